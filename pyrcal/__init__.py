@@ -1,6 +1,6 @@
 """The library: optical model, fits of measured matrices, reconstructors.
 
-Nothing is imported before it is asked for.
+Modules are imported when a name is first used.
 """
 
 from importlib import import_module
@@ -121,10 +121,10 @@ _HOMES = {
 }
 
 _RENAMED = {"InversionOptions": "Recipe", "array_backend": "arrays_of"}
-"""Public names of what is called otherwise in its module."""
+"""Public names that differ from the names in their modules."""
 
 _MODULES = {"conventions"}
-"""Modules that may be used without an import of their own."""
+"""Modules that are available without an explicit import."""
 
 
 def __getattr__(name: str) -> object:

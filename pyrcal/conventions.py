@@ -35,58 +35,60 @@ SIGN, MATRIX, LAW, PASSES, TIME = 11, 13, 14, 15, 17
 """Rules that can be measured."""
 
 MAX_ROTATION_DEG = 20.0
-"""From the nominal rotation, where one is told: further, rows and columns are another corner's."""
+"""Largest rotation from the nominal one, if that is known, degrees; a larger one indicates that
+rows and columns start at another corner."""
 
 MAX_GAIN_CHANGE = 0.3
-"""Of all modes, ratio less 1: wavelength and light change them, a factor of two is a pass."""
+"""Largest ratio of all gains, less 1: wavelength and flux change them, a factor of two is a wrong
+number of passes."""
 
 _A_PASS = 0.3
-"""Powers of two around a factor of two."""
+"""Range around a factor of two, in powers of two, that indicates a wrong number of passes."""
 
 MAX_MODE_CHANGE = 0.4
-"""Of a mode against all."""
+"""Largest relative deviation of a mode's gain from the common gain."""
 
 MIN_LIKENESS = 0.5
-"""Correlation of a column with its mode's of the model."""
+"""Smallest correlation of a column with the model of its mode."""
 
 MAX_RESIDUAL = 0.2
-"""RMS that the model leaves over: more is another list of slopes."""
+"""Largest RMS residual of the model; a larger one indicates another order of slopes."""
 
 HEIGHTS_M = (0.05, 50.0)
 """Peak of a mode over the pupil, metres per unit command: the range of any modes in metres."""
 
 COMMANDS_M = (1e-11, 1e-4)
-"""RMS of commands in metres."""
+"""Plausible range of the RMS of commands, metres."""
 
 MAX_SLOPE = 3.0
-"""RMS of slopes: they are dimensionless."""
+"""Largest plausible RMS of slopes, which are dimensionless."""
 
 YEARS_NS = (946_684_800_000_000_000, 4_102_444_800_000_000_000)
-"""2000 to 2100, nanoseconds since 1970."""
+"""Plausible range of times: 2000 to 2100, nanoseconds since 1970."""
 
 MAX_LAW_RESIDUAL = 0.5
-"""RMS of the commands' steps that the control law does not explain, of theirs."""
+"""Largest RMS of command steps that the control law does not explain, relative to all steps."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RuleCheck:
-    """One rule, and how far from it something is."""
+    """Result of the check of one rule."""
 
     rule: int
     """Number in docs/understand/conventions.md."""
 
     deviation: float
-    """As measured, in the unit that the text names."""
+    """Measured deviation, in the unit given in the text."""
 
     limit: float
     """Largest deviation that keeps the rule."""
 
     text: str
-    """What was found and what was expected."""
+    """Sentence with the measured and the expected value."""
 
     @property
     def kept(self) -> bool:
-        """Whether the rule is kept."""
+        """True if the rule is kept."""
         return self.deviation <= self.limit
 
 

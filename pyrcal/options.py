@@ -13,7 +13,7 @@ class Words(NamedTuple):
     form: str
     purpose: str | None
     how: dict[str, Any]
-    """What else argparse is told."""
+    """Further keyword arguments of argparse."""
 
 
 def words(form: str, purpose: str | None = None, **how: Any) -> Words:  # noqa: ANN401 - argparse's own

@@ -1,4 +1,4 @@
-"""Orders over REST: show, ask, send, follow to the end."""
+"""Orders over REST: show the subject, confirm, send, and follow the work to the end."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
     Raises
     ------
     ConfigurationError
-        If a reason or somebody's consent is missing and nobody is there to be asked.
+        If a reason or a confirmation is missing and there is no terminal to request it.
     RefusedError, UnreachableError
-        As of the service.
+        Errors of the service.
     """
     headers = {}
     if (request.needs_why and not options.why) or (request.asks and not options.yes):

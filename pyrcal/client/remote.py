@@ -1,8 +1,8 @@
-"""The commands that ask a running service; quick to import.
+"""The commands that query a running service; quick to import.
 
-Where REST takes an order, what it is decided on and where to look for what becomes of it stands in
-the service's own table, ``service/commands.toml``. What the service answers to an order is printed
-as it says it; what it refuses, too.
+The service's own table, ``service/commands.toml``, defines where REST accepts an order, what is
+shown before it, and where its progress is reported. Answers and refusals of the service are printed
+verbatim.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ USUAL_URL = "http://127.0.0.1:8080"
 ORDERS: Final = tomllib.loads(
     Path(errors.__file__).with_name("commands.toml").read_text(encoding="utf-8")
 )
-"""Every order by the name of its operation, as the service has it."""
+"""Orders by the name of their operation, from the service's table."""
 
 URL, KEY = "PYRCAL_URL", "PYRCAL_API_KEY"
-"""Variables of the environment."""
+"""Environment variables."""
 
 _EPILOG = """
 Exit status: 0 done, 1 refused by the service or not done (of status: not all is well), 2 a wrong

@@ -1,7 +1,7 @@
 """A client of the service's REST interface; quick to import.
 
-Whoever answers is a stranger until the answer makes sense: it may be late, cut, endless, or of
-something else than pyrcal.
+Every answer is validated before use: it may be late, truncated, endless, or come from another
+program.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from service import __version__
 from service.errors import CommandError, ConfigurationError, LinkError
 
 Document = dict[str, Any]
-"""A JSON object that REST answers."""
+"""A JSON object in an answer of the REST interface."""
 
 REQUEST_TIMEOUT_S = 5.0
 """Timeout of a request that only reads, seconds."""
@@ -34,11 +34,11 @@ _SAYS_PYRCAL = "urn:pyrcal:problem:"
 
 
 class UnreachableError(LinkError):
-    """Nothing answers in time, or something that is not this version of pyrcal."""
+    """No answer in time, or one that does not come from this version of pyrcal."""
 
 
 class RefusedError(CommandError):
-    """The service has refused, or does not have it."""
+    """The service refused the request, or does not have its subject."""
 
 
 class Fetched(NamedTuple):
@@ -46,7 +46,7 @@ class Fetched(NamedTuple):
 
     document: Document
     tag: str
-    """Its ETag; empty: it has none."""
+    """Value of its ETag header; empty if there is none."""
 
 
 class Service:

@@ -1,4 +1,4 @@
-"""What ``pyrcal demo`` understands. Nothing here takes long to import."""
+"""Arguments of ``pyrcal demo``; quick to import."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ REPEATED = {
 
 
 def demo_parser() -> argparse.ArgumentParser:
-    """Return what reads the command line of the demo."""
+    """Return the parser of the demo's command line."""
     demo = OneLineParser(
         prog="pyrcal demo",
         description="Start the service and a simulated RTC, show what happens, judge the outcome. "

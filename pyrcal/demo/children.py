@@ -1,4 +1,4 @@
-"""The two processes of the demo: started together, ended together, nothing left behind."""
+"""Start and end the two processes of the demo together."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 GRACE_S = 3.0
-"""They may take so long to end by themselves, both together; then they are killed."""
+"""Longest time for both processes to end by themselves, seconds; then they are killed."""
 
 _POLL_S = 0.05
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -40,12 +40,12 @@ class Child:
         return f"the {self.name} {how}: {last}"
 
     def signal(self, number: signal.Signals) -> None:
-        """Tell the process itself; it ends what it has started."""
+        """Send a signal to the process itself; it ends the processes that it started."""
         if self.process.poll() is None:
             self.process.send_signal(number)
 
     def kill_all(self) -> None:
-        """Kill it and whatever it has started: they share its process group."""
+        """Kill the process and its children: they share its process group."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.process.pid, signal.SIGKILL)
 
@@ -72,7 +72,7 @@ def _started(name: str, words: Sequence[str], directory: Path) -> Child:
 
 
 def _end(started: list[Child]) -> None:
-    """End all within ``GRACE_S``, whatever they do; an impatient Ctrl-C cannot leave one behind."""
+    """End all processes within ``GRACE_S``; a repeated Ctrl-C cannot interrupt this."""
     before = {number: signal.signal(number, signal.SIG_IGN) for number in _ENDING}
     try:
         for child in started:
@@ -90,7 +90,7 @@ def _end(started: list[Child]) -> None:
 
 @contextmanager
 def interrupted_by_any_end() -> Iterator[None]:
-    """Let a terminal that closes, or ``kill``, end the ``with`` block like Ctrl-C."""
+    """Let a closed terminal, or ``kill``, end the ``with`` block like Ctrl-C."""
 
     def interrupt(_number: int, _frame: object) -> None:
         raise KeyboardInterrupt

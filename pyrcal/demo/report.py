@@ -39,16 +39,17 @@ View = dict[str, Any]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Circumstances:
-    """Observations of the demo that explain why a result is bad."""
+    """Observations of the demo that explain a failed result."""
 
     seconds_to_ready: float | None = None
-    """From the start until model and simulator were prepared; None: they never were."""
+    """Time from the start until model and simulator were prepared, seconds; None if they never
+    were."""
 
     seconds_to_first_applied: float | None = None
-    """Time from then to the first applied matrix of the service, seconds; None if there is none."""
+    """Time from then to the service's first applied matrix, seconds; None if there was none."""
 
     pace: float | None = None
-    """Seconds of telemetry that the simulator made in a second; None: not known."""
+    """Seconds of telemetry per second; None if not known."""
 
     unanswered_s: float = 0.0
     """Time for which the service has not answered, seconds."""
@@ -63,16 +64,16 @@ class Circumstances:
     """Exit status and last output of processes that have ended."""
 
     wanted_ratio: float = 1.0
-    """Wavefront error at the start over that at the end which is wanted at least."""
+    """Smallest accepted ratio of the wavefront errors at the start and at the end."""
 
     across_subap: float = TOLERANCE_ACROSS_SUBAP
     """Subapertures across the pupil."""
 
     measured_plant: bool = False
-    """The plant is a measured matrix, whose true registration nobody knows."""
+    """True if the plant is a measured matrix, whose true registration is unknown."""
 
     refusal: str | None = None
-    """Why the last refused window was; None: not known."""
+    """Reason of the last refused window; None if not known."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -344,14 +345,14 @@ def _estimate_failures(report: Report, across_subap: float) -> list[str]:
 
 
 def _is_slowness(alarm: str) -> bool:
-    """Return whether an alarm only says that the machine is slow: that is told, and no failure."""
+    """Return True if an alarm only reports a slow machine, which is not a failure."""
     return alarm.startswith(f"{WORKER_BEHIND}: ")
 
 
 def _recovered(start: float | None, first: float | None) -> bool:
-    """Return whether an update has the better margin.
+    """Return True if an update improves the margin.
 
-    A worker without time never judges the matrix it replaces; the gate has judged the update.
+    A worker without time never checks the matrix that is replaced; the gate has checked the update.
     """
     return first is not None and (start is None or _less(first, start))
 

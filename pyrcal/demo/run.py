@@ -1,4 +1,4 @@
-"""One demo from its checks to its verdict: what the two processes are told, and when it is over."""
+"""Run one demo: check the arguments, start both processes, watch them, print the verdict."""
 
 from __future__ import annotations
 
@@ -31,21 +31,22 @@ from sim_rtc.rehearsal import write_live_instrument
 
 LOG = "service.log"
 LIVE_INSTRUMENT = "instrument.toml"
-"""Instrument file of the service where the plant is a measured matrix, in the demo's folder."""
+"""Instrument file of the service if the plant is a measured matrix, in the demo's folder."""
 
 USUAL_MAGNITUDE, USUAL_DIAMETER_M = 8.0, 8.22
-"""Star of the simulator, and telescope that it is meant for."""
+"""Magnitude of the simulator's star, and telescope diameter that it is meant for."""
 
 DEFAULT_INSTRUMENT = "flao-lbt"
 """Instrument of the demo unless another one is given."""
 
 WANTED_RATIO, OTHER_RATIO = 1.5, 1.25
-"""Of the wavefront error before and after, where the night begins far away: of FLAO, and of any
-other telescope, whose modes leave what they leave."""
+"""Required ratio of the wavefront errors before and after, with a large initial misregistration:
+for FLAO, and for other telescopes, whose modes correct less."""
 
 FEW_MODES, FEW_RATIO = 170, 1.05
-"""Of a telescope with fewer modes, which begins with seven tenths of them: all of them leave 1.17
-times less than that (variance by N^(-√3/2), Noll 1976), and a third of it in decibels is asked."""
+"""Number of modes below which ``FEW_RATIO`` is required. Such a demo begins with 70 % of the modes.
+All modes leave 1.17 times less (variance by N^(-√3/2), Noll 1976); a third of that in decibels is
+required."""
 
 SMALL_M = 2.0
 """Diameter below which the demo makes the star brighter and begins with a third of the modes.
@@ -55,8 +56,8 @@ PAPYRUS (1.6 m) at magnitude 8 has 1.5 electrons on a pixel and frame: 120 modes
 65 modes, 80 with 120, 79 with 195."""
 
 MEASURED_RATIO = 1 / 1.1
-"""Of a measured plant, which begins with the reconstructor of the measurement itself: the service's
-may leave a tenth more."""
+"""Required ratio for a measured plant, which begins with the reconstructor of the measurement
+itself: the service's may leave 10 % more."""
 
 PLACE_TEXT = """\
 The mirror lies 0.4 subapertures and 0.65 deg from where the RTC's matrix has it."""
@@ -82,7 +83,7 @@ and the simulator's own matrices: some 9 GB beside 6 of the service's.
 """
 
 HELD_GFLOP_S = 30.0
-"""Speed of matrix products with few frames on half of a processor with two cores, GFLOP/s."""
+"""Assumed speed of matrix products with few frames on half of a dual-core processor, GFLOP/s."""
 
 CHECK_WITHIN_S = 60.0
 
@@ -136,25 +137,28 @@ def run_demo(options: argparse.Namespace) -> int:
 
 
 def _is_measured(options: argparse.Namespace) -> bool:
-    """Return whether the plant is a measured matrix, whose true registration nobody knows."""
+    """Return True if the plant is a measured matrix, whose true registration is unknown."""
     return bool(options.plant == "measured")
 
 
 def _is_far(options: argparse.Namespace) -> bool:
-    """Return whether the night begins far away: nothing is said of another telescope or sky."""
+    """Return True if the demo begins with a large misregistration.
+
+    This is the default; it does not apply with another telescope or sky.
+    """
     told = any(getattr(options, name) is not None for name in ("alpha", "plant", "scene"))
     return not (told or options.near)
 
 
 def _beginning(options: argparse.Namespace) -> str:
-    """Return what a night that begins far away begins with; 400 modes are FLAO's."""
+    """Return the introduction of a demo with a large misregistration; only FLAO has 400 modes."""
     if options.instrument == DEFAULT_INSTRUMENT:
         return FAR_TEXT
     return OTHER_FAR_TEXT if _small_m(options) is None else SMALL_FAR_TEXT
 
 
 def _small_m(options: argparse.Namespace) -> float | None:
-    """Return the diameter of a small telescope, metres; None if it is none."""
+    """Return the diameter of a small telescope, metres; None for a larger one."""
     if _is_measured(options):
         return None
     said = read_instrument_file(options.instrument)
@@ -163,7 +167,7 @@ def _small_m(options: argparse.Namespace) -> float | None:
 
 
 def _words_of_small(options: argparse.Namespace) -> list[str]:
-    """Return what the simulator of a small telescope is told of its star and its loop."""
+    """Return the simulator's options for the star and the loop of a small telescope."""
     diameter_m = _small_m(options)
     if diameter_m is None:
         return []
@@ -181,7 +185,7 @@ def _n_modes(options: argparse.Namespace) -> int:
 
 
 class _Large(NamedTuple):
-    """A linear plant that no ordinary machine runs in real time."""
+    """Size of a linear plant that no ordinary machine simulates in real time."""
 
     rate_hz: float
     """Frame rate."""
@@ -191,9 +195,9 @@ class _Large(NamedTuple):
 
 
 def _too_large(options: argparse.Namespace) -> _Large | None:
-    """Return what it takes where that is more than a machine has; None: it keeps real time.
+    """Return the required speed if a machine cannot keep real time; None if it can.
 
-    Each frame is multiplied by R and by D. How fast is in its file; who does not say is small.
+    Each frame is multiplied by R and by D. An instrument file without a frame rate counts as small.
     """
     if options.plant == "diffractive":
         return None
@@ -206,7 +210,7 @@ def _too_large(options: argparse.Namespace) -> _Large | None:
 
 
 def _n_slopes(said: InstrumentFile) -> float:
-    """Return about how many slopes a file's sensor has."""
+    """Return the approximate number of slopes of a file's sensor."""
     kind = said.section(SlopesTable).said.kind
     return float(kind.n_planes * math.pi / 4 * _across_subap(said) ** 2)
 
@@ -242,7 +246,7 @@ def _wanted_ratio(options: argparse.Namespace) -> float:
 
 
 def _check(options: argparse.Namespace, sim_words: list[str]) -> None:
-    """Refuse what cannot be run before anything is started or emptied.
+    """Raise if the demo cannot run, before anything is started or deleted.
 
     Raises
     ------
@@ -278,7 +282,7 @@ def _check(options: argparse.Namespace, sim_words: list[str]) -> None:
 
 
 def _emptied(directory: Path) -> None:
-    """Begin with an empty directory; one that no earlier demo has filled is left alone.
+    """Start with an empty directory; one that no earlier demo has filled is not deleted.
 
     Raises
     ------

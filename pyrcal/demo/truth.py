@@ -10,7 +10,7 @@ Line = dict[str, Any]
 
 
 class TruthFile:
-    """Follows the file across a restart of the simulator, which begins it anew."""
+    """Reader of the truth file that follows it across a restart of the simulator."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -19,7 +19,7 @@ class TruthFile:
         self.lines: list[Line] = []
 
     def read(self) -> None:
-        """Take in the whole lines that have been written since the last call."""
+        """Read the complete lines written since the last call."""
         if not self._path.exists():
             return
         status = self._path.stat()
@@ -34,16 +34,16 @@ class TruthFile:
 
     @property
     def last(self) -> Line | None:
-        """The latest account of the truth."""
+        """Latest truth line; None if there is none."""
         return next((line for line in reversed(self.lines) if line["kind"] == "truth"), None)
 
     @property
     def swaps(self) -> list[Line]:
-        """Swaps of reconstructors whose aftermath is known."""
+        """Swaps of reconstructors whose effect has been measured."""
         return [line for line in self.lines if line["kind"] == "swap"]
 
     def wavefront_error_nm(self, cm_id: str, settling_s: float = 1.0) -> float | None:
-        """Return the RMS wavefront error under one reconstructor, its first moments left out."""
+        """Return the RMS wavefront error with one reconstructor, without its first moments."""
         under = [line for line in self.lines if line["kind"] == "truth" and line["cm_id"] == cm_id]
         if not under:
             return None

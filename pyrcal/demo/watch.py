@@ -48,20 +48,21 @@ USUAL_RATE_HZ = 1000.0
 """Frame rate of the simulated RTC, if the machine is fast enough."""
 
 HOLD_S = 5.0
-"""All must have been right for so long before the demo ends by itself."""
+"""Time for which all criteria must be met before the demo ends by itself, seconds."""
 
 SILENCE_S = 5.0
-"""If neither truth nor frames have grown for so long, they have stopped: the clock goes on without
-them."""
+"""Time without new truth or frames after which they count as stopped, seconds: the clock then
+continues without them."""
 
 STRETCH = 6.0
-"""A machine that does not keep real time may take so many times longer than asked for..."""
+"""Longest duration over the requested one on a machine that does not keep real time."""
 
 LARGE_STRETCH = 60.0
-"""... and one on which a telescope of thousands of modes runs in slow motion."""
+"""The same for a telescope of thousands of modes in slow motion."""
 
 SLOW_STRETCH = 2.0
-"""... and so many times the telemetry: where the simulator is slow, the service is."""
+"""Longest telemetry over the requested one on a slow machine: a slow simulator indicates a slow
+service."""
 
 _TRUTH_PERIOD_S = 0.5
 """Loop time between two lines of the truth file, seconds. It may be one line ahead of the clock."""
@@ -70,20 +71,20 @@ View = dict[str, Any]
 
 
 class Stopwatch:
-    """Seconds since all was ready: those of the telemetry, where a slow machine makes it late."""
+    """Seconds of telemetry since the end of preparation, including time without telemetry."""
 
     def __init__(self, now_s: float, telemetry_ns: int) -> None:
         self._start_s = self._now_s = self._grown_s = self._alive_s = now_s
         self._telemetry_ns = telemetry_ns
         self._idle_s = 0.0
         self.telemetry_s = 0.0
-        """Loop time the simulator has gone through."""
+        """Simulated loop time, seconds."""
 
     def look(self, now_s: float, telemetry_ns: int, frames_grown_s: float | None = None) -> None:
-        """Take note of the wall clock and of the simulator's; a step of the latter is left out.
+        """Update wall clock and simulator clock; steps of the simulator clock are ignored.
 
-        ``frames_grown_s``: when the service has last received a frame, by the wall clock: in slow
-        motion lines of the truth are far apart.
+        ``frames_grown_s`` is the wall-clock time of the last frame that the service received: in
+        slow motion lines of the truth are far apart.
         """
         step_s = (telemetry_ns - self._telemetry_ns) / 1e9
         if step_s != 0.0:
@@ -96,12 +97,12 @@ class Stopwatch:
 
     @property
     def wall_s(self) -> float:
-        """Seconds by the clock on the wall."""
+        """Wall-clock time since the start, seconds."""
         return self._now_s - self._start_s
 
     @property
     def spent_s(self) -> float:
-        """Seconds that count; a simulator that stands still does not stop the clock."""
+        """Seconds that count; the clock continues if the simulator stops."""
         return min(self.wall_s, self.telemetry_s + self._idle_s)
 
     @property
@@ -111,44 +112,44 @@ class Stopwatch:
 
     @property
     def pace(self) -> float | None:
-        """Seconds of telemetry a second; None: too early to say."""
+        """Seconds of telemetry per second; None if it is too early."""
         return self.telemetry_s / self.wall_s if self.wall_s > SILENCE_S else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Promise:
-    """Duration of the demo, and whether it may end earlier."""
+    """Duration of the demo, and conditions to end it earlier."""
 
     seconds: float | None
     """Duration from the end of preparation, seconds; None: until Ctrl-C."""
 
     whole: bool
-    """Something is to happen at a time of its own: all the seconds are wanted."""
+    """True if the demo must last all the seconds, because of events at given times."""
 
     real_time: bool
-    """The simulator keeps real time on an ordinary machine."""
+    """True if the simulator keeps real time on an ordinary machine."""
 
     large: bool = False
-    """Thousands of modes: until all is ready takes minutes."""
+    """True for thousands of modes: preparation takes minutes."""
 
     asked_rate_hz: float = USUAL_RATE_HZ
-    """Frames a second that the simulator is asked for."""
+    """Requested frame rate of the simulator, Hz."""
 
     wanted_ratio: float = 1.0
-    """Wavefront error before over after."""
+    """Required ratio of the wavefront errors before and after."""
 
     across_subap: float = TOLERANCE_ACROSS_SUBAP
     """Subapertures across the pupil."""
 
     measured_plant: bool = False
-    """The plant is a measured matrix, whose true registration nobody knows."""
+    """True if the plant is a measured matrix, whose true registration is unknown."""
 
     held_rate: bool = False
-    """The simulator runs at the highest rate that this machine holds."""
+    """True if the simulator runs at the highest rate that this machine sustains."""
 
 
 class TelemetryObserver:
-    """Looks at REST and the truth file, and prints."""
+    """Observer that polls REST and the truth file, and prints the progress."""
 
     def __init__(
         self,
@@ -175,7 +176,7 @@ class TelemetryObserver:
         self._said: set[str] = set()
 
     def run(self) -> None:
-        """Wait until all is ready, then watch until all has come out right or time is up."""
+        """Wait for the preparation, then watch until all criteria are met or time is up."""
         if not self._prepared():
             return
         n_lines, next_line_s = 0, 0.0
@@ -187,7 +188,7 @@ class TelemetryObserver:
             time.sleep(POLL_S)
 
     def report(self, refusal: str | None = None) -> Report:
-        """Return the figures as they stand now; ``refusal``: of the last window."""
+        """Return the current figures; ``refusal`` is that of the last window."""
         clock, now_s = self._stopwatch, time.monotonic()
         circumstances = Circumstances(
             seconds_to_ready=self._ready_s,
@@ -205,7 +206,7 @@ class TelemetryObserver:
         return make_report(self._state, self._reconstructors, self._truth, circumstances)
 
     def closing_report(self) -> Report:
-        """Return the figures at the end, with what only the service's log can say."""
+        """Return the final figures, with the reason from the service's log if they failed."""
         self._truth.read()
         report = self.report()
         return report if report.good else self.report(self._last_refusal())
@@ -218,7 +219,7 @@ class TelemetryObserver:
         return next((e["text"] for e in reversed(log) if e["name"] == "window.refused"), None)
 
     def _prepared(self) -> bool:
-        """Wait for the model and the simulated telescope; return whether both are there."""
+        """Wait for the model and the simulated telescope; return True if both are ready."""
         next_line_s = 0.0
         within_s = LARGE_WITHIN_S if self._promise.large else PREPARE_WITHIN_S
         while (waited_s := time.monotonic() - self._begun_s) < within_s:
@@ -251,7 +252,7 @@ class TelemetryObserver:
         return over or clock.wall_s >= stretch * promise.seconds
 
     def _patience(self, clock: Stopwatch) -> float:
-        """Return how many times the seconds asked for a slow machine is given, of telemetry."""
+        """Return the factor on the requested seconds of telemetry for a slow machine."""
         if self._behind or self._promise.large:
             return STRETCH
         return SLOW_STRETCH if clock.pace is not None and clock.pace < REAL_TIME else 1.0
@@ -275,7 +276,7 @@ class TelemetryObserver:
             self._take_note(state, self._stopwatch)
 
     def _take_note(self, state: View, clock: Stopwatch) -> None:
-        """Follow what has become of the frames, of the first matrix and of the promise."""
+        """Update frames, first applied matrix, and whether all criteria are met."""
         if state["link"]["frames_received"] != self._frames:
             self._frames = state["link"]["frames_received"]
             self._frames_grown_s = self._answered_s
@@ -359,7 +360,7 @@ def live_line(seconds: float, state: dict[str, Any] | None, truth: Line | None) 
 
 
 def awaited(state: dict[str, Any] | None) -> str:
-    """Return what keeps the clock from starting."""
+    """Return the reason why the clock has not started."""
     if state is None:
         return "the service is starting"
     if MODEL in (waited_for := waits(state)):
@@ -368,7 +369,7 @@ def awaited(state: dict[str, Any] | None) -> str:
 
 
 def rate_line(state: dict[str, Any] | None, asked_hz: float = USUAL_RATE_HZ) -> str | None:
-    """Return at which rate the loop runs where this machine holds no more; None: as asked for."""
+    """Return a line on a frame rate below the requested one, else None."""
     rtc = None if state is None else state["rtc"]
     if rtc is None or (held_hz := rtc["frame_rate_hz"]) >= asked_hz:
         return None
@@ -376,7 +377,7 @@ def rate_line(state: dict[str, Any] | None, asked_hz: float = USUAL_RATE_HZ) -> 
 
 
 def slow_line(pace: float | None, *, real_time: bool, behind: bool) -> str | None:
-    """Return what to say where it takes longer than asked for; None: it does not."""
+    """Return a line if the demo takes longer than requested, else None."""
     if pace is not None and pace < REAL_TIME:
         who = "this machine is slow: the simulator" if real_time else "the simulated telescope"
         return f"         {who} runs at {pace:.1f} of real time; this takes longer"
@@ -395,7 +396,7 @@ def _matrix(state: dict[str, Any]) -> str:
 
 
 def _waits(state: dict[str, Any]) -> list[str]:
-    """Return what is waited for besides the end of alarms."""
+    """Return the pending conditions that are not alarms."""
     known = {alarm["name"] for alarm in state["alarms"]}
     names = [wait["name"] for wait in state.get("waiting_for", ()) if wait["name"] not in known]
     return [f"waits for {', '.join(names)}"] if names else []

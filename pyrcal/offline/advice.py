@@ -1,4 +1,4 @@
-"""One sentence on what to do with a fit."""
+"""Recommend an action for a fit, in one sentence."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from pyrcal.offline.verdict import CANNOT_TELL, Refusal
 Array = NDArray[np.float64]
 
 ENOUGH_SUBAP = 0.03
-"""1 σ of where the mirror is seen at the pupil's edge: three of them are the tenth of a subaperture
-beyond which a loop begins to suffer (Heritier et al. 2018, section 3.2)."""
+"""Sufficient 1 σ of the mirror's position at the pupil's edge: 3 σ are then a tenth of a
+subaperture, where closed-loop performance begins to degrade (Heritier et al. 2018, section 3.2)."""
 
 FEWEST_SETS = 2
 """Sets of modes that can check each other."""
@@ -26,26 +26,26 @@ FEWEST_SETS = 2
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Grounds:
-    """What a recommendation rests on beside the fit's own numbers."""
+    """Inputs of a recommendation, besides the fit's own numbers."""
 
     refusal: Refusal | None
-    """Why it was refused; None: it was accepted."""
+    """Reason of the refusal; None if the fit was accepted."""
 
     structure: float
-    """RMS share of the signal that is left over and is no noise."""
+    """RMS share of the signal that is left over and is not noise."""
 
     n_sets: int
-    """Disjoint sets of modes that were fitted alone."""
+    """Number of disjoint sets of modes that were fitted separately."""
 
     columns: tuple[str, ...] = ()
-    """What is wrong with columns: signs, places."""
+    """Sentences on columns with wrong signs or in wrong places."""
 
     gains: tuple[str, ...] = ()
     """Causes of gains that are far from 1."""
 
 
 class Advice(StrEnum):
-    """What to do with a fit."""
+    """Recommended action for a fit."""
 
     USE = "use it"
     MEASURE_MORE = "measure more"
@@ -53,7 +53,7 @@ class Advice(StrEnum):
 
 
 def explained(fit: Fit, tried: tuple[Alternative, ...], grounds: Grounds) -> Fit:
-    """Return a fit with what else was tried, what stands out, and what to do with it."""
+    """Return the fit with alternatives, residual analysis and recommendation filled in."""
     preferred = (
         preference(one, fit.sigma)
         for one in tried
@@ -69,7 +69,7 @@ def explained(fit: Fit, tried: tuple[Alternative, ...], grounds: Grounds) -> Fit
 
 
 def with_displaced(fit: Fit, columns: tuple[str, ...]) -> Fit:
-    """Return a refused fit with the cause that all its columns stand elsewhere."""
+    """Return a refused fit whose cause is that all columns are displaced."""
     if not columns:
         return fit
     advised = f"{Advice.DO_NOT_USE}: {columns[0]}"
@@ -77,7 +77,7 @@ def with_displaced(fit: Fit, columns: tuple[str, ...]) -> Fit:
 
 
 def recommendation(fit: Fit, grounds: Grounds) -> str:
-    """Return what to do with a fit, in one sentence, and why."""
+    """Return the recommended action for a fit and its reason, in one sentence."""
     if grounds.refusal is not None:
         return _of_refused(fit, grounds)
     radius = _radius(fit)
@@ -105,7 +105,7 @@ def recommendation(fit: Fit, grounds: Grounds) -> str:
 
 
 def _uncertain(fit: Fit, edge: float, radius: float) -> str:
-    """Return how uncertain the registration is, and what would make it less so."""
+    """Return the uncertainty of the registration and how to reduce it."""
     known = (
         f"at the pupil's edge the mirror is known to {edge:.3f} subapertures (1 sigma), "
         f"{ENOUGH_SUBAP:g} is enough"
@@ -142,7 +142,7 @@ def _of_refused(fit: Fit, grounds: Grounds) -> str:
 
 
 def _cause(fit: Fit, grounds: Grounds) -> str:
-    """Return the likeliest cause of a refusal: what is more definite than the verdict first."""
+    """Return the most likely cause of a refusal; a definite cause precedes the verdict."""
     if grounds.refusal in {Refusal.ANOTHER_BASIS, Refusal.ANOTHER_UNIT} and grounds.gains:
         return grounds.gains[0]
     if grounds.columns and grounds.refusal is not Refusal.AXES:
@@ -162,7 +162,7 @@ def _cause(fit: Fit, grounds: Grounds) -> str:
 
 
 def _corrections(fit: Fit) -> Iterator[str]:
-    """Yield what the matrix says of the instrument file, as the file would write it."""
+    """Yield corrections of the instrument file, in its own notation."""
     for one in fit.origins:
         if one.correct:
             yield f"{one.key} = {one.found}"
@@ -172,7 +172,7 @@ def _corrections(fit: Fit) -> Iterator[str]:
 
 
 def _best_to_correct(fit: Fit) -> Alternative | None:
-    """Return the preferred alternative that leaves least and has a key, or None."""
+    """Return the preferred alternative with a key that leaves the smallest misfit, or None."""
     found = [
         one
         for one in fit.alternatives
@@ -187,5 +187,5 @@ def _radius(fit: Fit) -> float:
 
 
 def _at_edge(step: Array, radius: float) -> float:
-    """Return how far a step of α moves what is seen at the pupil's edge, subapertures."""
+    """Return the displacement at the pupil's edge for a change of α, subapertures."""
     return float(np.sqrt(np.max(step[:2] ** 2) + radius**2 * np.sum(step[2:] ** 2)))

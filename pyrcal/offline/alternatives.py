@@ -1,8 +1,8 @@
-"""What a rival explanation would change: other instruments, weights and sets of modes.
+"""Alternative explanations of a matrix: other instruments, weights and sets of modes.
 
-Each is allowed its own registration, to first order about the one found. It says how far the
-registration would move, and by its χ² whether the matrix prefers it. What is fitted beside the
-registration is held where the file has it; what is not is fitted as well.
+The registration is fitted again to first order under each alternative. This gives the change of the
+registration, and by χ² whether the matrix prefers the alternative. Quantities that the fit left
+free are fixed to the file's values, and quantities that it fixed are fitted.
 """
 
 from __future__ import annotations
@@ -27,77 +27,78 @@ from service.model.sensors.registry import kind_of
 Array = NDArray[np.float64]
 
 OFFSET_STEP_SUBAP = 0.05
-"""Of a pupil off the centre of the subapertures, for the difference that stands for a rate."""
+"""Step of the pupil offset for the finite difference that approximates its derivative."""
 
 NOTABLE_OFFSET_SUBAP = 0.05
-"""Less is not worth a word: the border of a pupil drawn on a grid is not better known."""
+"""Smallest pupil offset that is reported: the border of a pupil on a grid is not known better."""
 
 NOTABLE_OFFSET_SHARE = 0.2
-"""... nor less than this share of a shift: where the mirror is the stop, on the diffractive
-telescope, a tenth of the shift looks like an offset."""
+"""Smallest pupil offset that is reported, over the shift. If the mirror is the stop, on the
+diffractive telescope a tenth of the shift looks like an offset."""
 
 LEAST_OFFSET = 0.01
-"""RMS share of the signal that an offset of the pupil has to explain."""
+"""RMS share of the signal that a pupil offset must explain to be preferred."""
 
 EXCLUDED = 3.0
-"""An explanation is excluded where it is worse by this many σ of the difference."""
+"""Number of σ by which an alternative must be worse to be excluded."""
 
 NOTABLE_AXES = 0.02
-"""Of the gain of Sx over that of Sy, less 1."""
+"""Smallest reported ratio of the gains of Sx and Sy, less 1."""
 
 ARM_SUBAP = 0.5
-"""Width of the arms that are tried, subapertures; that which explains most is found from it."""
+"""Width of the arms in the trial model, subapertures; the best width is extrapolated from it."""
 
 PLAUSIBLE_DISPLACEMENT_PX = 0.5
 """Displacement of a pupil image beyond which it stands for something else: real pyramids have up to
 0.3 pixel, and images whose response the model explains to 70 % only were fitted 1.7 pixels off."""
 
 MODULATION_STEP = 0.1
-"""Share by which a modulation is taken for another, to see what it moves."""
+"""Relative change of the modulation for the alternative with another modulation."""
 
 _FEWEST = 6
-"""Modes below which a set tells nothing by itself."""
+"""Smallest number of modes in a set that is fitted as an alternative."""
 
 _WORST = 0.1
-"""Share of the modes that fit worst, left out to see what they move."""
+"""Share of the modes, those with the largest residual, that one alternative leaves out."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Alternative:
-    """Another explanation of the matrix, or another way to weigh it."""
+    """Another explanation of the matrix, or another weighting of it."""
 
     words: str
-    """What would be another, as the instrument file says it where it has a key."""
+    """Description of the change, in the notation of the instrument file if it has a key."""
 
     share: float | None
-    """χ² that it leaves over what the fit leaves, to first order; None: weights or modes are
-    others, and the two cannot be compared."""
+    """χ² that it leaves over that of the fit, to first order; None if weights or modes differ, so
+    that the two are not comparable."""
 
     moved: Array
-    """``(4,)`` by how much the registration would be another, numeric units."""
+    """``(4,)`` change of the registration, numeric units."""
 
     preferred: bool = False
-    """Whether the matrix is explained better by it, as far as χ² tells."""
+    """True if it explains the matrix better, by χ²."""
 
     undecided: bool = False
-    """Whether the matrix cannot tell the two apart."""
+    """True if the matrix does not distinguish it from the fit."""
 
     key: str = ""
-    """What to write into the instrument file, or the option that tries it; empty: it has none."""
+    """Entry for the instrument file, or option of the command; empty if there is none."""
 
     counts: bool = False
-    """Whether it is another explanation, whose move is an error of the registration until it is
-    excluded; other weights and sets of modes are none."""
+    """True if its change of α is an error of the registration until it is excluded; False for other
+    weights and sets of modes."""
 
     is_number: bool = False
-    """Whether it is a number at the value that explains most, of which the fit has another."""
+    """True if it is a number at its best-fitting value, for which the fit has another value."""
 
     def weight(self, residual_fraction: float) -> float:
-        """Return the weight of the square of its move in σ, 0 to 1.
+        """Return the weight of the square of its change of α in σ, 0 to 1.
 
         An explanation that the matrix prefers counts in full, one that is not excluded by its
         probability. Models of one instrument differ by ``MIN_EXPLAINED`` of the signal, and any
-        number fitted besides explains some of that by chance: less is no evidence for it.
+        additional fitted number explains some of that by coincidence: smaller improvements are no
+        evidence for it.
         """
         if not self.counts or not (self.preferred or self.undecided):
             return 0.0
@@ -121,14 +122,14 @@ class SigmaTerm:
 def systematic_terms(
     tried: Sequence[Alternative], residual_fraction: float, sigma: Array
 ) -> tuple[SigmaTerm, ...]:
-    """Return the alternatives that count in σ, the one that adds most first.
+    """Return the alternatives that enter σ, the largest contribution first.
 
     Parameters
     ----------
     tried
         Every alternative.
     residual_fraction
-        RMS of what the fit leaves over the RMS of the measurement.
+        RMS of the residual over the RMS of the measurement.
     sigma
         ``(4,)`` 1 σ of the registration.
     """
@@ -149,20 +150,20 @@ def alternatives(
     without: FileValuesFit | None,
     arms_deg: tuple[float, ...] = (),
 ) -> tuple[Alternative, ...]:
-    """Return every alternative that was tried, those that the matrix prefers first.
+    """Return every alternative that was tried, preferred ones first.
 
     Parameters
     ----------
     settled, few
-        The fit, and some of its modes on the cheap grid.
+        The fit, and a subset of its modes on the coarse grid.
     others
-        Other instruments that were tried for the verdict.
+        Other instruments, as tried for the verdict.
     pupils
         Other obscurations and diameters.
     optics, without
-        What was fitted of the instrument, and the fit without where they differ.
+        Fitted optical quantities, and the fit with the file's values if they differ.
     arms_deg
-        Directions of lines in what is left over.
+        Directions of lines in the residual, degrees.
     """
     beside = (_of_pupil(one, others) for one in pupils)
     found = [
@@ -192,20 +193,20 @@ def with_alternatives(
     width: Array,
     without: FileValuesFit | None,
 ) -> Uncertainty:
-    """Return the uncertainty with the moves of all alternatives that the data do not exclude.
+    """Return the uncertainty including all alternatives that the data do not exclude.
 
     Parameters
     ----------
     before
-        Without them.
+        Uncertainty without alternatives.
     tried
         Every alternative.
     residual_fraction
-        RMS of what the fit leaves over the RMS of the measurement.
+        RMS of the residual over the RMS of the measurement.
     width
-        ``(4,)`` move by a width of the influence functions that cannot be fitted.
+        ``(4,)`` change of α by a width of the influence functions that is not fitted.
     without
-        The fit with coupling and modulation as in the file; None where they are as fitted.
+        Fit with the file's coupling and modulation; None if they equal the fitted ones.
     """
     open_share = OTHER_SHARE * min(1.0, residual_fraction / MIN_EXPLAINED) ** 2
     moves = [width, *(one.moved for one in tried)]
@@ -217,14 +218,17 @@ def with_alternatives(
 
 
 def off_centre(few: Few, others: tuple[Rival, ...]) -> Alternative | None:
-    """Return a pupil off the middle that the matrix prefers, if a rival moves the pupil as well."""
+    """Return the preferred alternative with a decentred pupil, or None.
+
+    It is only considered if another stop is preferred, because that displaces the pupil as well.
+    """
     if not any(one.preferred and "stop" in one.change.words for one in others):
         return None
     return next((one for one in _that_can(_off_centre(few)) if one.preferred), None)
 
 
 def _that_can(rivals: Iterator[Alternative]) -> Iterator[Alternative]:
-    """Yield rivals as far as what was measured determines a registration under them."""
+    """Yield alternatives under which the measurement determines a registration."""
     try:
         yield from rivals
     except np.linalg.LinAlgError:
@@ -236,7 +240,7 @@ def _share(one: Alternative) -> float:
 
 
 def preference(one: Alternative, sigma: Array) -> str:
-    """Return in a sentence that the matrix prefers an alternative, and what it would move."""
+    """Return a sentence that the matrix prefers an alternative, with the change of α."""
     move = np.abs(one.moved) / sigma
     share = "" if one.share is None else f" ({one.share:.0%} of the misfit)"
     return (
@@ -246,7 +250,7 @@ def preference(one: Alternative, sigma: Array) -> str:
 
 
 def moved_words(moved: Array) -> str:
-    """Return how far a registration moves, boundary units."""
+    """Return a change of the registration in boundary units, as text."""
     x, y, turn, size = moved * BOUNDARY_SCALE
     return f"{x:+.2g}, {y:+.2g} subapertures, {turn:+.2g} deg, {size:+.2g}"
 
@@ -268,7 +272,7 @@ def _of_rival(rival: Rival, pupils: tuple[TriedPupil, ...]) -> Alternative:
 
 
 def _of_pupil(one: TriedPupil, others: tuple[Rival, ...]) -> Alternative | None:
-    """Return another pupil, unless it is among the rivals already."""
+    """Return an alternative with another pupil, or None if it is already in ``others``."""
     if any(one.words == rival.change.words for rival in others):
         return None
     return Alternative(
@@ -283,12 +287,12 @@ def _of_pupil(one: TriedPupil, others: tuple[Rival, ...]) -> Alternative | None:
 
 
 def is_open(lead: Lead) -> bool:
-    """Return whether the data do not exclude an explanation: it is not significantly worse."""
+    """Return True if an alternative is not excluded: it is not significantly worse."""
     return lead.significance > -EXCLUDED
 
 
 def _off_centre(few: Few) -> Iterator[Alternative]:
-    """Yield that the pupil's image is not in the middle of the subapertures."""
+    """Yield the alternative with the pupil image off the centre of the subapertures."""
     about, alpha = few.models.instrument, few.here
     here = np.array(about.pupil_shift_subap or (0.0, 0.0))
     if about.stop is Stop.MIRROR:
@@ -323,7 +327,7 @@ def _off_centre(few: Few) -> Iterator[Alternative]:
 
 
 def _axes_apart(few: Few) -> Iterator[Alternative]:
-    """Yield that Sx and Sy have gains of their own."""
+    """Yield the alternative with separate gains of Sx and Sy."""
     if few.models.instrument.slopes.kind is not SignalKind.XY:
         return
     half = len(few.own) // 2
@@ -345,7 +349,7 @@ def _axes_apart(few: Few) -> Iterator[Alternative]:
 
 
 def _uneven_light(few: Few) -> Iterator[Alternative]:
-    """Yield that a smooth gain over the pupil is common to all modes."""
+    """Yield the alternative with a smooth gain over the pupil, common to all modes."""
     maps = [pattern[:, None] * few.own for pattern in gain_maps(few)]
     _, lead, moved = _fitted_as_well(few, *maps)
     yield Alternative(
@@ -360,7 +364,7 @@ def _uneven_light(few: Few) -> Iterator[Alternative]:
 
 
 def _spiders(few: Few, arms_deg: tuple[float, ...]) -> Iterator[Alternative]:
-    """Yield arms of a spider where lines in what is left over look like them."""
+    """Yield the alternative with spider arms, if the residual shows lines like arms."""
     about = few.models.instrument
     if not arms_deg or about.spiders_deg or about.pupil is not None:
         return
@@ -387,7 +391,7 @@ def _spiders(few: Few, arms_deg: tuple[float, ...]) -> Iterator[Alternative]:
 
 
 def _wavelength(few: Few) -> Iterator[Alternative]:
-    """Yield a tenth more of the wavelength: the modulation, in λ/D, stays."""
+    """Yield the alternative with a 10 % longer wavelength and the same modulation in λ/D."""
     about = few.models.instrument
     wfs = replace(about.wfs, wavelength_m=1.1 * about.wfs.wavelength_m)
     matrix = few.matrix(few.of(replace(about, wfs=wfs)))
@@ -402,13 +406,13 @@ def _wavelength(few: Few) -> Iterator[Alternative]:
 
 
 def _fitted_as_well(few: Few, *rates: Array) -> tuple[Array, Lead, Array]:
-    """Return the values of more unknowns, their lead over the fit without, and α's move."""
+    """Return the values of further unknowns, their improvement, and the change of α."""
     step = few.step(few.own, *rates)
     return step[-len(rates) :], few.lead(few.own, *rates), step[:4] - few.step(few.own)[:4]
 
 
 def _ratio(chi: float, own: float) -> float:
-    """Return χ² over the fit's; 1 where that leaves nothing."""
+    """Return χ² over that of the fit; 1 if the fit leaves no residual."""
     return chi / own if own > 0.0 else 1.0
 
 
@@ -418,7 +422,7 @@ def _ratio(chi: float, own: float) -> float:
 def _optics(
     settled: Settled, optics: tuple[FoundOptic, ...], without: FileValuesFit | None
 ) -> Iterator[Alternative]:
-    """Yield coupling and modulation as the file says, and a modulation that is another."""
+    """Yield coupling and modulation as in the file, and a 10 % larger modulation."""
     stated = [one for one in optics if one.reported is not None]
     if without is not None:
         words = " and ".join(f"{one.key} = {one.reported:.3g}" for one in stated) or "as told"
@@ -438,7 +442,7 @@ def _optics(
 
 
 def _held(settled: Settled) -> Iterator[Alternative]:
-    """Yield the slopes' axes as they are told, and an image that is not stretched."""
+    """Yield alternatives with nominal slope axes and without anamorphosis."""
     nuisances, values = settled.nuisances, settled.solution.nuisances
     distance = nuisances.from_prior(values)
     groups = [("the slopes' axes not turned", [0])]
@@ -477,7 +481,7 @@ def _images_in_place(settled: Settled) -> Iterator[Alternative]:
 
 
 def _with(settled: Settled, steps: dict[int, float]) -> tuple[float, Array]:
-    """Return χ² over the fit's, and α's move, where nuisances are held so far from theirs."""
+    """Return χ² over that of the fit, and the change of α, with nuisances fixed at offsets."""
     seen = settled.solution.projection
     noise = seen.chi / max(seen.residual.size - len(seen.gains), 1)
     normal = seen.normal
@@ -496,7 +500,7 @@ def _with(settled: Settled, steps: dict[int, float]) -> tuple[float, Array]:
 
 
 def _weighted(settled: Settled) -> Iterator[Alternative]:
-    """Yield modes weighed as if every slope had the same noise at the same stroke."""
+    """Yield the alternative in which every slope has the same noise at the same stroke."""
     alike = np.full(len(settled.target.weights), np.mean(settled.target.weights))
     yield Alternative(
         words="every slope with the same weight", share=None, moved=_stepped(settled, alike)
@@ -504,7 +508,7 @@ def _weighted(settled: Settled) -> Iterator[Alternative]:
 
 
 def _some_modes(settled: Settled) -> Iterator[Alternative]:
-    """Yield halves of the modes, and all but those that fit worst."""
+    """Yield each half of the modes, and all modes but those with the largest residual."""
     n_modes = settled.target.n_modes
     order, numbers = np.argsort(settled.target.modes), np.arange(n_modes)
     worst = np.argsort(settled.by_mode)[: n_modes - int(np.ceil(_WORST * n_modes))]
@@ -520,7 +524,7 @@ def _some_modes(settled: Settled) -> Iterator[Alternative]:
 
 
 def _stepped(settled: Settled, weights: Array) -> Array:
-    """Return how far other weights of the modes ``(n_modes,)`` move α."""
+    """Return the change of α with other weights of the modes ``(n_modes,)``."""
     seen, nuisances = settled.solution.projection, settled.nuisances
     noise = seen.chi / max(seen.residual.size - len(seen.gains), 1)
     prior = settled.prior * noise
@@ -546,7 +550,7 @@ def _without_border(few: Few) -> Iterator[Alternative]:
 
 
 def border_of(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which valid subapertures ``(n, n)`` have a neighbour that is none."""
+    """Return the valid subapertures ``(n, n)`` that have an invalid neighbour."""
     wide = np.pad(valid, 1)
     inside = wide[:-2, 1:-1] & wide[2:, 1:-1] & wide[1:-1, :-2] & wide[1:-1, 2:]
     return np.asarray(valid & ~inside)

@@ -27,7 +27,7 @@ from service.tracking.policy import SECOND_NS
 from service.wire import FrameBatch, Manifest, Status, decode, decode_frames
 
 FRAMES = "frames"
-"""What the time of all measurements is called, by which files of pyrcal's own are known."""
+"""Name of the time of all measurements, by which files written by pyrcal are recognised."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -243,7 +243,7 @@ def _add_telemetry(aotpy: Any, system: Any, instrument: Instrument, taken: Excer
 
 
 def is_own(measurements: Any) -> bool:  # noqa: ANN401
-    """Whether measurements of an AOT file were written here: in the axes of conventions.md."""
+    """Return True if measurements in an AOT file were written by pyrcal, in its axes."""
     time = measurements.time
     return time is not None and str(time.uid).casefold() == f"time of {FRAMES}"
 

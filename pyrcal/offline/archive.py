@@ -26,7 +26,7 @@ from service.tracking.products import MatrixState
 DONE, DAMAGED = 0, 1
 
 BESIDE_NS = HOUR_NS
-"""So long before and after telemetry α is told beside it."""
+"""Time before and after the telemetry for which α is included, nanoseconds."""
 
 
 def main(options: argparse.Namespace) -> int:
@@ -159,7 +159,7 @@ def _prune(settings: Settings, *, dry_run: bool, as_json: bool) -> int:
 
 
 def _aot(options: argparse.Namespace, settings: Settings) -> int:
-    """Write what was measured in a night, or beside a recording, as AOT FITS."""
+    """Write the measurements of a night, or those around a recording, as AOT FITS."""
     from pyrcal.offline.aot import excerpt, write_aot
     from pyrcal.offline.importers.registration import Dated
     from service.config import load_instrument

@@ -1,6 +1,7 @@
-"""Arguments of the commands that work on files; quick to import.
+"""Arguments of the offline commands; quick to import.
 
-What the program calls methods and data sets stands here as text; a test compares it.
+Names of methods and data sets are repeated here as text, so that the modules need not be imported;
+a test compares them.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ _OF_A_FOLDER = (
     words("--config FILE", "the service's settings, TOML", type=Path),
     words("--data-dir DIR", "the service's data_dir, default var"),
 )
-"""What commands that work in a service's folder have in common."""
+"""Options of commands that work in a service's folder."""
 
 
 def _describe_archive(archive: argparse.ArgumentParser) -> None:
@@ -176,7 +177,7 @@ _OF_AN_ANSWER = (
     words("--output FILE.h5", "write everything found", type=Path),
     words("--threads N", "default: one for every core", type=_count, default=os.cpu_count() or 1),
 )
-"""What commands that fit have in common."""
+"""Options of commands that fit a registration."""
 
 
 def _describe_fit(fit: argparse.ArgumentParser) -> None:
@@ -424,7 +425,7 @@ _REPORTED = (
     words("--pupil-subap N", "pupil's diameter, subapertures; default the mask's", type=float),
     words("--pixels-per-subap N", "of camera frames; default: by the actuators", type=_count),
 )
-"""What no file says."""
+"""Options for values that no file contains."""
 
 
 def _role_and_path(text: str) -> tuple[str | None, Path]:

@@ -65,7 +65,7 @@ def _bundle_of(options: argparse.Namespace, settings: Settings, instrument: Inst
 def _whole(
     options: argparse.Namespace, instrument: Instrument, path: Path, record: ReconstructorRecord
 ) -> Bundle:
-    """Return an archived product, what is asked for beside it, and the basis it is of."""
+    """Return an archived product, the requested companion products, and its basis."""
     with open_hdf5(path) as file:
         names = {RECONSTRUCTOR: RECONSTRUCTOR, **_BESIDE}
         arrays = {name: np.asarray(file[at][()]) for name, at in names.items() if at in file}
@@ -113,7 +113,8 @@ _BESIDE = {
     "gain_factor": "gains/factor",
     "covariance": "covariance",
 }
-"""Arrays of a bundle that the archive has beside a reconstructor, and where."""
+"""Arrays of a bundle that are stored next to a reconstructor in the archive, and their names there.
+"""
 
 
 def _record(archive: Archive, name: str) -> ReconstructorRecord:

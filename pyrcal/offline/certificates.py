@@ -151,7 +151,7 @@ def _write(folder: Path, stem: str, signed: Signed) -> None:
 
 
 def _write_secret(path: Path, data: bytes) -> None:
-    """Write a file that nobody else may read, at no moment."""
+    """Write a file that other users can never read, not even while it is being written."""
     path.unlink(missing_ok=True)
     path.touch(mode=0o600)
     path.write_bytes(data)

@@ -1,4 +1,4 @@
-"""Columns of a matrix that are not those of their modes: signs, places, one too many."""
+"""Detect wrong columns of a matrix: signs, places, noise, and remainders of earlier pokes."""
 
 from __future__ import annotations
 
@@ -18,46 +18,47 @@ from service.model.sensors.sensor import Mapper
 Array = NDArray[np.float64]
 
 OPPOSITE = -0.5
-"""Correlation with its model below which a column has the wrong sign."""
+"""Correlation of a column with its model below which it has the wrong sign."""
 
 ANOTHERS = 0.7
-"""Correlation with another mode's model above which a column is that mode's."""
+"""Correlation with another mode's model above which a column belongs to that mode."""
 
 OWN = 0.35
-"""... unless its own model explains more than this of it."""
+"""Correlation with its own model above which a column is not attributed to another mode."""
 
 SURE = 0.7
-"""Correlation of the lowest orders above which columns listed another way are believed, ..."""
+"""Correlation of the lowest orders above which another arrangement of columns is accepted."""
 
 CLEARER = 1.3
-"""... where it is so many times what it is as they stand."""
+"""Factor by which that correlation must exceed the one of the listed arrangement."""
 
 CHANCE_SIGMA = 4.0
 """Correlation with the model, in 1 σ of that of noise, below which a column may be noise only."""
 
 WHITE = 11.8
-"""Sum of squares of two correlations of neighbours, in their σ, that noise exceeds in 0.3 %."""
+"""Sum of squares of two neighbour correlations, in their σ, that noise exceeds in 0.3 % of cases.
+"""
 
 SMALLEST_SMEAR = 0.01
-"""Share of the column before below which pokes are said to have settled."""
+"""Share of the previous column below which the pokes count as settled."""
 
 SMEAR_SIGMA = 5.0
-"""... or that is less than this many of its own σ."""
+"""Smallest significant share of the previous column, in its own σ."""
 
 MAX_SMEAR = 0.45
-"""Share from which a column is rather that of the poke before."""
+"""Share above which a column belongs to the previous poke rather than to its own."""
 
 _FEWEST = 9
-"""Modes below which some other order always looks alike."""
+"""Number of modes below which some other arrangement always correlates by chance."""
 
 _NAMED = 12
 
 
 def noise_columns(solution: Solution, target: Target, n_planes: int) -> NDArray[np.bool_]:
-    """Return which columns hold noise only, ``(n_modes,)``.
+    """Return the columns that contain noise only ``(n_modes,)``.
 
-    Such a column has nothing in common with its model, and its neighbouring subapertures nothing in
-    common with each other. A column of another mode, or of another basis, is smooth.
+    Such a column has nothing in common with its model, and its neighbouring subapertures are
+    uncorrelated. A column of another mode, or of another basis, is smooth.
     """
     measured = np.where(target.rows[:, None], target.matrix, 0.0)
     alike = np.sum(_unit(measured) * _unit(np.asarray(solution.matrix, np.float64)), axis=0)
@@ -79,7 +80,7 @@ def noise_columns(solution: Solution, target: Target, n_planes: int) -> NDArray[
 
 
 def strange_columns(solution: Solution, target: Target) -> Iterator[str]:
-    """Yield which columns have the wrong sign, and which are other modes'."""
+    """Yield sentences on columns with the wrong sign and on columns of other modes."""
     measured = _unit(target.matrix[target.rows])
     alike = measured.T @ _unit(np.asarray(solution.matrix, dtype=np.float64)[target.rows])
     own = np.diag(alike)
@@ -108,14 +109,16 @@ def strange_columns(solution: Solution, target: Target) -> Iterator[str]:
 def displaced_columns(
     instrument: Instrument, usable: Reference, basis: Basis, *, mapper: Mapper = map
 ) -> Iterator[str]:
-    """Yield that all columns stand one place off, or in reverse, where the lowest modes say so.
+    """Yield a sentence if all columns are displaced by one or reversed.
+
+    The lowest modes decide.
 
     Parameters
     ----------
     instrument
-        As it is told; its orientation may be open.
+        Instrument as described in its file; its orientation may be unknown.
     usable, basis
-        The matrix, and the modes of its columns in their order.
+        Measured matrix, and the modes of its columns in order.
     """
     n = len(usable.columns)
     if n < _FEWEST:
@@ -147,20 +150,20 @@ def displaced_columns(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Smear:
-    """Share of the column before that each column holds."""
+    """Share of the previous column contained in each column."""
 
     share: float
     sigma: float
-    """1 σ of it, from how it scatters between columns."""
+    """1 σ of the share, from its scatter between columns."""
 
     @property
     def is_found(self) -> bool:
-        """Whether it is more than chance, and enough to matter."""
+        """True if the share is significant and large enough to matter."""
         return self.share > max(SMALLEST_SMEAR, SMEAR_SIGMA * self.sigma)
 
     @property
     def words(self) -> str:
-        """What was found, how the fit allows for it, and what to do."""
+        """Sentence on the share, its treatment in the fit, and the remedy."""
         return (
             f"each column holds {self.share:.0%} of the column before it (+- {self.sigma:.1%}): "
             "pokes that had not settled; the fit takes it out. Wait longer after each poke, or "
@@ -169,10 +172,10 @@ class Smear:
 
 
 def measure_smear(solution: Solution, target: Target) -> Smear:
-    """Return how much more of the column before than of the one after each column holds.
+    """Return the share of the previous column in each column, less that of the next one.
 
     Errors of the model make a column look like its neighbours on either side; a mirror that has not
-    settled only adds the one before.
+    settled adds only the previous one.
     """
     measured = target.matrix[target.rows]
     model = np.asarray(solution.matrix, np.float64)[target.rows] * solution.projection.gains
@@ -190,7 +193,7 @@ def measure_smear(solution: Solution, target: Target) -> Smear:
 
 
 def without_smear(usable: Reference, share: float) -> Reference:
-    """Return the columns without this share of the column before, one after the other."""
+    """Return the columns with this share of the previous column removed, in sequence."""
     matrix = np.array(usable.matrix, dtype=np.float64)
     ratio = share / (1.0 - share)
     for k in np.flatnonzero(np.diff(usable.columns) == 1) + 1:

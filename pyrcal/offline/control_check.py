@@ -1,14 +1,14 @@
-"""Check whether a reconstructor of the fitted model holds the loop of the measured matrix.
+"""Check whether a reconstructor of the fitted model is stable with the measured matrix.
 
-The reconstructor is the one that ``pyrcal reconstruct`` makes of the fit: the least-squares inverse
-of D(α), its columns times the calibration gains. The plant is the measured matrix itself. The loop
-``c[k+d] = leak c[k+d-1] - g R s[k]`` is stable where every eigenvalue of ``g R M`` has its poles
-inside the unit circle. A stroke that is calibrated wrong is one global gain, which the loop gain
-takes up.
+The reconstructor is the one that ``pyrcal reconstruct`` computes from the fit: the least-squares
+inverse of D(α), with columns multiplied by the calibration gains. The plant is the measured matrix
+itself. The loop ``c[k+d] = leak c[k+d-1] - g R s[k]`` is stable if every eigenvalue of ``g R M``
+has its poles inside the unit circle. A stroke that is calibrated wrongly is one global gain, which
+the loop gain absorbs.
 
-Noise of the measured matrix moves the eigenvalues, too, and the more of them there are the further.
-How far is found by adding as much noise to the model: where that alone makes a loop unstable, the
-matrix cannot tell more, and the answer is a lower bound.
+Noise of the measured matrix also moves the eigenvalues, and more so with more modes. Its effect is
+estimated by adding the same noise to the model: if that alone makes a loop unstable, the matrix
+cannot show more, and the result is a lower bound.
 """
 
 from __future__ import annotations
@@ -25,69 +25,70 @@ from service.control.reconstructor import MAX_CONDITION
 Array = NDArray[np.float64]
 
 GAIN = 0.5
-"""Integrator gain that is asked for where none is given."""
+"""Default integrator gain of the loop."""
 
 DELAY_FRAMES = 2.0
 
 CHECKED = np.array([1.0, 1.7, 3.5])
-"""All modes over the numbers of modes that are checked before it is said that all are stable."""
+"""Divisors of the number of modes; the loop is checked at each before all are reported stable."""
 
 RESOLUTION = 0.03
-"""Relative distance of the numbers of modes of a stable and an unstable loop at which the search
-for the most stable modes ends."""
+"""Relative distance of a stable and an unstable number of modes at which the search for the largest
+stable number ends."""
 
 CORNER_FRAMES = 50.0
-"""Correlation time of the turbulence that the loss is computed for, in frames."""
+"""Correlation time of the turbulence used for the loss, frames."""
 
 N_FREQUENCIES = 64
 
 MIN_PART = 0.05
-"""Share of an eigenvector from which on a mode is named."""
+"""Share of an eigenvector above which a mode is listed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReconstructorVerdict:
-    """Whether a reconstructor of the model holds the loop of the measured matrix."""
+    """Stability of the measured matrix in closed loop with the model's reconstructor."""
 
     stable_modes: int
-    """Modes, the first of those fitted, up to which every loop that was tried is stable."""
+    """Largest number of modes, in fitted order, with which every tried loop is stable."""
 
     n_modes: int
-    """Modes that were asked for: all of those fitted, as far as there are slopes."""
+    """Number of modes checked: all fitted modes, at most the number of slopes."""
 
     gain: float
     """Integrator gain."""
 
     pole_radius: float
-    """Largest pole radius with ``stable_modes``; 1 is the edge of stability."""
+    """Largest pole radius with ``stable_modes``; 1 is the limit of stability."""
 
     pole_radius_all: float
-    """The same with all modes."""
+    """Largest pole radius with all modes."""
 
     aligned_pole_radius: float
-    """The same of a perfect reconstructor."""
+    """Pole radius of a perfect reconstructor."""
 
     loss_ratio: float | None
-    """Wavefront error of the controlled modes over that of a reconstructor of the measured matrix
+    """Wavefront error of the controlled modes over that of a reconstructor from the measured matrix
     itself, with ``stable_modes``; None if no loop is stable."""
 
     noise_limited: bool
-    """Whether noise of the measured matrix bounds the answer, so that more modes may be stable."""
+    """True if noise of the measured matrix limits the result, so that more modes may be stable."""
 
     weakest_modes: tuple[int, ...]
-    """Basis indices of the modes that take part most in the worst pole beyond."""
+    """Basis indices of the modes with the largest share in the worst pole beyond ``stable_modes``.
+    """
 
     reason: str
-    """The answer in one sentence."""
+    """Result in one sentence."""
 
     @property
     def holds(self) -> bool:
-        """Whether the loop is stable with all modes that were fitted."""
+        """True if the loop is stable with all fitted modes."""
         return self.stable_modes >= self.n_modes
 
     @property
     def usable(self) -> bool:
-        """Whether a loop of some modes is stable."""
+        """True if the loop is stable with at least one mode."""
         return self.stable_modes > 0
 
 
@@ -101,7 +102,7 @@ def check_control(
     gain: float = GAIN,
     noise: Array | None = None,
 ) -> ReconstructorVerdict:
-    """Return whether the model's reconstructor holds the loop whose plant was measured.
+    """Return the closed-loop stability of the measured plant with the model's reconstructor.
 
     Parameters
     ----------
@@ -116,8 +117,8 @@ def check_control(
     gain
         Integrator gain.
     noise
-        ``(n_modes,)`` 1 σ of an element of each measured column; None: estimated from what the
-        model leaves over.
+        ``(n_modes,)`` 1 σ of an element of each measured column; None to estimate it from the
+        residual.
     """
     order = np.argsort(modes, kind="stable")
     order = order[gains[order] > 0.0]

@@ -1,4 +1,4 @@
-"""What a telescope's optics let one know, before anything is measured."""
+"""Predict the interaction matrix and the achievable precision of an instrument."""
 
 from __future__ import annotations
 
@@ -48,17 +48,17 @@ def dither_sigma(
     n_frames: int,
     slope_noise: float,
 ) -> NDArray[np.float64]:
-    """Return 1 σ of α by sines on some modes at once, noise alone, ``(4,)``.
+    """Return ``(4,)`` 1 σ of α from sines on several modes at once, measurement noise only.
 
-    In subapertures, subapertures, radians and units of magnification. Each mode is dithered by a
-    sine of ``amplitude_m`` (RMS, metres of OPD) over ``n_frames`` frames, all at frequencies of
-    their own; slopes have white noise of ``slope_noise`` RMS a frame. The gain of each mode is
-    unknown, too, and is fitted with α: what looks like a gain tells nothing of α. What limits a
-    fit besides noise (turbulence at the lines' frequencies, the model itself) is not in it.
+    Units: subapertures, subapertures, radians, magnification. Each mode is dithered by a sine of
+    ``amplitude_m`` (RMS, metres of OPD) over ``n_frames`` frames, all at different frequencies;
+    slopes have white noise of ``slope_noise`` RMS per frame. The gain of each mode is fitted as
+    well, so changes that look like a gain do not contribute to α. Turbulence at the dither
+    frequencies and errors of the model are not included.
 
-    A column of D read from such a sine has an error of σ_slope / (a √N) in every slope; with J the
-    derivatives of the columns less their part along the columns themselves, the covariance of α is
-    that squared times (Σ JᵀJ)⁻¹.
+    A column of D from such a sine has an error of σ_slope / (a √N) in every slope. With J the
+    derivatives of the columns, less their projection on the columns themselves, the covariance of α
+    is that error squared times (Σ JᵀJ)⁻¹.
 
     Raises
     ------

@@ -1,20 +1,20 @@
-"""Disjoint sets of modes, actuators and subapertures, each fitted alone: a block jackknife.
+"""Disjoint sets of modes, actuators and subapertures, each fitted separately: a block jackknife.
 
 A set is fitted by one step from the common solution with its own part of the normal equations, so
 that no model is computed again. The σ of its step has three parts:
 
 - leaving out one of its modes at a time: noise, and errors of single modes;
-- leaving out one region of the pupil at a time, where sets see different parts of the pupil:
-  errors of the model that all modes share;
-- between two sets, the difference of how far a smooth distortion of the mirror moves them. The
-  distortion (second and third order) is fitted to the whole matrix: a relay or a drawing that is
-  not quite straight has other registrations in other parts of the pupil.
+- leaving out one region of the pupil at a time, if sets cover different parts of the pupil: errors
+  of the model that all modes share;
+- between two sets, the difference of their displacements by a smooth distortion of the mirror. The
+  distortion (second and third order) is fitted to the whole matrix. A distorted relay or a
+  distorted nominal geometry gives different registrations in different parts of the pupil.
 
-Sets that see the whole pupil evenly (a checkerboard, alternate sectors, rings, all sets of modes)
+Sets that cover the whole pupil evenly (a checkerboard, alternate sectors, rings, all sets of modes)
 repeat the whole fit, and their scatter enters the σ of the registration. Halves and quadrants do
-not: a distorted mirror moves opposite halves in opposite directions, which cancels in the whole.
-They are compared and reported only. Bow ties would be of no use: along one diagonal a rotation
-looks like a stretch.
+not: a distorted mirror moves opposite halves in opposite directions, which cancels over the pupil.
+They are compared and reported only. Bow ties are not used: along one diagonal a rotation looks like
+a stretch.
 """
 
 from __future__ import annotations
@@ -33,31 +33,31 @@ Array = NDArray[np.float64]
 Labels = NDArray[np.intp]
 
 N_COMBS = 8
-"""Most sets of modes of a partition."""
+"""Largest number of sets of modes in a partition."""
 
 MIN_MODES = 3
-"""Modes that a set must have."""
+"""Smallest number of modes in a set."""
 
 SIGNIFICANT = 3.0
-"""Sets that differ by more than this many of their combined σ enter σ with their own scatter, not
-with the mean over all partitions."""
+"""Number of combined σ by which sets must differ for their own scatter to enter σ, instead of the
+mean over all partitions."""
 
 N_SECTORS = 12
-"""Sectors of which every second one makes a set."""
+"""Number of sectors; alternate sectors make a set."""
 
 HALVES = ("left and right half", "lower and upper half", "quadrants")
-"""Partitions of the pupil whose sets see one side of it."""
+"""Partitions of the pupil whose sets cover one side of it."""
 
 ACTUATORS = ("alternate sectors of actuators", "inner and outer actuators")
-"""Partitions of modes whose sets answer in different parts of the pupil."""
+"""Partitions of modes whose responses are in different parts of the pupil."""
 
 DISTORTION_SIGMA_SUBAP = 0.1
-"""1 σ of each term of a smooth distortion, RMS over the pupil, before the matrix is seen."""
+"""Prior 1 σ of each term of a smooth distortion, RMS over the pupil, subapertures."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DisjointSets:
-    """One partition, and where each of its sets alone leads."""
+    """One partition, and the step of each of its sets."""
 
     words: str
     """Name of the partition."""
@@ -69,7 +69,8 @@ class DisjointSets:
     """``(n_sets, 4)`` 1 σ of each step, by leaving out modes and regions of the pupil."""
 
     distorted: Array
-    """``(n_sets, 4)`` how far the mirror's distortion moves each set; 0 where all see the same."""
+    """``(n_sets, 4)`` change of each set by the mirror's distortion; 0 if all cover the same
+    region."""
 
     jackknife: Array
     """``(4,)`` 1 σ of the registration by leaving out one set at a time."""
@@ -86,7 +87,7 @@ class DisjointSets:
 
     @property
     def straight_tension(self) -> Array:
-        """``(4,)`` the same if the mirror were not distorted."""
+        """``(4,)`` largest difference over combined σ, if the mirror were not distorted."""
         return np.asarray(self._ratios(np.zeros_like(self.distorted)).max(axis=0, initial=0.0))
 
     def _ratios(self, distorted: Array) -> Array:
@@ -98,30 +99,30 @@ class DisjointSets:
 
     @property
     def even(self) -> bool:
-        """Whether each of its sets sees the whole pupil, so that its scatter is that of α."""
+        """True if each set covers the whole pupil, so that their scatter is that of α."""
         return self.words not in HALVES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Distortion:
-    """A smooth distortion of the mirror, as the whole matrix has it."""
+    """A smooth distortion of the mirror, fitted to the whole matrix."""
 
     rms_subap: float
-    """RMS over the pupil of the displacement, shift to magnification taken out, subapertures."""
+    """RMS displacement over the pupil without shift, rotation and magnification, subapertures."""
 
     share: float
-    """χ² that it leaves, over what the fit leaves."""
+    """χ² with the distortion over that of the fit."""
 
     moved: Array
-    """``(4,)`` how far the registration moves if it is fitted besides, numeric units."""
+    """``(4,)`` change of the registration if the distortion is fitted, numeric units."""
 
     field: Array
-    """``(n_rows, 2)`` displacement along x and y where each slope is seen, subapertures."""
+    """``(n_rows, 2)`` displacement along x and y at the position of each slope, subapertures."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Normals:
-    """The normal equations of a projection in parts: of each mode, or of each slope."""
+    """Contributions of each mode, or of each slope, to the normal equations."""
 
     normals: Array
     """``(n_parts, n_unknowns, n_unknowns)``."""
@@ -130,7 +131,7 @@ class Normals:
     """``(n_unknowns, n_parts)``."""
 
     clusters: Labels
-    """``(n_parts,)`` parts with the same number are taken as dependent."""
+    """``(n_parts,)`` cluster number of each part; parts of a cluster are treated as dependent."""
 
     @classmethod
     def of_modes(cls, seen: Projection, rows: NDArray[np.bool_] | None = None) -> Normals:
@@ -169,7 +170,7 @@ class Normals:
     def leave_one_out(
         self, inside: NDArray[np.bool_], held: Array, pull: Array
     ) -> tuple[Array, Array]:
-        """Return the step of some parts ``(n_parts,)``, and its 1 σ by leaving out clusters."""
+        """Return the step of selected parts ``(n_parts,)`` and its 1 σ by leaving out clusters."""
         _, cluster = np.unique(self.clusters[inside], return_inverse=True)
         n_clusters = int(cluster.max()) + 1
         normals = np.zeros((n_clusters, *self.normals.shape[1:]))
@@ -182,7 +183,7 @@ class Normals:
         return np.linalg.solve(every, scored)[:4], sigma
 
     def distorted(self, inside: NDArray[np.bool_], held: Array, field: Array) -> Array:
-        """Return how far a displacement of each slope ``(n_parts, 2)`` moves some of them."""
+        """Return the change of selected parts by a displacement of each slope ``(n_parts, 2)``."""
         normals = self.normals[inside]
         along = np.einsum("ski,si->k", normals[:, :, :2], field[inside])
         return np.asarray(np.linalg.solve(normals.sum(axis=0) + held, along)[:4])
@@ -190,19 +191,19 @@ class Normals:
     def fit_distortion(
         self, places: Array, held: Array, pull: Array, chi: float, noise: float
     ) -> Distortion:
-        """Return the smooth distortion that explains most, every other unknown left free.
+        """Return the smooth distortion that explains the most, with all other unknowns free.
 
-        To first order a point displaced by u changes its slopes by the derivatives with the shift
-        times u, so that the parts of each slope hold all that is needed.
+        To first order, a displacement u of a point changes its slopes by u times the derivatives by
+        shift, so the normal equations of each slope contain all that is needed.
 
         Parameters
         ----------
         places
-            ``(n_rows, 2)`` where each slope is seen, pupil radii.
+            ``(n_rows, 2)`` position of each slope, pupil radii.
         held, pull
             Prior of the unknowns as normal equations: ``(n, n)`` and ``(n,)``.
         chi
-            χ² that the fit leaves.
+            χ² of the fit.
         noise
             Variance of a weighted residual.
         """
@@ -321,11 +322,11 @@ class SetComparison:
 
 
 def jackknife_sigma(partitions: Sequence[DisjointSets]) -> Array:
-    """Return ``(4,)`` 1 σ of the registration by all partitions of one kind.
+    """Return ``(4,)`` 1 σ of the registration from all partitions of one kind.
 
-    Each alone has few degrees of freedom, so their mean variance counts; but sets that differ
-    significantly show something that the others cannot see, and count by themselves: a distortion
-    that explains their difference leaves the registration uncertain by as much.
+    Each partition has few degrees of freedom, so their mean variance is used. A partition whose
+    sets differ significantly counts by itself, because it shows an error that the others cannot: a
+    distortion that explains the difference leaves the registration uncertain by as much.
     """
     found = [one for one in partitions if one.even]
     if not found:
@@ -339,8 +340,8 @@ def jackknife_sigma(partitions: Sequence[DisjointSets]) -> Array:
 def mode_partitions(target: Target, n_planes: int, *, by_actuator: bool) -> dict[str, Labels]:
     """Return partitions of the modes: name, and the set of each mode ``(n_modes,)``.
 
-    Columns of single actuators have places instead of an order: the place of each is the centroid
-    of its response.
+    Columns of single actuators are sorted by position instead of order: the centroid of the
+    response.
     """
     n_modes = target.n_modes
     rank = np.argsort(np.argsort(target.modes, kind="stable"), kind="stable")
@@ -363,7 +364,7 @@ def mode_partitions(target: Target, n_planes: int, *, by_actuator: bool) -> dict
 
 
 def _centroids(target: Target, n_planes: int) -> tuple[Array, Array]:
-    """Return where each column answers, ``(n_modes,)`` along x and y, subapertures."""
+    """Return the centroid of each column's response ``(n_modes,)`` along x and y, subapertures."""
     half = (len(target.valid) - 1) / 2
     y, x = np.stack(np.nonzero(target.valid)) - half
     power = (target.matrix**2).reshape(n_planes, len(x), -1).sum(axis=0)
@@ -378,7 +379,7 @@ def _sector(x: Array, y: Array) -> Labels:
 def pupil_partitions(
     valid: NDArray[np.bool_], n_planes: int, rows: NDArray[np.bool_]
 ) -> dict[str, Labels]:
-    """Return partitions of the subapertures: name, and the set of each slope that counts."""
+    """Return partitions of the subapertures: name, and the set of each used slope."""
     n = len(valid)
     row, column = np.nonzero(valid)
     x = np.asarray(column - (n - 1) / 2, dtype=np.float64)

@@ -1,6 +1,6 @@
-"""The figures of Heritier et al. 2018 for any fit, drawn or as numbers.
+"""The figures of Heritier et al. 2018 for any fit, as plots or as numbers for a browser.
 
-As numbers they are for a browser; only drawing needs the extra ``plots``.
+Only plotting needs the extra ``plots``.
 """
 
 from __future__ import annotations
@@ -284,15 +284,15 @@ PAPER_MODES = (1, 5, 10, 50, 100, 200, 300, 350, 400)
 """Modes the paper shows, counted from 1 as it does."""
 
 MAPS = 4
-"""Modes whose slopes a browser is given."""
+"""Number of modes whose slope maps are sent to a browser."""
 
 
 def numbers(fit: Fit) -> dict[str, Any]:
-    """Return the figures of a fit as JSON; null where nothing is known.
+    """Return the figures of a fit as JSON; null for unknown values.
 
-    Maps are lists of rows from the lowest y on, Sx beside Sy, or the four images as they lie on the
-    detector, in whole percent: of the measured RMS
-    for ``residual_map``, of three times a mode's own RMS for ``maps``, cut there.
+    Maps are lists of rows from the lowest y upwards, Sx next to Sy, or the four images as on the
+    detector. Values are whole percent: of the measured RMS for ``residual_map``; for ``maps``, of
+    three times the mode's own RMS, clipped there.
     """
     shown = shown_modes(fit)
     picked = shown[np.unique(np.linspace(0, len(shown) - 1, MAPS).round().astype(int))]
@@ -307,7 +307,7 @@ def numbers(fit: Fit) -> dict[str, Any]:
 
 
 def singular_values_of(fit: Fit) -> dict[str, Array]:
-    """Return the singular values of both matrices, each over its largest, by the matrix's name."""
+    """Return the normalised singular values of both matrices, by the matrix's name."""
     found = {}
     for name, matrix in (("synthetic", fit.synthetic * fit.gains), ("measured", fit.measured)):
         values = scipy.linalg.svdvals(np.asarray(matrix, dtype=np.float64))
@@ -316,7 +316,7 @@ def singular_values_of(fit: Fit) -> dict[str, Array]:
 
 
 def shown_modes(fit: Fit) -> NDArray[np.intp]:
-    """Return which columns of the fit are shown: the paper's modes, as far as they were used."""
+    """Return the columns of the fit that are shown: the paper's modes, if they were used."""
     found = np.flatnonzero(np.isin(fit.modes + 1, PAPER_MODES))
     return found if len(found) else np.arange(min(len(fit.modes), MAPS))
 

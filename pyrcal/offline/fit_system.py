@@ -32,15 +32,15 @@ from service.model.kinds import Stop
 ACCEPTED, REFUSED = 0, 1
 
 PUPIL_SUBAP = 0.02
-"""By which the pupil must lie elsewhere on a grid to be worth another fit."""
+"""Displacement of the pupil on a grid above which the pairs are fitted again, subapertures."""
 
 PUPIL_EFFECT = 0.2
-"""Share of a shift of the pupil that α is off at most where the fit had the pupil in the middle.
-Pairs that disagree by more disagree for another reason."""
+"""Largest error of α over the shift of the pupil, if the fit had the pupil in the centre. Pairs
+that disagree by more do so for another reason."""
 
 
 def main(options: argparse.Namespace) -> int:
-    """Fit every pair, find where everything is, print it, and return the exit status.
+    """Fit every pair, fit the system, print the result, and return the exit status.
 
     Raises
     ------
@@ -65,12 +65,12 @@ def main(options: argparse.Namespace) -> int:
 
 
 def fit_pairs(system: System, fit: Callable[[Pair, Instrument], FitReport]) -> SystemReport:
-    """Return where everything is, from a fit of each pair as an instrument.
+    """Return the fit of the system from a fit of each pair as an instrument.
 
-    A sensor that is shifted has the pupil elsewhere on its grid. Where that was not known, its
-    pairs are fitted again with the pupil there. They are not where the pairs disagree by more than
-    such a pupil explains, for the shift is then not that of the sensor; and the first fit stands if
-    a pair that was accepted is refused with the pupil elsewhere.
+    A shifted sensor has the pupil off the centre of its grid. If that was not known, its pairs are
+    fitted again with the displaced pupil. They are not fitted again if the pairs disagree by more
+    than such a displacement explains, because the shift is then not that of the sensor. The first
+    fit is kept if a pair that was accepted is refused with the displaced pupil.
     """
     fits = {pair: fit(pair, system.instrument(pair)) for pair in system.pairs}
     found = _found(system, fits, _telling(fits))
@@ -93,15 +93,16 @@ def fit_pairs(system: System, fit: Callable[[Pair, Instrument], FitReport]) -> S
 
 
 def _disagree(found: SystemFit, by_subap: float) -> bool:
-    """Return whether pairs differ significantly, and in shift by more than so many subapertures."""
+    """Return True if pairs differ significantly, and in shift by more than ``by_subap``."""
     apart = np.abs(found.misfit[:, SHIFTS])
     return found.probability < UNLIKELY and bool(np.nanmax(apart) > by_subap)
 
 
 def _telling(fits: dict[Pair, FitReport]) -> NDArray[np.bool_]:
-    """Return which pairs tell where the pupil lies: accepted ones, or what a sensor has instead.
+    """Return the pairs that determine the pupil's position.
 
-    A pupil that is taken to lie elsewhere may be all that a fit is refused for.
+    These are the accepted ones, or the converged ones of a sensor without an accepted pair: a
+    displaced pupil may be the only reason for a refusal.
     """
     trusted = {pair.sensor for pair, one in fits.items() if one.fit.accepted}
     return np.array(
@@ -115,7 +116,7 @@ def _telling(fits: dict[Pair, FitReport]) -> NDArray[np.bool_]:
 def _found(
     system: System, fits: dict[Pair, FitReport], used: NDArray[np.bool_]
 ) -> SystemFit | None:
-    """Return where everything is by those pairs that are used; None: by none."""
+    """Return the fit of the system from the used pairs; None if none is used."""
     alphas = np.array([one.fit.alpha.vector for one in fits.values()])
     alphas[~used] = np.nan
     covariances = np.array([one.fit.covariance for one in fits.values()])
@@ -123,21 +124,22 @@ def _found(
 
 
 class StoredMatrix(NamedTuple):
-    """Where the matrix of a pair is."""
+    """File and data set of a pair's matrix."""
 
     path: Path
     dataset: str
 
 
 def matrices_of(system: System, reference: Path, dataset: str | None) -> list[StoredMatrix]:
-    """Return where the matrix of each pair is, in the order of ``system.pairs``.
+    """Return the file and data set of each pair's matrix, in the order of ``system.pairs``.
 
-    ``{sensor}`` and ``{mirror}`` in the file's name and in that of the data set stand for names.
+    ``{sensor}`` and ``{mirror}`` in the file's name and in the data set's name are replaced by
+    names.
 
     Raises
     ------
     MatrixError
-        If one is missing, or all are the same.
+        If a matrix is missing, or several pairs have the same one.
     """
     apart = any(name in str(reference) for name in ("{sensor}", "{mirror}"))
     named = dataset or (DATASET if apart else f"{{sensor}}/{{mirror}}/{DATASET}")
@@ -160,7 +162,7 @@ def matrices_of(system: System, reference: Path, dataset: str | None) -> list[St
 
 
 def _check_there(stored: StoredMatrix, names: str) -> None:
-    """Refuse a pair whose matrix is missing, before any other is fitted."""
+    """Raise if the matrix of a pair is missing, before any other pair is fitted."""
     if not stored.path.is_file():
         raise MatrixError(f"{names}: found no file {stored.path}, expected the matrix of this pair")
     with opened(stored.path) as container:

@@ -24,16 +24,16 @@ _ROWS = (
 """Name, unit and decimals of each parameter."""
 
 _FAR_GAIN = 0.2
-"""Gains further than this from the median are named: such modes are worth a look."""
+"""Relative distance of a gain from the median above which the mode is listed."""
 
 _NAMED = 8
 
 _TERMS = 3
-"""Explanations in the systematic part of σ that are listed."""
+"""Number of alternatives in the systematic part of σ that are listed."""
 
 
 def table(report: FitReport) -> str:
-    """Return what to do, the verdict, the registration and what it rests on, as text."""
+    """Return recommendation, verdict, registration and supporting results as text."""
     fit = report.fit
     lines = [
         *([fit.recommendation] if fit.recommendation else []),
@@ -57,7 +57,7 @@ def _two_verdicts(fit: Fit) -> Iterator[str]:
 
 
 def _said_before(note: str, fit: Fit) -> bool:
-    """Whether a note repeats the line of what was found and not told."""
+    """Return True if a note repeats the line of the quantities that were found."""
     keys = [one.key for one in fit.origins if one.correct]
     return any(
         f"{key}: unknown; " in note
@@ -118,7 +118,7 @@ def _where_left(fit: Fit) -> Iterator[str]:
 
 
 def _not_told(fit: Fit) -> Iterator[str]:
-    """Yield what the matrix has told, but for the orientation, which has its line."""
+    """Yield the quantities that the matrix determined, except the orientation."""
     words = [one.words for one in fit.origins if one.correct and one.key != "orientation"]
     if words:
         yield f"{'found, not told':20s}{'; '.join(words)}"
@@ -128,7 +128,7 @@ def _not_told(fit: Fit) -> Iterator[str]:
 
 
 def _alternatives(fit: Fit) -> Iterator[str]:
-    """Yield how many rivals were tried, what the matrix prefers, and how far α would move."""
+    """Yield the number of alternatives, the preferred ones, and the changes of α."""
     tried = fit.alternatives
     if not tried:
         return
@@ -152,11 +152,11 @@ def _alternatives(fit: Fit) -> Iterator[str]:
 
 
 NOTABLE_DISPLACEMENT_PX = 0.03
-"""Displacement of a pupil image from which on it is mentioned; less is found on exact matrices."""
+"""Smallest reported displacement of a pupil image; exact matrices give smaller ones."""
 
 
 NOTABLE_DISTORTION_SUBAP = 0.03
-"""Distortion of the mirror, RMS over the pupil, from which on it is mentioned."""
+"""Smallest reported distortion of the mirror, RMS over the pupil, subapertures."""
 
 
 def displacement_words(offsets_px: NDArray[np.float64]) -> str:
@@ -205,7 +205,7 @@ def _extras(fit: Fit) -> Iterator[str]:
 
 
 def paper_lines(steps: tuple[ScanStep, ...]) -> Iterator[str]:
-    """Yield the paper's Table 1: which parameter was scanned, how finely, and its value."""
+    """Yield the paper's Table 1: parameter, range and step of each scan, and the value found."""
     yield f"{'step':>4s}  {'parameter':15s}{'from':>11s}{'to':>11s}{'by':>9s}{'value':>11s}"
     for number, scan in enumerate(steps, start=1):
         yield (

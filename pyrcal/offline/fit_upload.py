@@ -29,7 +29,7 @@ MOST_FILES = 32
 _ZIP_BEGINS = b"PK\x03\x04"
 
 _DAMAGE = (zipfile.BadZipFile, zlib.error, RuntimeError, OSError, EOFError, ValueError)
-"""What a damaged or encrypted archive raises, depending on where."""
+"""Exceptions that a damaged or encrypted archive raises."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,7 +95,7 @@ def _only_toml(names: list[str]) -> str:
 
 
 def _measured(left: list[str], names: list[str], reference: str | None) -> str:
-    """Return the name of the measured file: the one asked for, or the only one ``left``."""
+    """Return the name of the measured file: the requested one, or the only one in ``left``."""
     chosen = reference if reference is not None else left[0] if len(left) == 1 else None
     if chosen is None or chosen not in names:
         raise MatrixError(

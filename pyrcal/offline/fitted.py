@@ -1,4 +1,4 @@
-"""The record of a fit: the registration, what it rests on, what else was found."""
+"""The record of a fit: the registration, its uncertainty and evidence, and other findings."""
 
 from __future__ import annotations
 
@@ -27,60 +27,63 @@ if TYPE_CHECKING:
     from service.model.instrument import Instrument
 
 TOLD = 0.5
-"""1 σ of an anamorphosis over what is expected of any, below which modes tell of it."""
+"""Largest 1 σ of an anamorphosis, over its prior σ, at which the anamorphosis is reported."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Registration:
-    """Whether the registration is determined, and the two parts of its σ."""
+    """Verdict on the registration, and the two parts of its σ."""
 
     determined: bool
-    """Whether the data determine it; the same as ``Fit.accepted``."""
+    """True if the data determine the registration; the same as ``Fit.accepted``."""
 
     reason: str
-    """Why, or why not, in one sentence."""
+    """Reason of the verdict, in one sentence."""
 
     sigma_statistical: NDArray[np.float64]
-    """``(4,)`` 1 σ from noise and the scatter of disjoint sets, numeric units."""
+    """``(4,)`` 1 σ from noise and from the scatter of disjoint sets, numeric units."""
 
     sigma_systematic: NDArray[np.float64]
-    """``(4,)`` 1 σ from errors of the model and explanations that the data do not exclude."""
+    """``(4,)`` 1 σ from model errors and from alternatives that the data do not exclude, numeric
+    units."""
 
     sets: tuple[DisjointSets, ...] = ()
-    """Disjoint sets of modes, actuators and subapertures, each fitted alone."""
+    """Disjoint sets of modes, actuators and subapertures, each fitted separately."""
 
     distortion: Distortion | None = None
-    """The smooth distortion of the mirror that explains most; None of a fit made by hand."""
+    """Smooth distortion of the mirror that explains the most; None for a fit constructed by hand.
+    """
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fit(Determination):
     """A fitted registration with its σ and verdict.
 
-    The covariance is of noise, the disagreement of subsets and the model-error floor.
+    The covariance includes noise, the scatter of disjoint sets and the floor of model errors.
     """
 
     gains: NDArray[np.float64]
-    """``(n_used,)`` size of each measured column over the model's, passes accounted for."""
+    """``(n_used,)`` amplitude of each measured column over the model's, number of passes included.
+    """
 
     residual_fraction: float
-    """RMS of what is left over RMS of the measurement, each mode counted alike."""
+    """RMS of the residual over RMS of the measurement, with all modes weighted equally."""
 
     residual_map: NDArray[np.float64]
-    """``(n_planes, n, n)`` [x or y, or image; row, column] RMS over modes of what is left, in units
+    """``(n_planes, n, n)`` [x or y, or image; row, column] RMS of the residual over modes, in units
     of the measurement's own RMS; NaN outside the valid subapertures."""
 
     residual_by_mode: NDArray[np.float64]
-    """``(n_used,)`` the same fraction for each mode."""
+    """``(n_used,)`` RMS of the residual over RMS of the measurement, for each mode."""
 
     condition_number: float
-    """Of the synthetic matrix at ``alpha``, modes used."""
+    """Condition number of the synthetic matrix at ``alpha``, with the modes used."""
 
     modes: NDArray[np.intp]
     """``(n_used,)`` basis indices."""
 
     orientation: Orientation
-    """Of the slopes, given or found."""
+    """Orientation of the slopes, given or found."""
 
     order: SlopeOrder
     """Order of the components, given or found."""
@@ -89,74 +92,77 @@ class Fit(Determination):
     """``(4,)`` 1 σ scatter of disjoint sets of modes, units of ``alpha.vector``."""
 
     accepted: bool
-    """Whether this is the registration, as far as the data tell."""
+    """True if the data determine the registration."""
 
     converged: bool
-    """Whether the steps came to rest."""
+    """True if the steps converged."""
 
     verdict: str
-    """One line: accepted and how well, or refused, why and what to do."""
+    """Verdict in one line: accepted with its quality, or refused with the reason and the remedy."""
 
     left_out: tuple[str, ...]
-    """Columns and slopes that were not used, one sentence for each kind."""
+    """Unused columns and slopes, one sentence for each kind."""
 
     remarks: tuple[str, ...]
-    """What should be known beside the verdict, one sentence each."""
+    """Further notes on the fit, one sentence each."""
 
     n_evaluations: int
-    """Interaction matrices computed on the way, those for derivatives included."""
+    """Number of interaction matrices computed, those for derivatives included."""
 
     synthetic: NDArray[Any]
-    """``(n_slopes, n_used)`` the model at ``alpha``, gains not applied, conventions' axes."""
+    """``(n_slopes, n_used)`` model matrix at ``alpha`` without gains, in the axes of
+    conventions.md."""
 
     measured: NDArray[Any]
-    """``(n_slopes, n_used)`` the reference in the same axes and unit (passes divided out)."""
+    """``(n_slopes, n_used)`` measured matrix in the same axes and unit, divided by the number of
+    passes."""
 
     valid: NDArray[np.bool_]
-    """``(n, n)`` [y, x] mask that lists both, in conventions' axes."""
+    """``(n, n)`` [y, x] mask of the subapertures in both, in the axes of conventions.md."""
 
     gain_map: NDArray[np.float64] | None = None
-    """``(n, n)`` gain over the pupil common to all modes, mean 1; None: not asked for."""
+    """``(n, n)`` gain over the pupil common to all modes, mean 1; None if it was not fitted."""
 
     anamorphosis_sigma: NDArray[np.float64] | None = None
-    """``(2,)`` 1 σ of the anamorphosis of ``alpha``; None: it was not fitted."""
+    """``(2,)`` 1 σ of the anamorphosis of ``alpha``; None if it was not fitted."""
 
     image_offsets_px: NDArray[np.float64] | None = None
-    """``(4, 2)`` [x, y] where the pupil images were found beside their places on the pixel grid, as
-    the instrument file's key has it. A matrix cannot tell which of two opposite images is
-    displaced, nor does α depend on it. None if the file says where they lie, or the sensor has
+    """``(4, 2)`` [x, y] offsets of the pupil images from their nominal positions on the pixel grid,
+    as in the instrument file's key. A matrix does not determine which of two opposite images is
+    displaced, and α does not depend on it. None if the file gives the offsets, or the sensor has
     one image."""
 
     optics: tuple[FoundOptic, ...] = ()
-    """What of the instrument was fitted, too: coupling or width, modulation."""
+    """Optical quantities that were fitted: coupling or width, modulation."""
 
     alternatives: tuple[Alternative, ...] = ()
-    """What else might explain the matrix, and how far it would move α."""
+    """Alternative explanations of the matrix, with the change of α that each would cause."""
 
     registration: Registration | None = None
-    """Whether the registration is determined, and how well; None of a fit made by hand."""
+    """Verdict on the registration; None for a fit constructed by hand."""
 
     reconstructor: ReconstructorVerdict | None = None
-    """Whether a reconstructor of the model holds the loop of the measured matrix; None as above."""
+    """Result of the closed-loop check with the model's reconstructor; None for a fit constructed by
+    hand."""
 
     origins: tuple[Origin, ...] = ()
-    """What of the instrument was found rather than told."""
+    """Instrument quantities that the fit determined."""
 
     unknown_not_found: tuple[str, ...] = ()
-    """Keys that the file calls unknown and that the matrix does not determine."""
+    """Keys marked as unknown in the file that the matrix does not determine."""
 
     left_over: LeftOver | None = None
-    """Where the residual is."""
+    """Location of the residual in pupil and modes; None if it was not computed."""
 
     recommendation: str = ""
-    """What to do with it, in one sentence."""
+    """Recommended action, in one sentence."""
 
     paper_table: tuple[ScanStep, ...] | None = None
-    """The scans, in their order; None for the other methods."""
+    """Scans of the paper's method, in order; None for the other methods."""
 
     @property
     def anamorphosis(self) -> NDArray[np.float64] | None:
-        """``(2,)`` as α has it; None where the modes do not tell, or it was not fitted."""
+        """``(2,)`` stretches of α; None if the modes do not determine them."""
         sigma = self.anamorphosis_sigma
         told = sigma is not None and bool(np.all(sigma < TOLD * ANAMORPHOSIS_SIGMA))
         return self.alpha.stretches if told else None

@@ -1,8 +1,8 @@
-"""Why gains of modes are far from 1: what each mode was scaled by, and what all were.
+"""Find causes of mode gains far from 1: the scaling of each mode, or a common unit.
 
-The gain of a mode is the size of its measured column over the model's. Modes that are scaled
-another way have gains that go as one over their peak to valley, say; a unit is common to all of
-them.
+The gain of a mode is the amplitude of its measured column over the model's. Modes with another
+normalisation have gains proportional to, for example, one over their peak to valley; a wrong unit
+is common to all modes.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ from service.model.modes import ModalBasis
 Array = NDArray[np.float64]
 
 SCATTERED = 0.06
-"""Robust relative scatter of gains beyond which a cause is looked for in each mode."""
+"""Robust relative scatter of gains above which a cause is searched in each mode."""
 
 CLEARER = 0.3
-"""A size of the modes is the cause when what it leaves scatters by less than this share, ..."""
+"""Largest scatter that a normalisation may leave, over the original scatter, to be the cause."""
 
 CLEAR = 0.08
-"""... and by less than this."""
+"""Largest scatter that a normalisation may leave to be the cause."""
 
 SMOOTH = 0.05
-"""Scatter about a parabola in the logarithm of the mode's number that still is smooth."""
+"""Largest scatter about a parabola in the logarithm of the mode number that counts as smooth."""
 
 DIMMED = 0.9
-"""Gains whose median is less may be what residual turbulence leaves of them."""
+"""Median gain below which an optical gain in residual turbulence is considered."""
 
 UNIT = 0.03
-"""Relative distance from a unit at which it is believed."""
+"""Relative distance from a unit's factor within which the unit is reported."""
 
 _POINTS = 4000
-"""Of the pupil, that the modes' sizes are taken from."""
+"""Approximate number of pupil points at which modes are evaluated."""
 
 _FEWEST = 8
-"""Modes below which scatter tells nothing."""
+"""Smallest number of modes for which the scatter is evaluated."""
 
 
 def gain_causes(settled: Settled, *, passes: int, stroke_known: bool) -> Iterator[str]:
@@ -81,7 +81,7 @@ def scatter_of(values: Array) -> float:
 
 
 def _unit(middle: float, settled: Settled, passes: int) -> Iterator[str]:
-    """Yield the unit that all gains are off by."""
+    """Yield the unit that explains a common factor of all gains."""
     wavelength_m = settled.models.instrument.wfs.wavelength_m
     radian_m = wavelength_m / (2.0 * np.pi)
     units = {
@@ -99,7 +99,7 @@ def _unit(middle: float, settled: Settled, passes: int) -> Iterator[str]:
 
 
 def _sizes(settled: Settled) -> Mapping[str, Array]:
-    """Return sizes that modes may be scaled by, ``(n_modes,)`` each."""
+    """Return the norms by which modes may have been scaled, ``(n_modes,)`` each."""
     basis, points = settled.models.basis, settled.models.cheap.pupil.points
     shapes = basis.render(points[:: 1 + len(points) // _POINTS])
     sizes = {
@@ -117,7 +117,7 @@ def _sizes(settled: Settled) -> Mapping[str, Array]:
 
 
 def _smooth(gains: Array, modes: NDArray[np.intp]) -> bool:
-    """Return whether gains are smooth over the modes' numbers."""
+    """Return True if gains are a smooth function of the mode number."""
     order = np.log1p(modes.astype(np.float64))
     logarithms = np.log(gains)
     left = logarithms - np.polyval(np.polyfit(order, logarithms, 2), order)

@@ -1,7 +1,7 @@
-"""Fit coupling and modulation, and try the other stop and normalisation.
+"""Compare coupling and modulation with the instrument file, and try alternative instruments.
 
-The registration is fitted together with coupling and modulation, and both are compared with the
-file. Of a stop, a normalisation or a kind of influence the other one is tried as well,
+Coupling and modulation are fitted together with the registration and compared with the file. For
+the stop, the normalisation and the kind of influence function, the alternative is tried as well,
 and so are other pupils.
 """
 
@@ -22,53 +22,55 @@ from pyrcal.offline.uncertainty import Uncertainty
 Array = NDArray[np.float64]
 
 COUPLING_KEY = "coupling"
-"""Of the instrument file, for the width of influence functions."""
+"""Key of the instrument file for the width of influence functions."""
 
 NOTABLE = 0.03
-"""A logarithm of the instrument's that differs by less from the file's is not worth a word."""
+"""Smallest difference of a logarithm from the file's value that is reported."""
 
 MIN_EXPLAINED = 0.005
-"""RMS share of the signal that another instrument has to explain to be preferred. Models of one
+"""RMS share of the signal that another instrument must explain to be preferred. Models of one
 instrument differ by about as much: with OOPAO's own Shack-Hartmann 0.2 % is left over, and another
-stop, by chance of the model's errors, explains 0.12 %."""
+stop explains 0.12 % by coincidence with model errors."""
 
 LITTLE_EXPLAINED = 0.3
-"""Share of χ² left by another coupling or modulation above which it may stand for something else.
-Files told a wrong modulation left less than 0.05; pushes alone of 200 nm left 0.6."""
+"""Share of χ² left by another coupling or modulation above which it may compensate something else.
+With a wrong modulation in the file less than 0.05 was left; with push-only pokes of 200 nm 0.6 was
+left."""
 
 NO_SENSOR_NUMBER_LIMIT = 0.1
-"""A modulation, λ/D, found below this is none: to the matrix they are the same to 1e-3."""
+"""Fitted modulation, λ/D, below which 0 is reported: the matrices are the same to 1e-3."""
 
 NOTABLE_SIGMA = 3.0
-"""... nor one that differs by less than this many of its own σ."""
+"""Smallest such difference that is reported, in units of its own σ."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Rival:
-    """Another instrument that the matrix might come from."""
+    """An alternative instrument that might explain the matrix."""
 
     change: Other
-    """What to write into the file."""
+    """Change of the instrument file."""
 
     lead: Lead
-    """How much better it explains the matrix than this one."""
+    """Improvement of the misfit over the instrument of the file."""
 
     moved: Array
-    """``(4,)`` by how much the registration would be another, numeric units."""
+    """``(4,)`` change of the registration with this instrument, numeric units."""
 
     explained: float
-    """RMS share of the signal that it explains and this one does not."""
+    """RMS share of the signal that it explains and the file's instrument does not."""
 
     @property
     def share(self) -> float:
-        """χ² that it leaves, over what this one leaves."""
+        """χ² that it leaves, over that of the file's instrument."""
         return self.lead.share
 
     @property
     def preferred(self) -> bool:
-        """Whether the matrix prefers it to the instrument of the file.
+        """True if the matrix prefers it to the instrument of the file.
 
-        It leaves clearly less, by more than chance, and by more than models differ anyway.
+        Its residual must be clearly smaller, by more than chance and by more than models of one
+        instrument differ.
         """
         return (
             self.share < self.change.max_misfit_ratio
@@ -79,29 +81,30 @@ class Rival:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FoundOptic:
-    """A number of the instrument that was fitted beside the registration."""
+    """An optical quantity that was fitted together with the registration."""
 
     optic: Optic
-    """Which."""
+    """Kind of the quantity."""
 
     key: str
-    """Of the instrument file."""
+    """Key in the instrument file."""
 
     change: float
-    """Found over told, as a logarithm."""
+    """Logarithm of the fitted value over the file's value."""
 
     sigma: float
-    """1 σ of it."""
+    """1 σ of ``change``."""
 
     found: float | None
-    """Coupling, or the sensor's number; None: a width of influence functions without a coupling."""
+    """Fitted coupling, or the sensor's number; None for a width of influence functions without a
+    coupling."""
 
     reported: float | None
-    """The same in the instrument file; None as above, or said to be unknown."""
+    """Value in the instrument file; None if it is unknown or has no key."""
 
     @property
     def found_sigma(self) -> float:
-        """1 σ of the value found, in its own unit; of a width as its logarithm."""
+        """1 σ of the fitted value in its own unit; for a width, of its logarithm."""
         if self.found is None:
             return self.sigma
         if self.optic is Optic.SENSOR:
@@ -110,7 +113,7 @@ class FoundOptic:
 
     @property
     def found_words(self) -> str:
-        """The value found, as the file would write it."""
+        """Fitted value in the notation of the file."""
         if self.found is None:
             wider = np.expm1(self.change)
             side = "wider" if wider > 0.0 else "narrower"
@@ -119,14 +122,14 @@ class FoundOptic:
 
     @property
     def file_words(self) -> str:
-        """The value in the file."""
+        """Value in the file."""
         if self.reported is None:
             return "than the instrument file's" if self.found is None else "the file does not say"
         return f"the instrument file says {self.reported:.3g}"
 
     @property
     def notable(self) -> bool:
-        """Whether the file is wrong, as far as the matrix shows."""
+        """True if the fitted value differs significantly from the file."""
         unknown = self.found is not None and self.reported is None
         return not unknown and abs(self.change) > max(NOTABLE, NOTABLE_SIGMA * self.sigma)
 
@@ -136,24 +139,24 @@ class FileValuesFit:
     """The fit with coupling and modulation fixed to the values of the instrument file."""
 
     share: float
-    """χ² left now, over what it leaves."""
+    """χ² with fitted values, over that with the file's values."""
 
     moved: Array
-    """``(4,)`` by how much its registration is another, numeric units."""
+    """``(4,)`` change of the registration with the file's values, numeric units."""
 
     @property
     def is_undecided(self) -> bool:
-        """Whether the values that were fitted explain too little to correct the file.
+        """True if the fitted values explain too little to justify a correction of the file.
 
-        Pokes of a tenth of a wavelength, or pushed only, look like another modulation.
+        Pokes of a tenth of a wavelength, or push-only pokes, look like another modulation.
         """
         return self.share > LITTLE_EXPLAINED
 
 
 def rivals(settled: Settled, few: Few, pupils: tuple[TriedPupil, ...]) -> tuple[Rival, ...]:
-    """Return other instruments, the one that explains the matrix best first.
+    """Return alternative instruments, sorted by how well each explains the matrix.
 
-    Each is allowed its own registration, coupling and sensor, to first order about those found.
+    Each has its own registration, coupling and sensor number, fitted to first order.
     """
 
     def explained(lead: Lead) -> float:
@@ -178,11 +181,11 @@ def rivals(settled: Settled, few: Few, pupils: tuple[TriedPupil, ...]) -> tuple[
 
 
 def doubt_of_width(settled: Settled, few: Few) -> Array:
-    """Return how far a width of the influence functions that cannot be fitted moves α, ``(4,)``.
+    """Return the change of α for a width of influence functions that is not fitted, ``(4,)``.
 
-    Those of a table, or of a thin plate, have no coupling. What others would explain is not
-    followed: on the diffractive telescope, whose mirror is of another kind, that was no nearer to
-    the truth. It tells how sure the registration is.
+    Influence functions from a table or of a thin plate have no coupling. The change enters σ only
+    and does not correct α: on the diffractive telescope, whose mirror is of another kind, the
+    correction was not closer to the truth.
     """
     if Optic.WIDTH in settled.models.optics:
         return np.zeros(4)

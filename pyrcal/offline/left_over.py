@@ -1,4 +1,4 @@
-"""Where a fit leaves something over: in which subapertures, at the border, in which modes."""
+"""Locate the residual of a fit: subapertures, border, spider arms and modes."""
 
 from __future__ import annotations
 
@@ -13,90 +13,90 @@ from pyrcal.offline.alternatives import border_of
 Array = NDArray[np.float64]
 
 STRANGE = 5.0
-"""A subaperture, or a mode, that leaves so many times the median is named, ..."""
+"""Residual of a subaperture or mode, over the median, above which it is listed."""
 
 LEAST = 0.1
-"""... from this RMS share of the signal on."""
+"""Smallest residual that is listed, as RMS share of the signal."""
 
 LARGE = 3.0
-"""... and in slopes so many times the median."""
+"""Residual of a mode in slopes, over the median, above which the mode is listed."""
 
 NAMED = 8
-"""At most so many are named."""
+"""Largest number of subapertures or modes listed."""
 
 
 RIM = 1.8
-"""The border over the inside from which on a rim is named."""
+"""Residual at the border over that inside, above which it is reported."""
 
 UNEVEN_PLANES = 1.25
-"""One component over the mean of both from which on it is named."""
+"""Residual of one slope component over the mean of both, above which it is reported."""
 
 GRADIENT = 0.6
-"""Change across the pupil over the mean from which on a gradient is named."""
+"""Change of the residual across the pupil over its mean, above which it is reported."""
 
 ARM_EXCESS = 1.35
-"""Along an arm so many times what is left over elsewhere at the same radius, ..."""
+"""Residual along an arm over that elsewhere at the same radius, above which it is reported."""
 
 ARM_SIGMA = 6.0
-"""... by this many σ of the mean along it."""
+"""Significance of the excess along an arm above which it is reported, σ of the mean."""
 
 MIN_ARMS, MAX_ARMS = 2, 4
 
 _ARM_ANGLES = np.arange(0.0, 360.0, 3.0)
 
 _ARM_OFFSETS = np.arange(-0.25, 0.2501, 0.0625)
-"""Distances of the line of an arm from the middle, pupil radii: not all arms are radial."""
+"""Trial distances of an arm's line from the centre, pupil radii: not all arms are radial."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Arm:
-    """A line from the middle of the pupil outwards along which more is left over."""
+    """A line outwards from the centre of the pupil with an increased residual."""
 
     angle_deg: float
-    """Its direction, from +x towards +y, in the axes found."""
+    """Direction from +x towards +y in the fitted axes, degrees."""
 
     offset_subap: float
-    """Distance of the line from the middle, to its left; 0 is radial."""
+    """Distance of the line from the centre, positive to its left, subapertures; 0 is radial."""
 
     excess: float
-    """What is left over along it over that elsewhere at the same radius."""
+    """Residual along the line over that elsewhere at the same radius."""
 
     @property
     def words(self) -> str:
-        """Place and size in a few words."""
+        """Position and size as text."""
         off = f", {self.offset_subap:+.1f} subapertures off" if self.offset_subap else ""
         return f"{self.angle_deg:.0f} deg{off} ({self.excess:.1f} times as much)"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LeftOver:
-    """Where the residual of a fit is."""
+    """Location of the residual of a fit."""
 
     border: float | None
-    """RMS at the border of the pupil over that inside; None: there is no inside."""
+    """RMS at the border of the pupil over that inside; None if there is no inside."""
 
     subapertures: tuple[tuple[int, int, float], ...]
-    """Row, column and RMS share left over of subapertures that stand out, largest first; axes and
-    shares as ``Fit.residual_map`` has them."""
+    """Row, column and RMS share of subapertures with an outlying residual, largest first; axes and
+    shares as in ``Fit.residual_map``."""
 
     modes: tuple[tuple[int, float], ...]
-    """Basis index and RMS share left over of modes that stand out, largest first."""
+    """Basis index and RMS share of modes with an outlying residual, largest first."""
 
     level: float = 1.0
-    """RMS share of the signal that is left over, in all subapertures."""
+    """RMS share of the signal in the residual of all subapertures."""
 
     arms: tuple[Arm, ...] = ()
-    """Lines from the middle outwards along which more is left over, the clearest first."""
+    """Lines outwards from the centre with an increased residual, the clearest first."""
 
     planes: tuple[float, ...] = ()
-    """RMS left over in each plane of signals (Sx and Sy, or the four images) over the mean."""
+    """Residual RMS of each signal plane (Sx and Sy, or the four images) over the mean."""
 
     gradient: tuple[float, float] = (0.0, 0.0)
-    """Change of what is left over across the pupil along x and along y, over its mean."""
+    """Change of the residual across the pupil along x and along y, over its mean."""
 
     @property
     def _shape_words(self) -> Iterator[str]:
-        """Lines, rim, planes and gradient that stand out."""
+        """Sentences on arms, rim, planes and gradient."""
         if self.arms:
             named = ", ".join(arm.words for arm in self.arms)
             yield (
@@ -123,7 +123,7 @@ class LeftOver:
 
     @property
     def words(self) -> str:
-        """Where something stands out; empty: nowhere."""
+        """Sentence on outlying parts of the residual; empty if there are none."""
         parts = list(self._shape_words) if self.level > LEAST else []
         if self.subapertures:
             named = ", ".join(f"row {y} column {x}" for y, x, _ in self.subapertures)
@@ -140,20 +140,20 @@ class LeftOver:
 def left_over(
     planes: Array, by_mode: Array, *, valid: NDArray[np.bool_], modes: NDArray[np.intp], size: Array
 ) -> LeftOver:
-    """Return where the residual of a fit is.
+    """Return the location of a fit's residual.
 
     Parameters
     ----------
     planes
-        ``(n_planes, n, n)`` RMS of what is left over, over the measured RMS.
+        ``(n_planes, n, n)`` RMS of the residual over the measured RMS.
     by_mode
-        ``(n_used,)`` the same of each mode.
+        ``(n_used,)`` the same for each mode.
     valid
-        ``(n, n)`` subapertures that give signals.
+        ``(n, n)`` valid subapertures.
     modes
         ``(n_used,)`` basis indices.
     size
-        ``(n_used,)`` of the measured columns.
+        ``(n_used,)`` norms of the measured columns.
     """
     known = np.isfinite(planes).any(axis=0)
     squares = np.where(np.isfinite(planes), planes, 0.0) ** 2
@@ -173,14 +173,14 @@ def left_over(
 
 
 def _by_plane(planes: Array) -> tuple[float, ...]:
-    """Return the RMS of each plane over the mean of all; equal where nothing is left."""
+    """Return the RMS of each plane over the mean of all; 1 if there is no residual."""
     each = np.sqrt(np.nanmean(planes**2, axis=(1, 2)))
     mean = float(np.mean(each))
     return tuple(float(one / mean) if mean > 0.0 else 1.0 for one in each)
 
 
 def _gradient(by_place: Array) -> tuple[float, float]:
-    """Return the change across the pupil along x and y over the mean."""
+    """Return the change of the residual across the pupil along x and y over the mean."""
     rows, columns = np.nonzero(np.isfinite(by_place))
     values = by_place[rows, columns]
     if len(values) < _FEWEST_PLACES or not values.mean() > 0.0:
@@ -201,7 +201,7 @@ def arms_of(planes: Array) -> tuple[Arm, ...]:
 
 
 def _arms(by_place: Array) -> list[Arm]:
-    """Return lines along which more is left over, the clearest first."""
+    """Return lines with an increased residual, the clearest first."""
     rows, columns = np.nonzero(np.isfinite(by_place))
     if len(rows) < _FEWEST_PLACES:
         return []
@@ -242,7 +242,7 @@ def _excess(values: Array, away: Array) -> Array:
 
 
 def _apart(found: list[tuple[float, Arm]]) -> list[Arm]:
-    """Return the clearest of lines in about the same direction; one alone is no spider."""
+    """Return the clearest of lines with similar direction; a single line is not a spider."""
     chosen: list[Arm] = []
     for _, arm in sorted(found, key=lambda one: -one[0]):
         apart = [abs((arm.angle_deg - other.angle_deg + 180.0) % 360.0 - 180.0) for other in chosen]
@@ -254,7 +254,7 @@ def _apart(found: list[tuple[float, Arm]]) -> list[Arm]:
 _FEWEST_PLACES, _FEWEST_ALONG, _RINGS = 100, 5, 6
 
 _ARM_WIDTH = 0.75
-"""Half of the width of a line, subapertures."""
+"""Half width of a line, subapertures."""
 
 _ARMS_APART_DEG = 35.0
 
@@ -264,7 +264,7 @@ def _rms(values: Array) -> float:
 
 
 def _strange_places(by_place: Array, border: NDArray[np.bool_]) -> list[tuple[int, int, float]]:
-    """Return subapertures that stand out among those at the border, or inside."""
+    """Return outlying subapertures, compared separately at the border and inside."""
     found = []
     for part in (border, ~border):
         values = np.where(part & np.isfinite(by_place), by_place, 0.0)

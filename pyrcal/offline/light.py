@@ -1,4 +1,4 @@
-"""The light on a sensor, read from a file."""
+"""Read the illumination of a sensor from a file."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ FLUX = "flux"
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SeenLight:
-    """The light's evenness, place, rotation."""
+    """Measured illumination with its position and rotation."""
 
     illumination: Illumination
-    """For the model's pupil amplitude."""
+    """Illumination for the model's pupil amplitude."""
 
     position: PupilPosition
     turn: LightRotation | CannotTell | None = None
-    """Against the spider's arms at rotation 0, or the light of another day; None: neither is
-    known."""
+    """Rotation relative to the spider's arms at rotation 0, or to the illumination of another day;
+    None without a reference."""
 
     @property
     def note(self) -> str:
-        """A note for the reader of the fit, one sentence."""
+        """Note on the illumination for the report of the fit, one sentence."""
         (x, y), (sigma_x, sigma_y) = self.position.at, self.position.sigma
         return (
             f"the model is lit as the flux map says; by its light alone the pupil images lie at "
@@ -59,17 +59,17 @@ class SeenLight:
 def read_light(
     path: Path, instrument: Instrument, reference: Path | Arms | None = None
 ) -> SeenLight:
-    """Read mean counts, ``(4, n, n)`` of a pyramid: the images as they lie on the detector.
+    """Read mean counts ``(4, n, n)`` of a pyramid, with the images as on the detector.
 
-    They are in the RTC's own axes, as slopes are, so the instrument must know these. A
-    ``reference``, the counts of another day or the spider's arms at rotation 0, tells by how much
-    the light is turned: any angle against the first, up to half the arms' spacing about the
-    mirror's nominal rotation, if it has one, against the second.
+    The counts are in the axes of the RTC, like slopes, so the instrument must state these axes. A
+    ``reference`` (the counts of another day, or the spider's arms at rotation 0) determines the
+    rotation: over any angle with counts, and within half the arms' spacing around the mirror's
+    nominal rotation with arms.
 
     Raises
     ------
     MatrixError
-        If there are no such counts in a file, their axes are not known, or they show no pupil.
+        If the file has no such counts, their axes are unknown, or they show no pupil.
     """
     light = _light_of(path, instrument)
     counts, position = _read(path, instrument, light)

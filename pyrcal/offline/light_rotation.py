@@ -1,8 +1,8 @@
-"""A coarse rotation from the light on the pupil.
+"""Coarse rotation from the illumination of the pupil.
 
-Only what is not round tells: the shadows of spider arms, or unevenness of the beam. Whether these
-turn with the mirror is the instrument's business: at an adaptive secondary hung from its arms, they
-do.
+Only features without rotational symmetry carry information: shadows of spider arms, or an uneven
+beam. Whether they rotate with the mirror depends on the instrument; with an adaptive secondary
+mounted on those arms, they do.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ Array = NDArray[np.float64]
 
 _STEP_DEG = 0.5
 _MIN_CORRELATION = 0.3
-"""Below it the two maps show no common structure. Diffraction leaves narrow arms 0.4; a pupil
-without any reaches 0.2."""
+"""Correlation below which the two maps have no common structure. Diffraction leaves narrow arms
+0.4; a pupil without arms reaches 0.2."""
 
 _RIVAL = 0.85
-"""Another rotation whose correlation reaches this share of the best makes the answer ambiguous."""
+"""Correlation of another rotation over the best one above which the result is ambiguous."""
 
 _APART_DEG = 10.0
-"""A rival is a peak of its own, at least this far away."""
+"""Smallest distance of two separate correlation peaks, degrees."""
 
 _LARGEST_SIGMA_DEG = 2.0
 _SHADOW_SAMPLES = 5
@@ -37,30 +37,30 @@ _SHADOW_SAMPLES = 5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LightRotation:
-    """By how much the light is turned against its reference."""
+    """Measured rotation of the illumination relative to its reference."""
 
     rotation_rad: float
-    """From sensor +x towards +y."""
+    """Rotation from sensor +x towards +y, rad."""
 
     sigma_rad: float
-    """1 σ, from the noise of the map and the sharpness of its structure."""
+    """1 σ of the rotation from the noise of the map and the sharpness of its structure, rad."""
 
     correlation: float
-    """Of the map with the turned reference, 0..1."""
+    """Correlation of the map with the rotated reference, 0..1."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Arms:
-    """Spider arms as they lie when the rotation is 0."""
+    """Spider arms at rotation 0."""
 
     angles_rad: tuple[float, ...]
-    """Of each, from +x towards +y, from the centre outwards."""
+    """Direction of each arm from +x towards +y, from the centre outwards, rad."""
 
     width_subap: float
-    """Of each shadow."""
+    """Width of each shadow, subapertures."""
 
     def light(self, n: int) -> Array:
-        """Return the light they leave, ``(n, n)`` on subapertures about the centre, 0..1."""
+        """Return the illumination behind the arms ``(n, n)``, on centred subapertures, 0..1."""
         inside = (np.arange(_SHADOW_SAMPLES) + 0.5) / _SHADOW_SAMPLES - 0.5
         fine = (np.arange(n)[:, None] - (n - 1) / 2 + inside).reshape(-1)
         x, y = fine[None, :], fine[:, None]
@@ -82,19 +82,19 @@ def find_rotation(
     *,
     within_rad: float = 2 * np.pi,
 ) -> LightRotation | CannotTell:
-    """Return the turn of the light against a reference centred on its own pupil.
+    """Return the rotation of the illumination relative to a reference centred on its own pupil.
 
     Parameters
     ----------
     light, known
-        As from ``relative_light``, on the sensor.
+        Output of ``relative_light``, on the sensor.
     position
-        Of the pupil on the sensor.
+        Position of the pupil on the sensor.
     reference
-        The beam's light at rotation 0, measured once, or the arms it has to pass. Smooth
-        unevenness is left out of account beside arms: they say nothing of it.
+        Illumination measured at rotation 0, or the spider arms. With arms, smooth unevenness is
+        removed first, because arms do not predict it.
     within_rad
-        Largest turn looked for: arms evenly spread are alike after a fraction of a turn.
+        Largest rotation searched. Evenly spaced arms repeat after a fraction of a turn.
 
     Raises
     ------
@@ -146,7 +146,7 @@ def find_rotation(
 
 
 def _refusal(angles: Array, correlation: Array, best: int) -> str:
-    """Return why the best rotation is not to be believed; empty: it is."""
+    """Return why the best rotation is rejected; empty if it is accepted."""
     highest = float(correlation[best])
     if highest < _MIN_CORRELATION:
         return (
@@ -170,7 +170,7 @@ def _refusal(angles: Array, correlation: Array, best: int) -> str:
 def _turned(
     reference: Array, known: NDArray[np.bool_], position: PupilPosition, angle_rad: float
 ) -> Array:
-    """Return the reference, turned and moved to ``position``, on the known subapertures."""
+    """Return the reference rotated and moved to ``position``, on the known subapertures."""
     n, middle = len(known), (len(reference) - 1) / 2
     rows, columns = np.nonzero(known)
     x = columns - (n - 1) / 2 - position.at[0]
@@ -181,7 +181,7 @@ def _turned(
 
 
 def _smooth_shapes(known: NDArray[np.bool_], order: int) -> Array:
-    """Return polynomials over the known subapertures, orthonormal, ``(n_known, n_shapes)``."""
+    """Return orthonormal polynomials over the known subapertures ``(n_known, n_shapes)``."""
     y, x = (2.0 * axis / len(known) - 1.0 for axis in np.nonzero(known))
     terms = [x**i * y**j for i in range(order + 1) for j in range(order + 1 - i)]
     return np.asarray(np.linalg.qr(np.column_stack(terms))[0])

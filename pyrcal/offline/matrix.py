@@ -1,4 +1,4 @@
-"""From a measured interaction matrix to its registration."""
+"""Fit the registration of a measured interaction matrix."""
 
 from __future__ import annotations
 
@@ -80,21 +80,22 @@ from service.model.sensors.sensor import Mapper
 from service.model.slopes import Orientation, SlopeRecipe
 
 MIN_COLUMNS = 3
-"""Columns that must be left where those that hold noise only are left out."""
+"""Smallest number of columns that must remain when columns with noise only are left out."""
 
 _NAMED = 12
 
 _SMEAR_STEPS = 8
 _LONGEST_SMEAR_STEP = 0.15
-"""The registration follows the larger part of a smear of 0.3: secants over longer steps miss it."""
+"""Longest secant step. The registration follows most of a smear of 0.3, so longer secants miss it.
+"""
 _SMEAR_SETTLED = 1e-3
-"""Remaining share of the column before at which the steps end."""
+"""Remaining share of the previous column at which the iteration ends."""
 
 _LEAST_RATE = 0.1
-"""Change of the measured share over that of the one taken out, as far as it is believed."""
+"""Smallest slope of the measured share over the removed share used in the uncertainty."""
 
 _SMEAR_EXPLAINS = 0.9
-"""Residual without the smear, over that with it, above which it is not believed."""
+"""Residual without the smear over that with it, above which the smear is rejected."""
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -105,31 +106,33 @@ class FitOptions:
     """Options of a fit."""
 
     method: Method = Method.JOINT
-    """How the registration is found."""
+    """Fit method."""
 
     modes: NDArray[np.intp] | None = None
-    """Basis indices to use; None: all that the reference has."""
+    """Basis indices to use; None for all that the reference contains."""
 
     start: Misregistration | None = None
-    """Where to begin; None: a rough rotation from the lowest orders, the rest nominal."""
+    """Start of the fit. None for a coarse rotation from the lowest orders and nominal other values.
+    """
 
     orientation: Orientation | None = None
-    """Of the slopes; None: the instrument's, or found when that does not say either."""
+    """Orientation of the slopes. None for that of the instrument file, or a search if it has none.
+    """
 
     gain_map: bool = False
-    """Whether a smooth gain over the pupil, common to all modes, is unknown too."""
+    """True to fit a smooth gain over the pupil, common to all modes."""
 
     anamorphosis: bool = True
-    """Whether the anamorphosis of the mirror's image is unknown too."""
+    """True to fit the anamorphosis of the mirror's image."""
 
     illumination: Illumination | None = None
-    """Measured light of the beam, in the axes of conventions.md; None: even."""
+    """Measured illumination of the pupil, in the axes of conventions.md; None if it is uniform."""
 
     explain: bool = False
-    """Whether causes of gains that are far from 1, and of columns out of place, are looked for."""
+    """True to search for causes of gains far from 1 and of displaced columns."""
 
     gain: float = GAIN
-    """Integrator gain of the loop that the reconstructor is checked in."""
+    """Integrator gain of the loop in which the reconstructor is checked."""
 
 
 def fit_matrix(
@@ -141,29 +144,29 @@ def fit_matrix(
     mapper: Mapper = map,
     progress: Progress | None = None,
 ) -> Fit:
-    """Return the registration at which this matrix was measured, and whether to believe it.
+    """Return the registration of a measured matrix, with its uncertainty and verdict.
 
     Parameters
     ----------
     instrument
-        Whose matrix it is.
+        Instrument whose matrix was measured.
     reference
-        The matrix as it was measured.
+        Measured matrix.
     options
-        What is asked of the fit.
+        Options of the fit.
     basis
-        The instrument's modes, when they are at hand; None: made here, which takes seconds.
+        Modes of the instrument; None to compute them, which takes seconds.
     mapper
-        Like ``map``; an executor's spreads the work over threads.
+        Function like ``map``; an executor's ``map`` distributes the work over threads.
     progress
-        Told in a few words what begins.
+        Callback for a short text at the beginning of each stage.
 
     Raises
     ------
     MatrixError
-        If the matrix is another instrument's, transposed, in another unit or empty.
+        If the matrix belongs to another instrument, is transposed, in another unit or empty.
     ModelError
-        If a mode that is to be used was not measured, or the instrument cannot be modelled.
+        If a requested mode was not measured, or the instrument cannot be modelled.
     """
     options = options or FitOptions()
     tell = progress or (lambda _: None)
@@ -238,7 +241,7 @@ def _fitted(
 
 
 def _with_mask(fit: Fit, instrument: Instrument) -> Fit:
-    """Return a fit with what is wrong between mask and pupil, which a refusal may be due to."""
+    """Return the fit with any mismatch between mask and pupil added to remarks and advice."""
     x, y = fit.alpha.vector[:2].tolist()
     difference = check_mask(instrument, (x, y))
     if difference is None:
@@ -261,11 +264,11 @@ def _settled_pokes(
     options: FitOptions,
     tell: Progress,
 ) -> tuple[_Found, Reference]:
-    """Return the fit with what each poke left of the one before taken out of the columns.
+    """Return the fit with the remainder of each previous poke removed from the columns.
 
-    The registration itself follows part of it, so that the first measurement is too small; the
-    share at which none is left follows by secants. Where that does not explain the matrix clearly
-    better, the fit stays as it is.
+    The registration itself follows part of the smear, so the first measurement is too small. Secant
+    steps find the share at which none remains. If that does not explain the matrix clearly better,
+    the original fit is returned.
     """
     begin = instrument.with_anamorphosis(found.settled.solution.alpha)
     before, left_before, share = 0.0, first.share, first.share
@@ -289,7 +292,7 @@ def _settled_pokes(
 
 
 def _without_noise(usable: Reference, noisy: NDArray[np.bool_]) -> Reference:
-    """Return the columns that hold more than noise; the others are named."""
+    """Return the reference without the columns that hold noise only; these are listed."""
     named = ", ".join(str(mode) for mode in usable.columns[noisy][:_NAMED])
     more = f" and {int(noisy.sum()) - _NAMED} more" if noisy.sum() > _NAMED else ""
     left_out = f"{int(noisy.sum())} of {len(noisy)} columns hold noise only: modes {named}{more}"
@@ -303,12 +306,12 @@ def _without_noise(usable: Reference, noisy: NDArray[np.bool_]) -> Reference:
 
 
 def _stroke_known(instrument: Instrument) -> bool:
-    """Return whether the size of a column means anything: a wavelength scales them all."""
+    """Return True if the amplitude of a column is known: stroke and wavelength both scale it."""
     return instrument.mirror.stroke_known and "wfs.wavelength_m" not in instrument.unknown
 
 
 def _masked(instrument: Instrument) -> Instrument:
-    """Return the instrument with its mask worked out: every model of the fit asks for it."""
+    """Return the instrument with its mask computed once, because every model of the fit uses it."""
     mask = rtc_valid_subapertures(instrument)
     return replace(instrument, wfs=replace(instrument.wfs, valid_subapertures=mask))
 
@@ -340,7 +343,7 @@ def _selected(reference: Reference, modes: NDArray[np.intp] | None) -> Reference
 
 
 def _with_shape(reference: Reference, instrument: Instrument) -> Reference:
-    """Return only the columns of modes that have a shape in the instrument file."""
+    """Return only the columns of modes that have a usable shape in the instrument file."""
     flat = np.isin(reference.columns, instrument.mirror.flat_modes)
     if not flat.any() or flat.all() or reference.matrix.shape[1:] != flat.shape:
         return reference
@@ -360,20 +363,22 @@ def _with_shape(reference: Reference, instrument: Instrument) -> Reference:
 
 
 FAR_SUBAP = 2.0
-"""Shift at which the orientation is looked for again where none explains the lowest orders."""
+"""Shift at which the orientation search is repeated if none explains the lowest orders,
+subapertures."""
 
 
 EQUIVALENT = 0.02
-"""Difference of two correlations that rounding of the angles makes."""
+"""Largest difference of two correlations that rounding of the angles causes."""
 
 
 def _axes(
     instrument: Instrument, usable: Reference, basis: Basis, options: FitOptions, mapper: Mapper
 ) -> tuple[SlopeRecipe, Misregistration | None, str]:
-    """Return how slopes are listed, as stated or found, where to begin, why it is not sure.
+    """Return the slope recipe, the start pose, and the reason if the axes are uncertain.
 
-    The search also tells the rotation, so it is spared only when a start is given too. It is made
-    about the start, for a mirror that is subapertures away shows other lowest orders.
+    The search also determines the rotation, so it is skipped only if both orientation and start are
+    given. It is made around the start, because a mirror displaced by subapertures has different
+    lowest orders.
     """
     stated = options.orientation or instrument.slopes.orientation
     slopes = replace(instrument.slopes, orientation=stated)
@@ -417,10 +422,10 @@ class _Found:
     landing: Landing | None = None
     table: tuple[ScanStep, ...] | None = None
     smear: Smear | None = None
-    """Share of the column before that was taken out of each column."""
+    """Share of the previous column that was removed from each column."""
 
     before: Solution | None = None
-    """The solution with the columns as they were measured, where a smear was taken out."""
+    """Solution with the original columns, if a smear was removed."""
 
 
 def _found(
@@ -458,7 +463,7 @@ def _found(
 
 
 def _unknown_images(models: FitModels) -> dict[str, Any]:
-    """Return what is unknown of the places of the sensor's pupil images, where anything is."""
+    """Return the displacement patterns of the pupil images and their σ, if they are unknown."""
     sigma = kind_of(models.instrument).image_sigma_subap(models.instrument)
     if sigma is None:
         return {}
@@ -612,7 +617,7 @@ def _answer(
 
 
 def _magnification_floor(instrument: Instrument) -> tuple[float, str]:
-    """Return 1 σ that no magnification is surer than, and why where it is larger than usual."""
+    """Return the smallest 1 σ of a magnification, and the reason if it is larger than usual."""
     if instrument.slopes.normalisation is Normalisation.LOCAL:
         floor = LOCAL_MAGNIFICATION_FLOOR
         cause = "each subaperture is divided by its own light, which lets its border weigh as much"
@@ -635,7 +640,10 @@ def _noise_share(residual: float, structured: float) -> float:
 def _image_offsets(
     instrument: Instrument, nuisances: Nuisances, solution: Solution
 ) -> Array | None:
-    """Return where the pupil images were found beside their places, as an instrument file says."""
+    """Return the fitted pupil image offsets, as the instrument file's key gives them.
+
+    None if they were not fitted.
+    """
     if not len(nuisances.images):
         return None
     found = nuisances.image_offsets(solution.nuisances)
@@ -643,7 +651,7 @@ def _image_offsets(
 
 
 def _narrow(settled: Settled) -> SeenPupil | None:
-    """Return a pupil's image that is narrower than the instrument file says, if it is."""
+    """Return the pupil image if it is narrower than in the instrument file, else None."""
     target, solution = settled.target, settled.solution
     squares = solution.projection.gains**2
     measured = np.einsum("ij,ij->i", target.matrix, target.matrix)
@@ -654,7 +662,7 @@ def _narrow(settled: Settled) -> SeenPupil | None:
 
 
 def _rows_left_out(target: Target, instrument: Instrument) -> Iterator[str]:
-    """Yield how many slopes do not count, and why."""
+    """Yield the number of unused slopes and the reason."""
     n_all, n_left_out = len(target.rows), int(np.sum(~target.rows))
     of_sensor = kind_of(instrument).left_out(instrument)
     if of_sensor is not None:
@@ -679,7 +687,10 @@ def _residual_map(found: _Found) -> Array:
 
 
 def _condition_number(matrix: NDArray[np.float32]) -> float:
-    """Return the ratio of the extreme singular values, from the Gram matrix: ample below 1e6."""
+    """Return the ratio of the extreme singular values.
+
+    The Gram matrix is precise enough below 1e6.
+    """
     columns = matrix.astype(np.float64)
     power = np.linalg.eigvalsh(columns.T @ columns)
     return float(np.sqrt(power[-1] / power[0])) if power[0] > 0.0 else float("inf")

@@ -1,16 +1,16 @@
-"""Three methods from a start to the registration of a matrix.
+"""Three methods to fit the registration of a matrix from a start.
 
-**joint**: all four parameters together (:mod:`service.estimation.solver`), from one start or
-from many.
+**joint**: all four parameters together (:mod:`service.estimation.solver`), from one start or from
+many.
 
-**sensitivity**: as the Adaptive Optics Facility does it, the measured matrix less the synthetic one
-is projected on the derivatives of the synthetic one. It is first order, so it is repeated about
-each answer.
+**sensitivity**: as at the Adaptive Optics Facility, the measured matrix less the synthetic one is
+projected on the derivatives of the synthetic one. The method is first order, so it is repeated at
+each result.
 
-**paper**: the ten steps of Table 1 of Heritier et al. 2018. One parameter is scanned at a time, the
-others held, in the order and with the step sizes of :data:`TABLE_1`. The criterion is χ_N of
+**paper**: the ten steps of Table 1 of Heritier et al. 2018. One parameter is scanned at a time with
+the others fixed, in the order and with the step sizes of :data:`TABLE_1`. The criterion is χ_N of
 section 4.2, :func:`chi_n`: all modes, no free gain. The value of a step is the minimum of a second
-order polynomial through the samples about the lowest one. The modal gains are tuned afterwards, at
+order polynomial through the samples near the lowest one. The modal gains are fitted afterwards, at
 the registration found (section 4.3).
 
 References
@@ -53,42 +53,41 @@ from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistr
 Array = NDArray[np.float64]
 
 GOOD = 0.10
-"""Share of χ² that even uneven light and another mirror leave to the smooth shapes; a false
-minimum leaves several times as much."""
+"""Largest share of χ² left to the smooth shapes at the true minimum, even with uneven light and
+another mirror; a false minimum leaves several times as much."""
 
 SAME = np.array([0.15, 0.15, np.deg2rad(0.5), 0.01])
-"""Minima nearer than this are one (numeric units)."""
+"""Distance below which two minima are the same (numeric units)."""
 
 SAME_SENSOR = 0.1
-"""Logarithm by which the sensor's number may differ for derivatives with respect to other unknowns
-to be as good."""
+"""Largest logarithmic change of the sensor number for which other derivatives are reused."""
 
 NEARLY_AS_GOOD = 1.3
-"""A minimum with less than this times the least misfit is a rival."""
+"""Misfit of another minimum over the smallest one, below which it is an alternative."""
 
 MAX_REPEATS = 6
 LINEAR = 0.01
-"""A logarithm of the instrument's that differs by less is as good as linear."""
+"""Logarithmic change of an optical quantity below which the model is linear."""
 
 LINEAR_IMAGES = 0.02
-"""A pupil image displaced by less, in subapertures, is as good as linear, ..."""
+"""Displacement of a pupil image below which the model is linear, subapertures."""
 
 LINEAR_IMAGES_LEFT = 0.08
-"""... or by less than this times the root of the share of the signal that is left over: the second
-order of a displacement d, at most (π d)² / 2 of the signal, is then a thirtieth of that."""
+"""The same limit over the root of the residual share of the signal: the second order of a
+displacement d, at most (π d)² / 2 of the signal, is then a thirtieth of that share."""
 
 BLURS = (-0.5, -0.25, 0.25, 0.5)
-"""Displacements of a pattern that are tried, subapertures: half of each in every image."""
+"""Trial amplitudes of a blurring pattern, subapertures: half of each in every image."""
 
 LONGEST_MOVE = 0.3
-"""Of one pattern of displaced images, subapertures: beyond it their derivatives point elsewhere."""
+"""Longest change of one displacement pattern, subapertures; the derivatives hold no further."""
 
 IMAGES_GAIN = 0.9
-"""Share of χ² below which a fit about displaced images is worth another: four of the displacements
-hardly change a matrix, and would wander without end."""
+"""Ratio of χ² below which a fit with displaced images is repeated: four of the displacements hardly
+change a matrix, and would drift without end."""
 
 REACH = 20.0
-"""Derivatives within so many settling lengths of where they were taken are as good as new."""
+"""Number of settling lengths within which derivatives are reused."""
 
 TABLE_1 = (
     ("rotation_deg", 0.125),
@@ -112,25 +111,25 @@ HALF_WIDTH = 5
 """Samples on either side of the start of the later scans. The paper does not print a number."""
 
 MAX_EXTENSION = 60
-"""Samples added at most to a scan whose lowest sample is its last."""
+"""Largest number of samples added to a scan whose lowest sample is its last."""
 
 FITTED_HALF_WIDTH = 2
 """Samples on either side of the lowest one that the polynomial is fitted to."""
 
 MAX_MODES = 60
-"""Modes, spread over those fitted, that are compared where a few will do."""
+"""Largest number of modes used for comparisons that do not need all modes."""
 
 CHANGES = np.arange(-4, 5) * 0.3
-"""Logarithms of the factors that the sensor's number is looked for at, from a third to three."""
+"""Logarithms of the factors of the sensor number that are tried, from a third to three."""
 
 NO_SENSOR_NUMBER = 0.02
-"""A modulation, λ/D, that stands for none: a logarithm never comes to 0."""
+"""Modulation, λ/D, that represents none, because a logarithm has no value for 0."""
 
 STRANGE = 0.05
-"""RMS share of the signal left over beyond which the sensor is looked for from afar, ..."""
+"""RMS residual share of the signal above which the sensor number is searched over a wide range."""
 
 FAR_OFF = 0.03
-"""... as it is where its logarithm seems off by this."""
+"""Logarithmic step of the sensor number above which it is searched over a wide range."""
 
 _SHIFTS = (-1.3, 1.3)
 _TURNS_RAD = np.deg2rad([-6.0, 6.0])
@@ -138,7 +137,7 @@ _TURNS_RAD = np.deg2rad([-6.0, 6.0])
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ScanStep:
-    """One line of the paper's Table 1: one parameter scanned, the others held."""
+    """One line of the paper's Table 1: a scan of one parameter with the others fixed."""
 
     parameter: str
     """Name at the boundary, as in ``PARAMETERS``."""
@@ -156,20 +155,20 @@ class ScanStep:
     """Minimum of the polynomial, in boundary units: the parameter's value after this step."""
 
     coefficients: NDArray[np.float64]
-    """``(3,)`` of the polynomial, highest order first, in ``(value - minimum) / step``."""
+    """``(3,)`` polynomial coefficients, highest order first, in ``(value - minimum) / step``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Landing:
-    """End of the steps from one or many starts."""
+    """Result of the coarse steps from one or many starts."""
 
     best: Approach
     rivals: tuple[Approach, ...]
-    """Other minima nearly as good."""
+    """Other minima that are nearly as good."""
 
 
 def land(models: FitModels, target: Target, start: Misregistration) -> Landing:
-    """Return where a start leads; if that explains little, where the best of many leads."""
+    """Return the result from a start; if it explains little, the best of many starts."""
     matrix = models.low_order.measured(target.matrix)
     low = Columns(
         matrix=matrix, weights=1.0 / np.sum(matrix[target.rows] ** 2, axis=0), rows=target.rows
@@ -197,20 +196,20 @@ class Settled:
 
     solution: Solution
     target: Target
-    """Without the slopes of unknown surface."""
+    """Measured columns without the slopes of unknown surface."""
 
     models: FitModels
-    """Of the instrument that was found; its basis may have another coupling."""
+    """Models of the fitted instrument; their basis may have another coupling."""
 
     nuisances: Nuisances
-    """About these models."""
+    """Nuisances relative to these models."""
 
     on_fine_grid: bool = True
-    """Whether the fine model has decided."""
+    """True if the fine model determined the solution."""
 
     @property
     def prior(self) -> Array:
-        """``(4 + n_nuisances,)`` weight of the prior of each unknown, 1 / σ², as it counts."""
+        """``(4 + n_nuisances,)`` effective weight of the prior of each unknown, 1 / σ²."""
         return self.nuisances.prior * self.solution.dispersion
 
     @property
@@ -222,7 +221,7 @@ class Settled:
 
     @property
     def share(self) -> float:
-        """RMS of the residual, each mode counted alike."""
+        """RMS of the residual, with all modes weighted equally."""
         return float(np.sqrt(np.mean(self.by_mode**2)))
 
 
@@ -231,10 +230,10 @@ def settle(
 ) -> Settled:
     """Return the minimum on the fine grid.
 
-    What is found of the instrument is linear only close by, so the fit is done again about it: on
-    the cheap grid until that has come to rest, then on the fine one. A table of modes ends
-    somewhere, and where depends on the registration: the slopes near its edge are left out, and the
-    fit is done again if that changed anything.
+    The effect of optical quantities is linear only nearby, so the fit is repeated with updated
+    models: on the coarse grid until it converges, then on the fine one. A table of modes has an
+    edge, whose position depends on the registration. The slopes near the edge are left out, and the
+    fit is repeated if their set has changed.
     """
     seen = _known(models, target, start)
     solution = refine(models, seen, start, nuisances, decides=models.cheap)
@@ -278,7 +277,7 @@ def settle(
 
 
 def _images_of(settled: Settled, alpha: Misregistration, nuisances: Nuisances) -> Array | None:
-    """Return the derivatives of a fit with the images' places, if they hold for another nearby.
+    """Return the derivatives by image displacements of an earlier fit, if they still hold.
 
     They take as long as all others together. None if α, the images or the sensor differ too much.
     """
@@ -296,9 +295,10 @@ def _images_of(settled: Settled, alpha: Misregistration, nuisances: Nuisances) -
 
 
 def _with_nearest_instrument(settled: Settled) -> Settled:
-    """Return the fit with images and sensor that explain the matrix best, where they seem far off.
+    """Return the fit with the best images and sensor number, if they may be far off.
 
-    Displaced images look like another modulation, so they come first where a modulation is known.
+    Displaced images look like another modulation, so they are searched first if the modulation is
+    known.
     """
     searches = [_with_nearest_images, _with_nearest_sensor]
     if Optic.SENSOR in settled.nuisances.unknown:
@@ -315,10 +315,10 @@ def _with_nearest_instrument(settled: Settled) -> Settled:
 
 
 def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
-    """Return the models of the sensor that explains the matrix best, where it seems far off.
+    """Return the models with the best sensor number, if it may be far off.
 
-    Steps lead slowly there: gains hide much of what a modulation does. So a few modes are looked at
-    on the cheap grid; each sensor is allowed its own registration, to first order.
+    Steps converge slowly there, because gains hide much of a modulation's effect. So a few modes
+    are compared on the coarse grid, each with its own registration to first order.
     """
     models, nuisances, solution = settled.models, settled.nuisances, settled.solution
     places = [k for k, (o, _) in enumerate(nuisances.optics) if o is Optic.SENSOR]
@@ -357,9 +357,9 @@ def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
 
 
 def _descended(left: Callable[[float], float]) -> Array:
-    """Return χ² at ``CHANGES``, outwards from none until it grows; infinite beyond.
+    """Return χ² at ``CHANGES``, outwards from no change until it grows; infinite beyond.
 
-    The widest modulations take longest.
+    The widest modulations take longest, so they are not computed without need.
     """
     found = np.full(len(CHANGES), np.inf)
     middle = len(CHANGES) // 2
@@ -375,12 +375,12 @@ def _descended(left: Callable[[float], float]) -> Array:
 
 
 def _with_nearest_images(settled: Settled) -> tuple[FitModels, Nuisances]:
-    """Return the models with their pupil images where a few modes are explained best.
+    """Return the models with the pupil images that best explain a few modes.
 
-    Only where the first steps displace them, and no further than is likely. Quadrupoles and common
-    displacements change a matrix to first order. The others blur it, and a blur hardly tells its
-    sign: so each of them is looked for in turn, on the cheap grid, all other unknowns left free to
-    first order.
+    This is done only if the first steps displace the images, and within plausible displacements.
+    Quadrupoles and common displacements change a matrix to first order. The others blur it, and the
+    sign of a blur is hardly measurable: so each of them is searched in turn on the coarse grid,
+    with all other unknowns free to first order.
     """
     models, nuisances, solution = settled.models, settled.nuisances, settled.solution
     values = solution.nuisances[nuisances.image_places]
@@ -419,17 +419,17 @@ def _with_nearest_images(settled: Settled) -> tuple[FitModels, Nuisances]:
 
 
 def spread(n_modes: int) -> NDArray[np.intp]:
-    """Return a few columns, spread over all."""
+    """Return indices of a few columns, evenly spread over all."""
     return np.unique(np.linspace(0, n_modes - 1, min(MAX_MODES, n_modes)).astype(np.intp))
 
 
 def _linear_images(settled: Settled) -> float:
-    """Return the displacement of a pupil image below which it is as good as linear, subap."""
+    """Return the displacement of a pupil image below which the model is linear, subapertures."""
     return max(LINEAR_IMAGES, LINEAR_IMAGES_LEFT * float(np.sqrt(settled.share)))
 
 
 def _adjusted(settled: Settled, *, move_images: bool) -> tuple[FitModels, Nuisances]:
-    """Return the models of the instrument that was found, and the unknowns about it."""
+    """Return models updated with the fitted optical quantities, and nuisances relative to them."""
     models, nuisances = settled.models, settled.nuisances
     optics = []
     for k, (optic, offset) in enumerate(nuisances.optics, nuisances.first_optic):
@@ -451,7 +451,7 @@ def _adjusted(settled: Settled, *, move_images: bool) -> tuple[FitModels, Nuisan
 def settle_at(
     models: FitModels, target: Target, alpha: Misregistration, nuisances: Nuisances
 ) -> Settled:
-    """Return the model as it stands at a registration that another method has found."""
+    """Return the model evaluated at a registration from another method."""
     seen = _known(models, target, alpha)
     there = refine(models, seen, alpha, nuisances, max_steps=0)
     solution = replace(there, converged=within_limits(alpha.vector))
@@ -461,7 +461,7 @@ def settle_at(
 def project_on_sensitivities(
     models: FitModels, target: Target, start: Misregistration, nuisances: Nuisances
 ) -> Settled:
-    """Return the end of projections on sensitivities from one start."""
+    """Return the result of repeated projections on sensitivities from one start."""
     for _ in range(MAX_REPEATS):
         settled = settle(models, target, start, nuisances)
         step = settled.solution.vector - start.vector
@@ -480,8 +480,8 @@ def scan(
 ) -> tuple[Misregistration, tuple[ScanStep, ...]]:
     """Scan the parameters one by one and return the last values and every scan.
 
-    ``steps`` are the parameter and the step size of each scan, in boundary units. ``tell`` is
-    called with a line after each scan.
+    ``steps`` are the parameter and the step size of each scan, in boundary units. ``progress`` is a
+    callback that receives a line after each scan.
     """
     values = start.vector * BOUNDARY_SCALE
     table: list[ScanStep] = []
@@ -519,19 +519,19 @@ def chi_n(target: Target, matrix: NDArray[Any]) -> float:
     """Return the paper's criterion χ_N of a synthetic matrix, (slope per metre)².
 
     It is the squared norm over the modes (equation 8) of the RMS difference between measured and
-    synthetic slopes of each mode (equation 7). No gain is left free.
+    synthetic slopes of each mode (equation 7). There is no free gain.
     """
     difference = target.matrix[target.rows] - matrix[target.rows]
     return float(np.sum(np.mean(difference**2, axis=0, dtype=np.float64)))
 
 
 def _known(models: FitModels, target: Target, alpha: Misregistration) -> Target:
-    """Return the target without slopes that see surface a table of modes does not know."""
+    """Return the target without slopes from surface outside a table of modes."""
     return target.without(models.fine.unknown_rows(alpha))
 
 
 def _other_starts(start: Array) -> list[Array]:
-    """Return other starts: corners of the range, and turns."""
+    """Return further starts: corners of the range, and rotations."""
     corners = [np.array([x, y, 0.0, 0.0]) for x, y in product(_SHIFTS, _SHIFTS)]
     turns = [np.array([0.0, 0.0, turn, 0.0]) for turn in _TURNS_RAD]
     nominal = np.array([0.0, 0.0, start[2], 1.0])
@@ -541,7 +541,7 @@ def _other_starts(start: Array) -> list[Array]:
 def _scanned(
     chi: Callable[[float], float], parameter: str, start: float, step: float, half_width: int
 ) -> ScanStep:
-    """Scan one parameter about a start; continue where the lowest sample is the last one."""
+    """Scan one parameter around a start, and continue while the lowest sample is the last one."""
     found = {k: chi(start + k * step) for k in range(-half_width, half_width + 1)}
     for _ in range(MAX_EXTENSION):
         best = min(found, key=lambda k: found[k])

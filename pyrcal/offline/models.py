@@ -1,4 +1,4 @@
-"""The models of one fit, from coarse to fine."""
+"""Optical models of one fit at several samplings."""
 
 from __future__ import annotations
 
@@ -26,41 +26,41 @@ from service.model.surface import Gaussian, ThinPlate, mirror_surface
 Array = NDArray[np.float64]
 
 CHEAP = 2
-"""Pupil points per subaperture, and nodes, of the model for derivatives; for residuals, and for far
-steps, the sensor's kind says how many are enough."""
+"""Pupil points per subaperture, and nodes, of the model for derivatives. The sensor's kind defines
+the sampling for residuals and for far steps."""
 
 BETTER = 0.95
-"""Another instrument is preferred when it leaves less than this share of χ². On the diffractive
-telescope the right stop has left 0.83 to 0.94 of what the wrong one does, noise included, from a
-shift of 0.08 subaperture on; at no shift the two differ by less than 0.01."""
+"""Share of χ² that another instrument must leave at most to be preferred. On the diffractive
+telescope the correct stop left 0.83 to 0.94 of the wrong one's χ², noise included, from a shift of
+0.08 subapertures; without shift the two differ by less than 0.01."""
 
 FAR_BETTER = 0.7
-"""The same of influence functions and centroids, of which none is quite the bench's."""
+"""The same share for influence functions and centroids, because no model of them matches a bench
+exactly."""
 
 MOST_ACROSS = 160
-"""Points across the pupil of a simulator's black and white map that a fit takes as they are: of 16
-subapertures with six points each, three points left 0.0014 subapertures of error, 3.7 σ, six 0.0001
-(docs/results/peers.md). Beyond, a step is too small a part of the pupil to matter."""
+"""Largest number of points across a binary pupil map that the fit uses at full resolution. With 16
+subapertures of six points each, three points left an error of 0.0014 subapertures, 3.7 σ, six
+points 0.0001 (docs/results/peers.md). On larger maps a step is negligible."""
 
 SENSOR_STEP = 0.03
-"""Of the difference that stands for a derivative by the sensor's number, its logarithm. It is taken
-to one side: a fit ends where that number is within 0.01 of the model's, and the derivative is then
-off by a share of that."""
+"""Step of the sensor number's logarithm for a one-sided finite difference. A fit ends within 0.01
+of the model's number, so the error of the derivative is negligible."""
 
 
 class Optic(StrEnum):
-    """A number of the instrument that a matrix can determine, by its logarithm."""
+    """An optical quantity that a matrix can determine, fitted as its logarithm."""
 
     WIDTH = "width"
-    """Of the influence functions: their coupling, where they have one."""
+    """Width of the influence functions: their coupling, if they have one."""
 
     SENSOR = "sensor"
-    """What the kind of sensor says can be told: a pyramid's modulation."""
+    """Fitted number of the sensor's kind: a pyramid's modulation."""
 
 
 @dataclass(slots=True)
 class Counter:
-    """Interaction matrices computed so far."""
+    """Number of interaction matrices computed so far."""
 
     n: int = 0
 
@@ -70,17 +70,17 @@ class Other:
     """A change of the instrument file."""
 
     words: str
-    """Key and value, as the file would say them."""
+    """Key and value in the notation of the file."""
 
     max_misfit_ratio: float
-    """Largest χ² that it may leave, over what the file leaves, to be preferred."""
+    """Largest χ² over the file's at which this change is preferred."""
 
 
 def deciding_sampling(instrument: Instrument) -> int:
-    """Return how many pupil points a subaperture has in the model that decides a fit.
+    """Return the pupil points per subaperture of the model that determines a fit.
 
-    As many as a map of the pupil that knows no partly lit point, as simulators have it, as long as
-    that is no more than ``MOST_ACROSS`` in all: fewer points make its steps grey.
+    It is that of a binary pupil map, as simulators use, if that is at most ``MOST_ACROSS`` points
+    in all: with fewer points its edges become grey.
     """
     usual, pupil = kind_of(instrument).fine_sampling, instrument.pupil
     if pupil is None or np.any((pupil.lit > 0.0) & (pupil.lit < 1.0)):
@@ -92,26 +92,27 @@ def deciding_sampling(instrument: Instrument) -> int:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FitModels:
-    """One instrument and the modes to be fitted, at several samplings; each made when needed."""
+    """Models of one instrument and the fitted modes at several samplings, computed on demand."""
 
     instrument: Instrument
-    """Its orientation settled."""
+    """Instrument with a known orientation."""
 
     basis: Basis
-    """Only the modes that are fitted."""
+    """Fitted modes only."""
 
     illumination: Illumination | None = None
     mapper: Mapper = map
     counter: Counter = field(default_factory=Counter)
     made: dict[int, InteractionModel] = field(default_factory=dict)
-    """By sampling, the models of one instrument: those of other modes share their optics."""
+    """Models of one instrument by sampling; models of other modes share their optics."""
 
     def model(
         self, sampling: int, basis: Basis | None = None, *, once: bool = False
     ) -> InteractionModel:
-        """Return a model of this sampling, of ``basis`` or else of the own modes.
+        """Return a model of this sampling, for ``basis`` or the models' own modes.
 
-        One that is used ``once`` keeps no response of the sensor to every point of the pupil.
+        A model that is used ``once`` does not store the sensor's response to every point of the
+        pupil.
         """
         known = self.made.get(sampling)
         if known is not None and known.instrument is self.instrument:
@@ -131,12 +132,12 @@ class FitModels:
 
     @cached_property
     def low_order(self) -> LowOrder:
-        """The smoothest shapes of the modes."""
+        """Smoothest combinations of the modes."""
         return low_order_of(self._coarse)
 
     @cached_property
     def far(self) -> InteractionModel:
-        """Leads from afar: the smoothest shapes on the coarse grid."""
+        """Model for far steps: the smoothest shapes on the coarse grid."""
         return self._coarse.of_modes(self.low_order.shapes)
 
     @cached_property
@@ -145,12 +146,12 @@ class FitModels:
 
     @cached_property
     def cheap(self) -> InteractionModel:
-        """For derivatives near the solution."""
+        """Model for derivatives near the solution."""
         return self.model(CHEAP)
 
     @cached_property
     def fine(self) -> InteractionModel:
-        """Decides."""
+        """Model whose residual determines the fit."""
         return self.model(deciding_sampling(self.instrument))
 
     def matrix(self, model: InteractionModel, alpha: Misregistration) -> NDArray[np.float32]:
@@ -160,7 +161,7 @@ class FitModels:
 
     @property
     def optics(self) -> tuple[Optic, ...]:
-        """Numbers of the instrument fitted beside the registration."""
+        """Optical quantities that are fitted together with the registration."""
         found = []
         if self.coupling is not None:
             found.append(Optic.WIDTH)
@@ -170,33 +171,33 @@ class FitModels:
 
     @property
     def unknown(self) -> frozenset[Optic]:
-        """Numbers that the instrument file calls unknown."""
+        """Optical quantities that the instrument file marks as unknown."""
         keys = {Optic.WIDTH: "mirror.coupling", Optic.SENSOR: f"wfs.{self.sensor_key}"}
         return frozenset(one for one in self.optics if keys[one] in self.instrument.unknown)
 
     @property
     def sensor_key(self) -> str | None:
-        """Key of the sensor's number that the matrix can tell; None: it has none."""
+        """Key of the sensor number that the matrix can determine; None if it has none."""
         return kind_of(self.instrument).fitted_key(self.instrument.wfs)
 
     @property
     def sensor_number(self) -> float:
-        """That number, as the instrument has it; 0 where there is none."""
+        """Value of the sensor number in the instrument; 0 if there is none."""
         key = self.sensor_key
         return 0.0 if key is None else float(getattr(self.instrument.wfs, key))
 
     @property
     def coupling(self) -> float | None:
-        """Coupling of the influence functions; None: they have none."""
+        """Coupling of the influence functions; None if they have none."""
         surface = self.basis.surface if isinstance(self.basis, ModalBasis) else None
         return surface.coupling if isinstance(surface, Gaussian) else None
 
     def exact(self, optic: Optic) -> bool:
-        """Return whether an instrument of another value can be made, or a derivative has to do."""
+        """Return True if a model with another value can be built, not only a derivative."""
         return optic is Optic.SENSOR or self.coupling is not None
 
     def adjusted(self, optic: Optic, change: float) -> FitModels:
-        """Return the models of an instrument that differs by this in a logarithm."""
+        """Return the models of an instrument with a quantity changed by a logarithm."""
         if optic is Optic.SENSOR and self.sensor_key is not None:
             number = self.sensor_number * float(np.exp(change))
             wfs = replace(self.instrument.wfs, **{self.sensor_key: number})
@@ -208,10 +209,10 @@ class FitModels:
         return replace(self, basis=self.basis.of_surface(replace(surface, coupling=coupling)))
 
     def displaced(self, offsets: Array) -> FitModels:
-        """Return the models of a sensor whose pupil images lie beside their places ``(8,)``.
+        """Return the models of a sensor with displaced pupil images ``(8,)``.
 
-        Subapertures, axes of conventions.md: along x of the images at -x -y, +x -y, -x +y, +x +y,
-        then along y.
+        In subapertures, axes of conventions.md: along x of the images at -x -y, +x -y, -x +y, +x
+        +y, then along y.
         """
         wfs = kind_of(self.instrument).displaced(self.instrument, offsets)
         return replace(self, instrument=replace(self.instrument, wfs=wfs))
@@ -219,7 +220,10 @@ class FitModels:
     def optics_derivatives(
         self, alpha: Misregistration, optics: Sequence[Optic]
     ) -> list[NDArray[Any]]:
-        """Return how D changes with each of them, ``(n_slopes, n_modes)``, on the cheap grid."""
+        """Return the derivatives of D by optical quantities, ``(n_slopes, n_modes)`` each.
+
+        They are computed on the coarse grid.
+        """
         found = []
         for optic in optics:
             if optic is Optic.WIDTH:
@@ -234,7 +238,7 @@ class FitModels:
 
     @property
     def other_instruments(self) -> dict[Other, FitModels]:
-        """Models of instruments that this one may be taken for."""
+        """Models of instruments with which this one may be confused."""
         about = self.instrument
         stop = Stop.TELESCOPE if about.stop is Stop.MIRROR else Stop.MIRROR
         others = {f'stop = "{stop}"': replace(about, stop=stop)}

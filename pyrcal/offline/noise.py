@@ -1,8 +1,8 @@
-"""Split what a fit leaves over into noise and structure.
+"""Split the residual of a fit into noise and structure.
 
-Noise is another in every element; what an instrument does that its file does not say is the same
-thing in many of them. So the singular values of pure noise are spread as Marchenko and Pastur say,
-and their median tells its size whatever structure lies in the largest.
+Noise is independent in every element, whereas an error of the instrument file appears in many
+elements at once. The singular values of pure noise follow the Marchenko-Pastur distribution, and
+their median gives the noise level whatever structure the largest values contain.
 
 References
 ----------
@@ -20,22 +20,24 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _POINTS = 4001
-"""Of the distribution whose median is taken."""
+"""Number of points of the distribution whose median is computed."""
 
 
 def structure(residual: Array, power: Array, noise: Array | None) -> float:
-    """Return the RMS of the residual that is no noise, over the RMS of the measurement.
+    """Return the RMS of the structured residual over the RMS of the measurement.
 
-    What is spread evenly over all directions cannot be told from noise and counts as such.
+    Structure that is spread evenly over all directions is indistinguishable from noise and counts
+    as noise.
 
     Parameters
     ----------
     residual
-        ``(n_rows, n_modes)`` of the fit.
+        ``(n_rows, n_modes)`` residual of the fit.
     power
         ``(n_modes,)`` sum of squares of each measured column.
     noise
-        ``(n_modes,)`` 1 σ of one element of each column, from repeated measurements; None: unknown.
+        ``(n_modes,)`` 1 σ of one element of each column from repeated measurements; None if
+        unknown.
     """
     n_rows = len(residual)
     left = np.sum(residual**2, axis=0) / power
@@ -49,7 +51,7 @@ def structure(residual: Array, power: Array, noise: Array | None) -> float:
 
 
 def noise_sigma(matrix: Array) -> float:
-    """Return 1 σ of the noise in each element of a matrix that holds structure, too."""
+    """Return 1 σ of the noise in each element of a matrix that also contains structure."""
     few, many = sorted(matrix.shape)
     wide = matrix if matrix.shape[0] == few else matrix.T
     squares = np.linalg.eigvalsh(wide @ wide.T)  # precise enough: the median is no small one

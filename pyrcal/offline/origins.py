@@ -1,4 +1,4 @@
-"""What was found rather than told: each key, what the file says, what the matrix does, and how."""
+"""Quantities that the fit determined: key, value in the file, fitted value, and method."""
 
 from __future__ import annotations
 
@@ -13,37 +13,38 @@ from service.model.instrument import Instrument
 from service.model.slopes import FLIPS, Orientation, SlopeRecipe
 
 MAX_STRUCTURE = 0.09
-"""RMS share of the signal left over and no noise up to which a number that the file does not have
-is a finding. Beyond, it may make up for errors of the model: on PAPYRUS, where 14 % is left over,
-every disjoint set finds a modulation of 10.6 λ/D, and the bench is set to 5."""
+"""Largest RMS share of the signal, left over and not noise, at which a fitted number that the file
+does not have is accepted. Beyond it the number may compensate errors of the model: on PAPYRUS, with
+14 % left over, every disjoint set finds a modulation of 10.6 λ/D, although the bench is set to 5.
+"""
 
 MAX_LOG_SIGMA = 0.5
-"""1 σ of the logarithm of a number beyond which it was not found: half of what is allowed to one
-that is unknown."""
+"""Largest 1 σ of a number's logarithm at which it is accepted: half the prior of an unknown number.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Origin:
-    """A number or a choice that the matrix has told."""
+    """A number or choice determined from the matrix."""
 
     key: str
-    """As the instrument file has it."""
+    """Key in the instrument file."""
 
     found: str
-    """As the file would write it."""
+    """Fitted value, in the notation of the file."""
 
     reported: str
-    """What the file says."""
+    """Value in the file."""
 
     how: str
-    """How it was found: from what, by what."""
+    """Method by which it was determined."""
 
     correct: bool
-    """Whether the file should be corrected, or completed."""
+    """True if the file should be corrected or completed."""
 
     @property
     def words(self) -> str:
-        """All of it in a few words."""
+        """Summary of key, values and method."""
         return f"{self.key} = {self.found} ({self.how}; the file says {self.reported})"
 
 
@@ -56,22 +57,22 @@ def origins(
     structure: float,
     gains: NDArray[np.float64],
 ) -> tuple[Origin, ...]:
-    """Return what was found of the instrument and its slopes.
+    """Return the quantities of instrument and slopes that the fit determined.
 
     Parameters
     ----------
     about
-        The instrument as the file has it.
+        Instrument as the file describes it.
     reported, found
-        How slopes are listed, as asked for and as found.
+        Slope recipes: requested and fitted.
     optics
-        Numbers of the instrument fitted beside the registration.
+        Optical quantities that were fitted together with the registration.
     with_file_values
-        The fit with those of the file; None where none differs notably.
+        Fit with the file's values of these; None if none differs significantly.
     structure
-        RMS share of the signal that is left over and is no noise.
+        RMS share of the signal that is left over and is not noise.
     gains
-        ``(n_used,)`` of the modes.
+        ``(n_used,)`` gains of the modes.
     """
     return (
         *_slopes(reported, found),
@@ -114,11 +115,11 @@ def written(orientation: Orientation) -> str:
 def is_determined(
     one: FoundOptic, with_file_values: FileValuesFit | None, structure: float
 ) -> bool:
-    """Return whether a number that was fitted is a finding, and not a stand-in for model errors.
+    """Return True if a fitted number is reliable, rather than compensating model errors.
 
-    A number of the file is corrected if the file's own leaves several times as much. One that the
-    file does not have is a finding if hardly more than noise is left over. That disjoint sets agree
-    on it proves nothing: errors of the model are the same in all of them.
+    A number of the file is corrected if the file's value leaves several times the residual. A
+    number that the file does not have is accepted if hardly more than noise is left over. Agreement
+    of disjoint sets proves nothing: they share the errors of the model.
     """
     if one.sigma > MAX_LOG_SIGMA:
         return False
@@ -128,9 +129,9 @@ def is_determined(
 
 
 def unknown_not_found(about: Instrument, found: tuple[Origin, ...]) -> tuple[str, ...]:
-    """Return the keys that the file calls unknown and that the matrix does not determine.
+    """Return the keys marked as unknown in the file that the matrix does not determine.
 
-    The places of the pupil images are left out: they are fitted whenever the file has none.
+    The positions of the pupil images are excluded: they are fitted whenever the file has none.
     """
     keys = {one.key for one in found} | {"image_offsets_px"}
     return tuple(key for key in about.unknown if key.rpartition(".")[2] not in keys)

@@ -1,7 +1,8 @@
 """Try another obscuration and pupil size.
 
-Neither is fitted beside the registration: a pupil that is told wrong shows at its edges only, and
-there uneven light looks alike. What would explain the matrix far better is named instead.
+Neither is fitted together with the registration: a wrong pupil has an effect at its edges only, and
+uneven light has a similar one. A value that would explain the matrix far better is reported
+instead.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ from service.model.interaction import InteractionModel
 Array = NDArray[np.float64]
 
 LEAST_EXPLAINED = 0.03
-"""RMS share of the signal below which what a pupil explains may be the model's own error."""
+"""RMS share of the signal that a pupil must explain; less may be the model's own error."""
 
 _STEPS = 2
-"""Towards the value that explains most."""
+"""Number of steps towards the value that explains the most."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,38 +35,38 @@ class PupilNumber:
     """A number of the instrument file that describes the pupil."""
 
     key: str
-    """In the file."""
+    """Key in the instrument file."""
 
     reported: float
-    """What the file says."""
+    """Value in the instrument file."""
 
     power: int
-    """Light goes with this power of it: the step of an area is straight."""
+    """Power of the value to which the illuminated area is proportional; steps are linear in it."""
 
     step: float
-    """Of that power, for the difference that stands for a derivative."""
+    """Step of that power for the finite difference."""
 
     range: tuple[float, float]
-    """No file is wrong by more."""
+    """Range within which a file's value is assumed to be wrong at most."""
 
     notable: float
-    """Less is not worth a word: simulators round their pupils to whole points."""
+    """Smallest reported difference: simulators round their pupils to whole points."""
 
     def changed(self, about: Instrument, light: float) -> Instrument:
-        """Return the instrument with another value, given by its power."""
+        """Return the instrument with another value, given as its power."""
         value = light ** (1.0 / self.power)
         if self.key == "obscuration_ratio":
             return replace(about, obscuration_ratio=value)
         return replace(about, wfs=replace(about.wfs, pupil_diameter_subap=value))
 
     def rate(self, few: Few) -> Array:
-        """Return how D of the file's value changes with its power, ``(n_slopes, n_few)``."""
+        """Return the derivative of D by the value's power ``(n_slopes, n_few)``."""
         beside = self.reported**self.power + self.step
         there = few.matrix(few.of(self.changed(few.models.instrument, beside)))
         return np.asarray((there - few.own) / self.step)
 
     def near(self, few: Few) -> tuple[float, Lead, Array]:
-        """Return the value that explains most, its lead, α's move; to first order."""
+        """Return the best value, its improvement and the change of α, to first order."""
         light, rate = self.reported**self.power, self.rate(few)
         if not few.tells(few.own, rate):
             return self.reported, Lead(share=1.0, sigma=0.0), np.zeros(4)
@@ -75,14 +76,14 @@ class PupilNumber:
         return value, few.lead(few.own, rate), step[:4] - few.step(few.own)[:4]
 
     def far(self, few: Few) -> tuple[float, Lead, Array]:
-        """Return the same with D of the value itself."""
+        """Return the best value, its improvement and the change of α, with D of that value."""
         value, matrix = self.found(few)
         return value, few.lead(matrix), few.step(matrix)[:4] - few.step(few.own)[:4]
 
     def found(self, few: Few) -> tuple[float, Array]:
-        """Return the value that explains most, and D of it ``(n_slopes, n_few)``.
+        """Return the value that explains the most, and its D ``(n_slopes, n_few)``.
 
-        A second step takes its rate from the first, unless that was too short to tell one.
+        A second step takes its derivative from the first, unless that was too short.
         """
         light, matrix, rate = self.reported**self.power, few.own, self.rate(few)
         low, high = (limit**self.power for limit in self.range)
@@ -125,17 +126,17 @@ def _numbers(about: Instrument) -> tuple[PupilNumber, ...]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lead:
-    """How much better or worse another explanation is than the fit."""
+    """Improvement or degradation of the misfit by another explanation."""
 
     share: float
-    """χ² that it leaves over what the fit leaves."""
+    """χ² that it leaves over that of the fit."""
 
     sigma: float
-    """1 σ of that share, from how it differs between modes and between regions of the pupil."""
+    """1 σ of that share, from its scatter between modes and between regions of the pupil."""
 
     @property
     def significance(self) -> float:
-        """Number of σ by which the other explanation is better; negative where it is worse."""
+        """Number of σ by which the other explanation is better; negative if it is worse."""
         gained = 1.0 - self.share
         if self.sigma > 0.0:
             return gained / self.sigma
@@ -143,7 +144,7 @@ class Lead:
 
 
 class Few:
-    """Some of the modes of a fit at its solution, on the cheap grid."""
+    """A subset of a fit's modes at its solution, on the coarse grid."""
 
     def __init__(self, settled: Settled) -> None:
         solution, self.models = settled.solution, settled.models
@@ -153,16 +154,16 @@ class Few:
         self.here = solution.alpha
         known = np.concatenate([solution.derivatives, solution.nuisance_derivatives])
         self.derivatives = np.asarray(known[:, :, self.modes], dtype=np.float64)
-        """Of the instrument as it is: they hardly depend on the hypothesis."""
+        """Derivatives of the unchanged instrument; they hardly depend on the alternative."""
 
     @cached_property
     def model(self) -> InteractionModel:
-        """Of the instrument as it is, these modes only."""
+        """Model of the unchanged instrument with these modes only."""
         return self.models.cheap.of_modes(self.models.basis.subset(self.modes))
 
     @cached_property
     def own(self) -> Array:
-        """D of the instrument as it is, ``(n_slopes, n_few)``."""
+        """D of the unchanged instrument, ``(n_slopes, n_few)``."""
         return self._at_solution(self.model)
 
     def of(self, about: Instrument) -> FitModels:
@@ -176,15 +177,14 @@ class Few:
         return self._at_solution(tried.model(CHEAP, basis, once=True))
 
     def left(self, matrix: Array, *more: Array) -> float:
-        """Return χ² at the best unknowns, those given by a derivative included."""
+        """Return χ² at the best unknowns, including those of further derivatives."""
         return float(self.seen(matrix, *more).chi_at_best)
 
     def lead(self, matrix: Array, *more: Array) -> Lead:
-        """Return by how much another matrix explains more than the instrument as it is.
+        """Return the improvement of another matrix over the unchanged instrument.
 
-        Squares of both residuals are compared mode by mode and region by region: noise and errors
-        that both have in common cancel, and what is left scatters as much as it scatters between
-        modes and between regions.
+        Squares of both residuals are compared mode by mode and region by region: common noise and
+        errors cancel, and the rest scatters between modes and between regions.
         """
         own, other = self._own_left, self._left_at_best(self.seen(matrix, *more))
         gained = own - other
@@ -214,20 +214,20 @@ class Few:
 
     @staticmethod
     def _left_at_best(seen: Projection) -> Array:
-        """Return the weighted squares that the best step leaves, ``(n_rows, n_few)``."""
+        """Return the weighted squares of the residual after the best step ``(n_rows, n_few)``."""
         left = seen.residual - np.tensordot(seen.best_step, seen.jacobian, axes=1)
         return np.asarray(left**2 * seen.weights)
 
     def tells(self, matrix: Array, rate: Array) -> bool:
-        """Return whether what was measured depends on a number: it may cut no subaperture."""
+        """Return True if the measurement depends on a quantity; it may cut no subaperture."""
         return bool(self.target.project(matrix, rate[None]).normal[0, 0] > 0.0)
 
     def step(self, matrix: Array, *more: Array) -> Array:
-        """Return the best step of all of them."""
+        """Return the best step of all unknowns."""
         return self.seen(matrix, *more).best_step
 
     def seen(self, matrix: Array, *more: Array) -> Projection:
-        """Return what was measured against a matrix; of the instrument as it is once for all."""
+        """Return the projection of the measurement on a matrix; the unchanged one is cached."""
         if matrix is self.own and not more:
             return self._own_seen
         return self.target.project(matrix, self._with(more))
@@ -246,25 +246,26 @@ class Few:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TriedPupil:
-    """Another obscuration or diameter, at the value that explains most."""
+    """Another obscuration or diameter, at the value that explains the most."""
 
     words: str
-    """What to write into the file."""
+    """Entry for the instrument file."""
 
     lead: Lead
-    """How much better it explains the matrix than the file's pupil."""
+    """Improvement over the file's pupil."""
 
     moved: Array
-    """``(4,)`` by how much α would be another, numeric units."""
+    """``(4,)`` change of α, numeric units."""
 
     explains: bool
-    """Whether it explains enough of the signal to be worth a word."""
+    """True if it explains enough of the signal to be reported."""
 
 
 def tried_pupils(few: Few) -> tuple[TriedPupil, ...]:
-    """Return other pupils, each at the value that explains most.
+    """Return other pupils, each at the value that explains the most.
 
-    Where less is left over than a pupil would have to explain, to first order.
+    They are computed to first order only, if the residual is smaller than a pupil would have to
+    explain.
     """
     found = []
     little = few.residual_fraction < LEAST_EXPLAINED
@@ -284,7 +285,7 @@ def tried_pupils(few: Few) -> tuple[TriedPupil, ...]:
 
 
 def left_by_light(few: Few) -> float:
-    """Return χ² that a smooth gain over the pupil, common to all modes, leaves, over what is."""
+    """Return χ² with a smooth gain over the pupil, common to all modes, over that without."""
     own = few.own
     return few.left(own, *(pattern[:, None] * own for pattern in gain_maps(few))) / few.left(own)
 

@@ -1,8 +1,8 @@
-"""How wide the pupil's image is, told by the subapertures that answer.
+"""Measure the diameter of the pupil image from the subapertures that respond.
 
-Outside the light a subaperture hardly answers to any mode. A mask that is wider than the image,
-as those are that some RTCs cut out of the detector by default, looks like a smaller mirror under
-uneven light: everything fits, and the matrix made from it is another pupil's.
+Outside the light a subaperture hardly responds to any mode. A mask that is wider than the image, as
+some RTCs cut out of the detector by default, looks like a smaller mirror with uneven light:
+everything fits, but the resulting matrix belongs to another pupil.
 """
 
 from __future__ import annotations
@@ -15,41 +15,42 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 SILENT = 0.3
-"""A subaperture that answers by less than this share of what the others do has no light. One that
-the pupil's border cuts answers by half or more."""
+"""Response over that of the others below which a subaperture has no light. One that the pupil's
+border cuts has half or more."""
 
 BRIGHT = 0.8
-"""Quantile of the answers that stands for them: most may be silent."""
+"""Quantile of the responses used as their typical value, because most may be silent."""
 
 FEWEST = 0.08
-"""Share of the subapertures that must be silent: fewer are dead pixels or a spider."""
+"""Smallest share of silent subapertures; fewer are dead pixels or a spider."""
 
 STRAY = 0.2
-"""Share of the silent ones that may lie inside, or of as many others outside."""
+"""Largest number of misplaced subapertures (silent inside, responding outside) over the silent
+ones."""
 
 NARROWER_SUBAP = 1.0
-"""Of a diameter, by which it is worth a word."""
+"""Smallest difference of diameters that is reported, subapertures."""
 
 BORDER_SUBAP = 2.0
-"""Width of the ring in which subapertures may be lit in part."""
+"""Width of the ring of partly illuminated subapertures."""
 
 STEP_SUBAP = 0.25
-"""Between two diameters that are tried."""
+"""Step between trial diameters, subapertures."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeenPupil:
-    """A pupil's image that is narrower than the subapertures said to be valid."""
+    """A pupil image that is narrower than the mask of valid subapertures."""
 
     diameter_subap: float
-    """Across the subapertures that answer."""
+    """Diameter across the responding subapertures."""
 
     n_silent: int
     n_valid: int
 
     @property
     def words(self) -> str:
-        """What was found, and how wide the image looks."""
+        """Sentence on the silent subapertures and the diameter."""
         return (
             f"{self.n_silent} of {self.n_valid} subapertures, those at the border, hardly answer: "
             f"the pupil's image looks {self.diameter_subap:.0f} subapertures wide"
@@ -57,15 +58,15 @@ class SeenPupil:
 
 
 def seen_pupil(answers: Array, told_subap: float) -> SeenPupil | None:
-    """Return the pupil that answers, or None where it is as wide as it is said to be.
+    """Return the responding pupil, or None if it is as wide as stated.
 
     Parameters
     ----------
     answers
-        ``(n, n)`` how much each subaperture answers, over what is expected of it; NaN where
-        nothing is known or expected.
+        ``(n, n)`` response of each subaperture over the expected one; NaN if unknown or none is
+        expected.
     told_subap
-        Diameter of the pupil's image as it is said to be, subapertures.
+        Stated diameter of the pupil image, subapertures.
     """
     known = np.isfinite(answers)
     if not known.any():
@@ -89,7 +90,7 @@ def seen_pupil(answers: Array, told_subap: float) -> SeenPupil | None:
 
 
 def _diameter(answers: Array, about: float) -> float:
-    """Return the diameter of as much light: subapertures that the border cuts count in part."""
+    """Return the diameter of equal illuminated area; border subapertures count in part."""
     known = np.isfinite(answers)
     centre = np.argwhere(known).mean(axis=0)
     rows, columns = np.indices(answers.shape)
@@ -101,15 +102,15 @@ def _diameter(answers: Array, about: float) -> float:
 
 
 def answers_of(measured: Array, expected: Array, valid: NDArray[np.bool_]) -> Array:
-    """Return how much each subaperture answers over what is expected of it, ``(n, n)``.
+    """Return the response of each subaperture over the expected one, ``(n, n)``.
 
     Parameters
     ----------
     measured, expected
-        ``(n_slopes,)`` sums over the modes of squared slopes, planes one after the other; NaN where
-        a slope does not count.
+        ``(n_slopes,)`` sums over the modes of squared slopes, one plane after the other; NaN for
+        unused slopes.
     valid
-        ``(n, n)`` mask that lists both.
+        ``(n, n)`` mask of the subapertures in both.
     """
     found, due = (
         np.sqrt(one.reshape(-1, int(valid.sum())).sum(axis=0)) for one in (measured, expected)

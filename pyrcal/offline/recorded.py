@@ -20,13 +20,13 @@ Array = NDArray[np.float64]
 
 
 def check_sealed(path: Path) -> None:
-    """Refuse an HDF5 file that reaches beyond itself; any other file has no way to.
+    """Raise if an HDF5 file refers to data outside itself; other formats cannot.
 
     Raises
     ------
     MatrixError
-        If it holds a link to another file, a virtual dataset, or one whose data lie outside; is
-        damaged, or has too many things in it.
+        If it contains a link to another file, a virtual dataset or external data, if it is damaged,
+        or if it has too many members.
     """
     if not h5py.is_hdf5(path):
         return
@@ -43,7 +43,7 @@ def check_sealed(path: Path) -> None:
 
 
 def _sealed(group: h5py.Group, path: Path, seen: set[int]) -> list[h5py.Group]:
-    """Check what is in a group, following no link; return the groups not ``seen`` yet."""
+    """Check the members of a group without following links; return groups not ``seen`` yet."""
     found = []
     for name in group:
         link = group.get(name, getlink=True)
@@ -61,7 +61,7 @@ def _sealed(group: h5py.Group, path: Path, seen: set[int]) -> list[h5py.Group]:
 
 
 def _beyond(item: object) -> str | None:
-    """Return how an object, or a link, reaches beyond its file; None: it does not."""
+    """Return the reference of an object or link to other files; None if there is none."""
     if isinstance(item, h5py.ExternalLink):
         return f"a link to another file, {item.filename}"
     if isinstance(item, h5py.Dataset) and item.is_virtual:
@@ -77,49 +77,48 @@ FLUX_FRAME = "flux_frame"
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Recorded:
-    """The arrays as read; nothing is turned, scaled or left out."""
+    """Arrays exactly as read from the file."""
 
     values: Array
     """``(n_slopes, n_modes)`` in the RTC's own order, or ``(n_modes, ny, nx)`` detector frames."""
 
     modes: NDArray[np.intp] | None
-    """``(n_modes,)`` basis index of each column; None: the file does not say."""
+    """``(n_modes,)`` basis index of each column; None if the file does not give it."""
 
     noise: Array | None
-    """``(n_modes,)`` 1 σ of an element of each column; None: the file does not say."""
+    """``(n_modes,)`` 1 σ of an element of each column; None if the file does not give it."""
 
     double_pass: bool | None
-    """Whether the light saw the mirror twice; None: the file does not say."""
+    """True if the light was reflected by the mirror twice; None if the file does not give it."""
 
     flux_frame: Array | None
-    """``(ny, nx)`` detector frame at rest; None: the file has none."""
+    """``(ny, nx)`` detector frame without commands; None if the file has none."""
 
     where: str
     """File and array, for messages."""
 
     sha256: str
-    """Of the whole file, 64 lower-case hex digits."""
+    """SHA-256 of the whole file, 64 lower-case hex digits."""
 
 
 def read_recorded(path: Path, dataset: str | None = None) -> Recorded:
     """Read a measured matrix from an HDF5, FITS or NumPy file.
 
-    Beside the matrix, in the same HDF5 group or as further FITS extensions, ``modes``
-    (``(n_modes,)``, basis indices), ``noise`` (``(n_modes,)``) and ``flux_frame`` are taken where
-    they are; ``modes`` and ``double_pass`` may also be attributes of an HDF5 file, ``DBLPASS`` a
-    keyword of a FITS file.
+    In the same HDF5 group, or as further FITS extensions, ``modes`` (``(n_modes,)``, basis
+    indices), ``noise`` (``(n_modes,)``) and ``flux_frame`` are read if present. ``modes`` and
+    ``double_pass`` may also be attributes of an HDF5 file, ``DBLPASS`` a keyword of a FITS file.
 
     Parameters
     ----------
     path
         The file.
     dataset
-        Name of the array; None: ``interaction_matrix``, or the only one of a FITS or NumPy file.
+        Name of the array; None for ``interaction_matrix``, or the only one of a FITS or NumPy file.
 
     Raises
     ------
     MatrixError
-        If the file or the array cannot be used; where the array is missing, what is there.
+        If the file or the array cannot be used; a missing array is reported with the names present.
     """
     with opened(path) as container:
         stored = _matrix(container, dataset)

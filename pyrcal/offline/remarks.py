@@ -1,4 +1,4 @@
-"""Notes beside the verdict: what was overruled, what looks odd."""
+"""Notes that accompany the verdict: overruled entries of the file, and unusual values."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from service.model.misregistration import BOUNDARY_SCALE
 from service.model.slopes import FLIPS, SlopeRecipe
 
 STRAIGHT = 0.01
-"""Distance of the magnification from 1 beyond which pitch or diameter may be told wrong."""
+"""Distance of the magnification from 1 above which pitch or diameter may be wrong in the file."""
 
 UNIFORM = 0.06
-"""Relative scatter of gains that are off together."""
+"""Largest relative scatter of gains that have a common offset."""
 
 OFF_TOGETHER = 0.08
-"""... by more than this, ..."""
+"""Smallest common offset of the gains that is reported."""
 
 EXPLAINED = 0.1
-"""... where no more than this share of the signal is left over, ..."""
+"""Largest residual share of the signal at which a common offset is reported."""
 
 LIKELY = (0.3, 3.0)
-"""... and a wavelength may be wrong by so much."""
+"""Range of a wavelength's relative error that is reported."""
 
 
 def remarks(
@@ -37,16 +37,16 @@ def remarks(
     found: SlopeRecipe,
     about: Instrument,
 ) -> tuple[str, ...]:
-    """Return the notes on a fit, one sentence each; none of what noise has made.
+    """Return the notes on a fit, one sentence each; none if the result is mostly noise.
 
     Parameters
     ----------
     findings
-        Of the fit.
+        Findings of the fit.
     reported, found
-        How slopes are listed, as the instrument file says it and as the matrix lists them.
+        Slope recipes: as in the instrument file, and as the matrix shows.
     about
-        The instrument of the file.
+        Instrument as the file describes it.
     """
     if not findings.explained:
         return ()
@@ -71,7 +71,7 @@ def _order(reported: SlopeOrder, found: SlopeOrder) -> Iterator[str]:
 
 
 def _mirrored(reported: SlopeRecipe, found: SlopeRecipe) -> Iterator[str]:
-    """Yield that the sensor sees the mirror's drawing mirrored."""
+    """Yield a note if the sensor sees the nominal actuator geometry mirrored."""
     axes = found.assumed_orientation
     flags = [f"{name} = true" for name in FLIPS if getattr(axes, name)]
     if reported.orientation is None and len(flags) % 2:

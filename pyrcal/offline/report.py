@@ -37,7 +37,7 @@ from service.model.slopes import FLIPS, Orientation
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FitReport:
-    """A fit with its file and instrument."""
+    """A fit with its files and instrument."""
 
     fit: Fit
     method: Method
@@ -45,29 +45,29 @@ class FitReport:
     """Name of the instrument."""
 
     instrument_sha256: str
-    """Of everything that is known of the instrument, arrays included."""
+    """SHA-256 of the instrument's description, arrays included."""
 
     reference: str
     """File and array that were fitted."""
 
     reference_sha256: str
-    """Of the whole file."""
+    """SHA-256 of the whole file."""
 
     double_pass: bool
-    """Whether the matrix was taken as twice the model's."""
+    """True if the matrix was taken as twice the model's."""
 
     seconds: float
-    """Time of the fit, the optical model included and reading not."""
+    """Duration of the fit, optical model included and reading excluded, seconds."""
 
     notes: tuple[str, ...] = ()
-    """What was decided on the way and should be known, one sentence each."""
+    """Notes on decisions of the fit, one sentence each."""
 
 
 def document(report: FitReport) -> dict[str, Any]:
-    """Return the fit as one JSON object, in boundary units; a number that is not finite is None.
+    """Return the fit as one JSON object in boundary units; numbers that are not finite are None.
 
-    ``gains`` belong to the modes used, in the order of the basis. What was left out is named in
-    ``verdict``, which begins with "accepted" or "refused".
+    ``gains`` belong to the modes used, in the order of the basis. ``verdict`` begins with
+    "accepted" or "refused" and names what was left out.
     """
     fit = report.fit
     return {
@@ -193,7 +193,7 @@ def verdict_line(fit: Fit) -> str:
 
 
 def orientation_words(orientation: Orientation, order: SlopeOrder) -> dict[str, Any]:
-    """Return order and orientation as the instrument file would say them."""
+    """Return order and orientation in the notation of the instrument file."""
     both = [orientation.sign_x, orientation.sign_y]
     flips = {name: getattr(orientation, name) for name in FLIPS}
     return {"order": str(order), **flips, "sign": both[0] if both[0] == both[1] else both}
@@ -209,7 +209,8 @@ def _plain(values: float | NDArray[np.float64]) -> Any:  # noqa: ANN401 - as nes
 
 
 _WIDTH = "influence_width"
-"""What is found of influence functions that have no coupling: no key of an instrument file."""
+"""Name of the fitted width of influence functions without a coupling; not a key of instrument
+files."""
 
 # --- as an HDF5 file
 
@@ -252,7 +253,7 @@ def fill_fit(file: h5py.File, report: FitReport) -> None:
 
 
 def _put_alternatives(file: h5py.File, fit: Fit) -> None:
-    """Write what else was tried; its words as an attribute, in the same order."""
+    """Write the alternatives; their descriptions as an attribute in the same order."""
     if not fit.alternatives:
         return
     group = file.create_group("alternatives")
@@ -272,7 +273,7 @@ def _put_alternatives(file: h5py.File, fit: Fit) -> None:
 
 
 def _provenance(report: FitReport) -> dict[str, Any]:
-    """Return where a fit comes from, as HDF5 attributes."""
+    """Return the origin of a fit as HDF5 attributes."""
     return {
         "instrument": report.instrument,
         "instrument_sha256": report.instrument_sha256,
@@ -294,67 +295,68 @@ class KnownFit:
 
     alpha: Misregistration
     covariance: NDArray[np.float64] | None = None
-    """``(4, 4)`` of ``alpha.vector``; None: only α is known."""
+    """``(4, 4)`` covariance of ``alpha.vector``; None if only α is known."""
 
     modes: NDArray[np.intp] | None = None
-    """``(n_used,)`` basis indices that ``gains`` belong to; None: not in the file."""
+    """``(n_used,)`` basis indices that ``gains`` belong to; None if not in the file."""
 
     gains: NDArray[np.float64] | None = None
     """``(n_used,)`` calibration gains."""
 
     orientation: Orientation | None = None
-    """Of the slopes, as the fit found it; None: not in the file."""
+    """Orientation of the slopes found by the fit; None if not in the file."""
 
     order: SlopeOrder | None = None
-    """Of the components."""
+    """Order of the slope components; None if not in the file."""
 
     double_pass: bool | None = None
-    """Whether light met the mirror twice in the measured matrix; None: not in the file."""
+    """True if light was reflected by the mirror twice in the measured matrix; None if not in the
+    file."""
 
     accepted: bool | None = None
-    """Whether the registration is determined; None: α was given by hand."""
+    """True if the registration is determined; None if α was given by hand."""
 
     stable_modes: int | None = None
-    """Modes up to which a reconstructor of the model holds the loop of the measured matrix; None:
-    not in the file."""
+    """Largest number of modes with which the model's reconstructor is stable on the measured
+    matrix; None if not in the file."""
 
     stable_gain: float | None = None
     """Integrator gain of that loop."""
 
     origin: str = "given by hand"
-    """Where this comes from."""
+    """Source of this fit."""
 
     instrument_sha256: str | None = None
-    """Of the instrument it was fitted for; None: not in the file."""
+    """SHA-256 of the instrument it was fitted for; None if not in the file."""
 
     reference_sha256: str | None = None
-    """Of the measured file; None: not in the file."""
+    """SHA-256 of the measured file; None if not in the file."""
 
     instrument_found: Mapping[str, float] = field(default_factory=dict)
-    """What the fit found where the instrument file says otherwise or nothing, by key."""
+    """Fitted values by key that differ from the instrument file or are missing from it."""
 
     image_offsets_px: NDArray[np.float64] | None = None
-    """``(4, 2)`` displacements of the pupil images that the fit found, as the instrument file
-    states them; None if the file states them, or the sensor has one image."""
+    """``(4, 2)`` fitted displacements of the pupil images in the notation of the instrument file;
+    None if the file states them, or the sensor has one image."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Provenance:
-    """The inputs of a reconstructor, complete enough to make it again."""
+    """Complete inputs of a reconstructor, from which it can be reproduced."""
 
     recipe: Recipe
     inversion: Inversion
     fit: KnownFit
-    """The registration of its synthetic matrix, and the measured one that was fitted."""
+    """Registration of its synthetic matrix, and the measured matrix that was fitted."""
 
     gains: CalibrationGains | None
-    """Folded into the columns; None: the model's own."""
+    """Gains multiplied into the columns; None for the model's own."""
 
     measured_illumination: bool
-    """Whether the model's pupil was lit as the flux map says."""
+    """True if the model's pupil has the illumination of the flux map."""
 
     def attributes(self) -> dict[str, str | int | float | bool]:
-        """Return everything as flat, named, scalar facts: for file attributes and JSON."""
+        """Return everything as named scalars, for file attributes and JSON."""
         fit, prior = self.fit, self.recipe.prior
         found: dict[str, str | int | float | bool] = {
             "source": "synthetic",
@@ -431,7 +433,7 @@ def _of_document(values: dict[str, Any], path: Path) -> KnownFit:
 
 
 def _control(found: dict[str, Any] | None) -> dict[str, Any]:
-    """Return what a file says of the loop; nothing where it says nothing."""
+    """Return the closed-loop result of a file; empty if it has none."""
     if found is None:
         return {}
     return {
@@ -444,7 +446,7 @@ def _control(found: dict[str, Any] | None) -> dict[str, Any]:
 
 
 def _otherwise(found: dict[str, dict[str, float | None]]) -> dict[str, float]:
-    """Return values that differ from the instrument file's."""
+    """Return fitted values that differ from the instrument file's."""
     otherwise = {}
     for key, one in found.items():
         value, stated, sigma = one["found"], one["told"], one["sigma"] or 0.0
@@ -474,18 +476,18 @@ def fill_reconstructor(
     provenance: Provenance,
     circumstances: Mapping[str, str | int | float | bool],
 ) -> None:
-    """Write a reconstructor, and what it is made of, into an open, empty HDF5 file.
+    """Write a reconstructor and its inputs into an open, empty HDF5 file.
 
     Parameters
     ----------
     file
-        To be filled.
+        File to fill.
     interaction_matrix
-        ``(n_slopes, n_modes)`` what it inverts, slopes as the RTC lists them.
+        ``(n_slopes, n_modes)`` matrix that is inverted, slopes in the order of the RTC.
     provenance
-        How it was made, and what came of it.
+        Inputs and results of the inversion.
     circumstances
-        Instrument, model, orientation: further attributes.
+        Further attributes: instrument, model, orientation.
     """
     described = "slopes as the RTC lists them, single pass"
     for name, values, shape in (

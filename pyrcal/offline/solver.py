@@ -1,9 +1,9 @@
-"""The last steps of a fit, on the fine grid.
+"""The last steps of a fit: a regularised least-squares solution on the fine grid.
 
-They are linear, and held back by what is usual: each is one more derivative in the projection, with
-a prior of its own. A turn of the slope axes is always among them: a pyramid whose edges are turned
-by a degree would otherwise turn the registration by 0.007 deg with 400 modes, and by 0.06 deg with
-the lowest 40.
+Besides the registration, nuisance parameters are fitted linearly: each adds one derivative to the
+projection and has a prior of its own. A rotation of the slope axes is always among them. Without
+it, a pyramid whose edges are rotated by one degree would rotate the registration by 0.007 deg with
+400 modes, and by 0.06 deg with the lowest 40.
 """
 
 from __future__ import annotations
@@ -34,49 +34,53 @@ Array = NDArray[np.float64]
 MAX_NEAR_STEPS = 6
 
 SLOPE_TURN_SIGMA_RAD = np.deg2rad(1.5)
-"""A pyramid is aligned to the pixels to a degree or two."""
+"""Prior 1 σ of the rotation of the slope axes, rad: a pyramid is aligned to the pixels within a
+degree or two."""
 
 GAIN_MAP_ORDER = 4
-"""Of the polynomial in x and y that the gain over the pupil is."""
+"""Order of the polynomial in x and y that describes the gain over the pupil."""
 
 GAIN_MAP_SIGMA = 0.3
-"""Of each coefficient of the gain map."""
+"""Prior 1 σ of each coefficient of the gain map."""
 
 ANAMORPHOSIS_SIGMA = 0.02
-"""Half the stretch of the mirror's image along one axis over the other."""
+"""Prior 1 σ of each stretch: half the relative difference of the image scales along two axes."""
 
 STRETCHES = slice(1, 3)
-"""Where they stand among the nuisances, when they are unknown: behind the turn of the axes."""
+"""Indices of the two stretches among the nuisances, if they are unknown: after the axes' rotation.
+"""
 
 LONGEST_STRETCH = 0.03
-"""A longer step of one trusts the derivatives too far: 0.45 subapertures at the edge of 30."""
+"""Longest step of a stretch: 0.45 subapertures at the edge of 30. The derivatives hold no further.
+"""
 
 SETTLED_STRETCH = 1e-5
-"""Fits end with steps shorter than this: 1.5e-4 subapertures there."""
+"""Step of a stretch below which the fit has converged: 1.5e-4 subapertures at the edge of 30."""
 
 STRETCH_FLOOR = 1e-4
-"""No anamorphosis is surer, as no magnification is: both are lengths of the image."""
+"""Smallest 1 σ of an anamorphosis; the same floor as the magnification's: both are image scales."""
 
 NOMINAL = Misregistration()
 
 OPTIC_SIGMA = {Optic.WIDTH: 0.25, Optic.SENSOR: 0.5}
-"""How far what a file says of an instrument may be off, as a logarithm: a coupling of 0.35 might be
-0.18 or 0.53."""
+"""Prior 1 σ of the logarithm of a value that the instrument file states: a coupling of 0.35 might
+be 0.18 or 0.53."""
 
 UNKNOWN_SIGMA = 1.0
-"""The same of what a file says to be unknown."""
+"""Prior 1 σ of the logarithm of a value that the instrument file marks as unknown."""
 
 LONGEST_OPTIC_STEP = 0.4
-"""A step of such a logarithm beyond this trusts the derivatives too far."""
+"""Longest step of such a logarithm; the derivatives hold no further."""
 
 
 def image_patterns(stop: Stop) -> Array:
     """Return orthonormal displacements of the four images ``(n_patterns, 8)``.
 
-    Along x of the images at -x -y, +x -y, -x +y, +x +y, then along y. With the mirror as stop
-    there are six of mean zero, for a common displacement is the shift of α. With the telescope as
-    stop two more displace all images together: there α is where the mirror is seen on the grid,
-    and the pupil may lie elsewhere.
+    The eight components are displacements along x of the images at -x -y, +x -y, -x +y, +x +y, then
+    along y. With the mirror as stop there are six patterns of zero mean, because a common
+    displacement is the shift of α. With the telescope as stop, two more patterns displace all
+    images together: α is then the mirror's position on the grid, and the pupil may be displaced
+    independently.
     """
     along = np.array([[-1, 1, -1, 1], [-1, -1, 1, 1], [1, -1, -1, 1], [1, 1, 1, 1]]) / 2.0
     both: Array = np.kron(np.eye(2), along).astype(np.float64)  # those of x, then those of y
@@ -84,10 +88,10 @@ def image_patterns(stop: Stop) -> Array:
 
 
 def is_blurring(pattern: Array) -> bool:
-    """Return whether a pattern of ``image_patterns`` does not move slopes to first order.
+    """Return True if a pattern of ``image_patterns`` has no first-order effect on slopes.
 
-    Images that are stretched apart or sheared blur the slopes. A quadrupole along one axis looks
-    like a shift along the other to one of the slopes, and so it can be told.
+    Images that are stretched apart or sheared only blur the slopes. A quadrupole along one axis
+    looks like a shift along the other axis to one of the slope components, so it can be measured.
     """
     along_x, along_y = pattern.reshape(2, 2, 2)
     even = np.abs(along_x + along_x[::-1, ::-1]) + np.abs(along_y + along_y[::-1, ::-1])
@@ -96,7 +100,7 @@ def is_blurring(pattern: Array) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Nuisances:
-    """The unknowns beside the registration, in their order."""
+    """Unknowns fitted together with the registration, in a fixed order."""
 
     regions: NDArray[np.intp]
     """``(n_slopes,)`` region of the pupil of each slope."""
@@ -105,30 +109,30 @@ class Nuisances:
     """``(n_maps, n_slopes)`` gain over the pupil of each coefficient of the gain map."""
 
     anamorphosis: bool
-    """Whether the two stretches are unknown."""
+    """True if the two stretches are unknown."""
 
     nominal: Array = field(default_factory=lambda: np.zeros(2))
-    """``(2,)`` where they are expected."""
+    """``(2,)`` expected stretches."""
 
     optics: tuple[tuple[Optic, float], ...] = ()
-    """What of the instrument is unknown, and how far the models are already from what the file
-    says, as a logarithm: the prior is about the file."""
+    """Unknown optical quantities, each with the offset of the current models from the instrument
+    file, as a logarithm; the prior refers to the file."""
 
     unknown: frozenset[Optic] = frozenset()
-    """What of it the file says to be unknown."""
+    """Optical quantities that the instrument file marks as unknown."""
 
     images: Array = field(default_factory=lambda: np.zeros((0, 8)))
     """``(n_patterns, 8)`` unknown displacements of the pupil images, see ``image_patterns``."""
 
     image_sigma: float = 0.0
-    """How large each of these may be, 1 σ, subapertures."""
+    """Prior 1 σ of each displacement pattern, subapertures."""
 
     displaced: Array = field(default_factory=lambda: np.zeros(8))
-    """``(8,)`` how far the images of the models are already displaced, subapertures."""
+    """``(8,)`` displacements of the images already included in the models, subapertures."""
 
     @property
     def sigma(self) -> Array:
-        """``(n_nuisances,)`` how large each may be, 1 σ."""
+        """``(n_nuisances,)`` prior 1 σ of each nuisance."""
         stretches = [ANAMORPHOSIS_SIGMA] * (2 if self.anamorphosis else 0)
         optics = [
             UNKNOWN_SIGMA if optic in self.unknown else OPTIC_SIGMA[optic]
@@ -140,17 +144,17 @@ class Nuisances:
 
     @property
     def first_optic(self) -> int:
-        """Index of the first unknown of the instrument among the nuisances."""
+        """Index of the first optical quantity among the nuisances."""
         return 3 if self.anamorphosis else 1
 
     @property
     def image_places(self) -> slice:
-        """Places of the images' displacements among the nuisances."""
+        """Indices of the image displacements among the nuisances."""
         first = self.first_optic + len(self.optics)
         return slice(first, first + len(self.images))
 
     def from_prior(self, values: Array) -> Array:
-        """Return values ``(n_nuisances,)`` as distances from what is expected of them."""
+        """Return values ``(n_nuisances,)`` as offsets from their expected values."""
         distance = values.astype(float)
         if self.anamorphosis:
             distance[STRETCHES] -= self.nominal
@@ -160,11 +164,14 @@ class Nuisances:
         return distance
 
     def image_offsets(self, values: Array) -> Array:
-        """Return where the pupil images lie beside their places ``(8,)``, subapertures."""
+        """Return the displacements of the pupil images from their nominal positions ``(8,)``.
+
+        In subapertures, in the order of ``image_patterns``.
+        """
         return self.displaced + values[self.image_places] @ self.images
 
     def changes(self, values: Array) -> dict[Optic, float]:
-        """Return by how much each of the instrument's unknowns differs from the file, as ln."""
+        """Return the logarithm of each optical quantity over its value in the instrument file."""
         distance = self.from_prior(values)
         return {
             optic: float(distance[k]) for k, (optic, _) in enumerate(self.optics, self.first_optic)
@@ -172,7 +179,7 @@ class Nuisances:
 
     @property
     def prior(self) -> Array:
-        """``(4 + n_nuisances,)`` reciprocal variances: the registration itself has no prior."""
+        """``(4 + n_nuisances,)`` reciprocal variances; the registration itself has no prior."""
         return np.concatenate([np.zeros(4), 1.0 / self.sigma**2])
 
     def derivatives(
@@ -183,11 +190,11 @@ class Nuisances:
         of_alpha: Array,
         of_images: Array | None = None,
     ) -> Array:
-        """Return the change of D with each unknown but the gain map.
+        """Return the derivatives of D by each nuisance except the gain map.
 
-        ``(n_nuisances - n_maps, n_slopes, n_modes)``. ``of_alpha`` ``(4, n_slopes, n_modes)`` are
-        the derivatives with respect to α, ``of_images`` those with respect to the images' places
-        where they are known.
+        Shape ``(n_nuisances - n_maps, n_slopes, n_modes)``. ``of_alpha`` ``(4, n_slopes, n_modes)``
+        are the derivatives by α, ``of_images`` those by the image displacements if they are already
+        known.
         """
         model = models.cheap
         kind = model.instrument.slopes.kind
@@ -260,7 +267,7 @@ def nuisances_of(
     images: Array | None = None,
     image_sigma: float = 0.0,
 ) -> Nuisances:
-    """Return the unknowns beside the registration: the turn of the axes, and those asked for."""
+    """Return the nuisances: the axes' rotation, and the optional ones that were requested."""
     unknowns = Nuisances(
         maps=np.empty((0, kind.n_planes * int(valid.sum()))),
         anamorphosis=anamorphosis,
@@ -285,26 +292,27 @@ def nuisances_of(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Solution:
-    """Minimum on the fine grid."""
+    """Minimum of the fit on the fine grid."""
 
     alpha: Misregistration
-    """Its anamorphosis stays where it began when that is not unknown."""
+    """Registration. Its anamorphosis keeps its start value if it is not fitted."""
 
     nuisances: Array
-    """``(n_nuisances,)``."""
+    """``(n_nuisances,)`` values of the nuisances."""
 
     matrix: NDArray[np.float32]
-    """``(n_slopes, n_modes)`` the model there."""
+    """``(n_slopes, n_modes)`` model matrix at the solution."""
 
     near: Array
     """``(n_unknowns - n_maps, n_slopes, n_modes)`` derivatives of the model, taken nearby, before
-    a gain map is applied and without its own."""
+    the gain map is applied and without the map's own derivatives."""
 
     derivatives: Array
-    """``(4, n_slopes, n_modes)`` of the model, taken nearby, its gain map applied."""
+    """``(4, n_slopes, n_modes)`` derivatives of the model with the gain map applied, taken nearby.
+    """
 
     nuisance_derivatives: Array
-    """``(n_nuisances, n_slopes, n_modes)`` the same of the unknowns beside the registration."""
+    """``(n_nuisances, n_slopes, n_modes)`` derivatives with respect to the nuisances."""
 
     projection: Projection
     dispersion: float
@@ -329,23 +337,23 @@ def refine(
     of_images: Array | None = None,
     decides: InteractionModel | None = None,
 ) -> Solution:
-    """Return the minimum on the fine grid, with derivatives frozen on a cheaper one.
+    """Return the minimum on the fine grid, with derivatives frozen on a coarser one.
 
-    Near the minimum the derivatives' own error only slows the last steps down: what decides is
-    the residual, and that is the fine grid's.
+    Near the minimum an error of the derivatives only slows convergence: the minimum depends on the
+    residual, which is computed on the fine grid.
 
     Parameters
     ----------
     models, columns, start, nuisances
-        Of the instrument; what was measured; where to begin; the unknowns beside α.
+        Models of the instrument, measured columns, start of the registration, other unknowns.
     max_steps
-        Steps after which it ends, settled or not.
+        Largest number of steps.
     near
-        Derivatives of a solution nearby, ``Solution.near``; None: they are computed here.
+        Derivatives of a nearby solution, ``Solution.near``; None if they are to be computed.
     of_images
-        Those with respect to the places of the pupil images alone, of a solution nearby.
+        Derivatives by the image displacements only, of a nearby solution; None to compute them.
     decides
-        The model whose residual decides; None: the fine one.
+        Model of the residual that is minimised; None for the fine one.
     """
     vector, values = start.vector, nuisances.begin(start)
     decides = models.fine if decides is None else decides
@@ -393,10 +401,10 @@ def _seen(
     values: Array,
     nuisances: Nuisances,
 ) -> tuple[Projection, Array]:
-    """Return the measurement against D with its nuisances, and the derivatives of that.
+    """Return the projection of the measurement on D and nuisances, and the derivatives used.
 
-    A gain map multiplies D and its derivatives as they are now. Multiplied by D of the start, a
-    gain of 30 % left an error of 30 % of the way from the start to the solution.
+    The gain map multiplies the current D and its derivatives. When it multiplied D of the start
+    instead, a gain of 30 % left an error of 30 % of the distance from start to solution.
 
     Parameters
     ----------
@@ -422,11 +430,11 @@ def _seen(
 
 
 def _bounded_step(seen: Projection, values: Array, nuisances: Nuisances, counts: float) -> Array:
-    """Return the step of the registration, then of the nuisances, these held by their prior.
+    """Return the step of the registration and the nuisances, limited in length.
 
-    ``counts`` slopes count as one: slopes whose misfit has one cause tell less than as many
-    independent ones. On real benches, where a third of the signal is left over, all of them would
-    move pupil images by a pixel to explain some of it.
+    ``counts`` correlated slopes weigh as much as one independent slope, because residuals with a
+    common cause carry less information. Without this, benches with a third of the signal
+    unexplained would have pupil images displaced by a pixel to fit some of it.
     """
     noise = seen.chi / max(seen.residual.size - len(seen.gains), 1)
     prior = nuisances.prior * noise * counts

@@ -1,9 +1,10 @@
-"""Several sensors and mirrors: what each pair sees when each of them lies where it does.
+"""Geometry of several sensors and mirrors: the registration of each sensor-mirror pair.
 
-A sensor, a star and a mirror make a pair. A point of the mirror's drawing goes to its place at the
-mirror's altitude, along the star's light to the pupil, and from there to the sensor's grid: three
-similarities one after the other. What a pair's own matrix tells is α, the registration beside the
-nominal one; what is wanted is where each sensor, mirror and star is.
+A sensor, its guide star and a mirror make a pair. A point of the nominal mirror geometry is mapped
+to the mirror's conjugate altitude, along the star's line of sight to the pupil, and from there to
+the sensor's grid: three similarity transforms in sequence. The matrix of a pair determines α, its
+registration relative to the nominal one. This module relates those α to the positions of sensors,
+mirrors and stars.
 
 References
 ----------
@@ -40,77 +41,78 @@ N_OF_SENSOR, N_OF_MIRROR = 7, 4
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PlacedSensor:
-    """A sensor, where it lies nominally, and the star that it looks at."""
+    """A sensor with its nominal position and its guide star."""
 
     name: str
     instrument: Instrument
-    """Its telescope and sensor."""
+    """Instrument file with the telescope and the sensor."""
 
     star: GuideStar
     place: Similarity
-    """From the pupil to the sensor's grid, lengths in its subapertures."""
+    """Transform from the pupil to the sensor's grid, lengths in its subapertures."""
 
     fixed: bool = False
-    """Whether it lies just there."""
+    """True if the nominal position is exact and is not fitted."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PlacedMirror:
-    """A mirror, and where it lies nominally."""
+    """A mirror with its nominal position."""
 
     name: str
     instrument: Instrument
-    """Its actuators and modes."""
+    """Instrument file with the actuators and modes."""
 
     altitude_m: float
-    """That it is conjugate to, along the line of sight from the pupil."""
+    """Conjugate altitude above the pupil along the line of sight, metres."""
 
     place: Similarity
-    """From its drawing to the plane at its altitude, lengths in metres."""
+    """Transform from the nominal mirror geometry to the plane at its altitude, lengths in metres.
+    """
 
     fixed: bool = False
-    """Whether it lies just there."""
+    """True if the nominal position is exact and is not fitted."""
 
 
 class Pair(NamedTuple):
-    """A sensor with a mirror, by their numbers."""
+    """Indices of a sensor and of a mirror."""
 
     sensor: int
     mirror: int
 
 
 class Parameter(NamedTuple):
-    """One number that says where something is."""
+    """One parameter of the position of a sensor, star or mirror."""
 
     owner: str
     """Name of the sensor or mirror."""
 
     name: str
-    """With its unit at the boundary."""
+    """Name of the parameter, with its unit at the boundary."""
 
     boundary: float
-    """Multiply the numeric value by this to have that unit."""
+    """Factor from the numeric value to the boundary unit."""
 
     subap: float
-    """How much of it moves what a sensor sees by about one subaperture, at the edge of the pupil or
-    on the highest mirror."""
+    """Change of the parameter that moves the sensor's image of the mirror by about one subaperture,
+    at the edge of the pupil or on the highest mirror."""
 
     free: bool
-    """Whether it is to be found; else it is as the file says."""
+    """True if the parameter is fitted; otherwise it keeps its value from the file."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class System:
-    """Sensors and mirrors of one telescope, and what is not known of them."""
+    """Sensors and mirrors of one telescope, and which of their positions are unknown."""
 
     name: str
     sensors: tuple[PlacedSensor, ...]
     mirrors: tuple[PlacedMirror, ...]
     stars_move: bool = False
-    """Whether directions of stars are to be found, too."""
+    """True if the directions of stars are fitted as well."""
 
     heights_move: bool = False
-    """Whether heights of laser stars are."""
+    """True if the heights of laser stars are fitted as well."""
 
     @cached_property
     def pairs(self) -> tuple[Pair, ...]:
@@ -123,7 +125,7 @@ class System:
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        """What says where everything is, in the order of ``nominal``."""
+        """Parameters of all positions, in the order of ``nominal``."""
         return tuple(self._parameters())
 
     def _parameters(self) -> Iterator[Parameter]:
@@ -151,17 +153,17 @@ class System:
             yield Parameter(mirror.name, "magnification", 1.0, edge, free)
 
     def of_sensor(self, number: int) -> slice:
-        """Return where a sensor's numbers stand."""
+        """Return the indices of a sensor's parameters."""
         return slice(number * N_OF_SENSOR, (number + 1) * N_OF_SENSOR)
 
     def of_mirror(self, number: int) -> slice:
-        """Return where a mirror's numbers stand."""
+        """Return the indices of a mirror's parameters."""
         first = len(self.sensors) * N_OF_SENSOR
         return slice(first + number * N_OF_MIRROR, first + (number + 1) * N_OF_MIRROR)
 
     @cached_property
     def nominal(self) -> Array:
-        """``(n_parameters,)`` as the file says, numeric units."""
+        """``(n_parameters,)`` values from the system file, numeric units."""
         of_sensors = [
             [
                 *_numbers(s.place),
@@ -174,7 +176,7 @@ class System:
         return np.concatenate([*of_sensors, *(_numbers(m.place) for m in self.mirrors)])
 
     def at(self, values: Array) -> System:
-        """Return the system that is nominally where these numbers say."""
+        """Return the system whose nominal positions are these values."""
         sensors = tuple(
             replace(
                 one, star=_star(values[self.of_sensor(k)]), place=_place(values[self.of_sensor(k)])
@@ -188,7 +190,7 @@ class System:
         return replace(self, sensors=sensors, mirrors=mirrors)
 
     def seen(self, pair: Pair, values: Array) -> Similarity:
-        """Return where a mirror's drawing lands on a sensor's grid, lengths in its subapertures."""
+        """Return the map from the nominal mirror geometry to a sensor's grid, in subapertures."""
         to_grid, along_light, to_altitude = self._steps(pair, values)
         return to_grid.after(along_light).after(to_altitude)
 
@@ -202,10 +204,10 @@ class System:
         return _place(of_sensor), along_light.scaled(width_m), _place(of_mirror).scaled(width_m)
 
     def drawn(self, pair: Pair) -> Similarity:
-        """Return the part of the nominal map that is in the drawing of the pair's instrument.
+        """Return the part of the nominal map that the pair's instrument file already contains.
 
-        α is counted from there. All of it where actuators are known and the pupil stays where it
-        is; else nothing.
+        α is relative to it. It is the whole map if actuators are known and the telescope is the
+        stop; otherwise it is the identity.
         """
         mirror = self.mirrors[pair.mirror].instrument.mirror
         stop = self.sensors[pair.sensor].instrument.stop
@@ -214,10 +216,10 @@ class System:
         return Similarity()
 
     def instrument(self, pair: Pair) -> Instrument:
-        """Return the instrument that a pair is: its mirror drawn as this sensor sees it.
+        """Return the instrument of a pair: the sensor's, with the mirror as it appears on its grid.
 
-        At ``Misregistration()`` D of it is that of the nominal system, or at ``alphas`` of the
-        nominal numbers where nothing is in the drawing.
+        Its D at ``Misregistration()`` is that of the nominal system; where ``drawn`` is the
+        identity, D is nominal at ``alphas`` of the nominal values.
         """
         sensor, mirror = self.sensors[pair.sensor], self.mirrors[pair.mirror]
         about, own = sensor.instrument, mirror.instrument
@@ -238,7 +240,7 @@ class System:
         )
 
     def basis(self, pair: Pair) -> Basis:
-        """Return the mirror's modes as this sensor sees them; strokes are the same for all."""
+        """Return the mirror's modes as imaged on this sensor; strokes are the same for all."""
         about = self.instrument(pair)
         own = self.bases[pair.mirror]
         if not isinstance(own, ModalBasis):
@@ -248,13 +250,13 @@ class System:
 
     @cached_property
     def bases(self) -> tuple[Basis, ...]:
-        """The modes of each mirror, as its own instrument file has them."""
+        """Modes of each mirror, as its own instrument file defines them."""
         return tuple(modal_basis(mirror.instrument) for mirror in self.mirrors)
 
     def lit(self, pair: Pair) -> NDArray[np.intp] | None:
-        """Return the actuators of a mirror at an altitude that lie in the star's light.
+        """Return the illuminated actuators of a mirror at an altitude.
 
-        None: its modes are not single actuators, or it lies at the pupil.
+        None if the mirror is conjugate to the pupil or its modes are not single actuators.
         """
         mirror, about = self.mirrors[pair.mirror], self.instrument(pair)
         own = about.mirror
@@ -281,12 +283,12 @@ class System:
         )
 
     def alphas(self, values: Array) -> Array:
-        """Return α of every pair ``(n_pairs, 4)``, numeric units, when everything is so."""
+        """Return α of every pair ``(n_pairs, 4)`` for these parameters, numeric units."""
         found = [self.seen(p, values).after(self.drawn(p).inverse).alpha.vector for p in self.pairs]
         return np.array(found)
 
     def rates(self, values: Array) -> Array:
-        """Return how α of every pair changes with each number, ``(n_pairs, 4, n_parameters)``."""
+        """Return ``(n_pairs, 4, n_parameters)`` derivatives of the pairs' α by the parameters."""
         found = np.zeros((len(self.pairs), 4, len(values)))
         for rates, pair in zip(found, self.pairs, strict=True):
             turned, shifted = self._pair_rates(pair, values)
@@ -297,7 +299,7 @@ class System:
         return found
 
     def _pair_rates(self, pair: Pair, values: Array) -> tuple[NDArray[np.complex128], ...]:
-        """Return the change of the map's turn over itself, and of its shift, per parameter."""
+        """Return the derivatives of the logarithm of the map's linear part, and of its shift."""
         turned, shifted = np.zeros((2, len(values)), dtype=np.complex128)
         of_sensor, of_mirror = self.of_sensor(pair.sensor), self.of_mirror(pair.mirror)
         to_grid, along_light, to_altitude = self._steps(pair, values)

@@ -1,4 +1,4 @@
-"""The file of a system: sensors with their stars, mirrors with their altitudes."""
+"""Read a system file: sensors with their stars, mirrors with their altitudes."""
 
 from __future__ import annotations
 
@@ -30,22 +30,23 @@ are 2000 arcseconds."""
 
 
 class PlaceTable(Table):
-    """What sensors and mirrors have in common: a name, an instrument file, a nominal place."""
+    """Keys common to sensors and mirrors: a name, an instrument file, a nominal position."""
 
     name: Id
-    """Of the sensor or mirror, in answers and in the names of matrices."""
+    """Name of the sensor or mirror, in results and in the names of matrices."""
 
     instrument: str | None = None
-    """Its instrument file, relative to this one, or a packaged name; None: that of [system]."""
+    """Its instrument file, relative to this one, or a packaged name; None for that of [system]."""
 
     rotation_deg: float | None = None
-    """Nominal rotation, from +x towards +y; None: 0, of a mirror what its instrument file says."""
+    """Nominal rotation from +x towards +y, degrees; None for 0, or for a mirror the value of its
+    instrument file."""
 
     magnification: Positive = 1.0
     """Nominal magnification."""
 
     fixed: bool = False
-    """It lies just there, nothing of it is to be found: a reference for the others."""
+    """True if the nominal position is exact: a reference for the others."""
 
 
 class SensorTable(PlaceTable):
@@ -58,32 +59,32 @@ class SensorTable(PlaceTable):
     """Height of a laser star above the pupil, along the line of sight."""
 
     shift_subap: tuple[float, float] = (0.0, 0.0)
-    """Where the pupil's centre lies nominally on its grid, subapertures."""
+    """Nominal position of the pupil's centre on the sensor's grid, subapertures."""
 
 
 class MirrorTable(PlaceTable):
     """``[[mirrors]]``: one mirror."""
 
     altitude_m: float = 0.0
-    """That it is conjugate to, above the pupil along the line of sight."""
+    """Conjugate altitude above the pupil along the line of sight, metres."""
 
     shift_m: tuple[float, float] = (0.0, 0.0)
-    """Where its centre lies nominally, metres at its altitude."""
+    """Nominal position of the mirror's centre, metres at its altitude."""
 
 
 class AboutTable(Table):
-    """``[system]``: what all have in common."""
+    """``[system]``: keys common to all sensors and mirrors."""
 
     name: Id
     instrument: str | None = None
     """Instrument file of sensors and mirrors that name none."""
 
     stars: Literal["known", "direction", "direction and height"] = "known"
-    """What of the stars is to be found beside sensors and mirrors."""
+    """Unknown properties of the stars that are fitted together with sensors and mirrors."""
 
 
 class SystemFile(Table):
-    """A whole file."""
+    """A whole system file."""
 
     system: AboutTable
     sensors: Annotated[tuple[SensorTable, ...], Field(min_length=1)]
@@ -156,7 +157,7 @@ def _sensor(table: SensorTable, instrument: Instrument) -> PlacedSensor:
 
 
 def _check_star(where: str, off_axis_arcsec: float) -> None:
-    """Refuse a direction that is in radians or milliarcseconds by its size."""
+    """Raise if the size of a direction indicates radians or milliarcseconds."""
     if off_axis_arcsec > MAX_STAR_ARCSEC:
         refuse(
             where,
@@ -191,7 +192,7 @@ def _place(table: PlaceTable, shift: tuple[float, float], nominal_rad: float) ->
 
 
 def _check_telescope(path: Path, system: System) -> None:
-    """Refuse instruments of several telescopes."""
+    """Raise if the instruments belong to different telescopes."""
     every: list[PlacedSensor | PlacedMirror] = [*system.sensors, *system.mirrors]
     first = every[0].instrument
     for one in every[1:]:

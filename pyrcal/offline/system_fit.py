@@ -1,8 +1,8 @@
-"""Where each sensor, mirror and star is, from α of every pair.
+"""Fit the positions of sensors, mirrors and stars to α of every pair.
 
-Weighted least squares: every pair counts by its own covariance. Some directions change nothing that
-any pair sees, or so little that it is less than a subaperture for all that was measured: along
-those, everything stays nearest to what the file says, and they are named.
+The fit is a weighted least-squares solution with the covariance of each pair. Some directions
+change no pair's α measurably, less than a subaperture with all measurements together: along those,
+the parameters stay closest to the file's values, and the directions are reported.
 """
 
 from __future__ import annotations
@@ -21,69 +21,69 @@ from service.model.misregistration import wrapped
 Array = NDArray[np.float64]
 
 UNSEEN_SUBAP = 1.0
-"""1 σ along a direction, where it moves the edge of the pupil most, beyond which it is not seen."""
+"""Smallest 1 σ along a direction, at the pupil's edge, at which it counts as unobservable."""
 
 MAX_STEPS = 20
 SETTLED_SUBAP = 1e-7
 
 _ALONG = 0.9
-"""Share of a direction that lies among those not seen, from which it is one of them."""
+"""Share of a known direction within the unobservable ones above which it is reported."""
 
 _NEW = 0.1
-"""Share of it beyond those named before, from which it is named, too."""
+"""Share of it outside the directions reported before, above which it is reported too."""
 
 _NAMED, _NOTABLE = 4, 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SystemFit:
-    """Where everything is."""
+    """Fitted positions of sensors, mirrors and stars."""
 
     values: Array
-    """``(n_parameters,)`` numeric units."""
+    """``(n_parameters,)`` values, numeric units."""
 
     covariance: Array
-    """``(n_parameters, n_parameters)`` of what is seen; nothing along what is not."""
+    """``(n_parameters, n_parameters)`` covariance; zero along unobservable directions."""
 
     unseen_share: Array
-    """``(n_parameters,)`` share of each in directions that are not seen, 0..1: it is known only
-    beside the others there."""
+    """``(n_parameters,)`` share of each parameter in unobservable directions, 0..1; such a
+    parameter is known only relative to the others in that direction."""
 
     unseen: tuple[str, ...]
-    """Those directions, in words."""
+    """Unobservable directions as text."""
 
     misfit: Array
-    """``(n_pairs, 4)`` α of each pair less what these values make of it; NaN: not used."""
+    """``(n_pairs, 4)`` measured α of each pair less the fitted one; NaN if not used."""
 
     pulls: Array
-    """``(n_pairs, 4)`` the same over 1 σ of α."""
+    """``(n_pairs, 4)`` misfit over 1 σ of α."""
 
     chi2: float
     n_free: int
-    """Numbers measured beyond those found: what χ² should be about."""
+    """Degrees of freedom: measured numbers less fitted ones; the expected χ²."""
 
     @property
     def sigma(self) -> Array:
-        """``(n_parameters,)`` 1 σ."""
+        """``(n_parameters,)`` 1 σ of the parameters."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def probability(self) -> float:
-        """Of a larger χ² if all is as the covariances say; 1 where nothing is measured twice."""
+        """Probability of a larger χ² if the covariances are correct; 1 without redundancy."""
         return float(scipy.stats.chi2.sf(self.chi2, self.n_free)) if self.n_free else 1.0
 
 
 def fit_system(system: System, alphas: Array, covariances: Array) -> SystemFit:
-    """Return where everything is, from α of every pair.
+    """Return the positions of sensors, mirrors and stars from α of every pair.
 
     Parameters
     ----------
     system
-        As the file says.
+        System with its nominal positions.
     alphas
-        ``(n_pairs, 4)`` in the order of ``system.pairs``, numeric units; NaN: not measured.
+        ``(n_pairs, 4)`` in the order of ``system.pairs``, numeric units; NaN if not measured.
     covariances
-        ``(n_pairs, 4, 4)`` of them.
+        ``(n_pairs, 4, 4)`` covariances of ``alphas``.
     """
     used = np.isfinite(alphas).all(axis=1)
     roots = np.array([np.linalg.inv(np.linalg.cholesky(one)) for one in covariances[used]])
@@ -120,7 +120,7 @@ def fit_system(system: System, alphas: Array, covariances: Array) -> SystemFit:
 
 
 def _left(system: System, alphas: Array, values: Array) -> Array:
-    """Return α measured less expected, rotations the short way round."""
+    """Return measured less expected α, with rotation differences wrapped to half a turn."""
     left = alphas - system.alphas(values)
     left[:, 2] = [wrapped(angle) for angle in left[:, 2]]
     return left
@@ -128,18 +128,18 @@ def _left(system: System, alphas: Array, values: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Directions:
-    """Singular directions of what is to be found, in subapertures at the edge."""
+    """Singular directions of the fitted parameters, in subapertures at the edge."""
 
     rates: Array
-    """``(n_measured, n_found)`` in σ per subaperture."""
+    """``(n_measured, n_found)`` derivatives, in σ per subaperture."""
 
     left: Array
     size: Array
     seen: Array
-    """``(n_seen, n_found)``."""
+    """``(n_seen, n_found)`` observable directions, orthonormal."""
 
     unseen: Array
-    """``(n_unseen, n_found)`` orthonormal."""
+    """``(n_unseen, n_found)`` unobservable directions, orthonormal."""
 
     @classmethod
     def of(cls, rates: Array) -> _Directions:
@@ -158,7 +158,7 @@ class _Directions:
         return len(self.size)
 
     def best(self, measured: Array) -> Array:
-        """Return the shortest vector that explains most."""
+        """Return the shortest least-squares solution."""
         return np.asarray((measured @ self.left / self.size) @ self.seen)
 
     @property
@@ -201,7 +201,7 @@ def _named(
 
 
 def _known_directions(system: System, values: Array) -> Iterator[tuple[str, list[Array]]]:
-    """Yield directions that some systems do not see, in words, and as changes of all numbers."""
+    """Yield directions that some systems cannot observe: text, and changes of all values."""
     yield from _of_each_star(system, values)
     both = (1.0 + 0j, 1j)
     everything = "sensors, mirrors and stars" if system.stars_move else "sensors and mirrors"
@@ -225,7 +225,10 @@ def _known_directions(system: System, values: Array) -> Iterator[tuple[str, list
 
 
 def _of_each_star(system: System, values: Array) -> Iterator[tuple[str, list[Array]]]:
-    """Yield what one star's place shares with its own sensor, where mirrors lie at one altitude."""
+    """Yield changes of one star that its own sensor can compensate.
+
+    They are unobservable if all mirrors are at one altitude.
+    """
     altitude_m = float(np.mean([mirror.altitude_m for mirror in system.mirrors]))
     for number, sensor in enumerate(system.sensors):
         of_sensor = system.of_sensor(number)
@@ -262,7 +265,7 @@ def _of_each_star(system: System, values: Array) -> Iterator[tuple[str, list[Arr
 
 
 def _common_shift(system: System, values: Array, along: complex) -> Array:
-    """Return everything shifted over the pupil; a cone narrows what lies high."""
+    """Return a common shift over the pupil; the cone effect reduces it at altitude."""
     direction = np.zeros(len(values))
     heights = values[: len(system.sensors) * 7].reshape(-1, 7)[:, HEIGHT]
     for number, sensor in enumerate(system.sensors):
@@ -286,7 +289,7 @@ def _common_direction(system: System, along: complex) -> Array:
 
 
 def _common_turn(system: System, values: Array, turn: complex) -> Array:
-    """Return everything turned (imaginary) or magnified (real) about the pupil's centre."""
+    """Return a common rotation (imaginary) or magnification (real) about the pupil's centre."""
     direction = np.zeros(len(values))
     for number in range(len(system.sensors)):
         own, change = values[system.of_sensor(number)], direction[system.of_sensor(number)]

@@ -1,4 +1,4 @@
-"""Where each sensor, mirror and star is, as JSON, as a table, as HDF5."""
+"""Report a fitted system as JSON, as a table, and as HDF5."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from service.files.documents import json_text
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 
 UNLIKELY = 1e-4
-"""Probability of so large a χ², below which the pairs do not belong to one system."""
+"""Probability of χ² below which the pairs do not belong to one system."""
 
 PARTLY = 0.05
-"""Share in directions that are not seen, from which a number is marked."""
+"""Share in unobservable directions above which a parameter is marked."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SystemReport:
-    """A system, the fits of its pairs, and what follows of them."""
+    """A system, the fits of its pairs, and the fitted positions."""
 
     system: System
     fits: tuple[FitReport, ...]
-    """In the order of ``system.pairs``."""
+    """Fits of the pairs, in the order of ``system.pairs``."""
 
     found: SystemFit | None
-    """Where everything is; None: no pair was accepted."""
+    """Fitted positions; None if no pair was accepted."""
 
     @property
     def unmeasured(self) -> frozenset[str]:
-        """Sensors and mirrors of which no pair was used: nothing is known of where they are."""
+        """Sensors and mirrors without a used pair, whose positions are unknown."""
         system, used = self.system, set[str]()
         for pair, misfit in zip(
             system.pairs, self.found.misfit if self.found else (), strict=False
@@ -59,12 +59,12 @@ class SystemReport:
 
     @property
     def accepted(self) -> bool:
-        """Whether every pair was, and all agree."""
+        """True if every pair was accepted and all agree."""
         return not self.refused and self.found is not None and self.found.probability >= UNLIKELY
 
     @property
     def verdict(self) -> str:
-        """One line."""
+        """Verdict in one line."""
         if self.refused or self.found is None:
             more = f" (and {len(self.refused) - 1} more)" if len(self.refused) > 1 else ""
             n_pairs = len(self.fits)
@@ -80,7 +80,7 @@ class SystemReport:
         return f"accepted: {len(self.fits)} pairs agree ({agree})"
 
     def _cause(self, found: SystemFit) -> str:
-        """Return what in the file would make the pairs agree, as far as they show it."""
+        """Return the change of the file that would make the pairs agree, if they show it."""
         system = self.system
         if not system.stars_move:
             free = replace(system, stars_move=True)
@@ -95,9 +95,9 @@ class SystemReport:
         )
 
     def _farthest_star(self, moved: SystemFit) -> str:
-        """Return which star was found farthest from the file's place, beside the other stars.
+        """Return the star with the largest offset from the file, relative to the other stars.
 
-        A common direction of all stars changes nothing that pairs see.
+        A common direction of all stars changes no pair's α.
         """
         system = self.system
         places = [system.of_sensor(number) for number in range(len(system.sensors))]
@@ -120,12 +120,12 @@ class SystemReport:
 
 
 def document(report: SystemReport) -> dict[str, Any]:
-    """Return it as one JSON object, in boundary units.
+    """Return the report as one JSON object, in boundary units.
 
     ``sensors`` and ``mirrors`` have an object for each name, with ``value``, ``sigma``, ``nominal``
-    and ``unseen_share`` of each number that says where it is; ``sigma`` is None of what is as the
-    file says. Both are None if no pair with it was accepted. ``pairs`` has what
-    ``pyrcal fit --json`` prints.
+    and ``unseen_share`` of each parameter of its position; ``sigma`` is None for parameters that
+    are not fitted. Both are None if no pair with it was accepted. ``pairs`` has the output of
+    ``pyrcal fit --json``.
     """
     system, found = report.system, report.found
     pairs: dict[str, dict[str, Any]] = {sensor.name: {} for sensor in system.sensors}
@@ -154,7 +154,7 @@ def document(report: SystemReport) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Row:
-    """One number, boundary units; None: infinite, or not to be found."""
+    """One parameter in boundary units; values are None if infinite or unknown."""
 
     owner: str
     name: str
@@ -189,7 +189,7 @@ def _rows(report: SystemReport) -> Iterator[_Row]:
 
 
 def table(report: SystemReport) -> str:
-    """Return the verdict, where everything is, and α of each pair, as text."""
+    """Return the verdict, the positions, and α of each pair as text."""
     lines = [report.verdict, "", *_place_lines(report)]
     if report.found is not None:
         lines += [f"not seen: {words}" for words in report.found.unseen]

@@ -29,51 +29,52 @@ from service.estimation.solver import Projection
 Array = NDArray[np.float64]
 
 FLOOR_SUBAP = 3e-4
-"""1 σ of where a point of the pupil is seen, that no matrix is free of: of a shift, and at the
-pupil's edge of a rotation. Noise-free matrices of other codes, of the same mirror at 0.3 to 1.1
-subapertures, were read off by 0.017 to 0.038 % of one (RMS of a shift); modes of a sensor of 20
-subapertures, modulated by 20 points, by 0.05 % and 0.0017 deg."""
+"""Smallest 1 σ of a point's position on the pupil: of a shift, and at the pupil's edge of a
+rotation. Noise-free matrices of other codes, of the same mirror at 0.3 to 1.1 subapertures, were
+fitted with errors of 0.017 to 0.038 % (RMS of a shift); with modes of a sensor of 20 subapertures,
+modulated by 20 points, 0.05 % and 0.0017 deg."""
 
 MAGNIFICATION_FLOOR = 1e-4
-"""The same of the magnification: of those matrices 3e-5 with modes, 1.2e-4 with actuators."""
+"""Smallest 1 σ of the magnification: the error on those matrices was 3e-5 with modes, 1.2e-4 with
+actuators."""
 
 LOCAL_MAGNIFICATION_FLOOR = 1e-3
-"""The same where each subaperture is divided by its own flux: those at the border then weigh as
-much as full ones. Matrices of HCIPy with 20 subapertures were read 2e-4 to 6e-4 too small, others
-0.1 to 0.3 %."""
+"""The same if each subaperture is normalised by its own flux, because border subapertures then
+weigh as much as full ones. Matrices of HCIPy with 20 subapertures were fitted 2e-4 to 6e-4 too
+small, others 0.1 to 0.3 %."""
 
 WEAK_MODULATION_FLOOR = 1e-3
-"""The same of a pyramid that is modulated by little more than the width of a star. OOPAO samples a
-circle of 1 λ/D by 8 points: matrices of it were read 0.1 to 0.3 % wrong, and with an FFT pyramid of
-12 subapertures those 8 points alone move the magnification by 2.7e-4."""
+"""The same for a pyramid with a modulation of little more than the width of a star. OOPAO samples a
+circle of 1 λ/D by 8 points: its matrices were fitted with errors of 0.1 to 0.3 %, and with an FFT
+pyramid of 12 subapertures those 8 points alone change the magnification by 2.7e-4."""
 
 FAR_SHARE = np.array([1.5e-3, 1.5e-3, np.deg2rad(2.5e-3), 2.5e-4])
-"""1 σ by parameter over the length of the shift in subapertures: far off, a mirror of another kind
-parts from the model at the border. Of 24 telescopes at 0.66 to 1.0 subapertures with it, 23 lie
-inside the 95 % ellipse; without what it adds to rotation and magnification 20 did."""
+"""1 σ of each parameter over the length of the shift in subapertures: with a large shift, a mirror
+of another kind differs from the model at the border. Of 24 telescopes at 0.66 to 1.0 subapertures,
+23 are inside the 95 % ellipse; without the terms for rotation and magnification it was 20."""
 
 STRANGE_RESIDUAL = 0.095
-"""Share of the signal that a mirror of another kind leaves over. Less has no room for one: what
-a far shift adds is less in proportion, as with other codes, which leave a hundredth."""
+"""Residual share of the signal left by a mirror of another kind. The effect of a large shift is
+reduced in proportion for smaller residuals, as with other codes, which leave one percent."""
 
 REGIONAL_SHARE = np.array([0.53, 0.53, 0.165, 1.43])
-"""Error of the registration over the scatter of the regions of the pupil, by parameter: what pulls
-one region one way pulls another the other way."""
+"""Error of each parameter over the scatter between regions of the pupil: effects of opposite
+regions partly cancel."""
 
 FEW_MODES = 45.0
-"""Number of modes over which errors of the model cease to average out."""
+"""Number of modes above which errors of the model average out."""
 
 FEW_MODES_EXCESS = 5.0
-"""How much larger their share is with hardly any modes, less 1."""
+"""Relative increase of the model errors with hardly any modes."""
 
 FEW_MODES_POWER = np.array([1.0, 1.0, 1.0, 0.5])
-"""By parameter: the magnification feels it less."""
+"""Power of that increase for each parameter: the magnification is less affected."""
 
 OTHER_SHARE = 0.5
 """Probability of an instrument that explains a matrix as well as the file's."""
 
 UNINFORMATIVE = 5.0
-"""1 σ of a set of modes over the median of all, beyond which it does not know a parameter."""
+"""1 σ of a parameter in a set of modes, over the median of all sets, above which it is ignored."""
 
 N_SECTORS, N_RINGS = 12, 3
 MAX_SETS = 8
@@ -82,49 +83,49 @@ MIN_PER_SET = 3
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Uncertainty:
-    """σ of the registration, and how far sets of modes agree."""
+    """Covariance of the registration, and agreement of the sets of modes."""
 
     covariance: Array
-    """``(4, 4)`` of the registration, everything included."""
+    """``(4, 4)`` total covariance of the registration."""
 
     nuisance_sigma: Array
-    """``(n_nuisances,)`` 1 σ of the unknowns beside it."""
+    """``(n_nuisances,)`` 1 σ of the nuisances."""
 
     subset_steps: Array
-    """``(n_sets, 4)`` where each disjoint set of modes alone would go from the common solution."""
+    """``(n_sets, 4)`` step of each disjoint set of modes from the common solution."""
 
     subset_covariance: Array
-    """``(n_sets, 4, 4)`` of these steps by the disagreement of the modes within each set."""
+    """``(n_sets, 4, 4)`` covariance of these steps from the scatter of modes within each set."""
 
     statistical: Array
-    """``(4, 4)`` the part of the covariance that is from noise and the disagreement of sets."""
+    """``(4, 4)`` part of the covariance from noise and the scatter of sets."""
 
     sets: tuple[DisjointSets, ...] = ()
-    """Disjoint sets of modes, actuators and subapertures, each fitted alone."""
+    """Disjoint sets of modes, actuators and subapertures, each fitted separately."""
 
     distortion: Distortion | None = None
-    """The smooth distortion of the mirror that explains most."""
+    """Smooth distortion of the mirror that explains the most."""
 
     @property
     def sigma_statistical(self) -> Array:
-        """``(4,)`` 1 σ from noise and the disagreement of disjoint sets."""
+        """``(4,)`` 1 σ from noise and the scatter of disjoint sets."""
         return np.asarray(np.sqrt(np.diag(self.statistical)))
 
     @property
     def sigma_systematic(self) -> Array:
-        """``(4,)`` 1 σ from errors of the model and explanations that are not excluded."""
+        """``(4,)`` 1 σ from model errors and alternatives that are not excluded."""
         rest = np.diag(self.covariance) - np.diag(self.statistical)
         return np.asarray(np.sqrt(np.maximum(rest, 0.0)))
 
     def with_moves(self, moves: Array, shares: Array) -> Uncertainty:
-        """Return the uncertainty with other explanations of the matrix in its systematic part.
+        """Return the uncertainty with alternatives added to its systematic part.
 
         Parameters
         ----------
         moves
-            ``(n, 4)`` how far each explanation moves the registration, numeric units.
+            ``(n, 4)`` change of the registration under each alternative, numeric units.
         shares
-            ``(n,)`` how much of its square counts: 1 for one that the matrix prefers.
+            ``(n,)`` weight of its square: 1 for an alternative that the matrix prefers.
         """
         if not len(moves):
             return self
@@ -146,8 +147,8 @@ class Uncertainty:
     def subset_tension(self) -> float:
         """Largest distance of a set from the common solution, in its own σ.
 
-        A parameter that a set knows far worse than the others do is left out: its step is longer
-        than the model is linear.
+        A parameter whose σ in a set is far above the median is ignored, because its step exceeds
+        the linear range of the model.
         """
         if len(self.subset_steps) < 2:
             return 0.0
@@ -177,29 +178,31 @@ def uncertainty(
     Parameters
     ----------
     projection
-        At the solution.
+        Projection at the solution.
     values
-        ``(n_unknowns,)`` of the nuisances at the solution; 0 for the registration, whose prior is
-        none.
+        ``(n_unknowns,)`` values of the nuisances at the solution; 0 for the registration, which has
+        no prior.
     prior
         ``(n_unknowns,)`` weight of the prior of each unknown: its reciprocal variance times
         ``dispersed``.
     regions
         ``(n_rows,)`` region of the pupil of each slope.
     places
-        ``(n_rows, 2)`` where each slope is seen, pupil radii.
+        ``(n_rows, 2)`` position of each slope, pupil radii.
     dispersed
-        Number of dependent slopes that count as one, see ``dispersion``.
+        Number of correlated slopes that count as one, see ``dispersion``.
     shift_subap
-        Length of the shift at the solution: part of the model's error grows with it.
+        Length of the shift at the solution, subapertures: part of the model's error is proportional
+        to it.
     radius_subap
-        Of the pupil.
+        Radius of the pupil, subapertures.
     magnification_floor
-        What no magnification is surer than.
+        Smallest 1 σ of the magnification.
     residual_fraction
-        RMS of what is left over RMS of the measurement: so far the mirror may be another.
+        RMS of the residual over RMS of the measurement; it limits the difference between mirror and
+        model.
     noise_share
-        Share of the power of what is left over that is noise, 0 to 1.
+        Share of the residual's power that is noise, 0 to 1.
     mode_sets, pupil_sets
         Partitions into disjoint sets: the set of each mode ``(n_modes,)``, of each slope
         ``(n_rows,)``.
@@ -257,17 +260,17 @@ def uncertainty(
 
 
 def pupil_places(valid: NDArray[np.bool_], n_planes: int, radius_subap: float) -> Array:
-    """Return where every signal is seen, ``(n_slopes, 2)`` along x and y, pupil radii."""
+    """Return the position of every signal ``(n_slopes, 2)`` along x and y, pupil radii."""
     y, x = np.stack(np.nonzero(valid)) - (len(valid) - 1) / 2
     return np.tile(np.column_stack([x, y]) / radius_subap, (n_planes, 1))
 
 
 def dispersion(projection: Projection, regions: NDArray[np.intp]) -> float:
-    """Return how many dependent slopes count as one independent slope, at least 1.
+    """Return how many correlated slopes count as one independent slope, at least 1.
 
-    Parts of a projection, its modes or the regions of the pupil ``(n_rows,)``, pull the unknowns
-    apart. If slopes were independent, the squares of these pulls would add up to the variance of
-    the residual times the normal matrix; where errors are common to a part, they add up to more.
+    Modes, or regions of the pupil ``(n_rows,)``, each contribute a gradient by the unknowns. If
+    slopes were independent, the squares of these gradients would add up to the variance of the
+    residual times the normal matrix; errors common to a mode or region increase the sum.
     """
     n_unknowns = len(projection.jacobian)
     noise = projection.chi / max(projection.residual.size - len(projection.gains), 1)
@@ -281,7 +284,7 @@ def dispersion(projection: Projection, regions: NDArray[np.intp]) -> float:
 
 
 def pupil_regions(valid: NDArray[np.bool_], n_planes: int) -> NDArray[np.intp]:
-    """Return the region, sector and ring of equal area, of every signal ``(n_slopes,)``."""
+    """Return the region of every signal ``(n_slopes,)``: sector, and ring of equal area."""
     n = len(valid)
     y, x = np.stack(np.nonzero(valid)) - (n - 1) / 2
     sector = np.floor((np.arctan2(y, x) / (2 * np.pi) + 0.5) * N_SECTORS).astype(np.intp)
@@ -291,13 +294,13 @@ def pupil_regions(valid: NDArray[np.bool_], n_planes: int) -> NDArray[np.intp]:
 
 
 def _sandwich(spread: Array, scores: Array) -> Array:
-    """Return the covariance of all unknowns when columns of ``scores`` are independent."""
+    """Return the covariance of all unknowns if columns of ``scores`` are independent."""
     pulled = spread @ scores
     return np.asarray(pulled @ pulled.T)
 
 
 def _at_least(covariance: Array, other: Array) -> Array:
-    """Return a covariance with the correlations of the first and the larger σ of both."""
+    """Return the first covariance, scaled to the larger σ of both with its correlations."""
     own, least = np.sqrt(np.diag(covariance)), np.sqrt(np.diag(other))
     if not np.all(own > 0.0):
         return other
@@ -306,7 +309,7 @@ def _at_least(covariance: Array, other: Array) -> Array:
 
 
 def _regional_scores(projection: Projection, regions: NDArray[np.intp]) -> Array:
-    """Return ``(n_unknowns, n_regions)`` what each region says each unknown should do."""
+    """Return the gradient by the unknowns from each region ``(n_unknowns, n_regions)``."""
     weighted = projection.residual * projection.weights
     by_slope = np.einsum("ksm,sm->ks", projection.jacobian, weighted)
     return np.array([np.bincount(regions, row) for row in by_slope])
@@ -317,8 +320,8 @@ def _subsets(
 ) -> tuple[Array, Array]:
     """Return the step of every set of modes ``(n_sets, 4)`` and its covariance.
 
-    The covariance of a set is from how its modes scatter about the set's own solution: about the
-    common one, sets that agree within themselves and not with each other would hide it.
+    The covariance of a set is from the scatter of its modes around its own solution. The scatter
+    around the common solution would hide sets that agree within themselves but not with each other.
     """
     steps, covariances = [], []
     for k in range(n_sets):

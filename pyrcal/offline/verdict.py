@@ -1,12 +1,12 @@
 """Decide whether a fit determines the registration.
 
-What moves the registration decides, never a share of residual: uneven light leaves a third of the
-signal although the registration is right, and a wrong stop leaves a tenth although it is wrong.
-The registration is determined if disjoint sets of modes agree, if no other minimum is nearly as
-good, if one orientation is clearly the best, if no other instrument explains the matrix better and
-moves the registration by more than σ, if the gains are those of one basis, and if σ is small enough
-to be useful. Whether the model is good enough to control with is another question:
-:mod:`pyrcal.offline.control_check`.
+The verdict depends on changes of the registration, never on the size of the residual: uneven light
+leaves a third of the signal although the registration is correct, and a wrong stop leaves a tenth
+although it is wrong. The registration is determined if disjoint sets of modes agree, if no other
+minimum is nearly as good, if one orientation is clearly the best, if no other instrument explains
+the matrix better and changes the registration by more than σ, if the gains are those of one basis,
+and if σ is small enough to be useful. Whether the model is good enough for control is checked
+separately: :mod:`pyrcal.offline.control_check`.
 """
 
 from __future__ import annotations
@@ -28,97 +28,99 @@ from service.model.misregistration import BOUNDARY_SCALE
 Array = NDArray[np.float64]
 
 MAX_UNEXPLAINED_RATIO = 2.0
-"""What is left over and is no noise, over what the model explains, both as powers. With the modes
+"""Largest power of the structured residual over the power that the model explains. With the modes
 of another basis or in a false minimum the model explains a quarter of the signal or less."""
 
 MIN_CHANCE_RATIO = 4.0
-"""Power that the model explains over what it explains of pure noise, where one gain is fitted for
-each mode."""
+"""Smallest power that the model explains over what it explains of pure noise, with one gain fitted
+for each mode."""
 
 NOTABLE_STRUCTURE = 0.09
-"""RMS share of the signal left over that is no noise, for which a cause is named in a note."""
+"""RMS share of the signal in the structured residual above which a note names a cause."""
 
 MAX_TENSION = 5.0
-"""Distance of a set of modes from the others, in its own σ."""
+"""Largest distance of a set of modes from the others, in its own σ."""
 
 MOST_GAIN = 500.0
-"""Of all modes, or one over it: a thousand between two units is beyond, whatever the light."""
+"""Largest median gain, and the reciprocal of the smallest: illumination cannot explain a factor of
+1000, a unit can."""
 
 MAX_SCATTER = 0.35
-"""Robust relative scatter of the gains; modes of another basis scatter by more than this."""
+"""Largest robust relative scatter of the gains; modes of another basis have a larger one."""
 
 LARGEST_SIGMA = np.array([0.3, 0.3, np.deg2rad(3.0), 0.06])
-"""Less certain than this is not determined (numeric units)."""
+"""Largest 1 σ of a determined registration (numeric units)."""
 
 STRANGEST = 3.0
-"""Distance of such a logarithm from the file's, over its usual one, that no file is wrong by."""
+"""Largest plausible deviation of a logarithm from the file's, in units of its prior σ."""
 
 ALIKE = 2.0
-"""Misfits of two rivals within this factor leave open which is right: to first order each."""
+"""Ratio of two alternatives' misfits within which neither is preferred: both are first order."""
 
 MAX_DISPLACEMENT = 1.0
-"""An instrument that explains the matrix better and moves the registration by less than so many σ
-does not make it undetermined: its move is in σ, and the advice is to correct the file."""
+"""Change of the registration in σ up to which a better explanation does not make it undetermined:
+the change enters σ, and the advice is to correct the file."""
 
 CANNOT_TELL = "the matrix cannot tell which"
 
 _PASSES = 0.12
-"""By which gains are off a factor of two, and scatter, that is forgotten in all of them."""
+"""Largest relative deviation from a factor of two, and scatter, that indicates a forgotten pass."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FitFindings:
-    """All that a verdict is based on."""
+    """All inputs of a verdict."""
 
     solution: Solution
     residual_fraction: float
     structure: float
-    """RMS share of the signal that is left over and is no noise."""
+    """RMS share of the signal that is left over and is not noise."""
 
     after_light: float
-    """The same if a smooth gain over the pupil, as uneven light makes, were fitted too."""
+    """The same if a smooth gain over the pupil, as from uneven light, were also fitted."""
 
     uncertainty: Uncertainty
     before: Uncertainty
-    """The same without the explanations that the data do not exclude."""
+    """Uncertainty without the alternatives that the data do not exclude."""
 
     landing: Landing | None
-    """Where the starts led; None for methods that do not search."""
+    """Result of the coarse search; None for methods without one."""
 
     rivals: tuple[Rival, ...]
-    """Other instruments, the one that explains the matrix best first."""
+    """Other instruments, the best explanation first."""
 
     off_centre: Alternative | None
-    """A pupil off the subapertures' middle, where another stop would move the pupil as well."""
+    """Preferred alternative with a decentred pupil, if another stop would displace the pupil as
+    well."""
 
     alternatives: tuple[Alternative, ...]
-    """Every other explanation that was tried."""
+    """Every alternative that was tried."""
 
     optics: tuple[FoundOptic, ...]
-    """What was found of the instrument itself."""
+    """Fitted optical quantities."""
 
     narrow: SeenPupil | None
-    """A pupil's image that is narrower than the file says; None: it is as wide."""
+    """Pupil image that is narrower than in the file; None if it is as wide."""
 
     with_file_values: FileValuesFit | None
-    """The fit with all of these as in the file; None where none differs notably."""
+    """Fit with the file's values of ``optics``; None if none differs significantly."""
 
     axes: str
-    """Why the orientation cannot be told; empty: it can."""
+    """Reason if the orientation cannot be determined; empty if it can."""
 
     passes: int
-    """How often the light is said to have met the mirror."""
+    """Stated number of reflections by the mirror."""
 
     stroke_known: bool
 
     @property
     def sigma_of_sets(self) -> Array:
-        """``(4,)`` 1 σ without other explanations: noise, disjoint sets, floor of the model."""
+        """``(4,)`` 1 σ without alternatives: noise, disjoint sets, floor of the model."""
         return np.asarray(np.sqrt(np.diag(self.before.covariance)))
 
     @property
     def explained(self) -> bool:
-        """Whether the model explains enough for anything that was fitted to be a finding."""
+        """True if the model explains enough for fitted quantities to be meaningful."""
         power = 1.0 - self.residual_fraction**2
         n_rows = len(self.solution.projection.residual)
         return (
@@ -127,7 +129,7 @@ class FitFindings:
 
 
 class Refusal(StrEnum):
-    """Why a fit is refused."""
+    """Reason of a refused fit."""
 
     AXES = "axes"
     ANOTHER_PUPIL = "another pupil"
@@ -142,7 +144,7 @@ class Refusal(StrEnum):
 
 
 def judged(findings: FitFindings) -> tuple[Refusal | None, str]:
-    """Return why the registration is refused, or None, and the verdict on one line."""
+    """Return the reason of a refusal, or None, and the verdict in one line."""
     for reason, refusal in (
         (Refusal.AXES, findings.axes),
         (Refusal.ANOTHER_PUPIL, _another_pupil(findings)),
@@ -237,12 +239,12 @@ def _another_instrument(findings: FitFindings) -> str:
 
 
 def _displaces(findings: FitFindings, moved: Array) -> bool:
-    """Return whether another explanation moves the registration by more than σ has room for."""
+    """Return True if an explanation changes the registration by more than ``MAX_DISPLACEMENT``."""
     return bool(np.any(np.abs(moved) > MAX_DISPLACEMENT * findings.sigma_of_sets))
 
 
 def _which(findings: FitFindings, rival: Rival) -> str:
-    """Return the other instrument, or the two that the matrix cannot tell apart."""
+    """Return the other instrument, or both if the matrix does not distinguish them."""
     of_rival = f"with {rival.change.words} the misfit is {rival.share:.0%} of what it is now"
     off = findings.off_centre
     if off is None or off.share is None or off.share > ALIKE * rival.share:
@@ -301,9 +303,10 @@ def _another_unit(findings: FitFindings) -> str:
 
 
 def factor_of_passes(findings: FitFindings) -> float | None:
-    """Return 2 or 0.5 where gains, uniform or not, look like a forgotten factor; else None.
+    """Return 2 or 0.5 if the gains indicate a forgotten factor, else None.
 
-    Half the slopes after one pass are what the sky leaves of them.
+    Half the slopes after one pass are no such case: residual turbulence reduces the gain by as
+    much.
     """
     middle = float(np.median(findings.solution.projection.gains))
     if not findings.stroke_known:

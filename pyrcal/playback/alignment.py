@@ -16,44 +16,45 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 MAX_FRAMES: Final = 3000
-"""Frames that are looked at."""
+"""Largest number of frames used."""
 
 MIN_FRAMES: Final = 400
-"""Fewer do not tell."""
+"""Smallest number of frames for a measurement."""
 
 MAX_APART_FRAMES: Final = 6
-"""Streams that are further apart are not recognised."""
+"""Largest offset of the streams that is recognised, frames."""
 
 MAX_COMPONENTS: Final = 200
-"""Principal components of the slopes that predict."""
+"""Largest number of principal components of the slopes used as predictors."""
 
 FRAMES_PER_COMPONENT: Final = 4
 
 N_MODES: Final = 16
-"""Modes whose commands are predicted: those that change most."""
+"""Number of modes whose commands are predicted: those with the largest changes."""
 
 PREDICTED: Final = 0.3
-"""Share of the variance of changes that slopes of the right frame predict at least. Measured at the
-right delay: 0.84 to 0.95; at all others below 0."""
+"""Smallest share of the variance of changes that slopes predict at the true delay. Measured at the
+true delay: 0.84 to 0.95; at all others below 0."""
 
 MIN_MODES: Final = 2
-"""Modes that must be predicted: a dither of one frequency predicts itself at any delay."""
+"""Smallest number of predicted modes: a dither of one frequency predicts itself at any delay."""
 
 CLEARER: Final = 1.5
-"""Ratio of the predicted shares of the right delay and of any other that is not its neighbour."""
+"""Smallest ratio of the predicted shares at the true delay and at any other that is not its
+neighbour."""
 
 
 def measure_delay(slopes: Array, commands: Array, delay_frames: float) -> int | None:
-    """Return after how many frames slopes lead to commands, or None if they do not show it.
+    """Return the delay from slopes to commands in frames, or None if it is not measurable.
 
     Parameters
     ----------
     slopes
         ``(n_frames, n_slopes)``, without gaps.
     commands
-        ``(n_frames, n_modes)``, without the dither where it is known.
+        ``(n_frames, n_modes)``, without the dither if it is known.
     delay_frames
-        As stated; delays within ``MAX_APART_FRAMES`` of it are tried.
+        Stated delay, frames; delays within ``MAX_APART_FRAMES`` of it are tried.
     """
     n = min(len(slopes), MAX_FRAMES)
     if n < MIN_FRAMES:

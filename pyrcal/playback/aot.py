@@ -29,24 +29,26 @@ UNITS_M = {None: 1.0, "": 1.0, "m": 1.0, "um": 1e-6, "nm": 1e-9}
 """Metres of OPD in a unit of modal commands; without one they are metres."""
 
 OFF_THE_BEAT = 0.25
-"""Of a frame, by which a time may be off the rate."""
+"""Largest deviation of a time from the frame rate, frames."""
 
 NO_MODES = 1e-2
-"""RMS share of the actuators' commands that no mode makes: more, and modes do not tell them."""
+"""Largest RMS share of the actuator commands outside the modes' span; with a larger one, modes do
+not represent the commands."""
 
 
 @dataclass(kw_only=True, slots=True)
 class AotTelemetry:
-    """What an AOT file holds of a night."""
+    """Contents of an AOT file of a night."""
 
     registrations: tuple[Dated, ...]
-    """The file's own α over time; empty: it says none."""
+    """α over time from the file itself; empty if it has none."""
 
     arrays: dict[str, Array] = field(default_factory=dict)
-    """As ``pyrcal.playback.arrays`` names them, in the RTC's order; empty: no frames."""
+    """Arrays by the names of ``pyrcal.playback.arrays``, in the RTC's order; empty without frames.
+    """
 
     notes: list[str] = field(default_factory=list)
-    """What was taken for granted, and what is not played, one sentence each."""
+    """Notes on assumptions and on data that are not played, one sentence each."""
 
 
 def read_telemetry(path: Path, instrument: Instrument) -> AotTelemetry:

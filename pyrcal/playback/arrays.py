@@ -62,18 +62,18 @@ from service.wire import (
 Array = NDArray[np.float64]
 
 STATUS_S: Final = 0.5
-"""Between two statuses."""
+"""Time between two statuses, seconds."""
 
 MAX_NUMBER: Final = 1e12
 """Largest slope, command (m) or element of a reconstructor (m per slope), in whatever unit: larger
 ones overflow single precision once they are squared and summed."""
 
 MIN_APART_FRAMES: Final = 1.5
-"""Difference between the delay found and the stated one from which streams are said to be apart; a
-stated delay need not be whole."""
+"""Smallest difference of measured and stated delay that is reported as an offset of the streams; a
+stated delay need not be an integer."""
 
 _LOOKED_AT: Final = 2000
-"""Frames of the dither in which each of its modes has to move."""
+"""Number of frames of the dither in which each of its modes must move."""
 
 MAX_RATE_HZ: Final = 1e6
 MAX_DELAY_FRAMES: Final = 100.0
@@ -92,12 +92,12 @@ MATRIX_ID: Final = "of-the-file"
 
 @contextmanager
 def opened_arrays(path: Path) -> Iterator[Arrays]:
-    """Open a file of arrays.
+    """Open a file of arrays and close it at the end of the ``with`` block.
 
     Raises
     ------
     ConfigurationError
-        If it is none, misses what is needed, or its arrays do not fit together.
+        If the file is of another kind, lacks a required array, or its arrays do not fit together.
     """
     with contextlib.ExitStack() as stack:
         try:
@@ -117,7 +117,7 @@ def opened_arrays(path: Path) -> Iterator[Arrays]:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Arrays:
-    """Telemetry of a file; what is large stays in it until it is played."""
+    """Telemetry in a file; large arrays are read when they are played."""
 
     path: Path
     found: Mapping[str, Any]
@@ -233,7 +233,7 @@ class Arrays:
         )
 
     def _rows(self, first: int, last: int, n_modes: int) -> NDArray[np.float32]:
-        """Return some frames as they travel; modes that the file does not tell of stand still."""
+        """Return some frames in wire format; modes missing from the file are zero."""
         with np.errstate(over="ignore"):  # infinite in single precision: left out as such
             parts = [np.asarray(self.found["slopes"][first:last], np.float32)]
             for name in ("commands_m", "dither_m"):
@@ -285,7 +285,7 @@ class Arrays:
         )
 
     def _dither(self, rate_hz: float, n_given: int, n_frames: int) -> DitherStatus | None:
-        """Return the sines that play from the first frame on; None: the file tells of none."""
+        """Return the sines that play from the first frame; None if the file describes none."""
         names = ("dither_modes", "dither_frequencies_hz", "dither_amplitude_m")
         if not any(map(self._has, names)):
             return None

@@ -1,8 +1,8 @@
-"""Play recorded telemetry to the tracker: time is that of the recording.
+"""Play recorded telemetry to the tracker, with the time of the recording.
 
-Intake, estimators, worker and tracker are the service's own, so α comes out as it did that night.
-Only the worker's load is missing: live, windows that end while it is busy are fitted together, and
-about the α of a moment later.
+Intake, estimators, worker and tracker are the service's own, so α is the same as in that night.
+Only the worker's load is missing: live, windows that end while it is busy are fitted together, at
+the α of a moment later.
 """
 
 from __future__ import annotations
@@ -49,48 +49,48 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 TICK_S: Final = 1.0
-"""As often as the service's tracker hears that time goes by."""
+"""Time between two clock events of the service's tracker, seconds."""
 
 NOT_CARRIED_OUT: Final = "unsupported: telemetry of before"
 
 
 @dataclass(slots=True, kw_only=True)
 class Track:
-    """What the estimators have made of telemetry."""
+    """Results of the estimators from telemetry."""
 
     entries: list[HistoryEntry] = field(default_factory=list)
-    """Every measurement of α, in the order in which it was taken in."""
+    """Measurements of α, in the order in which they were processed."""
 
     passive: list[PassiveState] = field(default_factory=list)
-    """What ordinary telemetry says of α by itself, each estimate with its bias in it."""
+    """Estimates of α from ordinary telemetry alone, each with its bias included."""
 
     lines: list[LogEntry] = field(default_factory=list)
-    """What the tracker has logged."""
+    """Log entries of the tracker."""
 
     noisy: NoisyMatrix | None = None
-    """The interaction matrix that the last random dither holds; None: there was none."""
+    """Interaction matrix from the last random dither; None if there was none."""
 
     stated: tuple[Dated, ...] = ()
-    """α that the file itself says, in its order; only AOT files do."""
+    """α from the file itself, in its order; only AOT files have it."""
 
     misaligned: str = ""
-    """How far apart slopes and commands were stored; empty: as stated, or it does not show."""
+    """Measured offset between slopes and commands; empty if it is as stated or not measurable."""
 
     n_frames: int = 0
-    """Used."""
+    """Number of frames used."""
 
     n_missing: int = 0
-    """Between these, by their numbers."""
+    """Number of frames missing between these, from their sequence numbers."""
 
     n_gaps: int = 0
-    """Places where some are missing."""
+    """Number of gaps."""
 
     first_ns_utc: int = 0
     last_ns_utc: int = 0
-    """End of the first and of the last used frame, the RTC's clock."""
+    """End of the last used frame, the RTC's clock; ``first_ns_utc`` is that of the first."""
 
     state: TrackerState
-    """At the end."""
+    """State of the tracker at the end."""
 
     @property
     def t(self) -> NDArray[np.float64]:
@@ -105,7 +105,7 @@ class Track:
 
     @property
     def sigma(self) -> NDArray[np.float64]:
-        """``(n, 4)`` 1 σ of ``alpha``, the model's error included."""
+        """``(n, 4)`` 1 σ of ``alpha``, model error included."""
         return _at_boundary([entry.filtered_sigma for entry in self.entries])
 
     def plot(self, title: str = "") -> Figure:
@@ -130,7 +130,8 @@ class Player:
     """Driver of an engine without network, processes and clocks."""
 
     first: Callable[[], Done[None]] | None = None
-    """The one worker there is learns what it is told by itself; nobody else would need it."""
+    """Job for new workers, required by the interface; not used here, because the only worker has
+    already run it."""
 
     found_slopes: SlopeRecipe | None = None
 
@@ -164,7 +165,7 @@ class Player:
         self._engine.set_description(self._optics.describe())
 
     async def play(self, messages: Iterable[Message], progress: Callable[[float], None]) -> Track:
-        """Play messages in the order of sending; ``progress`` is told the seconds played."""
+        """Play messages in the order of sending; ``progress`` receives the seconds played."""
         for message in messages:
             self._now_s = max(self._now_s, message.time_s)
             self._take(message)
@@ -182,7 +183,7 @@ class Player:
         return self.track
 
     def _take(self, message: Message) -> None:
-        """Take one message in as the link does; one that breaks the contract is counted there."""
+        """Process one message like the link; the link counts messages that break the contract."""
         try:
             match message.kind:
                 case RecordedKind.FRAMES:
@@ -198,7 +199,7 @@ class Player:
             self._intake.malformed(message.kind.name.lower(), error)
 
     def _set_clock(self, message: Message) -> None:
-        """Have the service's clock agree with the RTC's, from its first status on."""
+        """Set the service's clock to the RTC's, from its first status on."""
         if not self._began_ns:
             now_ns = decode(Status, message.payload).t_ns
             self._began_ns = now_ns - round(message.time_s * SECOND_NS)
@@ -212,7 +213,7 @@ class Player:
         self._engine.post(ev.MatrixFetched(record=ReconstructorRecord.brought(manifest)))
 
     async def _look(self) -> None:
-        """Take in frames, then the events after them, as the service does."""
+        """Process frames, then the events after them, like the service."""
         while True:
             blocks = self._intake.drain(before_events=True)
             self._engine.feed(blocks)
@@ -253,7 +254,7 @@ class Player:
             self._random = window
 
     async def _hear_matrix(self) -> None:
-        """Learn how the RTC lists slopes and counts commands from a matrix that it has taken."""
+        """Learn the order of slopes and the unit of commands from a matrix that the RTC uses."""
         in_use, self._unheard = self._unheard, None
         record = None if in_use is None else self._engine.state.reconstructor(in_use)
         if in_use is None or record is None or in_use not in self._matrices:
@@ -287,7 +288,7 @@ class Player:
         return self._began_ns + round(self._now_s * SECOND_NS)
 
     def stepped(self, before: TrackerState, event: Event) -> None:
-        """Note what is new."""
+        """Record new log entries and measurements."""
         after = self._engine.state
         passive = after.alpha.passive
         if passive is not None and passive is not before.alpha.passive:
@@ -298,20 +299,20 @@ class Player:
         self.track.entries += [e for e in after.alpha.history if id(e) not in seen]
 
     def fit(self, window: EndedWindow) -> None:
-        """Take a window that is to be fitted."""
+        """Queue a window for fitting."""
         self._windows.append(window)
 
     def swapped(self, in_use: str | None) -> None:
-        """Note which matrix is in use."""
+        """Record the matrix in use."""
         self._unheard = in_use
 
     def sensor_mode_changed(self, config_id: str) -> None:
-        """Make the model of another mode of the sensor."""
+        """Build the model of another mode of the sensor."""
         self._engine.set_description(self._optics.enter_mode(config_id))
         self._unheard = self._engine.state.matrices.in_use
 
     def perform(self, effect: Effect) -> None:
-        """Refuse a dither, whose answer is waited for; nothing else is carried out either."""
+        """Answer a dither request with a refusal; other effects are ignored."""
         if isinstance(effect, ev.Ask) and isinstance(effect.request, DitherRequest):
             refused = Reply(
                 id=effect.request.id, accepted=False, reason=NOT_CARRIED_OUT, start_seq=None
@@ -321,5 +322,5 @@ class Player:
     async def call(
         self, job: Callable[Concatenate[OpticsWorker, P], R], *args: P.args, **kwargs: P.kwargs
     ) -> R:
-        """Run a method of the worker here and now."""
+        """Run a method of the worker synchronously."""
         return job(self._optics, *args, **kwargs)

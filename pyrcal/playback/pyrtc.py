@@ -1,9 +1,10 @@
-"""A session of pyRTC's recorder, as arrays that ``pyrcal track`` plays.
+"""Read a session of pyRTC's recorder as arrays for ``pyrcal track``.
 
-``Telemetry.save([signal, wfc], n)`` of pyRTC 2 writes a folder: ``session.json``, and of each
-stream its frames and the frame ids. An id says which exposure a signal or a command answers, so
-commands are paired by it. What no session has lies beside it in ``loop.npz``, by the names of
-:mod:`pyrcal.playback.arrays`: ``delay_frames``, ``gains``, ``leak``, ``reconstructor``...
+``Telemetry.save([signal, wfc], n)`` of pyRTC 2 writes a folder: ``session.json``, and for each
+stream its frames and the frame ids. An id names the exposure that a signal or a command belongs to,
+so commands are paired by it. Data that no session contains are read from ``loop.npz`` in the same
+folder, by the names of :mod:`pyrcal.playback.arrays`: ``delay_frames``, ``gains``, ``leak``,
+``reconstructor``...
 """
 
 from __future__ import annotations
@@ -26,23 +27,23 @@ Array = NDArray[Any]
 MANIFEST: Final = "session.json"
 FACTS: Final = "loop.npz"
 SLOPES, COMMANDS = "signal", "wfc"
-"""How pyRTC calls the streams; a name may have something before it."""
+"""Names of pyRTC's streams of slopes and commands; a name may have a prefix."""
 
 DELAY_FRAMES: Final = 2.0
 
 
 def is_session(path: Path) -> bool:
-    """Whether this is a folder that pyRTC's recorder has written, or its ``session.json``."""
+    """Return True for a folder written by pyRTC's recorder, or its ``session.json``."""
     return _folder(path).joinpath(MANIFEST).is_file()
 
 
 def read_session(path: Path, instrument: Instrument) -> dict[str, Array]:
-    """Return the frames whose commands are known, and what ``loop.npz`` says.
+    """Return the frames whose commands are known, and the values of ``loop.npz``.
 
     Raises
     ------
     ConfigurationError
-        If it cannot be read, or is not of this instrument: what was found, expected, and where.
+        If it cannot be read, or belongs to another instrument.
     """
     folder = _folder(path)
     streams = _streams(folder)

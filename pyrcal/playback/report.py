@@ -1,4 +1,4 @@
-"""What was made of telemetry: as a table, as one document, as HDF5, as a plot."""
+"""Report the results of telemetry as a table, as one document, as HDF5, as a plot."""
 
 from __future__ import annotations
 
@@ -36,22 +36,22 @@ DIGITS = (4, 4, 4, 5)
 UNITS = ("subaperture", "subaperture", "degree", "")
 
 ENOUGH = 5
-"""Windows whose scatter says something."""
+"""Smallest number of windows for which the scatter is reported."""
 
 _COLOURS = {Source.PASSIVE: "0.8", Source.RANDOM: "tab:green", Source.LOCK_IN: "tab:blue"}
-"""What is drawn last decides how much of α is shown."""
+"""Colours by source; later ones are plotted on top."""
 
 _OF_MISALIGNED = frozenset(
     {"modes-contrary", "modes-uneven", "response-mismatch", "window.refused"}
 )
-"""Alarms and warnings that streams of different frames raise by themselves."""
+"""Alarms and warnings that misaligned streams alone can cause."""
 
 _REASONS = 8
-"""Kinds of refusals and warnings that the table names."""
+"""Number of kinds of refusals and warnings listed in the table."""
 
 
 def table(track: Track) -> str:
-    """Return the result in a few lines: what was found, by what, and what was the matter."""
+    """Return the result in a few lines: α, its source, and problems."""
     seconds = (track.last_ns_utc - track.first_ns_utc) / SECOND_NS
     windows = track.state.windows
     missing = f", {track.n_missing} missing in {track.n_gaps} gaps" if track.n_missing else ""

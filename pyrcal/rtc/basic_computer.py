@@ -81,7 +81,7 @@ class BasicComputer:
         self.leak = leak
         """Factor of the integrator per frame."""
         self.closed = True
-        """Whether the loop is closed. When it opens, the integrator must be set to zero."""
+        """True if the loop is closed. When it opens, the integrator must be set to zero."""
         self.seq = 0
         """Sequence number of the next frame."""
         self._start_ns = time.time_ns()
@@ -129,7 +129,7 @@ class BasicComputer:
 
     @property
     def has_swapped(self) -> bool:
-        """Whether a swap has not been reported yet: call ``RtcLink.report_matrices``."""
+        """True if a swap has not been reported yet: call ``RtcLink.report_matrices``."""
         return bool(self._swaps)
 
     def begin_batch(self, n_frames: int) -> Array32:

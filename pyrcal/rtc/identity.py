@@ -32,7 +32,7 @@ class Identity:
     """Name of the sensor configuration. It must change when the sensor's geometry changes."""
 
     double_pass: bool = False
-    """Whether the light meets the mirror twice, as with a retro-reflector by day."""
+    """True if the light is reflected by the mirror twice, as with a retro-reflector by day."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -171,7 +171,7 @@ class Matrices(Background):
         return ""
 
     def _request_current(self) -> None:
-        """Request the matrix that the service wants in use, once, and stage it if it fits.
+        """Request the matrix that the service has selected, once, and stage it if it fits.
 
         Without this, an RTC that starts after the service would keep its own matrix until the next
         update.

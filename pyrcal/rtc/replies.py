@@ -45,7 +45,7 @@ class FinishedMeasurement(Protocol):
 
 
 class Computer(Protocol):
-    """What the link needs of an RTC: a program implements these methods to become one."""
+    """Interface of an RTC program to the link: a program implements these methods."""
 
     identity: Identity
     """Names that the telemetry carries."""

@@ -23,7 +23,7 @@ _MAX_REMEMBERED_ANSWERS = 1000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Terms:
-    """What a new reconstructor must agree with at present."""
+    """Present requirements on a new reconstructor."""
 
     session: str
     """Session of the frames to come."""
@@ -62,7 +62,7 @@ class _Collection:
 
 @dataclass(slots=True, kw_only=True)
 class Outcome:
-    """What the link must do after a message has arrived or a timeout has passed."""
+    """Actions for the link after a message or a timeout."""
 
     acknowledgements: list[Acknowledgement] = field(default_factory=list)
     """Acknowledgements to send, in order."""

@@ -16,32 +16,32 @@ from service.model.defects import COPY, explain_defects, find_defects
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class Mirror:
-    """A mirror as found, and which of its modes cannot be used."""
+    """An imported mirror, and its unusable modes."""
 
     n_modes: int
     n_actuators: int
     table: dict[str, Any]
-    """``[mirror]``."""
+    """Keys of ``[mirror]``."""
 
     arrays: dict[str, Array]
     per_mode: tuple[str, ...] = ()
     """Arrays with one entry for each mode along their first axis."""
 
     defects: dict[int, str] = field(default_factory=dict)
-    """Unusable modes, and why."""
+    """Unusable modes by number, with the reason."""
 
     @property
     def is_zonal(self) -> bool:
-        """Whether a mode is one actuator."""
+        """True if a mode is a single actuator."""
         return self.table.get("basis") == "zonal"
 
     def become_modal(self, n_modes: int) -> None:
-        """Take modes that pyrcal makes of the actuators instead of the actuators themselves."""
+        """Replace the actuators by modes that pyrcal computes from them."""
         del self.table["basis"]
         self.n_modes, self.per_mode, self.defects = n_modes, (), {}
 
     def keep(self, modes: Array) -> None:
-        """Leave out all but these modes of the basis."""
+        """Remove all but these modes of the basis."""
         for name in self.per_mode:
             values = self.arrays[name]
             along_columns = name == "mode_to_actuator"
@@ -52,7 +52,7 @@ class Mirror:
 def read_mirror(
     source: str, arrays: Mapping[str, Array], diameter_m: float, notes: list[str]
 ) -> Mirror:
-    """Return the mirror that positions of actuators or a cube of shapes describe.
+    """Return the mirror described by actuator positions or by a cube of shapes.
 
     Raises
     ------
@@ -129,7 +129,7 @@ def _tabulated(given: Array, diameter_m: float, *, is_basis: bool, notes: list[s
 
 
 def combine(mirror: Mirror, strokes: Array, notes: list[str]) -> None:
-    """Make the mirror's modes combinations of its actuators; unusable ones are left out."""
+    """Make the mirror's modes combinations of its actuators, without unusable ones."""
     n_actuators = mirror.n_actuators
     found = np.asarray(strokes)
     if found.ndim == 2 and found.shape[0] != n_actuators and found.shape[1] != n_actuators:

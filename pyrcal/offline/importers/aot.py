@@ -1,6 +1,6 @@
-"""From an AOT file: telescope, sensor and mirror of the loop with an interaction matrix, and α.
+"""Import an AOT file: telescope, sensor and mirror of a loop, its interaction matrix, and α.
 
-Reading one needs ``aotpy``, the extra ``aot``. AOT has no unit of commands: strokes are unknown.
+This needs ``aotpy``, the extra ``aot``. AOT has no unit of commands, so strokes are unknown.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from pyrcal.offline.importers.registration import Registrations, registrations_o
 from service.errors import ConfigurationError, MatrixError
 
 SENSORS = {"Pyramid": "pyramid", "ShackHartmann": "shack-hartmann"}
-"""AOT's classes, and kinds of sensors."""
+"""Kinds of sensors by AOT's class names."""
 
 _HEADER = 20 * 2880
-"""Bytes in which the version must stand."""
+"""Number of leading bytes that must contain the version."""
 
 
 def read_system(path: Path) -> Any:  # noqa: ANN401 - aotpy has no types
@@ -50,7 +50,7 @@ def read_system(path: Path) -> Any:  # noqa: ANN401 - aotpy has no types
 
 
 def _check(path: Path) -> None:
-    """Refuse what is no AOT file in our own words: aotpy's name options that nobody has here."""
+    """Raise if a file is not an AOT file, because aotpy's own message suggests unusable options."""
     try:
         with path.open("rb") as file:
             begins = file.read(_HEADER)
@@ -136,7 +136,7 @@ def from_aot(
 
 
 def _chosen_loop(path: Path, system: Any, wanted: str | None) -> Any:  # noqa: ANN401
-    """Return the loop that is asked for, or the only one with an interaction matrix."""
+    """Return the requested loop, or the only one with an interaction matrix."""
     measured = [one for one in system.loops if getattr(one, "interaction_matrix", None) is not None]
     if wanted is None:
         if len(measured) == 1:
@@ -165,7 +165,7 @@ def _listed(system: Any) -> str:  # noqa: ANN401
 
 
 def _words(loop: Any) -> str:  # noqa: ANN401
-    """Return what a loop has, in words."""
+    """Return the contents of a loop as text."""
     matrix = getattr(loop, "interaction_matrix", None)
     sensor = loop.input_sensor
     about = "no interaction matrix" if matrix is None else f"matrix {np.shape(matrix.data)}"
@@ -219,10 +219,10 @@ def _mirror(
 
 
 def _by_rows(values: Any, places: Array, where: str) -> Array:  # noqa: ANN401 - aotpy has no types
-    """Return AOT's matrix flat, all x first, subapertures row by row.
+    """Return AOT's matrix in two dimensions, all x first, subapertures row by row.
 
-    The standard has ``(n_valid, 2, n)``; ``(2, n_valid, n)`` and flat ones are found, too. Where a
-    subaperture is listed, the mask says.
+    The standard defines ``(n_valid, 2, n)``; ``(2, n_valid, n)`` and two-dimensional ones are
+    accepted, too. The mask gives the order of the subapertures.
     """
     listed = places_of(places, where)
     n_valid = len(listed)
@@ -239,7 +239,7 @@ def _by_rows(values: Any, places: Array, where: str) -> Array:  # noqa: ANN401 -
 
 
 def places_of(places: Array, where: str) -> Array:
-    """Return where each valid subaperture is listed, row by row, as AOT's mask says.
+    """Return the position of each valid subaperture in AOT's list, row by row.
 
     Raises
     ------

@@ -11,23 +11,23 @@ from service.errors import MatrixError
 from service.model.aperture import OFF_CENTRE_SUBAP, SMALLEST_HOLE
 
 _COHERENT = 0.5
-"""Least correlation of a lit subaperture's response with that of its neighbours. An influence
+"""Smallest correlation of a lit subaperture's response with that of its neighbours. An influence
 function spans several subapertures, so lit neighbours respond alike; noise does not."""
 
 _SMALLEST_SHARE = 0.1
-"""Least share of the grid that is believed to be lit."""
+"""Smallest plausible share of lit subapertures on the grid."""
 
 
 def find_lit(maps: Array, notes: list[str]) -> NDArray[np.bool_]:
-    """Return the subapertures ``(n, n)`` that respond, of maps ``(2, n, n, n_modes)``.
+    """Return the subapertures ``(n, n)`` that respond, from maps ``(2, n, n, n_modes)``.
 
-    Where dark subapertures are exactly 0 or not finite they are left out. Where they hold noise,
-    those are lit whose response is correlated with that of their neighbours.
+    If dark subapertures are exactly 0 or not finite, all others are lit. If dark ones contain
+    noise, those are lit whose response is correlated with that of their neighbours.
 
     Raises
     ------
     MatrixError
-        If no subaperture responds, or lit and dark ones cannot be told apart.
+        If no subaperture responds, or lit and dark ones cannot be distinguished.
     """
     numbers = np.nan_to_num(maps)
     lit = numbers.any(axis=(0, -1))
@@ -82,9 +82,9 @@ def _touches_edge(region: NDArray[np.bool_]) -> bool:
 
 
 def centre_grid(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return a mask on the smallest square grid in whose middle its pupil lies.
+    """Return a mask on the smallest square grid that centres its pupil.
 
-    Subapertures keep their order, so slopes listed by the one are listed by the other.
+    Subapertures keep their order, so the order of the slopes does not change.
     """
     rows, columns = np.flatnonzero(valid.any(axis=1)), np.flatnonzero(valid.any(axis=0))
     filled = scipy.ndimage.binary_fill_holes(valid)

@@ -1,8 +1,8 @@
-"""From a loop of cacao's: an example folder, or the ``conf`` folder of a loop that runs.
+"""Import a loop of cacao: an example folder, or the ``conf`` folder of a running loop.
 
-Files are known by their names, in any letter case, as ``.fits``, ``.fits.gz`` or ``.fits.fz``,
-with anything in front (``aol1_``, ``dmloop.``). A response of single actuators is preferred to one
-of modes. cacao's files have no units: strokes are unknown, and only shapes are compared.
+Files are recognised by their names, in any letter case, as ``.fits``, ``.fits.gz`` or ``.fits.fz``,
+with any prefix (``aol1_``, ``dmloop.``). A response of single actuators is preferred to one of
+modes. cacao's files have no units: strokes are unknown, and only shapes are compared.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ _SUFFIX = re.compile(r"\.(?:fits|fit)(?:\.gz|\.fz)?$", re.IGNORECASE)
 _VARIABLES = re.compile(r"^\s*export\s+CACAO_(\w+)=[\"']?([^\"'#\n]*)", re.MULTILINE)
 
 MAX_DEPTH = 6
-"""Folders within each other that are searched."""
+"""Largest depth of nested folders that are searched."""
 
 MAX_FILES = 10_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Kind:
-    """A response that cacao writes, and what its columns are."""
+    """A response file of cacao, and the meaning of its columns."""
 
     response: str
-    """Pattern of the end of its name, lower case."""
+    """Pattern of the end of the file's name, lower case."""
 
     modes: str | None
-    """Pattern of the name of its modes; None: each column is one actuator."""
+    """Pattern of the name of the modes' file; None if each column is one actuator."""
 
     words: str
 
@@ -56,14 +56,14 @@ RESPONSES = (
     _Kind(response=r"cmmodeswfs|modeswfs", modes=r"cmmodesdm|modesdm|dmmodes", words="modes"),
     _Kind(response=r"lorm", modes=r"lormmodes", words="low-order modes"),
 )
-"""In the order in which they are preferred."""
+"""Kinds of responses in order of preference."""
 
 PICTURES = {
     "valid": r"wfsmask",
     "actuators": r"dmmask|dmmaskctrl",
     "light": r"wfsref",
 }
-"""Other files that are used, and their roles."""
+"""Patterns of other files that are used, by role."""
 
 NOT_USED = {
     r"dmmask-?extr": "its actuators are extrapolated, not controlled",
@@ -77,7 +77,7 @@ INFLUENCE = r"influ_sim|influ"
 
 @dataclass(slots=True, kw_only=True)
 class _Folder:
-    """What was found in a folder."""
+    """Contents of a folder, and the files used so far."""
 
     root: Path
     files: dict[Path, str]
@@ -88,10 +88,10 @@ class _Folder:
     taken: list[str] = field(default_factory=list)
     used: set[Path] = field(default_factory=set)
     copies: dict[Path, Path] = field(default_factory=dict)
-    """Files with the same bytes as another, and that other."""
+    """Files with the same bytes as another file, and that other file."""
 
     def find(self, pattern: str) -> list[Path]:
-        """Return files whose name is the pattern, or ends in it after a separator."""
+        """Return files whose name is the pattern, or ends with it after a separator."""
         whole = re.compile(rf"(?:.*[._-])?(?:{pattern})")
         found = [path for path, name in self.files.items() if whole.fullmatch(name)]
         exact = [path for path in found if re.fullmatch(pattern, self.files[path])]
@@ -131,7 +131,7 @@ class _Folder:
         return [real[path] for path in copies.values()]
 
     def read(self, path: Path, purpose: str) -> Array:
-        """Return the one array of a FITS file, and note what it is taken for."""
+        """Return the only array of a FITS file, and record its purpose."""
         with opened(path) as container:
             if len(container.arrays) != 1:
                 raise MatrixError(f"{path}: found {container.listing()}, expected one array")
@@ -234,7 +234,7 @@ def _survey(folder: Path) -> _Folder:
 
 
 def _response(found: _Folder, wanted: str | None) -> tuple[Array, _Kind]:
-    """Return the response ``(n, ny, nx)`` and what its columns are."""
+    """Return the response ``(n, ny, nx)`` and the meaning of its columns."""
     if wanted is not None:
         name = _SUFFIX.sub("", wanted).lower()
         kinds = [

@@ -1,7 +1,7 @@
-"""From arrays of an instrument that a file describes: one of your own, or a packaged one.
+"""Import arrays of an instrument that a file describes: one of your own, or a packaged one.
 
-The arrays are a response, the modes it was measured with, the light. Everything else is taken from
-the instrument file.
+The arrays are a response, the modes it was measured with, and the light. Everything else is taken
+from the instrument file.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from service.model.instrument import Instrument
 from service.model.pupil_images import find_pupil_images
 
 OFF_CENTRE_SUBAP = 0.25
-"""Distance between the centres of the file and those of the light that is mentioned."""
+"""Smallest reported distance of the file's image centres from those of the light, subapertures."""
 
 WIDTH_TOLERANCE = 0.03
-"""Relative difference between the pupil image of the file and that of the frames."""
+"""Largest relative difference of the pupil image in the file and in the frames."""
 
 _REFERENCES = ("modes", "positions", "mode_to_actuator", "influence_functions", "influence_origin")
 
@@ -191,7 +191,7 @@ def _windows(
 
 
 def _beside_the_light(wfs: Mapping[str, Any], light: Array, name: str) -> list[str]:
-    """Return a note if the centres of the file do not lie where the light is."""
+    """Return a note if the file's image centres differ from those of the light."""
     centres = wfs.get("pupil_centres_px", "auto")
     if centres == "auto":
         return []

@@ -1,4 +1,4 @@
-"""From arrays in files to an instrument and its matrix: layouts are told by shape, and checked.
+"""Build an instrument and its matrix from arrays in files, recognised and checked by shape.
 
 Each array has a role: the matrix, the valid subapertures, the modes. Parameters missing from the
 files can be given as options. Otherwise they are read from the mask or marked unknown.
@@ -33,7 +33,7 @@ UNITS_M = {"m": 1.0, "um": 1e-6, "nm": 1e-9}
 """Metres of OPD in a unit of the commands."""
 
 NARROWER_SUBAP = 0.75
-"""Difference between the width of a grid and that of the pupil on it that is written down."""
+"""Difference of the widths of grid and pupil above which the pupil's width is recorded."""
 
 OBSCURED = 0.05
 """Smallest obscuration ratio that is read from a mask."""
@@ -41,47 +41,47 @@ OBSCURED = 0.05
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reported:
-    """Parameters that no array holds."""
+    """Parameters that no array contains."""
 
     diameter_m: float
-    """Of the pupil; cubes of modes are as wide, edge to edge."""
+    """Diameter of the pupil, metres; cubes of modes have the same width, edge to edge."""
 
     sensor: str | None = None
-    """``pyramid`` or ``shack-hartmann``; None: as the files say, else a pyramid."""
+    """``pyramid`` or ``shack-hartmann``; None for that of the files, or a pyramid."""
 
     stop: str
-    """``telescope`` or ``mirror``."""
+    """Aperture stop: ``telescope`` or ``mirror``."""
 
     obscuration_ratio: float | None = None
-    """Linear, of the pupil; None: read from the mask."""
+    """Linear obscuration of the pupil; None to read it from the mask."""
 
     wavelength_m: float | None = None
-    """None if unknown."""
+    """Sensing wavelength, metres; None if unknown."""
 
     modulation_lambda_over_d: float | None = None
-    """None if unknown; of a pyramid only."""
+    """Modulation of a pyramid, λ/D; None if unknown."""
 
     pupil_diameter_subap: float | None = None
-    """Of the pupil's image; None: as wide as the mask."""
+    """Diameter of the pupil image, subapertures; None for the width of the mask."""
 
     pixels_per_subaperture: int | None = None
-    """Of camera frames; None: as many as keep two subapertures for each actuator."""
+    """Binning of camera frames; None for the largest that keeps two subapertures per actuator."""
 
     centroid: str | None = None
-    """Of a Shack-Hartmann; None: the default of the instrument file."""
+    """Centroid algorithm of a Shack-Hartmann; None for the default of the instrument file."""
 
     order: str = "xy"
-    """Of the slopes, as its user would list them; the fit finds another."""
+    """Order of the slope components as assumed by the user; the fit may find another."""
 
     unit: str | None = None
-    """Of the commands, OPD; None if unknown, so that only shapes are compared."""
+    """Unit of the commands, OPD; None if unknown, so that only shapes are compared."""
 
     columns: Array | None = None
-    """``(n_columns,)`` basis index of each column; None: the first ones."""
+    """``(n_columns,)`` basis index of each column; None for the first ones."""
 
     basis: str | None = None
-    """What columns of positions without ``mode_to_actuator`` are: ``zonal``, one for each actuator;
-    ``KL``, the modes that pyrcal makes of them; None: zonal if there are as many."""
+    """Meaning of columns if positions come without ``mode_to_actuator``: ``zonal`` for single
+    actuators, ``KL`` for modes that pyrcal computes. None for zonal if the numbers agree."""
 
     @property
     def kind(self) -> str:
@@ -94,16 +94,16 @@ class Signals:
     """The sensor's part of an import."""
 
     table: dict[str, Any]
-    """``[wfs]``, without the numbers of its optics."""
+    """Keys of ``[wfs]`` except the optical parameters."""
 
     arrays: dict[str, Array]
     """The matrix and the mask."""
 
     obscuration_ratio: float
-    """As the mask or the light shows it."""
+    """Obscuration ratio measured on the mask or the light."""
 
     columns: int
-    """Axis of the matrix along which the modes are listed."""
+    """Axis of the matrix that enumerates the modes."""
 
     @property
     def n_columns(self) -> int:
@@ -112,11 +112,11 @@ class Signals:
 
     @property
     def by_column(self) -> Array:
-        """The matrix with its modes along the first axis."""
+        """Matrix with the modes along the first axis."""
         return np.moveaxis(self.arrays["interaction_matrix"], self.columns, 0)
 
     def keep(self, columns: Array) -> None:
-        """Leave out all but these columns."""
+        """Remove all but these columns."""
         kept = np.moveaxis(self.by_column[columns], 0, self.columns)
         self.arrays["interaction_matrix"] = kept
 
@@ -129,8 +129,8 @@ def from_arrays(
 ) -> Imported:
     """Return an instrument and its matrix from arrays by role.
 
-    ``column_numbers`` are the numbers of the columns in the file they come from, for messages and
-    for the record of what was kept; None: they are all there.
+    ``column_numbers`` are the numbers of the columns in their file, for messages and for the record
+    of what was kept; None if all columns are present.
 
     Raises
     ------
@@ -195,7 +195,7 @@ def from_arrays(
 def _own_modes(
     source: str, signals: Signals, mirror: Mirror, reported: Reported
 ) -> dict[str, dict[str, int]]:
-    """Return ``[modes]`` if the columns are Karhunen-Loeve modes of pyrcal's own; else nothing.
+    """Return ``[modes]`` if the columns are pyrcal's Karhunen-Loeve modes, else nothing.
 
     Raises
     ------
@@ -224,7 +224,7 @@ def _own_modes(
 
 
 def read_frames(source: str, arrays: Mapping[str, Array], kind: str) -> Frames | None:
-    """Return the response as camera frames; None if it is one of slopes."""
+    """Return the response as camera frames; None if it consists of slopes."""
     matrix = np.asarray(arrays["matrix"])
     light, valid = arrays.get("light"), arrays.get("valid")
     if matrix.ndim == 3:
@@ -248,7 +248,7 @@ def read_frames(source: str, arrays: Mapping[str, Array], kind: str) -> Frames |
 
 
 def _plane(values: Array) -> Array:
-    """Return a picture, of which a FITS file may have a single plane."""
+    """Return an image, also if a FITS file has it as a cube with a single plane."""
     found = np.asarray(values)
     return found[0] if found.ndim == 3 and len(found) == 1 else found
 
@@ -312,7 +312,7 @@ def read_slopes(
 
 
 def _oriented(found: Array, n_rows: int, n_columns: int) -> tuple[Array, tuple[str, ...]]:
-    """Return a matrix ``(n_slopes, n_modes)``; columns that hold NaN keep it."""
+    """Return a matrix ``(n_slopes, n_modes)``; NaN in columns are kept."""
     if found.dtype.kind != "f" or found.ndim != 2:
         return matrix_of(found, n_rows, n_columns)
     unknown = ~np.isfinite(found)
@@ -328,7 +328,7 @@ def _oriented(found: Array, n_rows: int, n_columns: int) -> tuple[Array, tuple[s
 def _without_dead_rows(
     found: Array, valid: NDArray[np.bool_], n_rows: int, notes: list[str]
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return matrix and mask without subapertures that give NaN or 0 whatever is poked."""
+    """Return matrix and mask without subapertures that are NaN or 0 for all modes."""
     if found.ndim != 2 or found.dtype.kind not in "iuf" or n_rows not in found.shape:
         return found, valid
     turned = found.shape[0] != n_rows
@@ -355,7 +355,7 @@ def _without_dead_rows(
 
 
 def _columns(matrix: Array, valid: NDArray[np.bool_], n_modes: int) -> int:
-    """Return how many columns are expected: all modes, or as many of them as the matrix has."""
+    """Return the expected number of columns: all modes, or fewer if the matrix has fewer."""
     others = [n for n in matrix.shape if n != 2 * int(valid.sum())]
     return others[0] if len(others) == 1 and others[0] < n_modes else n_modes
 
@@ -367,18 +367,18 @@ def usable_modes(
     notes: list[str],
     numbers: Array | None = None,
 ) -> dict[str, Array]:
-    """Leave out columns and modes that cannot be used; return the basis index of each column left.
+    """Remove unusable columns and modes; return the basis index of each remaining column.
 
     Parameters
     ----------
     signals, mirror
         Changed in place.
     columns
-        ``(n_columns,)`` basis index of each column; None: the first ones.
+        ``(n_columns,)`` basis index of each column; None for the first ones.
     notes
-        What is left out is added.
+        List to which notes on removed columns are appended.
     numbers
-        Numbers of the columns in their file; None: they count from 0.
+        Numbers of the columns in their file; None to count from 0.
 
     Raises
     ------
@@ -441,7 +441,7 @@ def _indices(columns: Array | None, n_columns: int, n_modes: int, notes: list[st
 
 
 def _sensor(reported: Reported, signals: Signals, notes: list[str]) -> dict[str, Any]:
-    """Return ``[wfs]``."""
+    """Return the keys of ``[wfs]``."""
     table: dict[str, Any] = {
         "kind": reported.kind,
         **signals.table,
@@ -461,7 +461,7 @@ def _sensor(reported: Reported, signals: Signals, notes: list[str]) -> dict[str,
 
 
 def _narrow(matrix: Array, valid: NDArray[np.bool_]) -> list[str]:
-    """Return that the mask is wider than the pupil's image, if it looks so."""
+    """Return a note if the mask seems wider than the pupil image."""
     power = np.einsum("ij,ij->i", matrix, matrix)
     seen = seen_pupil(answers_of(power, np.ones(len(power)), valid), len(valid))
     if seen is None:

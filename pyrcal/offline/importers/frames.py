@@ -1,7 +1,7 @@
 """Recognise camera frames of a pyramid, and describe them for the instrument file.
 
-A response may be recorded as the change of every pixel of the camera instead of as slopes. Such a
-cube is taken as it is: the pupil images are found in the light beside it, and the fit makes slopes.
+A response may be recorded as the change of every camera pixel instead of as slopes. Such a cube is
+imported unchanged: the pupil images are located in the light, and the fit computes slopes.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from service.errors import MatrixError
 from service.model.pupil_images import PupilImages, find_pupil_images
 
 SUBAPERTURES_PER_ACTUATOR = 2.0
-"""Least number of subapertures across for each actuator across: pixels are binned to no fewer, so
+"""Smallest number of subapertures per actuator along a diameter. Pixels are binned to no fewer, so
 that the finest influence functions stay sampled while the model stays small."""
 
 MARGIN_SUBAP = 1.0
 """Width by which the grid of subapertures exceeds the pupil image."""
 
 LIT_SHARE = 0.5
-"""Least light in a valid subaperture, relative to the median lit one."""
+"""Smallest light in a valid subaperture, relative to the median lit one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Frames:
-    """A response as camera frames."""
+    """A response recorded as camera frames."""
 
     cube: Array
     """``(n_modes, ny, nx)`` change of each pixel per unit of command."""
@@ -40,7 +40,7 @@ class Frames:
     """``(ny, nx)`` mean frame, or the mask of lit pixels where no frame was recorded."""
 
     light_name: str
-    """What ``light`` was read from, for messages."""
+    """Source of ``light``, for messages."""
 
 
 def frames_of(matrix: Array, light: Array | None, valid: Array | None) -> Frames | None:
@@ -131,7 +131,7 @@ def describe_frames(
 
 
 def images_words(frames: Frames, images: PupilImages) -> str:
-    """Return where the pupil images were found, one sentence."""
+    """Return a sentence on the positions of the pupil images."""
     centres = ", ".join(f"[{row:.2f}, {column:.2f}]" for row, column in images.centres_px)
     return (
         f"matrix: camera frames of {frames.cube.shape[1]} x {frames.cube.shape[2]} pixels; pupil "
@@ -141,7 +141,7 @@ def images_words(frames: Frames, images: PupilImages) -> str:
 
 
 def rounded_centres(images: PupilImages) -> list[list[float]]:
-    """Return the centres as an instrument file writes them."""
+    """Return the centres in the notation of an instrument file."""
     return [[round(float(value), 3) for value in at] for at in images.centres_px]
 
 

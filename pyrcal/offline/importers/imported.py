@@ -1,4 +1,4 @@
-"""What an importer found, and the two files it becomes: an instrument file and its arrays."""
+"""Result of an importer, and the two files written from it: instrument file and arrays."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ Tables = Mapping[str, Mapping[str, Any]]
 INSTRUMENT_FILE, ARRAYS_FILE = "instrument.toml", "matrix.h5"
 
 LARGEST_TELESCOPE_M = 100.0
-"""A wider one is a slip of the unit."""
+"""Largest plausible diameter of a telescope, metres; a larger one is in another unit."""
 
 UNKNOWN = "unknown"
-"""What an instrument file says of a number that nobody told."""
+"""Value in an instrument file for a number that is not known."""
 
 
 class Dataset(str):
@@ -42,47 +42,47 @@ class Dataset(str):
 
 
 class Saved(NamedTuple):
-    """Where an import lies."""
+    """Paths of a saved import."""
 
     instrument: Path
     matrix: Path
-    """Holds the interaction matrix and whatever the instrument file refers to."""
+    """File with the interaction matrix and the other arrays of the instrument file."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Imported:
-    """An instrument and its measured matrix, as pyrcal's own files say it."""
+    """An instrument and its measured matrix in pyrcal's own representation."""
 
     source: str
-    """What it was made of, in words."""
+    """Description of the origin."""
 
     tables: Tables
-    """Of the instrument file."""
+    """Tables of the instrument file, by name."""
 
     arrays: Mapping[str, Array]
-    """By name; ``interaction_matrix`` is ``(n_slopes, n_modes)``, where there is one."""
+    """Arrays by name; ``interaction_matrix`` is ``(n_slopes, n_modes)``, if there is one."""
 
     notes: tuple[str, ...] = ()
-    """What was converted, assumed or is unknown, one sentence each."""
+    """Notes on conversions, assumptions and unknown values, one sentence each."""
 
     centres_found: bool = False
-    """Whether ``wfs.pupil_centres_px`` was read off the flux frame, by circles through the edges
-    of the pupil images."""
+    """True if ``wfs.pupil_centres_px`` was measured on the flux frame with circles through the
+    edges of the pupil images."""
 
     inventory: tuple[str, ...] = ()
-    """Files that were taken, and for what; files that were ignored, and why."""
+    """Files that were used, with their purpose; files that were ignored, with the reason."""
 
     def save(self, folder: str | Path) -> Saved:
         """Write both files into a folder, and read the instrument file once as a check.
 
-        If anything fails, the folder is left as it was.
+        If anything fails, the folder is left unchanged.
 
         Raises
         ------
         ConfigurationError
             If the instrument file does not describe an instrument, or a telescope of 100 m.
         StorageError
-            If the disk refuses.
+            If writing fails.
         """
         diameter_m = float(self.tables["instrument"]["diameter_m"])
         if diameter_m > LARGEST_TELESCOPE_M:
@@ -106,7 +106,7 @@ class Imported:
         return saved
 
     def _write(self, place: Path) -> None:
-        """Write both files beside their place, read them as a check, then put them there."""
+        """Write both files to a temporary folder, check them by reading, then move them."""
         try:
             with tempfile.TemporaryDirectory(dir=place, prefix=".import-") as name:
                 draft = Saved(Path(name) / INSTRUMENT_FILE, Path(name) / ARRAYS_FILE)
@@ -127,7 +127,7 @@ class Imported:
             raise StorageError(f"{place}: cannot be written: {error}") from error
 
     def _check(self, instrument: Instrument) -> None:
-        """Refuse a matrix that is not of the instrument."""
+        """Raise if the matrix does not belong to the instrument."""
         matrix = self.arrays.get(DATASET)
         if matrix is None:
             return
@@ -147,7 +147,7 @@ class Imported:
             )
 
     def _with_refined_centres(self, instrument: Instrument) -> Imported:
-        """Return it with the centres that a fit would find with ``pupil_centres_px = "auto"``."""
+        """Return it with the centres that a fit would use for ``pupil_centres_px = "auto"``."""
         centres = kind_of(instrument).image_centres(instrument, self.arrays[FLUX_FRAME])
         if centres is None:
             return self  # the light is narrower than the file's pupil: the circles stay
@@ -155,11 +155,11 @@ class Imported:
         return replace(self, tables={**self.tables, "wfs": wfs})
 
     def noted(self, *notes: str) -> Imported:
-        """Return it with further notes."""
+        """Return the import with further notes."""
         return replace(self, notes=(*self.notes, *notes))
 
     def instrument_text(self) -> str:
-        """Return the instrument file, its notes first."""
+        """Return the text of the instrument file, notes first."""
         lines = [f"# Imported from {self.source}.", *(f"# {note}" for note in self.notes)]
         for name, table in self.tables.items():
             lines += ["", f"[{name}]", *(f"{key} = {_toml(value)}" for key, value in table.items())]
@@ -172,7 +172,7 @@ class Imported:
 
 
 def _toml(value: object) -> str:
-    """Return a value as TOML has it."""
+    """Return a value in TOML notation."""
     if isinstance(value, Dataset):
         return json.dumps(f"{ARRAYS_FILE}:/{value}")
     if isinstance(value, Mapping):
@@ -187,23 +187,23 @@ def _toml(value: object) -> str:
 def oriented(
     values: Array, rows: int, columns: int | None, what: str, of: str
 ) -> tuple[Array, tuple[str, ...]]:
-    """Return a matrix as ``(rows, columns)``, and a note where it was listed the other way.
+    """Return a matrix as ``(rows, columns)``, and a note if it was transposed.
 
     Parameters
     ----------
     values
-        As it was found.
+        Matrix as found.
     rows, columns
-        What it must have; ``columns`` None: any number.
+        Required shape; ``columns`` None for any number.
     what
-        Its name, for messages.
+        Name of the matrix, for messages.
     of
-        Its shape in words, like ``(n_slopes, n_modes)``.
+        Description of the shape, like ``(n_slopes, n_modes)``.
 
     Raises
     ------
     MatrixError
-        If it has neither shape, or holds a number that is not finite.
+        If it has neither shape, or contains a number that is not finite.
     """
     found = np.asarray(values)
     if found.ndim != 2 or found.dtype.kind not in "iuf" or not np.isfinite(found).all():
@@ -222,4 +222,4 @@ def oriented(
 
 
 matrix_of = partial(oriented, what=DATASET, of="(n_slopes, n_modes)")
-"""Returns the interaction matrix of so many slopes and modes."""
+"""Return the interaction matrix with given numbers of slopes and modes."""

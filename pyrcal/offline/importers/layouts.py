@@ -1,6 +1,6 @@
-"""Recognise by shape how arrays are laid out: masks, maps of slopes, cubes of modes.
+"""Recognise the layout of arrays by shape: masks, maps of slopes, cubes of modes.
 
-An array that fits no layout, or several, is refused.
+An array that fits no layout, or several, is rejected.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ROLES = {
     "mode_to_actuator": ("mode_to_actuator", "M2C", "m2c"),
     "positions": ("positions", "xy_m", "coordinates"),
 }
-"""What arrays are for, and the names by which they are known in a file of several."""
+"""Names of arrays by role, in a file with several arrays."""
 
 
 def mask_of(values: Array, notes: list[str]) -> NDArray[np.bool_]:
@@ -54,7 +54,7 @@ def mask_of(values: Array, notes: list[str]) -> NDArray[np.bool_]:
 
 
 def is_listed_twice(mask: Array) -> bool:
-    """Return whether a mask holds the subapertures of x and the same ones of y."""
+    """Return True if a mask contains the same subapertures twice, for x and for y."""
     if mask.ndim != 2 or max(mask.shape) != 2 * min(mask.shape):
         return False
     of_x, of_y = np.split(mask, 2, axis=int(np.argmax(mask.shape)))
@@ -62,7 +62,7 @@ def is_listed_twice(mask: Array) -> bool:
 
 
 def check_binary(mask: Array, what: str) -> None:
-    """Refuse a mask with values other than 0 and 1, and quote two of them.
+    """Raise if a mask has values other than 0 and 1, and quote two of them.
 
     Raises
     ------
@@ -77,9 +77,9 @@ def check_binary(mask: Array, what: str) -> None:
 
 
 def maps_of(values: Array, n: int | None, notes: list[str]) -> Array:
-    """Return slopes that are listed as maps as ``(2, n, n, n_modes)``, Sx then Sy.
+    """Return slopes listed as maps as ``(2, n, n, n_modes)``, Sx then Sy.
 
-    They may come as ``(2, n, n)`` maps or as one map of both, side by side ``(n, 2n)`` or one above
+    Accepted are ``(2, n, n)`` maps, or one map of both, next to each other ``(n, 2n)`` or one above
     the other ``(2n, n)``; modes first or last.
 
     Raises
@@ -109,12 +109,12 @@ def maps_of(values: Array, n: int | None, notes: list[str]) -> Array:
 
 
 def cube_of(values: Array, notes: list[str]) -> NDArray[np.float32]:
-    """Return shapes as ``(n_modes, ny, nx)``: the two axes of equal length are the map's.
+    """Return shapes as ``(n_modes, ny, nx)``: the map has the two axes of equal length.
 
     Raises
     ------
     MatrixError
-        If no two axes are, or it cannot be told which two.
+        If it is unclear which two axes are the map's.
     """
     cube = np.asarray(values)
     if cube.ndim != 3 or cube.dtype.kind not in "iuf":
@@ -134,7 +134,7 @@ def cube_of(values: Array, notes: list[str]) -> NDArray[np.float32]:
 
 
 def by_role(arrays: Mapping[str, Array], where: str) -> dict[str, Array]:
-    """Return the arrays of a file by what they are for, as their names say in any letter case.
+    """Return the arrays of a file by role, recognised by name in any letter case.
 
     FITS has capitals only.
 
@@ -155,7 +155,7 @@ def by_role(arrays: Mapping[str, Array], where: str) -> dict[str, Array]:
 
 
 def role_of_name(name: str) -> str | None:
-    """Return the role that an array or a file of this name has; None if the name says nothing.
+    """Return the role for an array or file name; None if the name is unknown.
 
     Numbers may follow the name, as in ``int_mat_1_5_10``.
     """

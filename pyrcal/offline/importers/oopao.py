@@ -1,13 +1,12 @@
-"""From OOPAO's objects: telescope, deformable mirror, wavefront sensor, M2C, calibration.
+"""Import OOPAO objects: telescope, deformable mirror, wavefront sensor, M2C, calibration.
 
-Nothing of OOPAO is imported: its objects are known by their attributes, so what was saved of them
-in an ``.npz`` under the same names will do. How OOPAO draws things was read from version 1.0.0 and
-is tested with it:
+OOPAO is not imported: its objects are accessed by their attributes, so an ``.npz`` with the same
+names is accepted as well. OOPAO's geometry was read from version 1.0.0 and is tested with it:
 
-- Its mirror and its modulation lie on a pupil of n points whose first and last are one diameter
-  apart, while a pupil of n samples is n steps wide: lengths times (n - 1) / n, modulation times
-  n / (n - 1).
-- Its ``MisRegistration`` scales, then turns, then moves the mirror by minus the shift.
+- Its mirror and its modulation are defined on a pupil of n points whose first and last are one
+  diameter apart, while a pupil of n samples is n steps wide: lengths are multiplied by (n - 1) / n,
+  the modulation by n / (n - 1).
+- Its ``MisRegistration`` scales, then rotates, then moves the mirror by minus the shift.
 - Its mirrors transmit: strokes are OPD, and there is no double pass.
 """
 
@@ -44,7 +43,7 @@ SAVED = {
         "is_geometric",
     ),
 }
-"""Attributes that are looked at, of each object; what an object lacks does not concern it."""
+"""Attributes that are read from each object; missing ones do not apply to that object."""
 
 _OPTIONAL = {
     *("pupilReflectivity", "altitude", "sign", "flip_", "flip_lr", "is_geometric", "validAct"),
@@ -68,30 +67,30 @@ _ARRAYS = {
     "initial_coordinates": (2,),
     "validAct": (1, 2),
 }
-"""Attributes that are arrays, and how many axes they may have."""
+"""Attributes that are arrays, with the allowed numbers of axes."""
 
 _COUNTS = {
     **dict.fromkeys(("nSubap", "n_pix_subap", "binning"), 1),
     **dict.fromkeys(("resolution", "nActAlongDiameter"), 2),
 }
-"""Attributes that are counts, and the least of each."""
+"""Attributes that are counts, with their smallest values."""
 
 _AXES = 2
-"""Coordinates of a point."""
+"""Number of coordinates of a point."""
 
 _POSITIVE = {"D", "wavelength", "mechCoupling", "pixel_scale"}
 
 _MAX_NUMBER = 1e6
-"""Largest number that any attribute has, in its own unit."""
+"""Largest allowed value of any attribute, in its own unit."""
 
 _SAME_SHAPE = 1e-3
-"""Largest deviation of an influence function from the Gaussian that is told, of its height."""
+"""Largest accepted deviation of an influence function from its Gaussian, relative to its height."""
 
 _ROUNDING = 1e-9
-"""Stretches below it are none."""
+"""Stretches below this are rounding errors."""
 
 _SAMPLED_ACTUATORS = 24
-"""Influence functions that are held against it."""
+"""Number of influence functions that are compared with the Gaussian."""
 
 
 def from_oopao(
@@ -109,16 +108,16 @@ def from_oopao(
     tel, dm, wfs
         ``Telescope``, ``DeformableMirror``, and ``Pyramid`` or ``ShackHartmann``.
     calib
-        ``CalibrationVault`` of ``InteractionMatrix``, or its ``D``; None: instrument alone.
+        ``CalibrationVault`` of ``InteractionMatrix``, or its ``D``; None for the instrument only.
     M2C
-        Modes to commands, ``(n_actuators, n_modes)``; None: ``calib`` is zonal.
+        Modes to commands, ``(n_actuators, n_modes)``; None if ``calib`` is zonal.
     ngs
-        ``Source`` that the sensor looks at; None: the telescope's.
+        ``Source`` of the sensor; None for the telescope's.
 
     Raises
     ------
     ConfigurationError
-        If the objects are not those, or do what pyrcal has no model of.
+        If the objects are of other classes, or have properties that pyrcal does not model.
     MatrixError
         If ``calib`` or ``M2C`` does not belong to them.
     """
@@ -382,7 +381,7 @@ def _gaussian(
     dm: Any,  # noqa: ANN401
     places: Array,
 ) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Return ``[mirror]`` of OOPAO's own Gaussian mirror where it lies without its misReg."""
+    """Return ``[mirror]`` of OOPAO's own Gaussian mirror at its position without misReg."""
     places = places.astype(float) * _steps(tel) * _mirrored(dm)
     table = {
         "layout": "positions",
@@ -395,7 +394,7 @@ def _gaussian(
 
 
 def _mirrored(dm: Any) -> NDArray[np.float64]:  # noqa: ANN401
-    """Return the sign of x and y that OOPAO's flips of the drawn functions give."""
+    """Return the sign of x and y from the flips of OOPAO's influence functions."""
     x, y = (-1.0, -1.0) if getattr(dm, "flip_", False) else (1.0, 1.0)
     return np.array([-x if getattr(dm, "flip_lr", False) else x, y])
 
@@ -406,7 +405,7 @@ def _is_gaussian(
     functions: Array,
     diameter_m: float,
 ) -> bool:
-    """Return whether the influence functions are the Gaussians that its attributes describe."""
+    """Return True if the influence functions are the Gaussians given by the attributes."""
     if getattr(dm, "sign", 1) != 1:
         return False
     some = np.unique(np.linspace(0, len(places) - 1, _SAMPLED_ACTUATORS).astype(int))

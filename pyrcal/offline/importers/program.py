@@ -1,4 +1,4 @@
-"""``pyrcal import``: write an instrument file and a matrix, and say what to do with them."""
+"""``pyrcal import``: write an instrument file and a matrix, and print the next steps."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _specula(options: argparse.Namespace) -> Imported:
 
 
 def _arrays(options: argparse.Namespace) -> Imported:
-    """Import arrays by their names, or by the roles that are given."""
+    """Import arrays by their names, or by the given roles."""
     found: dict[str, Array] = {}
     inventory: list[str] = []
     for role, path in _files(options.files):
@@ -59,7 +59,7 @@ def _arrays(options: argparse.Namespace) -> Imported:
 
 
 def _files(given: Sequence[tuple[str | None, Path]]) -> Iterator[tuple[str | None, Path]]:
-    """Yield the files that were given, of a folder those in it."""
+    """Yield the given files, and for a folder the files in it."""
     for role, path in given:
         if role is None and path.is_dir():
             for one in sorted(path.iterdir()):
@@ -71,7 +71,7 @@ def _files(given: Sequence[tuple[str | None, Path]]) -> Iterator[tuple[str | Non
 
 
 def _by_role(role: str | None, path: Path, source: str) -> dict[str, Array]:
-    """Return the arrays of a file by what they are for, as their names or the file's say."""
+    """Return the arrays of a file by role, from their names or the file's name."""
     arrays = _read(path)
     if role is not None:
         return {role: _only(arrays, str(path))}
@@ -97,7 +97,7 @@ def _modes_of_name(path: Path, matrix: Array, inventory: list[str]) -> Array | N
 
 
 def _role_of(path: Path) -> str | None:
-    """Return the role that a file's name says; None if it says nothing."""
+    """Return the role for a file's name; None if the name is unknown."""
     return role_of_name(path.name.partition(".")[0])
 
 
@@ -110,7 +110,7 @@ def _read(path: Path) -> dict[str, Array]:
 
 
 def _only(arrays: Mapping[str, Array], where: str) -> Array:
-    """Return the one array of a file; the record of pyRTC 2 is none."""
+    """Return the only array of a file, ignoring the record of pyRTC 2."""
     values = [array for name, array in arrays.items() if name != RECORD]
     if len(values) != 1:
         raise MatrixError(f"{where}: found {', '.join(arrays)}, expected one array")
@@ -164,7 +164,7 @@ def _reported(options: argparse.Namespace) -> Reported:
 
 
 _ARRAY_FILES = (".npy", ".fits", ".fits.gz", ".fits.fz", ".npz", ".h5")
-"""Ends of the names of files that are read from a folder."""
+"""Suffixes of files that are read from a folder."""
 
 IMPORTERS: Mapping[str, Callable[[argparse.Namespace], Imported]] = {
     "oopao": _oopao,
@@ -176,11 +176,11 @@ IMPORTERS: Mapping[str, Callable[[argparse.Namespace], Imported]] = {
     "files": _arrays,
     "npz": _arrays,
 }
-"""By the word that names them."""
+"""Importers by their name on the command line."""
 
 
 def main(options: argparse.Namespace) -> int:
-    """Import, write, and say what was found.
+    """Import, write both files, and print the notes.
 
     Raises
     ------

@@ -1,7 +1,8 @@
-"""From pyRTC's calibration files: ``.npz`` with a record since 2.0, bare ``.npy`` before.
+"""Import calibration files of pyRTC: ``.npz`` with a record since 2.0, bare ``.npy`` before.
 
-A bare array says nothing of itself: what it is for is told. Even subapertures of a Shack-Hartmann
-had their reference half a pixel off before 2.0; a matrix is a difference, which that leaves alone.
+A bare array has no description, so its role must be given. Before 2.0, Shack-Hartmann sensors with
+an even number of pixels had their reference off by half a pixel; a matrix is a difference, so it is
+not affected.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ from service.errors import MatrixError
 
 RECORD, DATA, FORMAT = "pyrtc_calibration", "data", 2
 KINDS = {"interaction_matrix": "matrix", "valid_sub_aps": "valid"}
-"""What pyRTC's record calls them, and their roles."""
+"""Roles by the kind in pyRTC's record."""
 
 
 def calibration_of(arrays: Mapping[str, Array], where: str) -> tuple[str, Array]:
-    """Return what a calibration file of pyRTC 2 is for, and its array.
+    """Return the role and the array of a calibration file of pyRTC 2.
 
     Raises
     ------

@@ -1,8 +1,8 @@
 """α over time from the ``TRANSFORMATION_MATRIX`` of a mirror in an AOT file.
 
 The standard has matrices ``(3, 3, t)`` that act on ``(x, y, 1)`` of the mirror, metres in the
-pupil. Any of them that does not mirror is an α of six numbers: what is sheared is stretched, then
-turned. One that mirrors is the same with ``parity = -1``.
+pupil. Any of them without reflection is an α of six numbers: a symmetric stretch followed by a
+rotation. One with reflection is the same with ``parity = -1``.
 """
 
 from __future__ import annotations
@@ -19,37 +19,37 @@ from service.errors import MatrixError
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration, rotation
 
 LARGEST_STRETCH = 0.2
-"""What an instrument file takes as an anamorphosis."""
+"""Largest anamorphosis that an instrument file accepts."""
 
 NO_STRETCH = 1e-6
-"""Below it is the rounding of the standard's numbers."""
+"""Largest stretch from rounding of the standard's numbers."""
 
 SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dated:
-    """α at a time."""
+    """α with its time."""
 
     t_ns_utc: int | None
-    """None: the file does not say when."""
+    """UTC, nanoseconds; None if the file does not give it."""
 
     alpha: Misregistration
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Registrations:
-    """What a file says of a mirror's registration."""
+    """Registration of a mirror over time from a file."""
 
     over_time: tuple[Dated, ...]
-    """In the file's order, at least one."""
+    """Values in the file's order, at least one."""
 
     parity: int
-    """-1: the mirror is seen from behind, all the time."""
+    """-1 if the mirror is seen from behind, at all times."""
 
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return α ``(t, 4)`` in boundary units, stretches ``(t, 2)``, and the times if told."""
+        """Return α ``(t, 4)`` in boundary units, stretches ``(t, 2)``, and the times if known."""
         told = {
             "registration": np.array([at.alpha.vector for at in self.over_time]) * BOUNDARY_SCALE,
             "registration_anamorphosis": np.array([at.alpha.stretches for at in self.over_time]),
@@ -61,7 +61,7 @@ class Registrations:
 
     @property
     def mirror(self) -> dict[str, Any]:
-        """Return the keys of ``[mirror]`` that start a fit as the last α is turned."""
+        """Return the keys of ``[mirror]`` that start a fit at the rotation of the last α."""
         alpha = self.over_time[-1].alpha
         return {
             "nominal_rotation_deg": float(np.rad2deg(alpha.rotation_rad)),
@@ -70,7 +70,7 @@ class Registrations:
 
     @property
     def text(self) -> str:
-        """Return what was read, one sentence."""
+        """Return a sentence on the values that were read."""
         last = self.over_time[-1].alpha
         stretch = (
             ""
@@ -83,7 +83,7 @@ class Registrations:
 
 
 def registrations_of(image: Any, subaperture_m: float, where: str) -> Registrations:  # noqa: ANN401
-    """Return α over time of aotpy's image of the matrices.
+    """Return α over time from aotpy's image of the matrices.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def _alpha(
 
 
 def _times(time: Any, n: int, where: str) -> Sequence[int | None]:  # noqa: ANN401 - aotpy's own
-    """Return UTC nanoseconds; what was written from nanoseconds comes back to the same double."""
+    """Return UTC nanoseconds; times written from nanoseconds are restored to the same double."""
     stamps = [] if time is None else list(time.timestamps)
     if not stamps:
         return [None] * n

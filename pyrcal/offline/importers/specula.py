@@ -1,12 +1,11 @@
-"""From SPECULA's own FITS files, and SynIM's, which are SPECULA's; and back into them.
+"""Import SPECULA's FITS files, which SynIM also writes, and export to them.
 
-Files are known by what is in them.
+Files are recognised by their contents. Neither program is imported. The layouts were read from
+SPECULA 1.1.0 and SynIM 2.0.0:
 
-Nothing of either is imported. How they list things was read from SPECULA 1.1.0 and SynIM 2.0.0:
-
-- ``Intmat`` is ``[slopes, modes]``, once ``[modes, slopes]``: told by the number of subapertures.
-  Slopes are all x, then all y, unless the file says ``INTRLVD``.
-- Subapertures stand in the order of ``PupData.ind_pup`` or ``SubapData.idxs``, which need not be
+- ``Intmat`` is ``[slopes, modes]``, in older files ``[modes, slopes]``; the number of subapertures
+  distinguishes them. Slopes are all x, then all y, unless the file has ``INTRLVD``.
+- Subapertures are in the order of ``PupData.ind_pup`` or ``SubapData.idxs``, which may differ from
   that of the mask's rows.
 - Commands are nanometres, and ``sign = -1`` of its mirrors is one sign of all slopes.
 """
@@ -27,7 +26,7 @@ from service.errors import MatrixError, StorageError
 from service.files.container import Container, opened
 
 UNIT = "nm"
-"""Of SPECULA's commands."""
+"""Unit of SPECULA's commands."""
 
 LENSLETS = (
     "slopes of lenslets are shares of half their field, which these files do not tell: the strokes "
@@ -36,18 +35,18 @@ LENSLETS = (
 
 
 MAX_WIDTH = 4096
-"""Width of the largest sensor, subapertures; indices that span more are damaged."""
+"""Largest width of a sensor, subapertures; indices with a larger range are damaged."""
 
 
 class Subapertures(NamedTuple):
-    """Where the subapertures lie, as they are listed."""
+    """Positions of the subapertures in their listed order."""
 
     rows: NDArray[np.intp]
     columns: NDArray[np.intp]
 
     @property
     def mask(self) -> NDArray[np.bool_]:
-        """``(n, n)``: the smallest square that holds them, in its middle."""
+        """``(n, n)`` mask on the smallest square that holds them, centred."""
         n = int(max(np.ptp(self.rows), np.ptp(self.columns))) + 1 if len(self.rows) else 0
         if not 0 < n <= MAX_WIDTH:
             raise MatrixError(
@@ -61,19 +60,19 @@ class Subapertures(NamedTuple):
 
     @property
     def by_rows(self) -> NDArray[np.intp]:
-        """Order in which they stand row by row."""
+        """Order that sorts the subapertures row by row."""
         return np.lexsort((self.columns, self.rows))
 
 
 def from_specula(paths: Sequence[Path], reported: Reported, source: str = "SPECULA") -> Imported:
-    """Return what SPECULA saved: an ``Intmat``, its ``PupData`` or ``SubapData``, an ``IFunc``.
+    """Import an ``Intmat``, its ``PupData`` or ``SubapData``, and an ``IFunc``.
 
-    An ``M2C`` beside them makes modes of the influence functions.
+    With an ``M2C`` among the files, modes are combined from the influence functions.
 
     Raises
     ------
     MatrixError
-        If one of them is missing, twice there, or something else.
+        If one of them is missing or present twice, or a file is something else.
     """
     found: dict[str, Array] = {}
     places: Subapertures | None = None
@@ -121,7 +120,7 @@ def from_specula(paths: Sequence[Path], reported: Reported, source: str = "SPECU
 
 
 def _role_of(container: Container) -> tuple[str, Array, tuple[str, ...]]:
-    """Return what the arrays of a file are for, them as numbers, and notes."""
+    """Return the role of a file's array, its numbers, and notes."""
     matrix, functions = container.find("INTMAT"), container.find("INFLUENCE_FUNCTION")
     if matrix is not None:
         return "matrix", matrix.numbers(), ()
@@ -137,7 +136,7 @@ def _role_of(container: Container) -> tuple[str, Array, tuple[str, ...]]:
 
 
 def _cube(container: Container, functions: Array) -> tuple[Array, tuple[str, ...]]:
-    """Return an ``IFunc`` as maps, unknown outside its mask: it holds the points inside alone."""
+    """Return an ``IFunc`` as maps with NaN outside its mask: it holds only the points inside."""
     stored = container.find("MASK_INF_FUNC")
     if stored is None:
         raise MatrixError(f"{container.path}: found no MASK_INF_FUNC beside INFLUENCE_FUNCTION")
@@ -151,7 +150,7 @@ def _cube(container: Container, functions: Array) -> tuple[Array, tuple[str, ...
 
 
 def _subapertures(container: Container) -> Subapertures:
-    """Return where a ``PupData``'s first image or a ``SubapData``'s lenslets are."""
+    """Return the positions of a ``PupData``'s first image or of a ``SubapData``'s lenslets."""
     first = container.find("1")
     if first is None:
         raise MatrixError(f"{container.path}: found no indices of pixels, expected them first")
@@ -191,22 +190,22 @@ def write_specula(
     Parameters
     ----------
     places
-        The ``PupData`` or ``SubapData`` that the matrix was imported with.
+        ``PupData`` or ``SubapData`` with which the matrix was imported.
     intmat, recmat
-        Files to write; those that are there are replaced.
+        Files to write; existing ones are replaced.
     matrix
-        ``(n_slopes, n_modes)`` as `from_specula` lists slopes.
+        ``(n_slopes, n_modes)`` matrix, slopes in the order of `from_specula`.
     reconstructor
-        ``(n_modes, n_slopes)``.
+        ``(n_modes, n_slopes)`` reconstructor.
     stroke_known
-        Whether commands are metres; False if they have SPECULA's own unit already.
+        True if commands are metres, False if they are in SPECULA's own unit.
 
     Raises
     ------
     MatrixError
-        If the subapertures are others.
+        If the subapertures differ.
     StorageError
-        If the disk refuses.
+        If writing fails.
     """
     from astropy.io import fits
 

@@ -12,7 +12,7 @@ from service.model.instrument import Instrument
 from service.model.pupil import instrument_pupil, valid_subapertures
 
 _POINTS = 6
-"""Of the pupil, for each subaperture."""
+"""Number of pupil points per subaperture."""
 
 _SENSOR, _MIRROR = "tab:blue", "tab:red"
 

@@ -1,4 +1,4 @@
-"""What an instrument file implies: modes, slopes, memory, time, the condition of its matrix."""
+"""Derived properties of an instrument: size, memory, computing time and condition of its matrix."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import Fineness
 
 SAMPLING = NODES = 3
-"""Of the model, as a fit has it."""
+"""Pupil points per subaperture, and detector nodes, of the model; the same as in a fit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Implied:
-    """Numbers of an instrument; those of its matrix where it was computed."""
+    """Derived properties of an instrument, with those of its matrix if it was computed."""
 
     n_valid: int
     """Valid subapertures."""
@@ -30,22 +30,21 @@ class Implied:
     n_slopes: int
     n_modes: int
     expected_gb: float
-    """Memory that the matrix and its derivatives take at their largest, as far as is known before,
-    the program included."""
+    """Expected peak memory of the matrix and its derivatives, program included, GB."""
 
     seconds: float | None = None
-    """Time that modes and matrix took; None: not computed."""
+    """Computing time of modes and matrix, seconds; None if they were not computed."""
 
     condition_number: float | None = None
-    """Of the whole matrix at the nominal registration; None: not computed, or more modes than
-    slopes."""
+    """Condition number of the whole matrix at the nominal registration; None if it was not computed
+    or has more modes than slopes."""
 
     n_weak: int = 0
-    """Singular values beyond the condition that a reconstructor keeps."""
+    """Number of singular values that a reconstructor truncates."""
 
 
 def implied(instrument: Instrument, most_gb: float) -> Implied:
-    """Return what an instrument implies; its matrix is computed if that takes no more than this.
+    """Return the properties; the matrix is computed if it needs at most ``most_gb`` of memory.
 
     Raises
     ------

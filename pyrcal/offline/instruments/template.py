@@ -27,7 +27,7 @@ pyrcal instrument check FILE, pyrcal instrument show FILE PICTURE.png
 
 
 def template(kind: SensorKind) -> str:
-    """Return an instrument file for a kind of sensor: it can be read as it stands."""
+    """Return a valid instrument file for a kind of sensor, as a template."""
     lines = [*_comment(_HEAD)]
     for table in tables_of(whole_of(kind)):
         examples = dict(EXAMPLES.get(table.header, {}))

@@ -32,7 +32,8 @@ FAR = 2.5
 """Distance of a far actuator over that of the tile's corner from its middle."""
 
 DEGREE = 22
-"""Of the series: 2.5^-22 is 2e-9, and heights are right to a thousandth of what float32 rounds."""
+"""Degree of the series: 2.5^-22 is 2e-9, and the error of heights is a thousandth of the
+rounding error of float32."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -56,7 +57,7 @@ class PlateSum:
     """``(n_actuators + 3, n_modes)`` weights of its functions."""
 
     _tiles: dict[tuple[int, int], _Tile] = field(default_factory=dict)
-    """Where points have lain so far; two threads may make the same one."""
+    """Tiles computed so far, by their place on the grid; two threads may compute the same one."""
 
     def heights(self, points: Array) -> Array:
         """Return the modes ``(n_points, n_modes)`` at points ``(n_points, 2)``."""

@@ -1,4 +1,4 @@
-"""What an instrument's matrices take in memory and work, known before anything is computed."""
+"""Memory and work that an instrument's matrices take, estimated before anything is computed."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ class Gaussian:
     """``(n_actuators, 2)`` x and y."""
 
     pitch: float
-    """In the units of ``positions``."""
+    """Distance of neighbouring actuators, in the units of ``positions``."""
 
     coupling: float
     """Height at one pitch, 0..1."""
@@ -147,7 +147,7 @@ _PER_PITCH = 4
 """Places along a pitch of a gap at which its step is looked at."""
 
 _BESIDE_DEG = 1e-6
-"""Beside a gap, on either side of it."""
+"""Angle on either side of a gap at which its step is evaluated, degrees."""
 
 NOTHING = 1e-6
 """Height below which a local function is left out: of slopes as much, and D keeps five digits."""
@@ -168,7 +168,7 @@ def mirror_surface(mirror: Mirror, subaperture_m: float) -> Surface:
 
 
 def segment_of(points: Array, gaps_deg: tuple[float, ...]) -> NDArray[np.intp]:
-    """Return the segment ``(n_points,)`` that each point lies on, counted from the first gap."""
+    """Return the segment ``(n_points,)`` that contains each point, counted from the first gap."""
     angle_deg = np.rad2deg(np.arctan2(points[:, 1], points[:, 0])) % 360.0
     return np.asarray(np.searchsorted(gaps_deg, angle_deg, side="right") % len(gaps_deg))
 

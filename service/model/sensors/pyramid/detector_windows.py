@@ -33,8 +33,8 @@ _AT_ONCE = 32
 """Frames that are cut together: more only need memory."""
 
 _FARTHEST_SUBAP = 0.5
-"""Distance from the circle through its edge at which a place that the model leads to is not
-believed."""
+"""Distance from the circle fitted to the edge beyond which a position computed with the model is
+rejected, subapertures."""
 
 _SAME_SIZE = 0.05
 """Relative difference of the images' diameter from the file's that is refused."""
@@ -64,7 +64,7 @@ class Windows:
     """``(2, 2, 2)``: of the image at this side along y and x its row and column."""
 
     shape: tuple[int, int]
-    """Of a frame: rows, columns."""
+    """Shape of a frame: rows, columns."""
 
     windows: tuple[_Window, ...]
     """At -y -x, -y +x, +y -x, +y +x."""
@@ -92,8 +92,8 @@ class Windows:
 def frame_windows(instrument: Instrument, flux_frame: Array) -> Windows:
     """Return the windows of an instrument that delivers frames.
 
-    ``flux_frame`` is ``(rows, columns)``, a mean frame; where the instrument does not tell where
-    the pupil images lie, they are found in it.
+    ``flux_frame`` is ``(rows, columns)``, a mean frame; pupil images without positions in the
+    instrument file are located in it.
 
     Raises
     ------
@@ -165,10 +165,9 @@ def _windows_at(instrument: Instrument, centres: Array, flux_frame: Array, pixel
 def locate_images(
     instrument: Instrument, flux_frame: NDArray[np.floating]
 ) -> tuple[Instrument, tuple[str, ...]]:
-    """Return the instrument with its pupil images where they lie in a mean frame, and remarks.
+    """Return the instrument with its pupil images located in a mean frame, and remarks.
 
-    Where the instrument file says where they lie it stays, and a remark says how far the light is
-    from there.
+    Positions in the instrument file are kept, and a remark states how far the light is from them.
 
     Raises
     ------
@@ -189,7 +188,7 @@ def locate_images(
 
 
 def _beside_the_light(instrument: Instrument, windows: FrameWindows, light: Array) -> Iterator[str]:
-    """Yield that the centres of the file lie beside the pupil images of the flux frame."""
+    """Yield a remark if the centres in the file differ from the pupil images of the flux frame."""
     if windows.centres_px is None:
         return
     pixels = windows.pixels_per_subaperture
@@ -213,7 +212,7 @@ def _listed(centres: Array) -> str:
 def slopes_from_frames(
     instrument: Instrument, frames: NDArray[np.floating], flux_frame: NDArray[np.floating]
 ) -> Array:
-    """Return the slopes ``(n_slopes, n_modes)`` that differential frames stand for.
+    """Return the slopes ``(n_slopes, n_modes)`` of differential frames.
 
     Parameters
     ----------

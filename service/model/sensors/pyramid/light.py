@@ -1,15 +1,15 @@
-"""Find the pupil images in their mean light, and how evenly they are lit.
+"""Find the pupil images in their mean light, and measure the illumination inside them.
 
-With the mirror as stop the outline and the obscuration move with the shift, so their edges are a
-start for a fit, before any matrix is looked at. The light inside the outline may be uneven: it is
-modelled as a smooth surface times what an even beam would show, diffraction included, and only the
-edges tell the position.
+With the mirror as stop the outline and the obscuration move with the shift, so their edges give a
+start for a fit before any matrix is measured. The light inside the outline may be uneven: it is
+modelled as a smooth surface times the image of an even beam, diffraction included, and only the
+edges determine the position.
 
 Slopes weigh by the light of their subaperture (global normalisation), so an unevenness of 20 % is
-20 % of a slope: larger than everything a registration does to the matrix. Heritier et al. 2018
-(section 4.4) suggest to put the measured illumination into the model. The pattern belongs to the
+20 % of a slope: larger than the effect of any misregistration on the matrix. Heritier et al. 2018
+(section 4.4) suggest putting the measured illumination into the model. The pattern belongs to the
 beam, that is to the pupil's images: with the mirror as stop it moves with them, and the map is kept
-relative to where they lay when the light was counted. With a fixed telescope stop it stays on the
+relative to their position when the light was measured. With a fixed telescope stop it stays on the
 sensor.
 """
 
@@ -34,7 +34,7 @@ from service.model.slopes import turned_mask
 Array = NDArray[np.float64]
 
 _ORDER = 3
-"""Of the polynomial that stands for uneven light."""
+"""Order of the polynomial that models uneven light."""
 
 _FIRST_STEPS = np.arange(-3.0, 3.1, 1.0)
 """Positions tried first on either axis, subapertures."""
@@ -76,8 +76,8 @@ _FLOOR_SUBAP = 0.02
 
 
 _OFFSET_FLOOR_SUBAP = 0.005
-"""1 σ of a displacement by static aberrations and dead pixels, which differ from image to image;
-uneven light, which all images share, moves none of them beside the others."""
+"""1 σ of a displacement by static aberrations and dead pixels, which differ from image to image,
+subapertures; uneven light, common to all images, does not displace them relative to one another."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -116,11 +116,11 @@ class PyramidLight:
         return np.ascontiguousarray(sides).reshape(4, n, n)
 
     def find_pupil(self, counts: NDArray[Any]) -> PupilPosition | CannotTell:
-        """Return where the pupil images lie."""
+        """Return the position of the pupil images."""
         return find_pupil(counts, self.instrument)
 
     def find_image_offsets(self, counts: NDArray[Any]) -> ImageOffsets | CannotTell:
-        """Return how far each pupil image lies from its place on the pixel grid."""
+        """Return the displacement of each pupil image from its place on the pixel grid."""
         return find_image_offsets(counts, self.instrument)
 
     def illumination(self, counts: NDArray[Any], position: PupilPosition) -> Illumination:
@@ -173,10 +173,10 @@ def find_pupil(counts: NDArray[Any], instrument: Instrument) -> PupilPosition | 
 
 
 def find_image_offsets(counts: NDArray[Any], instrument: Instrument) -> ImageOffsets | CannotTell:
-    """Return how far each pupil image lies from its place, in the mean counts ``(4, n, n)``.
+    """Return the displacement of each pupil image in the mean counts ``(4, n, n)``.
 
-    Whatever displacements the instrument file states are not used. Axes and order are those of
-    ``find_pupil``. What moves all four images alike is a shift, and no part of it.
+    Displacements stated in the instrument file are not used. Axes and order are those of
+    ``find_pupil``. A displacement common to all four images is a shift and is not included.
 
     Raises
     ------
@@ -196,9 +196,9 @@ def find_image_offsets(counts: NDArray[Any], instrument: Instrument) -> ImageOff
 
 
 def image_places(counts: NDArray[Any], instrument: Instrument) -> Array | CannotTell:
-    """Return where each image lies ``(4, 2)``: x and y from its place on the grid, subapertures.
+    """Return each image's displacement from its place on the grid ``(4, 2)``: x, y, subapertures.
 
-    ``counts`` ``(4, n, n)`` are the mean light, cut out so that the images lie within half a
+    ``counts`` ``(4, n, n)`` are the mean light, cut out so that the images are within half a
     subaperture of their places.
 
     Raises
@@ -320,7 +320,10 @@ def _first_guess(images: Array, optics: PyramidOptics) -> Array:
 def _departures(
     images: Array, optics: PyramidOptics, position: Array
 ) -> tuple[Array, Array, float]:
-    """Return how far each image lies from ``position`` and its σ, ``(4, 2)`` each, and the rest."""
+    """Return displacements of the images from ``position``, their σ and the RMS residual.
+
+    Displacements and σ are ``(4, 2)`` each.
+    """
     even = even_images(optics, _pair(position))
     rates = [
         (
@@ -377,10 +380,11 @@ def _pair(position: Array) -> tuple[float, float]:
 
 
 _LIT = 0.5
-"""Share of a full subaperture's light from which one tells how evenly the beam is lit."""
+"""Smallest share of a full subaperture's light at which the illumination of the beam is measured.
+"""
 
 _SMOOTHING_SUBAP = 1.0
-"""Of the map: a subaperture cannot tell what is finer than itself, and diffraction ripples."""
+"""Smoothing of the map, subapertures: finer structure is not resolved, and diffraction ripples."""
 
 _SPREAD_SUBAP = 1.0
 _MARGIN = 4
@@ -414,9 +418,10 @@ def measured_illumination(
 def relative_light(
     counts: NDArray[Any], instrument: Instrument, position: PupilPosition
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the light over that of an even beam, ``(n, n)`` on the sensor, and where it is known.
+    """Return the light relative to an even beam, ``(n, n)`` on the sensor, and the known part.
 
-    Not smoothed: what is sharp in it, a spider's shadow, tells the rotation.
+    The map is not smoothed: sharp structure in it, such as a spider's shadow, determines the
+    rotation.
 
     Raises
     ------
@@ -438,9 +443,9 @@ def _excess(images: Array, shown: Array, lit: NDArray[np.bool_]) -> Array:
 
 
 def _filled(share: Array, lit: NDArray[np.bool_]) -> Array:
-    """Return the map, smoothed, with what lies outside the pupil continued from inside.
+    """Return the smoothed map, extrapolated from inside the pupil to its outside.
 
-    Normalised convolution, ever wider until everything is reached.
+    It is a normalised convolution that widens until everything is reached.
     """
     padded = np.pad(np.where(lit, share, 0.0), _MARGIN)
     known = np.pad(lit.astype(np.float64), _MARGIN)

@@ -27,8 +27,8 @@ from service.model.sensors.shack_hartmann.stars import spots_of
 Array = NDArray[Any]
 
 _DARK = 0.1
-"""Light over that of a full subaperture below which a slope fades: of next to no light it tells of
-the very edge, and no RTC divides by it."""
+"""Light relative to a full subaperture below which a slope is attenuated: with little light it
+measures only the edge, and no RTC divides by it."""
 
 _LIGHT_SAMPLING = 12
 """Points of the light's grid along a subaperture, at least."""
@@ -60,7 +60,7 @@ class ShackHartmannSensor:
 
     @property
     def keeps_gradient(self) -> bool:
-        """That K, which is sparse, is kept."""
+        """True: K is sparse, so that it can be kept."""
         return True
 
     @property
@@ -131,7 +131,7 @@ class ShackHartmannSensor:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Interpolation:
-    """How the nodes of every lenslet read wavefronts on the pupil's grid, along one axis."""
+    """Interpolation from the pupil's grid to the nodes of every lenslet, along one axis."""
 
     first: NDArray[np.intp]
     """``(n,)`` first point of the grid that the nodes of each lenslet read."""
@@ -140,7 +140,7 @@ class Interpolation:
     """``(n_nodes, n_read)``, cubic."""
 
     rate: Array
-    """Of the weights, by the image's shift."""
+    """Derivative of the weights with respect to the image's shift."""
 
 
 def interpolation(sensor: ShackHartmannSensor, shift: float) -> Interpolation:
@@ -216,7 +216,7 @@ class ShackHartmannResponse:
         return light.reshape(n, n, *light.shape[1:]).swapaxes(1, 2)
 
     def lit(self, light: NDArray[np.float64]) -> ShackHartmannResponse:
-        """Return the same: a centroid does not depend on how much light tells it."""
+        """Return the response itself: a centroid does not depend on the light of its spot."""
         return self
 
     def apply(self, shapes: Shapes) -> Array:

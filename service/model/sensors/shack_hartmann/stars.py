@@ -26,20 +26,21 @@ if TYPE_CHECKING:
 
 
 STRAIGHT = (0.8, 1.25)
-"""Of the way that a spot's centroid goes over the way that its pixels at rest say: further from 1
-pixels pass the threshold as the spot moves."""
+"""Range of a centroid's motion relative to the motion computed with the pixels used at rest;
+further from 1, pixels cross the threshold as the spot moves."""
 
 _MOVES = 0.2
-"""By which spots move in a closed loop, λ/d."""
+"""Motion of a spot in a closed loop, λ/d."""
 
 _SPOTS_LOOKED_AT = 8
 """Across a sensor whose spots are not alike."""
 
 _FINEST = 0.5
-"""Of λ/d: a laser's beam is wider than that."""
+"""Smallest spot of a laser star, λ/d: a laser's beam is wider than that."""
 
 _LONGEST = 2.0
-"""Of a field's width: of a longer spot the field has but a piece."""
+"""Largest length of a spot relative to the width of a field, which holds only a part of a longer
+one."""
 
 
 def spots_of(wfs: ShackHartmann, width_m: float, lenslets: NDArray[np.bool_]) -> Spots:
@@ -74,7 +75,7 @@ def centroid_variances(instrument: Instrument) -> tuple[Term, Term]:
 
 
 def check_star(wfs: ShackHartmann, width_m: float) -> None:
-    """Refuse a laser star that no field of this sensor can hold, and centroids that lie.
+    """Refuse a laser star that no field of this sensor can hold, and nonlinear centroids.
 
     Raises
     ------

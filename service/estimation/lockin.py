@@ -51,13 +51,13 @@ class LockInPlan(WindowPlan):
     frame_rate_hz: float
 
     def __post_init__(self) -> None:
-        """Refuse a plan whose lines or side bins would leave the spectrum or be cut short.
+        """Refuse a plan with lines or side bins outside the spectrum or between its bins.
 
         Raises
         ------
         ModelError
             If the lists differ in length, a frequency leaves (20 Hz, Nyquist - 20 Hz), two lines
-            lie within 4 bins of one another, or the window cuts a period.
+            are within 4 bins of one another, or the window cuts a period.
         """
         lines = np.array(self.frequencies_hz)
         edge = SIDE_OFFSETS_HZ.max()

@@ -34,16 +34,16 @@ GROWTH = 3
 """Each next fit has so many times the columns of the last."""
 
 STEPS = 6
-"""Of each fit at most."""
+"""Largest number of iterations of each fit."""
 
 SETTLED = np.array([0.003, 0.003, 3e-4, 3e-4])
 """A shorter step ends a fit, numeric units."""
 
 LINEAR = np.array([0.1, 0.1, np.deg2rad(0.5), 0.005])
-"""Further from where it was taken a linearisation is made anew, numeric units."""
+"""Distance from its registration beyond which a linearisation is recomputed, numeric units."""
 
 LONGEST_STEP = np.array([0.7, 0.7, np.deg2rad(4.0), 0.04])
-"""Of one iteration, numeric units."""
+"""Longest step of one iteration, numeric units."""
 
 MAX_STRANGE = 0.3
 """Share of columns that may be no mode of the model before all are taken for another basis."""
@@ -121,7 +121,7 @@ class OwnMatrix:
     """Weight of each mode of the basis for the measurement of α; empty if all count alike."""
 
     left_over: LeftOver | None = None
-    """What the model leaves of the modes that it knows; None if it was not worked out."""
+    """Residual of the matrix in the recognised modes; None if it was not computed."""
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -147,12 +147,12 @@ class OwnMatrix:
 
     @property
     def tells_registration(self) -> bool:
-        """Whether enough modes were recognised for ``alpha`` to be a start of fits."""
+        """True if enough modes were recognised for ``alpha`` to be a start of fits."""
         return int(self.known.sum()) > N_PARAMETERS and bool(np.isfinite(self.covariance).all())
 
     @property
     def wrong(self) -> str:
-        """Which modes have another sign or place than the instrument file says; empty: none."""
+        """Text on modes with a sign or place unlike the instrument file's; empty without any."""
         strange = self.modes < 0
         if strange.mean() > MAX_STRANGE:
             return (
@@ -165,7 +165,7 @@ class OwnMatrix:
 
     @property
     def uneven(self) -> str:
-        """Which modes answer otherwise than their neighbours; empty: none."""
+        """Text on modes whose response differs from their neighbours'; empty without any."""
         recognised = np.flatnonzero(self.modes >= 0)
         size = np.abs(self.response)
         ratio = {
@@ -185,7 +185,7 @@ class OwnMatrix:
 
     @property
     def typical_response(self) -> float | None:
-        """Median response of the modes that are known, over the drawing's; None: none is."""
+        """Median ratio of the recognised modes' response to the nominal; None without any."""
         return float(np.median(self.response[self.known])) if self.known.any() else None
 
     @property

@@ -200,12 +200,12 @@ class ResidualLevel:
         return power > RUNAWAY_RATIO * float(usual[upper].sum())
 
     def lost(self, parts: tuple[Residual, ...]) -> bool:
-        """Return whether the loop no longer does what it is for.
+        """Return True if the loop no longer corrects.
 
         Its residual is far larger than before, and either as large as the turbulence that the
-        mirror followed then, or the mirror itself moves by far more. A pyramid that saturates
-        reads a small residual of a lost loop: there the commands of the upper half of the modes
-        tell, which wander less than those of tip and tilt.
+        mirror followed then, or the mirror itself moves by far more. A saturated pyramid measures a
+        small residual in a lost loop: then the commands of the upper half of the modes show the
+        loss, because they wander less than those of tip and tilt.
         """
         last = total_of(parts[-LATELY:])
         if last is None or not last.n_seen:

@@ -173,16 +173,16 @@ class Standby:
         drive: Callable[[zenoh.Session], list[object]],
         report: Callable[[ServicesMet], None],
     ) -> None:
-        """Take no place yet.
+        """Create the standby without joining the election.
 
         Parameters
         ----------
         keys
-            Of the system.
+            Keys of the system.
         drive
-            Declares what only the service that drives holds, and returns it.
+            Declares the subscribers and queryables of the driving service, and returns them.
         report
-            Is told when others came or went.
+            Called when other services came or went.
         """
         self._keys = keys
         self._drive = drive
@@ -266,7 +266,7 @@ class Standby:
         self._settle()
 
     def _settle(self) -> None:
-        """Drive or stand by according to the order, and report changes."""
+        """Drive or go to standby according to the election, and report changes."""
         with self._lock:
             if self._session is None:
                 return

@@ -285,18 +285,18 @@ def latency_s(session: zenoh.Session, sample: zenoh.Sample, now_ns: int) -> floa
 def send_command(
     session: zenoh.Session, endpoint: Endpoint, command: wire.Command, signatures: Signatures
 ) -> bytes:
-    """Return the RTC's answer to a command, repeated with the same id until there is one.
+    """Return the RTC's reply to a command, repeated with the same id until there is one.
 
-    zenoh ends a query at once that nobody serves. That an RTC does not offer an optional command is
-    concluded only if its liveliness token was there at each attempt: an RTC that has just lost its
-    link serves nothing for a moment, either.
+    zenoh ends a query without a queryable at once. An optional command counts as not offered only
+    if the RTC's liveliness token was there at each attempt: an RTC that has just lost its link has
+    no queryables for a moment, either.
 
     Raises
     ------
     WireError
         If the command breaks the contract.
     LinkError
-        If there is none after all attempts, or it is not signed as it must be.
+        If there is none after all attempts, or its signature is missing or wrong.
     """
     payload, kind = wire.encode(command), wire.command_kind(command)
     keys = wire.Keys(endpoint.system)

@@ -158,15 +158,15 @@ class ArchiveWriter:
         self._log.info(entry.name, **said, **ids_of(f"{entry.text} {answer}", self._state()))
 
     async def before(self, effect: Effect) -> None:
-        """Wait until what has led to an effect is on the disk.
+        """Wait until the causes of an effect are on the disk.
 
-        A demand to move the mirror's image is there for the next service as well: nobody else can
-        tell it that the image may stand elsewhere.
+        A request to move the mirror's image is saved for the next service as well: it has no other
+        way to learn that the image may have moved.
 
         Raises
         ------
         ArchiveError
-            If it cannot be: nothing is begun that cannot be recorded.
+            If that fails: an action that cannot be recorded must not begin.
         """
         request = effect.request if isinstance(effect, ev.Ask) else None
         if isinstance(request, BEGINNINGS) or isinstance(effect, ev.SendMatrix):

@@ -7,18 +7,19 @@ from collections.abc import Callable
 from typing import Final
 
 STALLED_S: Final = 30.0
-"""A round takes a second at most; on a machine that is full, or swaps, some."""
+"""Longest time between two rounds: a round takes a second at most, but some on a machine that is
+overloaded or swaps."""
 
 
 class Heartbeat:
-    """When each part of the service last began a round of its work.
+    """Time at which each part of the service last began a round of its work.
 
-    A part counts from its first round on: what has not begun cannot stand still.
+    A part is watched from its first round on.
 
     Parameters
     ----------
     now_s
-        The clock: monotonic, seconds.
+        Monotonic clock, seconds.
     """
 
     def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:

@@ -210,18 +210,18 @@ class FitQueue:
         n_bytes: int | None,
         name: str = "",
     ) -> FitJob:
-        """Keep an upload and queue its fit, under a ``name``.
+        """Store an upload and queue its fit, under a ``name``.
 
         Raises
         ------
         TooLargeError
-            If it is beyond the limit; before it is read where its length ``n_bytes`` is told.
+            If it exceeds the limit; before it is read if its length ``n_bytes`` is given.
         TooSlowError
-            If it stands still, or trickles.
+            If it stalls, or is too slow.
         BusyError
             If too many wait already.
         MatrixError
-            If it stops half-way, or is no file a matrix could be in.
+            If it is incomplete, or no type of file that can hold a matrix.
         """
         self._check_room(n_bytes)
         job = self._remember(name)
@@ -375,16 +375,16 @@ def _too_large(found: str, max_bytes: int) -> errors.TooLargeError:
 
 
 async def run_program(words: Sequence[str], *, limit_s: float) -> None:
-    """Run a program to its end; it is ended when the time is over, or nobody waits for it.
+    """Run a program to its end; it is ended after the time limit or on cancellation.
 
-    It holds the other end of its standard input: one that reads it sees when the service ends,
-    however that does. Ctrl-C in the service's terminal does not reach it.
+    This process holds the other end of its standard input: a program that reads it sees the end of
+    the service, however it comes. Ctrl-C in the service's terminal does not reach it.
 
     Raises
     ------
     WorkerError
         If it cannot be started, dies, takes longer than ``limit_s``, or ends with another status
-        than 0: what it said last on standard error.
+        than 0; the message is its last line on standard error.
     """
     try:
         process = await asyncio.create_subprocess_exec(

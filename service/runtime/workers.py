@@ -123,7 +123,7 @@ class WorkerPool:
         ------
         WorkerError
             If the worker process died, or hung and was killed, and a new one is there for the next
-            job; or if the job failed in a way nobody foresaw, which must not end the service.
+            job; or if the job raised an unexpected exception, which must not end the service.
         """
         work = partial(run_job, job, *args, **kwargs)
         if self._owner is asyncio.current_task():
@@ -186,7 +186,7 @@ class WorkerPool:
         Raises
         ------
         TimeoutError
-            If the worker stands still, or takes far more than such a job ever has.
+            If the worker has stopped, or takes far longer than such a job ever has.
         """
         begun_cpu_s = last_cpu_s = worker.cpu_s()
         moved_s, limit_s = time.monotonic(), self._limit_s.get(name, UNKNOWN_LIMIT_S)
@@ -212,7 +212,7 @@ class WorkerPool:
 
 
 async def with_another_worker(job: Callable[[], Awaitable[R]], lost: Callable[[str], None]) -> R:
-    """Return what a job brings, done again where the worker has died of it; ``lost`` hears why.
+    """Return the result of a job, repeated if its worker died; ``lost`` is called with the reason.
 
     Raises
     ------

@@ -299,14 +299,14 @@ def _own_definition(rule: Rule) -> AlarmDefinition:
 
 
 def set_value(context: StepContext, command: cmd.SetValue) -> None:
-    """Take a value that is asked for; it counts for as long as was said.
+    """Store a value that the observatory reports, for the stated validity time.
 
     Raises
     ------
     CommandError
-        If it is of another kind than whoever asks for it expects.
+        If its type differs from that of the rule or pointing law that uses it.
     UnknownIdError
-        If neither a rule nor the law of pointing asks for it.
+        If neither a rule nor the pointing law uses it.
     """
     asked = _values_asked_for(context)
     if command.name not in asked:

@@ -51,7 +51,7 @@ class Instruction:
     """Reason of the order, for the audit trail."""
 
     by: Annotated[str, MaxLen(100)] = ""
-    """Name of whoever gives the order; empty if only the address is known."""
+    """Name of the person who gives the order; empty if only the address is known."""
 
     def __post_init__(self) -> None:
         """Refuse what would act on the terminal it is shown on.

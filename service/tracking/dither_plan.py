@@ -46,16 +46,18 @@ from service.tracking.step_context import StepContext
 from service.wire import Status
 
 MIN_WINDOWS = 3
-"""Windows that must agree before the dither is less than the whole budget, or pauses."""
+"""Windows that must agree before the dither uses less than the whole budget, or pauses."""
 
 LASTING_S = 30.0
-"""Of a request without pause: no longer does a dead service leave a dither behind."""
+"""Longest dither requested at once, so that a dither ends soon after a crashed service."""
 
 SHORTEST_PAUSE_S = 3.0
-"""A shorter one is not worth the settling of the next dither."""
+"""Shortest pause between dithers: a shorter one saves less than the next dither's settling takes.
+"""
 
 PASSIVE_WITHIN_S = 25.0
-"""A passive estimate younger than this is watching: two of its looks, and some."""
+"""Largest age of a passive estimate that still counts as monitoring: a little more than two of its
+intervals."""
 
 FAINT_MAGNITUDE = 11.5
 FAINT_WINDOW_S = 5.0
@@ -72,33 +74,35 @@ USABLE = np.array([0.03, 0.03, np.deg2rad(0.04), 0.003])
 notices, numeric units."""
 
 CHANGE = 1.25
-"""The amplitude stays while the best one is within this factor of it."""
+"""Ratio of the best amplitude to the present one within which the present one is kept."""
 
 JUMP = np.array([0.1, 0.1, np.deg2rad(0.1), np.inf])
-"""What two windows must tell when it happens at once (numeric units): a tenth of a subaperture, a
+"""Smallest jump that two windows must detect at once, numeric units: a tenth of a subaperture, a
 tenth of a degree."""
 
 STANDS_OUT = 6.0
-"""A jump of so many σ of one window is told by two, wherever in the first it falls."""
+"""Two windows confirm a jump larger than this number of σ of one window, even if it occurred within
+the first one."""
 
 ALL_BESIDE, ONE_BESIDE = 0.25, 0.02
-"""Share of the power of the first dither that all weak lines have, and each at most: less than a
-tenth of what a strong one has, or nothing of α would be told where such a mode is another."""
+"""Share of the first dither's power for all weak lines together, and for each at most: less than a
+tenth of a strong line's, because α would be lost if the weak line's mode responded unlike the
+model."""
 
 BESIDE_HZ = 4.0
-"""Between a weak line and a strong one, or more where windows are short."""
+"""Smallest distance between a weak line and a strong one, Hz; larger if windows are short."""
 
 MIN_BESIDE = 2
-"""Windows that such a dither lasts for: they name a mode, and are enough to make a matrix."""
+"""Duration of a dither with weak lines, windows: enough to identify a mode and to make a matrix."""
 
 ROUNDING = 1.001
-"""What a dither may be stronger by than what was asked for."""
+"""Ratio of the played to the requested RMS that rounding explains."""
 
 RESULT_WITHIN_S = 10.0
-"""For the estimate of a window whose dither has ended."""
+"""Longest wait for the estimate of a window whose dither has ended."""
 
 _SLOWEST = 1e-9
-"""Random walk after a second, numeric units: nothing on a telescope stands stiller."""
+"""Smallest random walk after one second, numeric units; nothing on a telescope is more stable."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,7 +113,7 @@ class WantedDither:
     reason: str
     parameters: DitherParameters
     next_ns_utc: int
-    """When; now or earlier: at once."""
+    """Time of its start; now or earlier to start at once."""
 
 
 def choose_next(context: StepContext, rtc: Status) -> tuple[WantedDither, DitherPlan]:
@@ -160,9 +164,10 @@ def _to_show(
 def _with_others(context: StepContext, rtc: Status, choice: DitherParameters) -> DitherParameters:
     """Return the first dither with weak lines that show other modes: they cost no time.
 
-    The modes that tell of α keep most of the power, and there are none where the star is so faint
-    that one window is not as precise as is asked. It lasts for the two windows that are asked for
-    before anything is made, or one where all modes are to be shown first, and ends by itself.
+    The modes that determine α keep most of the power, and there are no weak lines if the star is so
+    faint that one window does not reach the required precision. The dither lasts for the two
+    windows that are required before a matrix is made, or for one if all modes are to be shown
+    first, and ends by itself.
     """
     registration, policy = context.registration, context.policy
     begun = registration is not None and registration.n_windows > 0
@@ -256,19 +261,19 @@ def budget_m(rtc: Status, policy: Policy) -> float:
 
 
 def quiet_budget_m(rtc: Status, policy: Policy, chosen: tuple[int, ...] = ()) -> float:
-    """Return the same of what is asked for: the loop amplifies a dither of its own modes.
+    """Return the largest RMS to request, metres: the loop amplifies a dither of its own modes.
 
-    Without ``chosen`` modes it is of those that are dithered to follow α.
+    Without ``chosen`` modes it is for those that are dithered to follow α.
     """
     quiet_m = policy.dither_budget_m / expected_amplification(rtc, policy, chosen)
     return float(min(budget_m(rtc, policy), quiet_m))
 
 
 def why_moved(dither: Dither, rtc: Status, policy: Policy, shunned: frozenset[int]) -> str:
-    """Return why another dither should take the place of one that runs; empty: it is as it should.
+    """Return why another dither should replace the one that runs, or "".
 
-    It was asked for when fewer modes were controlled, or before one of its modes was seen to
-    answer otherwise than the model says.
+    It was requested when fewer modes were controlled, or before the measured response of one of its
+    modes disagreed with the model.
     """
     if is_proving(dither.request):
         return ""
@@ -429,9 +434,9 @@ def awaits_result(context: StepContext, wanted_dither: WantedDither) -> bool:
 
 
 def why_too_strong(context: StepContext, rtc: Status) -> str | None:
-    """Return why a dither that is played costs more than it may, or None.
+    """Return why a running dither exceeds its limits, or None.
 
-    An operator's own may cost more than the budget, but not more than was asked for.
+    An operator's own dither may exceed the budget, but not its own request.
     """
     if rtc.dither is None:
         return None

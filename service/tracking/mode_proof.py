@@ -49,7 +49,7 @@ MIN_RESPONSE = 0.1
 """Slopes over the model's of any mode that a pyramid sees."""
 
 SIGNIFICANT = 4.0
-"""A response lies on one side of a limit if it does so by this many σ."""
+"""Number of σ by which a response must be beyond a limit to count as beyond it."""
 
 MAX_AT_ONCE = 100
 """Modes that are shown together: each has a line of its own, and shares the budget."""

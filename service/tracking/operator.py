@@ -174,7 +174,8 @@ CLOSE_AGAIN_EVERY_S = 5.0
 """An RTC that still measures refuses; it is asked again."""
 
 CLOSE_AGAIN_FOR_S = 3600.0
-"""Time for which the loop is closed again automatically; later, somebody wants it open."""
+"""Time for which the loop is closed again automatically; a loop open for longer is taken as open on
+purpose."""
 
 
 def set_loop(context: StepContext, command: cmd.SetLoop) -> None:

@@ -241,9 +241,9 @@ def on_proposal_judged(context: StepContext, event: ev.ProposalJudged) -> None:
 
 
 def send(context: StepContext, matrix_id: str, swapped_ns_utc: int | None = None) -> None:
-    """Mark a reconstructor as published and ask for it to be sent, with the gains in force.
+    """Mark a reconstructor as published and request to send it, with the gains in force.
 
-    ``swapped_ns_utc``: to go back behind the swap of then, as :func:`why_unsendable` has it.
+    ``swapped_ns_utc`` requests a rollback behind the swap of that time, see :func:`why_unsendable`.
 
     Raises
     ------

@@ -170,7 +170,7 @@ def on_vanished(context: StepContext, _: ev.RtcVanished) -> None:
 
 
 def on_services(context: StepContext, event: ev.ServicesMet) -> None:
-    """Stand by while another service drives the RTC, or report that one stands by."""
+    """Go to standby while another service drives the RTC, or report that one is in standby."""
     who = " and ".join(event.others)
     stood_by = context.state.alarm(alarms.STANDING_BY) is not None
     if not event.others:

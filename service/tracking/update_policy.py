@@ -1,4 +1,4 @@
-"""Decide whether a new reconstructor is worth a swap, and of how many modes."""
+"""Decide whether a new reconstructor justifies a swap, and its number of modes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ REACH = np.array([0.05, 0.05, np.deg2rad(0.05), 0.005])
 beyond α ± 3σ (numeric units)."""
 
 CALMING_S = 60.0
-"""After an update the thresholds are doubled, and come down to their own over this time."""
+"""Time over which the thresholds, doubled by an update, return to their own values."""
 
 SIGNIFICANT = 18.5
 """Squared distance, in σ, of a step of four parameters that noise makes once in a thousand."""
@@ -36,15 +36,15 @@ NOTICED = np.array([0.01, 0.01, np.deg2rad(0.02), 0.001])
 """A move of α that changes what a new matrix would win (numeric units), if it is more than 1 σ."""
 
 PROPOSAL_STANDS_S = 30.0
-"""A proposal is not replaced before, however much better α is known by then: an operator reads why,
-looks at the loop and clicks, and the gate judges it once more."""
+"""Time during which a proposal is not replaced, even if α is known better: an operator needs it to
+read the reason, check the loop and approve, and the gate judges the proposal once more."""
 
 VERDICT_REACH = np.array([0.01, 0.01, np.deg2rad(0.02), 0.001])
-"""A verdict of the gate is not for a registration further away than this (numeric units)."""
+"""Largest distance of a registration from the one of a verdict, numeric units."""
 
 
 def is_settled(registration: Registration) -> bool:
-    """Return whether α may be believed: windows agree, and none of them hints at a jump."""
+    """Return True if α is reliable: windows agree, and none of them indicates a jump."""
     sure = registration.suspected_jump is None and not registration.doubt
     return registration.n_windows >= MIN_WINDOWS and sure and registration.usable
 
@@ -69,9 +69,10 @@ def verdict_invalid_reason(
 def verdict_doubtful_reason(
     state: TrackerState, judged: Judged | None, gains: tuple[float, ...]
 ) -> str | None:
-    """Return the same where it need not be sent: while α is in doubt no verdict is of where it is.
+    """Return why a verdict is invalid or α in doubt, or None.
 
-    A reconstructor that somebody wants back is sent all the same.
+    While α is in doubt no verdict is known to cover it. A reconstructor that was requested by an
+    operator is sent all the same.
     """
     registration = state.alpha.registration
     if registration is not None and registration.doubt:
@@ -82,9 +83,9 @@ def verdict_doubtful_reason(
 def why_of_another_loop(
     state: TrackerState, judged: Judged | None, gains: tuple[float, ...]
 ) -> str | None:
-    """Return what is different in the loop since a verdict; None: nothing, or no RTC is there.
+    """Return what has changed in the loop since a verdict; None if nothing, or without an RTC.
 
-    An open loop does not tell the gains it will close with.
+    The status of an open loop does not contain the gains that it will close with.
     """
     rtc = state.loop.rtc
     if rtc is None:
@@ -184,10 +185,10 @@ def _raised(in_use: ReconstructorRecord, now_ns: int) -> float:
 def _step_since(
     in_use: ReconstructorRecord, alpha: Misregistration, registration: Registration
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Return the step from what a matrix was made for to ``alpha``, and its covariance.
+    """Return the step from a matrix's registration to ``alpha``, and its covariance.
 
-    As both were measured: they share the model error; what drift may have added since is no error
-    of either. None: noise explains it, or nobody knows.
+    Both are taken as measured: they share the model error, and drift that was added since is not an
+    error of either. None if noise explains the step, or the matrix's registration is unknown.
     """
     if in_use.alpha is None or in_use.sigma is None:
         return None
@@ -219,7 +220,7 @@ def _jumped(state: TrackerState, in_use: ReconstructorRecord, registration: Regi
 
 
 def is_left_behind(state: TrackerState, record: ReconstructorRecord, policy: Policy) -> bool:
-    """Return whether α has gone so far from this reconstructor that nobody may want it now."""
+    """Return True if α is so far from this reconstructor that it is obsolete."""
     registration = state.alpha.registration
     return registration is not None and (
         has_moved(state, record, policy) or _jumped(state, record, registration)
@@ -261,12 +262,12 @@ LADDER = (
 (FLAO, 1", where 400 leave 117); halves are tried, so that a finer list costs a trial at most."""
 
 FIRST_WAIT_S = 60.0
-"""After modes were lowered, before more are tried."""
+"""First delay after the number of modes was lowered before more are tried."""
 
 LONGEST_WAIT_S = 1800.0
 
 OPERATORS_WAIT_S = 3600.0
-"""After an operator declined more modes: who has said no is not asked again in the same hour."""
+"""Delay after an operator declined more modes: the same hour brings no second proposal."""
 
 FORGIVEN_AFTER_S = 3600.0
 """A limit found again later than this has nothing to do with the last one."""
@@ -275,7 +276,7 @@ COMFORT = 1.5
 """More modes are tried only while there is this times the margin that the gate asks for."""
 
 _DECLINED = frozenset({MatrixState.REFUSED, MatrixState.REJECTED, MatrixState.FAILED})
-"""By the gate when it judged it again, or by the RTC."""
+"""States after a rejection by the gate, when it judged again, or by the RTC."""
 
 
 def half_of_modes(n_modes: int) -> int:

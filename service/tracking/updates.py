@@ -242,8 +242,8 @@ def _explain_unproven(context: StepContext, rtc: Status, n_safe: int) -> str:
 def _is_busy(context: StepContext) -> bool:
     """Return True if a reconstructor is on its way, or one awaits an operator.
 
-    In auto nobody decides on a proposal left from another mode or an absent RTC, unless there is no
-    matrix to return to.
+    In auto a proposal left from another mode or an absent RTC awaits no decision, unless there is
+    no matrix to return to.
     """
     state = context.state
     awaited = state.operator.mode is not Mode.AUTO or why_no_return(state) is not None

@@ -98,16 +98,16 @@ def store_registration(context: StepContext, registration: Registration | None) 
 
 
 def shift_estimate(context: StepContext, step: Array, spread: Array, still_ns_utc: int) -> None:
-    """Expect α elsewhere, for the mirror's image was moved; windows must confirm it.
+    """Shift the estimate of α because the mirror's image was moved; windows must confirm it.
 
     Parameters
     ----------
-    turn
-        The event being worked out.
+    context
+        Context of the event.
     step, spread
-        ``(4,)`` by how much, and 1 σ of it, numeric units.
+        Shift ``(4,)`` and its 1 σ, numeric units.
     still_ns_utc
-        When the image stands still, by the RTC's clock.
+        Time at which the image has stopped moving, by the RTC's clock.
     """
     registration = context.registration
     if registration is None:

@@ -146,8 +146,8 @@ class OpticsWorker:
     def enter_mode(self, config_id: str) -> Description:
         """Make the models of another mode of the sensor; return the expected telemetry.
 
-        Order and signs of the slopes stay as they were found; how strongly modes answer is read
-        anew of the RTC's own matrix of that mode.
+        Order and signs of the slopes are kept; the response of modes is measured again on the RTC's
+        own matrix of that mode.
 
         Raises
         ------
@@ -258,11 +258,11 @@ class OpticsWorker:
         config_id: str | None = None,
         left_over: LeftOver | None = None,
     ) -> None:
-        """List slopes in this order from now on, and expect this response ``(n_modes,)`` of modes.
+        """Use this order of slopes from now on, and this response ``(n_modes,)`` of modes.
 
-        ``config_id`` is the sensor's mode that both are of. ``left_over`` is what the model leaves
-        of the RTC's own matrix: the gate judges loops with it. None leaves what it stands for as
-        it is.
+        ``config_id`` is the sensor's mode that both belong to. ``left_over`` is the model's
+        residual of the RTC's own matrix, which the gate adds to judged loops. None leaves each
+        unchanged.
         """
         if self._model.instrument.sensor_modes and config_id is not None:
             self.enter_mode(config_id)
@@ -280,13 +280,13 @@ class OpticsWorker:
     def recognise(
         self, own: NDArray[np.float32], near: Misregistration | None, rotation_rad: float | None
     ) -> tuple[OwnMatrix | None, NDArray[np.float64] | None]:
-        """Return which modes the RTC's own matrix controls, and the response the model expects.
+        """Return the modes that the RTC's own matrix controls, and the expected response of modes.
 
-        None: it controls none; the modes answer as drawn.
+        The first is None if it controls none; the second is None if modes respond nominally.
 
-        ``rotation_rad`` is where a coarser look has found the mirror, None: nobody looked. Where a
-        mode answers otherwise than was drawn, though with its own sign and in its own place, the
-        model takes its response over: matrices made from now on allow for it.
+        ``rotation_rad`` is the rotation found in a coarser search, None without one. If the
+        response of a mode differs from the nominal one, though with its own sign and in its own
+        place, the model adopts it: later matrices allow for it.
         """
         start = near or self._start
         if near is None and rotation_rad is not None:
@@ -416,10 +416,10 @@ class OpticsWorker:
 
     @waits(at_most_s=1.0)
     def make(self, conditions: Conditions, fewer: tuple[int, ...] = ()) -> Made:
-        """Compute the reconstructor for α, as many modes as the loop has gains, and judge it.
+        """Compute the reconstructor for α, with as many modes as the loop has gains, and judge it.
 
-        Where the gate refuses it, the most of ``fewer`` modes, largest first, that pass; none
-        passes: the one asked for.
+        If the gate rejects it, return the one with the most of ``fewer`` modes, largest first, that
+        passes; if none passes, the one requested.
         """
         matrix, loop = self._model.interaction_matrix(conditions.alpha), conditions.loop
 
@@ -498,9 +498,9 @@ class OpticsWorker:
         optical_gain: NDArray[np.float64],
         magnitude: float | None,
     ) -> tuple[GateVerdict, ExpectedGain | None]:
-        """Return verdict and worth of the matrix in use, ``(n_modes, n_slopes)`` metres per slope.
+        """Return verdict and gain of the matrix in use, ``(n_modes, n_slopes)`` metres per slope.
 
-        ``optical_gain`` ``(n_basis,)`` and the star's ``magnitude`` are the expected gain's.
+        ``optical_gain`` ``(n_basis,)`` and the star's ``magnitude`` enter the expected gain.
         """
         verdict = self.judge(in_use, conditions)
         loop = replace(conditions.loop, optical_gain=optical_gain)
@@ -510,9 +510,9 @@ class OpticsWorker:
     def fit_passive(
         self, sums: PassiveSums, start: Misregistration | None
     ) -> PassiveEstimate | None:
-        """Estimate α from ordinary telemetry; None when there is too little of it.
+        """Estimate α from ordinary telemetry; None if there is too little of it.
 
-        As whoever has summed it does, about ``start``, or without one about the nominal rotation.
+        The fit begins at ``start``, by default at the nominal rotation.
         """
         found = sums.fit(self._sensor.near(start or self._start))
         if found is None:

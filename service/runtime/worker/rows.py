@@ -22,10 +22,12 @@ from service.runtime.cluster import Cluster
 from service.runtime.worker.remote_rows import RemoteRows
 
 ROW_S = 0.2
-"""A row that takes less is not worth a task: Dask and the way there take some milliseconds,"""
+"""Shortest computation of a row that is sent to a worker of the cluster: Dask and the transfer take
+some milliseconds."""
 
 PAYS_S = 4.0
-"""nor is work that takes the threads here less: to send the shapes takes tenths of a second."""
+"""Shortest computation, with the threads of this machine, that is sent to the cluster: the transfer
+of the shapes takes tenths of a second."""
 
 LOOK_S = 10.0
 """Interval between two checks for the cluster."""

@@ -1,15 +1,15 @@
-"""Acquisition: from nothing known to tracking.
+"""Acquisition: from an unknown registration to tracking.
 
-Nothing is assumed of the registration. The loop is opened, for one that is closed far from
+Nothing is assumed of the registration. The loop is opened, because a loop closed far from
 registration slips; smooth modes lead to α and other modes must confirm it; a reconstructor for as
-many modes as the gate accepts everywhere in α ± 3σ closes the loop; then ordinary windows sharpen
-α and more modes follow. What does not come true within its time begins anew with the loop opened
-again, a few times, and then ends in a state that says why.
+many modes as the gate accepts everywhere in α ± 3σ closes the loop; then ordinary windows sharpen α
+and more modes follow. If a stage does not finish within its time, the acquisition restarts with the
+loop opened again, a few times, and then ends in a state that gives the reason.
 
-One that was cut off, by the end of the service or a gap in the link, leaves the RTC's loop as it
-had it, mostly open. The next service, or the same one when the RTC is back, begins anew where it
-may and the loop is as it was left; whatever else it finds it says, and leaves to the operator. It
-never closes a loop.
+An acquisition that was interrupted by the end of the service or by a gap in the link leaves the
+RTC's loop unchanged, mostly open. The next service, or the same one when the RTC is back, restarts
+it if that is permitted and the loop is as it was left; otherwise it reports what it found and
+leaves the decision to the operator. It never closes a loop.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ from service.tracking.step_context import StepContext, present
 from service.wire import DitherRequest, LoopRequest, Reply, Status
 
 ENOUGH_WINDOWS = 2
-"""Ordinary windows that must have held with the last reconstructor."""
+"""Ordinary windows that must agree with the last reconstructor in the loop."""
 
 NO_RTC = "no RTC is there: when one is, it begins anew or says why not; the loop may be open"
 
 _LASTING = (AcquisitionStage.FAILED, AcquisitionStage.INTERRUPTED)
-"""Stages that an operator, or windows, must end."""
+"""Stages that remain until an operator, or windows, end them."""
 
 PATIENCE_S = 180.0
-"""In one stage: a simulated RTC may be ten times slower than its timestamps."""
+"""Longest time in one stage: a simulated RTC may be ten times slower than its timestamps."""
 
 _LOST = (MatrixState.REJECTED, MatrixState.FAILED)
 
@@ -153,7 +153,7 @@ def _advance(context: StepContext, event: Event) -> None:
 
 
 def _end_by_event(context: StepContext, event: Event) -> bool:
-    """End one that cannot go on after the event, or begin it anew; return whether that is so."""
+    """End or restart an acquisition that cannot go on after the event; return True if it did so."""
     acquisition, state = context.acquisition, context.state
     late = context.now_ns - acquisition.since_ns_utc > PATIENCE_S * SECOND_NS
     match event:
@@ -338,11 +338,11 @@ def _finish(context: StepContext, record: ReconstructorRecord) -> None:
 
 
 def _forget_when_over(context: StepContext, event: Event) -> None:
-    """Forget an acquisition that holds back the next, once it need not.
+    """Forget an acquisition that holds back the next one, when that is no longer necessary.
 
-    One that had failed: when α is known without it, for whoever closed the loop has mended what it
-    could not, and the next trouble is another one. One that an operator ended: then too, or when an
-    operator sets the mode, which is to say what the service may do by itself.
+    One that failed is forgotten when α is known without it: the operator who closed the loop has
+    mended its cause, and a later failure has another. One that an operator ended is forgotten then
+    too, or when an operator sets the mode and so decides what the service may do by itself.
     """
     acquisition = context.acquisition
     if acquisition.stage is not AcquisitionStage.FAILED and not acquisition.held_off:
@@ -380,7 +380,7 @@ def _interrupted(state: TrackerState, cause: str) -> Acquisition:
 
 
 def _resume_interrupted(context: StepContext) -> None:
-    """Begin an acquisition that was cut off anew, or say why not and what the operator can do."""
+    """Restart an interrupted acquisition, or report why not and the operator's options."""
     rtc = context.rtc
     if rtc is None:
         return

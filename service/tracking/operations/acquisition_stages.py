@@ -45,48 +45,51 @@ from service.tracking.update_policy import (
 from service.wire import DitherKind, DitherRequest, Status
 
 WINDOW_S = 2.0
-"""Of telemetry in one far estimate."""
+"""Telemetry in one estimate with the loop open, seconds."""
 
 DITHER_S = 6.0
-"""Two windows and the time until they are fitted: a dead service leaves no dither behind."""
+"""Duration of a dither, seconds: two windows and the time until they are fitted; short, so that it
+ends soon after a crashed service."""
 
 CLOSING_GAIN = 0.3
-"""Of every mode of a loop that was found open: its status does not tell the gains."""
+"""Gain of every mode if the loop was open at the start: its status does not contain the gains."""
 
 OUT_OF_HAND_S = 2.0
-"""Duration of such an alarm before the service opens the loop itself. A lost one is opened at once,
-unless the service is going back to the matrix before, which takes less than this."""
+"""Duration of an alarm of a diverging loop after which the service opens the loop itself. A lost
+loop is opened at once, unless the service is rolling back to the previous matrix, which takes less
+than this."""
 
 MISSES_BEFORE = 3
-"""Windows in a row that found no registration, before the service acquires by itself."""
+"""Consecutive windows without a registration after which the service acquires by itself."""
 
 MISSES_DESPITE = 10
-"""The same while α is known: what comes may only be bad telemetry, which opens no loop."""
+"""Consecutive windows without a registration, while α is known, after which the service acquires:
+bad telemetry alone opens no loop."""
 
 MAX_ATTEMPTS = 3
-"""Times the loop is opened for one acquisition."""
+"""Largest number of times that one acquisition opens the loop."""
 
 HELD_OFF = (
     "; none begins by itself until windows agree in a closed loop, the mode is set anew, or one is "
     "asked for"
 )
-"""After an operator ended one, in the text of it."""
+"""End of the text of an acquisition that an operator ended."""
 
 _BELIEVED = (
     AcquisitionStage.PARTIAL,
     AcquisitionStage.WIDENING,
     AcquisitionStage.INTERRUPTED,
 )
-"""Stages in which α, where there is one, has been found by this acquisition."""
+"""Stages in which α, if it is known, was measured by this acquisition."""
 
 AGREE = 23.5
 """χ² of the difference of two estimates (4 degrees of freedom) that one in 10^4 exceeds."""
 
 MAX_MISSES = 4
-"""Windows of a stage that lead nowhere before the loop is opened anew."""
+"""Failed windows of a stage after which the loop is opened again."""
 
 STOPS_WITHIN_S = 2.0
-"""A dither that was asked to stop, by the status."""
+"""Longest time until the status shows the end of a dither that was stopped."""
 
 
 def band_of(stage: AcquisitionStage) -> Band:
@@ -157,9 +160,9 @@ def loop_found(state: TrackerState, rtc: Status, policy: Policy) -> LoopFound:
 
 
 def acquisition_left_open(state: TrackerState, rtc: Status) -> Acquisition | None:
-    """Return the acquisition that was cut off, if the loop is as it left it.
+    """Return the interrupted acquisition, if the loop is as it left it.
 
-    Opening a loop begins a session: the same one means that nobody has closed it in between.
+    Opening a loop begins a session: the same session means that the loop was not closed in between.
     """
     left = state.operations.acquisition.interruption
     if left is None or left.session != rtc.session or rtc.loop != "open":
@@ -302,7 +305,7 @@ def request_loop(context: StepContext, command: cmd.SetLoop) -> None:
 
 
 def restart_acquisition(context: StepContext, reason: str, *, slipped: bool = False) -> None:
-    """Begin anew with the loop opened again, at once, a few times; then give up.
+    """Restart with the loop opened again, at once, a few times; then give up.
 
     A loop that has slipped is closed on half as many modes next time.
     """
@@ -456,7 +459,7 @@ def _lift_limit_of_jump(context: StepContext) -> None:
 
 
 def on_missed(context: StepContext, reason: str) -> None:
-    """Count a window that led nowhere; after a few begin anew."""
+    """Count a window without a result; after a few, restart."""
     misses = context.acquisition.misses + 1
     if misses >= MAX_MISSES:
         restart_acquisition(context, reason)

@@ -1,7 +1,8 @@
 """Probation: return from a matrix that makes the loop worse.
 
-The previous matrix held the loop until a moment ago, whoever made it. It is sent again whatever the
-gate or the telemetry have reported since. If the loop is lost nevertheless, it is opened.
+The previous matrix was stable until a moment ago, whatever its origin. It is sent again regardless
+of what the gate or the telemetry have reported since. If the loop is lost nevertheless, it is
+opened.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ class RunningOperation:
 
     kind: OperationKind
     text: str
-    """What is running, and what ends it."""
+    """Running operation, and how it ends."""
 
 
 def running_operations(state: TrackerState, now_ns: int) -> tuple[RunningOperation, ...]:

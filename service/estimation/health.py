@@ -177,15 +177,15 @@ SLIPPED_RATIO = 4.5
 
 SUSPECT_RATIO = 2.5
 """Averaged position of an outer actuator, in σ of turbulence, that no healthy loop exceeds for
-longer than ``SUSPECT_FOR``; below it, a slip is over."""
+longer than ``SUSPECT_DURATION_MEMORIES``; below it, a slip is over."""
 
-SUSPECT_FOR = 2.0
+SUSPECT_DURATION_MEMORIES = 2.0
 """Times the memory of positions."""
 
-LOOK_FRAMES = 50
+EDGE_STRIDE_FRAMES = 50
 """One of so many frames is looked at, however long a block is."""
 
-SLOW_TURBULENCE = 2.0
+SLOW_TURBULENCE_RATIO = 2.0
 """Factor on the RMS of the inner actuators' averaged positions in the comparison with the outer
 ones. Turbulence carried by a slow wind keeps both parts of the mirror in place for longer than the
 memory; the largest of a ring of healthy actuators is then at 1.2 to 1.8."""
@@ -207,7 +207,7 @@ class EdgeHealth(Detector):
 
     ratio: float = 0.0
     """Largest averaged position of an outer actuator over what the inner ones show: their RMS, or
-    ``SLOW_TURBULENCE`` times that of their averaged positions, whichever is larger."""
+    ``SLOW_TURBULENCE_RATIO`` times that of their averaged positions, whichever is larger."""
 
     suspect_s: float = 0.0
     """Duration for which the ratio has been above ``SUSPECT_RATIO``, seconds."""
@@ -239,7 +239,7 @@ class EdgeHealth(Detector):
 
 def observe_edge(health: EdgeHealth, block: FrameBlock, watch: EdgeWatch) -> EdgeHealth:
     """Return the health after one more block, of which some frames are used."""
-    n_frames = np.diff([*range(0, block.n_frames, LOOK_FRAMES), block.n_frames])
+    n_frames = np.diff([*range(0, block.n_frames, EDGE_STRIDE_FRAMES), block.n_frames])
     moved = block.commands_m[np.cumsum(n_frames) - 1][:, watch.modes]
     inner = np.einsum("km,km->k", moved @ watch.inner, moved)
     each = zip(moved, inner, n_frames * (block.dt_ns * 1e-9), strict=True)
@@ -266,10 +266,10 @@ def _seen(
     power = float(fade) * health.turbulence**2 + float(1 - fade) * max(inner, 0.0)
     turbulence = float(np.sqrt(power))
     steady = max(float(average @ watch.inner @ average), 0.0) ** 0.5
-    scale = max(turbulence, SLOW_TURBULENCE * steady, 1e-3)
+    scale = max(turbulence, SLOW_TURBULENCE_RATIO * steady, 1e-3)
     ratio = float(np.abs(watch.outer @ average).max()) / scale
     suspect_s = health.suspect_s + lasted_s if ratio > SUSPECT_RATIO else 0.0
-    slipped = ratio > SLIPPED_RATIO or suspect_s > SUSPECT_FOR * watch.memory_s
+    slipped = ratio > SLIPPED_RATIO or suspect_s > SUSPECT_DURATION_MEMORIES * watch.memory_s
     return EdgeHealth(
         command=average,
         turbulence=turbulence,
@@ -289,10 +289,10 @@ LINE_RATIO = 8.0
 """Power of a line over its neighbourhood's median: a mean of eight spectra of noise never reaches
 it, so that a peak which does justifies moving a dither."""
 
-LOOK_SEGMENTS = 4
+LINE_SEARCH_SEGMENTS = 4
 """Spectra between two looks for lines: a look costs as much as hundreds of frames."""
 
-_NEIGHBOURHOOD = 20
+_NEIGHBOURHOOD_BINS = 20
 _MEMORY_SEGMENTS = 32.0
 _N_PATTERNS = 4
 
@@ -341,11 +341,11 @@ class SlopeSpectra:
         """
         if self.power is None or self.n_segments < MIN_SEGMENTS:
             return ()
-        typical = np.median(_around(self.power, _NEIGHBOURHOOD), axis=-1)
+        typical = np.median(_around(self.power, _NEIGHBOURHOOD_BINS), axis=-1)
         highest = _around(self.power, 2).max(axis=-1)
         peaks = (self.power > LINE_RATIO * typical) & (self.power == highest)
         step = self.frame_rate_hz / SEGMENT_FRAMES
-        found = [step * k for k in np.flatnonzero(peaks.any(axis=0)) if k > _NEIGHBOURHOOD]
+        found = [step * k for k in np.flatnonzero(peaks.any(axis=0)) if k > _NEIGHBOURHOOD_BINS]
         return tuple(
             float(f) for f in found if all(abs(f - known) > 3.0 * step for known in known_hz)
         )
@@ -419,21 +419,21 @@ class VibrationMonitor(Detector):
         before = self.quiet.n_segments + self.dithered.n_segments
         n_segments = quiet.n_segments + dithered.n_segments
         state = replace(self, quiet=quiet, dithered=dithered, dither_hz=dither_hz)
-        if n_segments == before or n_segments % LOOK_SEGMENTS:
+        if n_segments == before or n_segments % LINE_SEARCH_SEGMENTS:
             return state
         lines = quiet.lines_hz()
         under = dithered.lines_hz((*dither_hz, *lines))
         return replace(state, lines_hz=tuple(sorted((*lines, *under))))
 
 
-STRIDE = 8
+STANDSTILL_STRIDE_FRAMES = 8
 """One of so many frames is compared with the last one compared."""
 
-STANDS_S = 0.05
+MIN_STANDSTILL_S = 0.05
 """Telemetry that has not changed for so long is no measurement: photons and electrons always move
 the last digits of hundreds of slopes."""
 
-ALARM_S = 0.5
+STANDSTILL_ALARM_S = 0.5
 """Shortest standstill that raises an alarm: within less a camera may only have skipped some frames.
 """
 
@@ -467,13 +467,13 @@ class Standstill(Detector):
     @override
     def marks(self) -> Mark:
         """Mark of slopes that are not a measurement."""
-        return Mark.STANDS if self.lasts_s >= STANDS_S else UNMARKED
+        return Mark.STANDS if self.lasts_s >= MIN_STANDSTILL_S else UNMARKED
 
     @property
     @override
     def conditions(self) -> tuple[str | None, ...]:
         """Text of the alarm: what is frozen, since when, and the remedy; None if slopes change."""
-        if self.lasts_s < ALARM_S:
+        if self.lasts_s < STANDSTILL_ALARM_S:
             return (None,)
         what = "are the same in every frame" if self.slopes.any() else "are all zero"
         since = datetime.fromtimestamp(self.since_ns_utc * 1e-9, UTC)
@@ -487,7 +487,9 @@ class Standstill(Detector):
     def follow(self, block: FrameBlock) -> Standstill:
         """Return it after one more block."""
         state = self
-        for row in range(-block.first_seq % STRIDE, block.n_frames, STRIDE):
+        for row in range(
+            -block.first_seq % STANDSTILL_STRIDE_FRAMES, block.n_frames, STANDSTILL_STRIDE_FRAMES
+        ):
             slopes, t_ns = block.slopes[row], block.t0_ns_utc + row * block.dt_ns
             if state.session == block.session and np.array_equal(slopes, state.slopes):
                 state = replace(state, lasts_s=(t_ns - state.since_ns_utc) * 1e-9)

@@ -25,21 +25,21 @@ from service.link.statistics import EndingCertificate, Refusal
 
 DAY_S: Final = 86400.0
 
-RECENT_S: Final = 60.0
+REFUSAL_REPORT_DURATION_S: Final = 60.0
 """Time for which a refusal is reported."""
 
-LOG_EVERY_S: Final = 60.0
+LOG_INTERVAL_S: Final = 60.0
 """Least time between two lines of the log on the same."""
 
-REMEMBERED: Final = 64
+MAX_LISTED_REFUSALS: Final = 64
 """Largest number of refusals that are listed separately; the others are counted together."""
 
-OTHERS: Final = ("others", "several things", "")
+OTHER_REFUSALS: Final = ("others", "several things", "")
 
 HANDSHAKE_FAILURES_HZ: Final = 10.0
 """Failed TLS handshakes that zenoh deals with in a second: after each it waits for 0.1 s."""
 
-MIN_WAITING: Final = 20
+MIN_ALARM_CONNECTIONS: Final = 20
 """Closed connections from which on an alarm is raised: the next program waits for 2 s."""
 
 _SOCKET_TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
@@ -77,7 +77,7 @@ class LinkSecurity:
     """Time before its expiry from which a certificate is reported, seconds."""
 
 
-OPEN: Final = LinkSecurity()
+NO_SECURITY: Final = LinkSecurity()
 
 
 class LinkGuard:
@@ -111,14 +111,14 @@ class LinkGuard:
         """Note something that was refused, and log it unless that was done a moment ago."""
         now_s, key = time.monotonic(), (who, what, where)
         with self._lock:
-            if key not in self._refused and len(self._refused) >= REMEMBERED:
+            if key not in self._refused and len(self._refused) >= MAX_LISTED_REFUSALS:
                 self._forget(now_s)
-            if key not in self._refused and len(self._refused) >= REMEMBERED:
-                key = OTHERS
-            entry = self._refused.setdefault(key, [0, 0.0, -LOG_EVERY_S])
+            if key not in self._refused and len(self._refused) >= MAX_LISTED_REFUSALS:
+                key = OTHER_REFUSALS
+            entry = self._refused.setdefault(key, [0, 0.0, -LOG_INTERVAL_S])
             entry[0] += 1
             entry[1] = now_s
-            is_due = now_s - entry[2] >= LOG_EVERY_S
+            is_due = now_s - entry[2] >= LOG_INTERVAL_S
             if is_due:
                 entry[2] = now_s
         if is_due:
@@ -148,7 +148,9 @@ class LinkGuard:
 
     def _forget(self, now_s: float) -> None:
         self._refused = {
-            key: entry for key, entry in self._refused.items() if now_s - entry[1] < RECENT_S
+            key: entry
+            for key, entry in self._refused.items()
+            if now_s - entry[1] < REFUSAL_REPORT_DURATION_S
         }
 
 
@@ -181,7 +183,7 @@ def flooded_in_words(waiting: Mapping[int, int]) -> str:
         f"{n / HANDSHAKE_FAILURES_HZ:.0f} s, or when they end. Let the firewall admit few new "
         "connections of each address, or give the RTC a port of its own"
         for port, n in sorted(waiting.items())
-        if n >= MIN_WAITING
+        if n >= MIN_ALARM_CONNECTIONS
     )
 
 

@@ -340,7 +340,7 @@ def sensor_of_kind(instrument: Instrument, kind: type[_Sensor]) -> _Sensor:
     return instrument.wfs
 
 
-_LATER = frozenset(
+_LATER_FIELDS = frozenset(
     {
         "unknown",
         "sensor_modes",
@@ -395,7 +395,7 @@ def _parts(record: DataclassInstance) -> Iterator[tuple[str, object]]:
     """
     for one in fields(record):
         value = getattr(record, one.name)
-        if one.name in _LATER and not value:
+        if one.name in _LATER_FIELDS and not value:
             continue
         if isinstance(value, InfluenceShape):
             yield from _parts(value)

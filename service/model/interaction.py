@@ -49,7 +49,7 @@ LARGEST_STRETCH = 0.2
 
 _AXES = 2
 
-_DENSE = 5e5
+_MAX_DENSE_PRODUCT = 5e5
 """Points times functions of actuators up to which all are evaluated at once: tile by tile, what is
 done for each tile takes longer."""
 
@@ -191,7 +191,10 @@ class InteractionModel:
         self.basis = basis
         self._modes: _Last[Shapes] = _Last()
         local = local_of(basis)
-        by_tiles = local is not None and len(self.pupil.points) * len(local.coefficients) > _DENSE
+        by_tiles = (
+            local is not None
+            and len(self.pupil.points) * len(local.coefficients) > _MAX_DENSE_PRODUCT
+        )
         self._tiles = tiles_of(self.pupil) if by_tiles else ()
         self._combination: Array | None = None
         if local is not None and by_tiles:

@@ -25,10 +25,10 @@ from service.model.turbulence import (
 Array = NDArray[np.float64]
 
 _PISTON_RATIO = 1e-9
-_DEGENERATE = 1e-3
+_DEGENERACY_RATIO = 1e-3
 """The square grid splits pairs that the mirror's symmetry makes equal by less than this."""
 
-_FINER = 4
+_POINTS_PER_SUBAPERTURE = 4
 """Points a subaperture on which modes are orthonormal."""
 
 WHOLE_BYTES = 2.5e8
@@ -55,7 +55,7 @@ def karhunen_loeve(instrument: Instrument, surface: Surface) -> tuple[Array, Arr
             f"fewer than the {len(positions_m)} actuators (piston is left out)"
         )
     gram, covariance = surface_statistics(instrument, surface)
-    fine = instrument_pupil(instrument, _FINER)
+    fine = instrument_pupil(instrument, _POINTS_PER_SUBAPERTURE)
     sectors = [scipy.sparse.eye_array(len(positions_m), format="csc")]
     if np.allclose(fine.amplitude, fine.amplitude[::-1], rtol=0.0, atol=1e-9):
         sectors = _parity_sectors(positions_m)
@@ -182,7 +182,7 @@ def _even_before_odd(found: list[tuple[float, int, Array]]) -> list[tuple[float,
     for stop in range(1, len(found) + 1):
         if (
             stop == len(found)
-            or found[stop - 1][0] - found[stop][0] > _DEGENERATE * found[start][0]
+            or found[stop - 1][0] - found[stop][0] > _DEGENERACY_RATIO * found[start][0]
         ):
             ordered += sorted(found[start:stop], key=lambda mode: mode[1])
             start = stop

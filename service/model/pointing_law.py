@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 ANGLES: Final = ("azimuth", "elevation")
 """Names of the pointing's angles, in degrees."""
 
-LONGEST = 200
+MAX_EXPRESSION_LENGTH = 200
 """Letters of an expression."""
 
 
@@ -181,8 +181,10 @@ def _parsed(text: str) -> ast.expr:
         f"numbers, {' and '.join(ANGLES)} (degrees), names of the observatory's values, "
         f"+ - * / ** ( ) and {', '.join(FUNCTIONS)}"
     )
-    if len(text) > LONGEST:
-        raise ModelError(f"found {len(text)} letters, expected at most {LONGEST}: {expected}")
+    if len(text) > MAX_EXPRESSION_LENGTH:
+        raise ModelError(
+            f"found {len(text)} letters, expected at most {MAX_EXPRESSION_LENGTH}: {expected}"
+        )
     try:
         tree = ast.parse(text.strip(), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:

@@ -75,11 +75,11 @@ class Gaussian:
 
     @property
     def reach(self) -> float:
-        """Distance at which a function is ``NOTHING`` high, in the units of ``positions``."""
-        return float(self.pitch * np.sqrt(np.log(NOTHING) / np.log(self.coupling)))
+        """Distance at which a function has ``NEGLIGIBLE_HEIGHT``, in the units of ``positions``."""
+        return float(self.pitch * np.sqrt(np.log(NEGLIGIBLE_HEIGHT) / np.log(self.coupling)))
 
     def near(self, points: Array) -> NDArray[np.intp]:
-        """Return which functions are higher than ``NOTHING`` at any of some points close together.
+        """Return which functions exceed ``NEGLIGIBLE_HEIGHT`` at any of some points close together.
 
         ``points`` is ``(n_points, 2)``.
         """
@@ -129,7 +129,7 @@ class Gaussian:
         for gap in self.segments_deg:
             before, after = (
                 radius[:, None] * [np.cos(angle), np.sin(angle)]
-                for angle in np.deg2rad([gap - _BESIDE_DEG, gap + _BESIDE_DEG])
+                for angle in np.deg2rad([gap - _GAP_OFFSET_DEG, gap + _GAP_OFFSET_DEG])
             )
             found.append((self.basis(after) - self.basis(before)).mean(axis=0))
         return np.array(found)
@@ -146,10 +146,10 @@ class Gaussian:
 _PER_PITCH = 4
 """Places along a pitch of a gap at which its step is looked at."""
 
-_BESIDE_DEG = 1e-6
+_GAP_OFFSET_DEG = 1e-6
 """Angle on either side of a gap at which its step is evaluated, degrees."""
 
-NOTHING = 1e-6
+NEGLIGIBLE_HEIGHT = 1e-6
 """Height below which a local function is left out: of slopes as much, and D keeps five digits."""
 
 Surface = ThinPlate | Gaussian

@@ -36,10 +36,10 @@ from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.state import TrackerState
 from service.wire import Status
 
-TOLD_S = 8.0
+RECENT_WINDOW_S = 8.0
 """A window accepted within this time determines the registration."""
 
-STEADY_GATHER_S = 0.55
+IDLE_GATHER_S = 0.55
 """Duration of frames gathered while nothing happens: windows are four times as long, and alarms
 have a second. Usually a status, which is processed at once, ends the wait earlier."""
 
@@ -212,7 +212,7 @@ class Engine:
             return 0.0
         dithers = (OperationKind.OWN_DITHER, OperationKind.OTHER_DITHER)
         steady = all(running.kind in dithers for running in running_operations(state, now_ns))
-        return STEADY_GATHER_S if steady else 0.0
+        return IDLE_GATHER_S if steady else 0.0
 
     def take_sums(self) -> list[PassiveSums | str | None]:
         """Return the sums of ordinary telemetry and begin new ones, or why there are none yet.
@@ -226,7 +226,7 @@ class Engine:
         told = (
             registration is not None
             and not registration.doubt
-            and now_ns - registration.window_ns_utc < TOLD_S * SECOND_NS
+            and now_ns - registration.window_ns_utc < RECENT_WINDOW_S * SECOND_NS
         )
         self.bank, sums = close_sums(self.bank, has_windows=told)
         return list(sums.values())

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-STALLED_S: Final = 30.0
+MAX_ROUND_S: Final = 30.0
 """Longest time between two rounds: a round takes a second at most, but some on a machine that is
 overloaded or swaps."""
 
@@ -35,8 +35,8 @@ class Heartbeat:
         """Return the part that has stopped, and for how long; empty if all are running."""
         ages_s = {part: self._now_s() - beat_s for part, beat_s in self._beats_s.items()}
         return "; ".join(
-            f"{part} has stood still for {age_s:.0f} s, expected a round within {STALLED_S:g} s: "
+            f"{part} has stood still for {age_s:.0f} s, expected a round within {MAX_ROUND_S:g} s: "
             "restart the service"
             for part, age_s in ages_s.items()
-            if age_s > STALLED_S
+            if age_s > MAX_ROUND_S
         )

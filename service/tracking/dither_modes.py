@@ -23,11 +23,11 @@ LINE_RANGE = (0.2, 0.35)
 _OPTICAL_GAINS = (0.25, 0.5, 0.75, 1.0)
 """Optical gains that a loop on sky may have; unknown when a dither is planned."""
 
-PROVING_RANGE = (0.15, 0.45)
+PROVING_LINE_RANGE = (0.15, 0.45)
 """The same of the many lines that show how modes answer: what wind does to a slow one is little of
 its size."""
 
-_MANY_LINES = np.linspace(*PROVING_RANGE, 100)
+_MANY_LINES = np.linspace(*PROVING_LINE_RANGE, 100)
 
 
 def chosen_modes(

@@ -13,34 +13,34 @@ from service.errors import CommandError, ModelError
 from service.estimation.demodulation import SIDE_OFFSETS_HZ
 from service.estimation.lockin import LockInPlan
 from service.estimation.random_dither import FRAMES_PER_MODE, RandomPlan
-from service.estimation.windows import SETTLING_S, ExpectedDither
+from service.estimation.windows import DITHER_SETTLING_S, ExpectedDither
 from service.tracking.dither_modes import LINE_FRACTIONS, LINE_RANGE, N_LINES, chosen_modes
 from service.tracking.policy import Policy
 from service.tracking.products import ModeSet
 from service.wire import DitherKind, DitherRequest, Status
 
-CLEARANCES_HZ = (21.0, 8.0)
+VIBRATION_CLEARANCES_HZ = (21.0, 8.0)
 """Distances between a line and a vibration that are tried in turn: beyond the side bins that
 measure noise, then beyond the vibration's own width."""
 
-SPARE_S = 0.3
+DITHER_MARGIN_S = 0.3
 """Dither after the last window, in case it begins late because frames were lost."""
 
-PROVING_SPARE_S = 0.9
+PROVING_DITHER_MARGIN_S = 0.9
 """Dither after the last window if there is only one: frames may be delayed by half a second, and a
 status that shows the end of the dither before they are processed would cost the window."""
 
 OWN_DITHER = "dither-"
 PROVING_DITHER = "dither-prove-"
-ASKED_DITHER = "operator-"
+OPERATOR_DITHER = "operator-"
 NOISY_DITHER = "noisy-"
 ACQUIRING_DITHER = "acquire-"
 """First part of a dither's id, by purpose: to follow α, to show how modes respond, an operator's
 own, to measure a noisy interaction matrix, to acquire."""
 
-OUR_DITHERS = (OWN_DITHER, ASKED_DITHER, NOISY_DITHER, ACQUIRING_DITHER)
+OUR_DITHERS = (OWN_DITHER, OPERATOR_DITHER, NOISY_DITHER, ACQUIRING_DITHER)
 
-GONE_WITHIN_S = 3.0
+MAX_STOP_DELAY_S = 3.0
 """Time for a stop to be acknowledged, and for the next status to show it."""
 
 
@@ -140,10 +140,10 @@ def plan_dither(
     sizes = [amplitude_m or choice.total_m / np.sqrt(max(len(chosen), 1))] * len(chosen)
     if proving and choice.shares:
         sizes = [choice.total_m * np.sqrt(share) for share in choice.shares]
-    spare_s = PROVING_SPARE_S if proving else SPARE_S
-    lasting_s = SETTLING_S + choice.n_windows * choice.window_s + spare_s
+    spare_s = PROVING_DITHER_MARGIN_S if proving else DITHER_MARGIN_S
+    lasting_s = DITHER_SETTLING_S + choice.n_windows * choice.window_s + spare_s
     step_hz = step_of(rtc, choice.window_s)
-    begins = ASKED_DITHER if asked else PROVING_DITHER if proving else OWN_DITHER
+    begins = OPERATOR_DITHER if asked else PROVING_DITHER if proving else OWN_DITHER
     request = DitherRequest(
         id=f"{begins}{now_ns}",
         kind=DitherKind.SINE,
@@ -186,7 +186,7 @@ def lock_in_plan(dither: Dither, rtc: Status, window_s: float) -> LockInPlan:
         amplitude_m=dither.request.amplitude_m,
         frame_rate_hz=rtc.frame_rate_hz,
         n_frames=round((dither.window_s or window_s) * rtc.frame_rate_hz),
-        first_seq=(dither.start_seq or 0) + round(SETTLING_S * rtc.frame_rate_hz),
+        first_seq=(dither.start_seq or 0) + round(DITHER_SETTLING_S * rtc.frame_rate_hz),
     )
 
 
@@ -226,14 +226,14 @@ def clear_lines(rtc: Status, n_lines: int, choice: DitherParameters) -> tuple[fl
     edge = float(SIDE_OFFSETS_HZ.max()) + step
     near = [abs(line - vibration) for line in last for vibration in choice.avoid_hz]
     told = all(edge <= line <= rate / 2 - edge for line in last)
-    if len(last) == n_lines and told and min(near, default=np.inf) >= CLEARANCES_HZ[-1]:
+    if len(last) == n_lines and told and min(near, default=np.inf) >= VIBRATION_CLEARANCES_HZ[-1]:
         return last
     fractions = LINE_FRACTIONS[:n_lines]
     if n_lines > N_LINES:
         fractions = tuple(np.linspace(*LINE_RANGE, n_lines).tolist())
     wanted = tuple(fraction * rate for fraction in fractions)
     band = (max(LINE_RANGE[0] * rate, edge), min(LINE_RANGE[1] * rate, rate / 2 - edge))
-    for clearance_hz in (*CLEARANCES_HZ, 4.0 * step):
+    for clearance_hz in (*VIBRATION_CLEARANCES_HZ, 4.0 * step):
         found = place_lines(
             wanted, choice.avoid_hz, clearance_hz=clearance_hz, step_hz=step, range_hz=band
         )
@@ -244,7 +244,7 @@ def clear_lines(rtc: Status, n_lines: int, choice: DitherParameters) -> tuple[fl
 
 def on_vibrations(dither: Dither, avoid_hz: tuple[float, ...]) -> tuple[float, ...]:
     """Return the lines of a dither that are not clear of vibrations."""
-    near = CLEARANCES_HZ[-1] - 1e-6
+    near = VIBRATION_CLEARANCES_HZ[-1] - 1e-6
     return tuple(f for f in dither.frequency_hz if any(abs(f - v) < near for v in avoid_hz))
 
 
@@ -258,10 +258,10 @@ def step_of(rtc: Status, window_s: float) -> float:
     return rtc.frame_rate_hz / max(round(window_s * rtc.frame_rate_hz), 1)
 
 
-RANDOM_TOTAL_M = 5e-9
+DEFAULT_RANDOM_RMS_M = 5e-9
 """Default RMS of all modes together, metres OPD, within the budget."""
 
-COMFORTABLE = 2.0
+RANDOM_WINDOW_MARGIN_RATIO = 2.0
 """Ratio of the windows' length to the shortest possible for so many modes."""
 
 
@@ -302,7 +302,10 @@ def plan_random(
             f"found {1e9 * amplitude_m:.3g} nm on each of {len(modes)} modes, the RTC "
             f"takes at most {1e9 * rtc.max_dither_m:.3g} nm"
         )
-    least_s = max(policy.window_s, COMFORTABLE * FRAMES_PER_MODE * len(modes) / rtc.frame_rate_hz)
+    least_s = max(
+        policy.window_s,
+        RANDOM_WINDOW_MARGIN_RATIO * FRAMES_PER_MODE * len(modes) / rtc.frame_rate_hz,
+    )
     n_windows = int(duration_s / least_s * (1.0 + 1e-9))
     if n_windows < 1:
         raise CommandError(
@@ -314,7 +317,7 @@ def plan_random(
         modes=modes,
         amplitude_m=(amplitude_m,) * len(modes),
         seed=now_ns % (1 << 31),
-        duration_s=SETTLING_S + duration_s + SPARE_S,
+        duration_s=DITHER_SETTLING_S + duration_s + DITHER_MARGIN_S,
     )
     return Dither(request=request, asked_ns_utc=now_ns, window_s=duration_s / n_windows)
 
@@ -331,7 +334,7 @@ def random_plan(dither: Dither, rtc: Status, window_s: float) -> RandomPlan:
         modes=dither.request.modes,
         amplitude_m=dither.request.amplitude_m,
         n_frames=int((dither.window_s or window_s) * rtc.frame_rate_hz * (1.0 + 1e-12)),
-        first_seq=(dither.start_seq or 0) + round(SETTLING_S * rtc.frame_rate_hz),
+        first_seq=(dither.start_seq or 0) + round(DITHER_SETTLING_S * rtc.frame_rate_hz),
     )
 
 

@@ -291,7 +291,7 @@ def on_acknowledgement(context: StepContext, event: Acknowledgement) -> None:
 
     A rejection without an id is of a commit that the RTC could not read. It says nothing of a
     matrix of this service that is on its way: anyone may have sent that commit, and one of the
-    service's own is given up after ``ACKNOWLEDGE_WITHIN_S`` without an answer.
+    service's own is given up after ``ACKNOWLEDGEMENT_TIMEOUT_S`` without an answer.
     """
     if event.id is None:
         _warn_of_unreadable_commit(context, event)

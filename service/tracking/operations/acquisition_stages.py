@@ -44,51 +44,51 @@ from service.tracking.update_policy import (
 )
 from service.wire import DitherKind, DitherRequest, Status
 
-WINDOW_S = 2.0
+FAR_WINDOW_S = 2.0
 """Telemetry in one estimate with the loop open, seconds."""
 
-DITHER_S = 6.0
+FAR_DITHER_DURATION_S = 6.0
 """Duration of a dither, seconds: two windows and the time until they are fitted; short, so that it
 ends soon after a crashed service."""
 
 CLOSING_GAIN = 0.3
 """Gain of every mode if the loop was open at the start: its status does not contain the gains."""
 
-OUT_OF_HAND_S = 2.0
+MAX_DIVERGENCE_S = 2.0
 """Duration of an alarm of a diverging loop after which the service opens the loop itself. A lost
 loop is opened at once, unless the service is rolling back to the previous matrix, which takes less
 than this."""
 
-MISSES_BEFORE = 3
+MISSES_BEFORE_ACQUISITION = 3
 """Consecutive windows without a registration after which the service acquires by itself."""
 
-MISSES_DESPITE = 10
+MISSES_WHILE_TRACKING = 10
 """Consecutive windows without a registration, while α is known, after which the service acquires:
 bad telemetry alone opens no loop."""
 
 MAX_ATTEMPTS = 3
 """Largest number of times that one acquisition opens the loop."""
 
-HELD_OFF = (
+HELD_OFF_TEXT = (
     "; none begins by itself until windows agree in a closed loop, the mode is set anew, or one is "
     "asked for"
 )
 """End of the text of an acquisition that an operator ended."""
 
-_BELIEVED = (
+_MEASURED_STAGES = (
     AcquisitionStage.PARTIAL,
     AcquisitionStage.WIDENING,
     AcquisitionStage.INTERRUPTED,
 )
 """Stages in which α, if it is known, was measured by this acquisition."""
 
-AGREE = 23.5
+MAX_ESTIMATE_DIFFERENCE = 23.5
 """χ² of the difference of two estimates (4 degrees of freedom) that one in 10^4 exceeds."""
 
-MAX_MISSES = 4
+MAX_STAGE_MISSES = 4
 """Failed windows of a stage after which the loop is opened again."""
 
-STOPS_WITHIN_S = 2.0
+STOP_STATUS_DELAY_S = 2.0
 """Longest time until the status shows the end of a dither that was stopped."""
 
 
@@ -115,9 +115,9 @@ def wide_capture_dither(
         modes=modes,
         amplitude_m=(min(policy.acquisition_amplitude_m, rtc.max_dither_m),) * len(modes),
         frequency_hz=lines[: len(modes)],
-        duration_s=DITHER_S,
+        duration_s=FAR_DITHER_DURATION_S,
     )
-    return Dither(request=request, asked_ns_utc=now_ns, window_s=WINDOW_S)
+    return Dither(request=request, asked_ns_utc=now_ns, window_s=FAR_WINDOW_S)
 
 
 def _wide_capture_modes(
@@ -131,7 +131,7 @@ def _wide_capture_modes(
 @lru_cache(maxsize=4)
 def _lines(frame_rate_hz: float, n_lines: int) -> tuple[float, ...]:
     """Return the lines of an RTC; whether there are enough is asked with every state shown."""
-    return spread_lines(frame_rate_hz, WINDOW_S, n_lines)
+    return spread_lines(frame_rate_hz, FAR_WINDOW_S, n_lines)
 
 
 def _why_too_few(modes: tuple[int, ...], rtc: Status) -> str | None:
@@ -221,7 +221,7 @@ def why_needed(state: TrackerState, policy: Policy, now_ns: int) -> str | None:
         return None
     for alarm in state.alarms.active:
         lasted_ns = now_ns - alarm.since_ns_utc
-        waits_s = 0.0 if alarm.name == LOST and not _goes_back(state) else OUT_OF_HAND_S
+        waits_s = 0.0 if alarm.name == LOST and not _goes_back(state) else MAX_DIVERGENCE_S
         if alarm_blocks(alarm, Interlock.HOLD) and lasted_ns >= waits_s * SECOND_NS:
             return f"{alarm.name} for {lasted_ns / SECOND_NS:.0f} s"
     if missed_enough(state) and not state.loop.holds:
@@ -241,7 +241,9 @@ def _goes_back(state: TrackerState) -> bool:
 def missed_enough(state: TrackerState) -> bool:
     """Return whether so many windows in a row found no registration that it is no chance."""
     is_known = state.alpha.registration is not None and state.alpha.registration.usable
-    return state.operations.acquisition.misses >= (MISSES_DESPITE if is_known else MISSES_BEFORE)
+    return state.operations.acquisition.misses >= (
+        MISSES_WHILE_TRACKING if is_known else MISSES_BEFORE_ACQUISITION
+    )
 
 
 def count_miss(context: StepContext, kind: RefusalKind) -> None:
@@ -363,13 +365,13 @@ def abort_acquisition(context: StepContext, why: str, *, held_off: bool = False)
     begins by itself for now, though what made this one begin may last.
     """
     stop_running_dither(context)
-    if context.acquisition.stage not in _BELIEVED:
+    if context.acquisition.stage not in _MEASURED_STAGES:
         validity.forget_registration(context)
     left, found = "left as it is", _to_give_back(context.state)
     if found is not None:
         left = "closed as it was found"
         request_loop(context, cmd.SetLoop(loop="closed", leak=found.leak))
-    text = f"ended {why}; the loop is {left}{HELD_OFF if held_off else ''}"
+    text = f"ended {why}; the loop is {left}{HELD_OFF_TEXT if held_off else ''}"
     over = replace(context.acquisition, held_off=held_off, windows=context.windows.accepted)
     set_acquisition(context, over)
     enter_stage(context, AcquisitionStage.ABORTED, text)
@@ -414,11 +416,11 @@ def on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
         return
     difference = estimate.alpha.vector - before.alpha.vector
     chi2 = float(difference @ np.linalg.solve(covariance + before.covariance, difference))
-    if chi2 > AGREE:
+    if chi2 > MAX_ESTIMATE_DIFFERENCE:
         set_acquisition(context, before)
         reason = (
             f"two sets of modes disagree: {before.alpha} and {estimate.alpha}, "
-            f"chi2 {chi2:.0f}, expected at most {AGREE}"
+            f"chi2 {chi2:.0f}, expected at most {MAX_ESTIMATE_DIFFERENCE}"
         )
         restart_acquisition(context, reason)
         return
@@ -461,7 +463,7 @@ def _lift_limit_of_jump(context: StepContext) -> None:
 def on_missed(context: StepContext, reason: str) -> None:
     """Count a window without a result; after a few, restart."""
     misses = context.acquisition.misses + 1
-    if misses >= MAX_MISSES:
+    if misses >= MAX_STAGE_MISSES:
         restart_acquisition(context, reason)
     else:
         set_acquisition(context, replace(context.acquisition, misses=misses))
@@ -474,8 +476,8 @@ def _keep_dithering(context: StepContext, rtc: Status) -> None:
     if rtc.dither_id is not None:
         stopping = rtc.dither_id == context.dither_policy.stopped_id
         since_s = (context.now_ns - context.acquisition.since_ns_utc) / SECOND_NS
-        if not (stopping and since_s < STOPS_WITHIN_S):
-            context.put_off(dither_s=STOPS_WITHIN_S)
+        if not (stopping and since_s < STOP_STATUS_DELAY_S):
+            context.put_off(dither_s=STOP_STATUS_DELAY_S)
             request_stop(context)
         return
     dither = wide_capture_dither(context.acquisition.stage, rtc, context.policy, context.now_ns)

@@ -26,11 +26,11 @@ MEASURED_SIGMA_PX = 0.1
 to 0.01 pixel; on real benches, where light is uneven and spiders cross the edge, two ways to find
 them differ by 0.1 to 0.4."""
 
-SHIFT_BY_IMAGES = 0.25
+SHIFT_ERROR_RATIO = 0.25
 """Error of a shift that takes no account of displaced images, over their RMS displacement along an
 axis. Of 12 and 24 subapertures, modulated by 0 and 3 λ/D, low and high modes: 0.15 to 0.27."""
 
-EDGE_BY_IMAGES = 0.03
+EDGE_ERROR_RATIO = 0.03
 """The same of rotation and magnification, at the pupil's edge: 0.001 to 0.032."""
 
 _FRAME_KEYS = ("pupil_centres_px", "pixels_per_subaperture")
@@ -190,7 +190,7 @@ def image_floor(instrument: Instrument) -> NDArray[np.float64]:
     Numeric units. Rotation and magnification displace the pupil's edge.
     """
     sigma, radius = image_sigma_subap(instrument) or 0.0, instrument.wfs.pupil_diameter / 2.0
-    shift, edge = SHIFT_BY_IMAGES * sigma, EDGE_BY_IMAGES * sigma / radius
+    shift, edge = SHIFT_ERROR_RATIO * sigma, EDGE_ERROR_RATIO * sigma / radius
     return np.array([shift, shift, edge, edge])
 
 

@@ -41,7 +41,7 @@ _FIRST_STEPS = np.arange(-3.0, 3.1, 1.0)
 
 _PROBE_SUBAP = 0.05
 _LARGEST_STEP_SUBAP = 0.7
-_HUBER = 2.0
+_HUBER_SIGMA = 2.0
 """Residuals beyond so many robust σ count less."""
 
 _BAD_SIGMA = 6.0
@@ -49,10 +49,10 @@ _BAD_SHARE = 0.25
 """A pixel is bad when it departs from its three companions by so many robust σ and, besides, by
 this share of a lit pixel: diffraction and static aberrations make good ones differ."""
 
-_MAX_BAD = 0.03
+_MAX_BAD_SHARE = 0.03
 """Share of an image's pixels: beyond it they are not bad, the image is another one."""
 
-_LARGEST_RESIDUAL = 0.25
+_MAX_RESIDUAL = 0.25
 """RMS residual over mean light from which the map is no image of this pupil."""
 
 _PLACES_RESIDUAL = 0.12
@@ -156,10 +156,10 @@ def find_pupil(counts: NDArray[Any], instrument: Instrument) -> PupilPosition | 
         position, steps, formal, residual = _settled(images, optics, start)
     except np.linalg.LinAlgError:
         return CannotTell(reason="the light has no edge the position could be read from")
-    if residual > _LARGEST_RESIDUAL:
+    if residual > _MAX_RESIDUAL:
         return CannotTell(
             reason=f"the light is not that of the instrument's pupil: {residual:.0%} of it remain "
-            f"unexplained, expected at most {_LARGEST_RESIDUAL:.0%}; check the mask, the pupil "
+            f"unexplained, expected at most {_MAX_RESIDUAL:.0%}; check the mask, the pupil "
             "diameter and the obscuration"
         )
     scatter = steps.std(axis=0, ddof=1) / np.sqrt(len(steps))
@@ -235,7 +235,7 @@ def _locate_images(
                 break
     except np.linalg.LinAlgError:
         return CannotTell(reason="the light has no edge the places could be read from")
-    if residual > _LARGEST_RESIDUAL:
+    if residual > _MAX_RESIDUAL:
         return _other_light(residual)
     return places, formal, residual
 
@@ -286,7 +286,7 @@ def repaired(counts: NDArray[Any], instrument: Instrument) -> tuple[Array, NDArr
     spread = 1.4826 * np.nanmedian(np.abs(difference))
     lit = np.nanpercentile(middle, 75.0)
     bad = ~(np.abs(difference) <= _BAD_SIGMA * spread + _BAD_SHARE * np.maximum(middle, lit))
-    bad &= np.isnan(images) | (bad.mean(axis=(1, 2), keepdims=True) <= _MAX_BAD)
+    bad &= np.isnan(images) | (bad.mean(axis=(1, 2), keepdims=True) <= _MAX_BAD_SHARE)
     return np.where(bad, np.nan_to_num(middle) * level[:, None, None], images), bad
 
 
@@ -357,7 +357,7 @@ def _departure(
         solution, covariance = _weighted(columns, image, weights)
         left = image - columns @ solution
         scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
-        weights = np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(left), 1e-12))
+        weights = np.minimum(1.0, _HUBER_SIGMA * scale / np.maximum(np.abs(left), 1e-12))
         light = surface @ solution[: surface.shape[1]]
     return solution[-2:], scale * np.sqrt(np.diag(covariance)[-2:]), float(left.std())
 
@@ -379,7 +379,7 @@ def _pair(position: Array) -> tuple[float, float]:
     return float(position[0]), float(position[1])
 
 
-_LIT = 0.5
+_LIT_SHARE = 0.5
 """Smallest share of a full subaperture's light at which the illumination of the beam is measured.
 """
 
@@ -411,7 +411,7 @@ def measured_illumination(
     if not images.mean() > 0.0:
         raise ModelError("illumination: found no light; expected the mean counts of the images")
     shown = even_images(even_optics(instrument), position.at)
-    lit = shown.sum(axis=0) > _LIT * np.percentile(shown.sum(axis=0), 75.0)
+    lit = shown.sum(axis=0) > _LIT_SHARE * np.percentile(shown.sum(axis=0), 75.0)
     return _beam(_filled(_excess(images, shown, lit), lit), position)
 
 
@@ -430,7 +430,7 @@ def relative_light(
     """
     images, _ = repaired(counts, instrument)
     even = even_images(even_optics(instrument), position.at).sum(axis=0)
-    lit = even > _LIT * np.percentile(even, 75.0)
+    lit = even > _LIT_SHARE * np.percentile(even, 75.0)
     share = images.sum(axis=0) / np.where(lit, even, 1.0)
     return np.where(lit, share / share[lit].mean(), 1.0), lit
 

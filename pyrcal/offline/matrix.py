@@ -61,9 +61,9 @@ from pyrcal.offline.uncertainty import (
 from pyrcal.offline.verdict import FitFindings, judged
 from service.errors import ModelError
 from service.estimation.orientation import (
-    DOUBTFUL,
+    DOUBTFUL_CORRELATION,
     MIN_CORRELATION,
-    MIN_LEAD,
+    MIN_CORRELATION_LEAD,
     Search,
     find_orientation,
     overruled,
@@ -391,7 +391,7 @@ def _axes(
         return find_orientation(seen, usable, basis, mapper=mapper, about=place)
 
     search = search_about(about, stated)
-    if options.start is None and search.best.correlation < DOUBTFUL:
+    if options.start is None and search.best.correlation < DOUBTFUL_CORRELATION:
         corners = [
             about.moved_to(about.vector + FAR_SUBAP * np.array([x, y, 0.0, 0.0]))
             for x, y in product((-1.0, 0.0, 1.0), repeat=2)
@@ -402,14 +402,14 @@ def _axes(
         # turned by half, axes and all, the same mirror lies at the opposite shift
         alike = [one for one in far if far[one].best.correlation > most - EQUIVALENT]
         place = min(alike, key=lambda one: far[one].best.effort)
-        if far[place].best.correlation > search.best.correlation + 2.0 * MIN_LEAD:
+        if far[place].best.correlation > search.best.correlation + 2.0 * MIN_CORRELATION_LEAD:
             about, search = place, far[place]
     best = search.best
     sure = best.correlation >= MIN_CORRELATION
     pose = replace(about, rotation_rad=best.rotation_rad) if sure else None
     if stated is None:
         return best.slopes, pose, search.refusal
-    if best.correlation >= DOUBTFUL:
+    if best.correlation >= DOUBTFUL_CORRELATION:
         return best.slopes, pose, ""
     return best.slopes, pose, overruled(best, search_about(about, None).best)
 

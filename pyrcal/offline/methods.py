@@ -40,7 +40,7 @@ from pyrcal.offline.solver import (
 )
 from service.estimation.reference import Target
 from service.estimation.solver import (
-    SETTLED,
+    SETTLED_STEP,
     Approach,
     Columns,
     approach,
@@ -465,7 +465,7 @@ def project_on_sensitivities(
     for _ in range(MAX_REPEATS):
         settled = settle(models, target, start, nuisances)
         step = settled.solution.vector - start.vector
-        if not settled.solution.converged or np.all(np.abs(step) < REACH * SETTLED):
+        if not settled.solution.converged or np.all(np.abs(step) < REACH * SETTLED_STEP):
             break
         start = settled.solution.alpha
     return settled

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from pyrcal.offline.models import FitModels, Optic
 from pyrcal.offline.uncertainty import dispersion, pupil_regions
 from service.estimation.solver import (
-    LONGEST_STEP,
-    SETTLED,
+    MAX_STEP,
+    SETTLED_STEP,
     Columns,
     Projection,
     within_limits,
@@ -377,7 +377,7 @@ def refine(
         counts = dispersion(seen, regions)
         next_step = _bounded_step(seen, values, nuisances, counts)
         stretching = next_step[4:][STRETCHES] if nuisances.anamorphosis else np.zeros(1)
-        at_rest = np.all(np.abs(next_step[:4]) < SETTLED)
+        at_rest = np.all(np.abs(next_step[:4]) < SETTLED_STEP)
         if at_rest and np.all(np.abs(stretching) < SETTLED_STRETCH):
             converged = True
             break
@@ -440,7 +440,7 @@ def _bounded_step(seen: Projection, values: Array, nuisances: Nuisances, counts:
     prior = nuisances.prior * noise * counts
     pull = prior * np.concatenate([np.zeros(4), nuisances.from_prior(values)])
     step = np.linalg.solve(seen.normal + np.diag(prior), seen.scores.sum(axis=1) - pull)
-    excess = np.abs(step[:4]) / LONGEST_STEP
+    excess = np.abs(step[:4]) / MAX_STEP
     stretches = step[4:][STRETCHES] if nuisances.anamorphosis else np.zeros(1)
     first = 4 + nuisances.first_optic
     optics = np.abs(step[first : first + len(nuisances.optics)]) / LONGEST_OPTIC_STEP

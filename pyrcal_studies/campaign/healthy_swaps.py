@@ -33,7 +33,7 @@ from threadpoolctl import threadpool_limits
 from pyrcal_studies.campaign.observatory_dome import Dome
 from pyrcal_studies.campaign.small import SMALL, bench_of
 from service.control.reconstructor import Recipe, reconstruct
-from service.estimation.comparison import RECENT_S
+from service.estimation.comparison import REFERENCE_PERIOD_S
 from service.estimation.frames import FrameBlock
 from service.estimation.probation import Comparison, observe
 from service.model.misregistration import Misregistration
@@ -528,7 +528,7 @@ class SimulatedNight:
         The ratio is that of the wavefront error to ``healthy_nm``, of the same night with the right
         matrix, or to that before the swap.
         """
-        before_nm = self._wavefront_nm(RECENT_S)
+        before_nm = self._wavefront_nm(REFERENCE_PERIOD_S)
         right = next(reversed(self._matrices.values()))
         self._swap(np.asarray(share * right, np.float32))
         self._pass(4.5)

@@ -6,9 +6,9 @@
       reconstructors/<id>.h5        one reconstructor each, written once, complete or absent
       interaction_matrices/<id>.h5  one measured interaction matrix each, likewise
       noisy_matrices/<id>.h5        one noisy interaction matrix each, likewise
-      recordings/<id>.h5            telemetry that somebody has asked for, whole up to its end
+      recordings/<id>.h5            requested telemetry, readable while it grows
       tracking.json                 the registration, for the service after this one
-      index.sqlite                  where each is on its way, who did what, when, and α over time
+      index.sqlite                  state of each product, audit trail, and α over time
       lock                          held while a service uses the directory
 """
 

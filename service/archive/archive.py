@@ -26,12 +26,12 @@ from service.tracking.registration import HistoryEntry
 
 
 class Archive:
-    """Reconstructors, their states and the audit trail, below one directory.
+    """Reconstructors, their states and the audit trail, in one directory.
 
-    A call returns when what it wrote is on the disk, so a service killed at any moment finds after
-    its restart everything it was told is stored, and nothing half-written. Calls may come from
-    any thread and are carried out one at a time; a call waits for the disk (tens of milliseconds
-    for a FLAO matrix), so it does not belong on an event loop that serves others.
+    A call returns when its data is on the disk, so a service that is killed at any moment finds,
+    after its restart, everything whose storage was reported, and no incomplete files. Calls may
+    come from any thread and are executed one at a time; a call waits for the disk (tens of
+    milliseconds for a FLAO matrix), so it must not run on an event loop with other work.
 
     Parameters
     ----------
@@ -79,21 +79,21 @@ class Archive:
     def open(self) -> tuple[str, ...]:
         """Make the directory, open the index and bring it up to date with the products.
 
-        A product that was complete but not yet in the index when the service was killed is taken
-        in now; what was half-written is removed. An index that is not there is made of the products
-        and of what lies beside each on what became of it.
+        A product that was complete but not yet in the index when the service was killed is indexed
+        now; incomplete files are removed. A missing index is rebuilt from the products and the
+        state files next to them.
 
         Returns
         -------
-        One line for each thing that is wrong: a product missing or damaged, a record that is not
-        understood, what cannot be removed, a lost index. The others are not affected.
+        One line for each problem: a product missing or damaged, an unreadable record, a file that
+        cannot be removed, a lost index. Other products are not affected.
 
         Raises
         ------
         ArchiveError
             If the directory cannot be made, is in use by another service, or the index is
-            damaged. A disk that is full is none of these: the index is read into memory, and what
-            is recorded from then on refused until there is room.
+            damaged. A full disk is no error: the index is read into memory, and new records are
+            refused until there is room.
         """
         try:
             self.directory.mkdir(mode=FOLDER_MODE, parents=True, exist_ok=True)
@@ -134,7 +134,7 @@ class Archive:
         return [*told, f"{error}: the service runs on what it could read, and records nothing yet"]
 
     def look(self) -> None:
-        """Open it to read, beside a service that may be using it; nothing is brought up to date.
+        """Open the archive to read it, even while a service uses it; nothing is updated.
 
         Raises
         ------

@@ -72,14 +72,14 @@ class AuditEntry:
     """Time, nanoseconds since the Unix epoch."""
 
     who: str
-    """Name of whoever gave the order, else the address; "service" for its own actions."""
+    """Name of the person who gave the order, else the address; "service" for its own actions."""
 
     name: str
     """Machine-readable, like ``reconstructor.applied``; an order has two lines: ``Approve`` when
     it came, ``Approve.answered`` or ``Approve.refused`` when that was known."""
 
     text: str
-    """What happened, or what was ordered."""
+    """Event or order."""
 
     address: str = ""
     """Address of the client that gave the order."""

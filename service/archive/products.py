@@ -108,7 +108,7 @@ class ReconstructorArchive(Store[ReconstructorRecord]):
         return tuple(self._judged(record) for record in super().records())
 
     def write_state(self, record: ReconstructorRecord) -> None:
-        """Write beside a product that is stored here what has become of it.
+        """Write the present state of a stored product to the file next to it.
 
         Raises
         ------
@@ -290,9 +290,9 @@ class RecordingRecord:
 
 
 class Recordings(Folder):
-    """The folder of recordings: beside each, as JSON, what is known of it.
+    """Folder of recordings, each with its metadata in a JSON file of the same name.
 
-    They are kept until somebody removes them, and are no part of what ``keep_gb`` limits.
+    Recordings are kept until they are removed by an order, and do not count towards ``keep_gb``.
     """
 
     noun = "recording"
@@ -363,7 +363,7 @@ class Recordings(Folder):
 
 
 def _write_beside(path: Path, text: bytes) -> None:
-    """Write JSON beside a product: whoever reads it meanwhile finds what was there before, whole.
+    """Write JSON next to a product; concurrent readers find the previous text, complete.
 
     Raises
     ------

@@ -150,12 +150,12 @@ def remove(archive: Archive, item: Item, why: str) -> AuditEntry | None:
 def low_on_space(directory: Path, retention: RetentionPolicy, *, low: bool) -> str | None:
     """Return a warning if the disk has little room, else None.
 
-    Where it was told of (``low``) a tenth more has to be free before it is over.
+    After a warning (``low``) a tenth more must be free before it ends.
 
     Raises
     ------
     OSError
-        If the disk does not say.
+        If the free space cannot be read.
     """
     free_gb = shutil.disk_usage(directory).free / GIGABYTE
     if free_gb >= retention.reserve_gb * (1.1 if low else 1.0):

@@ -166,8 +166,8 @@ class TrackingFile:
         Raises
         ------
         ArchiveError
-            If the file is damaged; it has been put aside, for somebody to look at, and the next
-            one can be written.
+            If the file is damaged; it has been renamed for inspection, and the next one can be
+            written.
         """
         if not self._path.exists():
             return None

@@ -29,7 +29,7 @@ Record = TypeVar("Record", bound=Product)
 
 
 FOLDER_MODE = 0o700
-"""Of a folder that is made: the orders of a night and who gave them are nobody else's."""
+"""Permissions of a new folder: the orders of a night and the persons who gave them are private."""
 
 
 class Folder:
@@ -130,11 +130,11 @@ class Store(Folder, Generic[Record]):
         super().remove(product_id)
 
     def adopt(self, *, anew: bool) -> list[str]:
-        """Take in complete files that the index, made ``anew`` or not, does not know.
+        """Take in complete files that the index lacks; ``anew`` if it was just made.
 
         Returns
         -------
-        A line for each file that is missing or damaged, and each record that is not understood.
+        A line for each missing or damaged file, and for each unreadable record.
         """
         known, told = self._index.checksums(self._table), []
         for path in sorted(self.directory.glob("*.h5")):
@@ -155,9 +155,9 @@ class Store(Folder, Generic[Record]):
         return [*told, *self._unsound.values(), *wrong.values()]
 
     def records(self) -> tuple[Record, ...]:
-        """Return what is known of each, oldest first.
+        """Return the records of all products, oldest first.
 
-        Of a record that is not understood the one in the product is told.
+        A record that cannot be read is replaced by the one inside its product.
         """
         understood, wrong = self._index.records(self._table, self.kind)
         known = [*understood, *(r for name, r in self._stand_ins.items() if name in wrong)]

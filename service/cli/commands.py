@@ -179,14 +179,14 @@ def _login() -> str:
 
 
 def data_dir(options: argparse.Namespace) -> Path:
-    """Return where the service keeps its keys.
+    """Return the directory in which the service keeps its keys.
 
-    Command line > environment > TOML file > the service of this user that runs > default.
+    Command line > environment > TOML file > the running service of this user > default.
 
     Raises
     ------
     ConfigurationError
-        If the file cannot be read, or several services run and nobody says which is meant.
+        If the file cannot be read, or several services run and no option selects one.
     """
     given = options.data_dir or os.environ.get("PYRCAL_SERVICE__DATA_DIR")
     if given is None and options.config is not None:

@@ -44,12 +44,12 @@ def feeding_interval_s(environment: Mapping[str, str] = os.environ) -> float | N
 
 
 async def keep_informed(stalled: Callable[[], str], status: Callable[[], str]) -> None:
-    """Say that the service has started; feed the watchdog while nothing stands still.
+    """Report that the service has started; feed the watchdog while no part has stopped.
 
     Parameters
     ----------
     stalled
-        Which part of the service stands still; empty: none does.
+        Returns the part of the service that has stopped; empty if all run.
     status
         A line for ``systemctl status``.
     """

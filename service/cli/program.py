@@ -34,7 +34,7 @@ INTERRUPTED = 130
 def status_of(task: Callable[[], int], name: str = "pyrcal") -> int:
     """Return the exit status of a task: its own, 2 after an error, 130 after an interrupt.
 
-    The error is told in one line, without a control character.
+    The error is printed in one line, without control characters.
     """
     try:
         return task()
@@ -72,18 +72,18 @@ def run_command(
     own_process: bool,
     serves: bool,
 ) -> int:
-    """Return the exit status of a command, each a module with a ``main`` of its own.
+    """Return the exit status of a command; each command is a module with a ``main`` function.
 
     Parameters
     ----------
     read
         Reads the command line; ``module`` of what it returns names the command's.
     check
-        Refuses files that cannot be what they are given as, before anything large is imported.
+        Refuses files of the wrong type before large modules are imported.
     own_process
-        Whether signals are this program's to hear.
+        True if this program may install signal handlers.
     serves
-        Whether the command runs until it is told to stop, and hears signals by itself.
+        True if the command runs until it is stopped, and handles signals itself.
     """
     if own_process:
         _leave_when_asked(0 if serves else INTERRUPTED)
@@ -132,12 +132,12 @@ def imported_and_run(
     Parameters
     ----------
     load
-        Imports it. An interrupt meanwhile ends the process at once: nothing has begun that it could
-        cut in two.
+        Imports the task. An interrupt meanwhile ends the process at once: nothing has begun that
+        it could interrupt.
     own_process
-        Whether signals are this program's to hear.
+        True if this program may install signal handlers.
     received
-        Those that the task sees as ``KeyboardInterrupt``.
+        Signals that the task receives as ``KeyboardInterrupt``.
     """
     if own_process:
         signal.signal(signal.SIGINT, signal.SIG_DFL)

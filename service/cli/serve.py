@@ -62,8 +62,8 @@ UNUSED_BYTES = 8_000_000
 """Unused memory at the end of the heap above which it is returned to the system."""
 
 END_WITHIN_S = 4.5
-"""After this what holds the service up is named, and left behind: five seconds is what operators
-and process managers wait."""
+"""Time after which the parts that delay the end are named and abandoned: operators and process
+managers wait for five seconds."""
 
 
 def run(settings: Settings, instrument: Instrument, workers: WorkerPool) -> int:
@@ -122,7 +122,7 @@ async def _serve(settings: Settings, instrument: Instrument, workers: WorkerPool
 
 
 def warn_of_readers(folder: Path) -> None:
-    """Log that other users of this machine can read a data folder, as those of before let them."""
+    """Log that other users of this machine can read a data folder, as older versions permitted."""
     mode = stat.S_IMODE(folder.stat().st_mode)
     if mode & stat.S_IRWXO:
         text = f"{folder}: everybody on this machine can read it ({mode:o}): chmod 700 {folder}"
@@ -265,7 +265,8 @@ def _supervisor(
 
 
 FIT_PROGRAM = (sys.executable, "-m", "pyrcal.offline.uploaded")
-"""``pyrcal fit`` of an upload; of the service nothing is imported there but what it stands on."""
+"""Command of ``pyrcal fit`` for an upload; that process imports only the parts of the service that
+the library uses."""
 
 
 def _desk(settings: Settings, instrument: Instrument) -> FitQueue:

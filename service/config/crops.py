@@ -12,7 +12,7 @@ from service.config.sources import refuse
 from service.errors import ConfigurationError
 from service.files.container import MAX_BYTES
 from service.model.instrument import LocalFunctions
-from service.model.surface import NOTHING
+from service.model.surface import NEGLIGIBLE_HEIGHT
 
 _MIN_CROPPED_FUNCTIONS = 1000
 """Influence functions from which on cropping them saves time: with 663 it took twice as long."""
@@ -52,7 +52,7 @@ def local_functions(
         parts = [(whole, np.where(known, one, one.dtype.type(0))) for one in heights]
     found, places = [], []
     for (rows, columns), part in parts:
-        row, column = np.nonzero(np.abs(part) > NOTHING * np.abs(part).max())
+        row, column = np.nonzero(np.abs(part) > NEGLIGIBLE_HEIGHT * np.abs(part).max())
         found.append(part[row, column])
         places.append((row + rows.start) * known.shape[1] + column + columns.start)
     ends = np.concatenate([[0], np.cumsum([len(one) for one in places])]).astype(np.intp)
@@ -63,7 +63,7 @@ def local_functions(
         places=np.concatenate(places),
         ends=ends,
         strokes=None if strokes is None else strokes.astype(np.float64),
-        floor=NOTHING,
+        floor=NEGLIGIBLE_HEIGHT,
     )
     return local, known
 

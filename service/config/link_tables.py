@@ -87,7 +87,7 @@ class AccessTable(Table):
 
 
 class SigningTable(Table):
-    """``[zenoh.signing]``: service and RTC sign what they send, whoever runs the router."""
+    """``[zenoh.signing]``: service and RTC sign their messages, whoever runs the router."""
 
     key_file: Path
     """File whose first line is the shared secret; no other user may read it."""
@@ -251,7 +251,7 @@ def _certificates_of(tls: TlsTable) -> tuple[Certificate, ...]:
 
 
 def client_security(credentials: CredentialsTable) -> dict[str, dict[str, object]]:
-    """Return what zenoh is told of a program that connects; nothing: it shows nothing.
+    """Return zenoh's configuration for a client's credentials; empty without credentials.
 
     Raises
     ------

@@ -176,16 +176,16 @@ def reference_parts(text: str) -> re.Match[str] | None:
 
 
 def read_dataset(reference: str, folder: Path, where: str) -> NDArray[Any]:
-    """Return the numeric array behind ``reference``, in this machine's byte order.
+    """Return the numeric array at ``reference``, in this machine's byte order.
 
     Parameters
     ----------
     reference
         ``path:/dataset``, ``path.fits:EXTNAME``, ``path.npy``; relative paths start at ``folder``.
     folder
-        Where the instrument file lies.
+        Folder of the instrument file.
     where
-        The file and key that hold the reference, for the messages.
+        File and key of the reference, for the messages.
 
     Raises
     ------

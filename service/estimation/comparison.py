@@ -17,27 +17,28 @@ from service.estimation.residual import Residual, ResidualLevel
 
 Array = NDArray[np.float64]
 
-RECENT_S = 4.0
+REFERENCE_PERIOD_S = 4.0
 """Telemetry before the swap that the loop is compared with."""
 
-DECIDE_S = 4.0
+DECISION_PERIOD_S = 4.0
 """Telemetry with the new matrix after which a moderate change is decided. A gust of one second is a
 quarter of it, so the median does not see it."""
 
-LASTING_S = 2.0
+LARGE_CHANGE_PERIOD_S = 2.0
 """Time for which a large change must last before an early decision: longer than a gust."""
 
-LASTING_SHARE = 0.8
+LARGE_CHANGE_SHARE = 0.8
 """Share of the parts of that time that must show it; a gust of a second fills 0.6 of them."""
 
-SIGMAS = 3.0
-"""Noise of the median, in σ, that a change of the residual must exceed beyond ``WORSE``. With
-``WORSE`` itself, one to three σ, fewer than one healthy swap in 5,000 exceeds both."""
+RESIDUAL_SIGMAS = 3.0
+"""Noise of the median, in σ, that a change of the residual must exceed in addition to
+``WORSE_POWER_RATIO``. With
+``WORSE_POWER_RATIO`` itself, one to three σ, fewer than one healthy swap in 5,000 exceeds both."""
 
-WORSE = 1.21
+WORSE_POWER_RATIO = 1.21
 """Residual power that is worse, 1.1 in RMS, if nothing were known to vary."""
 
-MAX_LIMIT = 1.96
+MAX_WORSE_POWER_RATIO = 1.96
 """Residual power, 1.4 in RMS, that is worse however noisy the loop was before the swap: a gust in
 the few seconds before raises the measured noise. Of 200 healthy swaps, gusts and seeing that
 doubles included, none had more than 1.4 (1.18 in RMS)."""
@@ -45,35 +46,35 @@ doubles included, none had more than 1.4 (1.18 in RMS)."""
 MODE_SIGMAS = 4.5
 """The same of single modes: the worst of hundreds is looked at."""
 
-MODE_WORSE = 1.7
+WORSE_MODE_POWER_RATIO = 1.7
 """Power of a mode's steps that is worse: of hundreds of modes the one that a good matrix makes
 worst has 1.6."""
 
-SEVERAL = 6.25
+EARLY_POWER_RATIO = 6.25
 """Power ratio, 2.5 in RMS, that is acted on as soon as it has lasted. A gust that raises the
 residual 1.6 times makes 2.6 in power, and seeing that doubles in 10 s another 1.3."""
 
-DIVERGED = 9.0
+DIVERGED_POWER_RATIO = 9.0
 """Power of all slopes over that before that is acted on in ``DIVERGED_PARTS`` parts. Single modes
 have no such limit: a vibration of tip and tilt that raises the residual 1.6 times raises the steps
 of these two modes up to 30 times."""
 
 DIVERGED_PARTS = 3
 
-COMMON_WORSE = 4.0
+WORSE_MEDIAN_POWER_RATIO = 4.0
 """Power of the steps of the median mode: seeing changes it by half in three seconds."""
 
-SLOPES_WORSE = 6.0
+WORSE_SLOPES_POWER_RATIO = 6.0
 """Power of all slopes: seeing that doubles within three seconds makes it 3.2."""
 
-RING_WORSE = 6.0
+WORSE_RING_POWER_RATIO = 6.0
 """Power of the outer ring over that of the mirror inside of it."""
 
 GROUP_S = 0.5
 """Parts of so much time are summed for the decision: a ringing mode and a slow loop vary much from
 part to part, and the median of parts would be far below their mean."""
 
-MEDIAN_NOISE = 1.25
+MEDIAN_NOISE_RATIO = 1.25
 """1 σ of a median of independent values over that of their mean."""
 
 NOISE_LENGTHS = (1, 2)
@@ -220,7 +221,7 @@ class Before:
     ) -> Before:
         """Return the reference from these parts of a matrix that controls these modes."""
         groups = grouped(parts, part_s)
-        n_recent = min(max(round(RECENT_S / GROUP_S), 2), len(groups))
+        n_recent = min(max(round(REFERENCE_PERIOD_S / GROUP_S), 2), len(groups))
         powers = _powers(groups)
         power = np.asarray(np.median(powers[-n_recent:], axis=0))
         moving = modes[power[modes] > 0.0]
@@ -243,7 +244,7 @@ class Before:
 
     def noise(self, sigma: float, n_groups: int) -> float:
         """Return 1 σ of how the median of so many groups differs from that before."""
-        return MEDIAN_NOISE * sigma * float(np.sqrt(1.0 / n_groups + 1.0 / self.n_groups))
+        return MEDIAN_NOISE_RATIO * sigma * float(np.sqrt(1.0 / n_groups + 1.0 / self.n_groups))
 
 
 def measure_sigma(logs: Array, min_sigma: float, *, lower_half: bool = False) -> float:
@@ -294,7 +295,7 @@ def compared(
     own; what all modes have in common is taken out, unless it has become less: then a mode that has
     not is no worse.
     """
-    looked = _Look(n_last=max(round(LASTING_S / before.part_s), 2), decides=decides)
+    looked = _Look(n_last=max(round(LARGE_CHANGE_PERIOD_S / before.part_s), 2), decides=decides)
     series = grouped(parts, before.part_s) if decides else parts
     after = _powers(series)
     moving = modes[np.median(after, axis=0)[modes] > 0.0]
@@ -305,19 +306,21 @@ def compared(
     single = grown - np.maximum(common, 0.0)[:, None]
     worst = int(np.argmax(looked.value(single)))
     noise = before.noise(before.mode_sigma, len(series))
-    limit = float(np.log(MODE_WORSE)) + MODE_SIGMAS * noise
+    limit = float(np.log(WORSE_MODE_POWER_RATIO)) + MODE_SIGMAS * noise
     grounds = [
         looked.ground(
             f"mode {moving[worst]} moves {{:.2f}} times as much, against all modes,",
             single[:, worst],
             limit,
         ),
-        looked.ground("the median mode moves {:.2f} times as much", common, np.log(COMMON_WORSE)),
+        looked.ground(
+            "the median mode moves {:.2f} times as much", common, np.log(WORSE_MEDIAN_POWER_RATIO)
+        ),
         looked.ground(
             "all slopes are {:.2f} times as large",
             _log_growth(before.power, after, SLOPES),
-            np.log(SLOPES_WORSE),
-            diverged=float(np.log(DIVERGED)),
+            np.log(WORSE_SLOPES_POWER_RATIO),
+            diverged=float(np.log(DIVERGED_POWER_RATIO)),
         ),
     ]
     residual = None
@@ -328,13 +331,18 @@ def compared(
             residual = looked.ground(
                 "the residual, seeing taken out, is {:.2f} times as large",
                 logs,
-                min(np.log(WORSE) + SIGMAS * noise, np.log(MAX_LIMIT)),
+                min(
+                    np.log(WORSE_POWER_RATIO) + RESIDUAL_SIGMAS * noise,
+                    np.log(MAX_WORSE_POWER_RATIO),
+                ),
             )
             grounds.append(residual)
     ring = None
     if min(before.power[OUTER], before.power[INNER]) > 0.0 and after[:, [OUTER, INNER]].all():
         logs = _log_growth(before.power, after, OUTER) - _log_growth(before.power, after, INNER)
-        ring = looked.ground("the outer ring moves {:.2f} times as much", logs, np.log(RING_WORSE))
+        ring = looked.ground(
+            "the outer ring moves {:.2f} times as much", logs, np.log(WORSE_RING_POWER_RATIO)
+        )
         grounds.append(ring)
     lost = before.level is not None and before.level.lost(_residuals(parts))
     worse = lost or any(ground.worse for ground in grounds)
@@ -382,7 +390,7 @@ class _Look:
             return np.asarray(np.median(logs, axis=0))
         if len(logs) < self.n_last:
             return np.full(logs.shape[1:], -40.0)
-        return np.asarray(np.quantile(logs[-self.n_last :], 1.0 - LASTING_SHARE, axis=0))
+        return np.asarray(np.quantile(logs[-self.n_last :], 1.0 - LARGE_CHANGE_SHARE, axis=0))
 
     def ground(
         self, words: str, logs: Array, limit: float, *, diverged: float | None = None
@@ -393,7 +401,11 @@ class _Look:
             value, limit = float(newest.min()), diverged
         else:
             # however noisy the loop was: no healthy one is worse by a factor of several for so long
-            limit = min(limit, float(np.log(SEVERAL))) if self.decides else float(np.log(SEVERAL))
+            limit = (
+                min(limit, float(np.log(EARLY_POWER_RATIO)))
+                if self.decides
+                else float(np.log(EARLY_POWER_RATIO))
+            )
         rms = float(np.exp(0.5 * max(value, -40.0)))
         return _Ground(value > limit, words.format(rms), rms, float(np.exp(0.5 * limit)))
 

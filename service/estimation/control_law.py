@@ -19,38 +19,38 @@ from typing_extensions import override
 from service.estimation.estimator import Change, Detector, FrameContext, LoopContext, Mark
 from service.estimation.frames import FrameBlock
 from service.estimation.loop import last_seq
-from service.estimation.loopcheck import AT_EASE_S, SIGNIFICANCE
+from service.estimation.loopcheck import RECHECK_INTERVAL_S, SIGNIFICANCE_SIGMA
 from service.estimation.windows import ClosedLoop
 from service.model.misregistration import unit_like
 
 Array = NDArray[Any]
 
-MODES_WATCHED = 12
+N_WATCHED_MODES = 12
 """Spread over those in the loop."""
 
 KEPT_FRAMES = 640
 """Frames remembered."""
 
-ENOUGH_FRAMES = 240
+MIN_FRAMES = 240
 """Frames with all before them that they follow from; fewer say nothing."""
 
-JUDGED_EVERY = 200
+VERDICT_INTERVAL_FRAMES = 200
 """Frames between two verdicts."""
 
-VERDICTS = 2
+N_AGREEING_VERDICTS = 2
 """Verdicts in a row that must agree on a difference."""
 
-MORE_TAPS = 4
+N_EXTRA_TAPS = 4
 """Frames beyond the stated delay: it may be longer, or the mirror may lag."""
 
-EXPLAINED = 0.002
+MAX_UNEXPLAINED_SHARE = 0.002
 """Largest fraction of the steps' power that a mode may leave unexplained to be used."""
 
 LEAK_TOLERANCE = 0.004
 GAIN_TOLERANCE = 0.15
 """Relative: gains may follow the seeing between two status messages."""
 
-DELAY_TOLERANCE = 0.75
+DELAY_TOLERANCE_FRAMES = 0.75
 """Frames: a mirror that takes 0.7 of one to rise is none of the loop's delay."""
 
 _STILL_M = 1e-13
@@ -82,7 +82,7 @@ class ControlLawCheck(Detector):
     seen_m: Array = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     """``(n_frames, n_watched)`` R s."""
 
-    judged_seq: int = -JUDGED_EVERY
+    judged_seq: int = -VERDICT_INTERVAL_FRAMES
     """Up to here a verdict has been given."""
 
     errors: tuple[str, ...] = ()
@@ -112,8 +112,8 @@ class ControlLawCheck(Detector):
         if found is None:
             return law
         if found.wrong:
-            return replace(law, errors=(*law.errors, found.wrong)[-VERDICTS:])
-        rests = round(AT_EASE_S * rtc.frame_rate_hz)
+            return replace(law, errors=(*law.errors, found.wrong)[-N_AGREEING_VERDICTS:])
+        rests = round(RECHECK_INTERVAL_S * rtc.frame_rate_hz)
         return replace(law, judged_seq=law.judged_seq + rests, errors=())
 
     @property
@@ -124,7 +124,7 @@ class ControlLawCheck(Detector):
             f"the RTC's loop is not what its status says: {'; '.join(self.errors[-1:])}; mend "
             "its status, or its loop"
         )
-        return (wrong if len(self.errors) >= VERDICTS else None,)
+        return (wrong if len(self.errors) >= N_AGREEING_VERDICTS else None,)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -164,7 +164,7 @@ def follow(law: ControlLawCheck, block: FrameBlock, loop: ClosedLoop) -> Control
 
 def _has_time(law: ControlLawCheck, block: FrameBlock) -> bool:
     """Return whether these frames will be forgotten before the next verdict on their matrix."""
-    first_seq = law.judged_seq + JUDGED_EVERY - KEPT_FRAMES
+    first_seq = law.judged_seq + VERDICT_INTERVAL_FRAMES - KEPT_FRAMES
     return block.next_seq <= first_seq and block.cm_id == law.cm_id
 
 
@@ -172,13 +172,13 @@ def judged(
     law: ControlLawCheck, loop: ClosedLoop, last_seq: int
 ) -> tuple[ControlLawCheck, IdentifiedLaw | None]:
     """Return what the frames up to one say of the loop; None: nothing, or nothing new."""
-    if last_seq - law.judged_seq < JUDGED_EVERY:
+    if last_seq - law.judged_seq < VERDICT_INTERVAL_FRAMES:
         return law, None
-    n_taps = int(loop.delay_frames) + MORE_TAPS
+    n_taps = int(loop.delay_frames) + N_EXTRA_TAPS
     at = np.flatnonzero(law.seq <= last_seq)[n_taps:]
     # a frame counts where none of those before it was lost
     at = at[law.seq[at] - law.seq[at - n_taps] == n_taps]
-    if len(at) < ENOUGH_FRAMES:
+    if len(at) < MIN_FRAMES:
         return law, None
     law = replace(law, judged_seq=int(law.seq[at[-1]]))
     fits = _fitted(law.commands_m.astype(float), law.seen_m.astype(float), at, n_taps)
@@ -224,7 +224,8 @@ def _fitted(commands: Array, seen: Array, at: Array, n_taps: int) -> _Fits:
     with np.errstate(divide="ignore", invalid="ignore"):
         late = -(weights[:, 1:] @ taps) / gain
     return _Fits(
-        clear=(steps.std(axis=1) >= _STILL_M) & (left <= EXPLAINED * np.sum(steps**2, axis=1)),
+        clear=(steps.std(axis=1) >= _STILL_M)
+        & (left <= MAX_UNEXPLAINED_SHARE * np.sum(steps**2, axis=1)),
         leak=weights[:, 0],
         leak_sigma=np.sqrt(inverse[:, 0, 0] * left / len(at)) / scale[:, 0],
         gain=gain,
@@ -239,12 +240,12 @@ def _compared(fits: _Fits, clear: Array, gains: Array, loop: ClosedLoop) -> Iden
     ratios = fits.gain[clear] / gains[clear]
     gain, spread = float(np.median(ratios)), float(np.median(np.abs(ratios - np.median(ratios))))
     wrong = []
-    if abs(leak - loop.leak) > LEAK_TOLERANCE + SIGNIFICANCE * sigma:
+    if abs(leak - loop.leak) > LEAK_TOLERANCE + SIGNIFICANCE_SIGMA * sigma:
         wrong.append(f"leak {leak:.3f} found, {loop.leak:.3f} in the status")
-    tolerance = GAIN_TOLERANCE + SIGNIFICANCE * min(spread, abs(gain)) / np.sqrt(len(clear))
+    tolerance = GAIN_TOLERANCE + SIGNIFICANCE_SIGMA * min(spread, abs(gain)) / np.sqrt(len(clear))
     if abs(gain - 1.0) > tolerance:
         wrong.append(f"gain {gain:.3g} times the one in the status{_hint(gain)}")
-    if abs(late - loop.delay_frames) > DELAY_TOLERANCE:
+    if abs(late - loop.delay_frames) > DELAY_TOLERANCE_FRAMES:
         wrong.append(f"delay {late:.2f} frames found, {loop.delay_frames:.2f} in the status")
     return IdentifiedLaw(leak=leak, gain=gain, delay_frames=late, wrong="; ".join(wrong))
 
@@ -260,7 +261,7 @@ def _hint(gain: float) -> str:
 
 def _begun(law: ControlLawCheck, cm_id: str | None, loop: ClosedLoop) -> ControlLawCheck:
     in_loop = np.flatnonzero(loop.gains > 0.0)
-    chosen = np.unique(np.linspace(0, len(in_loop) - 1, MODES_WATCHED).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(in_loop) - 1, N_WATCHED_MODES).round().astype(int))
     modes = in_loop[chosen] if len(in_loop) else in_loop
     none = np.zeros((0, len(modes)), np.float32)
     return ControlLawCheck(

@@ -25,16 +25,16 @@ few."""
 SEGMENT_S = 0.12
 """Duration of a segment. Longer segments need more shapes, shorter ones more sums."""
 
-MIN_SEGMENT = 16
+MIN_SEGMENT_FRAMES = 16
 
-FAINTEST_SHAPE = 1e-7
+MIN_SHAPE_RATIO = 1e-7
 """Shapes weaker than this fraction of the strongest are below rounding in every bin."""
 
-_AT_ONCE = 256
+_COLUMNS_AT_ONCE = 256
 """Columns that are added at once: products of all would take twice the memory of their sums."""
 
-_BESIDE_HZ = np.unique(np.abs(SIDE_OFFSETS_HZ))
-_N_SHAPES = 1 + 2 * len(_BESIDE_HZ)
+_OFFSETS_HZ = np.unique(np.abs(SIDE_OFFSETS_HZ))
+_N_SHAPES = 1 + 2 * len(_OFFSETS_HZ)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,8 +58,8 @@ class DemodulationBank:
         stretches = [_segment(self, first // length) for first in cuts[:-1]]
         bins = np.hstack([stretch.bins for stretch in stretches])
         n_columns = columns.shape[1]
-        for start in range(0, n_columns, _AT_ONCE):
-            some = slice(start, min(start + _AT_ONCE, n_columns))
+        for start in range(0, n_columns, _COLUMNS_AT_ONCE):
+            some = slice(start, min(start + _COLUMNS_AT_ONCE, n_columns))
             width = some.stop - start
             found = np.empty((len(stretches), len(stretches[0].lines), width), np.float32)
             for stretch, (first, stop), part in zip(stretches, pairwise(cuts), found, strict=True):
@@ -73,7 +73,7 @@ class DemodulationBank:
     def at_bins(self, sums: Array) -> Array:
         """Return ``(n_lines, 1 + n_side, n_columns)`` sums of ``h_k x_k exp(-i w k)``."""
         n_lines, n_columns = sums.shape[1] // 2, sums.shape[2]
-        which = np.searchsorted(_BESIDE_HZ, np.abs(SIDE_OFFSETS_HZ))
+        which = np.searchsorted(_OFFSETS_HZ, np.abs(SIDE_OFFSETS_HZ))
         turning = (1j * np.sign(SIDE_OFFSETS_HZ)).astype(np.complex64)[:, None]
         found = np.empty((n_lines, 1 + len(which), n_columns), np.complex64)
         for line, bins in enumerate(found):
@@ -106,7 +106,7 @@ def _segment(bank: DemodulationBank, index: int) -> _Segment:
     smooth = _smooth(bank.frame_rate_hz, bank.n_frames)
     length = smooth.shape[1]
     frames = index * length + np.arange(length)
-    turns = np.outer(_BESIDE_HZ / bank.frame_rate_hz, frames)
+    turns = np.outer(_OFFSETS_HZ / bank.frame_rate_hz, frames)
     turning = np.vstack([np.ones(length), *cosines_and_sines(turns)])
     lines = smooth[:, None] * _lines(bank, frames)
     return _Segment(
@@ -118,13 +118,13 @@ def _segment(bank: DemodulationBank, index: int) -> _Segment:
 @lru_cache(maxsize=4)
 def _smooth(frame_rate_hz: float, n_frames: int) -> Array:
     """Return ``(n_smooth, length)`` orthonormal shapes: all that bins can be in a stretch."""
-    length = max(round(SEGMENT_S * frame_rate_hz), MIN_SEGMENT)
+    length = max(round(SEGMENT_S * frame_rate_hz), MIN_SEGMENT_FRAMES)
     # a Hann window is a mean and a turn more or less
     weight_hz = np.array([-1.0, 0.0, 1.0]) * frame_rate_hz / n_frames
-    slow_hz = np.add.outer([0.0, *_BESIDE_HZ], weight_hz)
+    slow_hz = np.add.outer([0.0, *_OFFSETS_HZ], weight_hz)
     turns = 2 * np.pi * np.outer(slow_hz / frame_rate_hz, np.arange(length))
     _, size, shapes = np.linalg.svd(np.vstack([np.cos(turns), np.sin(turns)]), full_matrices=False)
-    return np.asarray(shapes[size > FAINTEST_SHAPE * size[0]], np.float32)
+    return np.asarray(shapes[size > MIN_SHAPE_RATIO * size[0]], np.float32)
 
 
 def _lines(bank: DemodulationBank, frames: Array) -> Array:

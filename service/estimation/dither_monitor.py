@@ -24,34 +24,34 @@ from service.estimation.windows import ExpectedDither
 
 Array = NDArray[Any]
 
-CHECK_S = 1.0
+CHECK_INTERVAL_S = 1.0
 """Duration of dithered frames between two results."""
 
 MIN_FRAMES = 50
 
-LOUDER, WEAKER = 1.25, 0.5
+MAX_AMPLITUDE_RATIO, MIN_AMPLITUDE_RATIO = 1.25, 0.5
 """A mode is reported if its amplitude relative to the request is outside this range."""
 
-AMPLIFIED = 3.0
+MAX_AMPLIFICATION_RATIO = 3.0
 """Tolerated ratio of a mode's amplitude to its dither column if the loop has just begun to control
 the mode: the status reports this up to a second after the frames show it."""
 
-STRAY = 0.2
+MAX_STRAY_SHARE = 0.2
 """Fraction of the requested amplitude that all other modes together may have."""
 
-_NAMED = 4
+_MAX_LISTED_MODES = 4
 
-_GLANCED = 8
+_N_COMPARED_SLOPES = 8
 """Number of slopes per frame that are compared first, to decide if all must be."""
 
-SIDES_HZ = (-11, -7, -3, 3, 7, 11)
+NOISE_OFFSETS_HZ = (-11, -7, -3, 3, 7, 11)
 """Frequencies at which the noise of the slopes is measured, relative to a line; whole periods per
 second."""
 
-UNANSWERED = 0.03
+MIN_RESPONSE_POWER_SHARE = 0.03
 """Share of the power expected below which, by 3 σ, nothing has moved: an optical gain of 0.17."""
 
-REPEATED = 0.02
+MAX_REPEATED_SHARE = 0.02
 """Fraction of frames identical to the previous one above which the slopes count as frozen and are
 not used."""
 
@@ -180,7 +180,7 @@ def measure_block(
 
 
 def _enough(asked: ExpectedDither) -> int:
-    return max(round(CHECK_S * asked.frame_rate_hz), MIN_FRAMES)
+    return max(round(CHECK_INTERVAL_S * asked.frame_rate_hz), MIN_FRAMES)
 
 
 def _added(
@@ -238,7 +238,7 @@ def _add_slopes(monitor: DitherMonitor, slopes: Array, first_seq: int) -> Dither
     lines = np.array(asked.frequency_hz)[asked.audible]
     if not len(lines):
         return monitor
-    bins_hz = (lines[:, None] + np.array([0, *SIDES_HZ])).ravel()
+    bins_hz = (lines[:, None] + np.array([0, *NOISE_OFFSETS_HZ])).ravel()
     seq = first_seq - asked.first_seq + np.arange(len(slopes))
     turns = np.outer(bins_hz / asked.frame_rate_hz, seq)
     summed = np.concatenate(cosines_and_sines(turns)) @ slopes
@@ -251,7 +251,7 @@ def _add_slopes(monitor: DitherMonitor, slopes: Array, first_seq: int) -> Dither
 
 def _repeated(slopes: Array) -> int:
     """Return how many frames have the very slopes of the frame before."""
-    first = slopes[:, :_GLANCED]
+    first = slopes[:, :_N_COMPARED_SLOPES]
     again = 1 + np.flatnonzero((first[1:] == first[:-1]).all(axis=1))
     return int(np.count_nonzero((slopes[again] == slopes[again - 1]).all(axis=1)))
 
@@ -262,7 +262,7 @@ def _powers(monitor: DitherMonitor) -> tuple[float, float, float]:
     Earlier seconds are included if they were not sufficient for a decision.
     """
     asked, heard, before = monitor.asked, monitor.asked.audible, monitor.powers
-    if not heard or monitor.n_repeated > REPEATED * monitor.n_frames:
+    if not heard or monitor.n_repeated > MAX_REPEATED_SHARE * monitor.n_frames:
         return before
     parts = np.einsum("ks,ks->k", monitor.slopes, monitor.slopes).astype(float)
     power = parts.reshape(2, len(heard), -1).sum(axis=0)
@@ -279,9 +279,9 @@ def _unanswered(powers: tuple[float, float, float], asked: ExpectedDither) -> st
     if not expected:
         return None
     share, sigma = beyond / expected, np.sqrt(variance) / expected
-    if share - 3.0 * sigma > UNANSWERED:
+    if share - 3.0 * sigma > MIN_RESPONSE_POWER_SHARE:
         return ""
-    if share + 3.0 * sigma > UNANSWERED:
+    if share + 3.0 * sigma > MIN_RESPONSE_POWER_SHARE:
         return None
     modes = ", ".join(str(asked.modes[k]) for k in sorted(asked.audible))
     return (
@@ -300,10 +300,10 @@ def _found(monitor: DitherMonitor) -> tuple[DitherMeasurement, bool]:
     if asked.frequency_hz:
         fraction = np.array(asked.frequency_hz) / asked.frame_rate_hz
         moved = moved / np.abs(2.0 * np.sin(np.pi * fraction))
-        beyond = own & (moved > LOUDER * told)
-        doubted = bool(np.any(beyond & (moved <= AMPLIFIED * told)))
+        beyond = own & (moved > MAX_AMPLITUDE_RATIO * told)
+        doubted = bool(np.any(beyond & (moved <= MAX_AMPLIFICATION_RATIO * told)))
         if doubted and not monitor.doubted:
-            own = own & (moved > AMPLIFIED * told)
+            own = own & (moved > MAX_AMPLIFICATION_RATIO * told)
         # a mode of the loop answers the dither: there its column alone tells how strong it is
         carried = np.maximum(carried, np.where(own, moved, 0.0))
     stray = rms.copy()
@@ -325,12 +325,16 @@ def _outside_tolerance(
 ) -> list[str]:
     """Return requested modes with a wrong amplitude or frequency."""
     ratio, said = carried / wanted, []
-    for k in np.flatnonzero((ratio > LOUDER) | (ratio < WEAKER))[:_NAMED]:
+    for k in np.flatnonzero((ratio > MAX_AMPLITUDE_RATIO) | (ratio < MIN_AMPLITUDE_RATIO))[
+        :_MAX_LISTED_MODES
+    ]:
         found = f"mode {asked.modes[k]} carries {1e9 * carried[k]:.3g} nm"
         said.append(f"{found} instead of {1e9 * wanted[k]:.3g} nm")
     if not asked.frequency_hz:
         return said
-    for k in np.flatnonzero((ratio >= WEAKER) & (reported_m < WEAKER * carried))[:_NAMED]:
+    for k in np.flatnonzero(
+        (ratio >= MIN_AMPLITUDE_RATIO) & (reported_m < MIN_AMPLITUDE_RATIO * carried)
+    )[:_MAX_LISTED_MODES]:
         line = f"{asked.frequency_hz[k]:g} Hz"
         said.append(f"mode {asked.modes[k]} moves at another frequency than {line}")
     return said
@@ -339,12 +343,12 @@ def _outside_tolerance(
 def _strays(stray: Array, wanted_m: float) -> list[str]:
     """Return the modes that carry a dither without a request."""
     together = float(np.sqrt(np.sum(stray**2)))
-    if together <= STRAY * wanted_m:
+    if together <= MAX_STRAY_SHARE * wanted_m:
         return []
     worst = np.argsort(stray)[::-1]
     worst = worst[stray[worst] > 0.0]
-    named = ", ".join(str(mode) for mode in sorted(worst[:_NAMED].tolist()))
-    more = ", ..." if len(worst) > _NAMED else ""
+    named = ", ".join(str(mode) for mode in sorted(worst[:_MAX_LISTED_MODES].tolist()))
+    more = ", ..." if len(worst) > _MAX_LISTED_MODES else ""
     return [f"modes not asked for ({named}{more}) carry {1e9 * together:.3g} nm"]
 
 
@@ -352,10 +356,12 @@ def _hidden(asked: ExpectedDither, own: Array, reported_m: Array, moved: Array) 
     """Return which modes outside the loop move more than the columns of the dither say."""
     if not asked.frequency_hz:
         return []
-    much = moved > LOUDER * reported_m + WEAKER * np.array(asked.amplitude_m)
+    much = moved > MAX_AMPLITUDE_RATIO * reported_m + MIN_AMPLITUDE_RATIO * np.array(
+        asked.amplitude_m
+    )
     hidden = np.flatnonzero(own & much)
     return [
         f"the commands of mode {asked.modes[k]} hold {1e9 * moved[k]:.3g} nm at "
         f"{asked.frequency_hz[k]:g} Hz, its dither column {1e9 * reported_m[k]:.3g} nm"
-        for k in hidden[:_NAMED]
+        for k in hidden[:_MAX_LISTED_MODES]
     ]

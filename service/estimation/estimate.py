@@ -16,7 +16,7 @@ from typing_extensions import override
 
 from service.model.misregistration import Determination
 
-MODEL_ERROR = 15.0
+MODEL_ERROR_VARIANCE_RATIO = 15.0
 """Variance of α per unit of misfit above 1, over that of its scatter: what the model leaves over is
 smooth across the pupil and pulls at α more than noise of the same power. From campaigns on the
 diffractive telescope, two truths and two models (docs/results/night.md)."""
@@ -157,4 +157,4 @@ def model_error(covariance: NDArray[Any], misfit: float) -> NDArray[Any]:
     faint one hides, so the telescope need not be known. It does not average out, because the next
     window has the same error.
     """
-    return np.sqrt(MODEL_ERROR * max(misfit - 1.0, 0.0) * np.diag(covariance))
+    return np.sqrt(MODEL_ERROR_VARIANCE_RATIO * max(misfit - 1.0, 0.0) * np.diag(covariance))

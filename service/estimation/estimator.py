@@ -51,7 +51,7 @@ class Change(Flag):
 
 
 class Mark(Flag):
-    """What an estimator reports about a block to those that follow it."""
+    """Property of a block that one estimator reports to the next ones."""
 
     STANDS = auto()
     """The slopes are no measurement."""

@@ -1,18 +1,18 @@
-"""Watch the loop, the mirror's edge, vibrations, and slopes that stand still.
+"""Watch the loop, the mirror's edge, vibrations, and frozen slopes.
 
-**The loop** is watched on the commands of the highest controlled modes: a mis-registered loop goes
-unstable there first, while slopes and wavefront error look healthy almost to the end.
+**The loop** is watched on the commands of the highest controlled modes: a misregistered loop
+becomes unstable there first, while slopes and wavefront error look healthy almost to the end.
 
 **The outer ring** of the mirror is watched on the commands as well. A segment at the edge of the
 pupil can slip by wavelengths and stay there: the sensor sees little light across it, its slopes
 look healthy, and only the command shows the step. On the diffractive telescope the slowly averaged
-position of the outermost actuators stays below 2.2 times what turbulence asks of them in every loop
-that held. A slip takes it to 7 to 18, or leaves it at 3 for seconds while the wavefront is lost
+position of the outermost actuators stays below 2.2 times the RMS that turbulence requires in every
+stable loop. A slip takes it to 7 to 18, or leaves it at 3 for seconds while the wavefront is lost
 already (docs/results/edge_slip.md).
 
-**Vibrations** are lines in the slopes; no dither is put on one.
+**Vibrations** are lines in the slopes; the dither avoids them.
 
-**Slopes that stand still** are no measurement, however healthy they look.
+**Frozen slopes** are not a measurement, however healthy they look.
 """
 
 from __future__ import annotations
@@ -69,13 +69,13 @@ class LoopHealth(Detector):
 
     diverging: bool = False
     absurd: bool = False
-    """Whether commands are beyond any mirror and came there at once, as no loop does."""
+    """True if commands exceed any mirror's stroke, abruptly, unlike in a diverging loop."""
 
     beyond_s: float = 0.0
     """Duration for which every frame has been beyond ``LOST_RATIO``, seconds."""
 
     lost: bool = False
-    """Whether that lasted for ``LOST_S`` since the loop began to diverge."""
+    """True if that lasted for ``LOST_S`` since the loop began to diverge."""
 
     @override
     def begun_anew(self, loop: LoopContext, why: Change) -> LoopHealth:
@@ -91,13 +91,13 @@ class LoopHealth(Detector):
     @property
     @override
     def marks(self) -> Mark:
-        """Whether commands are those of no mirror."""
+        """Mark of commands in another unit."""
         return Mark.ABSURD if self.absurd else UNMARKED
 
     @property
     @override
     def conditions(self) -> tuple[str | None, ...]:
-        """Whether commands are in another unit, and whether the loop diverges or is lost."""
+        """Texts of the alarms for commands in another unit and for a diverging or lost loop."""
         absurd = (
             f"commands are {self.ratio:.3g} times what turbulence asks: {self.unit}; nothing is "
             "measured, made or sent until the RTC sends metres"
@@ -176,19 +176,19 @@ SLIPPED_RATIO = 4.5
 """Averaged position of an outer actuator, in σ of turbulence, that no healthy loop shows."""
 
 SUSPECT_RATIO = 2.5
-"""What no healthy loop shows for longer than ``SUSPECT_FOR``; below it, a ring that had slipped
-is back."""
+"""Averaged position of an outer actuator, in σ of turbulence, that no healthy loop exceeds for
+longer than ``SUSPECT_DURATION_MEMORIES``; below it, a slip is over."""
 
-SUSPECT_FOR = 2.0
+SUSPECT_DURATION_MEMORIES = 2.0
 """Times the memory of positions."""
 
-LOOK_FRAMES = 50
+EDGE_STRIDE_FRAMES = 50
 """One of so many frames is looked at, however long a block is."""
 
-SLOW_TURBULENCE = 2.0
-"""Times the averaged positions of the inner actuators, in RMS, that the outer ones are compared
-with. Turbulence that a slow wind carries leaves both parts of the mirror where they are for longer
-than the memory; the largest of a ring of healthy actuators then stands at 1.2 to 1.8."""
+SLOW_TURBULENCE_RATIO = 2.0
+"""Factor on the RMS of the inner actuators' averaged positions in the comparison with the outer
+ones. Turbulence carried by a slow wind keeps both parts of the mirror in place for longer than the
+memory; the largest of a ring of healthy actuators is then at 1.2 to 1.8."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -207,16 +207,16 @@ class EdgeHealth(Detector):
 
     ratio: float = 0.0
     """Largest averaged position of an outer actuator over what the inner ones show: their RMS, or
-    ``SLOW_TURBULENCE`` times that of their averaged positions, whichever is larger."""
+    ``SLOW_TURBULENCE_RATIO`` times that of their averaged positions, whichever is larger."""
 
     suspect_s: float = 0.0
-    """For how long the ratio has been above ``SUSPECT_RATIO``."""
+    """Duration for which the ratio has been above ``SUSPECT_RATIO``, seconds."""
 
     slipped: bool = False
 
     @override
     def begun_anew(self, loop: LoopContext, why: Change) -> EdgeHealth:
-        """Return it with nothing where the loop is open; a ring nobody watches has not slipped."""
+        """Return the health, without history if the loop is open."""
         return EdgeHealth() if loop.edge is None else self
 
     @override
@@ -228,7 +228,7 @@ class EdgeHealth(Detector):
     @property
     @override
     def conditions(self) -> tuple[str | None, ...]:
-        """Whether the edge has slipped."""
+        """Text of the alarm for a slipped edge."""
         slipped = (
             f"an outer actuator stands {self.ratio:.0f} sigma from where turbulence would have it: "
             "the edge has slipped, whatever the slopes say; open the loop and close it again with "
@@ -239,7 +239,7 @@ class EdgeHealth(Detector):
 
 def observe_edge(health: EdgeHealth, block: FrameBlock, watch: EdgeWatch) -> EdgeHealth:
     """Return the health after one more block, of which some frames are used."""
-    n_frames = np.diff([*range(0, block.n_frames, LOOK_FRAMES), block.n_frames])
+    n_frames = np.diff([*range(0, block.n_frames, EDGE_STRIDE_FRAMES), block.n_frames])
     moved = block.commands_m[np.cumsum(n_frames) - 1][:, watch.modes]
     inner = np.einsum("km,km->k", moved @ watch.inner, moved)
     each = zip(moved, inner, n_frames * (block.dt_ns * 1e-9), strict=True)
@@ -255,7 +255,7 @@ def _seen(
     inner: float,
     lasted_s: float,
 ) -> EdgeHealth:
-    """Return the health after a command that stands for so much time.
+    """Return the health after a command that lasted for ``lasted_s``.
 
     ``inner`` is the mean square of the inner actuators at that command.
     """
@@ -266,10 +266,10 @@ def _seen(
     power = float(fade) * health.turbulence**2 + float(1 - fade) * max(inner, 0.0)
     turbulence = float(np.sqrt(power))
     steady = max(float(average @ watch.inner @ average), 0.0) ** 0.5
-    scale = max(turbulence, SLOW_TURBULENCE * steady, 1e-3)
+    scale = max(turbulence, SLOW_TURBULENCE_RATIO * steady, 1e-3)
     ratio = float(np.abs(watch.outer @ average).max()) / scale
     suspect_s = health.suspect_s + lasted_s if ratio > SUSPECT_RATIO else 0.0
-    slipped = ratio > SLIPPED_RATIO or suspect_s > SUSPECT_FOR * watch.memory_s
+    slipped = ratio > SLIPPED_RATIO or suspect_s > SUSPECT_DURATION_MEMORIES * watch.memory_s
     return EdgeHealth(
         command=average,
         turbulence=turbulence,
@@ -283,16 +283,16 @@ SEGMENT_FRAMES = 1024
 """Length of a spectrum: 1 Hz per bin at 1 kHz."""
 
 MIN_SEGMENTS = 8
-"""Fewer spectra scatter too much for a line to be told from noise."""
+"""Smallest number of averaged spectra; with fewer, noise resembles a line."""
 
 LINE_RATIO = 8.0
-"""Power of a line over its neighbourhood's median: a mean of eight spectra of noise never gets
-there, so that what does is worth moving a dither for."""
+"""Power of a line over its neighbourhood's median: a mean of eight spectra of noise never reaches
+it, so that a peak which does justifies moving a dither."""
 
-LOOK_SEGMENTS = 4
+LINE_SEARCH_SEGMENTS = 4
 """Spectra between two looks for lines: a look costs as much as hundreds of frames."""
 
-_NEIGHBOURHOOD = 20
+_NEIGHBOURHOOD_BINS = 20
 _MEMORY_SEGMENTS = 32.0
 _N_PATTERNS = 4
 
@@ -315,7 +315,7 @@ class SlopeSpectra:
     """``(n, n_views)`` of the segment under way."""
 
     def with_frames(self, block: FrameBlock) -> SlopeSpectra:
-        """Return the spectra after a block; a gap or a new session starts the segment anew."""
+        """Return the spectra after a block; a gap or a new session restarts the segment."""
         rows = (block.slopes @ self.views.T).astype(np.float32)
         unbroken = (block.session, block.first_seq) == (self.session, self.next_seq)
         if unbroken and self.collected is not None:
@@ -333,19 +333,19 @@ class SlopeSpectra:
         )
 
     def lines_hz(self, known_hz: tuple[float, ...] = ()) -> tuple[float, ...]:
-        """Return the vibration lines, lowest first, without those known: the dither's own.
+        """Return the vibration lines, lowest first, without the known ones: the dither's own.
 
-        A bin is a line when in any view it stands ``LINE_RATIO`` above the median of its
-        neighbourhood and is the highest within two bins. Below 2 % of the frame rate turbulence
-        falls too steeply for a neighbourhood to tell, and no dither goes there.
+        A bin is a line if in any view it exceeds the median of its neighbourhood by ``LINE_RATIO``
+        and is the highest within two bins. Below 2 % of the frame rate turbulence falls too steeply
+        for a comparison with the neighbourhood, and no dither goes there.
         """
         if self.power is None or self.n_segments < MIN_SEGMENTS:
             return ()
-        typical = np.median(_around(self.power, _NEIGHBOURHOOD), axis=-1)
+        typical = np.median(_around(self.power, _NEIGHBOURHOOD_BINS), axis=-1)
         highest = _around(self.power, 2).max(axis=-1)
         peaks = (self.power > LINE_RATIO * typical) & (self.power == highest)
         step = self.frame_rate_hz / SEGMENT_FRAMES
-        found = [step * k for k in np.flatnonzero(peaks.any(axis=0)) if k > _NEIGHBOURHOOD]
+        found = [step * k for k in np.flatnonzero(peaks.any(axis=0)) if k > _NEIGHBOURHOOD_BINS]
         return tuple(
             float(f) for f in found if all(abs(f - known) > 3.0 * step for known in known_hz)
         )
@@ -361,9 +361,10 @@ class SlopeSpectra:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class VibrationMonitor(Detector):
-    """Finds vibrations with and without a dither: feed it blocks with ``update``.
+    """Detector of vibrations with and without a dither; ``update`` takes the blocks.
 
-    Apart, because only a pause tells a vibration from a dither that plays on it.
+    The spectra with and without a dither are kept apart, because only a pause distinguishes a
+    vibration from a dither line at the same frequency.
     """
 
     resets = Change.GONE | Change.RATE
@@ -392,9 +393,9 @@ class VibrationMonitor(Detector):
 
     @classmethod
     def of(cls, n_slopes: int, kind: SignalKind = SignalKind.XY) -> VibrationMonitor:
-        """Return the monitor of signals of which nothing has been seen yet.
+        """Return the monitor of signals of which nothing has been measured yet.
 
-        It looks at the mean x and y slopes, and at fixed patterns of random signs.
+        It uses the mean x and y slopes, and fixed patterns of random signs.
         """
         views = np.zeros((2 + _N_PATTERNS, n_slopes), np.float32)
         tilts = np.repeat(TO_SLOPES[kind], n_slopes // kind.n_planes, axis=1)
@@ -404,9 +405,9 @@ class VibrationMonitor(Detector):
         return cls(quiet=SlopeSpectra(views=views), dithered=SlopeSpectra(views=views))
 
     def follow(self, block: FrameBlock, dither_hz: tuple[float, ...]) -> VibrationMonitor:
-        """Return it after a block played under these dither lines; lines are sought now and then.
+        """Return the monitor after a block with these dither lines.
 
-        Another dither's spectra begin anew.
+        Vibrations are searched at intervals. The spectra restart with another dither.
         """
         quiet, dithered = self.quiet, self.dithered
         if block.dither_m is None:
@@ -418,22 +419,23 @@ class VibrationMonitor(Detector):
         before = self.quiet.n_segments + self.dithered.n_segments
         n_segments = quiet.n_segments + dithered.n_segments
         state = replace(self, quiet=quiet, dithered=dithered, dither_hz=dither_hz)
-        if n_segments == before or n_segments % LOOK_SEGMENTS:
+        if n_segments == before or n_segments % LINE_SEARCH_SEGMENTS:
             return state
         lines = quiet.lines_hz()
         under = dithered.lines_hz((*dither_hz, *lines))
         return replace(state, lines_hz=tuple(sorted((*lines, *under))))
 
 
-STRIDE = 8
+STANDSTILL_STRIDE_FRAMES = 8
 """One of so many frames is compared with the last one compared."""
 
-STANDS_S = 0.05
+MIN_STANDSTILL_S = 0.05
 """Telemetry that has not changed for so long is no measurement: photons and electrons always move
 the last digits of hundreds of slopes."""
 
-ALARM_S = 0.5
-"""A camera that stands for less may only have skipped some frames."""
+STANDSTILL_ALARM_S = 0.5
+"""Shortest standstill that raises an alarm: within less a camera may only have skipped some frames.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -464,14 +466,14 @@ class Standstill(Detector):
     @property
     @override
     def marks(self) -> Mark:
-        """Whether nothing can be measured with these slopes."""
-        return Mark.STANDS if self.lasts_s >= STANDS_S else UNMARKED
+        """Mark of slopes that are not a measurement."""
+        return Mark.STANDS if self.lasts_s >= MIN_STANDSTILL_S else UNMARKED
 
     @property
     @override
     def conditions(self) -> tuple[str | None, ...]:
-        """Text of the alarm: what stands still, since when, what to do; None: nothing."""
-        if self.lasts_s < ALARM_S:
+        """Text of the alarm: what is frozen, since when, and the remedy; None if slopes change."""
+        if self.lasts_s < STANDSTILL_ALARM_S:
             return (None,)
         what = "are the same in every frame" if self.slopes.any() else "are all zero"
         since = datetime.fromtimestamp(self.since_ns_utc * 1e-9, UTC)
@@ -485,7 +487,9 @@ class Standstill(Detector):
     def follow(self, block: FrameBlock) -> Standstill:
         """Return it after one more block."""
         state = self
-        for row in range(-block.first_seq % STRIDE, block.n_frames, STRIDE):
+        for row in range(
+            -block.first_seq % STANDSTILL_STRIDE_FRAMES, block.n_frames, STANDSTILL_STRIDE_FRAMES
+        ):
             slopes, t_ns = block.slopes[row], block.t0_ns_utc + row * block.dt_ns
             if state.session == block.session and np.array_equal(slopes, state.slopes):
                 state = replace(state, lasts_s=(t_ns - state.since_ns_utc) * 1e-9)

@@ -244,14 +244,14 @@ def scattered(joint: Joint, block: BiasBlock, innovation: float) -> Joint:
 
 
 def learnt(scatter: float, innovation: float) -> float:
-    """Return how much more measurements scatter than they say, in variance, after one more.
+    """Return the ratio of the measurements' variance to the stated one, after one more.
 
     Parameters
     ----------
     scatter
-        What those before have told; never less than 1.
+        Ratio from the previous measurements, at least 1.
     innovation
-        Of the newest, squared and normalised with that much scatter allowed for: 4 is expected.
+        Squared innovation of the newest, normalised with that scatter included: 4 is expected.
     """
     seen = min(innovation, JUMP_THRESHOLD) / 4.0
     return max(scatter * (1.0 + SCATTER_LEARNING * (seen - 1.0)), 1.0)

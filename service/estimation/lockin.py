@@ -32,7 +32,7 @@ from service.model.interaction import Linearisation
 
 Array = NDArray[Any]
 
-CUT_PERIODS = 0.01
+MAX_CUT_PERIODS = 0.01
 """Fraction of a period by which a window may be too long or too short, when the frame rate differs
 from its nominal value by parts per million. The Hann window keeps the error below 1e-4 of the
 amplitude."""
@@ -51,13 +51,13 @@ class LockInPlan(WindowPlan):
     frame_rate_hz: float
 
     def __post_init__(self) -> None:
-        """Refuse a plan whose lines or side bins would leave the spectrum or be cut short.
+        """Refuse a plan with lines or side bins outside the spectrum or between its bins.
 
         Raises
         ------
         ModelError
             If the lists differ in length, a frequency leaves (20 Hz, Nyquist - 20 Hz), two lines
-            lie within 4 bins of one another, or the window cuts a period.
+            are within 4 bins of one another, or the window cuts a period.
         """
         lines = np.array(self.frequencies_hz)
         edge = SIDE_OFFSETS_HZ.max()
@@ -75,7 +75,7 @@ class LockInPlan(WindowPlan):
                 f"between {edge:g} and {highest:.4g} Hz, room for the side bins"
             )
         periods = lines * self.n_frames / self.frame_rate_hz
-        if np.abs(periods - np.round(periods)).max() > CUT_PERIODS:
+        if np.abs(periods - np.round(periods)).max() > MAX_CUT_PERIODS:
             raise ModelError(
                 f"lock-in: {self.n_frames} frames cut a period of {lines} Hz; expected whole ones"
             )
@@ -211,19 +211,19 @@ _MAX_TERMS = 40
 """Largest number of terms of a series. If more are needed, the loop's equations are solved instead.
 """
 
-_GROWN = 10.0
+_DIVERGENCE_RATIO = 10.0
 """A term this much larger than the first is one of a series that does not end."""
 
 _ROUNDING = 1e-7
 """Relative rounding error of single precision."""
 
-LIKER = 3.0
+OTHER_MODE_POWER_RATIO = 3.0
 """Another mode explains more of a line than the line's own by this factor, if it is that mode."""
 
-CERTAIN = 6.0
+IDENTIFICATION_RATIO = 6.0
 """A mode is identified if it explains this many times the root mean square next to the line."""
 
-WEAK = 0.3
+WEAK_LINE_RATIO = 0.3
 """Lines weaker than this fraction of the strongest have less than a tenth of its weight."""
 
 MAX_LAG_FRAMES = 0.2
@@ -300,7 +300,7 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
     )
 
 
-_FEW_MOVED = 6
+_FEW_MOVED_RATIO = 6
 """If fewer than one mode in this many moves, the others are left out of the products."""
 
 
@@ -310,7 +310,7 @@ def _of_moved_modes(
     """Return both without modes that nothing moves, where that is most of a large telescope."""
     moves = np.any(spectra.commands, axis=(0, 1)) | np.any(spectra.dither, axis=0)
     moves[: len(loop.reconstructor)] = True
-    if _FEW_MOVED * np.count_nonzero(moves) > len(moves):
+    if _FEW_MOVED_RATIO * np.count_nonzero(moves) > len(moves):
         return spectra, linearisation
     moved = np.flatnonzero(moves)
     few = replace(spectra, commands=spectra.commands[:, :, moved], dither=spectra.dither[:, moved])
@@ -360,7 +360,7 @@ def _summed(first: Array, answer: Array, coupling: Array) -> Array | None:
         change, size = (np.abs(x).max(initial=0.0) for x in (reply - before, reply))
         if change <= _ROUNDING * size:  # zeros are settled, too
             return np.asarray(reply)
-        if not change < _GROWN * largest:
+        if not change < _DIVERGENCE_RATIO * largest:
             return None
     return None
 
@@ -404,18 +404,18 @@ def _answers_as(spectra: Spectra, matrix: Array) -> tuple[int, ...]:
     size = np.abs(_apply(unit.T, slopes[:, 0]))
     best = np.argmax(size, axis=1)
     lines = np.arange(len(own))
-    for line in np.flatnonzero(size[lines, best] > LIKER * size[lines, own]):
+    for line in np.flatnonzero(size[lines, best] > OTHER_MODE_POWER_RATIO * size[lines, own]):
         beside = np.abs(slopes[line, 1:] @ unit[:, best[line]])
-        if size[line, best[line]] < CERTAIN * np.sqrt(np.mean(beside**2)):
+        if size[line, best[line]] < IDENTIFICATION_RATIO * np.sqrt(np.mean(beside**2)):
             best[line] = own[line]
-    clear = size[lines, best] > LIKER * size[lines, own]
+    clear = size[lines, best] > OTHER_MODE_POWER_RATIO * size[lines, own]
     return tuple(np.where(clear, best, own).tolist())
 
 
 def _weak(spectra: Spectra) -> tuple[int, ...]:
     """Return the modes whose dither is far weaker than that of the strongest."""
     size = np.abs(spectra.dither).max(axis=1)
-    return tuple(np.array(spectra.plan.modes)[size < WEAK * size.max()].tolist())
+    return tuple(np.array(spectra.plan.modes)[size < WEAK_LINE_RATIO * size.max()].tolist())
 
 
 def _total_dither_m(spectra: Spectra) -> float:

@@ -30,33 +30,33 @@ Array = NDArray[Any]
 SAMPLES_PER_S = 20.0
 """Frames looked at: at 1 kHz one in 50."""
 
-BATCH = 32
+BATCH_SAMPLES = 32
 """Samples that may wait to be multiplied: the reconstructor is read once for all of them."""
 
 KEPT_SAMPLES = 512
 """The oldest give way."""
 
-ENOUGH_SAMPLES = 20
+MIN_SAMPLES = 20
 """Fewer judge nothing."""
 
 WINDOW_SAMPLES = 5
 """Frames of a window that must have been looked at before it can be said to be off the loop."""
 
-AT_EASE_S = 1.3
+RECHECK_INTERVAL_S = 1.3
 """A loop that was found correct is not checked again for this time."""
 
-TOLERANCE = 0.2
+STEP_TOLERANCE = 0.2
 """A mode that takes less than 0.8 or more than 1.2 of its steps does not obey."""
 
-SIGNIFICANCE = 5.0
+SIGNIFICANCE_SIGMA = 5.0
 """Standard errors beyond the tolerance before a mode counts: hundreds are looked at each second."""
 
-COMMON_TOLERANCE = 0.12
+MEAN_STEP_TOLERANCE = 0.12
 """The same for the mean of all modes; a mirror that lags by 0.64 frames is short of 0.05."""
 
-LARGEST_DELAY_FRAMES = 8
+MAX_DELAY_FRAMES = 8
 
-HELD_SHARE = 0.1
+MAX_CONSTANT_SHARE = 0.1
 """Fraction of the samples in which a mode may stay constant although it should move."""
 
 _STILL_M = 1e-12
@@ -117,7 +117,7 @@ class LoopCheck(Detector):
         if rtc is None or not fresh:
             return self
         seq, terms = last_seq(rtc), loop.terms(rtc.cm_id)
-        if self.residual is None and seq < self.obeyed_seq + AT_EASE_S * rtc.frame_rate_hz:
+        if self.residual is None and seq < self.obeyed_seq + RECHECK_INTERVAL_S * rtc.frame_rate_hz:
             return self
         span = last_samples(self, seq)
         if span is None or terms is None:
@@ -139,7 +139,7 @@ class LoopCheck(Detector):
             return check, None
         if not found.holds:
             return check, found.text
-        if n_frames / terms.frame_rate_hz >= ENOUGH_SAMPLES / SAMPLES_PER_S:
+        if n_frames / terms.frame_rate_hz >= MIN_SAMPLES / SAMPLES_PER_S:
             # what a long window shows need not be asked again
             check = replace(check, obeyed_seq=max(last, check.obeyed_seq))
         return check, None
@@ -222,7 +222,7 @@ class CommandResidual:
 def observe(check: LoopCheck, block: FrameBlock, loop: ClosedLoop) -> LoopCheck:
     """Return the check after one more block, as far as it is of this loop."""
     n_delay = int(loop.delay_frames)
-    if n_delay > LARGEST_DELAY_FRAMES or block.cm_id != loop.cm_id:
+    if n_delay > MAX_DELAY_FRAMES or block.cm_id != loop.cm_id:
         return replace(check, tail=None)
     if check.cm_id != loop.cm_id:  # frames of another matrix come before the status that tells it
         check = replace(check, cm_id=loop.cm_id, tail=None, waiting=(), batches=())
@@ -240,7 +240,7 @@ def observe(check: LoopCheck, block: FrameBlock, loop: ClosedLoop) -> LoopCheck:
         if frames.n_frames == depth and frames.first_seq >= check.from_seq:
             waiting.append(_sample(frames, loop))
     check = replace(check, tail=_last(tail, block, depth), waiting=tuple(waiting))
-    return _multiplied(check, loop) if len(waiting) >= BATCH else check
+    return _multiplied(check, loop) if len(waiting) >= BATCH_SAMPLES else check
 
 
 def command_residual(
@@ -248,7 +248,7 @@ def command_residual(
     loop: ClosedLoop,
     first_seq: int,
     last_seq: int,
-    enough: int = ENOUGH_SAMPLES,
+    enough: int = MIN_SAMPLES,
 ) -> tuple[LoopCheck, CommandResidual | None]:
     """Return how the modes obeyed in a span of frames, both ends included.
 
@@ -272,10 +272,10 @@ def command_residual(
 
 
 def last_samples(check: LoopCheck, before_seq: int) -> tuple[int, int] | None:
-    """Return the span of the last ``ENOUGH_SAMPLES`` samples up to a frame; None: too few."""
+    """Return the span of the last ``MIN_SAMPLES`` samples up to a frame; None: too few."""
     seq = np.array([k for b in check.batches for k in b.seq] + [s.seq for s in check.waiting])
-    seq = seq[seq <= before_seq][-ENOUGH_SAMPLES:]
-    return (int(seq[0]), int(seq[-1])) if len(seq) == ENOUGH_SAMPLES else None
+    seq = seq[seq <= before_seq][-MIN_SAMPLES:]
+    return (int(seq[0]), int(seq[-1])) if len(seq) == MIN_SAMPLES else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -320,18 +320,20 @@ class _Products:
 def _judged(asked: Array, taken: Array, held: Array, loop: ClosedLoop) -> CommandResidual:
     products = _Products.of(asked, taken)
     weights = _lag(products, loop)
-    obeys = np.abs(_shares(products, weights)[0] - 1.0) < TOLERANCE
+    obeys = np.abs(_shares(products, weights)[0] - 1.0) < STEP_TOLERANCE
     if obeys.any():
         # those that do not must not decide how late the others are
         weights = _lag(products.only(obeys), loop)
     share, error = _shares(products, weights)
     asked_for = products.power(weights) > products.n_samples * _STILL_M**2
-    off = (np.abs(share - 1.0) > TOLERANCE + SIGNIFICANCE * error) | (held > HELD_SHARE)
+    off = (np.abs(share - 1.0) > STEP_TOLERANCE + SIGNIFICANCE_SIGMA * error) | (
+        held > MAX_CONSTANT_SHARE
+    )
     if asked_for.any():
         mean = abs(share[asked_for].mean() - 1.0)
         uncertain = np.linalg.norm(error[asked_for]) / np.count_nonzero(asked_for)
-        if mean > COMMON_TOLERANCE + SIGNIFICANCE * uncertain:
-            off |= np.abs(share - 1.0) > COMMON_TOLERANCE
+        if mean > MEAN_STEP_TOLERANCE + SIGNIFICANCE_SIGMA * uncertain:
+            off |= np.abs(share - 1.0) > MEAN_STEP_TOLERANCE
     return CommandResidual(
         share=np.where(asked_for, share, np.nan),
         held=held,
@@ -359,7 +361,7 @@ def _lag(products: _Products, loop: ClosedLoop) -> Array:
     fitted = np.linalg.lstsq(
         (products.asked / scale).sum(axis=2), (products.common / scale).sum(axis=1)
     )[0]
-    if fitted.sum() > TOLERANCE and (fitted > -0.1 * fitted.sum()).all():
+    if fitted.sum() > STEP_TOLERANCE and (fitted > -0.1 * fitted.sum()).all():
         return np.asarray(fitted / fitted.sum())
     return np.array([1.0 - late, late, 0.0])
 

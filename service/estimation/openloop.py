@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from service.errors import ModelError
 from service.estimation import solver
 from service.estimation.lockin import MAX_LAG_FRAMES, LockInEstimate, Spectra, fit_window
-from service.estimation.solver import LONGEST_STEP, Columns
+from service.estimation.solver import MAX_STEP, Columns
 from service.estimation.windows import ClosedLoop, RefusalKind, WindowRefused
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
@@ -30,21 +30,21 @@ from service.model.slopes import Orientation
 
 Array = NDArray[Any]
 
-APPROACHED = np.array([0.02, 0.02, np.deg2rad(0.1), 2e-3])
+COARSE_STEP_LIMIT = np.array([0.02, 0.02, np.deg2rad(0.1), 2e-3])
 """A step shorter than this leaves the rest to the finer model (numeric units)."""
 
-LIMIT = np.array([3.0, 3.0, np.deg2rad(20.0), 0.15])
+SEARCH_RANGE = np.array([3.0, 3.0, np.deg2rad(20.0), 0.15])
 """Largest distance from the nominal registration that is searched (numeric units)."""
 
-UNEXPLAINED = 0.2
+MAX_UNEXPLAINED_SHARE = 0.2
 """Largest share of the columns' power, noise taken off, that the right registration may leave."""
 
-FAINTEST = 5.0
+MIN_LINE_SIGMA = 5.0
 """σ of a line's gain from which on it is seen."""
 
-LARGEST_GAIN = 3.0
+MAX_GAIN = 3.0
 
-FARTHEST_SUBAP = 3.0
+MAX_PUPIL_SHIFT_SUBAP = 3.0
 """Largest shift of the pupil that its light may indicate; beyond it the light is of another
 instrument."""
 
@@ -84,7 +84,7 @@ class WideCaptureSearch:
 
     def contains(self, vector: Array) -> bool:
         """Return whether a registration ``(4,)`` is within the range."""
-        return bool(np.all(np.abs(vector - self.nominal.vector) < LIMIT))
+        return bool(np.all(np.abs(vector - self.nominal.vector) < SEARCH_RANGE))
 
 
 def find(spectra: Spectra, search: WideCaptureSearch) -> WideCaptureEstimate | WindowRefused:
@@ -105,7 +105,7 @@ def find(spectra: Spectra, search: WideCaptureSearch) -> WideCaptureEstimate | W
     reason = "no start was given"
     for tried, start in enumerate(search.starts, start=1):
         landed = solver.approach(
-            search.coarse, columns, start, approached=APPROACHED, allowed=search.contains
+            search.coarse, columns, start, approached=COARSE_STEP_LIMIT, allowed=search.contains
         )
         if not landed.converged:
             reason = f"steps from {start} do not converge"
@@ -162,21 +162,21 @@ def _why_not(found: WideCaptureEstimate, search: WideCaptureSearch) -> str | Non
     """Return the reason why an estimate is rejected, or None."""
     estimate = found.estimate
     gains = np.abs(estimate.optical_gain)
-    if estimate.gain_sigma is not None and np.any(gains < FAINTEST * estimate.gain_sigma):
+    if estimate.gain_sigma is not None and np.any(gains < MIN_LINE_SIGMA * estimate.gain_sigma):
         return "the dither is not seen in the slopes: raise its amplitude or the window's length"
-    if gains.max() > LARGEST_GAIN:
+    if gains.max() > MAX_GAIN:
         return f"optical gains up to {gains.max():.1f}: the instrument file is another's"
     lag = float(np.median(estimate.lag_frames))
     if abs(lag) > MAX_LAG_FRAMES:
         return f"columns misaligned: slopes lag commands by {lag:+.2f} frame, 0 is expected"
     if not search.contains(estimate.alpha.vector):
         return f"{estimate.alpha} is out of range"
-    if np.any(np.abs(estimate.step) > LONGEST_STEP):
+    if np.any(np.abs(estimate.step) > MAX_STEP):
         return f"the finer model leads away from {estimate.alpha}"
-    if found.unexplained > UNEXPLAINED:
+    if found.unexplained > MAX_UNEXPLAINED_SHARE:
         return (
             f"{estimate.alpha} leaves {found.unexplained:.0%} of the response unexplained, "
-            f"expected at most {UNEXPLAINED:.0%}"
+            f"expected at most {MAX_UNEXPLAINED_SHARE:.0%}"
         )
     return None
 
@@ -210,6 +210,6 @@ def _lit_start(
         seen = light.find_pupil(light.counts_of(flux))
     except ModelError:
         return None
-    if isinstance(seen, CannotTell) or max(map(abs, seen.at)) > FARTHEST_SUBAP:
+    if isinstance(seen, CannotTell) or max(map(abs, seen.at)) > MAX_PUPIL_SHIFT_SUBAP:
         return None
     return replace(nominal, shift_x_subap=seen.at[0], shift_y_subap=seen.at[1])

@@ -43,7 +43,7 @@ ANGLES_RAD = np.deg2rad(np.arange(0.0, 360.0, 6.0))
 
 NOMINAL = Misregistration()
 
-MIN_LEAD = 0.08
+MIN_CORRELATION_LEAD = 0.08
 """Smallest difference of the correlations by which two classes of orientations are distinguished.
 """
 
@@ -51,7 +51,7 @@ MIN_CORRELATION = 0.4
 """Below, no orientation explains the lowest orders."""
 
 
-DOUBTFUL = 0.8
+DOUBTFUL_CORRELATION = 0.8
 """Below, others than a stated orientation are looked at as well."""
 
 
@@ -133,7 +133,7 @@ class Search:
 
 def overruled(stated: Pose, found: Pose) -> str:
     """Return why a stated orientation cannot be the RTC's; empty: it may be."""
-    if found.correlation < stated.correlation + 2.0 * MIN_LEAD:
+    if found.correlation < stated.correlation + 2.0 * MIN_CORRELATION_LEAD:
         return ""
     told = (
         f"with {setting_written(stated.slopes)} the lowest orders correlate with the model by "
@@ -227,7 +227,7 @@ def settings_of(reported: SlopeRecipe, orders: Iterable[SlopeOrder]) -> Iterator
 
 def _judged(poses: list[Pose], nominal_rad: float | None) -> Search:
     best = max(pose.correlation for pose in poses)
-    near = [pose for pose in poses if pose.correlation > best - MIN_LEAD]
+    near = [pose for pose in poses if pose.correlation > best - MIN_CORRELATION_LEAD]
     leader = max(near, key=lambda pose: pose.correlation)
 
     def preference(pose: Pose) -> tuple[float, float]:
@@ -284,21 +284,21 @@ class _Turned:
         return Pose(slopes=slopes, rotation_rad=wrapped(float(angle)), correlation=float(at))
 
 
-DEGREE = 5
+POLYNOMIAL_DEGREE = 5
 """Degree of the polynomials that represent the lowest orders: 20 without piston."""
 
-REPRESENTED = 0.5
+MIN_REPRESENTED_SHARE = 0.5
 """Least share of a smooth shape's amplitude that the modes must be able to make."""
 
-FEWEST = 3
+MIN_COMBINATIONS = 3
 """Combinations below which single modes lead, smooth or not."""
 
-MAX_SINGLE = 20
+MAX_SINGLE_MODES = 20
 
-UNSEEN = 1e-9
+UNSEEN_RESPONSE_RATIO = 1e-9
 """Response of a mode over the largest, below which it is none."""
 
-_NAMED = 5
+_MAX_LISTED_MODES = 5
 
 
 def coarse_sampling(instrument: Instrument) -> int:
@@ -339,12 +339,13 @@ def low_order_of(model: InteractionModel) -> LowOrder:
     root = np.sqrt(model.pupil.weights)[:, None]
     matrix = np.asarray(model.interaction_matrix(Misregistration()), dtype=np.float64)
     response = np.linalg.norm(matrix, axis=0)
-    unseen = np.flatnonzero(response <= UNSEEN * response.max())
+    unseen = np.flatnonzero(response <= UNSEEN_RESPONSE_RATIO * response.max())
     if len(unseen):
-        named = ", ".join(str(mode) for mode in unseen[:_NAMED])
+        named = ", ".join(str(mode) for mode in unseen[:_MAX_LISTED_MODES])
+        more = ", ..." if len(unseen) > _MAX_LISTED_MODES else ""
         raise ModelError(
             f"{model.instrument.name}: found {len(unseen)} of {len(response)} modes that move "
-            f"nothing the sensor sees (columns {named}{', ...' if len(unseen) > _NAMED else ''}); "
+            f"nothing the sensor sees (columns {named}{more}); "
             "expected actuators or tables in metres over the pupil (--modes leaves some out)"
         )
     root = np.where(model.basis.known(points)[:, None], root, 0.0)
@@ -355,10 +356,10 @@ def low_order_of(model: InteractionModel) -> LowOrder:
     held = gram + 1e-3 * np.trace(gram) / len(gram) * np.eye(len(gram))
     combined = np.linalg.solve(held, modes.T @ smooth)
     _, size, axes = np.linalg.svd(modes @ combined, full_matrices=False)
-    kept = size > REPRESENTED
+    kept = size > MIN_REPRESENTED_SHARE
     combined = combined @ (axes[kept].T / size[kept])
-    if combined.shape[1] < FEWEST:
-        combined = np.eye(len(response))[:, :MAX_SINGLE]
+    if combined.shape[1] < MIN_COMBINATIONS:
+        combined = np.eye(len(response))[:, :MAX_SINGLE_MODES]
     shapes = model.basis.combined(combined / response[:, None])
     return LowOrder(shapes=shapes, combinations=combined)
 
@@ -366,6 +367,6 @@ def low_order_of(model: InteractionModel) -> LowOrder:
 def _smooth(points: Array, root: Array) -> Array:
     """Return orthonormal polynomials without piston, times the root of the pupil's weights."""
     x, y = (points / np.abs(points).max()).T
-    powers = [x**i * y ** (n - i) for n in range(DEGREE + 1) for i in range(n + 1)]
+    powers = [x**i * y ** (n - i) for n in range(POLYNOMIAL_DEGREE + 1) for i in range(n + 1)]
     orthonormal, _ = np.linalg.qr(np.column_stack(powers) * root)
     return np.asarray(orthonormal[:, 1:])

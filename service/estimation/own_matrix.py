@@ -15,50 +15,50 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.slope_convention import LARGEST_CONDITION
+from service.estimation.slope_convention import MAX_CONDITION
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 
 Array = NDArray[Any]
 
-RECOGNISED = 0.5
+MIN_MODE_CORRELATION = 0.5
 """Least correlation of a column with a mode for which it may be taken."""
 
-ADVANTAGE = 1.3
+OTHER_MODE_ADVANTAGE = 1.3
 """A column is another mode's where it correlates better with that one by this factor."""
 
-FIRST_COLUMNS = 20
+N_FIRST_COLUMNS = 20
 """Lowest columns that a far registration is found by: their waves are long."""
 
-GROWTH = 3
+COLUMNS_GROWTH = 3
 """Each next fit has so many times the columns of the last."""
 
-STEPS = 6
-"""Of each fit at most."""
+MAX_FIT_STEPS = 6
+"""Largest number of iterations of each fit."""
 
-SETTLED = np.array([0.003, 0.003, 3e-4, 3e-4])
+SETTLED_STEP = np.array([0.003, 0.003, 3e-4, 3e-4])
 """A shorter step ends a fit, numeric units."""
 
-LINEAR = np.array([0.1, 0.1, np.deg2rad(0.5), 0.005])
-"""Further from where it was taken a linearisation is made anew, numeric units."""
+LINEAR_RANGE = np.array([0.1, 0.1, np.deg2rad(0.5), 0.005])
+"""Distance from its registration beyond which a linearisation is recomputed, numeric units."""
 
-LONGEST_STEP = np.array([0.7, 0.7, np.deg2rad(4.0), 0.04])
-"""Of one iteration, numeric units."""
+MAX_STEP = np.array([0.7, 0.7, np.deg2rad(4.0), 0.04])
+"""Longest step of one iteration, numeric units."""
 
-MAX_STRANGE = 0.3
+MAX_STRANGE_SHARE = 0.3
 """Share of columns that may be no mode of the model before all are taken for another basis."""
 
-UNLIKE_NEIGHBOURS = 1.6
+UNEVEN_RATIO = 1.6
 """A mode that answers so many times as its neighbours do, or one over that, is named: those of
 healthy telescopes are within 1.12, but for the last of a basis that has all of a mirror's."""
 
-NEIGHBOURS = 10
+N_NEIGHBOURS = 10
 """Modes on either side that a mode's response is compared with."""
 
-ROLLED = 0.8
+MIN_ROLLED_SHARE = 0.8
 """Share of misplaced modes that are so by as many places, when all are said to be rolled."""
 
-WELL_EXPLAINED = 0.08
+MAX_UNWEIGHTED_MISFIT = 0.08
 """Median misfit of the RTC's own modes, in norm, below which all modes count alike for α. Matrices
 of simulators that differ from the model in influence functions and light leave 0.01 to 0.05,
 measured ones 0.15 to 0.4."""
@@ -72,7 +72,7 @@ N_DITHERED = 4
 N_PARAMETERS = 4
 """Parameters of a registration: so many modes say nothing of their own scatter."""
 
-_NAMED = 8
+_MAX_LISTED_MODES = 8
 """Modes that a sentence names at most."""
 
 LineariseAt = Callable[[Misregistration], Linearisation]
@@ -121,7 +121,7 @@ class OwnMatrix:
     """Weight of each mode of the basis for the measurement of α; empty if all count alike."""
 
     left_over: LeftOver | None = None
-    """What the model leaves of the modes that it knows; None if it was not worked out."""
+    """Residual of the matrix in the recognised modes; None if it was not computed."""
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -147,14 +147,14 @@ class OwnMatrix:
 
     @property
     def tells_registration(self) -> bool:
-        """Whether enough modes were recognised for ``alpha`` to be a start of fits."""
+        """True if enough modes were recognised for ``alpha`` to be a start of fits."""
         return int(self.known.sum()) > N_PARAMETERS and bool(np.isfinite(self.covariance).all())
 
     @property
     def wrong(self) -> str:
-        """Which modes have another sign or place than the instrument file says; empty: none."""
+        """Text on modes with a sign or place unlike the instrument file's; empty without any."""
         strange = self.modes < 0
-        if strange.mean() > MAX_STRANGE:
+        if strange.mean() > MAX_STRANGE_SHARE:
             return (
                 f"{int(strange.sum())} of the {len(self.modes)} modes that the RTC's own matrix "
                 "controls are none of the instrument file's: its slopes are listed in another "
@@ -165,19 +165,19 @@ class OwnMatrix:
 
     @property
     def uneven(self) -> str:
-        """Which modes answer otherwise than their neighbours; empty: none."""
+        """Text on modes whose response differs from their neighbours'; empty without any."""
         recognised = np.flatnonzero(self.modes >= 0)
         size = np.abs(self.response)
         ratio = {
             int(self.columns[k]): float(
-                size[k] / np.median(size[recognised[np.abs(recognised - k) <= NEIGHBOURS]])
+                size[k] / np.median(size[recognised[np.abs(recognised - k) <= N_NEIGHBOURS]])
             )
             for k in recognised
         }
         odd = [
             f"mode {mode} {times:.2g} times"
             for mode, times in ratio.items()
-            if not 1.0 / UNLIKE_NEIGHBOURS < times < UNLIKE_NEIGHBOURS
+            if not 1.0 / UNEVEN_RATIO < times < UNEVEN_RATIO
         ]
         if not odd:
             return ""
@@ -185,7 +185,7 @@ class OwnMatrix:
 
     @property
     def typical_response(self) -> float | None:
-        """Median response of the modes that are known, over the drawing's; None: none is."""
+        """Median ratio of the recognised modes' response to the nominal; None without any."""
         return float(np.median(self.response[self.known])) if self.known.any() else None
 
     @property
@@ -198,7 +198,7 @@ class OwnMatrix:
         if size is not None and abs(size - 1.0) > 0.1:
             found += f" and answer {size:.2f} times as drawn"
         misfit = self.typical_misfit
-        if misfit is not None and misfit >= WELL_EXPLAINED:
+        if misfit is not None and misfit >= MAX_UNWEIGHTED_MISFIT:
             found += f"; the model leaves {misfit:.0%} of their response unexplained"
         return f"{found}; {self.uneven}" if self.uneven else found
 
@@ -216,7 +216,7 @@ class OwnMatrix:
             return ""
         columns, modes = self.columns[elsewhere], self.modes[elsewhere]
         by, times = np.unique(modes - columns, return_counts=True)
-        if times.max() > max(ROLLED * len(columns), 2):
+        if times.max() > max(MIN_ROLLED_SHARE * len(columns), 2):
             whole = np.flatnonzero(modes - columns == by[times.argmax()])
             return (
                 f"modes are rolled by {by[times.argmax()]:+d} by the RTC's own matrix: its mode "
@@ -260,12 +260,12 @@ def recognise_modes(
     inverse = _inverse_of(reconstructor[columns])
     seen = inverse / np.maximum(np.linalg.norm(inverse, axis=0), np.finfo(float).tiny)
     alpha, near = start, linearise(start)
-    n = min(FIRST_COLUMNS, len(columns))
+    n = min(N_FIRST_COLUMNS, len(columns))
     while True:
         alpha, near = _registered(seen[:, :n], columns[:n], alpha, near, linearise)
         if n == len(columns):
             break
-        n = min(GROWTH * n, len(columns))
+        n = min(COLUMNS_GROWTH * n, len(columns))
     response = near.matrix_at(alpha)
     modes = _recognised(seen, columns, response)
     gains, misfit = np.full((2, len(columns)), np.nan)
@@ -299,13 +299,13 @@ def weights_of_modes(found: OwnMatrix, power: NDArray[np.floating]) -> tuple[flo
         ``(n_modes,)`` sum of the squares of each column of the model.
     """
     columns, misfit = found.columns[found.known], found.misfit[found.known]
-    if len(columns) < N_FITTED or np.median(misfit) < WELL_EXPLAINED:
+    if len(columns) < N_FITTED or np.median(misfit) < MAX_UNWEIGHTED_MISFIT:
         return ()
     typical, every = float(np.median(misfit)), np.arange(len(power))
     slope, _ = np.polyfit(columns, misfit, 1)
     expected = typical + np.maximum(slope * (every - np.median(columns)), 0.0)
     expected[columns] = misfit
-    weights = 1.0 / (power * (WELL_EXPLAINED**2 + expected**2))
+    weights = 1.0 / (power * (MAX_UNWEIGHTED_MISFIT**2 + expected**2))
     return tuple((weights / weights.max()).tolist())
 
 
@@ -326,7 +326,7 @@ def left_over(
 
 def _inverse_of(reconstructor: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return the interaction matrix ``(n_slopes, n)`` that a reconstructor inverts."""
-    return np.linalg.pinv(reconstructor.astype(float), rcond=1.0 / LARGEST_CONDITION)
+    return np.linalg.pinv(reconstructor.astype(float), rcond=1.0 / MAX_CONDITION)
 
 
 def _scatter(
@@ -356,8 +356,8 @@ def _registered(
     linearise: LineariseAt,
 ) -> tuple[Misregistration, Linearisation]:
     """Return the registration that explains these columns of unit length, and a model near it."""
-    for _ in range(STEPS):
-        if np.any(np.abs(alpha.vector - near.alpha.vector) > LINEAR):
+    for _ in range(MAX_FIT_STEPS):
+        if np.any(np.abs(alpha.vector - near.alpha.vector) > LINEAR_RANGE):
             near = linearise(alpha)
         response = near.matrix_at(alpha)
         modes = _recognised(seen, columns, response)
@@ -367,9 +367,9 @@ def _registered(
         step = _step(
             seen[:, usable], response[:, modes[usable]], near.derivatives[:, :, modes[usable]]
         )
-        step = np.clip(step, -LONGEST_STEP, LONGEST_STEP)
+        step = np.clip(step, -MAX_STEP, MAX_STEP)
         alpha = alpha.stepped(step)
-        if np.all(np.abs(step) < SETTLED):
+        if np.all(np.abs(step) < SETTLED_STEP):
             break
     return alpha, near
 
@@ -386,9 +386,9 @@ def _recognised(
     own = likeness[columns, np.arange(len(columns))]
     best = np.argmax(likeness, axis=0)
     highest = likeness[best, np.arange(len(columns))]
-    modes = np.where(ADVANTAGE * own >= highest, columns, best)
+    modes = np.where(OTHER_MODE_ADVANTAGE * own >= highest, columns, best)
     taken = likeness[modes, np.arange(len(columns))]
-    return np.where(taken >= RECOGNISED, modes, -1)
+    return np.where(taken >= MIN_MODE_CORRELATION, modes, -1)
 
 
 def _step(seen: Array, response: Array, derivatives: Array) -> Array:
@@ -410,6 +410,6 @@ def _equations(seen: Array, response: Array, derivatives: Array) -> tuple[Array,
 
 def _listed(things: Sequence[object] | NDArray[np.intp]) -> str:
     """Return the first of some things in words, and how many more there are."""
-    first = [str(thing) for thing in things[:_NAMED]]
+    first = [str(thing) for thing in things[:_MAX_LISTED_MODES]]
     more = len(things) - len(first)
     return ", ".join(first) + (f" and {more} more" if more else "")

@@ -38,11 +38,11 @@ PASSIVE_MEMORY_S = 10.0
 N_TAPS = 11
 """Longer filters know turbulence from noise no better, and lose more frames at every gap."""
 
-CORNER = 0.08
+CORNER_RATIO = 0.08
 """Corner of the high-pass filter as a fraction of the frame rate. Above 0.1 a bright star leaves
 too little signal; below 0.06 turbulence in a wind of 20 m/s passes."""
 
-BAND_FRAMES = 32
+FILTER_BLOCK_FRAMES = 32
 """Filtered in one product: more are mostly products with nothing, fewer mostly calls."""
 
 MIN_DELAY_FRAMES = 2
@@ -56,7 +56,7 @@ _TURBULENCE_SLOPE = 34.0 / 3.0
 """Slope of the squared temporal power spectrum of a mode above its corner frequency: twice 17/3
 (Conan et al. 1995)."""
 
-_LOWEST = 0.015
+_LOWEST_FREQUENCY_RATIO = 0.015
 """Lowest frequency as a fraction of the frame rate. Below it turbulence is assumed to be as strong
 as at it."""
 
@@ -75,7 +75,7 @@ SAMPLES_KEPT = 64
 SAMPLE_FRAMES = 128
 """One sample in as many frames."""
 
-SHRUNK = 0.2
+CORRELATION_SHRINKAGE = 0.2
 """Fraction by which correlations between parameters are reduced. They are estimated from the few
 independent errors of columns, so directions that appear best known are partly known by chance: one
 estimate in 60 was 5 σ off in such a direction."""
@@ -83,10 +83,10 @@ estimate in 60 was 5 σ off in such a direction."""
 MIN_SAMPLES = 8
 """Smallest number of filtered frames from which the noise of the slopes is estimated."""
 
-_REACH = N_TAPS - 1
+_FILTER_SPAN_FRAMES = N_TAPS - 1
 """Frames besides its own that a filtered one is made of."""
 
-_RANK = 1e-6
+_RANK_TOLERANCE = 1e-6
 """Singular values below this fraction of the largest are rounding errors."""
 
 
@@ -101,7 +101,10 @@ class HighPass:
     """Frames after k that z_k depends on: their commands do not know the noise of frame k."""
 
     band: NDArray[np.float32]
-    """``(BAND_FRAMES, BAND_FRAMES + n_taps - 1)`` the taps, a column further in each row."""
+    """Taps, one column further in each row.
+
+    ``(FILTER_BLOCK_FRAMES, FILTER_BLOCK_FRAMES + n_taps - 1)``
+    """
 
     def __call__(self, commands: Array) -> Array:
         """Return ``(n_rows - n_taps + 1, n_modes)`` of contiguous commands ``(n_rows, n_modes)``.
@@ -110,8 +113,8 @@ class HighPass:
         """
         reach = len(self.taps) - 1
         out = np.empty((len(commands) - reach, commands.shape[1]), np.float32)
-        for start in range(0, len(out), BAND_FRAMES):
-            part = out[start : start + BAND_FRAMES]
+        for start in range(0, len(out), FILTER_BLOCK_FRAMES):
+            part = out[start : start + FILTER_BLOCK_FRAMES]
             n = len(part)
             np.matmul(self.band[:n, : n + reach], commands[start : start + n + reach], out=part)
         return out
@@ -127,9 +130,9 @@ def high_pass(delay_frames: float) -> HighPass:
     """Return the filter for a loop of this delay.
 
     It makes ``E[z c]``, the response to the sensor's noise, as large as it can be for the noise of
-    ``sum z s``, turbulence counted as noise that is ``CORNER`` away from being as strong: with a
-    loop's reply to white noise, ``P = 1 / |1 - z^-1 + g z^-d|^2``, taps solve ``M a = v``, where
-    ``v`` is the inverse transform of P and ``M`` that of ``P (1 + W)``.
+    ``sum z s``. Turbulence counts as noise, as strong as the sensor's at ``CORNER_RATIO``. With a
+    loop's response to white noise, ``P = 1 / |1 - z^-1 + g z^-d|^2``, the taps solve ``M a = v``,
+    where ``v`` is the inverse transform of P and ``M`` that of ``P (1 + W)``.
 
     Raises
     ------
@@ -146,14 +149,14 @@ def high_pass(delay_frames: float) -> HighPass:
     turns = (np.arange(4096) + 0.5) / 8192
     z = np.exp(-2j * np.pi * turns)
     power = 1.0 / np.abs(1.0 - 0.999 * z + _LOOP_GAIN * z ** round(delay_frames)) ** 2
-    turbulence = (CORNER / np.maximum(turns, _LOWEST)) ** _TURBULENCE_SLOPE
+    turbulence = (CORNER_RATIO / np.maximum(turns, _LOWEST_FREQUENCY_RATIO)) ** _TURBULENCE_SLOPE
     shifted = np.exp(-2j * np.pi * np.outer(np.arange(N_TAPS) - ahead, turns))
     signal = (shifted * power).real.mean(axis=1)
     noise = ((shifted * power * (1.0 + turbulence)) @ shifted.conj().T).real / len(turns)
     taps = np.linalg.solve(noise, signal)
     taps -= taps.mean()
     taps = (taps / np.abs(taps).max()).astype(np.float32)
-    band = np.zeros((BAND_FRAMES, BAND_FRAMES + N_TAPS - 1), np.float32)
+    band = np.zeros((FILTER_BLOCK_FRAMES, FILTER_BLOCK_FRAMES + N_TAPS - 1), np.float32)
     for k, row in enumerate(band):
         row[k : k + N_TAPS] = taps[::-1]
     return HighPass(taps=taps, ahead=ahead, band=band)
@@ -220,7 +223,7 @@ class Passive(PassiveSums):
     @override
     def n_waiting(self) -> int:
         """Frames that the filter reaches both ends of and that are not multiplied yet."""
-        return max(sum(block.n_frames for block in self.waiting) - _REACH, 0)
+        return max(sum(block.n_frames for block in self.waiting) - _FILTER_SPAN_FRAMES, 0)
 
     @property
     @override
@@ -282,14 +285,14 @@ def accumulate(state: Passive, block: FrameBlock) -> Passive:
         state = _ended(state)
     if block.commands_m.shape[1] == n_columns:  # a dither of the loop's modes is no noise
         state = _sampled(state, *before, block)
-    tail = block if block.n_frames >= _REACH else joined_frames((*before, block))
+    tail = block if block.n_frames >= _FILTER_SPAN_FRAMES else joined_frames((*before, block))
     waiting = (*(state.waiting or before), block)
-    state = replace(state, tail=tail.last(_REACH), waiting=waiting, n_others=n_others)
+    state = replace(state, tail=tail.last(_FILTER_SPAN_FRAMES), waiting=waiting, n_others=n_others)
     if state.n_waiting < CHUNK_FRAMES + TAPER_FRAMES:
         return state
     frames = joined_frames(waiting)
     state = _summed(state, frames.rows(0, frames.n_frames - TAPER_FRAMES), last=False)
-    return replace(state, waiting=(frames.last(_REACH + TAPER_FRAMES),), begun=True)
+    return replace(state, waiting=(frames.last(_FILTER_SPAN_FRAMES + TAPER_FRAMES),), begun=True)
 
 
 def _with_dither_beside(state: Passive, block: FrameBlock) -> FrameBlock:
@@ -330,12 +333,15 @@ def _others(state: Passive, *blocks: FrameBlock) -> NDArray[np.intp]:
 
 def _sampled(state: Passive, *blocks: FrameBlock) -> Passive:
     """Keep one filtered frame in ``SAMPLE_FRAMES``; all blocks but the last are short."""
-    first, n_rows = blocks[0].first_seq, sum(block.n_frames for block in blocks) - _REACH
+    first, n_rows = (
+        blocks[0].first_seq,
+        sum(block.n_frames for block in blocks) - _FILTER_SPAN_FRAMES,
+    )
     n_due = (first + n_rows) // SAMPLE_FRAMES - first // SAMPLE_FRAMES
     if n_rows < 1 or not n_due:
         return state
     head = joined_frames(tuple(block.rows(0, N_TAPS) for block in blocks)).rows(0, N_TAPS)
-    n_before, chosen = n_rows + _REACH - blocks[-1].n_frames, state.instrument_filter
+    n_before, chosen = n_rows + _FILTER_SPAN_FRAMES - blocks[-1].n_frames, state.instrument_filter
     later = range(SAMPLE_FRAMES - n_before, n_rows - n_before, SAMPLE_FRAMES)[: n_due - 1]
     samples = list(state.samples)
     for rows in (head, *(blocks[-1].rows(start, start + N_TAPS) for start in later)):
@@ -350,12 +356,12 @@ def _summed(state: Passive, frames: FrameBlock, *, last: bool) -> Passive:
     # those that the filter reaches both ends of
     now = slice(chosen.behind, frames.n_frames - chosen.ahead)
     before = slice(now.start - 1, now.stop - 1)
-    filtered, n = chosen(_of(commands, state.instruments)), frames.n_frames - _REACH
+    filtered, n = chosen(_of(commands, state.instruments)), frames.n_frames - _FILTER_SPAN_FRAMES
     others = _others(state, frames)
     if len(others):
         moving = np.hstack([commands[now][:, others], commands[before][:, others]])
         shapes, size, _ = np.linalg.svd(moving.astype(float), full_matrices=False)
-        known = shapes[:, size > _RANK * size[0]].astype(np.float32)
+        known = shapes[:, size > _RANK_TOLERANCE * size[0]].astype(np.float32)
         filtered -= known @ (known.T @ filtered)
     weight = np.ones((n, 1), np.float32)
     rise = np.sin(np.pi / 2 * (np.arange(TAPER_FRAMES) + 0.5) / TAPER_FRAMES)[:, None] ** 2
@@ -419,7 +425,7 @@ def fit(state: Passive, linearisation: Linearisation) -> PassiveEstimate | None:
     Uses :mod:`service.estimation.solver`, each mode weighted by its noise. The errors of the
     columns are correlated (Q), and so are those of the slopes (S), because fast turbulence
     resembles modes. With both, ``Cov = A^-1 (J w) (S x Q) (J w)^T A^-1``; S is estimated from the
-    residual. Its correlations are reduced by ``SHRUNK``.
+    residual. Its correlations are reduced by ``CORRELATION_SHRINKAGE``.
     """
     found = passive_matrix(state)
     if found is None:
@@ -479,7 +485,8 @@ def fit_matrix(
     covariance = variance * normal @ spread @ normal
     return PassiveEstimate(
         alpha=near.stepped(step),
-        covariance=(1.0 - SHRUNK) * covariance + SHRUNK * np.diag(np.diag(covariance)),
+        covariance=(1.0 - CORRELATION_SHRINKAGE) * covariance
+        + CORRELATION_SHRINKAGE * np.diag(np.diag(covariance)),
         optical_gain=seen.gains,
         misfit=variance,
         step=step,

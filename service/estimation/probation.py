@@ -3,16 +3,17 @@
 A matrix at the edge of stability makes a few modes ring near a tenth of the frame rate, while
 slopes and wavefront error hardly change: a pyramid that saturates holds what runs away. So every
 mode's steps are compared with its own under the matrix before. A step of the integrator is
-``g R s``, the residual as the loop sees it; its change over ``LAG`` frames keeps what rings and
-leaves turbulence out. What all modes have in common, their median, is seeing, light, optical gain.
+``g R s``, the residual as the loop sees it; its change over ``LAG_FRAMES`` frames keeps what rings
+and leaves turbulence out. What all modes have in common, their median, is seeing, light, optical
+gain.
 
 Whatever single modes do, the residual as a whole is compared as well, as both matrices read it
 (``residual``); and the slopes, block by block, for a loop that is lost has no tenth of a second.
 
 Turbulence makes all of these vary with a healthy loop. How much is measured before the swap
-(``comparison.measure_noise``), and a moderate change is decided once, after ``DECIDE_S``, from the
-median of all parts. Before that only what no turbulence does counts: divergence at once, and a
-factor of several that lasts longer than a gust.
+(``comparison.measure_noise``), and a moderate change is decided once, after ``DECISION_PERIOD_S``,
+from the median of all parts. Before that only what no turbulence does counts: divergence at once,
+and a factor of several that lasts longer than a gust.
 
 Numbers are from docs/results/probation.md.
 """
@@ -28,10 +29,10 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.estimation.comparison import (
-    DECIDE_S,
+    DECISION_PERIOD_S,
     INNER,
     OUTER,
-    RECENT_S,
+    REFERENCE_PERIOD_S,
     SLOPES,
     Before,
     Part,
@@ -49,7 +50,7 @@ from service.wire import Status
 
 Array = NDArray[np.float64]
 
-WITHIN_S = DECIDE_S
+MAX_PROBATION_S = DECISION_PERIOD_S
 """Telemetry with the new matrix that is looked at; the verdict comes at the latest then."""
 
 HISTORY_S = 10.0
@@ -58,40 +59,40 @@ HISTORY_S = 10.0
 PART_S = 0.1
 """Duration of a part, between two evaluations."""
 
-LONGEST_PART_S = 0.2
+MAX_PART_S = 0.2
 """A block that lasts longer makes more than one part."""
 
-MIN_PART = 50
+MIN_PART_FRAMES = 50
 """Frames: fewer scatter too much to be looked at."""
 
-MIN_BEFORE_S = 0.8
+MIN_HISTORY_S = 0.8
 """Telemetry with the matrix before; with less nothing is said."""
 
-SETTLING_S = 0.03
+SWAP_SETTLING_S = 0.03
 """Time after a swap in which the loop changes from one equilibrium to the other."""
 
-LAG = 5
+LAG_FRAMES = 5
 """Frames: what rings at a tenth of the frame rate shows twice, what is slow not at all. An optical
 gain of a half makes loops ring at a twentieth; with 3 it shows half as well, with 8 none at an
 eighth."""
 
-RUNAWAY = 9.0
+RUNAWAY_POWER_RATIO = 9.0
 """Power of the slopes of one frame over that of the strongest frame before, in so many of those
 looked at in a row (``RUNAWAY_FRAMES``): nothing but a loop that is lost does that, and at once."""
 
 RUNAWAY_FRAMES = 4
 
-RETURNED_S = 1.0
+RETURN_PERIOD_S = 1.0
 """With the matrix before in use again, until the loop is said to be as it was, or lost."""
 
-RETURNED_PARTS = 10
+N_RETURN_PARTS = 10
 """Number of the last parts that decide if the loop has returned."""
 
-_REACH = LAG + 1
-_SAMPLED = 4
+_LAG_SPAN_FRAMES = LAG_FRAMES + 1
+_POWER_STRIDE_FRAMES = 4
 """One of so many frames is looked at for the power of all slopes."""
 
-_SPARSE = 7
+_DITHER_STRIDE_FRAMES = 7
 """One of so many frames is looked at for a dither: odd, or a sine of half or a quarter of the frame
 rate may be 0 in all of them."""
 
@@ -191,7 +192,7 @@ def observe(
     ``matrix`` is the one that multiplied its slopes; None: its numbers are not known. A long block
     makes several parts: they scatter as those do that come one by one.
     """
-    n_parts = int(np.ceil(block.n_frames * block.dt_ns * 1e-9 / LONGEST_PART_S))
+    n_parts = int(np.ceil(block.n_frames * block.dt_ns * 1e-9 / MAX_PART_S))
     cuts = np.linspace(0, block.n_frames, max(n_parts, 1) + 1).astype(int).tolist()
     for start, stop in pairwise(cuts):
         some = block.rows(start, stop)
@@ -226,15 +227,15 @@ def _note_runaway(state: Comparison, block: FrameBlock) -> Comparison:
     before = state.before
     if before is None or not before.peak or block.cm_id is None or state.returned:
         return state
-    looked, n_runaway = block.slopes[::_SAMPLED], state.n_runaway
+    looked, n_runaway = block.slopes[::_POWER_STRIDE_FRAMES], state.n_runaway
     for power in np.einsum("ks,ks->k", looked, looked).tolist():
-        n_runaway = n_runaway + 1 if power > RUNAWAY * before.peak else 0
+        n_runaway = n_runaway + 1 if power > RUNAWAY_POWER_RATIO * before.peak else 0
     state = replace(state, n_runaway=n_runaway)
     if n_runaway < RUNAWAY_FRAMES:
         return state
     text = (
-        f"the slopes of {n_runaway} frames in a row, one of {_SAMPLED}, are over "
-        f"{np.sqrt(RUNAWAY):.0f} times the strongest with {before.id}"
+        f"the slopes of {n_runaway} frames in a row, one of {_POWER_STRIDE_FRAMES}, are over "
+        f"{np.sqrt(RUNAWAY_POWER_RATIO):.0f} times the strongest with {before.id}"
     )
     found = ProbationFinding(
         verdict=Verdict.WORSE, before=before.id, after=block.cm_id, text=text, lost=True
@@ -256,19 +257,19 @@ def _observed(
     edge: EdgeWatch | None,
 ) -> Comparison:
     tail, state = state.tail, replace(state, modes=modes)
-    some = None if block.dither_m is None else block.dither_m[::_SPARSE].any(axis=0)
+    some = None if block.dither_m is None else block.dither_m[::_DITHER_STRIDE_FRAMES].any(axis=0)
     moved = () if some is None else np.flatnonzero(some).tolist()
     n_modes = int(modes[-1]) + 1
     rows = block.commands_m[:, :n_modes]
     if tail is not None and block.follows(tail):
         rows = np.concatenate((tail.commands_m[:, :n_modes], rows))
-    last = block.last(_REACH) if block.n_frames >= _REACH else None
+    last = block.last(_LAG_SPAN_FRAMES) if block.n_frames >= _LAG_SPAN_FRAMES else None
     state = replace(state, tail=last, session=block.session)
     if moved and not lines_hz:
         return state
     if not state.dithered.issuperset(moved):
         state = replace(state, dithered=state.dithered.union(moved))
-    if state.n_skipped < SETTLING_S * 1e9 / block.dt_ns:
+    if state.n_skipped < SWAP_SETTLING_S * 1e9 / block.dt_ns:
         return replace(state, n_skipped=state.n_skipped + block.n_frames)
     steps = _changes(rows)
     lines = tuple(f * block.dt_ns * 1e-9 for f in lines_hz) if moved else ()
@@ -289,18 +290,18 @@ def _swapped(state: Comparison, block: FrameBlock) -> Comparison:
     if state.cm_id is None or block.cm_id is None or state.modes is None or not same_session:
         return fresh
     lasted_s = sum(part.n_frames for part in state.parts) * block.dt_ns * 1e-9
-    if lasted_s < MIN_BEFORE_S:
+    if lasted_s < MIN_HISTORY_S:
         why = f"only {lasted_s:.1f} s of telemetry with {state.cm_id} to compare with"
         return replace(fresh, found=not_compared(state.cm_id, block.cm_id, why))
-    part_s = max(PART_S, MIN_PART * block.dt_ns * 1e-9)
+    part_s = max(PART_S, MIN_PART_FRAMES * block.dt_ns * 1e-9)
     before = Before.of(state.cm_id, state.parts, state.modes, part_s)
     return replace(fresh, before=before, reader=state.reader)
 
 
 def _changes(rows: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return ``(n_rows - LAG - 1, n_modes)`` how each step differs from that ``LAG`` frames ago."""
+    """Return the change of each step in ``LAG_FRAMES``, ``(n_rows - LAG_FRAMES - 1, n_modes)``."""
     steps = rows[1:] - rows[:-1]
-    return np.asarray(steps[LAG:] - steps[:-LAG])
+    return np.asarray(steps[LAG_FRAMES:] - steps[:-LAG_FRAMES])
 
 
 def _part(
@@ -320,7 +321,7 @@ def _part(
         moved = np.maximum(moved - np.einsum("km,km->m", played, played), 0.0)
         moved *= n_frames / (n_frames - sines.shape[1])
     power[: steps.shape[1]] = moved
-    looked = block.slopes[::_SAMPLED]
+    looked = block.slopes[::_POWER_STRIDE_FRAMES]
     power[SLOPES] = n_frames * np.vdot(looked, looked) / len(looked)
     peak = float(np.einsum("ks,ks->k", looked, looked).max())
     if edge is not None:
@@ -342,16 +343,16 @@ def _sines(n_frames: int, lines: tuple[float, ...]) -> NDArray[np.float32]:
 def _added(state: Comparison, part: Part, block: FrameBlock) -> Comparison:
     """Add sums to the part under way, or begin another one."""
     dt_s, parts = block.dt_ns * 1e-9, state.parts
-    length = max(PART_S / dt_s, MIN_PART)
+    length = max(PART_S / dt_s, MIN_PART_FRAMES)
     last = parts[-1] if parts else None
-    if last is not None and last.n_frames < length - _REACH:
+    if last is not None and last.n_frames < length - _LAG_SPAN_FRAMES:
         part, parts = last.plus(part), parts[:-1]
     parts = (*parts, part)
     if state.before is not None:
         return replace(state, parts=parts)
     # the history of the next swap
     parts = parts[-round(HISTORY_S / dt_s / length) :]
-    n_recent = round(RECENT_S / dt_s / length)
+    n_recent = round(REFERENCE_PERIOD_S / dt_s / length)
     if len(parts) > n_recent:
         old = parts[-n_recent - 1]
         parts = (*parts[: -n_recent - 1], old.without_samples(), *parts[-n_recent:])
@@ -365,15 +366,15 @@ def _looked(state: Comparison, block: FrameBlock) -> Comparison:
         return state
     dt_s = block.dt_ns * 1e-9
     # a block that does not follow another loses some frames to the filter
-    if state.parts[-1].n_frames < max(PART_S / dt_s, MIN_PART) - _REACH:
+    if state.parts[-1].n_frames < max(PART_S / dt_s, MIN_PART_FRAMES) - _LAG_SPAN_FRAMES:
         return state
     known = np.intersect1d(before.modes, () if state.modes is None else state.modes)
     modes = np.setdiff1d(known, np.fromiter(state.dithered, np.intp))
     after_s = sum(part.n_frames for part in state.parts) * dt_s
-    if state.returned and after_s < RETURNED_S:
+    if state.returned and after_s < RETURN_PERIOD_S:
         return state
-    looked_at = state.parts[-RETURNED_PARTS:] if state.returned else state.parts
-    over = after_s >= WITHIN_S - PART_S
+    looked_at = state.parts[-N_RETURN_PARTS:] if state.returned else state.parts
+    over = after_s >= MAX_PROBATION_S - PART_S
     decides = over or state.returned
     found = compared(before, looked_at, modes.astype(np.intp), block.cm_id, decides=decides)
     waits = found.verdict is (Verdict.WORSE if state.returned else Verdict.AS_GOOD)

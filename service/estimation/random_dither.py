@@ -38,11 +38,11 @@ FRAMES_PER_MODE = 4
 N_BATCHES = 24
 """Parts of a window whose scatter gives the covariance."""
 
-MANY_MODES = 96
+MIN_MODES_WITHOUT_BATCHES = 96
 """With more, the scatter of the modes themselves gives it, for their dithers are independent, and
 the sums of batches need not be kept apart."""
 
-LATE_MODES = 16
+N_DELAY_MODES = 16
 """Modes on which a mirror that answers a frame late is looked for; more say nothing more."""
 
 
@@ -70,12 +70,12 @@ class RandomPlan(WindowPlan):
     @property
     def n_batches(self) -> int:
         """Parts of a window whose sums are kept apart."""
-        return 1 if len(self.modes) > MANY_MODES else N_BATCHES
+        return 1 if len(self.modes) > MIN_MODES_WITHOUT_BATCHES else N_BATCHES
 
     @property
     def late_columns(self) -> NDArray[np.intp]:
         """Return the dithered modes that also respond one frame later, ``(n_late,)``."""
-        n_late = min(len(self.modes), LATE_MODES)
+        n_late = min(len(self.modes), N_DELAY_MODES)
         return np.linspace(0, len(self.modes) - 1, n_late).astype(np.intp)
 
 
@@ -217,10 +217,10 @@ def _nothing(plan: RandomPlan, slopes: Array) -> Correlations:
 N_STEPS = 4
 """Gauss-Newton steps inside one linearisation: gains and α are multiplied with one another."""
 
-SIGNIFICANT = 5.0
+RESPONSE_SIGMA = 5.0
 """σ of a response that counts as seen."""
 
-WHITE_PARTS = 24
+WHITE_PRIOR_PARTS = 24
 """Weight, in parts, of the prior that the noise is nearly white."""
 
 
@@ -372,9 +372,9 @@ def _answers(
 
 def _why_nothing_to_fit(seen: float, late: float) -> Why | None:
     """Return why there is nothing to fit, from the significance of both answers, in σ."""
-    if seen > SIGNIFICANT:
+    if seen > RESPONSE_SIGMA:
         return None
-    if late > SIGNIFICANT:
+    if late > RESPONSE_SIGMA:
         return RefusalKind.MISALIGNED, (
             f"columns misaligned: the slopes answer the dither one frame late ({late:.0f} sigma, "
             f"{seen:.0f} in the same row)"
@@ -425,7 +425,9 @@ def _scatter(scores: Array, normal: Array) -> Array:
     n, own = len(scores), scores - scores.mean(axis=0)
     found = own.T @ own * n / (n - 1)
     inflation = float(np.trace(np.linalg.solve(normal, found))) / len(normal)
-    return np.asarray((WHITE_PARTS * inflation * normal + n * found) / (WHITE_PARTS + n))
+    return np.asarray(
+        (WHITE_PRIOR_PARTS * inflation * normal + n * found) / (WHITE_PRIOR_PARTS + n)
+    )
 
 
 def _gain_sigma(parts: list[Array], response: Array, power: Array) -> Array:

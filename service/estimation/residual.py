@@ -29,27 +29,27 @@ Array = NDArray[np.float64]
 SAMPLE_S = 0.008
 """Time between two frames that are sampled: turbulence moves little in it, at any frame rate."""
 
-LAG = 4
+LAG_SAMPLES = 4
 """Samples between two positions of the turbulence whose difference counts."""
 
-KEPT = 4
+KEPT_STRIDE_SAMPLES = 4
 """One of so many samples is kept, for a matrix to come to read."""
 
 CALM_SHARE = 0.7
 """Share of the groups before that make the reference. The others may be a gust, which would hide in
 the reference how far the turbulence usually moves."""
 
-LATELY = 3
+N_LOST_PARTS = 3
 """Parts in which a loop is checked for being lost."""
 
-LOST_RATIO = 9.0
+LOST_POWER_RATIO = 9.0
 """Residual power over that before which a lost loop exceeds at least: a gust makes it 2.6. The
 power of all commands alone says nothing: tip and tilt wander, and a healthy mirror may move ten
 times as much as in the seconds before."""
 
-RUNAWAY_RATIO = 6.25
+RUNAWAY_POWER_RATIO = 6.25
 """Power of the commands of the upper half of the modes, over that before, which only a loop that
-is lost exceeds in each of ``LATELY`` parts: seeing that doubles makes it 3.2, a gust 2.6."""
+is lost exceeds in each of ``N_LOST_PARTS`` parts: seeing that doubles makes it 3.2, a gust 2.6."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -108,7 +108,7 @@ class Reader:
     """``(n_modes, n_slopes)``."""
 
     seq: NDArray[np.int64]
-    """``(n,)`` of the last samples, ``LAG`` at most."""
+    """``(n,)`` of the last samples, ``LAG_SAMPLES`` at most."""
 
     turbulence_m: NDArray[np.float32]
     """``(n, n_modes)`` where it was then."""
@@ -135,9 +135,9 @@ class Reader:
         commands = block.commands_m[rows, :n_modes]
         seq = np.concatenate([self.seq, block.first_seq + rows])
         turbulence = np.concatenate([self.turbulence_m, residual - commands])
-        moved = turbulence[LAG:] - turbulence[:-LAG]
-        moved = moved[seq[LAG:] - seq[:-LAG] == LAG * stride]
-        kept = (block.first_seq + rows) % (KEPT * stride) == 0
+        moved = turbulence[LAG_SAMPLES:] - turbulence[:-LAG_SAMPLES]
+        moved = moved[seq[LAG_SAMPLES:] - seq[:-LAG_SAMPLES] == LAG_SAMPLES * stride]
+        kept = (block.first_seq + rows) % (KEPT_STRIDE_SAMPLES * stride) == 0
         sums = Residual(
             n_seen=len(rows),
             seen=_squares(residual),
@@ -147,7 +147,7 @@ class Reader:
             own=None if own is None else _squares(block.slopes[rows] @ own.T),
             kept=(block.slopes[rows[kept]],) if own is None and kept.any() else (),
         )
-        return replace(self, seq=seq[-LAG:], turbulence_m=turbulence[-LAG:]), sums
+        return replace(self, seq=seq[-LAG_SAMPLES:], turbulence_m=turbulence[-LAG_SAMPLES:]), sums
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -197,25 +197,25 @@ class ResidualLevel:
         if not len(upper) or len(part.commanded) != len(usual) or not part.n_seen:
             return False
         power = float(part.commanded[upper].sum()) / part.n_seen
-        return power > RUNAWAY_RATIO * float(usual[upper].sum())
+        return power > RUNAWAY_POWER_RATIO * float(usual[upper].sum())
 
     def lost(self, parts: tuple[Residual, ...]) -> bool:
-        """Return whether the loop no longer does what it is for.
+        """Return True if the loop no longer corrects.
 
         Its residual is far larger than before, and either as large as the turbulence that the
-        mirror followed then, or the mirror itself moves by far more. A pyramid that saturates
-        reads a small residual of a lost loop: there the commands of the upper half of the modes
-        tell, which wander less than those of tip and tilt.
+        mirror followed then, or the mirror itself moves by far more. A saturated pyramid measures a
+        small residual in a lost loop: then the commands of the upper half of the modes show the
+        loss, because they wander less than those of tip and tilt.
         """
-        last = total_of(parts[-LATELY:])
+        last = total_of(parts[-N_LOST_PARTS:])
         if last is None or not last.n_seen:
             return False
-        if len(parts) >= LATELY and all(map(self._runs_away, parts[-LATELY:])):
+        if len(parts) >= N_LOST_PARTS and all(map(self._runs_away, parts[-N_LOST_PARTS:])):
             return True
         followed = self.total.commanded.sum() / self.total.n_seen
         before = self.total.seen.sum() / self.total.n_seen
         left, moves = last.seen.sum() / last.n_seen, last.commanded.sum() / last.n_seen
-        far_larger = left > LOST_RATIO * before
+        far_larger = left > LOST_POWER_RATIO * before
         return bool(far_larger and (left > followed or moves > 10.0 * followed))
 
 
@@ -270,13 +270,13 @@ def _squares(rows: NDArray[np.float32]) -> Array:
     return np.asarray(np.einsum("km,km->m", rows, rows), np.float64)
 
 
-MEMORY_S = 1.0
+RESIDUAL_MEMORY_S = 1.0
 
-LEFT = 0.25
+MAX_RESIDUAL_RATIO = 0.25
 """RMS of the residual, as the loop itself reads it, over that of its commands: less in a loop that
 holds well. One of the small telescope has 0.04 to 0.08; 0.48 where it is 0.9 subapertures off."""
 
-LEFT_IN_MEDIAN = 0.35
+MAX_MEDIAN_RESIDUAL_RATIO = 0.35
 """The same of the median mode: 0.2 against 0.47 there."""
 
 
@@ -314,7 +314,7 @@ class Rejection(Detector):
         commanded, lasts_s = np.square(own[1:]).sum(axis=0), block.n_frames * block.dt_ns * 1e-9
         if self.residual is None or self.commanded is None or len(self.residual) != len(residual):
             return Rejection(lasts_s=lasts_s, residual=residual, commanded=commanded)
-        fade = float(np.exp(-lasts_s / MEMORY_S))
+        fade = float(np.exp(-lasts_s / RESIDUAL_MEMORY_S))
         return Rejection(
             lasts_s=self.lasts_s + lasts_s,
             residual=fade * self.residual + residual,
@@ -324,9 +324,9 @@ class Rejection(Detector):
     @property
     def holds(self) -> bool | None:
         """Return True if the loop holds well; None if there is too little telemetry."""
-        if self.residual is None or self.commanded is None or self.lasts_s < MEMORY_S:
+        if self.residual is None or self.commanded is None or self.lasts_s < RESIDUAL_MEMORY_S:
             return None
         commanded = np.maximum(self.commanded, 1e-40)
         left = float(np.sqrt(self.residual.sum() / commanded.sum()))
         median = float(np.sqrt(np.median(self.residual / commanded)))
-        return left < LEFT and median < LEFT_IN_MEDIAN
+        return left < MAX_RESIDUAL_RATIO and median < MAX_MEDIAN_RESIDUAL_RATIO

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from service.errors import MatrixError
 from service.estimation.orientation import (
     MIN_CORRELATION,
-    MIN_LEAD,
+    MIN_CORRELATION_LEAD,
     Pose,
     poses_of,
     setting_written,
@@ -35,29 +35,29 @@ from service.model.slopes import FLIPS, SlopeRecipe, to_conventions, turned_mask
 
 Array = NDArray[Any]
 
-REACH_RAD = np.deg2rad(30.0)
+MAX_ROTATION_RAD = np.deg2rad(30.0)
 """Rotations further than this from where a fit starts are another mounting, or other axes."""
 
-LARGEST_CONDITION = 100.0
+MAX_CONDITION = 100.0
 """Largest condition number of a reconstructor that is inverted; beyond it the inverse is noise."""
 
-RESEMBLANCE = 0.5
+MIN_AXES_CORRELATION = 0.5
 """Smallest correlation of a dither's response with the model for axes to be accepted."""
 
-ADVANTAGE = 2.0
+OTHER_AXES_ADVANTAGE = 2.0
 """The stated ones must do worse by this factor."""
 
 _ONE_MODE = 2
 """If more than this number of lines respond, a single contradicting line is a mode with a wrong
 response: wrong axes turn about half of them. The next dithered modes decide if it was the axes."""
 
-LAGS = np.arange(-3.0, 3.1, 0.5)
+LAGS_FRAMES = np.arange(-3.0, 3.1, 0.5)
 """Frames by which slopes may lag the commands of their row and still be recognised."""
 
-LIKELY = (0.1, 3.0)
+RESPONSE_RATIO_RANGE = (0.1, 3.0)
 """Slopes per unit of command over the model's: the optical gain, and by day both passes."""
 
-TWICE = (1.5, 3.0)
+DOUBLED_RESPONSE_RANGE = (1.5, 3.0)
 """The same of a matrix that halves every command, which no optical gain does."""
 
 _UNIT_DECADES = 1.4
@@ -99,7 +99,7 @@ def of_reconstructor(
     if not len(used) or not np.isfinite(reconstructor).all():
         return SlopeConvention()
     known = np.asarray(reconstructor[used], dtype=np.float64)
-    measured = np.asarray(np.linalg.pinv(known, rcond=1.0 / LARGEST_CONDITION), dtype=np.float64)
+    measured = np.asarray(np.linalg.pinv(known, rcond=1.0 / MAX_CONDITION), dtype=np.float64)
     lower = used[: (len(used) + 1) // 2]
     sizes = np.linalg.norm(measured[:, : len(lower)], axis=0)
     ratio = float(np.median(sizes / np.linalg.norm(response[:, lower], axis=0)))
@@ -139,21 +139,26 @@ def of_answer(
     model = _planes(expected, reported, mask)
     as_seen = _planes(slopes, reported, mask)
     as_stated = _resemblance(as_seen, model)
-    lagging = max(_resemblance(as_seen * np.exp(1j * turns_rad * lag), model) for lag in LAGS)
+    lagging = max(
+        _resemblance(as_seen * np.exp(1j * turns_rad * lag), model) for lag in LAGS_FRAMES
+    )
     ratio = float(np.median(np.linalg.norm(slopes, axis=1) / np.linalg.norm(expected, axis=1)))
     unit = ""
-    if as_stated >= RESEMBLANCE and not LIKELY[0] < ratio < LIKELY[1]:
+    if (
+        as_stated >= MIN_AXES_CORRELATION
+        and not RESPONSE_RATIO_RANGE[0] < ratio < RESPONSE_RATIO_RANGE[1]
+    ):
         unit = f"slopes answer commands {ratio:.2g} times as the model does: {_unit_named(ratio)}"
     every = {
         setting: _resemblance(_planes(slopes, setting, mask), model)
         for setting in settings_of(reported, reported.kind.orders)
     }
     best = max(every.values())
-    if best < RESEMBLANCE or as_stated * ADVANTAGE > best or lagging > best:
+    if best < MIN_AXES_CORRELATION or as_stated * OTHER_AXES_ADVANTAGE > best or lagging > best:
         return SlopeConvention(wrong=unit)
-    if len(slopes) > _ONE_MODE and np.sum(_of_lines(as_seen, model) < RESEMBLANCE) == 1:
+    if len(slopes) > _ONE_MODE and np.sum(_of_lines(as_seen, model) < MIN_AXES_CORRELATION) == 1:
         return SlopeConvention(wrong=unit)
-    alike = [setting for setting, much in every.items() if much > best - MIN_LEAD]
+    alike = [setting for setting, much in every.items() if much > best - MIN_CORRELATION_LEAD]
     found = min(alike, key=lambda setting: _n_changes(setting, reported))
     return SlopeConvention(
         wrong=_axes_named("the answer to the dither", found, reported), found=found
@@ -171,8 +176,10 @@ def _judged(poses: list[Pose], instrument: Instrument, start_rad: float) -> Slop
             "listed in another order: compare them with the file, or write [slopes] orientation"
         )
         return SlopeConvention(wrong="" if stated else text)
-    alike = [pose for pose in poses if pose.correlation > best.correlation - MIN_LEAD]
-    near = [pose for pose in alike if abs(wrapped(pose.rotation_rad - start_rad)) <= REACH_RAD]
+    alike = [pose for pose in poses if pose.correlation > best.correlation - MIN_CORRELATION_LEAD]
+    near = [
+        pose for pose in alike if abs(wrapped(pose.rotation_rad - start_rad)) <= MAX_ROTATION_RAD
+    ]
     settings = {pose.slopes: pose.rotation_rad for pose in near}
     if reported in settings:
         return SlopeConvention(found=reported, rotation_rad=settings[reported])
@@ -228,13 +235,13 @@ def _unit_of_matrix(ratio: float, *, double_pass: bool) -> str:
 
     An optical gain makes them fewer, the two passes of a day twice as many.
     """
-    if TWICE[0] < ratio < TWICE[1] and not double_pass:
+    if DOUBLED_RESPONSE_RANGE[0] < ratio < DOUBLED_RESPONSE_RANGE[1] and not double_pass:
         return (
             f"the RTC's own matrix expects {ratio:.2f} times the model's slopes: its commands are "
             "metres of surface, not of OPD, or it was measured in double pass ([instrument] "
             "double_pass = true)"
         )
-    if LIKELY[0] < ratio < LIKELY[1]:
+    if RESPONSE_RATIO_RANGE[0] < ratio < RESPONSE_RATIO_RANGE[1]:
         return ""
     return (
         f"the RTC's own matrix expects {ratio:.2g} times the model's slopes: {_unit_named(ratio)}"

@@ -29,22 +29,22 @@ from service.model.misregistration import Misregistration
 
 Array = NDArray[np.float64]
 
-LONGEST_STEP = np.array([0.8, 0.8, np.deg2rad(4.0), 0.04])
+MAX_STEP = np.array([0.8, 0.8, np.deg2rad(4.0), 0.04])
 """A step further than this trusts the derivatives too far (numeric units)."""
 
-APPROACHED = np.array([0.02, 0.02, np.deg2rad(0.05), 1e-3])
+COARSE_STEP_LIMIT = np.array([0.02, 0.02, np.deg2rad(0.05), 1e-3])
 """A coarse step shorter than this leaves the rest to the fine grid."""
 
-SETTLED = np.array([5e-4, 5e-4, np.deg2rad(5e-4), 1e-5])
+SETTLED_STEP = np.array([5e-4, 5e-4, np.deg2rad(5e-4), 1e-5])
 """A fine step shorter than this is the last."""
 
-LIMIT = np.array([4.0, 4.0, np.inf, 0.25])
+MAX_DISTANCE = np.array([4.0, 4.0, np.inf, 0.25])
 """Largest distance from the nominal registration (numeric units; rotation is not limited)."""
 
 MAX_FAR_STEPS = 12
 _HALVINGS = 3
 
-_ROWS = 64
+_ROWS_AT_ONCE = 64
 """Slopes that are weighted at once: a copy of all would not stay in the cache."""
 
 
@@ -149,8 +149,8 @@ class Projection:
         """Normal matrix of all modes together, ``(n_unknowns, n_unknowns)``."""
         n_unknowns, n_rows, _ = self.jacobian.shape
         root, total = np.sqrt(self.weights), np.zeros((n_unknowns, n_unknowns))
-        for start in range(0, n_rows, _ROWS):
-            flat = (self.jacobian[:, start : start + _ROWS] * root).reshape(n_unknowns, -1)
+        for start in range(0, n_rows, _ROWS_AT_ONCE):
+            flat = (self.jacobian[:, start : start + _ROWS_AT_ONCE] * root).reshape(n_unknowns, -1)
             total += flat @ flat.T
         return total
 
@@ -176,7 +176,7 @@ class Approach:
 
 def within_limits(vector: Array) -> bool:
     """Return whether a registration is one that an instrument could have."""
-    return bool(np.all(np.abs(vector - [0.0, 0.0, 0.0, 1.0]) < LIMIT))
+    return bool(np.all(np.abs(vector - [0.0, 0.0, 0.0, 1.0]) < MAX_DISTANCE))
 
 
 def approach(
@@ -184,7 +184,7 @@ def approach(
     columns: Columns,
     start: Misregistration,
     *,
-    approached: Array = APPROACHED,
+    approached: Array = COARSE_STEP_LIMIT,
     allowed: Callable[[Array], bool] = within_limits,
 ) -> Approach:
     """Return where Gauss-Newton steps on few modes lead from a start.
@@ -203,7 +203,7 @@ def approach(
             break
         damped = seen.normal + 1e-6 * np.diag(np.diag(seen.normal))
         step = np.linalg.solve(damped, seen.scores.sum(axis=1))
-        step /= max(1.0, float(np.max(np.abs(step) / LONGEST_STEP)))
+        step /= max(1.0, float(np.max(np.abs(step) / MAX_STEP)))
         converged, tried = bool(np.all(np.abs(step) < approached)), step
         for _ in range(_HALVINGS):
             if allowed(vector + tried):

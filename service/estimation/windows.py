@@ -24,7 +24,7 @@ class ClosedLoop(ControlLoop):
     """Id of the reconstructor in use; None if the RTC does not know it."""
 
 
-SETTLING_S = 0.3
+DITHER_SETTLING_S = 0.3
 """Settling time of the loop after a dither has begun, before the first window."""
 
 OTHER_SESSION = "the RTC has restarted since"
@@ -33,13 +33,13 @@ OTHER_SESSION = "the RTC has restarted since"
 CHUNK_FRAMES = 512
 """Frames multiplied at once: the sums, some MB, are read from memory once for all of them."""
 
-ENOUGH_FRAMES = 256
+MIN_SUM_FRAMES = 256
 """With so many the sums need not wait for more."""
 
 MAX_MISSING_FRACTION = 0.05
 """A window with more frames missing than this is refused."""
 
-AMPLITUDE_RATIO = (0.5, 1.5)
+AMPLITUDE_RATIO_RANGE = (0.5, 1.5)
 """A dither weaker or stronger than these shares of its request was not applied as asked."""
 
 
@@ -66,8 +66,8 @@ class WindowPlan:
         that were examined.
         """
         ratio = applied_m / np.array(self.amplitude_m)
-        weak = ratio.min() < AMPLITUDE_RATIO[0]
-        if not weak and ratio.max() <= AMPLITUDE_RATIO[1]:
+        weak = ratio.min() < AMPLITUDE_RATIO_RANGE[0]
+        if not weak and ratio.max() <= AMPLITUDE_RATIO_RANGE[1]:
             return None
         worst = int(ratio.argmin() if weak else ratio.argmax())
         see = "see whether the RTC clips it" if weak else "see the RTC's units"
@@ -78,7 +78,7 @@ class WindowPlan:
         )
 
 
-HEARD_LINES = 4
+N_CHECKED_LINES = 4
 """Lines on which the slopes are looked at: those that should show most."""
 
 
@@ -120,7 +120,7 @@ class ExpectedDither:
         if not self.frequency_hz or not self.response:
             return []
         expected = np.square(self.amplitude_m) * self.response
-        return [int(k) for k in np.argsort(expected)[::-1][:HEARD_LINES]]
+        return [int(k) for k in np.argsort(expected)[::-1][:N_CHECKED_LINES]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -353,7 +353,7 @@ class WindowCutter(Generic[P, S, F]):
             n_missing=window.n_missing + rows.first_seq - window.next_seq,
             waiting=(*window.waiting, rows),
         )
-        enough = sum(block.n_frames for block in window.waiting) >= ENOUGH_FRAMES
+        enough = sum(block.n_frames for block in window.waiting) >= MIN_SUM_FRAMES
         return self._added(window) if enough else window
 
     def _added(self, window: Window[S]) -> Window[S]:

@@ -69,12 +69,12 @@ class Bundle:
 
 
 def write_bundle(path: str | Path, bundle: Bundle) -> None:
-    """Write a bundle, complete or not at all: FITS where the name ends so, else HDF5.
+    """Write a complete bundle, or none: FITS if the name ends so, else HDF5.
 
     Raises
     ------
     ConfigurationError
-        If the file is there already, or FITS is asked for and astropy is missing.
+        If the file is there already, or FITS is requested and astropy is missing.
     MatrixError
         If an array is unknown, not finite, or of another type than float32 or float64.
     StorageError

@@ -38,14 +38,14 @@ def lock_file(file: IO[str] | int, path: Path, *, wait: bool = False, shared: bo
 
 
 def replace_file(path: Path, text: bytes, mode: int = 0o666) -> None:
-    """Replace a file; the new one is on the disk when this returns, its name included.
+    """Replace a file; when this returns the new one is on the disk, including its name.
 
-    It is written beside, as ``.part``, with these rights (less the process's mask).
+    It is first written to a ``.part`` file, with this mode (less the process's umask).
 
     Raises
     ------
     OSError
-        If the disk refuses; the file before stays, and nothing lies beside it.
+        If the disk refuses; the previous file is kept, and no ``.part`` file is left.
     """
     part = path.with_name(path.name + ".part")
     try:

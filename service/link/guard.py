@@ -1,11 +1,11 @@
-"""Who comes onto a secured link, what is refused to whom, and which certificates are about to end.
+"""Programs on a secured link, refusals, and certificates that are about to expire.
 
 zenoh reports each connection that is made, with the name of its certificate; a name without a role
 is counted as refused. What zenoh itself refuses (a TLS handshake, a message that the role does not
-allow) it reports nowhere but in its trace log, a line for each message that it lets through or not:
-that log is not read here. A router of one's own can write it (docs/operate/link.md).
-Connections that were closed before a handshake are counted in the kernel's table of sockets: zenoh
-deals with about ten of them a second, one after the other, and lets nobody else in meanwhile.
+allow) it reports only in its trace log, with a line for each message: that log is not read here. A
+separate router can write it (docs/operate/link.md). Connections that were closed before a handshake
+are counted in the kernel's table of sockets: zenoh processes about ten of them a second, one after
+the other, and admits no others meanwhile.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from service.link.statistics import EndingCertificate, Refusal
 
 DAY_S: Final = 86400.0
 
-RECENT_S: Final = 60.0
-"""For so long a refusal is spoken of."""
+REFUSAL_REPORT_DURATION_S: Final = 60.0
+"""Time for which a refusal is reported."""
 
-LOG_EVERY_S: Final = 60.0
+LOG_INTERVAL_S: Final = 60.0
 """Least time between two lines of the log on the same."""
 
-REMEMBERED: Final = 64
-"""Most refusals that are told apart; the others are counted together."""
+MAX_LISTED_REFUSALS: Final = 64
+"""Largest number of refusals that are listed separately; the others are counted together."""
 
-OTHERS: Final = ("others", "several things", "")
+OTHER_REFUSALS: Final = ("others", "several things", "")
 
 HANDSHAKE_FAILURES_HZ: Final = 10.0
 """Failed TLS handshakes that zenoh deals with in a second: after each it waits for 0.1 s."""
 
-MIN_WAITING: Final = 20
+MIN_ALARM_CONNECTIONS: Final = 20
 """Closed connections from which on an alarm is raised: the next program waits for 2 s."""
 
 _SOCKET_TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
@@ -56,28 +56,28 @@ class Certificate:
     """Its common name: what access goes by."""
 
     ends_s: float
-    """When it ends to hold, seconds since the Unix epoch, UTC."""
+    """Expiry, seconds since the Unix epoch, UTC."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkSecurity:
-    """How a link is secured; the default: not at all."""
+    """Security of a link; by default there is none."""
 
     zenoh: Mapping[str, object] = field(default_factory=dict)
-    """What zenoh is told about certificates, users and access."""
+    """Configuration of zenoh for certificates, users and access."""
 
     roles: Mapping[str, str] = field(default_factory=dict)
     """The role of each name that has one; empty: no names are known."""
 
     certificates: tuple[Certificate, ...] = ()
     secret: bytes | None = None
-    """What messages are signed with; None: they are not, and no signature is asked for."""
+    """Key that signs messages; None if messages are neither signed nor checked."""
 
     warn_s: float = 30 * DAY_S
-    """So long before its end a certificate is spoken of."""
+    """Time before its expiry from which a certificate is reported, seconds."""
 
 
-OPEN: Final = LinkSecurity()
+NO_SECURITY: Final = LinkSecurity()
 
 
 class LinkGuard:
@@ -111,14 +111,14 @@ class LinkGuard:
         """Note something that was refused, and log it unless that was done a moment ago."""
         now_s, key = time.monotonic(), (who, what, where)
         with self._lock:
-            if key not in self._refused and len(self._refused) >= REMEMBERED:
+            if key not in self._refused and len(self._refused) >= MAX_LISTED_REFUSALS:
                 self._forget(now_s)
-            if key not in self._refused and len(self._refused) >= REMEMBERED:
-                key = OTHERS
-            entry = self._refused.setdefault(key, [0, 0.0, -LOG_EVERY_S])
+            if key not in self._refused and len(self._refused) >= MAX_LISTED_REFUSALS:
+                key = OTHER_REFUSALS
+            entry = self._refused.setdefault(key, [0, 0.0, -LOG_INTERVAL_S])
             entry[0] += 1
             entry[1] = now_s
-            is_due = now_s - entry[2] >= LOG_EVERY_S
+            is_due = now_s - entry[2] >= LOG_INTERVAL_S
             if is_due:
                 entry[2] = now_s
         if is_due:
@@ -148,7 +148,9 @@ class LinkGuard:
 
     def _forget(self, now_s: float) -> None:
         self._refused = {
-            key: entry for key, entry in self._refused.items() if now_s - entry[1] < RECENT_S
+            key: entry
+            for key, entry in self._refused.items()
+            if now_s - entry[1] < REFUSAL_REPORT_DURATION_S
         }
 
 
@@ -181,12 +183,12 @@ def flooded_in_words(waiting: Mapping[int, int]) -> str:
         f"{n / HANDSHAKE_FAILURES_HZ:.0f} s, or when they end. Let the firewall admit few new "
         "connections of each address, or give the RTC a port of its own"
         for port, n in sorted(waiting.items())
-        if n >= MIN_WAITING
+        if n >= MIN_ALARM_CONNECTIONS
     )
 
 
 def refused_in_words(refusals: Sequence[Refusal]) -> str:
-    """Return who was refused what; empty: nobody of late."""
+    """Return the recent refusals in words; empty if there are none."""
     if not refusals:
         return ""
     details = "; ".join(

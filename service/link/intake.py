@@ -17,39 +17,39 @@ from service.errors import WireError
 from service.estimation.frames import FrameBlock
 from service.link.leader_election import SessionWatch
 from service.link.matrices import LinkEvent
-from service.link.ring import COUNTED, LEAP, FrameRing
+from service.link.ring import FRAME_OUTCOMES, LEAP, FrameRing
 from service.link.session import Endpoint
 from service.link.statistics import MALFORMED, USED, Counters, LinkStatistics
 from service.tracking import events as ev
 from service.tracking.alarms import OTHER_BASIS, SECOND_RTC
 from service.tracking.state import Level
 
-QUEUE_LENGTH: Final = 1024
+MAX_QUEUED_EVENTS: Final = 1024
 """Events kept; when more wait, the oldest are dropped and counted."""
 
-BURST_S: Final = 10.0
+COMPLAINT_INTERVAL_S: Final = 10.0
 """The same complaint is reported once in this time, however often it is counted."""
 
-LATENCIES: Final = 1024
+N_LATENCY_BATCHES: Final = 1024
 """Batches the median latency is taken over."""
 
-TAKE_FRAMES: Final = 512
+FRAMES_PER_COPY: Final = 512
 """Frames copied under one hold of the lock, so that ingest never waits for long."""
 
-LEFT_AS_THEY_CAME: Final = 16
+MAX_UNDECODED_BATCHES: Final = 16
 """Batches that are kept undecoded until they are needed; decoding many in a row is far quicker."""
 
 STATUS_INTERVAL_S: Final = 0.45
 """Interval between two statuses of the same content; of more frequent ones only the latest is used.
 """
 
-CHANGES: Final = 10
+MAX_CHANGED_STATUSES: Final = 10
 """Statuses that say something else each, which are taken within that time all the same."""
 
 COALESCED: Final = "spared"
 """Outcome of a status that a later one made superfluous."""
 
-PLACED: Final = {
+PLACEMENT_TEXTS: Final = {
     "duplicate": "they had come before",
     "late": "their place in the sequence had been passed",
     "nonfinite": "a slope or a command is not finite",
@@ -96,7 +96,7 @@ class Intake:
         self._endpoint = endpoint
         self._clock = clock
         self._lock = threading.Lock()
-        self._events: deque[_Put] = deque(maxlen=QUEUE_LENGTH)
+        self._events: deque[_Put] = deque(maxlen=MAX_QUEUED_EVENTS)
         self._callback: Callable[[], object] | None = None
         self._rung = False
         self._rings_for_frames = True
@@ -119,7 +119,7 @@ class Intake:
         self._essentials: tuple[object, ...] = ()
         self._changes = 0
         self._coalesced: bytes | None = None
-        self._latency_s: deque[float] = deque(maxlen=LATENCIES)
+        self._latency_s: deque[float] = deque(maxlen=N_LATENCY_BATCHES)
 
     def expect(
         self, basis_id: str | None, config_id: str | None, modes: Collection[str] = ()
@@ -170,7 +170,7 @@ class Intake:
                 at_s=self._clock(),
             )
         )
-        if len(self._arrived) >= LEFT_AS_THEY_CAME:
+        if len(self._arrived) >= MAX_UNDECODED_BATCHES:
             with self._up_to_date():
                 pass
         if self._rings_for_frames:
@@ -225,7 +225,7 @@ class Intake:
         if found == self._essentials:
             return True
         self._changes += 1
-        return self._changes > CHANGES
+        return self._changes > MAX_CHANGED_STATUSES
 
     def _take_status(self, data: bytes, found: tuple[object, ...]) -> None:
         status = wire.decode(wire.Status, data)
@@ -287,15 +287,17 @@ class Intake:
         self._wake()
 
     def _put(self, event: LinkEvent) -> None:
-        self._counted["dropped"] += len(self._events) == QUEUE_LENGTH
+        self._counted["dropped"] += len(self._events) == MAX_QUEUED_EVENTS
         ring = self._ring
         self._events.append(_Put(event=event, ring=ring, end=0 if ring is None else ring.head))
 
     def _is_new(self, complaint: str, now_s: float) -> bool:
         """Return whether a complaint is the first of a burst of equal ones."""
-        if now_s - self._complained_s.get(complaint, -math.inf) < BURST_S:
+        if now_s - self._complained_s.get(complaint, -math.inf) < COMPLAINT_INTERVAL_S:
             return False
-        recent = {kind: s for kind, s in self._complained_s.items() if now_s - s < BURST_S}
+        recent = {
+            kind: s for kind, s in self._complained_s.items() if now_s - s < COMPLAINT_INTERVAL_S
+        }
         self._complained_s = recent | {complaint: now_s}
         return True
 
@@ -315,7 +317,7 @@ class Intake:
                     ring, end = (ring, first.end) if first.ring is ring else (None, None)
                 if ring is None:
                     return blocks
-                more = ring.take(self._clock(), self._patience_s, TAKE_FRAMES, end)
+                more = ring.take(self._clock(), self._patience_s, FRAMES_PER_COPY, end)
                 waiting = ring.due(self._clock(), self._patience_s, end)
             blocks += more
             if not waiting:
@@ -364,8 +366,8 @@ class Intake:
                 basis_id=self._basis_id,
                 config_id=self._config_id,
                 batches_received=self._counted["batches"],
-                **{f"frames_{name}": self._counts[name] for name in COUNTED},
-                frames_refused=tally.of("frames", but=(USED, MALFORMED, *PLACED)),
+                **{f"frames_{name}": self._counts[name] for name in FRAME_OUTCOMES},
+                frames_refused=tally.of("frames", but=(USED, MALFORMED, *PLACEMENT_TEXTS)),
                 messages_malformed=malformed,
                 statuses_received=sum(tally.of("status", but=(MALFORMED,)).values()),
                 acknowledgements_received=sum(tally.of("ack", but=(MALFORMED,)).values()),
@@ -426,7 +428,7 @@ class Intake:
         before = counts.copy()
         ring.store(batch, now_s)
         self._counters.add("frames", USED, counts["received"] - before["received"], now_s)
-        for name, text in PLACED.items():
+        for name, text in PLACEMENT_TEXTS.items():
             self._counters.add("frames", name, counts[name] - before[name], now_s, text)
 
     def _capacity(self, header: wire.FrameHeader) -> int:

@@ -17,22 +17,22 @@ from service.wire import Keys, Role
 if TYPE_CHECKING:
     import zenoh
 
-NAME: Final = re.compile(r"[0-9]{1,19}-[0-9a-f]{1,32}")
+NAME_PATTERN: Final = re.compile(r"[0-9]{1,19}-[0-9a-f]{1,32}")
 """Start of a service, nanoseconds since the Unix epoch, and its zenoh id."""
 
-RECEIVED_WITHIN_S: Final = 5.0
+NAMELESS_TIMEOUT_S: Final = 5.0
 """A service that gives no name is there for so long after its last word."""
 
-UNDER_WAY_S: Final = 0.3
+TOKEN_ARRIVAL_S: Final = 0.3
 """Time for the tokens of services that started at the same time to arrive."""
 
-GRACE_S: Final = 1.0
+ENDED_SESSION_GRACE_S: Final = 1.0
 """Messages of a session that has ended may still be on their way for this long."""
 
-SILENCE_S: Final = 2.0
+SESSION_SILENCE_S: Final = 2.0
 """Silence of the current session after which another session is accepted."""
 
-REMEMBERED: Final = 16
+MAX_OTHER_SESSIONS: Final = 16
 """Most other sessions that are kept apart."""
 
 
@@ -79,12 +79,12 @@ class SessionWatch:
         if session == self.current:
             self._received_s, self._left, self.other = now_s, False, None
             return SessionDecision(accepted=True, other_session=self._other_session(now_s))
-        if self.current is None or self._left or now_s - self._received_s >= SILENCE_S:
+        if self.current is None or self._left or now_s - self._received_s >= SESSION_SILENCE_S:
             return self._begun(session, now_s)
-        echo = session == self._previous and now_s - self._since_s < SILENCE_S
+        echo = session == self._previous and now_s - self._since_s < SESSION_SILENCE_S
         if not echo:
             self.other = session
-            if len(self._other_sessions) < REMEMBERED:
+            if len(self._other_sessions) < MAX_OTHER_SESSIONS:
                 self._other_sessions.setdefault(session, now_s)
         return SessionDecision(accepted=False)
 
@@ -94,7 +94,7 @@ class SessionWatch:
 
     def waiting(self, now_s: float) -> str | None:
         """Return the session that will count if the present one stays silent, or None."""
-        quiet = now_s - self._received_s > GRACE_S / 2
+        quiet = now_s - self._received_s > ENDED_SESSION_GRACE_S / 2
         return next(reversed(self._other_sessions), None) if quiet else None
 
     def _begun(self, session: str, now_s: float) -> SessionDecision:
@@ -107,7 +107,7 @@ class SessionWatch:
     def _other_session(self, now_s: float) -> str | None:
         """Return a session so old that this message is no straggler; forget it."""
         for session, first_s in self._other_sessions.items():
-            if now_s - first_s > GRACE_S:
+            if now_s - first_s > ENDED_SESSION_GRACE_S:
                 del self._other_sessions[session]
                 return session
         return None
@@ -133,14 +133,14 @@ class LeaderElection:
 
     def join(self, found: Iterable[str], own_id: str, now_ns: int) -> str:
         """Take a name after all that are there, and return it."""
-        self._names = {name for name in found if NAME.fullmatch(name)}
+        self._names = {name for name in found if NAME_PATTERN.fullmatch(name)}
         latest_ns = max((_rank(name)[0] for name in self._names), default=0)
         self.name = f"{max(now_ns, latest_ns + 1)}-{own_id}"
         return self.name
 
     def notice(self, name: str, *, alive: bool) -> None:
         """Note that a service has come or gone."""
-        if name != self.name and NAME.fullmatch(name):
+        if name != self.name and NAME_PATTERN.fullmatch(name):
             (self._names.add if alive else self._names.discard)(name)
 
     def receive(self, now_s: float) -> None:
@@ -158,7 +158,7 @@ class LeaderElection:
     def others(self, now_s: float) -> tuple[str, ...]:
         """Return the other services that are there, in words, the first one first."""
         names = tuple(_words(name) for name in sorted(self._names, key=_rank))
-        heard = self._received_s is not None and now_s - self._received_s < RECEIVED_WITHIN_S
+        heard = self._received_s is not None and now_s - self._received_s < NAMELESS_TIMEOUT_S
         nameless = heard or (self.contract_held and not self.drives)
         return names if names or not nameless else ("one that gives no name",)
 
@@ -173,16 +173,16 @@ class Standby:
         drive: Callable[[zenoh.Session], list[object]],
         report: Callable[[ServicesMet], None],
     ) -> None:
-        """Take no place yet.
+        """Create the standby without joining the election.
 
         Parameters
         ----------
         keys
-            Of the system.
+            Keys of the system.
         drive
-            Declares what only the service that drives holds, and returns it.
+            Declares the subscribers and queryables of the driving service, and returns them.
         report
-            Is told when others came or went.
+            Called when other services came or went.
         """
         self._keys = keys
         self._drive = drive
@@ -234,7 +234,7 @@ class Standby:
             link.subscribe(session, keys.state, guarded("state", self._on_state)),
         ]
         if wait:
-            time.sleep(UNDER_WAY_S)
+            time.sleep(TOKEN_ARRIVAL_S)
         with self._lock:
             self._session = session
         self._settle()
@@ -266,7 +266,7 @@ class Standby:
         self._settle()
 
     def _settle(self) -> None:
-        """Drive or stand by according to the order, and report changes."""
+        """Drive or go to standby according to the election, and report changes."""
         with self._lock:
             if self._session is None:
                 return

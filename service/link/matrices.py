@@ -15,16 +15,16 @@ from service import wire
 from service.errors import UnknownIdError, WireError
 from service.tracking.events import Event
 
-OFFERS: Final = 8
+MAX_OFFERS: Final = 8
 """Most matrices kept, whatever their age; the current one is always among them."""
 
-PENDING: Final = 2
+MAX_PENDING_MATRICES: Final = 2
 """Measured matrices on their way at once; the one that was begun first gives way."""
 
-LIMIT_BYTES: Final = 1_000_000_000
+MAX_MATRIX_BYTES: Final = 1_000_000_000
 """Most memory for one of them."""
 
-REMEMBERED_IDS: Final = 4096
+MAX_REMEMBERED_IDS: Final = 4096
 """Ids whose acknowledgements are recognised."""
 
 
@@ -86,7 +86,7 @@ class Outbox:
             known = self._sums.setdefault(name, found)
             if known != found:
                 raise WireError(f"id: {name} already names a matrix with sha256 {known}")
-            if len(self._sums) > REMEMBERED_IDS:
+            if len(self._sums) > MAX_REMEMBERED_IDS:
                 self._sums.popitem(last=False)
             self._offers[name] = offer
             self._offers.move_to_end(name)
@@ -161,7 +161,7 @@ class Outbox:
 
     def _forget(self, now_s: float) -> None:
         idle = [name for name in self._offers if name != self._current]
-        crowd = len(self._offers) - OFFERS
+        crowd = len(self._offers) - MAX_OFFERS
         for position, name in enumerate(idle):
             if position < crowd or now_s - self._offers[name].offered_s > self._keep_s:
                 del self._offers[name]
@@ -207,9 +207,9 @@ class MeasuredIntake:
 
     def _assembler(self, name: str) -> wire.ChunkAssembler:
         if name not in self._pending:
-            if len(self._pending) == PENDING:
+            if len(self._pending) == MAX_PENDING_MATRICES:
                 self._forget(next(iter(self._pending)))
-            self._pending[name] = wire.ChunkAssembler(LIMIT_BYTES)
+            self._pending[name] = wire.ChunkAssembler(MAX_MATRIX_BYTES)
         return self._pending[name]
 
     def _finished(self, name: str) -> MeasuredMatrix | None:

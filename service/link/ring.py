@@ -21,17 +21,25 @@ VOID: Final = 2
 LEAP: Final = "leap"
 """Reason for which frames are held back until more have arrived."""
 
-LEAP_S: Final = 10.0
+MAX_LEAP_S: Final = 10.0
 """Longest leap of the sequence that is accepted at once, in seconds of frames; a longer one needs
 more batches to confirm it."""
 
-CONFIRMATIONS: Final = 2
+LEAP_CONFIRMATIONS: Final = 2
 """Batches that must go on where a leap has led."""
 
 Places = slice | NDArray[np.int64]
 """Indices of frames; a slice, if they are contiguous, is much faster."""
 
-COUNTED: Final = ("received", "lost", "recovered", "duplicate", "late", "nonfinite", "overwritten")
+FRAME_OUTCOMES: Final = (
+    "received",
+    "lost",
+    "recovered",
+    "duplicate",
+    "late",
+    "nonfinite",
+    "overwritten",
+)
 """Outcomes of frames; :class:`~service.link.statistics.LinkStatistics` describes each."""
 
 
@@ -85,15 +93,15 @@ class FrameRing:
         A number that was there before on a frame of a later time is no frame come late.
         """
         ahead = header.seq0 - self._head
-        far = min(round(LEAP_S * 1e9 / header.dt_ns), self._capacity)
+        far = min(round(MAX_LEAP_S * 1e9 / header.dt_ns), self._capacity)
         if ahead > far:
             return LEAP, (
                 f"seq0 leaps from {self._head} to {header.seq0} in session {self.session}: it is "
-                f"believed when {CONFIRMATIONS} more batches confirm it"
+                f"believed when {LEAP_CONFIRMATIONS} more batches confirm it"
             )
         old = header.seq0 + header.n <= self._head
         again = old and header.t0_ns > self._newest_ns
-        if again or (-ahead - header.n) * header.dt_ns > LEAP_S * 1e9:
+        if again or (-ahead - header.n) * header.dt_ns > MAX_LEAP_S * 1e9:
             return "sequence", (
                 f"seq0 goes back from {self._head} to {header.seq0} in session {self.session}: the "
                 "RTC must begin a new session when its sequence starts over; restart it"
@@ -107,7 +115,7 @@ class FrameRing:
         if before is None or not 0 <= header.seq0 - before.seq0 - before.n <= self._capacity:
             self._leapt = []
         self._leapt.append(batch)
-        if len(self._leapt) <= CONFIRMATIONS:
+        if len(self._leapt) <= LEAP_CONFIRMATIONS:
             return []
         found, self._leapt = self._leapt, []
         return found

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from service import wire
 from service.errors import LinkError, WireError
-from service.link.guard import OPEN, LinkSecurity
+from service.link.guard import NO_SECURITY, LinkSecurity
 from service.wire.signing import Signatures
 
-HISTORY_S = 0.5
+FETCHED_HISTORY_S = 0.5
 """Telemetry requested when the service starts late. Requesting all of an RTC's cache stalled its
 sender for seconds."""
 
@@ -37,13 +37,13 @@ any size travels in parts. zenoh's own limit is 1 GB for each sender, and that m
 TOKENS_TIMEOUT_S = 1.0
 """Time for the routers to report which tokens exist; they answer within milliseconds."""
 
-RETRY = {"period_init_ms": 200, "period_increase_factor": 1.5, "period_max_ms": 1000}
+RETRY_OPTIONS = {"period_init_ms": 200, "period_increase_factor": 1.5, "period_max_ms": 1000}
 """Back-off of a client that lost its router; zenoh's own is 3 s at the first loss."""
 
 ABSENT_PAUSE_S: Final = 0.3
 """Pause before a command is repeated: a query to an absent RTC ends at once."""
 
-OPTIONAL: Final = (wire.CommandKind.RAMP,)
+OPTIONAL_COMMANDS: Final = (wire.CommandKind.RAMP,)
 """Commands that an RTC need not know."""
 
 MATRIX_TIMEOUT_S: Final = 2.0
@@ -63,7 +63,7 @@ class Endpoint:
     connect: tuple[str, ...] = ()
     """Endpoints of an observatory's own routers, of which the service becomes a client."""
 
-    security: LinkSecurity = OPEN
+    security: LinkSecurity = NO_SECURITY
     """Certificates, users and access."""
 
     lease_s: float = 2.0
@@ -105,7 +105,7 @@ def open_session(endpoint: Endpoint) -> zenoh.Session:
         "mode": "client" if client else "router",
         "listen/endpoints": [] if client else list(endpoint.listen),
         "connect/endpoints": list(endpoint.connect),
-        "connect/retry": RETRY,
+        "connect/retry": RETRY_OPTIONS,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "timestamping/enabled": True,
@@ -151,7 +151,7 @@ def subscribe_frames(
         session,
         key,
         zenoh.handlers.Callback(callback, indirect=False),
-        history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_age=HISTORY_S),
+        history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_age=FETCHED_HISTORY_S),
         recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
     )
 
@@ -285,18 +285,18 @@ def latency_s(session: zenoh.Session, sample: zenoh.Sample, now_ns: int) -> floa
 def send_command(
     session: zenoh.Session, endpoint: Endpoint, command: wire.Command, signatures: Signatures
 ) -> bytes:
-    """Return the RTC's answer to a command, repeated with the same id until there is one.
+    """Return the RTC's reply to a command, repeated with the same id until there is one.
 
-    zenoh ends a query at once that nobody serves. That an RTC does not offer an optional command is
-    concluded only if its liveliness token was there at each attempt: an RTC that has just lost its
-    link serves nothing for a moment, either.
+    zenoh ends a query without a queryable at once. An optional command counts as not offered only
+    if the RTC's liveliness token was there at each attempt: an RTC that has just lost its link has
+    no queryables for a moment, either.
 
     Raises
     ------
     WireError
         If the command breaks the contract.
     LinkError
-        If there is none after all attempts, or it is not signed as it must be.
+        If there is none after all attempts, or its signature is missing or wrong.
     """
     payload, kind = wire.encode(command), wire.command_kind(command)
     keys = wire.Keys(endpoint.system)
@@ -312,7 +312,7 @@ def send_command(
         if time.monotonic() - began_s < timeout_s / 2:
             n_unserved += 1
             n_present += bool(tokens(session, keys.alive(wire.Role.RTC)))
-    if kind in OPTIONAL and n_present == endpoint.command_attempts:
+    if kind in OPTIONAL_COMMANDS and n_present == endpoint.command_attempts:
         reason = f"unsupported: the RTC offers no {kind}"
         return wire.encode(wire.Reply(id=command.id, accepted=False, reason=reason, start_seq=None))
     if n_unserved == endpoint.command_attempts:

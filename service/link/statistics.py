@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-RECENT_S: Final = 2.0
+STATISTICS_PERIOD_S: Final = 2.0
 """Messages of this last period describe the present telemetry."""
 
 BIN_S: Final = 0.25
@@ -31,7 +31,7 @@ class Disposition:
     """``used``, or in a word why not."""
 
     n: int
-    """Frames, or messages, in the last ``RECENT_S``."""
+    """Frames, or messages, in the last ``STATISTICS_PERIOD_S``."""
 
     age_s: float
     """Time since the last one, seconds."""
@@ -75,7 +75,7 @@ class Counters:
     def __init__(self) -> None:
         self.totals: Counter[tuple[str, str]] = Counter()
         self._bins: deque[tuple[float, Counter[tuple[str, str]]]] = deque(
-            maxlen=round(RECENT_S / BIN_S) + 1
+            maxlen=round(STATISTICS_PERIOD_S / BIN_S) + 1
         )
         self._last: dict[tuple[str, str], tuple[float, str]] = {}
 
@@ -102,7 +102,7 @@ class Counters:
         """Return what has become of everything, the most frequent first."""
         recent: Counter[tuple[str, str]] = Counter()
         for start_s, counts in self._bins:
-            if now_s - start_s <= RECENT_S:
+            if now_s - start_s <= STATISTICS_PERIOD_S:
                 recent.update(counts)
         fates = (
             Disposition(

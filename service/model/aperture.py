@@ -34,10 +34,11 @@ class Aperture:
     """Size and position of the pupil that a mask of subapertures shows."""
 
     diameter_subap: float
-    """Of the disc with the area of the mask and its hole."""
+    """Diameter of a disc that has the area of the mask and its central hole together, subapertures.
+    """
 
     hole_subap: float
-    """Of the disc with the area of the central hole; 0 where there is none."""
+    """Diameter of a disc that has the area of the central hole, subapertures; 0 without a hole."""
 
     centre: tuple[float, float]
     """Offset along x and y from the middle of the grid, subapertures."""
@@ -57,7 +58,7 @@ class Aperture:
 
     @property
     def is_off(self) -> bool:
-        """Whether the pupil does not lie in the middle of the grid."""
+        """True if the pupil is not centred on the grid."""
         return float(np.hypot(*self.centre)) > OFF_CENTRE_SUBAP
 
 

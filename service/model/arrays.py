@@ -1,7 +1,7 @@
-"""Which library computes the rows of D: NumPy, or another that keeps the array API standard.
+"""Array library that computes the rows of D: NumPy, or another with the array API standard.
 
-Torch and CuPy compute on a GPU where there is one. Only what streams row by row goes there; the
-rest of the model is NumPy and SciPy.
+Torch and CuPy compute on a GPU if there is one. Only the work done row by row goes there; the rest
+of the model is NumPy and SciPy.
 """
 
 from __future__ import annotations

@@ -28,11 +28,12 @@ Indices = NDArray[np.intp]
 TILE_SUBAP = 4.0
 """Side of a tile: smaller ones need more memory, larger ones more plates."""
 
-FAR = 2.5
+FAR_DISTANCE_RATIO = 2.5
 """Distance of a far actuator over that of the tile's corner from its middle."""
 
-DEGREE = 22
-"""Of the series: 2.5^-22 is 2e-9, and heights are right to a thousandth of what float32 rounds."""
+SERIES_DEGREE = 22
+"""Degree of the series: 2.5^-22 is 2e-9, and the error of heights is a thousandth of the
+rounding error of float32."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -44,7 +45,7 @@ class _Tile:
     """``(n_near,)`` actuators whose plates are added one by one."""
 
     series: Array
-    """``(4 (DEGREE + 1), n_modes)`` coefficients of all other plates, for ``_terms``."""
+    """``(4 (SERIES_DEGREE + 1), n_modes)`` coefficients of all other plates, for ``_terms``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -56,14 +57,14 @@ class PlateSum:
     """``(n_actuators + 3, n_modes)`` weights of its functions."""
 
     _tiles: dict[tuple[int, int], _Tile] = field(default_factory=dict)
-    """Where points have lain so far; two threads may make the same one."""
+    """Tiles computed so far, by their place on the grid; two threads may compute the same one."""
 
     def heights(self, points: Array) -> Array:
         """Return the modes ``(n_points, n_modes)`` at points ``(n_points, 2)``."""
         out = np.empty((len(points), self.coefficients.shape[1]))
         for tile, some in self._tiled(points):
             w = _complex(points[some]) - tile.middle
-            power = _powers(w, DEGREE)
+            power = _powers(w, SERIES_DEGREE)
             far = _terms(np.abs(w) ** 2 * power, power)
             near = ThinPlate(self.surface.positions[tile.near]).basis(points[some])
             out[some] = self._added(tile, far, near)
@@ -74,9 +75,9 @@ class PlateSum:
         out = np.empty((len(points), self.coefficients.shape[1]))
         for tile, some in self._tiled(points):
             w, along = _complex(points[some]) - tile.middle, _complex(direction[some])
-            power = _powers(w, DEGREE)
+            power = _powers(w, SERIES_DEGREE)
             rate = np.zeros_like(power)
-            rate[1:] = np.arange(1, DEGREE + 1)[:, None] * power[:-1] * along
+            rate[1:] = np.arange(1, SERIES_DEGREE + 1)[:, None] * power[:-1] * along
             widening = 2.0 * (w.conj() * along).real
             far = _terms(widening * power + np.abs(w) ** 2 * rate, rate)
             near = ThinPlate(self.surface.positions[tile.near]).slope(points[some], direction[some])
@@ -101,20 +102,22 @@ class PlateSum:
 
     def _tile(self, middle: complex) -> _Tile:
         b = _complex(self.surface.positions) - middle
-        far = np.abs(b) >= FAR * TILE_SUBAP / np.sqrt(2.0)
+        far = np.abs(b) >= FAR_DISTANCE_RATIO * TILE_SUBAP / np.sqrt(2.0)
         plates = _series(b[far])
         series = np.concatenate([plates.real, plates.imag]) @ self.coefficients[: len(b)][far]
         return _Tile(middle=middle, near=np.flatnonzero(~far), series=series)
 
 
 def _series(b: Complex) -> Complex:
-    """Return the coefficients of a, then of c, of each plate, ``(2 (DEGREE + 1), n_plates)``.
+    """Return coefficients of a, then of c, of each plate, ``(2 (SERIES_DEGREE + 1), n_plates)``.
 
     ``log(w - b)`` has the series g; ``|w - b|² = w̄w - w b̄ - w̄ b + b̄b``, and the real part of
     ``w̄ w^k`` is that of ``w̄w w^(k-1)``, of ``w̄`` itself that of w.
     """
-    k = np.arange(1, DEGREE + 2)
-    g = np.concatenate([np.log(np.abs(b))[None], -1.0 / (k[:, None] * _powers(b, DEGREE + 1)[1:])])
+    k = np.arange(1, SERIES_DEGREE + 2)
+    g = np.concatenate(
+        [np.log(np.abs(b))[None], -1.0 / (k[:, None] * _powers(b, SERIES_DEGREE + 1)[1:])]
+    )
     a = g[:-1] - b * g[1:]
     c = np.abs(b) ** 2 * g[:-1]
     c[1:] -= b.conj() * g[:-2]

@@ -25,10 +25,11 @@ class GuideStar:
     """Direction and height of a guide star."""
 
     direction_rad: complex = 0j
-    """x + iy on the sky, in the pupil's axes: towards +x, light at an altitude lies at +x."""
+    """Direction x + iy on the sky, radians, in the pupil's axes: light from +x at an altitude is
+    displaced towards +x."""
 
     height_m: float = inf
-    """Of a laser star, metres along the line of sight; infinite: a natural one."""
+    """Height of a laser guide star along the line of sight, metres; infinite for a natural star."""
 
     def seen(self, altitude_m: float) -> Similarity:
         """Return where points of a plane at this altitude are seen on the pupil, metres.

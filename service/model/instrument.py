@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class SensorDescription(Protocol):
-    """What is known of a sensor whatever its kind; each kind has a frozen dataclass of its own."""
+    """Properties that a sensor of any kind has; each kind has its own frozen dataclass."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
     kind: ClassVar[str]
@@ -61,21 +61,22 @@ class SensorDescription(Protocol):
 class Mount:
     """Nominal rotation and parity of a mirror, if its owner states them.
 
-    A point ``p`` of the mirror's drawing lies at ``diag(1, parity) p`` before α acts on it.
+    α acts on a point ``p`` of the mirror's own coordinates after ``diag(1, parity) p``.
     """
 
     nominal_rotation_rad: float | None = None
-    """Rotation at which a fit starts; None: not told. α always reports the whole rotation."""
+    """Rotation at which a fit starts, radians; None if not stated. α always reports the whole
+    rotation."""
 
     parity: int | None = None
-    """-1: the mirror is seen from behind, its y axis points backwards; 1: it does not; None: not
-    told."""
+    """-1 if the mirror is seen from behind, so that its y axis is reversed, else 1; None if not
+    stated."""
 
     stroke_known: bool = True
-    """Whether a unit command has a known height; if not, only shapes can be compared."""
+    """True if a unit command has a known height; otherwise only shapes can be compared."""
 
     nominal_anamorphosis: tuple[float, float] | None = None
-    """Anamorphosis at which a fit starts, as α has it; None: not told."""
+    """Anamorphosis at which a fit starts, in α's units; None if not stated."""
 
     @property
     def y_sign(self) -> float:
@@ -94,14 +95,14 @@ class Mirror(Mount):
     """Typical distance between neighbours, metres in the pupil plane."""
 
     shape: InfluenceShape = field(default_factory=InfluenceShape)
-    """Of the influence functions."""
+    """Shape of the influence functions."""
 
     basis: BasisKind = BasisKind.KARHUNEN_LOEVE
     """Modes where ``mode_to_actuator`` is None."""
 
     segments_deg: tuple[float, ...] = ()
-    """Where each gap between segments goes from the centre outwards, rising, degrees from +x
-    towards +y; empty: it is of one piece."""
+    """Direction of each gap between segments from the centre outwards, ascending, degrees from +x
+    towards +y; empty for a mirror of one piece."""
 
     mode_to_actuator: NDArray[np.float64] | None = None
     """The user's own modes ``(n_actuators, n_modes)``: strokes in metres OPD per unit command."""
@@ -121,7 +122,7 @@ class LocalFunctions:
     """``(n_samples,)`` metres of OPD per unit stroke, function after function."""
 
     places: NDArray[np.intp]
-    """``(n_samples,)`` where each lies in the table, row-major."""
+    """Index of each sample in the row-major table, ``(n_samples,)``."""
 
     ends: NDArray[np.intp]
     """``(n_functions + 1,)`` where the samples of each begin, and those of the last end."""
@@ -197,13 +198,13 @@ class SensorMode:
     """The RTC's name of it."""
 
     binning: int
-    """Of the finest subapertures, how many are one along each axis."""
+    """Number of the finest subapertures, along each axis, that are binned to one."""
 
     wfs: SensorDescription
     """The sensor, so read."""
 
     loop: LoopFacts
-    """What is known of the loop in this mode."""
+    """Properties of the loop in this mode."""
 
     def of(self, instrument: Instrument) -> Instrument:
         """Return an instrument that has this mode, in it."""
@@ -223,13 +224,13 @@ class Instrument(Telescope):
     delivers slopes."""
 
     loop: LoopFacts | None = None
-    """What is known of the loop without an RTC."""
+    """Properties of the loop that are known without an RTC; None if none are."""
 
     unknown: tuple[str, ...] = ()
     """Keys of the file, like ``mirror.coupling``, whose values are only where a fit begins."""
 
     remarks: tuple[str, ...] = ()
-    """What whoever uses this description should be told: one sentence each, with the key."""
+    """Remarks for users of this description: one sentence each, with the key."""
 
     basis_id: str | None = None
     """Pins the RTC's basis; None: the first seen is adopted."""
@@ -241,11 +242,11 @@ class Instrument(Telescope):
     """Outline and obscurations as they are; None: a ring, with the spider's arms."""
 
     pupil_shift_subap: tuple[float, float] | None = None
-    """Where the pupil's centre lies on the sensor's grid with the telescope as stop; None: in its
-    middle."""
+    """Position of the pupil's centre on the sensor's grid with the telescope as stop, (x, y) in
+    subapertures; None for the middle of the grid."""
 
     law: PointingLaw | None = None
-    """Where the mirror lies at any pointing; None: at the same place."""
+    """Misregistration as a function of the pointing; None if it does not depend on it."""
 
     sensor_modes: tuple[SensorMode, ...] = ()
     """Modes that the RTC may change to; ``config_id`` says which one ``wfs`` is of. Empty: it has
@@ -262,7 +263,7 @@ class Instrument(Telescope):
 
     @property
     def binning(self) -> int:
-        """Of the finest subapertures, how many are one along each axis."""
+        """Number of the finest subapertures, along each axis, that are binned to one."""
         now = (mode.binning for mode in self.sensor_modes if mode.config_id == self.config_id)
         return next(now, 1)
 
@@ -339,7 +340,7 @@ def sensor_of_kind(instrument: Instrument, kind: type[_Sensor]) -> _Sensor:
     return instrument.wfs
 
 
-_LATER = frozenset(
+_LATER_FIELDS = frozenset(
     {
         "unknown",
         "sensor_modes",
@@ -387,13 +388,14 @@ def _add(digest: hashlib._Hash, value: object) -> None:
 
 
 def _parts(record: DataclassInstance) -> Iterator[tuple[str, object]]:
-    """Yield fields by name, of an influence function its own: so fits of before know it.
+    """Yield fields by name; those of an influence function are listed as fields of the mirror.
 
-    What came later is told where anything is.
+    Both this flattening and the omission of newer fields that are empty keep the digest of an older
+    description unchanged.
     """
     for one in fields(record):
         value = getattr(record, one.name)
-        if one.name in _LATER and not value:
+        if one.name in _LATER_FIELDS and not value:
             continue
         if isinstance(value, InfluenceShape):
             yield from _parts(value)

@@ -1,8 +1,8 @@
 """The interaction matrix D(α) = K(shift) Φ(rotation, magnification), and its derivatives.
 
-Rows stand in the order and signs of conventions.md, or as one RTC lists its slopes: what travels to
-and from the RTC (telemetry, measured matrices, reconstructors) stays as it is, and only the model
-speaks two languages.
+Rows are in the order and signs of conventions.md, or in those of one RTC. Data exchanged with the
+RTC (telemetry, measured matrices, reconstructors) is never reordered; only the model converts
+between the two.
 """
 
 from __future__ import annotations
@@ -49,12 +49,13 @@ LARGEST_STRETCH = 0.2
 
 _AXES = 2
 
-_DENSE = 5e5
+_MAX_DENSE_PRODUCT = 5e5
 """Points times functions of actuators up to which all are evaluated at once: tile by tile, what is
 done for each tile takes longer."""
 
 _POINTS_TOGETHER = 2048
-"""Of the pupil, whose modes are evaluated at once: fewer would cut tiles of plates in pieces."""
+"""Pupil points whose modes are evaluated at once: with fewer, tiles of thin plates would be split.
+"""
 
 UNKNOWN_REACH_SUBAP = 1.0
 """Slopes this near to surface that a table does not know are left out of comparisons."""
@@ -65,7 +66,7 @@ class Linearisation:
     """D and its four derivatives at one registration: D(α) nearby costs one sum."""
 
     alpha: Misregistration
-    """Where it was taken."""
+    """Registration at which the derivatives were computed."""
 
     matrix: NDArray[np.float32]
     """``(n_slopes, n_modes)`` slope per metre OPD."""
@@ -112,12 +113,12 @@ class Linearisation:
         return np.asarray(moved)
 
     def stepped(self, step: Array) -> Misregistration:
-        """Return the registration a ``step`` ``(4,)`` or ``(6,)`` from where it was taken.
+        """Return the registration one ``step`` ``(4,)`` or ``(6,)`` from ``alpha``.
 
         Raises
         ------
         numpy.linalg.LinAlgError
-            If it leads to a stretch that no image has: what was fitted does not tell it.
+            If the step leads to a singular stretch: the fit did not determine it.
         """
         moved = self.alpha.stepped(step[:4])
         if len(step) == 4:
@@ -190,7 +191,10 @@ class InteractionModel:
         self.basis = basis
         self._modes: _Last[Shapes] = _Last()
         local = local_of(basis)
-        by_tiles = local is not None and len(self.pupil.points) * len(local.coefficients) > _DENSE
+        by_tiles = (
+            local is not None
+            and len(self.pupil.points) * len(local.coefficients) > _MAX_DENSE_PRODUCT
+        )
         self._tiles = tiles_of(self.pupil) if by_tiles else ()
         self._combination: Array | None = None
         if local is not None and by_tiles:
@@ -296,10 +300,10 @@ class InteractionModel:
         return self._at(self._image_shift(alpha)).apply(shapes)
 
     def unknown_rows(self, alpha: Misregistration) -> NDArray[np.bool_]:
-        """Return which slopes lie within one subaperture of unknown surface, ``(n_slopes,)``.
+        """Return which slopes are within one subaperture of unknown surface, ``(n_slopes,)``.
 
-        What a table of modes does not know cannot be compared with a measurement. Surface that no
-        light falls on does not count.
+        Surface outside a table of modes cannot be compared with a measurement. Surface that is not
+        illuminated does not count.
         """
         unknown = ~self.basis.known(self._mirror_points(alpha))
         if not unknown.any():
@@ -322,13 +326,13 @@ class InteractionModel:
         return (alpha.shift_x_subap, alpha.shift_y_subap)
 
     def _mirror_points(self, alpha: Misregistration) -> NDArray[np.float64]:
-        """Return where each lit pupil point lies on the mirror, ``(n_points, 2)``."""
+        """Return the position of each lit pupil point on the mirror, ``(n_points, 2)``."""
         return self._on_mirror(alpha, self.pupil.points)
 
     def _on_mirror(
         self, alpha: Misregistration, points: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return where points of the pupil lie on the mirror, ``(n_points, 2)``."""
+        """Return the positions of pupil points on the mirror, ``(n_points, 2)``."""
         beside = np.array(self._image_shift(alpha)) - alpha.vector[:2]
         return self.instrument.with_anamorphosis(alpha).on_mirror(points + beside)
 
@@ -339,7 +343,7 @@ class InteractionModel:
         return self._modes.get((*moved, *stretches), lambda: self._moved(alpha, None))
 
     def _as_listed(self, rows: Array) -> Array:
-        """Return rows ``(n_slopes, ...)`` as whoever asked this model knows them."""
+        """Return rows ``(n_slopes, ...)`` in the order and signs that this model's caller uses."""
         return rows
 
     def _with_rates(self, alpha: Misregistration) -> list[Array]:
@@ -463,10 +467,10 @@ class _Last(Generic[Value]):
 
 
 class RtcInteractionModel(InteractionModel):
-    """Interaction matrices whose rows stand as the RTC lists its slopes.
+    """Interaction matrices whose rows are in the RTC's order of slopes.
 
-    What travels to and from the RTC (telemetry, measured matrices, reconstructors) stays as it is;
-    only the model speaks two languages.
+    Data exchanged with the RTC (telemetry, measured matrices, reconstructors) is never reordered;
+    only the model converts.
     """
 
     def __init__(
@@ -479,7 +483,7 @@ class RtcInteractionModel(InteractionModel):
     ) -> None:
         super().__init__(instrument, basis, **settings)
         self._mode_response = mode_response
-        """``(n_modes,)`` slopes per unit of command over the drawing's; None: as drawn."""
+        """Slopes per unit command relative to the nominal mode, ``(n_modes,)``; None if nominal."""
 
     @override
     def _as_listed(self, rows: Array) -> Array:
@@ -491,7 +495,7 @@ class RtcInteractionModel(InteractionModel):
 
     @override
     def unknown_rows(self, alpha: Misregistration) -> NDArray[np.bool_]:
-        """Return which of the RTC's slopes lie near unknown surface, ``(n_slopes,)``."""
+        """Return which of the RTC's slopes are near unknown surface, ``(n_slopes,)``."""
         marks = self._listed(super().unknown_rows(alpha).astype(np.float32))
         return np.asarray(marks != 0.0)
 

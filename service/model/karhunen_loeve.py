@@ -25,10 +25,10 @@ from service.model.turbulence import (
 Array = NDArray[np.float64]
 
 _PISTON_RATIO = 1e-9
-_DEGENERATE = 1e-3
+_DEGENERACY_RATIO = 1e-3
 """The square grid splits pairs that the mirror's symmetry makes equal by less than this."""
 
-_FINER = 4
+_POINTS_PER_SUBAPERTURE = 4
 """Points a subaperture on which modes are orthonormal."""
 
 WHOLE_BYTES = 2.5e8
@@ -38,14 +38,15 @@ WHOLE_BYTES = 2.5e8
 def karhunen_loeve(instrument: Instrument, surface: Surface) -> tuple[Array, Array]:
     """Return strokes ``(n_actuators, n_modes)`` and variances of the mirror's first KL modes.
 
-    Piston-free, of unit RMS; mode 0 is the tilt along +x, mode 1 the tilt along +y. Where mirror
-    and pupil are symmetric about the x axis the even and odd modes are found apart, so that pairs
-    of equal variance have one well-defined orientation and every machine finds the same basis.
+    The modes are piston-free and of unit RMS; mode 0 is the tilt along +x, mode 1 the tilt along
+    +y. If mirror and pupil are symmetric about the x axis, even and odd modes are computed
+    separately, so that pairs of equal variance have a unique orientation and every machine computes
+    the same basis.
 
     Raises
     ------
     ModelError
-        If the mirror has fewer modes than were asked for.
+        If the mirror has fewer modes than requested.
     """
     n_modes, positions_m = instrument.modes.n_modes, instrument.analytic_mirror.positions_m
     if not 2 <= n_modes < len(positions_m):
@@ -54,7 +55,7 @@ def karhunen_loeve(instrument: Instrument, surface: Surface) -> tuple[Array, Arr
             f"fewer than the {len(positions_m)} actuators (piston is left out)"
         )
     gram, covariance = surface_statistics(instrument, surface)
-    fine = instrument_pupil(instrument, _FINER)
+    fine = instrument_pupil(instrument, _POINTS_PER_SUBAPERTURE)
     sectors = [scipy.sparse.eye_array(len(positions_m), format="csc")]
     if np.allclose(fine.amplitude, fine.amplitude[::-1], rtol=0.0, atol=1e-9):
         sectors = _parity_sectors(positions_m)
@@ -69,9 +70,9 @@ def karhunen_loeve(instrument: Instrument, surface: Surface) -> tuple[Array, Arr
 def _left_out(instrument: Instrument, surface: Surface) -> Array:
     """Return combinations of strokes ``(n, n_actuators)`` that are 0 in every mode.
 
-    They are the mean steps across the gaps between a mirror's segments. A pyramid hardly sees how
-    high segments stand relative to one another, least of all behind the arms of a spider: nothing
-    that is fitted or inverted has these differential pistons.
+    They are the mean steps across the gaps between a mirror's segments. A pyramid hardly measures
+    the height of segments relative to one another, least of all behind the arms of a spider, so
+    these differential pistons are excluded from every fit and inversion.
     """
     if not isinstance(surface, Gaussian) or not surface.segments_deg:
         return np.empty((0, len(surface.positions)))
@@ -181,7 +182,7 @@ def _even_before_odd(found: list[tuple[float, int, Array]]) -> list[tuple[float,
     for stop in range(1, len(found) + 1):
         if (
             stop == len(found)
-            or found[stop - 1][0] - found[stop][0] > _DEGENERATE * found[start][0]
+            or found[stop - 1][0] - found[stop][0] > _DEGENERACY_RATIO * found[start][0]
         ):
             ordered += sorted(found[start:stop], key=lambda mode: mode[1])
             start = stop

@@ -89,7 +89,7 @@ class SlopeOrder(StrEnum):
     """Sx and Sy of one subaperture, then of the next."""
 
     IMAGES = "images"
-    """One pupil image after the other, as they lie: at -x -y, +x -y, -x +y, +x +y."""
+    """One pupil image after the other, by position: at -x -y, +x -y, -x +y, +x +y."""
 
     IMAGES_YX = "images-yx"
     """The same, along y first: at -x -y, -x +y, +x -y, +x +y."""
@@ -101,7 +101,7 @@ class SlopeOrder(StrEnum):
     """The four pixels of one subaperture, as in ``images``, then of the next."""
 
     DETECTOR = "detector"
-    """As the rows of the detector are read: a row of two images, and so on."""
+    """Order of the detector's rows: a row of two images, and so on."""
 
     @property
     def kind(self) -> SignalKind:
@@ -171,7 +171,7 @@ class Telescope(Read):
     """Width of the shadows that the secondary's arms cast on the pupil, metres; None: none."""
 
     spiders_deg: tuple[float, ...] = ()
-    """Where each arm goes from the centre outwards, degrees from +x towards +y."""
+    """Direction of each arm from the centre outwards, degrees from +x towards +y."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -37,7 +37,7 @@ class Tile:
     """``(n_lit,)`` which of them see light."""
 
     places: Indices
-    """``(n_lit,)`` where those stand among the lit points of the pupil."""
+    """Indices of the lit points of this tile among those of the pupil, ``(n_lit,)``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -54,10 +54,10 @@ class Patch:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Drawing:
-    """Local shapes as what they are made from: a few kilobytes beside the modes."""
+    """Recipe of local shapes: the modes and a few kilobytes, for another process."""
 
     parts: tuple[object, ...]
-    """What all shapes of a model have in common: its settings and its modes."""
+    """Parts that all shapes of a model share: its settings and its modes."""
 
     prepare: Callable[..., Any]
     """Makes the model of its parts."""
@@ -67,7 +67,7 @@ class Drawing:
 
     @classmethod
     def beside(cls, drawings: Sequence[Drawing]) -> Drawing:
-        """Return the drawing of one model's shapes beside one another."""
+        """Return the recipe of several sets of shapes of one model, placed side by side."""
         draw = partial(_drawn_beside, draws=tuple(one.draw for one in drawings))
         return replace(drawings[0], draw=draw)
 
@@ -89,8 +89,8 @@ class LocalShapes:
     is a shape."""
 
     n_layers: int = 1
-    """Sets of functions, combined alike, that stand beside one another: heights and rates, as many
-    as were put ``beside`` one another. Function j of layer k is number ``k n_functions + j``."""
+    """Number of sets of functions with the same combination, placed side by side, such as heights
+    and rates. Function j of layer k has the index ``k n_functions + j``."""
 
     drawing: Drawing | None = None
     """From what somebody else can make them; None: he cannot."""
@@ -111,7 +111,7 @@ class LocalShapes:
 
     @property
     def is_cheaper(self) -> bool:
-        """Whether products of it take fewer operations than with an array of the shapes."""
+        """True if products with it take fewer operations than with an array of the shapes."""
         by_tiles = self.n_points * self.n_near + self.n_functions * self.shape[1]
         return by_tiles < self.n_points * self.shape[1]
 

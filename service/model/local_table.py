@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _TAIL = 12
-"""Samples beside a function that its spline reaches: weights fall by 0.27 from one to the next."""
+"""Samples around a function that its spline reaches: weights fall by 0.27 from one to the next."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,10 +1,10 @@
-"""What an instrument's matrices take in memory and work, known before anything is computed."""
+"""Memory and work that an instrument's matrices take, estimated before anything is computed."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from service.model.far_field import DEGREE
+from service.model.far_field import SERIES_DEGREE
 from service.model.far_field import TILE_SUBAP as PLATE_TILE_SUBAP
 from service.model.instrument import Instrument, Mirror
 from service.model.karhunen_loeve import WHOLE_BYTES
@@ -21,7 +21,7 @@ PROGRAM_BYTES = 0.13e9
 _N_MATRICES = 5
 """D and its four derivatives."""
 
-_OF_STATISTICS = 7.5
+_STATISTICS_COPIES = 7.5
 """Squares of the actuators, float64, while KL modes are made of functions known tile by tile."""
 
 
@@ -67,18 +67,20 @@ def _of_modes(instrument: Instrument) -> tuple[float, float]:
         if mirror.cube is not None:
             return 2.0 * mirror.cube.nbytes, 3.0 * mirror.cube.nbytes
         kept = 12.0 * _n_functions(instrument) * instrument.modes.n_modes
-        return kept, kept + _OF_STATISTICS * 8.0 * _n_functions(instrument) ** 2
+        return kept, kept + _STATISTICS_COPIES * 8.0 * _n_functions(instrument) ** 2
     n_actuators = float(len(mirror.positions_m))
     surface = mirror_surface(mirror, instrument.subaperture_m)
     local = isinstance(surface, Gaussian)
     kept = (1.0 if local else 2.0) * 8.0 * n_actuators * instrument.modes.n_modes
     area = np.pi / 4 * instrument.wfs.pupil_diameter**2
     if not local:
-        kept += 8.0 * 4 * (DEGREE + 1) * instrument.modes.n_modes * area / PLATE_TILE_SUBAP**2
+        kept += (
+            8.0 * 4 * (SERIES_DEGREE + 1) * instrument.modes.n_modes * area / PLATE_TILE_SUBAP**2
+        )
     n_points = 9.0 * area
     whole = 8.0 * n_points * n_actuators
     if local and whole >= WHOLE_BYTES:
-        return kept, kept + _OF_STATISTICS * 8.0 * n_actuators**2
+        return kept, kept + _STATISTICS_COPIES * 8.0 * n_actuators**2
     n_modes = instrument.modes.n_modes
     tables = max(3.3 * n_actuators, 3.0 * (4 / 3) ** 2 * n_modes)
     return kept, kept + 8.0 * (n_points * tables + 3.0 * n_actuators**2)

@@ -95,7 +95,7 @@ class Misregistration:
 
     @property
     def stretches(self) -> NDArray[np.float64]:
-        """``(2,)`` the anamorphosis; 0 where none is told."""
+        """Anamorphosis, ``(2,)``; 0 if none is given."""
         return np.array(self.anamorphosis or (0.0, 0.0))
 
     @classmethod
@@ -117,9 +117,9 @@ class Misregistration:
         return replace(self, anamorphosis=(float(stretches[0]), float(stretches[1])))
 
     def distance(self, other: Self) -> NDArray[np.float64]:
-        """Return how far ``(4,)`` the numbers lie from another's.
+        """Return the absolute differences ``(4,)`` from another registration, numeric units.
 
-        That of the magnification counts what stretches an axis, too.
+        The difference in magnification includes that of the anamorphosis.
         """
         apart = np.abs(self.vector - other.vector)
         apart[3] += float(np.abs(self.stretches - other.stretches).max())
@@ -132,7 +132,7 @@ class Misregistration:
         return turned if self.anamorphosis is None else stretching(self.stretches) @ turned
 
     def on_mirror(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return where points of the sensor ``(n_points, 2)`` lie on the mirror; no shift."""
+        """Return mirror positions of sensor points ``(n_points, 2)``, without the shift."""
         if self.anamorphosis is not None:
             points = points @ np.linalg.inv(stretching(self.stretches))
         return points @ rotation(self.rotation_rad) / self.magnification

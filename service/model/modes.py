@@ -86,7 +86,7 @@ class ModalBasis:
 
     @override
     def __getstate__(self) -> dict[str, object]:
-        """Leave out the sums, 26 MB: whoever gets it makes them by himself."""
+        """Leave out the sums, 26 MB: the process that receives the basis computes them itself."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @cached_property
@@ -97,7 +97,7 @@ class ModalBasis:
 
     @property
     def is_local(self) -> bool:
-        """Whether its functions end near their actuators, so that ``patch`` knows them."""
+        """True if its functions end near their actuators, so that ``patch`` finds them."""
         return isinstance(self.surface, Gaussian)
 
     def patch(
@@ -167,12 +167,12 @@ def local_of(basis: Basis) -> LocalBasis | None:
 
 
 def modal_basis(instrument: Instrument) -> Basis:
-    """Return the modes of this instrument, whatever kind they are.
+    """Return the modes of this instrument, of any kind.
 
     Raises
     ------
     ModelError
-        If the mirror has fewer modes than were asked for, or its table is too coarse.
+        If the mirror has fewer modes than requested, or its table is too coarse.
     """
     finest = instrument.finest
     mirror = finest.mirror
@@ -183,9 +183,10 @@ def modal_basis(instrument: Instrument) -> Basis:
 
 
 def in_subapertures(basis: Basis, instrument: Instrument) -> Basis:
-    """Return the mirror's modes in coordinates of the subapertures that an instrument has now.
+    """Return the mirror's modes in coordinates of the instrument's present subapertures.
 
-    The modes are those that were found with the finest ones: coarser ones cannot tell them apart.
+    The modes are always computed with the finest subapertures: with coarser ones they would be
+    degenerate.
     """
     wider = instrument.subaperture_m / instrument.finest.subaperture_m
     if wider == 1.0:
@@ -202,7 +203,7 @@ def analytic_basis(instrument: Instrument) -> ModalBasis:
     Raises
     ------
     ModelError
-        If the mirror has fewer modes than were asked for, or is a table of shapes.
+        If the mirror has fewer modes than requested, or is a table of shapes.
     """
     mirror = instrument.analytic_mirror
     if mirror.mode_to_actuator is not None:
@@ -233,7 +234,7 @@ def karhunen_loeve_basis(instrument: Instrument) -> ModalBasis:
     Raises
     ------
     ModelError
-        If the mirror has fewer modes than were asked for.
+        If the mirror has fewer modes than requested.
     """
     mirror = instrument.analytic_mirror
     surface = mirror_surface(mirror, instrument.subaperture_m)

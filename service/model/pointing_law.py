@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from service.model.misregistration import Misregistration
 
 ANGLES: Final = ("azimuth", "elevation")
-"""Names of what the pointing tells, degrees."""
+"""Names of the pointing's angles, in degrees."""
 
-LONGEST = 200
+MAX_EXPRESSION_LENGTH = 200
 """Letters of an expression."""
 
 
@@ -40,7 +40,7 @@ FUNCTIONS: Final[Mapping[str, Callable[[float], float]]] = {
     "sqrt": math.sqrt,
     "abs": abs,
 }
-"""What an expression may call; angles are in degrees."""
+"""Functions that an expression may call; angles are in degrees."""
 
 _OPERATORS: Final[Mapping[type[ast.AST], Callable[..., float]]] = {
     ast.Add: operator.add,
@@ -61,10 +61,11 @@ class Term:
     """One number of a registration: an expression, or a table over one."""
 
     expression: str
-    """Of the pointing and of values that the observatory reports, by their names."""
+    """Expression in the pointing and in values that the observatory reports, by their names."""
 
     at: tuple[float, ...] = ()
-    """Where a table over the expression has values, rising; empty: the expression is the number."""
+    """Ascending values of the expression at which the table has entries; empty if the expression
+    itself is the number."""
 
     values: tuple[float, ...] = ()
     """The values there, straight lines between them; beyond its ends those of the ends."""
@@ -135,7 +136,7 @@ class Term:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointingLaw:
-    """Where the mirror lies at any pointing; what has no term is nothing, a magnification 1."""
+    """Misregistration at any pointing; a missing term is 0, and 1 for the magnification."""
 
     shift_x_subap: Term | None = None
     shift_y_subap: Term | None = None
@@ -180,8 +181,10 @@ def _parsed(text: str) -> ast.expr:
         f"numbers, {' and '.join(ANGLES)} (degrees), names of the observatory's values, "
         f"+ - * / ** ( ) and {', '.join(FUNCTIONS)}"
     )
-    if len(text) > LONGEST:
-        raise ModelError(f"found {len(text)} letters, expected at most {LONGEST}: {expected}")
+    if len(text) > MAX_EXPRESSION_LENGTH:
+        raise ModelError(
+            f"found {len(text)} letters, expected at most {MAX_EXPRESSION_LENGTH}: {expected}"
+        )
     try:
         tree = ast.parse(text.strip(), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:

@@ -20,7 +20,7 @@ _EDGE_NODES = 32
 _PARTS = 8
 """Parts of a cell along either axis that an arm's shadow is looked at in."""
 
-_FULL = 0.999
+_FULL_SHARE = 0.999
 """Light of a full subaperture, to what those are good for."""
 
 
@@ -248,7 +248,7 @@ def lit_subapertures(instrument: Instrument) -> NDArray[np.bool_]:
 def fully_lit_subapertures(instrument: Instrument) -> NDArray[np.bool_]:
     """Return which subapertures ``(n, n)`` the edge of the pupil does not cut at α = 0."""
     flux = _light_per_subaperture(_outline(instrument))
-    return np.asarray(flux > _FULL)
+    return np.asarray(flux > _FULL_SHARE)
 
 
 @lru_cache(maxsize=8)

@@ -1,8 +1,8 @@
 """Find the four pupil images of a pyramid in a picture of its camera.
 
-The picture is a mean frame, or a mask of the pixels that see light. Each image is taken as a disc:
-its edge is where the light falls to half of what lies just inside, its central hole is where the
-light rises to half. Shadows of a spider and uneven light change neither.
+The picture is a mean frame, or a mask of illuminated pixels. Each image is taken as a disc: its
+edge is where the light falls to half of that just inside, its central hole is where the light rises
+to half. Shadows of a spider and uneven light change neither.
 """
 
 from __future__ import annotations
@@ -30,10 +30,11 @@ _N_RAYS = 180
 _RAY_STEP_PX = 0.25
 
 _OUTLIER_PX = 1.5
-"""A ray whose edge lies further from the circle is left out: a vane or a spot lies there."""
+"""Distance of a ray's edge from the fitted circle beyond which the ray is left out, pixels: a vane
+or a bright spot is there."""
 
 _SMALLEST_PX = 4.0
-"""Diameter of the smallest image and of the smallest hole that are believed."""
+"""Smallest accepted diameter of an image and of its hole, pixels."""
 
 _SAME_SIZE = 0.1
 """Largest relative difference between the diameters of the four images."""

@@ -18,7 +18,7 @@ class Similarity:
     """Its size scales, its phase turns from +x towards +y."""
 
     shift: complex = 0j
-    """Where the origin lands."""
+    """Image of the origin."""
 
     @classmethod
     def of(cls, alpha: Misregistration) -> Similarity:

@@ -1,13 +1,14 @@
-"""From the RTC's list of signals to our order, axes and signs, and back.
+"""Conversion between the RTC's list of signals and the order, axes and signs of conventions.md.
 
 An RTC has its own order of components, its own corner of the detector where rows and columns begin,
-and its own idea of which half of the light counts as positive. All of it is one permutation of the
-signal vector with one sign per element, so nothing is interpolated and the inverse is exact. Of
-pixels it is a permutation only: a sign of theirs says which images are at which side.
+and its own choice of which half of the light counts as positive. The conversion is one permutation
+of the signal vector with one sign per element, so nothing is interpolated and the inverse is exact.
+For pixels it is a permutation only: their sign states on which side the images are.
 
-Of any sensor: planes over the valid subapertures, their order in the list, and how the grid lies.
-Of each kind of signal, and so of the sensors that have it: which planes there are, what they become
-when the grid is turned or a sign is, and the orders that only they can have.
+The parts common to all sensors are planes over the valid subapertures, their order in the list, and
+the orientation of the grid. Each kind of signal, and so each sensor that has it, defines its
+planes, their change when the grid is turned or a sign is reversed, and the orders that only it can
+have.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ _PLANE_PLACES = {
     SlopeOrder.IMAGES_YX: [0, 2, 1, 3],
     SlopeOrder.AROUND: [0, 1, 3, 2],
 }
-"""Where each plane of conventions.md stands in the orders that list one after the other."""
+"""Index of each plane of conventions.md in the orders that list one plane after the other."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,7 +81,7 @@ class Orientation:
 
 
 FLIPS = ("swap_xy", "flip_x", "flip_y")
-"""What turns the grid, by the names of an instrument file."""
+"""Keys of an instrument file that turn or mirror the grid."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,7 +95,7 @@ class SlopeRecipe:
     """Axes and signs; None: not known ("auto"), to be found from a measured matrix."""
 
     normalisation: Normalisation = Normalisation.GLOBAL
-    """What the intensities are divided by."""
+    """Normalisation of the intensities."""
 
     @property
     def kind(self) -> SignalKind:
@@ -231,12 +232,12 @@ def as_maps(slopes: NDArray[np.floating], valid: NDArray[np.bool_]) -> NDArray[n
 
 
 def side_by_side(maps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return Sx beside Sy ``(n, 2 n)``, or four images as they lie ``(2 n, 2 n)``."""
+    """Return Sx next to Sy ``(n, 2 n)``, or four images in their positions ``(2 n, 2 n)``."""
     return np.vstack([np.hstack(list(maps[k : k + 2])) for k in range(0, len(maps), 2)])
 
 
 def _places(order: SlopeOrder, mask: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Return where the signals of every valid subaperture stand in the list.
+    """Return the indices in the list of the signals of every valid subaperture.
 
     ``(n_planes, n_valid)``: of Sx and Sy, or of the images at -x -y, +x -y, -x +y, +x +y.
     """

@@ -65,7 +65,7 @@ class Gaussian:
     """``(n_actuators, 2)`` x and y."""
 
     pitch: float
-    """In the units of ``positions``."""
+    """Distance of neighbouring actuators, in the units of ``positions``."""
 
     coupling: float
     """Height at one pitch, 0..1."""
@@ -75,11 +75,11 @@ class Gaussian:
 
     @property
     def reach(self) -> float:
-        """Distance at which a function is ``NOTHING`` high, in the units of ``positions``."""
-        return float(self.pitch * np.sqrt(np.log(NOTHING) / np.log(self.coupling)))
+        """Distance at which a function has ``NEGLIGIBLE_HEIGHT``, in the units of ``positions``."""
+        return float(self.pitch * np.sqrt(np.log(NEGLIGIBLE_HEIGHT) / np.log(self.coupling)))
 
     def near(self, points: Array) -> NDArray[np.intp]:
-        """Return which functions are higher than ``NOTHING`` at any of some points close together.
+        """Return which functions exceed ``NEGLIGIBLE_HEIGHT`` at any of some points close together.
 
         ``points`` is ``(n_points, 2)``.
         """
@@ -129,7 +129,7 @@ class Gaussian:
         for gap in self.segments_deg:
             before, after = (
                 radius[:, None] * [np.cos(angle), np.sin(angle)]
-                for angle in np.deg2rad([gap - _BESIDE_DEG, gap + _BESIDE_DEG])
+                for angle in np.deg2rad([gap - _GAP_OFFSET_DEG, gap + _GAP_OFFSET_DEG])
             )
             found.append((self.basis(after) - self.basis(before)).mean(axis=0))
         return np.array(found)
@@ -146,10 +146,10 @@ class Gaussian:
 _PER_PITCH = 4
 """Places along a pitch of a gap at which its step is looked at."""
 
-_BESIDE_DEG = 1e-6
-"""Beside a gap, on either side of it."""
+_GAP_OFFSET_DEG = 1e-6
+"""Angle on either side of a gap at which its step is evaluated, degrees."""
 
-NOTHING = 1e-6
+NEGLIGIBLE_HEIGHT = 1e-6
 """Height below which a local function is left out: of slopes as much, and D keeps five digits."""
 
 Surface = ThinPlate | Gaussian
@@ -168,7 +168,7 @@ def mirror_surface(mirror: Mirror, subaperture_m: float) -> Surface:
 
 
 def segment_of(points: Array, gaps_deg: tuple[float, ...]) -> NDArray[np.intp]:
-    """Return the segment ``(n_points,)`` that each point lies on, counted from the first gap."""
+    """Return the segment ``(n_points,)`` that contains each point, counted from the first gap."""
     angle_deg = np.rad2deg(np.arctan2(points[:, 1], points[:, 0])) % 360.0
     return np.asarray(np.searchsorted(gaps_deg, angle_deg, side="right") % len(gaps_deg))
 

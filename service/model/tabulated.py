@@ -35,7 +35,7 @@ ENOUGH_POINTS_PER_SUBAPERTURE = 4.0
 """0.45 % of error at mode 400; 2 points give 3 %."""
 
 _SMOOTHING_SUBAP = 0.5
-"""Step of the differences that stand for a Laplacian."""
+"""Step of the finite differences that approximate a Laplacian, subapertures."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,7 +43,7 @@ class TabulatedBasis:
     """Measured modes, in the units of their owner, between the points of their table."""
 
     instrument: Instrument
-    """Whose modes they are; its turbulence is what they are expected to meet."""
+    """Instrument whose modes they are; they are weighted by its turbulence."""
 
     coefficients: NDArray[np.floating]
     """``(ny * nx, n_modes)`` weights of the B-splines at every table point."""
@@ -58,7 +58,7 @@ class TabulatedBasis:
     """-1: the mirror is seen from behind."""
 
     is_local: ClassVar[bool] = False
-    """Whether its functions end near their actuators."""
+    """True if its functions end near their actuators."""
 
     @property
     def n_modes(self) -> int:
@@ -107,7 +107,7 @@ class TabulatedBasis:
         return replace(self, coefficients=self.coefficients @ weights)
 
     def _place(self, points: Array) -> Array:
-        """Return where points lie in the table, ``(n_points, 2)``: row and column."""
+        """Return the positions of points in the table, ``(n_points, 2)``: row and column."""
         centre = (np.array(self.surface_known.shape) - 1) / 2
         return np.asarray(points[:, ::-1] * [self.y_sign, 1.0] / self.step_subap + centre)
 

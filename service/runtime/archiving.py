@@ -35,31 +35,31 @@ from service.tracking.state import Level, LogEntry, TrackerState
 from service.tracking.step_context import logged
 from service.wire import DitherRequest, MeasureRequest, OffloadRequest, RampRequest
 
-RETRY_S = 2.0
+DISK_RETRY_INTERVAL_S = 2.0
 """Interval between two attempts while the disk refuses."""
 
 SAVE_INTERVAL_S = 5.0
 """Interval between two writes of the state for the next service; an α of that age is as good as a
 new one."""
 
-LOOK_S = 30.0
+SPACE_CHECK_INTERVAL_S = 30.0
 """Interval between two checks of the free space."""
 
-PRUNE_S = 3600.0
+PRUNE_INTERVAL_S = 3600.0
 """Interval between two searches for old products."""
 
-REST_S = 0.5
+REMOVAL_PAUSE_S = 0.5
 """Pause between the removal of two products, which leaves the disk to others."""
 
-MAX_WAITING = 10_000
+MAX_WAITING_LINES = 10_000
 """Lines of the audit trail, and estimates, that wait for a disk; newer ones are counted and
 dropped."""
 
-BEGINNINGS = (DitherRequest, MeasureRequest, RampRequest)
+RECORDED_REQUESTS = (DitherRequest, MeasureRequest, RampRequest)
 """Effects that are executed only after their cause is on the disk. What ends something never waits.
 """
 
-_LOGGED = ("who", "text", "address", "channel", "why", "answer")
+_LOGGED_FIELDS = ("who", "text", "address", "channel", "why", "answer")
 """Fields of an order that the log contains."""
 
 
@@ -120,7 +120,7 @@ class ArchiveWriter:
             last = before.alpha.history[-1:]
             new_ones = takewhile(lambda entry: entry not in last, reversed(after.alpha.history))
             with self._guard:
-                room = MAX_WAITING - len(self._estimates)
+                room = MAX_WAITING_LINES - len(self._estimates)
                 found = list(new_ones)[::-1]
                 self._estimates += found[:room]
                 self._lost += len(found[room:])
@@ -154,22 +154,22 @@ class ArchiveWriter:
         entry = actor.entry(name, asked, by=command.by, why=command.reason)
         entry = replace(entry, answer=answer, cause=order.id)
         self.add(entry)
-        said = {key: getattr(entry, key) for key in _LOGGED if getattr(entry, key)}
+        said = {key: getattr(entry, key) for key in _LOGGED_FIELDS if getattr(entry, key)}
         self._log.info(entry.name, **said, **ids_of(f"{entry.text} {answer}", self._state()))
 
     async def before(self, effect: Effect) -> None:
-        """Wait until what has led to an effect is on the disk.
+        """Wait until the causes of an effect are on the disk.
 
-        A demand to move the mirror's image is there for the next service as well: nobody else can
-        tell it that the image may stand elsewhere.
+        A request to move the mirror's image is saved for the next service as well: it has no other
+        way to learn that the image may have moved.
 
         Raises
         ------
         ArchiveError
-            If it cannot be: nothing is begun that cannot be recorded.
+            If that fails: an action that cannot be recorded must not begin.
         """
         request = effect.request if isinstance(effect, ev.Ask) else None
-        if isinstance(request, BEGINNINGS) or isinstance(effect, ev.SendMatrix):
+        if isinstance(request, RECORDED_REQUESTS) or isinstance(effect, ev.SendMatrix):
             await self.flush()
         if isinstance(request, OffloadRequest):
             await self._save_now()
@@ -213,7 +213,7 @@ class ArchiveWriter:
                     self._post(ev.ConditionChanged(name=ARCHIVE_FAILED, text="", over=True))
             except StorageError as error:
                 self.failed(error)
-                await asyncio.sleep(RETRY_S)
+                await asyncio.sleep(DISK_RETRY_INTERVAL_S)
 
     async def save(self) -> None:
         """Keep what the service after this one needs; seldom, but for what cannot wait."""
@@ -230,7 +230,7 @@ class ArchiveWriter:
                 self._lines.set()  # estimates are written as seldom as what the next service needs
             except StorageError as error:
                 self.failed(error)
-                await asyncio.sleep(RETRY_S)
+                await asyncio.sleep(DISK_RETRY_INTERVAL_S)
             except ArchiveError as error:  # it has been put aside: the next attempt finds none
                 self._log.error("archive.failed", text=str(error))
 
@@ -249,7 +249,7 @@ class ArchiveWriter:
 
     async def keep_house(self, retention: RetentionPolicy) -> None:
         """Prune and watch the disk until cancelled; in threads."""
-        next_s = time.monotonic() + LOOK_S
+        next_s = time.monotonic() + SPACE_CHECK_INTERVAL_S
         while True:
             low = self._state().alarm(DISK_LOW) is not None
             try:
@@ -260,13 +260,13 @@ class ArchiveWriter:
                         ev.ConditionChanged(name=DISK_LOW, text=text or "", over=text is None)
                     )
                 if time.monotonic() >= next_s:
-                    next_s = time.monotonic() + PRUNE_S
+                    next_s = time.monotonic() + PRUNE_INTERVAL_S
                     await self._prune(retention)
             except (OSError, ArchiveError) as error:  # a disk that refuses is told of elsewhere
                 self._log.warning("archive.not-looked-after", text=str(error))
             except Exception:  # noqa: BLE001 - a bug must not end the service
                 self._log.exception("archive.not-looked-after")
-            await asyncio.sleep(LOOK_S)
+            await asyncio.sleep(SPACE_CHECK_INTERVAL_S)
 
     async def _prune(self, retention: RetentionPolicy) -> None:
         """Remove what is old or too much, one by one; what has come into use meanwhile stays."""
@@ -277,7 +277,7 @@ class ArchiveWriter:
             entry = await asyncio.to_thread(remove, self._archive, item, why)
             if entry is not None:
                 self.add(entry)
-            await asyncio.sleep(REST_S)
+            await asyncio.sleep(REMOVAL_PAUSE_S)
 
     async def keep_orders(self, before: TrackerState) -> None:
         """Keep what was ordered since for the service after this one now, if the disk lets it.
@@ -302,7 +302,7 @@ class ArchiveWriter:
     def add(self, entry: AuditEntry) -> None:
         """Take a line of the audit trail, to be written soon."""
         with self._guard:
-            if len(self._entries) < MAX_WAITING:
+            if len(self._entries) < MAX_WAITING_LINES:
                 self._entries.append(entry)
             else:
                 self._lost += 1
@@ -311,7 +311,7 @@ class ArchiveWriter:
     def sampled(self, sample: TrendSample) -> None:
         """Take a sample of the trends; while the disk refuses, the oldest ones go."""
         with self._guard:
-            self._samples = [*self._samples, sample][-MAX_WAITING:]
+            self._samples = [*self._samples, sample][-MAX_WAITING_LINES:]
         self._lines.set()
 
     def _write(self) -> None:
@@ -369,7 +369,7 @@ def asked_for(command: Command, actor: Actor) -> str:
 
 
 def _loss_text(lost: int) -> tuple[AuditEntry]:
-    text = f"{lost} lines came while the disk refused and {MAX_WAITING} waited already"
+    text = f"{lost} lines came while the disk refused and {MAX_WAITING_LINES} waited already"
     return (AuditEntry(t_ns_utc=time.time_ns(), who="service", name="archive.lost", text=text),)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-FOLLOWED_NS = 1_000_000_000
+MAX_CLOCK_STEP_NS = 1_000_000_000
 """A clock that is set by less is followed at once: what is waited for lasts seconds."""
 
 
@@ -34,14 +34,14 @@ class ServiceClock:
     def now_ns(self) -> int:
         """Return the time, nanoseconds UTC."""
         ahead_ns = self._ahead_ns()
-        if abs(ahead_ns) <= FOLLOWED_NS:
+        if abs(ahead_ns) <= MAX_CLOCK_STEP_NS:
             self._offset_ns += ahead_ns
         return self._passed_ns() + self._offset_ns
 
     def complaint(self) -> str:
         """Return by how much the machine's clock has leapt; empty: it is followed."""
         ahead_ns = self._ahead_ns()
-        if abs(ahead_ns) <= FOLLOWED_NS:
+        if abs(ahead_ns) <= MAX_CLOCK_STEP_NS:
             return ""
         return (
             f"this machine's clock has leapt by {ahead_ns / 1e9:+.0f} s: the service goes on by "

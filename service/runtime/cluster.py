@@ -30,16 +30,16 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 Versions = Mapping[str, str]
 
-CONNECT_S = 5.0
+CONNECT_TIMEOUT_S = 5.0
 """A scheduler that does not answer within so long is not there."""
 
-FETCH_S = 30.0
+FETCH_TIMEOUT_S = 30.0
 """Time after which a missing result is requested again."""
 
-LOOK_S = 1.0
+CLUSTER_CHECK_INTERVAL_S = 1.0
 """Interval between two checks of scheduler and workers."""
 
-EMPTY_S = 20.0
+MAX_EMPTY_S = 20.0
 """A cluster that has had no worker for so long has lost them: a nanny restarts one in less."""
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
@@ -197,7 +197,7 @@ class Cluster:
         from distributed import CancelledError, wait
 
         with self._client.as_current(), contextlib.suppress(TimeoutError, CancelledError):
-            wait(list(waiting), timeout=LOOK_S, return_when="FIRST_COMPLETED")
+            wait(list(waiting), timeout=CLUSTER_CHECK_INTERVAL_S, return_when="FIRST_COMPLETED")
         done = [future for future in waiting if future.done()]
         if not done:
             self._look()
@@ -207,9 +207,10 @@ class Cluster:
         """Refuse to wait any longer for what does not answer, or has no worker."""
         if self._workers():
             self._seen_s = time.monotonic()
-        elif time.monotonic() - self._seen_s > EMPTY_S:
+        elif time.monotonic() - self._seen_s > MAX_EMPTY_S:
             raise ClusterError(
-                f"{self.address}: the cluster has had no worker for {EMPTY_S:.0f} s; {self._start}"
+                f"{self.address}: the cluster has had no worker for {MAX_EMPTY_S:.0f} s; "
+                f"{self._start}"
             )
 
     def _result_of(self, future: Future) -> Any:  # noqa: ANN401 - whatever the function returns
@@ -217,7 +218,7 @@ class Cluster:
 
         while True:
             try:
-                return future.result(timeout=FETCH_S)
+                return future.result(timeout=FETCH_TIMEOUT_S)
             except KilledWorker as error:
                 raise ClusterError(
                     f"{self.address}: a task has ended every worker that had it, last "
@@ -235,7 +236,9 @@ class Cluster:
         try:
             if client.status != "running":
                 raise OSError(f"connection {client.status}")
-            found = client.sync(client.scheduler.identity, callback_timeout=CONNECT_S, n_workers=-1)
+            found = client.sync(
+                client.scheduler.identity, callback_timeout=CONNECT_TIMEOUT_S, n_workers=-1
+            )
         except Exception as error:
             raise self._lost(error) from error
         return dict(found["workers"])
@@ -346,7 +349,7 @@ def _connected(address: str) -> Client:
             "pip install 'pyrcal[cluster]'"
         ) from error
     try:
-        return Client(address, timeout=CONNECT_S, set_as_default=False)
+        return Client(address, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
     except Exception as error:
         why = shown(str(error).partition("\n")[0])
         raise ClusterError(

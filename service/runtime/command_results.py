@@ -51,12 +51,12 @@ class GivenCommand:
     """The cause of all that it leads to."""
 
     def result(self, now: TrackerState) -> CommandResult:
-        """Return what has come of it by now.
+        """Return the present result of the command.
 
         Raises
         ------
         CommandError
-            If RTC or gate have refused it, or what it asked for came to nothing.
+            If RTC or gate have refused it, or it has failed.
         LinkError
             If the RTC did not answer in its time.
         """

@@ -36,10 +36,10 @@ from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.state import TrackerState
 from service.wire import Status
 
-TOLD_S = 8.0
+RECENT_WINDOW_S = 8.0
 """A window accepted within this time determines the registration."""
 
-STEADY_GATHER_S = 0.55
+IDLE_GATHER_S = 0.55
 """Duration of frames gathered while nothing happens: windows are four times as long, and alarms
 have a second. Usually a status, which is processed at once, ends the wait earlier."""
 
@@ -69,18 +69,18 @@ class Driver(Protocol):
 
 
 class Engine:
-    """State and streaming estimators, driven by events and blocks.
+    """Tracker state and streaming estimators, driven by events and blocks.
 
     Parameters
     ----------
     state
-        What is known at the start.
+        State at the start.
     policy
-        The user's numbers; ``prepared`` adds the model's.
+        Settings of the user; ``prepared`` adds the model's.
     driver
-        Does what takes time.
+        Executes effects that take time.
     step
-        The tracker; another one may write down what it is told.
+        The tracker's step; a test or a recorder may wrap it.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class Engine:
     def begin_anew(self) -> None:
         """Reset all estimators.
 
-        The matrices are kept, because nobody passes them again before the next swap.
+        The matrices are kept, because they are not passed again before the next swap.
         """
         self._checked_out = None
         if self.bank is not None:
@@ -116,14 +116,15 @@ class Engine:
             self._follow()
 
     def post(self, event: Event, cause: str = "") -> tuple[Effect, ...]:
-        """Let the tracker react, and set in motion what it wants done.
+        """Pass an event to the tracker and start the effects that it requests.
 
-        ``cause``: id of what has led to the event, an effect's where it comes of one.
+        ``cause``: id of the effect or order that led to the event, if there is one.
 
         Raises
         ------
         CommandError
-            If it is an operator's command that cannot be carried out now; the state stands.
+            If it is an operator's command that cannot be carried out now; the state is
+            unchanged.
         UnknownIdError
             If it names an unknown reconstructor.
         """
@@ -211,7 +212,7 @@ class Engine:
             return 0.0
         dithers = (OperationKind.OWN_DITHER, OperationKind.OTHER_DITHER)
         steady = all(running.kind in dithers for running in running_operations(state, now_ns))
-        return STEADY_GATHER_S if steady else 0.0
+        return IDLE_GATHER_S if steady else 0.0
 
     def take_sums(self) -> list[PassiveSums | str | None]:
         """Return the sums of ordinary telemetry and begin new ones, or why there are none yet.
@@ -225,7 +226,7 @@ class Engine:
         told = (
             registration is not None
             and not registration.doubt
-            and now_ns - registration.window_ns_utc < TOLD_S * SECOND_NS
+            and now_ns - registration.window_ns_utc < RECENT_WINDOW_S * SECOND_NS
         )
         self.bank, sums = close_sums(self.bank, has_windows=told)
         return list(sums.values())

@@ -43,7 +43,7 @@ from service.wire import checksum
 MatrixOf = Callable[[str], NDArray[np.float32]]
 """Returns a reconstructor ``(n_modes, n_slopes)`` by id; UnknownIdError if it is not archived."""
 
-LONGEST_S = 30.0
+MAX_WINDOW_SPAN_S = 30.0
 """Later ones are not joined to a window: α moves meanwhile."""
 
 
@@ -66,7 +66,7 @@ class PendingWindow:
     def put(self, window: EndedWindow) -> WindowRefused | None:
         """Add a window; return why the one that waited is given up, where it has to be."""
         waiting = self._window
-        late = window.t_end_ns_utc - self._first_end_ns > LONGEST_S * 1e9
+        late = window.t_end_ns_utc - self._first_end_ns > MAX_WINDOW_SPAN_S * 1e9
         both = None if waiting is None or late else _joined(waiting, window)
         self._window = both or window
         self._new.set()
@@ -77,7 +77,7 @@ class PendingWindow:
             return None
         return WindowRefused(
             reason="the worker had no hand free before the dither, the reconstructor or the "
-            f"session changed, or for {LONGEST_S:.0f} s: the window was given up",
+            f"session changed, or for {MAX_WINDOW_SPAN_S:.0f} s: the window was given up",
             t_ns_utc=waiting.t_end_ns_utc,
         )
 

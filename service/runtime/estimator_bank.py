@@ -20,7 +20,7 @@ from service.estimation.estimator import Change, FrameContext, LoopContext, Mark
 from service.estimation.frames import FrameBlock
 from service.estimation.loop import last_seq, same_loop, same_rate
 from service.estimation.passive_sums import PassiveSums
-from service.estimation.windows import SETTLING_S, WindowRefused
+from service.estimation.windows import DITHER_SETTLING_S, WindowRefused
 from service.runtime.registry import REGISTRY, Entry
 from service.tracking.dither_request import Dither, expected_dither, lock_in_plan, random_plan
 from service.wire import DitherKind, Status
@@ -81,7 +81,7 @@ def with_rtc(bank: EstimatorBank, rtc: Status | None) -> EstimatorBank:
     if changes & (Change.LOOP | Change.STATUS):
         seq = last_seq(rtc)
         # frames that are on their way may have been made by the loop as it was
-        settled_seq = seq + round(SETTLING_S * rtc.frame_rate_hz)
+        settled_seq = seq + round(DITHER_SETTLING_S * rtc.frame_rate_hz)
         loop = replace(loop, from_seq=seq + 1, settled_seq=settled_seq)
     if Change.LOOP in changes:
         bank, loop = replace(bank, begun_with=rtc), _of_modes(loop, rtc)
@@ -209,7 +209,7 @@ def _marked(frames: FrameContext, marks: Mark) -> FrameContext:
     """Return a block with the marks of a member; after frozen slopes measurements begin again."""
     loop = frames.loop
     if Mark.STANDS in marks:
-        seq = frames.block.next_seq + round(SETTLING_S * frames.rtc.frame_rate_hz)
+        seq = frames.block.next_seq + round(DITHER_SETTLING_S * frames.rtc.frame_rate_hz)
         loop = replace(loop, from_seq=seq, settled_seq=seq)
     return replace(frames, loop=loop, marks=frames.marks | marks)
 

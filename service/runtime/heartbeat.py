@@ -6,19 +6,20 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-STALLED_S: Final = 30.0
-"""A round takes a second at most; on a machine that is full, or swaps, some."""
+MAX_ROUND_S: Final = 30.0
+"""Longest time between two rounds: a round takes a second at most, but some on a machine that is
+overloaded or swaps."""
 
 
 class Heartbeat:
-    """When each part of the service last began a round of its work.
+    """Time at which each part of the service last began a round of its work.
 
-    A part counts from its first round on: what has not begun cannot stand still.
+    A part is watched from its first round on.
 
     Parameters
     ----------
     now_s
-        The clock: monotonic, seconds.
+        Monotonic clock, seconds.
     """
 
     def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
@@ -34,8 +35,8 @@ class Heartbeat:
         """Return the part that has stopped, and for how long; empty if all are running."""
         ages_s = {part: self._now_s() - beat_s for part, beat_s in self._beats_s.items()}
         return "; ".join(
-            f"{part} has stood still for {age_s:.0f} s, expected a round within {STALLED_S:g} s: "
+            f"{part} has stood still for {age_s:.0f} s, expected a round within {MAX_ROUND_S:g} s: "
             "restart the service"
             for part, age_s in ages_s.items()
-            if age_s > STALLED_S
+            if age_s > MAX_ROUND_S
         )

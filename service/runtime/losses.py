@@ -9,23 +9,23 @@ from service.link.statistics import LinkStatistics
 from service.tracking.alarms import FRAMES_LOST, NO_FRAMES
 from service.wire import Status
 
-LOST_S: Final = 5.0
+LOSS_PERIOD_S: Final = 5.0
 """Losses are summed over so long."""
 
-LOST_SHARE: Final = 0.01
+MAX_LOST_SHARE: Final = 0.01
 """Fraction of lost frames that raises an alarm; half of it does not end the alarm."""
 
-SLOW_S: Final = 2.0
+RATE_PERIOD_S: Final = 2.0
 """Frames that come are counted over so long."""
 
-SLOW_SHARE: Final = 0.25
+MIN_RATE_SHARE: Final = 0.25
 """Fraction of the previous frame rate below which an alarm is raised; twice as much does not end
 it."""
 
-NO_FRAMES_S: Final = 2.0
+FRAMES_TIMEOUT_S: Final = 2.0
 """Frames, of which tens come a second, are missed after so long."""
 
-WHAT_TO_DO: Final = "check the network, the RTC's publisher, and what else this machine does"
+REMEDY: Final = "check the network, the RTC's publisher, and what else this machine does"
 
 Counts = deque[tuple[float, LinkStatistics]]
 """Times with the counters at each."""
@@ -36,10 +36,10 @@ def silence(rtc: Status | None, frame_age_s: float | None) -> dict[str, str]:
 
     A matrix made of what was known before is not sent then.
     """
-    if rtc is None or not rtc.in_loop or frame_age_s is None or frame_age_s < NO_FRAMES_S:
+    if rtc is None or not rtc.in_loop or frame_age_s is None or frame_age_s < FRAMES_TIMEOUT_S:
         return {NO_FRAMES: ""}
     text = f"no frame could be used for {frame_age_s:.0f} s, though the RTC's loop is closed"
-    return {NO_FRAMES: f"{text}: nothing is made or sent until frames come; {WHAT_TO_DO}"}
+    return {NO_FRAMES: f"{text}: nothing is made or sent until frames come; {REMEDY}"}
 
 
 class Losses:
@@ -59,7 +59,7 @@ class Losses:
         """
         counts = self._counts
         counts.append((now_s, link))
-        while len(counts) > 1 and now_s - counts[1][0] >= LOST_S:
+        while len(counts) > 1 and now_s - counts[1][0] >= LOSS_PERIOD_S:
             counts.popleft()
         slow = self._slowness.complaint(counts)
         return {FRAMES_LOST: self._lost(*counts[0], link, now_s) or slow}
@@ -74,8 +74,8 @@ class Losses:
         lost = never_came + not_finite + overwritten
         n_frames = max(received + never_came + not_finite, 1)
         share = lost / n_frames
-        enough = now_s - since_s >= LOST_S
-        self._raised = share > (0.5 if self._raised else 1.0) * LOST_SHARE and enough
+        enough = now_s - since_s >= LOSS_PERIOD_S
+        self._raised = share > (0.5 if self._raised else 1.0) * MAX_LOST_SHARE and enough
         if not self._raised:
             return ""
         found = [
@@ -89,7 +89,7 @@ class Losses:
         ]
         return (
             f"frames are lost: of {n_frames} in the last {now_s - since_s:.0f} s {', '.join(found)}"
-            f" ({100.0 * share:.1f} %): {WHAT_TO_DO}"
+            f" ({100.0 * share:.1f} %): {REMEDY}"
         )
 
 
@@ -105,22 +105,22 @@ class _Slowness:
     def complaint(self, counts: Counts) -> str:
         """Return how slowly they come; empty: as before, or not at all, which others name."""
         now_s, now = counts[-1]
-        recent = next((at for at in reversed(counts) if now_s - at[0] >= SLOW_S), None)
+        recent = next((at for at in reversed(counts) if now_s - at[0] >= RATE_PERIOD_S), None)
         if recent is None or now.frames_received == counts[-2][1].frames_received:
             self._before_hz = None
             return ""
         rate_hz = _rate_hz(recent, counts[-1])
         if self._before_hz is not None:
-            slow = rate_hz < 2.0 * SLOW_SHARE * self._before_hz
+            slow = rate_hz < 2.0 * MIN_RATE_SHARE * self._before_hz
         else:
             self._before_hz = _rate_hz(counts[0], recent)
-            slow = rate_hz < SLOW_SHARE * self._before_hz
+            slow = rate_hz < MIN_RATE_SHARE * self._before_hz
         if not slow:
             self._before_hz = None
             return ""
         return (
-            f"frames come slowly: {rate_hz:.0f} a second in the last {SLOW_S:.0f} s, "
-            f"{self._before_hz:.0f} before, and ever later: {WHAT_TO_DO}"
+            f"frames come slowly: {rate_hz:.0f} a second in the last {RATE_PERIOD_S:.0f} s, "
+            f"{self._before_hz:.0f} before, and ever later: {REMEDY}"
         )
 
 

@@ -4,8 +4,8 @@ The caller waits in a thread, on a pipe. A process that is killed, even a suspen
 pipe, and the wait ends. An executor of the standard library would wait for its process to finish
 instead.
 
-This module is quick to import: a process can be started at once, and imports :data:`ITS_WORK` while
-its parent does.
+This module is quick to import: a process can be started at once, and imports
+:data:`WORKER_MODULE` while its parent does.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from threadpoolctl import threadpool_limits
 
 from service.errors import PyrcalError, WorkerError
 
-ITS_WORK = "service.runtime.worker"
+WORKER_MODULE = "service.runtime.worker"
 """Module that every process imports before its first job."""
 
-APART_BYTES = 1 << 16
+MAX_COPIED_BYTES = 1 << 16
 """An array that is larger is not copied to be sent: windows of many modes are 45 MB."""
 
 R = TypeVar("R")
@@ -112,7 +112,7 @@ class JobProcess:
             context = multiprocessing.get_context("spawn")
             ours, theirs = context.Pipe()
             process = context.Process(
-                target=_work, args=(theirs, self._nice, ITS_WORK), daemon=True
+                target=_work, args=(theirs, self._nice, WORKER_MODULE), daemon=True
             )
             with _deaf_to_the_keyboard():
                 process.start()
@@ -170,7 +170,7 @@ def _send(line: Connection, what: object) -> None:
 
     def is_small(buffer: pickle.PickleBuffer) -> bool:
         raw = buffer.raw()
-        if raw.nbytes < APART_BYTES:
+        if raw.nbytes < MAX_COPIED_BYTES:
             return True
         buffers.append(raw)
         return False

@@ -10,9 +10,15 @@ from typing import Final
 
 from service.link.guard import ending_in_words, flooded_in_words, refused_in_words
 from service.link.intake import COALESCED
-from service.link.statistics import MALFORMED, RECENT_S, USED, Disposition, LinkStatistics
+from service.link.statistics import (
+    MALFORMED,
+    STATISTICS_PERIOD_S,
+    USED,
+    Disposition,
+    LinkStatistics,
+)
 from service.model.misregistration import at_boundary
-from service.runtime.losses import NO_FRAMES_S, silence
+from service.runtime.losses import FRAMES_TIMEOUT_S, silence
 from service.tracking import alarms
 from service.tracking import events as ev
 from service.tracking.alarms import Alarm, Interlock, Prerequisite, Responsible, alarm_blocks
@@ -22,43 +28,43 @@ from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.sending import why_no_return, why_unread
 from service.tracking.state import Mode, TrackerState
-from service.tracking.update_policy import PROPOSAL_STANDS_S, is_outdated
+from service.tracking.update_policy import MIN_PROPOSAL_LIFETIME_S, is_outdated
 from service.wire import TEXT_LIMIT, AlarmMessage, StateMessage
 
 AlarmTexts = frozenset[tuple[str, str]]
 
-SILENT_S: Final = 3.0
+STATUS_TIMEOUT_S: Final = 3.0
 """A status that has not come for so long is waited for."""
 
-REVIVED_AFTER_S: Final = 10.0
+FIRST_REOPENING_DELAY_S: Final = 10.0
 """Time with the RTC's token and no message after which the link is opened again for the first time.
 """
 
-REVIVED_AT_MOST_S: Final = 300.0
+MAX_REOPENING_DELAY_S: Final = 300.0
 """Longest time between two such attempts."""
 
-FAULT_S: Final = 10.0
+FAULT_REPORT_DURATION_S: Final = 10.0
 """A message that broke the contract is complained of for so long."""
 
-UNUSED_SHARE: Final = 0.1
+MAX_UNUSED_SHARE: Final = 0.1
 """Fraction of frames lost by faults of their own that raises an alarm."""
 
 MAX_STATUSES_HZ: Final = 25.0
 """More than twice what the contract allows is a flood."""
 
-OVER_NS: Final = 3 * SECOND_NS
+COMPLAINT_TIMEOUT_NS: Final = 3 * SECOND_NS
 """A complaint that has not been made for so long is over."""
 
-FAULTS: Final = ("leap", "sequence", "shape", MALFORMED)
+FAULT_OUTCOMES: Final = ("leap", "sequence", "shape", MALFORMED)
 """Outcomes of frames that always mean a violation of the contract."""
 
-NAMED_ELSEWHERE: Final = ("basis", "config")
+OUTCOMES_WITH_ALARM: Final = ("basis", "config")
 """Outcomes of frames that have an alarm of their own."""
 
-LOG_AFTER_NS: Final = 2 * SECOND_NS
+MIN_LOGGED_DURATION_NS: Final = 2 * SECOND_NS
 """Conditions that last no longer than this are not logged."""
 
-LOG_EVERY_NS: Final = 60 * SECOND_NS
+LOG_INTERVAL_NS: Final = 60 * SECOND_NS
 """Least time between two records of the same."""
 
 DERIVED_EACH_SECOND: Final = frozenset(
@@ -91,9 +97,9 @@ def _unused(link: LinkStatistics) -> str:
     """Return which frames come and are not used, and why; empty: all is well."""
     frames = [disposition for disposition in link.dispositions if disposition.kind == "frames"]
     came, used = sum(f.n for f in frames), sum(f.n for f in frames if f.outcome == USED)
-    lost = [f for f in frames if f.outcome not in NAMED_ELSEWHERE and _is_lost(f, link, used)]
-    faults = [f for f in lost if f.outcome in FAULTS and f.age_s < FAULT_S]
-    if sum(f.n for f in lost) <= UNUSED_SHARE * came:
+    lost = [f for f in frames if f.outcome not in OUTCOMES_WITH_ALARM and _is_lost(f, link, used)]
+    faults = [f for f in lost if f.outcome in FAULT_OUTCOMES and f.age_s < FAULT_REPORT_DURATION_S]
+    if sum(f.n for f in lost) <= MAX_UNUSED_SHARE * came:
         lost = faults
     lost = [f for f in lost if f.n or f in faults]
     if not lost:
@@ -102,7 +108,7 @@ def _unused(link: LinkStatistics) -> str:
     details = "; ".join(f"{f.n} {f.outcome} ({f.text})" for f in lost[:3])
     return (
         f"the RTC's frames are not used ({reasons}): {details}; of {came} in the last "
-        f"{RECENT_S:.0f} s {used} were used: check the RTC's telemetry"
+        f"{STATISTICS_PERIOD_S:.0f} s {used} were used: check the RTC's telemetry"
     )
 
 
@@ -122,7 +128,7 @@ def _is_lost(disposition: Disposition, link: LinkStatistics, used: int) -> bool:
 def _refused(link: LinkStatistics) -> str:
     """Return which messages besides frames broke the contract; empty: none of late."""
     bad = [f for f in link.dispositions if f.outcome == MALFORMED and f.kind != "frames"]
-    bad = [f for f in bad if f.age_s < FAULT_S]
+    bad = [f for f in bad if f.age_s < FAULT_REPORT_DURATION_S]
     if not bad:
         return ""
     kinds = ", ".join(sorted(f.kind for f in bad))
@@ -131,7 +137,7 @@ def _refused(link: LinkStatistics) -> str:
 
 
 def _flood(link: LinkStatistics) -> str:
-    rate_hz = sum(f.n for f in link.dispositions if f.kind == "status") / RECENT_S
+    rate_hz = sum(f.n for f in link.dispositions if f.kind == "status") / STATISTICS_PERIOD_S
     if rate_hz <= MAX_STATUSES_HZ:
         return ""
     spared = any(f.outcome == COALESCED and f.n for f in link.dispositions)
@@ -151,7 +157,10 @@ def detect_link_changes(
     numbers only is kept, because it is no news.
     """
     made, found = complaints(link), []
-    if not any(f.outcome in NAMED_ELSEWHERE and f.age_s < RECENT_S for f in link.dispositions):
+    if not any(
+        f.outcome in OUTCOMES_WITH_ALARM and f.age_s < STATISTICS_PERIOD_S
+        for f in link.dispositions
+    ):
         also = silence(state.loop.rtc, link.frame_age_s) | dict(also)
     made |= {name: text for name, text in also.items() if text}
     raised = {
@@ -162,7 +171,7 @@ def detect_link_changes(
         same = before is not None and _NUMBER.sub("", before.text) == _NUMBER.sub("", text)
         found.append(ev.ConditionChanged(name=name, text=before.text if before and same else text))
     for name, alarm in raised.items():
-        if name not in made and now_ns - alarm.seen_ns_utc > OVER_NS:
+        if name not in made and now_ns - alarm.seen_ns_utc > COMPLAINT_TIMEOUT_NS:
             found.append(ev.ConditionChanged(name=name, text="over", over=True))
     return list(found)
 
@@ -227,11 +236,12 @@ def _for_messages(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
         yield Prerequisite(
             name="rtc-trouble", responsible=Responsible.RTC, text=rtc.trouble, blocks=True
         )
-    no_status = inputs.status_silent_s >= SILENT_S
+    no_status = inputs.status_silent_s >= STATUS_TIMEOUT_S
     if inputs.frames_come:
         if no_status:
             text = (
-                f"frames come, and no status that could be used for {SILENT_S:.0f} s: send one on "
+                "frames come, and no status that could be used for "
+                f"{STATUS_TIMEOUT_S:.0f} s: send one on "
                 f"{where}/tel/status 1 to 10 times a second"
             )
             yield Prerequisite(name="status", responsible=Responsible.RTC, text=text, blocks=True)
@@ -241,10 +251,11 @@ def _for_messages(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
     elif link.session is None or no_status:
         text = (
             f"its token is there, and nothing comes: send {where}/tel/frames and tel/status (after "
-            f"{REVIVED_AFTER_S:.0f} s the link is opened anew: a connection may be left over)"
+            f"{FIRST_REOPENING_DELAY_S:.0f} s the link is opened anew: "
+            "a connection may be left over)"
         )
         yield Prerequisite(name="telemetry", responsible=Responsible.RTC, text=text)
-    elif link.frame_age_s is None or link.frame_age_s >= NO_FRAMES_S:
+    elif link.frame_age_s is None or link.frame_age_s >= FRAMES_TIMEOUT_S:
         text = f"it sends statuses and no frames: send them on {where}/tel/frames"
         yield Prerequisite(name="frames", responsible=Responsible.RTC, text=text)
     if link.session_waiting is not None and inputs.frames_come:
@@ -302,7 +313,7 @@ def _replaced(state: TrackerState, record: ReconstructorRecord) -> str:
     """Return that a proposal will be replaced, and when; empty: it fits α."""
     if state.operator.mode is Mode.HOLD or not is_outdated(state, record):
         return ""
-    until_s = record.created_ns_utc / SECOND_NS + PROPOSAL_STANDS_S
+    until_s = record.created_ns_utc / SECOND_NS + MIN_PROPOSAL_LIFETIME_S
     then = datetime.fromtimestamp(until_s, UTC)
     return f"α has moved on since: a newer one follows after {then:%H:%M:%S} UTC"
 
@@ -389,13 +400,13 @@ class Revival:
 
     def __init__(self) -> None:
         self._since_s: float | None = None
-        self._wait_s = REVIVED_AFTER_S
+        self._wait_s = FIRST_REOPENING_DELAY_S
 
     def due(self, link: LinkStatistics, now_s: float) -> bool:
         """Return whether it is time; each time in vain, it is twice as long to the next."""
-        heard = any(disposition.age_s < SILENT_S for disposition in link.dispositions)
+        heard = any(disposition.age_s < STATUS_TIMEOUT_S for disposition in link.dispositions)
         if heard:
-            self._wait_s = REVIVED_AFTER_S
+            self._wait_s = FIRST_REOPENING_DELAY_S
         if heard or not link.rtc_alive:
             self._since_s = None
             return False
@@ -403,7 +414,7 @@ class Revival:
             self._since_s = now_s
         if now_s - self._since_s < self._wait_s:
             return False
-        self._since_s, self._wait_s = None, min(2 * self._wait_s, REVIVED_AT_MOST_S)
+        self._since_s, self._wait_s = None, min(2 * self._wait_s, MAX_REOPENING_DELAY_S)
         return True
 
 
@@ -428,9 +439,9 @@ class ReadinessLog:
 
     def _due(self, name: str, now_ns: int) -> bool:
         since_ns, told_ns = self._since_ns[name], self._logged_ns.get(name)
-        if now_ns - since_ns < LOG_AFTER_NS:
+        if now_ns - since_ns < MIN_LOGGED_DURATION_NS:
             return False
-        return told_ns is None or (told_ns < since_ns and now_ns - told_ns >= LOG_EVERY_NS)
+        return told_ns is None or (told_ns < since_ns and now_ns - told_ns >= LOG_INTERVAL_NS)
 
 
 def state_message(

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from service.estimation.control_law import ControlLawCheck
-from service.estimation.dither_monitor import LOUDER, DitherMeasurement, DitherWatch
+from service.estimation.dither_monitor import MAX_AMPLITUDE_RATIO, DitherMeasurement, DitherWatch
 from service.estimation.dither_windows import DitherWindows
 from service.estimation.estimator import Detector, LoopContext, Streaming
 from service.estimation.health import EdgeHealth, LoopHealth, Standstill, VibrationMonitor
@@ -20,7 +20,7 @@ from service.estimation.probation import Comparison
 from service.estimation.residual import Rejection
 from service.tracking import alarms
 from service.tracking import events as ev
-from service.tracking.dither import SILENT_S
+from service.tracking.dither import MISSING_DITHER_ALARM_S
 from service.tracking.events import Event
 from service.tracking.state import TrackerState
 
@@ -36,7 +36,7 @@ def _dither(
     if loop.dither is None:
         return found
     silent_s = watch.silent_s
-    if silent_s >= SILENT_S and int(2 * silent_s) > int(2 * before.silent_s):
+    if silent_s >= MISSING_DITHER_ALARM_S and int(2 * silent_s) > int(2 * before.silent_s):
         found.append(ev.DitherSilent(id=loop.dither.id, silent_s=silent_s))
     if watch.measurement is not None:
         found += _other_dither(loop.dither.id, watch.measurement, state)
@@ -50,7 +50,7 @@ def _other_dither(
     """Return a finding on the dither when it is new or over."""
     told = state.dithers.policy
     raised = state.alarm(alarms.NOT_AS_ASKED) or state.alarm(alarms.OVER_BUDGET)
-    louder = measurement.found_m > LOUDER * told.amiss_m
+    louder = measurement.found_m > MAX_AMPLITUDE_RATIO * told.amiss_m
     news = told.amiss_id != dither_id or louder if measurement.text else raised
     if not news:
         return []

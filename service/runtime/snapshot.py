@@ -75,7 +75,7 @@ class Snapshot:
     """True if the service can do its work."""
 
     ready_reason: str
-    """What the service waits for, or that it waits for nothing."""
+    """Prerequisite that the service waits for, or that there is none."""
 
     waiting_for: tuple[Prerequisite, ...] = ()
     """Whom the service waits for and what they should do, what hinders most first."""

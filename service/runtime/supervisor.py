@@ -45,15 +45,15 @@ from service.tracking.policy import Policy
 from service.tracking.state import Level, TrackerState
 from service.tracking.step_context import new_lines
 
-GATHER_S = 0.16
+LINK_POLL_INTERVAL_S = 0.16
 """Between two visits to the link at the least: each costs two milliseconds, whatever there is."""
 
-ANSWERED_WITHIN_S = 3.0
+ORDER_REPLY_TIMEOUT_S = 3.0
 """Time for the RTC or the gate to answer before the response to an order is sent."""
 
 NOT_READ = "the RTC's own reconstructor had not been read yet: the window was given up"
 
-ASK_AGAIN_S = 0.02
+RESULT_POLL_INTERVAL_S = 0.02
 OPERATOR = Actor()
 _LEVELS = {Level.ALARM: "error"}
 """Names of structlog's where they are others."""
@@ -220,12 +220,12 @@ class Supervisor:
         asked = self._running - running
         if asked and isinstance(order.command, cmd.Measure | cmd.SetLoop | cmd.Ramp):
             await asyncio.wait(asked)
-        until_s = time.monotonic() + ANSWERED_WITHIN_S
+        until_s = time.monotonic() + ORDER_REPLY_TIMEOUT_S
         while True:
             answer = order.result(self._engine.state)
             if answer.final or time.monotonic() > until_s:
                 return answer.text
-            await asyncio.sleep(ASK_AGAIN_S)
+            await asyncio.sleep(RESULT_POLL_INTERVAL_S)
 
     def matrix(self, matrix_id: str) -> NDArray[np.float32]:
         """Return a reconstructor ``(n_modes, n_slopes)``."""
@@ -276,10 +276,10 @@ class Supervisor:
         self._bridge.set_wakeup(lambda: loop.call_soon_threadsafe(rung.set), for_frames=False)
         while True:
             self._heartbeat.beat("the intake of telemetry")
-            await asyncio.sleep(GATHER_S)
+            await asyncio.sleep(LINK_POLL_INTERVAL_S)
             # asyncio.wait_for of Python 3.11 swallows a cancel that meets the bell
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(self._engine.gather_s - GATHER_S):
+                async with asyncio.timeout(self._engine.gather_s - LINK_POLL_INTERVAL_S):
                     await rung.wait()
             rung.clear()
             await self._feed()

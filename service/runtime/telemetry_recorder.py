@@ -33,12 +33,12 @@ from service.tracking.commands import Instruction
 from service.tracking.events import new_id
 from service.tracking.state import TrackerState
 
-LONGEST_S = 3600.0
+MAX_RECORDING_S = 3600.0
 
-LARGEST_GB = 20.0
+MAX_RECORDING_GB = 20.0
 """Largest recording in units of 1e9 bytes: half an hour of 1400 slopes and 600 modes at 1 kHz."""
 
-LOOK_S = 0.5
+PROGRESS_CHECK_INTERVAL_S = 0.5
 """Interval between two checks of its progress."""
 
 
@@ -46,10 +46,10 @@ LOOK_S = 0.5
 class RecordingChoice(Instruction):
     """Duration of a recording of telemetry."""
 
-    duration_s: Annotated[float, Ge(0.0), Le(LONGEST_S)] = 60.0
+    duration_s: Annotated[float, Ge(0.0), Le(MAX_RECORDING_S)] = 60.0
     """From now on; 0: nothing of what comes."""
 
-    before_s: Annotated[float, Ge(0.0), Le(LONGEST_S)] = 0.0
+    before_s: Annotated[float, Ge(0.0), Le(MAX_RECORDING_S)] = 0.0
     """Duration of earlier telemetry to include, as far as the service holds it: 60 s unless the
     settings say otherwise."""
 
@@ -241,7 +241,7 @@ class TelemetryRecorder:
         """End recordings in their time until cancelled, and the last one then."""
         try:
             while True:
-                await asyncio.sleep(LOOK_S)
+                await asyncio.sleep(PROGRESS_CHECK_INTERVAL_S)
                 await self._end_if_due()
         finally:
             if self._recorder is not None:
@@ -270,15 +270,15 @@ class TelemetryRecorder:
             return ""
         if recorder.trouble:
             return recorder.trouble
-        if recorder.n_bytes > LARGEST_GB * GIGABYTE:
-            return f"it holds {LARGEST_GB:g} GB, the most there may be"
+        if recorder.n_bytes > MAX_RECORDING_GB * GIGABYTE:
+            return f"it holds {MAX_RECORDING_GB:g} GB, the most there may be"
         return self._full()
 
 
 # --- a sample every few seconds, for a chart of the whole night
 
 
-LOOKED_AT = 100
+N_RESIDUAL_FRAMES = 100
 """Frames of which the residual is taken: a tenth of a second at 1 kHz."""
 
 
@@ -370,7 +370,7 @@ def sample_of(
 
 def residual_of(frames: FrameBlock, matrix: NDArray[np.float32]) -> float | None:
     """Return what a reconstructor reads in the last of these slopes, metres RMS over its modes."""
-    slopes = frames.slopes[-LOOKED_AT:]
+    slopes = frames.slopes[-N_RESIDUAL_FRAMES:]
     if slopes.shape[1] != matrix.shape[1]:
         return None
     modes_m = slopes @ matrix.T

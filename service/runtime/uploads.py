@@ -27,19 +27,25 @@ from service.files.fit_folder import DOCUMENT, FIGURES, STAGE, UPLOAD, FitReques
 FITS_KEPT = 50
 """Finished fits that are remembered."""
 
-STALL_S = 30.0
+MAX_UPLOAD_STALL_S = 30.0
 """Longest time without progress of an upload."""
 
-PATIENCE_S = 30.0
+MAX_UPLOAD_DELAY_S = 30.0
 """Tolerated delay of an upload relative to the slowest permitted rate, seconds."""
 
-SLOWEST_BYTES_S = 200_000
+MIN_UPLOAD_RATE_BYTES_S = 200_000
 """Least pace of an upload, bytes a second: one that trickles would hold a place for ever."""
 
-_BLOCK = 1 << 20
+_BLOCK_BYTES = 1 << 20
 """Bytes written to the disk at once."""
 
-_BEGINS = (b"\x89HDF\r\n\x1a\n", b"SIMPLE  =", b"\x1f\x8b", files.NUMPY_BEGINS, b"PK\x03\x04")
+_FILE_SIGNATURES = (
+    b"\x89HDF\r\n\x1a\n",
+    b"SIMPLE  =",
+    b"\x1f\x8b",
+    files.NUMPY_BEGINS,
+    b"PK\x03\x04",
+)
 """First bytes of HDF5, FITS, anything gzipped, NumPy, and zip."""
 
 
@@ -210,18 +216,18 @@ class FitQueue:
         n_bytes: int | None,
         name: str = "",
     ) -> FitJob:
-        """Keep an upload and queue its fit, under a ``name``.
+        """Store an upload and queue its fit, under a ``name``.
 
         Raises
         ------
         TooLargeError
-            If it is beyond the limit; before it is read where its length ``n_bytes`` is told.
+            If it exceeds the limit; before it is read if its length ``n_bytes`` is given.
         TooSlowError
-            If it stands still, or trickles.
+            If it stalls, or is too slow.
         BusyError
             If too many wait already.
         MatrixError
-            If it stops half-way, or is no file a matrix could be in.
+            If it is incomplete, or no type of file that can hold a matrix.
         """
         self._check_room(n_bytes)
         job = self._remember(name)
@@ -284,7 +290,7 @@ class FitQueue:
             if n_bytes > self._limits.max_bytes:
                 raise _too_large("more", self._limits.max_bytes)
             block += chunk
-            if len(block) >= _BLOCK:
+            if len(block) >= _BLOCK_BYTES:
                 await flush()
         await flush()
         if n_bytes == 0:
@@ -340,25 +346,29 @@ async def _in_time(body: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
     """Yield the chunks of a body for as long as they keep coming, and fast enough."""
     began_s, n_bytes = time.monotonic(), 0
     while True:
-        left_s = PATIENCE_S + n_bytes / SLOWEST_BYTES_S - (time.monotonic() - began_s)
+        left_s = (
+            MAX_UPLOAD_DELAY_S + n_bytes / MIN_UPLOAD_RATE_BYTES_S - (time.monotonic() - began_s)
+        )
         try:
-            async with asyncio.timeout(min(left_s, STALL_S)):
+            async with asyncio.timeout(min(left_s, MAX_UPLOAD_STALL_S)):
                 chunk = await anext(body)
         except StopAsyncIteration:
             return
         except TimeoutError as error:
-            if left_s > STALL_S:
-                raise errors.TooSlowError(f"upload: nothing came for {STALL_S:g} s") from error
+            if left_s > MAX_UPLOAD_STALL_S:
+                raise errors.TooSlowError(
+                    f"upload: nothing came for {MAX_UPLOAD_STALL_S:g} s"
+                ) from error
             raise errors.TooSlowError(
                 f"upload: found {n_bytes} bytes in {time.monotonic() - began_s:.0f} s, expected at "
-                f"least {SLOWEST_BYTES_S / 1e6:g} MB a second"
+                f"least {MIN_UPLOAD_RATE_BYTES_S / 1e6:g} MB a second"
             ) from error
         n_bytes += len(chunk)
         yield chunk
 
 
 def _check_kind(first: bytes) -> None:
-    if not first.startswith(_BEGINS):
+    if not first.startswith(_FILE_SIGNATURES):
         raise errors.MatrixError(
             f"upload: found a body that begins with {first[:8]!r}, expected an HDF5, FITS, NumPy "
             "or zip file (curl -X POST -T FILE)"
@@ -375,16 +385,16 @@ def _too_large(found: str, max_bytes: int) -> errors.TooLargeError:
 
 
 async def run_program(words: Sequence[str], *, limit_s: float) -> None:
-    """Run a program to its end; it is ended when the time is over, or nobody waits for it.
+    """Run a program to its end; it is ended after the time limit or on cancellation.
 
-    It holds the other end of its standard input: one that reads it sees when the service ends,
-    however that does. Ctrl-C in the service's terminal does not reach it.
+    This process holds the other end of its standard input: a program that reads it sees the end of
+    the service, however it comes. Ctrl-C in the service's terminal does not reach it.
 
     Raises
     ------
     WorkerError
         If it cannot be started, dies, takes longer than ``limit_s``, or ends with another status
-        than 0: what it said last on standard error.
+        than 0; the message is its last line on standard error.
     """
     try:
         process = await asyncio.create_subprocess_exec(

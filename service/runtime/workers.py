@@ -26,23 +26,23 @@ from service.tracking.state import TrackerState
 P = ParamSpec("P")
 R = TypeVar("R")
 
-STILL_S = 5.0
+STALL_REPORT_S = 5.0
 """A worker that has taken no processor time for so long is named,"""
 
-HUNG_S = 15.0
+STALL_KILL_S = 15.0
 """and for so long, killed: one of the lowest priority gets a hundredth of a loaded core."""
 
-UNKNOWN_LIMIT_S = 900.0
+FIRST_JOB_LIMIT_S = 900.0
 """Processor time of a job of which none has been done yet; ten times the largest telescopes'."""
 
-MIN_LIMIT_S = 60.0
-LIMIT_RATIO = 20.0
+MIN_JOB_LIMIT_S = 60.0
+JOB_LIMIT_RATIO = 20.0
 """Processor time of a job, over the longest one of its kind so far."""
 
-ATTEMPTS = 3
+MAX_JOB_ATTEMPTS = 3
 """Workers that may die while the model is prepared before the service gives up."""
 
-LOOK_S = 0.5
+WORKER_CHECK_INTERVAL_S = 0.5
 """Interval between two checks of a worker's processor time."""
 
 
@@ -123,7 +123,7 @@ class WorkerPool:
         ------
         WorkerError
             If the worker process died, or hung and was killed, and a new one is there for the next
-            job; or if the job failed in a way nobody foresaw, which must not end the service.
+            job; or if the job raised an unexpected exception, which must not end the service.
         """
         work = partial(run_job, job, *args, **kwargs)
         if self._owner is asyncio.current_task():
@@ -177,7 +177,7 @@ class WorkerPool:
         self.problem = ""
         self.cluster_problem = done.cluster_problem
         self._longest_s[name] = max(self._longest_s[name], done.cpu_s)
-        self._limit_s[name] = max(MIN_LIMIT_S, LIMIT_RATIO * self._longest_s[name])
+        self._limit_s[name] = max(MIN_JOB_LIMIT_S, JOB_LIMIT_RATIO * self._longest_s[name])
         return done
 
     async def _watched(self, name: str, worker: Worker, under_way: asyncio.Future[Done[R]]) -> None:
@@ -186,19 +186,19 @@ class WorkerPool:
         Raises
         ------
         TimeoutError
-            If the worker stands still, or takes far more than such a job ever has.
+            If the worker has stopped, or takes far longer than such a job ever has.
         """
         begun_cpu_s = last_cpu_s = worker.cpu_s()
-        moved_s, limit_s = time.monotonic(), self._limit_s.get(name, UNKNOWN_LIMIT_S)
-        while not (await asyncio.wait({under_way}, timeout=LOOK_S))[0]:
+        moved_s, limit_s = time.monotonic(), self._limit_s.get(name, FIRST_JOB_LIMIT_S)
+        while not (await asyncio.wait({under_way}, timeout=WORKER_CHECK_INTERVAL_S))[0]:
             cpu_s, now_s = worker.cpu_s(), time.monotonic()
             self._under_way = (name, cpu_s - begun_cpu_s)
             if cpu_s != last_cpu_s:
                 last_cpu_s, moved_s, self.problem = cpu_s, now_s, ""
             still_s = now_s - moved_s
-            if still_s >= STILL_S:
+            if still_s >= STALL_REPORT_S:
                 self.problem = f"the worker has stood still for {still_s:.0f} s in {name}"
-            if still_s >= HUNG_S:
+            if still_s >= STALL_KILL_S:
                 raise TimeoutError(self.problem)
             if cpu_s - begun_cpu_s > limit_s:
                 self._limit_s[name] = 2 * limit_s  # a telescope where it takes so long
@@ -212,14 +212,14 @@ class WorkerPool:
 
 
 async def with_another_worker(job: Callable[[], Awaitable[R]], lost: Callable[[str], None]) -> R:
-    """Return what a job brings, done again where the worker has died of it; ``lost`` hears why.
+    """Return the result of a job, repeated if its worker died; ``lost`` is called with the reason.
 
     Raises
     ------
     WorkerError
         If several have died of it.
     """
-    for _ in range(ATTEMPTS - 1):
+    for _ in range(MAX_JOB_ATTEMPTS - 1):
         try:
             return await job()
         except WorkerError as error:
@@ -238,24 +238,24 @@ def _run(
 # --- how the work keeps pace with the telemetry: what it costs, and what is said where it does not
 
 
-MEMORY_S = 60.0
+LOAD_AVERAGING_TIME_S = 60.0
 """Duration of the load average."""
 
-ENOUGH_S = 20.0
+MIN_LOAD_HISTORY_S = 20.0
 """Time before which the worker is not reported as late: a matrix is being made meanwhile."""
 
-LATE_WINDOWS = 3
+N_LATE_WINDOWS = 3
 """Windows that came before the worker had a hand free for the one before them, to be behind;"""
 
-FULLY_BUSY, AT_EASE = 0.8, 0.65
+OVERLOAD_SHARE, RELIEF_SHARE = 0.8, 0.65
 """and the share of the time in which it has a job: above the first it is behind, and below the
 second, or with no late window in a minute, it is not any more."""
 
-STARVED = 0.6
+MIN_PROCESSOR_SHARE = 0.6
 """Processor time of the worker over the time it is at work: with less the machine is loaded."""
 
 
-JOB = "job "
+JOB_PREFIX = "job "
 """Prefix of a job's name in the counters."""
 
 
@@ -285,7 +285,10 @@ class WorkerLoadMeter:
         """Record the present load and return the average."""
         now = self._mark()
         self._marks.append(now)
-        while len(self._marks) > 2 and now["clock_s"] - self._marks[1]["clock_s"] >= MEMORY_S:
+        while (
+            len(self._marks) > 2
+            and now["clock_s"] - self._marks[1]["clock_s"] >= LOAD_AVERAGING_TIME_S
+        ):
             self._marks.popleft()
         return self.worker_load
 
@@ -295,7 +298,11 @@ class WorkerLoadMeter:
         spent = self._spent()
         lasted_s, telemetry_s = max(spent["clock_s"], 1e-9), spent["telemetry_s"]
         fitted = spent["fitted"]
-        jobs = {key.removeprefix(JOB): s for key, s in spent.items() if key.startswith(JOB)}
+        jobs = {
+            key.removeprefix(JOB_PREFIX): s
+            for key, s in spent.items()
+            if key.startswith(JOB_PREFIX)
+        }
         per_s = {name: s / telemetry_s for name, s in jobs.items() if s > 0} if telemetry_s else {}
         return WorkerLoad(
             worker_per_s=sum(per_s.values()) if telemetry_s else None,
@@ -324,20 +331,20 @@ class WorkerLoadMeter:
 
     def _why_behind(self) -> str:
         load, spent = self.worker_load, self._spent()
-        if spent["clock_s"] < ENOUGH_S or load.busy_ratio is None:
+        if spent["clock_s"] < MIN_LOAD_HISTORY_S or load.busy_ratio is None:
             return ""
         if self._behind:
-            self._behind = load.busy_ratio > AT_EASE and load.windows_late > 0
+            self._behind = load.busy_ratio > RELIEF_SHARE and load.windows_late > 0
         else:
-            self._behind = load.busy_ratio > FULLY_BUSY and load.windows_late >= LATE_WINDOWS
+            self._behind = load.busy_ratio > OVERLOAD_SHARE and load.windows_late >= N_LATE_WINDOWS
         if not self._behind:
             return ""
         most = ", ".join(f"{name} {share:.2f}" for name, share in list(load.by_job.items())[:3])
-        got = sum(s for key, s in spent.items() if key.startswith(JOB))
+        got = sum(s for key, s in spent.items() if key.startswith(JOB_PREFIX))
         share = got / max(spent["busy_s"], 1e-9)
         cause = (
             f"the machine is loaded: of a second at work it gets {share:.1f} s of a processor"
-            if share < STARVED
+            if share < MIN_PROCESSOR_SHARE
             else "the machine is too slow for this instrument"
         )
         return (
@@ -349,7 +356,7 @@ class WorkerLoadMeter:
 
     def _mark(self) -> defaultdict[str, float]:
         """Return all counters as they are now."""
-        jobs = {f"{JOB}{name}": s for name, s in self._workers.cpu_s.items()}
+        jobs = {f"{JOB_PREFIX}{name}": s for name, s in self._workers.cpu_s.items()}
         clocks = {"clock_s": time.monotonic(), "service_s": time.process_time()}
         busy = {"busy_s": self._workers.busy_s}
         return defaultdict(float, self._counted | jobs | clocks | busy)

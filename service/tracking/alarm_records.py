@@ -25,7 +25,7 @@ from service.tracking.policy import SECOND_NS
 from service.tracking.state import Orders, TrackerState
 from service.tracking.step_context import StepContext
 
-RAISED_AGAIN_S = 60.0
+RESTART_GRACE_S = 60.0
 """Time after a restart of the service for an active alarm to be raised again."""
 
 
@@ -169,7 +169,7 @@ def _without_alarm(context: StepContext, record: AlarmRecord, *, ordered: bool) 
         )
         return replace(record, over_ns_utc=context.now_ns, text=last)
     waited_ns = context.now_ns - record.over_ns_utc
-    if record.acknowledged is not None and waited_ns > RAISED_AGAIN_S * SECOND_NS:
+    if record.acknowledged is not None and waited_ns > RESTART_GRACE_S * SECOND_NS:
         return _blank(record)
     return record
 

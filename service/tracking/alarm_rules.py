@@ -28,7 +28,7 @@ from service.tracking import (
 )
 from service.tracking import commands as cmd
 from service.tracking.alarms import ALARMS, RULE_PREFIX, AlarmDefinition, Severity
-from service.tracking.dither_request import GONE_WITHIN_S
+from service.tracking.dither_request import MAX_STOP_DELAY_S
 from service.tracking.operation_records import AcquisitionStage
 from service.tracking.operations.acquisition_stages import missed_enough
 from service.tracking.operations.probation import opening_text
@@ -37,7 +37,7 @@ from service.tracking.products import MatrixState
 from service.tracking.state import ObservatoryValue, TrackerState
 from service.tracking.step_context import StepContext
 
-RENEWED_S = 15.0
+LINK_ALARM_TIMEOUT_S = 15.0
 """An alarm that the link repeats while it lasts is over after this much silence."""
 
 
@@ -149,12 +149,12 @@ def _not_stopped(context: StepContext) -> str | None:
     rtc, memory = context.rtc, context.dither_policy
     if rtc is None or memory.unwanted_id is None or rtc.dither_id != memory.unwanted_id:
         return None
-    if context.now_ns - memory.stopped_ns_utc < GONE_WITHIN_S * SECOND_NS:
+    if context.now_ns - memory.stopped_ns_utc < MAX_STOP_DELAY_S * SECOND_NS:
         return None
     why = dither_plan.why_too_strong(context, rtc) or dither_plan.why_unwanted(context, rtc)
     return why and (
         f"{why}, and the RTC goes on playing {memory.unwanted_id}: it is asked every "
-        f"{dither.TELL_EVERY_S:.0f} s to stop it; stop it at the RTC"
+        f"{dither.STOP_REQUEST_INTERVAL_S:.0f} s to stop it; stop it at the RTC"
     )
 
 
@@ -235,7 +235,10 @@ def _is_given_up(context: StepContext) -> bool:
 def _is_repeated(name: str) -> Callable[[StepContext], bool]:
     def repeated(context: StepContext) -> bool:
         alarm = context.state.alarm(name)
-        return alarm is not None and context.now_ns - alarm.seen_ns_utc <= RENEWED_S * SECOND_NS
+        return (
+            alarm is not None
+            and context.now_ns - alarm.seen_ns_utc <= LINK_ALARM_TIMEOUT_S * SECOND_NS
+        )
 
     return repeated
 
@@ -299,14 +302,14 @@ def _own_definition(rule: Rule) -> AlarmDefinition:
 
 
 def set_value(context: StepContext, command: cmd.SetValue) -> None:
-    """Take a value that is asked for; it counts for as long as was said.
+    """Store a value that the observatory reports, for the stated validity time.
 
     Raises
     ------
     CommandError
-        If it is of another kind than whoever asks for it expects.
+        If its type differs from that of the rule or pointing law that uses it.
     UnknownIdError
-        If neither a rule nor the law of pointing asks for it.
+        If neither a rule nor the pointing law uses it.
     """
     asked = _values_asked_for(context)
     if command.name not in asked:

@@ -84,7 +84,7 @@ class Interlock(StrEnum):
     """Rely on the loop: after some seconds the service acquires by itself."""
 
     SEND_NEW = auto()
-    """Send a matrix that was never in use, whoever approves it; acquisitions need this."""
+    """Send a matrix that was never in use, with or without an approval; acquisitions need this."""
 
     SEND_KNOWN = auto()
     """Send one that has been in use before: a rollback."""
@@ -131,10 +131,10 @@ class Prerequisite:
     """Machine-readable."""
 
     responsible: Responsible
-    """Who can end it."""
+    """Party that can end the wait."""
 
     text: str
-    """What is missing, and what to do."""
+    """Missing prerequisite, and the remedy."""
 
     blocks: bool = False
     """True if the service can do none of its work meanwhile."""
@@ -149,7 +149,7 @@ class AlarmDefinition:
     """Meaning of the alarm."""
 
     do: str
-    """What an operator does about it."""
+    """Action for the operator."""
 
     blocks: frozenset[Interlock] = frozenset()
 
@@ -157,7 +157,7 @@ class AlarmDefinition:
     """Cause in the past tense, for the reason of a refusal; empty if it refuses nothing."""
 
     responsible: Responsible | None = None
-    """Who can end it, if the service waits for it although it may forbid nothing."""
+    """Party that can end the wait, if the service waits for it although it may forbid nothing."""
 
     origin: str = "settings"
     """File of the service that finds it; ``settings``: a rule of the operators' own."""
@@ -170,7 +170,7 @@ class Alarm:
     name: str
     since_ns_utc: int
     text: str
-    """What was found, and what to do."""
+    """Finding, and the remedy."""
 
     seen_ns_utc: int = 0
     """Time of the last detection."""

@@ -22,10 +22,10 @@ from service.wire import DitherKind, Pattern, Pointing
 MAX_SINES = 64
 MAX_MODES = 100_000
 MAX_GROUPS = 1000
-LONGEST_NOISY_S = 3600.0
-LONGEST_MUTE_S = 43_200.0
-LONGEST_VALUE_S = 86_400.0
-LONGEST_TEXT = 200
+MAX_NOISY_MEASUREMENT_S = 3600.0
+MAX_MUTE_S = 43_200.0
+MAX_VALUE_LIFETIME_S = 86_400.0
+MAX_TEXT_LENGTH = 200
 
 Value = bool | float | str
 """Type of a value that operators' own alarm rules compare."""
@@ -51,7 +51,7 @@ class Instruction:
     """Reason of the order, for the audit trail."""
 
     by: Annotated[str, MaxLen(100)] = ""
-    """Name of whoever gives the order; empty if only the address is known."""
+    """Name of the person who gives the order; empty if only the address is known."""
 
     def __post_init__(self) -> None:
         """Refuse what would act on the terminal it is shown on.
@@ -239,7 +239,7 @@ class NoisyChoice(RandomSigns):
     modes: BasisModes | ModeSet = ModeSet.CONTROLLED
     """0-based basis indices, none twice, or "controlled" or "all"."""
 
-    duration_s: Annotated[float, Gt(0.0), Le(LONGEST_NOISY_S)] | None = None
+    duration_s: Annotated[float, Gt(0.0), Le(MAX_NOISY_MEASUREMENT_S)] | None = None
     """Duration of telemetry by the RTC's time, seconds."""
 
     @override
@@ -279,15 +279,15 @@ class ReportedValue(Instruction):
     value: Value
     """A number, a text, or true or false, as the rule compares it."""
 
-    for_s: Annotated[float, Gt(0.0), Le(LONGEST_VALUE_S)] = 60.0
+    for_s: Annotated[float, Gt(0.0), Le(MAX_VALUE_LIFETIME_S)] = 60.0
     """Duration for which the value is valid, seconds. Afterwards it is unknown until it is reported
     again."""
 
     @override
     def __post_init__(self) -> None:
         Instruction.__post_init__(self)
-        if isinstance(self.value, str) and len(self.value) > LONGEST_TEXT:
-            raise ValueError(f"a text of at most {LONGEST_TEXT} characters")
+        if isinstance(self.value, str) and len(self.value) > MAX_TEXT_LENGTH:
+            raise ValueError(f"a text of at most {MAX_TEXT_LENGTH} characters")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -433,7 +433,7 @@ class AcknowledgeAlarm(SeenAlarm):
 class MuteTime(Instruction):
     """Duration for which an alarm is muted."""
 
-    for_s: Annotated[float, Gt(0.0), Le(LONGEST_MUTE_S)]
+    for_s: Annotated[float, Gt(0.0), Le(MAX_MUTE_S)]
     """Seconds, at most twelve hours."""
 
 

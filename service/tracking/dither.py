@@ -37,33 +37,33 @@ from service.tracking.state import Level, TrackerState
 from service.tracking.step_context import StepContext
 from service.wire import DitherRequest, DitherStatus, DitherStop, Reply, Status
 
-MEASURED = 1.1
+MAX_MEASURED_AMPLITUDE_RATIO = 1.1
 """Tolerated ratio of the amplitude measured in a second of frames to the permitted one."""
 
-CALM_S = 60.0
+FAILED_DITHER_PAUSE_S = 60.0
 """Pause after a dither that was too strong or had no response, before another is tried."""
 
-TELL_EVERY_S = 2.0
+STOP_REQUEST_INTERVAL_S = 2.0
 
-SILENT_S = 1.0
+MISSING_DITHER_ALARM_S = 1.0
 """Duration of frames without the dither after which it is reported missing."""
 
-PATIENCE_S = 1.5
+FIRST_DITHER_RETRY_S = 1.5
 """Duration of frames without the dither after which another is requested; doubled each time, for an
 RTC that begins late."""
 
-LONGEST_PATIENCE_S = 60.0
+MAX_DITHER_RETRY_S = 60.0
 
-SOON_OVER_S = 2.0
+MIN_STOPPED_REMAINDER_S = 2.0
 """A dither that ends by itself within this time is not stopped by a command."""
 
-STOPPED_WITHIN_S = 5.0
+STOP_TIMEOUT_S = 5.0
 """An RTC still playing a dither so long after it was asked to stop does not stop dithers."""
 
-MEMORY_S = 600.0
+COST_AVERAGING_TIME_S = 600.0
 """Averaging time of the cost that is displayed."""
 
-_ON_ITS_WAY_S = 2.0
+_STATUS_DELAY_S = 2.0
 """Time for a status made before the dither began to arrive, if it has no frame number."""
 
 
@@ -179,7 +179,7 @@ def follow_status(context: StepContext, rtc: Status) -> None:
         return
     elapsed_s = (context.now_ns - dither.asked_ns_utc) / SECOND_NS
     if rtc.seq is None:
-        begun, played_s = elapsed_s > _ON_ITS_WAY_S, elapsed_s
+        begun, played_s = elapsed_s > _STATUS_DELAY_S, elapsed_s
     else:
         begun = rtc.seq >= dither.start_seq
         played_s = (rtc.seq - dither.start_seq) / rtc.frame_rate_hz
@@ -187,7 +187,7 @@ def follow_status(context: StepContext, rtc: Status) -> None:
         return
     asked_to_stop = dither.id == context.dither_policy.stopped_id
     # a status a second old may be the first to show the end
-    if asked_to_stop or played_s >= dither.request.duration_s - SILENT_S:
+    if asked_to_stop or played_s >= dither.request.duration_s - MISSING_DITHER_ALARM_S:
         _set_policy(context, replace(context.dither_policy, ended_ns_utc=context.now_ns))
         _set_dither(context, None)
         context.clear_alarm(alarms.DITHER_LOST)
@@ -252,7 +252,7 @@ def why_too_strong(context: StepContext, event: ev.DitherMeasured) -> str | None
         return None
     _set_policy(context, replace(context.dither_policy, amiss_id=event.id, amiss_m=event.found_m))
     most_m = dither_plan.budget_m(rtc, context.policy)
-    if event.found_m > MEASURED * max(event.asked_m, most_m):
+    if event.found_m > MAX_MEASURED_AMPLITUDE_RATIO * max(event.asked_m, most_m):
         return f"{event.text}; the budget is {1e9 * most_m:.3g} nm"
     context.raise_alarm(alarms.NOT_AS_ASKED, f"{event.text}; check the RTC's dither")
     return None
@@ -269,9 +269,12 @@ def stop_too_strong(context: StepContext, dither_id: str, loud: str) -> None:
 def stop_unanswered(context: StepContext, text: str) -> None:
     """End a dither that the slopes do not answer, and try another in a while."""
     if context.dither is not None:
-        ended = f"{context.dither.id} was ended, and another is tried after {CALM_S:.0f} s"
+        ended = (
+            f"{context.dither.id} was ended, and another is tried after "
+            f"{FAILED_DITHER_PAUSE_S:.0f} s"
+        )
         context.raise_alarm(alarms.MIRROR_SILENT, f"the mirror does not answer: {text}; {ended}")
-        context.put_off(dither_s=CALM_S)
+        context.put_off(dither_s=FAILED_DITHER_PAUSE_S)
         stop_running_dither(context)
 
 
@@ -286,7 +289,10 @@ def stop_unwanted(context: StepContext, rtc: Status) -> None:
         _note_unwanted(context, running)
         if loud is not None:
             _raise_over_budget(context, running, loud)
-    if context.now_ns - context.dither_policy.stop_asked_ns_utc >= TELL_EVERY_S * SECOND_NS:
+    if (
+        context.now_ns - context.dither_policy.stop_asked_ns_utc
+        >= STOP_REQUEST_INTERVAL_S * SECOND_NS
+    ):
         stop_unfollowed(context)
 
 
@@ -307,7 +313,7 @@ def _set_policy(context: StepContext, policy: DitherPolicyState) -> None:
 def _begin(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
     """Ask for a dither if it is time, and nothing left behind is in its way."""
     loud_ns = context.dither_policy.loud_ns_utc
-    if loud_ns and context.now_ns < loud_ns + round(CALM_S * SECOND_NS):
+    if loud_ns and context.now_ns < loud_ns + round(FAILED_DITHER_PAUSE_S * SECOND_NS):
         _set_phase(context, DitherPhase.OFF, "the RTC has played the last one too strong")
         return
     if context.now_ns < context.dithers.no_dither_before_ns_utc:
@@ -354,12 +360,12 @@ def _end_when_done(context: StepContext, rtc: Status, dither: Dither, wanted: Wa
     """Stop a dither that has done its work, or is no longer the one to ask for."""
     left_s = dither.request.duration_s - (context.now_ns - dither.asked_ns_utc) / SECOND_NS
     was_stopped = dither.id == context.dither_policy.stopped_id
-    if dither.start_seq is None or left_s < SOON_OVER_S or was_stopped:
+    if dither.start_seq is None or left_s < MIN_STOPPED_REMAINDER_S or was_stopped:
         return
     registration = context.registration
     seen = registration is not None and registration.window_ns_utc > dither.asked_ns_utc
     pause_s = (wanted.next_ns_utc - context.now_ns) / SECOND_NS
-    done = seen and wanted.phase is DitherPhase.SPARSE and pause_s >= dither_plan.SHORTEST_PAUSE_S
+    done = seen and wanted.phase is DitherPhase.SPARSE and pause_s >= dither_plan.MIN_DITHER_PAUSE_S
     weak = (
         wanted.phase is DitherPhase.ACQUIRE
         and 2.0 * total_m(dither.request) < wanted.parameters.total_m
@@ -383,10 +389,13 @@ def _adopt(context: StepContext, rtc: Status) -> bool:
     if rtc.dither is None or rtc.dither_id == context.dithers.lost:
         return False
     running, begun_seq, dithering = rtc.dither.request, rtc.dither.start_seq, context.dither_policy
-    over = is_own_sine(running) and total_m(running) > dither_plan.ROUNDING * dithering.budget_m
+    over = (
+        is_own_sine(running)
+        and total_m(running) > dither_plan.AMPLITUDE_ROUNDING_RATIO * dithering.budget_m
+    )
     asked_to_stop = running.id == dithering.stopped_id
     # a recorded night stops nothing: what it goes on playing is read all the same
-    heard_ns = dithering.stopped_ns_utc + round(STOPPED_WITHIN_S * SECOND_NS)
+    heard_ns = dithering.stopped_ns_utc + round(STOP_TIMEOUT_S * SECOND_NS)
     if context.now_ns < heard_ns if asked_to_stop else over:
         return False
     for window_s in dither_plan.window_lengths_s(context.policy):
@@ -413,7 +422,7 @@ def _update_cost(context: StepContext, rtc: Status) -> None:
     playing = dither if followed else rtc.dither
     power = 0.0 if playing is None else total_m(playing.request) ** 2
     since_ns = context.now_ns if dithering.seen_ns_utc is None else dithering.seen_ns_utc
-    share = -np.expm1(-max(context.now_ns - since_ns, 0) / (MEMORY_S * SECOND_NS))
+    share = -np.expm1(-max(context.now_ns - since_ns, 0) / (COST_AVERAGING_TIME_S * SECOND_NS))
     passive_ns = dithering.passive_ns_utc
     windows_ns = 0 if registration is None else registration.window_ns_utc
     if registration is not None and windows_ns and registration.arrived_ns_utc > windows_ns:
@@ -447,7 +456,9 @@ def _take_over_played(context: StepContext, asked: Dither, shown: DitherStatus) 
     if running == asked:
         return
     plays, wanted = running.request, asked.request
-    if total_m(plays) > dither_plan.ROUNDING * max(total_m(wanted), context.dither_policy.budget_m):
+    if total_m(plays) > dither_plan.AMPLITUDE_ROUNDING_RATIO * max(
+        total_m(wanted), context.dither_policy.budget_m
+    ):
         _set_policy(context, replace(context.dither_policy, loud_id=running.id, loud_text=""))
     text = (
         f"{asked.id}: the RTC plays modes {plays.modes}, {running.frequency_hz} Hz, "
@@ -466,7 +477,7 @@ def _note_lost(context: StepContext, dither: Dither, text: str) -> None:
 
 
 def _patience_s(state: TrackerState) -> float:
-    return min(PATIENCE_S * 2.0**state.dithers.losses, LONGEST_PATIENCE_S)
+    return min(FIRST_DITHER_RETRY_S * 2.0**state.dithers.losses, MAX_DITHER_RETRY_S)
 
 
 def _note_stop(context: StepContext, dither_id: str) -> None:
@@ -493,7 +504,8 @@ def _note_unwanted(context: StepContext, running: str) -> None:
 
 def _raise_over_budget(context: StepContext, running: str, loud: str) -> None:
     text = (
-        f"{loud}: it was asked to stop {running}, and another is tried after {CALM_S:.0f} s; look "
+        f"{loud}: it was asked to stop {running}, and another is tried after "
+        f"{FAILED_DITHER_PAUSE_S:.0f} s; look "
         "at the RTC's dither, or stop the dither to do without"
     )
     _set_policy(context, replace(context.dither_policy, loud_ns_utc=context.now_ns))

@@ -23,23 +23,23 @@ LINE_RANGE = (0.2, 0.35)
 _OPTICAL_GAINS = (0.25, 0.5, 0.75, 1.0)
 """Optical gains that a loop on sky may have; unknown when a dither is planned."""
 
-PROVING_RANGE = (0.15, 0.45)
+PROVING_LINE_RANGE = (0.15, 0.45)
 """The same of the many lines that show how modes answer: what wind does to a slow one is little of
 its size."""
 
-_MANY_LINES = np.linspace(*PROVING_RANGE, 100)
+_MANY_LINES = np.linspace(*PROVING_LINE_RANGE, 100)
 
 
 def chosen_modes(
     rtc: Status, policy: Policy, shunned: frozenset[int] = frozenset()
 ) -> tuple[int, ...]:
-    """Return the modes to dither: the settings' own, or the best for α.
+    """Return the modes to dither: those in the settings, or the best for α.
 
-    These are four above the controlled modes. Where fewer are left they are four of the highest
-    ``N_MODES_ABOVE_LOOP``, in the loop or not: the last of a basis tell little of a rotation, and
-    answer least as the model says. Until the model is known they are spread evenly, or the last
-    four. None is ``shunned``, which answers otherwise than the model says, but where there is no
-    choice.
+    These are four above the controlled modes. If fewer are left they are four of the highest
+    ``N_MODES_ABOVE_LOOP``, in the loop or not: the last modes of a basis contain little information
+    on a rotation, and their response deviates most from the model. Until the model is available
+    they are spread evenly, or the last four. ``shunned`` modes, whose response disagrees with the
+    model, are used only if there are no others.
     """
     fixed = _without_choice(rtc, policy, shunned)
     if fixed is not None:
@@ -78,9 +78,9 @@ def expected_amplification(rtc: Status, policy: Policy, chosen: tuple[int, ...] 
 
 
 def why_elsewhere(request: DitherRequest, rtc: Status, policy: Policy) -> str:
-    """Return why a dither of the service's should go to modes that are still free; empty: it stays.
+    """Return why a dither of the service should move to modes that are still free, or "".
 
-    More modes may be controlled than when it was asked for.
+    More modes may be controlled now than when it was requested.
     """
     inside = controlled(request.modes, rtc)
     if not inside:

@@ -15,7 +15,7 @@ from service.control.dither import (
     look_up_precision,
 )
 from service.estimation.loop import why_open
-from service.estimation.windows import SETTLING_S
+from service.estimation.windows import DITHER_SETTLING_S
 from service.tracking import mode_proof
 from service.tracking.alarms import Interlock
 from service.tracking.dither_modes import (
@@ -25,9 +25,9 @@ from service.tracking.dither_modes import (
     why_elsewhere,
 )
 from service.tracking.dither_request import (
+    DITHER_MARGIN_S,
     OUR_DITHERS,
     OWN_DITHER,
-    SPARE_S,
     Dither,
     DitherParameters,
     DitherPhase,
@@ -45,60 +45,64 @@ from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext
 from service.wire import Status
 
-MIN_WINDOWS = 3
-"""Windows that must agree before the dither is less than the whole budget, or pauses."""
+MIN_WINDOWS_FOR_PAUSE = 3
+"""Windows that must agree before the dither uses less than the whole budget, or pauses."""
 
-LASTING_S = 30.0
-"""Of a request without pause: no longer does a dead service leave a dither behind."""
+MAX_DITHER_DURATION_S = 30.0
+"""Longest dither requested at once, so that a dither ends soon after a crashed service."""
 
-SHORTEST_PAUSE_S = 3.0
-"""A shorter one is not worth the settling of the next dither."""
+MIN_DITHER_PAUSE_S = 3.0
+"""Shortest pause between dithers: a shorter one saves less than the next dither's settling takes.
+"""
 
-PASSIVE_WITHIN_S = 25.0
-"""A passive estimate younger than this is watching: two of its looks, and some."""
+MAX_PASSIVE_AGE_S = 25.0
+"""Largest age of a passive estimate that still counts as monitoring: a little more than two of its
+intervals."""
 
 FAINT_MAGNITUDE = 11.5
 FAINT_WINDOW_S = 5.0
 """On a faint star a shorter window biases the rotation (0.08 deg at magnitude 12.5 in 1 s)."""
 
-WINDOW_LADDER = (1.0, 2.5, 5.0, 10.0)
+WINDOW_LENGTH_RATIOS = (1.0, 2.5, 5.0, 10.0)
 """Lengths of windows, in units of the shortest."""
 
-SITTING_LADDER = (1, 2, 3, 5, 8, 12)
+WINDOWS_PER_DITHER = (1, 2, 3, 5, 8, 12)
 """Windows in one sitting."""
 
-USABLE = np.array([0.03, 0.03, np.deg2rad(0.04), 0.003])
+MAX_UNBIASED_SIGMA = np.array([0.03, 0.03, np.deg2rad(0.04), 0.003])
 """1 σ of one window above which its fit may be biased by noise by more than a loop of FLAO
 notices, numeric units."""
 
-CHANGE = 1.25
-"""The amplitude stays while the best one is within this factor of it."""
+AMPLITUDE_HYSTERESIS_RATIO = 1.25
+"""Ratio of the best amplitude to the present one within which the present one is kept."""
 
-JUMP = np.array([0.1, 0.1, np.deg2rad(0.1), np.inf])
-"""What two windows must tell when it happens at once (numeric units): a tenth of a subaperture, a
+MIN_DETECTED_JUMP = np.array([0.1, 0.1, np.deg2rad(0.1), np.inf])
+"""Smallest jump that two windows must detect at once, numeric units: a tenth of a subaperture, a
 tenth of a degree."""
 
-STANDS_OUT = 6.0
-"""A jump of so many σ of one window is told by two, wherever in the first it falls."""
+JUMP_DETECTION_SIGMA = 6.0
+"""Two windows confirm a jump larger than this number of σ of one window, even if it occurred within
+the first one."""
 
-ALL_BESIDE, ONE_BESIDE = 0.25, 0.02
-"""Share of the power of the first dither that all weak lines have, and each at most: less than a
-tenth of what a strong one has, or nothing of α would be told where such a mode is another."""
+WEAK_LINES_POWER_SHARE, MAX_WEAK_LINE_POWER_SHARE = 0.25, 0.02
+"""Share of the first dither's power for all weak lines together, and for each at most: less than a
+tenth of a strong line's, because α would be lost if the weak line's mode responded unlike the
+model."""
 
-BESIDE_HZ = 4.0
-"""Between a weak line and a strong one, or more where windows are short."""
+WEAK_LINE_CLEARANCE_HZ = 4.0
+"""Smallest distance between a weak line and a strong one, Hz; larger if windows are short."""
 
-MIN_BESIDE = 2
-"""Windows that such a dither lasts for: they name a mode, and are enough to make a matrix."""
+N_WEAK_LINE_WINDOWS = 2
+"""Duration of a dither with weak lines, windows: enough to identify a mode and to make a matrix."""
 
-ROUNDING = 1.001
-"""What a dither may be stronger by than what was asked for."""
+AMPLITUDE_ROUNDING_RATIO = 1.001
+"""Ratio of the played to the requested RMS that rounding explains."""
 
-RESULT_WITHIN_S = 10.0
-"""For the estimate of a window whose dither has ended."""
+MAX_RESULT_DELAY_S = 10.0
+"""Longest wait for the estimate of a window whose dither has ended."""
 
-_SLOWEST = 1e-9
-"""Random walk after a second, numeric units: nothing on a telescope stands stiller."""
+_MIN_DRIFT_RATE = 1e-9
+"""Smallest random walk after one second, numeric units; nothing on a telescope is more stable."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,7 +113,7 @@ class WantedDither:
     reason: str
     parameters: DitherParameters
     next_ns_utc: int
-    """When; now or earlier: at once."""
+    """Time of its start; now or earlier to start at once."""
 
 
 def choose_next(context: StepContext, rtc: Status) -> tuple[WantedDither, DitherPlan]:
@@ -117,7 +121,7 @@ def choose_next(context: StepContext, rtc: Status) -> tuple[WantedDither, Dither
     state, policy, kappa = context.state, context.policy, precision(context.state, rtc)
     requirement = _requirement(context, rtc, kappa)
     window_s = requirement.window_s
-    sittings = tuple(n * window_s for n in SITTING_LADDER)
+    sittings = tuple(n * window_s for n in WINDOWS_PER_DITHER)
     sparse = replace(requirement, window_s=dither.choose_burst_s(kappa, requirement, sittings))
     phase, reason, next_ns = _next_window(context, sparse)
     requirement = sparse if phase is DitherPhase.SPARSE else requirement
@@ -160,9 +164,10 @@ def _to_show(
 def _with_others(context: StepContext, rtc: Status, choice: DitherParameters) -> DitherParameters:
     """Return the first dither with weak lines that show other modes: they cost no time.
 
-    The modes that tell of α keep most of the power, and there are none where the star is so faint
-    that one window is not as precise as is asked. It lasts for the two windows that are asked for
-    before anything is made, or one where all modes are to be shown first, and ends by itself.
+    The modes that determine α keep most of the power, and there are no weak lines if the star is so
+    faint that one window does not reach the required precision. The dither lasts for the two
+    windows that are required before a matrix is made, or for one if all modes are to be shown
+    first, and ends by itself.
     """
     registration, policy = context.registration, context.policy
     begun = registration is not None and registration.n_windows > 0
@@ -173,7 +178,9 @@ def _with_others(context: StepContext, rtc: Status, choice: DitherParameters) ->
     if not telling:  # the RTC plays none, or none can be believed: the dither itself says so
         return choice
     strong = clear_lines(rtc, len(telling), choice)
-    apart_hz = max(BESIDE_HZ, mode_proof.CLOSEST_STEPS * step_of(rtc, choice.window_s))
+    apart_hz = max(
+        WEAK_LINE_CLEARANCE_HZ, mode_proof.MIN_LINE_SPACING_STEPS * step_of(rtc, choice.window_s)
+    )
     free = [
         line
         for line in mode_proof.lines_clear(context, rtc, choice.window_s)
@@ -184,7 +191,7 @@ def _with_others(context: StepContext, rtc: Status, choice: DitherParameters) ->
     if not others:
         return choice
     spread = np.linspace(0, len(free) - 1, len(others)).round().astype(int)
-    share = min(ALL_BESIDE / len(others), ONE_BESIDE)
+    share = min(WEAK_LINES_POWER_SHARE / len(others), MAX_WEAK_LINE_POWER_SHARE)
     lines = {mode: (free[k], share) for mode, k in zip(others, spread.tolist(), strict=True)}
     rest = (1.0 - share * len(others)) / len(telling)
     lines |= {mode: (line, rest) for mode, line in zip(telling, strong, strict=True)}
@@ -193,7 +200,7 @@ def _with_others(context: StepContext, rtc: Status, choice: DitherParameters) ->
         modes=tuple(sorted(lines)),
         lines_hz=tuple(lines[mode][0] for mode in sorted(lines)),
         shares=tuple(lines[mode][1] for mode in sorted(lines)),
-        n_windows=1 if mode_proof.unknown_loop(context.state, rtc) else MIN_BESIDE,
+        n_windows=1 if mode_proof.unknown_loop(context.state, rtc) else N_WEAK_LINE_WINDOWS,
     )
 
 
@@ -201,7 +208,7 @@ def operator_parameters(context: StepContext, rtc: Status) -> DitherParameters:
     """Return what an operator's dither is like where the operator does not say."""
     policy, plan = context.policy, context.dither_policy.plan
     window_s = policy.window_s if plan is None else plan.window_s
-    lasting_s = policy.dither_duration_s - SETTLING_S - SPARE_S
+    lasting_s = policy.dither_duration_s - DITHER_SETTLING_S - DITHER_MARGIN_S
     return _parameters(context, quiet_budget_m(rtc, policy), window_s, lasting_s)
 
 
@@ -231,7 +238,7 @@ def _plan(
         total_m = requirement.budget_m
     if phase is not DitherPhase.SPARSE:
         interval_s = window_s
-    on_s = min(requirement.window_s + SETTLING_S, interval_s)
+    on_s = min(requirement.window_s + DITHER_SETTLING_S, interval_s)
     return DitherPlan(
         total_m=total_m,
         window_s=window_s,
@@ -256,19 +263,19 @@ def budget_m(rtc: Status, policy: Policy) -> float:
 
 
 def quiet_budget_m(rtc: Status, policy: Policy, chosen: tuple[int, ...] = ()) -> float:
-    """Return the same of what is asked for: the loop amplifies a dither of its own modes.
+    """Return the largest RMS to request, metres: the loop amplifies a dither of its own modes.
 
-    Without ``chosen`` modes it is of those that are dithered to follow α.
+    Without ``chosen`` modes it is for those that are dithered to follow α.
     """
     quiet_m = policy.dither_budget_m / expected_amplification(rtc, policy, chosen)
     return float(min(budget_m(rtc, policy), quiet_m))
 
 
 def why_moved(dither: Dither, rtc: Status, policy: Policy, shunned: frozenset[int]) -> str:
-    """Return why another dither should take the place of one that runs; empty: it is as it should.
+    """Return why another dither should replace the one that runs, or "".
 
-    It was asked for when fewer modes were controlled, or before one of its modes was seen to
-    answer otherwise than the model says.
+    It was requested when fewer modes were controlled, or before the measured response of one of its
+    modes disagreed with the model.
     """
     if is_proving(dither.request):
         return ""
@@ -280,14 +287,14 @@ def why_moved(dither: Dither, rtc: Status, policy: Policy, shunned: frozenset[in
     elsewhere = why_elsewhere(dither.request, rtc, policy)
     if elsewhere or not controlled(dither.request.modes, rtc):
         return elsewhere
-    if total_m(dither.request) <= CHANGE * quiet_budget_m(rtc, policy):
+    if total_m(dither.request) <= AMPLITUDE_HYSTERESIS_RATIO * quiet_budget_m(rtc, policy):
         return ""
     return "the loop controls its modes now and amplifies it: a weaker one is asked for"
 
 
 def window_lengths_s(policy: Policy) -> tuple[float, ...]:
     """Return how long a window may be, shortest first."""
-    lengths = [policy.window_s * step for step in WINDOW_LADDER]
+    lengths = [policy.window_s * step for step in WINDOW_LENGTH_RATIOS]
     return tuple(s for s in lengths if s <= policy.longest_window_s) or (policy.window_s,)
 
 
@@ -297,23 +304,27 @@ def _requirement(
     policy = context.policy
     requirement = DitherRequirement(
         sigma=policy.dither_sigma,
-        drift_rate=np.sqrt(np.maximum(_walk_rate(context), _SLOWEST**2)),
+        drift_rate=np.sqrt(np.maximum(_walk_rate(context), _MIN_DRIFT_RATE**2)),
         budget_m=quiet_budget_m(rtc, policy),
         window_s=policy.window_s,
-        window_sigma=JUMP / STANDS_OUT,
+        window_sigma=MIN_DETECTED_JUMP / JUMP_DETECTION_SIGMA,
         longest_s=policy.longest_pause_s,
     )
     lengths = window_lengths_s(policy)
     if rtc.magnitude is not None and rtc.magnitude >= FAINT_MAGNITUDE:
         lengths = tuple(s for s in lengths if s >= FAINT_WINDOW_S) or lengths[-1:]
-    usable = USABLE * policy.tolerance
+    usable = MAX_UNBIASED_SIGMA * policy.tolerance
     window_s = dither.choose_window_s(kappa, requirement, usable, lengths)
     return replace(requirement, window_s=window_s)
 
 
 def _lasting_s(phase: DitherPhase) -> float:
     """Return how long a request is to be read at least, seconds."""
-    return 0.0 if phase is DitherPhase.SPARSE else LASTING_S - SETTLING_S - SPARE_S
+    return (
+        0.0
+        if phase is DitherPhase.SPARSE
+        else MAX_DITHER_DURATION_S - DITHER_SETTLING_S - DITHER_MARGIN_S
+    )
 
 
 def _walk_rate(context: StepContext) -> NDArray[np.float64]:
@@ -339,15 +350,15 @@ def _next_window(
         return DitherPhase.ACQUIRE, "α is not known", now_ns
     if state.alpha.dither_due_since_ns_utc is not None:
         return DitherPhase.ACQUIRE, state.alpha.dither_due_reason or "α is in doubt", now_ns
-    if registration.n_windows < MIN_WINDOWS:
-        text = f"{registration.n_windows} of {MIN_WINDOWS} windows agree"
+    if registration.n_windows < MIN_WINDOWS_FOR_PAUSE:
+        text = f"{registration.n_windows} of {MIN_WINDOWS_FOR_PAUSE} windows agree"
         return DitherPhase.ACQUIRE, text, now_ns
     if policy.longest_pause_s == 0.0:
         return DitherPhase.FOLLOW, "the settings allow no pause", now_ns
     window_ns = registration.window_ns_utc or registration.arrived_ns_utc
     longest_ns = window_ns + round(policy.longest_pause_s * SECOND_NS)
     passive_ns = state.dithers.policy.passive_ns_utc
-    if passive_ns is not None and now_ns - passive_ns < PASSIVE_WITHIN_S * SECOND_NS:
+    if passive_ns is not None and now_ns - passive_ns < MAX_PASSIVE_AGE_S * SECOND_NS:
         return _pace_with_passive(registration, requirement, longest_ns, now_ns)
     return _pace_without_passive(registration, requirement, longest_ns)
 
@@ -369,9 +380,9 @@ def _pace_without_passive(
 ) -> tuple[DitherPhase, str, int]:
     """Pace by how far α may have walked since the last window."""
     room = requirement.sigma**2 - np.diag(registration.covariance)
-    on_s = SETTLING_S + requirement.window_s + SPARE_S
+    on_s = DITHER_SETTLING_S + requirement.window_s + DITHER_MARGIN_S
     pause_s = float(np.min(room / requirement.drift_rate**2)) - on_s
-    if pause_s < SHORTEST_PAUSE_S:
+    if pause_s < MIN_DITHER_PAUSE_S:
         text = "α walks too fast for a pause, or no window brings σ to its target"
         return DitherPhase.FOLLOW, text, registration.arrived_ns_utc
     due_ns = registration.arrived_ns_utc + round(min(pause_s, 1e6) * SECOND_NS)
@@ -391,7 +402,11 @@ def _steady_amplitude(
     if before is None or not settled or before.total_m > requirement.budget_m:
         return found.total_m
     ratio = found.total_m / before.total_m
-    return before.total_m if 1.0 / CHANGE <= ratio <= CHANGE else found.total_m
+    return (
+        before.total_m
+        if 1.0 / AMPLITUDE_HYSTERESIS_RATIO <= ratio <= AMPLITUDE_HYSTERESIS_RATIO
+        else found.total_m
+    )
 
 
 def why_no_dither(context: StepContext, rtc: Status) -> str | None:
@@ -424,20 +439,20 @@ def awaits_result(context: StepContext, wanted_dither: WantedDither) -> bool:
         return mode_proof.awaits_result(context, wanted_dither.parameters.window_s)
     if wanted_dither.phase is not DitherPhase.SPARSE or dithering.ended_ns_utc is None:
         return False
-    late = context.now_ns - dithering.ended_ns_utc > RESULT_WITHIN_S * SECOND_NS
+    late = context.now_ns - dithering.ended_ns_utc > MAX_RESULT_DELAY_S * SECOND_NS
     return not late and context.windows.accepted < dithering.results_due
 
 
 def why_too_strong(context: StepContext, rtc: Status) -> str | None:
-    """Return why a dither that is played costs more than it may, or None.
+    """Return why a running dither exceeds its limits, or None.
 
-    An operator's own may cost more than the budget, but not more than was asked for.
+    An operator's own dither may exceed the budget, but not its own request.
     """
     if rtc.dither is None:
         return None
     running, dithering = rtc.dither.request, context.dither_policy
     found_m, most_m = total_m(running), budget_m(rtc, context.policy)
-    over = is_own_sine(running) and found_m > ROUNDING * most_m
+    over = is_own_sine(running) and found_m > AMPLITUDE_ROUNDING_RATIO * most_m
     if not over and running.id != dithering.loud_id:
         return None
     if running.id == dithering.loud_id and dithering.loud_text:

@@ -13,91 +13,92 @@ from service.errors import CommandError, ModelError
 from service.estimation.demodulation import SIDE_OFFSETS_HZ
 from service.estimation.lockin import LockInPlan
 from service.estimation.random_dither import FRAMES_PER_MODE, RandomPlan
-from service.estimation.windows import SETTLING_S, ExpectedDither
+from service.estimation.windows import DITHER_SETTLING_S, ExpectedDither
 from service.tracking.dither_modes import LINE_FRACTIONS, LINE_RANGE, N_LINES, chosen_modes
 from service.tracking.policy import Policy
 from service.tracking.products import ModeSet
 from service.wire import DitherKind, DitherRequest, Status
 
-CLEARANCES_HZ = (21.0, 8.0)
-"""Between a line and a vibration: beyond the side bins of noise, or beyond its own width."""
+VIBRATION_CLEARANCES_HZ = (21.0, 8.0)
+"""Distances between a line and a vibration that are tried in turn: beyond the side bins that
+measure noise, then beyond the vibration's own width."""
 
-SPARE_S = 0.3
-"""Of dither behind the last window, if it begins late because frames were lost."""
+DITHER_MARGIN_S = 0.3
+"""Dither after the last window, in case it begins late because frames were lost."""
 
-PROVING_SPARE_S = 0.9
-"""The same where one window is all there is: frames may wait for half a second, and a status that
-shows the end of the dither before they are looked at would cost it."""
+PROVING_DITHER_MARGIN_S = 0.9
+"""Dither after the last window if there is only one: frames may be delayed by half a second, and a
+status that shows the end of the dither before they are processed would cost the window."""
 
 OWN_DITHER = "dither-"
 PROVING_DITHER = "dither-prove-"
-ASKED_DITHER = "operator-"
+OPERATOR_DITHER = "operator-"
 NOISY_DITHER = "noisy-"
 ACQUIRING_DITHER = "acquire-"
-"""How the id of a dither begins that the service has chosen (the second: to see how modes answer),
-an operator, one that measures a noisy interaction matrix, and one that finds α from nothing."""
+"""First part of a dither's id, by purpose: to follow α, to show how modes respond, an operator's
+own, to measure a noisy interaction matrix, to acquire."""
 
-OUR_DITHERS = (OWN_DITHER, ASKED_DITHER, NOISY_DITHER, ACQUIRING_DITHER)
+OUR_DITHERS = (OWN_DITHER, OPERATOR_DITHER, NOISY_DITHER, ACQUIRING_DITHER)
 
-GONE_WITHIN_S = 3.0
-"""For a stop to be answered, and for the next status to show it."""
+MAX_STOP_DELAY_S = 3.0
+"""Time for a stop to be acknowledged, and for the next status to show it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dither:
-    """A dither that the service follows, asked for or running."""
+    """A dither that the service follows, requested or running."""
 
     request: DitherRequest
-    """What is played."""
+    """Request that the RTC plays."""
 
     start_seq: int | None = None
     """First frame that contains it; None until the RTC has accepted."""
 
     asked_ns_utc: int
-    """When it was asked for, then when it was accepted or adopted."""
+    """Time of the request, later of its acceptance or adoption."""
 
     window_s: float | None = None
-    """Of telemetry in one estimate, where it was planned with the dither."""
+    """Telemetry in one estimate, seconds, if planned with the dither; otherwise None."""
 
     cause: str = field(default="", compare=False)
-    """Id of the order or event that has asked for it; empty: it was adopted."""
+    """Id of the order or event that led to the request; empty if the dither was adopted."""
 
     @property
     def id(self) -> str:
-        """The request's."""
+        """Id of the request."""
         return self.request.id
 
     @property
     def frequency_hz(self) -> tuple[float, ...]:
-        """One for each mode of a sine; a binary dither has none."""
+        """Frequency of each mode of a sine dither; empty for a binary dither."""
         return self.request.frequency_hz or ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DitherParameters:
-    """Parameters of a dither beside those of settings or an operator."""
+    """Parameters of a dither that do not come from settings or an operator."""
 
     total_m: float
     """RMS of all lines together, metres OPD."""
 
     window_s: float
-    """Telemetry in one estimate."""
+    """Telemetry in one estimate, seconds."""
 
     n_windows: int
-    """Windows it must last for."""
+    """Windows that it must last for."""
 
     avoid_hz: tuple[float, ...] = ()
-    """Vibrations."""
+    """Vibrations, Hz."""
 
     last_hz: tuple[float, ...] = ()
-    """Lines it need not leave without reason."""
+    """Lines of the last dither, kept if possible."""
 
     modes: tuple[int, ...] = ()
-    """Modes that are to be seen to answer; empty: those that tell most of α."""
+    """Modes whose response is to be measured; empty for those that determine α best."""
 
     lines_hz: tuple[float, ...] = ()
     shares: tuple[float, ...] = ()
-    """Of the power, one for each; empty: all alike."""
+    """Share of the power of each mode; empty for equal shares."""
 
     shunned: frozenset[int] = frozenset()
     """Modes that are not to be dithered to follow α."""
@@ -139,10 +140,10 @@ def plan_dither(
     sizes = [amplitude_m or choice.total_m / np.sqrt(max(len(chosen), 1))] * len(chosen)
     if proving and choice.shares:
         sizes = [choice.total_m * np.sqrt(share) for share in choice.shares]
-    spare_s = PROVING_SPARE_S if proving else SPARE_S
-    lasting_s = SETTLING_S + choice.n_windows * choice.window_s + spare_s
+    spare_s = PROVING_DITHER_MARGIN_S if proving else DITHER_MARGIN_S
+    lasting_s = DITHER_SETTLING_S + choice.n_windows * choice.window_s + spare_s
     step_hz = step_of(rtc, choice.window_s)
-    begins = ASKED_DITHER if asked else PROVING_DITHER if proving else OWN_DITHER
+    begins = OPERATOR_DITHER if asked else PROVING_DITHER if proving else OWN_DITHER
     request = DitherRequest(
         id=f"{begins}{now_ns}",
         kind=DitherKind.SINE,
@@ -170,14 +171,14 @@ def total_m(request: DitherRequest) -> float:
 
 
 def lock_in_plan(dither: Dither, rtc: Status, window_s: float) -> LockInPlan:
-    """Return how a dither is demodulated, from where the loop has settled.
+    """Return the demodulation plan of a dither, beginning when the loop has settled.
 
-    Its own window counts; ``window_s`` is for a dither that was planned without one.
+    The dither's own window length is used; ``window_s`` is the default for a dither without one.
 
     Raises
     ------
     ModelError
-        If its lines cannot be told apart in a window.
+        If its lines cannot be separated in a window.
     """
     return LockInPlan(
         modes=dither.request.modes,
@@ -185,16 +186,16 @@ def lock_in_plan(dither: Dither, rtc: Status, window_s: float) -> LockInPlan:
         amplitude_m=dither.request.amplitude_m,
         frame_rate_hz=rtc.frame_rate_hz,
         n_frames=round((dither.window_s or window_s) * rtc.frame_rate_hz),
-        first_seq=(dither.start_seq or 0) + round(SETTLING_S * rtc.frame_rate_hz),
+        first_seq=(dither.start_seq or 0) + round(DITHER_SETTLING_S * rtc.frame_rate_hz),
     )
 
 
 def expected_dither(
     dither: Dither, rtc: Status, products: NDArray[np.float32] | None = None
 ) -> ExpectedDither:
-    """Return a dither as the frames should hold it.
+    """Return the expected dither in the frames.
 
-    ``products`` is what ``Description`` has; None: nobody knows what the slopes should show.
+    ``products`` is that of ``Description``; None if the slopes' response is unknown.
     """
     first_seq, request = dither.start_seq or 0, dither.request
     modes = list(request.modes)
@@ -215,24 +216,24 @@ def expected_dither(
 
 
 def clear_lines(rtc: Status, n_lines: int, choice: DitherParameters) -> tuple[float, ...]:
-    """Return lines in the band that wind leaves alone, as clear of vibrations as these allow.
+    """Return lines in the band that wind affects little, as far from vibrations as possible.
 
-    Those of the last dither stay while none of them is on a vibration, or beyond what the frame
-    rate of now can tell.
+    The lines of the last dither are kept unless one is on a vibration or outside the band that the
+    present frame rate allows.
     """
     last = choice.last_hz
     rate, step = rtc.frame_rate_hz, step_of(rtc, choice.window_s)
     edge = float(SIDE_OFFSETS_HZ.max()) + step
     near = [abs(line - vibration) for line in last for vibration in choice.avoid_hz]
     told = all(edge <= line <= rate / 2 - edge for line in last)
-    if len(last) == n_lines and told and min(near, default=np.inf) >= CLEARANCES_HZ[-1]:
+    if len(last) == n_lines and told and min(near, default=np.inf) >= VIBRATION_CLEARANCES_HZ[-1]:
         return last
     fractions = LINE_FRACTIONS[:n_lines]
     if n_lines > N_LINES:
         fractions = tuple(np.linspace(*LINE_RANGE, n_lines).tolist())
     wanted = tuple(fraction * rate for fraction in fractions)
     band = (max(LINE_RANGE[0] * rate, edge), min(LINE_RANGE[1] * rate, rate / 2 - edge))
-    for clearance_hz in (*CLEARANCES_HZ, 4.0 * step):
+    for clearance_hz in (*VIBRATION_CLEARANCES_HZ, 4.0 * step):
         found = place_lines(
             wanted, choice.avoid_hz, clearance_hz=clearance_hz, step_hz=step, range_hz=band
         )
@@ -243,7 +244,7 @@ def clear_lines(rtc: Status, n_lines: int, choice: DitherParameters) -> tuple[fl
 
 def on_vibrations(dither: Dither, avoid_hz: tuple[float, ...]) -> tuple[float, ...]:
     """Return the lines of a dither that are not clear of vibrations."""
-    near = CLEARANCES_HZ[-1] - 1e-6
+    near = VIBRATION_CLEARANCES_HZ[-1] - 1e-6
     return tuple(f for f in dither.frequency_hz if any(abs(f - v) < near for v in avoid_hz))
 
 
@@ -257,11 +258,11 @@ def step_of(rtc: Status, window_s: float) -> float:
     return rtc.frame_rate_hz / max(round(window_s * rtc.frame_rate_hz), 1)
 
 
-RANDOM_TOTAL_M = 5e-9
-"""RMS of all modes together where none is asked for, within the budget."""
+DEFAULT_RANDOM_RMS_M = 5e-9
+"""Default RMS of all modes together, metres OPD, within the budget."""
 
-COMFORTABLE = 2.0
-"""Windows are longer by this than they have to be for so many modes."""
+RANDOM_WINDOW_MARGIN_RATIO = 2.0
+"""Ratio of the windows' length to the shortest possible for so many modes."""
 
 
 def plan_random(
@@ -301,7 +302,10 @@ def plan_random(
             f"found {1e9 * amplitude_m:.3g} nm on each of {len(modes)} modes, the RTC "
             f"takes at most {1e9 * rtc.max_dither_m:.3g} nm"
         )
-    least_s = max(policy.window_s, COMFORTABLE * FRAMES_PER_MODE * len(modes) / rtc.frame_rate_hz)
+    least_s = max(
+        policy.window_s,
+        RANDOM_WINDOW_MARGIN_RATIO * FRAMES_PER_MODE * len(modes) / rtc.frame_rate_hz,
+    )
     n_windows = int(duration_s / least_s * (1.0 + 1e-9))
     if n_windows < 1:
         raise CommandError(
@@ -313,7 +317,7 @@ def plan_random(
         modes=modes,
         amplitude_m=(amplitude_m,) * len(modes),
         seed=now_ns % (1 << 31),
-        duration_s=SETTLING_S + duration_s + SPARE_S,
+        duration_s=DITHER_SETTLING_S + duration_s + DITHER_MARGIN_S,
     )
     return Dither(request=request, asked_ns_utc=now_ns, window_s=duration_s / n_windows)
 
@@ -330,7 +334,7 @@ def random_plan(dither: Dither, rtc: Status, window_s: float) -> RandomPlan:
         modes=dither.request.modes,
         amplitude_m=dither.request.amplitude_m,
         n_frames=int((dither.window_s or window_s) * rtc.frame_rate_hz * (1.0 + 1e-12)),
-        first_seq=(dither.start_seq or 0) + round(SETTLING_S * rtc.frame_rate_hz),
+        first_seq=(dither.start_seq or 0) + round(DITHER_SETTLING_S * rtc.frame_rate_hz),
     )
 
 
@@ -422,79 +426,79 @@ class DitherPlan(Schedule):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DitherPolicyState:
-    """The dither policy's memory, and its account to the operator."""
+    """Memory of the dither policy, and its report to the operator."""
 
     phase: DitherPhase = DitherPhase.OFF
     reason: str = "nothing has been decided yet"
-    """Why it is on or off."""
+    """Reason for the present phase."""
 
     budget_m: float = 0.0
     """Largest RMS of all lines together that settings and RTC allow, metres OPD."""
 
     plan: DitherPlan | None = None
-    """None: none could be made yet."""
+    """Present schedule; None if none has been computed yet."""
 
     next_ns_utc: int | None = None
-    """When the next sitting is due; None: now, or never."""
+    """Start of the next dither; None if one runs now or none is planned."""
 
     precision: Precision | None = None
-    """None: no window has been accepted yet."""
+    """Precision of windows; None if no window has been accepted yet."""
 
     avoided_hz: tuple[float, ...] = ()
-    """Vibrations the lines keep clear of."""
+    """Vibrations that the lines avoid, Hz."""
 
     lines_hz: tuple[float, ...] = ()
-    """Of the last dither asked for: they stay where they are while they can."""
+    """Lines of the last requested dither, Hz; they are kept if possible."""
 
     passive_ns_utc: int | None = None
-    """When the estimate was last renewed without a dithered window."""
+    """Time at which the estimate was last renewed without a dithered window."""
 
     results_due: int = 0
-    """Windows accepted in all, once the last dither has told what it was asked for."""
+    """Total of accepted windows at which the last dither has delivered its results."""
 
     ended_ns_utc: int | None = None
-    """When the last of the service's own dithers ended by itself; None: one runs, or it was
-    stopped."""
+    """Time at which the service's last dither ended by itself; None if one runs, or it was stopped.
+    """
 
     stopped_id: str | None = None
-    """The last dither that the service asked the RTC to stop by itself."""
+    """Id of the last dither that the service stopped without an order."""
 
     stopped_ns_utc: int = 0
-    """When it did first."""
+    """Time of the first request to stop it."""
 
     unwanted_id: str | None = None
-    """A dither the RTC plays and should not; None: none."""
+    """Id of a dither that the RTC plays and should not; None if there is none."""
 
     stop_asked_ns_utc: int = 0
-    """When the RTC was last told to stop one that nobody wants."""
+    """Time of the last request to stop an unwanted dither."""
 
     loud_id: str | None = None
-    """The last dither the RTC played stronger than was asked for, and than the budget."""
+    """Id of the last dither that the RTC played stronger than requested and than the budget."""
 
     loud_ns_utc: int = 0
-    """When one that was too strong was last told to stop; 0: none ever was."""
+    """Time of the last request to stop a dither that was too strong; 0 if there was none."""
 
     loud_text: str = ""
-    """What the frames held of that one; empty: its status told."""
+    """Measured excess of that dither; empty if its status showed it."""
 
     amiss_id: str | None = None
-    """The last dither of which the frames held something else than was asked for."""
+    """Id of the last dither that differed from its request in the frames."""
 
     amiss_m: float = 0.0
-    """RMS of all of it, metres OPD."""
+    """RMS of all its lines together, metres OPD."""
 
     mean_square_m2: float = 0.0
-    """Mean square of what has been on the mirror, over ten minutes, metres OPD squared."""
+    """Mean square of the dither on the mirror, over ten minutes, metres OPD squared."""
 
     seen_ns_utc: int | None = None
-    """Up to when that mean was taken."""
+    """End of the interval of that mean."""
 
     @property
     def mean_cost_m(self) -> float:
-        """Quadratic mean of what has been on the mirror, over ten minutes, metres OPD."""
+        """Quadratic mean of the dither on the mirror, over ten minutes, metres OPD."""
         return float(np.sqrt(self.mean_square_m2))
 
     @property
     def n_windows_learnt(self) -> int:
-        """Windows that the precision was learnt from."""
+        """Windows from which the precision was learnt."""
         return 0 if self.precision is None else self.precision.n_windows

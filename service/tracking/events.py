@@ -51,11 +51,11 @@ class RepublishMatrix(Caused):
     source: str
     why: str
     judged: bool = True
-    """True to have the gate check the matrix; False if nobody requested it and the gate's earlier
+    """True to have the gate check the matrix; False if it was not requested and the gate's earlier
     verdict holds."""
 
     anyway: bool = False
-    """True if an operator wants it even if the gate rejects it."""
+    """True if an operator has approved it despite a rejection by the gate."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -42,13 +42,13 @@ MODES_KEPT = 64
 GAIN_RATE = 0.05 / np.sqrt(60.0)
 """Random walk of a gain, relative, 1 σ after one second: seeing changes it by 5 % in a minute."""
 
-FIRST_SCATTER = 0.1
+PRIOR_SCATTER = 0.1
 """Relative 1 σ of one window before any two were compared."""
 
-LEARNING = 0.1
+SCATTER_WEIGHT = 0.1
 """Weight of the newest window in the scatter: ten windows are remembered."""
 
-_FARTHEST = 3.0
+_MAX_SCATTER_SIGMA = 3.0
 """A window further out than this many σ counts as one at this distance."""
 
 Array = NDArray[np.float64]
@@ -56,14 +56,14 @@ Array = NDArray[np.float64]
 CAPTURE_RANGE = np.array([0.8, 0.8, np.deg2rad(2.0), 0.02])
 """Beyond this, one linearised fit with high modes cannot be trusted (numeric units)."""
 
-FAR_WINDOWS = 3
+N_FAR_WINDOWS = 3
 """Windows beyond ``CAPTURE_RANGE`` that must agree while α is unknown before they are used."""
 
-AGREEING = np.array([0.02, 0.02, np.deg2rad(0.1), 0.002])
+AGREEMENT_DISTANCE = np.array([0.02, 0.02, np.deg2rad(0.1), 0.002])
 """Distance of two windows that agree whatever their σ (numeric units): a loop's turbulence moves a
 window by so much."""
 
-MAX_UNEXPLAINED = 0.5
+MAX_UNEXPLAINED_SHARE = 0.5
 """Share of a line's power that the model may leave unexplained in a window far from its start. A
 model that is 40 % wrong per mode leaves 0.15 to 0.3, modes or slopes in another order 0.8."""
 
@@ -108,14 +108,14 @@ def _update_gain(
     A window's own σ describes the noise next to the lines, not the fluctuation of the gain itself.
     """
     if gain is None:
-        scatter = max(noise, FIRST_SCATTER * measured)
+        scatter = max(noise, PRIOR_SCATTER * measured)
         return ModeGain(mode=mode, gain=measured, sigma=scatter, scatter=scatter, t_ns_utc=t_ns)
     elapsed_s = max((t_ns - gain.t_ns_utc) / SECOND_NS, 0.0)
     prior = gain.sigma**2 + (GAIN_RATE * gain.gain) ** 2 * elapsed_s
-    farthest = _FARTHEST * float(np.sqrt(prior + gain.scatter**2))
+    farthest = _MAX_SCATTER_SIGMA * float(np.sqrt(prior + gain.scatter**2))
     innovation = float(np.clip(measured - gain.gain, -farthest, farthest))
     learnt = max(innovation**2 - prior, noise**2)
-    scatter = float(np.sqrt((1 - LEARNING) * gain.scatter**2 + LEARNING * learnt))
+    scatter = float(np.sqrt((1 - SCATTER_WEIGHT) * gain.scatter**2 + SCATTER_WEIGHT * learnt))
     weight = prior / (prior + scatter**2)
     return ModeGain(
         mode=mode,
@@ -448,7 +448,7 @@ def _far_windows_agree(context: StepContext, estimate: DitheredEstimate) -> bool
     if context.registration is not None:
         return False
     shares = None if estimate.unexplained is None else estimate.unexplained[estimate.strong]
-    if shares is None or shares.max(initial=0.0) > MAX_UNEXPLAINED:
+    if shares is None or shares.max(initial=0.0) > MAX_UNEXPLAINED_SHARE:
         context.alpha = replace(context.alpha, far_windows=())
         return False
     earlier = context.alpha.far_windows
@@ -458,11 +458,11 @@ def _far_windows_agree(context: StepContext, estimate: DitheredEstimate) -> bool
     if earlier:
         sigma = np.sqrt(np.diag(earlier[-1].covariance + estimate.covariance))
         apart = np.abs(estimate.alpha.vector - earlier[-1].alpha.vector)
-        if np.any(apart > np.maximum(_FARTHEST * sigma, AGREEING)):
+        if np.any(apart > np.maximum(_MAX_SCATTER_SIGMA * sigma, AGREEMENT_DISTANCE)):
             earlier = ()
-    together = (*earlier, window)[-FAR_WINDOWS:]
+    together = (*earlier, window)[-N_FAR_WINDOWS:]
     context.alpha = replace(context.alpha, far_windows=together)
-    return len(together) >= FAR_WINDOWS
+    return len(together) >= N_FAR_WINDOWS
 
 
 def why_no_measurement(state: TrackerState, when: TelemetrySpan) -> str | None:

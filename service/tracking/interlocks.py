@@ -34,7 +34,7 @@ class Permission:
 
     allowed: bool
     reason: str = ""
-    """What is running or missing, and what to do first; empty if the order is permitted."""
+    """Operation or prerequisite that forbids the order, and the remedy; empty if permitted."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

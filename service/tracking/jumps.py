@@ -24,48 +24,48 @@ from service.tracking.registration import (
 )
 from service.tracking.validity import CLOCK_SET_BACK_S, flexure
 
-STEADY_S = 60.0
+DRIFT_TIME_S = 60.0
 """Time scale of the drift: the settings give the drift of a minute; a shorter time has a
 proportional share."""
 
-VARYING = 0.3
+MODEL_ERROR_VARYING_SHARE = 0.3
 """Share of the model error that differs from window to window: bright stars scatter by 0.1 % of a
 subaperture and 6 mdeg, twice what their own data say (docs/results/night.md)."""
 
-USUAL_MODEL_ERROR = 1.5
+USUAL_MODEL_ERROR_RATIO = 1.5
 """Times the instrument's floor that windows of simulated telescopes find as their model error, and
 have in common: beyond it windows of other modes differ by it. Benches find 2 to 12 times."""
 
-ROTATION_LIMIT = 15.1
+MAX_ROTATION_INNOVATION = 15.1
 """Value that the normalised square of one parameter exceeds once in 10 000, as ``JUMP_THRESHOLD``
 does for four parameters. A rotation of 0.1 deg is 4 to 6 σ of a window at magnitude 10 and is not
 significant among four parameters; a tenth of a subaperture is 20 σ and needs no separate test."""
 
-ROTATION_LIMIT_OF_TWO = 12.2
+MAX_ROTATION_INNOVATION_OF_TWO = 12.2
 """The same for two windows together, once in 2000: they must also agree."""
 
-PASSIVE_LIMIT = 26.9
+MAX_PASSIVE_INNOVATION = 26.9
 """Value that the innovation of a passive estimate exceeds once in 10 000. It is the larger of two,
 and the scatter that normalises both is learnt from some forty estimates (four times F of 4 and 156,
 at half of that probability)."""
 
-SCATTERED = 1.5
+MAX_SCATTER_RATIO = 1.5
 """Ratio of the scatter of windows to their prediction, in variance, that is significant: an
 estimate of it from twenty windows scatters by 0.1, and one rejected window adds a quarter."""
 
-ALIKE_S = 10.0
+WINDOW_CORRELATION_TIME_S = 10.0
 """Time for which the effect of turbulence on windows may be correlated: when a loop slips out of
 the pyramid's range, windows are on one side of α for four to six seconds, then on the other."""
 
-FARTHEST = 12.0
+MAX_TURBULENCE_EXCESS = 12.0
 """Times what two windows together hardly exceed by chance that is beyond all turbulence: it has led
 them as far as 6."""
 
-SAME_WAY = 0.95
+MIN_JUMP_COSINE = 0.95
 """Cosine between two steps from α, each by the noise of windows, of one and the same jump. Of two
 mistakes in four parameters one pair in 150 points as much the same way."""
 
-LITTLE = 0.3
+MAX_JUMP_SHORTFALL_SHARE = 0.3
 """Share of a jump by which a window may fall short of it and still be of the new place."""
 
 _ROTATION = 2
@@ -84,7 +84,7 @@ class Innovation:
     rotation: float
     """The same of the likelihood ratio of a mirror that has turned against none: 1 is expected."""
 
-    rotation_limit: float = ROTATION_LIMIT
+    rotation_limit: float = MAX_ROTATION_INNOVATION
 
     @property
     def excess(self) -> float:
@@ -97,7 +97,7 @@ class Innovation:
         return self.excess > 1.0
 
 
-NEAR = Innovation(mahalanobis_squared=0.0, rotation=0.0)
+ZERO_INNOVATION = Innovation(mahalanobis_squared=0.0, rotation=0.0)
 """Result when there is nothing to compare with."""
 
 
@@ -140,7 +140,7 @@ def pair_innovation(
     """
     first, before = previous_window(registration), registration.previous_estimate
     if first is None:
-        return NEAR
+        return ZERO_INNOVATION
     seen_from = (as_previous(registration), before)
     if registration.suspected_jump is None and before is not None:
         seen_from = (before, before.previous_estimate)
@@ -154,7 +154,7 @@ def pair_innovation(
     if _squared_distance(first.alpha, first, window, policy) >= min(nearest, JUMP_THRESHOLD):
         return _jump_inside_first(registration, first, window, policy)
     found = _farthest(seen_from, _together(first, window), policy, varies)
-    return replace(found, rotation_limit=ROTATION_LIMIT_OF_TWO)
+    return replace(found, rotation_limit=MAX_ROTATION_INNOVATION_OF_TWO)
 
 
 def _jump_inside_first(
@@ -167,17 +167,17 @@ def _jump_inside_first(
     way.
     """
     if registration.suspected_jump is None:
-        return NEAR
+        return ZERO_INNOVATION
     varies = _model_scatter(registration, policy)
     found = _farthest((as_previous(registration),), window, policy, varies)
-    if found.excess <= FARTHEST:
-        return NEAR
+    if found.excess <= MAX_TURBULENCE_EXCESS:
+        return ZERO_INNOVATION
     total = _noise_of_two(first, window, policy)
     part, whole = (one.alpha.vector - registration.alpha.vector for one in (first, window))
     along = float(part @ np.linalg.solve(total, whole))
     part_sq, whole_sq = (float(step @ np.linalg.solve(total, step)) for step in (part, whole))
-    same_way = along >= SAME_WAY * np.sqrt(part_sq * whole_sq) and part_sq <= whole_sq
-    return found if same_way else NEAR
+    same_way = along >= MIN_JUMP_COSINE * np.sqrt(part_sq * whole_sq) and part_sq <= whole_sq
+    return found if same_way else ZERO_INNOVATION
 
 
 def previous_window(registration: Registration) -> TimedEstimate | None:
@@ -199,9 +199,9 @@ def jump_lasts(
     Two suffice where windows scatter by what they say and are independent. Where they scatter by
     more, neighbours are wrong together, and they must agree for longer than that lasts.
     """
-    if registration.scatter < SCATTERED or both.excess > FARTHEST:
+    if registration.scatter < MAX_SCATTER_RATIO or both.excess > MAX_TURBULENCE_EXCESS:
         return True
-    return (window.t_ns_utc - first.began_ns_utc) / SECOND_NS >= ALIKE_S
+    return (window.t_ns_utc - first.began_ns_utc) / SECOND_NS >= WINDOW_CORRELATION_TIME_S
 
 
 def wholly_after(
@@ -215,7 +215,7 @@ def wholly_after(
     apart = _squared_distance(first.alpha, first, window, policy)
     lacks = np.sqrt(apart) + 2.0
     return apart < JUMP_THRESHOLD and bool(
-        lacks <= LITTLE * np.sqrt(_squared_distance(old, first, window, policy))
+        lacks <= MAX_JUMP_SHORTFALL_SHARE * np.sqrt(_squared_distance(old, first, window, policy))
     )
 
 
@@ -284,13 +284,13 @@ def _squared_distance(
 def _noise_of_two(first: TimedEstimate, window: PointedEstimate, policy: Policy) -> Array:
     """Return ``(4, 4)`` covariance of the difference of two windows of one place."""
     elapsed_s = max(window.t_ns_utc - first.t_ns_utc, 0) / SECOND_NS
-    added = _drifted(elapsed_s, policy) + 2.0 * (VARYING * policy.floor) ** 2
+    added = _drifted(elapsed_s, policy) + 2.0 * (MODEL_ERROR_VARYING_SHARE * policy.floor) ** 2
     return np.asarray(first.covariance + window.covariance + np.diag(added))
 
 
 def _drifted(elapsed_s: float, policy: Policy) -> Array:
     """Return ``(4,)`` variance that a smooth flexure has added."""
-    return np.asarray(policy.drift_rate**2 * elapsed_s * min(elapsed_s / STEADY_S, 1.0))
+    return np.asarray(policy.drift_rate**2 * elapsed_s * min(elapsed_s / DRIFT_TIME_S, 1.0))
 
 
 def _model_scatter(registration: Registration, policy: Policy) -> Array:
@@ -299,7 +299,7 @@ def _model_scatter(registration: Registration, policy: Policy) -> Array:
     A window of other modes, or of a loop with another reconstructor, has another share of it: the
     whole of it may differ.
     """
-    usual = USUAL_MODEL_ERROR * policy.floor
+    usual = USUAL_MODEL_ERROR_RATIO * policy.floor
     return np.asarray(np.maximum(registration.floor**2 - usual**2, 0.0))
 
 
@@ -318,9 +318,14 @@ def _innovation_from(
 ) -> Innovation:
     elapsed_s = (window.t_ns_utc - previous.t_ns_utc) / SECOND_NS
     if elapsed_s < -CLOCK_SET_BACK_S:
-        return NEAR
+        return ZERO_INNOVATION
     elapsed_s = max(elapsed_s, 0.0)
     bent = flexure(previous.pointing, window.pointing, policy)
-    added = _drifted(elapsed_s, policy) + bent**2 + (VARYING * policy.floor) ** 2 + forgot
+    added = (
+        _drifted(elapsed_s, policy)
+        + bent**2
+        + (MODEL_ERROR_VARYING_SHARE * policy.floor) ** 2
+        + forgot
+    )
     total = previous.covariance + window.covariance + np.diag(added)
     return innovation_of(window.alpha.vector - previous.alpha.vector, total)

@@ -8,25 +8,25 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-UNEVEN, HEALTHY = 1.6, 1.3
+UNEVEN_RATIO, HEALTHY_RATIO = 1.6, 1.3
 """A mode whose response differs from that of its neighbours by the first factor or its inverse is
 reported if it certainly exceeds the second, which healthy modes do not exceed. It may still be
 controlled."""
 
-PERHAPS_UNEVEN = 1.45
+DOUBTFUL_RATIO = 1.45
 """From here on another window is asked."""
 
-CERTAIN = 3.0
+CERTAINTY_SIGMA = 3.0
 """A ratio is certainly beyond a limit if it exceeds it by this many σ."""
 
-NEIGHBOURS = 10
+N_NEIGHBOURS = 10
 """Number of neighbours that a mode is compared with. A window with fewer dithered modes is not
 compared."""
 
-FARTHEST = 2 * NEIGHBOURS
+MAX_NEIGHBOUR_DISTANCE = 2 * N_NEIGHBOURS
 """Modes away that one of them may be: others have another optical gain."""
 
-MAX_WINDOWS = 3
+MAX_COMPARED_WINDOWS = 3
 """Number of windows that compare a mode before it is accepted without a certain result."""
 
 
@@ -86,25 +86,25 @@ class ModeRatio:
     @property
     def stands_out(self) -> bool:
         """Return True if the mode may be uneven and certainly differs from the others."""
-        return self._beyond(PERHAPS_UNEVEN) and self._certainly_beyond(1.0)
+        return self._beyond(DOUBTFUL_RATIO) and self._certainly_beyond(1.0)
 
     @property
     def certain(self) -> bool:
         """Return True if more than one window shows that the mode is uneven."""
-        beyond = self._beyond(UNEVEN) and self._certainly_beyond(HEALTHY)
+        beyond = self._beyond(UNEVEN_RATIO) and self._certainly_beyond(HEALTHY_RATIO)
         return self.n_windows > 1 and beyond
 
     def _beyond(self, limit: float) -> bool:
         return self.ratio > limit or self.ratio < 1.0 / limit
 
     def _certainly_beyond(self, limit: float) -> bool:
-        spare = CERTAIN * self.sigma
+        spare = CERTAINTY_SIGMA * self.sigma
         return self.ratio - spare > limit or self.ratio + spare < 1.0 / limit
 
     @property
     def undecided(self) -> bool:
         """Return True if another window must decide."""
-        return self.stands_out and not self.certain and self.n_windows < MAX_WINDOWS
+        return self.stands_out and not self.certain and self.n_windows < MAX_COMPARED_WINDOWS
 
 
 def compare(
@@ -116,12 +116,12 @@ def compare(
     compare with.
     """
     found: dict[int, ModeRatio] = {}
-    if len(modes) <= NEIGHBOURS:
+    if len(modes) <= N_NEIGHBOURS:
         return found
     for k, mode in enumerate(modes.tolist()):
-        beside = np.argsort(np.abs(modes - mode), kind="stable")[1 : NEIGHBOURS + 1]
+        beside = np.argsort(np.abs(modes - mode), kind="stable")[1 : N_NEIGHBOURS + 1]
         usual = float(np.median(gains[beside]))
-        if usual > 0.0 and abs(modes[beside[-1]] - mode) <= FARTHEST:
+        if usual > 0.0 and abs(modes[beside[-1]] - mode) <= MAX_NEIGHBOUR_DISTANCE:
             found[mode] = ModeRatio(
                 mode=mode, ratio=float(gains[k]) / usual, sigma=float(sigma[k]) / usual
             )
@@ -206,7 +206,7 @@ class ModeProof:
         return tuple(sorted(self.contrary))
 
 
-NAMED = 8
+MAX_LISTED_MODES = 8
 """Modes, or runs of them, that a sentence lists; of more it says how many."""
 
 
@@ -224,5 +224,5 @@ def as_list(modes: Iterable[int]) -> str:
         else:
             runs.append([mode])
     parts = [" to ".join(map(str, run)) for run in runs]
-    more = f" and {len(parts) - NAMED} more" if len(parts) > NAMED else ""
-    return ", ".join(parts[:NAMED]) + more
+    more = f" and {len(parts) - MAX_LISTED_MODES} more" if len(parts) > MAX_LISTED_MODES else ""
+    return ", ".join(parts[:MAX_LISTED_MODES]) + more

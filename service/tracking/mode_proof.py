@@ -19,12 +19,12 @@ from service.estimation.lockin import LockInEstimate
 from service.estimation.random_dither import RandomEstimate
 from service.tracking import alarms
 from service.tracking import events as ev
-from service.tracking.dither_modes import N_LINES, PROVING_RANGE, chosen_modes
-from service.tracking.dither_request import CLEARANCES_HZ, step_of
+from service.tracking.dither_modes import N_LINES, PROVING_LINE_RANGE, chosen_modes
+from service.tracking.dither_request import VIBRATION_CLEARANCES_HZ, step_of
 from service.tracking.mode_limits import (
-    NAMED,
-    NEIGHBOURS,
-    UNEVEN,
+    MAX_LISTED_MODES,
+    N_NEIGHBOURS,
+    UNEVEN_RATIO,
     ModeAnswer,
     ModeProof,
     ModeRatio,
@@ -45,29 +45,29 @@ PLAUSIBLE_RESPONSE_RATIO = (0.4, 2.0)
 """Plausible range of a mode's response relative to the median of the modes dithered with it:
 optical gains stay within it, and so do all modes of a model that is 40 % wrong per mode."""
 
-MIN_RESPONSE = 0.1
+MIN_RESPONSE_RATIO = 0.1
 """Slopes over the model's of any mode that a pyramid sees."""
 
-SIGNIFICANT = 4.0
-"""A response lies on one side of a limit if it does so by this many σ."""
+RESPONSE_LIMIT_SIGMA = 4.0
+"""Number of σ by which a response must be beyond a limit to count as beyond it."""
 
-MAX_AT_ONCE = 100
+MAX_SHOWN_MODES = 100
 """Modes that are shown together: each has a line of its own, and shares the budget."""
 
-MAX_BESIDE = 40
+MAX_WEAK_LINES = 40
 """Largest number of modes that weak lines verify during the first dither."""
 
-FEWER = 4
+FAILED_DITHER_DIVISOR = 4
 """Divisor of that number after each dither without a result: fewer modes get larger amplitudes."""
 
-CLOSEST_STEPS = 5
+MIN_LINE_SPACING_STEPS = 5
 """Smallest spacing of two lines in inverse window lengths. Four separate them; rounding takes up to
 one."""
 
-TOLD_WITHIN_S = 15.0
+RESULT_TIMEOUT_S = 15.0
 """Time for a result after a dither was requested, in addition to the window itself."""
 
-TRIES = 3
+MAX_PROOF_TRIES = 3
 """Number of dithers without a result after which modes are not tried for a while."""
 
 
@@ -155,7 +155,9 @@ def modes_to_show(context: StepContext, rtc: Status, window_s: float) -> tuple[i
     missing = _missing_modes(context, rtc)
     if not (is_settled(registration) or (unknown_loop(state, rtc) and _plausible(registration))):
         return ()
-    at_once = max(MAX_AT_ONCE // FEWER**state.matrices.mode_proof.n_tries, N_LINES)
+    at_once = max(
+        MAX_SHOWN_MODES // FAILED_DITHER_DIVISOR**state.matrices.mode_proof.n_tries, N_LINES
+    )
     most = min(len(lines_clear(context, rtc, window_s)), at_once, rtc.max_dither_modes)
     shown = missing[:most]
     others = [mode for mode in _to_compare(context, rtc, shown) if mode not in shown]
@@ -176,7 +178,7 @@ def modes_beside(context: StepContext, rtc: Status, telling: tuple[int, ...]) ->
     if idle or not chosen or not awaits_proof(context, rtc):
         return []
     free = (mode for mode in _missing_modes(context, rtc) if mode >= rtc.n_controlled)
-    return [mode for mode in free if mode not in telling][:MAX_BESIDE]
+    return [mode for mode in free if mode not in telling][:MAX_WEAK_LINES]
 
 
 def _to_compare(context: StepContext, rtc: Status, shown: list[int]) -> list[int]:
@@ -189,7 +191,7 @@ def _to_compare(context: StepContext, rtc: Status, shown: list[int]) -> list[int
         # the loop answers a dither of its own modes: rather those that it leaves alone, too
         side = doubted in controlled
         healthy.sort(key=lambda m: ((m in controlled) != side, abs(m - doubted)))
-        found |= dict.fromkeys(healthy[:NEIGHBOURS])
+        found |= dict.fromkeys(healthy[:N_NEIGHBOURS])
     new = range(_wanted_modes(context, rtc)) if shown else ()
     return [*found, *(m for m in new if m not in proof.compared | controlled | odd)]
 
@@ -210,14 +212,16 @@ def _plausible(registration: Registration) -> bool:
 def lines_clear(context: StepContext, rtc: Status, window_s: float) -> tuple[float, ...]:
     """Return lines for many modes at once: evenly spaced, none on a vibration, lowest first."""
     step, edge_hz = step_of(rtc, window_s), float(SIDE_OFFSETS_HZ.max()) + 1.0
-    low = max(PROVING_RANGE[0] * rtc.frame_rate_hz, edge_hz)
-    high = min(PROVING_RANGE[1] * rtc.frame_rate_hz, rtc.frame_rate_hz / 2 - edge_hz)
+    low = max(PROVING_LINE_RANGE[0] * rtc.frame_rate_hz, edge_hz)
+    high = min(PROVING_LINE_RANGE[1] * rtc.frame_rate_hz, rtc.frame_rate_hz / 2 - edge_hz)
     # whole hertz apart: what is played is looked at second by second, and lines must not mix there
-    spacing = np.ceil(max(CLOSEST_STEPS * step, (high - low) / MAX_AT_ONCE))
+    spacing = np.ceil(max(MIN_LINE_SPACING_STEPS * step, (high - low) / MAX_SHOWN_MODES))
     avoid = (*context.policy.dither_avoid_hz, *context.loop.vibrations_hz)
     lines = np.arange(np.ceil(low), high, spacing)
     return tuple(
-        float(line) for line in lines if all(abs(line - v) >= CLEARANCES_HZ[-1] for v in avoid)
+        float(line)
+        for line in lines
+        if all(abs(line - v) >= VIBRATION_CLEARANCES_HZ[-1] for v in avoid)
     )
 
 
@@ -237,7 +241,7 @@ def awaits_result(context: StepContext, window_s: float) -> bool:
     """Return whether what the last such dither has shown may still be on its way."""
     proof = context.matrices.mode_proof
     waited_s = (context.now_ns - proof.shown_ns_utc) / SECOND_NS
-    return bool(proof.shown) and waited_s < window_s + TOLD_WITHIN_S
+    return bool(proof.shown) and waited_s < window_s + RESULT_TIMEOUT_S
 
 
 def learn_modes(context: StepContext, estimate: LockInEstimate | RandomEstimate) -> None:
@@ -380,12 +384,14 @@ def _classify(
     """Return which modes answer as they should, and which certainly do not; the rest may do."""
     typical = float(np.median(size))
     low, high = (
-        max(PLAUSIBLE_RESPONSE_RATIO[0] * typical, MIN_RESPONSE),
+        max(PLAUSIBLE_RESPONSE_RATIO[0] * typical, MIN_RESPONSE_RATIO),
         PLAUSIBLE_RESPONSE_RATIO[1] * typical,
     )
-    seen = gains > SIGNIFICANT * sigma
+    seen = gains > RESPONSE_LIMIT_SIGMA * sigma
     proven = seen & (gains > low) & (gains < high)
-    contrary = (gains + SIGNIFICANT * sigma < low) | (gains - SIGNIFICANT * sigma > high)
+    contrary = (gains + RESPONSE_LIMIT_SIGMA * sigma < low) | (
+        gains - RESPONSE_LIMIT_SIGMA * sigma > high
+    )
     return proven, contrary & ~proven
 
 
@@ -422,7 +428,7 @@ def _contrary_in_the_way(context: StepContext, rtc: Status) -> list[int]:
 def _in_words(proof: ModeProof, modes: list[int]) -> str:
     """Return how modes have answered, in brackets."""
     answers = {answer.mode: answer for answer in proof.answers}
-    listed = [answers[mode] for mode in modes[:NAMED] if mode in answers]
+    listed = [answers[mode] for mode in modes[:MAX_LISTED_MODES] if mode in answers]
     parts = []
     for answer in listed:
         other = answers.get(answer.like)
@@ -446,7 +452,7 @@ def uneven_text(context: StepContext) -> str | None:
         one = "answers" if len(proof.uneven) == 1 else "answer"
         noun = "mode" if len(proof.uneven) == 1 else "modes"
         found.append(
-            f"{noun} {as_list(proof.uneven)} {one} the dither more than {UNEVEN:g} times as "
+            f"{noun} {as_list(proof.uneven)} {one} the dither more than {UNEVEN_RATIO:g} times as "
             "strongly or as weakly as the modes beside"
         )
     return "; ".join(found) or None
@@ -460,13 +466,14 @@ def _after_miss(proof: ModeProof) -> ModeProof:
 def give_up_unseen(context: StepContext, rtc: Status) -> None:
     """Leave modes alone for a while that several dithers have not shown."""
     proof = context.matrices.mode_proof
-    if proof.n_tries < TRIES:
+    if proof.n_tries < MAX_PROOF_TRIES:
         return
     suspected = proof.suspected - proof.shown
     given_up = replace(proof, shown=frozenset(), n_tries=0, suspected=suspected)
     context.matrices = replace(context.matrices, mode_proof=given_up)
     text = (
-        f"{as_subject(proof.shown)} not been seen to answer in {TRIES} dithers: see why windows "
+        f"{as_subject(proof.shown)} not been seen to answer in {MAX_PROOF_TRIES} dithers: "
+        "see why windows "
         "are refused, or give the dither more budget"
     )
     limit_modes(context, n_proven_modes(context.state, rtc.n_modes), text)

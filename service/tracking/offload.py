@@ -26,19 +26,19 @@ from service.tracking.update_policy import is_settled
 from service.tracking.validity import MOVING, end_of, make_valid, void_until
 from service.wire import OffloadRequest, Reply, Status
 
-DISOBEDIENCE = 0.3
+OFFLOAD_ERROR_SIGMA = 0.3
 """1 σ of the relative error with which a device follows a demand."""
 
-CROSS_TALK = 0.05
+CROSS_TALK_SIGMA = 0.05
 """1 σ of what a step of one axis does to another, in limits of a step."""
 
-BEHIND = 1.5
+MAX_STEPS_BEHIND = 1.5
 """Steps by which α may leave the registration that the matrix in use was made for."""
 
-LONGEST_S = 50.0
+MAX_MOVE_DURATION_S = 50.0
 """Longest move that a reply may announce; telemetry of a minute ago may be of another clock."""
 
-STATUS_S = 1.0
+MAX_STATUS_AGE_S = 1.0
 """Largest age of the last status, whose clock gives the end of a move."""
 
 Array = NDArray[np.float64]
@@ -88,7 +88,7 @@ def wanted_step(
     used = state.reconstructor(state.matrices.in_use) if state.matrices.in_use else None
     made_for = start if used is None or used.alpha is None else used.alpha.vector
     before, after = (np.abs(_apart(at, made_for)) for at in (alpha, alpha + step))
-    allowed = np.maximum(before, BEHIND * limits.max_step)
+    allowed = np.maximum(before, MAX_STEPS_BEHIND * limits.max_step)
     idle = (np.abs(off) <= limits.near) | (after > allowed) | (limits.travel == 0.0)
     return np.where(idle, 0.0, step)
 
@@ -106,8 +106,8 @@ def on_answer(context: StepContext, request: OffloadRequest, reply: Reply) -> No
     lasts_s = limits.settle_s
     if reply.start_seq is not None and rtc is not None and rtc.seq is not None:
         until_s = (reply.start_seq - rtc.seq) / rtc.frame_rate_hz
-        lasts_s = min(max(until_s, 0.0), LONGEST_S)
-    spread = DISOBEDIENCE * np.abs(offload.step) + _cross_talk(offload.step, limits)
+        lasts_s = min(max(until_s, 0.0), MAX_MOVE_DURATION_S)
+    spread = OFFLOAD_ERROR_SIGMA * np.abs(offload.step) + _cross_talk(offload.step, limits)
     still_ns = _clock_ns(context, lasts_s)
     done = replace(offload, total=offload.total + offload.step, n_moves=offload.n_moves + 1)
     void_until(context, still_ns, MOVING)
@@ -178,7 +178,11 @@ def _rest_ns(last: Offload, policy: Policy) -> int:
 
 def _clock_ns(context: StepContext, after_s: float) -> int:
     """Return the RTC's clock so long after now, at the latest; 0: unknown."""
-    return 0 if context.rtc is None else context.rtc.t_ns + round((STATUS_S + after_s) * SECOND_NS)
+    return (
+        0
+        if context.rtc is None
+        else context.rtc.t_ns + round((MAX_STATUS_AGE_S + after_s) * SECOND_NS)
+    )
 
 
 def _end(context: StepContext, offload: Offload, state: OffloadState, text: str) -> None:
@@ -188,7 +192,7 @@ def _end(context: StepContext, offload: Offload, state: OffloadState, text: str)
 def _cross_talk(step: Array, limits: Offloading) -> Array:
     """Return ``(4,)`` 1 σ of what a step may do to the axes that it does not mean."""
     share = np.abs(step) / np.maximum(limits.max_step, 1e-12)
-    return np.asarray(CROSS_TALK * share.max() * limits.max_step)
+    return np.asarray(CROSS_TALK_SIGMA * share.max() * limits.max_step)
 
 
 def _apart(alpha: Array, other: Array) -> Array:

@@ -96,7 +96,7 @@ class Acquisition:
 
     stage: AcquisitionStage = AcquisitionStage.IDLE
     text: str = "none was needed"
-    """What the acquisition is doing, or how it ended and what to do."""
+    """Current step of the acquisition, or its end and the remedy."""
 
     started_ns_utc: int = 0
     since_ns_utc: int = 0
@@ -234,7 +234,7 @@ class Probation:
     """The numbers that were compared; None: not yet, or there are none."""
 
     worse: str = ""
-    """How the matrix made the loop worse; empty if it did not."""
+    """Way in which the matrix made the loop worse; empty if it did not."""
 
     rollback: str | None = None
     """Id under which the matrix before was sent again; None: it was not."""

@@ -15,8 +15,8 @@ from service.tracking.commands import GainGroup, ModeGroup
 from service.tracking.dither import allow_dither, request_dither
 from service.tracking.dither_plan import operator_parameters
 from service.tracking.dither_request import (
-    ASKED_DITHER,
-    RANDOM_TOTAL_M,
+    DEFAULT_RANDOM_RMS_M,
+    OPERATOR_DITHER,
     Dither,
     check_modes,
     cost_of,
@@ -116,9 +116,9 @@ def _planned(context: StepContext, rtc: Status, command: cmd.StartDither) -> Dit
             rtc,
             policy,
             now_ns,
-            dither_id=f"{ASKED_DITHER}{now_ns}",
+            dither_id=f"{OPERATOR_DITHER}{now_ns}",
             modes=command.modes or ModeSet.CONTROLLED,
-            total_m=command.total_amplitude_m or min(RANDOM_TOTAL_M, policy.dither_budget_m),
+            total_m=command.total_amplitude_m or min(DEFAULT_RANDOM_RMS_M, policy.dither_budget_m),
             duration_s=command.duration_s or policy.dither_duration_s,
         )
     dither = plan_dither(
@@ -170,11 +170,12 @@ RAMP_GAINS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
 RAMP_STEP_S = 1.0
 """At each gain: an integrator settles in a tenth of it."""
 
-CLOSE_AGAIN_EVERY_S = 5.0
+RECLOSING_INTERVAL_S = 5.0
 """An RTC that still measures refuses; it is asked again."""
 
-CLOSE_AGAIN_FOR_S = 3600.0
-"""Time for which the loop is closed again automatically; later, somebody wants it open."""
+MAX_RECLOSING_S = 3600.0
+"""Time for which the loop is closed again automatically; a loop open for longer is taken as open on
+purpose."""
 
 
 def set_loop(context: StepContext, command: cmd.SetLoop) -> None:
@@ -259,12 +260,12 @@ def close_again(context: StepContext) -> None:
     waited_s = (context.now_ns - since_ns) / SECOND_NS
     # a measurement only just asked for may open it yet
     closed = rtc.loop != "open"
-    if waited_s > (CLOSE_AGAIN_EVERY_S if closed else CLOSE_AGAIN_FOR_S):
+    if waited_s > (RECLOSING_INTERVAL_S if closed else MAX_RECLOSING_S):
         context.loop = replace(context.loop, close_since_ns_utc=None)
         return
     last = context.loop.command
     recent = (
-        last is not None and context.now_ns - last.asked_ns_utc < CLOSE_AGAIN_EVERY_S * SECOND_NS
+        last is not None and context.now_ns - last.asked_ns_utc < RECLOSING_INTERVAL_S * SECOND_NS
     )
     if not closed and not recent:
         request = LoopRequest(id=f"loop-{context.now_ns}", loop=Loop.CLOSED)

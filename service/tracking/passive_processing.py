@@ -69,7 +69,7 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
     far = jumps.passive_innovation(
         registration, filtering.joint_of(registration), block, window, context.policy
     )
-    if far > jumps.PASSIVE_LIMIT:
+    if far > jumps.MAX_PASSIVE_INNOVATION:
         _ask_for_window(context, registration, event, prior, far)
         return
     joint = kalman.corrected(prior, measured, estimate.covariance, block)

@@ -33,16 +33,16 @@ from service.tracking.validity import (
 
 Array = NDArray[np.float64]
 
-SPACING_NS = SECOND_NS // 2
+PATH_SPACING_NS = SECOND_NS // 2
 """Spacing of the recorded points of the path; between them it is interpolated linearly."""
 
-WAY_KEPT = 240
+MAX_PATH_POINTS = 240
 
 MAX_STEP = np.array([0.5, 0.5, np.deg2rad(3.0), 0.02])
 """Largest step of a law at once, and per second in addition, numeric units. Telescopes turn by a
 few degrees a second at most; a larger step is an error of the reported values."""
 
-FREE_STEP = np.array([0.03, 0.03, np.deg2rad(0.3), 0.002])
+MAX_STEP_AT_REST = np.array([0.03, 0.03, np.deg2rad(0.3), 0.002])
 """Largest step of a law of the pointing alone while the telescope is at rest, numeric units."""
 
 STEP_PER_DEG = np.array([0.2, 0.2, np.deg2rad(3.0), 0.004])
@@ -51,19 +51,19 @@ faster than the azimuth, and a pupil that turns about a point ten subapertures a
 law that is not periodic moves by its whole range at north, where the telescope has hardly turned.
 """
 
-BELIEVED_S = 3.0
+LEAP_CONFIRMATION_S = 3.0
 """A leap of the pointing that has lasted for this time is accepted."""
 
-LEAD_S = 6.0
+MATRIX_LEAD_S = 6.0
 """A matrix is made for the law so far ahead: it is judged and sent in half of that."""
 
-MAX_LEAD = np.array([0.2, 0.2, np.deg2rad(0.5), 0.008])
+MAX_LEAD_STEP = np.array([0.2, 0.2, np.deg2rad(0.5), 0.008])
 """A law that moves further in that time is of a telescope that slews, numeric units."""
 
-RATE_OVER_NS = 2 * SECOND_NS
+RATE_INTERVAL_NS = 2 * SECOND_NS
 """Over so long the rate of the law is taken."""
 
-SMEARED = np.array([0.1, 0.1, np.deg2rad(0.3), 0.004])
+MAX_WINDOW_MOTION = np.array([0.1, 0.1, np.deg2rad(0.3), 0.004])
 """A window in which the law moved further belongs to no single registration."""
 
 
@@ -121,11 +121,12 @@ def start_of_fit(
 def registration_ahead(state: TrackerState, registration: Registration) -> Registration:
     """Return what a matrix is to be made for: α half its life ahead, and σ for all of it.
 
-    α ± 3σ so returned holds α ± 3σ of now and of twice ``LEAD_S`` from now, as the law moves.
+    The returned α ± 3σ contains the present α ± 3σ and that at twice ``MATRIX_LEAD_S`` from now, as
+    the law moves.
     Nothing can be made for a slew: then, and where nothing moves, it is what is known now.
     """
-    step = LEAD_S * _rate(state)
-    if not step.any() or np.any(np.abs(step) > MAX_LEAD):
+    step = MATRIX_LEAD_S * _rate(state)
+    if not step.any() or np.any(np.abs(step) > MAX_LEAD_STEP):
         return registration
     third, sigma = np.abs(step) / 3.0, registration.sigma
     added = third**2 + 2.0 * sigma * third  # the root of σ² and this is σ and a third
@@ -142,7 +143,7 @@ def _rate(state: TrackerState) -> Array:
     if len(way) < 2:
         return np.zeros(4)
     (last_ns, last), first_ns = way[-1], way[0][0]
-    since_ns = max(last_ns - RATE_OVER_NS, first_ns)
+    since_ns = max(last_ns - RATE_INTERVAL_NS, first_ns)
     then = law_at(state, since_ns)
     if then is None or since_ns >= last_ns:
         return np.zeros(4)
@@ -155,7 +156,7 @@ def why_smeared(state: TrackerState, began_ns_utc: int, ended_ns_utc: int) -> st
     if first is None or last is None:
         return None
     step = difference(first, last)
-    if np.all(np.abs(step) <= SMEARED):
+    if np.all(np.abs(step) <= MAX_WINDOW_MOTION):
         return None
     return f"the law of pointing moved α inside the window, by {step_text(step)}"
 
@@ -245,7 +246,7 @@ def _outruns_pointing(context: StepContext, law: PointingLaw, now: Misregistrati
     turned_deg = abs(pointing.elevation_deg - state.pointing.elevation_deg) + abs(
         math.remainder(pointing.azimuth_deg - state.pointing.azimuth_deg, 360.0)
     )
-    allowed = FREE_STEP + STEP_PER_DEG * turned_deg
+    allowed = MAX_STEP_AT_REST + STEP_PER_DEG * turned_deg
     return bool(np.any(np.abs(difference(state.nominal, now)) > allowed))
 
 
@@ -257,12 +258,12 @@ def _hold(context: StepContext, before: Misregistration, now: Misregistration) -
         text = (
             f"what the law of pointing is told leapt, and would move α by "
             f"{step_text(difference(before, now))} at once: α is let be until it has stood for "
-            f"{BELIEVED_S:.0f} s; see who tells the pointing"
+            f"{LEAP_CONFIRMATION_S:.0f} s; see who tells the pointing"
         )
         _set(context, replace(law, problem=text, leap=leap))
         return
     leap = replace(leap, to=now, worked_out_ns_utc=context.now_ns)
-    if context.now_ns - leap.since_ns_utc < BELIEVED_S * SECOND_NS:
+    if context.now_ns - leap.since_ns_utc < LEAP_CONFIRMATION_S * SECOND_NS:
         _set(context, replace(law, leap=leap))
         return
     _set(context, replace(law, way=()))
@@ -310,8 +311,8 @@ def _way(context: StepContext, now: Misregistration) -> tuple[tuple[int, Misregi
         kept = tuple(place for place in way if place[0] < t_ns)
         return (*kept, (t_ns, now))
     still = len(way) > 1 and way[-1][1] == way[-2][1] == now
-    close = len(way) > 1 and t_ns - way[-2][0] < SPACING_NS and way[-1][1] != way[-2][1]
-    return (*(way[:-1] if still or close else way), (t_ns, now))[-WAY_KEPT:]
+    close = len(way) > 1 and t_ns - way[-2][0] < PATH_SPACING_NS and way[-1][1] != way[-2][1]
+    return (*(way[:-1] if still or close else way), (t_ns, now))[-MAX_PATH_POINTS:]
 
 
 def _set(context: StepContext, law: LawState) -> None:

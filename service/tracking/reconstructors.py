@@ -241,9 +241,9 @@ def on_proposal_judged(context: StepContext, event: ev.ProposalJudged) -> None:
 
 
 def send(context: StepContext, matrix_id: str, swapped_ns_utc: int | None = None) -> None:
-    """Mark a reconstructor as published and ask for it to be sent, with the gains in force.
+    """Mark a reconstructor as published and request to send it, with the gains in force.
 
-    ``swapped_ns_utc``: to go back behind the swap of then, as :func:`why_unsendable` has it.
+    ``swapped_ns_utc`` requests a rollback behind the swap of that time, see :func:`why_unsendable`.
 
     Raises
     ------
@@ -291,7 +291,7 @@ def on_acknowledgement(context: StepContext, event: Acknowledgement) -> None:
 
     A rejection without an id is of a commit that the RTC could not read. It says nothing of a
     matrix of this service that is on its way: anyone may have sent that commit, and one of the
-    service's own is given up after ``ACKNOWLEDGE_WITHIN_S`` without an answer.
+    service's own is given up after ``ACKNOWLEDGEMENT_TIMEOUT_S`` without an answer.
     """
     if event.id is None:
         _warn_of_unreadable_commit(context, event)

@@ -28,7 +28,7 @@ from service.tracking.validity import (
     restore_registration,
 )
 
-CLOCKS_AGREE_S = 60.0
+MAX_CLOCK_DIFFERENCE_S = 60.0
 """A state from further in the future than this was saved under another clock."""
 
 _RESTARTED = {
@@ -226,7 +226,7 @@ def _why_not(state: TrackerState, saved: Saved, now_ns: int) -> str | None:
     if saved.system != state.system:
         return f"it is of system {saved.system}, this is {state.system}"
     ahead_s = (saved.saved_ns_utc - now_ns) / SECOND_NS
-    if ahead_s > CLOCKS_AGREE_S:
+    if ahead_s > MAX_CLOCK_DIFFERENCE_S:
         return f"it was saved {ahead_s:.0f} s in the future: is this machine's clock right?"
     registration = saved.registration
     if registration is None:

@@ -22,12 +22,12 @@ from service.tracking.products import MatrixState
 from service.tracking.step_context import StepContext, log_bursts
 from service.wire import DitherRequest, DitherStop, Status
 
-ACKNOWLEDGE_WITHIN_S = 3.0
+ACKNOWLEDGEMENT_TIMEOUT_S = 3.0
 """An RTC applies within 2 s of the commit, or it has failed."""
 
 _SAME_LINE_HZ = 2.5
 
-COMPUTE_WITHIN_S = 60.0
+COMPUTATION_TIMEOUT_S = 60.0
 """A reconstructor that takes longer was lost with its worker."""
 
 
@@ -35,18 +35,19 @@ def on_tick(context: StepContext) -> None:
     """Give up what has been waited for too long."""
     for record in context.matrices.reconstructors:
         sent_ns = record.published_ns_utc or context.now_ns
-        if record.on_its_way and context.now_ns - sent_ns > ACKNOWLEDGE_WITHIN_S * SECOND_NS:
+        if record.on_its_way and context.now_ns - sent_ns > ACKNOWLEDGEMENT_TIMEOUT_S * SECOND_NS:
             text = (
-                f"{record.id} was not applied within {ACKNOWLEDGE_WITHIN_S:.0f} s; the RTC keeps "
+                f"{record.id} was not applied within {ACKNOWLEDGEMENT_TIMEOUT_S:.0f} s; "
+                "the RTC keeps "
                 "the old one: see the RTC's log, then publish again"
             )
             reconstructors.change_state(context, record.id, MatrixState.FAILED, text)
             with context.because_of(record.cause):
                 context.raise_alarm(alarms.NOT_ACKNOWLEDGED, text)
     since_ns = context.matrices.making_since_ns_utc
-    if since_ns is not None and context.now_ns - since_ns > COMPUTE_WITHIN_S * SECOND_NS:
+    if since_ns is not None and context.now_ns - since_ns > COMPUTATION_TIMEOUT_S * SECOND_NS:
         reconstructors.note_none_made(context)
-        text = f"no reconstructor came within {COMPUTE_WITHIN_S:.0f} s"
+        text = f"no reconstructor came within {COMPUTATION_TIMEOUT_S:.0f} s"
         context.warn("reconstructor.lost", text)
     log_bursts(context)
 
@@ -170,7 +171,7 @@ def on_vanished(context: StepContext, _: ev.RtcVanished) -> None:
 
 
 def on_services(context: StepContext, event: ev.ServicesMet) -> None:
-    """Stand by while another service drives the RTC, or report that one stands by."""
+    """Go to standby while another service drives the RTC, or report that one is in standby."""
     who = " and ".join(event.others)
     stood_by = context.state.alarm(alarms.STANDING_BY) is not None
     if not event.others:

@@ -81,7 +81,7 @@ class ObservatoryValue:
     """It counts before this."""
 
     by: str
-    """Name of whoever reported it; empty if unknown."""
+    """Name of the person who reported it; empty if unknown."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,7 +119,7 @@ class OperatorState:
     settings."""
 
     stopped_because: str = ""
-    """Who has stopped everything, and why; empty if nothing is stopped."""
+    """Operator who has stopped everything, and the reason; empty if nothing is stopped."""
 
     failures: tuple[Failure, ...] = ()
     """Failures, oldest first, bounded in number. The source of an order finds its own by the cause.
@@ -214,7 +214,7 @@ class MatrixStates:
     none."""
 
     applied_asked_ns_utc: int = 0
-    """Time at which the RTC was last asked for the matrix it uses."""
+    """Time of the last request to the RTC for the matrix that it uses."""
 
     read_back_error: str = ""
     """Reason why that matrix could not be read; empty if it could."""
@@ -273,7 +273,7 @@ class DitherState:
     """Dithers lost since the last window was accepted."""
 
     policy: DitherPolicyState = field(default_factory=DitherPolicyState)
-    """What the dither policy has learnt, and its reason for the present dither or its absence."""
+    """Statistics of the dither policy, and its reason for the present dither or its absence."""
 
     no_dither_before_ns_utc: int = 0
     """Time before which no further dither is requested, so that a refused dither does not block
@@ -414,10 +414,10 @@ class Orders:
 
     dither_stopped: bool = False
     stopped: str = ""
-    """Who has stopped everything, and why; empty if nothing was stopped."""
+    """Operator who has stopped everything, and the reason; empty if nothing was stopped."""
 
     seen: tuple[AlarmRecord, ...] = ()
-    """Alarms that operators have acknowledged, and alarms that nobody has acknowledged."""
+    """Alarms with and without an operator's acknowledgement."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

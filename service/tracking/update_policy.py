@@ -1,4 +1,4 @@
-"""Decide whether a new reconstructor is worth a swap, and of how many modes."""
+"""Decide whether a new reconstructor justifies a swap, and its number of modes."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext
 from service.wire import Status
 
-MIN_WINDOWS = 2
+MIN_AGREEING_WINDOWS = 2
 """Windows that must agree before anything is made from them."""
 
-REACH = np.array([0.05, 0.05, np.deg2rad(0.05), 0.005])
+VERDICT_MARGIN = np.array([0.05, 0.05, np.deg2rad(0.05), 0.005])
 """Half of the accuracy that 594 modes need, 10 % of a subaperture and 0.1 deg (Heritier et al.
 2018, section 3.2), and 0.5 % of magnification: a verdict is as good so far
 beyond α ± 3σ (numeric units)."""
 
-CALMING_S = 60.0
-"""After an update the thresholds are doubled, and come down to their own over this time."""
+THRESHOLD_DECAY_S = 60.0
+"""Time over which the thresholds, doubled by an update, return to their own values."""
 
-SIGNIFICANT = 18.5
+MIN_SIGNIFICANT_STEP = 18.5
 """Squared distance, in σ, of a step of four parameters that noise makes once in a thousand."""
 
-NOTICED = np.array([0.01, 0.01, np.deg2rad(0.02), 0.001])
+MIN_RELEVANT_MOVE = np.array([0.01, 0.01, np.deg2rad(0.02), 0.001])
 """A move of α that changes what a new matrix would win (numeric units), if it is more than 1 σ."""
 
-PROPOSAL_STANDS_S = 30.0
-"""A proposal is not replaced before, however much better α is known by then: an operator reads why,
-looks at the loop and clicks, and the gate judges it once more."""
+MIN_PROPOSAL_LIFETIME_S = 30.0
+"""Time during which a proposal is not replaced, even if α is known better: an operator needs it to
+read the reason, check the loop and approve, and the gate judges the proposal once more."""
 
-VERDICT_REACH = np.array([0.01, 0.01, np.deg2rad(0.02), 0.001])
-"""A verdict of the gate is not for a registration further away than this (numeric units)."""
+MAX_VERDICT_DISTANCE = np.array([0.01, 0.01, np.deg2rad(0.02), 0.001])
+"""Largest distance of a registration from the one of a verdict, numeric units."""
 
 
 def is_settled(registration: Registration) -> bool:
-    """Return whether α may be believed: windows agree, and none of them hints at a jump."""
+    """Return True if α is reliable: windows agree, and none of them indicates a jump."""
     sure = registration.suspected_jump is None and not registration.doubt
-    return registration.n_windows >= MIN_WINDOWS and sure and registration.usable
+    return registration.n_windows >= MIN_AGREEING_WINDOWS and sure and registration.usable
 
 
 def verdict_invalid_reason(
@@ -55,13 +55,13 @@ def verdict_invalid_reason(
     """Return why a verdict says nothing of a loop with these gains now; None: it does.
 
     It was taken over α ± 3σ as they were then, which must hold all of α ± 3σ as they are now, but
-    for a small ``REACH``: σ grows between two windows, and another verdict takes as long.
+    for a small ``VERDICT_MARGIN``: σ grows between two windows, and another verdict takes as long.
     """
     registration = state.alpha.registration
     if registration is None or judged is None:
         return None if registration is None else why_of_another_loop(state, judged, gains)
     moved = registration.alpha.distance(judged.alpha)
-    if np.any(moved + 3.0 * registration.sigma > 3.0 * judged.sigma + REACH):
+    if np.any(moved + 3.0 * registration.sigma > 3.0 * judged.sigma + VERDICT_MARGIN):
         return "α ± 3σ reaches further than it was judged for"
     return why_of_another_loop(state, judged, gains)
 
@@ -69,9 +69,10 @@ def verdict_invalid_reason(
 def verdict_doubtful_reason(
     state: TrackerState, judged: Judged | None, gains: tuple[float, ...]
 ) -> str | None:
-    """Return the same where it need not be sent: while α is in doubt no verdict is of where it is.
+    """Return why a verdict is invalid or α in doubt, or None.
 
-    A reconstructor that somebody wants back is sent all the same.
+    While α is in doubt no verdict is known to cover it. A reconstructor that was requested by an
+    operator is sent all the same.
     """
     registration = state.alpha.registration
     if registration is not None and registration.doubt:
@@ -82,9 +83,9 @@ def verdict_doubtful_reason(
 def why_of_another_loop(
     state: TrackerState, judged: Judged | None, gains: tuple[float, ...]
 ) -> str | None:
-    """Return what is different in the loop since a verdict; None: nothing, or no RTC is there.
+    """Return what has changed in the loop since a verdict; None if nothing, or without an RTC.
 
-    An open loop does not tell the gains it will close with.
+    The status of an open loop does not contain the gains that it will close with.
     """
     rtc = state.loop.rtc
     if rtc is None:
@@ -141,7 +142,9 @@ def assessment_is_old(state: TrackerState, in_use: ReconstructorRecord) -> bool:
     ):
         return False
     noise = np.sqrt(np.diag(registration.covariance))
-    return bool(np.any(registration.alpha.distance(last.alpha) > np.maximum(NOTICED, noise)))
+    return bool(
+        np.any(registration.alpha.distance(last.alpha) > np.maximum(MIN_RELEVANT_MOVE, noise))
+    )
 
 
 def _gain_reason(
@@ -178,23 +181,23 @@ def _margin_lost(last: Assessment) -> float:
 def _raised(in_use: ReconstructorRecord, now_ns: int) -> float:
     """Return by how much the thresholds are raised so soon after an update."""
     since_s = (now_ns - in_use.created_ns_utc) / SECOND_NS
-    return 1.0 + max(0.0, 1.0 - since_s / CALMING_S)
+    return 1.0 + max(0.0, 1.0 - since_s / THRESHOLD_DECAY_S)
 
 
 def _step_since(
     in_use: ReconstructorRecord, alpha: Misregistration, registration: Registration
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Return the step from what a matrix was made for to ``alpha``, and its covariance.
+    """Return the step from a matrix's registration to ``alpha``, and its covariance.
 
-    As both were measured: they share the model error; what drift may have added since is no error
-    of either. None: noise explains it, or nobody knows.
+    Both are taken as measured: they share the model error, and drift that was added since is not an
+    error of either. None if noise explains the step, or the matrix's registration is unknown.
     """
     if in_use.alpha is None or in_use.sigma is None:
         return None
     step = alpha.vector - in_use.alpha.vector
     then = np.maximum(in_use.sigma**2 - registration.floor**2, 0.0)
     covariance = registration.covariance + np.diag(then)
-    far = step @ np.linalg.solve(covariance, step) >= SIGNIFICANT
+    far = step @ np.linalg.solve(covariance, step) >= MIN_SIGNIFICANT_STEP
     return (step, covariance) if far else None
 
 
@@ -219,7 +222,7 @@ def _jumped(state: TrackerState, in_use: ReconstructorRecord, registration: Regi
 
 
 def is_left_behind(state: TrackerState, record: ReconstructorRecord, policy: Policy) -> bool:
-    """Return whether α has gone so far from this reconstructor that nobody may want it now."""
+    """Return True if α is so far from this reconstructor that it is obsolete."""
     registration = state.alpha.registration
     return registration is not None and (
         has_moved(state, record, policy) or _jumped(state, record, registration)
@@ -228,7 +231,7 @@ def is_left_behind(state: TrackerState, record: ReconstructorRecord, policy: Pol
 
 def is_outdated(state: TrackerState, record: ReconstructorRecord) -> bool:
     """Return whether this reconstructor's verdict is of another registration than the present."""
-    return _apart(state, record, VERDICT_REACH)
+    return _apart(state, record, MAX_VERDICT_DISTANCE)
 
 
 def is_beyond_verdict(state: TrackerState, record: ReconstructorRecord) -> bool:
@@ -237,7 +240,7 @@ def is_beyond_verdict(state: TrackerState, record: ReconstructorRecord) -> bool:
     if registration is None or record.alpha is None or record.sigma is None:
         return False
     moved = registration.alpha.distance(record.alpha) - 3.0 * registration.sigma
-    return bool(np.any(moved > 3.0 * record.sigma + REACH))
+    return bool(np.any(moved > 3.0 * record.sigma + VERDICT_MARGIN))
 
 
 def _apart(
@@ -253,39 +256,39 @@ def _apart(
     return bool(np.any(distance > np.maximum(threshold, 3.0 * noise)))
 
 
-LADDER = (
+MODE_NUMBERS = (
     *(594, 550, 500, 450, 400, 350, 300, 260, 230, 200, 175, 150),
     *(130, 115, 100, 90, 80, 70, 60, 52, 45, 40, 35, 30),
 )
 """Numbers of modes that are tried. A step costs 2 nm of wavefront at 594 modes, 6 at 400, 11 at 100
 (FLAO, 1", where 400 leave 117); halves are tried, so that a finer list costs a trial at most."""
 
-FIRST_WAIT_S = 60.0
-"""After modes were lowered, before more are tried."""
+FIRST_MODES_DELAY_S = 60.0
+"""First delay after the number of modes was lowered before more are tried."""
 
-LONGEST_WAIT_S = 1800.0
+MAX_MODES_DELAY_S = 1800.0
 
-OPERATORS_WAIT_S = 3600.0
-"""After an operator declined more modes: who has said no is not asked again in the same hour."""
+DECLINED_MODES_DELAY_S = 3600.0
+"""Delay after an operator declined more modes: the same hour brings no second proposal."""
 
-FORGIVEN_AFTER_S = 3600.0
+MODES_LIMIT_MEMORY_S = 3600.0
 """A limit found again later than this has nothing to do with the last one."""
 
-COMFORT = 1.5
+MORE_MODES_MARGIN_RATIO = 1.5
 """More modes are tried only while there is this times the margin that the gate asks for."""
 
-_DECLINED = frozenset({MatrixState.REFUSED, MatrixState.REJECTED, MatrixState.FAILED})
-"""By the gate when it judged it again, or by the RTC."""
+_DECLINED_STATES = frozenset({MatrixState.REFUSED, MatrixState.REJECTED, MatrixState.FAILED})
+"""States after a rejection by the gate, when it judged again, or by the RTC."""
 
 
 def half_of_modes(n_modes: int) -> int:
     """Return the largest rung that is at most half of ``n_modes``, or these where there is none."""
-    return max((rung for rung in LADDER if 2 * rung <= n_modes), default=n_modes)
+    return max((rung for rung in MODE_NUMBERS if 2 * rung <= n_modes), default=n_modes)
 
 
 def fewer_modes_than(n_modes: int) -> tuple[int, ...]:
     """Return the rungs below ``n_modes``, largest first."""
-    return tuple(rung for rung in LADDER if rung < n_modes)
+    return tuple(rung for rung in MODE_NUMBERS if rung < n_modes)
 
 
 def more_modes_to_try(
@@ -309,7 +312,7 @@ def _comfortable(state: TrackerState) -> bool:
     margin = state.matrices.margin
     if margin is None or not margin.accepted:
         return False
-    return 1.0 - margin.worst_pole_radius >= COMFORT * (1.0 - margin.bound)
+    return 1.0 - margin.worst_pole_radius >= MORE_MODES_MARGIN_RATIO * (1.0 - margin.bound)
 
 
 def forget_limit(context: StepContext) -> None:
@@ -370,21 +373,21 @@ def _wait_after(
     """Return for how long more modes are not tried after what became of one; None: no matter."""
     if earlier is None or earlier is record.state:
         return None
-    if record.state in _DECLINED:
-        return FIRST_WAIT_S
+    if record.state in _DECLINED_STATES:
+        return FIRST_MODES_DELAY_S
     if record.state is MatrixState.DISCARDED and rejected:
-        return OPERATORS_WAIT_S
+        return DECLINED_MODES_DELAY_S
     return None
 
 
 def limit_modes(
-    context: StepContext, n_modes: int, reason: str, first_wait_s: float = FIRST_WAIT_S
+    context: StepContext, n_modes: int, reason: str, first_wait_s: float = FIRST_MODES_DELAY_S
 ) -> None:
     """Try no more than these for a while, longer each time that it is found again."""
     before, wait_s, now_ns = context.matrices.mode_limit, first_wait_s, context.now_ns
-    if before is not None and now_ns - before.since_ns_utc < FORGIVEN_AFTER_S * SECOND_NS:
+    if before is not None and now_ns - before.since_ns_utc < MODES_LIMIT_MEMORY_S * SECOND_NS:
         left_s = (before.until_ns_utc - now_ns) / SECOND_NS
-        wait_s = max(first_wait_s, min(2.0 * before.wait_s, LONGEST_WAIT_S), left_s)
+        wait_s = max(first_wait_s, min(2.0 * before.wait_s, MAX_MODES_DELAY_S), left_s)
     limit = ModeLimit(
         n_modes=n_modes,
         since_ns_utc=now_ns,

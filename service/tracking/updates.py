@@ -16,7 +16,7 @@ from service.tracking.sending import why_no_return, why_unsendable
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.update_policy import (
-    PROPOSAL_STANDS_S,
+    MIN_PROPOSAL_LIFETIME_S,
     assessment_is_old,
     fewer_modes_than,
     is_left_behind,
@@ -27,23 +27,23 @@ from service.tracking.update_policy import (
 )
 from service.wire import Status
 
-ASK_FIRST_S = 3.0
+MATRIX_TIMEOUT_S = 3.0
 """Time for the RTC's matrix to arrive before it is requested again."""
 
-ASK_AGAIN_S = 10.0
+MATRIX_REQUEST_INTERVAL_S = 10.0
 """Interval between two requests for a matrix that was not available or has no name."""
 
 JUDGE_INTERVAL_S = 60.0
 """Interval between two verdicts on the matrix in use while the last one holds. A verdict takes 2 s
 of a core with 500 modes, and only the star and the optical gains may have changed."""
 
-JUDGE_REFUSED_S = 15.0
+REFUSED_JUDGE_INTERVAL_S = 15.0
 """The same where the margin is short, or no answer came: a smaller σ may let it pass."""
 
-PATIENT_WINDOWS = 2
+MAX_REFUSED_WINDOWS = 2
 """Windows refused in a row from which on it is said that α stays unknown."""
 
-JUDGE_AGAIN_S = 2.0
+MIN_JUDGE_INTERVAL_S = 2.0
 """Least time between two looks when the last one holds no longer."""
 
 
@@ -59,7 +59,7 @@ def fetch_in_use(context: StepContext) -> None:
         and not state.matrices.read_back_error
         and state.matrices.mismatched_id is None
     )
-    every_s = ASK_FIRST_S if anew else ASK_AGAIN_S
+    every_s = MATRIX_TIMEOUT_S if anew else MATRIX_REQUEST_INTERVAL_S
     if context.now_ns - state.matrices.applied_asked_ns_utc >= every_s * SECOND_NS:
         request_applied(context, rtc)
 
@@ -110,9 +110,11 @@ def _judgement_due(state: TrackerState, in_use: str, now_ns: int) -> bool:
     waited_s = (now_ns - state.matrices.judged_ns_utc) / SECOND_NS
     record = state.reconstructor(in_use)
     if state.matrices.margin is None or record is None or record.judged is None:
-        return waited_s > JUDGE_REFUSED_S
-    every_s = JUDGE_INTERVAL_S if state.matrices.margin.accepted else JUDGE_REFUSED_S
-    return waited_s > every_s or (waited_s > JUDGE_AGAIN_S and assessment_is_old(state, record))
+        return waited_s > REFUSED_JUDGE_INTERVAL_S
+    every_s = JUDGE_INTERVAL_S if state.matrices.margin.accepted else REFUSED_JUDGE_INTERVAL_S
+    return waited_s > every_s or (
+        waited_s > MIN_JUDGE_INTERVAL_S and assessment_is_old(state, record)
+    )
 
 
 def _choose_update(context: StepContext, rtc: Status) -> None:
@@ -213,7 +215,7 @@ def _explain_no_window(context: StepContext) -> str:
             "No reconstructor is made because α is unknown and [dither] enabled is false: enable "
             "it, or start a dither (pyrcal dither start)."
         )
-    if context.windows.run > -PATIENT_WINDOWS:
+    if context.windows.run > -MAX_REFUSED_WINDOWS:
         return ""
     return f"No reconstructor is made because no window gives α: {context.windows.refused_because}"
 
@@ -242,8 +244,8 @@ def _explain_unproven(context: StepContext, rtc: Status, n_safe: int) -> str:
 def _is_busy(context: StepContext) -> bool:
     """Return True if a reconstructor is on its way, or one awaits an operator.
 
-    In auto nobody decides on a proposal left from another mode or an absent RTC, unless there is no
-    matrix to return to.
+    In auto a proposal left from another mode or an absent RTC awaits no decision, unless there is
+    no matrix to return to.
     """
     state = context.state
     awaited = state.operator.mode is not Mode.AUTO or why_no_return(state) is not None
@@ -263,7 +265,7 @@ def _is_left_to_operator(context: StepContext, record: ReconstructorRecord) -> b
     usable = (
         not is_left_behind(state, record, context.policy) and why_unsendable(state, record) is None
     )
-    return usable and age_s < PROPOSAL_STANDS_S
+    return usable and age_s < MIN_PROPOSAL_LIFETIME_S
 
 
 def _next_attempt_ns(state: TrackerState, rtc: Status, policy: Policy) -> int:

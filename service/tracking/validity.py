@@ -37,23 +37,23 @@ _TURNED_DEG = 0.05
 AGEING_SHARE = 0.5
 """Share of the stale limit from which on α is ageing."""
 
-NO_LONGER_STALE = 0.8
+STALE_END_SHARE = 0.8
 """Share of the stale limit that σ must be below before α is stale no more: one that wavers about
 the limit does not come and go."""
 
-FIRST_WINDOWS = 5
+N_FIRST_WINDOWS = 5
 """Windows that a faint star needs until σ is within its limit for the first time,"""
 
-FIRST_WINDOWS_S = 10.0
+FIRST_WINDOWS_INTERVAL_S = 10.0
 """as long as they follow one another within this: σ shrinks then, and is no alarm."""
 
-SUSPECTED_FOR_S = 60.0
+MAX_SUSPICION_S = 60.0
 """A jump that nothing has confirmed or denied for so long is no longer waited for."""
 
 CLOCK_SET_BACK_S = 60.0
 """Telemetry is never so much older than what is known: the RTC's clock has gone back."""
 
-KEPT_S = 600.0
+MAX_TELEMETRY_AGE_S = 600.0
 """Telemetry older than this is worked out no more."""
 
 INTERVALS_KEPT = 16
@@ -98,16 +98,16 @@ def store_registration(context: StepContext, registration: Registration | None) 
 
 
 def shift_estimate(context: StepContext, step: Array, spread: Array, still_ns_utc: int) -> None:
-    """Expect α elsewhere, for the mirror's image was moved; windows must confirm it.
+    """Shift the estimate of α because the mirror's image was moved; windows must confirm it.
 
     Parameters
     ----------
-    turn
-        The event being worked out.
+    context
+        Context of the event.
     step, spread
-        ``(4,)`` by how much, and 1 σ of it, numeric units.
+        Shift ``(4,)`` and its 1 σ, numeric units.
     still_ns_utc
-        When the image stands still, by the RTC's clock.
+        Time at which the image has stopped moving, by the RTC's clock.
     """
     registration = context.registration
     if registration is None:
@@ -257,7 +257,7 @@ def _validity_of(context: StepContext, registration: Registration) -> ValiditySt
     if registration.n_windows == 0:
         return ValidityState(level=Validity.STALE, reason="no window has confirmed it yet")
     was_stale = before is not None and before.validity.level is Validity.STALE
-    ends = NO_LONGER_STALE if was_stale and before and before.n_windows else 1.0
+    ends = STALE_END_SHARE if was_stale and before and before.n_windows else 1.0
     if np.any(sigma > ends * limit):
         return ValidityState(level=Validity.STALE, reason=_worst(sigma, limit))
     rate = np.maximum(policy.drift_rate**2, np.finfo(float).tiny)
@@ -302,7 +302,7 @@ def _worst(sigma: Array, limit: Array) -> str:
 
 def _without_old_suspicion(registration: Registration, now_ns: int) -> Registration:
     candidate = registration.suspected_jump
-    if candidate is None or now_ns - candidate.held_ns_utc < SUSPECTED_FOR_S * SECOND_NS:
+    if candidate is None or now_ns - candidate.held_ns_utc < MAX_SUSPICION_S * SECOND_NS:
         return registration
     doubt = "a window was far out, and none has come since"
     return replace(registration, suspected_jump=None, doubt=doubt, doubt_voids=True)
@@ -323,7 +323,7 @@ def stale_text(context: StepContext) -> str | None:
 def _sharpens(registration: Registration, now_ns: int) -> bool:
     """Return whether σ is above its limit because only the first windows have come so far."""
     since_s = (now_ns - registration.window_ns_utc) / SECOND_NS
-    few = registration.n_windows < FIRST_WINDOWS and since_s < FIRST_WINDOWS_S
+    few = registration.n_windows < N_FIRST_WINDOWS and since_s < FIRST_WINDOWS_INTERVAL_S
     return few and registration.validity.level is Validity.STALE
 
 
@@ -399,7 +399,7 @@ def void_until(
         each
         for each in context.alpha.void_intervals
         if (each.purpose, each.because) != (purpose, because)
-        and until_ns_utc - each.until_ns_utc <= KEPT_S * SECOND_NS
+        and until_ns_utc - each.until_ns_utc <= MAX_TELEMETRY_AGE_S * SECOND_NS
     ]
     _store_intervals(context, [*others, new][-INTERVALS_KEPT:])
 

@@ -42,16 +42,16 @@ from service.tracking.validity import BOTH_SIDES
 
 Array = NDArray[Any]
 
-IN_A_ROW = 3
+N_CONSECUTIVE_WINDOWS = 3
 """Windows refused one after the other that are no chance, and windows used that end it."""
 
 
-NONE_FOR_S = 60.0
+MAX_TIME_WITHOUT_WINDOW_S = 60.0
 """Duration of a dither without an accepted window. A simulated RTC may be ten times slower than its
 timestamps; a window then takes 20 s."""
 
 
-AS_EXPECTED = (RefusalKind.CUT_SHORT, RefusalKind.VOID)
+HARMLESS_REFUSALS = (RefusalKind.CUT_SHORT, RefusalKind.VOID)
 """Kinds of refusals that are no fault, and say nothing of the windows before and after."""
 
 
@@ -114,7 +114,7 @@ def reject_window(context: StepContext, reason: str, kind: RefusalKind = Refusal
         context.raise_alarm(alarms.WRONG_ANSWER, reason)
     level = Level.INFO if kind is RefusalKind.CUT_SHORT else Level.WARNING
     _note_refusal(context, reason, level)
-    if kind not in AS_EXPECTED:
+    if kind not in HARMLESS_REFUSALS:
         run = min(context.windows.run, 0) - 1
         context.windows = replace(context.windows, run=run, refused_because=reason)
 
@@ -234,7 +234,7 @@ def _jump(
         joint = kalman.corrected(joint, first.alpha.vector, noise)
     update = FilterUpdate(
         joint=kalman.corrected(joint, measured.numbers, measured.noise),
-        n_windows=2 if whole or both.excess > jumps.FARTHEST else 1,
+        n_windows=2 if whole or both.excess > jumps.MAX_TURBULENCE_EXCESS else 1,
         innovation=_innovation(prior, measured),
         scatter=registration.scatter,
         jumped=True,
@@ -270,12 +270,12 @@ def refused_text(context: StepContext) -> str | None:
     refused.
     """
     raised, run = context.alarm_text(alarms.WINDOWS_REFUSED), context.windows.run
-    if run <= -IN_A_ROW:
+    if run <= -N_CONSECUTIVE_WINDOWS:
         because = context.windows.refused_because
         text = f"windows are refused one after the other: {because}; α is not measured meanwhile"
         if raised is not None and same_but_for_numbers(raised, text):
             text = raised  # one cause is one text: of each window the log tells the numbers
-    elif raised is not None and run < IN_A_ROW:
+    elif raised is not None and run < N_CONSECUTIVE_WINDOWS:
         text = raised
     else:
         text = _missing_text(context)
@@ -287,7 +287,7 @@ def _missing_text(context: StepContext) -> str:
     if dither is None or dither.start_seq is None or rtc is None:
         return ""
     since_ns = max(registration.window_ns_utc if registration else 0, dither.asked_ns_utc)
-    patience_s = max(NONE_FOR_S, 3.0 * (dither.window_s or 0.0))
+    patience_s = max(MAX_TIME_WITHOUT_WINDOW_S, 3.0 * (dither.window_s or 0.0))
     if context.now_ns - since_ns < patience_s * SECOND_NS:
         return ""
     # an RTC in slow motion has not played a window yet

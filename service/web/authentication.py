@@ -197,22 +197,23 @@ def channel_of(request: Request) -> Channel:
 
 
 class Authentication(Middleware):
-    """Lets requests through to the application that may be made, each with its whole body.
+    """Middleware that passes on permitted requests, each with its whole body.
 
-    ``request.user`` is then the key it was made with; None: there are no keys, or none is needed.
-    As soon as there has been a key, one is needed from everywhere: what comes from loopback may be
-    a proxy's, or anybody's who has an account here; and to revoke the last one opens no door.
+    ``request.user`` is then the key of the request, or None if there are no keys or none is needed.
+    As soon as a key has existed, one is required from every address: a request from loopback may
+    come through a proxy or from any account on this machine; and revoking the last key does not
+    lift the requirement.
 
     Parameters
     ----------
     app
         The application.
     hosts
-        Under which it is asked for.
+        Host names that requests may name.
     keys
-        Those there are; None: nobody needs one.
+        Existing keys; None if none is required.
     audit
-        Takes an entry of the audit trail.
+        Stores an entry of the audit trail.
     """
 
     def __init__(
@@ -327,12 +328,12 @@ class Authentication(Middleware):
         return sent
 
     def _holds(self, key: Key | None) -> bool:
-        """Return whether a key is good at this moment; None: whether none is needed.
+        """Return True if a key is valid at this moment; for None, if no key is required.
 
         Raises
         ------
         ConfigurationError
-            If nobody can tell.
+            If the keys cannot be read.
         """
         keys = () if self._keys is None else self._keys.all()
         if key is None:

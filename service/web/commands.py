@@ -41,12 +41,12 @@ JSON = "application/json"
 
 
 class Body:
-    """A request's body as a command; a dependency of a route.
+    """Dependency of a route that reads a request's body as a command.
 
     Parameters
     ----------
     kind
-        The command, or a union of several told apart by their ``action``.
+        The command, or a union of several that differ in their ``action``.
     """
 
     def __init__(self, kind: Any) -> None:  # noqa: ANN401  of the type of a type
@@ -222,7 +222,7 @@ class AcceptedView(BaseModel):
     model_config = ConfigDict(use_attribute_docstrings=True)
 
     text: str
-    """What was done, and what the RTC has answered within some seconds."""
+    """Result of the command, and the RTC's reply if it came within some seconds."""
 
     links: dict[str, str]
     """Paths where the consequences appear."""
@@ -263,9 +263,9 @@ class Client:
     """Headers of the response."""
 
     async def gives(self, order: OrderRoute, said: Any, name: str) -> AcceptedView:  # noqa: ANN401
-        """Hand an order on; return what was done, and where its work can be followed.
+        """Pass an order on; return its result, and the address of its progress.
 
-        One that decides about something only if that still is what whoever decides has seen.
+        An order that decides on something is refused if that has changed since the client read it.
         """
         made = new_id(order.makes, self.service.snapshot().now_ns) if order.makes else ""
         command: Any = order.commanded(said, **{order.named or "id": name or made})

@@ -122,14 +122,14 @@ async def numbers_of(
     matrix_of: Callable[[str], Numbers],
     file_of: Callable[[str], pathlib.Path],
 ) -> Response:
-    """Return a matrix as it is asked for; the shape is in the headers, but with HDF5.
+    """Return a matrix in the requested format; its shape is in the headers, except with HDF5.
 
-    An id is never reused: whoever has its numbers in this format need not have them again.
+    An id is never reused, so a client that has its numbers in this format need not load them again.
 
     Raises
     ------
     CommandError
-        If it cannot leave like that from here.
+        If it is not available in that format.
     """
 
     def made() -> Response:

@@ -316,16 +316,16 @@ Log = tuple[LogEntry, ...]
 
 
 class Stream:
-    """The service's news for every listener.
+    """Server-sent events of the service for every listener.
 
-    There is no queue: the service's log is one, and a listener is a place in it. One that falls
-    further behind than the log reaches is told to read the whole of it again. Of the state only the
-    newest is sent.
+    There is no queue: the service's log is one, and a listener has a position in it. One that falls
+    further behind than the log reaches is instructed to read the whole log again. Of the state only
+    the newest is sent.
 
     Parameters
     ----------
     service
-        Whose state and log it is.
+        Service whose state and log are sent.
     over
         Set when the service ends: so does every stream.
     """

@@ -149,8 +149,8 @@ def test_a_worker_without_pyrcal_is_named_whenever_it_comes(tmp_path):
 
 
 def test_rows_of_a_worker_that_is_killed_are_computed_by_the_other(tmp_path, monkeypatch):
-    monkeypatch.setattr(rows, "ROW_S", 0.0)
-    monkeypatch.setattr(rows, "PAYS_S", 0.0)
+    monkeypatch.setattr(rows, "MIN_REMOTE_ROW_S", 0.0)
+    monkeypatch.setattr(rows, "MIN_REMOTE_JOB_S", 0.0)
     monkeypatch.setattr(rows, "_compute", lambda *work: None)  # all but the first by the cluster
     here = model_of().linearise(FIRST)
     with dask_cluster(tmp_path) as dask, Cluster(dask.address) as cluster:

@@ -19,7 +19,7 @@ import zenoh
 
 from service.config.link_tables import AccessTable, TlsTable, UsersTable, ZenohTable, link_security
 from service.errors import LinkError
-from service.link.guard import MIN_WAITING, OPEN, LinkSecurity
+from service.link.guard import MIN_ALARM_CONNECTIONS, NO_SECURITY, LinkSecurity
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.readiness import complaints
 from service.tracking.alarms import LINK_FLOODED
@@ -283,7 +283,7 @@ def generous(folder):
 @pytest.mark.parametrize("attack", ATTACKS)
 def test_on_an_open_link_every_attack_succeeds(attack):
     listen = (f"tcp/127.0.0.1:{free_port()}",)
-    with bench(listen, OPEN) as scene, attacker(listen[0]) as session:
+    with bench(listen, NO_SECURITY) as scene, attacker(listen[0]) as session:
         assert attack(session, scene)
 
 
@@ -344,7 +344,7 @@ def test_a_flood_of_one_port_is_named_and_an_rtc_is_let_in_at_another(folder):
             while not bridge.statistics().rtc_alive:
                 assert not deadline.passed, "the RTC was not let in"
                 time.sleep(0.01)
-        assert bridge.statistics().waiting_connections[flooded] >= MIN_WAITING
+        assert bridge.statistics().waiting_connections[flooded] >= MIN_ALARM_CONNECTIONS
 
 
 def test_an_rtc_is_let_by_nobody_who_only_says_that_he_is_the_service(folder):
@@ -496,7 +496,7 @@ def test_an_order_of_before_counts_no_more(signed):
 
 def test_an_rtc_that_signs_and_a_service_that_does_not_ask_understand_each_other():
     listen = (f"tcp/127.0.0.1:{free_port()}",)
-    with bench(listen, OPEN) as scene:
+    with bench(listen, NO_SECURITY) as scene:
         scene.rtc.signatures = Signatures(SECRET, Role.RTC)
         before = scene.bridge.statistics().statuses_received
         scene.rtc.send_status()

@@ -34,7 +34,7 @@ class Tap:
 
 @pytest.fixture
 def keeper(service, monkeypatch):
-    monkeypatch.setattr(telemetry_recorder, "LOOK_S", 0.01)
+    monkeypatch.setattr(telemetry_recorder, "PROGRESS_CHECK_INTERVAL_S", 0.01)
     tap = Tap()
     service.recordings = TelemetryRecorder(
         archive=service.archive,

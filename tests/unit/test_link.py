@@ -7,9 +7,9 @@ import pytest
 
 from service.errors import LinkError, UnknownIdError, WireError
 from service.link import session
-from service.link.intake import LEFT_AS_THEY_CAME, QUEUE_LENGTH, Intake
+from service.link.intake import MAX_QUEUED_EVENTS, MAX_UNDECODED_BATCHES, Intake
 from service.link.leader_election import LeaderElection, SessionWatch
-from service.link.matrices import OFFERS, MeasuredIntake, Offer, Outbox
+from service.link.matrices import MAX_OFFERS, MeasuredIntake, Offer, Outbox
 from service.link.session import Endpoint
 from service.tracking import events as ev
 from service.wire import (
@@ -406,7 +406,7 @@ def test_frames_that_come_late_or_again_are_no_fault_of_the_sequence(intake):
 def test_more_frames_than_one_hold_of_the_lock_copies_are_all_drained(intake):
     for k in range(50):
         send(intake, 10 * k)
-    with patch("service.link.intake.TAKE_FRAMES", 256):
+    with patch("service.link.intake.FRAMES_PER_COPY", 256):
         blocks = intake.drain()
     assert sum(b.n_frames for b in blocks) == 500
     assert [b.first_seq for b in blocks[1:]] == [256]
@@ -513,11 +513,11 @@ def test_the_age_of_the_last_frame_is_told_by_arrival(intake, clock):
 
 
 def test_of_too_many_events_the_oldest_give_way_and_are_counted(intake):
-    for number in range(QUEUE_LENGTH + 1):
+    for number in range(MAX_QUEUED_EVENTS + 1):
         intake.event(ev.LogEvent(name=f"{number}", text=""))
     intake.event(ev.RtcVanished())
     events = intake.events()
-    assert (len(events), events[0].name, events[-1]) == (QUEUE_LENGTH, "2", ev.RtcVanished())
+    assert (len(events), events[0].name, events[-1]) == (MAX_QUEUED_EVENTS, "2", ev.RtcVanished())
     assert intake.statistics().events_dropped == 2
     assert intake.events() == []
 
@@ -563,7 +563,7 @@ def test_the_number_of_offers_is_bounded_and_the_oldest_go_first():
     outbox = Outbox(60.0)
     outbox.add(offer("used"))
     outbox.set_current("used")
-    for k in range(OFFERS):
+    for k in range(MAX_OFFERS):
         outbox.add(offer(f"r{k}"))
     with pytest.raises(UnknownIdError):
         outbox.answer("r0", None, 1.0)
@@ -611,7 +611,7 @@ def test_batches_do_not_pile_up_where_nobody_asks_for_them(clock):
     intake = Intake(Endpoint(system="bench", ring_seconds=5.0), clock)
     for k in range(100):
         send(intake, 10 * k)
-        assert len(intake._arrived) < LEFT_AS_THEY_CAME
+        assert len(intake._arrived) < MAX_UNDECODED_BATCHES
     assert sum(block.n_frames for block in intake.drain()) == 1000
 
 

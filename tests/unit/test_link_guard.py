@@ -22,7 +22,7 @@ def test_a_refusal_is_spoken_of_for_a_minute_and_counted(monkeypatch):
     (found,) = watched.refusals()
     assert (found.n, found.age_s) == (2, 0.0)
     assert refused([found]) == "refused on the link: viewer: Put (a), 2 times"
-    now[0] += guard.RECENT_S
+    now[0] += guard.REFUSAL_REPORT_DURATION_S
     assert watched.refusals() == ()
 
 
@@ -31,9 +31,9 @@ def test_a_flood_of_keys_takes_no_memory():
     for k in range(10_000):
         watched.refused("viewer", "Put", f"key-{k}")
     found = watched.refusals()
-    assert len(found) == guard.REMEMBERED + 1
+    assert len(found) == guard.MAX_LISTED_REFUSALS + 1
     assert sum(one.n for one in found) == 10_000
-    assert refused(found).endswith(f"and {guard.REMEMBERED - 2} more")
+    assert refused(found).endswith(f"and {guard.MAX_LISTED_REFUSALS - 2} more")
 
 
 def test_a_certificate_is_named_before_it_ends_and_when_it_has():
@@ -73,7 +73,7 @@ def test_connections_that_were_closed_before_a_handshake_are_counted_by_port(tmp
     listen = ("tls/0.0.0.0:7447", "tls/[::]:7448#iface=eth0", "tcp/127.0.0.1:8080")
     waiting = guard.count_waiting(listen, (table, tmp_path / "absent"))
     assert waiting == {7447: 30, 7448: 1}
-    assert guard.flooded_in_words({7448: guard.MIN_WAITING - 1}) == ""
+    assert guard.flooded_in_words({7448: guard.MIN_ALARM_CONNECTIONS - 1}) == ""
     assert "port 7447" in guard.flooded_in_words(waiting)
     assert "3 s" in guard.flooded_in_words(waiting)
     assert "7448" not in guard.flooded_in_words(waiting)

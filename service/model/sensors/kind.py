@@ -116,7 +116,7 @@ class SensorKind(ABC):
         return None
 
     def check(self, sensor: Any, subaperture_m: float) -> None:  # noqa: ANN401, B027 - its own
-        """Refuse a sensor that cannot work on subapertures of this width; any can, unless told.
+        """Refuse a sensor that cannot work with this subaperture width; by default accept any.
 
         Raises
         ------
@@ -151,9 +151,10 @@ class SensorKind(ABC):
     def signals_of_frames(
         self, instrument: Instrument, frames: NDArray[Any], flux_frame: NDArray[Any]
     ) -> NDArray[np.float64]:
-        """Return the signals ``(n_signals, n_modes)`` that frames ``(n_modes, ny, nx)`` stand for.
+        """Return the signals ``(n_signals, n_modes)`` of frames ``(n_modes, ny, nx)``.
 
-        They are changes per unit of each mode, beside a mean frame ``(ny, nx)``; see ``frames``.
+        They are changes per unit of each mode, relative to a mean frame ``(ny, nx)``; see
+        ``frames``.
 
         Raises
         ------
@@ -165,9 +166,9 @@ class SensorKind(ABC):
     def locate_images(
         self, instrument: Instrument, flux_frame: NDArray[Any]
     ) -> tuple[Instrument, tuple[str, ...]]:
-        """Return the instrument with its pupil images where they lie in a mean frame, and remarks.
+        """Return the instrument with its pupil images located in a mean frame, and remarks.
 
-        Only what the instrument file leaves open is looked for.
+        Only images that the instrument file leaves open are located.
         """
         return instrument, ()
 
@@ -229,7 +230,7 @@ class SensorKind(ABC):
 
     @abstractmethod
     def pixels(self, instrument: Instrument, valid: NDArray[np.bool_]) -> NDArray[np.intp]:
-        """Return where the pixels of valid subapertures stand in a response's flat light.
+        """Return the indices of the pixels of valid subapertures in a response's flat light.
 
         ``(n_pixels, n_valid)``; the light has n_pixels for every subaperture of the grid.
         """
@@ -242,7 +243,7 @@ class SensorKind(ABC):
         fineness: Fineness,
         working_point: WorkingPoint | None = None,
     ) -> Sensor:
-        """Return the sensor of an instrument on this pupil, for a flat wavefront unless told.
+        """Return the sensor of an instrument on this pupil, by default for a flat wavefront.
 
         Raises
         ------
@@ -310,7 +311,7 @@ class SensorKind(ABC):
         return np.zeros(4)
 
     def displaced(self, instrument: Instrument, offsets: NDArray[np.float64]) -> SensorDescription:
-        """Return the sensor with its pupil images beside their places ``(2 n_images,)``.
+        """Return the sensor with its pupil images displaced by ``offsets`` ``(2 n_images,)``.
 
         Subapertures, axes of conventions.md: of each image along x, then of each along y.
 
@@ -322,10 +323,11 @@ class SensorKind(ABC):
         raise ModelError(f"a {self.name}: found several images to be moved, expected a pyramid's")
 
     def image_offsets(self, instrument: Instrument) -> NDArray[np.float64] | None:
-        """Return where the instrument file has the pupil images beside the pixel grid, ``(4, 2)``.
+        """Return the displacements of the pupil images in the instrument file, ``(4, 2)``.
 
-        Subapertures, axes of conventions.md, (x, y) of the images at -x -y, +x -y, -x +y, +x +y,
-        less their mean. None if it does not say.
+        They are relative to the pixel grid, less their mean, in subapertures and the axes of
+        conventions.md: (x, y) of the images at -x -y, +x -y, -x +y, +x +y. None if the file does
+        not state them.
         """
         return None
 

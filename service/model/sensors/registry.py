@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from service.model.instrument import Instrument
 
 KINDS: Mapping[str, SensorKind] = {kind.name: kind for kind in (PyramidKind(), ShackHartmannKind())}
-"""By ``wfs.kind`` of an instrument file; the first one where a file does not say."""
+"""Sensor kinds by ``wfs.kind`` of an instrument file; the first one is the default."""
 
 
 def kind_of(instrument: Instrument) -> SensorKind:

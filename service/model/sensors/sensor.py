@@ -47,7 +47,8 @@ class RowsElsewhere:
     """A function of rows as what it is made from; all can be pickled."""
 
     parts: tuple[object, ...]
-    """What all matrices of a model share: instrument, modes. It is sent to a cluster once."""
+    """Parts that all matrices of a model share: instrument, modes. They are sent to a cluster once.
+    """
 
     prepare: Callable[..., Any]
     """Makes of the parts what is kept for the next matrix, too."""
@@ -212,7 +213,7 @@ class Light(Protocol):
         """Return counts in the RTC's axes, in those of conventions.md."""
 
     def find_pupil(self, counts: NDArray[Any]) -> PupilPosition | CannotTell:
-        """Return where the image of the pupil lies, at any shift that light can tell.
+        """Return the position of the pupil's image, for any shift that light can determine.
 
         Raises
         ------
@@ -221,7 +222,7 @@ class Light(Protocol):
         """
 
     def find_image_offsets(self, counts: NDArray[Any]) -> ImageOffsets | CannotTell:
-        """Return how far each of several pupil images lies from its place on the pixel grid.
+        """Return the displacement of each of several pupil images from its place on the pixel grid.
 
         Raises
         ------

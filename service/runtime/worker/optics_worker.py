@@ -40,7 +40,12 @@ from service.estimation.own_matrix import (
 )
 from service.estimation.passive_sums import PassiveSums
 from service.estimation.random_dither import Correlated, RandomEstimate, fit_random
-from service.estimation.slope_convention import LIKELY, SlopeConvention, of_answer, of_reconstructor
+from service.estimation.slope_convention import (
+    RESPONSE_RATIO_RANGE,
+    SlopeConvention,
+    of_answer,
+    of_reconstructor,
+)
 from service.estimation.windows import ClosedLoop, RefusalKind, WindowRefused
 from service.files.disk_cache import DiskCache
 from service.model.instrument import Instrument
@@ -59,13 +64,13 @@ from service.runtime.worker.records import (
     waits,
 )
 from service.runtime.worker.rows import SharedRows
-from service.runtime.worker.sensor import REACH, SensorAtWork, length, settled
+from service.runtime.worker.sensor import MAX_LINEAR_STEPS, SensorAtWork, length, settled
 
-MAX_APPROACHES = 12
+MAX_COARSE_STEPS = 12
 """Steps of the coarse model. From the edge of the capture range three are enough where the model
 is right. Where it is 20 to 40 % wrong per mode a step is 0.6 times the last: eight are needed."""
 
-MISFIT_RISE = 1.02
+MAX_MISFIT_RISE_RATIO = 1.02
 """A step that raises the misfit by more than this factor, and is not shorter than the last, has
 left the minimum: the fit has failed."""
 
@@ -75,7 +80,7 @@ MAX_REFINEMENTS = 4
 FAR_SAMPLING = 1
 """The same of the model that leads from afar: biased by some per cent of a subaperture."""
 
-AS_DRAWN = 0.15
+NOMINAL_RESPONSE_TOLERANCE = 0.15
 """Relative difference of a mode's response from the model's below which it counts as equal: noise
 and the model's own error are of this size."""
 
@@ -83,7 +88,7 @@ COARSE_SAMPLING = 2
 """Pupil points per subaperture and nodes of the coarse model: biased by 0.05 % of a subaperture,
 four times as fast."""
 
-FIT_RANGE = np.array([1.5, 1.5, np.deg2rad(6.0), 0.05])
+MAX_FIT_DISTANCE = np.array([1.5, 1.5, np.deg2rad(6.0), 0.05])
 """An estimate further than this from its start has diverged (numeric units)."""
 
 Dithered = TypeVar("Dithered", bound=DitheredEstimate)
@@ -146,8 +151,8 @@ class OpticsWorker:
     def enter_mode(self, config_id: str) -> Description:
         """Make the models of another mode of the sensor; return the expected telemetry.
 
-        Order and signs of the slopes stay as they were found; how strongly modes answer is read
-        anew of the RTC's own matrix of that mode.
+        Order and signs of the slopes are kept; the response of modes is measured again on the RTC's
+        own matrix of that mode.
 
         Raises
         ------
@@ -204,7 +209,10 @@ class OpticsWorker:
         outcome = self._fitted(spectra, loop, begun)
         if isinstance(outcome, LockInEstimate):
             gains = outcome.optical_gain
-            if gains.real.min() > LIKELY[0] and np.abs(gains).max() < LIKELY[1]:
+            if (
+                gains.real.min() > RESPONSE_RATIO_RANGE[0]
+                and np.abs(gains).max() < RESPONSE_RATIO_RANGE[1]
+            ):
                 return outcome
             begun = outcome.alpha
         seen = spectra.commands[:, 0] @ self._sensor.near(begun).matrix.T
@@ -258,11 +266,11 @@ class OpticsWorker:
         config_id: str | None = None,
         left_over: LeftOver | None = None,
     ) -> None:
-        """List slopes in this order from now on, and expect this response ``(n_modes,)`` of modes.
+        """Use this order of slopes from now on, and this response ``(n_modes,)`` of modes.
 
-        ``config_id`` is the sensor's mode that both are of. ``left_over`` is what the model leaves
-        of the RTC's own matrix: the gate judges loops with it. None leaves what it stands for as
-        it is.
+        ``config_id`` is the sensor's mode that both belong to. ``left_over`` is the model's
+        residual of the RTC's own matrix, which the gate adds to judged loops. None leaves each
+        unchanged.
         """
         if self._model.instrument.sensor_modes and config_id is not None:
             self.enter_mode(config_id)
@@ -280,13 +288,13 @@ class OpticsWorker:
     def recognise(
         self, own: NDArray[np.float32], near: Misregistration | None, rotation_rad: float | None
     ) -> tuple[OwnMatrix | None, NDArray[np.float64] | None]:
-        """Return which modes the RTC's own matrix controls, and the response the model expects.
+        """Return the modes that the RTC's own matrix controls, and the expected response of modes.
 
-        None: it controls none; the modes answer as drawn.
+        The first is None if it controls none; the second is None if modes respond nominally.
 
-        ``rotation_rad`` is where a coarser look has found the mirror, None: nobody looked. Where a
-        mode answers otherwise than was drawn, though with its own sign and in its own place, the
-        model takes its response over: matrices made from now on allow for it.
+        ``rotation_rad`` is the rotation found in a coarser search, None without one. If the
+        response of a mode differs from the nominal one, though with its own sign and in its own
+        place, the model adopts it: later matrices allow for it.
         """
         start = near or self._start
         if near is None and rotation_rad is not None:
@@ -298,7 +306,7 @@ class OpticsWorker:
         power = np.square(self._first().matrix).sum(axis=0)
         found = replace(found, weights=weights_of_modes(found, power))
         response = found.response[found.known]
-        if np.any(np.abs(response - 1.0) > AS_DRAWN):
+        if np.any(np.abs(response - 1.0) > NOMINAL_RESPONSE_TOLERANCE):
             n_modes = self._basis.n_modes
             gains = CalibrationGains.of_modes(response, found.columns[found.known], n_modes).values
             now = 1.0 if self._mode_response is None else self._mode_response
@@ -311,13 +319,13 @@ class OpticsWorker:
     ) -> LockInEstimate | None:
         """Return the fit about a linearisation that is near enough to it; None: there is none."""
         estimate = fit_window(spectra, self._sensor.near(start), loop)
-        if length(estimate.step) > REACH:
+        if length(estimate.step) > MAX_LINEAR_STEPS:
             near = self._approach(spectra, loop, estimate, start)
             if near is None:
                 return None
             estimate = fit_window(spectra, self._sensor.linearise(near), loop)
         for _ in range(MAX_REFINEMENTS):
-            if settled(estimate) or length(estimate.step) > REACH:
+            if settled(estimate) or length(estimate.step) > MAX_LINEAR_STEPS:
                 break
             # near enough; or the coarse model's bias, flat as it is, was more than what settles
             estimate = fit_window(spectra, self._sensor.linearise(estimate.alpha), loop)
@@ -365,13 +373,13 @@ class OpticsWorker:
         """Estimate α from one window of random dither, from ``start`` as in :meth:`fit`."""
         try:
             estimate = fit_random(window, self._sensor.near(start or self._start))
-            for _ in range(MAX_APPROACHES):
+            for _ in range(MAX_COARSE_STEPS):
                 if isinstance(estimate, WindowRefused):
                     return estimate
                 if settled(estimate):
                     return self._against_flat(estimate)
                 begun = start or self._start
-                if np.any(np.abs(estimate.alpha.vector - begun.vector) > FIT_RANGE):
+                if np.any(np.abs(estimate.alpha.vector - begun.vector) > MAX_FIT_DISTANCE):
                     break
                 estimate = fit_random(window, self._sensor.linearise(estimate.alpha))
         except np.linalg.LinAlgError as error:
@@ -403,23 +411,23 @@ class OpticsWorker:
         start: Misregistration,
     ) -> Misregistration | None:
         """Return where the coarse model's steps lead; None when they do not shrink."""
-        for _ in range(MAX_APPROACHES):
-            if np.any(np.abs(estimate.alpha.vector - start.vector) > FIT_RANGE):
+        for _ in range(MAX_COARSE_STEPS):
+            if np.any(np.abs(estimate.alpha.vector - start.vector) > MAX_FIT_DISTANCE):
                 return None
             before, misfit = length(estimate.step), estimate.misfit
             estimate = fit_window(spectra, self._coarse.linearise(estimate.alpha), loop)
-            if length(estimate.step) <= REACH:
+            if length(estimate.step) <= MAX_LINEAR_STEPS:
                 return estimate.alpha
-            if length(estimate.step) > before and estimate.misfit > MISFIT_RISE * misfit:
+            if length(estimate.step) > before and estimate.misfit > MAX_MISFIT_RISE_RATIO * misfit:
                 return None
         return None
 
     @waits(at_most_s=1.0)
     def make(self, conditions: Conditions, fewer: tuple[int, ...] = ()) -> Made:
-        """Compute the reconstructor for α, as many modes as the loop has gains, and judge it.
+        """Compute the reconstructor for α, with as many modes as the loop has gains, and judge it.
 
-        Where the gate refuses it, the most of ``fewer`` modes, largest first, that pass; none
-        passes: the one asked for.
+        If the gate rejects it, return the one with the most of ``fewer`` modes, largest first, that
+        passes; if none passes, the one requested.
         """
         matrix, loop = self._model.interaction_matrix(conditions.alpha), conditions.loop
 
@@ -498,9 +506,9 @@ class OpticsWorker:
         optical_gain: NDArray[np.float64],
         magnitude: float | None,
     ) -> tuple[GateVerdict, ExpectedGain | None]:
-        """Return verdict and worth of the matrix in use, ``(n_modes, n_slopes)`` metres per slope.
+        """Return verdict and gain of the matrix in use, ``(n_modes, n_slopes)`` metres per slope.
 
-        ``optical_gain`` ``(n_basis,)`` and the star's ``magnitude`` are the expected gain's.
+        ``optical_gain`` ``(n_basis,)`` and the star's ``magnitude`` enter the expected gain.
         """
         verdict = self.judge(in_use, conditions)
         loop = replace(conditions.loop, optical_gain=optical_gain)
@@ -510,9 +518,9 @@ class OpticsWorker:
     def fit_passive(
         self, sums: PassiveSums, start: Misregistration | None
     ) -> PassiveEstimate | None:
-        """Estimate α from ordinary telemetry; None when there is too little of it.
+        """Estimate α from ordinary telemetry; None if there is too little of it.
 
-        As whoever has summed it does, about ``start``, or without one about the nominal rotation.
+        The fit begins at ``start``, by default at the nominal rotation.
         """
         found = sums.fit(self._sensor.near(start or self._start))
         if found is None:

@@ -21,16 +21,18 @@ from service.model.sensors.sensor import RowTask
 from service.runtime.cluster import Cluster
 from service.runtime.worker.remote_rows import RemoteRows
 
-ROW_S = 0.2
-"""A row that takes less is not worth a task: Dask and the way there take some milliseconds,"""
+MIN_REMOTE_ROW_S = 0.2
+"""Shortest computation of a row that is sent to a worker of the cluster: Dask and the transfer take
+some milliseconds."""
 
-PAYS_S = 4.0
-"""nor is work that takes the threads here less: to send the shapes takes tenths of a second."""
+MIN_REMOTE_JOB_S = 4.0
+"""Shortest computation, with the threads of this machine, that is sent to the cluster: the transfer
+of the shapes takes tenths of a second."""
 
-LOOK_S = 10.0
+CLUSTER_SEARCH_INTERVAL_S = 10.0
 """Interval between two checks for the cluster."""
 
-HELP = "help of the cluster"
+RECEIVER_THREAD = "help of the cluster"
 """Name of the thread that takes in what the cluster answers."""
 
 Row = Callable[[int], Any]
@@ -58,7 +60,7 @@ class SharedRows:
         begun = time.monotonic()
         yield function(rows[0])
         row_s = time.monotonic() - begun
-        if row_s < ROW_S or row_s * len(rows) / self._n_threads < PAYS_S:
+        if row_s < MIN_REMOTE_ROW_S or row_s * len(rows) / self._n_threads < MIN_REMOTE_JOB_S:
             yield from self._threads.map(function, rows[1:])
         else:
             yield from self._shared(cluster, function, rows[1:])
@@ -67,13 +69,13 @@ class SharedRows:
         answers: list[Future[Any]] = [Future() for _ in rows]
         enough, places = threading.Event(), itertools.count()
         help_out = partial(self._have_help, cluster, function, rows, answers, enough)
-        threading.Thread(target=help_out, name=HELP, daemon=True).start()
+        threading.Thread(target=help_out, name=RECEIVER_THREAD, daemon=True).start()
         for _ in range(self._n_threads):
             self._threads.submit(_compute, function, rows, answers, places, enough)
         try:
             for place in range(len(answers)):
                 yield answers[place].result()
-                answers[place] = _TAKEN
+                answers[place] = _DISCARDED_RESULT
         finally:
             enough.set()
 
@@ -104,7 +106,7 @@ class SharedRows:
                     cluster.check()
             except ClusterError as error:
                 self._let_go(cluster, str(error))
-            time.sleep(LOOK_S)
+            time.sleep(CLUSTER_SEARCH_INTERVAL_S)
 
     def _let_go(self, cluster: Cluster | None, problem: str) -> None:
         if self._cluster is cluster:
@@ -113,9 +115,9 @@ class SharedRows:
             cluster.close()
 
 
-_TAKEN: Future[Any] = Future()
+_DISCARDED_RESULT: Future[Any] = Future()
 """Placeholder of a result that is not needed any more."""
-_TAKEN.set_result(None)
+_DISCARDED_RESULT.set_result(None)
 
 
 def _asked(

@@ -22,30 +22,30 @@ from service.model.sensors.registry import kind_of
 
 Array = NDArray[np.float64]
 
-SETTLED = np.array([0.03, 0.03, 1.5e-3, 3e-3])
-"""A step shorter than this (numeric units) has a linearisation error below ``FLAW``: D is almost
-linear, and another linearisation would cost more than it gains."""
+LINEAR_STEP = np.array([0.03, 0.03, 1.5e-3, 3e-3])
+"""Step, numeric units, below which the linearisation error is less than ``LINEARISATION_ERROR``: D
+is almost linear, and another linearisation would cost more than it gains."""
 
-FLAW = np.array([2.5e-4, 2.5e-4, 1.5e-5, 3e-5])
+LINEARISATION_ERROR = np.array([2.5e-4, 2.5e-4, 1.5e-5, 3e-5])
 """Largest linearisation error of such a step of all four parameters, on FLAO with any set of modes
 (numeric units); it grows with the square of the step. It is a fifteenth of the floor of a flat
 model."""
 
-STRETCHED = float(SETTLED[3])
+LINEAR_STRETCH = float(LINEAR_STEP[3])
 """The same of an anamorphosis: it is a length as a magnification is."""
 
-REACH = 4.0
-"""A step this long, in units of ``SETTLED``, ends well within one of them."""
+MAX_LINEAR_STEPS = 4.0
+"""A step this long, in units of ``LINEAR_STEP``, ends well within one of them."""
 
-UNSEEN = 0.1
+NEGLIGIBLE_ERROR_SIGMA = 0.1
 """Linearisation error, as a fraction of an estimate's σ, below which no further linearisation is
 made."""
 
-FOLLOWED = 0.04
+MIN_GAIN_CHANGE = 0.04
 """Logarithmic difference of gains from the model's that moves the working point: 0.02 % in
 magnification. Less needs no further linearisation."""
 
-STRENGTHS = (0.05, 4.0)
+STRENGTH_RANGE = (0.05, 4.0)
 """Variance of the residual over that at the instrument's r0. Of the first a wavefront is all but
 flat, and gains above 1 ask for less; the second is 2.3" of seeing."""
 
@@ -97,8 +97,8 @@ class SensorAtWork:
     def _apart(self, *both: Misregistration) -> bool:
         """Return whether a linearisation at one of two registrations is not for the other."""
         one, other = (self._instrument.with_anamorphosis(alpha) for alpha in both)
-        stretched = np.abs(one.stretches - other.stretches) > STRETCHED
-        return bool(np.any(np.abs(one.vector - other.vector) > SETTLED) or np.any(stretched))
+        stretched = np.abs(one.stretches - other.stretches) > LINEAR_STRETCH
+        return bool(np.any(np.abs(one.vector - other.vector) > LINEAR_STEP) or np.any(stretched))
 
     def linearise(self, alpha: Misregistration) -> Linearisation:
         """Return a new linearisation about ``alpha``, and keep it."""
@@ -150,10 +150,10 @@ class SensorAtWork:
             return False
         seen = float(np.log(np.abs(optical_gain)).mean())
         expected = float(np.log(self.ratio()[list(modes)]).mean())
-        if abs(seen - expected) <= FOLLOWED:
+        if abs(seen - expected) <= MIN_GAIN_CHANGE:
             return False
         before = self._strength
-        self._strength = float(np.clip(before * seen / expected, *STRENGTHS))
+        self._strength = float(np.clip(before * seen / expected, *STRENGTH_RANGE))
         if self._strength == before:
             return False
         self._model = self._at_work()
@@ -178,15 +178,17 @@ class SensorAtWork:
 
 def length(step: Array) -> float:
     """Return the length of a step ``(4,)`` of α, in units of what counts as settled."""
-    return float(np.abs(step / SETTLED).max())
+    return float(np.abs(step / LINEAR_STEP).max())
 
 
 def settled(estimate: DitheredEstimate) -> bool:
     """Return whether a fit may stay where its step has led it."""
-    return near_enough(estimate.step, estimate.covariance) and estimate.stretched < STRETCHED
+    return near_enough(estimate.step, estimate.covariance) and estimate.stretched < LINEAR_STRETCH
 
 
 def near_enough(step: Array, covariance: Array) -> bool:
     """Return whether a fit that made this step may stay: its linearisation is lost in the noise."""
-    borne = float((UNSEEN * np.sqrt(np.diag(covariance)) / FLAW).min())
-    return length(step) <= min(float(np.sqrt(max(1.0, borne))), REACH)
+    borne = float(
+        (NEGLIGIBLE_ERROR_SIGMA * np.sqrt(np.diag(covariance)) / LINEARISATION_ERROR).min()
+    )
+    return length(step) <= min(float(np.sqrt(max(1.0, borne))), MAX_LINEAR_STEPS)

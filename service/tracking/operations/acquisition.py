@@ -1,15 +1,15 @@
-"""Acquisition: from nothing known to tracking.
+"""Acquisition: from an unknown registration to tracking.
 
-Nothing is assumed of the registration. The loop is opened, for one that is closed far from
+Nothing is assumed of the registration. The loop is opened, because a loop closed far from
 registration slips; smooth modes lead to α and other modes must confirm it; a reconstructor for as
-many modes as the gate accepts everywhere in α ± 3σ closes the loop; then ordinary windows sharpen
-α and more modes follow. What does not come true within its time begins anew with the loop opened
-again, a few times, and then ends in a state that says why.
+many modes as the gate accepts everywhere in α ± 3σ closes the loop; then ordinary windows sharpen α
+and more modes follow. If a stage does not finish within its time, the acquisition restarts with the
+loop opened again, a few times, and then ends in a state that gives the reason.
 
-One that was cut off, by the end of the service or a gap in the link, leaves the RTC's loop as it
-had it, mostly open. The next service, or the same one when the RTC is back, begins anew where it
-may and the loop is as it was left; whatever else it finds it says, and leaves to the operator. It
-never closes a loop.
+An acquisition that was interrupted by the end of the service or by a gap in the link leaves the
+RTC's loop unchanged, mostly open. The next service, or the same one when the RTC is back, restarts
+it if that is permitted and the loop is as it was left; otherwise it reports what it found and
+leaves the decision to the operator. It never closes a loop.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext, present
 from service.wire import DitherRequest, LoopRequest, Reply, Status
 
-ENOUGH_WINDOWS = 2
-"""Ordinary windows that must have held with the last reconstructor."""
+MIN_FINAL_WINDOWS = 2
+"""Ordinary windows that must agree with the last reconstructor in the loop."""
 
 NO_RTC = "no RTC is there: when one is, it begins anew or says why not; the loop may be open"
 
-_LASTING = (AcquisitionStage.FAILED, AcquisitionStage.INTERRUPTED)
-"""Stages that an operator, or windows, must end."""
+_LASTING_STAGES = (AcquisitionStage.FAILED, AcquisitionStage.INTERRUPTED)
+"""Stages that remain until an operator, or windows, end them."""
 
-PATIENCE_S = 180.0
-"""In one stage: a simulated RTC may be ten times slower than its timestamps."""
+MAX_STAGE_DURATION_S = 180.0
+"""Longest time in one stage: a simulated RTC may be ten times slower than its timestamps."""
 
-_LOST = (MatrixState.REJECTED, MatrixState.FAILED)
+_LOST_STATES = (MatrixState.REJECTED, MatrixState.FAILED)
 
 
 def acquire_on_command(context: StepContext, _: cmd.Acquire) -> None:
@@ -91,7 +91,7 @@ def acquisition_to_save(state: TrackerState) -> Acquisition | None:
     if acquisition.under_way:
         return _interrupted(state, "the service ended")
     aborted = acquisition.stage is AcquisitionStage.ABORTED and state.alpha.registration is None
-    lasts = acquisition.stage in _LASTING or acquisition.held_off
+    lasts = acquisition.stage in _LASTING_STAGES or acquisition.held_off
     return _saved_part(acquisition) if aborted or lasts else None
 
 
@@ -153,9 +153,9 @@ def _advance(context: StepContext, event: Event) -> None:
 
 
 def _end_by_event(context: StepContext, event: Event) -> bool:
-    """End one that cannot go on after the event, or begin it anew; return whether that is so."""
+    """End or restart an acquisition that cannot go on after the event; return True if it did so."""
     acquisition, state = context.acquisition, context.state
-    late = context.now_ns - acquisition.since_ns_utc > PATIENCE_S * SECOND_NS
+    late = context.now_ns - acquisition.since_ns_utc > MAX_STAGE_DURATION_S * SECOND_NS
     match event:
         case cmd.StopDither():
             stages.abort_acquisition(context, "because the dither was stopped")
@@ -169,7 +169,7 @@ def _end_by_event(context: StepContext, event: Event) -> bool:
             stages.fail_acquisition(context, f"its dither cannot be read: {text}")
         case ev.Tick() if late:
             stages.restart_acquisition(
-                context, f"{acquisition.text}: not done in {PATIENCE_S:.0f} s"
+                context, f"{acquisition.text}: not done in {MAX_STAGE_DURATION_S:.0f} s"
             )
         case _:
             return _end_by_answer(context, event)
@@ -208,7 +208,7 @@ def _closed_stage(context: StepContext, rtc: Status) -> None:
     """Make, send, close; then let ordinary windows sharpen α and go on to more modes."""
     acquisition = context.acquisition
     record = context.state.reconstructor(acquisition.matrix) if acquisition.matrix else None
-    if record is not None and record.state in _LOST:
+    if record is not None and record.state in _LOST_STATES:
         stages.restart_acquisition(context, f"{record.id} was not applied: {record.reason}")
     elif acquisition.stage is AcquisitionStage.WIDENING:
         _widen(context, rtc, record)
@@ -300,7 +300,7 @@ def _widen(context: StepContext, rtc: Status, record: ReconstructorRecord | None
         ):
             _make(context, goal, rtc, at_least=record.n_modes)
             return
-        if seen >= ENOUGH_WINDOWS:
+        if seen >= MIN_FINAL_WINDOWS:
             _finish(context, record)
             return
     choose_dither(context, rtc)
@@ -338,11 +338,11 @@ def _finish(context: StepContext, record: ReconstructorRecord) -> None:
 
 
 def _forget_when_over(context: StepContext, event: Event) -> None:
-    """Forget an acquisition that holds back the next, once it need not.
+    """Forget an acquisition that holds back the next one, when that is no longer necessary.
 
-    One that had failed: when α is known without it, for whoever closed the loop has mended what it
-    could not, and the next trouble is another one. One that an operator ended: then too, or when an
-    operator sets the mode, which is to say what the service may do by itself.
+    One that failed is forgotten when α is known without it: the operator who closed the loop has
+    mended its cause, and a later failure has another. One that an operator ended is forgotten then
+    too, or when an operator sets the mode and so decides what the service may do by itself.
     """
     acquisition = context.acquisition
     if acquisition.stage is not AcquisitionStage.FAILED and not acquisition.held_off:
@@ -350,7 +350,7 @@ def _forget_when_over(context: StepContext, event: Event) -> None:
     if acquisition.held_off and isinstance(event, cmd.SetMode):
         text = f"an operator has set the mode, {event.mode}, since the last was ended"
     elif _is_followed(context.state):
-        text = f"{ENOUGH_WINDOWS} windows agree in the closed loop: none is needed any more"
+        text = f"{MIN_FINAL_WINDOWS} windows agree in the closed loop: none is needed any more"
     else:
         return
     stages.set_acquisition(context, Acquisition(text=text, since_ns_utc=context.now_ns))
@@ -364,7 +364,7 @@ def _is_followed(state: TrackerState) -> bool:
         return False
     since = state.windows.accepted - state.operations.acquisition.windows
     believed = registration.usable and registration.suspected_jump is None
-    return believed and min(since, registration.n_windows) >= ENOUGH_WINDOWS
+    return believed and min(since, registration.n_windows) >= MIN_FINAL_WINDOWS
 
 
 def _saved_part(acquisition: Acquisition) -> Acquisition:
@@ -380,7 +380,7 @@ def _interrupted(state: TrackerState, cause: str) -> Acquisition:
 
 
 def _resume_interrupted(context: StepContext) -> None:
-    """Begin an acquisition that was cut off anew, or say why not and what the operator can do."""
+    """Restart an interrupted acquisition, or report why not and the operator's options."""
     rtc = context.rtc
     if rtc is None:
         return

@@ -44,49 +44,52 @@ from service.tracking.update_policy import (
 )
 from service.wire import DitherKind, DitherRequest, Status
 
-WINDOW_S = 2.0
-"""Of telemetry in one far estimate."""
+FAR_WINDOW_S = 2.0
+"""Telemetry in one estimate with the loop open, seconds."""
 
-DITHER_S = 6.0
-"""Two windows and the time until they are fitted: a dead service leaves no dither behind."""
+FAR_DITHER_DURATION_S = 6.0
+"""Duration of a dither, seconds: two windows and the time until they are fitted; short, so that it
+ends soon after a crashed service."""
 
 CLOSING_GAIN = 0.3
-"""Of every mode of a loop that was found open: its status does not tell the gains."""
+"""Gain of every mode if the loop was open at the start: its status does not contain the gains."""
 
-OUT_OF_HAND_S = 2.0
-"""Duration of such an alarm before the service opens the loop itself. A lost one is opened at once,
-unless the service is going back to the matrix before, which takes less than this."""
+MAX_DIVERGENCE_S = 2.0
+"""Duration of an alarm of a diverging loop after which the service opens the loop itself. A lost
+loop is opened at once, unless the service is rolling back to the previous matrix, which takes less
+than this."""
 
-MISSES_BEFORE = 3
-"""Windows in a row that found no registration, before the service acquires by itself."""
+MISSES_BEFORE_ACQUISITION = 3
+"""Consecutive windows without a registration after which the service acquires by itself."""
 
-MISSES_DESPITE = 10
-"""The same while α is known: what comes may only be bad telemetry, which opens no loop."""
+MISSES_WHILE_TRACKING = 10
+"""Consecutive windows without a registration, while α is known, after which the service acquires:
+bad telemetry alone opens no loop."""
 
 MAX_ATTEMPTS = 3
-"""Times the loop is opened for one acquisition."""
+"""Largest number of times that one acquisition opens the loop."""
 
-HELD_OFF = (
+HELD_OFF_TEXT = (
     "; none begins by itself until windows agree in a closed loop, the mode is set anew, or one is "
     "asked for"
 )
-"""After an operator ended one, in the text of it."""
+"""End of the text of an acquisition that an operator ended."""
 
-_BELIEVED = (
+_MEASURED_STAGES = (
     AcquisitionStage.PARTIAL,
     AcquisitionStage.WIDENING,
     AcquisitionStage.INTERRUPTED,
 )
-"""Stages in which α, where there is one, has been found by this acquisition."""
+"""Stages in which α, if it is known, was measured by this acquisition."""
 
-AGREE = 23.5
+MAX_ESTIMATE_DIFFERENCE = 23.5
 """χ² of the difference of two estimates (4 degrees of freedom) that one in 10^4 exceeds."""
 
-MAX_MISSES = 4
-"""Windows of a stage that lead nowhere before the loop is opened anew."""
+MAX_STAGE_MISSES = 4
+"""Failed windows of a stage after which the loop is opened again."""
 
-STOPS_WITHIN_S = 2.0
-"""A dither that was asked to stop, by the status."""
+STOP_STATUS_DELAY_S = 2.0
+"""Longest time until the status shows the end of a dither that was stopped."""
 
 
 def band_of(stage: AcquisitionStage) -> Band:
@@ -112,9 +115,9 @@ def wide_capture_dither(
         modes=modes,
         amplitude_m=(min(policy.acquisition_amplitude_m, rtc.max_dither_m),) * len(modes),
         frequency_hz=lines[: len(modes)],
-        duration_s=DITHER_S,
+        duration_s=FAR_DITHER_DURATION_S,
     )
-    return Dither(request=request, asked_ns_utc=now_ns, window_s=WINDOW_S)
+    return Dither(request=request, asked_ns_utc=now_ns, window_s=FAR_WINDOW_S)
 
 
 def _wide_capture_modes(
@@ -128,7 +131,7 @@ def _wide_capture_modes(
 @lru_cache(maxsize=4)
 def _lines(frame_rate_hz: float, n_lines: int) -> tuple[float, ...]:
     """Return the lines of an RTC; whether there are enough is asked with every state shown."""
-    return spread_lines(frame_rate_hz, WINDOW_S, n_lines)
+    return spread_lines(frame_rate_hz, FAR_WINDOW_S, n_lines)
 
 
 def _why_too_few(modes: tuple[int, ...], rtc: Status) -> str | None:
@@ -157,9 +160,9 @@ def loop_found(state: TrackerState, rtc: Status, policy: Policy) -> LoopFound:
 
 
 def acquisition_left_open(state: TrackerState, rtc: Status) -> Acquisition | None:
-    """Return the acquisition that was cut off, if the loop is as it left it.
+    """Return the interrupted acquisition, if the loop is as it left it.
 
-    Opening a loop begins a session: the same one means that nobody has closed it in between.
+    Opening a loop begins a session: the same session means that the loop was not closed in between.
     """
     left = state.operations.acquisition.interruption
     if left is None or left.session != rtc.session or rtc.loop != "open":
@@ -218,7 +221,7 @@ def why_needed(state: TrackerState, policy: Policy, now_ns: int) -> str | None:
         return None
     for alarm in state.alarms.active:
         lasted_ns = now_ns - alarm.since_ns_utc
-        waits_s = 0.0 if alarm.name == LOST and not _goes_back(state) else OUT_OF_HAND_S
+        waits_s = 0.0 if alarm.name == LOST and not _goes_back(state) else MAX_DIVERGENCE_S
         if alarm_blocks(alarm, Interlock.HOLD) and lasted_ns >= waits_s * SECOND_NS:
             return f"{alarm.name} for {lasted_ns / SECOND_NS:.0f} s"
     if missed_enough(state) and not state.loop.holds:
@@ -238,7 +241,9 @@ def _goes_back(state: TrackerState) -> bool:
 def missed_enough(state: TrackerState) -> bool:
     """Return whether so many windows in a row found no registration that it is no chance."""
     is_known = state.alpha.registration is not None and state.alpha.registration.usable
-    return state.operations.acquisition.misses >= (MISSES_DESPITE if is_known else MISSES_BEFORE)
+    return state.operations.acquisition.misses >= (
+        MISSES_WHILE_TRACKING if is_known else MISSES_BEFORE_ACQUISITION
+    )
 
 
 def count_miss(context: StepContext, kind: RefusalKind) -> None:
@@ -302,7 +307,7 @@ def request_loop(context: StepContext, command: cmd.SetLoop) -> None:
 
 
 def restart_acquisition(context: StepContext, reason: str, *, slipped: bool = False) -> None:
-    """Begin anew with the loop opened again, at once, a few times; then give up.
+    """Restart with the loop opened again, at once, a few times; then give up.
 
     A loop that has slipped is closed on half as many modes next time.
     """
@@ -360,13 +365,13 @@ def abort_acquisition(context: StepContext, why: str, *, held_off: bool = False)
     begins by itself for now, though what made this one begin may last.
     """
     stop_running_dither(context)
-    if context.acquisition.stage not in _BELIEVED:
+    if context.acquisition.stage not in _MEASURED_STAGES:
         validity.forget_registration(context)
     left, found = "left as it is", _to_give_back(context.state)
     if found is not None:
         left = "closed as it was found"
         request_loop(context, cmd.SetLoop(loop="closed", leak=found.leak))
-    text = f"ended {why}; the loop is {left}{HELD_OFF if held_off else ''}"
+    text = f"ended {why}; the loop is {left}{HELD_OFF_TEXT if held_off else ''}"
     over = replace(context.acquisition, held_off=held_off, windows=context.windows.accepted)
     set_acquisition(context, over)
     enter_stage(context, AcquisitionStage.ABORTED, text)
@@ -411,11 +416,11 @@ def on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
         return
     difference = estimate.alpha.vector - before.alpha.vector
     chi2 = float(difference @ np.linalg.solve(covariance + before.covariance, difference))
-    if chi2 > AGREE:
+    if chi2 > MAX_ESTIMATE_DIFFERENCE:
         set_acquisition(context, before)
         reason = (
             f"two sets of modes disagree: {before.alpha} and {estimate.alpha}, "
-            f"chi2 {chi2:.0f}, expected at most {AGREE}"
+            f"chi2 {chi2:.0f}, expected at most {MAX_ESTIMATE_DIFFERENCE}"
         )
         restart_acquisition(context, reason)
         return
@@ -456,9 +461,9 @@ def _lift_limit_of_jump(context: StepContext) -> None:
 
 
 def on_missed(context: StepContext, reason: str) -> None:
-    """Count a window that led nowhere; after a few begin anew."""
+    """Count a window without a result; after a few, restart."""
     misses = context.acquisition.misses + 1
-    if misses >= MAX_MISSES:
+    if misses >= MAX_STAGE_MISSES:
         restart_acquisition(context, reason)
     else:
         set_acquisition(context, replace(context.acquisition, misses=misses))
@@ -471,8 +476,8 @@ def _keep_dithering(context: StepContext, rtc: Status) -> None:
     if rtc.dither_id is not None:
         stopping = rtc.dither_id == context.dither_policy.stopped_id
         since_s = (context.now_ns - context.acquisition.since_ns_utc) / SECOND_NS
-        if not (stopping and since_s < STOPS_WITHIN_S):
-            context.put_off(dither_s=STOPS_WITHIN_S)
+        if not (stopping and since_s < STOP_STATUS_DELAY_S):
+            context.put_off(dither_s=STOP_STATUS_DELAY_S)
             request_stop(context)
         return
     dither = wide_capture_dither(context.acquisition.stage, rtc, context.policy, context.now_ns)

@@ -20,10 +20,10 @@ from service.wire import MatrixStrokes, MeasureRequest, Pattern, Reply, Status
 
 MEASUREMENTS_KEPT = 300
 
-STROKE_M = 20e-9
+PUSH_PULL_RMS_M = 20e-9
 """RMS of a push or pull, metres OPD: small enough for a pyramid, far above its noise."""
 
-TONE_M = 5e-9
+TONE_RMS_M = 5e-9
 """RMS of each mode of a sine, metres OPD, where the settings fix no amplitude of the dither."""
 
 N_AVERAGE = 10
@@ -34,12 +34,12 @@ TONE_BAND = (0.05, 0.45)
 """Range of the tones as a fraction of the frame rate: above the loop's bandwidth and below half the
 rate."""
 
-TONES_LAST_S = 10.0
+DEFAULT_TONES_DURATION_S = 10.0
 
-OVERDUE_S = 15.0
+MAX_MATRIX_DELAY_S = 15.0
 """Time for the matrix to arrive after the loop is closed again."""
 
-LONGEST_S = 3600.0
+MAX_MEASUREMENT_S = 3600.0
 """Longest measurement."""
 
 MEASURING = "an interaction matrix is being measured: these frames are no ordinary telemetry"
@@ -181,14 +181,14 @@ def _kind(record: MeasurementRecord) -> str:
 def _give_up_overdue(context: StepContext, record: MeasurementRecord, *, closed: bool) -> None:
     """Give up a matrix that does not arrive although the RTC seems done."""
     asked_ns = record.asked_ns_utc or context.now_ns
-    if context.now_ns - asked_ns > LONGEST_S * SECOND_NS:
-        fail_measurement(context, record, f"no matrix came within {LONGEST_S:.0f} s")
+    if context.now_ns - asked_ns > MAX_MEASUREMENT_S * SECOND_NS:
+        fail_measurement(context, record, f"no matrix came within {MAX_MEASUREMENT_S:.0f} s")
     elif not (record.opens_loop and closed and record.start_seq is not None):
         store_measurement(context, replace(record, overdue_since_ns_utc=None))
     else:
         since_ns = record.overdue_since_ns_utc or context.now_ns
-        if context.now_ns - since_ns > OVERDUE_S * SECOND_NS:
-            text = f"the loop has been closed for {OVERDUE_S:.0f} s and no matrix came"
+        if context.now_ns - since_ns > MAX_MATRIX_DELAY_S * SECOND_NS:
+            text = f"the loop has been closed for {MAX_MATRIX_DELAY_S:.0f} s and no matrix came"
             fail_measurement(context, record, text)
         else:
             store_measurement(context, replace(record, overdue_since_ns_utc=since_ns))
@@ -199,9 +199,9 @@ def _planned(command: cmd.Measure, rtc: Status, policy: Policy, now_ns: int) -> 
     modes = command.modes or tuple(range(rtc.n_controlled))
     if sine and command.modes is None:
         modes = modes[:: -(-len(modes) // N_TONES)]
-    tone_m = policy.dither_amplitude_m or TONE_M
-    stroke_m = command.amplitude_m or (tone_m if sine else STROKE_M)
-    duration_s = (command.duration_s or TONES_LAST_S) if sine else None
+    tone_m = policy.dither_amplitude_m or TONE_RMS_M
+    stroke_m = command.amplitude_m or (tone_m if sine else PUSH_PULL_RMS_M)
+    duration_s = (command.duration_s or DEFAULT_TONES_DURATION_S) if sine else None
     lines = command.frequency_hz
     if duration_s is not None and lines is None:
         band_hz = np.linspace(*TONE_BAND, len(modes)) * rtc.frame_rate_hz

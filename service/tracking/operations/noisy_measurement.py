@@ -11,7 +11,7 @@ from service.errors import CommandError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither import request_dither, stop_running_dither
-from service.tracking.dither_request import RANDOM_TOTAL_M, cost_of, plan_random
+from service.tracking.dither_request import DEFAULT_RANDOM_RMS_M, cost_of, plan_random
 from service.tracking.events import Event
 from service.tracking.operation_records import MeasurementRecord, MeasureState
 from service.tracking.operations.measurement import fail_measurement, store_measurement
@@ -20,13 +20,13 @@ from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext, present
 from service.wire import DitherRequest, Reply, Status
 
-DURATION_S = 30.0
+DEFAULT_DURATION_S = 30.0
 """Default duration: on a bright star an element is then as large as its noise."""
 
-FREE_WITHIN_S = 15.0
+DITHER_END_TIMEOUT_S = 15.0
 """Time for the service's own dither to vanish from the RTC's status."""
 
-MADE_WITHIN_S = 120.0
+FIT_TIMEOUT_S = 120.0
 """Time for the fit and the archive."""
 
 
@@ -41,8 +41,8 @@ def measure_noisy(context: StepContext, command: cmd.MeasureNoisy) -> None:
     rtc = present(context.rtc)
     if context.state.measurement(command.id) is not None:
         raise CommandError(f"{command.id} was measured before; ids are never reused")
-    duration_s = command.duration_s or DURATION_S
-    total = command.total_amplitude_m or min(RANDOM_TOTAL_M, context.policy.dither_budget_m)
+    duration_s = command.duration_s or DEFAULT_DURATION_S
+    total = command.total_amplitude_m or min(DEFAULT_RANDOM_RMS_M, context.policy.dither_budget_m)
     cost_of(total, context.policy, over_budget=command.over_budget)
     dither = plan_random(
         rtc,
@@ -94,15 +94,17 @@ def _go_on(context: StepContext, record: MeasurementRecord, event: Event) -> Non
         case MeasureState.WAITING:
             if rtc is not None and rtc.loop != "open" and rtc.dither_id is None:
                 _begin_noisy(context, record, rtc)
-            elif waited_s > FREE_WITHIN_S:
+            elif waited_s > DITHER_END_TIMEOUT_S:
                 fail_noisy_measurement(
-                    context, f"the dither that ran did not end within {FREE_WITHIN_S:.0f} s"
+                    context, f"the dither that ran did not end within {DITHER_END_TIMEOUT_S:.0f} s"
                 )
         case MeasureState.ASKED | MeasureState.RUNNING:
             _follow_playing(context, record, event)
         case _:
             # a simulated RTC may be ten times slower than its timestamps
-            if waited_s >= 10.0 * ((record.duration_s or 0.0) + FREE_WITHIN_S + MADE_WITHIN_S):
+            if waited_s >= 10.0 * (
+                (record.duration_s or 0.0) + DITHER_END_TIMEOUT_S + FIT_TIMEOUT_S
+            ):
                 fail_noisy_measurement(context, "the worker did not answer")
 
 
@@ -128,7 +130,7 @@ def _begin_noisy(context: StepContext, record: MeasurementRecord, rtc: Status) -
             dither_id=record.id,
             modes=record.modes,
             total_m=record.total_m,
-            duration_s=record.duration_s or DURATION_S,
+            duration_s=record.duration_s or DEFAULT_DURATION_S,
         )
     except CommandError as error:  # the RTC is another than when it was asked for
         fail_measurement(context, record, str(error))

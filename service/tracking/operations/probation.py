@@ -1,7 +1,8 @@
 """Probation: return from a matrix that makes the loop worse.
 
-The previous matrix held the loop until a moment ago, whoever made it. It is sent again whatever the
-gate or the telemetry have reported since. If the loop is lost nevertheless, it is opened.
+The previous matrix was stable until a moment ago, whatever its origin. It is sent again regardless
+of what the gate or the telemetry have reported since. If the loop is lost nevertheless, it is
+opened.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from dataclasses import replace
 
 from service.estimation.comparison import Verdict
 from service.estimation.loop import same_but_for_modes, why_open
-from service.estimation.probation import WITHIN_S
+from service.estimation.probation import MAX_PROBATION_S
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking import reconstructors
@@ -32,31 +33,31 @@ from service.tracking.sending import why_unsendable
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
 
-LATE_S = 1.0
+MAX_VERDICT_DELAY_S = 1.0
 """Time for the telemetry with the verdict to arrive; everything else waits no longer."""
 
-REPUBLISHED_WITHIN_S = 10.0
+REPUBLICATION_TIMEOUT_S = 10.0
 """Time for the previous matrix to be ready for sending."""
 
-LAW_WITHIN_S = 5.0
+MAX_LAW_DETECTION_S = 5.0
 """Commands that contradict the loop law within this time are a consequence of the swap; it takes up
 to 2 s of telemetry to detect it."""
 
-CALM_WITHIN_S = 1.0
+MAX_CALMING_S = 1.0
 """Time for a diverging loop to become calm with the previous matrix; its detector remembers half a
 second."""
 
-OPEN_AGAIN_S = 2.0
+OPEN_REQUEST_INTERVAL_S = 2.0
 """Interval between two requests to open the loop."""
 
-_TELLING = (WRONG_LOOP, OFF_LOOP, DIVERGING)
+_CONCLUSIVE_ALARMS = (WRONG_LOOP, OFF_LOOP, DIVERGING)
 """Alarms that say by themselves that the RTC plays another matrix, or one that does not hold."""
 
-_OVER = frozenset(
+_FINAL_STATES = frozenset(
     {MatrixState.FAILED, MatrixState.REJECTED, MatrixState.REFUSED, MatrixState.DISCARDED}
 )
-_GOING_BACK = frozenset({ProbationState.ROLLING_BACK, ProbationState.KEPT})
-_WORSE = frozenset(
+_ROLLBACK_STATES = frozenset({ProbationState.ROLLING_BACK, ProbationState.KEPT})
+_WORSE_STATES = frozenset(
     {
         ProbationState.ROLLING_BACK,
         ProbationState.WATCHED,
@@ -163,7 +164,11 @@ def _begin_rollback(context: StepContext, trial: Probation, found: str) -> None:
 def _on_swap(context: StepContext, before: str | None, in_use: str | None) -> None:
     trial = context.operations.probation
     record = None if in_use is None else context.state.reconstructor(in_use)
-    if trial is not None and trial.state in _GOING_BACK and trial.rollback == in_use is not None:
+    if (
+        trial is not None
+        and trial.state in _ROLLBACK_STATES
+        and trial.rollback == in_use is not None
+    ):
         _begin_watch(context, trial, in_use)
         return
     if record is None or before is None:
@@ -172,7 +177,7 @@ def _on_swap(context: StepContext, before: str | None, in_use: str | None) -> No
             _set(context, replace(trial, state=ProbationState.NOT_JUDGED, text=why))
         return
     why = _why_none(context, record, trial)
-    worse = trial is not None and trial.id == before and trial.state in _WORSE
+    worse = trial is not None and trial.id == before and trial.state in _WORSE_STATES
     asked = context.policy.opens_lost_loop
     _set(
         context,
@@ -183,7 +188,7 @@ def _on_swap(context: StepContext, before: str | None, in_use: str | None) -> No
             state=ProbationState.NOT_JUDGED if why else ProbationState.RUNNING,
             text=why or f"compared with {before}",
             since_ns_utc=context.now_ns,
-            until_ns_utc=context.now_ns + round(WITHIN_S * SECOND_NS),
+            until_ns_utc=context.now_ns + round(MAX_PROBATION_S * SECOND_NS),
             loop=context.before.loop.rtc,
             opens=context.before.operator.mode is Mode.AUTO if asked is None else asked,
         ),
@@ -194,7 +199,7 @@ def _await_verdict(context: StepContext, trial: Probation) -> None:
     why = _why_not_comparable(context)
     if why:
         _set(context, replace(trial, state=ProbationState.NOT_JUDGED, text=why))
-    elif trial.under_way and context.now_ns > trial.until_ns_utc + LATE_S * SECOND_NS:
+    elif trial.under_way and context.now_ns > trial.until_ns_utc + MAX_VERDICT_DELAY_S * SECOND_NS:
         _set(context, replace(trial, state=ProbationState.OVERDUE, text="telemetry is late"))
 
 
@@ -214,7 +219,7 @@ def _begin_watch(context: StepContext, trial: Probation, in_use: str) -> None:
     watched = replace(
         trial,
         since_ns_utc=context.now_ns,
-        until_ns_utc=context.now_ns + round(WITHIN_S * SECOND_NS),
+        until_ns_utc=context.now_ns + round(MAX_PROBATION_S * SECOND_NS),
     )
     _end(context, watched, ProbationState.WATCHED, text)
     context.raise_alarm(
@@ -229,9 +234,9 @@ def _watch(context: StepContext, trial: Probation) -> None:
     if context.rtc is None or not context.rtc.in_loop:
         why = "the RTC is gone" if context.rtc is None else why_open(context.rtc)
         _end_watch(context, trial, why, lost=False)
-    elif lost is not None and waited_s > CALM_WITHIN_S:
+    elif lost is not None and waited_s > MAX_CALMING_S:
         _end_watch(context, trial, lost.text, lost=True)
-    elif waited_s > WITHIN_S + LATE_S:
+    elif waited_s > MAX_PROBATION_S + MAX_VERDICT_DELAY_S:
         _end_watch(context, trial, "telemetry does not show how the loop is since", lost=False)
 
 
@@ -261,7 +266,7 @@ def _await_opening(context: StepContext, trial: Probation, event: Event) -> None
         _set(context, replace(trial, state=ProbationState.OPENED))
     elif rtc is not None and asked is not None and not context.operator.stopped_because:
         waited_ns = context.now_ns - asked.asked_ns_utc
-        if waited_ns > OPEN_AGAIN_S * SECOND_NS:
+        if waited_ns > OPEN_REQUEST_INTERVAL_S * SECOND_NS:
             set_loop(context, cmd.SetLoop(loop="open"))
 
 
@@ -286,18 +291,18 @@ def opening_text(context: StepContext) -> str | None:
 def _alarm_of_swap(context: StepContext, trial: Probation) -> str:
     """Return what an alarm says of a matrix just applied; empty: none has come with it."""
     judged = {ProbationState.RUNNING, ProbationState.OVERDUE, ProbationState.PASSED}
-    late = context.now_ns > trial.since_ns_utc + LAW_WITHIN_S * SECOND_NS
+    late = context.now_ns > trial.since_ns_utc + MAX_LAW_DETECTION_S * SECOND_NS
     if trial.state not in judged or late or _why_not_comparable(context):
         return ""
     since = (a for a in context.alarms.active if a.since_ns_utc >= trial.since_ns_utc)
-    return next((alarm.text for alarm in since if alarm.name in _TELLING), "")
+    return next((alarm.text for alarm in since if alarm.name in _CONCLUSIVE_ALARMS), "")
 
 
 def _why_none(context: StepContext, record: ReconstructorRecord, last: Probation | None) -> str:
     """Return why a matrix just applied is not put on probation; empty: it is."""
     if record.published_ns_utc is None:
         return "the RTC took it by itself"
-    if last is not None and last.state in _WORSE:
+    if last is not None and last.state in _WORSE_STATES:
         worse = context.state.reconstructor(last.id)
         if worse is not None and worse.sha256 == record.sha256 != "":
             return "it was found worse before, and is wanted all the same"
@@ -321,9 +326,9 @@ def _why_stuck(context: StepContext, trial: Probation, event: Event) -> str:
         return event.text
     sent = None if trial.rollback is None else context.state.reconstructor(trial.rollback)
     if sent is None:
-        late = context.now_ns > trial.until_ns_utc + REPUBLISHED_WITHIN_S * SECOND_NS
+        late = context.now_ns > trial.until_ns_utc + REPUBLICATION_TIMEOUT_S * SECOND_NS
         return "its copy did not come" if late else ""
-    return sent.reason or sent.state if sent.state in _OVER else ""
+    return sent.reason or sent.state if sent.state in _FINAL_STATES else ""
 
 
 def _why_no_way_back(context: StepContext, trial: Probation) -> str | None:

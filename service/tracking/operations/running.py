@@ -12,12 +12,12 @@ from enum import StrEnum
 
 from service.estimation.loop import NO_RTC, why_open
 from service.tracking.alarms import STANDING_BY, Alarm, Severity
-from service.tracking.dither_request import GONE_WITHIN_S, OUR_DITHERS, OWN_DITHER
+from service.tracking.dither_request import MAX_STOP_DELAY_S, OUR_DITHERS, OWN_DITHER
 from service.tracking.operation_records import CommandState, LoopCommand
 from service.tracking.policy import SECOND_NS
 from service.tracking.state import Mode, TrackerState
 
-ANSWERED_WITHIN_S = 30.0
+RAMP_REPLY_TIMEOUT_S = 30.0
 """A gain ramp that the RTC has neither accepted nor refused for so long is none."""
 
 
@@ -42,7 +42,7 @@ class RunningOperation:
 
     kind: OperationKind
     text: str
-    """What is running, and what ends it."""
+    """Running operation, and how it ends."""
 
 
 def running_operations(state: TrackerState, now_ns: int) -> tuple[RunningOperation, ...]:
@@ -56,7 +56,7 @@ def running_ramp(state: TrackerState, now_ns: int) -> LoopCommand | None:
     if asked is None or not asked.lasts_s or rtc is None or rtc.loop == "open":
         return None
     if asked.state is CommandState.ASKED:
-        waits = now_ns - asked.asked_ns_utc < ANSWERED_WITHIN_S * SECOND_NS
+        waits = now_ns - asked.asked_ns_utc < RAMP_REPLY_TIMEOUT_S * SECOND_NS
         return asked if waits else None
     accepted = asked.state is CommandState.ACCEPTED
     return asked if accepted and now_ns < asked.until_ns_utc else None
@@ -90,7 +90,7 @@ def _exclusive(state: TrackerState, now_ns: int) -> Iterator[RunningOperation]:
 def _dither(state: TrackerState, now_ns: int) -> Iterator[RunningOperation]:
     """Yield the dither that plays, unless it was ordered to stop."""
     followed = None if state.dithers.dither is None else state.dithers.dither.id
-    stopping = now_ns - state.dithers.policy.stop_asked_ns_utc < GONE_WITHIN_S * SECOND_NS
+    stopping = now_ns - state.dithers.policy.stop_asked_ns_utc < MAX_STOP_DELAY_S * SECOND_NS
     seen = None if state.loop.rtc is None or stopping else state.loop.rtc.dither_id
     playing = followed or (None if seen is None or seen.startswith(OUR_DITHERS) else seen)
     if playing is not None:

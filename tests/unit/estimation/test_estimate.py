@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.estimation.estimate import MODEL_ERROR, model_error
+from service.estimation.estimate import MODEL_ERROR_VARIANCE_RATIO, model_error
 
 
 def test_the_model_errs_as_much_as_it_leaves_unexplained():
     covariance = np.diag([1.0, 4.0, 9.0, 16.0])
     np.testing.assert_allclose(
-        model_error(covariance, 2.0), np.sqrt(MODEL_ERROR) * np.array([1.0, 2.0, 3.0, 4.0])
+        model_error(covariance, 2.0),
+        np.sqrt(MODEL_ERROR_VARIANCE_RATIO) * np.array([1.0, 2.0, 3.0, 4.0]),
     )
 
 

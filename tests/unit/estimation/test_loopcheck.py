@@ -7,8 +7,8 @@ import pytest
 
 from service.estimation.frames import FrameBlock
 from service.estimation.loopcheck import (
-    ENOUGH_SAMPLES,
     KEPT_SAMPLES,
+    MIN_SAMPLES,
     LoopCheck,
     command_residual,
     last_samples,
@@ -230,7 +230,7 @@ def test_the_last_samples_span_a_second():
     check, _ = command_residual(check, told, 0, 10**9)
     first, last = last_samples(check, 1800)
     assert last <= 1800
-    assert last - first == (ENOUGH_SAMPLES - 1) * 50
+    assert last - first == (MIN_SAMPLES - 1) * 50
 
 
 def test_memory_is_bounded():

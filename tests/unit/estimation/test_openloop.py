@@ -8,7 +8,12 @@ import pytest
 
 from service.control.dither import COARSE_BAND, FINE_BAND, spread_lines, spread_modes
 from service.estimation.lockin import LockIn, LockInPlan
-from service.estimation.openloop import UNEXPLAINED, WideCaptureEstimate, WideCaptureSearch, find
+from service.estimation.openloop import (
+    MAX_UNEXPLAINED_SHARE,
+    WideCaptureEstimate,
+    WideCaptureSearch,
+    find,
+)
 from service.estimation.windows import RefusalKind, WindowRefused
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
@@ -86,7 +91,7 @@ def test_smooth_modes_lead_home_from_every_corner_of_the_range(alpha):
     found = look(window(alpha))
     # the model that decides is coarser than the one that made the telemetry
     assert np.all(error(found, alpha) < COARSE_BAND.floor)
-    assert found.unexplained < UNEXPLAINED / 2
+    assert found.unexplained < MAX_UNEXPLAINED_SHARE / 2
 
 
 def test_finer_modes_confirm_from_where_smooth_ones_lead():

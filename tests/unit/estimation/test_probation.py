@@ -10,7 +10,7 @@ import scipy
 
 from service.estimation.comparison import PRIOR_SCATTER, Verdict, measure_sigma
 from service.estimation.frames import FrameBlock
-from service.estimation.probation import WITHIN_S, Comparison, begun_anew, observe
+from service.estimation.probation import MAX_PROBATION_S, Comparison, begun_anew, observe
 
 N_MODES, BLOCK, DT_NS = 60, 50, 1_000_000
 BEFORE_S, AFTER_S = 2.0, 4.5
@@ -79,7 +79,7 @@ def test_a_few_modes_at_the_edge_of_stability_are_found(turns):
     found = judged([("a", residual(rng, BEFORE_S)), ("b", after)])
     assert found.verdict is Verdict.WORSE
     assert 40 <= found.mode < 44
-    assert found.after_s <= WITHIN_S
+    assert found.after_s <= MAX_PROBATION_S
     assert found.common_ratio == pytest.approx(1.0, abs=0.1)
     assert re.fullmatch(
         rf"mode {found.mode} moves [\d.]+ times as much, against all modes, as with a "
@@ -106,7 +106,7 @@ def test_a_matrix_after_a_bad_one_is_not_blamed_for_what_has_become_calm():
 def test_a_good_matrix_passes_at_the_decision_and_no_sooner():
     rng = np.random.default_rng(5)
     found = judged([("a", residual(rng, BEFORE_S)), ("b", residual(rng, AFTER_S))])
-    assert WITHIN_S - 0.15 < found.after_s <= WITHIN_S
+    assert MAX_PROBATION_S - 0.15 < found.after_s <= MAX_PROBATION_S
     assert found.text.startswith("as good: at most, ")
     assert len(found.text) < 110
 
@@ -189,7 +189,7 @@ def test_a_gust_of_one_second_is_not_the_matrix_s_doing(begins_s, modes):
     after[some, modes] *= 2.0 if modes == slice(None) else 4.0
     found = judged([("a", residual(rng, 4.0)), ("b", after)])
     assert found.verdict is Verdict.AS_GOOD, found.text
-    assert found.after_s > WITHIN_S - 0.15
+    assert found.after_s > MAX_PROBATION_S - 0.15
 
 
 def test_noise_that_is_correlated_for_several_groups_counts_more():

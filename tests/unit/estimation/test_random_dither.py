@@ -116,7 +116,7 @@ EVERY = tuple(range(N_MODES))
 @pytest.fixture
 def many(monkeypatch):
     """Modes so few that the small instrument has many."""
-    monkeypatch.setattr(random_dither, "MANY_MODES", 30)
+    monkeypatch.setattr(random_dither, "MIN_MODES_WITHOUT_BATCHES", 30)
 
 
 @pytest.mark.usefixtures("many")

@@ -12,8 +12,8 @@ from service.estimation.comparison import Verdict
 from service.estimation.frames import FrameBlock
 from service.estimation.probation import Comparison, observe
 from service.estimation.residual import (
-    LAG,
-    LATELY,
+    LAG_SAMPLES,
+    N_LOST_PARTS,
     Reader,
     Residual,
     ResidualLevel,
@@ -125,8 +125,8 @@ def test_a_lost_loop_whose_sensor_saturates_is_told_by_the_commands_of_its_upper
     level = ResidualLevel.of((part(usual),) * 8, 8)
     factors = np.full(N_MODES, factor)
     factors[:2] = 10.0
-    assert level.lost((part(factors),) * LATELY) is is_lost
-    assert not level.lost((part(usual), *(part(factors),) * (LATELY - 1)))
+    assert level.lost((part(factors),) * N_LOST_PARTS) is is_lost
+    assert not level.lost((part(usual), *(part(factors),) * (N_LOST_PARTS - 1)))
 
 
 @pytest.mark.parametrize("seed", [2, 3])
@@ -202,7 +202,7 @@ def test_one_that_is_lost_with_that_too_is_said_to_be():
 
 
 def test_samples_are_compared_over_their_lag_alone():
-    reader, n = Reader.of(MATRIX), STRIDE * (LAG + 1)
+    reader, n = Reader.of(MATRIX), STRIDE * (LAG_SAMPLES + 1)
     block = FrameBlock(
         session="s",
         first_seq=0,
@@ -214,8 +214,8 @@ def test_samples_are_compared_over_their_lag_alone():
         cm_id="a",
     )
     reader, sums = reader.read(block)
-    assert (sums.n_seen, sums.n_moved) == (LAG + 1, 1)
-    assert sums.moved == pytest.approx(np.full(N_MODES, (1e-9 * LAG * STRIDE) ** 2))
+    assert (sums.n_seen, sums.n_moved) == (LAG_SAMPLES + 1, 1)
+    assert sums.moved == pytest.approx(np.full(N_MODES, (1e-9 * LAG_SAMPLES * STRIDE) ** 2))
     assert not sums.seen.any()
 
 

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from service.model.far_field import FAR, TILE_SUBAP, PlateSum
+from service.model.far_field import FAR_DISTANCE_RATIO, TILE_SUBAP, PlateSum
 from service.model.surface import ThinPlate
 
 RADIUS_SUBAP = 15.0
@@ -71,7 +71,7 @@ def test_no_actuator_is_far_from_a_tile_that_is_near():
     modes().heights(places())
     for tile in modes()._tiles.values():
         apart = np.abs(mirror().positions @ [1.0, 1.0j] - tile.middle)
-        expected = int(np.sum(apart < FAR * TILE_SUBAP / np.sqrt(2.0)))
+        expected = int(np.sum(apart < FAR_DISTANCE_RATIO * TILE_SUBAP / np.sqrt(2.0)))
         assert len(tile.near) == expected
 
 

@@ -12,7 +12,7 @@ from tests.unit.runtime.small import COMPUTE, small_instrument
 @pytest.fixture
 def light_processes(monkeypatch):
     """Processes that import no optics before their work, which is of these tests."""
-    monkeypatch.setattr("service.runtime.processes.ITS_WORK", "tests.unit.runtime.jobs")
+    monkeypatch.setattr("service.runtime.processes.WORKER_MODULE", "tests.unit.runtime.jobs")
 
 
 @pytest.fixture(scope="session")

@@ -75,7 +75,7 @@ async def test_a_disk_that_refuses_for_long_loses_the_newest_and_says_how_many(
     def refuse(*_):
         raise StorageError("full")
 
-    monkeypatch.setattr(archiving, "MAX_WAITING", 3)
+    monkeypatch.setattr(archiving, "MAX_WAITING_LINES", 3)
     with monkeypatch.context() as patch:
         patch.setattr(archive, "record", refuse)
         measured(recorder, 0, 5)
@@ -90,7 +90,7 @@ async def test_a_disk_that_refuses_for_long_loses_the_newest_and_says_how_many(
 
 async def test_lines_that_were_lost_are_told_of_where_nothing_else_waits(archive, monkeypatch):
     recorder = ArchiveWriter(archive, lambda: None, lambda event: None)
-    monkeypatch.setattr(archiving, "MAX_WAITING", 0)
+    monkeypatch.setattr(archiving, "MAX_WAITING_LINES", 0)
     recorder.add(AuditEntry(t_ns_utc=1, who="Ada", name="mode", text=""))
     await recorder.flush()
     assert archive.audit_trail()[-1].text.startswith("1 lines came while the disk refused")

@@ -65,7 +65,7 @@ def test_what_a_cluster_that_is_lost_leaves_is_played_here(scheduler, monkeypatc
 
 
 def test_a_scheduler_that_is_not_there_is_named(monkeypatch):
-    monkeypatch.setattr(module, "CONNECT_S", 0.3)
+    monkeypatch.setattr(module, "CONNECT_TIMEOUT_S", 0.3)
     with pytest.raises(ClusterError, match=r"^tcp://127.0.0.1:1: found no Dask scheduler there"):
         Cluster("tcp://127.0.0.1:1")
     with pytest.raises(ClusterError, match=r"^here: found no Dask scheduler there"):

@@ -78,8 +78,8 @@ def test_what_comes_once_is_the_instrument_and_its_modes_in_single():
 
 
 def test_of_the_next_matrix_only_its_alpha_is_sent(scheduler, monkeypatch):
-    monkeypatch.setattr(rows, "ROW_S", 0.0)
-    monkeypatch.setattr(rows, "PAYS_S", 0.0)
+    monkeypatch.setattr(rows, "MIN_REMOTE_ROW_S", 0.0)
+    monkeypatch.setattr(rows, "MIN_REMOTE_JOB_S", 0.0)
     monkeypatch.setattr(rows, "_compute", lambda *work: None)  # all by the cluster
     with Cluster(scheduler.scheduler_address) as cluster:
         sent, scatter = [], cluster._client.scatter

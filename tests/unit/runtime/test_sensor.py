@@ -13,7 +13,7 @@ from service.model.misregistration import Misregistration
 from service.model.sensors.pyramid import working_point as pyramid_at_work
 from service.model.sensors.pyramid.working_point import working_point
 from service.runtime.worker import OpticsWorker
-from service.runtime.worker.sensor import FOLLOWED, STRENGTHS
+from service.runtime.worker.sensor import MIN_GAIN_CHANGE, STRENGTH_RANGE
 from tests.unit.runtime.small import (
     COMPUTE,
     N_CONTROLLED,
@@ -98,7 +98,7 @@ def test_what_follows_the_residual_is_nearer_the_truth_than_what_does_not(bench)
 def test_a_sensor_without_a_residual_is_taken_for_one(bench):
     window = dithered_window(flat(), ALPHA, noise=1e-6)
     estimate = bench.fit(window, still(), ALPHA)
-    assert bench._sensor.strength == STRENGTHS[0]
+    assert bench._sensor.strength == STRENGTH_RANGE[0]
     np.testing.assert_allclose(estimate.alpha.vector, ALPHA.vector, atol=5e-4)
     np.testing.assert_allclose(np.abs(estimate.optical_gain), 1.0, atol=0.01)
 
@@ -107,9 +107,9 @@ def test_gains_that_hardly_differ_cost_no_linearisation(bench):
     sensor = bench._sensor
     kept = sensor.linearise(ALPHA)
     expected = sensor.ratio()[list(MODES)].astype(complex)
-    assert not sensor.follow(MODES, expected * np.exp(0.9 * FOLLOWED))
+    assert not sensor.follow(MODES, expected * np.exp(0.9 * MIN_GAIN_CHANGE))
     assert sensor.near(ALPHA) is kept
-    assert sensor.follow(MODES, expected * np.exp(1.1 * FOLLOWED))
+    assert sensor.follow(MODES, expected * np.exp(1.1 * MIN_GAIN_CHANGE))
     assert sensor.strength < 1.0
     assert sensor.near(ALPHA) is not kept
 

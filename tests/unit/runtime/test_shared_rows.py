@@ -64,8 +64,8 @@ class Slow(RowTask):
 
 @pytest.fixture(autouse=True)
 def everything_pays(monkeypatch):
-    monkeypatch.setattr(module, "ROW_S", 0.0)
-    monkeypatch.setattr(module, "PAYS_S", 0.0)
+    monkeypatch.setattr(module, "MIN_REMOTE_ROW_S", 0.0)
+    monkeypatch.setattr(module, "MIN_REMOTE_JOB_S", 0.0)
 
 
 def helped_by(cluster, n_threads=2):
@@ -110,10 +110,10 @@ def test_what_a_row_raises_is_raised_here():
 
 def test_small_work_stays_here(monkeypatch):
     cluster = Pretended()
-    monkeypatch.setattr(module, "PAYS_S", 10.0)
+    monkeypatch.setattr(module, "MIN_REMOTE_JOB_S", 10.0)
     assert list(helped_by(cluster).map(Slow(), range(4))) == [0, 10, 20, 30]
     assert list(helped_by(cluster).map(Slow(), range(1))) == [0]
-    monkeypatch.setattr(module, "PAYS_S", 0.0)
+    monkeypatch.setattr(module, "MIN_REMOTE_JOB_S", 0.0)
     assert list(helped_by(cluster).map(lambda row: row, range(4))) == [0, 1, 2, 3]
     assert cluster.asked == []
 
@@ -132,7 +132,7 @@ def test_d_and_its_derivatives_are_the_same_to_the_bit_with_a_cluster(scheduler,
             ALPHA
         )
         for thread in threading.enumerate():
-            if thread.name == module.HELP:
+            if thread.name == module.RECEIVER_THREAD:
                 thread.join()
     np.testing.assert_array_equal(together.matrix, alone.matrix)
     np.testing.assert_array_equal(together.derivatives, alone.derivatives)
@@ -153,7 +153,7 @@ def _answered(cluster):
 
 
 def test_a_cluster_that_is_not_there_is_named_and_taken_up_when_it_comes(monkeypatch):
-    monkeypatch.setattr(module, "LOOK_S", 0.05)
+    monkeypatch.setattr(module, "CLUSTER_SEARCH_INTERVAL_S", 0.05)
     found = []
 
     def connected(address):

@@ -13,7 +13,7 @@ from service.estimation.loopcheck import LoopCheck
 from service.estimation.passive import Passive
 from service.estimation.windows import RefusalKind, WindowRefused
 from service.runtime.engine import (
-    STEADY_GATHER_S,
+    IDLE_GATHER_S,
     Engine,
     detect_changes,
     shape_mismatch,
@@ -693,7 +693,7 @@ def test_frames_wait_only_while_alpha_is_followed_and_nothing_else_happens():
     def gathered_s(**changes):
         return Engine(changed(handmade.STATE, **changes), POLICY, Driver()).gather_s
 
-    assert gathered_s() == gathered_s(dither=DITHER) == STEADY_GATHER_S
+    assert gathered_s() == gathered_s(dither=DITHER) == IDLE_GATHER_S
     sent = replace(foreign(), id="cm-2", state=MatrixState.PUBLISHED)
     alarm = Alarm(name="edge-slip", since_ns_utc=START_NS, text="")
     for changes in (

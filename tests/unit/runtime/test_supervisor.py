@@ -330,7 +330,7 @@ async def test_an_intake_that_hangs_is_named_though_the_process_lives(
     gone_on = threading.Event()
     async with running(supervisor):
         assert not supervisor.snapshot().stalled
-        monkeypatch.setattr(heartbeat, "STALLED_S", 0.3)
+        monkeypatch.setattr(heartbeat, "MAX_ROUND_S", 0.3)
         monkeypatch.setattr(bridge, "drain", lambda **_: gone_on.wait(60.0) and [])
         await until(lambda: "the intake of telemetry has stood" in supervisor.snapshot().stalled)
         gone_on.set()
@@ -449,7 +449,7 @@ def alarm_of(supervisor, name):
 
 @pytest.fixture
 def impatient(monkeypatch):
-    monkeypatch.setattr("service.runtime.archiving.RETRY_S", 0.05)
+    monkeypatch.setattr("service.runtime.archiving.DISK_RETRY_INTERVAL_S", 0.05)
 
 
 async def test_an_order_that_cannot_be_recorded_is_not_carried_out(supervisor, archive, impatient):
@@ -612,7 +612,7 @@ async def test_alpha_that_could_not_be_saved_is_an_alarm_and_saved_later(
 async def test_a_token_without_a_message_has_the_link_opened_anew_and_is_told(
     supervisor, bridge, monkeypatch
 ):
-    monkeypatch.setattr("service.runtime.readiness.REVIVED_AFTER_S", 1.0)
+    monkeypatch.setattr("service.runtime.readiness.FIRST_REOPENING_DELAY_S", 1.0)
     async with running(supervisor):
 
         def logged():

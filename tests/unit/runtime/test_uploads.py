@@ -175,7 +175,7 @@ async def test_a_body_no_matrix_could_be_in_is_refused_at_once(opened, tmp_path,
 
 
 async def test_an_upload_that_stops_is_given_up(opened, tmp_path, monkeypatch):
-    monkeypatch.setattr(uploads, "STALL_S", 0.1)
+    monkeypatch.setattr(uploads, "MAX_UPLOAD_STALL_S", 0.1)
 
     async def stalled():
         yield HDF5[:1000]
@@ -188,7 +188,7 @@ async def test_an_upload_that_stops_is_given_up(opened, tmp_path, monkeypatch):
 
 
 async def test_an_upload_that_trickles_does_not_hold_its_place(opened, tmp_path, monkeypatch):
-    monkeypatch.setattr(uploads, "PATIENCE_S", 0.3)
+    monkeypatch.setattr(uploads, "MAX_UPLOAD_DELAY_S", 0.3)
 
     async def trickling():
         yield HDF5[:1000]

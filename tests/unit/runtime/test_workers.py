@@ -100,7 +100,7 @@ async def test_the_worker_tells_the_processor_time_of_every_kind_of_job(workers)
 
 async def test_it_tells_that_of_a_job_under_way_as_well(workers, monkeypatch):
     await workers.call(process_id)
-    monkeypatch.setattr("service.runtime.workers.LOOK_S", 0.02)
+    monkeypatch.setattr("service.runtime.workers.WORKER_CHECK_INTERVAL_S", 0.02)
     under_way = asyncio.ensure_future(workers.call(spinning))
     begun = asyncio.Event()
     while not begun.is_set():
@@ -212,7 +212,7 @@ async def test_a_turn_nobody_takes_any_more_is_passed_on(shared):
 async def test_a_worker_that_stands_still_is_named_then_killed_and_replaced(
     workers, hired, monkeypatch
 ):
-    monkeypatch.setattr(crew_module, "STILL_S", 0.6)
+    monkeypatch.setattr(crew_module, "STALL_REPORT_S", 0.6)
     before = await workers.call(process_id)
     os.kill(before, signal.SIGSTOP)
     job = asyncio.create_task(workers.call(process_id))
@@ -220,7 +220,7 @@ async def test_a_worker_that_stands_still_is_named_then_killed_and_replaced(
         await asyncio.sleep(0.05)
     assert "has stood still for" in workers.problem
     with monkeypatch.context() as impatient:
-        impatient.setattr(crew_module, "HUNG_S", 0.6)
+        impatient.setattr(crew_module, "STALL_KILL_S", 0.6)
         with pytest.raises(WorkerError, match=r"stood still for \d+ s in process_id and was kil"):
             await job
     assert "was killed" in workers.problem
@@ -231,7 +231,7 @@ async def test_a_worker_that_stands_still_is_named_then_killed_and_replaced(
 
 async def test_a_worker_that_never_comes_to_an_end_is_killed(workers, hired, monkeypatch):
     await workers.call(process_id)
-    monkeypatch.setattr("service.runtime.workers.UNKNOWN_LIMIT_S", 0.5)
+    monkeypatch.setattr("service.runtime.workers.FIRST_JOB_LIMIT_S", 0.5)
     with pytest.raises(WorkerError, match="took more than 0 s for endless and was killed"):
         await workers.call(endless)
     assert await workers.call(process_id) == hired[1].pid
@@ -239,7 +239,7 @@ async def test_a_worker_that_never_comes_to_an_end_is_killed(workers, hired, mon
 
 async def test_a_job_that_rightly_takes_long_is_let_finish_in_the_end(workers, monkeypatch):
     await workers.call(process_id)
-    monkeypatch.setattr("service.runtime.workers.UNKNOWN_LIMIT_S", 0.2)
+    monkeypatch.setattr("service.runtime.workers.FIRST_JOB_LIMIT_S", 0.2)
     for _ in range(5):
         try:
             assert await workers.call(spinning) is None
@@ -251,7 +251,7 @@ async def test_a_job_that_rightly_takes_long_is_let_finish_in_the_end(workers, m
 
 
 async def test_a_job_that_waits_for_the_disk_a_moment_is_not_a_hung_one(shared, monkeypatch):
-    monkeypatch.setattr("service.runtime.workers.STILL_S", 0.6)
+    monkeypatch.setattr("service.runtime.workers.STALL_REPORT_S", 0.6)
     await shared.call(napping)
     assert shared.problem == ""
     assert shared.n_lost == 0

@@ -6,7 +6,7 @@ import numpy as np
 
 from service.control.dither import look_up_precision
 from service.estimation.estimate import PassiveEstimate
-from service.estimation.windows import SETTLING_S
+from service.estimation.windows import DITHER_SETTLING_S
 from service.tracking import events as ev
 from service.tracking.dither_request import total_m
 from service.tracking.state import Mode
@@ -51,7 +51,7 @@ class DitheredNight(Story):
                     self.requests.append(request)
                     self.windows_s.append(self.state.dithers.dither.window_s)
                     self.playing = replace(self.state.dithers.dither, start_seq=self.seq)
-                    self.done_s = self.t_s + SETTLING_S
+                    self.done_s = self.t_s + DITHER_SETTLING_S
                     answer = dither_answered(
                         request.id, accepted=True, reason="", start_seq=self.seq
                     )

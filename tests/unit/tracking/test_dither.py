@@ -7,7 +7,7 @@ import pytest
 
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.dither import LONGEST_PATIENCE_S, PATIENCE_S
+from service.tracking.dither import FIRST_DITHER_RETRY_S, MAX_DITHER_RETRY_S
 from service.tracking.state import Level, Mode
 from service.wire import DitherRequest, DitherStop
 from tests.states import changed
@@ -97,33 +97,33 @@ class TestTheFramesHoldNone:
         silence(story, 1.0)
         assert "dither-lost" in story.alarms
         assert story.state.dithers.dither is not None
-        effects = silence(story, PATIENCE_S)
+        effects = silence(story, FIRST_DITHER_RETRY_S)
         assert of_kind(effects, DitherStop), "the RTC plays no second one beside it"
         assert story.state.dithers.dither is None
         status(story, START + 2000)
         assert of_kind(story.wait(2), DitherRequest)
 
     def test_what_a_status_shows_and_the_frames_do_not_is_not_adopted(self, story, shown):
-        silence(story, 2 * PATIENCE_S)
+        silence(story, 2 * FIRST_DITHER_RETRY_S)
         for second in range(5):
             status(story, START + 3000 + 1000 * second, dither=shown, after_s=1)
             assert story.state.dithers.dither is None
 
     def test_the_next_is_given_more_time(self, story, shown):
-        silence(story, PATIENCE_S)
+        silence(story, FIRST_DITHER_RETRY_S)
         status(story, START + 3000, after_s=5)
         accept(story, START + 3100)
         status(story, START + 3200, dither=replace(story.state.dithers.dither, asked_ns_utc=0))
-        silence(story, 1.5 * PATIENCE_S)
+        silence(story, 1.5 * FIRST_DITHER_RETRY_S)
         assert story.state.dithers.dither is not None
-        silence(story, 2 * PATIENCE_S)
+        silence(story, 2 * FIRST_DITHER_RETRY_S)
         assert story.state.dithers.dither is None
 
     def test_patience_has_an_end(self, story, shown):
         story.state = changed(story.state, losses=50)
-        silence(story, LONGEST_PATIENCE_S - 1)
+        silence(story, MAX_DITHER_RETRY_S - 1)
         assert story.state.dithers.dither is not None
-        silence(story, LONGEST_PATIENCE_S)
+        silence(story, MAX_DITHER_RETRY_S)
         assert story.state.dithers.dither is None
 
     def test_silence_of_another_dither_means_nothing(self, story):

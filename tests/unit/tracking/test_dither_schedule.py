@@ -10,10 +10,15 @@ from hypothesis import given, settings
 
 from service.control.dither import look_up_precision
 from service.errors import CommandError
-from service.estimation.windows import SETTLING_S
+from service.estimation.windows import DITHER_SETTLING_S
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.dither_plan import FAINT_WINDOW_S, LASTING_S, MIN_WINDOWS, budget_m
+from service.tracking.dither_plan import (
+    FAINT_WINDOW_S,
+    MAX_DITHER_DURATION_S,
+    MIN_WINDOWS_FOR_PAUSE,
+    budget_m,
+)
 from service.tracking.dither_request import DitherPhase, total_m
 from service.wire import DitherRequest, DitherStop
 from tests.states import changed
@@ -49,7 +54,7 @@ class TestHowMuch:
         assert night.state.dithers.policy.phase is DitherPhase.ACQUIRE
         assert total_m(night.requests[0]) == pytest.approx(CALM.dither_budget_m)
         night.live(4)
-        assert night.state.alpha.registration.n_windows >= MIN_WINDOWS
+        assert night.state.alpha.registration.n_windows >= MIN_WINDOWS_FOR_PAUSE
         assert night.state.dithers.policy.phase is not DitherPhase.ACQUIRE
 
     def test_a_calm_mirror_is_looked_at_once_a_minute(self):
@@ -161,16 +166,16 @@ class TestWhen:
         night.live(25)
         assert 1 <= len(night.asked(DitherStop)) <= 3
         assert night.state.dithers.dither.id == night.requests[0].id
-        assert night.state.windows.accepted > MIN_WINDOWS + 2
+        assert night.state.windows.accepted > MIN_WINDOWS_FOR_PAUSE + 2
 
     def test_no_request_outlives_a_dead_service_for_long(self):
         night = brisk_night()
-        assert max(dither.duration_s for dither in night.requests) <= LASTING_S + 5.0
+        assert max(dither.duration_s for dither in night.requests) <= MAX_DITHER_DURATION_S + 5.0
 
     def test_a_sitting_lasts_for_its_windows_and_no_longer(self):
         night = calm_night()
         last = night.requests[-1]
-        n_windows = (last.duration_s - SETTLING_S) / night.windows_s[-1]
+        n_windows = (last.duration_s - DITHER_SETTLING_S) / night.windows_s[-1]
         assert 1.0 <= n_windows < 3.5
         assert last.duration_s < 7.5
 
@@ -323,7 +328,7 @@ def test_every_dither_asked_for_obeys_budget_limits_and_clearances(
         assert max(dither.amplitude_m) <= view.max_dither_m * (1.0 + 1e-9)
         assert len(set(dither.modes)) == len(dither.modes) <= view.max_dither_modes
         assert max(dither.modes) < view.n_modes
-        assert dither.duration_s <= LASTING_S + 2.0 * SETTLING_S + window_s
+        assert dither.duration_s <= MAX_DITHER_DURATION_S + 2.0 * DITHER_SETTLING_S + window_s
         avoid = (*policy.dither_avoid_hz, *(vibrations if number >= known else ()))
         gaps = [abs(line - vibration) for line in dither.frequency_hz for vibration in avoid]
         assert min(gaps, default=8.0) >= 8.0 - 1e-6

@@ -7,8 +7,8 @@ import pytest
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.alarms import NOT_AS_ASKED, NOT_STOPPED, OVER_BUDGET
-from service.tracking.dither import CALM_S, TELL_EVERY_S
-from service.tracking.dither_request import GONE_WITHIN_S, DitherPhase, total_m
+from service.tracking.dither import FAILED_DITHER_PAUSE_S, STOP_REQUEST_INTERVAL_S
+from service.tracking.dither_request import MAX_STOP_DELAY_S, DitherPhase, total_m
 from service.tracking.operation_records import AcquisitionStage, MeasureState
 from service.wire import DitherRequest, DitherStop
 from tests.unit.tracking.situations import POLICY, Story, dither_answered, of_kind, rtc, stopping
@@ -60,7 +60,7 @@ class TestOffByTheOperator:
         assert story.tell(cmd.StopDither()) == (stopping(story),)
         story.tell(ev.JobFailed(effect=stopping(story), text="no answer"))
         asked = of_kind(playing(story, dither, 20), DitherStop)
-        assert len(asked) == pytest.approx(20 / TELL_EVERY_S, abs=1)
+        assert len(asked) == pytest.approx(20 / STOP_REQUEST_INTERVAL_S, abs=1)
         assert NOT_STOPPED in story.alarms
         assert story.state.dithers.policy.phase is DitherPhase.OFF
         assert dither.id in story.state.dithers.policy.reason
@@ -135,7 +135,7 @@ class TestOffByTheOperator:
         dither = story.state.dithers.dither
         accept(story, dither)
         story.tell(cmd.StopDither())
-        playing(story, dither, round(GONE_WITHIN_S) + 2)
+        playing(story, dither, round(MAX_STOP_DELAY_S) + 2)
         story.tell(cmd.StartDither())
         assert not of_kind(playing(story, dither, 10), DitherStop)
         assert NOT_STOPPED not in story.alarms
@@ -165,7 +165,7 @@ class TestTooStrong:
         self, story, loud
     ):
         playing(story, loud)
-        assert not of_kind(silent(story, round(CALM_S) - 2), DitherRequest)
+        assert not of_kind(silent(story, round(FAILED_DITHER_PAUSE_S) - 2), DitherRequest)
         assert OVER_BUDGET in story.alarms
         assert "too strong" in story.state.dithers.policy.reason
         assert of_kind(silent(story, 4), DitherRequest)
@@ -186,7 +186,7 @@ class TestTooStrong:
                         on, n_tried = louder(dither), n_tried + 1
                     case ev.Ask(request=DitherStop()):
                         on = None
-        assert n_tried == pytest.approx(600 / CALM_S, abs=1)
+        assert n_tried == pytest.approx(600 / FAILED_DITHER_PAUSE_S, abs=1)
         assert lived_s <= n_tried + 1
         assert OVER_BUDGET in story.alarms
 
@@ -194,7 +194,7 @@ class TestTooStrong:
         self, story, loud
     ):
         asked = of_kind(playing(story, loud, 20), DitherStop)
-        assert len(asked) == pytest.approx(20 / TELL_EVERY_S, abs=1)
+        assert len(asked) == pytest.approx(20 / STOP_REQUEST_INTERVAL_S, abs=1)
         assert {OVER_BUDGET, NOT_STOPPED} <= story.alarms
         assert story.state.dithers.dither.id == loud.id
         silent(story)
@@ -236,7 +236,7 @@ def test_settings_that_forbid_it_do_not_tolerate_what_an_earlier_service_has_lef
     dither = Story().meet().state.dithers.dither
     story = Story(policy=replace(POLICY, dither_enabled=False)).meet()
     asked = of_kind(playing(story, dither, 20), DitherStop)
-    assert len(asked) == pytest.approx(20 / TELL_EVERY_S, abs=1)
+    assert len(asked) == pytest.approx(20 / STOP_REQUEST_INTERVAL_S, abs=1)
     assert "the settings forbid" in next(a.text for a in story.state.alarms.active)
 
 
@@ -263,7 +263,7 @@ class TestByTheFrames:
 
     def test_a_status_that_goes_on_saying_all_is_well_ends_no_alarm(self, story, on):
         self.measured(story, on, 20.0)
-        assert of_kind(silent(story, round(CALM_S) + 3), DitherRequest)
+        assert of_kind(silent(story, round(FAILED_DITHER_PAUSE_S) + 3), DitherRequest)
         accept(story, story.state.dithers.dither)
         playing(story, story.state.dithers.dither, 2)
         assert OVER_BUDGET in story.alarms
@@ -273,7 +273,7 @@ class TestByTheFrames:
     def test_one_that_is_not_stopped_is_told_again_and_again(self, story, on):
         self.measured(story, on, 20.0)
         asked = of_kind(playing(story, on, 20), DitherStop)
-        assert len(asked) == pytest.approx(20 / TELL_EVERY_S, abs=1)
+        assert len(asked) == pytest.approx(20 / STOP_REQUEST_INTERVAL_S, abs=1)
         assert {OVER_BUDGET, NOT_STOPPED} <= story.alarms
 
     def test_otherwise_than_asked_but_within_the_budget_it_is_named_and_goes_on(self, story, on):

@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.estimation.estimate import MODEL_ERROR
+from service.estimation.estimate import MODEL_ERROR_VARIANCE_RATIO
 from service.estimation.windows import RefusalKind, WindowRefused
 from service.model.misregistration import Misregistration
 from service.tracking import events as ev
@@ -48,7 +48,9 @@ def test_two_equal_windows_halve_the_variance_but_for_the_walk_between_them(stor
 def test_what_the_model_does_not_explain_stays_in_sigma_however_many_windows_agree(story):
     story.see(n_windows=20, misfit=3.0)
     known, noise = story.state.alpha.registration, np.diag(PRECISE)
-    np.testing.assert_allclose(known.floor**2, story.policy.floor**2 + MODEL_ERROR * 2.0 * noise)
+    np.testing.assert_allclose(
+        known.floor**2, story.policy.floor**2 + MODEL_ERROR_VARIANCE_RATIO * 2.0 * noise
+    )
     assert np.all(known.sigma > known.floor)
 
 
@@ -64,7 +66,7 @@ def test_one_odd_misfit_among_many_moves_the_model_error_by_a_tenth(story):
     np.testing.assert_allclose(story.state.alpha.registration.floor, story.policy.floor)
     story.see(misfit=1.5)
     added = story.state.alpha.registration.floor**2 - story.policy.floor**2
-    np.testing.assert_allclose(added, 0.1 * MODEL_ERROR * 0.5 * np.diag(PRECISE))
+    np.testing.assert_allclose(added, 0.1 * MODEL_ERROR_VARIANCE_RATIO * 0.5 * np.diag(PRECISE))
 
 
 def test_a_window_weaker_than_what_is_asked_of_alpha_says_nothing_of_the_model(story):

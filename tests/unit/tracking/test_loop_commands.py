@@ -6,7 +6,7 @@ from service.errors import CommandError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.operation_records import CommandState
-from service.tracking.operator import CLOSE_AGAIN_EVERY_S
+from service.tracking.operator import RECLOSING_INTERVAL_S
 from service.tracking.state import Mode
 from service.wire import Loop, LoopRequest, Pattern, RampRequest
 from tests.unit.tracking.situations import Story, judged, loop_answered, of_kind, rtc, verdict
@@ -170,7 +170,7 @@ class TestAMeasurementGivenUp:
         (asked,) = of_kind(story.tell(cmd.GiveUp(id="im-1")), LoopRequest)
         assert asked.loop is Loop.CLOSED
         story.tell(loop_answered(asked.id, accepted=False, reason="busy: im-1"))
-        assert len(of_kind(story.wait(2.2 * CLOSE_AGAIN_EVERY_S), LoopRequest)) == 2
+        assert len(of_kind(story.wait(2.2 * RECLOSING_INTERVAL_S), LoopRequest)) == 2
         story.tell(rtc())
         assert not of_kind(story.wait(60), LoopRequest)
         assert story.state.loop.close_since_ns_utc is None

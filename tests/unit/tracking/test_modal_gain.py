@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from service.tracking import events as ev
-from service.tracking.filtering import FIRST_SCATTER, GAIN_RATE, MODES_KEPT, update_gains
+from service.tracking.filtering import GAIN_RATE, MODES_KEPT, PRIOR_SCATTER, update_gains
 from service.tracking.state import Mode
 from tests.unit.tracking.situations import SECOND, START_NS, Story, estimate
 
@@ -19,7 +19,7 @@ def windows(gains, mode=501, every_s=2.0, sigma=0.001):
 
 def test_a_first_window_is_worth_a_tenth_whatever_its_own_sigma_says():
     found = windows([0.6])
-    assert (found.mode, found.gain, found.sigma) == (501, 0.6, FIRST_SCATTER * 0.6)
+    assert (found.mode, found.gain, found.sigma) == (501, 0.6, PRIOR_SCATTER * 0.6)
 
 
 def test_windows_that_scatter_tell_how_precise_one_is_and_their_mean_is_better():

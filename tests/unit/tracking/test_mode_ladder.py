@@ -10,10 +10,10 @@ from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.tracking.update_policy import (
-    FIRST_WAIT_S,
-    LADDER,
-    LONGEST_WAIT_S,
-    OPERATORS_WAIT_S,
+    DECLINED_MODES_DELAY_S,
+    FIRST_MODES_DELAY_S,
+    MAX_MODES_DELAY_S,
+    MODE_NUMBERS,
     fewer_modes_than,
 )
 from tests.unit.tracking.situations import (
@@ -81,8 +81,8 @@ def test_every_request_of_the_services_own_names_fewer_modes_to_try():
 
 def test_no_rung_is_far_below_the_next_and_five_more_trials_find_the_most_that_pass():
     """Six with the one asked for: 400 modes take a second each, and nothing else waits so long."""
-    assert all(lower >= 0.84 * upper for upper, lower in pairwise(LADDER))
-    assert len(LADDER) < 2**5
+    assert all(lower >= 0.84 * upper for upper, lower in pairwise(MODE_NUMBERS))
+    assert len(MODE_NUMBERS) < 2**5
 
 
 def test_raising_never_ends_below_the_present_number():
@@ -104,7 +104,7 @@ def test_a_short_margin_lowers_the_number_of_modes_and_says_why():
 
 def test_more_are_tried_after_a_wait_while_the_margin_is_comfortable():
     night = Night().lowered()
-    assert not of_kind(night.wait(FIRST_WAIT_S - 5), ev.MakeMatrix)
+    assert not of_kind(night.wait(FIRST_MODES_DELAY_S - 5), ev.MakeMatrix)
     (more,) = of_kind(night.wait(10), ev.MakeMatrix)
     assert (more.n_modes, more.fewer) == (500, (450, 400, 350))
 
@@ -113,23 +113,23 @@ def test_more_are_tried_after_a_wait_while_the_margin_is_comfortable():
 def test_but_not_while_the_margin_is_only_just_enough(radius):
     night = Night().lowered()
     night.tell(ev.MarginJudged(id=night.state.matrices.in_use, verdict=verdict(radius=radius)))
-    assert not of_kind(night.wait(3 * FIRST_WAIT_S), ev.MakeMatrix)
+    assert not of_kind(night.wait(3 * FIRST_MODES_DELAY_S), ev.MakeMatrix)
 
 
 def test_a_raise_the_gate_refuses_doubles_the_wait_and_publishes_nothing():
     night = Night().lowered()
-    (more,) = of_kind(night.wait(FIRST_WAIT_S + 5), ev.MakeMatrix)
+    (more,) = of_kind(night.wait(FIRST_MODES_DELAY_S + 5), ev.MakeMatrix)
     sent = len(night.asked(ev.SendMatrix))
     night.make_for(more, 500, state=MatrixState.REFUSED)
     assert len(night.asked(ev.SendMatrix)) == sent
-    assert night.state.matrices.mode_limit.wait_s == 2 * FIRST_WAIT_S
-    assert not of_kind(night.wait(2 * FIRST_WAIT_S - 5), ev.MakeMatrix)
+    assert night.state.matrices.mode_limit.wait_s == 2 * FIRST_MODES_DELAY_S
+    assert not of_kind(night.wait(2 * FIRST_MODES_DELAY_S - 5), ev.MakeMatrix)
     assert of_kind(night.wait(10), ev.MakeMatrix)
 
 
 def test_a_refused_raise_does_not_hold_back_an_update():
     night = Night().lowered()
-    (more,) = of_kind(night.wait(FIRST_WAIT_S + 5), ev.MakeMatrix)
+    (more,) = of_kind(night.wait(FIRST_MODES_DELAY_S + 5), ev.MakeMatrix)
     night.make_for(more, 500, state=MatrixState.REFUSED)
     (update,) = of_kind(night.see(moved(shift_x_subap=0.05), n_windows=4), ev.MakeMatrix)
     assert update.n_modes == 300
@@ -138,7 +138,7 @@ def test_a_refused_raise_does_not_hold_back_an_update():
 
 def test_a_raise_that_passes_is_published_and_logged():
     night = Night().lowered()
-    (more,) = of_kind(night.wait(FIRST_WAIT_S + 5), ev.MakeMatrix)
+    (more,) = of_kind(night.wait(FIRST_MODES_DELAY_S + 5), ev.MakeMatrix)
     night.make_for(more, 500)
     assert night.state.loop.rtc.n_controlled == 500
     assert night.state.log[-1].name != "modes.lowered"
@@ -156,7 +156,7 @@ def test_a_number_lowered_again_soon_waits_longer_and_never_for_ever():
         (more,) = of_kind(night.see(n_windows=n_windows, every_s=30), ev.MakeMatrix)
         night.make_for(more, 500, state=MatrixState.REFUSED)
     assert waits[:4] == [60.0, 120.0, 240.0, 480.0]
-    assert max(waits) == LONGEST_WAIT_S
+    assert max(waits) == MAX_MODES_DELAY_S
 
 
 def test_in_propose_fewer_modes_are_a_proposal_and_nothing_is_sent():
@@ -236,9 +236,11 @@ def nobody_answers(night, _name, _effects):
 
 def test_an_operator_who_declines_more_modes_is_not_asked_again_for_an_hour():
     night = Declined(Mode.PROPOSE)
-    assert [made.n_modes for made in night.for_s(OPERATORS_WAIT_S - 60, the_operator)] == [500]
+    assert [made.n_modes for made in night.for_s(DECLINED_MODES_DELAY_S - 60, the_operator)] == [
+        500
+    ]
     limit = night.state.matrices.mode_limit
-    assert (limit.n_modes, limit.wait_s) == (400, OPERATORS_WAIT_S)
+    assert (limit.n_modes, limit.wait_s) == (400, DECLINED_MODES_DELAY_S)
     assert limit.reason == "cm-2 was discarded: 400 will do"
     assert [made.n_modes for made in night.for_s(120, the_operator)] == [500]
 
@@ -261,9 +263,9 @@ def test_so_is_a_gate_that_judges_more_modes_again_and_then_refuses_them():
     assert night.matrix_state("cm-2") is MatrixState.REFUSED
     assert (night.state.matrices.mode_limit.n_modes, night.state.matrices.mode_limit.wait_s) == (
         400,
-        FIRST_WAIT_S,
+        FIRST_MODES_DELAY_S,
     )
-    assert not of_kind(night.wait(FIRST_WAIT_S - 5), ev.MakeMatrix)
+    assert not of_kind(night.wait(FIRST_MODES_DELAY_S - 5), ev.MakeMatrix)
 
 
 def test_updates_of_the_modes_in_use_go_on_meanwhile():

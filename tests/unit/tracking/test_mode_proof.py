@@ -6,14 +6,19 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError
-from service.estimation.lockin import WEAK
+from service.estimation.lockin import WEAK_LINE_RATIO
 from service.estimation.windows import WindowRefused
 from service.tracking import alarms
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.dither_modes import PROVING_RANGE
-from service.tracking.mode_limits import MAX_WINDOWS, ModeProof, ModeRatio, compare
-from service.tracking.mode_proof import MAX_BESIDE, TRIES, n_proven_modes, proven_modes
+from service.tracking.dither_modes import PROVING_LINE_RANGE
+from service.tracking.mode_limits import MAX_COMPARED_WINDOWS, ModeProof, ModeRatio, compare
+from service.tracking.mode_proof import (
+    MAX_PROOF_TRIES,
+    MAX_WEAK_LINES,
+    n_proven_modes,
+    proven_modes,
+)
 from service.tracking.products import MatrixState
 from service.tracking.resume import restored, resumed, saved_of
 from service.tracking.state import Mode
@@ -49,7 +54,7 @@ class Shown(World):
         modes = playing.request.modes
         gains = np.array([self.answers_of.get(mode, 0.6) for mode in modes], dtype=complex)
         size = np.array(playing.request.amplitude_m)
-        faint = size < WEAK * size.max()
+        faint = size < WEAK_LINE_RATIO * size.max()
         fitted = estimate(
             t_ns=self.now_ns,
             session=f"s{self.session}",
@@ -94,7 +99,7 @@ def test_many_are_shown_at_once_each_on_a_line_of_its_own_and_within_the_budget(
     assert len(proving.modes) == 50
     lines = np.sort(proving.frequency_hz)
     assert np.diff(lines).min() * WINDOW_S >= 4
-    assert PROVING_RANGE[0] * 1000 <= lines[0] < lines[-1] <= PROVING_RANGE[1] * 1000
+    assert PROVING_LINE_RANGE[0] * 1000 <= lines[0] < lines[-1] <= PROVING_LINE_RANGE[1] * 1000
     assert np.sqrt(np.sum(np.square(proving.amplitude_m))) <= POLICY.dither_budget_m * 1.001
 
 
@@ -160,7 +165,7 @@ def test_dithers_that_show_nothing_are_given_up_for_a_while():
     world.answers_of = dict.fromkeys(range(400, 450), 0.01 + 0.0j)
     world.windows = lambda: None
     world.pass_(120.0)
-    assert 1 <= len(world.shown) <= 2 * TRIES + 2
+    assert 1 <= len(world.shown) <= 2 * MAX_PROOF_TRIES + 2
     assert "have not been seen to answer in 3 dithers" in world.state.matrices.mode_limit.reason
 
 
@@ -393,11 +398,11 @@ def test_weak_lines_show_other_modes_beside_the_first_dither():
     first = Shown(policy=informed()).asked(DitherRequest)[0]
     size = dict(zip(first.modes, first.amplitude_m, strict=True))
     telling = {460, 470, 480, 490}
-    assert set(first.modes) == telling | set(range(400, 400 + MAX_BESIDE))
+    assert set(first.modes) == telling | set(range(400, 400 + MAX_WEAK_LINES))
     power = np.square(first.amplitude_m)
     assert np.sqrt(power.sum()) <= POLICY.dither_budget_m * 1.001
     assert sum(size[mode] ** 2 for mode in telling) >= 0.75 * power.sum() * 0.999
-    assert max(size[mode] for mode in size if mode not in telling) < WEAK * size[460]
+    assert max(size[mode] for mode in size if mode not in telling) < WEAK_LINE_RATIO * size[460]
     lines = dict(zip(first.modes, first.frequency_hz, strict=True))
     gaps = [abs(lines[mode] - lines[one]) for one in telling for mode in lines if mode != one]
     assert min(gaps) >= 4.0
@@ -473,7 +478,7 @@ def test_two_windows_say_together_what_neither_says_alone():
 
 def test_a_mode_that_no_window_is_sure_of_is_let_be_after_some():
     world = Shown().pass_(8.0)
-    for _ in range(MAX_WINDOWS):
+    for _ in range(MAX_COMPARED_WINDOWS):
         assert 415 not in proven_modes(world.state)
         told(world, [0.6] * 5 + [0.9] + [0.6] * 6)
     assert 415 in proven_modes(world.state)
@@ -512,7 +517,7 @@ def test_weak_lines_are_as_far_from_strong_ones_as_short_windows_ask():
 def test_where_all_modes_are_to_be_shown_the_first_dither_shows_the_free_ones_in_one_window():
     world = Shown({430: -0.6}, policy=informed(), offered=False)
     first = world.asked(DitherRequest)[0]
-    assert set(first.modes) == {460, 470, 480, 490} | set(range(400, 400 + MAX_BESIDE))
+    assert set(first.modes) == {460, 470, 480, 490} | set(range(400, 400 + MAX_WEAK_LINES))
     assert first.duration_s == pytest.approx(0.3 + WINDOW_S + 0.9)
     world.pass_(3.0)
     assert 430 in world.shown[1]

@@ -10,7 +10,7 @@ from service.model.misregistration import Misregistration
 from service.model.pointing_law import PointingLaw, Term
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.pointing_law import BELIEVED_S, law_at, start_of_fit
+from service.tracking.pointing_law import LEAP_CONFIRMATION_S, law_at, start_of_fit
 from service.tracking.policy import SensorModePolicy
 from service.tracking.registration import Validity
 from service.tracking.resume import resumed, saved_of
@@ -211,7 +211,7 @@ def test_one_pointing_that_leaps_moves_nothing(night):
 
 def test_a_leap_that_lasts_is_believed_and_alpha_doubted(night):
     night.point(at(10.0))
-    for _ in range(round(BELIEVED_S / 0.2)):
+    for _ in range(round(LEAP_CONFIRMATION_S / 0.2)):
         night.point(at(10.0))
     registration = night.state.alpha.registration
     assert registration.alpha.vector == pytest.approx(placed(10.0).vector)
@@ -264,7 +264,7 @@ def test_a_law_that_leaps_at_north_does_not_move_alpha():
     night.point(at(0.3))
     assert night.alpha.shift_x_subap == pytest.approx(before)
     assert "leapt" in night.problem
-    for _ in range(round(BELIEVED_S / 0.2) + 1):
+    for _ in range(round(LEAP_CONFIRMATION_S / 0.2) + 1):
         night.point(at(0.3))
     assert night.state.alpha.registration.doubt, "α is doubted where the leap lasts"
 

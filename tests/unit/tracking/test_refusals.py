@@ -10,7 +10,7 @@ from service.tracking import events as ev
 from service.tracking.alarms import WINDOWS_REFUSED
 from service.tracking.operations.running import ServiceState, operating
 from service.tracking.state import Mode
-from service.tracking.window_processing import IN_A_ROW
+from service.tracking.window_processing import N_CONSECUTIVE_WINDOWS
 from service.wire import DitherStatus
 from tests.unit.tracking.situations import ALPHA, Story, dither_answered, moved, rtc
 
@@ -38,7 +38,7 @@ def text_of(story):
 
 @pytest.mark.parametrize("between", [0, 4])
 def test_the_third_in_a_row_is_an_alarm_with_the_reason_and_the_service_is_degraded(story, between):
-    assert WINDOWS_REFUSED not in refuse(story, IN_A_ROW - 1).alarms
+    assert WINDOWS_REFUSED not in refuse(story, N_CONSECUTIVE_WINDOWS - 1).alarms
     refuse(story, between, RefusalKind.CUT_SHORT)
     assert WINDOWS_REFUSED not in story.alarms, "a matrix was swapped in them: no fault"
     refuse(story)
@@ -64,7 +64,7 @@ def test_the_last_one_is_known_without_the_log(story):
 
 
 def test_its_text_stays_while_the_cause_does_and_changes_with_it(story):
-    refuse(story, IN_A_ROW)
+    refuse(story, N_CONSECUTIVE_WINDOWS)
     told = text_of(story)
     assert MISSING in told
     refuse(story, reason=MISSING.replace("150", "153"))
@@ -75,26 +75,26 @@ def test_its_text_stays_while_the_cause_does_and_changes_with_it(story):
 
 def test_two_in_a_row_between_good_ones_are_none(story):
     for _ in range(20):
-        refuse(story, IN_A_ROW - 1)
+        refuse(story, N_CONSECUTIVE_WINDOWS - 1)
         story.see()
     assert not story.alarms
 
 
 def test_it_ends_by_itself_after_as_many_good_ones_and_not_by_one(story):
     refuse(story, 5)
-    story.see(n_windows=IN_A_ROW - 1)
+    story.see(n_windows=N_CONSECUTIVE_WINDOWS - 1)
     assert WINDOWS_REFUSED in story.alarms
     refuse(story)
-    story.see(n_windows=IN_A_ROW - 1)
+    story.see(n_windows=N_CONSECUTIVE_WINDOWS - 1)
     assert WINDOWS_REFUSED in story.alarms, "every second window refused is no end of it"
     story.see()
     assert WINDOWS_REFUSED not in story.alarms
 
 
 def test_a_window_far_from_alpha_could_be_used_and_has_an_alarm_of_its_own(story):
-    refuse(story, IN_A_ROW - 1)
+    refuse(story, N_CONSECUTIVE_WINDOWS - 1)
     story.see(moved(ALPHA, shift_x_subap=0.4))
-    refuse(story, IN_A_ROW - 1)
+    refuse(story, N_CONSECUTIVE_WINDOWS - 1)
     assert story.alarms == {"jump-suspected"}
 
 
@@ -139,7 +139,7 @@ def test_a_dither_of_a_minute_without_any_window_is_one_as_well(story):
     for _ in range(6):  # it does not waver, though windows had been used before
         story.tell(ev.Tick(), after_s=1.0)
         assert "no window was accepted for 60 s although a dither runs" in text_of(story)
-    story.see(n_windows=IN_A_ROW)
+    story.see(n_windows=N_CONSECUTIVE_WINDOWS)
     assert WINDOWS_REFUSED not in story.alarms
 
 

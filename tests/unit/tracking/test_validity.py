@@ -13,7 +13,7 @@ from service.tracking.registration import Purpose, Validity
 from service.tracking.state import Mode, TrackerState
 from service.tracking.validity import (
     INTERVALS_KEPT,
-    KEPT_S,
+    MAX_TELEMETRY_AGE_S,
     TelemetrySpan,
     invalidate_telemetry,
     make_valid,
@@ -313,7 +313,7 @@ def test_they_are_bounded_and_old_ones_go():
     for k in range(3 * INTERVALS_KEPT):
         state = void(state, float(k), f"reason {k}")
     assert len(state.alpha.void_intervals) == INTERVALS_KEPT
-    state = void(state, KEPT_S + 3 * INTERVALS_KEPT, "long after")
+    state = void(state, MAX_TELEMETRY_AGE_S + 3 * INTERVALS_KEPT, "long after")
     assert [each.because for each in state.alpha.void_intervals] == ["long after"]
 
 

@@ -9,7 +9,7 @@ from service.control.expected_gain import ExpectedGain
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.state import Mode
-from service.tracking.update_policy import CALMING_S
+from service.tracking.update_policy import THRESHOLD_DECAY_S
 from tests.unit.tracking import situations
 from tests.unit.tracking.situations import ALPHA, POLICY, Story, moved, of_kind, verdict
 
@@ -35,7 +35,7 @@ def story():
     story = Story(Mode.AUTO, FAR_THRESHOLDS).meet()
     story.see(n_windows=2)
     story.use("cm-1")
-    story.wait(CALMING_S + 5)
+    story.wait(THRESHOLD_DECAY_S + 5)
     story.see(NEAR, n_windows=8)
     story.effects.clear()
     return story
@@ -78,7 +78,7 @@ def test_noise_is_not(story):
 
 def test_a_loss_of_another_matrix_is_not(story):
     story.use("cm-2")
-    story.wait(CALMING_S + 5)
+    story.wait(THRESHOLD_DECAY_S + 5)
     assert not judged(story, told(loss_m=1e-9), matrix_id="cm-1")
 
 
@@ -93,7 +93,7 @@ def test_soon_after_an_update_it_takes_twice_as_much(story):
 
 def test_the_raised_threshold_comes_down_again(story):
     story.use("cm-2")
-    story.wait(CALMING_S)
+    story.wait(THRESHOLD_DECAY_S)
     there = moved(NEAR, shift_x_subap=0.04)
     story.see(there, n_windows=6)
     assert judged(story, told(loss_m=0.8e-9), alpha=there, matrix_id="cm-2")

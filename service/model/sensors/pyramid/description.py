@@ -17,20 +17,20 @@ from service.model.slopes import Orientation
 _SEPARATION_TOLERANCE = 0.1
 
 IMAGE_SIGMA_PX = 0.15
-"""1 σ of a coordinate of a pupil image beside its place on the pixel grid, detector pixels. Real
-pyramids have 0.05 to 0.3 px: faces differ by some 0.1 % of their angle, and the windows that cut
-the images begin at whole pixels."""
+"""1 σ of the displacement of a pupil image from its place on the pixel grid, along an axis, in
+detector pixels. Real pyramids have 0.05 to 0.3 px: faces differ by some 0.1 % of their angle, and
+the windows that cut out the images begin at whole pixels."""
 
 MEASURED_SIGMA_PX = 0.1
 """The same of centres that were measured on the detector's frames. Under even light they are found
 to 0.01 pixel; on real benches, where light is uneven and spiders cross the edge, two ways to find
 them differ by 0.1 to 0.4."""
 
-SHIFT_BY_IMAGES = 0.25
+SHIFT_ERROR_RATIO = 0.25
 """Error of a shift that takes no account of displaced images, over their RMS displacement along an
 axis. Of 12 and 24 subapertures, modulated by 0 and 3 λ/D, low and high modes: 0.15 to 0.27."""
 
-EDGE_BY_IMAGES = 0.03
+EDGE_ERROR_RATIO = 0.03
 """The same of rotation and magnification, at the pupil's edge: 0.001 to 0.032."""
 
 _FRAME_KEYS = ("pupil_centres_px", "pixels_per_subaperture")
@@ -64,12 +64,12 @@ class FrameWindows:
 
 
 def pyramid_of(table: PyramidTable, given: frozenset[str]) -> Pyramid:
-    """Return the pyramid of a table, its mask apart; ``given`` are the keys that are written.
+    """Return the pyramid of a table without its mask; ``given`` are the keys that are written.
 
     Raises
     ------
     ModelError
-        One line that begins with the key: the images overlap, or lie elsewhere than told.
+        One line that begins with the key: the images overlap, or are not where the keys place them.
     """
     diameter, separation = table.pupil_diameter, _separation(table, given)
     if separation < diameter:
@@ -150,11 +150,11 @@ def _in_mode(sensor: Pyramid, mode: PyramidMode, where: str) -> SensorMode:
 
 
 def image_offsets(instrument: Instrument) -> NDArray[np.float64] | None:
-    """Return where the images lie beside their places ``(2, 2, 2)``: side y, side x, (x, y).
+    """Return displacements of the images from their places ``(2, 2, 2)``: side y, side x, (x, y).
 
-    In subapertures and the axes of conventions.md. With the mirror as stop less their mean, which
-    is the shift of α; with the telescope as stop ``pupil_offset`` is the mean. None if they are
-    unknown.
+    They are in subapertures and in the axes of conventions.md. With the mirror as stop their mean
+    is subtracted, because it is the shift of α; with the telescope as stop ``pupil_offset`` is the
+    mean. None if they are unknown.
     """
     told = pyramid_in(instrument).image_offsets_subap
     if told is None:
@@ -174,9 +174,9 @@ def pupil_offset(instrument: Instrument) -> tuple[float, float] | None:
 
 
 def image_sigma_subap(instrument: Instrument) -> float | None:
-    """Return how far each image may lie beside its place, 1 σ along an axis, subapertures.
+    """Return 1 σ of an image's displacement from its place along an axis, subapertures.
 
-    None if the instrument file says where the images lie.
+    None if the instrument file states the positions of the images.
     """
     if pyramid_in(instrument).image_offsets_subap is not None:
         return None
@@ -185,17 +185,17 @@ def image_sigma_subap(instrument: Instrument) -> float | None:
 
 
 def image_floor(instrument: Instrument) -> NDArray[np.float64]:
-    """Return 1 σ of α ``(4,)`` by images that lie anywhere within ``image_sigma_subap``.
+    """Return 1 σ of α ``(4,)`` caused by unknown image displacements of ``image_sigma_subap``.
 
-    Numeric units. Rotation and magnification are moved at the pupil's edge.
+    Numeric units. Rotation and magnification displace the pupil's edge.
     """
     sigma, radius = image_sigma_subap(instrument) or 0.0, instrument.wfs.pupil_diameter / 2.0
-    shift, edge = SHIFT_BY_IMAGES * sigma, EDGE_BY_IMAGES * sigma / radius
+    shift, edge = SHIFT_ERROR_RATIO * sigma, EDGE_ERROR_RATIO * sigma / radius
     return np.array([shift, shift, edge, edge])
 
 
 def displaced(instrument: Instrument, offsets: NDArray[np.float64]) -> Pyramid:
-    """Return the pyramid with its images beside their places ``(8,)``.
+    """Return the pyramid with its images displaced from their places ``(8,)``.
 
     Subapertures, axes of conventions.md: along x of the images at -x -y, +x -y, -x +y, +x +y, then
     along y.
@@ -263,7 +263,7 @@ def pyramid_in(instrument: Instrument) -> Pyramid:
 
 
 def frames_of(table: PyramidTable, given: frozenset[str]) -> FrameWindows | None:
-    """Return where the images lie on the frames that the RTC delivers; None: it sends slopes.
+    """Return the positions of the images on the RTC's frames; None if the RTC sends slopes.
 
     Raises
     ------
@@ -285,7 +285,7 @@ def by_quadrant(centres_px: NDArray[np.float64]) -> NDArray[np.float64]:
     Raises
     ------
     ModelError
-        If they do not lie in the four quadrants around their middle, one in each.
+        If the four quadrants around their mean do not contain one each.
     """
     side = (centres_px > centres_px.mean(axis=0)).astype(int)
     place = 2 * side[:, 0] + side[:, 1]
@@ -297,7 +297,7 @@ def by_quadrant(centres_px: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _separation(table: PyramidTable, given: frozenset[str]) -> float:
-    """Return the images' distance: as given, or as the images on the frames lie."""
+    """Return the distance of the images: as given, or from their positions on the frames."""
     stated = table.image_separation_subap
     if table.pupil_centres_px is None or table.input == "slopes":
         return stated

@@ -26,20 +26,20 @@ from service.model.slopes import SlopeRecipe
 
 Array = NDArray[np.float64]
 
-_REACH_PX = 16
+_SPLINE_MARGIN_PX = 16
 """Pixels around a window that its spline is made of: further ones weigh less than 1e-5."""
 
-_AT_ONCE = 32
+_FRAMES_AT_ONCE = 32
 """Frames that are cut together: more only need memory."""
 
-_FARTHEST_SUBAP = 0.5
-"""Distance from the circle through its edge at which a place that the model leads to is not
-believed."""
+_MAX_EDGE_DISTANCE_SUBAP = 0.5
+"""Distance from the circle fitted to the edge beyond which a position computed with the model is
+rejected, subapertures."""
 
-_SAME_SIZE = 0.05
+_DIAMETER_TOLERANCE = 0.05
 """Relative difference of the images' diameter from the file's that is refused."""
 
-_BESIDE_SUBAP = 0.25
+_REMARK_DISTANCE_SUBAP = 0.25
 """Distance of the centres of the file from the light that is mentioned."""
 
 
@@ -64,7 +64,7 @@ class Windows:
     """``(2, 2, 2)``: of the image at this side along y and x its row and column."""
 
     shape: tuple[int, int]
-    """Of a frame: rows, columns."""
+    """Shape of a frame: rows, columns."""
 
     windows: tuple[_Window, ...]
     """At -y -x, -y +x, +y -x, +y +x."""
@@ -92,8 +92,8 @@ class Windows:
 def frame_windows(instrument: Instrument, flux_frame: Array) -> Windows:
     """Return the windows of an instrument that delivers frames.
 
-    ``flux_frame`` is ``(rows, columns)``, a mean frame; where the instrument does not tell where
-    the pupil images lie, they are found in it.
+    ``flux_frame`` is ``(rows, columns)``, a mean frame; pupil images without positions in the
+    instrument file are located in it.
 
     Raises
     ------
@@ -133,7 +133,7 @@ def _refined(instrument: Instrument, flux_frame: Array, pixels: int) -> Array:
     if isinstance(places, CannotTell):
         return centres
     found = whole + pixels * places[:, ::-1].reshape(2, 2, 2)  # (x, y) to (row, column)
-    return found if np.abs(found - centres).max() < _FARTHEST_SUBAP * pixels else centres
+    return found if np.abs(found - centres).max() < _MAX_EDGE_DISTANCE_SUBAP * pixels else centres
 
 
 def image_centres(instrument: Instrument, flux_frame: NDArray[np.floating]) -> Array | None:
@@ -165,10 +165,9 @@ def _windows_at(instrument: Instrument, centres: Array, flux_frame: Array, pixel
 def locate_images(
     instrument: Instrument, flux_frame: NDArray[np.floating]
 ) -> tuple[Instrument, tuple[str, ...]]:
-    """Return the instrument with its pupil images where they lie in a mean frame, and remarks.
+    """Return the instrument with its pupil images located in a mean frame, and remarks.
 
-    Where the instrument file says where they lie it stays, and a remark says how far the light is
-    from there.
+    Positions in the instrument file are kept, and a remark states how far the light is from them.
 
     Raises
     ------
@@ -189,7 +188,7 @@ def locate_images(
 
 
 def _beside_the_light(instrument: Instrument, windows: FrameWindows, light: Array) -> Iterator[str]:
-    """Yield that the centres of the file lie beside the pupil images of the flux frame."""
+    """Yield a remark if the centres in the file differ from the pupil images of the flux frame."""
     if windows.centres_px is None:
         return
     pixels = windows.pixels_per_subaperture
@@ -199,7 +198,7 @@ def _beside_the_light(instrument: Instrument, windows: FrameWindows, light: Arra
         return
     expected = by_quadrant(windows.centres_px).reshape(4, 2)
     away = float(np.hypot(*(found - expected).T).max()) / pixels
-    if away > _BESIDE_SUBAP:
+    if away > _REMARK_DISTANCE_SUBAP:
         yield (
             f"wfs.pupil_centres_px lie up to {away:.2f} subapertures beside the pupil images of "
             f"the flux frame, which are centred at [{_listed(found)}]: correct the key"
@@ -213,7 +212,7 @@ def _listed(centres: Array) -> str:
 def slopes_from_frames(
     instrument: Instrument, frames: NDArray[np.floating], flux_frame: NDArray[np.floating]
 ) -> Array:
-    """Return the slopes ``(n_slopes, n_modes)`` that differential frames stand for.
+    """Return the slopes ``(n_slopes, n_modes)`` of differential frames.
 
     Parameters
     ----------
@@ -246,9 +245,9 @@ def slopes_from_frames(
     rest = windows.cut(flux_frame)
     slopes = [
         slopes_per_unit(
-            rest, windows.cut(frames[start : start + _AT_ONCE]), valid, instrument.slopes
+            rest, windows.cut(frames[start : start + _FRAMES_AT_ONCE]), valid, instrument.slopes
         )
-        for start in range(0, len(frames), _AT_ONCE)
+        for start in range(0, len(frames), _FRAMES_AT_ONCE)
     ]
     return np.concatenate(slopes, axis=1)
 
@@ -292,7 +291,7 @@ def found_centres(flux_frame: Array, diameter_px: float) -> Array:
         images = find_pupil_images(flux_frame, "flux frame")
     except MatrixError as error:
         raise ModelError(str(error)) from error
-    if abs(images.diameter_px / diameter_px - 1.0) > _SAME_SIZE:
+    if abs(images.diameter_px / diameter_px - 1.0) > _DIAMETER_TOLERANCE:
         raise ModelError(
             f"flux frame: found lit areas as large as a disc of {images.diameter_px:.1f} pixels; "
             f"expected four pupil images of {diameter_px:g}"
@@ -308,8 +307,8 @@ def _axis(centre_px: float, n: int, pixels: int, length: int, name: str) -> tupl
             f"frames: found a window of {n * pixels} {name} around {centre_px:g}, which leaves "
             f"the frame of {length}"
         )
-    first = max(int(np.floor(edges[0])) - _REACH_PX, 0)
-    last = min(int(np.ceil(edges[-1])) + _REACH_PX, length)
+    first = max(int(np.floor(edges[0])) - _SPLINE_MARGIN_PX, 0)
+    last = min(int(np.ceil(edges[-1])) + _SPLINE_MARGIN_PX, length)
     running = np.tri(last - first + 1, last - first, -1)
     spline = scipy.interpolate.make_interp_spline(np.arange(first, last + 1), running, k=5)
     return slice(first, last), np.diff(spline(np.clip(edges, first, last)), axis=0)

@@ -1,15 +1,15 @@
-"""Find the pupil images in their mean light, and how evenly they are lit.
+"""Find the pupil images in their mean light, and measure the illumination inside them.
 
-With the mirror as stop the outline and the obscuration move with the shift, so their edges are a
-start for a fit, before any matrix is looked at. The light inside the outline may be uneven: it is
-modelled as a smooth surface times what an even beam would show, diffraction included, and only the
-edges tell the position.
+With the mirror as stop the outline and the obscuration move with the shift, so their edges give a
+start for a fit before any matrix is measured. The light inside the outline may be uneven: it is
+modelled as a smooth surface times the image of an even beam, diffraction included, and only the
+edges determine the position.
 
 Slopes weigh by the light of their subaperture (global normalisation), so an unevenness of 20 % is
-20 % of a slope: larger than everything a registration does to the matrix. Heritier et al. 2018
-(section 4.4) suggest to put the measured illumination into the model. The pattern belongs to the
+20 % of a slope: larger than the effect of any misregistration on the matrix. Heritier et al. 2018
+(section 4.4) suggest putting the measured illumination into the model. The pattern belongs to the
 beam, that is to the pupil's images: with the mirror as stop it moves with them, and the map is kept
-relative to where they lay when the light was counted. With a fixed telescope stop it stays on the
+relative to their position when the light was measured. With a fixed telescope stop it stays on the
 sensor.
 """
 
@@ -34,14 +34,14 @@ from service.model.slopes import turned_mask
 Array = NDArray[np.float64]
 
 _ORDER = 3
-"""Of the polynomial that stands for uneven light."""
+"""Order of the polynomial that models uneven light."""
 
 _FIRST_STEPS = np.arange(-3.0, 3.1, 1.0)
 """Positions tried first on either axis, subapertures."""
 
 _PROBE_SUBAP = 0.05
 _LARGEST_STEP_SUBAP = 0.7
-_HUBER = 2.0
+_HUBER_SIGMA = 2.0
 """Residuals beyond so many robust σ count less."""
 
 _BAD_SIGMA = 6.0
@@ -49,10 +49,10 @@ _BAD_SHARE = 0.25
 """A pixel is bad when it departs from its three companions by so many robust σ and, besides, by
 this share of a lit pixel: diffraction and static aberrations make good ones differ."""
 
-_MAX_BAD = 0.03
+_MAX_BAD_SHARE = 0.03
 """Share of an image's pixels: beyond it they are not bad, the image is another one."""
 
-_LARGEST_RESIDUAL = 0.25
+_MAX_RESIDUAL = 0.25
 """RMS residual over mean light from which the map is no image of this pupil."""
 
 _PLACES_RESIDUAL = 0.12
@@ -77,8 +77,8 @@ _FLOOR_SUBAP = 0.02
 
 
 _OFFSET_FLOOR_SUBAP = 0.005
-"""1 σ of a displacement by static aberrations and dead pixels, which differ from image to image;
-uneven light, which all images share, moves none of them beside the others."""
+"""1 σ of a displacement by static aberrations and dead pixels, which differ from image to image,
+subapertures; uneven light, common to all images, does not displace them relative to one another."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -117,11 +117,11 @@ class PyramidLight:
         return np.ascontiguousarray(sides).reshape(4, n, n)
 
     def find_pupil(self, counts: NDArray[Any]) -> PupilPosition | CannotTell:
-        """Return where the pupil images lie."""
+        """Return the position of the pupil images."""
         return find_pupil(counts, self.instrument)
 
     def find_image_offsets(self, counts: NDArray[Any]) -> ImageOffsets | CannotTell:
-        """Return how far each pupil image lies from its place on the pixel grid."""
+        """Return the displacement of each pupil image from its place on the pixel grid."""
         return find_image_offsets(counts, self.instrument)
 
     def illumination(self, counts: NDArray[Any], position: PupilPosition) -> Illumination:
@@ -157,10 +157,10 @@ def find_pupil(counts: NDArray[Any], instrument: Instrument) -> PupilPosition | 
         position, steps, formal, residual = _settled(images, optics, start)
     except np.linalg.LinAlgError:
         return CannotTell(reason="the light has no edge the position could be read from")
-    if residual > _LARGEST_RESIDUAL:
+    if residual > _MAX_RESIDUAL:
         return CannotTell(
             reason=f"the light is not that of the instrument's pupil: {residual:.0%} of it remain "
-            f"unexplained, expected at most {_LARGEST_RESIDUAL:.0%}; check the mask, the pupil "
+            f"unexplained, expected at most {_MAX_RESIDUAL:.0%}; check the mask, the pupil "
             "diameter and the obscuration"
         )
     scatter = steps.std(axis=0, ddof=1) / np.sqrt(len(steps))
@@ -174,10 +174,10 @@ def find_pupil(counts: NDArray[Any], instrument: Instrument) -> PupilPosition | 
 
 
 def find_image_offsets(counts: NDArray[Any], instrument: Instrument) -> ImageOffsets | CannotTell:
-    """Return how far each pupil image lies from its place, in the mean counts ``(4, n, n)``.
+    """Return the displacement of each pupil image in the mean counts ``(4, n, n)``.
 
-    Whatever displacements the instrument file states are not used. Axes and order are those of
-    ``find_pupil``. What moves all four images alike is a shift, and no part of it.
+    Displacements stated in the instrument file are not used. Axes and order are those of
+    ``find_pupil``. A displacement common to all four images is a shift and is not included.
 
     Raises
     ------
@@ -197,9 +197,9 @@ def find_image_offsets(counts: NDArray[Any], instrument: Instrument) -> ImageOff
 
 
 def image_places(counts: NDArray[Any], instrument: Instrument) -> Array | CannotTell:
-    """Return where each image lies ``(4, 2)``: x and y from its place on the grid, subapertures.
+    """Return each image's displacement from its place on the grid ``(4, 2)``: x, y, subapertures.
 
-    ``counts`` ``(4, n, n)`` are the mean light, cut out so that the images lie within half a
+    ``counts`` ``(4, n, n)`` are the mean light, cut out so that the images are within half a
     subaperture of their places.
 
     Raises
@@ -236,7 +236,7 @@ def _locate_images(
                 break
     except np.linalg.LinAlgError:
         return CannotTell(reason="the light has no edge the places could be read from")
-    if residual > _LARGEST_RESIDUAL:
+    if residual > _MAX_RESIDUAL:
         return _other_light(residual)
     return places, formal, residual
 
@@ -287,7 +287,7 @@ def repaired(counts: NDArray[Any], instrument: Instrument) -> tuple[Array, NDArr
     spread = 1.4826 * np.nanmedian(np.abs(difference))
     lit = np.nanpercentile(middle, 75.0)
     bad = ~(np.abs(difference) <= _BAD_SIGMA * spread + _BAD_SHARE * np.maximum(middle, lit))
-    bad &= np.isnan(images) | (bad.mean(axis=(1, 2), keepdims=True) <= _MAX_BAD)
+    bad &= np.isnan(images) | (bad.mean(axis=(1, 2), keepdims=True) <= _MAX_BAD_SHARE)
     return np.where(bad, np.nan_to_num(middle) * level[:, None, None], images), bad
 
 
@@ -321,7 +321,10 @@ def _first_guess(images: Array, optics: PyramidOptics) -> Array:
 def _departures(
     images: Array, optics: PyramidOptics, position: Array
 ) -> tuple[Array, Array, float]:
-    """Return how far each image lies from ``position`` and its σ, ``(4, 2)`` each, and the rest."""
+    """Return displacements of the images from ``position``, their σ and the RMS residual.
+
+    Displacements and σ are ``(4, 2)`` each.
+    """
     even = even_images(optics, _pair(position))
     rates = [
         (
@@ -355,7 +358,7 @@ def _departure(
         solution, covariance = _weighted(columns, image, weights)
         left = image - columns @ solution
         scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
-        weights = np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(left), 1e-12))
+        weights = np.minimum(1.0, _HUBER_SIGMA * scale / np.maximum(np.abs(left), 1e-12))
         light = surface @ solution[: surface.shape[1]]
     return solution[-2:], scale * np.sqrt(np.diag(covariance)[-2:]), float(left.std())
 
@@ -377,11 +380,12 @@ def _pair(position: Array) -> tuple[float, float]:
     return float(position[0]), float(position[1])
 
 
-_LIT = 0.5
-"""Share of a full subaperture's light from which one tells how evenly the beam is lit."""
+_LIT_SHARE = 0.5
+"""Smallest share of a full subaperture's light at which the illumination of the beam is measured.
+"""
 
 _SMOOTHING_SUBAP = 1.0
-"""Of the map: a subaperture cannot tell what is finer than itself, and diffraction ripples."""
+"""Smoothing of the map, subapertures: finer structure is not resolved, and diffraction ripples."""
 
 _SPREAD_SUBAP = 1.0
 _MARGIN = 4
@@ -408,16 +412,17 @@ def measured_illumination(
     if not images.mean() > 0.0:
         raise ModelError("illumination: found no light; expected the mean counts of the images")
     shown = even_images(even_optics(instrument), position.at)
-    lit = shown.sum(axis=0) > _LIT * np.percentile(shown.sum(axis=0), 75.0)
+    lit = shown.sum(axis=0) > _LIT_SHARE * np.percentile(shown.sum(axis=0), 75.0)
     return _beam(_filled(_excess(images, shown, lit), lit), position)
 
 
 def relative_light(
     counts: NDArray[Any], instrument: Instrument, position: PupilPosition
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the light over that of an even beam, ``(n, n)`` on the sensor, and where it is known.
+    """Return the light relative to an even beam, ``(n, n)`` on the sensor, and the known part.
 
-    Not smoothed: what is sharp in it, a spider's shadow, tells the rotation.
+    The map is not smoothed: sharp structure in it, such as a spider's shadow, determines the
+    rotation.
 
     Raises
     ------
@@ -426,7 +431,7 @@ def relative_light(
     """
     images, _ = repaired(counts, instrument)
     even = even_images(even_optics(instrument), position.at).sum(axis=0)
-    lit = even > _LIT * np.percentile(even, 75.0)
+    lit = even > _LIT_SHARE * np.percentile(even, 75.0)
     share = images.sum(axis=0) / np.where(lit, even, 1.0)
     return np.where(lit, share / share[lit].mean(), 1.0), lit
 
@@ -439,9 +444,9 @@ def _excess(images: Array, shown: Array, lit: NDArray[np.bool_]) -> Array:
 
 
 def _filled(share: Array, lit: NDArray[np.bool_]) -> Array:
-    """Return the map, smoothed, with what lies outside the pupil continued from inside.
+    """Return the smoothed map, extrapolated from inside the pupil to its outside.
 
-    Normalised convolution, ever wider until everything is reached.
+    It is a normalised convolution that widens until everything is reached.
     """
     padded = np.pad(np.where(lit, share, 0.0), _MARGIN)
     known = np.pad(lit.astype(np.float64), _MARGIN)

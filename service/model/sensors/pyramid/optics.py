@@ -71,7 +71,7 @@ class LightGradient:
     ``(n_valid, n_points)`` of each one's own flux with local normalisation."""
 
     recipe: SlopeRecipe
-    """What the signals are, and what normalises them."""
+    """Definition of the signals, and their normalisation."""
 
     def to(self, shapes: Shapes, product: Callable[[Array, Shapes], Array]) -> LightGradient:
         """Return the response to combinations of points, ``shapes`` ``(n_points, n_shapes)``.
@@ -108,17 +108,17 @@ class PyramidOptics:
     """Precision of the products; float64 for derivative checks."""
 
     halo: Halo | None = None
-    """What residual turbulence makes of the star; None: a flat wavefront."""
+    """Light spread by residual turbulence; None for a flat wavefront."""
 
     recipe: SlopeRecipe = PLAIN
-    """Which signals, and whose flux, a response has the gradient of."""
+    """Signals and flux whose gradient a response has."""
 
     arrays: Arrays = NUMPY
-    """What computes a row of subapertures; all that rows share is made by NumPy."""
+    """Array library that computes a row of subapertures; parts that all rows share use NumPy."""
 
     offsets: NDArray[np.float64] | None = None
-    """``(2, 2, 2)`` displacement of each image from its place on the pixel grid, subapertures: side
-    along y, side along x, (x, y); None: all four lie where they should."""
+    """Displacement of each image from its place on the pixel grid, ``(2, 2, 2)``, subapertures:
+    side along y, side along x, (x, y); None for no displacement."""
 
     def __post_init__(self) -> None:
         """Refuse a modulation that the formulas cannot fold.
@@ -232,7 +232,7 @@ class PyramidOptics:
 
     @property
     def _grids(self) -> tuple[_Grid, ...]:
-        """The four images together or, where each lies elsewhere, one by one."""
+        """The four images together, or one by one if they are displaced differently."""
         if self.offsets is None:
             return (_Grid(sides_y=slice(0, 2), sides_x=slice(0, 2)),)
         return tuple(
@@ -356,8 +356,8 @@ class PyramidOptics:
 
         The sum of their products over the terms, times the amplitude, is the gradient of each line:
         the signals plane by plane, then the flux of every subaperture with local normalisation,
-        else, apart from the others, their sum. Modulation, nodes and images along y are terms; only
-        the imaginary part is needed: Re | Im of one factor stand against Im | Re of the other.
+        otherwise their sum by itself. Modulation, nodes and images along y are terms. Only the
+        imaginary part is needed, so Re | Im of one factor is paired with Im | Re of the other.
         """
         xp, there = self.arrays.xp, self.arrays.there
         along_y = rows.factors_y[:, :, row]
@@ -464,7 +464,7 @@ class _Grid:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PreparedGrid:
-    """What all rows of subapertures share, of the images on one grid."""
+    """Arrays that all rows of subapertures share, for the images on one grid."""
 
     grid: _Grid
     fields: Array
@@ -475,19 +475,19 @@ class PreparedGrid:
     """``(n, M/2, 2, 2 of the pair, n_nodes, Re | Im, N)``."""
 
     signs: Array
-    """What a field is multiplied by in every plane of signals."""
+    """Factor of a field in every plane of signals."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PreparedRows:
-    """What all rows of subapertures share."""
+    """Arrays that all rows of subapertures share."""
 
     images: NDArray[np.float64]
     parts: tuple[PreparedGrid, ...]
     """One for the four images together, or one for each."""
 
     finish: Callable[[Foreign, list[Foreign]], Foreign]
-    """What makes of a row's factors its gradient, or its response to shapes."""
+    """Function that turns a row's factors into its gradient, or into its response to shapes."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -508,7 +508,7 @@ class RowResponse(RowTask):
 
     @cached_property
     def shared(self) -> PreparedRows:
-        """What all rows share."""
+        """Arrays that all rows share."""
         return self.optics.prepare(self)
 
     @property
@@ -529,7 +529,7 @@ class RowResponse(RowTask):
 
     @override
     def __getstate__(self) -> dict[str, object]:
-        """Leave out what whoever gets it prepares by himself."""
+        """Leave out the arrays that the receiving process prepares itself."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 

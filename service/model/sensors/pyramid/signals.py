@@ -38,7 +38,7 @@ def pyramid_sensor(
     fineness: Fineness,
     working_point: WorkingPoint | None = None,
 ) -> PyramidSensor:
-    """Return the pyramid of an instrument on this pupil, for a flat wavefront unless told.
+    """Return the pyramid of an instrument on this pupil, by default for a flat wavefront.
 
     Raises
     ------
@@ -84,7 +84,7 @@ class PyramidSensor:
 
     @property
     def keeps_gradient(self) -> bool:
-        """Whether the gradient at every point is small enough to be kept."""
+        """True if the gradient at every point is small enough to be kept."""
         optics = self.optics
         n_points = int(optics.pupil.lit.sum())
         return bool(np.dtype(optics.dtype).itemsize * self.n_signals * n_points <= self.kept_bytes)
@@ -241,7 +241,7 @@ def _of_image(gradient: Array, image: tuple[int, int], recipe: SlopeRecipe) -> L
 
 
 def pixel_places(valid: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Return where the pixels of valid subapertures stand in flat light ``(2, n, 2, n)``.
+    """Return the indices of the pixels of valid subapertures in flat light ``(2, n, 2, n)``.
 
     ``(4, n_valid)``: in the images at -x -y, +x -y, -x +y, +x +y.
     """

@@ -10,7 +10,7 @@ from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
 from service.model.kinds import Count, Positive, Read
 
 USUAL_SEPARATION = 1.2
-"""Distance of neighbouring pupil images over their diameter, where nobody tells."""
+"""Default distance of neighbouring pupil images over their diameter."""
 
 MAX_OFFSET_PX = 4.0
 """Largest displacement of a pupil image from its place on the pixel grid, detector pixels. Whole
@@ -86,7 +86,7 @@ class PyramidMode(Read):
     """Frames per second, for work without an RTC; None: that of ``[loop]``."""
 
     n_controlled: Count | None = None
-    """Modes to control at most; None: as many as the settings want."""
+    """Largest number of controlled modes; None for the number in the settings."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -102,7 +102,8 @@ class PyramidTable(PyramidNumbers):
     """Signals that the RTC sends."""
 
     pupil_centres_px: Centres | None = None
-    """Of the four pupil images, row and column; "auto": from a flux frame. Frames only."""
+    """Centres of the four pupil images, row and column; "auto" to find them in a flux frame. Frames
+    only."""
 
     pixels_per_subaperture: Count = 1
     """Frames only."""

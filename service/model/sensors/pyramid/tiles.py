@@ -1,6 +1,6 @@
-"""What rows of subapertures make of local functions, strip by strip of the pupil, tile by tile.
+"""Products of rows of subapertures with local functions, by strips of the pupil and by tiles.
 
-Written in the array API standard alone: any library that keeps it may compute.
+The code uses the array API standard alone, so any library that implements it can compute.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ Indices = NDArray[np.intp]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Sum:
-    """Adds rows that belong to the same function, by slices alone: the standard has no other way.
+    """Sum of the rows of each function by slices alone: the standard has no scatter-add.
 
-    Functions stand in order of how many rows they have, so that the second rows of all that have
-    one are a slice, and the third.
+    Functions are sorted by their number of rows, so that the second rows of all functions that have
+    one form a slice, and likewise the third.
     """
 
     functions: Indices
@@ -58,7 +58,7 @@ class _Sum:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Strip:
-    """Tiles that lie in the same lines of the pupil."""
+    """Tiles that share the same lines of the pupil."""
 
     lines: slice
     tiles: Sequence[tuple[slice, Foreign]]

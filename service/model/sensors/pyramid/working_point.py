@@ -31,7 +31,7 @@ POINTS = tuple(range(12, 42, 2))
 every ring, all at the same angles, would need 600: the outer ones are the longer."""
 
 _N_SAMPLES = 1000
-"""Of frequencies and of tilts."""
+"""Number of frequencies and of tilts."""
 
 _N_DISTANCES = 600
 """Nodes of a Gauss-Legendre rule over the pupil: enough for 100 subapertures. On FLAO the light of
@@ -40,7 +40,7 @@ a ring is right to 1e-5, for which equal steps would have to be 20,000."""
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Halo(WorkingPoint):
-    """Source points beside the modulation circle, on rings about the axis."""
+    """Source points around the modulation circle, on rings about the axis."""
 
     core_weight: float
     """Share of the light that stays on the modulation circle, 0..1."""
@@ -116,7 +116,7 @@ def _residual_spectrum(
 
 
 def _rings(tilt: Array, brightness: Array, core: float) -> Halo:
-    """Return rings of equal light: each stands for a quantile of the halo."""
+    """Return rings of equal light: each represents a quantile of the halo."""
     light = np.concatenate([[0.0], np.cumsum((brightness[1:] + brightness[:-1]) / 2)])
     light *= tilt[1] - tilt[0]
     n_rings = len(POINTS)

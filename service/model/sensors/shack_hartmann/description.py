@@ -35,7 +35,7 @@ class ShackHartmann(ShackHartmannNumbers):
 
     @property
     def leaves_out_partly_lit(self) -> bool:
-        """Whether fits leave out the subapertures that the pupil's edge cuts."""
+        """True if fits leave out the subapertures that the pupil's edge cuts."""
         return (self.partly_lit or _usual(self.centroid)) is PartlyLit.LEAVE_OUT
 
     def pixel_lambda_over_d(self, subaperture_m: float) -> float:
@@ -109,7 +109,7 @@ def shack_hartmann_in(instrument: Instrument) -> ShackHartmann:
 
 
 def pixel_places(sensor: ShackHartmann, valid: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Return where the pixels of valid subapertures stand in flat light ``(n, m, n, m)``.
+    """Return the indices of the pixels of valid subapertures in flat light ``(n, m, n, m)``.
 
     ``(m**2, n_valid)``: m pixels along a side of each of n subapertures, row by row.
     """

@@ -27,7 +27,7 @@ FWHM = math.sqrt(8.0 * math.log(2.0))
 """Full width at half maximum of a Gaussian, in σ."""
 
 _STEP = 0.5
-"""Between angles, λ/d: the light of a lenslet has no finer structure."""
+"""Step between angles, λ/d: the light of a lenslet has no finer structure."""
 
 _BEYOND_SIGMA = 3.0
 """σ of the star that the angles go on beyond the field, and λ/d more."""
@@ -36,10 +36,10 @@ _BEYOND = 1.0
 
 
 def elongation_rad(laser: LaserStar, places_m: Array) -> Array:
-    """Return full widths at half maximum ``(..., 2)``, x and y, from places ``(..., 2)``, metres.
+    """Return full widths at half maximum ``(..., 2)``, x and y, at places ``(..., 2)``, metres.
 
-    Light from z above the middle of the layer, at height H, comes from ``z / H**2`` times the
-    distance to the launcher aside: the star stands still along the launcher's own beam.
+    Light from z above the middle of the layer, at height H, is displaced by ``z / H**2`` times the
+    distance to the launcher: along the launcher's own beam the star does not move.
     """
     aslant = laser.thickness_m / laser.height_m**2
     return np.asarray((places_m - np.asarray(laser.launcher_m)) * aslant)

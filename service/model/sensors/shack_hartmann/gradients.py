@@ -1,8 +1,9 @@
 """Mean gradients of wavefronts over the light of each lenslet, as geometric simulators take them.
 
-There is no spot: a field without end, whose pixels are fine, tells the mean gradient of the phase,
-each point counting with its light. A field of six λ/d counts the rim of a lenslet otherwise, which
-turns a fit of mean gradients by some thousandths of a degree (docs/results/peers.md).
+There is no spot: with an unlimited field of fine pixels the centroid is the mean gradient of the
+phase, weighted by the light at each point. A field of six λ/d weighs the rim of a lenslet
+differently, which rotates a fit of mean gradients by some thousandths of a degree
+(docs/results/peers.md).
 """
 
 from __future__ import annotations

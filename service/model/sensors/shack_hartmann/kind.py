@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class ShackHartmannKind(SensorKind):
-    """Lenslets, each with a spot whose centroid tells the wavefront's gradient."""
+    """Lenslets, each with a spot whose centroid measures the wavefront's gradient."""
 
     name = "shack-hartmann"
     table = ShackHartmannTable

@@ -26,17 +26,17 @@ from service.model.sensors.shack_hartmann.stars import spots_of
 
 Array = NDArray[Any]
 
-_DARK = 0.1
-"""Light over that of a full subaperture below which a slope fades: of next to no light it tells of
-the very edge, and no RTC divides by it."""
+_DARK_SHARE = 0.1
+"""Light relative to a full subaperture below which a slope is attenuated: with little light it
+measures only the edge, and no RTC divides by it."""
 
 _LIGHT_SAMPLING = 12
 """Points of the light's grid along a subaperture, at least."""
 
-_BEYOND = 3
+_MARGIN_POINTS = 3
 """Points beyond the edge that a node next to it may read."""
 
-_NEIGHBOURS = 16
+_N_PARABOLA_POINTS = 16
 """Lit points that the parabola beyond the edge goes through, in least squares."""
 
 
@@ -60,13 +60,13 @@ class ShackHartmannSensor:
 
     @property
     def keeps_gradient(self) -> bool:
-        """That K, which is sparse, is kept."""
+        """True: K is sparse, so that it can be kept."""
         return True
 
     @property
     def side(self) -> int:
         """Points across the grid of wavefronts that lenslets read: the pupil's, and beyond."""
-        return len(self.pupil.coordinates) + 2 * _BEYOND
+        return len(self.pupil.coordinates) + 2 * _MARGIN_POINTS
 
     @cached_property
     def spots(self) -> Spots:
@@ -101,10 +101,10 @@ class ShackHartmannSensor:
     @cached_property
     def continued(self) -> Any:  # noqa: ANN401 - scipy has no types
         """``(n_grid, n_points)``: from wavefronts where it is lit to that grid; sparse."""
-        lit = np.pad(self.pupil.lit, _BEYOND)
-        near = scipy.ndimage.binary_dilation(lit, np.ones((2 * _BEYOND + 1,) * 2)) & ~lit
+        lit = np.pad(self.pupil.lit, _MARGIN_POINTS)
+        near = scipy.ndimage.binary_dilation(lit, np.ones((2 * _MARGIN_POINTS + 1,) * 2)) & ~lit
         inside, beyond = np.argwhere(lit), np.argwhere(near)
-        n = min(_NEIGHBOURS, len(inside))
+        n = min(_N_PARABOLA_POINTS, len(inside))
         _, nearest = scipy.spatial.cKDTree(inside).query(beyond, n)
         y, x = np.moveaxis(inside[nearest] - beyond[:, None], 2, 0)
         shapes = np.stack([np.ones(x.shape), x, y, x**2, x * y, y**2], axis=2)
@@ -131,7 +131,7 @@ class ShackHartmannSensor:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Interpolation:
-    """How the nodes of every lenslet read wavefronts on the pupil's grid, along one axis."""
+    """Interpolation from the pupil's grid to the nodes of every lenslet, along one axis."""
 
     first: NDArray[np.intp]
     """``(n,)`` first point of the grid that the nodes of each lenslet read."""
@@ -140,13 +140,13 @@ class Interpolation:
     """``(n_nodes, n_read)``, cubic."""
 
     rate: Array
-    """Of the weights, by the image's shift."""
+    """Derivative of the weights with respect to the image's shift."""
 
 
 def interpolation(sensor: ShackHartmannSensor, shift: float) -> Interpolation:
     """Return how nodes read the grid along an axis along which the image is moved by ``shift``."""
     n, sampling = sensor.instrument.wfs.n_subapertures, sensor.pupil.sampling
-    start = sensor.pupil.coordinates[0] - _BEYOND / sampling
+    start = sensor.pupil.coordinates[0] - _MARGIN_POINTS / sampling
     # of the first lenslet, in points of the grid; the others lie whole numbers of points further
     places = (sensor.spots.nodes[0] + 0.5 - n / 2 - shift - start) * sampling
     first = int(np.floor((-n / 2 - shift - start) * sampling)) - 1
@@ -216,7 +216,7 @@ class ShackHartmannResponse:
         return light.reshape(n, n, *light.shape[1:]).swapaxes(1, 2)
 
     def lit(self, light: NDArray[np.float64]) -> ShackHartmannResponse:
-        """Return the same: a centroid does not depend on how much light tells it."""
+        """Return the response itself: a centroid does not depend on the light of its spot."""
         return self
 
     def apply(self, shapes: Shapes) -> Array:
@@ -271,7 +271,7 @@ class ShackHartmannResponse:
         spots = self.sensor.spots
         amplitude, *rates = (each[self.sensor.valid] for each in self._amplitudes)
         full = np.ones((1, *amplitude.shape[1:]))
-        light = np.maximum(spots.light(amplitude, amplitude), _DARK * spots.light(full, full))
+        light = np.maximum(spots.light(amplitude, amplitude), _DARK_SHARE * spots.light(full, full))
         light = light[:, None, None]
         return spots.pull(amplitude, amplitude), light, (amplitude, rates[0], rates[1])
 

@@ -79,9 +79,9 @@ class Spots:
 
     @cached_property
     def _counts(self) -> tuple[Array, Array, Array]:
-        """How much the light at an angle counts, and that times its pixel's x, and y.
+        """Weight of the light at an angle, and that weight times its pixel's x, and y.
 
-        ``(..., n_angles, n_angles)`` each, of its quadrature too.
+        ``(..., n_angles, n_angles)`` each, including the quadrature weight.
         """
         full = self.images(np.ones((1, *[len(self.nodes[0])] * 2)))
         counts = self._spread(self.weights_of(full))
@@ -100,7 +100,7 @@ class Spots:
                 return np.asarray(light)
 
     def _spread(self, on_pixels: Array) -> Array:
-        """Return what stands on pixels ``(n, n_pixels, n_pixels)`` at the angles within them."""
+        """Return pixel values ``(n, n_pixels, n_pixels)`` at the angles within the pixels."""
         n_inside = self._angles[0].shape[1]
         return np.asarray(np.kron(on_pixels, np.ones((n_inside, n_inside))) * self._area)
 
@@ -115,7 +115,7 @@ class Spots:
 
     @property
     def memory_bytes(self) -> float:
-        """What spots that are not alike take."""
+        """Memory of spots that differ from lenslet to lenslet, bytes."""
         return 0.0
 
     def light(self, first: Array, second: Array) -> Array:

@@ -25,21 +25,22 @@ if TYPE_CHECKING:
     from service.model.sensors.kind import Term
 
 
-STRAIGHT = (0.8, 1.25)
-"""Of the way that a spot's centroid goes over the way that its pixels at rest say: further from 1
-pixels pass the threshold as the spot moves."""
+LINEARITY_RANGE = (0.8, 1.25)
+"""Range of a centroid's motion relative to the motion computed with the pixels used at rest;
+further from 1, pixels cross the threshold as the spot moves."""
 
-_MOVES = 0.2
-"""By which spots move in a closed loop, λ/d."""
+_SPOT_MOTION_LAMBDA_OVER_D = 0.2
+"""Motion of a spot in a closed loop, λ/d."""
 
-_SPOTS_LOOKED_AT = 8
+_N_CHECKED_SPOTS = 8
 """Across a sensor whose spots are not alike."""
 
-_FINEST = 0.5
-"""Of λ/d: a laser's beam is wider than that."""
+_MIN_SPOT_LAMBDA_OVER_D = 0.5
+"""Smallest spot of a laser star, λ/d: a laser's beam is wider than that."""
 
-_LONGEST = 2.0
-"""Of a field's width: of a longer spot the field has but a piece."""
+_MAX_SPOT_FIELD_RATIO = 2.0
+"""Largest length of a spot relative to the width of a field, which holds only a part of a longer
+one."""
 
 
 def spots_of(wfs: ShackHartmann, width_m: float, lenslets: NDArray[np.bool_]) -> Spots:
@@ -74,7 +75,7 @@ def centroid_variances(instrument: Instrument) -> tuple[Term, Term]:
 
 
 def check_star(wfs: ShackHartmann, width_m: float) -> None:
-    """Refuse a laser star that no field of this sensor can hold, and centroids that lie.
+    """Refuse a laser star that no field of this sensor can hold, and nonlinear centroids.
 
     Raises
     ------
@@ -87,14 +88,15 @@ def check_star(wfs: ShackHartmann, width_m: float) -> None:
     if wfs.threshold is None:
         return
     some = np.zeros((n, n), np.bool_)
-    each = 1 if wfs.laser is None else max(1, n // _SPOTS_LOOKED_AT)
+    each = 1 if wfs.laser is None else max(1, n // _N_CHECKED_SPOTS)
     some[::each, ::each] = True
-    moved = spots_of(wfs, width_m, some).straightness(_MOVES)
+    moved = spots_of(wfs, width_m, some).straightness(_SPOT_MOTION_LAMBDA_OVER_D)
     worst = float(moved[np.argmax(np.abs(np.log(np.maximum(moved, 1e-3))))])
-    low, high = STRAIGHT
+    low, high = LINEARITY_RANGE
     if not low < worst < high:
         raise ModelError(
-            f"threshold: found {wfs.threshold:g}: a spot that moves by {_MOVES:g} λ/d moves its "
+            f"threshold: found {wfs.threshold:g}: a spot that moves by "
+            f"{_SPOT_MOTION_LAMBDA_OVER_D:g} λ/d moves its "
             f"centroid by {worst:.2g} times what its pixels at rest say, expected {low:g} to "
             f"{high:g}: a lower one, or another centroid"
         )
@@ -102,17 +104,19 @@ def check_star(wfs: ShackHartmann, width_m: float) -> None:
 
 def _check_laser(laser: LaserStar, wfs: ShackHartmann, width_m: float) -> None:
     lambda_over_d = math.degrees(wfs.wavelength_m / width_m) * 3600.0
-    if laser.spot_arcsec < _FINEST * lambda_over_d:
+    if laser.spot_arcsec < _MIN_SPOT_LAMBDA_OVER_D * lambda_over_d:
         raise ModelError(
-            f"laser.spot_arcsec: found {laser.spot_arcsec:g}, expected {_FINEST:g} λ/d or more: "
-            f"{_FINEST * lambda_over_d:.2g} of a subaperture of {width_m:.3g} m"
+            f"laser.spot_arcsec: found {laser.spot_arcsec:g}, expected "
+            f"{_MIN_SPOT_LAMBDA_OVER_D:g} λ/d or more: "
+            f"{_MIN_SPOT_LAMBDA_OVER_D * lambda_over_d:.2g} of a subaperture of {width_m:.3g} m"
         )
     corner = width_m * wfs.n_subapertures / 2 * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
     long = math.degrees(np.linalg.norm(elongation_rad(laser, corner), axis=1).max()) * 3600.0
     field = wfs.pixels_per_subaperture * wfs.pixel_lambda_over_d(width_m) * lambda_over_d
-    if long > _LONGEST * field:
+    if long > _MAX_SPOT_FIELD_RATIO * field:
         raise ModelError(
             f"laser.thickness_m: found spots of up to {long:.3g} arcseconds in a field of "
-            f"{field:.3g}, expected {_LONGEST:g} times that at most: thickness_m, height_m and "
+            f"{field:.3g}, expected {_MAX_SPOT_FIELD_RATIO:g} times that at most: "
+            "thickness_m, height_m and "
             "launcher_m are metres"
         )

@@ -12,7 +12,7 @@ from service.model.kinds import Positive, Read
 
 
 class Centroid(StrEnum):
-    """How a spot's place is made of its pixels."""
+    """Computation of a spot's position from its pixels."""
 
     CENTRE_OF_GRAVITY = "cog"
     """Each pixel counts with its light."""
@@ -28,7 +28,7 @@ class Centroid(StrEnum):
 
 
 class PartlyLit(StrEnum):
-    """What becomes of subapertures that the edge of the pupil cuts."""
+    """Treatment of subapertures that the edge of the pupil cuts."""
 
     USE = "use"
     LEAVE_OUT = "leave out"
@@ -48,7 +48,8 @@ class LaserStar(Read):
     """Full width at half maximum of the star across its beam."""
 
     launcher_m: tuple[float, float]
-    """Where the laser is launched, x and y from the middle of the pupil, in the sensor's axes."""
+    """Position of the laser's launcher, x and y from the middle of the pupil, metres, in the
+    sensor's axes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -75,17 +76,18 @@ class ShackHartmannNumbers(Read):
     """Width of a pixel on the sky, arcseconds; None: λ/d, d the width of a subaperture."""
 
     centroid: Centroid = Centroid.CENTRE_OF_GRAVITY
-    """How a spot's place is made of its pixels: `cog`, all of them with their light; `weighted`,
-    times the spot of a flat wavefront; `threshold`, without the faint ones; `gradient`, of a
-    geometric simulator: no pixels, the mean gradient of the wavefront over the lenslet's light."""
+    """Computation of a spot's position from its pixels: `cog`, all pixels weighted by their light;
+    `weighted`, also by the spot of a flat wavefront; `threshold`, without the faint ones;
+    `gradient`, of a geometric simulator: no pixels, the mean gradient of the wavefront over the
+    lenslet's light."""
 
     threshold: Annotated[float, Gt(0.0), Lt(1.0)] | None = None
     """With `threshold` only: pixels fainter than this share of the spot's brightest do not
     count."""
 
     partly_lit: PartlyLit | None = None
-    """What fits of matrices do with subapertures that the pupil's edge cuts: `use` or `leave out`;
-    None: used, but not beside a threshold, which makes their centroids lie."""
+    """Treatment, in fits of matrices, of subapertures that the pupil's edge cuts: `use` or `leave
+    out`; None: used, except with a threshold, which makes their centroids nonlinear."""
 
     laser: LaserStar | None = None
     """A laser star, a table `[wfs.laser]`; None: a star at infinity, a point."""

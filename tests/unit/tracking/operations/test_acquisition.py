@@ -13,13 +13,13 @@ from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither_request import lock_in_plan
 from service.tracking.operation_records import AcquisitionStage
-from service.tracking.operations.acquisition import PATIENCE_S
+from service.tracking.operations.acquisition import MAX_STAGE_DURATION_S
 from service.tracking.operations.acquisition_stages import (
     MAX_ATTEMPTS,
-    MAX_MISSES,
-    MISSES_BEFORE,
-    MISSES_DESPITE,
-    OUT_OF_HAND_S,
+    MAX_DIVERGENCE_S,
+    MAX_STAGE_MISSES,
+    MISSES_BEFORE_ACQUISITION,
+    MISSES_WHILE_TRACKING,
     wide_capture_dither,
 )
 from service.tracking.products import MatrixState
@@ -195,7 +195,7 @@ class TestByItself:
     def test_it_begins_when_the_loop_goes_on_diverging(self):
         story = Acquiring()
         story.tell(DIVERGING)
-        assert not story.wait(OUT_OF_HAND_S - 1)
+        assert not story.wait(MAX_DIVERGENCE_S - 1)
         story.wait(2)
         assert story.stage is AcquisitionStage.OPENING
         assert [asked.loop for asked in story.asked(LoopRequest)] == [Loop.OPEN]
@@ -229,7 +229,7 @@ class TestByItself:
 
     def test_it_begins_when_windows_find_no_registration(self):
         story = Acquiring()
-        for _ in range(MISSES_BEFORE - 1):
+        for _ in range(MISSES_BEFORE_ACQUISITION - 1):
             story.miss_afar("it is far away", RefusalKind.OUT_OF_REACH)
         assert story.stage is AcquisitionStage.IDLE
         story.miss_afar("it is far away", RefusalKind.OUT_OF_REACH)
@@ -239,7 +239,7 @@ class TestByItself:
         story = Acquiring()
         story.tell(ev.LoopHeld(holds=True))
         texts = set()
-        for _ in range(2 * MISSES_DESPITE):
+        for _ in range(2 * MISSES_WHILE_TRACKING):
             story.miss_afar("it is far away", RefusalKind.OUT_OF_REACH)
             alarms = story.state.alarms.active
             texts |= {a.text for a in alarms if a.name == "registration-not-found"}
@@ -252,7 +252,7 @@ class TestByItself:
     def test_one_that_holds_no_longer_is(self):
         story = Acquiring()
         story.tell(ev.LoopHeld(holds=True))
-        for _ in range(MISSES_BEFORE):
+        for _ in range(MISSES_BEFORE_ACQUISITION):
             story.miss_afar("it is far away", RefusalKind.OUT_OF_REACH)
         story.tell(ev.LoopHeld(holds=False))
         assert story.stage is AcquisitionStage.OPENING
@@ -260,7 +260,7 @@ class TestByItself:
     def test_with_alpha_known_bad_windows_must_go_on_for_longer(self):
         story = Acquiring()
         story.see(n_windows=3)
-        for _ in range(MISSES_DESPITE - 1):
+        for _ in range(MISSES_WHILE_TRACKING - 1):
             story.miss_afar("it is far away", RefusalKind.OUT_OF_REACH)
         assert story.stage is AcquisitionStage.IDLE
         story.miss_afar("it is far away", RefusalKind.OUT_OF_REACH)
@@ -275,7 +275,7 @@ class TestByItself:
 
     def test_windows_refused_for_another_reason_do_not_count(self):
         story = Acquiring()
-        for _ in range(2 * MISSES_BEFORE):
+        for _ in range(2 * MISSES_BEFORE_ACQUISITION):
             story.miss_afar("520 of 2000 frames missing", RefusalKind.OTHER)
         assert story.stage is AcquisitionStage.IDLE
 
@@ -464,7 +464,7 @@ class TestTrouble:
         story = Acquiring()
         story.tell(cmd.Acquire())
         story.open()
-        for _ in range(MAX_ATTEMPTS * MAX_MISSES):
+        for _ in range(MAX_ATTEMPTS * MAX_STAGE_MISSES):
             assert story.state.operations.acquisition.under_way
             story.miss_afar()
             story.still_open()
@@ -476,7 +476,7 @@ class TestTrouble:
         story = Acquiring()
         story.tell(cmd.Acquire())
         story.open()
-        for _ in range(2 * MAX_MISSES):
+        for _ in range(2 * MAX_STAGE_MISSES):
             story.miss_afar("the worker is too slow: a window was given up", RefusalKind.OTHER)
         assert story.state.operations.acquisition.attempt == 1
 
@@ -484,7 +484,7 @@ class TestTrouble:
         story = Acquiring()
         story.tell(cmd.Acquire())
         story.open()
-        story.wait(PATIENCE_S + 2)
+        story.wait(MAX_STAGE_DURATION_S + 2)
         assert story.state.operations.acquisition.attempt == 2
 
     def test_an_rtc_that_will_not_open_its_loop_ends_it(self):

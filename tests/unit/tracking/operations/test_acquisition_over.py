@@ -6,8 +6,8 @@ from service.estimation.windows import RefusalKind
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.operation_records import AcquisitionStage
-from service.tracking.operations.acquisition import ENOUGH_WINDOWS
-from service.tracking.operations.acquisition_stages import MISSES_DESPITE
+from service.tracking.operations.acquisition import MIN_FINAL_WINDOWS
+from service.tracking.operations.acquisition_stages import MISSES_WHILE_TRACKING
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import Loop, LoopRequest
@@ -37,7 +37,7 @@ class Failed(Acquiring):
 
 def test_a_failure_is_over_when_windows_agree_in_a_loop_somebody_has_closed():
     story = Failed().close_on_their_own()
-    story.see(n_windows=ENOUGH_WINDOWS - 1)
+    story.see(n_windows=MIN_FINAL_WINDOWS - 1)
     assert story.stage is AcquisitionStage.FAILED
     assert "acquisition" in story.alarms
     story.see()
@@ -50,7 +50,7 @@ def test_a_failure_is_over_when_windows_agree_in_a_loop_somebody_has_closed():
 def test_a_loop_of_a_part_of_the_modes_will_do():
     gains = (0.0,) + (0.4,) * 399 + (0.0,) * 194
     story = Failed().close_on_their_own(loop="partial", gains=gains)
-    story.see(n_windows=ENOUGH_WINDOWS)
+    story.see(n_windows=MIN_FINAL_WINDOWS)
     assert story.stage is AcquisitionStage.IDLE
 
 
@@ -71,7 +71,7 @@ def test_but_nothing_is_over_while_the_loop_does_not_hold():
     assert story.stage is AcquisitionStage.FAILED
     story.tell(CALM)
     assert story.stage is AcquisitionStage.FAILED
-    story.see(n_windows=ENOUGH_WINDOWS)
+    story.see(n_windows=MIN_FINAL_WINDOWS)
     assert story.stage is AcquisitionStage.IDLE
 
 
@@ -85,7 +85,7 @@ def test_windows_that_contradict_one_another_are_not_enough():
 
 def test_windows_that_find_nothing_leave_a_failure_as_it_is():
     story = Failed().close_on_their_own()
-    for _ in range(2 * MISSES_DESPITE):
+    for _ in range(2 * MISSES_WHILE_TRACKING):
         story.miss_afar("it is far away", RefusalKind.OUT_OF_REACH)
     assert story.stage is AcquisitionStage.FAILED
     assert "acquisition" in story.alarms
@@ -99,7 +99,7 @@ def test_a_restarted_service_can_leave_it_too(n_before):
     assert again.stage is AcquisitionStage.FAILED
     again.find(loop="closed", gains=(0.4,) * 400 + (0.0,) * 194, cm_id="own")
     again.tell(ev.MatrixFetched(record=foreign("own")))
-    again.see(n_windows=ENOUGH_WINDOWS)
+    again.see(n_windows=MIN_FINAL_WINDOWS)
     assert again.stage is AcquisitionStage.IDLE
     assert "acquisition" not in again.alarms
 
@@ -142,7 +142,7 @@ def test_nor_when_the_alarm_goes_and_comes():
 def test_nor_when_windows_find_nothing():
     story = Ended()
     story.tell(CALM)
-    for _ in range(MISSES_DESPITE):
+    for _ in range(MISSES_WHILE_TRACKING):
         story.miss_afar("it is far away", RefusalKind.OUT_OF_REACH)
     assert story.began == 1
 
@@ -150,7 +150,7 @@ def test_nor_when_windows_find_nothing():
 def test_windows_that_agree_in_a_closed_loop_let_the_next_trouble_count():
     story = Ended()
     story.tell(CALM)
-    story.see(n_windows=ENOUGH_WINDOWS)
+    story.see(n_windows=MIN_FINAL_WINDOWS)
     assert (story.stage, story.state.operations.acquisition.held_off) == (
         AcquisitionStage.IDLE,
         False,
@@ -165,7 +165,7 @@ def test_windows_from_before_it_was_ended_do_not_count():
     story.see(FAR)
     story.widen(400)
     story.see(FAR)
-    assert story.state.alpha.registration.n_windows >= ENOUGH_WINDOWS
+    assert story.state.alpha.registration.n_windows >= MIN_FINAL_WINDOWS
     story.tell(cmd.AbortAcquisition())
     assert story.stage is AcquisitionStage.ABORTED
     story.tell(DIVERGING)

@@ -7,7 +7,7 @@ from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.operation_records import MeasureState
-from service.tracking.operations.measurement import LONGEST_S, OVERDUE_S
+from service.tracking.operations.measurement import MAX_MATRIX_DELAY_S, MAX_MEASUREMENT_S
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import DitherRequest, MeasureRequest, Pattern
@@ -201,7 +201,7 @@ def test_a_matrix_that_does_not_come_after_the_loop_has_closed_is_given_up(story
     story.wait(60)
     assert story.state.measuring is not None, "the loop is open: it may take long"
     close(story)
-    story.wait(OVERDUE_S - 1)
+    story.wait(MAX_MATRIX_DELAY_S - 1)
     assert story.state.measuring is not None
     story.wait(3)
     assert "no matrix came" in story.state.measurement("im-1").reason
@@ -209,7 +209,7 @@ def test_a_matrix_that_does_not_come_after_the_loop_has_closed_is_given_up(story
 
 def test_nothing_is_measured_for_ever(story):
     begin(story, pattern=Pattern.SINE, duration_s=5.0)
-    story.wait(LONGEST_S + 60, every_s=60)
+    story.wait(MAX_MEASUREMENT_S + 60, every_s=60)
     assert story.state.measurement("im-1").state is MeasureState.FAILED
 
 

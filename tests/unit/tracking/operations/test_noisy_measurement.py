@@ -9,7 +9,7 @@ from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.operation_records import MeasureState, NoisyFinding
-from service.tracking.operations.noisy_measurement import FREE_WITHIN_S
+from service.tracking.operations.noisy_measurement import DITHER_END_TIMEOUT_S
 from service.tracking.products import ModeSet
 from service.wire import DitherKind, DitherRequest, DitherStop
 from tests.unit.tracking.situations import (
@@ -101,7 +101,7 @@ def test_a_dither_that_does_not_make_way_ends_the_wait(dithering):
     own = dithering.state.dithers.dither
     dithering.tell(ASK)
     status(dithering, dither=own)
-    dithering.wait(FREE_WITHIN_S + 2.0)
+    dithering.wait(DITHER_END_TIMEOUT_S + 2.0)
     assert state_of(dithering) is MeasureState.FAILED
     assert "did not end within" in dithering.state.measurement("noisy-1").reason
 

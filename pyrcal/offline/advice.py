@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pyrcal.offline.alternatives import Alternative, moved_words, preference, systematic_terms
 from pyrcal.offline.fitted import Fit
 from pyrcal.offline.left_over import left_over
+from pyrcal.offline.origins import Origin
 from pyrcal.offline.verdict import CANNOT_TELL, Refusal
 
 Array = NDArray[np.float64]
@@ -39,6 +40,9 @@ class Grounds:
 
     columns: tuple[str, ...] = ()
     """Sentences on columns with wrong signs or in wrong places."""
+
+    numbers_share: float = 1.0
+    """χ² left with coupling and modulation as fitted, over that with those of the file."""
 
     gains: tuple[str, ...] = ()
     """Causes of gains that are far from 1."""
@@ -149,6 +153,9 @@ def _cause(fit: Fit, grounds: Grounds) -> str:
         return "; ".join(grounds.columns)
     best = _best_to_correct(fit)
     if best is not None and grounds.refusal is Refusal.ANOTHER_INSTRUMENT:
+        number = next(_wrong_numbers(fit), None)
+        if number is not None and grounds.numbers_share < (best.share or 0.0):
+            return f"{number.words}; correct that and fit again"
         if CANNOT_TELL in fit.verdict:
             return fit.verdict.rpartition("better: ")[2]
         return (
@@ -158,7 +165,7 @@ def _cause(fit: Fit, grounds: Grounds) -> str:
     left = fit.left_over
     if grounds.refusal is Refusal.DIVIDED and left is not None and left.modes:
         return f"{left.words}; measure these again, or leave them out (--modes)"
-    return fit.verdict.removeprefix("refused: ").partition(";")[0]
+    return fit.verdict.removeprefix("refused: ")
 
 
 def _corrections(fit: Fit) -> Iterator[str]:
@@ -169,6 +176,16 @@ def _corrections(fit: Fit) -> Iterator[str]:
     best = _best_to_correct(fit)
     if best is not None:
         yield best.key
+
+
+def _wrong_numbers(fit: Fit) -> Iterator[Origin]:
+    """Yield numbers of the file that the matrix contradicts.
+
+    With a wrong modulation another stop explains part of the misfit that the fitted number leaves.
+    What reduces the misfit by the larger factor is corrected first.
+    """
+    notable = {one.key for one in fit.optics if one.notable}
+    return (one for one in fit.origins if one.correct and one.key in notable)
 
 
 def _best_to_correct(fit: Fit) -> Alternative | None:

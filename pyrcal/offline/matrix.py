@@ -54,6 +54,7 @@ from pyrcal.offline.uncertainty import (
     LOCAL_MAGNIFICATION_FLOOR,
     MAGNIFICATION_FLOOR,
     WEAK_MODULATION_FLOOR,
+    misplacement_sigma,
     pupil_places,
     pupil_regions,
     uncertainty,
@@ -70,8 +71,8 @@ from service.estimation.orientation import (
 )
 from service.estimation.reference import Reference, Target, is_by_actuator, target_of
 from service.model.aperture import check_mask
-from service.model.instrument import Instrument
-from service.model.kinds import Method, Normalisation
+from service.model.instrument import Instrument, Mirror
+from service.model.kinds import Method, Normalisation, Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import Basis, modal_basis
 from service.model.pupil import Illumination, rtc_valid_subapertures
@@ -250,7 +251,12 @@ def _with_mask(fit: Fit, instrument: Instrument) -> Fit:
     if difference not in instrument.remarks:
         remarks = (*remarks, difference)
     advised = fit.recommendation
-    if not fit.accepted:
+    # where the mirror is the stop, its shift moves the pupil: another stop may be the cause
+    of_stop = (
+        instrument.stop is Stop.MIRROR
+        and check_mask(replace(instrument, stop=Stop.TELESCOPE), (x, y)) is None
+    )
+    if not fit.accepted and not of_stop:
         advised = f"{Advice.DO_NOT_USE}: {difference}"
     return replace(fit, remarks=remarks, recommendation=advised)
 
@@ -524,6 +530,9 @@ def _answer(
         by_smear = solution.vector - found.before.vector
         error = by_smear * found.smear.sigma / found.smear.share
         sure = sure.with_moves(error[np.newaxis], np.ones(1))
+    misplaced = _misplacement_sigma(models.instrument, structured)
+    sure = sure.with_moves(misplaced[np.newaxis], np.ones(1))
+    stretch_sigma = nuisances.stretch_sigma(sure.nuisance_sigma)
     findings = FitFindings(
         solution=solution,
         residual_fraction=residual_fraction,
@@ -581,7 +590,8 @@ def _answer(
         measured=target.matrix,
         valid=target.valid,
         gain_map=nuisances.gain_map(solution.nuisances, target.valid),
-        anamorphosis_sigma=nuisances.stretch_sigma(sure.nuisance_sigma),
+        # misplaced actuators stretch the image as much as they turn it
+        anamorphosis_sigma=None if stretch_sigma is None else np.hypot(stretch_sigma, misplaced[2]),
         image_offsets_px=_image_offsets(models.instrument, nuisances, solution),
         # what noise determines is no finding
         optics=optics if findings.explained else (),
@@ -608,7 +618,11 @@ def _answer(
         paper_table=found.table,
     )
     grounds = Grounds(
-        refusal=refusal, structure=structured, n_sets=len(sure.subset_steps), columns=columns
+        refusal=refusal,
+        structure=structured,
+        n_sets=len(sure.subset_steps),
+        columns=columns,
+        numbers_share=1.0 if without is None else without.share,
     )
     if not options.explain:
         return replace(fit, recommendation=recommendation(fit, grounds))
@@ -630,6 +644,15 @@ def _magnification_floor(instrument: Instrument) -> tuple[float, str]:
         f"sigma of the magnification is mostly a floor of {floor:.1%}: {cause}, and matrices of "
         "such sensors differ by 0.1 to 0.3 % from their model"
     )
+
+
+def _misplacement_sigma(instrument: Instrument, structured: float) -> Array:
+    """Return 1 σ from misplaced actuators; 0 where sets of actuators show it or none are drawn."""
+    mirror = instrument.mirror
+    if not isinstance(mirror, Mirror) or is_by_actuator(instrument):
+        return np.zeros(4)
+    radius_m = instrument.wfs.pupil_diameter / 2.0 * instrument.subaperture_m
+    return misplacement_sigma(mirror, radius_m, instrument.subaperture_m, structured)
 
 
 def _noise_share(residual: float, structured: float) -> float:

@@ -182,7 +182,7 @@ def _listed(numbers: NDArray[np.intp], what: str = "mode") -> str:
 
 
 def _check_unit(matrix: Array, wavelength_m: float) -> None:
-    """Refuse a matrix per nanometre or micrometre.
+    """Refuse a matrix per nanometre, micrometre, wave or radian.
 
     Tilting a wavefront by one wavelength RMS moves slopes by some units, whatever the instrument.
     """
@@ -191,6 +191,14 @@ def _check_unit(matrix: Array, wavelength_m: float) -> None:
         return
     unit = unit_like(1.0 / typical, _UNIT_DECADES).removesuffix("s")
     hint = f": it looks like slope per {unit}" if unit else ""
+    # a wave and a radian lie between a nanometre and a micrometre: nothing but the size tells them
+    phase = {
+        "per wave of OPD (then divide it by the wavelength)": 1.0,
+        "per radian of phase (then multiply it by 2 pi over the wavelength)": 2.0 * np.pi,
+    }
+    for words, per_wave in phase.items():
+        if abs(np.log10(typical / wavelength_m * per_wave)) < _UNIT_DECADES:
+            hint += f", or {words}" if hint else f": it looks like slope {words}"
     raise MatrixError(
         f"reference: found {typical / wavelength_m:.3g} as the typical slope per metre{hint}; "
         f"expected about {1.0 / wavelength_m:.1g}. Multiply the matrix, or say stroke = "

@@ -17,6 +17,7 @@ from pyrcal.terminal import table as aligned
 from service.errors import ConfigurationError
 from service.files.container import put_array
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, wrapped
+from service.tracking import alarms
 from service.tracking.policy import SECOND_NS
 from service.tracking.registration import HistoryEntry, Source
 from service.tracking.state import Level
@@ -42,7 +43,7 @@ _COLOURS = {Source.PASSIVE: "0.8", Source.RANDOM: "tab:green", Source.LOCK_IN: "
 """Colours by source; later ones are plotted on top."""
 
 _OF_MISALIGNED = frozenset(
-    {"modes-contrary", "modes-uneven", "response-mismatch", "window.refused"}
+    {alarms.MODES_CONTRARY, alarms.MODES_UNEVEN, alarms.WRONG_ANSWER, "window.refused"}
 )
 """Alarms and warnings that misaligned streams alone can cause."""
 

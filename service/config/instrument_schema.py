@@ -91,6 +91,10 @@ class MirrorTable(kinds.InfluenceShape):
     hole_m: kinds.Positive | None = None
     """Hexagonal only: diameter of a hole in the middle, where there are no actuators."""
 
+    position_error_pitch: Annotated[float, Field(ge=0.0, le=0.2)] | None = None
+    """RMS error of an actuator's position along each axis, in pitches, which sigma of a fit covers;
+    None: 0.02."""
+
     segments_deg: tuple[float, ...] = ()
     """Direction of each gap between segments from the centre outwards, degrees from +x towards +y;
     Gaussian influence only. No function crosses a gap, no actuator of a grid is on one, and KL

@@ -35,7 +35,7 @@ _LAYOUT_KEYS = {
 _CROPPED = {"influence_origin", "influence_table"}
 _MEASURED = {"modes_pitch_m"} | _CROPPED
 _GAUSSIAN = {"coupling", "segments_deg"}
-_ANALYTIC = set().union(*_LAYOUT_KEYS.values()) | {"influence"} | _GAUSSIAN
+_ANALYTIC = set().union(*_LAYOUT_KEYS.values()) | {"influence", "position_error_pitch"} | _GAUSSIAN
 
 _FOREIGN = {
     "layout": _MEASURED,
@@ -156,6 +156,7 @@ def _analytic(file: MirrorSection) -> tuple[Mirror, tuple[str, ...]]:
         shape=InfluenceShape(influence=table.influence, coupling=table.coupling),
         segments_deg=_segments(file, positions),
         basis=table.basis,
+        position_error_pitch=table.position_error_pitch,
         mode_to_actuator=None if strokes is None else _opd(file, strokes).astype(np.float64),
         **_mount(table),
     )

@@ -107,6 +107,9 @@ class Mirror(Mount):
     mode_to_actuator: NDArray[np.float64] | None = None
     """The user's own modes ``(n_actuators, n_modes)``: strokes in metres OPD per unit command."""
 
+    position_error_pitch: float | None = None
+    """RMS error of an actuator's position along each axis, in pitches; None: not stated."""
+
     @property
     def flat_modes(self) -> NDArray[np.intp]:
         """Modes that do not move the surface, by number."""
@@ -354,6 +357,7 @@ _LATER_FIELDS = frozenset(
         "laser",
         "local",
         "image_offsets_subap",
+        "position_error_pitch",
     }
 )
 """Fields without which an instrument has the digest that it has always had."""

@@ -7,7 +7,7 @@ accepted and right. Where nothing is advised, the first fit must be.
 
 import re
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import h5py
 import numpy as np
@@ -15,10 +15,12 @@ import pytest
 
 from pyrcal.offline.matrix import FitOptions, fit_matrix
 from service.config import load_instrument
+from service.errors import MatrixError
 from service.estimation.reference import Reference
 from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
+from service.model.pupil import rtc_valid_subapertures
 
 EXPLAIN = FitOptions(explain=True)
 
@@ -61,6 +63,8 @@ SECTION = {
     "influence": "mirror",
     "stroke": "mirror",
     "pupil_diameter_subap": "wfs",
+    "spiders_m": "instrument",
+    "spiders_deg": "instrument",
     "modulation_lambda_over_d": "wfs",
     "wavelength_m": "wfs",
 }
@@ -110,6 +114,15 @@ def measured(about, spoil=lambda values: values):
 
 
 _ADVICE = re.compile(r"\b([a-z_]+) = (\"[a-z-]+\"|[-+.\de]+|true|false|\{[^}]*\})")
+
+
+def first_line_of(found):
+    """Return the values that the first line of a fit advises by their keys."""
+    return {
+        key: tomllib.loads(f"it = {value.rstrip('.')}")["it"]
+        for key, value in _ADVICE.findall(found.recommendation)
+        if key in SECTION
+    }
 
 
 def advice_of(found):
@@ -189,6 +202,24 @@ CASES = {
         stated={"modulation_lambda_over_d": 3.0},
         base=PYRAMID,
     ),
+    "normalisation, global": Case(
+        key="normalisation",
+        true={"normalisation": "global"},
+        stated={"normalisation": "local"},
+        base=PYRAMID,
+    ),
+    "normalisation, local": Case(
+        key="normalisation",
+        true={"normalisation": "local"},
+        stated={"normalisation": "global"},
+        base=PYRAMID,
+    ),
+    "spiders": Case(
+        key="spiders_m",
+        true={"spiders_m": 0.15, "spiders_deg": [0.0, 90.0, 180.0, 270.0]},
+        stated={},
+        advised=False,
+    ),
     "modulation unknown": Case(
         key="modulation_lambda_over_d",
         true={"modulation_lambda_over_d": 5.0},
@@ -224,8 +255,98 @@ def test_advice_followed_once_gives_a_fit_that_is_accepted_and_right(name, tmp_p
         check_right(first, case.scale)
         return
     assert case.key in advice
+    if not first.accepted:
+        assert first_line_of(first) == {case.key: advice[case.key]}
     about = loaded(tmp_path, changed(stated, **{case.key: advice[case.key]}), mask)
     check_right(fit_matrix(about, Reference(matrix=values, double_pass=about.double_pass), EXPLAIN))
+
+
+def fitted(about, values, modes=None, **options):
+    reference = Reference(matrix=values, modes=modes, double_pass=about.double_pass)
+    return fit_matrix(about, reference, FitOptions(explain=True, **options))
+
+
+def test_a_pupil_that_is_narrower_than_the_file_says_is_named_with_its_width(tmp_path):
+    """The width is seen in whole subapertures; sigma of the magnification covers the rest."""
+    everywhere = mask_of(10.0)
+    true = loaded(tmp_path, changed(LENSLETS, pupil_diameter_subap=8.0), everywhere)
+    values = measured(true)
+    first = fitted(loaded(tmp_path, LENSLETS, everywhere), values)
+    assert not first.accepted
+    (width,) = re.findall(r"looks (\d+) subapertures wide", first.recommendation)
+    assert "pupil_diameter_subap" in first.recommendation
+    stated = changed(LENSLETS, pupil_diameter_subap=float(width))
+    found = fitted(loaded(tmp_path, stated, everywhere), values)
+    assert found.accepted
+    true_vector = ALPHA.vector * [1.0, 1.0, 1.0, 8.0 / float(width)]
+    assert np.all(np.abs(found.alpha.vector - true_vector) < 3.0 * found.sigma)
+
+
+def test_a_pupil_off_the_middle_is_named_and_right_once_it_is_written(tmp_path):
+    about = loaded(tmp_path, LENSLETS)
+    values = measured(replace(about, pupil_shift_subap=(0.3, 0.1)))
+    first = fitted(about, values)
+    check_right(first)
+    (x, y) = re.search(
+        r"the pupil ([-+.\d]+), ([-+.\d]+) subapertures off", str(first.remarks)
+    ).groups()
+    followed = fitted(replace(about, pupil_shift_subap=(float(x), float(y))), values)
+    check_right(followed)
+    assert followed.residual_fraction < first.residual_fraction
+
+
+def test_uneven_light_is_right_with_a_gain_map_and_with_the_light(tmp_path):
+    about = loaded(tmp_path, LENSLETS)
+    valid = rtc_valid_subapertures(about)
+    y, x = (np.stack(np.nonzero(valid)) - 4.5) / 5.0
+    uneven = np.tile(1.0 - 0.6 * (x**2 + y**2), 2)[:, np.newaxis]
+    values = measured(about, lambda matrix: matrix * uneven)
+    first = fitted(about, values)
+    assert "--gain-map" in " ".join(first.remarks)
+    check_right(fitted(about, values, gain_map=True))
+
+
+@pytest.mark.parametrize(
+    ("words", "spoilt", "columns"),
+    [
+        ("column too many", lambda m: np.column_stack([m.mean(axis=1), m]), slice(1, None)),
+        ("first column is missing", lambda m: m[:, 1:], slice(None)),
+    ],
+)
+def test_columns_one_place_off_are_right_once_they_are_listed_as_advised(
+    words, spoilt, columns, tmp_path
+):
+    about = loaded(tmp_path, LENSLETS)
+    n_modes = modal_basis(about).n_modes
+    values = spoilt(measured(about))
+    listed = np.arange(min(values.shape[1], n_modes))
+    first = fitted(about, values[:, listed], listed)
+    assert not first.accepted
+    assert words in first.recommendation
+    places = listed if words.startswith("first") else listed[:-1]
+    modes = places + 1 if words.startswith("first") else places
+    check_right(fitted(about, values[:, columns][:, : len(modes)], modes))
+
+
+@pytest.mark.parametrize(
+    ("unit", "words"),
+    [(650e-9, "per wave of OPD"), (650e-9 / (2.0 * np.pi), "per radian of phase")],
+)
+def test_a_matrix_in_waves_or_radians_is_refused_by_those_names(unit, words, tmp_path):
+    about = loaded(tmp_path, LENSLETS)
+    values = measured(about) * unit
+    with pytest.raises(MatrixError, match=words):
+        fitted(about, values)
+    check_right(fitted(about, values / unit))
+
+
+def test_a_matrix_of_both_passes_is_right_once_it_is_divided_by_the_number_named(tmp_path):
+    about = loaded(tmp_path, LENSLETS)
+    values = measured(about) * 4.0
+    (named,) = re.findall(r"divide it by ([\d.]+)", " ".join(fitted(about, values).remarks))
+    found = fitted(about, values / float(named))
+    check_right(found)
+    assert np.median(found.gains) == pytest.approx(1.0, abs=0.01)
 
 
 def check_right(found, scale=1.0):

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from pyrcal.offline.matrix import FitOptions
-from pyrcal.offline.uncertainty import FAR_SHARE, STRANGE_RESIDUAL
+from pyrcal.offline.uncertainty import FAR_SHARE, STRANGE_RESIDUAL, misplacement_sigma
 from service.errors import ModelError
+from service.model.instrument import Mirror
 from service.model.kinds import Method, Stop
 from service.model.misregistration import Misregistration
 from service.model.pupil import Illumination
@@ -219,5 +220,23 @@ def test_double_pass_is_divided_out():
     np.testing.assert_allclose(found.gains, 1.0, atol=0.02)
 
 
-def test_the_number_of_evaluations_is_small():
-    assert fit(matrix(), options=from_here(0.2, 0.1, 0.5, 0.01)).n_evaluations < 40
+@pytest.mark.parametrize(("images", "most"), [(((0.0, 0.0),) * 4, 40), (None, 80)])
+def test_the_number_of_evaluations_is_small(images, most):
+    """Places of the pupil images that the file does not state are fitted as well, in twice."""
+    about = instrument()
+    about = replace(about, wfs=replace(about.wfs, image_offsets_subap=images))
+    found = fit(matrix(), about, options=from_here(0.2, 0.1, 0.5, 0.01))
+    assert (found.image_offsets_px is None) == (images is not None)
+    assert found.n_evaluations < most
+
+
+def test_misplaced_actuators_are_in_sigma_as_far_as_the_residual_has_room_for_them():
+    """Rotation of n points, each wrong by p: p / (sqrt(n) r), here 4 points at radius 2."""
+    corners = np.array([[2.0, 0.0], [0.0, 2.0], [-2.0, 0.0], [0.0, -2.0]])
+    mirror = Mirror(positions_m=corners, pitch_m=1.0, position_error_pitch=0.05)
+    sigma = misplacement_sigma(mirror, 1.5, 0.5, residual=0.1)
+    np.testing.assert_allclose(sigma, [0.05, 0.05, 0.0125, 0.0125])
+    assert not misplacement_sigma(mirror, 0.5, 0.5, residual=0.1).any()
+    np.testing.assert_allclose(misplacement_sigma(mirror, 1.5, 0.5, residual=0.01), sigma / 5.0)
+    unstated = replace(mirror, position_error_pitch=None)
+    np.testing.assert_allclose(misplacement_sigma(unstated, 1.5, 0.5, residual=0.1), sigma * 0.4)

@@ -93,7 +93,7 @@ def _same_state(one: Status, other: Status) -> bool:
     return one.session == other.session and one.loop == other.loop
 
 
-def why_open(rtc: Status) -> str:
+def explain_open_loop(rtc: Status) -> str:
     """Return the message for a loop that controls no mode."""
     return "the loop is open" if rtc.loop == Loop.OPEN else "all gains of the loop are 0"
 

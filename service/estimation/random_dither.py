@@ -367,10 +367,10 @@ def _answers(
     louder = np.sqrt(sums.slope_power.sum() / sums.noise_power.sum())
     late = later * np.sqrt(norm) / louder
     lag = max(later / (at_once + later), 0.0) if at_once + later > 0.0 else 0.0
-    return min(lag, 1.0), _why_nothing_to_fit(seen, late)
+    return min(lag, 1.0), _check_responses(seen, late)
 
 
-def _why_nothing_to_fit(seen: float, late: float) -> Why | None:
+def _check_responses(seen: float, late: float) -> Why | None:
     """Return why there is nothing to fit, from the significance of both answers, in σ."""
     if seen > RESPONSE_SIGMA:
         return None

@@ -245,7 +245,7 @@ class Window(Generic[S]):
             n_missing=self.n_missing + lost,
         )
 
-    def why_broken(self, block: FrameBlock, n_frames: int) -> Why | None:
+    def check_continuity(self, block: FrameBlock, n_frames: int) -> Why | None:
         """Return why a window of ``n_frames`` cannot take this block, or None."""
         expected_ns = self.next_t_ns + (block.first_seq - self.next_seq) * block.dt_ns
         if block.session != self.session:
@@ -328,7 +328,7 @@ class WindowCutter(Generic[P, S, F]):
                 dt_ns=block.dt_ns,
                 sums=self.begin(block),
             )
-        why = window.why_broken(block, n_frames)
+        why = window.check_continuity(block, n_frames)
         if why is not None:
             kind, reason = why
             return None, 0, WindowRefused(reason=reason, t_ns_utc=window.next_t_ns, kind=kind)

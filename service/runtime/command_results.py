@@ -18,7 +18,7 @@ from service.tracking.dither_request import total_m
 from service.tracking.events import Effect, Event
 from service.tracking.operation_records import CommandState, MeasureState
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.sending import why_unsendable
+from service.tracking.sending import check_sendable
 from service.tracking.state import TrackerState
 
 SILENT = "sent, the RTC has not answered yet"
@@ -93,7 +93,7 @@ def _of_matrix(now: TrackerState, name: str) -> CommandResult:
     record = now.reconstructor(name)
     if record is None:
         raise CommandError(f"{name} is not known any more")
-    held = why_unsendable(now, record) if record.state is MatrixState.PROPOSED else None
+    held = check_sendable(now, record) if record.state is MatrixState.PROPOSED else None
     if held is not None and not now.failure(record.cause):
         return CommandResult(f"{name} is proposed and not sent: {held}")
     words = _ON_ITS_WAY.get(record.state)

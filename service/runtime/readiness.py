@@ -26,7 +26,7 @@ from service.tracking.operation_records import AcquisitionStage
 from service.tracking.operations.running import operating
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.sending import why_no_return, why_unread
+from service.tracking.sending import check_return, explain_unread_matrix
 from service.tracking.state import Mode, TrackerState
 from service.tracking.update_policy import MIN_PROPOSAL_LIFETIME_S, is_outdated
 from service.wire import TEXT_LIMIT, AlarmMessage, StateMessage
@@ -99,6 +99,7 @@ def _unused(link: LinkStatistics) -> str:
     came, used = sum(f.n for f in frames), sum(f.n for f in frames if f.outcome == USED)
     lost = [f for f in frames if f.outcome not in OUTCOMES_WITH_ALARM and _is_lost(f, link, used)]
     faults = [f for f in lost if f.outcome in FAULT_OUTCOMES and f.age_s < FAULT_REPORT_DURATION_S]
+    # A few lost frames are normal on a network; violations of the contract are always reported.
     if sum(f.n for f in lost) <= MAX_UNUSED_SHARE * came:
         lost = faults
     lost = [f for f in lost if f.n or f in faults]
@@ -168,9 +169,11 @@ def detect_link_changes(
     }
     for name, text in made.items():
         before = raised.get(name)
+        # Counters in a text change every second: they must not make a new line in the log.
         same = before is not None and _NUMBER.sub("", before.text) == _NUMBER.sub("", text)
         found.append(ev.ConditionChanged(name=name, text=before.text if before and same else text))
     for name, alarm in raised.items():
+        # An alarm that came and went each second would hide the others.
         if name not in made and now_ns - alarm.seen_ns_utc > COMPLAINT_TIMEOUT_NS:
             found.append(ev.ConditionChanged(name=name, text="over", over=True))
     return list(found)
@@ -284,7 +287,8 @@ def _for_the_matrix(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
         )
         yield Prerequisite(name="matrix-name", responsible=Responsible.RTC, text=text)
     elif rtc is not None and (
-        why_unread(state, rtc.cm_id) or (rtc.cm_id and state.reconstructor(rtc.cm_id) is None)
+        explain_unread_matrix(state, rtc.cm_id)
+        or (rtc.cm_id and state.reconstructor(rtc.cm_id) is None)
     ):
         text = f"its reconstructor {rtc.cm_id}: offer it on rtc/cm/applied{_describe_rtc(state)}"
         yield Prerequisite(name="matrix-in-use", responsible=Responsible.RTC, text=text)
@@ -292,7 +296,7 @@ def _for_the_matrix(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
         yield Prerequisite(
             name="new-matrix", responsible=Responsible.OPERATOR, text=state.matrices.hindrance
         )
-    no_return = why_no_return(state)
+    no_return = check_return(state)
     for record in state.matrices.reconstructors:
         if record.on_its_way:
             text = f"reconstructor {record.id} was sent: acknowledge that it is applied"
@@ -414,6 +418,7 @@ class Revival:
             self._since_s = now_s
         if now_s - self._since_s < self._wait_s:
             return False
+        # Reopening interrupts the link, so that attempts without success become rarer.
         self._since_s, self._wait_s = None, min(2 * self._wait_s, MAX_REOPENING_DELAY_S)
         return True
 

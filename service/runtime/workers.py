@@ -325,11 +325,11 @@ class WorkerLoadMeter:
         keeps_up = "the worker keeps up with the telemetry again"
         return [
             *ev.ConditionChanged.detect(state, WORKER_LOST, lost, "the worker does its work again"),
-            *ev.ConditionChanged.detect(state, WORKER_BEHIND, self._why_behind(), keeps_up),
+            *ev.ConditionChanged.detect(state, WORKER_BEHIND, self._explain_delay(), keeps_up),
             *ev.ConditionChanged.detect(state, CLUSTER_LOST, alone, "the cluster helps again"),
         ]
 
-    def _why_behind(self) -> str:
+    def _explain_delay(self) -> str:
         load, spent = self.worker_load, self._spent()
         if spent["clock_s"] < MIN_LOAD_HISTORY_S or load.busy_ratio is None:
             return ""

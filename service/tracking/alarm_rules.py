@@ -16,7 +16,7 @@ from difflib import get_close_matches
 from typing import Any, Final
 
 from service.errors import CommandError, UnknownIdError
-from service.estimation.loop import why_open
+from service.estimation.loop import explain_open_loop
 from service.model.pointing_law import ANGLES
 from service.tracking import (
     alarms,
@@ -94,7 +94,7 @@ def _loop_open(context: StepContext) -> str | None:
     opened = acquisition.under_way or (measuring is not None and measuring.opens_loop)
     if rtc.in_loop or interrupted or opened:
         return None
-    return f"{why_open(rtc)}: close it to calibrate"
+    return f"{explain_open_loop(rtc)}: close it to calibrate"
 
 
 def _other_numbers(context: StepContext) -> str | None:
@@ -151,7 +151,7 @@ def _not_stopped(context: StepContext) -> str | None:
         return None
     if context.now_ns - memory.stopped_ns_utc < MAX_STOP_DELAY_S * SECOND_NS:
         return None
-    why = dither_plan.why_too_strong(context, rtc) or dither_plan.why_unwanted(context, rtc)
+    why = dither_plan.why_too_strong(context, rtc) or dither_plan.check_dither_wanted(context, rtc)
     return why and (
         f"{why}, and the RTC goes on playing {memory.unwanted_id}: it is asked every "
         f"{dither.STOP_REQUEST_INTERVAL_S:.0f} s to stop it; stop it at the RTC"

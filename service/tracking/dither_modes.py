@@ -30,7 +30,7 @@ its size."""
 _MANY_LINES = np.linspace(*PROVING_LINE_RANGE, 100)
 
 
-def chosen_modes(
+def choose_modes(
     rtc: Status, policy: Policy, shunned: frozenset[int] = frozenset()
 ) -> tuple[int, ...]:
     """Return the modes to dither: those in the settings, or the best for α.
@@ -77,7 +77,7 @@ def expected_amplification(rtc: Status, policy: Policy, chosen: tuple[int, ...] 
     return max(float(np.sqrt(np.mean(found**2, axis=-1)).max()), 1.0)
 
 
-def why_elsewhere(request: DitherRequest, rtc: Status, policy: Policy) -> str:
+def check_free_modes(request: DitherRequest, rtc: Status, policy: Policy) -> str:
     """Return why a dither of the service should move to modes that are still free, or "".
 
     More modes may be controlled now than when it was requested.

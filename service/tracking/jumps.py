@@ -143,6 +143,7 @@ def pair_innovation(
         return ZERO_INNOVATION
     seen_from = (as_previous(registration), before)
     if registration.suspected_jump is None and before is not None:
+        # The first window has entered α already, so both are compared with the estimate before it.
         seen_from = (before, before.previous_estimate)
     window = _scattering(registration, window)
     first = _scattering(registration, first)
@@ -151,6 +152,8 @@ def pair_innovation(
     nearest = min(
         _farthest(seen_from, one, policy, varies).mahalanobis_squared for one in (alone, window)
     )
+    # Two windows of one new registration are near one another. Otherwise one is an outlier, or
+    # began before the jump.
     if _squared_distance(first.alpha, first, window, policy) >= min(nearest, JUMP_THRESHOLD):
         return _jump_inside_first(registration, first, window, policy)
     found = _farthest(seen_from, _together(first, window), policy, varies)
@@ -170,6 +173,8 @@ def _jump_inside_first(
         return ZERO_INNOVATION
     varies = _model_scatter(registration, policy)
     found = _farthest((as_previous(registration),), window, policy, varies)
+    # A third window would cost two seconds of a loop that suffers, but only a jump this large
+    # excludes turbulence (docs/decisions/0025-jumps.md).
     if found.excess <= MAX_TURBULENCE_EXCESS:
         return ZERO_INNOVATION
     total = _noise_of_two(first, window, policy)
@@ -213,6 +218,7 @@ def wholly_after(
     difference allowed for) must be little.
     """
     apart = _squared_distance(first.alpha, first, window, policy)
+    # Upper limit of what the first window may lack, 2 σ of the difference included.
     lacks = np.sqrt(apart) + 2.0
     return apart < JUMP_THRESHOLD and bool(
         lacks <= MAX_JUMP_SHORTFALL_SHARE * np.sqrt(_squared_distance(old, first, window, policy))
@@ -234,6 +240,7 @@ def passive_innovation(
         if earlier is not None:
             elapsed_s = max(window.t_ns_utc - earlier.t_ns_utc, 0) / SECOND_NS
             fading = -np.expm1(-2.0 * elapsed_s / policy.bias_memory_s)
+            # The bias fades with its memory, so an old comparison must allow for a new bias.
             forgot = np.square(block.floor) * fading + off
             found.append(_innovation_from(earlier, window, policy, forgot).mahalanobis_squared)
     return max(found)
@@ -290,6 +297,7 @@ def _noise_of_two(first: TimedEstimate, window: PointedEstimate, policy: Policy)
 
 def _drifted(elapsed_s: float, policy: Policy) -> Array:
     """Return ``(4,)`` variance that a smooth flexure has added."""
+    # Flexure is smooth: within a minute its variance grows with the square of the time.
     return np.asarray(policy.drift_rate**2 * elapsed_s * min(elapsed_s / DRIFT_TIME_S, 1.0))
 
 
@@ -317,6 +325,7 @@ def _innovation_from(
     previous: PreviousEstimate, window: PointedEstimate, policy: Policy, forgot: Array
 ) -> Innovation:
     elapsed_s = (window.t_ns_utc - previous.t_ns_utc) / SECOND_NS
+    # The RTC's clock was set back: the two times cannot be compared.
     if elapsed_s < -CLOCK_SET_BACK_S:
         return ZERO_INNOVATION
     elapsed_s = max(elapsed_s, 0.0)

@@ -19,7 +19,7 @@ from service.estimation.lockin import LockInEstimate
 from service.estimation.random_dither import RandomEstimate
 from service.tracking import alarms
 from service.tracking import events as ev
-from service.tracking.dither_modes import N_LINES, PROVING_LINE_RANGE, chosen_modes
+from service.tracking.dither_modes import N_LINES, PROVING_LINE_RANGE, choose_modes
 from service.tracking.dither_request import VIBRATION_CLEARANCES_HZ, step_of
 from service.tracking.mode_limits import (
     MAX_LISTED_MODES,
@@ -86,6 +86,7 @@ def _controlled(state: TrackerState) -> frozenset[int]:
     in_use = None if state.matrices.in_use is None else state.reconstructor(state.matrices.in_use)
     if in_use is None:
         return frozenset()
+    # A matrix without a parent is the RTC's own; only there may the model fail to recognise a mode.
     strange = state.matrices.mode_proof.strange if in_use.parent is None else frozenset()
     return frozenset(range(in_use.n_modes)) - strange
 
@@ -95,7 +96,7 @@ def shunned_modes(state: TrackerState) -> frozenset[int]:
     return state.matrices.mode_proof.contrary - proven_modes(state)
 
 
-def why_tells_nothing(context: StepContext, estimate: DitheredEstimate) -> str | None:
+def check_information(context: StepContext, estimate: DitheredEstimate) -> str | None:
     """Return why a window of these modes does not determine α, or None.
 
     What the loop makes of a line is fitted with the gain of the line's own mode.
@@ -104,6 +105,7 @@ def why_tells_nothing(context: StepContext, estimate: DitheredEstimate) -> str |
         return None  # there is no choice of others
     proof = context.matrices.mode_proof
     odd = (proof.contrary | proof.suspected).intersection(estimate.modes)
+    # Weak lines have too little weight to bias α.
     odd -= proven_modes(context.state).union(estimate.weak)
     if not odd:
         return None
@@ -116,7 +118,7 @@ def n_proven_modes(state: TrackerState, n_modes: int) -> int:
     return next((mode for mode in range(n_modes) if mode not in proven), n_modes)
 
 
-def why_unproven(state: TrackerState, record: ReconstructorRecord) -> str | None:
+def check_proven(state: TrackerState, record: ReconstructorRecord) -> str | None:
     """Return why a matrix would control unproven modes, or None."""
     if state.operations.acquisition.under_way:
         return None  # it closes the loop on smooth modes first, and watches it
@@ -153,8 +155,10 @@ def modes_to_show(context: StepContext, rtc: Status, window_s: float) -> tuple[i
     if not awaits_proof(context, rtc):
         return ()
     missing = _missing_modes(context, rtc)
+    # Many weak lines measure α less well, so that α must be known first.
     if not (is_settled(registration) or (unknown_loop(state, rtc) and _plausible(registration))):
         return ()
+    # Fewer modes share the budget after a failure, so that each line is stronger.
     at_once = max(
         MAX_SHOWN_MODES // FAILED_DITHER_DIVISOR**state.matrices.mode_proof.n_tries, N_LINES
     )
@@ -162,7 +166,7 @@ def modes_to_show(context: StepContext, rtc: Status, window_s: float) -> tuple[i
     shown = missing[:most]
     others = [mode for mode in _to_compare(context, rtc, shown) if mode not in shown]
     shown += others[: most - len(shown)]
-    telling = chosen_modes(rtc, context.policy, shunned_modes(state))
+    telling = choose_modes(rtc, context.policy, shunned_modes(state))
     spare = [mode for mode in telling if mode not in shown]
     room = min(N_LINES if others else N_LINES - len(shown), most - len(shown))
     return tuple(sorted([*shown, *spare[: max(room, 0)]]))
@@ -253,6 +257,7 @@ def learn_modes(context: StepContext, estimate: LockInEstimate | RandomEstimate)
     proven, contrary = _classify(gains, np.abs(estimate.optical_gain), estimate.gain_sigma)
     good, bad = (frozenset(modes[which].tolist()) for which in (proven, contrary))
     before = proof
+    # Two windows must agree before a mode is excluded.
     sure = bad & (proof.suspected | proof.contrary)
     compared = _without(
         compare(modes, gains, estimate.gain_sigma), bad | _controlled(context.state)
@@ -368,6 +373,7 @@ def believe_restored(context: StepContext, rtc: Status) -> None:
     proof = context.matrices.mode_proof
     if not proof.session:
         return
+    # Another session may have another order or signs of modes.
     same = proof.session == rtc.session and context.registration is not None
     now = replace(proof, session="") if same else ModeProof()
     context.matrices = replace(context.matrices, mode_proof=now)
@@ -382,6 +388,8 @@ def _classify(
     gains: NDArray[np.float64], size: NDArray[np.float64], sigma: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return which modes answer as they should, and which certainly do not; the rest may do."""
+    # The optical gain is common to all modes, so that a single mode is judged relative to the
+    # median.
     typical = float(np.median(size))
     low, high = (
         max(PLAUSIBLE_RESPONSE_RATIO[0] * typical, MIN_RESPONSE_RATIO),

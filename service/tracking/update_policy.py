@@ -59,11 +59,13 @@ def verdict_invalid_reason(
     """
     registration = state.alpha.registration
     if registration is None or judged is None:
-        return None if registration is None else why_of_another_loop(state, judged, gains)
+        return None if registration is None else explain_loop_change(state, judged, gains)
     moved = registration.alpha.distance(judged.alpha)
+    # The gate examined the ends of the 3 σ ellipsoid: the present one must lie inside the examined
+    # one.
     if np.any(moved + 3.0 * registration.sigma > 3.0 * judged.sigma + VERDICT_MARGIN):
         return "α ± 3σ reaches further than it was judged for"
-    return why_of_another_loop(state, judged, gains)
+    return explain_loop_change(state, judged, gains)
 
 
 def verdict_doubtful_reason(
@@ -80,7 +82,7 @@ def verdict_doubtful_reason(
     return verdict_invalid_reason(state, judged, gains)
 
 
-def why_of_another_loop(
+def explain_loop_change(
     state: TrackerState, judged: Judged | None, gains: tuple[float, ...]
 ) -> str | None:
     """Return what has changed in the loop since a verdict; None if nothing, or without an RTC.
@@ -98,6 +100,7 @@ def why_of_another_loop(
         return f"the leak was {judged.leak:g}, it is {rtc.leak:g}"
     if abs(judged.delay_frames - rtc.delay_frames) > SAME_DELAY:
         return f"the delay was {judged.delay_frames:g} frames, it is {rtc.delay_frames:g}"
+    # The status of an open loop does not contain the gains that it will close with.
     same = rtc.loop == "open" or same_gains(gains, judged.gains)
     return None if same else "the gains have changed"
 
@@ -160,6 +163,7 @@ def _gain_reason(
         return None
     step, covariance = since
     found, raised = last.expected, _raised(in_use, now_ns)
+    # Noise of α alone would show a loss, which no new matrix recovers.
     win_m = found.loss_m - estimate_noise_loss_m(found.loss_m, step, covariance)
     if win_m > policy.update_gain_m * raised:
         return f"a new one is expected to win {win_m * 1e9:.2f} nm over {in_use.id}"
@@ -298,6 +302,7 @@ def more_modes_to_try(
 
     New modes get the gain of the last: where that is 0 they would not be in the loop.
     """
+    # Added modes get the gain of the last one.
     if not rtc.gains[rtc.n_controlled - 1]:
         return ()
     target = policy.wanted_modes(rtc)
@@ -387,6 +392,8 @@ def limit_modes(
     before, wait_s, now_ns = context.matrices.mode_limit, first_wait_s, context.now_ns
     if before is not None and now_ns - before.since_ns_utc < MODES_LIMIT_MEMORY_S * SECOND_NS:
         left_s = (before.until_ns_utc - now_ns) / SECOND_NS
+        # The wait is doubled with each failure, up to 30 min (docs/decisions/0023-update-
+        # policy.md).
         wait_s = max(first_wait_s, min(2.0 * before.wait_s, MAX_MODES_DELAY_S), left_s)
     limit = ModeLimit(
         n_modes=n_modes,

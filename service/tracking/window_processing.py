@@ -59,14 +59,17 @@ def on_window(context: StepContext, event: ev.WindowFitted) -> None:
     """Fold one window's estimate into the registration, or refuse it with its reason."""
     estimate = event.estimate
     when = validity.telemetry_span(event.began_ns_utc, estimate.t_ns_utc)
-    why = filtering.why_no_window(context, estimate, when)
-    smeared = pointing_law.why_smeared(context.state, when.began_ns_utc, when.ended_ns_utc)
+    why = filtering.check_window(context, estimate, when)
+    smeared = pointing_law.check_pointing_motion(
+        context.state, when.began_ns_utc, when.ended_ns_utc
+    )
     if smeared is not None:
         why = RefusalKind.VOID, smeared
     if why is not None:
         kind, reason = why
         reject_window(context, reason, kind)
         return
+    # ``run`` counts accepted windows in a row as positive and refused ones as negative.
     context.windows = replace(context.windows, run=max(context.windows.run, 0) + 1)
     if validity.is_since_alarm(context.state, alarms.DITHER_LOST, when):
         note_found(context)
@@ -112,6 +115,7 @@ def reject_window(context: StepContext, reason: str, kind: RefusalKind = Refusal
         context.raise_alarm(alarms.MISALIGNED, reason)
     if kind is RefusalKind.MISTOLD:
         context.raise_alarm(alarms.WRONG_ANSWER, reason)
+    # The end of a dither cuts its last window: that is no fault.
     level = Level.INFO if kind is RefusalKind.CUT_SHORT else Level.WARNING
     _note_refusal(context, reason, level)
     if kind not in HARMLESS_REFUSALS:
@@ -142,7 +146,9 @@ def process_window(context: StepContext, measured: WindowEstimate) -> None:
             _suspect_jump(context, registration, measured, both, first)
         return
     far = jumps.window_innovation(registration, measured, context.policy)
-    too_early = validity.why_void(context.state, measured.when, Purpose.SETTLE)
+    too_early = validity.explain_void(context.state, measured.when, Purpose.SETTLE)
+    # A window that began before the doubt and agrees with the old α cannot end the doubt. If it
+    # disagrees, it counts.
     if too_early is not None and not far.is_outlier:
         _note_refusal(context, too_early)
         return
@@ -229,17 +235,20 @@ def _jump(
     if whole:
         elapsed_s = max(measured.t_ns_utc - first.t_ns_utc, 0) / SECOND_NS
         noise = first.covariance + np.diag(policy.drift_rate**2 * elapsed_s)
+    # The earlier estimates contain no information on the new registration.
     joint = kalman.widened(prior, noise)
     if whole:
         joint = kalman.corrected(joint, first.alpha.vector, noise)
     update = FilterUpdate(
         joint=kalman.corrected(joint, measured.numbers, measured.noise),
+        # Two windows are required before a matrix is made (docs/decisions/0025-jumps.md).
         n_windows=2 if whole or both.excess > jumps.MAX_TURBULENCE_EXCESS else 1,
         innovation=_innovation(prior, measured),
         scatter=registration.scatter,
         jumped=True,
     )
     validity.store_registration(context, registration)
+    # Ordinary telemetry summed until now mixes both registrations.
     validity.void_until(context, first.t_ns_utc, BOTH_SIDES, Purpose.PASSIVE)
     held = whole and registration.suspected_jump is not None
     filtering.accept(context, update, measured, n_accepted=2 if held else 1)

@@ -113,7 +113,7 @@ async def test_a_disk_that_refuses_ends_the_recording_and_nothing_else(
 
 async def test_an_operator_may_end_it_while_its_time_is_up(client, keeper, monkeypatch):
     name = await begun(client)
-    monkeypatch.setattr(keeper, "_why_end", lambda _: "")
+    monkeypatch.setattr(keeper, "_check_recording_end", lambda _: "")
     async with keeper._guard:
         ended = asyncio.create_task(keeper.end("Bob has ended it"))
         await asyncio.sleep(0.05)

@@ -239,7 +239,7 @@ class Intake:
             self._counters.add("status", USED, 1, now_s)
             self._essentials = found
             self._last_status_s = now_s
-            self._expected(status.basis_id, status.config_id, now_s)
+            self._check_ids(status.basis_id, status.config_id, now_s)
             self._shape = (status.n_slopes, status.n_modes)
             self._put(status)
 
@@ -397,13 +397,15 @@ class Intake:
         """Return whether frames are of the session, basis, configuration and shape that count."""
         if not self._admit("frames", header.session, header.n, now_s):
             return False
-        wrong = self._expected(header.basis_id, header.config_id, now_s) or self._misshapen(header)
+        wrong = self._check_ids(header.basis_id, header.config_id, now_s) or self._check_shape(
+            header
+        )
         if wrong:
             reason, text = wrong
             self._counters.add("frames", reason, header.n, now_s, text)
         return not wrong
 
-    def _misshapen(self, header: wire.FrameHeader) -> tuple[str, str] | None:
+    def _check_shape(self, header: wire.FrameHeader) -> tuple[str, str] | None:
         """Return why frames are not of the sizes that the status says; None: they are."""
         found, expected = (header.n_slopes, header.n_modes), self._shape
         if expected is None or found == expected:
@@ -466,7 +468,7 @@ class Intake:
             self._put(ev.ConditionChanged(name=SECOND_RTC, text=told))
         return admission.accepted
 
-    def _expected(self, basis_id: str, config_id: str, now_s: float) -> tuple[str, str] | None:
+    def _check_ids(self, basis_id: str, config_id: str, now_s: float) -> tuple[str, str] | None:
         """Return which id is not the expected one, None: both are; adopt where none is."""
         if self._basis_id is None or self._config_id is None:
             self._basis_id = self._basis_id or basis_id

@@ -312,7 +312,7 @@ def send_command(
         signed = signatures.sign(selector, payload)
         answer = ask(session, selector, timeout_s, signed, wire.Encodings.COMMAND)
         if answer is not None:
-            return _vouched(answer, selector, command, signatures)
+            return _verify(answer, selector, command, signatures)
         # zenoh ended the query early, so no queryable was there.
         if time.monotonic() - began_s < timeout_s / 2:
             n_unserved += 1
@@ -332,7 +332,7 @@ def send_command(
     )
 
 
-def _vouched(answer: bytes, selector: str, command: wire.Command, signatures: Signatures) -> bytes:
+def _verify(answer: bytes, selector: str, command: wire.Command, signatures: Signatures) -> bytes:
     try:
         signatures.check(selector, answer)
     except WireError as error:
@@ -352,17 +352,17 @@ def fetch_applied(
     LinkError
         If the RTC does not answer or has none.
     """
-    told = _asked(session, keys.applied)
+    told = _request(session, keys.applied)
     signatures.check(keys.applied, told)
     manifest = wire.decode(wire.Manifest, told)
     assembler = wire.ChunkAssembler()
     assembler.announce(manifest.layout)
     for index in range(manifest.layout.n_chunks):
-        assembler.add(index, _asked(session, f"{keys.applied}?chunk={index}"))
+        assembler.add(index, _request(session, f"{keys.applied}?chunk={index}"))
     return manifest, assembler.matrix()
 
 
-def _asked(session: zenoh.Session, selector: str) -> bytes:
+def _request(session: zenoh.Session, selector: str) -> bytes:
     answer = ask(session, selector, MATRIX_TIMEOUT_S)
     if answer is None:
         raise LinkError(f"no answer from the RTC on {selector} within {MATRIX_TIMEOUT_S} s")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Final
 
-from service.link.guard import ending_in_words, flooded_in_words, refused_in_words
+from service.link.guard import describe_expiry, describe_flood, describe_refusals
 from service.link.intake import COALESCED
 from service.link.statistics import (
     MALFORMED,
@@ -83,17 +83,17 @@ _NUMBER: Final = re.compile(r"[0-9]+")
 def complaints(link: LinkStatistics) -> dict[str, str]:
     """Return the alarms of what came in the last seconds, by name."""
     made = {
-        alarms.FRAMES_UNUSED: _unused(link),
-        alarms.MESSAGES_REFUSED: _refused(link),
+        alarms.FRAMES_UNUSED: _explain_unused(link),
+        alarms.MESSAGES_REFUSED: _explain_refused(link),
         alarms.STATUS_FLOOD: _flood(link),
-        alarms.LINK_FLOODED: flooded_in_words(link.waiting_connections),
-        alarms.LINK_REFUSED: refused_in_words(link.refusals),
-        alarms.CERTIFICATE_ENDING: ending_in_words(link.ending_certificates),
+        alarms.LINK_FLOODED: describe_flood(link.waiting_connections),
+        alarms.LINK_REFUSED: describe_refusals(link.refusals),
+        alarms.CERTIFICATE_ENDING: describe_expiry(link.ending_certificates),
     }
     return {name: text for name, text in made.items() if text}
 
 
-def _unused(link: LinkStatistics) -> str:
+def _explain_unused(link: LinkStatistics) -> str:
     """Return which frames come and are not used, and why; empty: all is well."""
     frames = [disposition for disposition in link.dispositions if disposition.kind == "frames"]
     came, used = sum(f.n for f in frames), sum(f.n for f in frames if f.outcome == USED)
@@ -126,7 +126,7 @@ def _is_lost(disposition: Disposition, link: LinkStatistics, used: int) -> bool:
             return True
 
 
-def _refused(link: LinkStatistics) -> str:
+def _explain_refused(link: LinkStatistics) -> str:
     """Return which messages besides frames broke the contract; empty: none of late."""
     bad = [f for f in link.dispositions if f.outcome == MALFORMED and f.kind != "frames"]
     bad = [f for f in bad if f.age_s < FAULT_REPORT_DURATION_S]
@@ -270,7 +270,7 @@ def _for_messages(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
 
 
 def _for_frames(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
-    text, fates = _unused(inputs.link), inputs.link.dispositions
+    text, fates = _explain_unused(inputs.link), inputs.link.dispositions
     if text and not any(f.n for f in fates if f.kind == "frames" and f.outcome == USED):
         yield Prerequisite(
             name=alarms.FRAMES_UNUSED, responsible=Responsible.RTC, text=text, blocks=True
@@ -305,7 +305,7 @@ def _for_the_matrix(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
             state.operator.mode is not Mode.AUTO or no_return
         ):
             text = f"reconstructor {record.id} is proposed: approve or reject it"
-            more = [no_return or "", _replaced(state, record)]
+            more = [no_return or "", _explain_replacement(state, record)]
             yield Prerequisite(
                 name="approval",
                 responsible=Responsible.OPERATOR,
@@ -313,7 +313,7 @@ def _for_the_matrix(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
             )
 
 
-def _replaced(state: TrackerState, record: ReconstructorRecord) -> str:
+def _explain_replacement(state: TrackerState, record: ReconstructorRecord) -> str:
     """Return that a proposal will be replaced, and when; empty: it fits α."""
     if state.operator.mode is Mode.HOLD or not is_outdated(state, record):
         return ""

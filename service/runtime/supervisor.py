@@ -307,7 +307,7 @@ class Supervisor:
             with self._surviving("telemetry"):
                 try:
                     blocks, found = await loop.run_in_executor(
-                        self._telemetry_executor, self._taken_in, bank
+                        self._telemetry_executor, self._take_in, bank
                     )
                 finally:
                     self._engine.checkin(*found)
@@ -315,7 +315,7 @@ class Supervisor:
             for block in blocks:
                 self._worker_load.count_frames(block.n_frames * block.dt_ns * 1e-9)
 
-    def _taken_in(self, bank: EstimatorBank) -> tuple[list[frames.FrameBlock], Fed]:
+    def _take_in(self, bank: EstimatorBank) -> tuple[list[frames.FrameBlock], Fed]:
         blocks = self._bridge.drain(before_events=True)
         return blocks, process_blocks(bank, blocks)
 

@@ -25,12 +25,12 @@ from service.tracking.dither_request import (
     DitherPhase,
     DitherPolicyState,
     Precision,
+    check_dither_usable,
     is_own_sine,
     is_proving,
     on_vibrations,
     plan_dither,
     total_m,
-    why_unusable,
 )
 from service.tracking.policy import SECOND_NS
 from service.tracking.state import Level, TrackerState
@@ -243,7 +243,7 @@ def learn_precision(context: StepContext, estimate: LockInEstimate | RandomEstim
         _set_policy(context, replace(context.dither_policy, precision=precision))
 
 
-def why_too_strong(context: StepContext, event: ev.DitherMeasured) -> str | None:
+def check_measured_dither(context: StepContext, event: ev.DitherMeasured) -> str | None:
     """Report a dither that differs from the request; return the reason why it must be stopped.
 
     The commands in the frames are what the mirror does, whatever the RTC's status says.
@@ -285,7 +285,7 @@ def stop_unanswered(context: StepContext, text: str) -> None:
 
 def stop_unwanted(context: StepContext, rtc: Status) -> None:
     """Ask the RTC, again and again, to stop what it should not play."""
-    running, loud = rtc.dither_id, dither_plan.why_too_strong(context, rtc)
+    running, loud = rtc.dither_id, dither_plan.check_dither_strength(context, rtc)
     why = loud or dither_plan.check_dither_wanted(context, rtc)
     if running is None or why is None:
         forget_unwanted(context)
@@ -333,7 +333,7 @@ def _begin(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
 
 def _ask(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
     dither = plan_dither(rtc, context.policy, context.now_ns, choice=wanted.parameters)
-    reason = why_unusable(dither, rtc, context.policy)
+    reason = check_dither_usable(dither, rtc, context.policy)
     if reason is not None:
         text = (
             f"no usable dither: {reason}; a dither of random signs needs no lines, and α can be "
@@ -407,7 +407,7 @@ def _adopt(context: StepContext, rtc: Status) -> bool:
         dither = Dither(
             request=running, start_seq=begun_seq, asked_ns_utc=context.now_ns, window_s=window_s
         )
-        if why_unusable(dither, rtc, context.policy) is None:
+        if check_dither_usable(dither, rtc, context.policy) is None:
             _set_dither(context, dither)
             context.log("dither.adopted", f"{running.id} runs since frame {begun_seq}")
             return True

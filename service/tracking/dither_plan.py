@@ -138,7 +138,7 @@ def choose_next(context: StepContext, rtc: Status) -> tuple[WantedDither, Dither
         return _to_show(context, rtc, shown, window_s), plan
     fixed = policy.dither_amplitude_m is not None
     total_m = requirement.budget_m if fixed else plan.total_m
-    choice = _parameters(context, total_m, window_s, max(requirement.window_s, _lasting_s(phase)))
+    choice = _parameters(context, total_m, window_s, max(requirement.window_s, _duration_s(phase)))
     # An acquisition watches its matrices itself (``mode_proof.check_proven``).
     if phase is DitherPhase.ACQUIRE and not context.acquisition.under_way:
         choice = _with_others(context, rtc, choice)
@@ -326,7 +326,7 @@ def _requirement(
     return replace(requirement, window_s=window_s)
 
 
-def _lasting_s(phase: DitherPhase) -> float:
+def _duration_s(phase: DitherPhase) -> float:
     """Return how long a request is to be read at least, seconds."""
     return (
         0.0
@@ -455,7 +455,7 @@ def awaits_result(context: StepContext, wanted_dither: WantedDither) -> bool:
     return not late and context.windows.accepted < dithering.results_due
 
 
-def why_too_strong(context: StepContext, rtc: Status) -> str | None:
+def check_dither_strength(context: StepContext, rtc: Status) -> str | None:
     """Return why a running dither exceeds its limits, or None.
 
     An operator's own dither may exceed the budget, but not its own request.

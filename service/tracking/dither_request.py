@@ -104,7 +104,7 @@ class DitherParameters:
     """Modes that are not to be dithered to follow α."""
 
 
-def why_unusable(dither: Dither, rtc: Status, policy: Policy) -> str | None:
+def check_dither_usable(dither: Dither, rtc: Status, policy: Policy) -> str | None:
     """Return why the lines of a dither cannot be separated in its windows, or None."""
     kind = dither.request.kind
     if kind is not DitherKind.SINE:

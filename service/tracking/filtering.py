@@ -18,7 +18,7 @@ from service.estimation.windows import OTHER_SESSION, RefusalKind, Why
 from service.model.misregistration import Misregistration
 from service.tracking import mode_proof, validity
 from service.tracking.alarms import Interlock, blocking_alarm
-from service.tracking.jumps import as_previous
+from service.tracking.jumps import to_previous_estimate
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import (
     HistoryEntry,
@@ -341,7 +341,7 @@ def _previous_estimate(
         return None
     before = registration.previous_estimate
     return replace(
-        as_previous(registration),
+        to_previous_estimate(registration),
         next_window=measured,
         previous_estimate=None
         if before is None

@@ -121,8 +121,8 @@ def window_innovation(
     neither half need be significant.
     """
     return _farthest(
-        (as_previous(registration), registration.previous_estimate),
-        _scattering(registration, window),
+        (to_previous_estimate(registration), registration.previous_estimate),
+        _with_scatter(registration, window),
         policy,
         _model_scatter(registration, policy),
     )
@@ -141,12 +141,12 @@ def pair_innovation(
     first, before = previous_window(registration), registration.previous_estimate
     if first is None:
         return ZERO_INNOVATION
-    seen_from = (as_previous(registration), before)
+    seen_from = (to_previous_estimate(registration), before)
     if registration.suspected_jump is None and before is not None:
         # The first window has entered α already, so both are compared with the estimate before it.
         seen_from = (before, before.previous_estimate)
-    window = _scattering(registration, window)
-    first = _scattering(registration, first)
+    window = _with_scatter(registration, window)
+    first = _with_scatter(registration, first)
     varies = _model_scatter(registration, policy)
     alone = replace(window, alpha=first.alpha, covariance=first.covariance, t_ns_utc=first.t_ns_utc)
     nearest = min(
@@ -172,7 +172,7 @@ def _jump_inside_first(
     if registration.suspected_jump is None:
         return ZERO_INNOVATION
     varies = _model_scatter(registration, policy)
-    found = _farthest((as_previous(registration),), window, policy, varies)
+    found = _farthest((to_previous_estimate(registration),), window, policy, varies)
     # A third window would cost two seconds of a loop that suffers, but only a jump this large
     # excludes turbulence (docs/decisions/0025-jumps.md).
     if found.excess <= MAX_TURBULENCE_EXCESS:
@@ -209,7 +209,7 @@ def jump_lasts(
     return (window.t_ns_utc - first.began_ns_utc) / SECOND_NS >= WINDOW_CORRELATION_TIME_S
 
 
-def wholly_after(
+def is_after_jump(
     first: TimedEstimate, window: PointedEstimate, old: Misregistration, policy: Policy
 ) -> bool:
     """Return whether a window is of the new place ``reading`` shows, and not partly of ``old``.
@@ -246,7 +246,7 @@ def passive_innovation(
     return max(found)
 
 
-def as_previous(registration: Registration) -> PreviousEstimate:
+def to_previous_estimate(registration: Registration) -> PreviousEstimate:
     """Return what is known, for when it will have been before."""
     return PreviousEstimate(
         alpha=registration.alpha,
@@ -267,7 +267,7 @@ def sum_of(registration: Registration, joint: Joint, block: BiasBlock) -> Previo
     )
 
 
-def _scattering(registration: Registration, window: EstimateT) -> EstimateT:
+def _with_scatter(registration: Registration, window: EstimateT) -> EstimateT:
     """Return a window that says of itself how much windows have scattered lately."""
     return replace(window, covariance=registration.scatter * window.covariance)
 
@@ -291,11 +291,13 @@ def _squared_distance(
 def _noise_of_two(first: TimedEstimate, window: PointedEstimate, policy: Policy) -> Array:
     """Return ``(4, 4)`` covariance of the difference of two windows of one place."""
     elapsed_s = max(window.t_ns_utc - first.t_ns_utc, 0) / SECOND_NS
-    added = _drifted(elapsed_s, policy) + 2.0 * (MODEL_ERROR_VARYING_SHARE * policy.floor) ** 2
+    added = (
+        _drift_variance(elapsed_s, policy) + 2.0 * (MODEL_ERROR_VARYING_SHARE * policy.floor) ** 2
+    )
     return np.asarray(first.covariance + window.covariance + np.diag(added))
 
 
-def _drifted(elapsed_s: float, policy: Policy) -> Array:
+def _drift_variance(elapsed_s: float, policy: Policy) -> Array:
     """Return ``(4,)`` variance that a smooth flexure has added."""
     # Flexure is smooth: within a minute its variance grows with the square of the time.
     return np.asarray(policy.drift_rate**2 * elapsed_s * min(elapsed_s / DRIFT_TIME_S, 1.0))
@@ -331,7 +333,7 @@ def _innovation_from(
     elapsed_s = max(elapsed_s, 0.0)
     bent = flexure(previous.pointing, window.pointing, policy)
     added = (
-        _drifted(elapsed_s, policy)
+        _drift_variance(elapsed_s, policy)
         + bent**2
         + (MODEL_ERROR_VARYING_SHARE * policy.floor) ** 2
         + forgot

@@ -29,9 +29,9 @@ from service.tracking.mode_limits import (
     ModeProof,
     ModeRatio,
     add_ratios,
-    as_list,
-    as_subject,
     compare,
+    format_modes,
+    format_subject,
 )
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
@@ -109,7 +109,9 @@ def check_information(context: StepContext, estimate: DitheredEstimate) -> str |
     odd -= proven_modes(context.state).union(estimate.weak)
     if not odd:
         return None
-    return f"{as_subject(odd)} not answered as the instrument file says: such a window gives no α"
+    return (
+        f"{format_subject(odd)} not answered as the instrument file says: such a window gives no α"
+    )
 
 
 def n_proven_modes(state: TrackerState, n_modes: int) -> int:
@@ -128,10 +130,10 @@ def check_proven(state: TrackerState, record: ReconstructorRecord) -> str | None
         return None
     contrary = [mode for mode in missing if mode in state.matrices.mode_proof.contrary]
     if contrary:
-        return f"{as_subject(contrary)} not answered as the instrument file says"
+        return f"{format_subject(contrary)} not answered as the instrument file says"
     return (
-        f"{as_subject(missing)} not been seen to answer yet: a dither shows them before they are "
-        "controlled; let the service dither"
+        f"{format_subject(missing)} not been seen to answer yet: a dither shows them before they "
+        "are controlled; let the service dither"
     )
 
 
@@ -238,7 +240,9 @@ def note_shown(context: StepContext, modes: tuple[int, ...]) -> None:
         proof = _after_miss(proof)
     shown = replace(proof, shown=frozenset(modes), shown_ns_utc=context.now_ns)
     context.matrices = replace(context.matrices, mode_proof=shown)
-    context.log("modes.shown", f"modes {as_list(modes)} are dithered before they are controlled")
+    context.log(
+        "modes.shown", f"modes {format_modes(modes)} are dithered before they are controlled"
+    )
 
 
 def awaits_result(context: StepContext, window_s: float) -> bool:
@@ -421,7 +425,7 @@ def contrary_text(context: StepContext) -> str | None:
 
 def _contrary_in_words(proof: ModeProof, in_the_way: list[int]) -> str:
     return (
-        f"{as_subject(in_the_way)} not answered the dither as the instrument file says"
+        f"{format_subject(in_the_way)} not answered the dither as the instrument file says"
         f"{_in_words(proof, in_the_way)}: no new matrix controls more than {in_the_way[0]} modes"
     )
 
@@ -450,7 +454,7 @@ def _in_words(proof: ModeProof, modes: list[int]) -> str:
     return f" ({', '.join(parts)}{times})" if parts else ""
 
 
-def uneven_text(context: StepContext) -> str | None:
+def explain_uneven(context: StepContext) -> str | None:
     """Return which modes answer more or less strongly than their neighbours, or None."""
     proof = context.matrices.mode_proof
     if proof.session:
@@ -460,8 +464,8 @@ def uneven_text(context: StepContext) -> str | None:
         one = "answers" if len(proof.uneven) == 1 else "answer"
         noun = "mode" if len(proof.uneven) == 1 else "modes"
         found.append(
-            f"{noun} {as_list(proof.uneven)} {one} the dither more than {UNEVEN_RATIO:g} times as "
-            "strongly or as weakly as the modes beside"
+            f"{noun} {format_modes(proof.uneven)} {one} the dither more than {UNEVEN_RATIO:g} "
+            "times as strongly or as weakly as the modes beside"
         )
     return "; ".join(found) or None
 
@@ -480,7 +484,7 @@ def give_up_unseen(context: StepContext, rtc: Status) -> None:
     given_up = replace(proof, shown=frozenset(), n_tries=0, suspected=suspected)
     context.matrices = replace(context.matrices, mode_proof=given_up)
     text = (
-        f"{as_subject(proof.shown)} not been seen to answer in {MAX_PROOF_TRIES} dithers: "
+        f"{format_subject(proof.shown)} not been seen to answer in {MAX_PROOF_TRIES} dithers: "
         "see why windows "
         "are refused, or give the dither more budget"
     )

@@ -51,7 +51,7 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
     block = estimate.bias
     registration = _with_first_bias(registration, estimate)
     forward = filtering.predict(context, registration, event.t_ns_utc)
-    prior = kalman.allowing(forward, block, estimate.bias_excess)
+    prior = kalman.allow_scatter(forward, block, estimate.bias_excess)
     mixed = _check_single_registration(context.state, registration, event)
     if mixed is not None:
         biases = _biases_after_look(
@@ -77,7 +77,7 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
         _ask_for_window(context, registration, event, prior, far)
         return
     joint = kalman.corrected(prior, measured, estimate.covariance, block)
-    joint = kalman.scattered(joint, block, far)
+    joint = kalman.update_scatter(joint, block, far)
     registration = _registration_after_passive(context, registration, joint, event)
     validity.store_registration(context, registration)
     validity.age_registration(context)

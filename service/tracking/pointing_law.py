@@ -95,14 +95,14 @@ def event_of_now(context: StepContext, event: Event) -> Event:
     """Return an event whose estimate of α is brought to the present pointing."""
     match event:
         case ev.WindowFitted(estimate=estimate, began_ns_utc=began_ns):
-            alpha = _of_now(context.state, estimate.alpha, began_ns, estimate.t_ns_utc)
+            alpha = _to_present(context.state, estimate.alpha, began_ns, estimate.t_ns_utc)
             return replace(event, estimate=replace(estimate, alpha=alpha))
         case ev.PassiveFitted(estimate=estimate, began_ns_utc=began_ns, t_ns_utc=t_ns):
-            alpha = _of_now(context.state, estimate.alpha, began_ns, t_ns)
+            alpha = _to_present(context.state, estimate.alpha, began_ns, t_ns)
             return replace(event, estimate=replace(estimate, alpha=alpha))
         case ev.WideCaptureFitted(found=found, began_ns_utc=began_ns):
             estimate = found.estimate
-            alpha = _of_now(context.state, estimate.alpha, began_ns, estimate.t_ns_utc)
+            alpha = _to_present(context.state, estimate.alpha, began_ns, estimate.t_ns_utc)
             return replace(event, found=replace(found, estimate=replace(estimate, alpha=alpha)))
         case _:
             return event
@@ -182,7 +182,7 @@ def difference(one: Misregistration, other: Misregistration) -> Array:
     return step
 
 
-def _of_now(
+def _to_present(
     state: TrackerState, alpha: Misregistration, began_ns_utc: int, ended_ns_utc: int
 ) -> Misregistration:
     """Return an estimate at the present pointing, made of telemetry of another."""
@@ -197,7 +197,7 @@ def _of_now(
 
 def _nominal(context: StepContext, law: PointingLaw) -> Misregistration | str:
     """Return the present registration by the law, or why it is unknown and what to do."""
-    reported = _reported(context)
+    reported = _reported_values(context)
     missing = sorted(law.names - reported.keys())
     if missing and context.alpha.pointing is None:
         return (
@@ -220,7 +220,7 @@ def _nominal(context: StepContext, law: PointingLaw) -> Misregistration | str:
     return found if scale is None else Misregistration.from_vector(found.vector * scale)
 
 
-def _reported(context: StepContext) -> Reported:
+def _reported_values(context: StepContext) -> Reported:
     """Return the numbers that a law may be of."""
     values = {
         value.name: float(value.value)

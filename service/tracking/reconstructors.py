@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.errors import CommandError, UnknownIdError
-from service.estimation.loop import commanded_gains, extended_gains
+from service.estimation.loop import extend_gains, select_gains
 from service.tracking import events as ev
 from service.tracking import update_policy
 from service.tracking.alarms import Interlock
@@ -158,7 +158,7 @@ def on_matrix(context: StepContext, made: ev.MatrixMade) -> None:
     record, wanted = made.record, made.wanted
     # A matrix that was being made when a jump was confirmed is for the registration before it. One
     # that an operator ordered is judged again instead.
-    overtaken = not wanted and _jumped_since(context.state, record)
+    overtaken = not wanted and _has_jumped_since(context.state, record)
     propose(context, record)
     if made.asked_modes is not None:
         update_policy.note_limit(context, record, made.asked_modes, made.why_fewer)
@@ -206,7 +206,7 @@ def send_once_judged(context: StepContext, matrix_id: str, *, wanted: bool = Tru
         If it cannot be sent now, whatever the gate would say.
     """
     record, rtc = _sendable(context, matrix_id)
-    gains = commanded_gains(rtc, record.n_modes)
+    gains = select_gains(rtc, record.n_modes)
     stale = update_policy.verdict_invalid_reason(context.state, record.judged, gains)
     # A rollback into an open loop cannot be judged and is sent all the same
     # (docs/decisions/0026-gate-verdict-read-back.md).
@@ -240,7 +240,7 @@ def on_proposal_judged(context: StepContext, event: ev.ProposalJudged) -> None:
         reason = f"{alarm.name}: {alarm.text}" if alarm else "the mode, the loop or α has changed"
     if rtc is not None and reason is None:
         reason = update_policy.verdict_invalid_reason(
-            context.state, record.judged, commanded_gains(rtc, record.n_modes)
+            context.state, record.judged, select_gains(rtc, record.n_modes)
         )
     if reason is None:
         send(context, record.id)
@@ -262,7 +262,7 @@ def send(context: StepContext, matrix_id: str, swapped_ns_utc: int | None = None
     """
     record, rtc = _sendable(context, matrix_id, swapped_ns_utc)
     same = record.n_modes == rtc.n_controlled
-    _send(context, record, None if same else extended_gains(rtc, record.n_modes))
+    _send(context, record, None if same else extend_gains(rtc, record.n_modes))
 
 
 def send_with(context: StepContext, matrix_id: str, gains: tuple[float, ...] | None) -> None:
@@ -313,12 +313,10 @@ def on_acknowledgement(context: StepContext, event: Acknowledgement) -> None:
         return
     if not _is_old(context.state, record, event):
         with context.because_of(record.cause):
-            _acknowledged(context, record, event)
+            _on_state(context, record, event)
 
 
-def _acknowledged(
-    context: StepContext, record: ReconstructorRecord, event: Acknowledgement
-) -> None:
+def _on_state(context: StepContext, record: ReconstructorRecord, event: Acknowledgement) -> None:
     """Take a reconstructor further on its way, or note why the RTC holds other numbers."""
     # The id alone does not prove that the numbers have arrived unchanged.
     if record.sha256 and event.sha256 not in {None, record.sha256}:
@@ -332,7 +330,7 @@ def _acknowledged(
         record = replace(record, applied_frame_seq=event.frame_seq, reason=reason)
         replace_record(context, record)
         mark_applied(context, record.id)
-        gains = () if context.rtc is None else commanded_gains(context.rtc, record.n_modes)
+        gains = () if context.rtc is None else select_gains(context.rtc, record.n_modes)
         of_other = update_policy.verdict_doubtful_reason(context.state, record.judged, gains)
         context.matrices = replace(
             context.matrices,
@@ -456,7 +454,7 @@ def _trust(context: StepContext, matrix_id: str) -> None:
         context.log("reconstructor.right", f"the RTC holds {matrix_id} as it was sent")
 
 
-def _jumped_since(state: TrackerState, record: ReconstructorRecord) -> bool:
+def _has_jumped_since(state: TrackerState, record: ReconstructorRecord) -> bool:
     """Return True if a jump was found since its request: the verdict is out of date."""
     registration, began_ns = state.alpha.registration, state.matrices.making_since_ns_utc
     if registration is None or registration.jumped_ns_utc is None or began_ns is None:

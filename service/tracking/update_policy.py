@@ -119,7 +119,7 @@ def update_reason(
     if has_moved(state, in_use, policy):
         step = registration.alpha.vector - in_use.alpha.vector
         return f"moved by {step_text(step)} since {in_use.id}"
-    if _jumped(state, in_use, registration):
+    if _has_jumped(state, in_use, registration):
         return f"{in_use.id} was made before the mirror jumped"
     last = state.matrices.assessment
     if last is None or last.id != in_use.id:
@@ -162,7 +162,7 @@ def _gain_reason(
     if since is None:
         return None
     step, covariance = since
-    found, raised = last.expected, _raised(in_use, now_ns)
+    found, raised = last.expected, _threshold_ratio(in_use, now_ns)
     # Noise of α alone would show a loss, which no new matrix recovers.
     win_m = found.loss_m - estimate_noise_loss_m(found.loss_m, step, covariance)
     if win_m > policy.update_gain_m * raised:
@@ -182,7 +182,7 @@ def _margin_lost(last: Assessment) -> float:
     return (1.0 - (1.0 - last.expected.pole_radius) / whole) if whole > 0.0 else 0.0
 
 
-def _raised(in_use: ReconstructorRecord, now_ns: int) -> float:
+def _threshold_ratio(in_use: ReconstructorRecord, now_ns: int) -> float:
     """Return by how much the thresholds are raised so soon after an update."""
     since_s = (now_ns - in_use.created_ns_utc) / SECOND_NS
     return 1.0 + max(0.0, 1.0 - since_s / THRESHOLD_DECAY_S)
@@ -213,7 +213,9 @@ def has_moved(state: TrackerState, record: ReconstructorRecord, policy: Policy) 
     return _apart(state, record, policy.update_threshold)
 
 
-def _jumped(state: TrackerState, in_use: ReconstructorRecord, registration: Registration) -> bool:
+def _has_jumped(
+    state: TrackerState, in_use: ReconstructorRecord, registration: Registration
+) -> bool:
     """Return whether the mirror has jumped since, further than the gate's verdict reaches.
 
     What a new one wins does not matter: what has jumped once may jump again.
@@ -229,7 +231,7 @@ def is_left_behind(state: TrackerState, record: ReconstructorRecord, policy: Pol
     """Return True if α is so far from this reconstructor that it is obsolete."""
     registration = state.alpha.registration
     return registration is not None and (
-        has_moved(state, record, policy) or _jumped(state, record, registration)
+        has_moved(state, record, policy) or _has_jumped(state, record, registration)
     )
 
 

@@ -81,14 +81,14 @@ def decide_updates(context: StepContext) -> None:
     hindrance = explain_hindrance(context, rtc)
     if hindrance != context.matrices.hindrance:
         context.matrices = replace(context.matrices, hindrance=hindrance)
-    unjudged = _unjudged_in_use(context)
+    unjudged = _find_unjudged(context)
     # asked for first: after a jump the loop waits for it, and nobody for the old one's margin
     _choose_update(context, rtc)
     if unjudged is not None:
         request_verdict(context, unjudged)
 
 
-def _unjudged_in_use(context: StepContext) -> str | None:
+def _find_unjudged(context: StepContext) -> str | None:
     """Return the matrix in use if its margin is not known or was judged too long ago, else None.
 
     Nothing is sent on such an answer: what is made, approved, copied or asked of the loop is judged

@@ -134,7 +134,7 @@ def process_window(context: StepContext, measured: WindowEstimate) -> None:
     if registration is None:
         joint = kalman.begin_joint(measured.numbers, measured.noise)
         if measured.with_stretches is not None:
-            joint = kalman.expecting(joint, context.nominal.stretches)
+            joint = kalman.expect_stretches(joint, context.nominal.stretches)
         filtering.accept(context, FilterUpdate(joint=joint, n_windows=1, innovation=0.0), measured)
         return
     first = jumps.previous_window(registration)
@@ -231,12 +231,12 @@ def _jump(
     policy = context.policy
     prior = filtering.predict_for(context, registration, measured)
     noise = measured.covariance
-    whole = jumps.wholly_after(first, measured, registration.alpha, policy)
+    whole = jumps.is_after_jump(first, measured, registration.alpha, policy)
     if whole:
         elapsed_s = max(measured.t_ns_utc - first.t_ns_utc, 0) / SECOND_NS
         noise = first.covariance + np.diag(policy.drift_rate**2 * elapsed_s)
     # The earlier estimates contain no information on the new registration.
-    joint = kalman.widened(prior, noise)
+    joint = kalman.widen_after_jump(prior, noise)
     if whole:
         joint = kalman.corrected(joint, first.alpha.vector, noise)
     update = FilterUpdate(
@@ -272,7 +272,7 @@ def reset_run(context: StepContext) -> None:
         context.windows = replace(context.windows, run=0)
 
 
-def refused_text(context: StepContext) -> str | None:
+def explain_refusals(context: StepContext) -> str | None:
     """Return why windows are refused one after the other, or none comes; None: they are not.
 
     As many in a row as raise the alarm end it. One that is expected and does not come is as good as
@@ -287,11 +287,11 @@ def refused_text(context: StepContext) -> str | None:
     elif raised is not None and run < N_CONSECUTIVE_WINDOWS:
         text = raised
     else:
-        text = _missing_text(context)
+        text = _explain_missing_windows(context)
     return None if not text or _is_excused(context) else text
 
 
-def _missing_text(context: StepContext) -> str:
+def _explain_missing_windows(context: StepContext) -> str:
     registration, dither, rtc = context.registration, context.dither, context.rtc
     if dither is None or dither.start_seq is None or rtc is None:
         return ""

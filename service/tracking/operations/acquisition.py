@@ -75,7 +75,7 @@ def advance(context: StepContext, event: Event) -> None:
             _begin(context, context.rtc, why, commanded=False)
     elif isinstance(event, ev.RtcVanished):
         # the state before still knows in which session that was
-        stages.set_acquisition(context, _interrupted(context.before, "the RTC vanished"))
+        stages.set_acquisition(context, _interrupt(context.before, "the RTC vanished"))
         _note_interrupted(context, NO_RTC)
     else:
         with context.because_of("" if isinstance(event, cmd.Instruction) else acquisition.cause):
@@ -90,7 +90,7 @@ def acquisition_to_save(state: TrackerState) -> Acquisition | None:
     """
     acquisition = state.operations.acquisition
     if acquisition.under_way:
-        return _interrupted(state, "the service ended")
+        return _interrupt(state, "the service ended")
     aborted = acquisition.stage is AcquisitionStage.ABORTED and state.alpha.registration is None
     lasts = acquisition.stage in _LASTING_STAGES or acquisition.held_off
     return _saved_part(acquisition) if aborted or lasts else None
@@ -381,7 +381,7 @@ def _saved_part(acquisition: Acquisition) -> Acquisition:
     return replace(acquisition, alpha=None, covariance=None, command=None, applied=None, windows=0)
 
 
-def _interrupted(state: TrackerState, cause: str) -> Acquisition:
+def _interrupt(state: TrackerState, cause: str) -> Acquisition:
     session = None if state.loop.rtc is None else state.loop.rtc.session
     doing = f"{state.operations.acquisition.stage}: {state.operations.acquisition.text}"
     interruption = Interruption(doing=doing, session=session, cause=cause)

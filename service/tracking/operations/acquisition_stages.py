@@ -231,7 +231,7 @@ def explain_acquisition(state: TrackerState, policy: Policy, now_ns: int) -> str
             return f"{alarm.name} for {lasted_ns / SECOND_NS:.0f} s"
     # Bad telemetry alone also refuses windows. Only a loop that has stopped correcting is opened
     # for it.
-    if missed_enough(state) and not state.loop.holds:
+    if has_missed_enough(state) and not state.loop.holds:
         return f"{acquisition.misses} windows in a row found no registration"
     return None
 
@@ -245,7 +245,7 @@ def _goes_back(state: TrackerState) -> bool:
     }
 
 
-def missed_enough(state: TrackerState) -> bool:
+def has_missed_enough(state: TrackerState) -> bool:
     """Return whether so many windows in a row found no registration that it is no chance."""
     is_known = state.alpha.registration is not None and state.alpha.registration.usable
     return state.operations.acquisition.misses >= (
@@ -414,7 +414,7 @@ def on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
         return
     if rtc is None or not before.uses_wide_capture or estimate.session != rtc.session:
         return
-    if not _of_stage(context, rtc, estimate.modes):
+    if not _is_of_stage(context, rtc, estimate.modes):
         return
     covariance = estimate.covariance + np.diag(band_of(before.stage).floor ** 2)
     set_acquisition(context, replace(before, alpha=estimate.alpha, covariance=covariance))
@@ -508,7 +508,7 @@ def _to_give_back(state: TrackerState) -> LoopFound | None:
     return found
 
 
-def _of_stage(context: StepContext, rtc: Status, modes: tuple[int, ...]) -> bool:
+def _is_of_stage(context: StepContext, rtc: Status, modes: tuple[int, ...]) -> bool:
     """Return whether these are the modes of the present stage."""
     dither = wide_capture_dither(context.acquisition.stage, rtc, context.policy, 0)
     return not isinstance(dither, str) and dither.request.modes == modes

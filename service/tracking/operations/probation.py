@@ -276,7 +276,7 @@ def _await_opening(context: StepContext, trial: Probation, event: Event) -> None
             set_loop(context, cmd.SetLoop(loop="open"))
 
 
-def opening_text(context: StepContext) -> str | None:
+def explain_opening(context: StepContext) -> str | None:
     """Return that the loop was lost and is asked to open, and whether it did; None: it is not."""
     trial, asked = context.operations.probation, context.loop.command
     if trial is None or trial.state not in {ProbationState.OPENING, ProbationState.OPENED}:

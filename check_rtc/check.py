@@ -26,7 +26,7 @@ from service.config import load_instrument, packaged_instrument
 from service.config.link_tables import ZenohTable, link_security, read_link_tables
 from service.errors import ConfigurationError, LinkError, ModelError, say, shown
 from service.estimation.lockin import LockInEstimate, Spectra
-from service.estimation.slope_convention import SlopeConvention, of_reconstructor
+from service.estimation.slope_convention import SlopeConvention, identify_from_reconstructor
 from service.estimation.windows import ClosedLoop, WindowRefused
 from service.files.disk_cache import DiskCache, usual_folder
 from service.link.session import Endpoint
@@ -177,7 +177,7 @@ def compare_matrix(instrument: Instrument, matrix: NDArray[np.float32]) -> Slope
                 f"{len(response)} slopes and {response.shape[1]} modes"
                 f"{likely_kind(matrix.shape[1], len(response))}"
             )
-        convention = of_reconstructor(
+        convention = identify_from_reconstructor(
             matrix, instrument, basis, near=instrument.start, response=response
         )
     except ModelError as error:

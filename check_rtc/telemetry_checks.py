@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from check_rtc.requirements import CheckResult, fine, seen, skipped, wrong
 from check_rtc.watch import Arrival, TelemetryObserver, select_session, sort_by_frame
-from service.estimation.orientation import setting_written
+from service.estimation.orientation import format_setting
 from service.estimation.slope_convention import SlopeConvention
 from service.runtime.readiness import MAX_STATUSES_HZ
 from service.wire import Keys, Manifest, Status
@@ -471,9 +471,7 @@ def _orientation(_: TelemetryObserver, context: TelemetryContext) -> CheckResult
     if convention.found is None:
         return skipped("orientation", "the matrix in use does not determine it")
     origin = "not set in the instrument file" if convention.adopted else "as in the instrument file"
-    return fine(
-        "orientation", f"{setting_written(convention.found)} by the matrix in use: {origin}"
-    )
+    return fine("orientation", f"{format_setting(convention.found)} by the matrix in use: {origin}")
 
 
 def _late_join(observer: TelemetryObserver, context: TelemetryContext) -> CheckResult:

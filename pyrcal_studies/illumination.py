@@ -21,7 +21,7 @@ from service.model.interaction import InteractionModel
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import karhunen_loeve_basis
 from service.model.pupil import Illumination
-from service.model.sensors.pyramid.light import PyramidLight, find_pupil, measured_illumination
+from service.model.sensors.pyramid.light import PyramidLight, find_pupil, measure_illumination
 from service.model.sensors.sensor import CannotTell
 
 N_FRAMES = 100
@@ -65,7 +65,7 @@ def main() -> None:
             noise = noise_share(measured, telescope.detector.sigma, given.averages)
             lights: dict[str, Illumination | None] = {
                 "even": None,
-                "measured": measured_illumination(counts, instrument, position),
+                "measured": measure_illumination(counts, instrument, position),
             }
             for name, illumination in lights.items():
                 model = InteractionModel(instrument, basis, illumination=illumination)

@@ -170,7 +170,7 @@ def _on_made(context: StepContext, made: ev.MatrixMade) -> None:
 
 def _on_dither_measured(context: StepContext, event: ev.DitherMeasured) -> None:
     """Stop a dither that is measured to be stronger than requested."""
-    reason = dither.why_too_strong(context, event)
+    reason = dither.check_measured_dither(context, event)
     if reason is not None:
         noisy_measurement.fail_noisy_measurement(
             context, f"its dither was too strong: {event.text}"

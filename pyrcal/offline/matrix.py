@@ -66,8 +66,8 @@ from service.estimation.orientation import (
     MIN_CORRELATION,
     MIN_CORRELATION_LEAD,
     Search,
+    check_stated_orientation,
     find_orientation,
-    overruled,
 )
 from service.estimation.reference import Reference, Target, is_by_actuator, target_of
 from service.model.aperture import check_mask
@@ -417,7 +417,7 @@ def _axes(
         return best.slopes, pose, search.refusal
     if best.correlation >= DOUBTFUL_CORRELATION:
         return best.slopes, pose, ""
-    return best.slopes, pose, overruled(best, search_about(about, None).best)
+    return best.slopes, pose, check_stated_orientation(best, search_about(about, None).best)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -12,7 +12,13 @@ from pyrcal_studies.campaign.observatory import Latencies, Observatory
 from pyrcal_studies.campaign.observatory_dome import Dome
 from pyrcal_studies.campaign.observatory_link import ShortLink
 from service.archive import Archive
-from service.runtime.archiving import SAVE_INTERVAL_S, is_unsaved, is_urgent, leave, taken_up
+from service.runtime.archiving import (
+    SAVE_INTERVAL_S,
+    is_unsaved,
+    is_urgent,
+    leave,
+    restore_tracking,
+)
 from service.runtime.worker import OpticsWorker
 from service.tracking.events import Event
 from service.tracking.policy import Policy
@@ -81,7 +87,7 @@ class KeptNight(Observatory):
             operator=OperatorState(mode=self._mode),
             matrices=MatrixStates(reconstructors=restored(self._archive.reconstructors.records())),
         )
-        self._engine.state = taken_up(self._archive, state, self._policy, self.now_ns())
+        self._engine.state = restore_tracking(self._archive, state, self._policy, self.now_ns())
         self._engine.begin_anew()
         self._begin()
 

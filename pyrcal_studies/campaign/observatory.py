@@ -23,10 +23,10 @@ from pyrcal_studies.campaign.observatory_dome import Dome
 from pyrcal_studies.campaign.observatory_link import OwnHands, Shelf, ShortLink
 from service.errors import PyrcalError
 from service.estimation.dither_windows import EndedWindow
-from service.estimation.loop import commanded_gains
+from service.estimation.loop import select_gains
 from service.estimation.passive_sums import PASSIVE_INTERVAL_S
 from service.estimation.random_dither import Correlated
-from service.runtime.actions import Actions, Publishing, judged_now
+from service.runtime.actions import Actions, Publishing, present_conditions
 from service.runtime.engine import Engine
 from service.runtime.estimates import PendingWindow, fit_passive, fitted, read_own_matrix
 from service.runtime.ports import StorePort
@@ -206,7 +206,7 @@ class Observatory:
             parent=state.matrices.in_use,
             sha256=checksum(matrix),
             gate=margin,
-            judged=judged_now(state, commanded_gains(rtc, n_modes)),
+            judged=present_conditions(state, select_gains(rtc, n_modes)),
         )
         self._shelf.reconstructors.store(record, matrix, registration.total_covariance, {})
         self._post(ev.MatrixMade(record=record, wanted=True))

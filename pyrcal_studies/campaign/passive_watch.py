@@ -17,7 +17,7 @@ from service.config.policy import policy_of
 from service.estimation.kalman import (
     Drift,
     Joint,
-    allowing,
+    allow_scatter,
     begin_joint,
     corrected,
     forget,
@@ -167,7 +167,7 @@ class Watch:
         if prior is not None:
             if not prior.biases:
                 prior = forget(prior, found.bias)
-            prior = allowing(prior, found.bias, found.bias_excess)
+            prior = allow_scatter(prior, found.bias, found.bias_excess)
             self._joint = corrected(prior, found.alpha.vector, found.covariance, found.bias)
             measured["followed"] = self._joint.alpha
             own = np.diag(self._joint.alpha_covariance)

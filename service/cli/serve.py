@@ -34,7 +34,7 @@ from service.files.last_telemetry import LastTelemetry
 from service.model.instrument import Instrument, instrument_sha256
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.actions import Actions, Publishing
-from service.runtime.archiving import taken_up
+from service.runtime.archiving import restore_tracking
 from service.runtime.clock import ServiceClock
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitLimits, FitQueue
@@ -253,7 +253,7 @@ def _supervisor(
         loop=LoopState(basis_id=instrument.basis_id, config_id=instrument.config_id),
     )
     return Supervisor(
-        state=taken_up(archive, state, policy, clock.now_ns()),
+        state=restore_tracking(archive, state, policy, clock.now_ns()),
         policy=policy,
         bridge=bridge,
         workers=workers,

@@ -220,7 +220,7 @@ class Before:
         cls, cm_id: str, parts: tuple[Part, ...], modes: NDArray[np.intp], part_s: float
     ) -> Before:
         """Return the reference from these parts of a matrix that controls these modes."""
-        groups = grouped(parts, part_s)
+        groups = group_parts(parts, part_s)
         n_recent = min(max(round(REFERENCE_PERIOD_S / GROUP_S), 2), len(groups))
         powers = _powers(groups)
         power = np.asarray(np.median(powers[-n_recent:], axis=0))
@@ -268,7 +268,7 @@ def measure_sigma(logs: Array, min_sigma: float, *, lower_half: bool = False) ->
     return max(float(np.sqrt(found)), min_sigma)
 
 
-def grouped(parts: tuple[Part, ...], part_s: float) -> tuple[Part, ...]:
+def group_parts(parts: tuple[Part, ...], part_s: float) -> tuple[Part, ...]:
     """Return the sums over groups of parts, the newest whole; an incomplete first one is left out.
 
     Fewer parts than one group are summed as they are.
@@ -296,7 +296,7 @@ def compared(
     not is no worse.
     """
     looked = _Look(n_last=max(round(LARGE_CHANGE_PERIOD_S / before.part_s), 2), decides=decides)
-    series = grouped(parts, before.part_s) if decides else parts
+    series = group_parts(parts, before.part_s) if decides else parts
     after = _powers(series)
     moving = modes[np.median(after, axis=0)[modes] > 0.0]
     if len(moving) == 0:

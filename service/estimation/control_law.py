@@ -181,11 +181,11 @@ def judged(
     if len(at) < MIN_FRAMES:
         return law, None
     law = replace(law, judged_seq=int(law.seq[at[-1]]))
-    fits = _fitted(law.commands_m.astype(float), law.seen_m.astype(float), at, n_taps)
+    fits = _fit_laws(law.commands_m.astype(float), law.seen_m.astype(float), at, n_taps)
     clear = np.flatnonzero(fits.clear)
     if 2 * len(clear) < len(law.modes) or not len(clear):
         return law, None
-    return law, _compared(fits, clear, loop.gains[law.modes].astype(float), loop)
+    return law, _compare_law(fits, clear, loop.gains[law.modes].astype(float), loop)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -201,7 +201,7 @@ class _Fits:
     delay_frames: Array
 
 
-def _fitted(commands: Array, seen: Array, at: Array, n_taps: int) -> _Fits:
+def _fit_laws(commands: Array, seen: Array, at: Array, n_taps: int) -> _Fits:
     """Return the law of every mode, by the normal equations: a few unknowns, hundreds of frames.
 
     A constant is free for every mode, and leaves with the means.
@@ -233,7 +233,7 @@ def _fitted(commands: Array, seen: Array, at: Array, n_taps: int) -> _Fits:
     )
 
 
-def _compared(fits: _Fits, clear: Array, gains: Array, loop: ClosedLoop) -> IdentifiedLaw:
+def _compare_law(fits: _Fits, clear: Array, gains: Array, loop: ClosedLoop) -> IdentifiedLaw:
     leak, sigma, late = (
         float(np.median(found[clear])) for found in (fits.leak, fits.leak_sigma, fits.delay_frames)
     )

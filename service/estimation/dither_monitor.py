@@ -174,7 +174,7 @@ def measure_block(
     stop = max(min(asked.stop_seq - block.first_seq, block.n_frames), 0)
     while start < stop:
         end = min(start + _enough(asked) - monitor.n_frames, stop)
-        monitor, new = _added(monitor, block.rows(start, end))
+        monitor, new = _add_frames(monitor, block.rows(start, end))
         start, found = end, new or found
     return monitor, found
 
@@ -183,7 +183,7 @@ def _enough(asked: ExpectedDither) -> int:
     return max(round(CHECK_INTERVAL_S * asked.frame_rate_hz), MIN_FRAMES)
 
 
-def _added(
+def _add_frames(
     monitor: DitherMonitor, block: FrameBlock
 ) -> tuple[DitherMonitor, DitherMeasurement | None]:
     """Add frames that fill a second at most."""
@@ -191,7 +191,7 @@ def _added(
     if dither is None or not block.is_dithered:
         return monitor, None
     squares = np.einsum("km,km->m", dither, dither).astype(float)
-    monitor, lines = _demodulated(monitor, block, dither[:, list(asked.modes)])
+    monitor, lines = _demodulate(monitor, block, dither[:, list(asked.modes)])
     monitor = _add_slopes(monitor, block.slopes, block.first_seq)
     monitor = replace(
         monitor,
@@ -202,7 +202,7 @@ def _added(
     if monitor.n_frames < _enough(asked):
         return monitor, None
     powers = _powers(monitor)
-    unanswered = _unanswered(powers, asked)
+    unanswered = _check_response(powers, asked)
     found, doubted = _found(monitor)
     begun = DitherMonitor(
         asked=asked, last_m=monitor.last_m, next_seq=monitor.next_seq, doubted=doubted
@@ -212,7 +212,7 @@ def _added(
     return begun, replace(found, unanswered=unanswered)
 
 
-def _demodulated(
+def _demodulate(
     monitor: DitherMonitor, block: FrameBlock, dither: Array
 ) -> tuple[DitherMonitor, Array]:
     """Return ``(2, n_asked)`` sums at the lines; random signs have none and are left out.
@@ -245,11 +245,11 @@ def _add_slopes(monitor: DitherMonitor, slopes: Array, first_seq: int) -> Dither
     return replace(
         monitor,
         slopes=monitor.slopes + summed,
-        n_repeated=monitor.n_repeated + _repeated(slopes),
+        n_repeated=monitor.n_repeated + _count_repeated(slopes),
     )
 
 
-def _repeated(slopes: Array) -> int:
+def _count_repeated(slopes: Array) -> int:
     """Return how many frames have the very slopes of the frame before."""
     first = slopes[:, :_N_COMPARED_SLOPES]
     again = 1 + np.flatnonzero((first[1:] == first[:-1]).all(axis=1))
@@ -273,7 +273,7 @@ def _powers(monitor: DitherMonitor) -> tuple[float, float, float]:
     return before[0] + beyond, before[1] + variance, before[2] + expected
 
 
-def _unanswered(powers: tuple[float, float, float], asked: ExpectedDither) -> str | None:
+def _check_response(powers: tuple[float, float, float], asked: ExpectedDither) -> str | None:
     """Return how the slopes fail to answer the dither; empty: they answer; None: unknown."""
     beyond, variance, expected = powers
     if not expected:
@@ -313,7 +313,7 @@ def _found(monitor: DitherMonitor) -> tuple[DitherMeasurement, bool]:
     said = [
         *_outside_tolerance(asked, carried, wanted, told),
         *_strays(stray, wanted_total),
-        *_hidden(asked, own, told, moved),
+        *_find_hidden_modes(asked, own, told, moved),
     ]
     head = f"the frames hold {1e9 * total:.3g} nm RMS of dither in all, {1e9 * wanted_total:.3g} nm"
     text = f"{head} were asked for: {'; '.join(said)}" if said else ""
@@ -352,7 +352,9 @@ def _strays(stray: Array, wanted_m: float) -> list[str]:
     return [f"modes not asked for ({named}{more}) carry {1e9 * together:.3g} nm"]
 
 
-def _hidden(asked: ExpectedDither, own: Array, reported_m: Array, moved: Array) -> list[str]:
+def _find_hidden_modes(
+    asked: ExpectedDither, own: Array, reported_m: Array, moved: Array
+) -> list[str]:
     """Return which modes outside the loop move more than the columns of the dither say."""
     if not asked.frequency_hz:
         return []

@@ -100,7 +100,7 @@ class FrameBlock:
         )
 
 
-def joined_frames(blocks: tuple[FrameBlock, ...]) -> FrameBlock:
+def join_frames(blocks: tuple[FrameBlock, ...]) -> FrameBlock:
     """Return blocks of which each follows the one before as one.
 
     Without dither columns where one of them has none.

@@ -139,7 +139,7 @@ def with_stretches(joint: Joint, nominal: Array) -> Joint:
     return replace(joint, mean=np.insert(joint.mean, 4, nominal), covariance=covariance, n_alpha=6)
 
 
-def expecting(joint: Joint, nominal: Array) -> Joint:
+def expect_stretches(joint: Joint, nominal: Array) -> Joint:
     """Return the estimate after a first measurement, its anamorphosis as likely as it is expected.
 
     What was measured with it follows as far as it depends on it.
@@ -168,7 +168,7 @@ def forget(joint: Joint, block: BiasBlock, excess: Array | None = None) -> Joint
     return replace(joint, mean=mean, covariance=covariance, biases=biases).with_bias(fresh)
 
 
-def allowing(joint: Joint, block: BiasBlock, excess: Array) -> Joint:
+def allow_scatter(joint: Joint, block: BiasBlock, excess: Array) -> Joint:
     """Increase the covariance of a bias by the excess scatter.
 
     Only the excess beyond earlier values is added: a steady wind adds it once, and what was learnt
@@ -234,7 +234,7 @@ def _seen(prior: Joint, sees: Array, measured: Array, noise: Array) -> Joint:
     )
 
 
-def scattered(joint: Joint, block: BiasBlock, innovation: float) -> Joint:
+def update_scatter(joint: Joint, block: BiasBlock, innovation: float) -> Joint:
     """Return the estimate after an innovation, 4 expected, with ``scatter`` learnt from it.
 
     In fast wind the bias swings from look to look, and looks scatter by more than they say.
@@ -257,7 +257,7 @@ def learnt(scatter: float, innovation: float) -> float:
     return max(scatter * (1.0 + SCATTER_LEARNING * (seen - 1.0)), 1.0)
 
 
-def widened(prior: Joint, noise: Array) -> Joint:
+def widen_after_jump(prior: Joint, noise: Array) -> Joint:
     """Return the state after a jump of α; the next measurement must say how far.
 
     The bias is kept: the wind has not moved with the mirror.

@@ -254,7 +254,7 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
     not small, the caller linearises again at the estimate.
     """
     window, every_mode = spectra, linearisation.matrix
-    spectra, linearisation = _of_moved_modes(spectra, linearisation, loop)
+    spectra, linearisation = _select_moved_modes(spectra, linearisation, loop)
     matrix = linearisation.matrix
     coupling = loop.reconstructor @ matrix
     slopes = spectra.slopes[:, 0]
@@ -304,7 +304,7 @@ _FEW_MOVED_RATIO = 6
 """If fewer than one mode in this many moves, the others are left out of the products."""
 
 
-def _of_moved_modes(
+def _select_moved_modes(
     spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop
 ) -> tuple[Spectra, Linearisation]:
     """Return both without modes that nothing moves, where that is most of a large telescope."""
@@ -343,7 +343,7 @@ def closed_loop_responses(
     answer = (np.outer(loop.gains[:n], integrator * gains)).astype(np.complex64)
     own = np.ascontiguousarray(coupling[:, :n])
     first = -answer * _apply(coupling, dither).T
-    reply = _summed(first, answer, own)
+    reply = _sum_series(first, answer, own)
     if reply is None:
         around = answer.T[:, :, None] * own + np.eye(n, dtype=np.complex64)
         reply = np.linalg.solve(around, first.T[:, :, None])[:, :, 0].T
@@ -352,7 +352,7 @@ def closed_loop_responses(
     return total
 
 
-def _summed(first: Array, answer: Array, coupling: Array) -> Array | None:
+def _sum_series(first: Array, answer: Array, coupling: Array) -> Array | None:
     """Return ``(1 + F)^-1 first`` as a series, ``F = answer * coupling``; None: not that way."""
     reply, largest = first, np.abs(first).max(initial=0.0)
     for _ in range(_MAX_TERMS):

@@ -93,7 +93,7 @@ def _same_state(one: Status, other: Status) -> bool:
     return one.session == other.session and one.loop == other.loop
 
 
-def why_open(rtc: Status) -> str:
+def explain_open_loop(rtc: Status) -> str:
     """Return the message for a loop that controls no mode."""
     return "the loop is open" if rtc.loop == Loop.OPEN else "all gains of the loop are 0"
 
@@ -103,13 +103,13 @@ def last_seq(rtc: Status) -> int:
     return -1 if rtc.seq is None else rtc.seq
 
 
-def extended_gains(rtc: Status, n_modes: int) -> tuple[float, ...]:
+def extend_gains(rtc: Status, n_modes: int) -> tuple[float, ...]:
     """Return gains for ``n_modes`` controlled modes: those in force, the last one for new modes."""
     last = rtc.gains[rtc.n_controlled - 1]
     kept = rtc.gains[: min(rtc.n_controlled, n_modes)]
     return (*kept, *(last,) * (n_modes - len(kept)), *(0.0,) * (rtc.n_modes - n_modes))
 
 
-def commanded_gains(rtc: Status, n_modes: int) -> tuple[float, ...]:
+def select_gains(rtc: Status, n_modes: int) -> tuple[float, ...]:
     """Return the gains of the modes that a reconstructor of ``n_modes`` would command."""
-    return extended_gains(rtc, n_modes)[:n_modes]
+    return extend_gains(rtc, n_modes)[:n_modes]

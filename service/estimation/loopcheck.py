@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.estimation.estimator import Change, Detector, FrameContext, LoopContext, Mark
-from service.estimation.frames import FrameBlock, joined_frames
+from service.estimation.frames import FrameBlock, join_frames
 from service.estimation.loop import last_seq
 from service.estimation.windows import ClosedLoop, Telemetry
 
@@ -240,7 +240,7 @@ def observe(check: LoopCheck, block: FrameBlock, loop: ClosedLoop) -> LoopCheck:
         if frames.n_frames == depth and frames.first_seq >= check.from_seq:
             waiting.append(_sample(frames, loop))
     check = replace(check, tail=_last(tail, block, depth), waiting=tuple(waiting))
-    return _multiplied(check, loop) if len(waiting) >= BATCH_SAMPLES else check
+    return _multiply_waiting(check, loop) if len(waiting) >= BATCH_SAMPLES else check
 
 
 def command_residual(
@@ -259,7 +259,7 @@ def command_residual(
     """
     if check.cm_id != loop.cm_id:
         return check, None
-    check = _multiplied(check, loop)
+    check = _multiply_waiting(check, loop)
     near = [b for b in check.batches if b.seq[-1] >= first_seq and b.seq[0] <= last_seq]
     seq = np.concatenate([batch.seq for batch in near] or [np.empty(0, int)])
     chosen = (seq >= first_seq) & (seq <= last_seq)
@@ -268,7 +268,7 @@ def command_residual(
     asked = np.concatenate([batch.asked_m for batch in near], axis=1)[:, chosen].astype(float)
     taken = np.concatenate([batch.taken_m for batch in near])[chosen].astype(float)
     held = np.concatenate([batch.held for batch in near])[chosen].mean(axis=0)
-    return check, _judged(asked, taken, held, loop)
+    return check, _judge(asked, taken, held, loop)
 
 
 def last_samples(check: LoopCheck, before_seq: int) -> tuple[int, int] | None:
@@ -317,7 +317,7 @@ class _Products:
         return np.asarray(np.einsum("i,j,ijm->m", weights, weights, self.asked))
 
 
-def _judged(asked: Array, taken: Array, held: Array, loop: ClosedLoop) -> CommandResidual:
+def _judge(asked: Array, taken: Array, held: Array, loop: ClosedLoop) -> CommandResidual:
     products = _Products.of(asked, taken)
     weights = _lag(products, loop)
     obeys = np.abs(_shares(products, weights)[0] - 1.0) < STEP_TOLERANCE
@@ -371,7 +371,7 @@ def _last(tail: FrameBlock | None, block: FrameBlock, n: int) -> FrameBlock:
     part = block.last(n).without_dither()
     if tail is None or part.n_frames == n:
         return part
-    return joined_frames((tail, part)).last(n)
+    return join_frames((tail, part)).last(n)
 
 
 def _goes_on(tail: FrameBlock, block: FrameBlock) -> bool:
@@ -397,7 +397,7 @@ def _twice(rows: Array) -> Array:
     return np.asarray(rows[2:] - 2 * rows[1:-1] + rows[:-2])
 
 
-def _multiplied(check: LoopCheck, loop: ClosedLoop) -> LoopCheck:
+def _multiply_waiting(check: LoopCheck, loop: ClosedLoop) -> LoopCheck:
     if not check.waiting:
         return check
     slopes = np.stack([sample.slopes for sample in check.waiting], axis=1)

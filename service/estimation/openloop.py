@@ -112,7 +112,7 @@ def find(spectra: Spectra, search: WideCaptureSearch) -> WideCaptureEstimate | W
             continue
         there = search.fine.linearise(landed.alpha)
         estimate = fit_window(alone, there, loop)
-        left = _unexplained(columns, noise, search.fine.interaction_matrix(estimate.alpha))
+        left = _unexplained_share(columns, noise, search.fine.interaction_matrix(estimate.alpha))
         found = WideCaptureEstimate(estimate=estimate, unexplained=left, n_starts=tried)
         why_not = _why_not(found, search)
         if why_not is None:
@@ -150,7 +150,7 @@ def _columns(spectra: Spectra) -> tuple[Columns, Array]:
     return columns, 0.5 * beside / np.abs(known) ** 2
 
 
-def _unexplained(columns: Columns, noise: Array, matrix: Array) -> float:
+def _unexplained_share(columns: Columns, noise: Array, matrix: Array) -> float:
     """Return the mean share of the columns that a matrix leaves, the noise taken off both."""
     power, total = np.sum(matrix**2, axis=0), np.sum(columns.matrix**2, axis=0)
     along = np.maximum(np.sum(matrix * columns.matrix, axis=0), 0.0)

@@ -87,10 +87,10 @@ class Pose:
 
     def reported(self) -> str:
         """Return it in the words of the instrument file."""
-        return f"{setting_written(self.slopes)} at {np.rad2deg(self.rotation_rad):.0f} deg"
+        return f"{format_setting(self.slopes)} at {np.rad2deg(self.rotation_rad):.0f} deg"
 
 
-def setting_written(slopes: SlopeRecipe) -> str:
+def format_setting(slopes: SlopeRecipe) -> str:
     """Return order and orientation of slopes as the instrument file says them."""
     axes = slopes.assumed_orientation
     flags = [f"{name} = true" for name in FLIPS if getattr(axes, name)]
@@ -131,12 +131,12 @@ class Search:
         return ""
 
 
-def overruled(stated: Pose, found: Pose) -> str:
+def check_stated_orientation(stated: Pose, found: Pose) -> str:
     """Return why a stated orientation cannot be the RTC's; empty: it may be."""
     if found.correlation < stated.correlation + 2.0 * MIN_CORRELATION_LEAD:
         return ""
     told = (
-        f"with {setting_written(stated.slopes)} the lowest orders correlate with the model by "
+        f"with {format_setting(stated.slopes)} the lowest orders correlate with the model by "
         f"{stated.correlation:.2f}, with {found.reported()} by {found.correlation:.2f}"
     )
     if found.mirrored is not stated.mirrored:
@@ -163,7 +163,7 @@ def find_orientation(
     stated = instrument.slopes
     settings = [stated] if stated.orientation is not None else list(_settings(stated))
     poses = poses_of(instrument, reference, basis, settings, mapper=mapper, about=about)
-    return _judged(poses, instrument.mirror.nominal_rotation_rad)
+    return _judge_classes(poses, instrument.mirror.nominal_rotation_rad)
 
 
 def poses_of(
@@ -225,7 +225,7 @@ def settings_of(reported: SlopeRecipe, orders: Iterable[SlopeOrder]) -> Iterator
         yield replace(reported, order=listed, orientation=axes)
 
 
-def _judged(poses: list[Pose], nominal_rad: float | None) -> Search:
+def _judge_classes(poses: list[Pose], nominal_rad: float | None) -> Search:
     best = max(pose.correlation for pose in poses)
     near = [pose for pose in poses if pose.correlation > best - MIN_CORRELATION_LEAD]
     leader = max(near, key=lambda pose: pose.correlation)

@@ -181,7 +181,7 @@ class OwnMatrix:
         ]
         if not odd:
             return ""
-        return f"by the RTC's own matrix {_listed(odd)} as strongly as its neighbours"
+        return f"by the RTC's own matrix {_list_in_words(odd)} as strongly as its neighbours"
 
     @property
     def typical_response(self) -> float | None:
@@ -208,7 +208,7 @@ class OwnMatrix:
             return ""
         if len(turned) == 1:
             return f"mode {turned[0]} has the other sign by the RTC's own matrix"
-        return f"modes {_listed(turned)} have the other sign by the RTC's own matrix"
+        return f"modes {_list_in_words(turned)} have the other sign by the RTC's own matrix"
 
     def _order(self) -> str:
         elsewhere = (self.modes >= 0) & (self.modes != self.columns)
@@ -226,11 +226,9 @@ class OwnMatrix:
         place = dict(zip(columns.tolist(), modes.tolist(), strict=True))
         pairs = [(one, to) for one, to in place.items() if place.get(to) == one and one < to]
         if 2 * len(pairs) == len(columns):
-            return (
-                f"modes {_listed([f'{one} and {to}' for one, to in pairs])} are exchanged by the "
-                "RTC's own matrix"
-            )
-        told = _listed([f"{one} is the instrument file's {to}" for one, to in place.items()])
+            exchanged = _list_in_words([f"{one} and {to}" for one, to in pairs])
+            return f"modes {exchanged} are exchanged by the RTC's own matrix"
+        told = _list_in_words([f"{one} is the instrument file's {to}" for one, to in place.items()])
         return f"modes have other places by the RTC's own matrix: {told}"
 
 
@@ -262,12 +260,12 @@ def recognise_modes(
     alpha, near = start, linearise(start)
     n = min(N_FIRST_COLUMNS, len(columns))
     while True:
-        alpha, near = _registered(seen[:, :n], columns[:n], alpha, near, linearise)
+        alpha, near = _fit_registration(seen[:, :n], columns[:n], alpha, near, linearise)
         if n == len(columns):
             break
         n = min(COLUMNS_GROWTH * n, len(columns))
     response = near.matrix_at(alpha)
-    modes = _recognised(seen, columns, response)
+    modes = _recognise_columns(seen, columns, response)
     gains, misfit = np.full((2, len(columns)), np.nan)
     for k in np.flatnonzero(modes >= 0):
         mode = response[:, modes[k]].astype(float)
@@ -348,7 +346,7 @@ def _scatter(
     return np.asarray(inverse @ spread @ inverse.T)
 
 
-def _registered(
+def _fit_registration(
     seen: Array,
     columns: NDArray[np.intp],
     alpha: Misregistration,
@@ -360,7 +358,7 @@ def _registered(
         if np.any(np.abs(alpha.vector - near.alpha.vector) > LINEAR_RANGE):
             near = linearise(alpha)
         response = near.matrix_at(alpha)
-        modes = _recognised(seen, columns, response)
+        modes = _recognise_columns(seen, columns, response)
         usable = np.flatnonzero(modes >= 0)
         if len(usable) < 3:
             return alpha, near
@@ -374,7 +372,7 @@ def _registered(
     return alpha, near
 
 
-def _recognised(
+def _recognise_columns(
     seen: Array, columns: NDArray[np.intp], response: NDArray[np.float32]
 ) -> NDArray[np.intp]:
     """Return the mode that each column is, ``(n,)``; -1: none.
@@ -408,7 +406,7 @@ def _equations(seen: Array, response: Array, derivatives: Array) -> tuple[Array,
     return np.einsum("jsm,ksm->jk", moved, moved), np.einsum("jsm,sm->jm", moved, left)
 
 
-def _listed(things: Sequence[object] | NDArray[np.intp]) -> str:
+def _list_in_words(things: Sequence[object] | NDArray[np.intp]) -> str:
     """Return the first of some things in words, and how many more there are."""
     first = [str(thing) for thing in things[:_MAX_LISTED_MODES]]
     more = len(things) - len(first)

@@ -24,7 +24,7 @@ from typing_extensions import override
 from service.errors import ModelError
 from service.estimation.estimate import PassiveEstimate
 from service.estimation.estimator import FrameContext, LoopContext
-from service.estimation.frames import FrameBlock, joined_frames
+from service.estimation.frames import FrameBlock, join_frames
 from service.estimation.passive_sums import MIN_FRAMES_PER_MODE, PASSIVE_INTERVAL_S, PassiveSums
 from service.estimation.solver import Columns
 from service.estimation.windows import CHUNK_FRAMES
@@ -277,21 +277,21 @@ def accumulate(state: Passive, block: FrameBlock) -> Passive:
         return state
     n_columns, block = block.commands_m.shape[1], _with_dither_beside(state, block)
     if state.tail is not None and not _follows(block, state.tail):
-        state = replace(_ended(state), tail=None)
+        state = replace(_end_run(state), tail=None)
     before = () if state.tail is None else (state.tail,)
     n_others = len(_others(state, *before, block))
     if state.n_waiting and n_others != state.n_others:
         # a dither begins or ends: what it is taken out of must hold it from end to end
-        state = _ended(state)
+        state = _end_run(state)
     if block.commands_m.shape[1] == n_columns:  # a dither of the loop's modes is no noise
-        state = _sampled(state, *before, block)
-    tail = block if block.n_frames >= _FILTER_SPAN_FRAMES else joined_frames((*before, block))
+        state = _keep_sample(state, *before, block)
+    tail = block if block.n_frames >= _FILTER_SPAN_FRAMES else join_frames((*before, block))
     waiting = (*(state.waiting or before), block)
     state = replace(state, tail=tail.last(_FILTER_SPAN_FRAMES), waiting=waiting, n_others=n_others)
     if state.n_waiting < CHUNK_FRAMES + TAPER_FRAMES:
         return state
-    frames = joined_frames(waiting)
-    state = _summed(state, frames.rows(0, frames.n_frames - TAPER_FRAMES), last=False)
+    frames = join_frames(waiting)
+    state = _sum_frames(state, frames.rows(0, frames.n_frames - TAPER_FRAMES), last=False)
     return replace(state, waiting=(frames.last(_FILTER_SPAN_FRAMES + TAPER_FRAMES),), begun=True)
 
 
@@ -317,10 +317,10 @@ def _follows(block: FrameBlock, tail: FrameBlock) -> bool:
     return block.follows(tail) and block.commands_m.shape[1] == tail.commands_m.shape[1]
 
 
-def _ended(state: Passive) -> Passive:
+def _end_run(state: Passive) -> Passive:
     """Return the state after the end of a run: what waits fades out, or was too short to count."""
     if state.n_waiting >= (1 if state.begun else 2 * TAPER_FRAMES):
-        state = _summed(state, joined_frames(state.waiting), last=True)
+        state = _sum_frames(state, join_frames(state.waiting), last=True)
     return replace(state, waiting=(), begun=False)
 
 
@@ -331,7 +331,7 @@ def _others(state: Passive, *blocks: FrameBlock) -> NDArray[np.intp]:
     return others[:0] if len(others) > MAX_OTHER_MODES else others
 
 
-def _sampled(state: Passive, *blocks: FrameBlock) -> Passive:
+def _keep_sample(state: Passive, *blocks: FrameBlock) -> Passive:
     """Keep one filtered frame in ``SAMPLE_FRAMES``; all blocks but the last are short."""
     first, n_rows = (
         blocks[0].first_seq,
@@ -340,7 +340,7 @@ def _sampled(state: Passive, *blocks: FrameBlock) -> Passive:
     n_due = (first + n_rows) // SAMPLE_FRAMES - first // SAMPLE_FRAMES
     if n_rows < 1 or not n_due:
         return state
-    head = joined_frames(tuple(block.rows(0, N_TAPS) for block in blocks)).rows(0, N_TAPS)
+    head = join_frames(tuple(block.rows(0, N_TAPS) for block in blocks)).rows(0, N_TAPS)
     n_before, chosen = n_rows + _FILTER_SPAN_FRAMES - blocks[-1].n_frames, state.instrument_filter
     later = range(SAMPLE_FRAMES - n_before, n_rows - n_before, SAMPLE_FRAMES)[: n_due - 1]
     samples = list(state.samples)
@@ -350,7 +350,7 @@ def _sampled(state: Passive, *blocks: FrameBlock) -> Passive:
     return replace(state, samples=tuple(samples[-SAMPLES_KEPT:]))
 
 
-def _summed(state: Passive, frames: FrameBlock, *, last: bool) -> Passive:
+def _sum_frames(state: Passive, frames: FrameBlock, *, last: bool) -> Passive:
     """Add frames to the sums: the first of a run, the last, or some between."""
     chosen, commands = state.instrument_filter, frames.commands_m
     # those that the filter reaches both ends of
@@ -433,8 +433,8 @@ def fit(state: Passive, linearisation: Linearisation) -> PassiveEstimate | None:
     some, carried = state.instruments, found.carried
     estimate = fit_matrix(
         found,
-        _seen_by(linearisation.matrix, some, carried),
-        _seen_by(linearisation.derivatives, some, carried),
+        _project_instruments(linearisation.matrix, some, carried),
+        _project_instruments(linearisation.derivatives, some, carried),
         linearisation.alpha,
     )
     whole = found.matrix
@@ -447,13 +447,13 @@ def fit(state: Passive, linearisation: Linearisation) -> PassiveEstimate | None:
     return replace(estimate, misfit=estimate.misfit / _slope_variance(state, whole))
 
 
-def _seen_by(matrix: Array, some: NDArray[np.intp], carried: Array) -> Array:
+def _project_instruments(matrix: Array, some: NDArray[np.intp], carried: Array) -> Array:
     """Return columns of instruments ``(..., n_instruments)`` with what moves with them."""
     own = _of(matrix, some)
     if not len(carried):
         return own
     if matrix.ndim == 3:
-        return np.stack([_seen_by(one, some, carried) for one in matrix])
+        return np.stack([_project_instruments(one, some, carried) for one in matrix])
     n_modes = len(some) + len(carried)
     others = np.delete(matrix[:, :n_modes], some, axis=1)
     return np.asarray(own + others @ carried.astype(matrix.dtype))

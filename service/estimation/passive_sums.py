@@ -13,7 +13,7 @@ from typing_extensions import override
 from service.estimation.estimate import PassiveEstimate
 from service.estimation.estimator import Change, Estimator, LoopContext, Mark
 from service.estimation.frames import FrameBlock
-from service.estimation.loop import why_open
+from service.estimation.loop import explain_open_loop
 from service.model.interaction import Linearisation
 
 PASSIVE_INTERVAL_S = 4.0
@@ -105,7 +105,7 @@ class PassiveSums(Estimator):
         since_ns = sums.since_ns_utc if beside else 0
         if now_ns - since_ns < MIN_PASSIVE_S * 1e9 and since_ns:
             return sums, None
-        why = sums.why_none(loop)
+        why = sums.check_fittable(loop)
         if loop.rtc is None or why is not None:
             return sums, why
         rate_hz = loop.rtc.frame_rate_hz
@@ -120,12 +120,12 @@ class PassiveSums(Estimator):
         )
         return begun, sums
 
-    def why_none(self, loop: LoopContext) -> str | None:
+    def check_fittable(self, loop: LoopContext) -> str | None:
         """Return why the sums cannot be fitted, or None."""
         if loop.rtc is None:
             return "no passive estimate: there is no telemetry that could be used"
         if not loop.rtc.in_loop:
-            return f"no passive estimate: {why_open(loop.rtc)}"
+            return f"no passive estimate: {explain_open_loop(loop.rtc)}"
         if self.why_unusable is not None:
             return self.why_unusable
         least = MIN_FRAMES_PER_MODE * self.n_instruments

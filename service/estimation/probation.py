@@ -197,12 +197,12 @@ def observe(
     for start, stop in pairwise(cuts):
         some = block.rows(start, stop)
         if some.cm_id != state.cm_id or (state.session and some.session != state.session):
-            state = _swapped(state, some)
+            state = _begin_comparison(state, some)
         if state.before is None and state.healthy is None:
             state = _believe(state, matrix)
         elif state.before is not None and matrix is not state.own:
             state = _read_by(state, state.before, matrix)
-        state = _observed(_note_runaway(state, some), some, modes, lines_hz, edge)
+        state = _observe(_note_runaway(state, some), some, modes, lines_hz, edge)
     return state
 
 
@@ -240,16 +240,16 @@ def _note_runaway(state: Comparison, block: FrameBlock) -> Comparison:
     found = ProbationFinding(
         verdict=Verdict.WORSE, before=before.id, after=block.cm_id, text=text, lost=True
     )
-    return _ended(state, found)
+    return _end_comparison(state, found)
 
 
-def _ended(state: Comparison, found: ProbationFinding) -> Comparison:
+def _end_comparison(state: Comparison, found: ProbationFinding) -> Comparison:
     """Return what is left of a comparison that is over."""
     healthy = state.before if found.verdict is Verdict.WORSE else None
     return replace(state, found=found, before=None, healthy=healthy, n_runaway=0)
 
 
-def _observed(
+def _observe(
     state: Comparison,
     block: FrameBlock,
     modes: NDArray[np.intp],
@@ -278,10 +278,10 @@ def _observed(
     if len(steps) < 3 * (1 + 2 * len(lines)):
         return state
     part = replace(_part(block, steps, lines, edge), residual=residual)
-    return _looked(_added(state, part, block), block)
+    return _judge_parts(_add_sums(state, part, block), block)
 
 
-def _swapped(state: Comparison, block: FrameBlock) -> Comparison:
+def _begin_comparison(state: Comparison, block: FrameBlock) -> Comparison:
     """Return what is compared from now on: what there is of the matrix until now is the before."""
     same_session = state.session == block.session
     fresh = Comparison(cm_id=block.cm_id, dithered=state.dithered, of_loop=state.of_loop)
@@ -340,7 +340,7 @@ def _sines(n_frames: int, lines: tuple[float, ...]) -> NDArray[np.float32]:
     return np.asarray(basis, np.float32)
 
 
-def _added(state: Comparison, part: Part, block: FrameBlock) -> Comparison:
+def _add_sums(state: Comparison, part: Part, block: FrameBlock) -> Comparison:
     """Add sums to the part under way, or begin another one."""
     dt_s, parts = block.dt_ns * 1e-9, state.parts
     length = max(PART_S / dt_s, MIN_PART_FRAMES)
@@ -359,7 +359,7 @@ def _added(state: Comparison, part: Part, block: FrameBlock) -> Comparison:
     return replace(state, parts=parts)
 
 
-def _looked(state: Comparison, block: FrameBlock) -> Comparison:
+def _judge_parts(state: Comparison, block: FrameBlock) -> Comparison:
     """Judge what there is, at the end of each part; say nothing before there is enough."""
     before = state.before
     if before is None or block.cm_id is None:
@@ -380,4 +380,4 @@ def _looked(state: Comparison, block: FrameBlock) -> Comparison:
     waits = found.verdict is (Verdict.WORSE if state.returned else Verdict.AS_GOOD)
     if waits and not over and not (state.returned and found.lost):
         return state
-    return _ended(state, replace(found, after_s=after_s))
+    return _end_comparison(state, replace(found, after_s=after_s))

@@ -141,7 +141,7 @@ class RandomDither(WindowCutter[RandomPlan, Correlations | None, Correlated]):
             batch = (place + start) * n_batches // n_frames
             next_batch = -(-(batch + 1) * n_frames // n_batches)
             end = min(block.n_frames, next_batch - place)
-            sums = self._summed(sums, block.rows(start - self.overlap, end), batch)
+            sums = self._sum_batch(sums, block.rows(start - self.overlap, end), batch)
             start = end
         return sums
 
@@ -158,12 +158,12 @@ class RandomDither(WindowCutter[RandomPlan, Correlations | None, Correlated]):
             return WindowRefused(reason=refusal, t_ns_utc=window.next_t_ns)
         return Correlated(plan=self.plan, sums=sums, **window.telemetry)
 
-    def _summed(self, sums: Correlations | None, block: FrameBlock, batch: int) -> Correlations:
+    def _sum_batch(self, sums: Correlations | None, block: FrameBlock, batch: int) -> Correlations:
         """Return the sums with the frames of a batch, the last one before them included."""
         if block.dither_m is None:
             raise ValueError("no block without dither columns comes this far")
         plan, slopes, dither = self.plan, block.slopes, block.dither_m[:, list(self.plan.modes)]
-        done = sums or _nothing(plan, slopes)
+        done = sums or _empty_sums(plan, slopes)
         fresh = slopes[1:] - np.float32(done.memory) * slopes[:-1]
         done.response[batch] += fresh.T @ dither[1:]
         done.late[...] += slopes[1:].T @ dither[:-1, plan.late_columns]
@@ -198,7 +198,7 @@ def joined(one: Correlated, other: Correlated) -> Correlated:
     )
 
 
-def _nothing(plan: RandomPlan, slopes: Array) -> Correlations:
+def _empty_sums(plan: RandomPlan, slopes: Array) -> Correlations:
     """Return empty sums; these first rows say how the slopes remember the frame before."""
     n_slopes, n_dithered = slopes.shape[1], len(plan.modes)
     power = float(np.vdot(slopes, slopes))
@@ -367,10 +367,10 @@ def _answers(
     louder = np.sqrt(sums.slope_power.sum() / sums.noise_power.sum())
     late = later * np.sqrt(norm) / louder
     lag = max(later / (at_once + later), 0.0) if at_once + later > 0.0 else 0.0
-    return min(lag, 1.0), _why_nothing_to_fit(seen, late)
+    return min(lag, 1.0), _check_responses(seen, late)
 
 
-def _why_nothing_to_fit(seen: float, late: float) -> Why | None:
+def _check_responses(seen: float, late: float) -> Why | None:
     """Return why there is nothing to fit, from the significance of both answers, in σ."""
     if seen > RESPONSE_SIGMA:
         return None

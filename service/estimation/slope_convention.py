@@ -20,8 +20,8 @@ from service.estimation.orientation import (
     MIN_CORRELATION,
     MIN_CORRELATION_LEAD,
     Pose,
+    format_setting,
     poses_of,
-    setting_written,
     settings_of,
     sign_written,
 )
@@ -81,7 +81,7 @@ class SlopeConvention:
     """Rough rotation of the mirror from the same source; None if it cannot be determined."""
 
 
-def of_reconstructor(
+def identify_from_reconstructor(
     reconstructor: NDArray[np.float32],
     instrument: Instrument,
     basis: Basis,
@@ -116,11 +116,11 @@ def of_reconstructor(
         return SlopeConvention(
             wrong=unit or f"the RTC's matrix answers to hardly any slope: {error}"
         )
-    axes = _judged(poses, instrument, near.rotation_rad)
+    axes = _judge_candidates(poses, instrument, near.rotation_rad)
     return replace(axes, wrong="; ".join(part for part in (unit, axes.wrong) if part))
 
 
-def of_answer(
+def identify_from_response(
     slopes: Array, expected: Array, turns_rad: Array, instrument: Instrument
 ) -> SlopeConvention:
     """Return what the slopes that answer a dither say.
@@ -135,7 +135,7 @@ def of_answer(
         ``(n_lines,)`` phase by which each line advances in a frame: slopes that lag by half a
         period are no slopes of the other sign.
     """
-    reported, mask = _reported(instrument), rtc_valid_subapertures(instrument)
+    reported, mask = _report_recipe(instrument), rtc_valid_subapertures(instrument)
     model = _planes(expected, reported, mask)
     as_seen = _planes(slopes, reported, mask)
     as_stated = _resemblance(as_seen, model)
@@ -156,7 +156,10 @@ def of_answer(
     best = max(every.values())
     if best < MIN_AXES_CORRELATION or as_stated * OTHER_AXES_ADVANTAGE > best or lagging > best:
         return SlopeConvention(wrong=unit)
-    if len(slopes) > _ONE_MODE and np.sum(_of_lines(as_seen, model) < MIN_AXES_CORRELATION) == 1:
+    if (
+        len(slopes) > _ONE_MODE
+        and np.sum(_correlate_lines(as_seen, model) < MIN_AXES_CORRELATION) == 1
+    ):
         return SlopeConvention(wrong=unit)
     alike = [setting for setting, much in every.items() if much > best - MIN_CORRELATION_LEAD]
     found = min(alike, key=lambda setting: _n_changes(setting, reported))
@@ -165,8 +168,10 @@ def of_answer(
     )
 
 
-def _judged(poses: list[Pose], instrument: Instrument, start_rad: float) -> SlopeConvention:
-    reported = _reported(instrument)
+def _judge_candidates(
+    poses: list[Pose], instrument: Instrument, start_rad: float
+) -> SlopeConvention:
+    reported = _report_recipe(instrument)
     best = max(poses, key=lambda pose: pose.correlation)
     stated = instrument.slopes.orientation is not None
     if best.correlation < MIN_CORRELATION:
@@ -197,7 +202,7 @@ def _judged(poses: list[Pose], instrument: Instrument, start_rad: float) -> Slop
     return SlopeConvention(wrong=_axes_named("the RTC's own matrix", found, reported), found=found)
 
 
-def _reported(instrument: Instrument) -> SlopeRecipe:
+def _report_recipe(instrument: Instrument) -> SlopeRecipe:
     return replace(instrument.slopes, orientation=instrument.slopes.assumed_orientation)
 
 
@@ -226,7 +231,7 @@ def _axes_named(witness: str, found: SlopeRecipe, reported: SlopeRecipe) -> str:
     other = "slopes have the other sign" if only_the_sign else "slopes lie otherwise"
     return (
         f"{other} than the instrument file says: {', '.join(differ)} by {witness}. Write "
-        f"[slopes] {setting_written(found)}, and start the service again"
+        f"[slopes] {format_setting(found)}, and start the service again"
     )
 
 
@@ -271,10 +276,10 @@ def _planes(rows: Array, slopes: SlopeRecipe, mask: NDArray[np.bool_]) -> Array:
 
 def _resemblance(seen: Array, model: Array) -> float:
     """Return the mean correlation of the lines, -1..1: one sign for all, no lag."""
-    return float(np.mean(_of_lines(seen, model)))
+    return float(np.mean(_correlate_lines(seen, model)))
 
 
-def _of_lines(seen: Array, model: Array) -> Array:
+def _correlate_lines(seen: Array, model: Array) -> Array:
     """Return the correlation of each line, ``(n_lines,)``, -1..1."""
     lines = (0, 1, 2)
     along = np.sum(seen * model.conj(), axis=lines).real

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.control.loop import ControlLoop
-from service.estimation.frames import FrameBlock, joined_frames
+from service.estimation.frames import FrameBlock, join_frames
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -245,7 +245,7 @@ class Window(Generic[S]):
             n_missing=self.n_missing + lost,
         )
 
-    def why_broken(self, block: FrameBlock, n_frames: int) -> Why | None:
+    def check_continuity(self, block: FrameBlock, n_frames: int) -> Why | None:
         """Return why a window of ``n_frames`` cannot take this block, or None."""
         expected_ns = self.next_t_ns + (block.first_seq - self.next_seq) * block.dt_ns
         if block.session != self.session:
@@ -304,12 +304,12 @@ class WindowCutter(Generic[P, S, F]):
         ended: list[F | WindowRefused] = []
         window, done = self.window, 0
         while done < block.n_frames:
-            window, used, found = self._advanced(window, block.rows(done, block.n_frames))
+            window, used, found = self._advance(window, block.rows(done, block.n_frames))
             done += used
             ended += [] if found is None else [found]
         return replace(self, window=window), ended
 
-    def _advanced(
+    def _advance(
         self, window: Window[S] | None, block: FrameBlock
     ) -> tuple[Window[S] | None, int, F | WindowRefused | None]:
         """Take rows from the start of a block: into the open window, or up to the next one."""
@@ -328,23 +328,23 @@ class WindowCutter(Generic[P, S, F]):
                 dt_ns=block.dt_ns,
                 sums=self.begin(block),
             )
-        why = window.why_broken(block, n_frames)
+        why = window.check_continuity(block, n_frames)
         if why is not None:
             kind, reason = why
             return None, 0, WindowRefused(reason=reason, t_ns_utc=window.next_t_ns, kind=kind)
         end_seq = window.first_seq + n_frames
         if block.first_seq >= end_seq:  # the window's last frames never came
-            return None, 0, self.close(self._added(window).without_rest(n_frames))
+            return None, 0, self.close(self._add_waiting(window).without_rest(n_frames))
         part = block.rows(0, min(block.n_frames, end_seq - block.first_seq, CHUNK_FRAMES))
         window = self._with_rows(window, part)
         if window.next_seq < end_seq:
             return window, part.n_frames, None
-        return None, part.n_frames, self.close(self._added(window))
+        return None, part.n_frames, self.close(self._add_waiting(window))
 
     def _with_rows(self, window: Window[S], rows: FrameBlock) -> Window[S]:
         """Return the window after some rows, which wait until there are enough to be added."""
         if window.waiting and not rows.follows(window.waiting[-1]):
-            window = replace(self._added(window), waiting=())
+            window = replace(self._add_waiting(window), waiting=())
         window = replace(
             window,
             next_seq=rows.next_seq,
@@ -354,13 +354,13 @@ class WindowCutter(Generic[P, S, F]):
             waiting=(*window.waiting, rows),
         )
         enough = sum(block.n_frames for block in window.waiting) >= MIN_SUM_FRAMES
-        return self._added(window) if enough else window
+        return self._add_waiting(window) if enough else window
 
-    def _added(self, window: Window[S]) -> Window[S]:
+    def _add_waiting(self, window: Window[S]) -> Window[S]:
         """Return the window with the frames that wait in its sums."""
         if sum(block.n_frames for block in window.waiting) <= self.overlap:
             return window
-        block = joined_frames(window.waiting)
+        block = join_frames(window.waiting)
         sums = self.add(window.sums, block, block.first_seq - window.first_seq)
         kept = (block.last(self.overlap),) if self.overlap else ()
         return replace(window, sums=sums, waiting=kept)

@@ -175,7 +175,7 @@ def count_waiting(listen: Sequence[str], tables: Sequence[Path] = _SOCKET_TABLES
     return found
 
 
-def flooded_in_words(waiting: Mapping[int, int]) -> str:
+def describe_flood(waiting: Mapping[int, int]) -> str:
     """Return which port keeps programs out, and for how long; empty: none does."""
     return "; ".join(
         f"{n} connections to port {port} were closed before a handshake. A program that connects "
@@ -187,7 +187,7 @@ def flooded_in_words(waiting: Mapping[int, int]) -> str:
     )
 
 
-def refused_in_words(refusals: Sequence[Refusal]) -> str:
+def describe_refusals(refusals: Sequence[Refusal]) -> str:
     """Return the recent refusals in words; empty if there are none."""
     if not refusals:
         return ""
@@ -198,7 +198,7 @@ def refused_in_words(refusals: Sequence[Refusal]) -> str:
     return f"refused on the link: {details}{f'; and {more} more' if more > 0 else ''}"
 
 
-def ending_in_words(certificates: Sequence[EndingCertificate]) -> str:
+def describe_expiry(certificates: Sequence[EndingCertificate]) -> str:
     """Return which certificates end soon or have ended; empty: none."""
     return "; ".join(
         f"the certificate of {one.name} ({one.path}) "

@@ -170,6 +170,7 @@ class Intake:
                 at_s=self._clock(),
             )
         )
+        # Decoding many batches in a row is faster, but zenoh's thread must not fall behind.
         if len(self._arrived) >= MAX_UNDECODED_BATCHES:
             with self._up_to_date():
                 pass
@@ -191,6 +192,8 @@ class Intake:
     def _take_frames(self, arrived: _Arrived) -> None:
         batch = wire.decode_frames(arrived.payload, arrived.attachment)
         endpoint = self._endpoint
+        # Missing frames that zenoh can recover are requested again, which takes longer than
+        # reordering.
         self._patience_s = endpoint.recovery_s if arrived.recoverable else endpoint.reorder_s
         if arrived.latency_s is not None:
             self._latency_s.append(arrived.latency_s)
@@ -236,7 +239,7 @@ class Intake:
             self._counters.add("status", USED, 1, now_s)
             self._essentials = found
             self._last_status_s = now_s
-            self._expected(status.basis_id, status.config_id, now_s)
+            self._check_ids(status.basis_id, status.config_id, now_s)
             self._shape = (status.n_slopes, status.n_modes)
             self._put(status)
 
@@ -287,8 +290,10 @@ class Intake:
         self._wake()
 
     def _put(self, event: LinkEvent) -> None:
+        # The deque drops its oldest event silently.
         self._counted["dropped"] += len(self._events) == MAX_QUEUED_EVENTS
         ring = self._ring
+        # The position in the ring orders the event among the frames: see ``drain``.
         self._events.append(_Put(event=event, ring=ring, end=0 if ring is None else ring.head))
 
     def _is_new(self, complaint: str, now_s: float) -> bool:
@@ -314,9 +319,12 @@ class Intake:
                 ring, end = self._ring, None
                 if before_events and self._events:
                     first = self._events[0]
+                    # A new ring means a new session or new sizes: its frames came after the event.
                     ring, end = (ring, first.end) if first.ring is ring else (None, None)
                 if ring is None:
                     return blocks
+                # The lock is released between two copies, so that zenoh's threads can store frames
+                # meanwhile.
                 more = ring.take(self._clock(), self._patience_s, FRAMES_PER_COPY, end)
                 waiting = ring.due(self._clock(), self._patience_s, end)
             blocks += more
@@ -389,13 +397,15 @@ class Intake:
         """Return whether frames are of the session, basis, configuration and shape that count."""
         if not self._admit("frames", header.session, header.n, now_s):
             return False
-        wrong = self._expected(header.basis_id, header.config_id, now_s) or self._misshapen(header)
+        wrong = self._check_ids(header.basis_id, header.config_id, now_s) or self._check_shape(
+            header
+        )
         if wrong:
             reason, text = wrong
             self._counters.add("frames", reason, header.n, now_s, text)
         return not wrong
 
-    def _misshapen(self, header: wire.FrameHeader) -> tuple[str, str] | None:
+    def _check_shape(self, header: wire.FrameHeader) -> tuple[str, str] | None:
         """Return why frames are not of the sizes that the status says; None: they are."""
         found, expected = (header.n_slopes, header.n_modes), self._shape
         if expected is None or found == expected:
@@ -411,11 +421,14 @@ class Intake:
         self._last_frame_s = now_s
         if self._ring is None or not self._ring.fits(header):
             if self._ring is not None:
+                # Undelivered frames of the previous session are lost with their ring, but counted.
                 self._counts["overwritten"] += self._ring.undelivered
             self._ring = FrameRing(header, self._capacity(header), self._counts)
         batches, wrong = [batch], self._ring.why_not(header)
         if wrong is not None:
             reason, text = wrong
+            # A single wrong number must not make all later frames late: a leap counts only when
+            # more batches continue from it (docs/decisions/0031-sessions-and-services.md).
             batches = self._ring.leapt(batch) if reason == LEAP else []
             if not batches:
                 self._counters.add("frames", reason, header.n, now_s, text)
@@ -442,6 +455,7 @@ class Intake:
         admission = self._sessions.admit(session, now_s)
         if admission.changed:
             self._shape, self._begun_s = None, now_s
+            # The first status of a session is never superfluous.
             self._last_status_s, self._essentials = None, ()
             self._counters.begin()
             self._put(ev.SessionStarted(session=session))
@@ -454,13 +468,15 @@ class Intake:
             self._put(ev.ConditionChanged(name=SECOND_RTC, text=told))
         return admission.accepted
 
-    def _expected(self, basis_id: str, config_id: str, now_s: float) -> tuple[str, str] | None:
+    def _check_ids(self, basis_id: str, config_id: str, now_s: float) -> tuple[str, str] | None:
         """Return which id is not the expected one, None: both are; adopt where none is."""
         if self._basis_id is None or self._config_id is None:
             self._basis_id = self._basis_id or basis_id
             self._config_id = self._config_id or config_id
             told = f"basis {self._basis_id}, configuration {self._config_id}"
             self._put(ev.LogEvent(name="ids.adopted", text=told))
+        # The RTC may change the sensor's mode during a session; all modes of the instrument file
+        # are expected.
         if basis_id == self._basis_id and config_id in self._modes:
             self._config_id = config_id
         expected, found = (self._basis_id, self._config_id), (basis_id, config_id)

@@ -188,15 +188,15 @@ class MeasuredIntake:
         if index is not None:
             self._assembler(name).add(index, data)
         else:
-            manifest = self._checked(name, data)
+            manifest = self._check(name, data)
             if not manifest.layout.n_chunks:
                 self._forget(name)
                 return MeasuredMatrix(manifest=manifest, matrix=None)
             self._assembler(name).announce(manifest.layout)
             self._manifests[name] = manifest
-        return self._finished(name)
+        return self._finish(name)
 
-    def _checked(self, name: str, data: bytes) -> wire.MeasuredManifest:
+    def _check(self, name: str, data: bytes) -> wire.MeasuredManifest:
         manifest = wire.decode(wire.MeasuredManifest, data)
         if (manifest.id, manifest.system) != (name, self._keys.system):
             raise WireError(
@@ -212,7 +212,7 @@ class MeasuredIntake:
             self._pending[name] = wire.ChunkAssembler(MAX_MATRIX_BYTES)
         return self._pending[name]
 
-    def _finished(self, name: str) -> MeasuredMatrix | None:
+    def _finish(self, name: str) -> MeasuredMatrix | None:
         assembler = self._pending[name]
         if not assembler.complete:
             return None

@@ -100,6 +100,8 @@ class FrameRing:
                 f"believed when {LEAP_CONFIRMATIONS} more batches confirm it"
             )
         old = header.seq0 + header.n <= self._head
+        # A late frame has an old number and an old time. A reused number with a new time is an
+        # error of the RTC.
         again = old and header.t0_ns > self._newest_ns
         if again or (-ahead - header.n) * header.dt_ns > MAX_LEAP_S * 1e9:
             return "sequence", (

@@ -269,6 +269,7 @@ def bytes_of(data: zenoh.ZBytes, limit: int, what: str) -> bytes:
     WireError
         If it is longer than ``limit``: then it is not read.
     """
+    # The length is checked before the bytes are copied into Python.
     if len(data) > limit:
         raise WireError(f"range: {what} has {len(data)} bytes, expected at most {limit}")
     return data.to_bytes()
@@ -277,6 +278,7 @@ def bytes_of(data: zenoh.ZBytes, limit: int, what: str) -> bytes:
 def latency_s(session: zenoh.Session, sample: zenoh.Sample, now_ns: int) -> float | None:
     """Return put-to-now of a message its publisher stamped; a router's own stamp says nothing."""
     stamp = sample.timestamp
+    # This session's router stamps what arrives without a timestamp: that would be no latency.
     if stamp is None or str(stamp.get_id()) == str(session.zid()):
         return None
     return (now_ns - stamp.get_time_as_ntp64().as_nanos()) * 1e-9
@@ -302,16 +304,20 @@ def send_command(
     keys = wire.Keys(endpoint.system)
     selector, n_unserved, n_present = keys.command(kind), 0, 0
     for attempt in range(endpoint.command_attempts):
+        # A query to an absent RTC ends at once; without a pause all attempts would fail in
+        # milliseconds.
         if attempt:
             time.sleep(ABSENT_PAUSE_S)
         timeout_s, began_s = endpoint.command_timeout_s, time.monotonic()
         signed = signatures.sign(selector, payload)
         answer = ask(session, selector, timeout_s, signed, wire.Encodings.COMMAND)
         if answer is not None:
-            return _vouched(answer, selector, command, signatures)
+            return _verify(answer, selector, command, signatures)
+        # zenoh ended the query early, so no queryable was there.
         if time.monotonic() - began_s < timeout_s / 2:
             n_unserved += 1
             n_present += bool(tokens(session, keys.alive(wire.Role.RTC)))
+    # The RTC was there each time and does not offer the command.
     if kind in OPTIONAL_COMMANDS and n_present == endpoint.command_attempts:
         reason = f"unsupported: the RTC offers no {kind}"
         return wire.encode(wire.Reply(id=command.id, accepted=False, reason=reason, start_seq=None))
@@ -326,7 +332,7 @@ def send_command(
     )
 
 
-def _vouched(answer: bytes, selector: str, command: wire.Command, signatures: Signatures) -> bytes:
+def _verify(answer: bytes, selector: str, command: wire.Command, signatures: Signatures) -> bytes:
     try:
         signatures.check(selector, answer)
     except WireError as error:
@@ -346,17 +352,17 @@ def fetch_applied(
     LinkError
         If the RTC does not answer or has none.
     """
-    told = _asked(session, keys.applied)
+    told = _request(session, keys.applied)
     signatures.check(keys.applied, told)
     manifest = wire.decode(wire.Manifest, told)
     assembler = wire.ChunkAssembler()
     assembler.announce(manifest.layout)
     for index in range(manifest.layout.n_chunks):
-        assembler.add(index, _asked(session, f"{keys.applied}?chunk={index}"))
+        assembler.add(index, _request(session, f"{keys.applied}?chunk={index}"))
     return manifest, assembler.matrix()
 
 
-def _asked(session: zenoh.Session, selector: str) -> bytes:
+def _request(session: zenoh.Session, selector: str) -> bytes:
     answer = ask(session, selector, MATRIX_TIMEOUT_S)
     if answer is None:
         raise LinkError(f"no answer from the RTC on {selector} within {MATRIX_TIMEOUT_S} s")

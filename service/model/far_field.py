@@ -62,18 +62,18 @@ class PlateSum:
     def heights(self, points: Array) -> Array:
         """Return the modes ``(n_points, n_modes)`` at points ``(n_points, 2)``."""
         out = np.empty((len(points), self.coefficients.shape[1]))
-        for tile, some in self._tiled(points):
+        for tile, some in self._iterate_tiles(points):
             w = _complex(points[some]) - tile.middle
             power = _powers(w, SERIES_DEGREE)
             far = _terms(np.abs(w) ** 2 * power, power)
             near = ThinPlate(self.surface.positions[tile.near]).basis(points[some])
-            out[some] = self._added(tile, far, near)
+            out[some] = self._add_terms(tile, far, near)
         return out
 
     def slopes(self, points: Array, direction: Array) -> Array:
         """Return the derivative of the modes along ``direction``, ``(n_points, n_modes)``."""
         out = np.empty((len(points), self.coefficients.shape[1]))
-        for tile, some in self._tiled(points):
+        for tile, some in self._iterate_tiles(points):
             w, along = _complex(points[some]) - tile.middle, _complex(direction[some])
             power = _powers(w, SERIES_DEGREE)
             rate = np.zeros_like(power)
@@ -81,15 +81,15 @@ class PlateSum:
             widening = 2.0 * (w.conj() * along).real
             far = _terms(widening * power + np.abs(w) ** 2 * rate, rate)
             near = ThinPlate(self.surface.positions[tile.near]).slope(points[some], direction[some])
-            out[some] = self._added(tile, far, near)
+            out[some] = self._add_terms(tile, far, near)
         return out
 
-    def _added(self, tile: _Tile, far: Array, near: Array) -> Array:
+    def _add_terms(self, tile: _Tile, far: Array, near: Array) -> Array:
         """Return the sum of the terms of all far plates, and of near ones and the plane."""
         used = np.concatenate([tile.near, np.arange(-3, 0)])
         return np.asarray(far @ tile.series + near @ self.coefficients[used])
 
-    def _tiled(self, points: Array) -> Iterator[tuple[_Tile, Indices]]:
+    def _iterate_tiles(self, points: Array) -> Iterator[tuple[_Tile, Indices]]:
         """Yield every tile that has any of the points, and which they are."""
         places = np.floor(points / TILE_SUBAP).astype(np.intp)
         order = np.lexsort(places.T)

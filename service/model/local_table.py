@@ -89,7 +89,9 @@ def local_table(instrument: Instrument, table: TabulatedModes) -> LocalTable:
         raise ModelError("modes: found a table of modes; expected functions that end")
     step, margin = margin_of(instrument, table)
     known = padded(table.known, margin)
-    samples = _continued(_placed(local, table.known.shape, margin, known.shape), known)
+    samples = _continue_samples(
+        _place_samples(local, table.known.shape, margin, known.shape), known
+    )
     strokes = np.eye(local.n_functions) if local.strokes is None else local.strokes
     return LocalTable(
         instrument=instrument,
@@ -101,7 +103,7 @@ def local_table(instrument: Instrument, table: TabulatedModes) -> LocalTable:
     )
 
 
-def _placed(
+def _place_samples(
     local: LocalFunctions,
     shape: tuple[int, ...],
     margin: tuple[int, int],
@@ -117,7 +119,7 @@ def _placed(
     return scipy.sparse.csc_array((local.heights[inside], (places, function[inside])), shape=size)
 
 
-def _continued(samples: Any, known: Mask) -> Any:  # noqa: ANN401 - scipy has no types
+def _continue_samples(samples: Any, known: Mask) -> Any:  # noqa: ANN401 - scipy has no types
     """Return the samples, and where nothing is known what continues them oddly."""
     target, weights = continuation(known)
     found = (weights.astype(samples.dtype) @ samples).tocoo()

@@ -78,7 +78,7 @@ class Term:
         ModelError
             With what was found.
         """
-        _parsed(self.expression)
+        _parse(self.expression)
         if len(self.at) != len(self.values) or (self.at and len(self.at) < 2):
             raise ModelError(
                 f"found {len(self.at)} places and {len(self.values)} values, expected as many of "
@@ -90,7 +90,7 @@ class Term:
     @property
     def names(self) -> frozenset[str]:
         """Names of what must be reported."""
-        nodes = ast.walk(_parsed(self.expression))
+        nodes = ast.walk(_parse(self.expression))
         found = {node.id for node in nodes if isinstance(node, ast.Name)}
         return frozenset(found - FUNCTIONS.keys())
 
@@ -122,7 +122,7 @@ class Term:
             If it is none: a division by zero, the root of a negative number.
         """
         try:
-            found = _evaluated(_parsed(self.expression), reported)
+            found = _evaluate(_parse(self.expression), reported)
         except (ArithmeticError, ValueError, TypeError) as error:
             raise ModelError(f"{self.expression} is no number now: {error}") from error
         if isinstance(found, complex) or not math.isfinite(found):
@@ -169,7 +169,7 @@ class PointingLaw:
 
 
 @cache
-def _parsed(text: str) -> ast.expr:
+def _parse(text: str) -> ast.expr:
     """Return an expression, of arithmetic alone.
 
     Raises
@@ -209,17 +209,17 @@ def _strange(node: ast.AST) -> str:
             return "" if type(node) in _OPERATORS else type(node).__name__.lower()
 
 
-def _evaluated(node: ast.expr, reported: Reported) -> float:
+def _evaluate(node: ast.expr, reported: Reported) -> float:
     match node:
         case ast.Constant(value=int() | float() as value):
             return float(value)
         case ast.Name(id=name):
             return float(reported[name])
         case ast.Call(func=ast.Name(id=name), args=[argument]):
-            return FUNCTIONS[name](_evaluated(argument, reported))
+            return FUNCTIONS[name](_evaluate(argument, reported))
         case ast.UnaryOp(op=op, operand=operand):
-            return _OPERATORS[type(op)](_evaluated(operand, reported))
+            return _OPERATORS[type(op)](_evaluate(operand, reported))
         case ast.BinOp(left=left, op=op, right=right):
-            return _OPERATORS[type(op)](_evaluated(left, reported), _evaluated(right, reported))
+            return _OPERATORS[type(op)](_evaluate(left, reported), _evaluate(right, reported))
         case _:
             raise TypeError(f"found {type(node).__name__}")

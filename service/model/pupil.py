@@ -157,7 +157,7 @@ def _outline(instrument: Instrument) -> _Outline:
 
 def _drawn(outline: _Outline, sampling: int) -> PupilGrid:
     if outline.own is not None:
-        return _mapped(outline, outline.own, sampling)
+        return _pupil_from_map(outline, outline.own, sampling)
     ring = annular_pupil(
         n_subapertures=outline.n_subapertures,
         diameter_subap=outline.diameter,
@@ -169,7 +169,7 @@ def _drawn(outline: _Outline, sampling: int) -> PupilGrid:
     return replace(ring, amplitude=ring.amplitude * (1.0 - _shadows(ring, outline)))
 
 
-def _mapped(outline: _Outline, own: PupilMap, sampling: int) -> PupilGrid:
+def _pupil_from_map(outline: _Outline, own: PupilMap, sampling: int) -> PupilGrid:
     """Return a pupil from its map: of every cell the share of its area that is lit."""
     step = own.pitch_m / outline.subaperture_m
     width = max(outline.n_subapertures, outline.diameter, max(own.lit.shape) * step)

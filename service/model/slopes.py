@@ -132,7 +132,7 @@ def to_conventions(
     ModelError
         If there are not two slopes for every valid subaperture.
     """
-    index, sign = _listing(values, recipe, mask)
+    index, sign = _list_signals(values, recipe, mask)
     return np.asarray(values[index] * _as_column(sign, values))
 
 
@@ -148,7 +148,7 @@ def to_rtc(
     ModelError
         If there are not two slopes for every valid subaperture.
     """
-    index, sign = _listing(values, recipe, mask)
+    index, sign = _list_signals(values, recipe, mask)
     listed = np.empty_like(values)
     listed[index] = values * _as_column(sign, values)
     return listed
@@ -156,20 +156,20 @@ def to_rtc(
 
 def turned_mask(mask: NDArray[Scalar], orientation: Orientation) -> NDArray[Scalar]:
     """Return a map ``(n, n)`` [y, x] in the RTC's axes, in those of conventions.md."""
-    flipped = _flipped(mask, orientation)
+    flipped = _flip(mask, orientation)
     return flipped.T if orientation.swap_xy else flipped
 
 
 def rtc_mask(mask: NDArray[Scalar], orientation: Orientation) -> NDArray[Scalar]:
     """Return a map ``(n, n)`` [y, x] in the axes of conventions.md, in the RTC's."""
-    return _flipped(mask.T if orientation.swap_xy else mask, orientation)
+    return _flip(mask.T if orientation.swap_xy else mask, orientation)
 
 
-def _flipped(plane: NDArray[Scalar], orientation: Orientation) -> NDArray[Scalar]:
+def _flip(plane: NDArray[Scalar], orientation: Orientation) -> NDArray[Scalar]:
     return plane[:: -1 if orientation.flip_y else 1, :: -1 if orientation.flip_x else 1]
 
 
-def _listing(
+def _list_signals(
     values: NDArray[Any], recipe: SlopeRecipe, mask: NDArray[np.bool_]
 ) -> tuple[NDArray[np.intp], NDArray[np.int8]]:
     """Return for every signal of conventions.md its place in the RTC's list, and its sign."""

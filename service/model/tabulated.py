@@ -233,7 +233,7 @@ def known_samples(cube: Table) -> Mask:
 
 def padded(mask: Mask, margin: tuple[int, int]) -> Mask:
     """Return the mask with ``margin`` unknown rows and columns around it; negative ones cut."""
-    return np.asarray(_resized(mask[None], margin)[0])
+    return np.asarray(_resize(mask[None], margin)[0])
 
 
 def filled(cube: Table, known: Mask, margin: tuple[int, int]) -> Table:
@@ -242,14 +242,14 @@ def filled(cube: Table, known: Mask, margin: tuple[int, int]) -> Table:
     Unknown samples continue the surface oddly about the nearest known one, as a tangent would:
     ``f(p) = 2 f(b) - f(2 b - p)``. Every filled sample is two known ones, for all modes at once.
     """
-    shapes = _resized(np.where(known, cube, cube.dtype.type(0)), margin)
+    shapes = _resize(np.where(known, cube, cube.dtype.type(0)), margin)
     samples = np.ascontiguousarray(shapes.reshape(len(shapes), -1).T)
     target, weights = continuation(padded(known, margin))
     samples[target] = weights.astype(samples.dtype) @ samples
     return samples
 
 
-def _resized(planes: NDArray[np.generic], margin: tuple[int, int]) -> NDArray[np.generic]:
+def _resize(planes: NDArray[np.generic], margin: tuple[int, int]) -> NDArray[np.generic]:
     grown = [(max(m, 0), max(m, 0)) for m in margin]
     cut = [slice(max(-m, 0), n - max(-m, 0)) for m, n in zip(margin, planes.shape[1:], strict=True)]
     return np.pad(planes[:, cut[0], cut[1]], [(0, 0), *grown])

@@ -19,7 +19,7 @@ from service.control.gate import GateVerdict
 from service.control.loop import ControlLoop
 from service.errors import ArchiveError, CommandError, LinkError, UnknownIdError
 from service.estimation.description import Description
-from service.estimation.loop import commanded_gains, extended_gains, same_gains
+from service.estimation.loop import extend_gains, same_gains, select_gains
 from service.link.matrices import MeasuredMatrix
 from service.model.instrument import Instrument
 from service.runtime import estimates, ports
@@ -177,8 +177,8 @@ class Actions:
         return ev.Answered(request=request, reply=reply)
 
     async def _make(self, effect: ev.MakeMatrix, state: TrackerState) -> Event:
-        rtc, registration = _there(state), _registered(state)
-        gains = (effect.gains or extended_gains(rtc, effect.n_modes))[: effect.n_modes]
+        rtc, registration = _there(state), _registration_to_use(state)
+        gains = (effect.gains or extend_gains(rtc, effect.n_modes))[: effect.n_modes]
         conditions = self._conditions(state, gains)
         made = await self._workers.call(OpticsWorker.make, conditions, effect.fewer)
         accepted = made.gate.accepted
@@ -190,7 +190,7 @@ class Actions:
             state=products.MatrixState.PROPOSED if accepted else products.MatrixState.REFUSED,
             condition_number=made.condition_number,
             gate=made.gate,
-            judged=judged_now(state, gains[: len(made.matrix)]),
+            judged=present_conditions(state, gains[: len(made.matrix)]),
             sha256=wire.checksum(made.matrix),
         )
         await self._keep(record, made.matrix, registration, effect.why)
@@ -203,14 +203,14 @@ class Actions:
         source = state.reconstructor(effect.source)
         matrix = await asyncio.to_thread(self.matrix, effect.source)
         gate, judged, why = None, None, effect.why
-        gains = commanded_gains(rtc, len(matrix))
+        gains = select_gains(rtc, len(matrix))
         if not effect.judged and source is not None:
             # the loop ran with it: what the gate has against it since does not count
             held = source.gate is not None and source.gate.accepted
             gate, judged = (source.gate, source.judged) if held else (None, None)
         elif registration is not None and any(gains):
             gate = await self._verdict(matrix, gains, state)
-            judged = judged_now(state, gains)
+            judged = present_conditions(state, gains)
         else:
             unknown = "α is unknown" if registration is None else "an open loop shows no gains"
             why = f"{why}; the gate could not judge it: {unknown}"
@@ -238,14 +238,14 @@ class Actions:
         if isinstance(effect, ev.JudgeMatrix):
             return await self._margin(effect, state)
         matrix = await asyncio.to_thread(self.matrix, effect.id)
-        judged = judged_now(state, effect.gains)
+        judged = present_conditions(state, effect.gains)
         verdict = await self._verdict(matrix, effect.gains, state)
         return ev.ProposalJudged(id=effect.id, verdict=verdict, judged=judged)
 
     async def _margin(self, effect: ev.JudgeMatrix, state: TrackerState) -> Event | None:
         if effect.id in self._judging:
             return None  # the answer to the question that waits serves
-        rtc, registration = _there(state), _registered(state)
+        rtc, registration = _there(state), _registration_to_use(state)
         self._judging.add(effect.id)
         try:
             matrix = await asyncio.to_thread(self.matrix, effect.id)
@@ -264,7 +264,7 @@ class Actions:
             verdict=verdict,
             alpha=registration.alpha,
             expected=expected,
-            judged=judged_now(state, gains),
+            judged=present_conditions(state, gains),
         )
 
     async def _verdict(
@@ -275,7 +275,7 @@ class Actions:
 
     def _conditions(self, state: TrackerState, gains: tuple[float, ...]) -> Conditions:
         """Return what a reconstructor has to hold in now, with these gains."""
-        registration = _registered(state)
+        registration = _registration_to_use(state)
         return Conditions(
             alpha=registration.alpha,
             covariance=registration.covariance_to_hold_in,
@@ -403,7 +403,7 @@ GAIN_SAFETY = 1.1
 
 def loop_to_judge(state: TrackerState, gains: tuple[float, ...]) -> ControlLoop:
     """Return the loop the gate is to judge, with the largest optical gains it may have."""
-    rtc, registration = _there(state), _registered(state)
+    rtc, registration = _there(state), _registration_to_use(state)
     mean = registration.optical_gain
     highest: float | NDArray[np.float64] = 1.0 if mean is None else GAIN_SAFETY * mean
     if registration.optical_gains:
@@ -425,9 +425,9 @@ def expected_gains(registration: Registration, n_modes: int) -> NDArray[np.float
     return np.full(n_modes, registration.optical_gain or 1.0)
 
 
-def judged_now(state: TrackerState, gains: tuple[float, ...]) -> products.Judged:
+def present_conditions(state: TrackerState, gains: tuple[float, ...]) -> products.Judged:
     """Return the conditions of a verdict requested now."""
-    rtc, registration = _there(state), _registered(state)
+    rtc, registration = _there(state), _registration_to_use(state)
     return products.Judged(
         session=rtc.session,
         gains=tuple(gains),
@@ -457,7 +457,7 @@ def _there(state: TrackerState) -> wire.Status:
     return state.loop.rtc
 
 
-def _registered(state: TrackerState) -> Registration:
+def _registration_to_use(state: TrackerState) -> Registration:
     """Return what matrices are made and judged for."""
     if state.alpha.registration is None:
         raise CommandError("α is not known")

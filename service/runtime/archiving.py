@@ -149,7 +149,7 @@ class ArchiveWriter:
         self._order(order, actor, ".refused", str(error))
 
     def _order(self, order: GivenCommand, actor: Actor, end: str = "", answer: str = "") -> None:
-        command, asked = order.command, asked_for(order.command, actor)
+        command, asked = order.command, command_json(order.command, actor)
         name = f"{type(command).__name__}{end}"
         entry = actor.entry(name, asked, by=command.by, why=command.reason)
         entry = replace(entry, answer=answer, cause=order.id)
@@ -354,7 +354,7 @@ def ids_of(text: str, state: TrackerState) -> dict[str, object]:
     return {name: found for name, found in ids.items() if found}
 
 
-def asked_for(command: Command, actor: Actor) -> str:
+def command_json(command: Command, actor: Actor) -> str:
     """Return the fields of a command other than name and reason, as JSON.
 
     With a key, the name in the command is only what its sender calls himself.
@@ -373,7 +373,9 @@ def _loss_text(lost: int) -> tuple[AuditEntry]:
     return (AuditEntry(t_ns_utc=time.time_ns(), who="service", name="archive.lost", text=text),)
 
 
-def taken_up(archive: Archive, state: TrackerState, policy: Policy, now_ns: int) -> TrackerState:
+def restore_tracking(
+    archive: Archive, state: TrackerState, policy: Policy, now_ns: int
+) -> TrackerState:
     """Return the state with the saved registration, if there is one and it fits.
 
     A damaged file costs only the α in it. Other problems of the archive are logged.

@@ -9,7 +9,7 @@ MAX_CLOCK_STEP_NS = 1_000_000_000
 """A clock that is set by less is followed at once: what is waited for lasts seconds."""
 
 
-def _passed_ns() -> int:
+def _uptime_ns() -> int:
     """Return the time that has passed since the machine was started, its sleep included."""
     return time.clock_gettime_ns(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
@@ -26,7 +26,7 @@ class ServiceClock:
     def __init__(
         self,
         utc_ns: Callable[[], int] = time.time_ns,
-        passed_ns: Callable[[], int] = _passed_ns,
+        passed_ns: Callable[[], int] = _uptime_ns,
     ) -> None:
         self._utc_ns, self._passed_ns = utc_ns, passed_ns
         self._offset_ns = utc_ns() - passed_ns()

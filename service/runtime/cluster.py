@@ -64,7 +64,7 @@ class Cluster:
             If there is none, it has no worker, or one runs another version.
         """
         self.address = address
-        self._client = _connected(address)
+        self._client = _connect_client(address)
         self._seen_s = time.monotonic()
         self._submitting = threading.Lock()
         self._parts: list[tuple[object, Future]] = []
@@ -148,16 +148,16 @@ class Cluster:
         waiting: dict[Future, int] = {}
         self._check_workers()
         try:
-            futures = self._submitted(function, items, parts, is_large=is_large)
+            futures = self._submit(function, items, parts, is_large=is_large)
             waiting |= {future: number for number, future in enumerate(futures)}
             while waiting and not (enough and enough.is_set()):
-                for future in self._finished(waiting):
+                for future in self._wait_for_first(waiting):
                     yield waiting.pop(future), self._result_of(future)
         finally:
             with contextlib.suppress(Exception):  # of one that is gone
                 self._client.cancel(list(waiting))
 
-    def _submitted(
+    def _submit(
         self,
         function: Callable[..., Result],
         items: Sequence[Item],
@@ -171,7 +171,7 @@ class Cluster:
             futures = self._client.map(
                 _perform,
                 items,
-                function=self._scattered(function) if is_large else function,
+                function=self._scatter(function) if is_large else function,
                 expected=own_versions(),
                 parts=there,
                 pure=False,
@@ -185,14 +185,14 @@ class Cluster:
         if not parts:
             return []
         there = {id(part): future for part, future in self._parts if future.status == "finished"}
-        found = [there.get(id(part)) or self._scattered(part) for part in parts]
+        found = [there.get(id(part)) or self._scatter(part) for part in parts]
         self._parts = list(zip(parts, found, strict=True))
         return found
 
-    def _scattered(self, what: object) -> Future:
+    def _scatter(self, what: object) -> Future:
         return self._client.scatter(what, broadcast=True, hash=False)
 
-    def _finished(self, waiting: Mapping[Future, int]) -> list[Future]:
+    def _wait_for_first(self, waiting: Mapping[Future, int]) -> list[Future]:
         """Wait for the first of them, for no longer than a look; return those that are done."""
         from distributed import CancelledError, wait
 
@@ -335,7 +335,7 @@ def _other_version(where: str, who: str, found: object, expected: Versions | Non
     return f"{where}: {who}: {told}; start scheduler and workers from this very installation"
 
 
-def _connected(address: str) -> Client:
+def _connect_client(address: str) -> Client:
     try:
         import dask.config
 

@@ -11,14 +11,14 @@ from service.errors import CommandError, LinkError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.alarm_records import muted_records
-from service.tracking.alarm_rules import as_text
+from service.tracking.alarm_rules import format_value
 from service.tracking.alarms import AlarmRecord
 from service.tracking.commands import Command
 from service.tracking.dither_request import total_m
 from service.tracking.events import Effect, Event
 from service.tracking.operation_records import CommandState, MeasureState
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.sending import why_unsendable
+from service.tracking.sending import check_sendable
 from service.tracking.state import TrackerState
 
 SILENT = "sent, the RTC has not answered yet"
@@ -73,7 +73,7 @@ def _sent(command: cmd.Approve, _: str, now: TrackerState) -> CommandResult:
     return _of_matrix(now, command.id)
 
 
-def _republished(
+def _report_republished(
     command: cmd.Publish | cmd.Rollback, cause: str, now: TrackerState
 ) -> CommandResult:
     """Report the reconstructor that goes out again, under an id of its own."""
@@ -93,7 +93,7 @@ def _of_matrix(now: TrackerState, name: str) -> CommandResult:
     record = now.reconstructor(name)
     if record is None:
         raise CommandError(f"{name} is not known any more")
-    held = why_unsendable(now, record) if record.state is MatrixState.PROPOSED else None
+    held = check_sendable(now, record) if record.state is MatrixState.PROPOSED else None
     if held is not None and not now.failure(record.cause):
         return CommandResult(f"{name} is proposed and not sent: {held}")
     words = _ON_ITS_WAY.get(record.state)
@@ -184,8 +184,8 @@ def _no_dither(_: cmd.StopDither, __: str, now: TrackerState) -> CommandResult:
 
 _TOLD_LATER: Final[dict[type, Callable[[Any, str, TrackerState], CommandResult]]] = {
     cmd.Approve: _sent,
-    cmd.Publish: _republished,
-    cmd.Rollback: _republished,
+    cmd.Publish: _report_republished,
+    cmd.Rollback: _report_republished,
     cmd.StartDither: _dither,
     cmd.StopDither: _no_dither,
     cmd.SetLoop: _loop,
@@ -223,7 +223,7 @@ def _done(  # noqa: C901 - one line for each command
         case cmd.SetPointing(elevation_deg=up, azimuth_deg=round_):
             text = f"the telescope points at elevation {up:g} deg, azimuth {round_:g} deg"
         case cmd.SetValue(name=name, value=value, for_s=for_s):
-            text = f"{name} is {as_text(value)} for {for_s:g} s"
+            text = f"{name} is {format_value(value)} for {for_s:g} s"
         case cmd.UnmuteAlarm(name=name):
             text = f"{name} is not muted any more"
         case cmd.AcknowledgeAlarm(name=name) | cmd.MuteAlarm(name=name):

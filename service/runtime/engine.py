@@ -154,6 +154,7 @@ class Engine:
         config_id = self.state.loop.config_id
         if config_id is None or config_id == before.loop.config_id:
             return
+        # Telemetry of the new mode does not fit the models of the old one.
         if config_id in self.policy.sensor_modes:
             self.bank = self._checked_out = None
             self._driver.sensor_mode_changed(config_id)
@@ -187,10 +188,12 @@ class Engine:
 
     def checkin(self, bank: EstimatorBank, windows: Iterable[Window]) -> None:
         """Take the estimators back after frames, unless they were reset meanwhile."""
+        # The estimators were reset while the other thread worked with the old ones.
         if self._checked_out is None:
             return
         (before, state), self._checked_out = self._checked_out, None
         self.bank = bank
+        # Events came meanwhile: the estimators have not seen them yet.
         if self.state is not state:
             self._follow()
         for window in windows:
@@ -208,6 +211,8 @@ class Engine:
         Longer while α is followed and nothing else happens: no alarm, no matrix made or tried.
         """
         state, now_ns = self.state, self._driver.now_ns()
+        # Each visit costs the same, so that frames are gathered only while no decision waits for
+        # them.
         if state.alpha.registration is None or state.alarms.active or state.on_probation:
             return 0.0
         dithers = (OperationKind.OWN_DITHER, OperationKind.OTHER_DITHER)

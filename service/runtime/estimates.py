@@ -67,7 +67,7 @@ class PendingWindow:
         """Add a window; return why the one that waited is given up, where it has to be."""
         waiting = self._window
         late = window.t_end_ns_utc - self._first_end_ns > MAX_WINDOW_SPAN_S * 1e9
-        both = None if waiting is None or late else _joined(waiting, window)
+        both = None if waiting is None or late else _join(waiting, window)
         self._window = both or window
         self._new.set()
         if both is not None:
@@ -92,7 +92,7 @@ class PendingWindow:
         return window
 
 
-def _joined(one: EndedWindow, other: EndedWindow) -> EndedWindow | None:
+def _join(one: EndedWindow, other: EndedWindow) -> EndedWindow | None:
     if isinstance(one, lockin.Spectra) and isinstance(other, lockin.Spectra):
         return lockin.joined(one, other)
     if isinstance(one, Correlated) and isinstance(other, Correlated) and one.is_like(other):
@@ -233,7 +233,7 @@ async def read_own_matrix(
         at, known = state.loop.config_id, workers.found_slopes
         left_over = None if own is None else own.left_over
         workers.first = partial(run_job, OpticsWorker.adopt, known, response, at, left_over)
-    return [*unread, *_what_it_shows(record, dialect, own, state)]
+    return [*unread, *_report_own_matrix(record, dialect, own, state)]
 
 
 async def _brought(
@@ -254,7 +254,7 @@ async def _brought(
         return record, matrix, [event]
 
 
-def _what_it_shows(
+def _report_own_matrix(
     record: products.ReconstructorRecord,
     dialect: SlopeConvention,
     own: OwnMatrix | None,
@@ -263,7 +263,7 @@ def _what_it_shows(
     """Return how the RTC lists its slopes and which modes the model has recognised, as events."""
     events: list[Event] = []
     if dialect.adopted and dialect.found is not None:
-        text = f'orientation "auto": found {orientation.setting_written(dialect.found)}'
+        text = f'orientation "auto": found {orientation.format_setting(dialect.found)}'
         events.append(ev.LogEvent(name="slopes.adopted", text=f"{text} by {record.id}"))
     wrong = dialect.wrong or (own.wrong if own is not None else "")
     if wrong or state.alarm(alarms.WRONG_MATRIX) is not None:

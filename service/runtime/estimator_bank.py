@@ -75,7 +75,7 @@ def with_rtc(bank: EstimatorBank, rtc: Status | None) -> EstimatorBank:
         if before is None:
             return bank
         loop = replace(bank.loop, rtc=None, dither=None, edge=None, cm_id=None)
-        return replace(_changed(bank, loop, Change.GONE), begun_with=None, dither=None)
+        return replace(_reset_members(bank, loop, Change.GONE), begun_with=None, dither=None)
     changes = estimator.NOTHING if rtc is before else _changes(bank, before, rtc)
     loop = replace(bank.loop, rtc=rtc)
     if changes & (Change.LOOP | Change.STATUS):
@@ -87,7 +87,7 @@ def with_rtc(bank: EstimatorBank, rtc: Status | None) -> EstimatorBank:
         bank, loop = replace(bank, begun_with=rtc), _of_modes(loop, rtc)
     if Change.RATE in changes:
         bank, loop = replace(bank, dither=None), replace(loop, dither=None)
-    bank = _changed(bank, loop, changes)
+    bank = _reset_members(bank, loop, changes)
     fresh = before is None or before.seq != rtc.seq
     members = tuple(member.on_status(loop, fresh=fresh) for member in bank.members)
     return replace(bank, members=members)
@@ -122,7 +122,7 @@ def _of_modes(loop: LoopContext, rtc: Status) -> LoopContext:
     return replace(loop, in_loop=in_loop, still=still, edge=edge, dither=dither)
 
 
-def _changed(bank: EstimatorBank, loop: LoopContext, changes: Change) -> EstimatorBank:
+def _reset_members(bank: EstimatorBank, loop: LoopContext, changes: Change) -> EstimatorBank:
     """Return the bank for a changed loop: members that declare one of the changes are reset."""
     members = tuple(
         member.begun_anew(loop, why) if (why := changes & member.resets) else member
@@ -159,7 +159,7 @@ def with_dither(bank: EstimatorBank, dither: Dither | None, window_s: float) -> 
             played = replace(played, plan=plan)
         except ModelError as error:
             played = replace(played, why_unreadable=str(error))
-    bank = _changed(bank, replace(bank.loop, dither=played), Change.DITHER)
+    bank = _reset_members(bank, replace(bank.loop, dither=played), Change.DITHER)
     return replace(bank, dither=dither)
 
 
@@ -199,13 +199,13 @@ def process_block(bank: EstimatorBank, block: FrameBlock) -> Fed:
         if (closed or not member.only_closed) and not frames.marks & member.unless:
             member = member.update(frames)
         if member.marks:
-            frames = _marked(frames, member.marks)
+            frames = _mark_block(frames, member.marks)
             changes |= Change.STANDSTILL if Mark.STANDS in member.marks else estimator.NOTHING
         members.append(member)
     return _with_windows(replace(bank, loop=loop), members)
 
 
-def _marked(frames: FrameContext, marks: Mark) -> FrameContext:
+def _mark_block(frames: FrameContext, marks: Mark) -> FrameContext:
     """Return a block with the marks of a member; after frozen slopes measurements begin again."""
     loop = frames.loop
     if Mark.STANDS in marks:

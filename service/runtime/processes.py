@@ -84,10 +84,10 @@ class JobProcess:
         """
         with self._busy:
             try:
-                line = self._started()
+                line = self._start()
                 if not sent:
                     _send(line, work)
-                answer = _loaded(*_received(line))
+                answer = _load(*_receive(line))
             except OSError as error:  # no process to be had, or a line that is cut
                 raise EOFError from error
         if isinstance(answer, PyrcalError):
@@ -105,7 +105,7 @@ class JobProcess:
             if self._line is not None:
                 self._line.close()
 
-    def _started(self) -> Connection:
+    def _start(self) -> Connection:
         if self._ended.is_set():
             raise EOFError
         if self._line is None:
@@ -134,7 +134,7 @@ class Worker(JobProcess):
     def begin(self) -> Worker:
         """Begin the process before there is work for it, and return it."""
         with contextlib.suppress(EOFError, OSError):  # the first job begins it, or says why not
-            self._started()
+            self._start()
         return self
 
     def begun(self, enter: Callable[[], None]) -> Worker:
@@ -161,7 +161,7 @@ def _work(line: Connection, nice: int, imports: str) -> None:
     threadpool_limits(1)  # of BLAS, which has been imported now
     with contextlib.suppress(EOFError, OSError):
         while True:
-            _send(line, _answer(*_received(line)))
+            _send(line, _answer(*_receive(line)))
 
 
 def _send(line: Connection, what: object) -> None:
@@ -183,7 +183,7 @@ def _send(line: Connection, what: object) -> None:
         line.send_bytes(buffer)
 
 
-def _received(line: Connection) -> tuple[bytes, list[bytearray]]:
+def _receive(line: Connection) -> tuple[bytes, list[bytearray]]:
     """Return what was sent: pickled, and its arrays where they are to stay."""
     sizes = pickle.loads(line.recv_bytes())  # of this very program
     head, buffers = line.recv_bytes(), [bytearray(size) for size in sizes]
@@ -192,13 +192,13 @@ def _received(line: Connection) -> tuple[bytes, list[bytearray]]:
     return head, buffers
 
 
-def _loaded(head: bytes, buffers: list[bytearray]) -> Any:  # noqa: ANN401 - whatever was sent
+def _load(head: bytes, buffers: list[bytearray]) -> Any:  # noqa: ANN401 - whatever was sent
     return pickle.loads(head, buffers=buffers)  # of this very program
 
 
 def _answer(head: bytes, buffers: list[bytearray]) -> object:
     try:
-        return _loaded(head, buffers)()
+        return _load(head, buffers)()
     except PyrcalError as error:
         return error
     except Exception as error:  # noqa: BLE001 - sent home, where it is a failed job

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Final
 
-from service.link.guard import ending_in_words, flooded_in_words, refused_in_words
+from service.link.guard import describe_expiry, describe_flood, describe_refusals
 from service.link.intake import COALESCED
 from service.link.statistics import (
     MALFORMED,
@@ -26,7 +26,7 @@ from service.tracking.operation_records import AcquisitionStage
 from service.tracking.operations.running import operating
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.sending import why_no_return, why_unread
+from service.tracking.sending import check_return, explain_unread_matrix
 from service.tracking.state import Mode, TrackerState
 from service.tracking.update_policy import MIN_PROPOSAL_LIFETIME_S, is_outdated
 from service.wire import TEXT_LIMIT, AlarmMessage, StateMessage
@@ -83,22 +83,23 @@ _NUMBER: Final = re.compile(r"[0-9]+")
 def complaints(link: LinkStatistics) -> dict[str, str]:
     """Return the alarms of what came in the last seconds, by name."""
     made = {
-        alarms.FRAMES_UNUSED: _unused(link),
-        alarms.MESSAGES_REFUSED: _refused(link),
+        alarms.FRAMES_UNUSED: _explain_unused(link),
+        alarms.MESSAGES_REFUSED: _explain_refused(link),
         alarms.STATUS_FLOOD: _flood(link),
-        alarms.LINK_FLOODED: flooded_in_words(link.waiting_connections),
-        alarms.LINK_REFUSED: refused_in_words(link.refusals),
-        alarms.CERTIFICATE_ENDING: ending_in_words(link.ending_certificates),
+        alarms.LINK_FLOODED: describe_flood(link.waiting_connections),
+        alarms.LINK_REFUSED: describe_refusals(link.refusals),
+        alarms.CERTIFICATE_ENDING: describe_expiry(link.ending_certificates),
     }
     return {name: text for name, text in made.items() if text}
 
 
-def _unused(link: LinkStatistics) -> str:
+def _explain_unused(link: LinkStatistics) -> str:
     """Return which frames come and are not used, and why; empty: all is well."""
     frames = [disposition for disposition in link.dispositions if disposition.kind == "frames"]
     came, used = sum(f.n for f in frames), sum(f.n for f in frames if f.outcome == USED)
     lost = [f for f in frames if f.outcome not in OUTCOMES_WITH_ALARM and _is_lost(f, link, used)]
     faults = [f for f in lost if f.outcome in FAULT_OUTCOMES and f.age_s < FAULT_REPORT_DURATION_S]
+    # A few lost frames are normal on a network; violations of the contract are always reported.
     if sum(f.n for f in lost) <= MAX_UNUSED_SHARE * came:
         lost = faults
     lost = [f for f in lost if f.n or f in faults]
@@ -125,7 +126,7 @@ def _is_lost(disposition: Disposition, link: LinkStatistics, used: int) -> bool:
             return True
 
 
-def _refused(link: LinkStatistics) -> str:
+def _explain_refused(link: LinkStatistics) -> str:
     """Return which messages besides frames broke the contract; empty: none of late."""
     bad = [f for f in link.dispositions if f.outcome == MALFORMED and f.kind != "frames"]
     bad = [f for f in bad if f.age_s < FAULT_REPORT_DURATION_S]
@@ -168,9 +169,11 @@ def detect_link_changes(
     }
     for name, text in made.items():
         before = raised.get(name)
+        # Counters in a text change every second: they must not make a new line in the log.
         same = before is not None and _NUMBER.sub("", before.text) == _NUMBER.sub("", text)
         found.append(ev.ConditionChanged(name=name, text=before.text if before and same else text))
     for name, alarm in raised.items():
+        # An alarm that came and went each second would hide the others.
         if name not in made and now_ns - alarm.seen_ns_utc > COMPLAINT_TIMEOUT_NS:
             found.append(ev.ConditionChanged(name=name, text="over", over=True))
     return list(found)
@@ -267,7 +270,7 @@ def _for_messages(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
 
 
 def _for_frames(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
-    text, fates = _unused(inputs.link), inputs.link.dispositions
+    text, fates = _explain_unused(inputs.link), inputs.link.dispositions
     if text and not any(f.n for f in fates if f.kind == "frames" and f.outcome == USED):
         yield Prerequisite(
             name=alarms.FRAMES_UNUSED, responsible=Responsible.RTC, text=text, blocks=True
@@ -284,7 +287,8 @@ def _for_the_matrix(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
         )
         yield Prerequisite(name="matrix-name", responsible=Responsible.RTC, text=text)
     elif rtc is not None and (
-        why_unread(state, rtc.cm_id) or (rtc.cm_id and state.reconstructor(rtc.cm_id) is None)
+        explain_unread_matrix(state, rtc.cm_id)
+        or (rtc.cm_id and state.reconstructor(rtc.cm_id) is None)
     ):
         text = f"its reconstructor {rtc.cm_id}: offer it on rtc/cm/applied{_describe_rtc(state)}"
         yield Prerequisite(name="matrix-in-use", responsible=Responsible.RTC, text=text)
@@ -292,7 +296,7 @@ def _for_the_matrix(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
         yield Prerequisite(
             name="new-matrix", responsible=Responsible.OPERATOR, text=state.matrices.hindrance
         )
-    no_return = why_no_return(state)
+    no_return = check_return(state)
     for record in state.matrices.reconstructors:
         if record.on_its_way:
             text = f"reconstructor {record.id} was sent: acknowledge that it is applied"
@@ -301,7 +305,7 @@ def _for_the_matrix(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
             state.operator.mode is not Mode.AUTO or no_return
         ):
             text = f"reconstructor {record.id} is proposed: approve or reject it"
-            more = [no_return or "", _replaced(state, record)]
+            more = [no_return or "", _explain_replacement(state, record)]
             yield Prerequisite(
                 name="approval",
                 responsible=Responsible.OPERATOR,
@@ -309,7 +313,7 @@ def _for_the_matrix(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
             )
 
 
-def _replaced(state: TrackerState, record: ReconstructorRecord) -> str:
+def _explain_replacement(state: TrackerState, record: ReconstructorRecord) -> str:
     """Return that a proposal will be replaced, and when; empty: it fits α."""
     if state.operator.mode is Mode.HOLD or not is_outdated(state, record):
         return ""
@@ -414,6 +418,7 @@ class Revival:
             self._since_s = now_s
         if now_s - self._since_s < self._wait_s:
             return False
+        # Reopening interrupts the link, so that attempts without success become rarer.
         self._since_s, self._wait_s = None, min(2 * self._wait_s, MAX_REOPENING_DELAY_S)
         return True
 

@@ -40,7 +40,7 @@ def _dither(
         found.append(ev.DitherSilent(id=loop.dither.id, silent_s=silent_s))
     if watch.measurement is not None:
         found += _other_dither(loop.dither.id, watch.measurement, state)
-        found += _answered(watch.measurement, loop, state)
+        found += _report_response(watch.measurement, loop, state)
     return found
 
 
@@ -64,7 +64,7 @@ def _other_dither(
     ]
 
 
-def _answered(
+def _report_response(
     measurement: DitherMeasurement, loop: LoopContext, state: TrackerState
 ) -> list[Event]:
     """Return that the slopes do not answer the dither, or do so again.
@@ -94,7 +94,7 @@ def _held(_: Rejection, now: Rejection, loop: LoopContext, state: TrackerState) 
     return [] if holds is None or holds is state.loop.holds else [ev.LoopHeld(holds=holds)]
 
 
-def _compared(
+def _report_comparison(
     _: Comparison, now: Comparison, loop: LoopContext, state: TrackerState
 ) -> list[Event]:
     judged, trial = now.found, state.operations.probation
@@ -138,7 +138,7 @@ REGISTRY: Final = (
     Entry(EdgeHealth, {alarms.EDGE_SLIP: "the outer ring is back"}),
     Entry(LoopCheck, {alarms.OFF_LOOP: "commands obey the loop equation again"}),
     Entry(Rejection, events=_held),
-    Entry(Comparison, events=_compared),
+    Entry(Comparison, events=_report_comparison),
     Entry(Passive),
     Entry(DitherWindows),
 )

@@ -19,7 +19,7 @@ from service.tracking.interlocks import Permission, permissions
 from service.tracking.operations.running import Operating, operating
 from service.tracking.policy import Policy
 from service.tracking.registration import PassiveBias, Registration
-from service.tracking.sending import why_no_return
+from service.tracking.sending import check_return
 from service.tracking.state import LogEntry, TrackerState
 from service.wire import Status
 
@@ -150,7 +150,7 @@ class Snapshot:
     @property
     def no_return(self) -> str | None:
         """Why the matrix in use could not be sent back after another one; null: it could."""
-        return why_no_return(self.tracker)
+        return check_return(self.tracker)
 
     @property
     def rtc(self) -> Rtc | None:

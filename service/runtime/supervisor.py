@@ -196,6 +196,8 @@ class Supervisor:
         if again or isinstance(command, cmd.SetPointing):  # every second, and changes nothing
             return await self._result_of(order)
         try:
+            # The order is on the disk before the tracker gets it (docs/decisions/0034-archive-and-
+            # audit.md).
             await self._writer.ordered(order, actor)
         except StorageError as error:
             if not isinstance(command, cmd.StopEverything):  # that one waits for no disk
@@ -218,6 +220,7 @@ class Supervisor:
         if isinstance(order.command, cmd.Refit):
             self.refits.begin(effects, self._clock.now_ns())
         asked = self._running - running
+        # The RTC answers these commands within a moment, and its answer is the result.
         if asked and isinstance(order.command, cmd.Measure | cmd.SetLoop | cmd.Ramp):
             await asyncio.wait(asked)
         until_s = time.monotonic() + ORDER_REPLY_TIMEOUT_S
@@ -282,6 +285,8 @@ class Supervisor:
                 async with asyncio.timeout(self._engine.gather_s - LINK_POLL_INTERVAL_S):
                     await rung.wait()
             rung.clear()
+            # Frames before events: the last window of a dither must end before the event that stops
+            # it.
             await self._feed()
             for event in self._bridge.events():
                 if isinstance(event, matrices.MeasuredMatrix):
@@ -302,7 +307,7 @@ class Supervisor:
             with self._surviving("telemetry"):
                 try:
                     blocks, found = await loop.run_in_executor(
-                        self._telemetry_executor, self._taken_in, bank
+                        self._telemetry_executor, self._take_in, bank
                     )
                 finally:
                     self._engine.checkin(*found)
@@ -310,7 +315,7 @@ class Supervisor:
             for block in blocks:
                 self._worker_load.count_frames(block.n_frames * block.dt_ns * 1e-9)
 
-    def _taken_in(self, bank: EstimatorBank) -> tuple[list[frames.FrameBlock], Fed]:
+    def _take_in(self, bank: EstimatorBank) -> tuple[list[frames.FrameBlock], Fed]:
         blocks = self._bridge.drain(before_events=True)
         return blocks, process_blocks(bank, blocks)
 
@@ -478,11 +483,13 @@ class Supervisor:
         for event in await read_own_matrix(
             record, matrix, self._engine.state, self._workers, self._actions.matrix
         ):
+            # The RTC may have swapped its matrix while this one was read.
             if self._engine.state.matrices.in_use == in_use:
                 self._post(event)
 
     async def _do(self, effect: Effect, state: TrackerState) -> None:
         try:
+            # Nothing is done that cannot be recorded (docs/decisions/0034-archive-and-audit.md).
             await self._writer.before(effect)
             event = await self._actions.perform(effect, state)
         except StorageError as error:

@@ -252,7 +252,7 @@ class TelemetryRecorder:
         recorder, record = self._recorder, self._record
         if recorder is None or record is None:
             return
-        reason = await asyncio.to_thread(self._why_end, recorder)
+        reason = await asyncio.to_thread(self._check_recording_end, recorder)
         if reason is not None:
             with suppress(CommandError):
                 await self.end(reason, record.id)
@@ -264,7 +264,7 @@ class TelemetryRecorder:
         except OSError as error:
             return str(error)
 
-    def _why_end(self, recorder: RecordingWriter) -> str | None:
+    def _check_recording_end(self, recorder: RecordingWriter) -> str | None:
         """Return why a recording ends now, None: it goes on; empty: its time is up."""
         if time.monotonic() >= self._ends_s:
             return ""

@@ -165,7 +165,7 @@ class FitQueue:
 
     def jobs(self) -> Sequence[FitJob]:
         """Return the fits that are remembered, oldest first."""
-        return tuple(self._staged(job) for job in self._jobs.values())
+        return tuple(self._read_stage(job) for job in self._jobs.values())
 
     def job(self, fit_id: str) -> FitJob:
         """Return one of them.
@@ -178,7 +178,7 @@ class FitQueue:
         found = self._jobs.get(fit_id)
         if found is None:
             raise errors.UnknownIdError(f"unknown fit {fit_id}: the service has begun no such fit")
-        return self._staged(found)
+        return self._read_stage(found)
 
     async def give_up(self, fit_id: str) -> FitJob:
         """End a fit that waits or runs, and return what is left of it.
@@ -201,7 +201,7 @@ class FitQueue:
             await asyncio.to_thread(shutil.rmtree, self._folder / fit_id, ignore_errors=True)
         return self.job(fit_id)
 
-    def _staged(self, job: FitJob) -> FitJob:
+    def _read_stage(self, job: FitJob) -> FitJob:
         """Return a fit with what it is at, as its process has written it down."""
         if job.state is not FitState.RUNNING:
             return job
@@ -306,7 +306,7 @@ class FitQueue:
                 self._put(replace(self._jobs[fit_id], state=FitState.RUNNING))
                 await asyncio.to_thread(replace(self._request, asked=asked).write, folder)
                 await run_program([*self._program, str(folder)], limit_s=self._limits.seconds)
-            found, drawn = await asyncio.to_thread(_answered, folder)
+            found, drawn = await asyncio.to_thread(_read_result, folder)
             done = replace(self._jobs[fit_id], state=FitState.DONE, document=found, figures=drawn)
             self._put(done)
             self._log.info("fit.done", id=fit_id, verdict=found["verdict"])
@@ -333,7 +333,7 @@ class FitQueue:
         await asyncio.to_thread(shutil.rmtree, self._folder / fit_id, ignore_errors=True)
 
 
-def _answered(folder: Path) -> tuple[dict[str, Any], bytes]:
+def _read_result(folder: Path) -> tuple[dict[str, Any], bytes]:
     """Return what a fit has found, and what its figures are drawn from."""
     try:
         found: dict[str, Any] = json.loads((folder / DOCUMENT).read_text(encoding="utf-8"))

@@ -159,7 +159,7 @@ class WorkerPool:
         # where nobody waits for it to the end, it says nothing
         under_way.add_done_callback(lambda job: job.cancelled() or job.exception())
         try:
-            await self._watched(name, worker, under_way)
+            await self._watch(name, worker, under_way)
             done = under_way.result()
             self._under_way = (name, done.cpu_s)
         except EOFError as error:
@@ -180,7 +180,7 @@ class WorkerPool:
         self._limit_s[name] = max(MIN_JOB_LIMIT_S, JOB_LIMIT_RATIO * self._longest_s[name])
         return done
 
-    async def _watched(self, name: str, worker: Worker, under_way: asyncio.Future[Done[R]]) -> None:
+    async def _watch(self, name: str, worker: Worker, under_way: asyncio.Future[Done[R]]) -> None:
         """Wait for a job.
 
         Raises
@@ -325,11 +325,11 @@ class WorkerLoadMeter:
         keeps_up = "the worker keeps up with the telemetry again"
         return [
             *ev.ConditionChanged.detect(state, WORKER_LOST, lost, "the worker does its work again"),
-            *ev.ConditionChanged.detect(state, WORKER_BEHIND, self._why_behind(), keeps_up),
+            *ev.ConditionChanged.detect(state, WORKER_BEHIND, self._explain_delay(), keeps_up),
             *ev.ConditionChanged.detect(state, CLUSTER_LOST, alone, "the cluster helps again"),
         ]
 
-    def _why_behind(self) -> str:
+    def _explain_delay(self) -> str:
         load, spent = self.worker_load, self._spent()
         if spent["clock_s"] < MIN_LOAD_HISTORY_S or load.busy_ratio is None:
             return ""

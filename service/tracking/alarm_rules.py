@@ -16,7 +16,7 @@ from difflib import get_close_matches
 from typing import Any, Final
 
 from service.errors import CommandError, UnknownIdError
-from service.estimation.loop import why_open
+from service.estimation.loop import explain_open_loop
 from service.model.pointing_law import ANGLES
 from service.tracking import (
     alarms,
@@ -30,8 +30,8 @@ from service.tracking import commands as cmd
 from service.tracking.alarms import ALARMS, RULE_PREFIX, AlarmDefinition, Severity
 from service.tracking.dither_request import MAX_STOP_DELAY_S
 from service.tracking.operation_records import AcquisitionStage
-from service.tracking.operations.acquisition_stages import missed_enough
-from service.tracking.operations.probation import opening_text
+from service.tracking.operations.acquisition_stages import has_missed_enough
+from service.tracking.operations.probation import explain_opening
 from service.tracking.policy import SECOND_NS, Rule
 from service.tracking.products import MatrixState
 from service.tracking.state import ObservatoryValue, TrackerState
@@ -94,7 +94,7 @@ def _loop_open(context: StepContext) -> str | None:
     opened = acquisition.under_way or (measuring is not None and measuring.opens_loop)
     if rtc.in_loop or interrupted or opened:
         return None
-    return f"{why_open(rtc)}: close it to calibrate"
+    return f"{explain_open_loop(rtc)}: close it to calibrate"
 
 
 def _other_numbers(context: StepContext) -> str | None:
@@ -120,7 +120,7 @@ def _acquisition(context: StepContext) -> str | None:
 def _not_found(context: StepContext) -> str | None:
     if context.acquisition.under_way or not context.acquisition.misses:
         return None
-    if not (context.loop.holds and missed_enough(context.state)):
+    if not (context.loop.holds and has_missed_enough(context.state)):
         return context.alarm_text(alarms.NOT_FOUND)
     proof = context.matrices.mode_proof
     if proof.own_response_ratio is not None and not proof.strange:
@@ -151,7 +151,9 @@ def _not_stopped(context: StepContext) -> str | None:
         return None
     if context.now_ns - memory.stopped_ns_utc < MAX_STOP_DELAY_S * SECOND_NS:
         return None
-    why = dither_plan.why_too_strong(context, rtc) or dither_plan.why_unwanted(context, rtc)
+    why = dither_plan.check_dither_strength(context, rtc) or dither_plan.check_dither_wanted(
+        context, rtc
+    )
     return why and (
         f"{why}, and the RTC goes on playing {memory.unwanted_id}: it is asked every "
         f"{dither.STOP_REQUEST_INTERVAL_S:.0f} s to stop it; stop it at the RTC"
@@ -177,15 +179,15 @@ RULES: Final[dict[str, Callable[[StepContext], str | None]]] = {
     alarms.NOT_FOUND: _not_found,
     alarms.OTHER_SUM: _other_numbers,
     alarms.SHORT_MARGIN: _margin,
-    alarms.LOOP_OPENED: opening_text,
+    alarms.LOOP_OPENED: explain_opening,
     alarms.NOT_STOPPED: _not_stopped,
     alarms.MODES_CONTRARY: mode_proof.contrary_text,
-    alarms.MODES_UNEVEN: mode_proof.uneven_text,
+    alarms.MODES_UNEVEN: mode_proof.explain_uneven,
     alarms.SUSPECTED: _jump_suspected,
     "pointing-law": _law_not_followed,
     alarms.STALE: validity.stale_text,
     # the last: windows may be refused for what another alarm says
-    alarms.WINDOWS_REFUSED: window_processing.refused_text,
+    alarms.WINDOWS_REFUSED: window_processing.explain_refusals,
 }
 """Text of each alarm as a function of state, policy and time; None if the alarm is not active.
 
@@ -287,7 +289,7 @@ def _rule_text(context: StepContext, rule: Rule) -> str | None:
     """Return what an operators' rule says that holds now, else None."""
     found = _value_of(context, rule)
     holds = rule.holds_unknown if found is None else _COMPARE[rule.how](found, rule.than)
-    shown = "not known" if found is None else as_text(found)
+    shown = "not known" if found is None else format_value(found)
     return f"{rule.text} ({rule.about} is {shown})" if holds else None
 
 
@@ -319,7 +321,7 @@ def set_value(context: StepContext, command: cmd.SetValue) -> None:
         raise UnknownIdError(f"value {command.name}: no rule asks for it{hint}")
     kind, because = asked[command.name]
     if kind_of(command.value) != kind:
-        found = as_text(command.value)
+        found = format_value(command.value)
         raise CommandError(f"{command.name}: found {found}, expected {kind}: {because}")
     until_ns = context.now_ns + round(command.for_s * SECOND_NS)
     value = ObservatoryValue(
@@ -337,7 +339,7 @@ def _values_asked_for(context: StepContext) -> dict[str, tuple[str, str]]:
     return of_law | {
         rule.about: (
             kind_of(rule.than),
-            f"rule {rule.name} compares it with {as_text(rule.than)}",
+            f"rule {rule.name} compares it with {format_value(rule.than)}",
         )
         for rule in context.policy.rules
         if rule.about not in FIELDS
@@ -359,7 +361,7 @@ def kind_of(value: cmd.Value) -> str:
     return "a text" if isinstance(value, str) else "a number"
 
 
-def as_text(value: cmd.Value) -> str:
+def format_value(value: cmd.Value) -> str:
     """Return a value as TOML and JSON write it."""
     return str(value).lower() if isinstance(value, bool) else repr(value)
 

@@ -25,12 +25,12 @@ from service.tracking.dither_request import (
     DitherPhase,
     DitherPolicyState,
     Precision,
+    check_dither_usable,
     is_own_sine,
     is_proving,
     on_vibrations,
     plan_dither,
     total_m,
-    why_unusable,
 )
 from service.tracking.policy import SECOND_NS
 from service.tracking.state import Level, TrackerState
@@ -75,7 +75,7 @@ def choose_dither(context: StepContext, rtc: Status) -> None:
     if dither is not None and not is_own_sine(dither.request):
         _set_phase(context, DitherPhase.OPERATOR, f"{dither.id} runs")
         return
-    forbidden = dither_plan.why_no_dither(context, rtc)
+    forbidden = dither_plan.check_dither_allowed(context, rtc)
     if forbidden is not None:
         _set_phase(context, DitherPhase.OFF, forbidden)
         return
@@ -93,6 +93,7 @@ def choose_dither(context: StepContext, rtc: Status) -> None:
     _set_phase(context, wanted.phase, wanted.reason)
     if dither is not None:
         _end_when_done(context, rtc, dither, wanted)
+    # After a restart of the service its dither may still run: it is followed, not restarted.
     elif not _adopt(context, rtc):
         _begin(context, rtc, wanted)
 
@@ -106,6 +107,7 @@ def request_dither(context: StepContext, dither: Dither) -> None:
 def request_stop(context: StepContext) -> None:
     """Ask the RTC to play no dither; two reasons at once are one request."""
     stop = ev.Ask(request=DitherStop(id=f"stop-{context.now_ns}"))
+    # Two reasons in one step would otherwise send two commands.
     if stop not in context.effects:
         context.ask(stop)
 
@@ -178,6 +180,7 @@ def follow_status(context: StepContext, rtc: Status) -> None:
         _take_over_played(context, dither, rtc.dither)
         return
     elapsed_s = (context.now_ns - dither.asked_ns_utc) / SECOND_NS
+    # Without a frame number in the status only the elapsed time shows whether the dither has begun.
     if rtc.seq is None:
         begun, played_s = elapsed_s > _STATUS_DELAY_S, elapsed_s
     else:
@@ -193,6 +196,7 @@ def follow_status(context: StepContext, rtc: Status) -> None:
         context.clear_alarm(alarms.DITHER_LOST)
         context.log("dither.ended", f"{dither.id} has ended", _level(dither.request))
         return
+    # The first loss is retried at once; an RTC that begins late needs more time.
     if context.dithers.losses:
         context.put_off(dither_s=_patience_s(context.state))
     text = f"the RTC's status shows no {dither.id} although it was accepted: it is asked for again"
@@ -239,7 +243,7 @@ def learn_precision(context: StepContext, estimate: LockInEstimate | RandomEstim
         _set_policy(context, replace(context.dither_policy, precision=precision))
 
 
-def why_too_strong(context: StepContext, event: ev.DitherMeasured) -> str | None:
+def check_measured_dither(context: StepContext, event: ev.DitherMeasured) -> str | None:
     """Report a dither that differs from the request; return the reason why it must be stopped.
 
     The commands in the frames are what the mirror does, whatever the RTC's status says.
@@ -252,6 +256,7 @@ def why_too_strong(context: StepContext, event: ev.DitherMeasured) -> str | None
         return None
     _set_policy(context, replace(context.dither_policy, amiss_id=event.id, amiss_m=event.found_m))
     most_m = dither_plan.budget_m(rtc, context.policy)
+    # An operator may have allowed more than the budget.
     if event.found_m > MAX_MEASURED_AMPLITUDE_RATIO * max(event.asked_m, most_m):
         return f"{event.text}; the budget is {1e9 * most_m:.3g} nm"
     context.raise_alarm(alarms.NOT_AS_ASKED, f"{event.text}; check the RTC's dither")
@@ -280,8 +285,8 @@ def stop_unanswered(context: StepContext, text: str) -> None:
 
 def stop_unwanted(context: StepContext, rtc: Status) -> None:
     """Ask the RTC, again and again, to stop what it should not play."""
-    running, loud = rtc.dither_id, dither_plan.why_too_strong(context, rtc)
-    why = loud or dither_plan.why_unwanted(context, rtc)
+    running, loud = rtc.dither_id, dither_plan.check_dither_strength(context, rtc)
+    why = loud or dither_plan.check_dither_wanted(context, rtc)
     if running is None or why is None:
         forget_unwanted(context)
         return
@@ -328,7 +333,7 @@ def _begin(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
 
 def _ask(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
     dither = plan_dither(rtc, context.policy, context.now_ns, choice=wanted.parameters)
-    reason = why_unusable(dither, rtc, context.policy)
+    reason = check_dither_usable(dither, rtc, context.policy)
     if reason is not None:
         text = (
             f"no usable dither: {reason}; a dither of random signs needs no lines, and α can be "
@@ -370,7 +375,7 @@ def _end_when_done(context: StepContext, rtc: Status, dither: Dither, wanted: Wa
         wanted.phase is DitherPhase.ACQUIRE
         and 2.0 * total_m(dither.request) < wanted.parameters.total_m
     )
-    moved = dither_plan.why_moved(dither, rtc, context.policy, wanted.parameters.shunned)
+    moved = dither_plan.check_dithered_modes(dither, rtc, context.policy, wanted.parameters.shunned)
     # weak lines are worth another dither where what is known was restored, and is to be confirmed
     confirms = registration is not None and bool(wanted.parameters.modes)
     if (confirms or wanted.phase is DitherPhase.PROVE) and not is_proving(dither.request):
@@ -402,7 +407,7 @@ def _adopt(context: StepContext, rtc: Status) -> bool:
         dither = Dither(
             request=running, start_seq=begun_seq, asked_ns_utc=context.now_ns, window_s=window_s
         )
-        if why_unusable(dither, rtc, context.policy) is None:
+        if check_dither_usable(dither, rtc, context.policy) is None:
             _set_dither(context, dither)
             context.log("dither.adopted", f"{running.id} runs since frame {begun_seq}")
             return True

@@ -30,7 +30,7 @@ its size."""
 _MANY_LINES = np.linspace(*PROVING_LINE_RANGE, 100)
 
 
-def chosen_modes(
+def choose_modes(
     rtc: Status, policy: Policy, shunned: frozenset[int] = frozenset()
 ) -> tuple[int, ...]:
     """Return the modes to dither: those in the settings, or the best for α.
@@ -46,7 +46,9 @@ def chosen_modes(
         return fixed
     first = _first_free(rtc, policy)
     if policy.mode_information is not None:
-        return _telling(policy, first, min(first + N_MODES_ABOVE_LOOP, rtc.n_modes), shunned)
+        return _most_informative(
+            policy, first, min(first + N_MODES_ABOVE_LOOP, rtc.n_modes), shunned
+        )
     step = max(1, min(20, (rtc.n_modes - first) // (N_LINES + 1)))
     return tuple(first + step // 2 + step * line for line in range(N_LINES))
 
@@ -77,7 +79,7 @@ def expected_amplification(rtc: Status, policy: Policy, chosen: tuple[int, ...] 
     return max(float(np.sqrt(np.mean(found**2, axis=-1)).max()), 1.0)
 
 
-def why_elsewhere(request: DitherRequest, rtc: Status, policy: Policy) -> str:
+def check_free_modes(request: DitherRequest, rtc: Status, policy: Policy) -> str:
     """Return why a dither of the service should move to modes that are still free, or "".
 
     More modes may be controlled now than when it was requested.
@@ -103,11 +105,13 @@ def _without_choice(
     if policy.mode_information is None:
         return tuple(range(max(rtc.n_modes - N_LINES, 0), rtc.n_modes))
     highest = max(rtc.n_modes - N_MODES_ABOVE_LOOP, 0)
-    return _telling(policy, highest, rtc.n_modes, shunned)[: rtc.max_dither_modes]
+    return _most_informative(policy, highest, rtc.n_modes, shunned)[: rtc.max_dither_modes]
 
 
 @lru_cache(maxsize=4)  # of one policy; asked for with every status
-def _telling(policy: Policy, first: int, stop: int, shunned: frozenset[int]) -> tuple[int, ...]:
+def _most_informative(
+    policy: Policy, first: int, stop: int, shunned: frozenset[int]
+) -> tuple[int, ...]:
     """Return the modes with most information on α."""
     if policy.mode_information is None:
         return ()

@@ -14,15 +14,15 @@ from service.control.dither import (
     compute_schedule,
     look_up_precision,
 )
-from service.estimation.loop import why_open
+from service.estimation.loop import explain_open_loop
 from service.estimation.windows import DITHER_SETTLING_S
 from service.tracking import mode_proof
 from service.tracking.alarms import Interlock
 from service.tracking.dither_modes import (
-    chosen_modes,
+    check_free_modes,
+    choose_modes,
     controlled,
     expected_amplification,
-    why_elsewhere,
 )
 from service.tracking.dither_request import (
     DITHER_MARGIN_S,
@@ -129,6 +129,8 @@ def choose_next(context: StepContext, rtc: Status) -> tuple[WantedDither, Dither
     plan = _plan(state, found, requirement, window_s, phase)
     shown: tuple[int, ...] = ()
     no_matrix = state.matrices.in_use is None or mode_proof.unknown_loop(state, rtc)
+    # If the RTC offers no matrix, all modes must be shown before a matrix controls any of them
+    # (docs/decisions/0032-rtc-checked-by-its-telemetry.md).
     early = state.alpha.dither_due_since_ns_utc is None and no_matrix
     if phase in {DitherPhase.FOLLOW, DitherPhase.SPARSE} or early:
         shown = mode_proof.modes_to_show(context, rtc, window_s)
@@ -136,7 +138,8 @@ def choose_next(context: StepContext, rtc: Status) -> tuple[WantedDither, Dither
         return _to_show(context, rtc, shown, window_s), plan
     fixed = policy.dither_amplitude_m is not None
     total_m = requirement.budget_m if fixed else plan.total_m
-    choice = _parameters(context, total_m, window_s, max(requirement.window_s, _lasting_s(phase)))
+    choice = _parameters(context, total_m, window_s, max(requirement.window_s, _duration_s(phase)))
+    # An acquisition watches its matrices itself (``mode_proof.check_proven``).
     if phase is DitherPhase.ACQUIRE and not context.acquisition.under_way:
         choice = _with_others(context, rtc, choice)
         if choice.modes:
@@ -174,7 +177,7 @@ def _with_others(context: StepContext, rtc: Status, choice: DitherParameters) ->
     window_sigma = precision(context.state, rtc) / (choice.total_m * np.sqrt(choice.window_s))
     if begun or policy.dither_frequencies_hz or np.any(window_sigma > policy.dither_sigma):
         return choice
-    telling = chosen_modes(rtc, policy, choice.shunned)[: rtc.max_dither_modes]
+    telling = choose_modes(rtc, policy, choice.shunned)[: rtc.max_dither_modes]
     if not telling:  # the RTC plays none, or none can be believed: the dither itself says so
         return choice
     strong = clear_lines(rtc, len(telling), choice)
@@ -234,6 +237,7 @@ def _plan(
 ) -> DitherPlan:
     """Return the schedule as it is carried out."""
     total_m, interval_s = _steady_amplitude(state, found, requirement), found.interval_s
+    # Until α is measured the dither uses the whole budget.
     if phase is DitherPhase.ACQUIRE:
         total_m = requirement.budget_m
     if phase is not DitherPhase.SPARSE:
@@ -267,11 +271,14 @@ def quiet_budget_m(rtc: Status, policy: Policy, chosen: tuple[int, ...] = ()) ->
 
     Without ``chosen`` modes it is for those that are dithered to follow α.
     """
+    # The budget limits what is on the mirror, the request what is added to the commands.
     quiet_m = policy.dither_budget_m / expected_amplification(rtc, policy, chosen)
     return float(min(budget_m(rtc, policy), quiet_m))
 
 
-def why_moved(dither: Dither, rtc: Status, policy: Policy, shunned: frozenset[int]) -> str:
+def check_dithered_modes(
+    dither: Dither, rtc: Status, policy: Policy, shunned: frozenset[int]
+) -> str:
     """Return why another dither should replace the one that runs, or "".
 
     It was requested when fewer modes were controlled, or before the measured response of one of its
@@ -280,11 +287,11 @@ def why_moved(dither: Dither, rtc: Status, policy: Policy, shunned: frozenset[in
     if is_proving(dither.request):
         return ""
     odd = shunned.intersection(dither.request.modes)
-    if odd and not odd.intersection(chosen_modes(rtc, policy, shunned)):
+    if odd and not odd.intersection(choose_modes(rtc, policy, shunned)):
         return (
             f"mode {min(odd)} has not answered as the instrument file says: others are used for α"
         )
-    elsewhere = why_elsewhere(dither.request, rtc, policy)
+    elsewhere = check_free_modes(dither.request, rtc, policy)
     if elsewhere or not controlled(dither.request.modes, rtc):
         return elsewhere
     if total_m(dither.request) <= AMPLITUDE_HYSTERESIS_RATIO * quiet_budget_m(rtc, policy):
@@ -311,6 +318,7 @@ def _requirement(
         longest_s=policy.longest_pause_s,
     )
     lengths = window_lengths_s(policy)
+    # See ``FAINT_WINDOW_S``: a shorter window biases the rotation on a faint star.
     if rtc.magnitude is not None and rtc.magnitude >= FAINT_MAGNITUDE:
         lengths = tuple(s for s in lengths if s >= FAINT_WINDOW_S) or lengths[-1:]
     usable = MAX_UNBIASED_SIGMA * policy.tolerance
@@ -318,7 +326,7 @@ def _requirement(
     return replace(requirement, window_s=window_s)
 
 
-def _lasting_s(phase: DitherPhase) -> float:
+def _duration_s(phase: DitherPhase) -> float:
     """Return how long a request is to be read at least, seconds."""
     return (
         0.0
@@ -333,6 +341,7 @@ def _walk_rate(context: StepContext) -> NDArray[np.float64]:
     if registration is None:
         return base
     age_s = (context.now_ns - registration.arrived_ns_utc) / SECOND_NS
+    # During a slew flexure adds more than the drift of the settings.
     return np.maximum(base, registration.grown / age_s) if age_s >= 1.0 else base
 
 
@@ -353,6 +362,8 @@ def _next_window(
     if registration.n_windows < MIN_WINDOWS_FOR_PAUSE:
         text = f"{registration.n_windows} of {MIN_WINDOWS_FOR_PAUSE} windows agree"
         return DitherPhase.ACQUIRE, text, now_ns
+    # This is the default: a jump in a pause of 20 s remained undetected for 19 s
+    # (docs/decisions/0021-dither-policy.md).
     if policy.longest_pause_s == 0.0:
         return DitherPhase.FOLLOW, "the settings allow no pause", now_ns
     window_ns = registration.window_ns_utc or registration.arrived_ns_utc
@@ -399,6 +410,7 @@ def _steady_amplitude(
     """Return the amplitude, left as it is while the best one is near."""
     before = state.dithers.policy.plan
     settled = state.dithers.policy.phase in {DitherPhase.FOLLOW, DitherPhase.SPARSE}
+    # A lower budget takes effect at once.
     if before is None or not settled or before.total_m > requirement.budget_m:
         return found.total_m
     ratio = found.total_m / before.total_m
@@ -409,7 +421,7 @@ def _steady_amplitude(
     )
 
 
-def why_no_dither(context: StepContext, rtc: Status) -> str | None:
+def check_dither_allowed(context: StepContext, rtc: Status) -> str | None:
     """Return why the service asks for no dither of its own, or None."""
     state = context.state
     still = state.dithers.policy.unwanted_id
@@ -419,7 +431,7 @@ def why_no_dither(context: StepContext, rtc: Status) -> str | None:
     if not context.policy.dither_enabled and state.dithers.dither is None:
         return f"the settings forbid it{left}"
     if not rtc.in_loop:
-        return why_open(rtc)
+        return explain_open_loop(rtc)
     unnamed = rtc.cm_id is None or state.matrices.read_back_error
     if (
         state.matrices.in_use is None
@@ -443,7 +455,7 @@ def awaits_result(context: StepContext, wanted_dither: WantedDither) -> bool:
     return not late and context.windows.accepted < dithering.results_due
 
 
-def why_too_strong(context: StepContext, rtc: Status) -> str | None:
+def check_dither_strength(context: StepContext, rtc: Status) -> str | None:
     """Return why a running dither exceeds its limits, or None.
 
     An operator's own dither may exceed the budget, but not its own request.
@@ -463,7 +475,7 @@ def why_too_strong(context: StepContext, rtc: Status) -> str | None:
     )
 
 
-def why_unwanted(context: StepContext, rtc: Status) -> str | None:
+def check_dither_wanted(context: StepContext, rtc: Status) -> str | None:
     """Return why the dither that the RTC plays must go though it is not too strong, or None."""
     state, running = context.state, rtc.dither_id
     if running is None or not running.startswith(OUR_DITHERS):

@@ -14,7 +14,7 @@ from service.estimation.demodulation import SIDE_OFFSETS_HZ
 from service.estimation.lockin import LockInPlan
 from service.estimation.random_dither import FRAMES_PER_MODE, RandomPlan
 from service.estimation.windows import DITHER_SETTLING_S, ExpectedDither
-from service.tracking.dither_modes import LINE_FRACTIONS, LINE_RANGE, N_LINES, chosen_modes
+from service.tracking.dither_modes import LINE_FRACTIONS, LINE_RANGE, N_LINES, choose_modes
 from service.tracking.policy import Policy
 from service.tracking.products import ModeSet
 from service.wire import DitherKind, DitherRequest, Status
@@ -104,7 +104,7 @@ class DitherParameters:
     """Modes that are not to be dithered to follow α."""
 
 
-def why_unusable(dither: Dither, rtc: Status, policy: Policy) -> str | None:
+def check_dither_usable(dither: Dither, rtc: Status, policy: Policy) -> str | None:
     """Return why the lines of a dither cannot be separated in its windows, or None."""
     kind = dither.request.kind
     if kind is not DitherKind.SINE:
@@ -133,7 +133,7 @@ def plan_dither(
     """
     asked = any(wish is not None for wish in (modes, amplitude_m, frequency_hz, duration_s))
     proving = choice.modes and not asked
-    chosen = modes or choice.modes or chosen_modes(rtc, policy, choice.shunned)
+    chosen = modes or choice.modes or choose_modes(rtc, policy, choice.shunned)
     chosen = chosen[: rtc.max_dither_modes]
     lines = choice.lines_hz if proving else frequency_hz or policy.dither_frequencies_hz
     lines = clear_lines(rtc, len(chosen), choice) if lines is None else lines

@@ -18,7 +18,7 @@ from service.estimation.windows import OTHER_SESSION, RefusalKind, Why
 from service.model.misregistration import Misregistration
 from service.tracking import mode_proof, validity
 from service.tracking.alarms import Interlock, blocking_alarm
-from service.tracking.jumps import as_previous
+from service.tracking.jumps import to_previous_estimate
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import (
     HistoryEntry,
@@ -96,6 +96,7 @@ def update_gains(
     own = np.zeros(len(gains)) if sigma is None else sigma
     for mode, gain, noise in zip(modes, gains, own, strict=True):
         table[mode] = _update_gain(table.get(mode), mode, float(gain), float(noise), t_ns)
+    # Sorted by time, so that the oldest measurements are forgotten.
     newest = sorted(table.values(), key=lambda gain: gain.t_ns_utc)[-MODES_KEPT:]
     return tuple(sorted(newest, key=lambda gain: gain.mode))
 
@@ -113,6 +114,7 @@ def _update_gain(
     elapsed_s = max((t_ns - gain.t_ns_utc) / SECOND_NS, 0.0)
     prior = gain.sigma**2 + (GAIN_RATE * gain.gain) ** 2 * elapsed_s
     farthest = _MAX_SCATTER_SIGMA * float(np.sqrt(prior + gain.scatter**2))
+    # A single outlier must not inflate the scatter for the next ten windows.
     innovation = float(np.clip(measured - gain.gain, -farthest, farthest))
     learnt = max(innovation**2 - prior, noise**2)
     scatter = float(np.sqrt((1 - SCATTER_WEIGHT) * gain.scatter**2 + SCATTER_WEIGHT * learnt))
@@ -318,8 +320,9 @@ def _still_doubted(state: TrackerState, update: FilterUpdate, when: TelemetrySpa
     if registration is None or not registration.doubt:
         return False
     if update.jumped:
+        # A jump is confirmed by two windows that agree, even if the first began before the doubt.
         when = replace(when, began_ns_utc=when.ended_ns_utc)
-    return validity.why_void(state, when, Purpose.SETTLE) is not None
+    return validity.explain_void(state, when, Purpose.SETTLE) is not None
 
 
 def _jumped_ns_utc(
@@ -338,7 +341,7 @@ def _previous_estimate(
         return None
     before = registration.previous_estimate
     return replace(
-        as_previous(registration),
+        to_previous_estimate(registration),
         next_window=measured,
         previous_estimate=None
         if before is None
@@ -379,11 +382,13 @@ def model_error_of(
     before = policy.floor if registration is None else registration.floor
     if own is not None:
         before = np.maximum(before, np.hypot(policy.floor, own))
+    # Noise in the misfit of such a window, times its own σ, would exceed any model error.
     if np.any(np.diag(estimate.covariance) > (policy.tolerance * policy.dither_sigma) ** 2):
         return before
     told = model_error(estimate.covariance, estimate.misfit)
     if own is not None:
         told = np.maximum(told, own)
+    # The model error does not average down with the number of windows.
     squared = policy.floor**2 + told**2
     share = 1.0 if registration is None else 1.0 / min(registration.n_windows + 1, MISFIT_WINDOWS)
     return np.asarray(np.sqrt(before**2 + share * (squared - before**2)))
@@ -402,16 +407,16 @@ def strong_gains(estimate: DitheredEstimate) -> Array:
     return gains if len(modes) != len(estimate.strong) else gains[estimate.strong]
 
 
-def why_no_window(
+def check_window(
     context: StepContext, estimate: DitheredEstimate, when: TelemetrySpan
 ) -> Why | None:
     """Return why a window's estimate must not be used, or None."""
     if context.rtc is None or estimate.session != context.rtc.session:
         return RefusalKind.VOID, OTHER_SESSION
-    reason = why_no_measurement(context.state, when)
+    reason = check_measurable(context.state, when)
     if reason is not None:
         return RefusalKind.VOID, reason
-    odd = mode_proof.why_tells_nothing(context, estimate)
+    odd = mode_proof.check_information(context, estimate)
     if odd is not None:
         return RefusalKind.VOID, odd
     lag = float(np.median(estimate.lag_frames))
@@ -465,10 +470,10 @@ def _far_windows_agree(context: StepContext, estimate: DitheredEstimate) -> bool
     return len(together) >= N_FAR_WINDOWS
 
 
-def why_no_measurement(state: TrackerState, when: TelemetrySpan) -> str | None:
+def check_measurable(state: TrackerState, when: TelemetrySpan) -> str | None:
     """Return why telemetry taken then, or any that comes now, measures nothing; None: it does."""
     alarm = blocking_alarm(state.alarms.active, Interlock.MEASURE)
     if alarm is None:
-        because = validity.why_void(state, when)
+        because = validity.explain_void(state, when)
         return because and f"{because} when it was taken: its telemetry is no measurement"
     return f"{alarm.definition.because}: its telemetry is no measurement"

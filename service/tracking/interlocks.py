@@ -18,12 +18,12 @@ from service.tracking.alarms import ALARMS, RULE_PREFIX
 from service.tracking.commands import Command
 from service.tracking.events import kebab
 from service.tracking.operation_records import AcquisitionStage
-from service.tracking.operations.acquisition_stages import why_not_now
+from service.tracking.operations.acquisition_stages import check_acquisition
 from service.tracking.operations.running import OperationKind, RunningOperation, running_operations
 from service.tracking.policy import Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import require_record
-from service.tracking.sending import beyond_judging, why_refused
+from service.tracking.sending import beyond_judging, check_approved
 from service.tracking.state import Mode, TrackerState
 from service.tracking.update_policy import is_left_behind
 
@@ -196,7 +196,7 @@ def _compensate(moment: Moment) -> str | None:
 
 
 def _acquire(moment: Moment, _: str) -> str | None:
-    return _needs_rtc(moment) or why_not_now(moment.state, moment.policy)
+    return _needs_rtc(moment) or check_acquisition(moment.state, moment.policy)
 
 
 def _abort(moment: Moment, _: str) -> str | None:
@@ -228,7 +228,7 @@ def _approve(moment: Moment, matrix_id: str) -> str | None:
         return f"{record.id} cannot be judged: α is invalid ({why}): wait for a window"
     if is_left_behind(state, record, moment.policy):
         return f"{record.id} was made for another α than the present one: refit"
-    reason = why_refused(state, record)
+    reason = check_approved(state, record)
     if reason is not None:
         return f"{record.id} cannot be sent: {reason}"
     if registration is not None and beyond_judging(state, record):

@@ -121,8 +121,8 @@ def window_innovation(
     neither half need be significant.
     """
     return _farthest(
-        (as_previous(registration), registration.previous_estimate),
-        _scattering(registration, window),
+        (to_previous_estimate(registration), registration.previous_estimate),
+        _with_scatter(registration, window),
         policy,
         _model_scatter(registration, policy),
     )
@@ -141,16 +141,19 @@ def pair_innovation(
     first, before = previous_window(registration), registration.previous_estimate
     if first is None:
         return ZERO_INNOVATION
-    seen_from = (as_previous(registration), before)
+    seen_from = (to_previous_estimate(registration), before)
     if registration.suspected_jump is None and before is not None:
+        # The first window has entered α already, so both are compared with the estimate before it.
         seen_from = (before, before.previous_estimate)
-    window = _scattering(registration, window)
-    first = _scattering(registration, first)
+    window = _with_scatter(registration, window)
+    first = _with_scatter(registration, first)
     varies = _model_scatter(registration, policy)
     alone = replace(window, alpha=first.alpha, covariance=first.covariance, t_ns_utc=first.t_ns_utc)
     nearest = min(
         _farthest(seen_from, one, policy, varies).mahalanobis_squared for one in (alone, window)
     )
+    # Two windows of one new registration are near one another. Otherwise one is an outlier, or
+    # began before the jump.
     if _squared_distance(first.alpha, first, window, policy) >= min(nearest, JUMP_THRESHOLD):
         return _jump_inside_first(registration, first, window, policy)
     found = _farthest(seen_from, _together(first, window), policy, varies)
@@ -169,7 +172,9 @@ def _jump_inside_first(
     if registration.suspected_jump is None:
         return ZERO_INNOVATION
     varies = _model_scatter(registration, policy)
-    found = _farthest((as_previous(registration),), window, policy, varies)
+    found = _farthest((to_previous_estimate(registration),), window, policy, varies)
+    # A third window would cost two seconds of a loop that suffers, but only a jump this large
+    # excludes turbulence (docs/decisions/0025-jumps.md).
     if found.excess <= MAX_TURBULENCE_EXCESS:
         return ZERO_INNOVATION
     total = _noise_of_two(first, window, policy)
@@ -204,7 +209,7 @@ def jump_lasts(
     return (window.t_ns_utc - first.began_ns_utc) / SECOND_NS >= WINDOW_CORRELATION_TIME_S
 
 
-def wholly_after(
+def is_after_jump(
     first: TimedEstimate, window: PointedEstimate, old: Misregistration, policy: Policy
 ) -> bool:
     """Return whether a window is of the new place ``reading`` shows, and not partly of ``old``.
@@ -213,6 +218,7 @@ def wholly_after(
     difference allowed for) must be little.
     """
     apart = _squared_distance(first.alpha, first, window, policy)
+    # Upper limit of what the first window may lack, 2 σ of the difference included.
     lacks = np.sqrt(apart) + 2.0
     return apart < JUMP_THRESHOLD and bool(
         lacks <= MAX_JUMP_SHORTFALL_SHARE * np.sqrt(_squared_distance(old, first, window, policy))
@@ -234,12 +240,13 @@ def passive_innovation(
         if earlier is not None:
             elapsed_s = max(window.t_ns_utc - earlier.t_ns_utc, 0) / SECOND_NS
             fading = -np.expm1(-2.0 * elapsed_s / policy.bias_memory_s)
+            # The bias fades with its memory, so an old comparison must allow for a new bias.
             forgot = np.square(block.floor) * fading + off
             found.append(_innovation_from(earlier, window, policy, forgot).mahalanobis_squared)
     return max(found)
 
 
-def as_previous(registration: Registration) -> PreviousEstimate:
+def to_previous_estimate(registration: Registration) -> PreviousEstimate:
     """Return what is known, for when it will have been before."""
     return PreviousEstimate(
         alpha=registration.alpha,
@@ -260,7 +267,7 @@ def sum_of(registration: Registration, joint: Joint, block: BiasBlock) -> Previo
     )
 
 
-def _scattering(registration: Registration, window: EstimateT) -> EstimateT:
+def _with_scatter(registration: Registration, window: EstimateT) -> EstimateT:
     """Return a window that says of itself how much windows have scattered lately."""
     return replace(window, covariance=registration.scatter * window.covariance)
 
@@ -284,12 +291,15 @@ def _squared_distance(
 def _noise_of_two(first: TimedEstimate, window: PointedEstimate, policy: Policy) -> Array:
     """Return ``(4, 4)`` covariance of the difference of two windows of one place."""
     elapsed_s = max(window.t_ns_utc - first.t_ns_utc, 0) / SECOND_NS
-    added = _drifted(elapsed_s, policy) + 2.0 * (MODEL_ERROR_VARYING_SHARE * policy.floor) ** 2
+    added = (
+        _drift_variance(elapsed_s, policy) + 2.0 * (MODEL_ERROR_VARYING_SHARE * policy.floor) ** 2
+    )
     return np.asarray(first.covariance + window.covariance + np.diag(added))
 
 
-def _drifted(elapsed_s: float, policy: Policy) -> Array:
+def _drift_variance(elapsed_s: float, policy: Policy) -> Array:
     """Return ``(4,)`` variance that a smooth flexure has added."""
+    # Flexure is smooth: within a minute its variance grows with the square of the time.
     return np.asarray(policy.drift_rate**2 * elapsed_s * min(elapsed_s / DRIFT_TIME_S, 1.0))
 
 
@@ -317,12 +327,13 @@ def _innovation_from(
     previous: PreviousEstimate, window: PointedEstimate, policy: Policy, forgot: Array
 ) -> Innovation:
     elapsed_s = (window.t_ns_utc - previous.t_ns_utc) / SECOND_NS
+    # The RTC's clock was set back: the two times cannot be compared.
     if elapsed_s < -CLOCK_SET_BACK_S:
         return ZERO_INNOVATION
     elapsed_s = max(elapsed_s, 0.0)
     bent = flexure(previous.pointing, window.pointing, policy)
     added = (
-        _drifted(elapsed_s, policy)
+        _drift_variance(elapsed_s, policy)
         + bent**2
         + (MODEL_ERROR_VARYING_SHARE * policy.floor) ** 2
         + forgot

@@ -210,12 +210,16 @@ MAX_LISTED_MODES = 8
 """Modes, or runs of them, that a sentence lists; of more it says how many."""
 
 
-def as_subject(modes: Collection[int]) -> str:
+def format_subject(modes: Collection[int]) -> str:
     """Return modes as the subject of a sentence, with its verb."""
-    return f"mode {as_list(modes)} has" if len(modes) == 1 else f"modes {as_list(modes)} have"
+    return (
+        f"mode {format_modes(modes)} has"
+        if len(modes) == 1
+        else f"modes {format_modes(modes)} have"
+    )
 
 
-def as_list(modes: Iterable[int]) -> str:
+def format_modes(modes: Iterable[int]) -> str:
     """Return modes in words, lowest first, a run of them by its ends."""
     runs: list[list[int]] = []
     for mode in sorted(modes):

@@ -19,7 +19,7 @@ from service.estimation.lockin import LockInEstimate
 from service.estimation.random_dither import RandomEstimate
 from service.tracking import alarms
 from service.tracking import events as ev
-from service.tracking.dither_modes import N_LINES, PROVING_LINE_RANGE, chosen_modes
+from service.tracking.dither_modes import N_LINES, PROVING_LINE_RANGE, choose_modes
 from service.tracking.dither_request import VIBRATION_CLEARANCES_HZ, step_of
 from service.tracking.mode_limits import (
     MAX_LISTED_MODES,
@@ -29,9 +29,9 @@ from service.tracking.mode_limits import (
     ModeProof,
     ModeRatio,
     add_ratios,
-    as_list,
-    as_subject,
     compare,
+    format_modes,
+    format_subject,
 )
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
@@ -86,6 +86,7 @@ def _controlled(state: TrackerState) -> frozenset[int]:
     in_use = None if state.matrices.in_use is None else state.reconstructor(state.matrices.in_use)
     if in_use is None:
         return frozenset()
+    # A matrix without a parent is the RTC's own; only there may the model fail to recognise a mode.
     strange = state.matrices.mode_proof.strange if in_use.parent is None else frozenset()
     return frozenset(range(in_use.n_modes)) - strange
 
@@ -95,7 +96,7 @@ def shunned_modes(state: TrackerState) -> frozenset[int]:
     return state.matrices.mode_proof.contrary - proven_modes(state)
 
 
-def why_tells_nothing(context: StepContext, estimate: DitheredEstimate) -> str | None:
+def check_information(context: StepContext, estimate: DitheredEstimate) -> str | None:
     """Return why a window of these modes does not determine α, or None.
 
     What the loop makes of a line is fitted with the gain of the line's own mode.
@@ -104,10 +105,13 @@ def why_tells_nothing(context: StepContext, estimate: DitheredEstimate) -> str |
         return None  # there is no choice of others
     proof = context.matrices.mode_proof
     odd = (proof.contrary | proof.suspected).intersection(estimate.modes)
+    # Weak lines have too little weight to bias α.
     odd -= proven_modes(context.state).union(estimate.weak)
     if not odd:
         return None
-    return f"{as_subject(odd)} not answered as the instrument file says: such a window gives no α"
+    return (
+        f"{format_subject(odd)} not answered as the instrument file says: such a window gives no α"
+    )
 
 
 def n_proven_modes(state: TrackerState, n_modes: int) -> int:
@@ -116,7 +120,7 @@ def n_proven_modes(state: TrackerState, n_modes: int) -> int:
     return next((mode for mode in range(n_modes) if mode not in proven), n_modes)
 
 
-def why_unproven(state: TrackerState, record: ReconstructorRecord) -> str | None:
+def check_proven(state: TrackerState, record: ReconstructorRecord) -> str | None:
     """Return why a matrix would control unproven modes, or None."""
     if state.operations.acquisition.under_way:
         return None  # it closes the loop on smooth modes first, and watches it
@@ -126,10 +130,10 @@ def why_unproven(state: TrackerState, record: ReconstructorRecord) -> str | None
         return None
     contrary = [mode for mode in missing if mode in state.matrices.mode_proof.contrary]
     if contrary:
-        return f"{as_subject(contrary)} not answered as the instrument file says"
+        return f"{format_subject(contrary)} not answered as the instrument file says"
     return (
-        f"{as_subject(missing)} not been seen to answer yet: a dither shows them before they are "
-        "controlled; let the service dither"
+        f"{format_subject(missing)} not been seen to answer yet: a dither shows them before they "
+        "are controlled; let the service dither"
     )
 
 
@@ -153,8 +157,10 @@ def modes_to_show(context: StepContext, rtc: Status, window_s: float) -> tuple[i
     if not awaits_proof(context, rtc):
         return ()
     missing = _missing_modes(context, rtc)
+    # Many weak lines measure α less well, so that α must be known first.
     if not (is_settled(registration) or (unknown_loop(state, rtc) and _plausible(registration))):
         return ()
+    # Fewer modes share the budget after a failure, so that each line is stronger.
     at_once = max(
         MAX_SHOWN_MODES // FAILED_DITHER_DIVISOR**state.matrices.mode_proof.n_tries, N_LINES
     )
@@ -162,7 +168,7 @@ def modes_to_show(context: StepContext, rtc: Status, window_s: float) -> tuple[i
     shown = missing[:most]
     others = [mode for mode in _to_compare(context, rtc, shown) if mode not in shown]
     shown += others[: most - len(shown)]
-    telling = chosen_modes(rtc, context.policy, shunned_modes(state))
+    telling = choose_modes(rtc, context.policy, shunned_modes(state))
     spare = [mode for mode in telling if mode not in shown]
     room = min(N_LINES if others else N_LINES - len(shown), most - len(shown))
     return tuple(sorted([*shown, *spare[: max(room, 0)]]))
@@ -234,7 +240,9 @@ def note_shown(context: StepContext, modes: tuple[int, ...]) -> None:
         proof = _after_miss(proof)
     shown = replace(proof, shown=frozenset(modes), shown_ns_utc=context.now_ns)
     context.matrices = replace(context.matrices, mode_proof=shown)
-    context.log("modes.shown", f"modes {as_list(modes)} are dithered before they are controlled")
+    context.log(
+        "modes.shown", f"modes {format_modes(modes)} are dithered before they are controlled"
+    )
 
 
 def awaits_result(context: StepContext, window_s: float) -> bool:
@@ -253,6 +261,7 @@ def learn_modes(context: StepContext, estimate: LockInEstimate | RandomEstimate)
     proven, contrary = _classify(gains, np.abs(estimate.optical_gain), estimate.gain_sigma)
     good, bad = (frozenset(modes[which].tolist()) for which in (proven, contrary))
     before = proof
+    # Two windows must agree before a mode is excluded.
     sure = bad & (proof.suspected | proof.contrary)
     compared = _without(
         compare(modes, gains, estimate.gain_sigma), bad | _controlled(context.state)
@@ -368,6 +377,7 @@ def believe_restored(context: StepContext, rtc: Status) -> None:
     proof = context.matrices.mode_proof
     if not proof.session:
         return
+    # Another session may have another order or signs of modes.
     same = proof.session == rtc.session and context.registration is not None
     now = replace(proof, session="") if same else ModeProof()
     context.matrices = replace(context.matrices, mode_proof=now)
@@ -382,6 +392,8 @@ def _classify(
     gains: NDArray[np.float64], size: NDArray[np.float64], sigma: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return which modes answer as they should, and which certainly do not; the rest may do."""
+    # The optical gain is common to all modes, so that a single mode is judged relative to the
+    # median.
     typical = float(np.median(size))
     low, high = (
         max(PLAUSIBLE_RESPONSE_RATIO[0] * typical, MIN_RESPONSE_RATIO),
@@ -413,7 +425,7 @@ def contrary_text(context: StepContext) -> str | None:
 
 def _contrary_in_words(proof: ModeProof, in_the_way: list[int]) -> str:
     return (
-        f"{as_subject(in_the_way)} not answered the dither as the instrument file says"
+        f"{format_subject(in_the_way)} not answered the dither as the instrument file says"
         f"{_in_words(proof, in_the_way)}: no new matrix controls more than {in_the_way[0]} modes"
     )
 
@@ -442,7 +454,7 @@ def _in_words(proof: ModeProof, modes: list[int]) -> str:
     return f" ({', '.join(parts)}{times})" if parts else ""
 
 
-def uneven_text(context: StepContext) -> str | None:
+def explain_uneven(context: StepContext) -> str | None:
     """Return which modes answer more or less strongly than their neighbours, or None."""
     proof = context.matrices.mode_proof
     if proof.session:
@@ -452,8 +464,8 @@ def uneven_text(context: StepContext) -> str | None:
         one = "answers" if len(proof.uneven) == 1 else "answer"
         noun = "mode" if len(proof.uneven) == 1 else "modes"
         found.append(
-            f"{noun} {as_list(proof.uneven)} {one} the dither more than {UNEVEN_RATIO:g} times as "
-            "strongly or as weakly as the modes beside"
+            f"{noun} {format_modes(proof.uneven)} {one} the dither more than {UNEVEN_RATIO:g} "
+            "times as strongly or as weakly as the modes beside"
         )
     return "; ".join(found) or None
 
@@ -472,7 +484,7 @@ def give_up_unseen(context: StepContext, rtc: Status) -> None:
     given_up = replace(proof, shown=frozenset(), n_tries=0, suspected=suspected)
     context.matrices = replace(context.matrices, mode_proof=given_up)
     text = (
-        f"{as_subject(proof.shown)} not been seen to answer in {MAX_PROOF_TRIES} dithers: "
+        f"{format_subject(proof.shown)} not been seen to answer in {MAX_PROOF_TRIES} dithers: "
         "see why windows "
         "are refused, or give the dither more budget"
     )

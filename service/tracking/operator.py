@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from service.control.gains import gain_table
 from service.errors import CommandError
-from service.estimation.loop import extended_gains
+from service.estimation.loop import extend_gains
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking import reconstructors
@@ -18,12 +18,12 @@ from service.tracking.dither_request import (
     DEFAULT_RANDOM_RMS_M,
     OPERATOR_DITHER,
     Dither,
+    check_dither_usable,
     check_modes,
     cost_of,
     plan_dither,
     plan_random,
     total_m,
-    why_unusable,
 )
 from service.tracking.operation_records import CommandState, LoopCommand
 from service.tracking.policy import SECOND_NS
@@ -92,7 +92,7 @@ def start_dither(context: StepContext, command: cmd.StartDither) -> None:
         If it cannot be played or read, or costs more than the budget.
     """
     rtc = present(context.rtc)
-    dither = _planned(context, rtc, command)
+    dither = _plan_dither(context, rtc, command)
     total, over_budget = total_m(dither.request), command.over_budget
     cost = cost_of(total, context.policy, over_budget=over_budget)
     allow_dither(context)
@@ -102,7 +102,7 @@ def start_dither(context: StepContext, command: cmd.StartDither) -> None:
     request_dither(context, dither)
 
 
-def _planned(context: StepContext, rtc: Status, command: cmd.StartDither) -> Dither:
+def _plan_dither(context: StepContext, rtc: Status, command: cmd.StartDither) -> Dither:
     """Return the dither to ask for.
 
     Raises
@@ -132,7 +132,7 @@ def _planned(context: StepContext, rtc: Status, command: cmd.StartDither) -> Dit
         duration_s=command.duration_s,
     )
     check_modes(dither.request.modes, rtc)
-    reason = why_unusable(dither, rtc, policy)
+    reason = check_dither_usable(dither, rtc, policy)
     if reason is not None:
         raise CommandError(reason)
     return dither
@@ -277,7 +277,7 @@ def _gains_of(
 ) -> tuple[float, ...] | None:
     """Return a gain for each mode of the basis as requested; None if they are unchanged."""
     if command.effective_gain is not None:
-        return _compensated(context, rtc, command.effective_gain, n_modes)
+        return _compensate(context, rtc, command.effective_gain, n_modes)
     return None if command.gains is None else _gains(rtc, command.gains, n_modes)
 
 
@@ -293,13 +293,13 @@ def _gains(rtc: Status, groups: tuple[GainGroup, ...], n_modes: int) -> tuple[fl
             f"found gains for {named} modes; expected all {n_modes} while the loop is open, "
             "for its status does not tell the others"
         )
-    gains = list(extended_gains(rtc, n_modes))
+    gains = list(extend_gains(rtc, n_modes))
     for group in groups:
         gains[group.first : group.last + 1] = [group.gain] * (group.last - group.first + 1)
     return tuple(gains)
 
 
-def _compensated(
+def _compensate(
     context: StepContext, rtc: Status, in_effect: float, n_modes: int
 ) -> tuple[float, ...]:
     """Return the gains that act alike on every controlled mode; the others stay at 0."""

@@ -18,7 +18,7 @@ from service.estimation.loop import loop_numbers, same_numbers
 from service.model.misregistration import Misregistration
 from service.tracking import alarms, filtering, jumps, validity
 from service.tracking import events as ev
-from service.tracking.dither_plan import why_no_dither
+from service.tracking.dither_plan import check_dither_allowed
 from service.tracking.registration import (
     HistoryEntry,
     PassiveBias,
@@ -38,7 +38,9 @@ Array = NDArray[Any]
 
 def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
     """Fold the passive estimate in, its bias allowed for, or doubt α where it does not fit."""
-    reason = _why_passive_unusable(context.state, event) or _why_known_already(context.state, event)
+    reason = _check_passive_estimate(context.state, event) or _find_later_telemetry(
+        context.state, event
+    )
     if reason is not None:
         _note_unavailable(context, f"the passive estimate was not used: {reason}")
         return
@@ -49,8 +51,8 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
     block = estimate.bias
     registration = _with_first_bias(registration, estimate)
     forward = filtering.predict(context, registration, event.t_ns_utc)
-    prior = kalman.allowing(forward, block, estimate.bias_excess)
-    mixed = _why_of_two_places(context.state, registration, event)
+    prior = kalman.allow_scatter(forward, block, estimate.bias_excess)
+    mixed = _check_single_registration(context.state, registration, event)
     if mixed is not None:
         biases = _biases_after_look(
             context.state, registration, filtering.joint_of(registration), event
@@ -69,11 +71,13 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
     far = jumps.passive_innovation(
         registration, filtering.joint_of(registration), block, window, context.policy
     )
+    # A passive estimate never moves α far by itself: wind and a moved mirror look alike in it
+    # (docs/decisions/0020-filter-and-passive-estimate.md).
     if far > jumps.MAX_PASSIVE_INNOVATION:
         _ask_for_window(context, registration, event, prior, far)
         return
     joint = kalman.corrected(prior, measured, estimate.covariance, block)
-    joint = kalman.scattered(joint, block, far)
+    joint = kalman.update_scatter(joint, block, far)
     registration = _registration_after_passive(context, registration, joint, event)
     validity.store_registration(context, registration)
     validity.age_registration(context)
@@ -112,17 +116,18 @@ def fit_begins_at(state: TrackerState) -> Misregistration | None:
     return last.alpha if last is not None and np.isfinite(last.sigma).all() else None
 
 
-def _why_passive_unusable(state: TrackerState, event: ev.PassiveFitted) -> str | None:
+def _check_passive_estimate(state: TrackerState, event: ev.PassiveFitted) -> str | None:
     """Return why a passive estimate says nothing of the telescope as it is, or None."""
     of_loop = loop_numbers(state.loop.rtc)
+    # The bias belongs to the loop in which it was measured.
     if event.loop and of_loop and not same_numbers(event.loop, of_loop):
         return "the loop has changed since"
-    return filtering.why_no_measurement(
+    return filtering.check_measurable(
         state, validity.telemetry_span(event.began_ns_utc, event.t_ns_utc)
     )
 
 
-def _why_known_already(state: TrackerState, event: ev.PassiveFitted) -> str | None:
+def _find_later_telemetry(state: TrackerState, event: ev.PassiveFitted) -> str | None:
     """Return the later telemetry that supersedes a delayed estimate, in words, or None."""
     registration = state.alpha.registration
     if registration is None or not registration.window_began_ns_utc:
@@ -191,7 +196,7 @@ def _loop(
     return () if bias is None else bias.loop
 
 
-def _why_of_two_places(
+def _check_single_registration(
     state: TrackerState, registration: Registration, event: ev.PassiveFitted
 ) -> str | None:
     """Return why a passive estimate may be of telemetry from before a jump and after it, or None.
@@ -201,9 +206,10 @@ def _why_of_two_places(
     if registration.suspected_jump is not None:
         return BOTH_SIDES
     bias = registration.bias(event.estimate.bias)
+    # Passive estimates share no telemetry, so this one began after the last one ended.
     began_ns = 0 if bias is None else bias.looked_ns_utc
     span = TelemetrySpan(began_ns_utc=began_ns, ended_ns_utc=event.t_ns_utc)
-    return validity.why_void(state, span, Purpose.PASSIVE)
+    return validity.explain_void(state, span, Purpose.PASSIVE)
 
 
 def _ask_for_window(
@@ -228,7 +234,8 @@ def _ask_for_window(
         bool(registration.doubt),
         bool(registration.doubt) and registration.doubt_voids,
     )
-    why_none = None if context.rtc is None else why_no_dither(context, context.rtc)
+    why_none = None if context.rtc is None else check_dither_allowed(context, context.rtc)
+    # In another wind the bias is another one.
     gone = kalman.forget(prior, event.estimate.bias, event.estimate.bias_excess)
     after = _registration_after_passive(context, registration, gone, event)
     biases = _biases_after_look(context.state, registration, gone, event)
@@ -237,6 +244,7 @@ def _ask_for_window(
     validity.cast_doubt(context, event.t_ns_utc)
     context.warn("registration.passive-jump", f"{text} (innovation {far:.0f}, expected 4)")
     validity.request_window(context, text)
+    # Normally a dithered window decides within seconds, and no operator need act.
     if why_none is not None or was_doubted:
         cannot = "no window since the last disagreement" if why_none is None else why_none
         context.raise_alarm(alarms.DISAGREES, f"{text}: {cannot}; α stands as windows have it")

@@ -95,14 +95,14 @@ def event_of_now(context: StepContext, event: Event) -> Event:
     """Return an event whose estimate of α is brought to the present pointing."""
     match event:
         case ev.WindowFitted(estimate=estimate, began_ns_utc=began_ns):
-            alpha = _of_now(context.state, estimate.alpha, began_ns, estimate.t_ns_utc)
+            alpha = _to_present(context.state, estimate.alpha, began_ns, estimate.t_ns_utc)
             return replace(event, estimate=replace(estimate, alpha=alpha))
         case ev.PassiveFitted(estimate=estimate, began_ns_utc=began_ns, t_ns_utc=t_ns):
-            alpha = _of_now(context.state, estimate.alpha, began_ns, t_ns)
+            alpha = _to_present(context.state, estimate.alpha, began_ns, t_ns)
             return replace(event, estimate=replace(estimate, alpha=alpha))
         case ev.WideCaptureFitted(found=found, began_ns_utc=began_ns):
             estimate = found.estimate
-            alpha = _of_now(context.state, estimate.alpha, began_ns, estimate.t_ns_utc)
+            alpha = _to_present(context.state, estimate.alpha, began_ns, estimate.t_ns_utc)
             return replace(event, found=replace(found, estimate=replace(estimate, alpha=alpha)))
         case _:
             return event
@@ -126,6 +126,7 @@ def registration_ahead(state: TrackerState, registration: Registration) -> Regis
     Nothing can be made for a slew: then, and where nothing moves, it is what is known now.
     """
     step = MATRIX_LEAD_S * _rate(state)
+    # A step this large is a slew, for which no matrix can be made.
     if not step.any() or np.any(np.abs(step) > MAX_LEAD_STEP):
         return registration
     third, sigma = np.abs(step) / 3.0, registration.sigma
@@ -150,7 +151,7 @@ def _rate(state: TrackerState) -> Array:
     return difference(then, last) * (SECOND_NS / (last_ns - since_ns))
 
 
-def why_smeared(state: TrackerState, began_ns_utc: int, ended_ns_utc: int) -> str | None:
+def check_pointing_motion(state: TrackerState, began_ns_utc: int, ended_ns_utc: int) -> str | None:
     """Return why a window belongs to no single registration (the law moved within it), or None."""
     first, last = law_at(state, began_ns_utc), law_at(state, ended_ns_utc)
     if first is None or last is None:
@@ -181,11 +182,12 @@ def difference(one: Misregistration, other: Misregistration) -> Array:
     return step
 
 
-def _of_now(
+def _to_present(
     state: TrackerState, alpha: Misregistration, began_ns_utc: int, ended_ns_utc: int
 ) -> Misregistration:
     """Return an estimate at the present pointing, made of telemetry of another."""
     now = state.alpha.law.nominal
+    # A window measures the mean registration, which is that of its middle if the law is smooth.
     middle_ns = ((began_ns_utc or ended_ns_utc) + ended_ns_utc) // 2
     then = law_at(state, middle_ns)
     if now is None or then is None:
@@ -195,7 +197,7 @@ def _of_now(
 
 def _nominal(context: StepContext, law: PointingLaw) -> Misregistration | str:
     """Return the present registration by the law, or why it is unknown and what to do."""
-    reported = _reported(context)
+    reported = _reported_values(context)
     missing = sorted(law.names - reported.keys())
     if missing and context.alpha.pointing is None:
         return (
@@ -218,7 +220,7 @@ def _nominal(context: StepContext, law: PointingLaw) -> Misregistration | str:
     return found if scale is None else Misregistration.from_vector(found.vector * scale)
 
 
-def _reported(context: StepContext) -> Reported:
+def _reported_values(context: StepContext) -> Reported:
     """Return the numbers that a law may be of."""
     values = {
         value.name: float(value.value)
@@ -253,6 +255,7 @@ def _outruns_pointing(context: StepContext, law: PointingLaw, now: Misregistrati
 def _hold(context: StepContext, before: Misregistration, now: Misregistration) -> None:
     """Hold α where the reported values leap. A leap that lasts is accepted, and α is in doubt."""
     law, leap = context.alpha.law, context.alpha.law.leap
+    # A single wrong report must not move α; another leap restarts the wait.
     if leap is None or _is_far(leap.to, now, (context.now_ns - leap.worked_out_ns_utc) / SECOND_NS):
         leap = LawLeap(to=now, since_ns_utc=context.now_ns, worked_out_ns_utc=context.now_ns)
         text = (
@@ -310,6 +313,7 @@ def _way(context: StepContext, now: Misregistration) -> tuple[tuple[int, Misregi
     if way and t_ns <= way[-1][0]:
         kept = tuple(place for place in way if place[0] < t_ns)
         return (*kept, (t_ns, now))
+    # While nothing moves one point is enough: the last one is replaced.
     still = len(way) > 1 and way[-1][1] == way[-2][1] == now
     close = len(way) > 1 and t_ns - way[-2][0] < PATH_SPACING_NS and way[-1][1] != way[-2][1]
     return (*(way[:-1] if still or close else way), (t_ns, now))[-MAX_PATH_POINTS:]

@@ -5,18 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.errors import CommandError, UnknownIdError
-from service.estimation.loop import commanded_gains, extended_gains
+from service.estimation.loop import extend_gains, select_gains
 from service.tracking import events as ev
 from service.tracking import update_policy
 from service.tracking.alarms import Interlock
 from service.tracking.products import Assessment, MatrixState, ReconstructorRecord
 from service.tracking.sending import (
     beyond_judging,
+    check_approved,
+    check_return,
+    check_sendable,
+    explain_unread_matrix,
     may_follow,
-    why_no_return,
-    why_refused,
-    why_unread,
-    why_unsendable,
 )
 from service.tracking.state import Level, Mode, TrackerState
 from service.tracking.step_context import StepContext
@@ -71,6 +71,7 @@ def change_state(context: StepContext, matrix_id: str, to: MatrixState, reason: 
 def mark_applied(context: StepContext, matrix_id: str) -> None:
     """Mark one reconstructor as applied; whichever was, has been superseded."""
     record = require_record(context.state, matrix_id)
+    # Each status names the matrix in use: a repetition must not discard its verdict.
     if context.matrices.in_use == matrix_id and record.state is MatrixState.APPLIED:
         return
     for other in context.matrices.reconstructors:
@@ -100,6 +101,8 @@ def forget_session(context: StepContext) -> None:
             change_state(context, record.id, MatrixState.FAILED, "the RTC restarted")
     context.matrices = replace(
         context.matrices,
+        # A restarted RTC may hold other numbers under a known id, so that nothing is verified any
+        # more (docs/decisions/0026-gate-verdict-read-back.md).
         in_use=None,
         verified_ids=frozenset(),
         mismatched_id=None,
@@ -153,7 +156,9 @@ def on_matrix(context: StepContext, made: ev.MatrixMade) -> None:
     alarms, and if α is valid.
     """
     record, wanted = made.record, made.wanted
-    overtaken = not wanted and _jumped_since(context.state, record)
+    # A matrix that was being made when a jump was confirmed is for the registration before it. One
+    # that an operator ordered is judged again instead.
+    overtaken = not wanted and _has_jumped_since(context.state, record)
     propose(context, record)
     if made.asked_modes is not None:
         update_policy.note_limit(context, record, made.asked_modes, made.why_fewer)
@@ -164,9 +169,11 @@ def on_matrix(context: StepContext, made: ev.MatrixMade) -> None:
         change_state(context, record.id, MatrixState.DISCARDED, text)
         context.log("reconstructor.discarded", text)
         return
-    held = why_unsendable(context.state, record) or beyond_judging(context.state, record)
+    held = check_sendable(context.state, record) or beyond_judging(context.state, record)
     no_return = (
-        None if wanted or context.operator.mode is not Mode.AUTO else why_no_return(context.state)
+        # In auto no matrix is sent without a way back from it: probation must be able to send the
+        # previous one.
+        None if wanted or context.operator.mode is not Mode.AUTO else check_return(context.state)
     )
     if not held and no_return is not None:
         context.log("reconstructor.kept-back", f"{record.id} is proposed and not sent: {no_return}")
@@ -199,8 +206,10 @@ def send_once_judged(context: StepContext, matrix_id: str, *, wanted: bool = Tru
         If it cannot be sent now, whatever the gate would say.
     """
     record, rtc = _sendable(context, matrix_id)
-    gains = commanded_gains(rtc, record.n_modes)
+    gains = select_gains(rtc, record.n_modes)
     stale = update_policy.verdict_invalid_reason(context.state, record.judged, gains)
+    # A rollback into an open loop cannot be judged and is sent all the same
+    # (docs/decisions/0026-gate-verdict-read-back.md).
     if stale is None or (rtc.loop == "open" and record.gate is None):
         send(context, matrix_id)
         return
@@ -224,13 +233,14 @@ def on_proposal_judged(context: StepContext, event: ev.ProposalJudged) -> None:
         context.warn("reconstructor.refused", f"{record.id}: {verdict.reason}")
         return
     replace_record(context, record)
-    reason = why_unsendable(context.state, record)
+    reason = check_sendable(context.state, record)
+    # The verdict takes a second: mode, loop and α may have changed meanwhile.
     if reason is None and not event.wanted and not may_follow(context.state):
         alarm = context.blocking_alarm(Interlock.DECIDE)
         reason = f"{alarm.name}: {alarm.text}" if alarm else "the mode, the loop or α has changed"
     if rtc is not None and reason is None:
         reason = update_policy.verdict_invalid_reason(
-            context.state, record.judged, commanded_gains(rtc, record.n_modes)
+            context.state, record.judged, select_gains(rtc, record.n_modes)
         )
     if reason is None:
         send(context, record.id)
@@ -243,7 +253,7 @@ def on_proposal_judged(context: StepContext, event: ev.ProposalJudged) -> None:
 def send(context: StepContext, matrix_id: str, swapped_ns_utc: int | None = None) -> None:
     """Mark a reconstructor as published and request to send it, with the gains in force.
 
-    ``swapped_ns_utc`` requests a rollback behind the swap of that time, see :func:`why_unsendable`.
+    ``swapped_ns_utc`` requests a rollback behind the swap of that time, see :func:`check_sendable`.
 
     Raises
     ------
@@ -252,7 +262,7 @@ def send(context: StepContext, matrix_id: str, swapped_ns_utc: int | None = None
     """
     record, rtc = _sendable(context, matrix_id, swapped_ns_utc)
     same = record.n_modes == rtc.n_controlled
-    _send(context, record, None if same else extended_gains(rtc, record.n_modes))
+    _send(context, record, None if same else extend_gains(rtc, record.n_modes))
 
 
 def send_with(context: StepContext, matrix_id: str, gains: tuple[float, ...] | None) -> None:
@@ -270,7 +280,7 @@ def send_with(context: StepContext, matrix_id: str, gains: tuple[float, ...] | N
 def _send(
     context: StepContext, record: ReconstructorRecord, gains: tuple[float, ...] | None
 ) -> None:
-    unjudged = _why_unjudged(record)
+    unjudged = _explain_missing_verdict(record)
     replace_record(
         context,
         replace(
@@ -303,28 +313,28 @@ def on_acknowledgement(context: StepContext, event: Acknowledgement) -> None:
         return
     if not _is_old(context.state, record, event):
         with context.because_of(record.cause):
-            _acknowledged(context, record, event)
+            _on_state(context, record, event)
 
 
-def _acknowledged(
-    context: StepContext, record: ReconstructorRecord, event: Acknowledgement
-) -> None:
+def _on_state(context: StepContext, record: ReconstructorRecord, event: Acknowledgement) -> None:
     """Take a reconstructor further on its way, or note why the RTC holds other numbers."""
+    # The id alone does not prove that the numbers have arrived unchanged.
     if record.sha256 and event.sha256 not in {None, record.sha256}:
         _distrust(context, record, MatrixState(event.state.value), event.sha256)
         return
     reason, state = event.reason, MatrixState(event.state.value)
     if state in {MatrixState.APPLIED, MatrixState.STAGED}:
-        reason = reason or _why_unjudged(record)
+        reason = reason or _explain_missing_verdict(record)
     if state is MatrixState.APPLIED:
         _trust(context, record.id)
         record = replace(record, applied_frame_seq=event.frame_seq, reason=reason)
         replace_record(context, record)
         mark_applied(context, record.id)
-        gains = () if context.rtc is None else commanded_gains(context.rtc, record.n_modes)
+        gains = () if context.rtc is None else select_gains(context.rtc, record.n_modes)
         of_other = update_policy.verdict_doubtful_reason(context.state, record.judged, gains)
         context.matrices = replace(
             context.matrices,
+            # The gate's verdict is the margin only while loop and α are those that it judged.
             margin=None if of_other else record.gate,
             judged_ns_utc=None if of_other else context.now_ns,
         )
@@ -362,10 +372,11 @@ def apply_named(context: StepContext, matrix_id: str) -> None:
     Only once its numbers are known to be the RTC's, or are not to be had.
     """
     record = context.state.reconstructor(matrix_id)
-    if record is None or why_unread(context.state, matrix_id):
+    if record is None or explain_unread_matrix(context.state, matrix_id):
         return
     mark_applied(context, matrix_id)
     if record.state is MatrixState.FAILED:
+        # The acknowledgement may be lost or late; the status is repeated.
         text = f"{matrix_id} is in use after all, by the RTC's status, without an acknowledgement"
         change_state(context, matrix_id, MatrixState.APPLIED, text)
         context.log("reconstructor.applied", text)
@@ -407,7 +418,7 @@ def _sendable(
         If it cannot be sent now.
     """
     record, rtc = require_record(context.state, matrix_id), context.rtc
-    reason = why_refused(context.state, record, swapped_ns_utc)
+    reason = check_approved(context.state, record, swapped_ns_utc)
     if rtc is None or reason is not None:
         raise CommandError(f"{matrix_id} cannot be sent: {reason}")
     return record, rtc
@@ -443,15 +454,16 @@ def _trust(context: StepContext, matrix_id: str) -> None:
         context.log("reconstructor.right", f"the RTC holds {matrix_id} as it was sent")
 
 
-def _jumped_since(state: TrackerState, record: ReconstructorRecord) -> bool:
+def _has_jumped_since(state: TrackerState, record: ReconstructorRecord) -> bool:
     """Return True if a jump was found since its request: the verdict is out of date."""
     registration, began_ns = state.alpha.registration, state.matrices.making_since_ns_utc
     if registration is None or registration.jumped_ns_utc is None or began_ns is None:
         return False
+    # A jump that is smaller than the range of the verdict leaves it valid.
     return registration.jumped_ns_utc >= began_ns and update_policy.is_outdated(state, record)
 
 
-def _why_unjudged(record: ReconstructorRecord) -> str:
+def _explain_missing_verdict(record: ReconstructorRecord) -> str:
     """Return why the gate has said nothing of one on its way to the RTC; empty: it has."""
     going = record.on_its_way or record.state is MatrixState.PROPOSED
     return record.reason if record.gate is None and going else ""

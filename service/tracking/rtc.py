@@ -149,6 +149,7 @@ def _begin_anew(context: StepContext, because: str) -> None:
     validity.invalidate_telemetry(context, because)
     dither.forget_dither(context)
     end_ramp(context)
+    # α belongs to the telescope and is kept, but windows must confirm it.
     validity.require_new_windows(context)
     context.retry_all()
     context.loop = replace(context.loop, rtc=None, holds=False)
@@ -201,6 +202,7 @@ def on_services(context: StepContext, event: ev.ServicesMet) -> None:
 def on_failure(context: StepContext, effect: Effect, text: str) -> None:
     """Undo the memory of having asked, so that it can be asked again later."""
     match effect:
+        # Without a pause a worker that fails at once would be asked in every step.
         case ev.MakeMatrix() | ev.RepublishMatrix():
             context.put_off(make_s=5.0)
             reconstructors.note_none_made(context)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from service.estimation.loop import NO_RTC
 from service.tracking import alarms, update_policy
 from service.tracking.alarms import Alarm, Interlock, alarm_blocks, blocking_alarm
-from service.tracking.mode_proof import why_unproven
+from service.tracking.mode_proof import check_proven
 from service.tracking.products import ReconstructorRecord
 from service.tracking.state import Mode, TrackerState
 
@@ -16,7 +16,7 @@ _OF_A_SWAP = (
 """Alarms that telemetry raises when a wrong matrix multiplies its slopes."""
 
 
-def why_unsendable(
+def check_sendable(
     state: TrackerState, record: ReconstructorRecord, swapped_ns_utc: int | None = None
 ) -> str | None:
     """Return why a reconstructor may not be published now, by anybody, or None.
@@ -43,20 +43,20 @@ def why_unsendable(
     alarm = next((alarm for alarm in before if alarm_blocks(alarm, interlock)), None)
     if alarm is not None:
         return alarm.text
-    unread = why_unread(state, state.loop.rtc.cm_id)
-    return unread if unread or was_used else why_unproven(state, record)
+    unread = explain_unread_matrix(state, state.loop.rtc.cm_id)
+    return unread if unread or was_used else check_proven(state, record)
 
 
-def why_refused(
+def check_approved(
     state: TrackerState, record: ReconstructorRecord, swapped_ns_utc: int | None = None
 ) -> str | None:
     """Return the same where the gate's verdict counts: one that says no comes first."""
     if record.gate is not None and not record.gate.accepted:
         return record.gate.reason
-    return why_unsendable(state, record, swapped_ns_utc)
+    return check_sendable(state, record, swapped_ns_utc)
 
 
-def why_no_return(state: TrackerState) -> str | None:
+def check_return(state: TrackerState) -> str | None:
     """Return why the matrix in use could not be sent back after another one, or None."""
     rtc = state.loop.rtc
     if rtc is None or (rtc.cm_id or state.matrices.in_use) in state.matrices.verified_ids:
@@ -64,7 +64,7 @@ def why_no_return(state: TrackerState) -> str | None:
     name = "its matrix" if rtc.cm_id is None else rtc.cm_id
     why = (
         state.matrices.read_back_error
-        or why_unread(state, rtc.cm_id)
+        or explain_unread_matrix(state, rtc.cm_id)
         or "its status does not name it"
     )
     return (
@@ -82,7 +82,7 @@ def _not_of_swap(state: TrackerState, swapped_ns_utc: int) -> tuple[Alarm, ...]:
     )
 
 
-def why_unread(state: TrackerState, matrix_id: str | None) -> str | None:
+def explain_unread_matrix(state: TrackerState, matrix_id: str | None) -> str | None:
     """Return why the numbers of this matrix of the RTC's are unknown, or None."""
     if matrix_id is None or matrix_id in state.matrices.verified_ids:
         return None
@@ -100,7 +100,7 @@ def may_follow(state: TrackerState) -> bool:
         return False
     if (
         blocking_alarm(state.alarms.active, Interlock.DECIDE) is not None
-        or why_no_return(state) is not None
+        or check_return(state) is not None
     ):
         return False
     return registration is not None and update_policy.is_settled(registration)

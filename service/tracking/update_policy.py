@@ -59,11 +59,13 @@ def verdict_invalid_reason(
     """
     registration = state.alpha.registration
     if registration is None or judged is None:
-        return None if registration is None else why_of_another_loop(state, judged, gains)
+        return None if registration is None else explain_loop_change(state, judged, gains)
     moved = registration.alpha.distance(judged.alpha)
+    # The gate examined the ends of the 3 σ ellipsoid: the present one must lie inside the examined
+    # one.
     if np.any(moved + 3.0 * registration.sigma > 3.0 * judged.sigma + VERDICT_MARGIN):
         return "α ± 3σ reaches further than it was judged for"
-    return why_of_another_loop(state, judged, gains)
+    return explain_loop_change(state, judged, gains)
 
 
 def verdict_doubtful_reason(
@@ -80,7 +82,7 @@ def verdict_doubtful_reason(
     return verdict_invalid_reason(state, judged, gains)
 
 
-def why_of_another_loop(
+def explain_loop_change(
     state: TrackerState, judged: Judged | None, gains: tuple[float, ...]
 ) -> str | None:
     """Return what has changed in the loop since a verdict; None if nothing, or without an RTC.
@@ -98,6 +100,7 @@ def why_of_another_loop(
         return f"the leak was {judged.leak:g}, it is {rtc.leak:g}"
     if abs(judged.delay_frames - rtc.delay_frames) > SAME_DELAY:
         return f"the delay was {judged.delay_frames:g} frames, it is {rtc.delay_frames:g}"
+    # The status of an open loop does not contain the gains that it will close with.
     same = rtc.loop == "open" or same_gains(gains, judged.gains)
     return None if same else "the gains have changed"
 
@@ -116,7 +119,7 @@ def update_reason(
     if has_moved(state, in_use, policy):
         step = registration.alpha.vector - in_use.alpha.vector
         return f"moved by {step_text(step)} since {in_use.id}"
-    if _jumped(state, in_use, registration):
+    if _has_jumped(state, in_use, registration):
         return f"{in_use.id} was made before the mirror jumped"
     last = state.matrices.assessment
     if last is None or last.id != in_use.id:
@@ -159,7 +162,8 @@ def _gain_reason(
     if since is None:
         return None
     step, covariance = since
-    found, raised = last.expected, _raised(in_use, now_ns)
+    found, raised = last.expected, _threshold_ratio(in_use, now_ns)
+    # Noise of α alone would show a loss, which no new matrix recovers.
     win_m = found.loss_m - estimate_noise_loss_m(found.loss_m, step, covariance)
     if win_m > policy.update_gain_m * raised:
         return f"a new one is expected to win {win_m * 1e9:.2f} nm over {in_use.id}"
@@ -178,7 +182,7 @@ def _margin_lost(last: Assessment) -> float:
     return (1.0 - (1.0 - last.expected.pole_radius) / whole) if whole > 0.0 else 0.0
 
 
-def _raised(in_use: ReconstructorRecord, now_ns: int) -> float:
+def _threshold_ratio(in_use: ReconstructorRecord, now_ns: int) -> float:
     """Return by how much the thresholds are raised so soon after an update."""
     since_s = (now_ns - in_use.created_ns_utc) / SECOND_NS
     return 1.0 + max(0.0, 1.0 - since_s / THRESHOLD_DECAY_S)
@@ -209,7 +213,9 @@ def has_moved(state: TrackerState, record: ReconstructorRecord, policy: Policy) 
     return _apart(state, record, policy.update_threshold)
 
 
-def _jumped(state: TrackerState, in_use: ReconstructorRecord, registration: Registration) -> bool:
+def _has_jumped(
+    state: TrackerState, in_use: ReconstructorRecord, registration: Registration
+) -> bool:
     """Return whether the mirror has jumped since, further than the gate's verdict reaches.
 
     What a new one wins does not matter: what has jumped once may jump again.
@@ -225,7 +231,7 @@ def is_left_behind(state: TrackerState, record: ReconstructorRecord, policy: Pol
     """Return True if α is so far from this reconstructor that it is obsolete."""
     registration = state.alpha.registration
     return registration is not None and (
-        has_moved(state, record, policy) or _jumped(state, record, registration)
+        has_moved(state, record, policy) or _has_jumped(state, record, registration)
     )
 
 
@@ -298,6 +304,7 @@ def more_modes_to_try(
 
     New modes get the gain of the last: where that is 0 they would not be in the loop.
     """
+    # Added modes get the gain of the last one.
     if not rtc.gains[rtc.n_controlled - 1]:
         return ()
     target = policy.wanted_modes(rtc)
@@ -387,6 +394,8 @@ def limit_modes(
     before, wait_s, now_ns = context.matrices.mode_limit, first_wait_s, context.now_ns
     if before is not None and now_ns - before.since_ns_utc < MODES_LIMIT_MEMORY_S * SECOND_NS:
         left_s = (before.until_ns_utc - now_ns) / SECOND_NS
+        # The wait is doubled with each failure, up to 30 min (docs/decisions/0023-update-
+        # policy.md).
         wait_s = max(first_wait_s, min(2.0 * before.wait_s, MAX_MODES_DELAY_S), left_s)
     limit = ModeLimit(
         n_modes=n_modes,

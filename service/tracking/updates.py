@@ -12,7 +12,7 @@ from service.tracking.operations.running import running_ramp
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import request_applied, request_matrix, request_verdict
-from service.tracking.sending import why_no_return, why_unsendable
+from service.tracking.sending import check_return, check_sendable
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.update_policy import (
@@ -52,6 +52,7 @@ def fetch_in_use(context: StepContext) -> None:
     rtc, state = context.rtc, context.state
     if rtc is None or context.blocking_alarm(Interlock.ASK) is not None:
         return
+    # A matrix of FLAO is 3 MB: it travels once in a session.
     if rtc.cm_id in state.matrices.verified_ids:
         return
     anew = (
@@ -80,14 +81,14 @@ def decide_updates(context: StepContext) -> None:
     hindrance = explain_hindrance(context, rtc)
     if hindrance != context.matrices.hindrance:
         context.matrices = replace(context.matrices, hindrance=hindrance)
-    unjudged = _unjudged_in_use(context)
+    unjudged = _find_unjudged(context)
     # asked for first: after a jump the loop waits for it, and nobody for the old one's margin
     _choose_update(context, rtc)
     if unjudged is not None:
         request_verdict(context, unjudged)
 
 
-def _unjudged_in_use(context: StepContext) -> str | None:
+def _find_unjudged(context: StepContext) -> str | None:
     """Return the matrix in use if its margin is not known or was judged too long ago, else None.
 
     Nothing is sent on such an answer: what is made, approved, copied or asked of the loop is judged
@@ -111,6 +112,7 @@ def _judgement_due(state: TrackerState, in_use: str, now_ns: int) -> bool:
     record = state.reconstructor(in_use)
     if state.matrices.margin is None or record is None or record.judged is None:
         return waited_s > REFUSED_JUDGE_INTERVAL_S
+    # A smaller σ may let a rejected matrix pass soon.
     every_s = JUDGE_INTERVAL_S if state.matrices.margin.accepted else REFUSED_JUDGE_INTERVAL_S
     return waited_s > every_s or (
         waited_s > MIN_JUDGE_INTERVAL_S and assessment_is_old(state, record)
@@ -139,11 +141,13 @@ def _choose_update(context: StepContext, rtc: Status) -> None:
         return
     why, n_now = update_reason(state, in_use, context.policy, now_ns), rtc.n_controlled
     n_safe = n_proven_modes(state, rtc.n_modes)
+    # No new matrix may control modes whose response has not been verified.
     if n_safe < n_now:
         return
     if why is not None:
         request_matrix(context, MakeMatrix(n_modes=n_now, why=why, fewer=fewer_modes_than(n_now)))
         return
+    # More modes are tried only when the matrix in use needs no replacement.
     more = tuple(n for n in more_modes_to_try(state, rtc, context.policy, now_ns) if n <= n_safe)
     if more and not awaits_proof(context, rtc):
         why = f"{n_now} of {more[0]} modes controlled"
@@ -248,7 +252,7 @@ def _is_busy(context: StepContext) -> bool:
     no matrix to return to.
     """
     state = context.state
-    awaited = state.operator.mode is not Mode.AUTO or why_no_return(state) is not None
+    awaited = state.operator.mode is not Mode.AUTO or check_return(state) is not None
     return any(
         r.on_its_way
         or (r.state is MatrixState.PROPOSED and awaited and _is_left_to_operator(context, r))
@@ -263,7 +267,7 @@ def _is_left_to_operator(context: StepContext, record: ReconstructorRecord) -> b
         return True
     age_s = (context.now_ns - record.created_ns_utc) / SECOND_NS
     usable = (
-        not is_left_behind(state, record, context.policy) and why_unsendable(state, record) is None
+        not is_left_behind(state, record, context.policy) and check_sendable(state, record) is None
     )
     return usable and age_s < MIN_PROPOSAL_LIFETIME_S
 

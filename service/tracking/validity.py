@@ -88,6 +88,7 @@ def pointing_at(state: TrackerState, t_ns_utc: int) -> Pointing | None:
     later = [place for place in state.alpha.pointings if place[0] > t_ns_utc]
     if not later:
         return state.alpha.pointing
+    # A report is valid until the next one.
     earlier = state.alpha.pointings[: len(state.alpha.pointings) - len(later)]
     return earlier[-1][1] if earlier else later[0][1]
 
@@ -121,6 +122,7 @@ def shift_estimate(context: StepContext, step: Array, spread: Array, still_ns_ut
             n_windows=0,
             previous_estimate=None,
             suspected_jump=None,
+            # The passive bias is of the loop and the wind: it does not move with the image.
             biases=without_previous(registration.biases),
         ),
     )
@@ -199,6 +201,7 @@ def age_registration(context: StepContext) -> None:
         standing = _validity_of(context, registration)
         if standing.level in _WORTHLESS:
             request_window(context, standing.reason)
+        # The gate examines α ± 3σ: a large σ would reject any new matrix.
         elif context.dither is None and _too_wide_for_the_gate(context.state, registration):
             request_window(context, "σ has grown beyond what the stability gate accepts")
         store_registration(context, replace(registration, validity=standing))
@@ -249,7 +252,10 @@ def elapsed_s(state: TrackerState, registration: Registration, now_ns: int) -> f
 
 
 def _validity_of(context: StepContext, registration: Registration) -> ValidityState:
-    policy, reason = context.policy, _why_invalid(context.state, registration, context.policy)
+    policy, reason = (
+        context.policy,
+        _explain_invalidity(context.state, registration, context.policy),
+    )
     if reason is not None:
         return ValidityState(level=Validity.INVALID, reason=reason)
     sigma, before = registration.sigma, context.before.alpha.registration
@@ -257,6 +263,7 @@ def _validity_of(context: StepContext, registration: Registration) -> ValiditySt
     if registration.n_windows == 0:
         return ValidityState(level=Validity.STALE, reason="no window has confirmed it yet")
     was_stale = before is not None and before.validity.level is Validity.STALE
+    # Hysteresis: a σ near its limit must not raise and clear the alarm in turn.
     ends = STALE_END_SHARE if was_stale and before and before.n_windows else 1.0
     if np.any(sigma > ends * limit):
         return ValidityState(level=Validity.STALE, reason=_worst(sigma, limit))
@@ -270,11 +277,14 @@ def _validity_of(context: StepContext, registration: Registration) -> ValiditySt
     return ValidityState(until_ns_utc=until_ns)
 
 
-def _why_invalid(state: TrackerState, registration: Registration, policy: Policy) -> str | None:
+def _explain_invalidity(
+    state: TrackerState, registration: Registration, policy: Policy
+) -> str | None:
     """Return why α may be somewhere else altogether, or None."""
     if registration.doubt and registration.doubt_voids:
         return registration.doubt
     moved_deg = slewed_deg(state, registration)
+    # With a pointing law α follows the slew.
     if moved_deg > policy.slew_limit_deg and registration.nominal is None:
         return f"the telescope has moved by {moved_deg:.0f} deg since the last dithered window"
     limit = beyond_model_error(policy.useless_sigma, registration.floor, policy)
@@ -369,7 +379,7 @@ def precedes(state: TrackerState, span: TelemetrySpan, since_ns_utc: int) -> boo
     return span.began_ns_utc < since_ns_utc - _ROUNDING_NS
 
 
-def why_void(
+def explain_void(
     state: TrackerState, span: TelemetrySpan, purpose: Purpose = Purpose.MEASURE
 ) -> str | None:
     """Return why telemetry taken then is void for a purpose, whatever is the matter now, or None.

@@ -59,14 +59,17 @@ def on_window(context: StepContext, event: ev.WindowFitted) -> None:
     """Fold one window's estimate into the registration, or refuse it with its reason."""
     estimate = event.estimate
     when = validity.telemetry_span(event.began_ns_utc, estimate.t_ns_utc)
-    why = filtering.why_no_window(context, estimate, when)
-    smeared = pointing_law.why_smeared(context.state, when.began_ns_utc, when.ended_ns_utc)
+    why = filtering.check_window(context, estimate, when)
+    smeared = pointing_law.check_pointing_motion(
+        context.state, when.began_ns_utc, when.ended_ns_utc
+    )
     if smeared is not None:
         why = RefusalKind.VOID, smeared
     if why is not None:
         kind, reason = why
         reject_window(context, reason, kind)
         return
+    # ``run`` counts accepted windows in a row as positive and refused ones as negative.
     context.windows = replace(context.windows, run=max(context.windows.run, 0) + 1)
     if validity.is_since_alarm(context.state, alarms.DITHER_LOST, when):
         note_found(context)
@@ -112,6 +115,7 @@ def reject_window(context: StepContext, reason: str, kind: RefusalKind = Refusal
         context.raise_alarm(alarms.MISALIGNED, reason)
     if kind is RefusalKind.MISTOLD:
         context.raise_alarm(alarms.WRONG_ANSWER, reason)
+    # The end of a dither cuts its last window: that is no fault.
     level = Level.INFO if kind is RefusalKind.CUT_SHORT else Level.WARNING
     _note_refusal(context, reason, level)
     if kind not in HARMLESS_REFUSALS:
@@ -130,7 +134,7 @@ def process_window(context: StepContext, measured: WindowEstimate) -> None:
     if registration is None:
         joint = kalman.begin_joint(measured.numbers, measured.noise)
         if measured.with_stretches is not None:
-            joint = kalman.expecting(joint, context.nominal.stretches)
+            joint = kalman.expect_stretches(joint, context.nominal.stretches)
         filtering.accept(context, FilterUpdate(joint=joint, n_windows=1, innovation=0.0), measured)
         return
     first = jumps.previous_window(registration)
@@ -142,7 +146,9 @@ def process_window(context: StepContext, measured: WindowEstimate) -> None:
             _suspect_jump(context, registration, measured, both, first)
         return
     far = jumps.window_innovation(registration, measured, context.policy)
-    too_early = validity.why_void(context.state, measured.when, Purpose.SETTLE)
+    too_early = validity.explain_void(context.state, measured.when, Purpose.SETTLE)
+    # A window that began before the doubt and agrees with the old α cannot end the doubt. If it
+    # disagrees, it counts.
     if too_early is not None and not far.is_outlier:
         _note_refusal(context, too_early)
         return
@@ -225,21 +231,24 @@ def _jump(
     policy = context.policy
     prior = filtering.predict_for(context, registration, measured)
     noise = measured.covariance
-    whole = jumps.wholly_after(first, measured, registration.alpha, policy)
+    whole = jumps.is_after_jump(first, measured, registration.alpha, policy)
     if whole:
         elapsed_s = max(measured.t_ns_utc - first.t_ns_utc, 0) / SECOND_NS
         noise = first.covariance + np.diag(policy.drift_rate**2 * elapsed_s)
-    joint = kalman.widened(prior, noise)
+    # The earlier estimates contain no information on the new registration.
+    joint = kalman.widen_after_jump(prior, noise)
     if whole:
         joint = kalman.corrected(joint, first.alpha.vector, noise)
     update = FilterUpdate(
         joint=kalman.corrected(joint, measured.numbers, measured.noise),
+        # Two windows are required before a matrix is made (docs/decisions/0025-jumps.md).
         n_windows=2 if whole or both.excess > jumps.MAX_TURBULENCE_EXCESS else 1,
         innovation=_innovation(prior, measured),
         scatter=registration.scatter,
         jumped=True,
     )
     validity.store_registration(context, registration)
+    # Ordinary telemetry summed until now mixes both registrations.
     validity.void_until(context, first.t_ns_utc, BOTH_SIDES, Purpose.PASSIVE)
     held = whole and registration.suspected_jump is not None
     filtering.accept(context, update, measured, n_accepted=2 if held else 1)
@@ -263,7 +272,7 @@ def reset_run(context: StepContext) -> None:
         context.windows = replace(context.windows, run=0)
 
 
-def refused_text(context: StepContext) -> str | None:
+def explain_refusals(context: StepContext) -> str | None:
     """Return why windows are refused one after the other, or none comes; None: they are not.
 
     As many in a row as raise the alarm end it. One that is expected and does not come is as good as
@@ -278,11 +287,11 @@ def refused_text(context: StepContext) -> str | None:
     elif raised is not None and run < N_CONSECUTIVE_WINDOWS:
         text = raised
     else:
-        text = _missing_text(context)
+        text = _explain_missing_windows(context)
     return None if not text or _is_excused(context) else text
 
 
-def _missing_text(context: StepContext) -> str:
+def _explain_missing_windows(context: StepContext) -> str:
     registration, dither, rtc = context.registration, context.dither, context.rtc
     if dither is None or dither.start_seq is None or rtc is None:
         return ""

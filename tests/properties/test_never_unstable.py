@@ -6,7 +6,7 @@ import hypothesis.strategies as st
 from hypothesis import given
 
 from service.control.expected_gain import ExpectedGain
-from service.estimation.loop import commanded_gains
+from service.estimation.loop import select_gains
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
@@ -92,7 +92,7 @@ def test_nothing_is_sent_whose_verdict_is_not_yes_or_of_another_loop(story, mode
 
 def of_now(state, found, effect):
     """Whether the verdict is of the loop and the α there are."""
-    gains = effect.gains or commanded_gains(state.loop.rtc, found.n_modes)
+    gains = effect.gains or select_gains(state.loop.rtc, found.n_modes)
     return verdict_invalid_reason(state, found.judged, gains[: found.n_modes]) is None
 
 

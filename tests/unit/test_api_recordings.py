@@ -113,7 +113,7 @@ async def test_a_disk_that_refuses_ends_the_recording_and_nothing_else(
 
 async def test_an_operator_may_end_it_while_its_time_is_up(client, keeper, monkeypatch):
     name = await begun(client)
-    monkeypatch.setattr(keeper, "_why_end", lambda _: "")
+    monkeypatch.setattr(keeper, "_check_recording_end", lambda _: "")
     async with keeper._guard:
         ended = asyncio.create_task(keeper.end("Bob has ended it"))
         await asyncio.sleep(0.05)
@@ -150,7 +150,7 @@ async def test_it_ends_in_its_time_and_with_the_service(client, service, keeper)
     assert (await of(client, last))["reason"] == "the service was ended"
 
 
-@pytest.mark.parametrize("limit", ["LARGEST_GB", "full"])
+@pytest.mark.parametrize("limit", ["MAX_RECORDING_GB", "full"])
 async def test_one_that_is_too_large_or_fills_the_disk_is_ended(client, keeper, monkeypatch, limit):
     name = await begun(client)
     keeper.tap.recorder.put(RecordedKind.FRAMES, bytes(2000))
@@ -162,7 +162,7 @@ async def test_one_that_is_too_large_or_fills_the_disk_is_ended(client, keeper, 
     await ended_by_itself(client, name)
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)
-    expected = "the most there may be" if limit == "LARGEST_GB" else "are free in"
+    expected = "the most there may be" if limit == "MAX_RECORDING_GB" else "are free in"
     assert expected in (await of(client, name))["reason"]
 
 

@@ -119,7 +119,7 @@ def test_one_killed_between_index_and_disk_has_lost_nothing(archive):
 
 @pytest.fixture
 def quick(monkeypatch):
-    for name in ("LOOK_S", "REST_S"):
+    for name in ("SPACE_CHECK_INTERVAL_S", "REMOVAL_PAUSE_S"):
         monkeypatch.setattr(archiving, name, 0.0)
     monkeypatch.setattr(archiving.time, "time_ns", lambda: NOW)
 

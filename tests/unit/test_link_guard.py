@@ -8,8 +8,8 @@ import zenoh
 
 from service.link import guard
 from service.link.guard import Certificate, LinkGuard, LinkSecurity
-from service.link.guard import ending_in_words as ending
-from service.link.guard import refused_in_words as refused
+from service.link.guard import describe_expiry as ending
+from service.link.guard import describe_refusals as refused
 
 
 def test_a_refusal_is_spoken_of_for_a_minute_and_counted(monkeypatch):
@@ -73,10 +73,10 @@ def test_connections_that_were_closed_before_a_handshake_are_counted_by_port(tmp
     listen = ("tls/0.0.0.0:7447", "tls/[::]:7448#iface=eth0", "tcp/127.0.0.1:8080")
     waiting = guard.count_waiting(listen, (table, tmp_path / "absent"))
     assert waiting == {7447: 30, 7448: 1}
-    assert guard.flooded_in_words({7448: guard.MIN_ALARM_CONNECTIONS - 1}) == ""
-    assert "port 7447" in guard.flooded_in_words(waiting)
-    assert "3 s" in guard.flooded_in_words(waiting)
-    assert "7448" not in guard.flooded_in_words(waiting)
+    assert guard.describe_flood({7448: guard.MIN_ALARM_CONNECTIONS - 1}) == ""
+    assert "port 7447" in guard.describe_flood(waiting)
+    assert "3 s" in guard.describe_flood(waiting)
+    assert "7448" not in guard.describe_flood(waiting)
 
 
 @pytest.mark.parametrize("name", ["link-refused", "certificate-ending"])

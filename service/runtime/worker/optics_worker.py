@@ -43,8 +43,8 @@ from service.estimation.random_dither import Correlated, RandomEstimate, fit_ran
 from service.estimation.slope_convention import (
     RESPONSE_RATIO_RANGE,
     SlopeConvention,
-    of_answer,
-    of_reconstructor,
+    identify_from_reconstructor,
+    identify_from_response,
 )
 from service.estimation.windows import ClosedLoop, RefusalKind, WindowRefused
 from service.files.disk_cache import DiskCache
@@ -206,7 +206,7 @@ class OpticsWorker:
         measured is followed first. Slopes of another instrument are refused: what they look like.
         """
         begun = start or self._start
-        outcome = self._fitted(spectra, loop, begun)
+        outcome = self._fit_spectra(spectra, loop, begun)
         if isinstance(outcome, LockInEstimate):
             gains = outcome.optical_gain
             if (
@@ -217,26 +217,26 @@ class OpticsWorker:
             begun = outcome.alpha
         seen = spectra.commands[:, 0] @ self._sensor.near(begun).matrix.T
         turns = 2 * np.pi * np.array(spectra.plan.frequencies_hz) / spectra.plan.frame_rate_hz
-        answer = of_answer(spectra.slopes[:, 0], seen, turns, self._model.instrument)
+        answer = identify_from_response(spectra.slopes[:, 0], seen, turns, self._model.instrument)
         if not answer.wrong:
             return outcome
         return WindowRefused(
             reason=answer.wrong, t_ns_utc=spectra.t_end_ns_utc, kind=RefusalKind.MISTOLD
         )
 
-    def _fitted(
+    def _fit_spectra(
         self, spectra: Spectra, loop: ClosedLoop, start: Misregistration
     ) -> LockInEstimate | WindowRefused:
         try:
-            estimate = self._settled_fit(spectra, loop, start)
+            estimate = self._refine_fit(spectra, loop, start)
             if estimate is None:
-                return _unsettled(spectra)
+                return _refuse_unsettled(spectra)
             found = self._against_flat(estimate)
             if self._sensor.follow(found.modes, found.optical_gain):
-                estimate = self._settled_fit(spectra, loop, found.alpha)
+                estimate = self._refine_fit(spectra, loop, found.alpha)
         except np.linalg.LinAlgError as error:
             return WindowRefused(reason=f"no fit: {error}", t_ns_utc=spectra.t_end_ns_utc)
-        return _unsettled(spectra) if estimate is None else self._against_flat(estimate)
+        return _refuse_unsettled(spectra) if estimate is None else self._against_flat(estimate)
 
     def read_slope_convention(
         self, in_use: NDArray[np.float32], near: Misregistration | None
@@ -246,7 +246,7 @@ class OpticsWorker:
         Where the file leaves the orientation open, what is found is taken over.
         """
         at, instrument = near or self._start, self._model.instrument
-        dialect = of_reconstructor(
+        dialect = identify_from_reconstructor(
             in_use,
             instrument,
             self._basis,
@@ -314,7 +314,7 @@ class OpticsWorker:
         self._left_over = left_over(own, found, self._coarse.interaction_matrix(found.alpha))
         return replace(found, left_over=self._left_over), self._mode_response
 
-    def _settled_fit(
+    def _refine_fit(
         self, spectra: Spectra, loop: ClosedLoop, start: Misregistration
     ) -> LockInEstimate | None:
         """Return the fit about a linearisation that is near enough to it; None: there is none."""
@@ -384,7 +384,7 @@ class OpticsWorker:
                 estimate = fit_random(window, self._sensor.linearise(estimate.alpha))
         except np.linalg.LinAlgError as error:
             return WindowRefused(reason=f"no fit: {error}", t_ns_utc=window.t_end_ns_utc)
-        return _unsettled(window)
+        return _refuse_unsettled(window)
 
     def response(self, alpha: Misregistration | None) -> NDArray[np.float32]:
         """Return D(α) to a flat wavefront, ``(n_slopes, n_modes)``, slope per metre OPD.
@@ -529,7 +529,7 @@ class OpticsWorker:
         return replace(found, optical_gain=gains)
 
 
-def _unsettled(spectra: Spectra | Correlated) -> WindowRefused:
+def _refuse_unsettled(spectra: Spectra | Correlated) -> WindowRefused:
     return WindowRefused(
         reason="the fit did not settle: the mirror moved inside the window, the registration is "
         "outside the capture range, or the instrument file is another's",

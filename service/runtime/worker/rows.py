@@ -63,9 +63,9 @@ class SharedRows:
         if row_s < MIN_REMOTE_ROW_S or row_s * len(rows) / self._n_threads < MIN_REMOTE_JOB_S:
             yield from self._threads.map(function, rows[1:])
         else:
-            yield from self._shared(cluster, function, rows[1:])
+            yield from self._share(cluster, function, rows[1:])
 
-    def _shared(self, cluster: Cluster, function: Row, rows: list[int]) -> Iterator[Any]:
+    def _share(self, cluster: Cluster, function: Row, rows: list[int]) -> Iterator[Any]:
         answers: list[Future[Any]] = [Future() for _ in rows]
         enough, places = threading.Event(), itertools.count()
         help_out = partial(self._have_help, cluster, function, rows, answers, enough)
@@ -88,7 +88,7 @@ class SharedRows:
         enough: threading.Event,
     ) -> None:
         try:
-            for number, answer in _asked(cluster, function, rows[::-1], enough):
+            for number, answer in _request_rows(cluster, function, rows[::-1], enough):
                 _give(answers[-1 - number], answer)
         except ClusterError as error:
             self._let_go(cluster, str(error))
@@ -120,7 +120,7 @@ _DISCARDED_RESULT: Future[Any] = Future()
 _DISCARDED_RESULT.set_result(None)
 
 
-def _asked(
+def _request_rows(
     cluster: Cluster, function: Row, rows: list[int], enough: threading.Event
 ) -> Iterator[tuple[int, Any]]:
     """Ask a cluster for rows: it gets what they are made from, where that is known, else all."""

@@ -30,7 +30,7 @@ from service.tracking.operations.noisy_measurement import fail_noisy_measurement
 from service.tracking.operations.running import running_ramp
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.sending import why_unsendable
+from service.tracking.sending import check_sendable
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext, present
 from service.wire import DitherRequest, LoopRequest, Reply, Status
@@ -67,14 +67,15 @@ def advance(context: StepContext, event: Event) -> None:
         _resume_interrupted(context)
     elif not acquisition.under_way:
         if context.windows.accepted > context.before.windows.accepted:
+            # An accepted window ends the sequence of misses.
             stages.set_acquisition(context, replace(acquisition, misses=0))
         _forget_when_over(context, event)
-        why = stages.why_needed(context.state, context.policy, context.now_ns)
+        why = stages.explain_acquisition(context.state, context.policy, context.now_ns)
         if why is not None and context.rtc and running_ramp(context.state, context.now_ns) is None:
             _begin(context, context.rtc, why, commanded=False)
     elif isinstance(event, ev.RtcVanished):
         # the state before still knows in which session that was
-        stages.set_acquisition(context, _interrupted(context.before, "the RTC vanished"))
+        stages.set_acquisition(context, _interrupt(context.before, "the RTC vanished"))
         _note_interrupted(context, NO_RTC)
     else:
         with context.because_of("" if isinstance(event, cmd.Instruction) else acquisition.cause):
@@ -89,7 +90,7 @@ def acquisition_to_save(state: TrackerState) -> Acquisition | None:
     """
     acquisition = state.operations.acquisition
     if acquisition.under_way:
-        return _interrupted(state, "the service ended")
+        return _interrupt(state, "the service ended")
     aborted = acquisition.stage is AcquisitionStage.ABORTED and state.alpha.registration is None
     lasts = acquisition.stage in _LASTING_STAGES or acquisition.held_off
     return _saved_part(acquisition) if aborted or lasts else None
@@ -104,11 +105,14 @@ def restore_acquisition(context: StepContext, left: Acquisition) -> None:
 
 def _begin(context: StepContext, rtc: Status, why: str, *, commanded: bool) -> None:
     stop_running_dither(context)
+    # Its telemetry would contain the opening of the loop.
     fail_noisy_measurement(context, "an acquisition has begun")
     lost = _own_loop_lost(context)
     stages.begin_acquisition(context, rtc, why=why, commanded=commanded)
     context.log("acquisition.begun", why)
     if lost is not None:
+        # The loop was unstable with this number of modes although its matrix fitted α, so the same
+        # number would fail again (``_own_loop_lost``).
         most = update_policy.half_of_modes(rtc.n_controlled)
         first = min(context.acquisition.n_modes, most)
         limited = replace(
@@ -161,6 +165,8 @@ def _end_by_event(context: StepContext, event: Event) -> bool:
             stages.abort_acquisition(context, "because the dither was stopped")
         case cmd.SetMode(mode=mode) if mode is not Mode.AUTO and not acquisition.commanded:
             stages.abort_acquisition(context, f"because the mode is {mode}")
+        # Opening the loop begins a session of its own. In a later stage the loop was changed from
+        # outside.
         case ev.SessionStarted() if acquisition.stage is not AcquisitionStage.OPENING:
             stages.restart_acquisition(context, "the RTC began a new session")
         case ev.DitherMeasured(id=loud, text=text) if loud == state.dithers.policy.loud_id and text:
@@ -213,6 +219,7 @@ def _closed_stage(context: StepContext, rtc: Status) -> None:
     elif acquisition.stage is AcquisitionStage.WIDENING:
         _widen(context, rtc, record)
     elif record is None:
+        # After the request for a leak, the gate must judge the loop with it.
         if acquisition.command is None or rtc.leak <= MAX_SLIP_SAFE_LEAK:
             _make(context, acquisition.n_modes, rtc)
     elif rtc.cm_id != record.id:
@@ -249,7 +256,7 @@ def _on_made(context: StepContext, made: ev.MatrixMade) -> None:
         )
         context.log("reconstructor.discarded", f"{record.id}: {stale}")
         return
-    reason = why_unsendable(context.state, record)
+    reason = check_sendable(context.state, record)
     if reason is not None:
         stages.restart_acquisition(context, f"{record.id} cannot be sent: {reason}")
         return
@@ -267,6 +274,8 @@ def _on_refused(context: StepContext, record: ReconstructorRecord) -> None:
     slippery = gate is not None and gate.edge_motion_m is not None
     if acquisition.stage is AcquisitionStage.WIDENING:
         stages.set_acquisition(context, replace(acquisition, max_modes=acquisition.n_modes))
+    # With this leak a slipped segment at the edge recovers within a tenth of a second
+    # (docs/results/edge_slip.md).
     elif slippery and rtc is not None and rtc.leak > MAX_SLIP_SAFE_LEAK:
         text = f"a leak of {MAX_SLIP_SAFE_LEAK} is to keep the outer ring in place"
         context.log("acquisition.leak", text)
@@ -372,7 +381,7 @@ def _saved_part(acquisition: Acquisition) -> Acquisition:
     return replace(acquisition, alpha=None, covariance=None, command=None, applied=None, windows=0)
 
 
-def _interrupted(state: TrackerState, cause: str) -> Acquisition:
+def _interrupt(state: TrackerState, cause: str) -> Acquisition:
     session = None if state.loop.rtc is None else state.loop.rtc.session
     doing = f"{state.operations.acquisition.stage}: {state.operations.acquisition.text}"
     interruption = Interruption(doing=doing, session=session, cause=cause)
@@ -387,7 +396,7 @@ def _resume_interrupted(context: StepContext) -> None:
     if rtc.loop != "open":
         _note_closed(context, rtc)
         return
-    why_not = _why_not_by_itself(context, rtc)
+    why_not = _check_automatic_resumption(context, rtc)
     if why_not is not None:
         do = (
             "The loop may be open, and its matrix is for a registration that was not believed: "
@@ -400,7 +409,7 @@ def _resume_interrupted(context: StepContext) -> None:
     stages.restart_acquisition(context, cause)
 
 
-def _why_not_by_itself(context: StepContext, rtc: Status) -> str | None:
+def _check_automatic_resumption(context: StepContext, rtc: Status) -> str | None:
     state = context.state
     if stages.acquisition_left_open(state, rtc) is None:
         return "the RTC has begun another session since, and who left its loop open is not known"
@@ -410,7 +419,7 @@ def _why_not_by_itself(context: StepContext, rtc: Status) -> str | None:
         return "the settings forbid that"
     if state.dithers.stopped:
         return "the dither was stopped"
-    return stages.why_not_now(state, context.policy)
+    return stages.check_acquisition(state, context.policy)
 
 
 def _note_interrupted(context: StepContext, what: str, do: str = "") -> None:

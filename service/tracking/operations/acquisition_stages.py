@@ -106,7 +106,7 @@ def wide_capture_dither(
     meanwhile that could be spoilt.
     """
     modes, lines = _wide_capture_modes(stage, rtc)
-    reason = _why_too_few(modes, rtc)
+    reason = _check_mode_number(modes, rtc)
     if reason is not None:
         return reason
     request = DitherRequest(
@@ -124,6 +124,8 @@ def _wide_capture_modes(
     stage: AcquisitionStage, rtc: Status
 ) -> tuple[tuple[int, ...], tuple[float, ...]]:
     """Return the modes dithered in a stage with the loop open, and lines for them, Hz."""
+    # With the loop open a dithered line is a measured column of D, so any mode of the basis can be
+    # used.
     lines = _lines(rtc.frame_rate_hz, rtc.max_dither_modes)
     return spread_modes(band_of(stage), rtc.n_modes, len(lines)) if lines else (), lines
 
@@ -134,7 +136,7 @@ def _lines(frame_rate_hz: float, n_lines: int) -> tuple[float, ...]:
     return spread_lines(frame_rate_hz, FAR_WINDOW_S, n_lines)
 
 
-def _why_too_few(modes: tuple[int, ...], rtc: Status) -> str | None:
+def _check_mode_number(modes: tuple[int, ...], rtc: Status) -> str | None:
     if len(modes) >= MIN_LINES:
         return None
     return (
@@ -149,6 +151,7 @@ def loop_found(state: TrackerState, rtc: Status, policy: Policy) -> LoopFound:
     closed = rtc.loop != "open"
     out_of_hand = blocking_alarm(state.alarms.active, Interlock.HOLD) is not None
     goal = rtc.n_controlled or policy.wanted_modes(rtc)
+    # The status of an open loop does not contain the gains with which it was closed.
     gains = rtc.gains if closed else (CLOSING_GAIN,) * goal
     return LoopFound(
         closed=closed,
@@ -195,12 +198,13 @@ def begin_acquisition(context: StepContext, rtc: Status, *, why: str, commanded:
             cause=context.cause,
         ),
     )
+    # A window that began before the loop is opened would mix two loops.
     validity.invalidate_telemetry(context, "the acquisition had not begun")
     validity.forget_registration(context)
     forget_verdict(context)
 
 
-def why_needed(state: TrackerState, policy: Policy, now_ns: int) -> str | None:
+def explain_acquisition(state: TrackerState, policy: Policy, now_ns: int) -> str | None:
     """Return why the service should acquire by itself, or None."""
     rtc, acquisition = state.loop.rtc, state.operations.acquisition
     if (
@@ -221,10 +225,13 @@ def why_needed(state: TrackerState, policy: Policy, now_ns: int) -> str | None:
         return None
     for alarm in state.alarms.active:
         lasted_ns = now_ns - alarm.since_ns_utc
+        # During a rollback the loop is given the time in which the previous matrix can recover it.
         waits_s = 0.0 if alarm.name == LOST and not _goes_back(state) else MAX_DIVERGENCE_S
         if alarm_blocks(alarm, Interlock.HOLD) and lasted_ns >= waits_s * SECOND_NS:
             return f"{alarm.name} for {lasted_ns / SECOND_NS:.0f} s"
-    if missed_enough(state) and not state.loop.holds:
+    # Bad telemetry alone also refuses windows. Only a loop that has stopped correcting is opened
+    # for it.
+    if has_missed_enough(state) and not state.loop.holds:
         return f"{acquisition.misses} windows in a row found no registration"
     return None
 
@@ -238,7 +245,7 @@ def _goes_back(state: TrackerState) -> bool:
     }
 
 
-def missed_enough(state: TrackerState) -> bool:
+def has_missed_enough(state: TrackerState) -> bool:
     """Return whether so many windows in a row found no registration that it is no chance."""
     is_known = state.alpha.registration is not None and state.alpha.registration.usable
     return state.operations.acquisition.misses >= (
@@ -254,7 +261,7 @@ def count_miss(context: StepContext, kind: RefusalKind) -> None:
         )
 
 
-def why_not_now(state: TrackerState, policy: Policy) -> str | None:
+def check_acquisition(state: TrackerState, policy: Policy) -> str | None:
     """Return why no acquisition can begin now, or None."""
     if state.loop.rtc is None:
         return NO_RTC
@@ -264,7 +271,7 @@ def why_not_now(state: TrackerState, policy: Policy) -> str | None:
     if alarm is not None:
         return f"{alarm.name}: {alarm.text}"
     modes, _ = _wide_capture_modes(AcquisitionStage.COARSE, state.loop.rtc)
-    return _why_too_few(modes, state.loop.rtc)
+    return _check_mode_number(modes, state.loop.rtc)
 
 
 def sigma_of(acquisition: Acquisition) -> str:
@@ -318,6 +325,7 @@ def restart_acquisition(context: StepContext, reason: str, *, slipped: bool = Fa
     most = acquisition.max_modes
     lost_with = acquisition.lost_with
     if slipped:
+        # Fewer modes tolerate a larger misregistration.
         most, lost_with = half_of_modes(acquisition.n_modes), None
         limit_modes(context, most, reason)
     goal = acquisition.n_modes if acquisition.found is None else acquisition.found.n_controlled
@@ -365,6 +373,7 @@ def abort_acquisition(context: StepContext, why: str, *, held_off: bool = False)
     begins by itself for now, though what made this one begin may last.
     """
     stop_running_dither(context)
+    # In the other stages a second set of modes has not confirmed α.
     if context.acquisition.stage not in _MEASURED_STAGES:
         validity.forget_registration(context)
     left, found = "left as it is", _to_give_back(context.state)
@@ -397,7 +406,7 @@ def on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
     """Take over where a window puts the mirror, or hold it against where another one did."""
     rtc, before, estimate = context.rtc, context.acquisition, event.found.estimate
     if (
-        validity.why_void(
+        validity.explain_void(
             context.state, validity.telemetry_span(event.began_ns_utc, estimate.t_ns_utc)
         )
         is not None
@@ -405,7 +414,7 @@ def on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
         return
     if rtc is None or not before.uses_wide_capture or estimate.session != rtc.session:
         return
-    if not _of_stage(context, rtc, estimate.modes):
+    if not _is_of_stage(context, rtc, estimate.modes):
         return
     covariance = estimate.covariance + np.diag(band_of(before.stage).floor ** 2)
     set_acquisition(context, replace(before, alpha=estimate.alpha, covariance=covariance))
@@ -416,6 +425,7 @@ def on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
         return
     difference = estimate.alpha.vector - before.alpha.vector
     chi2 = float(difference @ np.linalg.solve(covariance + before.covariance, difference))
+    # Two sets of modes must agree before α is used (docs/decisions/0019-acquisition.md).
     if chi2 > MAX_ESTIMATE_DIFFERENCE:
         set_acquisition(context, before)
         reason = (
@@ -498,7 +508,7 @@ def _to_give_back(state: TrackerState) -> LoopFound | None:
     return found
 
 
-def _of_stage(context: StepContext, rtc: Status, modes: tuple[int, ...]) -> bool:
+def _is_of_stage(context: StepContext, rtc: Status, modes: tuple[int, ...]) -> bool:
     """Return whether these are the modes of the present stage."""
     dither = wide_capture_dither(context.acquisition.stage, rtc, context.policy, 0)
     return not isinstance(dither, str) and dither.request.modes == modes

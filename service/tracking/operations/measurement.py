@@ -56,7 +56,9 @@ def measure(context: StepContext, command: cmd.Measure) -> None:
     rtc = present(context.rtc)
     if context.state.measurement(command.id) is not None:
         raise CommandError(f"{command.id} was measured before; ids are never reused")
-    record = replace(_planned(command, rtc, context.policy, context.now_ns), cause=context.cause)
+    record = replace(
+        _plan_measurement(command, rtc, context.policy, context.now_ns), cause=context.cause
+    )
     check_modes(record.modes, rtc)
     store_measurement(context, record)
     context.log("measurement.asked", f"{record.id}: {record.pattern} of {len(record.modes)} modes")
@@ -194,7 +196,9 @@ def _give_up_overdue(context: StepContext, record: MeasurementRecord, *, closed:
             store_measurement(context, replace(record, overdue_since_ns_utc=since_ns))
 
 
-def _planned(command: cmd.Measure, rtc: Status, policy: Policy, now_ns: int) -> MeasurementRecord:
+def _plan_measurement(
+    command: cmd.Measure, rtc: Status, policy: Policy, now_ns: int
+) -> MeasurementRecord:
     sine = command.pattern is Pattern.SINE
     modes = command.modes or tuple(range(rtc.n_controlled))
     if sine and command.modes is None:

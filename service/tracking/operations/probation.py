@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.estimation.comparison import Verdict
-from service.estimation.loop import same_but_for_modes, why_open
+from service.estimation.loop import explain_open_loop, same_but_for_modes
 from service.estimation.probation import MAX_PROBATION_S
 from service.tracking import commands as cmd
 from service.tracking import events as ev
@@ -29,7 +29,7 @@ from service.tracking.operation_records import CommandState, Probation, Probatio
 from service.tracking.operator import enter_hold, set_loop
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.sending import why_unsendable
+from service.tracking.sending import check_sendable
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
 
@@ -105,6 +105,7 @@ def on_compared(context: StepContext, event: ev.Compared) -> None:
     trial, found = context.operations.probation, event.finding
     if trial is None or not trial.awaits(found.before, found.after):
         return
+    # The comparison now concerns the previous matrix, which is in use again.
     if trial.state is ProbationState.WATCHED:
         _end_watch(context, trial, found.text, lost=found.lost)
         return
@@ -136,7 +137,7 @@ def send_way_back(context: StepContext, made: ev.MatrixMade) -> None:
     reconstructors.propose(context, made.record)
     if trial is None:
         return
-    why = _why_no_way_back(context, trial)
+    why = _check_rollback(context, trial)
     if why is not None:
         _keep_worse(context, trial, why)
         return
@@ -148,7 +149,7 @@ def _begin_rollback(context: StepContext, trial: Probation, found: str) -> None:
     """Have the matrix before sent again; where that cannot be say why."""
     enter_hold(context, f"{trial.id} made the loop worse")
     trial = replace(trial, worse=f"made the loop worse: {found}")
-    why = _why_no_way_back(context, trial)
+    why = _check_rollback(context, trial)
     if why is not None:
         _keep_worse(context, trial, why)
         return
@@ -171,12 +172,14 @@ def _on_swap(context: StepContext, before: str | None, in_use: str | None) -> No
     ):
         _begin_watch(context, trial, in_use)
         return
+    # Without both matrices nothing can be compared.
     if record is None or before is None:
         if trial is not None and trial.judges is not None:
             why = "the RTC's matrix is unknown"
             _set(context, replace(trial, state=ProbationState.NOT_JUDGED, text=why))
         return
-    why = _why_none(context, record, trial)
+    why = _explain_missing_probation(context, record, trial)
+    # The reference is the last matrix that was good, not the one that made the loop worse.
     worse = trial is not None and trial.id == before and trial.state in _WORSE_STATES
     asked = context.policy.opens_lost_loop
     _set(
@@ -196,7 +199,7 @@ def _on_swap(context: StepContext, before: str | None, in_use: str | None) -> No
 
 
 def _await_verdict(context: StepContext, trial: Probation) -> None:
-    why = _why_not_comparable(context)
+    why = _check_comparable(context)
     if why:
         _set(context, replace(trial, state=ProbationState.NOT_JUDGED, text=why))
     elif trial.under_way and context.now_ns > trial.until_ns_utc + MAX_VERDICT_DELAY_S * SECOND_NS:
@@ -204,7 +207,7 @@ def _await_verdict(context: StepContext, trial: Probation) -> None:
 
 
 def _await_republished(context: StepContext, trial: Probation, event: Event) -> None:
-    why = _why_stuck(context, trial, event)
+    why = _explain_failed_rollback(context, trial, event)
     if why:
         _keep_worse(context, trial, why)
 
@@ -232,8 +235,10 @@ def _watch(context: StepContext, trial: Probation) -> None:
     waited_s = (context.now_ns - trial.since_ns_utc) / SECOND_NS
     lost = next((a for a in context.alarms.active if alarm_blocks(a, Interlock.HOLD)), None)
     if context.rtc is None or not context.rtc.in_loop:
-        why = "the RTC is gone" if context.rtc is None else why_open(context.rtc)
+        why = "the RTC is gone" if context.rtc is None else explain_open_loop(context.rtc)
         _end_watch(context, trial, why, lost=False)
+    # The detector of divergence averages over half a second, so that it still shows the rejected
+    # matrix.
     elif lost is not None and waited_s > MAX_CALMING_S:
         _end_watch(context, trial, lost.text, lost=True)
     elif waited_s > MAX_PROBATION_S + MAX_VERDICT_DELAY_S:
@@ -260,6 +265,7 @@ def _open(context: StepContext, trial: Probation) -> None:
 def _await_opening(context: StepContext, trial: Probation, event: Event) -> None:
     """Ask again until the loop is open, or an operator says how to go on."""
     rtc, asked = context.rtc, context.loop.command
+    # An operator who sets the mode has taken over.
     if isinstance(event, cmd.SetMode):
         _set(context, replace(trial, state=ProbationState.KEPT))
     elif rtc is not None and not rtc.in_loop:
@@ -270,7 +276,7 @@ def _await_opening(context: StepContext, trial: Probation, event: Event) -> None
             set_loop(context, cmd.SetLoop(loop="open"))
 
 
-def opening_text(context: StepContext) -> str | None:
+def explain_opening(context: StepContext) -> str | None:
     """Return that the loop was lost and is asked to open, and whether it did; None: it is not."""
     trial, asked = context.operations.probation, context.loop.command
     if trial is None or trial.state not in {ProbationState.OPENING, ProbationState.OPENED}:
@@ -291,36 +297,40 @@ def opening_text(context: StepContext) -> str | None:
 def _alarm_of_swap(context: StepContext, trial: Probation) -> str:
     """Return what an alarm says of a matrix just applied; empty: none has come with it."""
     judged = {ProbationState.RUNNING, ProbationState.OVERDUE, ProbationState.PASSED}
+    # A later alarm has another cause than the swap.
     late = context.now_ns > trial.since_ns_utc + MAX_LAW_DETECTION_S * SECOND_NS
-    if trial.state not in judged or late or _why_not_comparable(context):
+    if trial.state not in judged or late or _check_comparable(context):
         return ""
     since = (a for a in context.alarms.active if a.since_ns_utc >= trial.since_ns_utc)
     return next((alarm.text for alarm in since if alarm.name in _CONCLUSIVE_ALARMS), "")
 
 
-def _why_none(context: StepContext, record: ReconstructorRecord, last: Probation | None) -> str:
+def _explain_missing_probation(
+    context: StepContext, record: ReconstructorRecord, last: Probation | None
+) -> str:
     """Return why a matrix just applied is not put on probation; empty: it is."""
     if record.published_ns_utc is None:
         return "the RTC took it by itself"
     if last is not None and last.state in _WORSE_STATES:
         worse = context.state.reconstructor(last.id)
+        # The same numbers under a new id: an operator has sent them despite the verdict.
         if worse is not None and worse.sha256 == record.sha256 != "":
             return "it was found worse before, and is wanted all the same"
-    return _why_not_comparable(context)
+    return _check_comparable(context)
 
 
-def _why_not_comparable(context: StepContext) -> str:
+def _check_comparable(context: StepContext) -> str:
     """Return why telemetry cannot be compared now; empty: it can."""
     if context.rtc is None:
         return "the RTC is gone"
     if not context.rtc.in_loop:
-        return why_open(context.rtc)
+        return explain_open_loop(context.rtc)
     if context.acquisition.under_way:
         return "an acquisition watches its matrices itself"
     return ""
 
 
-def _why_stuck(context: StepContext, trial: Probation, event: Event) -> str:
+def _explain_failed_rollback(context: StepContext, trial: Probation, event: Event) -> str:
     """Return why the matrix before does not come into use again; empty: it is on its way."""
     if isinstance(event, ev.JobFailed) and isinstance(event.effect, ev.RepublishMatrix):
         return event.text
@@ -331,7 +341,7 @@ def _why_stuck(context: StepContext, trial: Probation, event: Event) -> str:
     return sent.reason or sent.state if sent.state in _FINAL_STATES else ""
 
 
-def _why_no_way_back(context: StepContext, trial: Probation) -> str | None:
+def _check_rollback(context: StepContext, trial: Probation) -> str | None:
     """Return why the matrix before may not be sent by itself now, or None.
 
     The RTC has shown its numbers in this session, and the loop is as it was then. The gate is not
@@ -340,6 +350,7 @@ def _why_no_way_back(context: StepContext, trial: Probation) -> str | None:
     state, rtc, record = context.state, context.rtc, context.state.reconstructor(trial.before)
     if rtc is None or record is None:
         return "it is no longer known, or the RTC is gone"
+    # A restarted RTC may hold other numbers under this id.
     if record.id not in state.matrices.verified_ids:
         return "the RTC has not shown its numbers in this session"
     if trial.loop is None or not same_but_for_modes(trial.loop, rtc):
@@ -347,12 +358,13 @@ def _why_no_way_back(context: StepContext, trial: Probation) -> str | None:
     on_way = next((r.id for r in state.matrices.reconstructors if r.on_its_way), None)
     if on_way is not None:
         return f"{on_way} is on its way to the RTC"
-    return why_unsendable(state, record, trial.since_ns_utc)
+    return check_sendable(state, record, trial.since_ns_utc)
 
 
 def _keep_worse(context: StepContext, trial: Probation, why: str) -> None:
     """Say that a matrix that is worse stays in use; open the loop that is lost with it."""
     text = f"{trial.worse}; the service did not go back to {trial.before}: {why}"
+    # If there is no way back, an open loop is better than a lost one.
     out_of_hand = context.blocking_alarm(Interlock.HOLD) is not None
     lost = out_of_hand or (trial.finding is not None and trial.finding.lost)
     if lost and trial.opens and context.rtc is not None and not context.operator.stopped_because:

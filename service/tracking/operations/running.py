@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
-from service.estimation.loop import NO_RTC, why_open
+from service.estimation.loop import NO_RTC, explain_open_loop
 from service.tracking.alarms import STANDING_BY, Alarm, Severity
 from service.tracking.dither_request import MAX_STOP_DELAY_S, OUR_DITHERS, OWN_DITHER
 from service.tracking.operation_records import CommandState, LoopCommand
@@ -197,7 +197,7 @@ def operating(state: TrackerState, hindered: str, now_ns: int) -> Operating:
     elif state.operator.stopped_because:
         operation = ServiceState.READY
     elif occupation in {CurrentOperation.IDLE, CurrentOperation.HOLD, CurrentOperation.TRACKING}:
-        idle = _why_nothing_to_do(state)
+        idle = _explain_idleness(state)
         operation, because = (ServiceState.READY, idle) if idle else (operation, because)
     return Operating(service_state=operation, current_operation=occupation, because=because)
 
@@ -208,18 +208,18 @@ def _current_operation(state: TrackerState, now_ns: int) -> tuple[CurrentOperati
             return OPERATION_OF[running.kind], running.text
     if state.operator.mode is Mode.HOLD:
         return CurrentOperation.HOLD, "mode is hold: nothing is made or sent unless asked for"
-    if _why_nothing_to_do(state):
+    if _explain_idleness(state):
         return CurrentOperation.IDLE, "there is no closed loop"
     if state.alpha.registration is None:
         return CurrentOperation.IDLE, "α is not known yet: no window has been accepted"
     return CurrentOperation.TRACKING, "α is known and the loop is closed"
 
 
-def _why_nothing_to_do(state: TrackerState) -> str:
+def _explain_idleness(state: TrackerState) -> str:
     rtc = state.loop.rtc
     if rtc is None:
         return NO_RTC
-    return "" if rtc.in_loop else why_open(rtc)
+    return "" if rtc.in_loop else explain_open_loop(rtc)
 
 
 def _first(state: TrackerState, severity: Severity) -> Alarm | None:

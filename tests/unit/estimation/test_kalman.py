@@ -12,14 +12,14 @@ from service.estimation.kalman import (
     JUMP_THRESHOLD,
     Drift,
     Joint,
-    allowing,
+    allow_scatter,
     begin_joint,
     corrected,
-    expecting,
+    expect_stretches,
     forget,
     innovation,
     predicted,
-    widened,
+    widen_after_jump,
     with_stretches,
 )
 
@@ -97,7 +97,7 @@ class TestWindows:
         measured = joint.alpha + jump
         prior = predicted(joint, walk, 1.0)
         assert innovation(prior, measured, noise) > JUMP_THRESHOLD
-        found = corrected(widened(prior, noise), measured, noise)
+        found = corrected(widen_after_jump(prior, noise), measured, noise)
         assert np.all(np.abs(found.alpha - measured) < 0.02 * np.abs(jump).max())
         assert np.all(np.diag(found.alpha_covariance) > 0.9 * SIGMA**2)
 
@@ -159,7 +159,7 @@ class TestBias:
         for _ in range(50):
             joint = corrected(joint, NOWHERE, DITHERED)
             joint = corrected(joint, away(0.05, 0, 0, 0), SCATTER, PASSIVE_BIAS)
-        moved = corrected(widened(joint, DITHERED), away(0.1, 0, 0, 0), DITHERED)
+        moved = corrected(widen_after_jump(joint, DITHERED), away(0.1, 0, 0, 0), DITHERED)
         assert moved.alpha[0] == pytest.approx(0.1, abs=0.005)
         assert moved.bias(PASSIVE_BIAS)[0] == pytest.approx(0.05, abs=0.01)
 
@@ -177,7 +177,7 @@ class TestExcess:
     def test_where_nothing_is_learnt_a_reading_is_worth_what_the_estimate_says(self):
         """10 % and, at a scatter of 1.4 %, 14 % more of it: together with the scatter 17.3 %."""
         excess = np.array([0.14, 0.14, 0.0, 0.0]) ** 2
-        found = allowing(begun(NOWHERE, DITHERED), PASSIVE_BIAS, excess)
+        found = allow_scatter(begun(NOWHERE, DITHERED), PASSIVE_BIAS, excess)
         np.testing.assert_allclose(np.diag(found.covariance)[4:], BIAS_FLOOR**2 + excess)
         np.testing.assert_array_equal(found.alpha_covariance, DITHERED)
 
@@ -188,9 +188,12 @@ class TestExcess:
         for _ in range(50):
             joint = corrected(joint, NOWHERE, DITHERED)
             joint = corrected(
-                allowing(joint, PASSIVE_BIAS, excess), away(0.15, 0, 0, 0), SCATTER, PASSIVE_BIAS
+                allow_scatter(joint, PASSIVE_BIAS, excess),
+                away(0.15, 0, 0, 0),
+                SCATTER,
+                PASSIVE_BIAS,
             )
-        again = allowing(joint, PASSIVE_BIAS, excess)
+        again = allow_scatter(joint, PASSIVE_BIAS, excess)
         np.testing.assert_array_equal(again.covariance, joint.covariance)
         assert np.sqrt(again.covariance[4, 4]) < 0.002
         assert again.bias(PASSIVE_BIAS)[0] == pytest.approx(0.15, abs=0.005)
@@ -203,7 +206,7 @@ class TestExcess:
             joint = corrected(joint, NOWHERE, SCATTER, PASSIVE_BIAS)
         joint = predicted(joint, Drift(alpha_rate=np.full(4, 0.01), bias_memory_s=np.inf), 1.0)
         calm = corrected(joint, away(0.06, 0, 0, 0), SCATTER, PASSIVE_BIAS)
-        windy = allowing(joint, PASSIVE_BIAS, np.array([0.12, 0.12, 0.0, 0.0]) ** 2)
+        windy = allow_scatter(joint, PASSIVE_BIAS, np.array([0.12, 0.12, 0.0, 0.0]) ** 2)
         stormy = corrected(windy, away(0.06, 0, 0, 0), 16 * SCATTER, PASSIVE_BIAS)
         assert calm.alpha[0] > 0.04
         assert stormy.alpha[0] < 0.001
@@ -211,7 +214,7 @@ class TestExcess:
 
     def test_what_is_forgotten_is_as_uncertain_as_the_look_that_made_it_be(self):
         excess = np.array([0.05, 0.0, 0.0, 0.0])
-        much = allowing(begun(NOWHERE, DITHERED), PASSIVE_BIAS, 3.0 * excess)
+        much = allow_scatter(begun(NOWHERE, DITHERED), PASSIVE_BIAS, 3.0 * excess)
         gone = forget(much, PASSIVE_BIAS, excess)
         np.testing.assert_allclose(np.diag(gone.covariance)[4:], BIAS_FLOOR**2 + excess)
         np.testing.assert_array_equal(gone.bias_of(PASSIVE_BIAS).excess, excess)
@@ -219,9 +222,9 @@ class TestExcess:
     def test_a_wind_that_lasts_keeps_it_while_the_filter_fades_it(self):
         """For days: one hour of memory, a look every minute."""
         excess = np.array([0.2, 0.2, 0.0, 0.0]) ** 2
-        joint = allowing(begun(NOWHERE, DITHERED), PASSIVE_BIAS, excess)
+        joint = allow_scatter(begun(NOWHERE, DITHERED), PASSIVE_BIAS, excess)
         for _ in range(3000):
-            joint = allowing(predicted(joint, DRIFT, 60.0), PASSIVE_BIAS, excess)
+            joint = allow_scatter(predicted(joint, DRIFT, 60.0), PASSIVE_BIAS, excess)
         np.testing.assert_allclose(np.diag(joint.covariance)[4:], BIAS_FLOOR**2 + excess)
 
 
@@ -305,7 +308,7 @@ def windy_night(seed: int, scatters: tuple[np.ndarray, np.ndarray]) -> np.ndarra
             joint = corrected(joint, read, DITHERED)
         read = true + bias + scatter * rng.normal(size=4)
         joint = corrected(
-            allowing(joint, PASSIVE_BIAS, excess), read, np.diag(scatter**2), PASSIVE_BIAS
+            allow_scatter(joint, PASSIVE_BIAS, excess), read, np.diag(scatter**2), PASSIVE_BIAS
         )
         error, covariance = joint.alpha - true, joint.alpha_covariance
         square = error @ np.linalg.solve(covariance, error)
@@ -372,7 +375,7 @@ class TestAnamorphosis:
 
     def test_a_first_window_and_what_is_expected_are_weighed_by_their_precision(self):
         """Expected is 0 with 2 %; what the window knows together follows as it is correlated."""
-        found = expecting(begin_joint(self.SEEN, self.NOISE), np.zeros(2))
+        found = expect_stretches(begin_joint(self.SEEN, self.NOISE), np.zeros(2))
         prior = np.diag([0.0, 0.0, 0.0, 0.0, 2500.0, 2500.0])
         precision = np.linalg.inv(self.NOISE)
         expected = np.linalg.solve(precision + prior, precision @ self.SEEN)
@@ -391,14 +394,14 @@ class TestAnamorphosis:
         assert np.count_nonzero(found.covariance[4:6, :4]) == 0
 
     def test_a_window_that_does_not_tell_it_tells_the_four(self):
-        prior = expecting(begin_joint(self.SEEN, self.NOISE), np.zeros(2))
+        prior = expect_stretches(begin_joint(self.SEEN, self.NOISE), np.zeros(2))
         found = corrected(prior, self.SEEN[:4], DITHERED)
         assert np.all(np.diag(found.covariance) <= np.diag(prior.covariance) + 1e-15)
         assert len(found.mean) == 6
 
     def test_a_jump_of_the_mirror_leaves_it(self):
         prior = begin_joint(self.SEEN, self.NOISE)
-        wider = widened(prior, DITHERED)
+        wider = widen_after_jump(prior, DITHERED)
         np.testing.assert_array_equal(wider.covariance[4:, 4:], prior.covariance[4:, 4:])
         assert np.all(np.diag(wider.covariance)[:4] > 50.0 * np.diag(DITHERED))
 

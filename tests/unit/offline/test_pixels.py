@@ -12,7 +12,7 @@ from pyrcal.offline.solver import nuisances_of
 from service.errors import MatrixError
 from service.estimation.orientation import Pose, find_orientation
 from service.estimation.reference import Reference
-from service.estimation.slope_convention import of_answer
+from service.estimation.slope_convention import identify_from_response
 from service.model.kinds import SignalKind, SlopeOrder
 from service.model.pupil import valid_subapertures
 from service.model.slopes import Orientation, SlopeRecipe, slopes_of
@@ -90,6 +90,13 @@ def test_the_answer_to_a_dither_tells_images_that_lie_otherwise_than_told():
     rows = matrix(about=PIXELS)[:, 2:6].T
     seen = listed(rows.T, SlopeOrder.IMAGES, Orientation(sign_x=-1, sign_y=-1)).T
     told = replace(PIXELS, slopes=replace(PIXELS.slopes, orientation=PLAIN))
-    found = of_answer(seen.astype(complex), rows.astype(complex), np.full(4, 0.1), told)
+    found = identify_from_response(
+        seen.astype(complex), rows.astype(complex), np.full(4, 0.1), told
+    )
     assert "other sign" in found.wrong
-    assert of_answer(rows.astype(complex), rows.astype(complex), np.full(4, 0.1), told).wrong == ""
+    assert (
+        identify_from_response(
+            rows.astype(complex), rows.astype(complex), np.full(4, 0.1), told
+        ).wrong
+        == ""
+    )

@@ -10,7 +10,7 @@ from pyrcal_studies.campaign.observatory import Observatory
 from service.archive import Archive
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
-from service.runtime.archiving import is_unsaved, is_urgent, leave, taken_up
+from service.runtime.archiving import is_unsaved, is_urgent, leave, restore_tracking
 from service.runtime.engine import Engine
 from service.runtime.estimates import PendingWindow
 from service.runtime.worker import Compute, OpticsWorker
@@ -87,7 +87,7 @@ def test_the_alpha_on_the_disk_goes_when_an_acquisition_forgets_it(tmp_path):
         assert archive.tracking.read().registration is not None
         story.tell(cmd.Acquire())
         leave(archive, story.state, story.now_ns)
-        state = taken_up(archive, TrackerState(system="flao"), story.policy, story.now_ns)
+        state = restore_tracking(archive, TrackerState(system="flao"), story.policy, story.now_ns)
     assert state.alpha.registration is None
     assert state.operations.acquisition.stage is AcquisitionStage.INTERRUPTED
 
@@ -115,7 +115,7 @@ def test_orders_are_left_beside_the_alpha_of_another_night_and_taken_back_there(
         assert ordered.orders.dither_stopped
         assert ordered.registration.alpha == story.state.alpha.registration.alpha
         leave(archive, fresh, START_NS)
-        state = taken_up(archive, fresh, story.policy, story.now_ns)
+        state = restore_tracking(archive, fresh, story.policy, story.now_ns)
     assert state.alpha.registration is not None
     assert not state.dithers.stopped
 
@@ -127,7 +127,7 @@ def test_orders_are_left_where_nothing_else_is_and_taken_back_there(tmp_path):
         story = Acquiring()
         for stopped in (True, False):
             leave(archive, changed(fresh, stopped=stopped), START_NS)
-            state = taken_up(archive, fresh, story.policy, START_NS)
+            state = restore_tracking(archive, fresh, story.policy, START_NS)
             assert state.dithers.stopped is stopped
 
 
@@ -136,7 +136,7 @@ def test_what_another_system_has_left_is_neither_read_nor_kept(tmp_path):
     with Archive(tmp_path) as archive:
         archive.open()
         leave(archive, changed(fresh, system="other", stopped=True), START_NS)
-        assert not taken_up(archive, fresh, Acquiring().policy, START_NS).dithers.stopped
+        assert not restore_tracking(archive, fresh, Acquiring().policy, START_NS).dithers.stopped
         leave(archive, changed(fresh, stopped=True), START_NS)
         assert archive.tracking.read().system == "flao"
 
@@ -153,7 +153,7 @@ class Restartable(Observatory):
         shelf = restored(old.matrices.reconstructors)
         fresh = tracker_state(system=old.system, mode=mode, reconstructors=shelf)
         policy = self._engine.policy
-        self._engine = Engine(taken_up(archive, fresh, policy, now_ns), policy, self)
+        self._engine = Engine(restore_tracking(archive, fresh, policy, now_ns), policy, self)
         self._engine.set_description(bench.describe())
         self._begin()
 

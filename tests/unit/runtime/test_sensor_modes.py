@@ -21,7 +21,7 @@ from service.runtime.estimates import fitted, read_own_matrix
 from service.runtime.worker import OpticsWorker
 from service.tracking.products import MatrixState
 from service.tracking.resume import resumed, saved_of
-from service.tracking.sending import why_unsendable
+from service.tracking.sending import check_sendable
 from service.tracking.state import LoopState, Mode, TrackerState
 from sim_rtc.options import parse_options
 from tests.unit.runtime.small import COMPUTE
@@ -157,7 +157,7 @@ def test_matrices_are_made_and_used_in_each_mode_with_no_more_modes_than_it_has(
 
 def test_a_matrix_of_another_mode_cannot_be_sent(night):
     coarse = next(r for r in night.state.matrices.reconstructors if r.config_id == "coarse")
-    why = why_unsendable(night.state, coarse)
+    why = check_sendable(night.state, coarse)
     assert why.startswith("it is for the sensor's mode coarse, which is now fine: ")
     previous = night.state.previous
     assert previous is None or night.state.reconstructor(previous).config_id == "fine"

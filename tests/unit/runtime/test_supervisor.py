@@ -15,7 +15,7 @@ from service.archive import Actor, AuditEntry, Channel, Range
 from service.errors import ArchiveError, CommandError, PyrcalError
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime import heartbeat
-from service.runtime.archiving import taken_up
+from service.runtime.archiving import restore_tracking
 from service.runtime.engine import follow_state
 from service.runtime.supervisor import Supervisor
 from service.tracking import commands as cmd
@@ -200,14 +200,14 @@ async def test_alpha_outlives_the_service_that_measured_it(supervisor, archive):
     know(supervisor, registration=before)
     async with running(supervisor):
         assert archive.tracking.read() is None
-    again = taken_up(archive, TrackerState(system="small"), POLICY, time.time_ns())
+    again = restore_tracking(archive, TrackerState(system="small"), POLICY, time.time_ns())
     assert again.alpha.registration.alpha == before.alpha
     assert again.alpha.registration.n_windows == 0
 
 
 async def test_a_damaged_file_costs_alpha_and_not_the_start(archive, tmp_path):
     (tmp_path / "tracking.json").write_text("{")
-    state = taken_up(archive, TrackerState(system="small"), POLICY, time.time_ns())
+    state = restore_tracking(archive, TrackerState(system="small"), POLICY, time.time_ns())
     assert state.alpha.registration is None
     assert "damaged" in state.log[-1].text
     assert (tmp_path / "tracking.damaged").exists()
@@ -217,7 +217,7 @@ async def test_what_is_wrong_in_the_archive_is_on_record_from_the_start(archive)
     (archive.directory / "reconstructors" / "old.h5").mkdir()
     archive.close()
     archive.open()
-    state = taken_up(archive, TrackerState(system="small"), POLICY, time.time_ns())
+    state = restore_tracking(archive, TrackerState(system="small"), POLICY, time.time_ns())
     (entry,) = [entry for entry in state.log if entry.name == "archive.damaged"]
     assert "old.h5" in entry.text
     assert entry.level is Level.WARNING
@@ -269,7 +269,7 @@ async def test_an_order_is_on_the_disk_before_a_service_that_is_killed_could_for
         await until(lambda: archive.tracking.read().orders is not None)
         assert in_time(began, 0.5)
     again = tracker_state(system="small", mode=Mode.AUTO)
-    assert taken_up(archive, again, POLICY, time.time_ns()).dithers.stopped
+    assert restore_tracking(archive, again, POLICY, time.time_ns()).dithers.stopped
 
 
 def told(story, n_windows):

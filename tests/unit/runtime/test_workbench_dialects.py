@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.estimation.slope_convention import of_answer
+from service.estimation.slope_convention import identify_from_response
 from service.estimation.windows import RefusalKind
 from service.model.interaction import InteractionModel
 from service.model.kinds import Normalisation, SlopeOrder
@@ -244,7 +244,7 @@ def test_one_mode_of_the_other_sign_is_not_taken_for_other_axes():
     slopes = expected * np.array([1.0, 1.0, 1.0, -1.0])[:, None]
     noise = np.random.default_rng(3).normal(size=(3, expected.shape[1]))
     slopes[:3] += 0.75 * noise * np.sqrt(np.mean(np.abs(expected[:3]) ** 2, axis=1))[:, None]
-    assert of_answer(slopes, expected, np.zeros(4), told_upright()).wrong == ""
+    assert identify_from_response(slopes, expected, np.zeros(4), told_upright()).wrong == ""
 
 
 def test_axes_that_turn_half_of_the_modes_over_are_named():
@@ -252,5 +252,7 @@ def test_axes_that_turn_half_of_the_modes_over_are_named():
     alike = parities(upright, other)
     modes = [*np.argsort(alike)[-2:], *np.argsort(alike)[:2]]
     expected = upright[modes].astype(complex)
-    found = of_answer(other[modes].astype(complex), expected, np.zeros(4), told_upright())
+    found = identify_from_response(
+        other[modes].astype(complex), expected, np.zeros(4), told_upright()
+    )
     assert "orientation.flip_y = true" in found.wrong

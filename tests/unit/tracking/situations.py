@@ -10,7 +10,7 @@ from service.config.policy import policy_of
 from service.control.gate import GateVerdict
 from service.errors import CommandError
 from service.estimation.lockin import LockInEstimate
-from service.estimation.loop import commanded_gains
+from service.estimation.loop import select_gains
 from service.model.misregistration import Misregistration
 from service.tracker import step
 from service.tracking import events as ev
@@ -131,7 +131,7 @@ def judged(known, view, n_modes=400, **changes):
     """What a verdict given now is of."""
     values = {
         "session": view.session,
-        "gains": commanded_gains(view, n_modes),
+        "gains": select_gains(view, n_modes),
         "leak": view.leak,
         "delay_frames": view.delay_frames,
         "alpha": known.alpha,

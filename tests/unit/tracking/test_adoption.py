@@ -5,7 +5,12 @@ from dataclasses import replace
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.alarms import OVER_BUDGET
-from service.tracking.dither_request import Dither, DitherParameters, plan_dither, why_unusable
+from service.tracking.dither_request import (
+    Dither,
+    DitherParameters,
+    check_dither_usable,
+    plan_dither,
+)
 from service.wire import DitherRequest, DitherStop
 from tests.unit.tracking.situations import (
     POLICY,
@@ -91,5 +96,5 @@ def test_one_over_budget_from_before_a_restart_is_stopped_and_read_only_where_it
 
 def test_only_a_sine_can_be_demodulated():
     random = Dither(request=dither_request("d-1"), start_seq=4000, asked_ns_utc=0)
-    assert why_unusable(random, rtc(), POLICY) == "d-1 is binary, not a sine"
-    assert why_unusable(RUNNING, rtc(), POLICY) is None
+    assert check_dither_usable(random, rtc(), POLICY) == "d-1 is binary, not a sine"
+    assert check_dither_usable(RUNNING, rtc(), POLICY) is None

@@ -9,7 +9,7 @@ from service.control.loop import compute_amplification
 from service.tracking.alarms import OVER_BUDGET
 from service.tracking.dither_modes import (
     LINE_RANGE,
-    chosen_modes,
+    choose_modes,
     controlled,
     expected_amplification,
 )
@@ -38,13 +38,13 @@ def on_the_mirror_m(request, view):
 
 def test_free_modes_are_amplified_by_nothing():
     view = rtc(400)
-    assert not controlled(chosen_modes(view, POLICY), view)
+    assert not controlled(choose_modes(view, POLICY), view)
     assert expected_amplification(view, POLICY) == 1.0
 
 
 def test_modes_of_the_loop_are_amplified_as_its_gain_leak_and_delay_say():
     view = rtc(N_MODES)
-    assert controlled(chosen_modes(view, ALL), view) == (590, 591, 592, 593)
+    assert controlled(choose_modes(view, ALL), view) == (590, 591, 592, 593)
     strong = replace(view, gains=(0.6,) * N_MODES)
     assert 1.1 < expected_amplification(view, ALL) < expected_amplification(strong, ALL)
     assert expected_amplification(replace(view, loop="open"), ALL) == 1.0
@@ -126,11 +126,11 @@ def test_where_none_is_free_those_that_tell_most_are_dithered_not_the_last():
     """The last modes of a basis are seen badly: the rotation was 27 of its own σ off by them."""
     policy = informed(range(580, N_MODES))
     for n_controlled in (400, N_MODES):
-        modes = chosen_modes(rtc(n_controlled), policy)
+        modes = choose_modes(rtc(n_controlled), policy)
         assert len(modes) == 4
         assert min(modes) >= N_MODES - 100
         assert max(modes) < 580
-    assert chosen_modes(rtc(400, max_dither_modes=3), policy) == modes[:3]
+    assert choose_modes(rtc(400, max_dither_modes=3), policy) == modes[:3]
 
 
 def test_the_dither_stays_where_it_is_when_its_modes_come_into_the_loop():

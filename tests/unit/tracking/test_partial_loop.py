@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from service.estimation.loop import extended_gains
+from service.estimation.loop import extend_gains
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.operation_records import MeasureState
@@ -71,7 +71,7 @@ def test_modes_above_those_that_were_taken_out_are_not_tried(last_gain):
     gains = (*(0.4,) * 399, last_gain, *(0.0,) * (N_MODES - 400))
     story = Story(Mode.AUTO).meet()
     view = partial(gains)
-    assert extended_gains(view, 500)[450] == last_gain
+    assert extend_gains(view, 500)[450] == last_gain
     assert bool(more_modes_to_try(story.state, view, POLICY, story.now_ns)) is bool(last_gain)
 
 

@@ -1,6 +1,6 @@
 import pytest
 
-from service.estimation.loop import extended_gains
+from service.estimation.loop import extend_gains
 from service.tracker import step
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
@@ -28,12 +28,12 @@ def story():
 
 def test_more_modes_get_the_gain_of_the_last_controlled_one():
     view = rtc(gains=(0.4,) * 399 + (0.3,) + (0.0,) * 194)
-    gains = extended_gains(view, 500)
+    gains = extend_gains(view, 500)
     assert gains == (0.4,) * 399 + (0.3,) * 101 + (0.0,) * 94
 
 
 def test_fewer_modes_keep_their_gains_and_release_the_rest():
-    gains = extended_gains(rtc(), 100)
+    gains = extend_gains(rtc(), 100)
     assert gains == (0.4,) * 100 + (0.0,) * 494
 
 

@@ -15,11 +15,11 @@ from service.tracking.validity import (
     INTERVALS_KEPT,
     MAX_TELEMETRY_AGE_S,
     TelemetrySpan,
+    explain_void,
     invalidate_telemetry,
     make_valid,
     separation_deg,
     void_until,
-    why_void,
 )
 from service.wire import Pointing
 from tests.states import changed, tracker_state
@@ -278,34 +278,34 @@ def void(state, until_s, because, **kwargs):
 
 def test_what_began_before_is_void_whenever_it_is_worked_out():
     state = void(STATE, 10.0, "the edge had slipped")
-    assert why_void(state, at(9.9)) == "the edge had slipped"
-    assert why_void(state, at(10.0)) is None, "a window may begin where the one before it ends"
-    assert why_void(state, at(9.9995)) is None, "but for the rounding of a frame"
-    assert why_void(STATE, at(-1e6)) is None
+    assert explain_void(state, at(9.9)) == "the edge had slipped"
+    assert explain_void(state, at(10.0)) is None, "a window may begin where the one before it ends"
+    assert explain_void(state, at(9.9995)) is None, "but for the rounding of a frame"
+    assert explain_void(STATE, at(-1e6)) is None
 
 
 def test_each_purpose_is_asked_by_itself():
     state = void(STATE, 10.0, "it jumped", purpose=Purpose.PASSIVE)
-    assert why_void(state, at(0.0)) is None
-    assert why_void(state, at(0.0), Purpose.PASSIVE) == "it jumped"
-    assert why_void(state, at(0.0), Purpose.SETTLE) is None
+    assert explain_void(state, at(0.0)) is None
+    assert explain_void(state, at(0.0), Purpose.PASSIVE) == "it jumped"
+    assert explain_void(state, at(0.0), Purpose.SETTLE) is None
 
 
 def test_the_first_reason_that_covers_is_told_and_a_later_one_for_what_came_after_it():
     state = void(void(STATE, 5.0, "one"), 10.0, "other")
-    assert (why_void(state, at(4.0)), why_void(state, at(6.0))) == ("one", "other")
+    assert (explain_void(state, at(4.0)), explain_void(state, at(6.0))) == ("one", "other")
 
 
 def test_the_same_reason_again_takes_the_place_of_the_last():
     state = void(void(STATE, 10.0, "one"), 5.0, "one")
     assert len(state.alpha.void_intervals) == 1
-    assert why_void(state, at(6.0)) is None
+    assert explain_void(state, at(6.0)) is None
 
 
 def test_what_was_not_so_after_all_is_valid_again():
     state = void(void(STATE, 5.0, "moved"), 5.0, "slipped")
-    assert why_void(turned(state, make_valid, Purpose.MEASURE, "moved"), at(0.0)) == "slipped"
-    assert why_void(turned(state, make_valid, Purpose.MEASURE), at(0.0)) is None
+    assert explain_void(turned(state, make_valid, Purpose.MEASURE, "moved"), at(0.0)) == "slipped"
+    assert explain_void(turned(state, make_valid, Purpose.MEASURE), at(0.0)) is None
 
 
 def test_they_are_bounded_and_old_ones_go():
@@ -320,7 +320,7 @@ def test_they_are_bounded_and_old_ones_go():
 @pytest.mark.parametrize(("ahead_s", "is_void"), [(50.0, True), (70.0, False)])
 def test_a_clock_that_was_set_back_makes_nothing_void(ahead_s, is_void):
     state = void(STATE, ahead_s, "one")
-    assert (why_void(state, at(0.0)) is not None) is is_void
+    assert (explain_void(state, at(0.0)) is not None) is is_void
 
 
 def test_telemetry_until_now_is_void_by_the_rtcs_clock_or_by_what_is_known_better():

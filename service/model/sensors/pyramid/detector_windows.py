@@ -105,13 +105,13 @@ def frame_windows(instrument: Instrument, flux_frame: Array) -> Windows:
         raise ModelError(f"{instrument.name}: found wfs.input = slopes, expected frames")
     pixels = told.pixels_per_subaperture
     if told.centres_px is None:
-        centres = _refined(instrument, flux_frame, pixels)
+        centres = _refine_centres(instrument, flux_frame, pixels)
     else:
         centres = by_quadrant(told.centres_px)
     return _windows_at(instrument, centres, flux_frame, pixels)
 
 
-def _refined(instrument: Instrument, flux_frame: Array, pixels: int) -> Array:
+def _refine_centres(instrument: Instrument, flux_frame: Array, pixels: int) -> Array:
     """Return the centres of the pupil images ``(2, 2, 2)`` in a mean frame, to 0.01 pixel.
 
     Circles through the images' edges are good to 0.1 pixel: light is diffracted between the images,
@@ -145,7 +145,9 @@ def image_centres(instrument: Instrument, flux_frame: NDArray[np.floating]) -> A
     if not isinstance(windows, FrameWindows):
         return None
     try:
-        found = _refined(instrument, flux_frame.astype(np.float64), windows.pixels_per_subaperture)
+        found = _refine_centres(
+            instrument, flux_frame.astype(np.float64), windows.pixels_per_subaperture
+        )
     except ModelError:
         return None
     return found.reshape(4, 2)
@@ -183,7 +185,8 @@ def locate_images(
         remarks = () if moving else tuple(_beside_the_light(instrument, windows, light))
         return instrument, remarks
     centres = frame_windows(instrument, light).centres_px.reshape(4, 2)
-    remark = f"shifts count from the pupil images as found: pupil_centres_px = [{_listed(centres)}]"
+    found = _format_centres(centres)
+    remark = f"shifts count from the pupil images as found: pupil_centres_px = [{found}]"
     return replace(instrument, frames=replace(windows, centres_px=centres)), (remark,)
 
 
@@ -201,11 +204,11 @@ def _beside_the_light(instrument: Instrument, windows: FrameWindows, light: Arra
     if away > _REMARK_DISTANCE_SUBAP:
         yield (
             f"wfs.pupil_centres_px lie up to {away:.2f} subapertures beside the pupil images of "
-            f"the flux frame, which are centred at [{_listed(found)}]: correct the key"
+            f"the flux frame, which are centred at [{_format_centres(found)}]: correct the key"
         )
 
 
-def _listed(centres: Array) -> str:
+def _format_centres(centres: Array) -> str:
     return ", ".join(f"[{row:.2f}, {column:.2f}]" for row, column in centres)
 
 

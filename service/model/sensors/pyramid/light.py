@@ -126,7 +126,7 @@ class PyramidLight:
 
     def illumination(self, counts: NDArray[Any], position: PupilPosition) -> Illumination:
         """Return how evenly the beam is lit."""
-        return measured_illumination(counts, self.instrument, position)
+        return measure_illumination(counts, self.instrument, position)
 
     def relative(
         self, counts: NDArray[Any], position: PupilPosition
@@ -146,7 +146,7 @@ def find_pupil(counts: NDArray[Any], instrument: Instrument) -> PupilPosition | 
     ModelError
         If the counts are not four images of the instrument's size.
     """
-    images, _ = repaired(counts, instrument)
+    images, _ = repair_pixels(counts, instrument)
     light = float(images.mean())
     if not light > 0.0:
         return CannotTell(reason=f"no light: the mean count is {light:g}; open the shutter")
@@ -154,7 +154,7 @@ def find_pupil(counts: NDArray[Any], instrument: Instrument) -> PupilPosition | 
     optics = even_optics(instrument)
     try:
         start = _first_guess(images, even_optics(instrument, 1))
-        position, steps, formal, residual = _settled(images, optics, start)
+        position, steps, formal, residual = _settle_position(images, optics, start)
     except np.linalg.LinAlgError:
         return CannotTell(reason="the light has no edge the position could be read from")
     if residual > _MAX_RESIDUAL:
@@ -222,7 +222,7 @@ def _locate_images(
     Every image is compared with that of an even beam, diffraction between the images included,
     under smooth light of its own.
     """
-    images, _ = repaired(counts, instrument)
+    images, _ = repair_pixels(counts, instrument)
     light = float(images.mean())
     if not light > 0.0:
         return CannotTell(reason=f"no light: the mean count is {light:g}; open the shutter")
@@ -262,7 +262,7 @@ def even_images(optics: PyramidOptics, shift: tuple[float, float]) -> Array:
     return optics.images(shift).transpose(0, 2, 1, 3).reshape(4, n, n)
 
 
-def repaired(counts: NDArray[Any], instrument: Instrument) -> tuple[Array, NDArray[np.bool_]]:
+def repair_pixels(counts: NDArray[Any], instrument: Instrument) -> tuple[Array, NDArray[np.bool_]]:
     """Return the counts ``(4, n, n)`` with bad pixels replaced, and which were bad.
 
     A pixel is bad when it is no number or far from the median of the same place in all images,
@@ -291,7 +291,7 @@ def repaired(counts: NDArray[Any], instrument: Instrument) -> tuple[Array, NDArr
     return np.where(bad, np.nan_to_num(middle) * level[:, None, None], images), bad
 
 
-def _settled(
+def _settle_position(
     images: Array, optics: PyramidOptics, position: Array
 ) -> tuple[Array, Array, Array, float]:
     """Return position, the four images' own departures and their formal σ, and the residual."""
@@ -352,10 +352,10 @@ def _departure(
     """
     lit = np.column_stack([surface * even[:, None], np.ones_like(even)])
     weights = np.ones_like(image)
-    light = surface @ _weighted(lit, image, weights)[0][:-1]
+    light = surface @ _weigh(lit, image, weights)[0][:-1]
     for _ in range(5):
         columns = np.column_stack([lit, rates[0] * light, rates[1] * light])
-        solution, covariance = _weighted(columns, image, weights)
+        solution, covariance = _weigh(columns, image, weights)
         left = image - columns @ solution
         scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
         weights = np.minimum(1.0, _HUBER_SIGMA * scale / np.maximum(np.abs(left), 1e-12))
@@ -363,7 +363,7 @@ def _departure(
     return solution[-2:], scale * np.sqrt(np.diag(covariance)[-2:]), float(left.std())
 
 
-def _weighted(columns: Array, values: Array, weights: Array) -> tuple[Array, Array]:
+def _weigh(columns: Array, values: Array, weights: Array) -> tuple[Array, Array]:
     normal = columns.T @ (columns * weights[:, None])
     covariance = np.asarray(np.linalg.inv(normal))
     return covariance @ (columns.T @ (weights * values)), covariance
@@ -392,7 +392,7 @@ _MARGIN = 4
 """Subapertures around the sensor's grid: the pupil may have moved when the map is used."""
 
 
-def measured_illumination(
+def measure_illumination(
     counts: NDArray[Any], instrument: Instrument, position: PupilPosition
 ) -> Illumination:
     """Return how evenly the beam is lit, from the mean counts ``(4, n, n)``.
@@ -408,12 +408,12 @@ def measured_illumination(
     ModelError
         If the counts are not four images of the instrument's size, or dark.
     """
-    images, _ = repaired(counts, instrument)
+    images, _ = repair_pixels(counts, instrument)
     if not images.mean() > 0.0:
         raise ModelError("illumination: found no light; expected the mean counts of the images")
     shown = even_images(even_optics(instrument), position.at)
     lit = shown.sum(axis=0) > _LIT_SHARE * np.percentile(shown.sum(axis=0), 75.0)
-    return _beam(_filled(_excess(images, shown, lit), lit), position)
+    return _beam(_fill_outside(_excess(images, shown, lit), lit), position)
 
 
 def relative_light(
@@ -429,7 +429,7 @@ def relative_light(
     ModelError
         If the counts are not four images of the instrument's size.
     """
-    images, _ = repaired(counts, instrument)
+    images, _ = repair_pixels(counts, instrument)
     even = even_images(even_optics(instrument), position.at).sum(axis=0)
     lit = even > _LIT_SHARE * np.percentile(even, 75.0)
     share = images.sum(axis=0) / np.where(lit, even, 1.0)
@@ -443,7 +443,7 @@ def _excess(images: Array, shown: Array, lit: NDArray[np.bool_]) -> Array:
     return np.asarray(excess / excess[lit].mean())
 
 
-def _filled(share: Array, lit: NDArray[np.bool_]) -> Array:
+def _fill_outside(share: Array, lit: NDArray[np.bool_]) -> Array:
     """Return the smoothed map, extrapolated from inside the pupil to its outside.
 
     It is a normalised convolution that widens until everything is reached.

@@ -8,7 +8,7 @@ import pytest
 from service.errors import ModelError
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
-from service.model.sensors.pyramid.light import find_pupil, measured_illumination, relative_light
+from service.model.sensors.pyramid.light import find_pupil, measure_illumination, relative_light
 from service.model.sensors.sensor import PupilPosition
 from tests.numerics import small_basis
 from tests.unit.estimation.lamps import beam, counts_of, flao, fringes, gaussian, small
@@ -31,7 +31,7 @@ def inside(illumination, function, radius: float = 13.0):
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (-0.92, 0.35)])
 def test_a_fibres_beam_is_found_whatever_the_images_have_moved(shift):
     """0.025: an eighth of its unevenness of 16 % is hidden by scattered light."""
-    found = measured_illumination(counts_of(flao(), shift, beam(gaussian)), flao(), at(*shift))
+    found = measure_illumination(counts_of(flao(), shift, beam(gaussian)), flao(), at(*shift))
     measured, true = inside(found, gaussian)
     assert np.std(true) > 0.1
     assert np.std(measured - true) < 0.025
@@ -39,21 +39,21 @@ def test_a_fibres_beam_is_found_whatever_the_images_have_moved(shift):
 
 def test_an_even_beam_is_found_even():
     """0.01: ripples of a pupil sampled more finely than the map's own."""
-    found = measured_illumination(counts_of(flao()), flao(), at())
+    found = measure_illumination(counts_of(flao()), flao(), at())
     measured, _ = inside(found, lambda x, y: np.ones_like(x + y))
     assert np.std(measured) < 0.01
 
 
 def test_bad_pixels_leave_no_trace():
     counts = counts_of(flao(), light=beam(gaussian))
-    clean = measured_illumination(counts, flao(), at())
+    clean = measure_illumination(counts, flao(), at())
     counts[1, 10, 10], counts[2, 16, 20] = 0.0, 1e5
-    damaged = measured_illumination(counts, flao(), at())
+    damaged = measure_illumination(counts, flao(), at())
     np.testing.assert_allclose(damaged.intensity, clean.intensity, atol=0.02)
 
 
 def test_the_light_goes_on_smoothly_beyond_the_outline():
-    found = measured_illumination(counts_of(flao(), light=beam(gaussian)), flao(), at())
+    found = measure_illumination(counts_of(flao(), light=beam(gaussian)), flao(), at())
     steps = np.abs(np.diff(found.intensity, axis=0))
     assert found.intensity.min() > 0.2
     assert steps.max() < 0.15
@@ -66,7 +66,7 @@ def test_the_matrix_of_an_uneven_beam_is_nearer_with_the_light_that_was_measured
     counts = counts_of(small(), shift, light)
     position = find_pupil(counts, small())
     assert isinstance(position, PupilPosition)
-    measured = measured_illumination(counts, small(), position)
+    measured = measure_illumination(counts, small(), position)
 
     def matrix(illumination):
         model = InteractionModel(small(), small_basis(), illumination=illumination)
@@ -91,7 +91,7 @@ def test_where_the_light_is_not_known_is_said():
 
 def test_darkness_lights_nothing():
     with pytest.raises(ModelError, match="no light"):
-        measured_illumination(np.zeros((4, 30, 30)), flao(), at())
+        measure_illumination(np.zeros((4, 30, 30)), flao(), at())
 
 
 def test_counts_of_another_size_are_refused():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.model.sensors.pyramid.light import find_pupil, repaired
+from service.model.sensors.pyramid.light import find_pupil, repair_pixels
 from service.model.sensors.sensor import CannotTell, PupilPosition
 from tests.unit.estimation.lamps import (
     beam,
@@ -42,7 +42,7 @@ def test_dead_and_hot_pixels_are_named_and_do_no_harm():
     shift = (0.3, -0.7)
     counts = counts_of(flao(), shift)
     counts[0, 8, 9], counts[1, 14, 3], counts[3, 20, 21] = 0.0, 60_000.0, np.nan
-    _, bad = repaired(counts, flao())
+    _, bad = repair_pixels(counts, flao())
     assert bad.sum() == 3
     found = found_in(counts)
     assert found.at == pytest.approx(shift, abs=0.03)

@@ -30,7 +30,7 @@ from benchmarks import plant
 from benchmarks.bench_alone import alone_rows, elt_section, peak_mb
 from benchmarks.bench_page import Row, page, plot
 from benchmarks.peer_rounds import cpu_s
-from pyrcal.offline.fit_file import fit_file, reference_of
+from pyrcal.offline.fit_file import fit_file, make_reference
 from pyrcal.offline.fitted import Fit
 from pyrcal.offline.matrix import FitOptions, fit_matrix
 from pyrcal.offline.recorded import read_recorded
@@ -268,7 +268,7 @@ def _judged(case: Case, found: Measured, cube: Array | None, folder: Path) -> tu
 
     def fitted() -> Fit:
         told = load_instrument(str(toml))
-        reference, _ = reference_of(read_recorded(path), told)
+        reference, _ = make_reference(read_recorded(path), told)
         return fit_matrix(told, reference)
 
     took_s, fit = cpu_s(fitted)

@@ -22,7 +22,7 @@ OTHER_PROGRAMS = {
     "check-rtc": ("check_rtc", "check whether an RTC keeps the contract"),
     "cacao": ("cacao_bridge", "the bridge to a loop of cacao's"),
 }
-"""Module and purpose of what is run in this program's place, with options of its own."""
+"""Modules and purposes of programs that run in place of this one, with options of their own."""
 
 
 HEADINGS = {
@@ -33,7 +33,7 @@ HEADINGS = {
     "fit": "files in, answers out, without a service",
     "demo": "try it, or an RTC of yours",
 }
-"""Said before the first command of a group."""
+"""Text before the first command of a group."""
 
 
 def command_line() -> argparse.ArgumentParser:
@@ -61,7 +61,7 @@ def command_line() -> argparse.ArgumentParser:
 
 
 class _Grouped(argparse.HelpFormatter):
-    """Commands under headings."""
+    """Help formatter that prints commands under headings."""
 
     @override
     def _format_action(self, action: argparse.Action) -> str:
@@ -71,7 +71,7 @@ class _Grouped(argparse.HelpFormatter):
 
 
 class _Completion(argparse.Action):
-    """Print the shell completion of this command line, and end the program."""
+    """Action that prints the shell completion of this command line and exits."""
 
     @override
     def __call__(
@@ -87,8 +87,8 @@ _NEGATIVE = re.compile(r"-[\d.][-+\d.eE]*,.*")
 
 
 def with_negative_numbers(given: Sequence[str]) -> list[str]:
-    """Return command-line words such that argparse takes ``-0.3,0.1,65,1`` for a value.
+    """Return command-line words so that argparse accepts ``-0.3,0.1,65,1`` as a value.
 
-    It takes it for an option; a word with a blank in it, never.
+    argparse takes it for an option, except if the word contains a blank.
     """
     return [f" {word}" if _NEGATIVE.fullmatch(word) else word for word in given]

@@ -55,7 +55,7 @@ MAX_RESIDUAL = 0.2
 """Largest RMS residual of the model; a larger one indicates another order of slopes."""
 
 HEIGHTS_M = (0.05, 50.0)
-"""Peak of a mode over the pupil, metres per unit command: the range of any modes in metres."""
+"""Plausible range of a mode's peak over the pupil, metres per unit command."""
 
 COMMANDS_M = (1e-11, 1e-4)
 """Plausible range of the RMS of commands, metres."""
@@ -137,7 +137,7 @@ def check(
     columns: Array | None = None,
     stream: Stream | None = None,
 ) -> tuple[RuleCheck, ...]:
-    """Return every rule that could be measured; those that are broken are not ``kept``.
+    """Return every rule that could be measured; broken ones have ``kept`` False.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def check(
 
 
 def _basis(instrument: Instrument) -> Iterator[RuleCheck]:
-    """Yield what the shapes of the modes are like over the pupil, the lowest ones alone."""
+    """Yield checks of the modes' shapes over the pupil, for the lowest modes."""
     if not instrument.mirror.stroke_known:
         return
     basis = cached_basis(instrument)
@@ -181,7 +181,7 @@ def _basis(instrument: Instrument) -> Iterator[RuleCheck]:
 
 
 def _decades_outside(value: float, limits: tuple[float, float]) -> float:
-    """Return by how many powers of ten a number misses a range; 0 within it."""
+    """Return the powers of ten by which a number is outside a range; 0 within it."""
     if not np.isfinite(value) or value <= 0.0:
         return np.inf
     low, high = limits
@@ -228,7 +228,7 @@ def _matrix(instrument: Instrument, matrix: Array, columns: Array | None) -> Ite
 
 
 def _axes(instrument: Instrument, fit: Fit) -> Iterator[RuleCheck]:
-    """Yield how slopes are listed, against what is stated."""
+    """Yield the check of the slopes' order and signs against the stated ones."""
     stated, found = instrument.slopes.orientation, fit.orientation
     yield RuleCheck(
         rule=ORDER,
@@ -264,11 +264,13 @@ def _axes(instrument: Instrument, fit: Fit) -> Iterator[RuleCheck]:
 
 
 def _gains(instrument: Instrument, fit: Fit) -> Iterator[RuleCheck]:
-    """Yield the sizes of columns against the model's."""
+    """Yield the check of the columns' norms against the model's."""
     if not instrument.mirror.stroke_known or "wfs.wavelength_m" in instrument.unknown:
         return
     median = float(np.median(fit.gains))
-    factor = abs(np.log2(max(median, 1e-300)))  # of two, either way: a pass, or a surface for OPD
+    factor = abs(
+        np.log2(max(median, 1e-300))
+    )  # in powers of two: a wrong number of passes, or surface instead of OPD
     twice = abs(factor - 1.0) < _A_PASS
     yield RuleCheck(
         rule=PASSES if twice else MATRIX,
@@ -287,7 +289,7 @@ def _gains(instrument: Instrument, fit: Fit) -> Iterator[RuleCheck]:
 
 
 def _columns(fit: Fit) -> Iterator[RuleCheck]:
-    """Yield how little the column that is least alike resembles its own mode's."""
+    """Yield the check of the column that correlates least with its own mode."""
     measured, model = _unit(fit.measured), _unit(fit.synthetic)
     alike = np.einsum("ij,ij->j", measured, model)
     worst = int(np.argmin(alike))
@@ -362,14 +364,14 @@ def _times(stream: Stream) -> Iterator[RuleCheck]:
 
 
 def _law(stream: Stream) -> Iterator[RuleCheck]:
-    """Yield whether ``c[k+d] - c[k+d-1] = -gain R s[k]`` with one gain above 0."""
+    """Yield the check of ``c[k+d] - c[k+d-1] = -gain R s[k]`` with one gain above 0."""
     d = stream.delay_frames
     steps = np.diff(stream.commands, axis=0)[d - 1 :]
-    asked = -(stream.slopes @ stream.reconstructor.T)[: len(steps)]
-    steps = steps[: len(asked)]
-    power = float(np.sum(asked * asked))
-    gain = float(np.sum(asked * steps)) / power if power else 0.0
-    left = steps - gain * asked
+    requested = -(stream.slopes @ stream.reconstructor.T)[: len(steps)]
+    steps = steps[: len(requested)]
+    power = float(np.sum(requested * requested))
+    gain = float(np.sum(requested * steps)) / power if power else 0.0
+    left = steps - gain * requested
     size = float(np.sqrt(np.mean(np.square(steps))))
     share = float(np.sqrt(np.mean(np.square(left)))) / size if size else np.inf
     yield RuleCheck(

@@ -17,7 +17,7 @@ class Words(NamedTuple):
 
 
 def words(form: str, purpose: str | None = None, **how: Any) -> Words:  # noqa: ANN401 - argparse's own
-    """Return an option or an operand; one with ``choices`` is no flag."""
+    """Return an option or an operand; one with ``choices`` is not a flag."""
     return Words(form, purpose, how)
 
 
@@ -30,7 +30,7 @@ def add(to: Any, *every: Words) -> None:  # noqa: ANN401 - argparse's own, whose
         to.add_argument(name, help=purpose, **named, **how)
 
 
-def named(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
-    """Return the given ones of these options."""
+def collect_arguments(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
+    """Return those of the named options that were given."""
     given = {name: getattr(options, name, None) for name in names}
     return {name: value for name, value in given.items() if value is not None}

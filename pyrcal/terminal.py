@@ -12,7 +12,7 @@ from service.errors import say, shown
 
 
 def login() -> str:
-    """Return the login name; empty: there is none."""
+    """Return the login name; empty if there is none."""
     try:
         return getpass.getuser()
     except (KeyError, OSError):  # a container may run under a number that has no name
@@ -20,7 +20,7 @@ def login() -> str:
 
 
 def show_progress(step: str) -> None:
-    """Show progress at a terminal; a log gets no such lines."""
+    """Show progress at a terminal, but not in a log."""
     if sys.stderr.isatty():
         say(f"... {step}")
 
@@ -31,13 +31,13 @@ def print_document(document: dict[str, Any], indent: int | None = 2) -> None:
 
 
 def print_lines(lines: Iterable[str]) -> None:
-    """Print lines that may quote strangers."""
+    """Print lines that may quote untrusted text."""
     sys.stdout.writelines(f"{shown(line)}\n" for line in lines)
     sys.stdout.flush()
 
 
 def table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Yield rows as lines with columns of equal width; the last one is as long as it is."""
+    """Yield rows as lines with columns of equal width, except the last."""
     clean = [[shown(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(*clean, strict=True)]
     for row in clean:
@@ -46,12 +46,12 @@ def table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
 
 
 def clock(utc: str | None) -> str:
-    """Return a time of REST as people read it at night: to the second, Z for UTC."""
+    """Return a time from REST for people: to the second, Z for UTC."""
     return "?" if utc is None else f"{utc[:10]} {utc[11:19]}Z"
 
 
 def span(seconds: float) -> str:
-    """Return a time as people say it; seconds."""
+    """Return a duration in seconds as text for people."""
     for unit_s, unit, smaller_s, smaller in (
         (86_400.0, "d", 3600.0, "h"),
         (3600.0, "h", 60.0, "min"),

@@ -22,7 +22,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.alternatives import moved_words, systematic_terms
+from pyrcal.offline.alternatives import format_move, systematic_terms
 from pyrcal.offline.disjoint_sets import DisjointSets
 from pyrcal.offline.figures import shown_modes
 from pyrcal.offline.fit_file import fit_file
@@ -445,7 +445,7 @@ def _of_sets(registration: Registration) -> Iterator[str]:
         yield (
             f"A smooth distortion of the mirror, {found.rms_subap:.2f} subapertures RMS over the "
             f"pupil, leaves {found.share:.1%} of the misfit and moves the registration by "
-            f"{moved_words(found.moved)}. What it moves each set by is in the combined σ: without "
+            f"{format_move(found.moved)}. What it moves each set by is in the combined σ: without "
             f"it the largest difference is {straight:.1f} σ."
         )
         yield ""

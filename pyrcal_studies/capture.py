@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from pyrcal.offline.fitted import Fit
 from pyrcal.offline.matrix import FitOptions, fit_matrix
-from pyrcal.offline.methods import SAME, land
+from pyrcal.offline.methods import SAME_MINIMUM, search_minimum
 from pyrcal.offline.models import FitModels
 from pyrcal_studies.fit_coverage import FIRST_SEED, N_MODES, measured
 from service.config import load_instrument
@@ -71,9 +71,9 @@ def captured(
     found = refused = false = 0
     before = bench.counter.n
     for start in starts:
-        landing = land(bench, target, Misregistration.from_vector(start))
+        landing = search_minimum(bench, target, Misregistration.from_vector(start))
         place = landing.best.alpha.vector
-        known = [fit for where, fit in places if np.all(np.abs(where - place) < 0.1 * SAME)]
+        known = [fit for where, fit in places if np.all(np.abs(where - place) < 0.1 * SAME_MINIMUM)]
         if known:
             fit = known[0]
         else:

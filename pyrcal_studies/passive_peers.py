@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from OOPAO.Atmosphere import Atmosphere
 
-from pyrcal.playback.arrays import opened_arrays
+from pyrcal.playback.arrays import open_arrays
 from pyrcal.playback.player import Player
 from pyrcal_studies.peers_cases import mirror_points
 from pyrcal_studies.peers_oopao import Oopao
@@ -233,7 +233,7 @@ def tracked(
     )
     instrument = load_instrument(str(folder / "instrument.toml"))
     player = Player(instrument, load_settings(None, {}), instrument.name)
-    with opened_arrays(path) as arrays:
+    with open_arrays(path) as arrays:
         track = asyncio.run(player.play(arrays.messages(instrument), lambda _: None))
     found = track.passive[-1]  # the one before begins at a perfect registration
     return found.alpha.vector - sky.alpha.vector, found.sigma

@@ -23,7 +23,7 @@ import pyrcal.offline.alternatives as other_explanations
 import pyrcal.offline.instrument_checks as checks
 import pyrcal.offline.matrix as fits
 import pyrcal.offline.verdict as verdicts
-from pyrcal.offline.pupil_checks import Few
+from pyrcal.offline.pupil_checks import FitSubset
 from service.estimation.reference import Reference
 from service.model.instrument import Instrument
 from service.model.kinds import Influence, InfluenceShape, Stop
@@ -36,14 +36,14 @@ MAX_SIGMA = 3.0
 
 SETTINGS: dict[str, tuple[float, ...]] = {
     "MAX_DISPLACEMENT": (0.3, 1.0, 3.0, 10.0),
-    "EXCLUDED": (1.0, 2.0, 3.0, 5.0),
+    "EXCLUSION_SIGMA": (1.0, 2.0, 3.0, 5.0),
     "MIN_EXPLAINED": (0.001, 0.0025, 0.005, 0.01, 0.03),
 }
 """Values of each constant that are tried."""
 
 _MODULES: dict[str, tuple[Any, ...]] = {
     "MAX_DISPLACEMENT": (verdicts,),
-    "EXCLUDED": (other_explanations,),
+    "EXCLUSION_SIGMA": (other_explanations,),
     "MIN_EXPLAINED": (other_explanations, checks),
 }
 
@@ -82,7 +82,7 @@ class Recorded:
 
     words: str
     alternatives: tuple[Any, ...]
-    """Arguments of ``alternatives``."""
+    """Arguments of ``find_alternatives``."""
 
     width: Array
     matrices: list[Array]
@@ -93,16 +93,16 @@ class Recorded:
     def judged(self) -> tuple[bool, float]:
         """Return whether the fit is accepted, and its largest error over σ."""
         found, replay = self.findings, iter(self.matrices)
-        with patch.object(Few, "matrix", lambda _self, _tried: next(replay)):
-            tried = other_explanations.alternatives(*self.alternatives)
-        sure = other_explanations.with_alternatives(
+        with patch.object(FitSubset, "matrix", lambda _self, _tried: next(replay)):
+            tried = other_explanations.find_alternatives(*self.alternatives)
+        sure = other_explanations.add_alternatives(
             found.before,
             tried,
             found.residual_fraction,
             width=self.width,
             without=found.with_file_values,
         )
-        refusal, _ = verdicts.judged(replace(found, uncertainty=sure, alternatives=tried))
+        refusal, _ = verdicts.judge_fit(replace(found, uncertainty=sure, alternatives=tried))
         sigma = np.sqrt(np.diag(sure.covariance))
         error = np.abs(found.solution.vector - TRUTH.vector)
         return refusal is None, float(np.max(error / sigma))
@@ -112,20 +112,20 @@ def recorded(words: str, about: Instrument, matrix: Array) -> Recorded:
     """Return a fit with all that its verdict is made of."""
     kept: dict[str, Any] = {"matrices": []}
     own: dict[str, Any] = {
-        "alternatives": other_explanations.alternatives,
-        "judged": verdicts.judged,
-        "width": checks.doubt_of_width,
-        "matrix": Few.matrix,
+        "alternatives": other_explanations.find_alternatives,
+        "judged": verdicts.judge_fit,
+        "width": checks.estimate_width_effect,
+        "matrix": FitSubset.matrix,
     }
 
     def alternatives(*given: Any) -> Any:  # noqa: ANN401 - passes all on
         kept["alternatives"] = given
 
-        def matrix_of(self: Few, tried: Any) -> Array:  # noqa: ANN401
+        def matrix_of(self: FitSubset, tried: Any) -> Array:  # noqa: ANN401
             kept["matrices"].append(own["matrix"](self, tried))
             return np.asarray(kept["matrices"][-1])
 
-        with patch.object(Few, "matrix", matrix_of):
+        with patch.object(FitSubset, "matrix", matrix_of):
             return own["alternatives"](*given)
 
     def judged(findings: verdicts.FitFindings) -> Any:  # noqa: ANN401
@@ -137,9 +137,9 @@ def recorded(words: str, about: Instrument, matrix: Array) -> Recorded:
         return np.asarray(kept["width"])
 
     with (
-        patch.object(fits, "alternatives", alternatives),
-        patch.object(fits, "judged", judged),
-        patch.object(fits, "doubt_of_width", width),
+        patch.object(fits, "find_alternatives", alternatives),
+        patch.object(fits, "judge_fit", judged),
+        patch.object(fits, "estimate_width_effect", width),
     ):
         fits.fit_matrix(about, Reference(matrix=matrix))
     return Recorded(words=words, **kept)

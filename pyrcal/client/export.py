@@ -14,7 +14,7 @@ from urllib.parse import quote, urlencode
 from pyrcal.client.reading import understood
 from pyrcal.client.remote import DONE, Request
 from pyrcal.client.rest import Document, Service, chunks
-from pyrcal.options import named
+from pyrcal.options import collect_arguments
 from pyrcal.terminal import print_document, print_lines
 from service.errors import ConfigurationError
 
@@ -60,12 +60,12 @@ def run_command(service: Service, _request: Request, options: argparse.Namespace
     target = options.output or Path(f"{plain}.{_ENDINGS.get(form, form)}")
     part = target.with_name(f"{target.name}.part")
     path = path.replace("{id}", quote(options.id or "", safe=""))
-    query = named(options, ("since", "until"))
+    query = collect_arguments(options, ("since", "until"))
     if target.exists():
         raise ConfigurationError(f"{target}: found a file, expected a new name (--output)")
     if not target.absolute().parent.is_dir():
         raise ConfigurationError(f"{target}: found no folder {target.parent}, expected it to exist")
-    write = _history if options.what == "alpha" else _sent
+    write = _history if options.what == "alpha" else _stream_export
     try:
         with part.open("wb") as file:
             for each in write(service, path, form, query):
@@ -89,10 +89,14 @@ def _write(file: BinaryIO, content: bytes, target: Path) -> None:
         raise ConfigurationError(f"{target}: cannot be written: {error.strerror}") from error
 
 
-def _sent(service: Service, path: str, form: str, query: dict[str, str]) -> Iterator[bytes]:
+def _stream_export(
+    service: Service, path: str, form: str, query: dict[str, str]
+) -> Iterator[bytes]:
     """Yield the bytes that the service sends."""
-    asked = f"{path}?{urlencode({'format': form, **query})}"
-    with service.answered("GET", asked, within_s=None, silent_s=MATRIX_TIMEOUT_S) as response:
+    query_path = f"{path}?{urlencode({'format': form, **query})}"
+    with service.open_response(
+        "GET", query_path, within_s=None, silent_s=MATRIX_TIMEOUT_S
+    ) as response:
         yield from chunks(response)
 
 
@@ -103,7 +107,7 @@ def _history(service: Service, path: str, form: str, query: dict[str, str]) -> I
         document = service.get(path, **query, after=after, limit=_PAGE_ENTRIES).document
         with understood(service):
             entries = [dict(entry) for entry in document["entries"]]
-            lines = _written(entries, form, head=head)
+            lines = _format_entries(entries, form, head=head)
             now = int(entries[-1]["t_ns_utc"]) if entries else 0
         if now <= after:
             return
@@ -111,7 +115,7 @@ def _history(service: Service, path: str, form: str, query: dict[str, str]) -> I
         after, head = now, False
 
 
-def _written(entries: list[Document], form: str, *, head: bool) -> bytes:
+def _format_entries(entries: list[Document], form: str, *, head: bool) -> bytes:
     if form == "jsonl":
         return "".join(json.dumps(entry) + "\n" for entry in entries).encode()
     rows = [_flat(entry) for entry in entries]

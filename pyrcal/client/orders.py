@@ -13,7 +13,7 @@ from urllib.parse import quote
 from pyrcal.client.reading import reconstructor_lines, understood
 from pyrcal.client.remote import DONE, NOT_DONE, RECONSTRUCTORS, Request
 from pyrcal.client.rest import Document, RefusedError, Service
-from pyrcal.options import named
+from pyrcal.options import collect_arguments
 from pyrcal.terminal import login, print_document, print_lines
 from service.errors import ConfigurationError, say, shown
 
@@ -23,9 +23,9 @@ POLL_S = 0.5
 MAX_SWAP_WAIT_S = 30.0
 """Longest time to wait for a matrix to be applied, seconds; it is then left to the service."""
 
-_ON_ITS_WAY = {"proposed", "published", "staged"}
-_UNDER_WAY = _ON_ITS_WAY | {"waiting", "asked", "running", "finishing"}
-_WELL = {"applied", "superseded", "stored", "made"}
+_PENDING_STATES = {"proposed", "published", "staged"}
+_UNFINISHED_STATES = _PENDING_STATES | {"waiting", "asked", "running", "finishing"}
+_SUCCESS_STATES = {"applied", "superseded", "stored", "made"}
 
 
 class Step(NamedTuple):
@@ -55,11 +55,11 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
         _refuse_early(service, request)
     if request.decides_on:
         headers["If-Match"] = _show(service, request, options)
-    why = options.why or (_asked(request, "why", "--why") if request.needs_why else "")
+    why = options.why or (_prompt_user(request, "why", "--why") if request.needs_why else "")
     agreed = (
         not request.asks
         or options.yes
-        or _asked(request, f"{request.asks}? [y/N]", "--yes").lower() in {"y", "yes"}
+        or _prompt_user(request, f"{request.asks}? [y/N]", "--yes").lower() in {"y", "yes"}
     )
     if not agreed or (request.needs_why and not why):
         say(f"pyrcal: {request.name}: nothing was ordered")
@@ -67,7 +67,7 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
     if request.method == "POST":
         headers["Idempotency-Key"] = str(uuid.uuid4())
     who = login() if options.who is None else options.who
-    given = named(options, request.body)
+    given = collect_arguments(options, request.body)
     body = {**given, **request.always, "reason": why, "by": who}
     answer = service.order(request.method, path_of(request.path, options), body, headers).document
     with understood(service):
@@ -133,11 +133,11 @@ def _progress(service: Service, request: Request, options: argparse.Namespace) -
     return copies[-1] if copies else judged
 
 
-def _asked(request: Request, question: str, option: str) -> str:
+def _prompt_user(request: Request, question: str, option: str) -> str:
     """Ask at the terminal and return the answer."""
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         raise ConfigurationError(
-            f"{request.name}: found no {option} and nobody to ask, expected {option}"
+            f"{request.name}: found no {option} and no terminal to ask on, expected {option}"
         )
     sys.stderr.write(f"{question} ")
     sys.stderr.flush()
@@ -179,7 +179,7 @@ def _follow(service: Service, request: Request, options: argparse.Namespace) -> 
         raise
     if options.json:
         print_document(document)
-    elif n_looks > 1 or not step.well:  # else the answer has said so
+    elif n_looks > 1 or not step.well:  # otherwise the answer already reported it
         print_lines([step.text])
     return DONE if step.well else NOT_DONE
 
@@ -192,11 +192,11 @@ def _step(document: Document, lasted_s: float) -> Step:
         return Step(text, work["under_way"], work["stage"] == "tracking")
     state = document["state"]
     why = f": {document['reason']}" if document["reason"] else ""
-    too_long = state in _ON_ITS_WAY and lasted_s > MAX_SWAP_WAIT_S
+    too_long = state in _PENDING_STATES and lasted_s > MAX_SWAP_WAIT_S
     text = f"{document['id']} is {state}{why}"
     return Step(
         f"{text}, still; pyrcal watch shows the rest" if too_long else text,
-        state in _UNDER_WAY and not too_long,
-        state in _WELL,
+        state in _UNFINISHED_STATES and not too_long,
+        state in _SUCCESS_STATES,
         document.get("duration_s"),
     )

@@ -10,7 +10,7 @@ from urllib.parse import quote
 from pyrcal.client.remote import DONE, NOT_DONE, Request
 from pyrcal.client.rest import Document, Service
 from pyrcal.client.status import alarm_line, registration_lines, status_lines, verdict, worst_first
-from pyrcal.options import named
+from pyrcal.options import collect_arguments
 from pyrcal.terminal import clock, print_document, print_lines, span, table
 
 
@@ -24,7 +24,7 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
     """
     one = getattr(options, "id", None)
     path = request.path if one is None else f"{request.path}/{quote(one, safe='')}"
-    document = service.get(path, **named(options, ("since", "until", "limit"))).document
+    document = service.get(path, **collect_arguments(options, ("since", "until", "limit"))).document
     lines = _SCREENS["reconstructor" if one else request.name]
     with understood(service):
         text_lines = [] if options.json else list(lines(document))
@@ -47,7 +47,7 @@ def understood(service: Service) -> Iterator[None]:
     try:
         yield
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
-        raise service.stranger(f"{error!r}; --json shows it") from error
+        raise service.foreign_answer_error(f"{error!r}; --json shows it") from error
 
 
 def reconstructor_lines(one: Document) -> Iterator[str]:

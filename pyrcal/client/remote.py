@@ -34,7 +34,7 @@ URL, KEY = "PYRCAL_URL", "PYRCAL_API_KEY"
 
 _EPILOG = """
 Exit status: 0 done, 1 refused by the service or not done (of status: not all is well), 2 a wrong
-command line, 3 the service is not reached. PYRCAL_URL and PYRCAL_API_KEY stand for --url and the
+command line, 3 the service is not reached. PYRCAL_URL and PYRCAL_API_KEY replace --url and the
 key's file.
 """
 
@@ -55,21 +55,22 @@ class Request(NamedTuple):
     """Fixed content of the request body."""
 
     decides_on: str = ""
-    """Path of what is shown before, and named in ``If-Match``; empty: nothing."""
+    """Path of the subject that is shown before, and named in ``If-Match``; empty if there is none.
+    """
 
     asks: str = ""
     """Question that must be confirmed at a terminal; empty if there is none."""
 
     needs_why: bool = False
     permitted: str = ""
-    """Name of the order in the state's ``permitted``; empty: it may always be given."""
+    """Name of the order in the state's ``permitted``; empty if it is always allowed."""
 
     then: str = ""
     """Action after the answer."""
 
     follows: str = ""
-    """Path of what is looked at until the work is done, of all reconstructors: the copy that goes
-    out; empty: the answer is the end."""
+    """Path that is polled until the work is done; for all reconstructors, that of the copy which is
+    sent. Empty if the answer is final."""
 
     @property
     def method(self) -> str:
@@ -149,7 +150,7 @@ _RESUMES = "pyrcal mode propose, or auto, ends it"
 
 REQUESTS = (
     _reads("status", "show what the service does, on one screen", "/v1/state"),
-    _reads("alpha", "show where the mirror lies, with 1 sigma", "/v1/alpha"),
+    _reads("alpha", "show the mirror's registration, with 1 sigma", "/v1/alpha"),
     _reads(
         "reconstructors",
         "list the reconstructors, or show one",
@@ -337,7 +338,7 @@ def main(options: argparse.Namespace) -> int:
     ConfigurationError
         If the address or the key is none.
     """
-    # HTTP takes longer to import than all the commands are told with
+    # importing the HTTP client takes longer than printing help, so it is imported here
     from pyrcal.client.rest import RefusedError, Service, UnreachableError
 
     request: Request = options.request
@@ -356,7 +357,7 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _key(file: Path | None) -> str:
-    """Return the API key; empty: there is none."""
+    """Return the API key; empty if there is none."""
     if file is None:
         return os.environ.get(KEY, "").strip()
     try:

@@ -57,7 +57,7 @@ class Service:
     url
         ``http://HOST:PORT``, or https.
     key
-        API key; empty: none is sent.
+        API key; empty to send none.
 
     Raises
     ------
@@ -95,7 +95,7 @@ class Service:
         """
         given = {name: value for name, value in query.items() if value is not None}
         path = f"{path}?{urlencode(given)}" if given else path
-        with self.answered("GET", path, within_s=REQUEST_TIMEOUT_S) as response:
+        with self.open_response("GET", path, within_s=REQUEST_TIMEOUT_S) as response:
             return self._read(response)
 
     def order(self, method: str, path: str, body: Document, headers: Mapping[str, str]) -> Fetched:
@@ -113,7 +113,9 @@ class Service:
         raw, again = json.dumps(body).encode(), "Idempotency-Key" in headers
         while True:
             try:
-                with self.answered(method, path, raw, sent, within_s=ORDER_TIMEOUT_S) as response:
+                with self.open_response(
+                    method, path, raw, sent, within_s=ORDER_TIMEOUT_S
+                ) as response:
                     return self._read(response)
             except _LostError as error:
                 if not again:
@@ -124,7 +126,7 @@ class Service:
                 again = False
 
     @contextmanager
-    def answered(
+    def open_response(
         self,
         method: str,
         path: str,
@@ -197,7 +199,7 @@ class Service:
         except (ValueError, RecursionError):
             document = None
         if not isinstance(document, dict):
-            raise self.stranger("no JSON object")
+            raise self.foreign_answer_error("no JSON object")
         return Fetched(document, response.headers.get("ETag", ""))
 
     def _refusal(self, response: http.client.HTTPResponse) -> RefusedError | UnreachableError:
@@ -209,9 +211,9 @@ class Service:
         kind, detail = problem.get("type"), problem.get("detail")
         if isinstance(kind, str) and kind.startswith(_SAYS_PYRCAL) and isinstance(detail, str):
             return RefusedError(detail)
-        return self.stranger(f"{response.status} {response.reason}")
+        return self.foreign_answer_error(f"{response.status} {response.reason}")
 
-    def stranger(self, found: str) -> UnreachableError:
+    def foreign_answer_error(self, found: str) -> UnreachableError:
         """Return the error for an answer that is not pyrcal's."""
         return UnreachableError(
             f"{self.url}: something answers, but it is not pyrcal, or not this version: {found}"
@@ -228,7 +230,7 @@ def _cut(sock: socket.socket, late: threading.Event) -> None:
     try:
         sock.shutdown(socket.SHUT_RDWR)
     except OSError:
-        return  # it has just ended
+        return  # the connection has already ended
 
 
 def chunks(response: http.client.HTTPResponse) -> Iterator[bytes]:

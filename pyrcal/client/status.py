@@ -6,7 +6,7 @@ from pyrcal.client.rest import Document
 from pyrcal.terminal import span
 
 FEW = 2
-"""So many orders, and fewer, may be refused for one reason in any quiet minute."""
+"""Largest number of orders that may be refused for one reason in normal operation."""
 
 _ALPHA = {
     "shift_x_subap": ("shift x", "+.4f", "subap"),
@@ -31,11 +31,11 @@ def status_lines(state: Document) -> list[str]:
         for wait in state["waiting_for"]
         if wait["name"] not in alarms
     ]
-    return [*lines, "", *_rtc(state), *_alpha(state), *_matrix(state), *_doing(state)]
+    return [*lines, "", *_rtc(state), *_alpha(state), *_matrix(state), *_activity_lines(state)]
 
 
 def worst_first(state: Document) -> list[Document]:
-    """Return the alarms that are not muted: the worst first, the unseen before others."""
+    """Return the alarms that are not muted: the most severe first, unacknowledged before others."""
     shown = [alarm for alarm in state["alarms"] if alarm["muted"] is None]
     return sorted(
         shown, key=lambda one: (-_SEVERITIES.index(one["severity"]), one["alarm_state"] != "active")
@@ -79,7 +79,7 @@ def _alpha(state: Document) -> list[str]:
 
 
 def _refusal(state: Document) -> list[str]:
-    """Return when and why the last window was refused."""
+    """Return time and reason of the last refused window."""
     last = state["window_refusal"]
     if last is None:
         return []
@@ -112,7 +112,7 @@ def _matrix(state: Document) -> list[str]:
 
 
 def verdict(margin: Document | None) -> str:
-    """Return the stability gate's verdict on a reconstructor in words."""
+    """Return the stability gate's verdict on a reconstructor as text."""
     if margin is None:
         return "not judged"
     outcome = "accepted" if margin["accepted"] else f"REFUSED: {margin['reason']}"
@@ -120,7 +120,7 @@ def verdict(margin: Document | None) -> str:
     return f"worst pole radius {radius} of at most {margin['bound']:g}: {outcome}"
 
 
-def _doing(state: Document) -> list[str]:
+def _activity_lines(state: Document) -> list[str]:
     dither_policy, acquisition = state["dither_policy"], state["acquisition"]
     lines = [f"dither   {dither_policy['phase']}: {dither_policy['reason']}"]
     if acquisition["under_way"]:
@@ -129,11 +129,11 @@ def _doing(state: Document) -> list[str]:
         lines.append(f"doing    {state['measuring']['id']} is being measured")
     if state["noisy_measurement"] is not None:
         lines.append(f"doing    {state['noisy_measurement']['id']}, a noisy matrix, is under way")
-    return [*lines, *_refused(state)]
+    return [*lines, *_refusal_lines(state)]
 
 
-def _refused(state: Document) -> list[str]:
-    """Return what refuses several orders now, and what to do first."""
+def _refusal_lines(state: Document) -> list[str]:
+    """Return the reasons that refuse several orders now, and the first remedy."""
     orders: dict[str, list[str]] = {}
     for name, permission in state["permitted"].items():
         if not permission["allowed"]:

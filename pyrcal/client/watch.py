@@ -54,7 +54,7 @@ class Latest:
     """Id of the last line of the log."""
 
     lost: str = "not connected yet"
-    """Why nothing comes; empty: the stream is open."""
+    """Reason for a missing stream; empty if it is open."""
 
 
 def run_command(service: Service, request: Request, options: argparse.Namespace) -> int:
@@ -86,7 +86,9 @@ def events(service: Service, path: str, latest: Latest) -> Iterator[Event]:
     while True:
         headers = {"Last-Event-ID": latest.last} if latest.last else {}
         try:
-            with service.answered("GET", path, headers=headers, silent_s=MAX_SILENCE_S) as response:
+            with service.open_response(
+                "GET", path, headers=headers, silent_s=MAX_SILENCE_S
+            ) as response:
                 for name, data in _read(service, response, latest):
                     ever = True
                     if name == "reset":
@@ -116,7 +118,7 @@ def _read(service: Service, response: HTTPResponse, latest: Latest) -> Iterator[
         If it is no stream of pyrcal's.
     """
     if not response.headers.get("Content-Type", "").startswith("text/event-stream"):
-        raise service.stranger("no stream of events")
+        raise service.foreign_answer_error("no stream of events")
     fields: dict[str, str] = {}
     while raw := response.readline(_MAX_LINE_BYTES):
         name, _, value = raw.decode(errors="replace").rstrip("\r\n").partition(":")
@@ -142,10 +144,10 @@ def _print_log(coming: Iterator[Event]) -> None:
         if name == "lost":
             say(f"DISCONNECTED: {data['text']}; trying again")
         for line in data["log"] if name == "reset" else [data] if name == "log" else ():
-            print_lines([_of_log(line)])
+            print_lines([_format_log_line(line)])
 
 
-def _of_log(line: Document) -> str:
+def _format_log_line(line: Document) -> str:
     times = f" ({line['n_times']} times)" if line["n_times"] > 1 else ""
     return f"{clock(line['t_utc'])}  {line['level']:7}  {line['text']}{times}"
 
@@ -174,9 +176,10 @@ def screen(latest: Latest, now_s: float) -> Group:
         old = f"; what is below is {span(age_s)} old" if latest.state else ""
         head = Text(shown(f"DISCONNECTED: {lost}; trying again{old}"), style="bold white on red")
     try:
-        status = [] if latest.state is None else status_lines(_aged(latest.state, age_s))
+        status = [] if latest.state is None else status_lines(_add_age(latest.state, age_s))
         log = [
-            (_of_log(line)[11:], _LEVELS.get(line["level"], "")) for line in reversed(latest.log)
+            (_format_log_line(line)[11:], _LEVELS.get(line["level"], ""))
+            for line in reversed(latest.log)
         ]
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         status, log = [f"NOT this version of pyrcal: {error!r}"], []
@@ -199,11 +202,11 @@ def _style(line: str, lost: str) -> str:
     return "bold red" if line.startswith("ALARM") or "NOT READY" in line else ""
 
 
-def _aged(value: Any, by_s: float) -> Any:  # noqa: ANN401 - as JSON has it
+def _add_age(value: Any, by_s: float) -> Any:  # noqa: ANN401 - as JSON has it
     """Return a state in which all ages have grown since it came."""
     if not isinstance(value, dict):
         return value
     return {
-        name: one + by_s if name in _GROWS and one is not None else _aged(one, by_s)
+        name: one + by_s if name in _GROWS and one is not None else _add_age(one, by_s)
         for name, one in value.items()
     }

@@ -56,13 +56,13 @@ def children(directory: Path, commands: Mapping[str, Sequence[str]]) -> Iterator
     started: list[Child] = []
     try:
         for name, words in commands.items():
-            started.append(_started(name, words, directory))
+            started.append(_start_child(name, words, directory))
         yield started
     finally:
-        _end(started)
+        _end_children(started)
 
 
-def _started(name: str, words: Sequence[str], directory: Path) -> Child:
+def _start_child(name: str, words: Sequence[str], directory: Path) -> Child:
     path = directory / f"{name}.log"
     with path.open("wb") as log:
         process = subprocess.Popen(
@@ -71,8 +71,9 @@ def _started(name: str, words: Sequence[str], directory: Path) -> Child:
     return Child(name=name, log=path, process=process)
 
 
-def _end(started: list[Child]) -> None:
+def _end_children(started: list[Child]) -> None:
     """End all processes within ``GRACE_S``; a repeated Ctrl-C cannot interrupt this."""
+    # ignored meanwhile, so that no second Ctrl-C interrupts the clean-up
     before = {number: signal.signal(number, signal.SIG_IGN) for number in _ENDING}
     try:
         for child in started:
@@ -89,7 +90,7 @@ def _end(started: list[Child]) -> None:
 
 
 @contextmanager
-def interrupted_by_any_end() -> Iterator[None]:
+def interrupt_on_end() -> Iterator[None]:
     """Let a closed terminal, or ``kill``, end the ``with`` block like Ctrl-C."""
 
     def interrupt(_number: int, _frame: object) -> None:

@@ -1,4 +1,4 @@
-"""The demo in one picture: the wavefront error while the service works, before and after."""
+"""Plot the wavefront error of the demo over time, and before and after."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ BEFORE, BETWEEN, AFTER = "#c0392b", "#7f8c8d", "#1f6fb2"
 
 
 def draw(report: Report, truth: TruthFile, path: Path) -> None:
-    """Write the picture; nothing is drawn of a night without its two stages."""
+    """Write the figure; nothing is plotted if one of the two stages is missing."""
     figure, (over_time, bars) = plt.subplots(
         1, 2, figsize=(8.4, 3.1), width_ratios=(2.6, 1.0), layout="constrained"
     )

@@ -18,21 +18,21 @@ TOLERANCE = {
     "rotation_deg": 0.05,
     "magnification": 0.002,
 }
-"""Largest error of an estimate the demo calls good, of 30 subapertures across the pupil or more."""
+"""Largest error of a good estimate, with 30 subapertures across the pupil or more."""
 
 TOLERANCE_ACROSS_SUBAP = 30.0
-"""Fewer may be turned or magnified by more: their edge moves as far."""
+"""Number of subapertures below which larger angles are allowed: the edge moves by as much."""
 
 MAX_ERROR_IN_SIGMA = 4.0
 
-LONG_S = 5.0
+MAX_SILENCE_S = 5.0
 """Time without data after which its source counts as stopped, seconds."""
 
 MODEL = "model"
-"""Name of what the service waits for until its model is prepared."""
+"""Name of the wait for the model's preparation."""
 
 REAL_TIME = 0.9
-"""A simulator below this share of real time is called slow."""
+"""Share of real time below which a simulator is called slow."""
 
 View = dict[str, Any]
 
@@ -57,7 +57,7 @@ class Circumstances:
     frameless_s: float = 0.0
     """Time for which the service has received no frame, seconds."""
 
-    untold_s: float = 0.0
+    silent_s: float = 0.0
     """Time for which the simulator has written no truth, seconds."""
 
     endings: tuple[str, ...] = ()
@@ -78,12 +78,12 @@ class Circumstances:
 
 @dataclass(slots=True, kw_only=True)
 class Stage:
-    """The loop under one reconstructor."""
+    """Loop with one reconstructor."""
 
     id: str | None = None
     n_modes: int | None = None
     wavefront_error_nm: float | None = None
-    """From the simulator's truth."""
+    """True wavefront error from the simulator, nm RMS."""
 
     worst_pole_radius: float | None = None
     """Largest closed-loop pole radius within 3 sigma, as predicted by the service's gate."""
@@ -91,7 +91,7 @@ class Stage:
 
 @dataclass(slots=True, kw_only=True)
 class Report:
-    """The figures of one run."""
+    """Results of one run."""
 
     true_alpha: dict[str, float] | None = None
     estimated_alpha: dict[str, float] | None = None
@@ -121,16 +121,16 @@ class Report:
     """Time from the end of preparation, seconds; None if no matrix was applied."""
 
     pace: float | None = None
-    """Seconds of telemetry that the simulator made in a second."""
+    """Seconds of telemetry per second."""
 
     alarms: list[str] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
     reasons: list[str] = field(default_factory=list)
-    """Why it failed, as far as it can be seen."""
+    """Reasons of a failure, if they are known."""
 
     @property
     def good(self) -> bool:
-        """True if the main job was done."""
+        """True if the demo succeeded."""
         return not self.failures
 
     def to_json(self) -> str:
@@ -144,7 +144,7 @@ def make_report(
     truth: TruthFile,
     circumstances: Circumstances,
 ) -> Report:
-    """Compare what the service says with what was true."""
+    """Compare the service's results with the truth."""
     report = Report(
         seconds_to_ready=circumstances.seconds_to_ready,
         seconds_to_first_applied=circumstances.seconds_to_first_applied,
@@ -160,7 +160,7 @@ def make_report(
         _count(report, reconstructors)
         _stages(report, reconstructors, truth, measured_plant=circumstances.measured_plant)
         _compare(report, state, truth)
-        if circumstances.unanswered_s > LONG_S:
+        if circumstances.unanswered_s > MAX_SILENCE_S:
             report.failures.append(
                 f"the service has not answered for {circumstances.unanswered_s:.0f} s"
             )
@@ -171,43 +171,43 @@ def make_report(
 
 
 def _reasons(state: View | None, circumstances: Circumstances) -> Iterator[str]:
-    """Yield what may have kept the service from its job."""
+    """Yield possible causes of a failure."""
     if state is None:
         return
     waited_for = waits(state)
     if MODEL in waited_for:
         yield f"the service was not ready: {waited_for[MODEL]}"
         return
-    if circumstances.untold_s > LONG_S:
-        yield f"the simulator has made nothing for {circumstances.untold_s:.0f} s"
-    if circumstances.unanswered_s <= LONG_S:
-        yield from _of_frames(state, circumstances.frameless_s)
+    if circumstances.silent_s > MAX_SILENCE_S:
+        yield f"the simulator has made nothing for {circumstances.silent_s:.0f} s"
+    if circumstances.unanswered_s <= MAX_SILENCE_S:
+        yield from _explain_missing_frames(state, circumstances.frameless_s)
     for alarm in state["alarms"]:
         if alarm["name"] == WORKER_BEHIND:
             yield f"too slow: {alarm['text']}"
     if circumstances.pace is not None and circumstances.pace < REAL_TIME:
         yield f"too slow: the simulator made {circumstances.pace:.2f} s of telemetry a second"
-    yield from _of_windows(state, circumstances.refusal)
-    told = {alarm["name"] for alarm in state["alarms"]}
-    yield from (f"waiting: {text}" for name, text in waited_for.items() if name not in told)
+    yield from _explain_refused_windows(state, circumstances.refusal)
+    alarm_names = {alarm["name"] for alarm in state["alarms"]}
+    yield from (f"waiting: {text}" for name, text in waited_for.items() if name not in alarm_names)
 
 
 def waits(state: View) -> dict[str, str]:
-    """Return what the service waits for, and whom, by name."""
+    """Return the conditions that the service waits for, by name."""
     return {
         wait["name"]: f"for the {wait['responsible']}: {wait['text']}"
         for wait in state["waiting_for"]
     }
 
 
-def _of_frames(state: View, frameless_s: float) -> Iterator[str]:
+def _explain_missing_frames(state: View, frameless_s: float) -> Iterator[str]:
     if state["link"]["frames_received"] == 0:
         yield "no frames: none has reached the service"
-    elif frameless_s > LONG_S:
+    elif frameless_s > MAX_SILENCE_S:
         yield f"no frames: the last reached the service {frameless_s:.0f} s ago"
 
 
-def _of_windows(state: View, refusal: str | None) -> Iterator[str]:
+def _explain_refused_windows(state: View, refusal: str | None) -> Iterator[str]:
     accepted, refused = state["windows_accepted"], state["windows_refused"]
     if refused > accepted:
         last = "" if refusal is None else f"; the last: {refusal}"
@@ -244,7 +244,7 @@ def _stages(
         if report.start.n_modes and r["n_modes"] > report.start.n_modes
     ]
     if larger:
-        # one applied just before the end has no wavefront error yet
+        # a matrix applied just before the end has no measured wavefront error yet
         seen = [stage for stage in larger if stage.wavefront_error_nm is not None]
         report.target_modes = (seen or larger)[-1]
     last = report.target_modes if larger or not measured_plant else report.first_update
@@ -278,7 +278,7 @@ def _compare(report: Report, state: View, truth: TruthFile) -> None:
 
 
 def _judge(report: Report, circumstances: Circumstances) -> None:
-    """Say in words everything that is not as it should be."""
+    """Describe everything that is not as required."""
     judge = _failures_on_measured_plant if circumstances.measured_plant else _failures
     report.failures += judge(report, circumstances)
     for swap in report.swaps:
@@ -290,12 +290,12 @@ def _judge(report: Report, circumstances: Circumstances) -> None:
 
 
 def _failures(report: Report, circumstances: Circumstances) -> list[str]:
-    """Return what is not as it should be of estimate and loop, where the truth is known."""
+    """Return failures of the estimate and the loop, if the truth is known."""
     failures = _estimate_failures(report, circumstances.across_subap)
     start, first, target = report.start, report.first_update, report.target_modes
-    if not _recovered(start.worst_pole_radius, first.worst_pole_radius):
+    if not _has_recovered(start.worst_pole_radius, first.worst_pole_radius):
         failures.append("the stability margin has not recovered")
-    if not _less(target.wavefront_error_nm, start.wavefront_error_nm):
+    if not _is_less(target.wavefront_error_nm, start.wavefront_error_nm):
         failures.append("the wavefront error with more modes is not below that of the start")
         return failures
     ratio, wanted = report.wavefront_ratio, circumstances.wanted_ratio
@@ -308,7 +308,7 @@ def _failures(report: Report, circumstances: Circumstances) -> list[str]:
 
 
 def _failures_on_measured_plant(report: Report, circumstances: Circumstances) -> list[str]:
-    """Return what is not as it should be where the RTC began with its measured reconstructor."""
+    """Return failures in a demo that begins with the measured reconstructor."""
     failures, ratio = [], report.wavefront_ratio
     if report.estimated_alpha is None:
         failures.append("no estimate of the registration")
@@ -349,15 +349,15 @@ def _is_slowness(alarm: str) -> bool:
     return alarm.startswith(f"{WORKER_BEHIND}: ")
 
 
-def _recovered(start: float | None, first: float | None) -> bool:
+def _has_recovered(start: float | None, first: float | None) -> bool:
     """Return True if an update improves the margin.
 
     A worker without time never checks the matrix that is replaced; the gate has checked the update.
     """
-    return first is not None and (start is None or _less(first, start))
+    return first is not None and (start is None or _is_less(first, start))
 
 
-def _less(value: float | None, limit: float | None) -> bool:
+def _is_less(value: float | None, limit: float | None) -> bool:
     return value is not None and limit is not None and math.isfinite(value) and value < limit
 
 
@@ -415,7 +415,7 @@ def _bar(value_nm: float, whole_nm: float) -> str:
 
 
 def strehl_ratio(error_nm: float, wavelength_nm: float = 1650.0) -> float:
-    """Return the share of the light that an image keeps in its peak: Marechal's approximation."""
+    """Return the Strehl ratio by Marechal's approximation."""
     return math.exp(-((2.0 * math.pi * error_nm / wavelength_nm) ** 2))
 
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import httpx
 
 from pyrcal.demo.arguments import FORWARDED, REPEATED
-from pyrcal.demo.children import children, interrupted_by_any_end
+from pyrcal.demo.children import children, interrupt_on_end
 from pyrcal.demo.report import table
 from pyrcal.demo.truth import TruthFile
 from pyrcal.demo.watch import REQUEST_TIMEOUT_S, USUAL_RATE_HZ, Promise, TelemetryObserver
@@ -39,7 +39,7 @@ USUAL_MAGNITUDE, USUAL_DIAMETER_M = 8.0, 8.22
 DEFAULT_INSTRUMENT = "flao-lbt"
 """Instrument of the demo unless another one is given."""
 
-WANTED_RATIO, OTHER_RATIO = 1.5, 1.25
+FLAO_RATIO, OTHER_RATIO = 1.5, 1.25
 """Required ratio of the wavefront errors before and after, with a large initial misregistration:
 for FLAO, and for other telescopes, whose modes correct less."""
 
@@ -48,7 +48,7 @@ FEW_MODES, FEW_RATIO = 170, 1.05
 All modes leave 1.17 times less (variance by N^(-√3/2), Noll 1976); a third of that in decibels is
 required."""
 
-SMALL_M = 2.0
+SMALL_DIAMETER_M = 2.0
 """Diameter below which the demo makes the star brighter and begins with a third of the modes.
 
 PAPYRUS (1.6 m) at magnitude 8 has 1.5 electrons on a pixel and frame: 120 modes leave as much as
@@ -60,26 +60,26 @@ MEASURED_RATIO = 1 / 1.1
 itself: the service's may leave 10 % more."""
 
 PLACE_TEXT = """\
-The mirror lies 0.4 subapertures and 0.65 deg from where the RTC's matrix has it."""
+The mirror is misregistered by 0.4 subapertures and 0.65 deg from the RTC's matrix."""
 FAR_TEXT = f"""\
 {PLACE_TEXT} With that matrix a
-loop of 400 modes diverges, so the RTC begins with 120. WFE is what the simulator knows to be left.
+loop of 400 modes diverges, so the RTC begins with 120. WFE is the simulator's true wavefront error.
 """
 OTHER_FAR_TEXT = f"""\
 {PLACE_TEXT} The RTC begins
-with 120 modes, or with seven tenths of them all where that is fewer. WFE is what the simulator
-knows to be left.
+with 120 modes, or with 70 % of all its modes if that is fewer. WFE is the simulator's true
+wavefront error.
 """
 SMALL_FAR_TEXT = f"""\
 {PLACE_TEXT} The RTC begins
 with a third of its modes, on a star that gives this small telescope the light of an 8 m telescope
-at magnitude 8. WFE is what the simulator knows to be left.
+at magnitude 8. WFE is the simulator's true wavefront error.
 """
 TOO_LARGE_TEXT = """\
 This telescope is too large for real time: {gflop_s:.0f} GFLOP/s at {rate_hz:g} Hz. Its loop runs as
-fast as this machine goes: at the highest rate that it holds or, where a dither needs more, in slow
-motion. Until all is ready takes minutes: modes (kept on disk afterwards), D and its derivatives,
-and the simulator's own matrices: some 9 GB beside 6 of the service's.
+fast as this machine can: at the highest sustained rate or, if a dither needs more, in slow motion.
+The preparation takes minutes: modes (cached on disk), D and its derivatives, and the simulator's
+own matrices. The simulator needs about 9 GB and the service 6 GB.
 """
 
 HELD_GFLOP_S = 30.0
@@ -96,36 +96,36 @@ def run_demo(options: argparse.Namespace) -> int:
     ConfigurationError
         If an argument makes no sense; nothing has been started then.
     """
-    service_words, sim_words = _commands(options)
+    service_words, sim_words = _make_commands(options)
     _check(options, sim_words)
-    _emptied(options.dir)
+    _prepare_directory(options.dir)
     if _is_measured(options):
         write_live_instrument(options.instrument, options.dir / LIVE_INSTRUMENT)
     url = f"http://127.0.0.1:{options.port}"
     _say(f"service    pyrcal {' '.join(service_words)}")
     _say(f"simulator  pyrcal sim {' '.join(sim_words)}")
     _say(f"REST       {url}/v1/state   logs and truth: {options.dir}\n")
-    large = _too_large(options)
+    large = _measure_load(options)
     if large is not None:
         _say(TOO_LARGE_TEXT.format(gflop_s=large.gflop_s, rate_hz=large.rate_hz))
     if _is_far(options):
-        _say(_beginning(options))
+        _say(_choose_introduction(options))
     commands = {
         "service": ["-m", "service", *service_words],
         "simulator": ["-m", "sim_rtc", *sim_words],
     }
     with (
         httpx.Client(base_url=url, timeout=REQUEST_TIMEOUT_S) as client,
-        interrupted_by_any_end(),
+        interrupt_on_end(),
         children(options.dir, commands) as started,
     ):
         truth = TruthFile(options.dir / "truth.jsonl")
-        watch = TelemetryObserver(client, truth, started, _promise(options), _say)
+        watch = TelemetryObserver(client, truth, started, _make_promise(options), _say)
         try:
             watch.run()
         except KeyboardInterrupt:
             _say("\nstopping")
-        report = watch.closing_report()
+        report = watch.make_final_report()
     _say(table(report))
     if options.plot is not None:
         from pyrcal.demo.figure import draw
@@ -146,29 +146,29 @@ def _is_far(options: argparse.Namespace) -> bool:
 
     This is the default; it does not apply with another telescope or sky.
     """
-    told = any(getattr(options, name) is not None for name in ("alpha", "plant", "scene"))
-    return not (told or options.near)
+    is_customised = any(getattr(options, name) is not None for name in ("alpha", "plant", "scene"))
+    return not (is_customised or options.near)
 
 
-def _beginning(options: argparse.Namespace) -> str:
+def _choose_introduction(options: argparse.Namespace) -> str:
     """Return the introduction of a demo with a large misregistration; only FLAO has 400 modes."""
     if options.instrument == DEFAULT_INSTRUMENT:
         return FAR_TEXT
-    return OTHER_FAR_TEXT if _small_m(options) is None else SMALL_FAR_TEXT
+    return OTHER_FAR_TEXT if _find_small_diameter_m(options) is None else SMALL_FAR_TEXT
 
 
-def _small_m(options: argparse.Namespace) -> float | None:
+def _find_small_diameter_m(options: argparse.Namespace) -> float | None:
     """Return the diameter of a small telescope, metres; None for a larger one."""
     if _is_measured(options):
         return None
-    said = read_instrument_file(options.instrument)
-    diameter_m = float(said.section(AboutTable).said.diameter_m)
-    return diameter_m if diameter_m < SMALL_M else None
+    instrument_file = read_instrument_file(options.instrument)
+    diameter_m = float(instrument_file.section(AboutTable).said.diameter_m)
+    return diameter_m if diameter_m < SMALL_DIAMETER_M else None
 
 
-def _words_of_small(options: argparse.Namespace) -> list[str]:
+def _make_small_options(options: argparse.Namespace) -> list[str]:
     """Return the simulator's options for the star and the loop of a small telescope."""
-    diameter_m = _small_m(options)
+    diameter_m = _find_small_diameter_m(options)
     if diameter_m is None:
         return []
     words = []
@@ -180,8 +180,8 @@ def _words_of_small(options: argparse.Namespace) -> list[str]:
 
 
 def _n_modes(options: argparse.Namespace) -> int:
-    said = read_instrument_file(options.instrument)
-    return int(said.section(KarhunenLoeve).said.n_modes)
+    instrument_file = read_instrument_file(options.instrument)
+    return int(instrument_file.section(KarhunenLoeve).said.n_modes)
 
 
 class _Large(NamedTuple):
@@ -194,54 +194,59 @@ class _Large(NamedTuple):
     """Speed that the products of slopes and modes need, GFLOP/s."""
 
 
-def _too_large(options: argparse.Namespace) -> _Large | None:
+def _measure_load(options: argparse.Namespace) -> _Large | None:
     """Return the required speed if a machine cannot keep real time; None if it can.
 
     Each frame is multiplied by R and by D. An instrument file without a frame rate counts as small.
     """
     if options.plant == "diffractive":
         return None
-    said = read_instrument_file(options.instrument)
-    rate_hz = said.section(LoopFacts).said.frame_rate_hz
+    instrument_file = read_instrument_file(options.instrument)
+    rate_hz = instrument_file.section(LoopFacts).said.frame_rate_hz
     if rate_hz is None:
         return None
-    gflop_s = 4e-9 * rate_hz * _n_slopes(said) * said.section(KarhunenLoeve).said.n_modes
+    gflop_s = (
+        4e-9
+        * rate_hz
+        * _n_slopes(instrument_file)
+        * instrument_file.section(KarhunenLoeve).said.n_modes
+    )
     return _Large(rate_hz, gflop_s) if gflop_s > HELD_GFLOP_S else None
 
 
-def _n_slopes(said: InstrumentFile) -> float:
+def _n_slopes(instrument_file: InstrumentFile) -> float:
     """Return the approximate number of slopes of a file's sensor."""
-    kind = said.section(SlopesTable).said.kind
-    return float(kind.n_planes * math.pi / 4 * _across_subap(said) ** 2)
+    kind = instrument_file.section(SlopesTable).said.kind
+    return float(kind.n_planes * math.pi / 4 * _across_subap(instrument_file) ** 2)
 
 
-def _across_subap(said: InstrumentFile) -> float:
-    return float(said.section(said.kind.table).said.pupil_diameter)
+def _across_subap(instrument_file: InstrumentFile) -> float:
+    return float(instrument_file.section(instrument_file.kind.table).said.pupil_diameter)
 
 
-def _promise(options: argparse.Namespace) -> Promise:
-    large = _too_large(options)
+def _make_promise(options: argparse.Namespace) -> Promise:
+    large = _measure_load(options)
     return Promise(
         seconds=options.seconds,
         whole=any(getattr(options, name) for name in ("jump", "drift", "fault")),
         real_time=options.plant != "diffractive" and large is None,
-        wanted_ratio=_wanted_ratio(options),
+        wanted_ratio=_choose_ratio(options),
         across_subap=_across_subap(read_instrument_file(options.instrument)),
         measured_plant=_is_measured(options),
         held_rate=options.instrument != DEFAULT_INSTRUMENT,
         large=large is not None,
-        asked_rate_hz=USUAL_RATE_HZ if large is None else large.rate_hz,
+        requested_rate_hz=USUAL_RATE_HZ if large is None else large.rate_hz,
     )
 
 
-def _wanted_ratio(options: argparse.Namespace) -> float:
+def _choose_ratio(options: argparse.Namespace) -> float:
     if _is_measured(options):
         return MEASURED_RATIO
-    if not _is_far(options) or _too_large(options) is not None:
+    if not _is_far(options) or _measure_load(options) is not None:
         return 1.0
     if options.instrument == DEFAULT_INSTRUMENT:
-        return WANTED_RATIO
-    few = _n_modes(options) <= FEW_MODES or _small_m(options) is not None
+        return FLAO_RATIO
+    few = _n_modes(options) <= FEW_MODES or _find_small_diameter_m(options) is not None
     return FEW_RATIO if few else OTHER_RATIO
 
 
@@ -269,7 +274,7 @@ def _check(options: argparse.Namespace, sim_words: list[str]) -> None:
                 f"{name} {port}: cannot listen on 127.0.0.1:{port}: {error.strerror or error}; "
                 "choose another, the service would not start"
             ) from error
-    # the simulator alone knows what it understands, and the service does not know the simulator
+    # only the simulator can check its own options, and pyrcal does not import the simulator
     checked = subprocess.run(
         [sys.executable, "-m", "sim_rtc.options", *sim_words],
         capture_output=True,
@@ -281,7 +286,7 @@ def _check(options: argparse.Namespace, sim_words: list[str]) -> None:
         raise ConfigurationError(checked.stderr.strip().removeprefix("sim_rtc: "))
 
 
-def _emptied(directory: Path) -> None:
+def _prepare_directory(directory: Path) -> None:
     """Start with an empty directory; one that no earlier demo has filled is not deleted.
 
     Raises
@@ -298,7 +303,7 @@ def _emptied(directory: Path) -> None:
         raise ConfigurationError(f"--dir {directory}: {error.strerror or error}") from error
 
 
-def _commands(options: argparse.Namespace) -> tuple[list[str], list[str]]:
+def _make_commands(options: argparse.Namespace) -> tuple[list[str], list[str]]:
     endpoint = f"tcp/127.0.0.1:{options.zenoh_port}"
     service = ["run", "--mode", "auto", "--listen", endpoint, "--port", str(options.port)]
     live = str(options.dir / LIVE_INSTRUMENT) if _is_measured(options) else options.instrument
@@ -308,12 +313,12 @@ def _commands(options: argparse.Namespace) -> tuple[list[str], list[str]]:
     simulator += ["--truth", str(options.dir / "truth.jsonl"), "--quiet"]
     if options.instrument != DEFAULT_INSTRUMENT:
         simulator.append("--held-rate")
-    large = _too_large(options)
+    large = _measure_load(options)
     if large is not None:
         simulator.append(f"--rate={large.rate_hz:g}")
     if _is_far(options):
         simulator.append("--far")
-    simulator += _words_of_small(options)
+    simulator += _make_small_options(options)
     for name in FORWARDED:
         value = getattr(options, name)
         if value is not None:

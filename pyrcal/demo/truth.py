@@ -28,6 +28,7 @@ class TruthFile:
         with self._path.open("rb") as file:
             file.seek(self._offset)
             text = file.read()
+        # the simulator may be in the middle of writing the last line
         whole = text[: text.rfind(b"\n") + 1]
         self._offset += len(whole)
         self.lines += [json.loads(line) for line in whole.splitlines()]

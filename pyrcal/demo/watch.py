@@ -1,4 +1,4 @@
-"""Looking at REST and the truth while the demo runs, and knowing when it is over."""
+"""Observe REST and the truth file while the demo runs, and decide when it ends."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ REQUEST_TIMEOUT_S = 1.0
 """Timeout of a request, seconds."""
 
 PREPARE_WITHIN_S = 180.0
-"""Until service and simulator are ready; a slow machine without a cache needs a third of it."""
+"""Time limit of the preparation, seconds; a slow machine without a cache needs a third of it."""
 
 LARGE_WITHIN_S = 1800.0
-"""The same of a telescope of thousands of modes."""
+"""The same for a telescope of thousands of modes."""
 
 USUAL_RATE_HZ = 1000.0
 """Frame rate of the simulated RTC, if the machine is fast enough."""
@@ -54,7 +54,7 @@ SILENCE_S = 5.0
 """Time without new truth or frames after which they count as stopped, seconds: the clock then
 continues without them."""
 
-STRETCH = 6.0
+MAX_STRETCH = 6.0
 """Longest duration over the requested one on a machine that does not keep real time."""
 
 LARGE_STRETCH = 60.0
@@ -86,6 +86,7 @@ class Stopwatch:
         ``frames_grown_s`` is the wall-clock time of the last frame that the service received: in
         slow motion lines of the truth are far apart.
         """
+        # limited by the wall clock: a step of the simulator's clock is no telemetry
         step_s = (telemetry_ns - self._telemetry_ns) / 1e9
         if step_s != 0.0:
             self.telemetry_s += min(max(step_s, 0.0), now_s - self._grown_s + _TRUTH_PERIOD_S)
@@ -121,7 +122,7 @@ class Promise:
     """Duration of the demo, and conditions to end it earlier."""
 
     seconds: float | None
-    """Duration from the end of preparation, seconds; None: until Ctrl-C."""
+    """Duration from the end of preparation, seconds; None to run until Ctrl-C."""
 
     whole: bool
     """True if the demo must last all the seconds, because of events at given times."""
@@ -132,7 +133,7 @@ class Promise:
     large: bool = False
     """True for thousands of modes: preparation takes minutes."""
 
-    asked_rate_hz: float = USUAL_RATE_HZ
+    requested_rate_hz: float = USUAL_RATE_HZ
     """Requested frame rate of the simulator, Hz."""
 
     wanted_ratio: float = 1.0
@@ -177,7 +178,7 @@ class TelemetryObserver:
 
     def run(self) -> None:
         """Wait for the preparation, then watch until all criteria are met or time is up."""
-        if not self._prepared():
+        if not self._wait_until_ready():
             return
         n_lines, next_line_s = 0, 0.0
         while not self._is_over():
@@ -196,7 +197,7 @@ class TelemetryObserver:
             pace=None if clock is None else clock.pace,
             unanswered_s=now_s - self._answered_s,
             frameless_s=0.0 if clock is None else now_s - self._frames_grown_s,
-            untold_s=0.0 if clock is None else clock.silent_s,
+            silent_s=0.0 if clock is None else clock.silent_s,
             endings=self._endings(),
             wanted_ratio=self._promise.wanted_ratio,
             across_subap=self._promise.across_subap,
@@ -205,7 +206,7 @@ class TelemetryObserver:
         )
         return make_report(self._state, self._reconstructors, self._truth, circumstances)
 
-    def closing_report(self) -> Report:
+    def make_final_report(self) -> Report:
         """Return the final figures, with the reason from the service's log if they failed."""
         self._truth.read()
         report = self.report()
@@ -218,7 +219,7 @@ class TelemetryObserver:
             return None
         return next((e["text"] for e in reversed(log) if e["name"] == "window.refused"), None)
 
-    def _prepared(self) -> bool:
+    def _wait_until_ready(self) -> bool:
         """Wait for the model and the simulated telescope; return True if both are ready."""
         next_line_s = 0.0
         within_s = LARGE_WITHIN_S if self._promise.large else PREPARE_WITHIN_S
@@ -234,7 +235,7 @@ class TelemetryObserver:
                 self._say(f"{waited_s:7.1f}  ready: the clock starts\n")
                 return True
             if waited_s >= next_line_s:
-                self._say(f"{waited_s:7.1f}  preparing: {awaited(self._state)}")
+                self._say(f"{waited_s:7.1f}  preparing: {explain_waiting(self._state)}")
                 next_line_s = waited_s + PRINT_PERIOD_S
             time.sleep(POLL_S)
         return False
@@ -246,15 +247,15 @@ class TelemetryObserver:
         right_s = 0.0 if self._right_since_s is None else clock.spent_s - self._right_since_s
         if self._endings() or (right_s >= HOLD_S and not promise.whole):
             return True
-        patience = 1.0 if self._right_since_s is not None else self._patience(clock)
+        patience = 1.0 if self._right_since_s is not None else self._time_factor(clock)
         over = clock.spent_s >= patience * promise.seconds
-        stretch = LARGE_STRETCH if promise.large else STRETCH
+        stretch = LARGE_STRETCH if promise.large else MAX_STRETCH
         return over or clock.wall_s >= stretch * promise.seconds
 
-    def _patience(self, clock: Stopwatch) -> float:
+    def _time_factor(self, clock: Stopwatch) -> float:
         """Return the factor on the requested seconds of telemetry for a slow machine."""
         if self._behind or self._promise.large:
-            return STRETCH
+            return MAX_STRETCH
         return SLOW_STRETCH if clock.pace is not None and clock.pace < REAL_TIME else 1.0
 
     def _look(self) -> None:
@@ -301,7 +302,9 @@ class TelemetryObserver:
         if slow is not None:
             self._say_once(slow)
         slower = (
-            rate_line(self._state, self._promise.asked_rate_hz) if self._promise.held_rate else None
+            rate_line(self._state, self._promise.requested_rate_hz)
+            if self._promise.held_rate
+            else None
         )
         if slower is not None:
             self._say_once(slower)
@@ -359,7 +362,7 @@ def live_line(seconds: float, state: dict[str, Any] | None, truth: Line | None) 
     )
 
 
-def awaited(state: dict[str, Any] | None) -> str:
+def explain_waiting(state: dict[str, Any] | None) -> str:
     """Return the reason why the clock has not started."""
     if state is None:
         return "the service is starting"

@@ -9,11 +9,16 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.alternatives import Alternative, moved_words, preference, systematic_terms
+from pyrcal.offline.alternatives import (
+    Alternative,
+    describe_preference,
+    format_move,
+    systematic_terms,
+)
 from pyrcal.offline.fitted import Fit
-from pyrcal.offline.left_over import left_over
+from pyrcal.offline.left_over import locate_residual
 from pyrcal.offline.origins import Origin
-from pyrcal.offline.verdict import CANNOT_TELL, Refusal
+from pyrcal.offline.verdict import UNDECIDED_WORDS, Refusal
 
 Array = NDArray[np.float64]
 
@@ -56,23 +61,23 @@ class Advice(StrEnum):
     DO_NOT_USE = "do not use it"
 
 
-def explained(fit: Fit, tried: tuple[Alternative, ...], grounds: Grounds) -> Fit:
+def add_explanations(fit: Fit, tried: tuple[Alternative, ...], grounds: Grounds) -> Fit:
     """Return the fit with alternatives, residual analysis and recommendation filled in."""
     preferred = (
-        preference(one, fit.sigma)
+        describe_preference(one, fit.sigma)
         for one in tried
         if one.preferred and one.words not in fit.verdict
     )
-    said = (*fit.remarks, *grounds.gains, *preferred)
+    sentences = (*fit.remarks, *grounds.gains, *preferred)
     size = np.linalg.norm(np.asarray(fit.measured, dtype=np.float64), axis=0)
-    left = left_over(
+    left = locate_residual(
         fit.residual_map, fit.residual_by_mode, valid=fit.valid, modes=fit.modes, size=size
     )
-    fit = replace(fit, alternatives=tried, remarks=said, left_over=left)
-    return replace(fit, recommendation=recommendation(fit, grounds))
+    fit = replace(fit, alternatives=tried, remarks=sentences, left_over=left)
+    return replace(fit, recommendation=recommend_action(fit, grounds))
 
 
-def with_displaced(fit: Fit, columns: tuple[str, ...]) -> Fit:
+def add_displaced(fit: Fit, columns: tuple[str, ...]) -> Fit:
     """Return a refused fit whose cause is that all columns are displaced."""
     if not columns:
         return fit
@@ -80,18 +85,18 @@ def with_displaced(fit: Fit, columns: tuple[str, ...]) -> Fit:
     return replace(fit, remarks=(*fit.remarks, *columns), recommendation=advised)
 
 
-def recommendation(fit: Fit, grounds: Grounds) -> str:
+def recommend_action(fit: Fit, grounds: Grounds) -> str:
     """Return the recommended action for a fit and its reason, in one sentence."""
     if grounds.refusal is not None:
-        return _of_refused(fit, grounds)
+        return _advise_refused(fit, grounds)
     radius = _radius(fit)
     edge = float(_at_edge(fit.sigma, radius))
     control = fit.reconstructor
     if control is not None and not control.usable:
         return f"{Advice.MEASURE_MORE}: the reconstructor is not stable: {control.reason}"
-    # a model that holds every loop of the measured matrix is good enough, whatever sigma
+    # a reconstructor that is stable with all modes is good enough, however large sigma is
     if edge > ENOUGH_SUBAP and not (control is not None and control.holds):
-        return f"{Advice.MEASURE_MORE}: {_uncertain(fit, edge, radius)}"
+        return f"{Advice.MEASURE_MORE}: {_explain_uncertainty(fit, edge, radius)}"
     if grounds.n_sets < FEWEST_SETS:
         return (
             f"{Advice.MEASURE_MORE}: too few modes ({len(fit.modes)}) to check each other; push "
@@ -102,13 +107,13 @@ def recommendation(fit: Fit, grounds: Grounds) -> str:
     known = f"the mirror is known to {edge:.2g} subapertures at the pupil's edge (1 sigma)"
     if control is not None and not control.holds:
         known = f"{known}; the reconstructor is {control.reason}"
-    corrections = ", ".join(_corrections(fit))
+    corrections = ", ".join(_list_corrections(fit))
     if corrections:
         return f"{Advice.USE}, and correct the instrument file ({corrections}): {known}"
     return f"{Advice.USE}: {known}"
 
 
-def _uncertain(fit: Fit, edge: float, radius: float) -> str:
+def _explain_uncertainty(fit: Fit, edge: float, radius: float) -> str:
     """Return the uncertainty of the registration and how to reduce it."""
     known = (
         f"at the pupil's edge the mirror is known to {edge:.3f} subapertures (1 sigma), "
@@ -123,40 +128,40 @@ def _uncertain(fit: Fit, edge: float, radius: float) -> str:
         return f"{known}; the model differs from the bench, and more averaging does not help"
     other = most.alternative
     return (
-        f"{known}; the matrix cannot tell {other.words} from what the file says, which would move "
-        f"it by {moved_words(other.moved)}"
+        f"{known}; the matrix does not exclude {other.words}, which would move the registration "
+        f"by {format_move(other.moved)}"
     )
 
 
-def _of_refused(fit: Fit, grounds: Grounds) -> str:
+def _advise_refused(fit: Fit, grounds: Grounds) -> str:
     match grounds.refusal:
         case Refusal.UNDETERMINED:
             return f"{Advice.MEASURE_MORE}: the modes do not determine the registration"
         case Refusal.ANOTHER_MINIMUM:
             return (
                 f"{Advice.MEASURE_MORE}: two registrations explain the matrix nearly as well; push "
-                "more modes, or say where the mirror is (--start)"
+                "more modes, or give a start near the true registration (--start)"
             )
         case Refusal.UNEXPLAINED if grounds.structure < 0.5 * fit.residual_fraction:
             return (
                 f"{Advice.MEASURE_MORE}: {fit.residual_fraction:.0%} of the signal is noise; "
                 "average more, or push further"
             )
-    return f"{Advice.DO_NOT_USE}: {_cause(fit, grounds)}"
+    return f"{Advice.DO_NOT_USE}: {_find_cause(fit, grounds)}"
 
 
-def _cause(fit: Fit, grounds: Grounds) -> str:
+def _find_cause(fit: Fit, grounds: Grounds) -> str:
     """Return the most likely cause of a refusal; a definite cause precedes the verdict."""
     if grounds.refusal in {Refusal.ANOTHER_BASIS, Refusal.ANOTHER_UNIT} and grounds.gains:
         return grounds.gains[0]
     if grounds.columns and grounds.refusal is not Refusal.AXES:
         return "; ".join(grounds.columns)
-    best = _best_to_correct(fit)
+    best = _choose_correction(fit)
     if best is not None and grounds.refusal is Refusal.ANOTHER_INSTRUMENT:
-        number = next(_wrong_numbers(fit), None)
+        number = next(_list_wrong_numbers(fit), None)
         if number is not None and grounds.numbers_share < (best.share or 0.0):
             return f"{number.words}; correct that and fit again"
-        if CANNOT_TELL in fit.verdict:
+        if UNDECIDED_WORDS in fit.verdict:
             return fit.verdict.rpartition("better: ")[2]
         return (
             f"with {best.words} the misfit is {best.share:.0%} of what it is; correct that and fit "
@@ -168,17 +173,17 @@ def _cause(fit: Fit, grounds: Grounds) -> str:
     return fit.verdict.removeprefix("refused: ")
 
 
-def _corrections(fit: Fit) -> Iterator[str]:
+def _list_corrections(fit: Fit) -> Iterator[str]:
     """Yield corrections of the instrument file, in its own notation."""
     for one in fit.origins:
         if one.correct:
             yield f"{one.key} = {one.found}"
-    best = _best_to_correct(fit)
+    best = _choose_correction(fit)
     if best is not None:
         yield best.key
 
 
-def _wrong_numbers(fit: Fit) -> Iterator[Origin]:
+def _list_wrong_numbers(fit: Fit) -> Iterator[Origin]:
     """Yield numbers of the file that the matrix contradicts.
 
     With a wrong modulation another stop explains part of the misfit that the fitted number leaves.
@@ -188,7 +193,7 @@ def _wrong_numbers(fit: Fit) -> Iterator[Origin]:
     return (one for one in fit.origins if one.correct and one.key in notable)
 
 
-def _best_to_correct(fit: Fit) -> Alternative | None:
+def _choose_correction(fit: Fit) -> Alternative | None:
     """Return the preferred alternative with a key that leaves the smallest misfit, or None."""
     found = [
         one

@@ -14,10 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.disjoint_sets import SIGNIFICANT
-from pyrcal.offline.instrument_checks import MIN_EXPLAINED, FileValuesFit, FoundOptic, Rival
+from pyrcal.offline.instrument_checks import (
+    MIN_EXPLAINED,
+    AlternativeInstrument,
+    FileValuesFit,
+    FoundOptic,
+)
 from pyrcal.offline.methods import Settled
-from pyrcal.offline.models import BETTER, FAR_BETTER, Optic
-from pyrcal.offline.pupil_checks import Few, Lead, TriedPupil, gain_maps
+from pyrcal.offline.models import FAR_PREFERRED_SHARE, PREFERRED_SHARE, Optic
+from pyrcal.offline.pupil_checks import FitSubset, Lead, TriedPupil, gain_maps
 from pyrcal.offline.solver import refine
 from pyrcal.offline.uncertainty import OTHER_SHARE, Uncertainty
 from service.model.kinds import SignalKind, Stop
@@ -36,13 +41,13 @@ NOTABLE_OFFSET_SHARE = 0.2
 """Smallest pupil offset that is reported, over the shift. If the mirror is the stop, on the
 diffractive telescope a tenth of the shift looks like an offset."""
 
-LEAST_OFFSET = 0.01
+MIN_OFFSET_EXPLAINED = 0.01
 """RMS share of the signal that a pupil offset must explain to be preferred."""
 
-EXCLUDED = 3.0
+EXCLUSION_SIGMA = 3.0
 """Number of σ by which an alternative must be worse to be excluded."""
 
-NOTABLE_AXES = 0.02
+NOTABLE_GAIN_RATIO = 0.02
 """Smallest reported ratio of the gains of Sx and Sy, less 1."""
 
 ARM_SUBAP = 0.5
@@ -55,10 +60,10 @@ PLAUSIBLE_DISPLACEMENT_PX = 0.5
 MODULATION_STEP = 0.1
 """Relative change of the modulation for the alternative with another modulation."""
 
-_FEWEST = 6
+_MIN_MODES = 6
 """Smallest number of modes in a set that is fitted as an alternative."""
 
-_WORST = 0.1
+_WORST_SHARE = 0.1
 """Share of the modes, those with the largest residual, that one alternative leaves out."""
 
 
@@ -141,10 +146,10 @@ def systematic_terms(
     return tuple(sorted(terms, key=lambda term: -float(np.max(term.sigma / sigma))))
 
 
-def alternatives(
+def find_alternatives(
     settled: Settled,
-    few: Few,
-    others: tuple[Rival, ...],
+    few: FitSubset,
+    others: tuple[AlternativeInstrument, ...],
     pupils: tuple[TriedPupil, ...],
     optics: tuple[FoundOptic, ...],
     without: FileValuesFit | None,
@@ -165,27 +170,27 @@ def alternatives(
     arms_deg
         Directions of lines in the residual, degrees.
     """
-    beside = (_of_pupil(one, others) for one in pupils)
+    pupil_alternatives = (_describe_pupil(one, others) for one in pupils)
     found = [
-        *(_of_rival(one, pupils) for one in others),
-        *(one for one in beside if one is not None),
-        *_that_can(_off_centre(few)),
-        *_that_can(_axes_apart(few)),
-        *_that_can(_uneven_light(few)),
-        *_that_can(_spiders(few, arms_deg)),
-        *_that_can(_optics(settled, optics, without)),
-        *_that_can(_held(settled)),
-        *_that_can(_images_in_place(settled)),
-        *_that_can(_wavelength(few)),
-        *_that_can(_weighted(settled)),
-        *_that_can(_some_modes(settled)),
-        *_that_can(_without_border(few)),
+        *(_describe_rival(one, pupils) for one in others),
+        *(one for one in pupil_alternatives if one is not None),
+        *_yield_determined(_try_off_centre(few)),
+        *_yield_determined(_try_separate_gains(few)),
+        *_yield_determined(_try_uneven_light(few)),
+        *_yield_determined(_try_spiders(few, arms_deg)),
+        *_yield_determined(_try_file_optics(settled, optics, without)),
+        *_yield_determined(_try_fixed_nuisances(settled)),
+        *_yield_determined(_try_images_in_place(settled)),
+        *_yield_determined(_try_wavelength(few)),
+        *_yield_determined(_try_equal_weights(settled)),
+        *_yield_determined(_try_mode_subsets(settled)),
+        *_yield_determined(_try_without_border(few)),
     ]
     sure = [one for one in found if np.all(np.isfinite(one.moved))]
     return tuple(sorted(sure, key=lambda one: (not one.preferred, not one.undecided, _share(one))))
 
 
-def with_alternatives(
+def add_alternatives(
     before: Uncertainty,
     tried: Sequence[Alternative],
     residual_fraction: float,
@@ -217,17 +222,19 @@ def with_alternatives(
     return before.with_moves(np.array(moves), np.array(shares))
 
 
-def off_centre(few: Few, others: tuple[Rival, ...]) -> Alternative | None:
+def find_decentred_pupil(
+    few: FitSubset, others: tuple[AlternativeInstrument, ...]
+) -> Alternative | None:
     """Return the preferred alternative with a decentred pupil, or None.
 
     It is only considered if another stop is preferred, because that displaces the pupil as well.
     """
     if not any(one.preferred and "stop" in one.change.words for one in others):
         return None
-    return next((one for one in _that_can(_off_centre(few)) if one.preferred), None)
+    return next((one for one in _yield_determined(_try_off_centre(few)) if one.preferred), None)
 
 
-def _that_can(rivals: Iterator[Alternative]) -> Iterator[Alternative]:
+def _yield_determined(rivals: Iterator[Alternative]) -> Iterator[Alternative]:
     """Yield alternatives under which the measurement determines a registration."""
     try:
         yield from rivals
@@ -239,17 +246,17 @@ def _share(one: Alternative) -> float:
     return float("inf") if one.share is None else one.share
 
 
-def preference(one: Alternative, sigma: Array) -> str:
+def describe_preference(one: Alternative, sigma: Array) -> str:
     """Return a sentence that the matrix prefers an alternative, with the change of α."""
     move = np.abs(one.moved) / sigma
     share = "" if one.share is None else f" ({one.share:.0%} of the misfit)"
     return (
         f"the matrix is explained better with {one.words}{share}: the registration would move by "
-        f"{moved_words(one.moved)}, at most {np.max(move):.1f} sigma"
+        f"{format_move(one.moved)}, at most {np.max(move):.1f} sigma"
     )
 
 
-def moved_words(moved: Array) -> str:
+def format_move(moved: Array) -> str:
     """Return a change of the registration in boundary units, as text."""
     x, y, turn, size = moved * BOUNDARY_SCALE
     return f"{x:+.2g}, {y:+.2g} subapertures, {turn:+.2g} deg, {size:+.2g}"
@@ -258,7 +265,7 @@ def moved_words(moved: Array) -> str:
 # --- other instruments
 
 
-def _of_rival(rival: Rival, pupils: tuple[TriedPupil, ...]) -> Alternative:
+def _describe_rival(rival: AlternativeInstrument, pupils: tuple[TriedPupil, ...]) -> Alternative:
     return Alternative(
         words=rival.change.words,
         share=rival.share,
@@ -271,7 +278,9 @@ def _of_rival(rival: Rival, pupils: tuple[TriedPupil, ...]) -> Alternative:
     )
 
 
-def _of_pupil(one: TriedPupil, others: tuple[Rival, ...]) -> Alternative | None:
+def _describe_pupil(
+    one: TriedPupil, others: tuple[AlternativeInstrument, ...]
+) -> Alternative | None:
     """Return an alternative with another pupil, or None if it is already in ``others``."""
     if any(one.words == rival.change.words for rival in others):
         return None
@@ -288,10 +297,10 @@ def _of_pupil(one: TriedPupil, others: tuple[Rival, ...]) -> Alternative | None:
 
 def is_open(lead: Lead) -> bool:
     """Return True if an alternative is not excluded: it is not significantly worse."""
-    return lead.significance > -EXCLUDED
+    return lead.significance > -EXCLUSION_SIGMA
 
 
-def _off_centre(few: Few) -> Iterator[Alternative]:
+def _try_off_centre(few: FitSubset) -> Iterator[Alternative]:
     """Yield the alternative with the pupil image off the centre of the subapertures."""
     about, alpha = few.models.instrument, few.here
     here = np.array(about.pupil_shift_subap or (0.0, 0.0))
@@ -299,11 +308,11 @@ def _off_centre(few: Few) -> Iterator[Alternative]:
         here = alpha.vector[:2]
     rates = []
     for step in np.eye(2) * OFFSET_STEP_SUBAP:
-        beside = replace(about, stop=Stop.TELESCOPE, pupil_shift_subap=tuple(here + step))
-        rates.append((few.matrix(few.of(beside)) - few.own) / OFFSET_STEP_SUBAP)
+        displaced = replace(about, stop=Stop.TELESCOPE, pupil_shift_subap=tuple(here + step))
+        rates.append((few.matrix(few.of(displaced)) - few.own) / OFFSET_STEP_SUBAP)
     if not all(few.tells(few.own, rate) for rate in rates):
         return
-    (x, y), lead, moved = _fitted_as_well(few, *rates)
+    (x, y), lead, moved = _fit_with_rates(few, *rates)
     explained = few.residual_fraction * float(np.sqrt(max(1.0 - lead.share, 0.0)))
     off = float(np.hypot(x, y))
     shift = float(np.hypot(*alpha.vector[:2])) if about.stop is Stop.MIRROR else 0.0
@@ -314,10 +323,10 @@ def _off_centre(few: Few) -> Iterator[Alternative]:
         share=lead.share,
         moved=moved,
         preferred=bool(
-            lead.share < FAR_BETTER
+            lead.share < FAR_PREFERRED_SHARE
             and lead.significance > SIGNIFICANT
             and off > notable
-            and explained > LEAST_OFFSET
+            and explained > MIN_OFFSET_EXPLAINED
         ),
         undecided=is_open(lead),
         key="pupil, or valid_subapertures, centred",
@@ -326,13 +335,13 @@ def _off_centre(few: Few) -> Iterator[Alternative]:
     )
 
 
-def _axes_apart(few: Few) -> Iterator[Alternative]:
+def _try_separate_gains(few: FitSubset) -> Iterator[Alternative]:
     """Yield the alternative with separate gains of Sx and Sy."""
     if few.models.instrument.slopes.kind is not SignalKind.XY:
         return
     half = len(few.own) // 2
     rate = np.concatenate([few.own[:half], -few.own[half:]])
-    (value,), lead, moved = _fitted_as_well(few, rate)
+    (value,), lead, moved = _fit_with_rates(few, rate)
     apart = float((1.0 + value) / (1.0 - value)) - 1.0
     side = "stronger" if apart > 0.0 else "weaker"
     yield Alternative(
@@ -340,7 +349,9 @@ def _axes_apart(few: Few) -> Iterator[Alternative]:
         share=lead.share,
         moved=moved,
         preferred=bool(
-            lead.share < BETTER and lead.significance > SIGNIFICANT and abs(apart) > NOTABLE_AXES
+            lead.share < PREFERRED_SHARE
+            and lead.significance > SIGNIFICANT
+            and abs(apart) > NOTABLE_GAIN_RATIO
         ),
         undecided=is_open(lead),
         counts=True,
@@ -348,10 +359,10 @@ def _axes_apart(few: Few) -> Iterator[Alternative]:
     )
 
 
-def _uneven_light(few: Few) -> Iterator[Alternative]:
+def _try_uneven_light(few: FitSubset) -> Iterator[Alternative]:
     """Yield the alternative with a smooth gain over the pupil, common to all modes."""
     maps = [pattern[:, None] * few.own for pattern in gain_maps(few)]
-    _, lead, moved = _fitted_as_well(few, *maps)
+    _, lead, moved = _fit_with_rates(few, *maps)
     yield Alternative(
         words="uneven light (--gain-map)",
         share=lead.share,
@@ -363,7 +374,7 @@ def _uneven_light(few: Few) -> Iterator[Alternative]:
     )
 
 
-def _spiders(few: Few, arms_deg: tuple[float, ...]) -> Iterator[Alternative]:
+def _try_spiders(few: FitSubset, arms_deg: tuple[float, ...]) -> Iterator[Alternative]:
     """Yield the alternative with spider arms, if the residual shows lines like arms."""
     about = few.models.instrument
     if not arms_deg or about.spiders_deg or about.pupil is not None:
@@ -373,16 +384,16 @@ def _spiders(few: Few, arms_deg: tuple[float, ...]) -> Iterator[Alternative]:
     rate = shaded - few.own
     if not few.tells(few.own, rate):
         return
-    (width,), lead, moved = _fitted_as_well(few, rate)
+    (width,), lead, moved = _fit_with_rates(few, rate)
     if width <= 0.0:
-        return  # brighter, not darker: no shadow
+        return  # a negative width means brighter lines, which are no shadows
     angles = ", ".join(f"{angle:.0f}" for angle in arms_deg)
     words = f"spiders_m = {width * width_m:.2g}, spiders_deg = [{angles}]"
     yield Alternative(
         words=words,
         share=lead.share,
         moved=moved,
-        preferred=bool(lead.share < BETTER and lead.significance > SIGNIFICANT),
+        preferred=bool(lead.share < PREFERRED_SHARE and lead.significance > SIGNIFICANT),
         undecided=is_open(lead),
         key=words,
         counts=True,
@@ -390,12 +401,13 @@ def _spiders(few: Few, arms_deg: tuple[float, ...]) -> Iterator[Alternative]:
     )
 
 
-def _wavelength(few: Few) -> Iterator[Alternative]:
+def _try_wavelength(few: FitSubset) -> Iterator[Alternative]:
     """Yield the alternative with a 10 % longer wavelength and the same modulation in λ/D."""
     about = few.models.instrument
     wfs = replace(about.wfs, wavelength_m=1.1 * about.wfs.wavelength_m)
     matrix = few.matrix(few.of(replace(about, wfs=wfs)))
-    matrix *= np.linalg.norm(few.own) / np.linalg.norm(matrix)  # the gains take that up
+    # the free gains absorb the common scale
+    matrix *= np.linalg.norm(few.own) / np.linalg.norm(matrix)
     seen = few.seen(matrix)
     yield Alternative(
         words=f"wavelength_m = {wfs.wavelength_m:.3g}",
@@ -405,7 +417,7 @@ def _wavelength(few: Few) -> Iterator[Alternative]:
     )
 
 
-def _fitted_as_well(few: Few, *rates: Array) -> tuple[Array, Lead, Array]:
+def _fit_with_rates(few: FitSubset, *rates: Array) -> tuple[Array, Lead, Array]:
     """Return the values of further unknowns, their improvement, and the change of α."""
     step = few.step(few.own, *rates)
     return step[-len(rates) :], few.lead(few.own, *rates), step[:4] - few.step(few.own)[:4]
@@ -416,32 +428,35 @@ def _ratio(chi: float, own: float) -> float:
     return chi / own if own > 0.0 else 1.0
 
 
-# --- what is fitted beside the registration, held
+# --- nuisances of the fit, fixed
 
 
-def _optics(
+def _try_file_optics(
     settled: Settled, optics: tuple[FoundOptic, ...], without: FileValuesFit | None
 ) -> Iterator[Alternative]:
     """Yield coupling and modulation as in the file, and a 10 % larger modulation."""
     stated = [one for one in optics if one.reported is not None]
     if without is not None:
-        words = " and ".join(f"{one.key} = {one.reported:.3g}" for one in stated) or "as told"
+        words = (
+            " and ".join(f"{one.key} = {one.reported:.3g}" for one in stated)
+            or "the values of the file"
+        )
         yield Alternative(words=words, share=1.0 / max(without.share, 1e-12), moved=without.moved)
     first = settled.nuisances.first_optic
     for place, one in enumerate(optics, first):
         if without is None and one.reported is not None:
-            share, moved = _with(settled, {place: -one.change})
-            near = share < 1.0 / BETTER
+            share, moved = _fix_nuisances(settled, {place: -one.change})
+            near = share < 1.0 / PREFERRED_SHARE
             words = f"{one.key} = {one.reported:.3g}, not fitted"
             yield Alternative(words=words, share=share, moved=moved, undecided=near)
         if one.optic is Optic.SENSOR and one.found is not None:
-            share, moved = _with(settled, {place: float(np.log1p(MODULATION_STEP))})
+            share, moved = _fix_nuisances(settled, {place: float(np.log1p(MODULATION_STEP))})
             words = f"{one.key} = {one.found * (1.0 + MODULATION_STEP):.3g}"
-            near = share < 1.0 / BETTER
+            near = share < 1.0 / PREFERRED_SHARE
             yield Alternative(words=words, share=share, moved=moved, undecided=near)
 
 
-def _held(settled: Settled) -> Iterator[Alternative]:
+def _try_fixed_nuisances(settled: Settled) -> Iterator[Alternative]:
     """Yield alternatives with nominal slope axes and without anamorphosis."""
     nuisances, values = settled.nuisances, settled.solution.nuisances
     distance = nuisances.from_prior(values)
@@ -449,12 +464,12 @@ def _held(settled: Settled) -> Iterator[Alternative]:
     if nuisances.anamorphosis:
         groups.append(("no anamorphosis fitted", [1, 2]))
     for words, places in groups:
-        share, moved = _with(settled, {place: -float(distance[place]) for place in places})
-        near = share < 1.0 / BETTER
+        share, moved = _fix_nuisances(settled, {place: -float(distance[place]) for place in places})
+        near = share < 1.0 / PREFERRED_SHARE
         yield Alternative(words=words, share=share, moved=moved, undecided=near)
 
 
-def _images_in_place(settled: Settled) -> Iterator[Alternative]:
+def _try_images_in_place(settled: Settled) -> Iterator[Alternative]:
     """Yield pupil images that are not displaced, where the fit displaced them beyond belief.
 
     Such displacements make up for errors of the model, and there are several that do so about as
@@ -467,7 +482,7 @@ def _images_in_place(settled: Settled) -> Iterator[Alternative]:
     found = kind_of(about).offsets_px(about, nuisances.image_offsets(solution.nuisances))
     if np.abs(found).max() < PLAUSIBLE_DISPLACEMENT_PX:
         return
-    models = settled.models.displaced(-nuisances.displaced)
+    models = settled.models.with_displaced_images(-nuisances.displaced)
     others = replace(nuisances, images=np.zeros((0, 8)), displaced=np.zeros(8))
     there = refine(models, settled.target, solution.alpha, others, decides=models.cheap)
     share = _ratio(there.projection.chi, solution.projection.chi)
@@ -475,12 +490,12 @@ def _images_in_place(settled: Settled) -> Iterator[Alternative]:
         words="the pupil images in their places",
         share=share,
         moved=there.vector - solution.vector,
-        undecided=bool(there.converged and share < 1.0 / FAR_BETTER),
+        undecided=bool(there.converged and share < 1.0 / FAR_PREFERRED_SHARE),
         counts=True,
     )
 
 
-def _with(settled: Settled, steps: dict[int, float]) -> tuple[float, Array]:
+def _fix_nuisances(settled: Settled, steps: dict[int, float]) -> tuple[float, Array]:
     """Return χ² over that of the fit, and the change of α, with nuisances fixed at offsets."""
     seen = settled.solution.projection
     noise = seen.chi / max(seen.residual.size - len(seen.gains), 1)
@@ -499,31 +514,33 @@ def _with(settled: Settled, steps: dict[int, float]) -> tuple[float, Array]:
 # --- other weights, modes and slopes
 
 
-def _weighted(settled: Settled) -> Iterator[Alternative]:
+def _try_equal_weights(settled: Settled) -> Iterator[Alternative]:
     """Yield the alternative in which every slope has the same noise at the same stroke."""
     alike = np.full(len(settled.target.weights), np.mean(settled.target.weights))
     yield Alternative(
-        words="every slope with the same weight", share=None, moved=_stepped(settled, alike)
+        words="every slope with the same weight",
+        share=None,
+        moved=_move_with_weights(settled, alike),
     )
 
 
-def _some_modes(settled: Settled) -> Iterator[Alternative]:
+def _try_mode_subsets(settled: Settled) -> Iterator[Alternative]:
     """Yield each half of the modes, and all modes but those with the largest residual."""
     n_modes = settled.target.n_modes
     order, numbers = np.argsort(settled.target.modes), np.arange(n_modes)
-    worst = np.argsort(settled.by_mode)[: n_modes - int(np.ceil(_WORST * n_modes))]
+    worst = np.argsort(settled.by_mode)[: n_modes - int(np.ceil(_WORST_SHARE * n_modes))]
     for words, kept in (
         ("the lower half of the modes", order[: (n_modes + 1) // 2]),
         ("the upper half of the modes", order[n_modes // 2 :]),
         ("without the tenth of the modes that fits worst", worst),
     ):
-        if len(kept) < _FEWEST:
+        if len(kept) < _MIN_MODES:
             continue
         weights = np.where(np.isin(numbers, kept), settled.target.weights, 0.0)
-        yield Alternative(words=words, share=None, moved=_stepped(settled, weights))
+        yield Alternative(words=words, share=None, moved=_move_with_weights(settled, weights))
 
 
-def _stepped(settled: Settled, weights: Array) -> Array:
+def _move_with_weights(settled: Settled, weights: Array) -> Array:
     """Return the change of α with other weights of the modes ``(n_modes,)``."""
     seen, nuisances = settled.solution.projection, settled.nuisances
     noise = seen.chi / max(seen.residual.size - len(seen.gains), 1)
@@ -538,9 +555,9 @@ def _stepped(settled: Settled, weights: Array) -> Array:
     return np.asarray(step(weights) - step(seen.weights))[:4]
 
 
-def _without_border(few: Few) -> Iterator[Alternative]:
+def _try_without_border(few: FitSubset) -> Iterator[Alternative]:
     """Yield the fit without the subapertures at the border of the pupil."""
-    border = border_of(few.target.valid)
+    border = find_border(few.target.valid)
     rows = np.tile(border[few.target.valid], len(few.own) // int(few.target.valid.sum()))
     if (few.target.rows & ~rows).sum() < len(rows) // 3:
         return
@@ -549,7 +566,7 @@ def _without_border(few: Few) -> Iterator[Alternative]:
     yield Alternative(words="without the border of the pupil", share=None, moved=moved[:4])
 
 
-def border_of(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def find_border(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the valid subapertures ``(n, n)`` that have an invalid neighbour."""
     wide = np.pad(valid, 1)
     inside = wide[:-2, 1:-1] & wide[2:, 1:-1] & wide[1:-1, :-2] & wide[1:-1, 2:]

@@ -36,13 +36,13 @@ class Excerpt:
 
     batches: list[FrameBatch] = field(default_factory=list)
     status: Status | None = None
-    """The last one of that time, or before it; None: there was none."""
+    """Last status of the excerpt, or before it; None if there is none."""
 
     matrices: dict[str, NDArray[np.float32]] = field(default_factory=dict)
     """Reconstructors ``(n_modes, n_slopes)`` in the RTC's order, by id."""
 
     n_damaged: int = 0
-    """Messages that break the contract, and are left out."""
+    """Number of messages that break the contract and are left out."""
 
     @property
     def first_ns_utc(self) -> int:
@@ -139,7 +139,7 @@ def write_aot(
         _add_telemetry(aotpy, system, instrument, taken)
     try:
         with warnings.catch_warnings():
-            # what is left out stays empty: without telemetry there is no loop
+            # missing fields stay empty: without telemetry there is no loop to describe
             warnings.filterwarnings("ignore", message=".*contains no data")
             system.write_to_file(path, "fits")
     except OSError as error:
@@ -186,7 +186,7 @@ def _system(aotpy: Any, instrument: Instrument, estimates: tuple[Dated, ...]) ->
 
 
 def _over_time(aotpy: Any, instrument: Instrument, estimates: tuple[Dated, ...]) -> Any:  # noqa: ANN401
-    """Return α over time; None: there is no estimate."""
+    """Return α over time; None if there is no estimate."""
     if not estimates:
         return None
     seconds = [at.t_ns_utc / SECOND_NS for at in estimates if at.t_ns_utc is not None]
@@ -196,7 +196,7 @@ def _over_time(aotpy: Any, instrument: Instrument, estimates: tuple[Dated, ...])
 
 
 def affine(alpha: Misregistration, subaperture_m: float) -> NDArray[np.float64]:
-    """Return ``(3, 3)``: from ``(x, y, 1)`` on the mirror to the sensor, metres in the pupil."""
+    """Return ``(3, 3)``, from ``(x, y, 1)`` on the mirror to the sensor, metres in the pupil."""
     shift_m = np.array([alpha.shift_x_subap, alpha.shift_y_subap]) * subaperture_m
     matrix = np.eye(3)
     matrix[:2, :2] = alpha.image
@@ -254,7 +254,7 @@ def _time(aotpy: Any, name: str, t_ns: NDArray[np.int64], seqs: NDArray[np.int64
 
 
 def _as_listed(values: NDArray[np.float32], instrument: Instrument) -> NDArray[np.float32]:
-    """Return the RTC's signals ``(n, n_slopes)`` in our order: ``(n, 2, n_valid)``, or 4."""
+    """Return the RTC's signals ``(n, n_slopes)`` in pyrcal's order: ``(n, 2, n_valid)``, or 4."""
     recipe = instrument.slopes
     mask = rtc_valid_subapertures(instrument)
     ours = to_conventions(values.T, recipe, mask)

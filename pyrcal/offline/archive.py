@@ -25,7 +25,7 @@ from service.tracking.products import MatrixState
 
 DONE, DAMAGED = 0, 1
 
-BESIDE_NS = HOUR_NS
+ALPHA_MARGIN_NS = HOUR_NS
 """Time before and after the telemetry for which α is included, nanoseconds."""
 
 
@@ -44,7 +44,7 @@ def main(options: argparse.Namespace) -> int:
     if options.action == "prune":
         return _prune(settings, dry_run=options.dry_run, as_json=options.json)
     with _open_archive(settings) as archive:
-        every = items(archive, _saved(archive))
+        every = items(archive, _list_saved_matrices(archive))
         if options.action == "list":
             return _list(every, as_json=options.json)
         if options.action == "show":
@@ -134,14 +134,17 @@ def _verify(archive: Archive, every: tuple[Item, ...], *, as_json: bool) -> int:
 
 
 def _prune(settings: Settings, *, dry_run: bool, as_json: bool) -> int:
-    """Remove what the settings let go; a running service does so by itself, and has the lock."""
+    """Remove what the retention settings allow.
+
+    A running service does this itself and holds the lock.
+    """
     retention, archive = keeping_of(settings), Archive(settings.service.data_dir)
     with archive:
-        archive.look()  # a folder that is none is refused before one is made
+        archive.look()  # reject a folder without an archive before anything is written
         if not dry_run:
             archive.close()
             archive.open()
-        going = tuple(due(items(archive, _saved(archive)), retention, time.time_ns()))
+        going = tuple(due(items(archive, _list_saved_matrices(archive)), retention, time.time_ns()))
         gone = []
         for item, why in going:
             entry = None if dry_run else remove(archive, item, why)
@@ -170,7 +173,7 @@ def _aot(options: argparse.Namespace, settings: Settings) -> int:
     taken, span = None, (0, FOREVER_NS)
     if options.recording is not None:
         taken = excerpt(options.recording, options.skip, options.seconds)
-        span = (taken.first_ns_utc - BESIDE_NS, taken.last_ns_utc + BESIDE_NS)
+        span = (taken.first_ns_utc - ALPHA_MARGIN_NS, taken.last_ns_utc + ALPHA_MARGIN_NS)
     with _open_archive(settings) as archive:
         if options.night is not None:
             nights = archive.nights.between(*span)
@@ -190,7 +193,7 @@ def _aot(options: argparse.Namespace, settings: Settings) -> int:
     return DONE
 
 
-def _saved(archive: Archive) -> tuple[str, ...]:
+def _list_saved_matrices(archive: Archive) -> tuple[str, ...]:
     """Return the α that the next service would start with."""
     saved = archive.tracking.read()
     if saved is None:
@@ -204,7 +207,7 @@ _IN_USE = "the RTC has it, and goes on; it could not be sent again to one that r
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Damage:
-    """A product that is not what was stored."""
+    """A product that differs from what was stored."""
 
     id: str
     kind: str
@@ -215,7 +218,7 @@ class Damage:
 
 
 def verify(archive: Archive, which: Collection[Item]) -> Iterator[Damage | None]:
-    """Read every product and yield what is wrong with it, or None where it is as it was stored."""
+    """Read every product and yield its damage, or None if it is intact."""
     of_kind = {store.noun: store for store in archive.stores}
     for item in which:
         store = of_kind[item.kind]

@@ -69,8 +69,8 @@ _OF_A_FOLDER = (
 def _describe_archive(archive: argparse.ArgumentParser) -> None:
     archive.set_defaults(module="pyrcal.offline.archive")
     archive.description = (
-        "List, check, export and prune the matrices in a service's data_dir. Works beside a "
-        "running service, but for prune, which the service does by itself."
+        "List, check, export and prune the matrices in a service's data_dir. They work while "
+        "the service runs, except prune, which the service does by itself."
     )
     archive.epilog = "Exit status: 0 done, 1 something is damaged, 2 it cannot be done."
     aot = (
@@ -97,7 +97,7 @@ def _describe_bundle(bundle: argparse.ArgumentParser) -> None:
     bundle.set_defaults(module="pyrcal.offline.bundles")
     bundle.description = (
         "Write a reconstructor with its gains, basis, registration, verdict and provenance into "
-        "one file with checksums, or check such a file. Works beside a running service; of one on "
+        "one file with checksums, or check such a file. Works while the service runs; for one on "
         "another machine, 'pyrcal export reconstructor in-use --format hdf5' brings the source. "
         "docs/integrate/bundle.md says what is in it."
     )
@@ -151,8 +151,8 @@ def _describe_certificates(certificates: argparse.ArgumentParser) -> None:
 
 
 _FIT = """
-Find where the mirror lies on the sensor from a measured interaction matrix: shift, rotation and
-magnification with 1 sigma, the gain of every mode, what is left over, and whether to believe it.
+Fit the registration of the mirror on the sensor to a measured interaction matrix: shift, rotation
+and magnification with 1 sigma, the gain of every mode, the residual, and a verdict.
 """
 
 _FIT_EPILOG = """
@@ -225,9 +225,9 @@ def _describe_fit(fit: argparse.ArgumentParser) -> None:
 
 
 _FIT_SYSTEM = """
-Find where each sensor, mirror and star of a system lies, from the measured interaction matrix of
-every sensor with every mirror: each pair is fitted as pyrcal fit does, and what is common to them
-follows by weighted least squares. Directions that no pair can see are named.
+Find the position of each sensor, mirror and star of a system from the measured interaction matrix
+of every sensor with every mirror: each pair is fitted as by pyrcal fit, and the positions follow by
+weighted least squares. Directions that no pair can observe are listed.
 """
 
 _FIT_SYSTEM_EPILOG = """
@@ -286,7 +286,7 @@ def _describe_reconstruct(make: argparse.ArgumentParser) -> None:
         words("--reference FILE", "the measured matrix, for its checksum", type=Path),
         words(
             "--specula PUPDATA.fits",
-            "write SPECULA's Intmat and Recmat, too: its PupData or SubapData tells the order",
+            "write SPECULA's Intmat and Recmat, too: its PupData or SubapData gives the order",
             type=Path,
         ),
     )

@@ -1,4 +1,4 @@
-"""``pyrcal bundle``: a calibration as one file, from a service's archive; and its check."""
+"""``pyrcal bundle``: write a calibration from a service's archive as one file, and check it."""
 
 from __future__ import annotations
 
@@ -53,21 +53,21 @@ def main(options: argparse.Namespace) -> int:
 def _bundle_of(options: argparse.Namespace, settings: Settings, instrument: Instrument) -> Bundle:
     archived = Path(options.source)
     if archived.suffix == ".h5" and archived.is_file():
-        return _whole(options, instrument, archived, _record_in(archived))
+        return _read_product(options, instrument, archived, _record_in(archived))
     with Archive(settings.service.data_dir) as archive:
         archive.look()
         record = _record(archive, options.source)
         archive.reconstructors.matrix(record.id)  # refuses one that is damaged
         path = archive.reconstructors.path_of(record.id)
-        return _whole(options, instrument, path, record)
+        return _read_product(options, instrument, path, record)
 
 
-def _whole(
+def _read_product(
     options: argparse.Namespace, instrument: Instrument, path: Path, record: ReconstructorRecord
 ) -> Bundle:
     """Return an archived product, the requested companion products, and its basis."""
     with open_hdf5(path) as file:
-        names = {RECONSTRUCTOR: RECONSTRUCTOR, **_BESIDE}
+        names = {RECONSTRUCTOR: RECONSTRUCTOR, **_COMPANION_ARRAYS}
         arrays = {name: np.asarray(file[at][()]) for name, at in names.items() if at in file}
         provenance = {
             key: value.item() if isinstance(value, np.generic) else value
@@ -96,19 +96,19 @@ def _whole(
 
 
 def _record_in(path: Path) -> ReconstructorRecord:
-    """Return the record in an archived product, its matrix held against it."""
+    """Return the record in an archived product after comparing it with its matrix."""
     try:
         with open_hdf5(path) as file:
             record = from_json(file.attrs["record"], ReconstructorRecord)
-            told, found = file.attrs["sha256"], checksum(np.asarray(file[RECONSTRUCTOR][()]))
+            stated, found = file.attrs["sha256"], checksum(np.asarray(file[RECONSTRUCTOR][()]))
     except NOT_UNDERSTOOD as error:
         raise ArchiveError(f"{path}: no archived reconstructor: {error}") from error
-    if found != told:
-        raise ArchiveError(f"{path}: damaged: found checksum {found}, expected {told}")
+    if found != stated:
+        raise ArchiveError(f"{path}: damaged: found checksum {found}, expected {stated}")
     return record
 
 
-_BESIDE = {
+_COMPANION_ARRAYS = {
     "optical_gain": "gains/optical_gain",
     "gain_factor": "gains/factor",
     "covariance": "covariance",
@@ -119,15 +119,15 @@ _BESIDE = {
 
 def _record(archive: Archive, name: str) -> ReconstructorRecord:
     records = archive.reconstructors.records()
-    wanted = (
+    matching = (
         [one for one in records if one.state is MatrixState.APPLIED]
         if name == IN_USE
         else [one for one in records if one.id == name]
     )
-    if not wanted:
+    if not matching:
         what = "no reconstructor is in use" if name == IN_USE else f"{name}: no such reconstructor"
         raise UnknownIdError(f"{what} in {archive.directory}; pyrcal archive list has all")
-    return wanted[-1]
+    return matching[-1]
 
 
 def _interaction_matrix(
@@ -136,7 +136,7 @@ def _interaction_matrix(
     basis: Any,  # noqa: ANN401 - any basis
 ) -> NDArray[np.float32]:
     if record.alpha is None:
-        raise ArchiveError(f"{record.id}: is the RTC's own; nobody knows the registration it is of")
+        raise ArchiveError(f"{record.id}: is the RTC's own; its registration is unknown")
     model = RtcInteractionModel(instrument, basis)
     return np.asarray(model.interaction_matrix(record.alpha)[:, : record.n_modes], np.float32)
 
@@ -154,7 +154,7 @@ def _reference(path: Path, n_slopes: int) -> NDArray[np.float32]:
 
 
 def _summary(path: Path, bundle: Bundle, *, as_json: bool) -> str:
-    """Return what a bundle says of itself."""
+    """Return the summary of a bundle."""
     if as_json:
         arrays = {name: list(values.shape) for name, values in bundle.arrays.items()}
         found = {"id": bundle.id, "sha256": bundle.sha256, "arrays": arrays, **bundle.facts}

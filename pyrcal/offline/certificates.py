@@ -30,10 +30,10 @@ from service.wire.access import LinkRole
 AUTHORITY_DAYS: Final = 3650
 
 CLOCKS_DIFFER: Final = timedelta(hours=1)
-"""A certificate holds from so long before it was made."""
+"""Time before its creation from which a certificate is valid, for clocks that differ."""
 
 SECRET: Final = "signing.key"
-"""File of what service and RTC may sign their messages with."""
+"""File with the key by which service and RTC sign their messages."""
 
 DONE: Final = 0
 
@@ -72,7 +72,7 @@ def _make(folder: Path, hosts: tuple[str, ...], port: int, days: float) -> None:
         if not (folder / SECRET).exists():
             _write_secret(folder / SECRET, secrets.token_hex(32).encode() + b"\n")
         for role in LinkRole:
-            _write(folder, str(role), _signed_by(authority, role, hosts, days))
+            _write(folder, str(role), _make_certificate(authority, role, hosts, days))
             _write_settings(folder.absolute(), role, hosts[0], port)
     except OSError as error:
         raise ConfigurationError(f"{folder}: cannot be written: {error.strerror}") from error
@@ -83,12 +83,12 @@ def _make(folder: Path, hosts: tuple[str, ...], port: int, days: float) -> None:
 
 
 def _authority(folder: Path) -> Signed:
-    """Return the folder's own authority, made if there is none."""
+    """Return the folder's own authority; create it if there is none."""
     path, key_path = folder / "ca.pem", folder / "ca-key.pem"
     if not path.exists():
         key = ec.generate_private_key(ec.SECP256R1())
         name = f"pyrcal bench {datetime.now(UTC):%Y-%m-%d %H:%M}"
-        builder = _builder(name, _named(name), key, AUTHORITY_DAYS).add_extension(
+        builder = _builder(name, _make_name(name), key, AUTHORITY_DAYS).add_extension(
             x509.BasicConstraints(ca=True, path_length=0), critical=True
         )
         _write(folder, "ca", Signed(certificate=builder.sign(key, hashes.SHA256()), key=key))
@@ -102,8 +102,10 @@ def _authority(folder: Path) -> Signed:
     return Signed(certificate=certificate, key=private)
 
 
-def _signed_by(authority: Signed, role: LinkRole, hosts: tuple[str, ...], days: float) -> Signed:
-    """Return a certificate of a role; the service's alone is one that may be connected to."""
+def _make_certificate(
+    authority: Signed, role: LinkRole, hosts: tuple[str, ...], days: float
+) -> Signed:
+    """Return a certificate of a role; only the service's accepts connections."""
     key = ec.generate_private_key(ec.SECP256R1())
     serves = role is LinkRole.SERVICE
     usages = [Usage.CLIENT_AUTH, *([Usage.SERVER_AUTH] if serves else [])]
@@ -124,7 +126,7 @@ def _builder(
     now = datetime.now(UTC)
     return (
         x509.CertificateBuilder()
-        .subject_name(_named(name))
+        .subject_name(_make_name(name))
         .issuer_name(issuer)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
@@ -133,7 +135,7 @@ def _builder(
     )
 
 
-def _named(common_name: str) -> x509.Name:
+def _make_name(common_name: str) -> x509.Name:
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
 
 
@@ -158,7 +160,7 @@ def _write_secret(path: Path, data: bytes) -> None:
 
 
 def _write_settings(folder: Path, role: LinkRole, host: str, port: int) -> None:
-    """Write what a program of this role is started with, and zenoh's own for any other."""
+    """Write the start settings of a role's program, and zenoh's own for other programs."""
     own, key = folder / f"{role}.pem", folder / f"{role}-key.pem"
     ca, endpoint = folder / "ca.pem", f"tls/{host}:{port}"
     others = [str(folder / f"{other}.pem") for other in LinkRole if other is not role]

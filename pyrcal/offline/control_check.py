@@ -133,7 +133,7 @@ def check_control(
         beyond = min(n_most, 2 * stable + 1)
         left = plant - synthetic
         level = noise_sigma(left) if noise is None else noise[order] / gains[order]
-        # no column has more noise than is left over there
+        # the noise of a column cannot exceed its residual
         level = np.minimum(level, np.sqrt(np.mean(left**2, axis=0)))
         added = level * np.random.default_rng(0).standard_normal(synthetic.shape)
         noise_limited = _Loops(synthetic, synthetic + added, gain).radius(beyond) >= 1.0
@@ -204,7 +204,7 @@ class _Loops:
         form = (vectors.conj().T @ vectors) * (back @ back.conj().T).T
         rejected = 1.0 / (1.0 + integrator[:, None] * eigenvalues)
         power = np.einsum("fi,ij,fj->f", rejected.conj(), form, rejected, optimize=True).real / n
-        # combinations that the inverse leaves out are not controlled by either
+        # truncated combinations are controlled by neither reconstructor
         ideal = (np.abs(1.0 / (1.0 + integrator)) ** 2 * (n - n_left_out) + n_left_out) / n
         return float(np.sqrt((power @ spectrum) / (ideal @ spectrum)))
 
@@ -217,7 +217,7 @@ def _most_stable(loops: _Loops, n_most: int) -> int:
         return n_most
     most, fewest_unstable = 0, min(unstable)
     while fewest_unstable - most > max(1.0, RESOLUTION * most):
-        # halfway in the logarithm: few modes take hardly any time
+        # bisect in the logarithm: loops with few modes are cheap to check
         middle = max(most + 1, round(float(np.sqrt(most * fewest_unstable))))
         middle = min(middle, fewest_unstable - 1)
         if loops.radius(middle) < 1.0:

@@ -182,7 +182,7 @@ class Normals:
         sigma = np.sqrt((n_clusters - 1) / n_clusters * spread)
         return np.linalg.solve(every, scored)[:4], sigma
 
-    def distorted(self, inside: NDArray[np.bool_], held: Array, field: Array) -> Array:
+    def solve_displacement(self, inside: NDArray[np.bool_], held: Array, field: Array) -> Array:
         """Return the change of selected parts by a displacement of each slope ``(n_parts, 2)``."""
         normals = self.normals[inside]
         along = np.einsum("ski,si->k", normals[:, :, :2], field[inside])
@@ -267,19 +267,21 @@ class SetComparison:
         """Yield partitions of the modes; ``parts`` are the normal equations of each mode."""
         every = np.ones(len(self.regions), dtype=bool)
         for words, labels in partitions.items():
-            with suppress(np.linalg.LinAlgError):  # a set that determines nothing is left out
+            with suppress(np.linalg.LinAlgError):  # skip sets that do not determine a registration
                 sets = []
                 for number in np.unique(labels):
                     inside = labels == number
                     step, sigma = parts.leave_one_out(inside, self.held, self.pull)
                     moved = np.zeros(4)
+                    # sets of actuators respond in different parts of the pupil, so errors of one
+                    # region and a distortion of the mirror move them apart
                     if words in ACTUATORS:
                         by_row = Normals.of_rows(self.seen, self.regions, inside)
                         _, common = by_row.leave_one_out(every, self.held, self.pull)
                         sigma = np.hypot(sigma, common)
-                        moved = by_row.distorted(every, self.held, self.distortion.field)
+                        moved = by_row.solve_displacement(every, self.held, self.distortion.field)
                     sets.append((step, self._at_least_noise(sigma, parts, inside), moved))
-                yield self._compared(words, labels, sets, parts)
+                yield self._make_sets(words, labels, sets, parts)
 
     def of_rows(
         self, partitions: Mapping[str, Labels], parts: Normals, by_mode: Normals
@@ -301,15 +303,15 @@ class SetComparison:
                     rest = rest.without(own)
                     _, single = own.leave_one_out(every, self.held, self.pull)
                     sigma = self._at_least_noise(np.hypot(sigma, single), parts, inside)
-                    moved = parts.distorted(inside, self.held, self.distortion.field)
+                    moved = parts.solve_displacement(inside, self.held, self.distortion.field)
                     sets.append((step, sigma, moved))
-                yield self._compared(words, labels, sets, parts)
+                yield self._make_sets(words, labels, sets, parts)
 
     def _at_least_noise(self, sigma: Array, parts: Normals, inside: NDArray[np.bool_]) -> Array:
         spread = np.linalg.inv(parts.normals[inside].sum(axis=0) + self.held)
         return np.maximum(sigma, np.sqrt(np.diag(spread)[:4] * self.noise))
 
-    def _compared(
+    def _make_sets(
         self, words: str, labels: Labels, sets: list[tuple[Array, Array, Array]], parts: Normals
     ) -> DisjointSets:
         steps, sigma, distorted = (np.array(values) for values in zip(*sets, strict=True))
@@ -333,6 +335,7 @@ def jackknife_sigma(partitions: Sequence[DisjointSets]) -> Array:
         return np.zeros(4)
     squares = np.array([one.jackknife**2 for one in found])
     tensions = np.array([one.straight_tension for one in found])
+    # a significant difference may not be averaged away by partitions that cannot show it
     alone = np.where(tensions > SIGNIFICANT, squares, 0.0).max(axis=0)
     return np.asarray(np.sqrt(np.maximum(squares.mean(axis=0), alone)))
 

@@ -40,7 +40,7 @@ _MODES_ACROSS, _SCANS_ACROSS = 2, 5
 
 
 def check_plots(what: str = "--plot") -> None:
-    """Refuse to begin where figures cannot be drawn; ``what`` asks for one.
+    """Raise if figures cannot be plotted; ``what`` names the figure.
 
     Raises
     ------
@@ -155,10 +155,10 @@ def registration(axes: Axes, fit: Fit, instrument: Instrument) -> None:
         vmax=1.0,
     )
     points, style = mirror_outline(instrument)
-    here = landed(points, fit.alpha)
+    here = map_to_sensor(points, fit.alpha)
     axes.plot(here[:, 0], here[:, 1], style, color=MEASURED, markersize=3.0, linewidth=1.0)
-    centre = landed(np.zeros((1, 2)), fit.alpha)[0]
-    arm = landed(np.array([[edge / 2, 0.0]]), fit.alpha)[0]
+    centre = map_to_sensor(np.zeros((1, 2)), fit.alpha)[0]
+    arm = map_to_sensor(np.array([[edge / 2, 0.0]]), fit.alpha)[0]
     axes.annotate("", xy=arm, xytext=centre, arrowprops={"arrowstyle": "->", "color": "black"})
     axes.set(
         title="mirror over subapertures; its x axis as arrow",
@@ -169,12 +169,12 @@ def registration(axes: Axes, fit: Fit, instrument: Instrument) -> None:
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
 
 
-def landed(points: Array, alpha: Misregistration) -> Array:
+def map_to_sensor(points: Array, alpha: Misregistration) -> Array:
     """Return where points of the mirror ``(n, 2)`` fall on the sensor, in subapertures."""
     return np.asarray(points @ alpha.image.T + alpha.vector[:2])
 
 
-def _shown(fit: Fit) -> str:
+def _panel_title(fit: Fit) -> str:
     return "Sx | Sy" if fit.order.kind is SignalKind.XY else "four images"
 
 
@@ -188,12 +188,12 @@ def residual(axes: Axes, fit: Fit) -> None:
         places = x + n * (planes % 2), y + n * (planes // 2)
         axes.plot(*places, "o", color="tab:red", fillstyle="none", markersize=9.0)
     _draw_arms(axes, fit)
-    axes.set(title=f"left over: {_shown(fit)}, % of the measured RMS", xticks=[], yticks=[])
+    axes.set(title=f"left over: {_panel_title(fit)}, % of the measured RMS", xticks=[], yticks=[])
     axes.figure.colorbar(image, ax=axes, shrink=0.7)
 
 
 def _draw_arms(axes: Axes, fit: Fit) -> None:
-    """Draw the lines along which more is left over, in the first plane."""
+    """Plot the lines with an increased residual, in the first plane."""
     if fit.left_over is None:
         return
     middle, half = (len(fit.valid) - 1) / 2, len(fit.valid) / 2
@@ -237,11 +237,11 @@ def slope_maps(figure: SubFigure, fit: Fit) -> None:
     for axes in triples[len(columns) :].ravel():
         axes.set_axis_off()
     for axes, name in zip(places[0], _COLUMNS * _MODES_ACROSS, strict=True):
-        axes.set_title(f"{name}: {_shown(fit)}", fontsize="small")
+        axes.set_title(f"{name}: {_panel_title(fit)}", fontsize="small")
 
 
 def _rows(shown: Sized, across: int) -> int:
-    """Return how many rows hold the figures."""
+    """Return the number of rows of figures."""
     return math.ceil(len(shown) / across)
 
 
@@ -283,7 +283,7 @@ def _scan(axes: Axes, scan: ScanStep, number: int) -> None:
 PAPER_MODES = (1, 5, 10, 50, 100, 200, 300, 350, 400)
 """Modes the paper shows, counted from 1 as it does."""
 
-MAPS = 4
+N_MAPS = 4
 """Number of modes whose slope maps are sent to a browser."""
 
 
@@ -295,7 +295,7 @@ def numbers(fit: Fit) -> dict[str, Any]:
     three times the mode's own RMS, clipped there.
     """
     shown = shown_modes(fit)
-    picked = shown[np.unique(np.linspace(0, len(shown) - 1, MAPS).round().astype(int))]
+    picked = shown[np.unique(np.linspace(0, len(shown) - 1, N_MAPS).round().astype(int))]
     singular = {name: _plain(values, 5) for name, values in singular_values_of(fit).items()}
     return {
         "modes": fit.modes.tolist(),
@@ -318,7 +318,7 @@ def singular_values_of(fit: Fit) -> dict[str, Array]:
 def shown_modes(fit: Fit) -> NDArray[np.intp]:
     """Return the columns of the fit that are shown: the paper's modes, if they were used."""
     found = np.flatnonzero(np.isin(fit.modes + 1, PAPER_MODES))
-    return found if len(found) else np.arange(min(len(fit.modes), MAPS))
+    return found if len(found) else np.arange(min(len(fit.modes), N_MAPS))
 
 
 def _of_mode(fit: Fit, column: int) -> tuple[Array, Array, float]:

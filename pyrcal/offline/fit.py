@@ -1,4 +1,4 @@
-"""``pyrcal fit``: from a matrix on disk to a registration and a verdict."""
+"""``pyrcal fit``: fit the registration of a matrix in a file, and print a verdict."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def main(options: argparse.Namespace) -> int:
         check_plots()
     instrument = load_instrument(options.instrument)
     light = _light(options, instrument)
-    asked = FitOptions(
+    fit_options = FitOptions(
         method=Method(options.method),
         modes=options.modes,
         start=options.start,
@@ -49,7 +49,7 @@ def main(options: argparse.Namespace) -> int:
     report = fit_file(
         instrument,
         options.reference,
-        asked,
+        fit_options,
         dataset=options.dataset,
         threads=options.threads,
         memory_gb=options.memory_gb,
@@ -76,6 +76,6 @@ def _light(options: argparse.Namespace, instrument: Instrument) -> SeenLight | N
         return read_light(options.flux_map, instrument, reference)
     if reference is not None:
         raise ConfigurationError(
-            "found a reference for the light and no light, expected --flux-map beside it"
+            "found a reference for the light and no light, expected --flux-map as well"
         )
     return None

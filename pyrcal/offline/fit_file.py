@@ -1,4 +1,4 @@
-"""Fit a matrix in memory or in a file: one way for library, command line and REST."""
+"""Fit a matrix in memory or in a file, for the library, the command line and REST."""
 
 from __future__ import annotations
 
@@ -95,12 +95,12 @@ def fit(
         where="matrix",
         sha256="",
     )
-    reference, notes = reference_of(recorded, instrument)
+    reference, notes = make_reference(recorded, instrument)
     if reference.noise is not None and len(reference.noise) != n_modes:
         raise MatrixError(
             f"noise: found {len(reference.noise)} numbers, expected one for each of {n_modes} modes"
         )
-    found = _fitted(instrument, recorded, reference, options or FitOptions(), threads=threads)
+    found = _fit_recorded(instrument, recorded, reference, options or FitOptions(), threads=threads)
     return replace(found, remarks=(*notes, *found.remarks))
 
 
@@ -134,8 +134,8 @@ def fit_file(
 ) -> FitReport:
     """Return the fit of the measured matrix in a file.
 
-    ``basis`` are the instrument's modes; None: from the cache on disk, or made here.
-    What would take more than ``memory_gb`` is refused before it is fitted; None: it is not asked.
+    ``basis`` are the instrument's modes; None to use the disk cache or to compute them. A fit that
+    would take more than ``memory_gb`` is rejected before it starts; None for no limit.
 
     Raises
     ------
@@ -145,12 +145,12 @@ def fit_file(
         If the optical model cannot work with the instrument or the options.
     """
     recorded = read_recorded(Path(path), dataset)
-    reference, notes = reference_of(recorded, instrument)
+    reference, notes = make_reference(recorded, instrument)
     if memory_gb is not None:
         n_modes = len(reference.columns if options.modes is None else options.modes)
         check_fit(instrument, n_modes, memory_gb, gain_map=options.gain_map)
     begun = time.perf_counter()
-    found = _fitted(
+    found = _fit_recorded(
         instrument, recorded, reference, options, threads=threads, basis=basis, progress=progress
     )
     return FitReport(
@@ -166,7 +166,7 @@ def fit_file(
     )
 
 
-def _fitted(
+def _fit_recorded(
     instrument: Instrument,
     recorded: Recorded,
     reference: Reference,
@@ -176,25 +176,25 @@ def _fitted(
     basis: Basis | None = None,
     progress: Progress | None = None,
 ) -> Fit:
-    """Return the fit with its alternatives, the work shared by threads."""
-    tell = progress or (lambda _: None)
+    """Return the fit with its alternatives, with the work distributed over threads."""
+    report_stage = progress or (lambda _: None)
     options = replace(options, explain=True)
     # BLAS keeps to one thread: nested threading made a fit seven times slower
     with threadpool_limits(1), ThreadPoolExecutor(threads) as pool:
         mapper: Mapper = pool.map if threads > 1 else map
         try:
             if basis is None:
-                tell("modes")
+                report_stage("modes")
                 basis = cached_basis(instrument)
             return fit_matrix(
-                instrument, reference, options, basis=basis, mapper=mapper, progress=tell
+                instrument, reference, options, basis=basis, mapper=mapper, progress=report_stage
             )
         except MatrixError as error:
             text = str(error).removeprefix("reference: ")
             raise MatrixError(f"{recorded.where}: {text}") from error
 
 
-def reference_of(recorded: Recorded, instrument: Instrument) -> tuple[Reference, tuple[str, ...]]:
+def make_reference(recorded: Recorded, instrument: Instrument) -> tuple[Reference, tuple[str, ...]]:
     """Return the matrix to be fitted, and the decisions made on the way.
 
     Raises
@@ -229,7 +229,7 @@ def reference_of(recorded: Recorded, instrument: Instrument) -> tuple[Reference,
 def _slopes(
     recorded: Recorded, instrument: Instrument
 ) -> tuple[NDArray[np.float64], tuple[str, ...]]:
-    """Return the measured slopes, cut from detector frames if need be, and remarks on these."""
+    """Return the measured slopes, extracted from detector frames if necessary, and notes."""
     found = f"{recorded.where}: found shape {recorded.values.shape}"
     if instrument.frames is None:
         if recorded.values.ndim == 3:
@@ -244,7 +244,7 @@ def _slopes(
         )
     if recorded.flux_frame is None:
         raise MatrixError(
-            f"{recorded.where}: found no {FLUX_FRAME} beside it, expected a mean detector frame "
+            f"{recorded.where}: found no {FLUX_FRAME} next to it, expected a mean detector frame "
             "(ny, nx) in the same counts"
         )
     kind, flux_frame = kind_of(instrument), recorded.flux_frame

@@ -20,7 +20,7 @@ from pyrcal.offline.system import SHIFTS, Pair, System
 from pyrcal.offline.system_figures import write_system_sheet
 from pyrcal.offline.system_file import load_system
 from pyrcal.offline.system_fit import SystemFit, fit_system
-from pyrcal.offline.system_report import UNLIKELY, SystemReport, document, fill_system, table
+from pyrcal.offline.system_report import MIN_PROBABILITY, SystemReport, document, fill_system, table
 from pyrcal.terminal import show_progress
 from service.errors import MatrixError, PyrcalError
 from service.files.container import DATASET, opened
@@ -51,10 +51,10 @@ def main(options: argparse.Namespace) -> int:
         check_plots()
     system = load_system(options.system)
     stored = dict(
-        zip(system.pairs, matrices_of(system, options.reference, options.dataset), strict=True)
+        zip(system.pairs, locate_matrices(system, options.reference, options.dataset), strict=True)
     )
     report = fit_pairs(
-        system, lambda pair, about: _fitted(system, pair, about, stored[pair], options.threads)
+        system, lambda pair, about: _fit_pair(system, pair, about, stored[pair], options.threads)
     )
     print(json_text(document(report)) if options.json else table(report))
     if options.output is not None:
@@ -73,32 +73,33 @@ def fit_pairs(system: System, fit: Callable[[Pair, Instrument], FitReport]) -> S
     fit is kept if a pair that was accepted is refused with the displaced pupil.
     """
     fits = {pair: fit(pair, system.instrument(pair)) for pair in system.pairs}
-    found = _found(system, fits, _telling(fits))
+    found = _fit_positions(system, fits, _select_pairs(fits))
     for number, sensor in enumerate(system.sensors):
         if found is None or sensor.instrument.stop is Stop.MIRROR:
             break
         shift = found.values[system.of_sensor(number)][SHIFTS]
         off = np.hypot(*(shift - [sensor.place.shift.real, sensor.place.shift.imag]))
-        if off < PUPIL_SUBAP or _disagree(found, PUPIL_EFFECT * float(off)):
+        if off < PUPIL_SUBAP or _pairs_disagree(found, PUPIL_EFFECT * float(off)):
             continue
         again: dict[Pair, FitReport] = {}
         for pair in (pair for pair in system.pairs if pair.sensor == number):
             about = replace(system.instrument(pair), pupil_shift_subap=tuple(shift.tolist()))
             again[pair] = fit(pair, about)
+        # a displaced pupil that makes an accepted pair fail is not the true one
         if all(one.fit.accepted or not fits[pair].fit.accepted for pair, one in again.items()):
             fits |= again
     accepted = np.array([one.fit.accepted for one in fits.values()])
-    found = _found(system, fits, accepted)
+    found = _fit_positions(system, fits, accepted)
     return SystemReport(system=system, fits=tuple(fits.values()), found=found)
 
 
-def _disagree(found: SystemFit, by_subap: float) -> bool:
+def _pairs_disagree(found: SystemFit, by_subap: float) -> bool:
     """Return True if pairs differ significantly, and in shift by more than ``by_subap``."""
     apart = np.abs(found.misfit[:, SHIFTS])
-    return found.probability < UNLIKELY and bool(np.nanmax(apart) > by_subap)
+    return found.probability < MIN_PROBABILITY and bool(np.nanmax(apart) > by_subap)
 
 
-def _telling(fits: dict[Pair, FitReport]) -> NDArray[np.bool_]:
+def _select_pairs(fits: dict[Pair, FitReport]) -> NDArray[np.bool_]:
     """Return the pairs that determine the pupil's position.
 
     These are the accepted ones, or the converged ones of a sensor without an accepted pair: a
@@ -113,7 +114,7 @@ def _telling(fits: dict[Pair, FitReport]) -> NDArray[np.bool_]:
     )
 
 
-def _found(
+def _fit_positions(
     system: System, fits: dict[Pair, FitReport], used: NDArray[np.bool_]
 ) -> SystemFit | None:
     """Return the fit of the system from the used pairs; None if none is used."""
@@ -130,7 +131,7 @@ class StoredMatrix(NamedTuple):
     dataset: str
 
 
-def matrices_of(system: System, reference: Path, dataset: str | None) -> list[StoredMatrix]:
+def locate_matrices(system: System, reference: Path, dataset: str | None) -> list[StoredMatrix]:
     """Return the file and data set of each pair's matrix, in the order of ``system.pairs``.
 
     ``{sensor}`` and ``{mirror}`` in the file's name and in the data set's name are replaced by
@@ -173,7 +174,7 @@ def _check_there(stored: StoredMatrix, names: str) -> None:
             )
 
 
-def _fitted(
+def _fit_pair(
     system: System, pair: Pair, about: Instrument, stored: StoredMatrix, threads: int
 ) -> FitReport:
     names = " x ".join(system.names(pair))
@@ -194,7 +195,7 @@ def _fitted(
         return report
     mirror = system.mirrors[pair.mirror].instrument.analytic_mirror
     outside = (
-        f"{len(mirror.positions_m) - len(lit)} of {len(mirror.positions_m)} actuators lie outside "
+        f"{len(mirror.positions_m) - len(lit)} of {len(mirror.positions_m)} actuators are outside "
         "the star's light"
     )
     return replace(report, notes=(*report.notes, outside))

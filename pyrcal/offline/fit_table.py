@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.alternatives import PLAUSIBLE_DISPLACEMENT_PX, moved_words, systematic_terms
+from pyrcal.offline.alternatives import PLAUSIBLE_DISPLACEMENT_PX, format_move, systematic_terms
 from pyrcal.offline.fitted import Fit
 from pyrcal.offline.methods import ScanStep
 from pyrcal.offline.report import FitReport, orientation_words, verdict_line
@@ -26,9 +26,9 @@ _ROWS = (
 _FAR_GAIN = 0.2
 """Relative distance of a gain from the median above which the mode is listed."""
 
-_NAMED = 8
+_MAX_LISTED = 8
 
-_TERMS = 3
+_MAX_TERMS = 3
 """Number of alternatives in the systematic part of σ that are listed."""
 
 
@@ -38,25 +38,25 @@ def table(report: FitReport) -> str:
     lines = [
         *([fit.recommendation] if fit.recommendation else []),
         verdict_line(fit),
-        *_two_verdicts(fit),
+        *_verdict_lines(fit),
         "",
-        *_registration(fit),
+        *_registration_lines(fit),
         "",
-        *_basis(report),
-        *_extras(fit),
-        *(f"note: {note}" for note in report.notes if not _said_before(note, fit)),
+        *_basis_lines(report),
+        *_extra_lines(fit),
+        *(f"note: {note}" for note in report.notes if not _repeats_findings(note, fit)),
     ]
     return "\n".join(shown(line) for line in lines)
 
 
-def _two_verdicts(fit: Fit) -> Iterator[str]:
+def _verdict_lines(fit: Fit) -> Iterator[str]:
     if fit.registration is not None:
         yield f"registration: {'' if fit.registration.determined else 'not '}determined"
     if fit.reconstructor is not None:
         yield f"reconstructor: {fit.reconstructor.reason}"
 
 
-def _said_before(note: str, fit: Fit) -> bool:
+def _repeats_findings(note: str, fit: Fit) -> bool:
     """Return True if a note repeats the line of the quantities that were found."""
     keys = [one.key for one in fit.origins if one.correct]
     return any(
@@ -66,7 +66,7 @@ def _said_before(note: str, fit: Fit) -> bool:
     )
 
 
-def _registration(fit: Fit) -> Iterator[str]:
+def _registration_lines(fit: Fit) -> Iterator[str]:
     found = fit.registration
     parts = () if found is None else (found.sigma_statistical, found.sigma_systematic)
     columns = ("value", "1 sigma", *(("statistical", "systematic") if parts else ()), "subsets")
@@ -89,25 +89,25 @@ def _number(value: float, decimals: int) -> str:
     return f"{value:12.{decimals}f}" if np.isfinite(value) else f"{'-':>12s}"
 
 
-def _basis(report: FitReport) -> Iterator[str]:
+def _basis_lines(report: FitReport) -> Iterator[str]:
     fit = report.fit
     yield f"{'residual':20s}{100.0 * fit.residual_fraction:.2f} % of the measured slopes"
-    yield from _where_left(fit)
-    yield f"{'modes used':20s}{len(fit.modes)} ({_spans(fit)})"
+    yield from _residual_lines(fit)
+    yield f"{'modes used':20s}{len(fit.modes)} ({_format_ranges(fit)})"
     for sentence in fit.left_out:
         yield f"{'left out':20s}{sentence}"
-    yield f"{'gains':20s}{_gains(fit)}"
+    yield f"{'gains':20s}{_format_gains(fit)}"
     yield f"{'condition number':20s}{fit.condition_number:.2f}"
-    yield f"{'slopes':20s}{_as_written(fit)}"
-    yield from _not_told(fit)
-    yield from _alternatives(fit)
+    yield f"{'slopes':20s}{_format_slopes(fit)}"
+    yield from _finding_lines(fit)
+    yield from _alternative_lines(fit)
     yield f"{'double pass':20s}{'yes' if report.double_pass else 'no'}"
     yield f"{'method':20s}{report.method}, {fit.n_evaluations} matrices, {report.seconds:.1f} s"
     yield f"{'reference':20s}{report.reference}"
     yield f"{'instrument':20s}{report.instrument}"
 
 
-def _where_left(fit: Fit) -> Iterator[str]:
+def _residual_lines(fit: Fit) -> Iterator[str]:
     left = fit.left_over
     if left is None:
         return
@@ -117,17 +117,17 @@ def _where_left(fit: Fit) -> Iterator[str]:
         yield f"{'':20s}{left.words}"
 
 
-def _not_told(fit: Fit) -> Iterator[str]:
+def _finding_lines(fit: Fit) -> Iterator[str]:
     """Yield the quantities that the matrix determined, except the orientation."""
     words = [one.words for one in fit.origins if one.correct and one.key != "orientation"]
     if words:
-        yield f"{'found, not told':20s}{'; '.join(words)}"
+        yield f"{'determined by fit':20s}{'; '.join(words)}"
     if fit.unknown_not_found:
         keys = ", ".join(fit.unknown_not_found)
         yield f"{'unknown, not found':20s}{keys}: the matrix does not determine it"
 
 
-def _alternatives(fit: Fit) -> Iterator[str]:
+def _alternative_lines(fit: Fit) -> Iterator[str]:
     """Yield the number of alternatives, the preferred ones, and the changes of α."""
     tried = fit.alternatives
     if not tried:
@@ -135,14 +135,14 @@ def _alternatives(fit: Fit) -> Iterator[str]:
     sigma = fit.sigma
     preferred = [one for one in tried if one.preferred]
     named = f"{len(preferred)} preferred: see notes" if preferred else "none preferred"
-    yield f"{'rivals':20s}{len(tried)} tried, {named}"
+    yield f"{'alternatives':20s}{len(tried)} tried, {named}"
     open_ = [one for one in tried if one.undecided]
     weights = [one for one in tried if one.share is None]
-    for term in systematic_terms(tried, fit.residual_fraction, sigma)[:_TERMS]:
+    for term in systematic_terms(tried, fit.residual_fraction, sigma)[:_MAX_TERMS]:
         one = term.alternative
-        yield f"{'  in systematic':20s}{one.words}: {moved_words(one.moved)}"
+        yield f"{'  in systematic':20s}{one.words}: {format_move(one.moved)}"
     for words, group in (
-        ("not excluded: would move it by up to", open_),
+        ("not excluded: would move alpha by up to", open_),
         ("other weights and modes: by up to", weights),
     ):
         if group:
@@ -165,7 +165,7 @@ def displacement_words(offsets_px: NDArray[np.float64]) -> str:
     return f"image_offsets_px = [{places}]"
 
 
-def _as_written(fit: Fit) -> str:
+def _format_slopes(fit: Fit) -> str:
     """Return order and orientation as ``[slopes]`` of the instrument file has them."""
     words = orientation_words(fit.orientation, fit.order)
     order = words.pop("order")
@@ -173,7 +173,7 @@ def _as_written(fit: Fit) -> str:
     return f'order = "{order}", orientation = {{ {axes} }}'
 
 
-def _extras(fit: Fit) -> Iterator[str]:
+def _extra_lines(fit: Fit) -> Iterator[str]:
     listed = {one.key for one in fit.origins if one.correct}
     for one in fit.optics:
         if one.found is not None and one.key not in listed:
@@ -182,8 +182,8 @@ def _extras(fit: Fit) -> Iterator[str]:
             yield f"{one.key + ' ':20s}{words} (the instrument file says {stated})"
     if fit.anamorphosis_sigma is not None:
         words = _anamorphosis(fit.alpha.stretches, fit.anamorphosis_sigma)
-        told = "" if fit.anamorphosis is not None else "not observable with these modes: "
-        yield f"{'anamorphosis':20s}{told}{words}"
+        caveat = "" if fit.anamorphosis is not None else "not observable with these modes: "
+        yield f"{'anamorphosis':20s}{caveat}{words}"
     places = fit.image_offsets_px
     if places is not None and np.abs(places).max() > NOTABLE_DISPLACEMENT_PX:
         plausible = np.abs(places).max() < PLAUSIBLE_DISPLACEMENT_PX
@@ -214,20 +214,22 @@ def paper_lines(steps: tuple[ScanStep, ...]) -> Iterator[str]:
         )
 
 
-def _spans(fit: Fit) -> str:
+def _format_ranges(fit: Fit) -> str:
     """Return the modes as ranges, ends included."""
     modes = np.sort(fit.modes)
     runs = np.split(modes, np.flatnonzero(np.diff(modes) > 1) + 1)
-    words = [f"{run[0]}" if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs[:_NAMED]]
-    return ", ".join(words) + (", ..." if len(runs) > _NAMED else "")
+    words = [
+        f"{run[0]}" if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs[:_MAX_LISTED]
+    ]
+    return ", ".join(words) + (", ..." if len(runs) > _MAX_LISTED else "")
 
 
-def _gains(fit: Fit) -> str:
+def _format_gains(fit: Fit) -> str:
     low, middle, high = np.percentile(fit.gains, [5.0, 50.0, 95.0])
     text = f"median {middle:.3g}, 90 % of them within {low:.3g} to {high:.3g}"
     far = fit.modes[np.abs(fit.gains / middle - 1.0) > _FAR_GAIN]
     if len(far):
-        named = ", ".join(str(mode) for mode in far[:_NAMED])
-        more = f" and {len(far) - _NAMED} more" if len(far) > _NAMED else ""
+        named = ", ".join(str(mode) for mode in far[:_MAX_LISTED])
+        more = f" and {len(far) - _MAX_LISTED} more" if len(far) > _MAX_LISTED else ""
         text += f"; more than {100 * _FAR_GAIN:.0f} % off: mode {named}{more}"
     return text

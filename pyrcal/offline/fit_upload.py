@@ -40,7 +40,7 @@ class Upload:
     """The measured matrix."""
 
     instrument: Path | None
-    """The instrument file; None: it came alone."""
+    """Instrument file; None if the matrix was uploaded alone."""
 
 
 def open_upload(upload: Path, folder: Path, reference: str | None, max_bytes: int) -> Upload:
@@ -53,7 +53,7 @@ def open_upload(upload: Path, folder: Path, reference: str | None, max_bytes: in
     folder
         Where files of an archive go.
     reference
-        Name of the measured file in an archive; None: the only one that can be it.
+        Name of the measured file in an archive; None for the only possible one.
     most_bytes
         Of all files of an archive together.
 
@@ -77,14 +77,16 @@ def open_upload(upload: Path, folder: Path, reference: str | None, max_bytes: in
     for name in names:
         check_sealed(folder / name)
     instrument = folder / _only_toml(names)
-    referred = set(_referred(instrument))
+    referred = set(_list_references(instrument))
     for name in sorted(referred - set(names)):
         raise ConfigurationError(
             f"{instrument.name}: refers to {name}, expected a file of the archive: "
             f"{', '.join(names)}"
         )
     left = [name for name in names if name not in referred and name != instrument.name]
-    return Upload(reference=folder / _measured(left, names, reference), instrument=instrument)
+    return Upload(
+        reference=folder / _choose_measured(left, names, reference), instrument=instrument
+    )
 
 
 def _only_toml(names: list[str]) -> str:
@@ -94,7 +96,7 @@ def _only_toml(names: list[str]) -> str:
     return tomls[0]
 
 
-def _measured(left: list[str], names: list[str], reference: str | None) -> str:
+def _choose_measured(left: list[str], names: list[str], reference: str | None) -> str:
     """Return the name of the measured file: the requested one, or the only one in ``left``."""
     chosen = reference if reference is not None else left[0] if len(left) == 1 else None
     if chosen is None or chosen not in names:
@@ -128,25 +130,25 @@ def _unpack(archive: zipfile.ZipFile, folder: Path, max_bytes: int) -> list[str]
     return names
 
 
-def _referred(instrument: Path) -> Iterator[str]:
+def _list_references(instrument: Path) -> Iterator[str]:
     """Yield every file that an instrument file refers to."""
     try:
         tables = read_toml(instrument)
     except ConfigurationError:
-        return  # whoever loads it says what is wrong
-    for text in _texts(tables):
+        return  # loading the file later reports the error
+    for text in _iterate_texts(tables):
         parts = reference_parts(text)
         if parts is not None:
             yield parts["path"]
 
 
-def _texts(value: object) -> Iterator[str]:
-    """Yield every text in a TOML file's values, however deep."""
+def _iterate_texts(value: object) -> Iterator[str]:
+    """Yield every text in a TOML file's values, at any depth."""
     if isinstance(value, str):
         yield value
     elif isinstance(value, dict | list):
         for part in value.values() if isinstance(value, dict) else value:
-            yield from _texts(part)
+            yield from _iterate_texts(part)
 
 
 def fit_upload(folder: Path, request: FitRequest) -> None:
@@ -160,10 +162,10 @@ def fit_upload(folder: Path, request: FitRequest) -> None:
     unpacked = folder / "unpacked"
     unpacked.mkdir()
 
-    def tell(stage: str) -> None:
+    def write_stage(stage: str) -> None:
         (folder / STAGE).write_text(stage, encoding="utf-8")
 
-    tell(STAGES[0])
+    write_stage(STAGES[0])
     asked = request.asked
     try:
         upload = open_upload(folder / UPLOAD, unpacked, asked["reference"], request.max_bytes)
@@ -174,12 +176,12 @@ def fit_upload(folder: Path, request: FitRequest) -> None:
             _options(asked),
             dataset=asked["dataset"],
             threads=request.threads,
-            progress=tell,
+            progress=write_stage,
         )
     except PyrcalError as error:
         text = str(error).replace(f"{unpacked}/", "").replace(f"{folder}/", "")
         raise MatrixError(text) from error
-    tell(STAGES[-1])
+    write_stage(STAGES[-1])
     report = replace(report, notes=(*report.notes, *remarks))
     own = asked["instrument"] is None and upload.instrument is None and not remarks
     _write(folder / FIGURES, {"own_instrument": own, **numbers(report.fit)})

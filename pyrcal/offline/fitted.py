@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from service.model.instrument import Instrument
 
-TOLD = 0.5
+MAX_STRETCH_SIGMA_RATIO = 0.5
 """Largest 1 σ of an anamorphosis, over its prior σ, at which the anamorphosis is reported."""
 
 
@@ -164,8 +164,10 @@ class Fit(Determination):
     def anamorphosis(self) -> NDArray[np.float64] | None:
         """``(2,)`` stretches of α; None if the modes do not determine them."""
         sigma = self.anamorphosis_sigma
-        told = sigma is not None and bool(np.all(sigma < TOLD * ANAMORPHOSIS_SIGMA))
-        return self.alpha.stretches if told else None
+        is_observable = sigma is not None and bool(
+            np.all(sigma < MAX_STRETCH_SIGMA_RATIO * ANAMORPHOSIS_SIGMA)
+        )
+        return self.alpha.stretches if is_observable else None
 
     def plot(self, instrument: Instrument | None = None) -> Figure:
         """Return the figures of this fit, as ``pyrcal fit --plot`` draws them.
@@ -178,7 +180,7 @@ class Fit(Determination):
         ConfigurationError
             If matplotlib, the extra ``plots``, is not installed.
         """
-        figures = import_module("pyrcal.offline.figures")  # it draws this record
+        figures = import_module("pyrcal.offline.figures")  # imported late: it imports this module
         heading = "" if instrument is None else instrument.name
         figure: Figure = figures.draw_sheet(self, heading, instrument)
         return figure

@@ -17,32 +17,32 @@ from service.model.modes import ModalBasis
 
 Array = NDArray[np.float64]
 
-SCATTERED = 0.06
+MIN_SCATTER = 0.06
 """Robust relative scatter of gains above which a cause is searched in each mode."""
 
-CLEARER = 0.3
+MAX_SCATTER_RATIO = 0.3
 """Largest scatter that a normalisation may leave, over the original scatter, to be the cause."""
 
-CLEAR = 0.08
+MAX_CAUSE_SCATTER = 0.08
 """Largest scatter that a normalisation may leave to be the cause."""
 
-SMOOTH = 0.05
+MAX_SMOOTH_SCATTER = 0.05
 """Largest scatter about a parabola in the logarithm of the mode number that counts as smooth."""
 
-DIMMED = 0.9
+DIMMED_GAIN = 0.9
 """Median gain below which an optical gain in residual turbulence is considered."""
 
-UNIT = 0.03
+UNIT_TOLERANCE = 0.03
 """Relative distance from a unit's factor within which the unit is reported."""
 
-_POINTS = 4000
+_N_POINTS = 4000
 """Approximate number of pupil points at which modes are evaluated."""
 
-_FEWEST = 8
+_MIN_MODES = 8
 """Smallest number of modes for which the scatter is evaluated."""
 
 
-def gain_causes(settled: Settled, *, passes: int, stroke_known: bool) -> Iterator[str]:
+def find_gain_causes(settled: Settled, *, passes: int, stroke_known: bool) -> Iterator[str]:
     """Yield likely causes of gains that are far from 1, one sentence each."""
     gains = settled.solution.projection.gains
     if len(gains) < 1 or np.any(gains <= 0.0):
@@ -53,20 +53,29 @@ def gain_causes(settled: Settled, *, passes: int, stroke_known: bool) -> Iterato
             )
         return
     if stroke_known:
-        yield from _unit(float(np.median(gains)), settled, passes)
-    if len(gains) < _FEWEST or scatter_of(gains) <= SCATTERED:
+        yield from _find_unit(float(np.median(gains)), settled, passes)
+    if len(gains) < _MIN_MODES or scatter_of(gains) <= MIN_SCATTER:
         return
-    sizes = _sizes(settled)
+    # multiplied by the norm that the modes were divided by, the gains become equal
+    sizes = _compute_norms(settled)
     apart = {words: scatter_of(gains * size) for words, size in sizes.items()}
     words = min(apart, key=lambda one: apart[one])
-    if apart[words] < min(CLEARER * scatter_of(gains), CLEAR):
+    if apart[words] < min(MAX_SCATTER_RATIO * scatter_of(gains), MAX_CAUSE_SCATTER):
         middle = float(np.median(gains * sizes[words]))
-        times = "" if abs(middle - 1.0) < UNIT or "normalised" in words else f", times {middle:.3g}"
+        times = (
+            ""
+            if abs(middle - 1.0) < UNIT_TOLERANCE or "normalised" in words
+            else f", times {middle:.3g}"
+        )
         yield (
             f"the gains go as one over {words}{times}: the matrix's modes are scaled so, the "
             "file's are not; the registration does not depend on it"
         )
-    elif stroke_known and float(np.median(gains)) < DIMMED and _smooth(gains, settled.target.modes):
+    elif (
+        stroke_known
+        and float(np.median(gains)) < DIMMED_GAIN
+        and _is_smooth(gains, settled.target.modes)
+    ):
         low, high = np.percentile(gains, [5.0, 95.0])
         yield (
             f"the gains run smoothly from {low:.2g} to {high:.2g} over the modes, as the optical "
@@ -80,7 +89,7 @@ def scatter_of(values: Array) -> float:
     return float(np.median(np.abs(logarithms - np.median(logarithms)))) * 1.4826
 
 
-def _unit(middle: float, settled: Settled, passes: int) -> Iterator[str]:
+def _find_unit(middle: float, settled: Settled, passes: int) -> Iterator[str]:
     """Yield the unit that explains a common factor of all gains."""
     wavelength_m = settled.models.instrument.wfs.wavelength_m
     radian_m = wavelength_m / (2.0 * np.pi)
@@ -94,14 +103,14 @@ def _unit(middle: float, settled: Settled, passes: int) -> Iterator[str]:
     if passes == 1:
         units["of both passes and per metre of surface: divide it by 4"] = 4.0
     for words, unit in units.items():
-        if abs(np.log(middle / unit)) < UNIT:
+        if abs(np.log(middle / unit)) < UNIT_TOLERANCE:
             yield f"the gains' median is {middle:.3g}: the matrix is {words}"
 
 
-def _sizes(settled: Settled) -> Mapping[str, Array]:
+def _compute_norms(settled: Settled) -> Mapping[str, Array]:
     """Return the norms by which modes may have been scaled, ``(n_modes,)`` each."""
     basis, points = settled.models.basis, settled.models.cheap.pupil.points
-    shapes = basis.render(points[:: 1 + len(points) // _POINTS])
+    shapes = basis.render(points[:: 1 + len(points) // _N_POINTS])
     sizes = {
         "the modes' peak to valley": np.ptp(shapes, axis=0),
         "the modes' largest value": np.abs(shapes).max(axis=0),
@@ -116,9 +125,9 @@ def _sizes(settled: Settled) -> Mapping[str, Array]:
     return sizes
 
 
-def _smooth(gains: Array, modes: NDArray[np.intp]) -> bool:
+def _is_smooth(gains: Array, modes: NDArray[np.intp]) -> bool:
     """Return True if gains are a smooth function of the mode number."""
     order = np.log1p(modes.astype(np.float64))
     logarithms = np.log(gains)
     left = logarithms - np.polyval(np.polyfit(order, logarithms, 2), order)
-    return bool(np.std(left) < SMOOTH)
+    return bool(np.std(left) < MAX_SMOOTH_SCATTER)

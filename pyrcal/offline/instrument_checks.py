@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from pyrcal.offline.disjoint_sets import SIGNIFICANT
 from pyrcal.offline.methods import Settled
-from pyrcal.offline.models import FAR_BETTER, FitModels, Optic, Other
-from pyrcal.offline.pupil_checks import Few, Lead, TriedPupil
+from pyrcal.offline.models import FAR_PREFERRED_SHARE, FitModels, InstrumentChange, Optic
+from pyrcal.offline.pupil_checks import FitSubset, Lead, TriedPupil
 from pyrcal.offline.solver import refine
 from pyrcal.offline.uncertainty import Uncertainty
 
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 COUPLING_KEY = "coupling"
 """Key of the instrument file for the width of influence functions."""
 
-NOTABLE = 0.03
+NOTABLE_CHANGE = 0.03
 """Smallest difference of a logarithm from the file's value that is reported."""
 
 MIN_EXPLAINED = 0.005
@@ -32,7 +32,7 @@ MIN_EXPLAINED = 0.005
 instrument differ by about as much: with OOPAO's own Shack-Hartmann 0.2 % is left over, and another
 stop explains 0.12 % by coincidence with model errors."""
 
-LITTLE_EXPLAINED = 0.3
+UNDECIDED_SHARE = 0.3
 """Share of χ² left by another coupling or modulation above which it may compensate something else.
 With a wrong modulation in the file less than 0.05 was left; with push-only pokes of 200 nm 0.6 was
 left."""
@@ -45,10 +45,10 @@ NOTABLE_SIGMA = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Rival:
+class AlternativeInstrument:
     """An alternative instrument that might explain the matrix."""
 
-    change: Other
+    change: InstrumentChange
     """Change of the instrument file."""
 
     lead: Lead
@@ -131,7 +131,7 @@ class FoundOptic:
     def notable(self) -> bool:
         """True if the fitted value differs significantly from the file."""
         unknown = self.found is not None and self.reported is None
-        return not unknown and abs(self.change) > max(NOTABLE, NOTABLE_SIGMA * self.sigma)
+        return not unknown and abs(self.change) > max(NOTABLE_CHANGE, NOTABLE_SIGMA * self.sigma)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -150,24 +150,26 @@ class FileValuesFit:
 
         Pokes of a tenth of a wavelength, or push-only pokes, look like another modulation.
         """
-        return self.share > LITTLE_EXPLAINED
+        return self.share > UNDECIDED_SHARE
 
 
-def rivals(settled: Settled, few: Few, pupils: tuple[TriedPupil, ...]) -> tuple[Rival, ...]:
+def compare_instruments(
+    settled: Settled, few: FitSubset, pupils: tuple[TriedPupil, ...]
+) -> tuple[AlternativeInstrument, ...]:
     """Return alternative instruments, sorted by how well each explains the matrix.
 
     Each has its own registration, coupling and sensor number, fitted to first order.
     """
 
-    def explained(lead: Lead) -> float:
+    def share_explained(lead: Lead) -> float:
         return float(settled.share * np.sqrt(max(1.0 - lead.share, 0.0)))
 
     found = [
-        Rival(
-            change=Other(words=one.words, max_misfit_ratio=FAR_BETTER),
+        AlternativeInstrument(
+            change=InstrumentChange(words=one.words, max_misfit_ratio=FAR_PREFERRED_SHARE),
             lead=one.lead,
             moved=one.moved,
-            explained=explained(one.lead),
+            explained=share_explained(one.lead),
         )
         for one in pupils
         if one.explains
@@ -176,11 +178,15 @@ def rivals(settled: Settled, few: Few, pupils: tuple[TriedPupil, ...]) -> tuple[
         matrix = few.matrix(other)
         lead = few.lead(matrix)
         moved = few.step(matrix)[:4] - few.step(few.own)[:4]
-        found.append(Rival(change=change, lead=lead, moved=moved, explained=explained(lead)))
+        found.append(
+            AlternativeInstrument(
+                change=change, lead=lead, moved=moved, explained=share_explained(lead)
+            )
+        )
     return tuple(sorted(found, key=lambda one: one.share / one.change.max_misfit_ratio))
 
 
-def doubt_of_width(settled: Settled, few: Few) -> Array:
+def estimate_width_effect(settled: Settled, few: FitSubset) -> Array:
     """Return the change of α for a width of influence functions that is not fitted, ``(4,)``.
 
     Influence functions from a table or of a thin plate have no coupling. The change enters σ only
@@ -195,7 +201,7 @@ def doubt_of_width(settled: Settled, few: Few) -> Array:
     return np.asarray(few.step(fine, wider)[:4] - few.step(fine)[:4])
 
 
-def found_optics(models: FitModels, settled: Settled, sure: Uncertainty) -> tuple[FoundOptic, ...]:
+def list_optics(models: FitModels, settled: Settled, sure: Uncertainty) -> tuple[FoundOptic, ...]:
     """Return coupling and modulation as fitted; ``models`` are of the file's instrument."""
     nuisances = settled.nuisances
     changes = nuisances.changes(settled.solution.nuisances)

@@ -8,30 +8,30 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.alternatives import border_of
+from pyrcal.offline.alternatives import find_border
 
 Array = NDArray[np.float64]
 
-STRANGE = 5.0
+OUTLIER_RATIO = 5.0
 """Residual of a subaperture or mode, over the median, above which it is listed."""
 
-LEAST = 0.1
+MIN_RESIDUAL = 0.1
 """Smallest residual that is listed, as RMS share of the signal."""
 
-LARGE = 3.0
+MIN_SLOPE_RATIO = 3.0
 """Residual of a mode in slopes, over the median, above which the mode is listed."""
 
-NAMED = 8
+MAX_LISTED = 8
 """Largest number of subapertures or modes listed."""
 
 
-RIM = 1.8
+RIM_RATIO = 1.8
 """Residual at the border over that inside, above which it is reported."""
 
-UNEVEN_PLANES = 1.25
+PLANE_RATIO = 1.25
 """Residual of one slope component over the mean of both, above which it is reported."""
 
-GRADIENT = 0.6
+MIN_GRADIENT = 0.6
 """Change of the residual across the pupil over its mean, above which it is reported."""
 
 ARM_EXCESS = 1.35
@@ -103,18 +103,18 @@ class LeftOver:
                 f"lines from the middle outwards, as the arms of a secondary make: {named} "
                 "(spiders_m, spiders_deg)"
             )
-        if self.border is not None and self.border > RIM:
+        if self.border is not None and self.border > RIM_RATIO:
             yield (
                 f"the rim leaves {self.border:.1f} times as much as the inside "
                 "(pupil_diameter_subap, valid_subapertures)"
             )
-        if len(self.planes) == 2 and max(self.planes) > UNEVEN_PLANES:
+        if len(self.planes) == 2 and max(self.planes) > PLANE_RATIO:
             worse = "x" if self.planes[0] > self.planes[1] else "y"
             yield (
                 f"S{worse} leaves {max(self.planes) / min(self.planes):.1f} times as much as the "
                 "other component"
             )
-        if np.hypot(*self.gradient) > GRADIENT:
+        if np.hypot(*self.gradient) > MIN_GRADIENT:
             angle = np.rad2deg(np.arctan2(self.gradient[1], self.gradient[0]))
             yield (
                 f"it grows by {np.hypot(*self.gradient):.0%} of its mean across the pupil towards "
@@ -124,7 +124,7 @@ class LeftOver:
     @property
     def words(self) -> str:
         """Sentence on outlying parts of the residual; empty if there are none."""
-        parts = list(self._shape_words) if self.level > LEAST else []
+        parts = list(self._shape_words) if self.level > MIN_RESIDUAL else []
         if self.subapertures:
             named = ", ".join(f"row {y} column {x}" for y, x, _ in self.subapertures)
             parts.append(
@@ -137,7 +137,7 @@ class LeftOver:
         return "; ".join(parts)
 
 
-def left_over(
+def locate_residual(
     planes: Array, by_mode: Array, *, valid: NDArray[np.bool_], modes: NDArray[np.intp], size: Array
 ) -> LeftOver:
     """Return the location of a fit's residual.
@@ -159,14 +159,14 @@ def left_over(
     squares = np.where(np.isfinite(planes), planes, 0.0) ** 2
     by_place = np.full(known.shape, np.nan)
     by_place[known] = np.sqrt(np.mean(squares, axis=0))[known]
-    border = border_of(valid)
+    border = find_border(valid)
     at_border, inside = by_place[known & border], by_place[known & ~border]
     return LeftOver(
         border=float(_rms(at_border) / _rms(inside)) if inside.any() and at_border.any() else None,
-        subapertures=tuple(_strange_places(by_place, border)),
-        modes=tuple(_strange_modes(by_mode, size, modes)),
+        subapertures=tuple(_find_outlying_places(by_place, border)),
+        modes=tuple(_find_outlying_modes(by_mode, size, modes)),
         level=_rms(by_place[known]),
-        arms=tuple(_arms(by_place)),
+        arms=tuple(_find_arms(by_place)),
         planes=_by_plane(planes),
         gradient=_gradient(by_place),
     )
@@ -191,16 +191,16 @@ def _gradient(by_place: Array) -> tuple[float, float]:
     return float(x), float(y)
 
 
-def arms_of(planes: Array) -> tuple[Arm, ...]:
+def find_arms(planes: Array) -> tuple[Arm, ...]:
     """Return the arms in a residual map ``(n_planes, n, n)``, the clearest first."""
     known = np.isfinite(planes).any(axis=0)
     by_place = np.full(known.shape, np.nan)
     squares = np.where(np.isfinite(planes), planes, 0.0) ** 2
     by_place[known] = np.sqrt(np.mean(squares, axis=0))[known]
-    return tuple(_arms(by_place)) if _rms(by_place[known]) > LEAST else ()
+    return tuple(_find_arms(by_place)) if _rms(by_place[known]) > MIN_RESIDUAL else ()
 
 
-def _arms(by_place: Array) -> list[Arm]:
+def _find_arms(by_place: Array) -> list[Arm]:
     """Return lines with an increased residual, the clearest first."""
     rows, columns = np.nonzero(np.isfinite(by_place))
     if len(rows) < _FEWEST_PLACES:
@@ -218,18 +218,20 @@ def _arms(by_place: Array) -> list[Arm]:
             on = (np.abs(left - offset) < _ARM_WIDTH) & (forward > 0.35 * radius)
             if on.sum() < _FEWEST_ALONG:
                 continue
-            # the median, so that one bad subaperture makes no arm
+            # the median, so that a single bad subaperture does not look like an arm
             mean = float(np.median(excess[on]))
-            beside = (np.abs(np.abs(left - offset) - 3.0 * _ARM_WIDTH) < _ARM_WIDTH) & (
+            neighbours = (np.abs(np.abs(left - offset) - 3.0 * _ARM_WIDTH) < _ARM_WIDTH) & (
                 forward > 0.35 * radius
             )
-            if not beside.any() or mean < ARM_EXCESS * float(np.quantile(excess[beside], 0.7)):
-                continue  # broad: no arm
+            if not neighbours.any() or mean < ARM_EXCESS * float(
+                np.quantile(excess[neighbours], 0.7)
+            ):
+                continue  # a broad feature, such as uneven light, is not an arm
             significance = (mean - 1.0) / max(scatter * 1.25 / np.sqrt(on.sum()), 1e-9)
             if mean > ARM_EXCESS and significance > ARM_SIGMA:
                 arm = Arm(angle_deg=float(angle), offset_subap=round(float(offset), 1), excess=mean)
                 found.append((significance, arm))
-    return _apart(found)
+    return _select_directions(found)
 
 
 def _excess(values: Array, away: Array) -> Array:
@@ -241,11 +243,12 @@ def _excess(values: Array, away: Array) -> Array:
     return np.asarray(values / np.where(typical > 0.0, typical, 1.0)[ring])
 
 
-def _apart(found: list[tuple[float, Arm]]) -> list[Arm]:
+def _select_directions(found: list[tuple[float, Arm]]) -> list[Arm]:
     """Return the clearest of lines with similar direction; a single line is not a spider."""
     chosen: list[Arm] = []
     for _, arm in sorted(found, key=lambda one: -one[0]):
         apart = [abs((arm.angle_deg - other.angle_deg + 180.0) % 360.0 - 180.0) for other in chosen]
+        # neighbouring trial lines cover the same subapertures
         if all(one > _ARMS_APART_DEG for one in apart):
             chosen.append(arm)
     return chosen[:MAX_ARMS] if len(chosen) >= MIN_ARMS else []
@@ -263,23 +266,29 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _strange_places(by_place: Array, border: NDArray[np.bool_]) -> list[tuple[int, int, float]]:
+def _find_outlying_places(
+    by_place: Array, border: NDArray[np.bool_]
+) -> list[tuple[int, int, float]]:
     """Return outlying subapertures, compared separately at the border and inside."""
     found = []
     for part in (border, ~border):
         values = np.where(part & np.isfinite(by_place), by_place, 0.0)
         typical = float(np.median(values[values > 0.0])) if values.any() else 0.0
-        places = np.argwhere(values > max(STRANGE * typical, LEAST))
+        places = np.argwhere(values > max(OUTLIER_RATIO * typical, MIN_RESIDUAL))
         found += [(int(y), int(x), float(by_place[y, x])) for y, x in places]
-    return sorted(found, key=lambda one: -one[2])[:NAMED]
+    return sorted(found, key=lambda one: -one[2])[:MAX_LISTED]
 
 
-def _strange_modes(shares: Array, size: Array, modes: NDArray[np.intp]) -> list[tuple[int, float]]:
+def _find_outlying_modes(
+    shares: Array, size: Array, modes: NDArray[np.intp]
+) -> list[tuple[int, float]]:
     if not np.isfinite(shares).all():
         return []
-    # actuators beyond the pupil hardly move a slope: noise is much of them and strange in none
+    # actuators outside the pupil hardly change a slope, so their large relative residual is noise
     left = shares * size
-    large = left > LARGE * float(np.median(left))
-    places = np.flatnonzero(large & (shares > max(STRANGE * float(np.median(shares)), LEAST)))
+    large = left > MIN_SLOPE_RATIO * float(np.median(left))
+    places = np.flatnonzero(
+        large & (shares > max(OUTLIER_RATIO * float(np.median(shares)), MIN_RESIDUAL))
+    )
     found = [(int(modes[k]), float(shares[k])) for k in places]
-    return sorted(found, key=lambda one: -one[1])[:NAMED]
+    return sorted(found, key=lambda one: -one[1])[:MAX_LISTED]

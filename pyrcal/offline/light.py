@@ -37,7 +37,7 @@ class SeenLight:
         """Note on the illumination for the report of the fit, one sentence."""
         (x, y), (sigma_x, sigma_y) = self.position.at, self.position.sigma
         return (
-            f"the model is lit as the flux map says; by its light alone the pupil images lie at "
+            f"the model is lit as the flux map says; from the light alone the pupil images are at "
             f"x = {x:.2f} ± {sigma_x:.2f}, y = {y:.2f} ± {sigma_y:.2f} subapertures"
             f"{self._turn_note}"
         )
@@ -117,8 +117,8 @@ def _read(
     """Return counts in the axes of conventions.md, and where they show the pupil."""
     if instrument.slopes.orientation is None:
         raise MatrixError(
-            f'{path}: found slopes.orientation = "auto", expected it written down: which way a '
-            "flux map lies it does not show; fit without it once, and copy what was found"
+            f'{path}: found slopes.orientation = "auto", expected a stated orientation: a '
+            "flux map does not show its own; fit without it once, and copy the orientation found"
         )
     with opened(path) as container:
         stored = container.find(FLUX)

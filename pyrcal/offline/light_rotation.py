@@ -25,7 +25,7 @@ _MIN_CORRELATION = 0.3
 """Correlation below which the two maps have no common structure. Diffraction leaves narrow arms
 0.4; a pupil without arms reaches 0.2."""
 
-_RIVAL = 0.85
+_MAX_PEAK_RATIO = 0.85
 """Correlation of another rotation over the best one above which the result is ambiguous."""
 
 _APART_DEG = 10.0
@@ -106,17 +106,17 @@ def find_rotation(
             f"rotation: found light {light.shape} and its mask {known.shape}; expected the same "
             "square map"
         )
-    # beyond half a turn, so that its end is a rotation like any other
+    # slightly beyond half a turn, so that a peak at 180 deg has neighbours on both sides
     limit = min(np.rad2deg(within_rad), 180.0 + _APART_DEG / 2)
     angles = np.arange(-limit, limit + _STEP_DEG / 2, _STEP_DEG)
     if isinstance(reference, Arms):
         template, smooth = reference.light(len(light) + 2), _smooth_shapes(known, 3)
     else:
         template, smooth = reference.intensity, _smooth_shapes(known, 0)
-    seen = _without(light[known], smooth)
+    seen = _remove_shapes(light[known], smooth)
     turned = np.array(
         [
-            _without(_turned(template, known, position, angle), smooth)
+            _remove_shapes(_rotate_reference(template, known, position, angle), smooth)
             for angle in np.deg2rad(angles)
         ]
     )
@@ -156,18 +156,18 @@ def _refusal(angles: Array, correlation: Array, best: int) -> str:
     apart = np.abs((angles - angles[best] + 180.0) % 360.0 - 180.0)
     peak = np.r_[False, np.diff(np.sign(np.diff(correlation))) < 0, False]
     rivals = np.where(peak & (apart >= _APART_DEG), correlation, -1.0)
-    if rivals.max() > _RIVAL * highest:
+    if rivals.max() > _MAX_PEAK_RATIO * highest:
         other = angles[int(np.argmax(rivals))]
         return (
             f"ambiguous: rotations of {angles[best]:.0f} and {other:.0f} deg explain the light "
-            "equally well; say within which range it lies"
+            "equally well; give a narrower range"
         )
     if best in {0, len(angles) - 1}:
         return f"the best rotation is the last one tried, {angles[best]:.0f} deg; try a wider range"
     return ""
 
 
-def _turned(
+def _rotate_reference(
     reference: Array, known: NDArray[np.bool_], position: PupilPosition, angle_rad: float
 ) -> Array:
     """Return the reference rotated and moved to ``position``, on the known subapertures."""
@@ -187,5 +187,5 @@ def _smooth_shapes(known: NDArray[np.bool_], order: int) -> Array:
     return np.asarray(np.linalg.qr(np.column_stack(terms))[0])
 
 
-def _without(values: Array, shapes: Array) -> Array:
+def _remove_shapes(values: Array, shapes: Array) -> Array:
     return np.asarray(values - shapes @ (shapes.T @ values))

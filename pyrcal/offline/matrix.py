@@ -10,45 +10,45 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.advice import Advice, Grounds, explained, recommendation, with_displaced
-from pyrcal.offline.alternatives import alternatives, off_centre, with_alternatives
+from pyrcal.offline.advice import Advice, Grounds, add_displaced, add_explanations, recommend_action
+from pyrcal.offline.alternatives import add_alternatives, find_alternatives, find_decentred_pupil
 from pyrcal.offline.columns import (
     MAX_SMEAR,
     Smear,
-    displaced_columns,
+    find_displaced_columns,
+    find_noise_columns,
+    find_strange_columns,
     measure_smear,
-    noise_columns,
-    strange_columns,
-    without_smear,
+    remove_smear,
 )
 from pyrcal.offline.control_check import GAIN, check_control
 from pyrcal.offline.disjoint_sets import mode_partitions, pupil_partitions
 from pyrcal.offline.fitted import Fit, Registration
-from pyrcal.offline.gain_causes import gain_causes
+from pyrcal.offline.gain_causes import find_gain_causes
 from pyrcal.offline.instrument_checks import (
-    doubt_of_width,
+    compare_instruments,
+    estimate_width_effect,
     fit_file_values,
-    found_optics,
-    rivals,
+    list_optics,
 )
-from pyrcal.offline.left_over import arms_of
+from pyrcal.offline.left_over import find_arms
 from pyrcal.offline.methods import (
     Landing,
     ScanStep,
     Settled,
-    land,
     project_on_sensitivities,
     scan,
+    search_minimum,
     settle,
     settle_at,
 )
 from pyrcal.offline.models import FitModels
-from pyrcal.offline.noise import structure
-from pyrcal.offline.origins import Origin, origins, unknown_not_found
-from pyrcal.offline.pupil_checks import Few, left_by_light, tried_pupils
-from pyrcal.offline.pupil_width import SeenPupil, answers_of, seen_pupil
-from pyrcal.offline.reference import checked
-from pyrcal.offline.remarks import remarks
+from pyrcal.offline.noise import measure_structure
+from pyrcal.offline.origins import Origin, list_origins, list_undetermined_keys
+from pyrcal.offline.pupil_checks import FitSubset, fit_smooth_gain, try_pupils
+from pyrcal.offline.pupil_width import SeenPupil, compute_responses, measure_pupil
+from pyrcal.offline.reference import check_reference
+from pyrcal.offline.remarks import collect_remarks
 from pyrcal.offline.solver import Nuisances, Solution, image_patterns, nuisances_of
 from pyrcal.offline.uncertainty import (
     LOCAL_MAGNIFICATION_FLOOR,
@@ -59,7 +59,7 @@ from pyrcal.offline.uncertainty import (
     pupil_regions,
     uncertainty,
 )
-from pyrcal.offline.verdict import FitFindings, judged
+from pyrcal.offline.verdict import FitFindings, judge_fit
 from service.errors import ModelError
 from service.estimation.orientation import (
     DOUBTFUL_CORRELATION,
@@ -83,7 +83,7 @@ from service.model.slopes import Orientation, SlopeRecipe
 MIN_COLUMNS = 3
 """Smallest number of columns that must remain when columns with noise only are left out."""
 
-_NAMED = 12
+_MAX_LISTED = 12
 
 _SMEAR_STEPS = 8
 _LONGEST_SMEAR_STEP = 0.15
@@ -170,78 +170,81 @@ def fit_matrix(
         If a requested mode was not measured, or the instrument cannot be modelled.
     """
     options = options or FitOptions()
-    tell = progress or (lambda _: None)
+    report_stage = progress or (lambda _: None)
     try:
-        return _fitted(instrument, reference, options, basis, mapper, tell)
+        return _fit_usable(instrument, reference, options, basis, mapper, report_stage)
     except np.linalg.LinAlgError as error:
         raise ModelError(
-            f"{instrument.name}: found modes that tell nothing of a registration ({error}); "
+            f"{instrument.name}: found modes that do not depend on the registration ({error}); "
             "expected actuators or tables in metres over the pupil that the sensor sees"
         ) from error
 
 
-def _fitted(
+def _fit_usable(
     instrument: Instrument,
     reference: Reference,
     options: FitOptions,
     basis: Basis | None,
     mapper: Mapper,
-    tell: Progress,
+    report_stage: Progress,
 ) -> Fit:
     if basis is None:
-        tell("modes")
+        report_stage("modes")
         basis = modal_basis(instrument)
-    usable = checked(
-        _with_shape(_selected(reference, options.modes), instrument),
+    usable = check_reference(
+        _remove_shapeless(_select_modes(reference, options.modes), instrument),
         n_slopes=instrument.slopes.kind.n_planes * int(rtc_valid_subapertures(instrument).sum()),
         n_modes=basis.n_modes,
         wavelength_m=instrument.wfs.wavelength_m,
         stroke_known=_stroke_known(instrument),
     )
     used = basis.subset(usable.columns)
-    tell("orientation")
+    report_stage("orientation")
+    # remembered here, because ``_fix_mask`` gives every instrument a mask
     own_mask = instrument.wfs.valid_subapertures is not None
-    instrument = _masked(instrument)
+    instrument = _fix_mask(instrument)
     reported = replace(
         instrument.slopes, orientation=options.orientation or instrument.slopes.orientation
     )
-    slopes, pose, untold = _axes(instrument, usable, used, options, mapper)
+    slopes, pose, axes_doubt = _find_axes(instrument, usable, used, options, mapper)
     instrument = replace(instrument, slopes=slopes)
     target = target_of(usable, instrument)
     models = FitModels(
         instrument=instrument, basis=used, illumination=options.illumination, mapper=mapper
     )
-    tell("fit")
+    report_stage("fit")
     if options.start is not None:
         start = options.start
     else:
         start = pose if pose is not None else instrument.start
-    found = _found(models, target, instrument.with_anamorphosis(start), options, tell)
-    noisy = noise_columns(
+    found = _run_method(models, target, instrument.with_anamorphosis(start), options, report_stage)
+    noisy = find_noise_columns(
         found.settled.solution, found.settled.target, instrument.slopes.kind.n_planes
     )
     if noisy.any() and np.sum(~noisy) >= MIN_COLUMNS:
-        tell("fit")
-        usable = _without_noise(usable, noisy)
+        report_stage("fit")
+        usable = _remove_noise(usable, noisy)
         used = basis.subset(usable.columns)
         target, models = target_of(usable, instrument), replace(models, basis=used)
         begin = instrument.with_anamorphosis(found.settled.solution.alpha)
-        found = _found(models, target, begin, options, tell)
+        found = _run_method(models, target, begin, options, report_stage)
     smear = measure_smear(found.settled.solution, found.settled.target)
     if smear.is_found:
-        tell("fit")
-        found, usable = _settled_pokes(models, instrument, found, usable, smear, options, tell)
-    tell("verdict")
-    fit = _answer(models, found, usable, untold, reported, options)
+        report_stage("fit")
+        found, usable = _remove_smear(
+            models, instrument, found, usable, smear, options, report_stage
+        )
+    report_stage("verdict")
+    fit = _make_fit(models, found, usable, axes_doubt, reported, options)
     if options.explain and not fit.accepted:
-        columns = displaced_columns(
+        columns = find_displaced_columns(
             replace(instrument, slopes=reported), usable, used, mapper=mapper
         )
-        fit = with_displaced(fit, tuple(columns))
-    return _with_mask(fit, instrument) if own_mask else fit
+        fit = add_displaced(fit, tuple(columns))
+    return _note_mask(fit, instrument) if own_mask else fit
 
 
-def _with_mask(fit: Fit, instrument: Instrument) -> Fit:
+def _note_mask(fit: Fit, instrument: Instrument) -> Fit:
     """Return the fit with any mismatch between mask and pupil added to remarks and advice."""
     x, y = fit.alpha.vector[:2].tolist()
     difference = check_mask(instrument, (x, y))
@@ -261,14 +264,14 @@ def _with_mask(fit: Fit, instrument: Instrument) -> Fit:
     return replace(fit, remarks=remarks, recommendation=advised)
 
 
-def _settled_pokes(
+def _remove_smear(
     models: FitModels,
     instrument: Instrument,
     found: _Found,
     usable: Reference,
     first: Smear,
     options: FitOptions,
-    tell: Progress,
+    report_stage: Progress,
 ) -> tuple[_Found, Reference]:
     """Return the fit with the remainder of each previous poke removed from the columns.
 
@@ -281,12 +284,13 @@ def _settled_pokes(
     again, sigma = found, first.sigma
     for _ in range(_SMEAR_STEPS):
         if not 0.0 < share <= MAX_SMEAR:
-            return found, usable
-        cleaned = without_smear(usable, share)
-        again = _found(models, target_of(cleaned, instrument), begin, options, tell)
+            return found, usable  # the secants diverged: the residual has another cause
+        cleaned = remove_smear(usable, share)
+        again = _run_method(models, target_of(cleaned, instrument), begin, options, report_stage)
         left = measure_smear(again.settled.solution, again.settled.target)
         rate = (left.share - left_before) / (share - before)
         sigma = left.sigma / max(abs(rate), _LEAST_RATE)
+        # removing more must leave less; a rate of the other sign is noise
         if abs(left.share) < max(left.sigma, _SMEAR_SETTLED) or rate >= 0.0:
             break
         step = float(np.clip(-left.share / rate, -_LONGEST_SMEAR_STEP, _LONGEST_SMEAR_STEP))
@@ -294,13 +298,13 @@ def _settled_pokes(
     if again.settled.share > _SMEAR_EXPLAINS * found.settled.share:
         return found, usable
     again = replace(again, smear=Smear(share=share, sigma=sigma), before=found.settled.solution)
-    return again, without_smear(usable, share)
+    return again, remove_smear(usable, share)
 
 
-def _without_noise(usable: Reference, noisy: NDArray[np.bool_]) -> Reference:
+def _remove_noise(usable: Reference, noisy: NDArray[np.bool_]) -> Reference:
     """Return the reference without the columns that hold noise only; these are listed."""
-    named = ", ".join(str(mode) for mode in usable.columns[noisy][:_NAMED])
-    more = f" and {int(noisy.sum()) - _NAMED} more" if noisy.sum() > _NAMED else ""
+    named = ", ".join(str(mode) for mode in usable.columns[noisy][:_MAX_LISTED])
+    more = f" and {int(noisy.sum()) - _MAX_LISTED} more" if noisy.sum() > _MAX_LISTED else ""
     left_out = f"{int(noisy.sum())} of {len(noisy)} columns hold noise only: modes {named}{more}"
     return replace(
         usable,
@@ -316,13 +320,13 @@ def _stroke_known(instrument: Instrument) -> bool:
     return instrument.mirror.stroke_known and "wfs.wavelength_m" not in instrument.unknown
 
 
-def _masked(instrument: Instrument) -> Instrument:
+def _fix_mask(instrument: Instrument) -> Instrument:
     """Return the instrument with its mask computed once, because every model of the fit uses it."""
     mask = rtc_valid_subapertures(instrument)
     return replace(instrument, wfs=replace(instrument.wfs, valid_subapertures=mask))
 
 
-def _selected(reference: Reference, modes: NDArray[np.intp] | None) -> Reference:
+def _select_modes(reference: Reference, modes: NDArray[np.intp] | None) -> Reference:
     """Return only the columns of these modes.
 
     Raises
@@ -336,7 +340,7 @@ def _selected(reference: Reference, modes: NDArray[np.intp] | None) -> Reference
     missing = [int(mode) for mode in modes if int(mode) not in place]
     if missing:
         raise ModelError(
-            f"modes: {missing[0]} is asked for and was not measured; expected some of the "
+            f"modes: {missing[0]} is requested and was not measured; expected some of the "
             f"{len(place)} that were ({min(place)} to {max(place)})"
         )
     columns = np.array([place[int(mode)] for mode in modes], dtype=np.intp)
@@ -348,13 +352,13 @@ def _selected(reference: Reference, modes: NDArray[np.intp] | None) -> Reference
     )
 
 
-def _with_shape(reference: Reference, instrument: Instrument) -> Reference:
+def _remove_shapeless(reference: Reference, instrument: Instrument) -> Reference:
     """Return only the columns of modes that have a usable shape in the instrument file."""
     flat = np.isin(reference.columns, instrument.mirror.flat_modes)
     if not flat.any() or flat.all() or reference.matrix.shape[1:] != flat.shape:
         return reference
-    named = ", ".join(str(mode) for mode in reference.columns[flat][:_NAMED])
-    more = f" and {int(flat.sum()) - _NAMED} more" if flat.sum() > _NAMED else ""
+    named = ", ".join(str(mode) for mode in reference.columns[flat][:_MAX_LISTED])
+    more = f" and {int(flat.sum()) - _MAX_LISTED} more" if flat.sum() > _MAX_LISTED else ""
     noise = reference.noise
     return replace(
         reference,
@@ -373,11 +377,11 @@ FAR_SUBAP = 2.0
 subapertures."""
 
 
-EQUIVALENT = 0.02
+EQUAL_CORRELATION = 0.02
 """Largest difference of two correlations that rounding of the angles causes."""
 
 
-def _axes(
+def _find_axes(
     instrument: Instrument, usable: Reference, basis: Basis, options: FitOptions, mapper: Mapper
 ) -> tuple[SlopeRecipe, Misregistration | None, str]:
     """Return the slope recipe, the start pose, and the reason if the axes are uncertain.
@@ -405,8 +409,8 @@ def _axes(
         ]
         far = {place: search_about(place, stated) for place in corners}
         most = max(one.best.correlation for one in far.values())
-        # turned by half, axes and all, the same mirror lies at the opposite shift
-        alike = [one for one in far if far[one].best.correlation > most - EQUIVALENT]
+        # rotated by 180 deg together with the axes, the same mirror is at the opposite shift
+        alike = [one for one in far if far[one].best.correlation > most - EQUAL_CORRELATION]
         place = min(alike, key=lambda one: far[one].best.effort)
         if far[place].best.correlation > search.best.correlation + 2.0 * MIN_CORRELATION_LEAD:
             about, search = place, far[place]
@@ -434,12 +438,12 @@ class _Found:
     """Solution with the original columns, if a smear was removed."""
 
 
-def _found(
+def _run_method(
     models: FitModels,
     target: Target,
     start: Misregistration,
     options: FitOptions,
-    tell: Progress,
+    report_stage: Progress,
 ) -> _Found:
     nuisances = nuisances_of(
         target.valid,
@@ -453,7 +457,7 @@ def _found(
     )
     match options.method:
         case Method.JOINT:
-            landing = land(models, target, start)
+            landing = search_minimum(models, target, start)
             settled = settle(models, target, landing.best.alpha, nuisances)
             return _Found(settled=settled, landing=landing)
         case Method.SENSITIVITY:
@@ -464,7 +468,7 @@ def _found(
                     "--method paper: found a matrix whose strokes are unknown; expected slopes per "
                     "metre, because the paper's criterion leaves no gain free. Use --method joint"
                 )
-            alpha, table = scan(models, target, start, tell=tell)
+            alpha, table = scan(models, target, start, progress=report_stage)
             return _Found(settled=settle_at(models, target, alpha, nuisances), table=table)
 
 
@@ -476,11 +480,11 @@ def _unknown_images(models: FitModels) -> dict[str, Any]:
     return {"images": image_patterns(models.instrument.stop), "image_sigma": sigma}
 
 
-def _answer(
+def _make_fit(
     as_in_file: FitModels,
     found: _Found,
     usable: Reference,
-    untold: str,
+    axes_doubt: str,
     reported: SlopeRecipe,
     options: FitOptions,
 ) -> Fit:
@@ -491,13 +495,13 @@ def _answer(
     values = np.concatenate([np.zeros(4), nuisances.from_prior(solution.nuisances)])
     regions = pupil_regions(target.valid, slopes.kind.n_planes)[target.rows]
     residual_fraction = settled.share
-    few = Few(settled)
-    pupils = tried_pupils(few)
-    others = rivals(settled, few, pupils)
+    few = FitSubset(settled)
+    pupils = try_pupils(few)
+    others = compare_instruments(settled, few, pupils)
     power = np.sum(target.matrix[target.rows] ** 2, axis=0)
     noise = None if usable.noise is None else usable.noise / usable.passes
-    structured = structure(seen.residual, power, noise)
-    by_light = residual_fraction**2 * (1.0 - left_by_light(few))
+    structured = measure_structure(seen.residual, power, noise)
+    by_light = residual_fraction**2 * (1.0 - fit_smooth_gain(few))
     n_planes = slopes.kind.n_planes
     floor_of_size, floor_words = _magnification_floor(models.instrument)
     before = uncertainty(
@@ -517,14 +521,14 @@ def _answer(
         mode_sets=mode_partitions(target, n_planes, by_actuator=is_by_actuator(models.instrument)),
         pupil_sets=pupil_partitions(target.valid, n_planes, target.rows),
     )
-    optics = found_optics(as_in_file, settled, before)
+    optics = list_optics(as_in_file, settled, before)
     stroke_known = _stroke_known(models.instrument)
     without = fit_file_values(as_in_file, settled) if any(one.notable for one in optics) else None
     left_map = _residual_map(found)
-    arms_deg = tuple(arm.angle_deg for arm in arms_of(left_map))
-    tried = alternatives(settled, few, others, pupils, optics, without, arms_deg)
-    sure = with_alternatives(
-        before, tried, residual_fraction, width=doubt_of_width(settled, few), without=without
+    arms_deg = tuple(arm.angle_deg for arm in find_arms(left_map))
+    tried = find_alternatives(settled, few, others, pupils, optics, without, arms_deg)
+    sure = add_alternatives(
+        before, tried, residual_fraction, width=estimate_width_effect(settled, few), without=without
     )
     if found.smear is not None and found.before is not None:
         by_smear = solution.vector - found.before.vector
@@ -543,20 +547,20 @@ def _answer(
         alternatives=tried,
         landing=found.landing,
         rivals=others,
-        off_centre=off_centre(few, others),
+        off_centre=find_decentred_pupil(few, others),
         optics=optics,
-        narrow=_narrow(settled),
+        narrow=_find_narrow_pupil(settled),
         with_file_values=without,
-        axes=untold,
+        axes=axes_doubt,
         passes=usable.passes,
         stroke_known=stroke_known,
     )
-    refusal, verdict = judged(findings)
+    refusal, verdict = judge_fit(findings)
     smeared = () if found.smear is None else (found.smear.words,)
-    columns = tuple(strange_columns(solution, target))
+    columns = tuple(find_strange_columns(solution, target))
     found_origins: tuple[Origin, ...] = ()
     if findings.explained:
-        found_origins = origins(
+        found_origins = list_origins(
             as_in_file.instrument, reported, slopes, optics, without, structured, seen.gains
         )
     fit = Fit(
@@ -575,7 +579,7 @@ def _answer(
         converged=solution.converged,
         verdict=verdict,
         remarks=(
-            *remarks(findings, reported=reported, found=slopes, about=models.instrument),
+            *collect_remarks(findings, reported=reported, found=slopes, about=models.instrument),
             *columns,
             *smeared,
             *(
@@ -593,10 +597,10 @@ def _answer(
         # misplaced actuators stretch the image as much as they turn it
         anamorphosis_sigma=None if stretch_sigma is None else np.hypot(stretch_sigma, misplaced[2]),
         image_offsets_px=_image_offsets(models.instrument, nuisances, solution),
-        # what noise determines is no finding
+        # values fitted to noise are not reported
         optics=optics if findings.explained else (),
         origins=found_origins,
-        unknown_not_found=unknown_not_found(as_in_file.instrument, found_origins),
+        unknown_not_found=list_undetermined_keys(as_in_file.instrument, found_origins),
         alternatives=tried,
         registration=Registration(
             determined=refusal is None,
@@ -625,9 +629,9 @@ def _answer(
         numbers_share=1.0 if without is None else without.share,
     )
     if not options.explain:
-        return replace(fit, recommendation=recommendation(fit, grounds))
-    causes = gain_causes(settled, passes=usable.passes, stroke_known=stroke_known)
-    return explained(fit, tried, replace(grounds, gains=tuple(causes)))
+        return replace(fit, recommendation=recommend_action(fit, grounds))
+    causes = find_gain_causes(settled, passes=usable.passes, stroke_known=stroke_known)
+    return add_explanations(fit, tried, replace(grounds, gains=tuple(causes)))
 
 
 def _magnification_floor(instrument: Instrument) -> tuple[float, str]:
@@ -673,15 +677,15 @@ def _image_offsets(
     return kind_of(instrument).offsets_px(instrument, found)
 
 
-def _narrow(settled: Settled) -> SeenPupil | None:
+def _find_narrow_pupil(settled: Settled) -> SeenPupil | None:
     """Return the pupil image if it is narrower than in the instrument file, else None."""
     target, solution = settled.target, settled.solution
     squares = solution.projection.gains**2
     measured = np.einsum("ij,ij->i", target.matrix, target.matrix)
     counted = np.where(target.rows | (measured == 0.0), 1.0, np.nan)
     expected = np.einsum("ij,ij,j->i", solution.matrix, solution.matrix, squares)
-    answers = answers_of(measured * counted, expected * counted, target.valid)
-    return seen_pupil(answers, settled.models.instrument.wfs.pupil_diameter)
+    answers = compute_responses(measured * counted, expected * counted, target.valid)
+    return measure_pupil(answers, settled.models.instrument.wfs.pupil_diameter)
 
 
 def _rows_left_out(target: Target, instrument: Instrument) -> Iterator[str]:

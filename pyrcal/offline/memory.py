@@ -1,8 +1,8 @@
-"""Refuse what would not fit in memory, before anything of it is computed."""
+"""Reject work that would exceed the memory, before it is started."""
 
 from __future__ import annotations
 
-from pyrcal.offline.models import deciding_sampling
+from pyrcal.offline.models import choose_sampling
 from service.errors import ModelError
 from service.model.instrument import Instrument
 from service.model.memory import GB, PROGRAM_BYTES, work_of
@@ -12,9 +12,9 @@ from service.model.sensors.sensor import Fineness
 
 
 def bytes_of_reconstruction(instrument: Instrument, n_modes: int, sampling: int) -> float:
-    """Return what D of all modes, and the inverse of its first ``n_modes`` columns, take.
+    """Return the peak memory of D of all modes and the inverse of ``n_modes`` columns.
 
-    At their largest, the program included; the sensor as a model of this sampling has it.
+    The program is included; the sensor is modelled with this sampling.
     """
     pupil = instrument_pupil(instrument, sampling * instrument.binning)
     fineness = Fineness(n_nodes=sampling * instrument.binning)
@@ -29,7 +29,7 @@ def bytes_of_reconstruction(instrument: Instrument, n_modes: int, sampling: int)
 def check_reconstruction(
     instrument: Instrument, n_modes: int, sampling: int, most_gb: float
 ) -> None:
-    """Refuse what takes more than ``most_gb``.
+    """Raise if a reconstruction takes more than ``most_gb``.
 
     Raises
     ------
@@ -46,9 +46,9 @@ def check_reconstruction(
 
 
 def bytes_of_fit(instrument: Instrument, n_modes: int, *, gain_map: bool = False) -> float:
-    """Return what a fit of ``n_modes`` columns takes at its largest, the program included."""
+    """Return the peak memory of a fit of ``n_modes`` columns, the program included."""
     kind = kind_of(instrument)
-    sampling = deciding_sampling(instrument) * instrument.binning
+    sampling = choose_sampling(instrument) * instrument.binning
     pupil, fineness = instrument_pupil(instrument, sampling), Fineness(n_nodes=sampling)
     sensor = kind.sensor(instrument, pupil, fineness)
     made = work_of(instrument, sensor, pupil, n_matrices=1).memory_bytes
@@ -60,25 +60,25 @@ def bytes_of_fit(instrument: Instrument, n_modes: int, *, gain_map: bool = False
 
 
 _USUAL_UNKNOWNS = 9
-"""Registration, turn of the axes, anamorphosis, coupling and modulation."""
+"""Number of unknowns: registration, rotation of the axes, anamorphosis, coupling and modulation."""
 
 _OF_GAIN_MAP = 20
-"""14 coefficients of the gain over the pupil, and all derivatives multiplied by that gain."""
+"""Unknowns of the gain map: 14 coefficients; all derivatives are multiplied by the gain as well."""
 
 _KEPT = 4.4
-"""Copies of the derivatives by each of them, float64, while a model is computed, ..."""
+"""Copies of each unknown's derivatives, float64, while a model is computed."""
 
 _PROJECTED = 7.8
-"""... and while they are projected."""
+"""Copies of each unknown's derivatives while they are projected."""
 
 _MODELS = 1.4
-"""Over what the fine model takes: the coarser ones together with it."""
+"""Memory of all models over that of the fine one."""
 
 
 def check_fit(
     instrument: Instrument, n_modes: int, most_gb: float, *, gain_map: bool = False
 ) -> None:
-    """Refuse a fit that takes more than ``most_gb``.
+    """Raise if a fit takes more than ``most_gb``.
 
     Raises
     ------

@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.models import CHEAP, FitModels, Optic
+from pyrcal.offline.models import COARSE_SAMPLING, FitModels, Optic
 from pyrcal.offline.solver import (
     LONGEST_OPTIC_STEP,
     Nuisances,
@@ -52,31 +52,31 @@ from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistr
 
 Array = NDArray[np.float64]
 
-GOOD = 0.10
+GOOD_MISFIT = 0.10
 """Largest share of χ² left to the smooth shapes at the true minimum, even with uneven light and
 another mirror; a false minimum leaves several times as much."""
 
-SAME = np.array([0.15, 0.15, np.deg2rad(0.5), 0.01])
+SAME_MINIMUM = np.array([0.15, 0.15, np.deg2rad(0.5), 0.01])
 """Distance below which two minima are the same (numeric units)."""
 
 SAME_SENSOR = 0.1
 """Largest logarithmic change of the sensor number for which other derivatives are reused."""
 
-NEARLY_AS_GOOD = 1.3
+ALTERNATIVE_MISFIT_RATIO = 1.3
 """Misfit of another minimum over the smallest one, below which it is an alternative."""
 
 MAX_REPEATS = 6
-LINEAR = 0.01
+LINEAR_CHANGE = 0.01
 """Logarithmic change of an optical quantity below which the model is linear."""
 
-LINEAR_IMAGES = 0.02
+LINEAR_DISPLACEMENT = 0.02
 """Displacement of a pupil image below which the model is linear, subapertures."""
 
-LINEAR_IMAGES_LEFT = 0.08
+LINEAR_DISPLACEMENT_RATIO = 0.08
 """The same limit over the root of the residual share of the signal: the second order of a
 displacement d, at most (π d)² / 2 of the signal, is then a thirtieth of that share."""
 
-BLURS = (-0.5, -0.25, 0.25, 0.5)
+BLUR_STEPS = (-0.5, -0.25, 0.25, 0.5)
 """Trial amplitudes of a blurring pattern, subapertures: half of each in every image."""
 
 LONGEST_MOVE = 0.3
@@ -86,7 +86,7 @@ IMAGES_GAIN = 0.9
 """Ratio of χ² below which a fit with displaced images is repeated: four of the displacements hardly
 change a matrix, and would drift without end."""
 
-REACH = 20.0
+REUSE_DISTANCE = 20.0
 """Number of settling lengths within which derivatives are reused."""
 
 TABLE_1 = (
@@ -119,16 +119,16 @@ FITTED_HALF_WIDTH = 2
 MAX_MODES = 60
 """Largest number of modes used for comparisons that do not need all modes."""
 
-CHANGES = np.arange(-4, 5) * 0.3
+SENSOR_CHANGES = np.arange(-4, 5) * 0.3
 """Logarithms of the factors of the sensor number that are tried, from a third to three."""
 
 NO_SENSOR_NUMBER = 0.02
 """Modulation, λ/D, that represents none, because a logarithm has no value for 0."""
 
-STRANGE = 0.05
+SEARCH_RESIDUAL = 0.05
 """RMS residual share of the signal above which the sensor number is searched over a wide range."""
 
-FAR_OFF = 0.03
+SEARCH_STEP = 0.03
 """Logarithmic step of the sensor number above which it is searched over a wide range."""
 
 _SHIFTS = (-1.3, 1.3)
@@ -167,7 +167,7 @@ class Landing:
     """Other minima that are nearly as good."""
 
 
-def land(models: FitModels, target: Target, start: Misregistration) -> Landing:
+def search_minimum(models: FitModels, target: Target, start: Misregistration) -> Landing:
     """Return the result from a start; if it explains little, the best of many starts."""
     matrix = models.low_order.measured(target.matrix)
     low = Columns(
@@ -177,15 +177,15 @@ def land(models: FitModels, target: Target, start: Misregistration) -> Landing:
     for tried in (start, *map(start.moved_to, _other_starts(start.vector))):
         found.append(approach(models.far, low, tried))
         models.counter.n += found[-1].n_matrices
-        if found[-1].converged and found[-1].misfit < GOOD:
+        if found[-1].converged and found[-1].misfit < GOOD_MISFIT:
             break
     best = min(found, key=lambda one: (not one.converged, one.misfit))
     rivals = [
         one
         for one in found
         if one.converged
-        and one.misfit < NEARLY_AS_GOOD * best.misfit
-        and np.any(np.abs(one.alpha.vector - best.alpha.vector) > SAME)
+        and one.misfit < ALTERNATIVE_MISFIT_RATIO * best.misfit
+        and np.any(np.abs(one.alpha.vector - best.alpha.vector) > SAME_MINIMUM)
     ]
     return Landing(best=best, rivals=tuple(rivals))
 
@@ -235,24 +235,25 @@ def settle(
     edge, whose position depends on the registration. The slopes near the edge are left out, and the
     fit is repeated if their set has changed.
     """
-    seen = _known(models, target, start)
+    seen = _remove_unknown_rows(models, target, start)
     solution = refine(models, seen, start, nuisances, decides=models.cheap)
     settled = Settled(
         solution=solution, target=seen, models=models, nuisances=nuisances, on_fine_grid=False
     )
-    if settled.share < STRANGE:
+    if settled.share < SEARCH_RESIDUAL:
         # so little is left over that the cheap grid's own error would displace pupil images
         solution = refine(models, seen, solution.alpha, nuisances, near=solution.near)
         settled = replace(settled, solution=solution, on_fine_grid=True)
     settled = _with_nearest_instrument(settled)
     models, nuisances = settled.models, settled.nuisances
+    # ``approaching``: iterate on the coarse grid, which is cheaper, until that has converged
     before, approaching, taken = np.inf, True, settled
     for _ in range(MAX_REPEATS):
         left = settled.solution.projection.chi
         if models is settled.models:
-            models, nuisances = _adjusted(settled, move_images=left < IMAGES_GAIN * before)
+            models, nuisances = _update_models(settled, move_images=left < IMAGES_GAIN * before)
         before = left
-        there, near = _known(models, target, settled.solution.alpha), None
+        there, near = _remove_unknown_rows(models, target, settled.solution.alpha), None
         if models is settled.models and np.array_equal(there.rows, settled.target.rows):
             if settled.on_fine_grid:
                 break
@@ -286,7 +287,7 @@ def _images_of(settled: Settled, alpha: Misregistration, nuisances: Nuisances) -
     apart = np.abs(alpha.vector - settled.solution.alpha.vector)
     if (
         abs(sensors[1] - sensors[0]) > SAME_SENSOR
-        or np.any(apart > SAME)
+        or np.any(apart > SAME_MINIMUM)
         or not np.array_equal(before.displaced, nuisances.displaced)
     ):
         return None
@@ -300,6 +301,7 @@ def _with_nearest_instrument(settled: Settled) -> Settled:
     Displaced images look like another modulation, so they are searched first if the modulation is
     known.
     """
+    # the order matters: the first search absorbs part of the other's effect
     searches = [_with_nearest_images, _with_nearest_sensor]
     if Optic.SENSOR in settled.nuisances.unknown:
         searches.reverse()
@@ -326,7 +328,7 @@ def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
         return models, nuisances
     step = solution.nuisances[nuisances.first_optic + places[0]]
     unknown = Optic.SENSOR in nuisances.unknown
-    if settled.share < STRANGE and abs(step) < FAR_OFF and not unknown:
+    if settled.share < SEARCH_RESIDUAL and abs(step) < SEARCH_STEP and not unknown:
         return models, nuisances
     modes = spread(settled.target.n_modes)
     few = settled.target.column_subset(modes)
@@ -335,39 +337,39 @@ def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
 
     def left(change: float) -> float:
         models.counter.n += 1
-        changed = subset.adjusted(Optic.SENSOR, change) if change else subset
-        matrix = changed.model(CHEAP, once=True).interaction_matrix(solution.alpha)
+        changed = subset.with_optic(Optic.SENSOR, change) if change else subset
+        matrix = changed.model(COARSE_SAMPLING, once=True).interaction_matrix(solution.alpha)
         return few.project(matrix, every).chi_at_best
 
-    found = _descended(left)
+    found = _scan_outwards(left)
     best = int(np.argmin(found))
-    change = CHANGES[best]
+    change = SENSOR_CHANGES[best]
     nothing = float(np.log(NO_SENSOR_NUMBER / models.sensor_number))
     if best == 0 and left(nothing) < found[0]:
         change = nothing
     elif 0 < best < len(found) - 1:
-        change += vertex(*found[best - 1 : best + 2]) * (CHANGES[1] - CHANGES[0])
-    if abs(change) < LINEAR:
+        change += vertex(*found[best - 1 : best + 2]) * (SENSOR_CHANGES[1] - SENSOR_CHANGES[0])
+    if abs(change) < LINEAR_CHANGE:
         return models, nuisances
     optics = [
         (optic, offset + change * (optic is Optic.SENSOR)) for optic, offset in nuisances.optics
     ]
-    moved = models.adjusted(Optic.SENSOR, float(change))
+    moved = models.with_optic(Optic.SENSOR, float(change))
     return moved, replace(nuisances, optics=tuple(optics))
 
 
-def _descended(left: Callable[[float], float]) -> Array:
-    """Return χ² at ``CHANGES``, outwards from no change until it grows; infinite beyond.
+def _scan_outwards(left: Callable[[float], float]) -> Array:
+    """Return χ² at ``SENSOR_CHANGES``, outwards from no change until it grows; infinite beyond.
 
     The widest modulations take longest, so they are not computed without need.
     """
-    found = np.full(len(CHANGES), np.inf)
-    middle = len(CHANGES) // 2
+    found = np.full(len(SENSOR_CHANGES), np.inf)
+    middle = len(SENSOR_CHANGES) // 2
     found[middle] = left(0.0)
     for side in (-1, 1):
         k = middle + side
         while 0 <= k < len(found):
-            found[k] = left(CHANGES[k])
+            found[k] = left(SENSOR_CHANGES[k])
             if found[k] > found[k - side]:
                 break
             k += side
@@ -390,7 +392,7 @@ def _with_nearest_images(settled: Settled) -> tuple[FitModels, Nuisances]:
     few = settled.target.column_subset(modes)
     subset = replace(models, basis=models.basis.subset(modes))
     blurring = np.array([is_blurring(pattern) for pattern in nuisances.images])
-    # the derivatives with a blur, taken without one, would explain anything
+    # derivatives by a blur, evaluated without blur, would fit any residual
     free = np.ones(len(solution.nuisance_derivatives), dtype=bool)
     free[nuisances.image_places] = ~blurring
     every = np.concatenate([solution.derivatives, solution.nuisance_derivatives[free]])
@@ -404,18 +406,18 @@ def _with_nearest_images(settled: Settled) -> tuple[FitModels, Nuisances]:
         if improbable > seen.chi:
             return np.inf
         models.counter.n += 1
-        matrix = subset.displaced(displaced).cheap.interaction_matrix(solution.alpha)
+        matrix = subset.with_displaced_images(displaced).cheap.interaction_matrix(solution.alpha)
         return few.project(matrix, every).chi_at_best + improbable
 
     displaced = nuisances.displaced + np.where(blurring, 0.0, values) @ nuisances.images
     least = left(displaced)
     for pattern in nuisances.images[blurring]:
-        tried = [displaced + size * pattern for size in BLURS]
+        tried = [displaced + size * pattern for size in BLUR_STEPS]
         found = [left(one) for one in tried]
         best = int(np.argmin(found))
         if found[best] < least:
             displaced, least = tried[best], found[best]
-    return models.displaced(displaced), replace(nuisances, displaced=displaced)
+    return models.with_displaced_images(displaced), replace(nuisances, displaced=displaced)
 
 
 def spread(n_modes: int) -> NDArray[np.intp]:
@@ -425,18 +427,18 @@ def spread(n_modes: int) -> NDArray[np.intp]:
 
 def _linear_images(settled: Settled) -> float:
     """Return the displacement of a pupil image below which the model is linear, subapertures."""
-    return max(LINEAR_IMAGES, LINEAR_IMAGES_LEFT * float(np.sqrt(settled.share)))
+    return max(LINEAR_DISPLACEMENT, LINEAR_DISPLACEMENT_RATIO * float(np.sqrt(settled.share)))
 
 
-def _adjusted(settled: Settled, *, move_images: bool) -> tuple[FitModels, Nuisances]:
+def _update_models(settled: Settled, *, move_images: bool) -> tuple[FitModels, Nuisances]:
     """Return models updated with the fitted optical quantities, and nuisances relative to them."""
     models, nuisances = settled.models, settled.nuisances
     optics = []
     for k, (optic, offset) in enumerate(nuisances.optics, nuisances.first_optic):
         change = float(settled.solution.nuisances[k])
-        if abs(change) > LINEAR and models.exact(optic):
+        if abs(change) > LINEAR_CHANGE and models.exact(optic):
             change = float(np.clip(change, -LONGEST_OPTIC_STEP, LONGEST_OPTIC_STEP))
-            models, offset = models.adjusted(optic, change), offset + change
+            models, offset = models.with_optic(optic, change), offset + change
         optics.append((optic, offset))
     nuisances = replace(nuisances, optics=tuple(optics))
     step = settled.solution.nuisances[nuisances.image_places]
@@ -444,7 +446,7 @@ def _adjusted(settled: Settled, *, move_images: bool) -> tuple[FitModels, Nuisan
     displaced = nuisances.displaced + step
     far = np.any(np.abs(displaced - nuisances.displaced) > _linear_images(settled))
     if move_images and far:
-        return models.displaced(displaced), replace(nuisances, displaced=displaced)
+        return models.with_displaced_images(displaced), replace(nuisances, displaced=displaced)
     return models, nuisances
 
 
@@ -452,7 +454,7 @@ def settle_at(
     models: FitModels, target: Target, alpha: Misregistration, nuisances: Nuisances
 ) -> Settled:
     """Return the model evaluated at a registration from another method."""
-    seen = _known(models, target, alpha)
+    seen = _remove_unknown_rows(models, target, alpha)
     there = refine(models, seen, alpha, nuisances, max_steps=0)
     solution = replace(there, converged=within_limits(alpha.vector))
     return Settled(solution=solution, target=seen, models=models, nuisances=nuisances)
@@ -465,7 +467,7 @@ def project_on_sensitivities(
     for _ in range(MAX_REPEATS):
         settled = settle(models, target, start, nuisances)
         step = settled.solution.vector - start.vector
-        if not settled.solution.converged or np.all(np.abs(step) < REACH * SETTLED_STEP):
+        if not settled.solution.converged or np.all(np.abs(step) < REUSE_DISTANCE * SETTLED_STEP):
             break
         start = settled.solution.alpha
     return settled
@@ -476,7 +478,7 @@ def scan(
     target: Target,
     start: Misregistration,
     steps: Sequence[tuple[str, float]] = TABLE_1,
-    tell: Callable[[str], None] = lambda _: None,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> tuple[Misregistration, tuple[ScanStep, ...]]:
     """Scan the parameters one by one and return the last values and every scan.
 
@@ -486,22 +488,22 @@ def scan(
     values = start.vector * BOUNDARY_SCALE
     table: list[ScanStep] = []
     for number, (parameter, step) in enumerate(steps):
-        # the value of a parameter is that of its last scan: the earlier ones lead there
+        # only the last scan of a parameter sets its value, so earlier ones use the coarse model
         last = all(later != parameter for later, _ in steps[number + 1 :])
         model = models.fine if last else models.cheap
         index, known = PARAMETERS.index(parameter), values.copy()
 
-        chi = partial(_chi_at, models, model, target, start, known, index)
+        chi = partial(_compute_chi, models, model, target, start, known, index)
         first = all(done.parameter != parameter for done in table)
         reach = ROUGH_RANGE.get(parameter, 0.0) if first else 0.0
         half_width = max(HALF_WIDTH, round(reach / step))
-        table.append(_scanned(chi, parameter, float(values[index]), step, half_width))
+        table.append(_scan_parameter(chi, parameter, float(values[index]), step, half_width))
         values[index] = table[-1].minimum
-        tell(f"step {len(table)}: {parameter} by {step:g}: {table[-1].minimum:.4f}")
+        progress(f"step {len(table)}: {parameter} by {step:g}: {table[-1].minimum:.4f}")
     return start.moved_to(values / BOUNDARY_SCALE), tuple(table)
 
 
-def _chi_at(
+def _compute_chi(
     models: FitModels,
     model: InteractionModel,
     target: Target,
@@ -525,7 +527,7 @@ def chi_n(target: Target, matrix: NDArray[Any]) -> float:
     return float(np.sum(np.mean(difference**2, axis=0, dtype=np.float64)))
 
 
-def _known(models: FitModels, target: Target, alpha: Misregistration) -> Target:
+def _remove_unknown_rows(models: FitModels, target: Target, alpha: Misregistration) -> Target:
     """Return the target without slopes from surface outside a table of modes."""
     return target.without(models.fine.unknown_rows(alpha))
 
@@ -538,7 +540,7 @@ def _other_starts(start: Array) -> list[Array]:
     return [nominal, *(nominal + step for step in [*turns, *corners])]
 
 
-def _scanned(
+def _scan_parameter(
     chi: Callable[[float], float], parameter: str, start: float, step: float, half_width: int
 ) -> ScanStep:
     """Scan one parameter around a start, and continue while the lowest sample is the last one."""
@@ -553,7 +555,7 @@ def _scanned(
     values = np.array([found[k] for k in places])
     near = np.abs(places - best) <= FITTED_HALF_WIDTH
     bend, slope, least = np.polyfit(places[near] - best, values[near], 2)
-    # a polynomial without a minimum near the lowest sample says nothing better than the sample
+    # without a minimum near the lowest sample, the polynomial is no better than the sample
     turn = -slope / (2.0 * bend) if bend > 0.0 and abs(slope) <= 2.0 * bend else 0.0
     level = least + turn * (slope + bend * turn)
     return ScanStep(

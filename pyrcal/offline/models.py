@@ -25,20 +25,20 @@ from service.model.surface import Gaussian, ThinPlate, mirror_surface
 
 Array = NDArray[np.float64]
 
-CHEAP = 2
+COARSE_SAMPLING = 2
 """Pupil points per subaperture, and nodes, of the model for derivatives. The sensor's kind defines
 the sampling for residuals and for far steps."""
 
-BETTER = 0.95
+PREFERRED_SHARE = 0.95
 """Share of χ² that another instrument must leave at most to be preferred. On the diffractive
 telescope the correct stop left 0.83 to 0.94 of the wrong one's χ², noise included, from a shift of
 0.08 subapertures; without shift the two differ by less than 0.01."""
 
-FAR_BETTER = 0.7
+FAR_PREFERRED_SHARE = 0.7
 """The same share for influence functions and centroids, because no model of them matches a bench
 exactly."""
 
-MOST_ACROSS = 160
+MAX_POINTS_ACROSS = 160
 """Largest number of points across a binary pupil map that the fit uses at full resolution. With 16
 subapertures of six points each, three points left an error of 0.0014 subapertures, 3.7 σ, six
 points 0.0001 (docs/results/peers.md). On larger maps a step is negligible."""
@@ -66,7 +66,7 @@ class Counter:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Other:
+class InstrumentChange:
     """A change of the instrument file."""
 
     words: str
@@ -76,18 +76,18 @@ class Other:
     """Largest χ² over the file's at which this change is preferred."""
 
 
-def deciding_sampling(instrument: Instrument) -> int:
+def choose_sampling(instrument: Instrument) -> int:
     """Return the pupil points per subaperture of the model that determines a fit.
 
-    It is that of a binary pupil map, as simulators use, if that is at most ``MOST_ACROSS`` points
-    in all: with fewer points its edges become grey.
+    It is that of a binary pupil map, as simulators use, if that is at most ``MAX_POINTS_ACROSS``
+    points in all: with fewer points its edges become grey.
     """
     usual, pupil = kind_of(instrument).fine_sampling, instrument.pupil
     if pupil is None or np.any((pupil.lit > 0.0) & (pupil.lit < 1.0)):
         return usual
     points = round(instrument.subaperture_m / (instrument.binning * pupil.pitch_m))
     across = instrument.wfs.n_subapertures * instrument.binning * points
-    return max(usual, points) if across <= MOST_ACROSS else usual
+    return max(usual, points) if across <= MAX_POINTS_ACROSS else usual
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -147,12 +147,12 @@ class FitModels:
     @cached_property
     def cheap(self) -> InteractionModel:
         """Model for derivatives near the solution."""
-        return self.model(CHEAP)
+        return self.model(COARSE_SAMPLING)
 
     @cached_property
     def fine(self) -> InteractionModel:
         """Model whose residual determines the fit."""
-        return self.model(deciding_sampling(self.instrument))
+        return self.model(choose_sampling(self.instrument))
 
     def matrix(self, model: InteractionModel, alpha: Misregistration) -> NDArray[np.float32]:
         """Return D of one of the models, ``(n_slopes, n_modes)``, and count it."""
@@ -196,7 +196,7 @@ class FitModels:
         """Return True if a model with another value can be built, not only a derivative."""
         return optic is Optic.SENSOR or self.coupling is not None
 
-    def adjusted(self, optic: Optic, change: float) -> FitModels:
+    def with_optic(self, optic: Optic, change: float) -> FitModels:
         """Return the models of an instrument with a quantity changed by a logarithm."""
         if optic is Optic.SENSOR and self.sensor_key is not None:
             number = self.sensor_number * float(np.exp(change))
@@ -208,7 +208,7 @@ class FitModels:
         coupling = float(surface.coupling ** np.exp(-2.0 * change))
         return replace(self, basis=self.basis.of_surface(replace(surface, coupling=coupling)))
 
-    def displaced(self, offsets: Array) -> FitModels:
+    def with_displaced_images(self, offsets: Array) -> FitModels:
         """Return the models of a sensor with displaced pupil images ``(8,)``.
 
         In subapertures, axes of conventions.md: along x of the images at -x -y, +x -y, -x +y, +x
@@ -229,15 +229,15 @@ class FitModels:
             if optic is Optic.WIDTH:
                 found.append(self.cheap.width_derivative(alpha))
                 continue
-            other = self.adjusted(optic, SENSOR_STEP).model(CHEAP, once=True)
-            beside = other.interaction_matrix(alpha)
-            found.append((beside - self.cheap.interaction_matrix(alpha)) / SENSOR_STEP)
+            other = self.with_optic(optic, SENSOR_STEP).model(COARSE_SAMPLING, once=True)
+            stepped = other.interaction_matrix(alpha)
+            found.append((stepped - self.cheap.interaction_matrix(alpha)) / SENSOR_STEP)
             self.counter.n += 1
         self.counter.n += len(found)
         return found
 
     @property
-    def other_instruments(self) -> dict[Other, FitModels]:
+    def other_instruments(self) -> dict[InstrumentChange, FitModels]:
         """Models of instruments with which this one may be confused."""
         about = self.instrument
         stop = Stop.TELESCOPE if about.stop is Stop.MIRROR else Stop.MIRROR
@@ -245,11 +245,13 @@ class FitModels:
         for words, recipe in kind_of(about).other_recipes(about.slopes).items():
             others[words] = replace(about, slopes=recipe)
         found = {
-            Other(words=words, max_misfit_ratio=BETTER): replace(self, instrument=other)
+            InstrumentChange(words=words, max_misfit_ratio=PREFERRED_SHARE): replace(
+                self, instrument=other
+            )
             for words, other in others.items()
         }
         for words, sensor in kind_of(about).other_sensors(about.wfs).items():
-            other = Other(words=words, max_misfit_ratio=FAR_BETTER)
+            other = InstrumentChange(words=words, max_misfit_ratio=FAR_PREFERRED_SHARE)
             found[other] = replace(self, instrument=replace(about, wfs=sensor))
         if isinstance(self.basis, ModalBasis):
             gaussian = isinstance(self.basis.surface, ThinPlate)
@@ -258,6 +260,8 @@ class FitModels:
             surface = mirror_surface(
                 replace(mirror, shape=replace(mirror.shape, influence=shape)), about.subaperture_m
             )
-            other = Other(words=f'influence = "{shape}"', max_misfit_ratio=FAR_BETTER)
+            other = InstrumentChange(
+                words=f'influence = "{shape}"', max_misfit_ratio=FAR_PREFERRED_SHARE
+            )
             found[other] = replace(self, basis=self.basis.of_surface(surface))
         return found

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_POINTS = 4001
+_N_POINTS = 4001
 """Number of points of the distribution whose median is computed."""
 
 
-def structure(residual: Array, power: Array, noise: Array | None) -> float:
+def measure_structure(residual: Array, power: Array, noise: Array | None) -> float:
     """Return the RMS of the structured residual over the RMS of the measurement.
 
     Structure that is spread evenly over all directions is indistinguishable from noise and counts
@@ -41,8 +41,9 @@ def structure(residual: Array, power: Array, noise: Array | None) -> float:
     """
     n_rows = len(residual)
     left = np.sum(residual**2, axis=0) / power
-    # of one stroke for all noise is alike in slopes, of strokes that make slopes alike in shares;
-    # no column is believed to have more of it than is left over there
+    # With one stroke for all modes, noise is equal in slopes; with strokes that give equal slopes,
+    # it is equal in relative terms. The larger estimate is used; in no column may it exceed the
+    # residual.
     alike_in_slopes = np.minimum(noise_sigma(residual) ** 2 * n_rows / power, left)
     alike_in_shares = noise_sigma(residual / np.sqrt(power)) ** 2 * n_rows
     known = np.zeros(1) if noise is None else n_rows * noise**2 / power
@@ -54,7 +55,9 @@ def noise_sigma(matrix: Array) -> float:
     """Return 1 σ of the noise in each element of a matrix that also contains structure."""
     few, many = sorted(matrix.shape)
     wide = matrix if matrix.shape[0] == few else matrix.T
-    squares = np.linalg.eigvalsh(wide @ wide.T)  # precise enough: the median is no small one
+    squares = np.linalg.eigvalsh(
+        wide @ wide.T
+    )  # precise enough, because the median eigenvalue is not small
     return float(np.sqrt(max(np.median(squares), 0.0) / (many * _median_square(few / many))))
 
 
@@ -62,8 +65,8 @@ def noise_sigma(matrix: Array) -> float:
 def _median_square(aspect: float) -> float:
     """Return the median of squared singular values of unit noise, over the longer side."""
     low, high = (1.0 - np.sqrt(aspect)) ** 2, (1.0 + np.sqrt(aspect)) ** 2
-    # even steps of the angle: the density is infinite at 0 where the matrix is square
-    angle = (np.arange(_POINTS) + 0.5) / _POINTS * np.pi
+    # equal steps of the angle, because the density diverges at 0 for a square matrix
+    angle = (np.arange(_N_POINTS) + 0.5) / _N_POINTS * np.pi
     square = (low + high) / 2.0 - (high - low) / 2.0 * np.cos(angle)
     share = np.cumsum(np.sin(angle) ** 2 / square)
     return float(np.interp(0.5, share / share[-1], square))

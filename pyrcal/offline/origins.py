@@ -48,7 +48,7 @@ class Origin:
         return f"{self.key} = {self.found} ({self.how}; the file says {self.reported})"
 
 
-def origins(
+def list_origins(
     about: Instrument,
     reported: SlopeRecipe,
     found: SlopeRecipe,
@@ -75,18 +75,18 @@ def origins(
         ``(n_used,)`` gains of the modes.
     """
     return (
-        *_slopes(reported, found),
+        *_find_slopes(reported, found),
         *(
-            _of_optic(one, determined=is_determined(one, with_file_values, structure))
+            _describe_optic(one, determined=is_determined(one, with_file_values, structure))
             for one in optics
             if one.found is not None and one.sigma < MAX_LOG_SIGMA
         ),
-        *_wavelength(about, gains),
-        *_strokes(about),
+        *_find_wavelength(about, gains),
+        *_find_strokes(about),
     )
 
 
-def _slopes(reported: SlopeRecipe, found: SlopeRecipe) -> Iterator[Origin]:
+def _find_slopes(reported: SlopeRecipe, found: SlopeRecipe) -> Iterator[Origin]:
     if reported.order is not found.order:
         yield Origin(
             key="order",
@@ -98,14 +98,14 @@ def _slopes(reported: SlopeRecipe, found: SlopeRecipe) -> Iterator[Origin]:
     if reported.orientation is None:
         yield Origin(
             key="orientation",
-            found=written(found.assumed_orientation),
+            found=format_orientation(found.assumed_orientation),
             reported='"auto"',
             how="scanned: the lowest modes",
             correct=False,
         )
 
 
-def written(orientation: Orientation) -> str:
+def format_orientation(orientation: Orientation) -> str:
     """Return an orientation as the instrument file writes it."""
     flips = ", ".join(f"{name} = {str(getattr(orientation, name)).lower()}" for name in FLIPS)
     both = [orientation.sign_x, orientation.sign_y]
@@ -128,7 +128,7 @@ def is_determined(
     return not with_file_values.is_undecided
 
 
-def unknown_not_found(about: Instrument, found: tuple[Origin, ...]) -> tuple[str, ...]:
+def list_undetermined_keys(about: Instrument, found: tuple[Origin, ...]) -> tuple[str, ...]:
     """Return the keys marked as unknown in the file that the matrix does not determine.
 
     The positions of the pupil images are excluded: they are fitted whenever the file has none.
@@ -137,9 +137,9 @@ def unknown_not_found(about: Instrument, found: tuple[Origin, ...]) -> tuple[str
     return tuple(key for key in about.unknown if key.rpartition(".")[2] not in keys)
 
 
-def _of_optic(one: FoundOptic, *, determined: bool) -> Origin:
+def _describe_optic(one: FoundOptic, *, determined: bool) -> Origin:
     unknown = one.reported is None
-    doubt = "" if determined else ", may stand for errors of the model"
+    doubt = "" if determined else ", may compensate errors of the model"
     return Origin(
         key=one.key,
         found=f"{one.found:.3g}",
@@ -149,7 +149,7 @@ def _of_optic(one: FoundOptic, *, determined: bool) -> Origin:
     )
 
 
-def _wavelength(about: Instrument, gains: NDArray[np.float64]) -> Iterator[Origin]:
+def _find_wavelength(about: Instrument, gains: NDArray[np.float64]) -> Iterator[Origin]:
     middle = float(np.median(gains))
     if "wfs.wavelength_m" in about.unknown and about.mirror.stroke_known and middle > 0.0:
         scatter = float(np.std(gains)) / middle
@@ -162,12 +162,12 @@ def _wavelength(about: Instrument, gains: NDArray[np.float64]) -> Iterator[Origi
         )
 
 
-def _strokes(about: Instrument) -> Iterator[Origin]:
+def _find_strokes(about: Instrument) -> Iterator[Origin]:
     if not about.mirror.stroke_known:
         yield Origin(
             key="stroke",
             found="one gain for each mode",
             reported='"unknown"',
-            how="fitted: shapes alone tell the registration",
+            how="fitted: the shapes alone determine the registration",
             correct=False,
         )

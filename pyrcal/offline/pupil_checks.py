@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.methods import Settled, spread
-from pyrcal.offline.models import BETTER, CHEAP, FitModels
+from pyrcal.offline.models import COARSE_SAMPLING, PREFERRED_SHARE, FitModels
 from pyrcal.offline.solver import nuisances_of
 from pyrcal.offline.uncertainty import pupil_regions
 from service.estimation.solver import Projection
@@ -23,10 +23,10 @@ from service.model.interaction import InteractionModel
 
 Array = NDArray[np.float64]
 
-LEAST_EXPLAINED = 0.03
+MIN_PUPIL_EXPLAINED = 0.03
 """RMS share of the signal that a pupil must explain; less may be the model's own error."""
 
-_STEPS = 2
+_N_STEPS = 2
 """Number of steps towards the value that explains the most."""
 
 
@@ -52,20 +52,20 @@ class PupilNumber:
     notable: float
     """Smallest reported difference: simulators round their pupils to whole points."""
 
-    def changed(self, about: Instrument, light: float) -> Instrument:
+    def with_value(self, about: Instrument, light: float) -> Instrument:
         """Return the instrument with another value, given as its power."""
         value = light ** (1.0 / self.power)
         if self.key == "obscuration_ratio":
             return replace(about, obscuration_ratio=value)
         return replace(about, wfs=replace(about.wfs, pupil_diameter_subap=value))
 
-    def rate(self, few: Few) -> Array:
+    def rate(self, few: FitSubset) -> Array:
         """Return the derivative of D by the value's power ``(n_slopes, n_few)``."""
-        beside = self.reported**self.power + self.step
-        there = few.matrix(few.of(self.changed(few.models.instrument, beside)))
+        stepped = self.reported**self.power + self.step
+        there = few.matrix(few.of(self.with_value(few.models.instrument, stepped)))
         return np.asarray((there - few.own) / self.step)
 
-    def near(self, few: Few) -> tuple[float, Lead, Array]:
+    def near(self, few: FitSubset) -> tuple[float, Lead, Array]:
         """Return the best value, its improvement and the change of α, to first order."""
         light, rate = self.reported**self.power, self.rate(few)
         if not few.tells(few.own, rate):
@@ -75,19 +75,19 @@ class PupilNumber:
         value = float(np.clip(light + step[-1], low, high)) ** (1.0 / self.power)
         return value, few.lead(few.own, rate), step[:4] - few.step(few.own)[:4]
 
-    def far(self, few: Few) -> tuple[float, Lead, Array]:
+    def far(self, few: FitSubset) -> tuple[float, Lead, Array]:
         """Return the best value, its improvement and the change of α, with D of that value."""
         value, matrix = self.found(few)
         return value, few.lead(matrix), few.step(matrix)[:4] - few.step(few.own)[:4]
 
-    def found(self, few: Few) -> tuple[float, Array]:
+    def found(self, few: FitSubset) -> tuple[float, Array]:
         """Return the value that explains the most, and its D ``(n_slopes, n_few)``.
 
         A second step takes its derivative from the first, unless that was too short.
         """
         light, matrix, rate = self.reported**self.power, few.own, self.rate(few)
         low, high = (limit**self.power for limit in self.range)
-        for _ in range(_STEPS):
+        for _ in range(_N_STEPS):
             if not few.tells(matrix, rate):
                 break
             before, left = light, matrix
@@ -95,7 +95,7 @@ class PupilNumber:
             light = float(np.clip(light, low, high))
             if light == before:
                 break
-            matrix = few.matrix(few.of(self.changed(few.models.instrument, light)))
+            matrix = few.matrix(few.of(self.with_value(few.models.instrument, light)))
             if abs(light - before) > self.step:
                 rate = (matrix - left) / (light - before)
         return light ** (1.0 / self.power), matrix
@@ -112,7 +112,7 @@ def _numbers(about: Instrument) -> tuple[PupilNumber, ...]:
         notable=0.01 * size,
     )
     if about.pupil is not None:
-        return (width,)  # its map has the obscuration
+        return (width,)  # the pupil map contains the obscuration
     inner = PupilNumber(
         key="obscuration_ratio",
         reported=hole,
@@ -143,7 +143,7 @@ class Lead:
         return float(np.copysign(np.inf, gained)) if gained else 0.0
 
 
-class Few:
+class FitSubset:
     """A subset of a fit's modes at its solution, on the coarse grid."""
 
     def __init__(self, settled: Settled) -> None:
@@ -174,7 +174,7 @@ class Few:
         """Return D of an instrument, ``(n_slopes, n_few)``."""
         own = tried.basis is self.models.basis
         basis = self.model.basis if own else tried.basis.subset(self.modes)
-        return self._at_solution(tried.model(CHEAP, basis, once=True))
+        return self._at_solution(tried.model(COARSE_SAMPLING, basis, once=True))
 
     def left(self, matrix: Array, *more: Array) -> float:
         """Return χ² at the best unknowns, including those of further derivatives."""
@@ -261,36 +261,38 @@ class TriedPupil:
     """True if it explains enough of the signal to be reported."""
 
 
-def tried_pupils(few: Few) -> tuple[TriedPupil, ...]:
+def try_pupils(few: FitSubset) -> tuple[TriedPupil, ...]:
     """Return other pupils, each at the value that explains the most.
 
     They are computed to first order only, if the residual is smaller than a pupil would have to
     explain.
     """
     found = []
-    little = few.residual_fraction < LEAST_EXPLAINED
+    little = few.residual_fraction < MIN_PUPIL_EXPLAINED
     for number in _numbers(few.models.instrument):
         value, lead, moved = number.near(few) if little else number.far(few)
         explained = few.residual_fraction * np.sqrt(max(1.0 - lead.share, 0.0))
-        notable = abs(value - number.reported) >= number.notable and explained >= LEAST_EXPLAINED
+        notable = (
+            abs(value - number.reported) >= number.notable and explained >= MIN_PUPIL_EXPLAINED
+        )
         found.append(
             TriedPupil(
                 words=f"{number.key} = {value:.3g}",
                 lead=lead,
                 moved=moved,
-                explains=notable and lead.share < BETTER,
+                explains=notable and lead.share < PREFERRED_SHARE,
             )
         )
     return tuple(found)
 
 
-def left_by_light(few: Few) -> float:
+def fit_smooth_gain(few: FitSubset) -> float:
     """Return χ² with a smooth gain over the pupil, common to all modes, over that without."""
     own = few.own
     return few.left(own, *(pattern[:, None] * own for pattern in gain_maps(few))) / few.left(own)
 
 
-def gain_maps(few: Few) -> Array:
+def gain_maps(few: FitSubset) -> Array:
     """Return the shapes of a smooth gain over the pupil, ``(n_maps, n_slopes)``."""
     kind = few.models.instrument.slopes.kind
     return nuisances_of(few.target.valid, kind, gain_map=True).maps

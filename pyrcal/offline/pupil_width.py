@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-SILENT = 0.3
+SILENT_SHARE = 0.3
 """Response over that of the others below which a subaperture has no light. One that the pupil's
 border cuts has half or more."""
 
-BRIGHT = 0.8
+BRIGHT_QUANTILE = 0.8
 """Quantile of the responses used as their typical value, because most may be silent."""
 
-FEWEST = 0.08
+MIN_SILENT_SHARE = 0.08
 """Smallest share of silent subapertures; fewer are dead pixels or a spider."""
 
-STRAY = 0.2
+MAX_STRAY_SHARE = 0.2
 """Largest number of misplaced subapertures (silent inside, responding outside) over the silent
 ones."""
 
@@ -57,7 +57,7 @@ class SeenPupil:
         )
 
 
-def seen_pupil(answers: Array, told_subap: float) -> SeenPupil | None:
+def measure_pupil(answers: Array, stated_subap: float) -> SeenPupil | None:
     """Return the responding pupil, or None if it is as wide as stated.
 
     Parameters
@@ -71,20 +71,23 @@ def seen_pupil(answers: Array, told_subap: float) -> SeenPupil | None:
     known = np.isfinite(answers)
     if not known.any():
         return None
-    silent = known & (np.nan_to_num(answers) < SILENT * np.quantile(answers[known], BRIGHT))
+    silent = known & (
+        np.nan_to_num(answers) < SILENT_SHARE * np.quantile(answers[known], BRIGHT_QUANTILE)
+    )
     n_silent = int(silent.sum())
-    if n_silent < FEWEST * known.sum():
+    if n_silent < MIN_SILENT_SHARE * known.sum():
         return None
+    # the diameter whose circle misclassifies the fewest subapertures
     places = np.argwhere(known)
     away = np.hypot(*(places - places.mean(axis=0)).T)
     quiet = silent[known]
     diameters = np.arange(2.0, 2.0 * float(away.max()), STEP_SUBAP)
     outside = away > diameters[:, None] / 2.0
     wrong = np.sum(outside != quiet, axis=1)
-    if not len(wrong) or wrong.min() > STRAY * n_silent:
+    if not len(wrong) or wrong.min() > MAX_STRAY_SHARE * n_silent:
         return None
     found = _diameter(answers, float(np.mean(diameters[wrong == wrong.min()])))
-    if found > told_subap - NARROWER_SUBAP:
+    if found > stated_subap - NARROWER_SUBAP:
         return None
     return SeenPupil(diameter_subap=found, n_silent=n_silent, n_valid=int(known.sum()))
 
@@ -95,13 +98,15 @@ def _diameter(answers: Array, about: float) -> float:
     centre = np.argwhere(known).mean(axis=0)
     rows, columns = np.indices(answers.shape)
     beyond = np.hypot(rows - centre[0], columns - centre[1]) - about / 2.0
-    shares = np.clip(np.nan_to_num(answers) / np.quantile(answers[known], BRIGHT), 0.0, 1.0)
+    shares = np.clip(
+        np.nan_to_num(answers) / np.quantile(answers[known], BRIGHT_QUANTILE), 0.0, 1.0
+    )
     at_border = np.where(beyond > BORDER_SUBAP, 0.0, shares)
     area = float(np.sum(np.where(beyond < -BORDER_SUBAP, 1.0, at_border)))
     return 2.0 * float(np.sqrt(area / np.pi))
 
 
-def answers_of(measured: Array, expected: Array, valid: NDArray[np.bool_]) -> Array:
+def compute_responses(measured: Array, expected: Array, valid: NDArray[np.bool_]) -> Array:
     """Return the response of each subaperture over the expected one, ``(n, n)``.
 
     Parameters
@@ -118,6 +123,6 @@ def answers_of(measured: Array, expected: Array, valid: NDArray[np.bool_]) -> Ar
     known = np.isfinite(found) & np.isfinite(due)
     answers = np.full(valid.shape, np.nan)
     if known.any():
-        known &= np.nan_to_num(due) > SILENT * np.median(due[known])
+        known &= np.nan_to_num(due) > SILENT_SHARE * np.median(due[known])
         answers[valid] = np.divide(found, due, out=np.full(len(due), np.nan), where=known)
     return answers

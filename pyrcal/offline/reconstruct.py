@@ -1,4 +1,4 @@
-"""``pyrcal reconstruct``: from a registration to a reconstructor."""
+"""``pyrcal reconstruct``: compute a reconstructor for a registration."""
 
 from __future__ import annotations
 
@@ -60,12 +60,12 @@ def main(options: argparse.Namespace) -> int:
         raise ConfigurationError(
             f"--max-condition: found {options.max_condition:g}, expected at least 1"
         )
-    arrays, fit = arrays_of(options.array), _fit_of(options)
+    arrays, fit = arrays_of(options.array), _read_known_fit(options)
     described = load_instrument(options.instrument)
     found = instrument_sha256(described)
     if fit.instrument_sha256 not in {None, found}:
         say(f"note: {options.instrument} has changed since {fit.origin} was fitted with it")
-    instrument = _with_sensor(_oriented(described, fit), fit)
+    instrument = _apply_sensor(_apply_orientation(described, fit), fit)
     check_reconstruction(instrument, options.modes, SAMPLING, options.memory_gb)
     light = None if options.flux_map is None else read_light(options.flux_map, instrument)
     with threadpool_limits(1), ThreadPoolExecutor(os.cpu_count() or 1) as pool:
@@ -80,7 +80,7 @@ def main(options: argparse.Namespace) -> int:
         )
         show_progress(f"{model.n_slopes} slopes, {model.basis.n_modes} modes")
         matrix = model.interaction_matrix(fit.alpha)
-    provenance, inverted = _inverted(options, fit, model, matrix)
+    provenance, inverted = _invert_matrix(options, fit, model, matrix)
     inversion, slopes = provenance.inversion, instrument.slopes
     fill = partial(
         fill_reconstructor,
@@ -117,11 +117,11 @@ def main(options: argparse.Namespace) -> int:
 
 
 _SPECULA = ("im", "rec")
-"""Ends of the names of the files for SPECULA."""
+"""Suffixes of the files for SPECULA."""
 
 
-def _fit_of(options: argparse.Namespace) -> KnownFit:
-    """Return the registration, from the words or from the file.
+def _read_known_fit(options: argparse.Namespace) -> KnownFit:
+    """Return the registration from the arguments or from a file.
 
     Raises
     ------
@@ -146,7 +146,7 @@ def _fit_of(options: argparse.Namespace) -> KnownFit:
 
 
 def _check_control(path: Path, fit: KnownFit, n_modes: int) -> None:
-    """Refuse a model whose reconstructor would not hold the loop that was measured.
+    """Raise if the model's reconstructor is unstable with the measured matrix.
 
     Raises
     ------
@@ -181,8 +181,8 @@ def _check_control(path: Path, fit: KnownFit, n_modes: int) -> None:
         )
 
 
-def _oriented(instrument: Instrument, fit: KnownFit) -> Instrument:
-    """Return the instrument with the slopes as the fit found them."""
+def _apply_orientation(instrument: Instrument, fit: KnownFit) -> Instrument:
+    """Return the instrument with the orientation of the slopes from the fit."""
     recipe = instrument.slopes
     if fit.orientation is not None and fit.order is not None:
         if fit.order.kind is not recipe.kind:
@@ -199,13 +199,13 @@ def _oriented(instrument: Instrument, fit: KnownFit) -> Instrument:
     return replace(instrument, slopes=recipe)
 
 
-def _with_sensor(instrument: Instrument, fit: KnownFit) -> Instrument:
-    """Return the instrument with the sensor that the fit found; say so."""
+def _apply_sensor(instrument: Instrument, fit: KnownFit) -> Instrument:
+    """Return the instrument with the sensor values from the fit; print a note on each."""
     for key, value in fit.instrument_found.items():
         say(f"note: made with {key} = {value:.3g}, as {fit.origin} found; correct the instrument")
     kind = kind_of(instrument)
     if fit.image_offsets_px is not None and kind.image_offsets(instrument) is None:
-        # D with images on the pixel grid is 20 % wrong for images 0.2 pixel beside it
+        # D with images on the pixel grid has an error of 20 % if they are 0.2 pixel off it
         instrument = replace(instrument, wfs=kind.with_images_at(instrument, fit.image_offsets_px))
         if np.abs(fit.image_offsets_px).max() > NOTABLE_DISPLACEMENT_PX:
             words = displacement_words(fit.image_offsets_px)
@@ -218,7 +218,7 @@ def _with_sensor(instrument: Instrument, fit: KnownFit) -> Instrument:
 
 
 def _basis(instrument: Instrument, fit: KnownFit) -> Basis:
-    """Return the modes of the instrument, its actuators coupled as the fit found."""
+    """Return the modes of the instrument, with the coupling from the fit."""
     basis, coupling = cached_basis(instrument), fit.instrument_found.get(COUPLING_KEY)
     if coupling is None or not isinstance(basis, ModalBasis):
         return basis
@@ -227,10 +227,10 @@ def _basis(instrument: Instrument, fit: KnownFit) -> Basis:
     return basis.of_surface(replace(basis.surface, coupling=coupling))
 
 
-def _inverted(
+def _invert_matrix(
     options: argparse.Namespace, fit: KnownFit, model: RtcInteractionModel, matrix: NDArray[Any]
 ) -> tuple[Provenance, NDArray[Any]]:
-    """Return the reconstructor, how it was made, and the matrix that it inverts."""
+    """Return the reconstructor with its provenance, and the matrix that it inverts."""
     gains = None
     if fit.gains is not None and fit.modes is not None and not options.no_gains:
         gains = CalibrationGains.of_modes(fit.gains, fit.modes, model.basis.n_modes)

@@ -37,18 +37,18 @@ def check_sealed(path: Path) -> None:
             while groups:
                 n_links += len(groups[-1])
                 check_number(n_links, path)
-                groups += _sealed(groups.pop(), path, seen)
+                groups += _check_group(groups.pop(), path, seen)
     except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
         raise MatrixError(f"{path}: damaged HDF5 file: {error}") from error
 
 
-def _sealed(group: h5py.Group, path: Path, seen: set[int]) -> list[h5py.Group]:
+def _check_group(group: h5py.Group, path: Path, seen: set[int]) -> list[h5py.Group]:
     """Check the members of a group without following links; return groups not ``seen`` yet."""
     found = []
     for name in group:
         link = group.get(name, getlink=True)
         item = group[name] if isinstance(link, h5py.HardLink) else link
-        beyond = _beyond(item)
+        beyond = _find_outside_data(item)
         if beyond is not None:
             where = f"{path}:{group.name.rstrip('/')}/{name}"
             raise MatrixError(f"{where}: found {beyond}, expected all data in the file itself")
@@ -60,7 +60,7 @@ def _sealed(group: h5py.Group, path: Path, seen: set[int]) -> list[h5py.Group]:
     return found
 
 
-def _beyond(item: object) -> str | None:
+def _find_outside_data(item: object) -> str | None:
     """Return the reference of an object or link to other files; None if there is none."""
     if isinstance(item, h5py.ExternalLink):
         return f"a link to another file, {item.filename}"
@@ -130,15 +130,15 @@ def read_recorded(path: Path, dataset: str | None = None) -> Recorded:
         group = (dataset or DATASET).strip("/").rpartition("/")[0]
         n_modes = stored.shape[1 if len(stored.shape) == 2 else 0]
 
-        def beside(name: str) -> StoredArray | None:
+        def find_sibling(name: str) -> StoredArray | None:
             return container.find(f"{group}/{name}")
 
         return Recorded(
             values=stored.numbers(),
-            modes=_modes(container, beside("modes"), n_modes),
-            noise=_noise(beside("noise"), n_modes),
+            modes=_modes(container, find_sibling("modes"), n_modes),
+            noise=_noise(find_sibling("noise"), n_modes),
             double_pass=_double_pass(container),
-            flux_frame=_numbers(beside(FLUX_FRAME)),
+            flux_frame=_numbers(find_sibling(FLUX_FRAME)),
             where=stored.where,
             sha256=file_sha256(path),
         )

@@ -17,25 +17,26 @@ from service.model.slopes import likely_kind
 
 Array = NDArray[Any]
 
-DEAD = 1e-4
-"""A column with less than this share of the median column's size is no measurement."""
+DEAD_COLUMN_RATIO = 1e-4
+"""Norm of a column over the median below which it is not a measurement."""
 
 DEAD_ROW_SHARE = 0.5
-"""A slope that is not finite in more than this share of the columns belongs to a dead subaperture;
-otherwise the columns are at fault."""
+"""Share of columns with a value that is not finite above which a slope belongs to a dead
+subaperture; below it the columns are at fault."""
 
-PLAUSIBLE = 1e-4
-"""RMS slope per metre of OPD times the wavelength is some units; outside this share of 1 to its
-reciprocal the unit is another one: nanometres and micrometres are 1e-9 and 1e-6."""
+PLAUSIBLE_UNIT_RATIO = 1e-4
+"""Smallest plausible RMS slope per metre of OPD times the wavelength, and the reciprocal of the
+largest; nanometres and micrometres give 1e-9 and 1e-6."""
 
-FEWEST_TO_COMPARE = 9
-"""Columns from which equal rows are copies: of a few low orders many rows are equal."""
+MIN_COMPARED_COLUMNS = 9
+"""Smallest number of columns at which equal rows count as copies: in a few low orders many rows are
+equal."""
 
 _UNIT_DECADES = 1.5
-"""Powers of ten around a unit that are still recognised as it."""
+"""Powers of ten around a unit within which it is recognised."""
 
 
-def checked(
+def check_reference(
     reference: Reference,
     *,
     n_slopes: int,
@@ -43,7 +44,7 @@ def checked(
     wavelength_m: float,
     stroke_known: bool = True,
 ) -> Reference:
-    """Return the usable columns of a reference for an instrument; the others are named in it.
+    """Return the usable columns of a reference for an instrument, with notes on the others.
 
     Parameters
     ----------
@@ -63,8 +64,8 @@ def checked(
         unit is not the metre.
     """
     _check_shape(reference, n_slopes, n_modes)
-    reference, silenced = _without_dead_rows(reference)
-    kept, left_out = _usable(reference)
+    reference, silenced = _remove_dead_rows(reference)
+    kept, left_out = _find_usable(reference)
     left_out = (*reference.left_out, *silenced, *left_out)
     matrix = np.asarray(reference.matrix, dtype=np.float64)[:, kept]
     usable = replace(
@@ -107,7 +108,7 @@ def _check_shape(reference: Reference, n_slopes: int, n_modes: int) -> None:
         )
 
 
-def _without_dead_rows(reference: Reference) -> tuple[Reference, tuple[str, ...]]:
+def _remove_dead_rows(reference: Reference) -> tuple[Reference, tuple[str, ...]]:
     """Return the reference with unusable slopes as 0, and sentences that name them.
 
     A dead subaperture gives NaN, or 0, in every column. Slopes of 0 do not count in a fit, so that
@@ -120,35 +121,37 @@ def _without_dead_rows(reference: Reference) -> tuple[Reference, tuple[str, ...]
     dead = unknown[:, measured].mean(axis=1) > DEAD_ROW_SHARE
     rows = np.where(unknown, 0.0, reference.matrix)
     rows[dead] = 0.0
-    kinds = find_defects(rows) if rows.shape[1] >= FEWEST_TO_COMPARE else {}
+    kinds = find_defects(rows) if rows.shape[1] >= MIN_COMPARED_COLUMNS else {}
     copies = {row: reason for row, reason in kinds.items() if reason.startswith(COPY)}
     silent = ~rows.any(axis=1) & ~dead
     if not (dead.any() or copies or silent.any()):
         return reference, ()
     matrix = np.array(reference.matrix)
     matrix[np.ix_(dead, measured)] = 0.0
-    said = []
+    reasons = []
     if dead.any():
-        said.append(f"not finite: {_listed(np.flatnonzero(dead), 'slope')}")
+        reasons.append(f"not finite: {_format_numbers(np.flatnonzero(dead), 'slope')}")
     if silent.any():
-        said.append(f"zero in every column: {_listed(np.flatnonzero(silent), 'slope')}")
+        reasons.append(f"zero in every column: {_format_numbers(np.flatnonzero(silent), 'slope')}")
     if copies:
         matrix[np.ix_(np.array(list(copies)), measured)] = 0.0
-        said.append(f"copies: {_copied(copies, np.arange(len(matrix)), 'slope')}")
-    return replace(reference, matrix=matrix), tuple(said)
+        reasons.append(f"copies: {_describe_copies(copies, np.arange(len(matrix)), 'slope')}")
+    return replace(reference, matrix=matrix), tuple(reasons)
 
 
-def _usable(reference: Reference) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
-    """Return which columns are measurements, and a sentence for each kind that is not."""
+def _find_usable(reference: Reference) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
+    """Return the columns that are measurements, and a sentence for each kind that is not."""
     finite = np.isfinite(reference.matrix).all(axis=0)
     size = np.linalg.norm(np.where(finite, reference.matrix, 0.0), axis=0)
     typical = float(np.median(size[finite])) if finite.any() else 0.0
-    alive = size > DEAD * typical
+    alive = size > DEAD_COLUMN_RATIO * typical
     left_out = []
     if not finite.all():
-        left_out.append(f"not finite: {_listed(reference.columns[~finite])}")
+        left_out.append(f"not finite: {_format_numbers(reference.columns[~finite])}")
     if not alive[finite].all():
-        left_out.append(f"dead (no response): {_listed(reference.columns[finite & ~alive])}")
+        left_out.append(
+            f"dead (no response): {_format_numbers(reference.columns[finite & ~alive])}"
+        )
     kept = finite & alive
     places = np.flatnonzero(kept)
     equal = find_defects(np.ascontiguousarray(reference.matrix.T[kept])) if len(places) else {}
@@ -159,7 +162,7 @@ def _usable(reference: Reference) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
     }
     if copies:
         kept[list(copies)] = False
-        left_out.append(f"copies: {_copied(copies, reference.columns)}")
+        left_out.append(f"copies: {_describe_copies(copies, reference.columns)}")
     if not kept.any():
         raise MatrixError(
             f"reference: no usable column among {len(kept)} ({'; '.join(left_out) or 'empty'}); "
@@ -168,26 +171,29 @@ def _usable(reference: Reference) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
     return kept, tuple(left_out)
 
 
-def _copied(copies: Mapping[int, str], numbers: NDArray[np.intp], what: str = "mode") -> str:
-    """Return in words which entries repeat an earlier one."""
+def _describe_copies(
+    copies: Mapping[int, str], numbers: NDArray[np.intp], what: str = "mode"
+) -> str:
+    """Return a text on entries that repeat an earlier one."""
     first = numbers[[int(reason.removeprefix(COPY)) for reason in copies.values()]]
-    listed = _listed(numbers[list(copies)], what)
+    listed = _format_numbers(numbers[list(copies)], what)
     return f"{listed} (of {', '.join(str(number) for number in first[:8])})"
 
 
-def _listed(numbers: NDArray[np.intp], what: str = "mode") -> str:
+def _format_numbers(numbers: NDArray[np.intp], what: str = "mode") -> str:
     named = ", ".join(str(number) for number in numbers[:8])
     more = f" and {len(numbers) - 8} more" if len(numbers) > 8 else ""
     return f"{what}{'s' if len(numbers) > 1 else ''} {named}{more}"
 
 
 def _check_unit(matrix: Array, wavelength_m: float) -> None:
-    """Refuse a matrix per nanometre, micrometre, wave or radian.
+    """Raise if a matrix is per nanometre, micrometre, wave or radian.
 
-    Tilting a wavefront by one wavelength RMS moves slopes by some units, whatever the instrument.
+    Tilting a wavefront by one wavelength RMS changes slopes by a few units, whatever the
+    instrument.
     """
     typical = float(np.median(np.sqrt(np.mean(matrix**2, axis=0)))) * wavelength_m
-    if PLAUSIBLE < typical < 1.0 / PLAUSIBLE:
+    if PLAUSIBLE_UNIT_RATIO < typical < 1.0 / PLAUSIBLE_UNIT_RATIO:
         return
     unit = unit_like(1.0 / typical, _UNIT_DECADES).removesuffix("s")
     hint = f": it looks like slope per {unit}" if unit else ""

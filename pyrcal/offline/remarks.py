@@ -14,23 +14,23 @@ from service.model.kinds import SlopeOrder
 from service.model.misregistration import BOUNDARY_SCALE
 from service.model.slopes import FLIPS, SlopeRecipe
 
-STRAIGHT = 0.01
+NOTABLE_MAGNIFICATION = 0.01
 """Distance of the magnification from 1 above which pitch or diameter may be wrong in the file."""
 
-UNIFORM = 0.06
+MAX_COMMON_SCATTER = 0.06
 """Largest relative scatter of gains that have a common offset."""
 
-OFF_TOGETHER = 0.08
+MIN_COMMON_OFFSET = 0.08
 """Smallest common offset of the gains that is reported."""
 
-EXPLAINED = 0.1
+MAX_COMMON_RESIDUAL = 0.1
 """Largest residual share of the signal at which a common offset is reported."""
 
-LIKELY = (0.3, 3.0)
+WAVELENGTH_RANGE = (0.3, 3.0)
 """Range of a wavelength's relative error that is reported."""
 
 
-def remarks(
+def collect_remarks(
     findings: FitFindings,
     *,
     reported: SlopeRecipe,
@@ -51,17 +51,17 @@ def remarks(
     if not findings.explained:
         return ()
     return (
-        *_order(reported.order, found.order),
-        *_mirrored(reported, found),
-        *_optics(findings),
-        *_light(findings),
-        *_size(findings),
-        *_passes(findings),
-        *_scale(findings, about),
+        *_note_order(reported.order, found.order),
+        *_note_mirrored(reported, found),
+        *_note_optics(findings),
+        *_note_light(findings),
+        *_note_size(findings),
+        *_note_passes(findings),
+        *_note_scale(findings, about),
     )
 
 
-def _order(reported: SlopeOrder, found: SlopeOrder) -> Iterator[str]:
+def _note_order(reported: SlopeOrder, found: SlopeOrder) -> Iterator[str]:
     if reported is not found:
         yield (
             f'the instrument file says order = "{reported}", the matrix lists its slopes '
@@ -70,20 +70,20 @@ def _order(reported: SlopeOrder, found: SlopeOrder) -> Iterator[str]:
         )
 
 
-def _mirrored(reported: SlopeRecipe, found: SlopeRecipe) -> Iterator[str]:
+def _note_mirrored(reported: SlopeRecipe, found: SlopeRecipe) -> Iterator[str]:
     """Yield a note if the sensor sees the nominal actuator geometry mirrored."""
     axes = found.assumed_orientation
     flags = [f"{name} = true" for name in FLIPS if getattr(axes, name)]
     if reported.orientation is None and len(flags) % 2:
         yield (
-            f"the slopes' grid is mirrored against the actuators' drawing ({', '.join(flags)}): "
-            "the detector is read from another corner, or the coordinates of the actuators are "
-            "mirrored or exchanged (parity = -1); a matrix looks the same in both cases, and shift "
-            "and rotation count in the axes found"
+            f"the slopes' grid is mirrored against the nominal actuator positions "
+            f"({', '.join(flags)}): the detector is read from another corner, or the coordinates "
+            "of the actuators are mirrored or exchanged (parity = -1); a matrix looks the same in "
+            "both cases, and shift and rotation count in the axes found"
         )
 
 
-def _optics(findings: FitFindings) -> Iterator[str]:
+def _note_optics(findings: FitFindings) -> Iterator[str]:
     """Yield coupling and modulation that differ from the file, or that it left unknown."""
     for optic in findings.optics:
         if optic.found is None or optic.reported is not None or optic.sigma > MAX_LOG_SIGMA:
@@ -93,8 +93,8 @@ def _optics(findings: FitFindings) -> Iterator[str]:
             yield f"{found}: write it into the instrument file"
         else:
             yield (
-                f"{found}; {findings.structure:.0%} of the signal is left over and no noise, so it "
-                'may stand for errors of the model: leave it "unknown", or measure it'
+                f"{found}; {findings.structure:.0%} of the signal is left over and is not noise, "
+                'so it may compensate errors of the model: leave it "unknown", or measure it'
             )
     wrong = [optic for optic in findings.optics if optic.notable]
     if not wrong or findings.with_file_values is None:
@@ -119,28 +119,28 @@ def _advice(without: FileValuesFit) -> str:
     )
 
 
-def _light(findings: FitFindings) -> Iterator[str]:
+def _note_light(findings: FitFindings) -> Iterator[str]:
     """Yield that uneven light explains the residual."""
     if findings.structure > NOTABLE_STRUCTURE >= findings.after_light:
         yield (
-            f"{findings.structure:.0%} of the signal is left over and no noise; a smooth gain over "
-            "the pupil explains it: uneven light, which sigma allows for; give the light "
+            f"{findings.structure:.0%} of the signal is left over and is not noise; a smooth gain "
+            "over the pupil explains it: uneven light, which sigma allows for; give the light "
             "(--flux-map), or have the gain fitted (--gain-map)"
         )
 
 
-def _size(findings: FitFindings) -> Iterator[str]:
+def _note_size(findings: FitFindings) -> Iterator[str]:
     """Yield that the mirror is drawn in another size than the pupil."""
     magnification = float(findings.solution.vector[3])
-    if abs(magnification - 1.0) > STRAIGHT:
+    if abs(magnification - 1.0) > NOTABLE_MAGNIFICATION:
         yield (
-            f"magnification {magnification:.3f}: a matrix tells only how large the mirror is on "
+            f"magnification {magnification:.3f}: a matrix determines only the mirror's size on "
             "the sensor, so pitch_m or positions (modes_pitch_m), diameter_m or "
             f"pupil_diameter_subap may be off by {abs(magnification - 1.0):.1%} instead"
         )
 
 
-def _scale(findings: FitFindings, about: Instrument) -> Iterator[str]:
+def _note_scale(findings: FitFindings, about: Instrument) -> Iterator[str]:
     """Yield that all gains are off together: the wavelength, or the unit."""
     gains = findings.solution.projection.gains
     middle = float(np.median(gains))
@@ -150,8 +150,14 @@ def _scale(findings: FitFindings, about: Instrument) -> Iterator[str]:
             f"wavelength_m = {wavelength_m:.3g} was found, if the matrix is per metre of OPD on a "
             f"flat wavefront: gains of the modes scatter by {float(np.std(gains)) / middle:.1%}"
         )
-    together = float(np.std(gains)) < UNIFORM * abs(middle) and abs(middle - 1.0) > OFF_TOGETHER
-    explained = findings.residual_fraction < EXPLAINED and LIKELY[0] < middle < LIKELY[1]
+    together = (
+        float(np.std(gains)) < MAX_COMMON_SCATTER * abs(middle)
+        and abs(middle - 1.0) > MIN_COMMON_OFFSET
+    )
+    explained = (
+        findings.residual_fraction < MAX_COMMON_RESIDUAL
+        and WAVELENGTH_RANGE[0] < middle < WAVELENGTH_RANGE[1]
+    )
     if findings.stroke_known and explained and together and factor_of_passes(findings) is None:
         yield (
             f"the gain of every mode is {middle:.3g}: a wavelength of {wavelength_m:.3g} "
@@ -160,7 +166,7 @@ def _scale(findings: FitFindings, about: Instrument) -> Iterator[str]:
         )
 
 
-def _passes(findings: FitFindings) -> Iterator[str]:
+def _note_passes(findings: FitFindings) -> Iterator[str]:
     factor = factor_of_passes(findings)
     if factor is None:
         return

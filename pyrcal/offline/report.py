@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pyrcal.offline.alternatives import Alternative
 from pyrcal.offline.control_check import ReconstructorVerdict
 from pyrcal.offline.fitted import Fit, Registration
-from pyrcal.offline.instrument_checks import NOTABLE, NOTABLE_SIGMA
+from pyrcal.offline.instrument_checks import NOTABLE_CHANGE, NOTABLE_SIGMA
 from pyrcal.offline.left_over import LeftOver
 from service import __version__
 from service.control.gains import CalibrationGains
@@ -437,7 +437,7 @@ def _control(found: dict[str, Any] | None) -> dict[str, Any]:
     if found is None:
         return {}
     return {
-        # all modes that were fitted: more may be stable as well
+        # stable with all fitted modes: the limit is unknown, more may be stable as well
         "stable_modes": None
         if found["stable_modes"] >= found["n_modes"]
         else int(found["stable_modes"]),
@@ -452,7 +452,9 @@ def _otherwise(found: dict[str, dict[str, float | None]]) -> dict[str, float]:
         value, stated, sigma = one["found"], one["told"], one["sigma"] or 0.0
         if value is None or key == _WIDTH:
             continue
-        if stated is None or abs(value - stated) > max(NOTABLE * stated, NOTABLE_SIGMA * sigma):
+        if stated is None or abs(value - stated) > max(
+            NOTABLE_CHANGE * stated, NOTABLE_SIGMA * sigma
+        ):
             otherwise[key] = value
     return otherwise
 

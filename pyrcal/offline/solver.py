@@ -83,7 +83,7 @@ def image_patterns(stop: Stop) -> Array:
     independently.
     """
     along = np.array([[-1, 1, -1, 1], [-1, -1, 1, 1], [1, -1, -1, 1], [1, 1, 1, 1]]) / 2.0
-    both: Array = np.kron(np.eye(2), along).astype(np.float64)  # those of x, then those of y
+    both: Array = np.kron(np.eye(2), along).astype(np.float64)  # patterns along x, then along y
     return both if stop is Stop.TELESCOPE else both[[0, 1, 2, 4, 5, 6]]
 
 
@@ -215,7 +215,7 @@ class Nuisances:
         """Return the change with each pattern, of the changes ``(8, ...)`` with each image."""
         rates = np.tensordot(self.images.astype(apart.dtype), apart, axes=1)
         common = self.images.reshape(-1, 2, 4).mean(axis=2)
-        # where all images move the pupil does, and α, the mirror on the grid, stays
+        # a common displacement moves the pupil; α, the mirror's position on the grid, is unchanged
         rates -= np.tensordot(common.astype(apart.dtype), of_alpha[:2], axes=1)
         return np.asarray(rates)
 
@@ -361,21 +361,21 @@ def refine(
     if near is None:
         models.counter.n += 4
         frozen = models.cheap.derivatives(start)
-        beside = nuisances.derivatives(models, start, matrix, frozen, of_images)
-        near = np.concatenate([frozen, beside])
-    seen, every = _seen(columns, matrix, near, values, nuisances)
+        nuisance_rates = nuisances.derivatives(models, start, matrix, frozen, of_images)
+        near = np.concatenate([frozen, nuisance_rates])
+    seen, every = _project_columns(columns, matrix, near, values, nuisances)
     regions = nuisances.regions[columns.rows]
     counts = dispersion(seen, regions)
     converged = False
     for _ in range(max_steps):
-        step = _bounded_step(seen, values, nuisances, counts)
+        step = _limit_step(seen, values, nuisances, counts)
         if not within_limits(vector + step[:4]):
             break
         vector, values = vector + step[:4], values + step[4:]
         matrix = models.matrix(decides, nuisances.at(start, vector, values))
-        seen, every = _seen(columns, matrix, near, values, nuisances)
+        seen, every = _project_columns(columns, matrix, near, values, nuisances)
         counts = dispersion(seen, regions)
-        next_step = _bounded_step(seen, values, nuisances, counts)
+        next_step = _limit_step(seen, values, nuisances, counts)
         stretching = next_step[4:][STRETCHES] if nuisances.anamorphosis else np.zeros(1)
         at_rest = np.all(np.abs(next_step[:4]) < SETTLED_STEP)
         if at_rest and np.all(np.abs(stretching) < SETTLED_STRETCH):
@@ -394,7 +394,7 @@ def refine(
     )
 
 
-def _seen(
+def _project_columns(
     columns: Columns,
     matrix: NDArray[np.float32],
     near: Array,
@@ -429,17 +429,19 @@ def _seen(
     return columns.project(model * gain, every), every
 
 
-def _bounded_step(seen: Projection, values: Array, nuisances: Nuisances, counts: float) -> Array:
+def _limit_step(seen: Projection, values: Array, nuisances: Nuisances, counts: float) -> Array:
     """Return the step of the registration and the nuisances, limited in length.
 
     ``counts`` correlated slopes weigh as much as one independent slope, because residuals with a
     common cause carry less information. Without this, benches with a third of the signal
     unexplained would have pupil images displaced by a pixel to fit some of it.
     """
+    # the residual itself sets the noise level: the normal equations are in units of its variance
     noise = seen.chi / max(seen.residual.size - len(seen.gains), 1)
     prior = nuisances.prior * noise * counts
     pull = prior * np.concatenate([np.zeros(4), nuisances.from_prior(values)])
     step = np.linalg.solve(seen.normal + np.diag(prior), seen.scores.sum(axis=1) - pull)
+    # the whole step is shortened, not its components: its direction is the solution's
     excess = np.abs(step[:4]) / MAX_STEP
     stretches = step[4:][STRETCHES] if nuisances.anamorphosis else np.zeros(1)
     first = 4 + nuisances.first_optic

@@ -232,7 +232,7 @@ class System:
             about,
             name=f"{sensor.name}-{mirror.name}",
             pupil_shift_subap=(shift.real, shift.imag) if shift else None,
-            mirror=self._drawing(pair),
+            mirror=self._place_mirror(pair),
             modes=own.modes,
             unknown=unknown,
             law=None,
@@ -268,7 +268,7 @@ class System:
         inside = radius_m <= about.diameter_m / 2
         return np.flatnonzero(inside & (radius_m >= about.obscuration_ratio * about.diameter_m / 2))
 
-    def _drawing(self, pair: Pair) -> Mirror | TabulatedModes:
+    def _place_mirror(self, pair: Pair) -> Mirror | TabulatedModes:
         mirror, drawn = self.mirrors[pair.mirror].instrument.mirror, self.drawn(pair)
         if drawn == Similarity() or not isinstance(mirror, Mirror):
             return mirror
@@ -306,7 +306,7 @@ class System:
         width_m = self.sensors[pair.sensor].instrument.subaperture_m
         altitude_m = self.mirrors[pair.mirror].altitude_m
         height_m = values[of_sensor][HEIGHT]
-        # from metres at the altitude to the grid, and what a point of the pupil adds there
+        # ``scale``: metres at the altitude to the grid; ``centre``: image of the mirror's centre
         scale = to_grid.turn * along_light.turn / width_m
         centre = to_grid.after(along_light).after(to_altitude).shift - to_grid.shift
         narrower = -abs(along_light.turn) * altitude_m / height_m**2

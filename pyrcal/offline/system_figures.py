@@ -1,4 +1,4 @@
-"""Figures of a system: what each star sees of each mirror, how far all is from nominal."""
+"""Figures of a system: footprints of the stars on the mirrors, and offsets from nominal."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 _ACROSS = 3
 _SIDE = 5.0
-"""Panels side by side, and inches of one."""
+"""Number of panels in a row, and size of one, inches."""
 
 
 def write_system_sheet(report: SystemReport, path: Path) -> None:
-    """Write the figures as an image of the kind the file's name says.
+    """Write the figures as an image in the format of the file's suffix.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def write_system_sheet(report: SystemReport, path: Path) -> None:
 
 
 def footprints(axes: Axes, report: SystemReport, number: int) -> None:
-    """Draw a mirror's actuators, and where the light of each star meets it, metres."""
+    """Plot a mirror's actuators, and the footprint of each star's light on it, metres."""
     system = report.system
     placed = system.mirrors[number]
     mirror = placed.instrument.mirror
@@ -69,7 +69,7 @@ def footprints(axes: Axes, report: SystemReport, number: int) -> None:
 
 
 def moved(axes: Axes, report: SystemReport) -> None:
-    """Draw how far each number is from nominal, 1 σ, in subapertures at the edge of the pupil."""
+    """Plot each parameter's offset from nominal, 1 σ, in subapertures at the pupil's edge."""
     found, system = report.found, report.system
     if found is None:
         return
@@ -86,7 +86,7 @@ def moved(axes: Axes, report: SystemReport) -> None:
 
 
 def pulls(axes: Axes, report: SystemReport) -> None:
-    """Draw what is left of α of each pair over its 1 σ."""
+    """Plot the misfit of α of each pair over its 1 σ."""
     found, system = report.found, report.system
     if found is None:
         return

@@ -99,12 +99,12 @@ def load_system(path: Path) -> System:
     ConfigurationError
         One line with the file and the key.
     """
-    said = validated(SystemFile, read_toml(path), in_file(path))
-    _check_names(path, (*said.sensors, *said.mirrors))
+    document = validated(SystemFile, read_toml(path), in_file(path))
+    _check_names(path, (*document.sensors, *document.mirrors))
     known: dict[str, Instrument] = {}
 
     def instrument(table: PlaceTable, where: str) -> Instrument:
-        named = table.instrument or said.system.instrument
+        named = table.instrument or document.system.instrument
         if named is None:
             raise ConfigurationError(
                 f"{path}: {where}.instrument: missing, and system.instrument is, too"
@@ -115,20 +115,20 @@ def load_system(path: Path) -> System:
         return known[named]
 
     system = System(
-        name=said.system.name,
+        name=document.system.name,
         sensors=tuple(
             _sensor(table, instrument(table, f"sensors.{k}"))
-            for k, table in enumerate(said.sensors)
+            for k, table in enumerate(document.sensors)
         ),
         mirrors=tuple(
             _mirror(table, instrument(table, f"mirrors.{k}"))
-            for k, table in enumerate(said.mirrors)
+            for k, table in enumerate(document.mirrors)
         ),
-        stars_move=said.system.stars != "known",
-        heights_move=said.system.stars == "direction and height",
+        stars_move=document.system.stars != "known",
+        heights_move=document.system.stars == "direction and height",
     )
     _check_telescope(path, system)
-    for number, table in enumerate(said.sensors):
+    for number, table in enumerate(document.sensors):
         _check_star(f"{path}: sensors.{number}.star_arcsec", math.hypot(*table.star_arcsec))
     for number, mirror in enumerate(system.mirrors):
         _check_mirror(f"{path}: mirrors.{number}", mirror, system)

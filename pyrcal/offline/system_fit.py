@@ -26,13 +26,13 @@ UNSEEN_SUBAP = 1.0
 MAX_STEPS = 20
 SETTLED_SUBAP = 1e-7
 
-_ALONG = 0.9
+_MIN_SHARE = 0.9
 """Share of a known direction within the unobservable ones above which it is reported."""
 
-_NEW = 0.1
+_MIN_NEW_SHARE = 0.1
 """Share of it outside the directions reported before, above which it is reported too."""
 
-_NAMED, _NOTABLE = 4, 0.2
+_MAX_LISTED, _MIN_LISTED = 4, 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -91,7 +91,7 @@ def fit_system(system: System, alphas: Array, covariances: Array) -> SystemFit:
     unit = np.array([parameter.subap for parameter in system.parameters])
     values = system.nominal.copy()
     for _ in range(MAX_STEPS):
-        left = _left(system, alphas, values)
+        left = _compute_misfit(system, alphas, values)
         rates = np.einsum("pij,pjk->pik", roots, system.rates(values)[used])
         seen = _Directions.of(rates.reshape(-1, len(values))[:, free] * unit[free])
         moved = (values[free] - system.nominal[free]) / unit[free]
@@ -100,7 +100,7 @@ def fit_system(system: System, alphas: Array, covariances: Array) -> SystemFit:
         values[free] += step * unit[free]
         if np.max(np.abs(step), initial=0.0) < SETTLED_SUBAP:
             break
-    left = _left(system, alphas, values)
+    left = _compute_misfit(system, alphas, values)
     whitened = np.einsum("pij,pj->pi", roots, left[used])
     covariance = np.zeros((len(values), len(values)))
     covariance[np.ix_(free, free)] = seen.covariance * np.outer(unit[free], unit[free])
@@ -111,7 +111,7 @@ def fit_system(system: System, alphas: Array, covariances: Array) -> SystemFit:
         values=values,
         covariance=covariance,
         unseen_share=share,
-        unseen=tuple(_named(system, values, seen.unseen, free, unit)),
+        unseen=tuple(_name_directions(system, values, seen.unseen, free, unit)),
         misfit=left,
         pulls=left / sigma,
         chi2=float(np.sum(whitened**2)),
@@ -119,7 +119,7 @@ def fit_system(system: System, alphas: Array, covariances: Array) -> SystemFit:
     )
 
 
-def _left(system: System, alphas: Array, values: Array) -> Array:
+def _compute_misfit(system: System, alphas: Array, values: Array) -> Array:
     """Return measured less expected α, with rotation differences wrapped to half a turn."""
     left = alphas - system.alphas(values)
     left[:, 2] = [wrapped(angle) for angle in left[:, 2]]
@@ -144,6 +144,7 @@ class _Directions:
     @classmethod
     def of(cls, rates: Array) -> _Directions:
         left, size, along = np.linalg.svd(rates, full_matrices=True)
+        # singular values are in σ per subaperture: their reciprocal is 1 σ along the direction
         n_seen = int(np.sum(size > 1.0 / UNSEEN_SUBAP))
         return cls(
             rates=rates,
@@ -167,7 +168,7 @@ class _Directions:
         return np.asarray(scaled.T @ scaled)
 
 
-def _named(
+def _name_directions(
     system: System, values: Array, unseen: Array, free: NDArray[np.bool_], unit: Array
 ) -> Iterator[str]:
     """Yield in words the directions that ``unseen`` spans."""
@@ -177,25 +178,25 @@ def _named(
         for direction in directions:
             moved = (direction / unit)[free]
             size = float(np.linalg.norm(moved))
-            if size == 0.0 or np.linalg.norm(unseen @ moved) < _ALONG * size:
+            if size == 0.0 or np.linalg.norm(unseen @ moved) < _MIN_SHARE * size:
                 continue
             moved = moved @ left.T @ left / size
-            if np.linalg.norm(moved) < _NEW:
+            if np.linalg.norm(moved) < _MIN_NEW_SHARE:
                 continue
             found = True
             moved /= np.linalg.norm(moved)
-            # what is left is turned so that this direction is its first, which then goes
+            # rotate the remaining basis so that this direction comes first, then remove it
             turned, _ = np.linalg.qr(np.column_stack([left @ moved, np.eye(len(left))]))
             left = turned[:, 1:].T @ left
         if found:
             yield words
     parameters = [parameter for parameter in system.parameters if parameter.free]
     for direction in left:
-        largest = np.argsort(-np.abs(direction))[:_NAMED]
+        largest = np.argsort(-np.abs(direction))[:_MAX_LISTED]
         parts = [
             f"{parameters[k].owner} {parameters[k].name} ({direction[k]:+.2f})"
             for k in largest
-            if abs(direction[k]) > _NOTABLE
+            if abs(direction[k]) > _MIN_LISTED
         ]
         yield f"together, in subapertures: {', '.join(parts)}"
 
@@ -206,7 +207,7 @@ def _known_directions(system: System, values: Array) -> Iterator[tuple[str, list
     both = (1.0 + 0j, 1j)
     everything = "sensors, mirrors and stars" if system.stars_move else "sensors and mirrors"
     yield (
-        "the common shift of all sensors and mirrors: only where one lies on the other is seen",
+        "the common shift of all sensors and mirrors: only their relative shift is observable",
         [_common_shift(system, values, along) for along in both],
     )
     yield (
@@ -242,7 +243,7 @@ def _of_each_star(system: System, values: Array) -> Iterator[tuple[str, list[Arr
             direction[of_sensor][STAR] = _xy(along)
             direction[of_sensor][SHIFTS] = _xy(turn * narrowed * altitude_m / width_m * along)
             aside.append(direction)
-        nothing = "no mirror lies above or below the pupil"
+        nothing = "all mirrors are in the pupil"
         one = "they separate only with mirrors at several altitudes"
         yield (
             f"the star of {sensor.name}: {nothing}"

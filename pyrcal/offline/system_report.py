@@ -18,10 +18,10 @@ from service.files.container import put_array
 from service.files.documents import json_text
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 
-UNLIKELY = 1e-4
+MIN_PROBABILITY = 1e-4
 """Probability of χ² below which the pairs do not belong to one system."""
 
-PARTLY = 0.05
+NOTABLE_UNSEEN_SHARE = 0.05
 """Share in unobservable directions above which a parameter is marked."""
 
 
@@ -60,7 +60,11 @@ class SystemReport:
     @property
     def accepted(self) -> bool:
         """True if every pair was accepted and all agree."""
-        return not self.refused and self.found is not None and self.found.probability >= UNLIKELY
+        return (
+            not self.refused
+            and self.found is not None
+            and self.found.probability >= MIN_PROBABILITY
+        )
 
     @property
     def verdict(self) -> str:
@@ -87,7 +91,7 @@ class SystemReport:
             alphas = np.array([one.fit.alpha.vector for one in self.fits])
             alphas[~np.isfinite(found.misfit).all(axis=1)] = np.nan
             moved = fit_system(free, alphas, np.array([one.fit.covariance for one in self.fits]))
-            if moved.n_free and moved.probability >= UNLIKELY:
+            if moved.n_free and moved.probability >= MIN_PROBABILITY:
                 return f'with stars = "direction" they agree: {self._farthest_star(moved)}'
         return (
             "an altitude, a star or a nominal place is not as the file says, or a matrix is "
@@ -102,13 +106,14 @@ class SystemReport:
         system = self.system
         places = [system.of_sensor(number) for number in range(len(system.sensors))]
         off = np.array([moved.values[one][STAR] - system.nominal[one][STAR] for one in places])
+        # the mean of the others is the common direction, which α does not show
         n_others = max(len(off) - 1, 1)
-        beside = off - (off.sum(axis=0) - off) / n_others
+        to_others = off - (off.sum(axis=0) - off) / n_others
         number = int(np.argmax(np.hypot(*off.T)))
-        x, y = beside[number] / ARCSEC_RAD
+        x, y = to_others[number] / ARCSEC_RAD
         return (
             f"the star of {system.sensors[number].name} is {x:+.2f}, {y:+.2f} arcseconds from "
-            "where the file says, beside the other stars"
+            "the file's direction, relative to the other stars"
         )
 
     def _worst(self, found: SystemFit) -> str:
@@ -208,7 +213,11 @@ def _place_lines(report: SystemReport) -> Iterator[str]:
     for row in rows:
         if row.sigma is None:
             continue
-        mark = "  only beside others: see not seen" if row.unseen_share > PARTLY else ""
+        mark = (
+            "  only relative to others: see not seen"
+            if row.unseen_share > NOTABLE_UNSEEN_SHARE
+            else ""
+        )
         numbers = "".join(
             f"{number:12.6g}" if number is not None else f"{'':>12s}"
             for number in (row.value, row.sigma, row.nominal)
@@ -224,8 +233,8 @@ def _pair_lines(report: SystemReport) -> Iterator[str]:
         values = one.fit.alpha.vector * BOUNDARY_SCALE
         numbers = "".join(f"{value:12.5f}" for value in values)
         names = " x ".join(report.system.names(pair))
-        said = "" if one.fit.accepted else "  refused"
-        yield f"{names:28s}{numbers}{100.0 * one.fit.residual_fraction:12.2f}{said}"
+        refusal_mark = "" if one.fit.accepted else "  refused"
+        yield f"{names:28s}{numbers}{100.0 * one.fit.residual_fraction:12.2f}{refusal_mark}"
 
 
 def fill_system(file: h5py.File, report: SystemReport) -> None:

@@ -79,7 +79,7 @@ FEW_MODES_POWER = np.array([1.0, 1.0, 1.0, 0.5])
 OTHER_SHARE = 0.5
 """Probability of an instrument that explains a matrix as well as the file's."""
 
-UNINFORMATIVE = 5.0
+UNINFORMATIVE_RATIO = 5.0
 """1 σ of a parameter in a set of modes, over the median of all sets, above which it is ignored."""
 
 N_SECTORS, N_RINGS = 12, 3
@@ -159,7 +159,7 @@ class Uncertainty:
         if len(self.subset_steps) < 2:
             return 0.0
         sigma = np.sqrt([np.diag(matrix) for matrix in self.subset_covariance])
-        sigma[sigma > UNINFORMATIVE * np.median(sigma, axis=0)] = np.inf
+        sigma[sigma > UNINFORMATIVE_RATIO * np.median(sigma, axis=0)] = np.inf
         return float(np.max(np.abs(self.subset_steps) / sigma))
 
 
@@ -223,15 +223,15 @@ def uncertainty(
     every = _sandwich(spread, scores) * n_modes / max(n_modes - 1, 1)
     from_modes = _at_least(every[:4, :4], (spread * noise)[:4, :4])
     by_region = _sandwich(spread, _regional_scores(projection, regions))
-    # noise scatters between regions, too, and is in the statistical part already
+    # noise also scatters between regions, but the statistical part already includes it
     white = np.diag(spread)[:4] * noise * noise_share
     regional = np.diag(np.maximum(np.diag(by_region)[:4] - white, 0.0))
     few = (1.0 + FEW_MODES_EXCESS * np.exp(-n_modes / FEW_MODES)) ** FEW_MODES_POWER
     share = few * REGIONAL_SHARE * np.sqrt(np.diag(regional))
-    strange = min(1.0, residual_fraction / STRANGE_RESIDUAL)
-    far = strange * FAR_SHARE * shift_subap
+    kind_share = min(1.0, residual_fraction / STRANGE_RESIDUAL)
+    far = kind_share * FAR_SHARE * shift_subap
     floor = np.array([FLOOR_SUBAP, FLOOR_SUBAP, FLOOR_SUBAP / radius_subap, magnification_floor])
-    # what the prior holds may be anywhere within it
+    # a quantity fixed by its prior may have any value within that prior
     held_back = (spread * np.diag(held) @ spread)[:4, :4] * noise * dispersed
     from_model = np.diag(share**2 + floor**2 + far**2) + held_back
     pull = prior * noise * values

@@ -1,6 +1,6 @@
 """``python -m pyrcal.offline.uploaded FOLDER``: the process of an uploaded fit.
 
-Nothing large is imported before the process is nice.
+Large modules are imported after the process has lowered its priority.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from service.files.fit_folder import read_request
 DONE, FAILED = 0, 2
 
 ROOM_BYTES = 48_000_000
-"""Beyond the imports, or a fit is not begun: a buffer of BLAS for a second thread, and objects."""
+"""Memory beyond the imports that must be free before a fit starts: a BLAS buffer of a second
+thread, and objects."""
 
 
 def main(folder: Path) -> int:
@@ -31,11 +32,13 @@ def main(folder: Path) -> int:
         _limit_memory(request.memory_mb * 1_000_000)
         fit_upload(folder, request)
     except PyrcalError as error:
-        return _failed(str(error))
-    except (MemoryError, SystemError):  # the latter: an extension module got no memory
-        return _failed(f"needs more memory than {request.memory_mb} MB, the most it may have")
+        return _report_failure(str(error))
+    except (MemoryError, SystemError):  # SystemError: an extension module could not allocate memory
+        return _report_failure(
+            f"needs more memory than {request.memory_mb} MB, the most it may have"
+        )
     except Exception as error:  # noqa: BLE001 - sent home, where it is a failed fit
-        return _failed(f"failed unforeseen: {error!r}")
+        return _report_failure(f"failed unforeseen: {error!r}")
     return DONE
 
 
@@ -64,12 +67,12 @@ def _limit_memory(max_bytes: int) -> None:
 
 
 def _follow_service() -> None:
-    """End with the service, even when it was killed: it holds the other end of standard input."""
+    """End this process when the service ends, even if it is killed: standard input then closes."""
     sys.stdin.buffer.read()
     os._exit(FAILED)
 
 
-def _failed(why: str) -> int:
+def _report_failure(why: str) -> int:
     sys.stderr.buffer.write(f"{why}\n".encode())
     return FAILED
 
@@ -77,4 +80,4 @@ def _failed(why: str) -> int:
 if __name__ == "__main__":
     status = main(Path(sys.argv[1]))
     sys.stderr.flush()
-    os._exit(status)  # the thread that follows the service holds standard input
+    os._exit(status)  # the thread that watches the service blocks on standard input

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.alternatives import Alternative
-from pyrcal.offline.instrument_checks import FileValuesFit, FoundOptic, Rival
+from pyrcal.offline.instrument_checks import AlternativeInstrument, FileValuesFit, FoundOptic
 from pyrcal.offline.methods import Landing
 from pyrcal.offline.pupil_width import SeenPupil
 from pyrcal.offline.solver import OPTIC_SIGMA, UNKNOWN_SIGMA, Solution
@@ -41,7 +41,7 @@ NOTABLE_STRUCTURE = 0.09
 MAX_TENSION = 5.0
 """Largest distance of a set of modes from the others, in its own σ."""
 
-MOST_GAIN = 500.0
+MAX_GAIN_RATIO = 500.0
 """Largest median gain, and the reciprocal of the smallest: illumination cannot explain a factor of
 1000, a unit can."""
 
@@ -51,19 +51,19 @@ MAX_SCATTER = 0.35
 LARGEST_SIGMA = np.array([0.3, 0.3, np.deg2rad(3.0), 0.06])
 """Largest 1 σ of a determined registration (numeric units)."""
 
-STRANGEST = 3.0
+MAX_OPTIC_DEVIATION = 3.0
 """Largest plausible deviation of a logarithm from the file's, in units of its prior σ."""
 
-ALIKE = 2.0
+EQUAL_MISFIT_RATIO = 2.0
 """Ratio of two alternatives' misfits within which neither is preferred: both are first order."""
 
 MAX_DISPLACEMENT = 1.0
 """Change of the registration in σ up to which a better explanation does not make it undetermined:
 the change enters σ, and the advice is to correct the file."""
 
-CANNOT_TELL = "the matrix cannot tell which"
+UNDECIDED_WORDS = "the matrix does not show which"
 
-_PASSES = 0.12
+_PASS_TOLERANCE = 0.12
 """Largest relative deviation from a factor of two, and scatter, that indicates a forgotten pass."""
 
 
@@ -86,7 +86,7 @@ class FitFindings:
     landing: Landing | None
     """Result of the coarse search; None for methods without one."""
 
-    rivals: tuple[Rival, ...]
+    rivals: tuple[AlternativeInstrument, ...]
     """Other instruments, the best explanation first."""
 
     off_centre: Alternative | None
@@ -143,26 +143,26 @@ class Refusal(StrEnum):
     DIVIDED = "divided"
 
 
-def judged(findings: FitFindings) -> tuple[Refusal | None, str]:
+def judge_fit(findings: FitFindings) -> tuple[Refusal | None, str]:
     """Return the reason of a refusal, or None, and the verdict in one line."""
     for reason, refusal in (
         (Refusal.AXES, findings.axes),
-        (Refusal.ANOTHER_PUPIL, _another_pupil(findings)),
-        (Refusal.UNSETTLED, _unsettled(findings)),
-        (Refusal.UNDETERMINED, _undetermined(findings)),
-        (Refusal.UNEXPLAINED, _unexplained(findings)),
-        (Refusal.ANOTHER_MINIMUM, _another_minimum(findings)),
-        (Refusal.ANOTHER_INSTRUMENT, _another_instrument(findings)),
-        (Refusal.ANOTHER_BASIS, _another_basis(findings)),
-        (Refusal.ANOTHER_UNIT, _another_unit(findings)),
-        (Refusal.DIVIDED, _divided(findings)),
+        (Refusal.ANOTHER_PUPIL, _check_pupil(findings)),
+        (Refusal.UNSETTLED, _check_convergence(findings)),
+        (Refusal.UNDETERMINED, _check_determination(findings)),
+        (Refusal.UNEXPLAINED, _check_explanation(findings)),
+        (Refusal.ANOTHER_MINIMUM, _check_minimum(findings)),
+        (Refusal.ANOTHER_INSTRUMENT, _check_instrument(findings)),
+        (Refusal.ANOTHER_BASIS, _check_basis(findings)),
+        (Refusal.ANOTHER_UNIT, _check_unit(findings)),
+        (Refusal.DIVIDED, _check_agreement(findings)),
     ):
         if refusal:
             return reason, f"refused: {refusal}"
-    return None, f"accepted: {_quality(findings)}"
+    return None, f"accepted: {_describe_quality(findings)}"
 
 
-def _quality(findings: FitFindings) -> str:
+def _describe_quality(findings: FitFindings) -> str:
     shares = f"residual {findings.residual_fraction:.1%} of the signal"
     if len(findings.uncertainty.subset_steps) < 2:
         return f"{shares}; too few modes to split into sets that check each other"
@@ -171,18 +171,18 @@ def _quality(findings: FitFindings) -> str:
     return f"{n_sets} sets of modes agree within {tension:.1f} sigma, {shares}"
 
 
-def _unsettled(findings: FitFindings) -> str:
+def _check_convergence(findings: FitFindings) -> str:
     if findings.solution.converged:
         return ""
     noise = "" if findings.explained else "there is too much noise, "
     return (
-        f"the steps did not come to rest: {noise}the modes (another basis, another order) or the "
-        "instrument file are another's, or the start is outside the capture range: start closer "
-        "(--start), or leave the start out"
+        f"the fit did not converge: {noise}the modes (basis or order) or the instrument file do "
+        "not match the matrix, or the start is outside the capture range: start closer (--start), "
+        "or leave the start out"
     )
 
 
-def _undetermined(findings: FitFindings) -> str:
+def _check_determination(findings: FitFindings) -> str:
     sigma = np.sqrt(np.diag(findings.uncertainty.covariance))
     if np.all(sigma < LARGEST_SIGMA):
         return ""
@@ -193,7 +193,7 @@ def _undetermined(findings: FitFindings) -> str:
     )
 
 
-def _unexplained(findings: FitFindings) -> str:
+def _check_explanation(findings: FitFindings) -> str:
     if findings.explained:
         return ""
     return (
@@ -203,7 +203,7 @@ def _unexplained(findings: FitFindings) -> str:
     )
 
 
-def _another_minimum(findings: FitFindings) -> str:
+def _check_minimum(findings: FitFindings) -> str:
     if findings.landing is None or not findings.landing.rivals:
         return ""
     rival = findings.landing.rivals[0].alpha.to_boundary()
@@ -214,7 +214,7 @@ def _another_minimum(findings: FitFindings) -> str:
     )
 
 
-def _another_pupil(findings: FitFindings) -> str:
+def _check_pupil(findings: FitFindings) -> str:
     if findings.narrow is None:
         return ""
     return (
@@ -223,14 +223,15 @@ def _another_pupil(findings: FitFindings) -> str:
     )
 
 
-def _another_instrument(findings: FitFindings) -> str:
+def _check_instrument(findings: FitFindings) -> str:
     for rival in findings.rivals:
-        if rival.preferred and _displaces(findings, rival.moved):
-            return f"another instrument explains the matrix better: {_which(findings, rival)}"
+        if rival.preferred and _moves_registration(findings, rival.moved):
+            other = _describe_instrument(findings, rival)
+            return f"another instrument explains the matrix better: {other}"
     for optic in findings.optics:
         usual = OPTIC_SIGMA[optic.optic] if optic.reported is not None else UNKNOWN_SIGMA
-        # a logarithm has no value for a modulation that is found to be none
-        if abs(optic.change) > STRANGEST * usual and optic.found != 0.0:
+        # the logarithm of a fitted modulation of 0 is meaningless
+        if abs(optic.change) > MAX_OPTIC_DEVIATION * usual and optic.found != 0.0:
             return (
                 f"only {optic.found_words} would explain the matrix, {optic.file_words}: the "
                 "mirror, the sensor or the modes are not those of the instrument file"
@@ -238,29 +239,29 @@ def _another_instrument(findings: FitFindings) -> str:
     return ""
 
 
-def _displaces(findings: FitFindings, moved: Array) -> bool:
+def _moves_registration(findings: FitFindings, moved: Array) -> bool:
     """Return True if an explanation changes the registration by more than ``MAX_DISPLACEMENT``."""
     return bool(np.any(np.abs(moved) > MAX_DISPLACEMENT * findings.sigma_of_sets))
 
 
-def _which(findings: FitFindings, rival: Rival) -> str:
+def _describe_instrument(findings: FitFindings, rival: AlternativeInstrument) -> str:
     """Return the other instrument, or both if the matrix does not distinguish them."""
     of_rival = f"with {rival.change.words} the misfit is {rival.share:.0%} of what it is now"
     off = findings.off_centre
-    if off is None or off.share is None or off.share > ALIKE * rival.share:
+    if off is None or off.share is None or off.share > EQUAL_MISFIT_RATIO * rival.share:
         return f"{of_rival}; correct the instrument file"
-    if rival.share > ALIKE * off.share:
+    if rival.share > EQUAL_MISFIT_RATIO * off.share:
         return (
             f"with {off.words} the misfit is {off.share:.0%} of what it is now; centre the pupil, "
             "or correct the mask of valid subapertures"
         )
     return (
-        f"{of_rival}, with {off.words} {off.share:.0%}: {CANNOT_TELL}; look where the pupil "
-        "lies and correct that"
+        f"{of_rival}, with {off.words} {off.share:.0%}: {UNDECIDED_WORDS}; check the pupil's "
+        "position and correct the file"
     )
 
 
-def _another_basis(findings: FitFindings) -> str:
+def _check_basis(findings: FitFindings) -> str:
     gains = findings.solution.projection.gains
     middle = float(np.median(gains))
     scatter = float(np.median(np.abs(gains - middle)) / abs(middle)) * 1.4826
@@ -278,18 +279,18 @@ def _another_basis(findings: FitFindings) -> str:
     )
 
 
-def _another_unit(findings: FitFindings) -> str:
+def _check_unit(findings: FitFindings) -> str:
     if not findings.stroke_known:
         return ""
     gains = findings.solution.projection.gains
     middle = float(np.median(gains))
-    if not 1.0 / MOST_GAIN < middle < MOST_GAIN:
+    if not 1.0 / MAX_GAIN_RATIO < middle < MAX_GAIN_RATIO:
         return (
             f"the measured slopes are {middle:.1e} times the model's: the matrix is in another "
             "unit than slope per metre of OPD (per nanometre would be 1e-09)"
         )
     factor = factor_of_passes(findings)
-    if factor is None or float(np.std(gains) / middle) >= _PASSES:
+    if factor is None or float(np.std(gains) / middle) >= _PASS_TOLERANCE:
         return ""
     words = "twice" if factor > 1.0 else "half"
     cause = (
@@ -312,12 +313,12 @@ def factor_of_passes(findings: FitFindings) -> float | None:
     if not findings.stroke_known:
         return None
     for factor in (2.0,) if findings.passes == 1 else (2.0, 0.5):
-        if abs(middle / factor - 1.0) < _PASSES:
+        if abs(middle / factor - 1.0) < _PASS_TOLERANCE:
             return factor
     return None
 
 
-def _divided(findings: FitFindings) -> str:
+def _check_agreement(findings: FitFindings) -> str:
     tension = findings.uncertainty.subset_tension
     if tension <= MAX_TENSION:
         return ""

@@ -32,14 +32,14 @@ FRAMES_PER_COMPONENT: Final = 4
 N_MODES: Final = 16
 """Number of modes whose commands are predicted: those with the largest changes."""
 
-PREDICTED: Final = 0.3
+MIN_PREDICTED_SHARE: Final = 0.3
 """Smallest share of the variance of changes that slopes predict at the true delay. Measured at the
 true delay: 0.84 to 0.95; at all others below 0."""
 
 MIN_MODES: Final = 2
 """Smallest number of predicted modes: a dither of one frequency predicts itself at any delay."""
 
-CLEARER: Final = 1.5
+MIN_SHARE_RATIO: Final = 1.5
 """Smallest ratio of the predicted shares at the true delay and at any other that is not its
 neighbour."""
 
@@ -67,11 +67,14 @@ def measure_delay(slopes: Array, commands: Array, delay_frames: float) -> int | 
         return None
     stated = round(delay_frames)
     delays = np.arange(stated - MAX_APART_FRAMES, stated + MAX_APART_FRAMES + 1)
-    shares = np.array([_predicted(seen, changes, int(delay)) for delay in delays])
-    strengths = np.where(shares > PREDICTED, shares, 0.0).sum(axis=1)
+    shares = np.array([_predict_share(seen, changes, int(delay)) for delay in delays])
+    strengths = np.where(shares > MIN_PREDICTED_SHARE, shares, 0.0).sum(axis=1)
     best = int(np.argmax(strengths))
     others = np.delete(strengths, slice(max(best - 1, 0), best + 2))
-    if np.sum(shares[best] > PREDICTED) < MIN_MODES or strengths[best] < CLEARER * others.max():
+    if (
+        np.sum(shares[best] > MIN_PREDICTED_SHARE) < MIN_MODES
+        or strengths[best] < MIN_SHARE_RATIO * others.max()
+    ):
         return None
     return int(delays[best])
 
@@ -88,8 +91,8 @@ def _components(slopes: Array, n_most: int) -> Array:
     return np.asarray(centred @ axes)
 
 
-def _predicted(seen: Array, changes: Array, delay: int) -> Array:
-    """Return which share of each mode's changes slopes so many frames earlier predict.
+def _predict_share(seen: Array, changes: Array, delay: int) -> Array:
+    """Return the share of each mode's changes that slopes of an earlier frame predict.
 
     The first half of the frames gives the weights, the second half tests them.
     """

@@ -28,10 +28,10 @@ Array = NDArray[Any]
 UNITS_M = {None: 1.0, "": 1.0, "m": 1.0, "um": 1e-6, "nm": 1e-9}
 """Metres of OPD in a unit of modal commands; without one they are metres."""
 
-OFF_THE_BEAT = 0.25
+MAX_TIME_OFFSET = 0.25
 """Largest deviation of a time from the frame rate, frames."""
 
-NO_MODES = 1e-2
+MAX_UNMODELLED_SHARE = 1e-2
 """Largest RMS share of the actuator commands outside the modes' span; with a larger one, modes do
 not represent the commands."""
 
@@ -63,7 +63,7 @@ def read_telemetry(path: Path, instrument: Instrument) -> AotTelemetry:
     """
     system = read_system(path)
     loops = [one for one in system.loops if _commands(one) is not None]
-    sensors = [one for one in system.wavefront_sensors if _is_of(one, instrument)]
+    sensors = [one for one in system.wavefront_sensors if _belongs_to(one, instrument)]
     if not sensors:
         listed = ", ".join(
             f"{one.uid} ({type(one).__name__}, {_n_valid(one)} subapertures)"
@@ -83,8 +83,8 @@ def read_telemetry(path: Path, instrument: Instrument) -> AotTelemetry:
     loops.sort(key=lambda one: -len(_commands(one).data))
     sensor = loops[0].input_sensor if loops else sensors[0]
     mirror = loops[0].commanded_corrector if loops else _only_mirror(path, system)
-    told = registrations_between(mirror, sensor, instrument.subaperture_m, str(path))
-    night = AotTelemetry(registrations=() if told is None else told.over_time)
+    dated = registrations_between(mirror, sensor, instrument.subaperture_m, str(path))
+    night = AotTelemetry(registrations=() if dated is None else dated.over_time)
     if len(system.wavefront_sensors) > 1:
         night.notes.append(
             f"of {len(system.wavefront_sensors)} sensors {sensor.uid} is taken, whose mask is the "
@@ -105,7 +105,7 @@ def _n_valid(sensor: Any) -> int:  # noqa: ANN401 - aotpy has no types
     return 0 if mask is None else int((np.asarray(mask.data) >= 0).sum())
 
 
-def _is_of(sensor: Any, instrument: Instrument) -> bool:  # noqa: ANN401
+def _belongs_to(sensor: Any, instrument: Instrument) -> bool:  # noqa: ANN401
     """Return whether a sensor may be the instrument's: without a mask the reader refuses it."""
     mask = getattr(sensor, "subaperture_mask", None)
     if mask is None:
@@ -125,7 +125,7 @@ def _only_mirror(path: Path, system: Any) -> Any:  # noqa: ANN401
 
 
 def _commands(loop: Any) -> Any:  # noqa: ANN401 - aotpy has no types
-    """Return the image of a loop's commands: of modes, or else of actuators; None: it has none."""
+    """Return the image of a loop's commands, modal if available; None if it has none."""
     modal = getattr(loop, "modal_coefficients", None)
     return loop.commands if modal is None else modal
 
@@ -146,8 +146,8 @@ class _Reader:
         if not loop.framerate:
             raise self._refusal(f"loop {loop.uid}: found no framerate, expected frames a second")
         own = is_own(image)
-        listed = self._listed(sensor, own=own)
-        slopes = self._as_rtc(np.asarray(image.data), listed, own=own)
+        listed = self._list_positions(sensor, own=own)
+        slopes = self._order_as_rtc(np.asarray(image.data), listed, own=own)
         every, seqs = self._frames(image, commands, float(loop.framerate))
         places = {seq: k for k, seq in enumerate(every)}
         if alone := [seq for seq in seqs if seq not in places]:
@@ -159,7 +159,7 @@ class _Reader:
             raise self._refusal(f"loop {loop.uid}: found times that are not finite numbers")
         arrays = {
             "slopes": slopes[[places[seq] for seq in seqs]],
-            "commands_m": self._modal(loop),
+            "commands_m": self._compute_modal_commands(loop),
             "seq": np.array(seqs, np.int64),
             "frame_rate_hz": np.array(float(loop.framerate)),
             "t0_ns_utc": np.array(float(round(stamps[0] * SECOND_NS)) if stamps else 0.0),
@@ -168,14 +168,14 @@ class _Reader:
         if loop.delay is not None:
             arrays["delay_frames"] = np.array(float(loop.delay))
         if loop.measurements_to_modes is not None:
-            control = self._in_metres(loop.measurements_to_modes)
-            arrays["reconstructor"] = self._as_rtc(control, listed, own=own)
+            control = self._convert_to_metres(loop.measurements_to_modes)
+            arrays["reconstructor"] = self._order_as_rtc(control, listed, own=own)
         return arrays
 
     # --- signals
 
-    def _listed(self, sensor: Any, *, own: bool) -> Array:  # noqa: ANN401
-        """Return where the file lists each of the instrument's subapertures, row by row."""
+    def _list_positions(self, sensor: Any, *, own: bool) -> Array:  # noqa: ANN401
+        """Return the position of each of the instrument's subapertures in the file, row by row."""
         if sensor.subaperture_mask is None:
             raise self._refusal("found no subaperture_mask, expected one")
         valid = (valid_subapertures if own else rtc_valid_subapertures)(self.instrument)
@@ -188,7 +188,7 @@ class _Reader:
             )
         return places_of(places, str(self.path))
 
-    def _as_rtc(self, values: Array, listed: Array, *, own: bool) -> Array:
+    def _order_as_rtc(self, values: Array, listed: Array, *, own: bool) -> Array:
         """Return signals ``(n, 2, n_valid)``, pixels 4, as the RTC lists them: ``(n, n_slopes)``.
 
         A file that pyrcal has not written has the RTC's axes and signs, as ``pyrcal import aot``
@@ -218,7 +218,7 @@ class _Reader:
         if [len(one) for one in stamps] == [len(image.data), len(commands.data)]:
             self.notes.append("frames have no numbers: counted by their times")
             first = min(stamps[0][0], stamps[1][0])
-            every, seqs = (self._counted(one, first, rate_hz) for one in stamps)
+            every, seqs = (self._number_frames(one, first, rate_hz) for one in stamps)
             return every, seqs
         if any(n_numbers) or any(stamps) or len(image.data) != len(commands.data):
             raise self._refusal(
@@ -229,26 +229,26 @@ class _Reader:
         self.notes.append("frames have neither numbers nor times: taken as all there are, in order")
         return list(range(len(image.data))), list(range(len(image.data)))
 
-    def _counted(self, stamps: list[float], first: float, rate_hz: float) -> list[int]:
+    def _number_frames(self, stamps: list[float], first: float, rate_hz: float) -> list[int]:
         beats = (np.array(stamps) - first) * rate_hz
         numbers = np.round(beats)
         off = float(np.max(np.abs(beats - numbers)))
-        if not off <= OFF_THE_BEAT or np.any(np.diff(numbers) <= 0):
+        if not off <= MAX_TIME_OFFSET or np.any(np.diff(numbers) <= 0):
             raise self._refusal(
                 f"found times that are {off:.2g} of a frame off the loop's {rate_hz:g} Hz, or "
-                f"twice in one, expected at most {OFF_THE_BEAT:g}; give frame_numbers"
+                f"twice in one, expected at most {MAX_TIME_OFFSET:g}; give frame_numbers"
             )
         return [int(number) for number in numbers]
 
     # --- commands
 
-    def _modal(self, loop: Any) -> Array:  # noqa: ANN401
+    def _compute_modal_commands(self, loop: Any) -> Array:  # noqa: ANN401
         """Return the commands ``(n, n_modes)`` of the instrument's modes, metres."""
         if loop.modal_coefficients is not None:
-            return self._in_metres(loop.modal_coefficients)
-        strokes_m = self._in_metres(loop.commands)
+            return self._convert_to_metres(loop.modal_coefficients)
+        strokes_m = self._convert_to_metres(loop.commands)
         if loop.ref_commands is not None:
-            strokes_m = strokes_m - self._in_metres(loop.ref_commands).ravel()
+            strokes_m = strokes_m - self._convert_to_metres(loop.ref_commands).ravel()
         mirror = self.instrument.mirror
         to_actuators = mirror.mode_to_actuator if isinstance(mirror, Mirror) else None
         if to_actuators is None or strokes_m.shape[1:] != to_actuators.shape[:1]:
@@ -259,10 +259,10 @@ class _Reader:
             )
         modal = strokes_m @ np.linalg.pinv(to_actuators).T
         left = np.linalg.norm(strokes_m - modal @ to_actuators.T) / np.linalg.norm(strokes_m)
-        if not left <= NO_MODES:
+        if not left <= MAX_UNMODELLED_SHARE:
             raise self._refusal(
                 f"commands: found {left:.0%} of them that no mode of mode_to_actuator makes, "
-                f"expected at most {NO_MODES:.0%}: other actuators, or another order"
+                f"expected at most {MAX_UNMODELLED_SHARE:.0%}: other actuators, or another order"
             )
         self.notes.append("commands of actuators: turned into modes by mode_to_actuator")
         return np.asarray(modal)
@@ -282,7 +282,7 @@ class _Reader:
         self.notes.append("the time filter is no integrator with one leak: gains are taken as 0.5")
         return {}
 
-    def _in_metres(self, image: Any) -> Array:  # noqa: ANN401
+    def _convert_to_metres(self, image: Any) -> Array:  # noqa: ANN401
         if image.unit not in UNITS_M:
             raise self._refusal(
                 f"{image.name}: found the unit {image.unit}, expected one of m, um, nm"
@@ -304,6 +304,6 @@ def _numbers(image: Any) -> list[int]:  # noqa: ANN401
 
 
 def _stamps(image: Any) -> list[float]:  # noqa: ANN401
-    """Return their times in seconds, NaN where one is missing; empty if it has none."""
+    """Return the times of an image in seconds, NaN if one is missing; empty if it has none."""
     given = [] if image.time is None else image.time.timestamps
     return [math.nan if stamp is None else float(stamp) for stamp in given]

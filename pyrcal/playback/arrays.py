@@ -72,7 +72,7 @@ MIN_APART_FRAMES: Final = 1.5
 """Smallest difference of measured and stated delay that is reported as an offset of the streams; a
 stated delay need not be an integer."""
 
-_LOOKED_AT: Final = 2000
+_N_CHECKED_FRAMES: Final = 2000
 """Number of frames of the dither in which each of its modes must move."""
 
 MAX_RATE_HZ: Final = 1e6
@@ -91,7 +91,7 @@ MATRIX_ID: Final = "of-the-file"
 
 
 @contextmanager
-def opened_arrays(path: Path) -> Iterator[Arrays]:
+def open_arrays(path: Path) -> Iterator[Arrays]:
     """Open a file of arrays and close it at the end of the ``with`` block.
 
     Raises
@@ -299,7 +299,7 @@ class Arrays:
         fits = (modes >= 0) & (modes < n_given) & (modes == np.round(modes))
         self._check_each("dither_modes", modes, fits, indices)
         if self._has("dither_m"):
-            moving = np.any(self.found["dither_m"][:_LOOKED_AT], axis=0)
+            moving = np.any(self.found["dither_m"][:_N_CHECKED_FRAMES], axis=0)
             still = "modes that dither_m moves (indices are counted from 0)"
             self._check_each("dither_modes", modes, moving[modes.astype(int)], still)
         most_hz = rate_hz / 2.0
@@ -447,8 +447,8 @@ def _matrix_message(matrix: NDArray[np.float32], status: Status) -> Message:
 def _status_message(status: Status, seq: int, since: int) -> Message:
     """Return the status of a frame, ``since`` frames after the first."""
     seconds = since / status.frame_rate_hz
-    told = replace(status, seq=seq, t_ns=status.t_ns + round(seconds * SECOND_NS))
-    return Message(seconds, RecordedKind.STATUS, encode(told))
+    later_status = replace(status, seq=seq, t_ns=status.t_ns + round(seconds * SECOND_NS))
+    return Message(seconds, RecordedKind.STATUS, encode(later_status))
 
 
 def _frames_at_once(n_columns: int) -> int:

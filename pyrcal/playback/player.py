@@ -51,7 +51,7 @@ R = TypeVar("R")
 TICK_S: Final = 1.0
 """Time between two clock events of the service's tracker, seconds."""
 
-NOT_CARRIED_OUT: Final = "unsupported: telemetry of before"
+NOT_CARRIED_OUT: Final = "unsupported: recorded telemetry"
 
 
 @dataclass(slots=True, kw_only=True)
@@ -116,7 +116,7 @@ class Track:
         ConfigurationError
             If matplotlib, the extra ``plots``, is not installed.
         """
-        report = import_module("pyrcal.playback.report")  # it draws this record
+        report = import_module("pyrcal.playback.report")  # imported late: it imports this module
         figure: Figure = report.draw(self, title)
         return figure
 
@@ -158,7 +158,7 @@ class Player:
         self._intake.expect(instrument.basis_id, instrument.config_id, modes)
         self._matrices: dict[str, NDArray[np.float32]] = {}
         self._windows: list[EndedWindow] = []
-        self._unheard: str | None = None
+        self._unread_matrix: str | None = None
         self._random: Correlated | None = None
         self._next: tuple[str, int] | None = None
         self._engine = Engine(state, policy, self)
@@ -173,9 +173,11 @@ class Player:
             await self._age()
             progress(self._now_s)
         rest_s = self._now_s - self._summed_s
-        self._now_s += 1.0  # what waited for frames that are missing comes
+        # lets the intake give up on missing frames and release the blocks behind them
+        self._now_s += 1.0
         await self._look()
-        if rest_s > PASSIVE_INTERVAL_S / 2 or not self.track.passive:  # a short one knows little
+        # a short rest has a large uncertainty and would only add noise to the list
+        if rest_s > PASSIVE_INTERVAL_S / 2 or not self.track.passive:
             await self._sum_up()
         self.track.state = self._engine.state
         if self._random is not None:
@@ -194,7 +196,7 @@ class Player:
                 case RecordedKind.MATRIX:
                     self._keep(message)
                 case RecordedKind.LIVELINESS | RecordedKind.ACKNOWLEDGEMENT:
-                    pass  # of a service that is not this one; a status says what came of it
+                    pass  # of the recorded service, not this one; the statuses show their effect
         except WireError as error:
             self._intake.malformed(message.kind.name.lower(), error)
 
@@ -224,7 +226,7 @@ class Player:
             for event in events:
                 if not isinstance(event, MeasuredMatrix):
                     self._engine.receive(event)
-            await self._hear_matrix()
+            await self._read_matrix()
             if not events:
                 return
 
@@ -250,12 +252,12 @@ class Player:
     def _correlate(self, window: Correlated) -> None:
         try:
             self._random = window if self._random is None else joined(self._random, window)
-        except ModelError:  # another dither: its matrix is that of the last one
+        except ModelError:  # another dither began: only the last one's matrix is kept
             self._random = window
 
-    async def _hear_matrix(self) -> None:
+    async def _read_matrix(self) -> None:
         """Learn the order of slopes and the unit of commands from a matrix that the RTC uses."""
-        in_use, self._unheard = self._unheard, None
+        in_use, self._unread_matrix = self._unread_matrix, None
         record = None if in_use is None else self._engine.state.reconstructor(in_use)
         if in_use is None or record is None or in_use not in self._matrices:
             return
@@ -304,12 +306,12 @@ class Player:
 
     def swapped(self, in_use: str | None) -> None:
         """Record the matrix in use."""
-        self._unheard = in_use
+        self._unread_matrix = in_use
 
     def sensor_mode_changed(self, config_id: str) -> None:
         """Build the model of another mode of the sensor."""
         self._engine.set_description(self._optics.enter_mode(config_id))
-        self._unheard = self._engine.state.matrices.in_use
+        self._unread_matrix = self._engine.state.matrices.in_use
 
     def perform(self, effect: Effect) -> None:
         """Answer a dither request with a refusal; other effects are ignored."""

@@ -55,8 +55,8 @@ def read_session(path: Path, instrument: Instrument) -> dict[str, Array]:
         raise ConfigurationError(
             f"{folder / FACTS}: delay_frames: found {delay.tolist()}, expected 1 to 20"
         )
-    sent_m, known = _on_mirror(
-        _in_modes(strokes, instrument, folder), by, answered, float(delay.item())
+    sent_m, known = _average_commands(
+        _convert_to_modes(strokes, instrument, folder), by, answered, float(delay.item())
     )
     if not known.any():
         raise ConfigurationError(
@@ -82,7 +82,7 @@ def _streams(folder: Path) -> list[Mapping[str, Any]]:
         raise ConfigurationError(f"{path}: is no session of pyRTC 2: {error!r}") from error
 
 
-def _named(folder: Path, streams: list[Mapping[str, Any]], kind: str) -> Mapping[str, Any]:
+def _find_stream(folder: Path, streams: list[Mapping[str, Any]], kind: str) -> Mapping[str, Any]:
     fitting = [one for one in streams if one["name"] == kind] or [
         one for one in streams if one["name"].endswith(kind)
     ]
@@ -98,15 +98,15 @@ def _named(folder: Path, streams: list[Mapping[str, Any]], kind: str) -> Mapping
 def _stream(
     folder: Path, streams: list[Mapping[str, Any]], kind: str
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Return the frames of a stream, each a row, and which exposure each answers, rising."""
-    record = _named(folder, streams, kind)
-    frames = _loaded(folder, record, "frames_file")
+    """Return the frames of a stream, one per row, and the exposure each belongs to, increasing."""
+    record = _find_stream(folder, streams, kind)
+    frames = _load_array(folder, record, "frames_file")
     if "frame_ids_file" not in record:
         raise ConfigurationError(
             f"{folder}: {record['name']}: found no frame ids, expected those of pyRTC 2.1: without "
-            "them nobody knows which command was on the mirror"
+            "them it is unknown which command was on the mirror"
         )
-    ids = _loaded(folder, record, "frame_ids_file")
+    ids = _load_array(folder, record, "frame_ids_file")
     if frames.ndim < 2 or ids.shape != frames.shape[:1] or frames.dtype.kind != "f":
         raise ConfigurationError(
             f"{folder}: {record['name']}: found {frames.dtype} of shape {frames.shape} with ids of "
@@ -116,7 +116,7 @@ def _stream(
     return np.asarray(frames[first], np.float32).reshape(len(ids), -1), ids
 
 
-def _loaded(folder: Path, record: Mapping[str, Any], key: str) -> Array:
+def _load_array(folder: Path, record: Mapping[str, Any], key: str) -> Array:
     path = (folder / str(record.get(key))).resolve()
     if not path.is_relative_to(folder.resolve()):
         raise ConfigurationError(f"{folder / MANIFEST}: {key}: found {path}, expected a file in it")
@@ -131,7 +131,7 @@ def _facts(folder: Path) -> dict[str, Array]:
     return read_npz(path) if path.exists() else {}
 
 
-def _in_modes(strokes: Array, instrument: Instrument, folder: Path) -> Array:
+def _convert_to_modes(strokes: Array, instrument: Instrument, folder: Path) -> Array:
     """Return the commands ``(n_frames, n_modes)``: pyRTC sends its modes, as M2C has them."""
     n_modes = instrument.modes.n_modes
     if strokes.shape[1] > n_modes:
@@ -142,13 +142,13 @@ def _in_modes(strokes: Array, instrument: Instrument, folder: Path) -> Array:
     return strokes.astype(np.float64)
 
 
-def _on_mirror(
+def _average_commands(
     commands_m: Array, answers: NDArray[np.int64], exposures: NDArray[np.int64], delay: float
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the mean command during each exposure, and for which exposures it is known.
+    """Return the mean command during each exposure, and the exposures for which it is known.
 
-    The answer to exposure n is on the mirror from n + delay on: a delay of 1.7 frames leaves .3 of
-    an exposure to the answer of the one before, .7 to that of two before.
+    The command for exposure n is on the mirror from n + delay on: with a delay of 1.7 frames, .3 of
+    an exposure see the command for the previous one, .7 that for the one before it.
     """
     whole = int(np.ceil(delay))
     total = np.zeros((len(exposures), commands_m.shape[1]))
@@ -162,9 +162,9 @@ def _on_mirror(
 
 
 def _rate_hz(folder: Path, streams: list[Mapping[str, Any]], exposures: NDArray[np.int64]) -> float:
-    """Return the frame rate as the recorder's clock has it."""
-    record = _named(folder, streams, SLOPES)
-    times = _loaded(folder, record, "timestamps_file").astype(float)
+    """Return the frame rate from the recorder's clock."""
+    record = _find_stream(folder, streams, SLOPES)
+    times = _load_array(folder, record, "timestamps_file").astype(float)
     seconds, n_frames = float(np.ptp(times)), int(np.ptp(exposures))
     if not (np.isfinite(seconds) and seconds > 0.0 and n_frames > 0):
         raise ConfigurationError(

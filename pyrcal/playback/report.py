@@ -36,7 +36,7 @@ VERSION = 1
 DIGITS = (4, 4, 4, 5)
 UNITS = ("subaperture", "subaperture", "degree", "")
 
-ENOUGH = 5
+MIN_WINDOWS = 5
 """Smallest number of windows for which the scatter is reported."""
 
 _COLOURS = {Source.PASSIVE: "0.8", Source.RANDOM: "tab:green", Source.LOCK_IN: "tab:blue"}
@@ -47,7 +47,7 @@ _OF_MISALIGNED = frozenset(
 )
 """Alarms and warnings that misaligned streams alone can cause."""
 
-_REASONS = 8
+_MAX_REASONS = 8
 """Number of kinds of refusals and warnings listed in the table."""
 
 
@@ -70,21 +70,21 @@ def table(track: Track) -> str:
         if of_it:
             rows.append((f"{source.value}, {len(of_it)}x: scatter / sigma", *_scatter(of_it)))
             if out := sum(not entry.entered for entry in of_it):
-                rows.append((f"{source.value}: {out}x not believed", *("" for _ in PARAMETERS)))
+                rows.append((f"{source.value}: {out}x rejected", *("" for _ in PARAMETERS)))
     if registration is None and track.passive:
         last = track.passive[-1]
         rows.append(("ordinary telemetry alone", *_cells(last.alpha.vector * BOUNDARY_SCALE)))
         rows.append(("1 sigma, its bias included", *_cells(last.sigma * BOUNDARY_SCALE)))
-    rows += _stated(track, None if registration is None else registration.alpha.vector)
+    rows += _file_rows(track, None if registration is None else registration.alpha.vector)
     lines = [heading, *(aligned(rows) if len(rows) > 1 else ())]
     if registration is None:
-        lines.append(f"alpha was not found: {_why_not(track)}")
+        lines.append(f"alpha was not found: {_explain_failure(track)}")
     if track.noisy is not None:
         lines.append(f"noisy matrix: {len(track.noisy.modes)} modes, S/N {track.noisy.snr:.1f}")
-    return "\n".join([*lines, *_complaints(track)])
+    return "\n".join([*lines, *_list_problems(track)])
 
 
-def _stated(track: Track, found: Array | None) -> list[Sequence[str]]:
+def _file_rows(track: Track, found: Array | None) -> list[Sequence[str]]:
     """Return the file's own last α, if it says one, and how far from it the track ends."""
     if not track.stated:
         return []
@@ -99,7 +99,7 @@ def _stated(track: Track, found: Array | None) -> list[Sequence[str]]:
     return rows
 
 
-def _why_not(track: Track) -> str:
+def _explain_failure(track: Track) -> str:
     """Return why nothing could be made of the telemetry, as far as anybody knows."""
     if not track.n_frames:
         return "no frame could be used"
@@ -123,17 +123,17 @@ def _scatter(entries: Sequence[HistoryEntry]) -> list[str]:
     Neighbours are compared: a drift is no scatter.
     """
     entered = [entry for entry in entries if entry.entered]
-    if len(entered) < ENOUGH:
+    if len(entered) < MIN_WINDOWS:
         return ["too few"] * len(PARAMETERS)
     measured = np.array([entry.measured.vector for entry in entered])
     scatter = np.sqrt(np.mean(np.diff(measured, axis=0) ** 2, axis=0) / 2.0)
-    said = np.sqrt(np.mean([entry.measured_sigma**2 for entry in entered], axis=0))
-    return [f"{ratio:.2f}" for ratio in scatter / said]
+    stated_sigma = np.sqrt(np.mean([entry.measured_sigma**2 for entry in entered], axis=0))
+    return [f"{ratio:.2f}" for ratio in scatter / stated_sigma]
 
 
-def _complaints(track: Track) -> list[str]:
+def _list_problems(track: Track) -> list[str]:
     """Return alarms that last, then what else the tracker warned of, the most frequent first."""
-    # answers of another frame look like those of another sign
+    # responses of another frame look like responses of the opposite sign
     led_to = _OF_MISALIGNED if track.misaligned else frozenset()
     lines = [f"note: {track.misaligned}"] if track.misaligned else []
     lines += [
@@ -147,7 +147,9 @@ def _complaints(track: Track) -> list[str]:
         if entry.level in {Level.WARNING, Level.ALARM} and entry.name not in led_to:
             names[entry.name] += 1
             texts[entry.name] = entry.text
-    lines += [f"{name} ({times}x): {texts[name]}" for name, times in names.most_common(_REASONS)]
+    lines += [
+        f"{name} ({times}x): {texts[name]}" for name, times in names.most_common(_MAX_REASONS)
+    ]
     return lines
 
 
@@ -171,7 +173,7 @@ def document(track: Track, source: Path) -> dict[str, Any]:
                 "t_ns_utc": one.t_ns_utc,
                 "estimator": one.estimator,
                 "alpha": one.alpha.to_boundary(),
-                "sigma": _named(one.sigma) if np.isfinite(one.sigma).all() else None,
+                "sigma": _name_values(one.sigma) if np.isfinite(one.sigma).all() else None,
                 "text": one.text,
             }
             for one in track.passive
@@ -192,7 +194,7 @@ def document(track: Track, source: Path) -> dict[str, Any]:
     }
 
 
-def _named(values: Array) -> dict[str, float]:
+def _name_values(values: Array) -> dict[str, float]:
     return dict(zip(PARAMETERS, (values * BOUNDARY_SCALE).tolist(), strict=True))
 
 
@@ -201,9 +203,9 @@ def _entry(entry: HistoryEntry) -> dict[str, Any]:
         "t_ns_utc": entry.t_ns_utc,
         "source": entry.source.value,
         "measured": entry.measured.to_boundary(),
-        "measured_sigma": _named(entry.measured_sigma),
+        "measured_sigma": _name_values(entry.measured_sigma),
         "filtered": entry.filtered.to_boundary(),
-        "filtered_sigma": _named(entry.filtered_sigma),
+        "filtered_sigma": _name_values(entry.filtered_sigma),
         "innovation": entry.innovation,
         "misfit": entry.misfit if np.isfinite(entry.misfit) else None,
         "entered": entry.entered,
@@ -227,7 +229,7 @@ def fill(file: h5py.File, track: Track, source: Path) -> None:
             _boundary([e.filtered_sigma for e in entries]),
             "(n, 4) 1 sigma of it, the model's error included",
         ),
-        ("entered", np.array([e.entered for e in entries], bool), "(n,) whether it was believed"),
+        ("entered", np.array([e.entered for e in entries], bool), "(n,) whether it was accepted"),
         ("misfit", np.array([e.misfit for e in entries]), "(n,) residual power over noise"),
         ("passive/t_ns_utc", np.array([p.t_ns_utc for p in passive], np.int64), "(m,) ends"),
         ("passive/alpha", _boundary([p.alpha.vector for p in passive]), "(m, 4) its bias in it"),

@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from pyrcal.offline.figures import check_plots
 from pyrcal.playback.aot import read_telemetry
-from pyrcal.playback.arrays import Arrays, opened_arrays
+from pyrcal.playback.arrays import Arrays, open_arrays
 from pyrcal.playback.player import Player, Track
 from pyrcal.playback.pyrtc import is_session, read_session
 from pyrcal.playback.report import document, fill, plot, table
@@ -62,9 +62,9 @@ def track(
 ) -> Track:
     """Return α over time from recorded telemetry, by the service's own estimators.
 
-    ``path`` is a recording of pyrcal's, arrays in ``.npz`` or HDF5, an AOT file or pyRTC's session
-    (docs/integrate/tracking.md). ``instrument`` is what ``load_instrument`` returns or takes;
-    ``settings`` None: the usual ones.
+    ``path`` is a recording of pyrcal, arrays in ``.npz`` or HDF5, an AOT file or a session of pyRTC
+    (docs/integrate/tracking.md). ``instrument`` is the result or the argument of
+    ``load_instrument``. ``settings`` are the defaults if None.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def track(
         if is_session(path):
             session = Arrays(path=path, found=read_session(path, instrument), facts={})
             return _play_arrays(session, instrument, settings)
-        with opened_arrays(path) as arrays:
+        with open_arrays(path) as arrays:
             return _play_arrays(arrays, instrument, settings)
 
 

@@ -27,7 +27,7 @@ import scipy
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from pyrcal.offline.fit_file import reference_of
+from pyrcal.offline.fit_file import make_reference
 from pyrcal.offline.recorded import read_recorded
 from service.errors import ConfigurationError, MatrixError, ModelError
 from service.model.instrument import Instrument
@@ -90,7 +90,7 @@ def read_measured_matrix(
     """
     try:
         recorded = read_recorded(path, dataset)
-        reference, notes = reference_of(recorded, instrument)
+        reference, notes = make_reference(recorded, instrument)
     except (MatrixError, ModelError) as error:
         raise ConfigurationError(f"--matrix: {error}") from error
     matrix = np.asarray(reference.matrix, dtype=np.float64) / reference.passes

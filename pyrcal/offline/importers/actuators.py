@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pyrcal.offline.importers.imported import UNKNOWN, Array, Dataset, oriented
+from pyrcal.offline.importers.imported import UNKNOWN, Array, Dataset, orient_matrix
 from pyrcal.offline.importers.layouts import cube_of
 from service.errors import MatrixError
 from service.model.defects import COPY, explain_defects, find_defects
@@ -61,9 +61,9 @@ def read_mirror(
     """
     strokes = arrays.get("mode_to_actuator")
     if "positions" in arrays:
-        mirror = _positioned(arrays["positions"], notes)
+        mirror = _read_positions(arrays["positions"], notes)
     elif "modes" in arrays:
-        mirror = _tabulated(arrays["modes"], diameter_m, is_basis=strokes is None, notes=notes)
+        mirror = _read_shapes(arrays["modes"], diameter_m, is_basis=strokes is None, notes=notes)
     else:
         raise MatrixError(
             f"{source}: found neither modes nor positions of actuators, expected one of the two; a "
@@ -74,7 +74,7 @@ def read_mirror(
     return mirror
 
 
-def _positioned(given: Array, notes: list[str]) -> Mirror:
+def _read_positions(given: Array, notes: list[str]) -> Mirror:
     longer = max(np.shape(given), default=0)
     places = np.asarray(given)
     if places.ndim == 2 and 2 in places.shape and np.issubdtype(places.dtype, np.floating):
@@ -84,7 +84,7 @@ def _positioned(given: Array, notes: list[str]) -> Mirror:
                 "positions: found a number that is not finite for actuator "
                 f"{np.flatnonzero(~np.isfinite(turned).all(axis=1))[0]}, expected x and y in metres"
             )
-    places, words = oriented(given, longer, 2, "positions", "(n_actuators, 2)")
+    places, words = orient_matrix(given, longer, 2, "positions", "(n_actuators, 2)")
     notes += words
     copies = find_defects(places)
     twice = {number: kind for number, kind in copies.items() if kind.startswith(COPY)}
@@ -113,7 +113,7 @@ def _positioned(given: Array, notes: list[str]) -> Mirror:
     )
 
 
-def _tabulated(given: Array, diameter_m: float, *, is_basis: bool, notes: list[str]) -> Mirror:
+def _read_shapes(given: Array, diameter_m: float, *, is_basis: bool, notes: list[str]) -> Mirror:
     cube = cube_of(given, notes)
     pitch = {"modes_pitch_m": diameter_m / cube.shape[1]}
     name = "mode_shapes" if is_basis else "influence_functions"
@@ -138,7 +138,7 @@ def combine(mirror: Mirror, strokes: Array, notes: list[str]) -> None:
             f"({n_actuators}, any)"
         )
     broken = ~np.isfinite(found) if found.dtype.kind == "f" else np.zeros(found.shape, bool)
-    commands, words = oriented(
+    commands, words = orient_matrix(
         np.where(broken, 0, found), n_actuators, None, "mode_to_actuator", "(n_actuators, n_modes)"
     )
     notes += words

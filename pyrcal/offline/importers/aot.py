@@ -20,7 +20,7 @@ from service.errors import ConfigurationError, MatrixError
 SENSORS = {"Pyramid": "pyramid", "ShackHartmann": "shack-hartmann"}
 """Kinds of sensors by AOT's class names."""
 
-_HEADER = 20 * 2880
+_HEADER_BYTES = 20 * 2880
 """Number of leading bytes that must contain the version."""
 
 
@@ -53,7 +53,7 @@ def _check(path: Path) -> None:
     """Raise if a file is not an AOT file, because aotpy's own message suggests unusable options."""
     try:
         with path.open("rb") as file:
-            begins = file.read(_HEADER)
+            begins = file.read(_HEADER_BYTES)
     except OSError as error:
         raise MatrixError(f"{path}: cannot be read: {error.strerror or error}") from error
     if not begins.startswith(b"SIMPLE"):
@@ -86,7 +86,7 @@ def from_aot(
         If the file cannot be read, or has no such loop with an interaction matrix.
     """
     system = read_system(path)
-    chosen = _chosen_loop(path, system, loop)
+    chosen = _choose_loop(path, system, loop)
     sensor, mirror = chosen.input_sensor, chosen.commanded_corrector
     kind = SENSORS.get(type(sensor).__name__)
     if kind is None or sensor.subaperture_mask is None:
@@ -113,7 +113,7 @@ def from_aot(
         )
     telescope = system.main_telescope
     diameter_m = telescope.enclosing_diameter or reported.diameter_m
-    told = registrations_between(mirror, sensor, diameter_m / max(places.shape), str(path))
+    dated = registrations_between(mirror, sensor, diameter_m / max(places.shape), str(path))
     imported = from_arrays(
         f"AOT, {path}",
         arrays,
@@ -125,29 +125,29 @@ def from_aot(
             or reported.obscuration_ratio,
             wavelength_m=sensor.wavelength or reported.wavelength_m,
         ),
-    ).noted(*notes)
-    if told is None:
+    ).with_notes(*notes)
+    if dated is None:
         return imported
     return replace(
         imported,
-        tables={**imported.tables, "mirror": {**imported.tables["mirror"], **told.mirror}},
-        arrays={**imported.arrays, **told.arrays},
-    ).noted(told.text)
+        tables={**imported.tables, "mirror": {**imported.tables["mirror"], **dated.mirror}},
+        arrays={**imported.arrays, **dated.arrays},
+    ).with_notes(dated.text)
 
 
-def _chosen_loop(path: Path, system: Any, wanted: str | None) -> Any:  # noqa: ANN401
+def _choose_loop(path: Path, system: Any, wanted: str | None) -> Any:  # noqa: ANN401
     """Return the requested loop, or the only one with an interaction matrix."""
     measured = [one for one in system.loops if getattr(one, "interaction_matrix", None) is not None]
     if wanted is None:
         if len(measured) == 1:
             return measured[0]
-        listed = _listed(system)
+        listed = _format_loops(system)
         what = "no loop" if not measured else f"{len(measured)} loops"
         raise MatrixError(
             f"{path}: found {what} with an interaction matrix, expected one: choose with --loop: "
             f"{listed}"
         )
-    listed = _listed(system)
+    listed = _format_loops(system)
     for number, one in enumerate(system.loops, start=1):
         if wanted in {str(number), one.uid}:
             if one not in measured:
@@ -158,13 +158,15 @@ def _chosen_loop(path: Path, system: Any, wanted: str | None) -> Any:  # noqa: A
     raise MatrixError(f"{path}: --loop: found {wanted}, expected one of {listed}")
 
 
-def _listed(system: Any) -> str:  # noqa: ANN401
+def _format_loops(system: Any) -> str:  # noqa: ANN401
     """Return the loops of a file, each with its number."""
-    loops = (f"{k} {one.uid} ({_words(one)})" for k, one in enumerate(system.loops, start=1))
+    loops = (
+        f"{k} {one.uid} ({_describe_loop(one)})" for k, one in enumerate(system.loops, start=1)
+    )
     return "; ".join(loops) or "none"
 
 
-def _words(loop: Any) -> str:  # noqa: ANN401
+def _describe_loop(loop: Any) -> str:  # noqa: ANN401
     """Return the contents of a loop as text."""
     matrix = getattr(loop, "interaction_matrix", None)
     sensor = loop.input_sensor
@@ -178,7 +180,7 @@ def registrations_between(
     subaperture_m: float,
     where: str,
 ) -> Registrations | None:
-    """Return α of a mirror on a sensor over time; None: the file has none.
+    """Return α of a mirror on a sensor over time; None if the file has none.
 
     Raises
     ------

@@ -10,7 +10,7 @@ from pyrcal.offline.importers.imported import Array
 from service.errors import MatrixError
 from service.model.aperture import OFF_CENTRE_SUBAP, SMALLEST_HOLE
 
-_COHERENT = 0.5
+_MIN_COHERENCE = 0.5
 """Smallest correlation of a lit subaperture's response with that of its neighbours. An influence
 function spans several subapertures, so lit neighbours respond alike; noise does not."""
 
@@ -36,11 +36,11 @@ def find_lit(maps: Array, notes: list[str]) -> NDArray[np.bool_]:
     if not lit.all():
         notes.append(f"valid: no mask: the {int(lit.sum())} subapertures that answer to any mode")
         return np.asarray(lit)
-    coherent = _largest_piece(_coherence(numbers) > _COHERENT)
+    coherent = _largest_piece(_coherence(numbers) > _MIN_COHERENCE)
     if coherent.sum() < _SMALLEST_SHARE * coherent.size:
         raise MatrixError(
             "matrix: found no mask, and noise in every subaperture: lit and dark ones cannot be "
-            "told apart; expected a mask of valid subapertures"
+            "distinguished; expected a mask of valid subapertures"
         )
     if coherent.all():
         notes.append("valid: no mask: all subapertures of the grid respond")

@@ -167,7 +167,7 @@ def from_cacao(folder: Path, reported: Reported, response: str | None = None) ->
     reported
         What the files do not say.
     response
-        Name of the response to take, without its suffix; None: the first of `RESPONSES`.
+        Name of the response to use, without its suffix; None for the first of `RESPONSES`.
 
     Raises
     ------
@@ -193,11 +193,11 @@ def from_cacao(folder: Path, reported: Reported, response: str | None = None) ->
         notes.append(f"wfsref has shape {arrays['light'].shape}, the response another: ignored")
         del arrays["light"]
     elif processed == "ON":
-        arrays.pop("light", None)  # reference slopes: a picture of no light
+        arrays.pop("light", None)  # these are reference slopes, not an image of the light
     numbers = arrays.pop("numbers", None)
     reported = replace(reported, sensor=sensor)
     imported = from_arrays(f"cacao, {folder}", arrays, reported, numbers)
-    return replace(imported, inventory=(*found.taken, *found.ignored())).noted(*notes)
+    return replace(imported, inventory=(*found.taken, *found.ignored())).with_notes(*notes)
 
 
 _PURPOSES = {"valid": "mask of valid subapertures or lit pixels", "light": "mean frame"}
@@ -233,17 +233,17 @@ def _survey(folder: Path) -> _Folder:
     return found
 
 
-def _response(found: _Folder, wanted: str | None) -> tuple[Array, _Kind]:
+def _response(found: _Folder, requested: str | None) -> tuple[Array, _Kind]:
     """Return the response ``(n, ny, nx)`` and the meaning of its columns."""
-    if wanted is not None:
-        name = _SUFFIX.sub("", wanted).lower()
+    if requested is not None:
+        name = _SUFFIX.sub("", requested).lower()
         kinds = [
             kind for kind in RESPONSES if re.fullmatch(rf"(?:.*[._-])?(?:{kind.response})", name)
         ]
         path = found.one(re.escape(name), "the response")
         if path is None or not kinds:
             names = ", ".join(sorted(set(found.files.values()))) or "no FITS file"
-            raise MatrixError(f"{found.root}: found {names}, expected the response {wanted}")
+            raise MatrixError(f"{found.root}: found {names}, expected the response {requested}")
         return _cube(found, path, kinds[0]), kinds[0]
     for kind in RESPONSES:
         path = found.one(kind.response, f"the response of {kind.words}")
@@ -288,7 +288,7 @@ def _mirror(
     if listed is not None:
         notes.append(
             f"the positions of the actuators are in units of the pupil's radius, {diameter_m / 2:g}"
-            " m: the magnification that a fit finds tells how large the unit is"
+            " m: the fitted magnification gives the true unit"
         )
         return {"positions": listed * diameter_m / 2.0, **strokes}
     path = found.one(INFLUENCE, "influence functions")
@@ -349,13 +349,13 @@ def _on_grid(
     inside = np.ones(shape, dtype=bool) if mask is None else np.asarray(mask)
     row, column = np.nonzero(inside)
     radius = _numbers(found.variables, "DM_beam_rad") or (max(shape) - 1) / 2.0
-    told = (_numbers(found.variables, f"DM_beam_{axis}cent") for axis in "xy")
+    stated_centres = (_numbers(found.variables, f"DM_beam_{axis}cent") for axis in "xy")
     grid = ((n - 1) / 2.0 for n in reversed(shape))
-    middle = [own if at is None else at for at, own in zip(told, grid, strict=True)]
+    middle = [own if at is None else at for at, own in zip(stated_centres, grid, strict=True)]
     pitch_m = diameter_m / 2.0 / radius
     notes.append(
         f"the pitch of the actuators is unknown: {pitch_m:.4g} m, so that {2 * radius + 1:g} of "
-        "them span diameter_m; the magnification that a fit finds tells"
+        "them span diameter_m; the fitted magnification gives the true pitch"
     )
     arrays: dict[str, Array] = {"positions": (np.column_stack([column, row]) - middle) * pitch_m}
     if modes is not None:

@@ -20,7 +20,7 @@ from pyrcal.offline.importers.files import (
     read_slopes,
     usable_modes,
 )
-from pyrcal.offline.importers.frames import Frames, images_words, rounded_centres
+from pyrcal.offline.importers.frames import Frames, describe_images, round_centres
 from pyrcal.offline.importers.imported import UNKNOWN, Array, Dataset, Imported
 from service.config import instrument_path, load_instrument
 from service.config.sources import read_toml
@@ -57,7 +57,7 @@ def from_described(
     unit
         Of the commands, OPD; None if unknown.
     columns
-        ``(n_columns,)`` basis index of each column; None: the first ones.
+        ``(n_columns,)`` basis index of each column; None for the first ones.
 
     Raises
     ------
@@ -69,7 +69,9 @@ def from_described(
     path = instrument_path(instrument_file)
     instrument, tables = load_instrument(path), read_toml(path)
     if "matrix" not in arrays:
-        raise MatrixError(f"{source}: found no matrix, expected one beside the instrument file")
+        raise MatrixError(
+            f"{source}: found no matrix, expected one in addition to the instrument file"
+        )
     notes = [f"telescope, sensor and mirror as {path.name} describes them"]
     mirror = _mirror(instrument, tables["mirror"], path.parent, arrays, notes)
     signals = _signals(source, instrument, tables["wfs"], arrays, mirror, notes)
@@ -83,7 +85,7 @@ def from_described(
     wfs = {**tables["wfs"], **signals.table}
     slopes = {**tables.get("slopes", {})}
     if wfs.get("input") == "frames":
-        # both follow from where the images lie on the frames
+        # both follow from the positions of the images on the frames
         wfs.pop("pupil_separation_subap", None)
         slopes.pop("order", None)
     slopes.setdefault("orientation", "auto")
@@ -124,8 +126,8 @@ def _mirror(
     if "mode_to_actuator" in arrays:
         if "modes" in table:
             raise MatrixError(
-                "mode_to_actuator: found beside an instrument file with modes of its own, expected "
-                "one with actuators"
+                "mode_to_actuator: found with an instrument file that has modes of its own, "
+                "expected one with actuators"
             )
         mirror.table.pop("basis", None)
         combine(mirror, arrays["mode_to_actuator"], notes)
@@ -144,7 +146,7 @@ def _signals(
     if instrument.frames is not None and frames is None:
         raise MatrixError(
             f"{source}: matrix: found shape {np.shape(arrays['matrix'])}, expected camera frames: "
-            'wfs.input = "frames"; give the mask of lit pixels or the mean frame beside them'
+            'wfs.input = "frames"; give the mask of lit pixels or the mean frame as well'
         )
     if frames is None:
         signals = read_slopes(source, arrays, mirror.n_modes, notes)
@@ -158,7 +160,7 @@ def _signals(
         return signals
     table: dict[str, Any] = {}
     if instrument.frames is not None:
-        notes += _beside_the_light(wfs, frames.light, frames.light_name)
+        notes += _check_centres(wfs, frames.light, frames.light_name)
     else:
         table = _windows(source, instrument, frames, notes)
     return Signals(
@@ -181,16 +183,16 @@ def _windows(
             f"{source}: {frames.light_name}: found pupil images of {images.diameter_px:.1f} "
             f"pixels, expected a multiple of wfs.pupil_diameter_subap = {width:g}"
         )
-    notes.append(images_words(frames, images))
+    notes.append(describe_images(frames, images))
     return {
         "input": "frames",
         "pixels_per_subaperture": pixels,
-        "pupil_centres_px": rounded_centres(images),
+        "pupil_centres_px": round_centres(images),
         "pupil_diameter_subap": round(images.diameter_px / pixels, 3),
     }
 
 
-def _beside_the_light(wfs: Mapping[str, Any], light: Array, name: str) -> list[str]:
+def _check_centres(wfs: Mapping[str, Any], light: Array, name: str) -> list[str]:
     """Return a note if the file's image centres differ from those of the light."""
     centres = wfs.get("pupil_centres_px", "auto")
     if centres == "auto":
@@ -205,6 +207,6 @@ def _beside_the_light(wfs: Mapping[str, Any], light: Array, name: str) -> list[s
         return []
     words = ", ".join(f"[{row:.2f}, {column:.2f}]" for row, column in found)
     return [
-        f"wfs.pupil_centres_px lie up to {away:.2f} subapertures beside the pupil images in "
+        f"wfs.pupil_centres_px is off by up to {away:.2f} subapertures from the pupil images in "
         f"{name}, which are centred at {words}: change the key if the light is right"
     ]

@@ -24,7 +24,7 @@ from pyrcal.offline.importers.imported import (
     matrix_of,
 )
 from pyrcal.offline.importers.layouts import ROLES, maps_of, mask_of
-from pyrcal.offline.pupil_width import answers_of, seen_pupil
+from pyrcal.offline.pupil_width import compute_responses, measure_pupil
 from service.errors import ConfigurationError, MatrixError
 from service.model.aperture import measure_aperture
 from service.model.defects import explain_defects, find_defects
@@ -32,10 +32,10 @@ from service.model.defects import explain_defects, find_defects
 UNITS_M = {"m": 1.0, "um": 1e-6, "nm": 1e-9}
 """Metres of OPD in a unit of the commands."""
 
-NARROWER_SUBAP = 0.75
+MIN_WIDTH_DIFFERENCE_SUBAP = 0.75
 """Difference of the widths of grid and pupil above which the pupil's width is recorded."""
 
-OBSCURED = 0.05
+MIN_OBSCURATION = 0.05
 """Smallest obscuration ratio that is read from a mask."""
 
 
@@ -152,7 +152,7 @@ def from_arrays(
             frames, mirror.n_actuators, reported.pixels_per_subaperture, source, notes
         )
         signals = Signals(table=table, arrays=kept, obscuration_ratio=ratio, columns=0)
-    turbulence = _own_modes(source, signals, mirror, reported)
+    turbulence = _make_own_modes(source, signals, mirror, reported)
     modes = usable_modes(signals, mirror, reported.columns, notes, column_numbers)
     if reported.unit is None:
         mirror.table["stroke"] = UNKNOWN
@@ -165,7 +165,7 @@ def from_arrays(
     obscuration = reported.obscuration_ratio
     if obscuration is None:
         seen = signals.obscuration_ratio
-        obscuration = round(seen, 3) if seen > OBSCURED else 0.0
+        obscuration = round(seen, 3) if seen > MIN_OBSCURATION else 0.0
         if obscuration:
             notes.append(f"obscuration_ratio = {obscuration}: read from the hole in the mask")
     return Imported(
@@ -181,7 +181,7 @@ def from_arrays(
             "mirror": mirror.table,
             **turbulence,
             "slopes": {
-                # slopes made of frames have the order of the program itself
+                # slopes that pyrcal computes from frames have its own order
                 **({} if frames else {"order": reported.order}),
                 "orientation": "auto",
             },
@@ -192,7 +192,7 @@ def from_arrays(
     )
 
 
-def _own_modes(
+def _make_own_modes(
     source: str, signals: Signals, mirror: Mirror, reported: Reported
 ) -> dict[str, dict[str, int]]:
     """Return ``[modes]`` if the columns are pyrcal's Karhunen-Loeve modes, else nothing.
@@ -206,8 +206,8 @@ def _own_modes(
     if not mirror.is_zonal:
         if reported.basis is not None:
             raise MatrixError(
-                f"{source}: --basis: found it beside modes of the mirror, expected it beside "
-                "positions of actuators alone"
+                f"{source}: --basis: found it with modes of the mirror, expected it only with "
+                "positions of actuators"
             )
         return {}
     if reported.basis == "KL":
@@ -285,8 +285,8 @@ def read_slopes(
     if valid is None:
         raise MatrixError(f"{source}: found no valid subapertures, expected a mask (n, n)")
     n_rows = 2 * int(valid.sum())
-    found, valid = _without_dead_rows(found, valid, n_rows, notes)
-    matrix, turned = _oriented(found, 2 * int(valid.sum()), _columns(found, valid, n_modes))
+    found, valid = _remove_dead_rows(found, valid, n_rows, notes)
+    matrix, turned = _orient_matrix(found, 2 * int(valid.sum()), _columns(found, valid, n_modes))
     notes += turned
     grid = centre_grid(valid)
     if grid.shape != valid.shape or np.any(grid != valid):
@@ -297,7 +297,7 @@ def read_slopes(
     aperture = measure_aperture(grid)
     notes.append(f"valid: {int(grid.sum())} subapertures, {aperture.words}")
     width: dict[str, Any] = {}
-    if len(grid) - aperture.diameter_subap > NARROWER_SUBAP:
+    if len(grid) - aperture.diameter_subap > MIN_WIDTH_DIFFERENCE_SUBAP:
         width = {"pupil_diameter_subap": round(aperture.diameter_subap, 2)}
     return Signals(
         table={
@@ -311,7 +311,7 @@ def read_slopes(
     )
 
 
-def _oriented(found: Array, n_rows: int, n_columns: int) -> tuple[Array, tuple[str, ...]]:
+def _orient_matrix(found: Array, n_rows: int, n_columns: int) -> tuple[Array, tuple[str, ...]]:
     """Return a matrix ``(n_slopes, n_modes)``; NaN in columns are kept."""
     if found.dtype.kind != "f" or found.ndim != 2:
         return matrix_of(found, n_rows, n_columns)
@@ -325,7 +325,7 @@ def _oriented(found: Array, n_rows: int, n_columns: int) -> tuple[Array, tuple[s
     return matrix, turned
 
 
-def _without_dead_rows(
+def _remove_dead_rows(
     found: Array, valid: NDArray[np.bool_], n_rows: int, notes: list[str]
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Return matrix and mask without subapertures that are NaN or 0 for all modes."""
@@ -456,14 +456,14 @@ def _sensor(reported: Reported, signals: Signals, notes: list[str]) -> dict[str,
         return {**table, "pupil_diameter_subap": reported.pupil_diameter_subap}
     if table.get("input") != "frames":
         valid = signals.arrays["valid_subapertures"].astype(bool)
-        notes += _narrow(signals.arrays["interaction_matrix"], valid)
+        notes += _check_width(signals.arrays["interaction_matrix"], valid)
     return table
 
 
-def _narrow(matrix: Array, valid: NDArray[np.bool_]) -> list[str]:
+def _check_width(matrix: Array, valid: NDArray[np.bool_]) -> list[str]:
     """Return a note if the mask seems wider than the pupil image."""
     power = np.einsum("ij,ij->i", matrix, matrix)
-    seen = seen_pupil(answers_of(power, np.ones(len(power)), valid), len(valid))
+    seen = measure_pupil(compute_responses(power, np.ones(len(power)), valid), len(valid))
     if seen is None:
         return []
     return [

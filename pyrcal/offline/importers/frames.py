@@ -111,7 +111,7 @@ def describe_frames(
     images = find_pupil_images(frames.light, f"{where}: {frames.light_name}")
     pixels = pixels_per_subaperture or _binning(images, n_actuators)
     n = _grid(images, pixels, frames.light.shape)
-    notes.append(images_words(frames, images))
+    notes.append(describe_images(frames, images))
     notes.append(f"{pixels} x {pixels} pixels are one subaperture; --pixels-per-subap changes that")
     valid = _valid(frames.light, images, n, pixels)
     table = {
@@ -119,7 +119,7 @@ def describe_frames(
         "pupil_diameter_subap": round(images.diameter_px / pixels, 3),
         "input": "frames",
         "pixels_per_subaperture": pixels,
-        "pupil_centres_px": rounded_centres(images),
+        "pupil_centres_px": round_centres(images),
         "valid_subapertures": Dataset("valid_subapertures"),
     }
     arrays = {
@@ -130,7 +130,7 @@ def describe_frames(
     return table, arrays, images.obscuration_ratio
 
 
-def images_words(frames: Frames, images: PupilImages) -> str:
+def describe_images(frames: Frames, images: PupilImages) -> str:
     """Return a sentence on the positions of the pupil images."""
     centres = ", ".join(f"[{row:.2f}, {column:.2f}]" for row, column in images.centres_px)
     return (
@@ -140,7 +140,7 @@ def images_words(frames: Frames, images: PupilImages) -> str:
     )
 
 
-def rounded_centres(images: PupilImages) -> list[list[float]]:
+def round_centres(images: PupilImages) -> list[list[float]]:
     """Return the centres in the notation of an instrument file."""
     return [[round(float(value), 3) for value in at] for at in images.centres_px]
 

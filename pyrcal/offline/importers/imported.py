@@ -119,7 +119,7 @@ class Imported:
                         refined = self._with_refined_centres(instrument)
                         draft.instrument.write_text(refined.instrument_text(), encoding="utf-8")
                 except ConfigurationError as error:
-                    # the draft's folder is gone when this is read
+                    # the message must not name the temporary folder, which is deleted by then
                     raise ConfigurationError(str(error).replace(name, str(place))) from error
                 draft.matrix.replace(place / ARRAYS_FILE)
                 draft.instrument.replace(place / INSTRUMENT_FILE)
@@ -150,11 +150,11 @@ class Imported:
         """Return it with the centres that a fit would use for ``pupil_centres_px = "auto"``."""
         centres = kind_of(instrument).image_centres(instrument, self.arrays[FLUX_FRAME])
         if centres is None:
-            return self  # the light is narrower than the file's pupil: the circles stay
+            return self  # the light is narrower than the file's pupil: keep the fitted circles
         wfs = {**self.tables["wfs"], "pupil_centres_px": np.round(centres, 3).tolist()}
         return replace(self, tables={**self.tables, "wfs": wfs})
 
-    def noted(self, *notes: str) -> Imported:
+    def with_notes(self, *notes: str) -> Imported:
         """Return the import with further notes."""
         return replace(self, notes=(*self.notes, *notes))
 
@@ -184,7 +184,7 @@ def _toml(value: object) -> str:
     return repr(float(value)) if isinstance(value, float | np.floating) else str(value)
 
 
-def oriented(
+def orient_matrix(
     values: Array, rows: int, columns: int | None, what: str, of: str
 ) -> tuple[Array, tuple[str, ...]]:
     """Return a matrix as ``(rows, columns)``, and a note if it was transposed.
@@ -221,5 +221,5 @@ def oriented(
     raise MatrixError(f"{what}: found shape {found.shape}, expected {of} = {wanted}")
 
 
-matrix_of = partial(oriented, what=DATASET, of="(n_slopes, n_modes)")
+matrix_of = partial(orient_matrix, what=DATASET, of="(n_slopes, n_modes)")
 """Return the interaction matrix with given numbers of slopes and modes."""

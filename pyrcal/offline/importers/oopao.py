@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.importers.imported import Array, Dataset, Imported, matrix_of, oriented
+from pyrcal.offline.importers.imported import Array, Dataset, Imported, matrix_of, orient_matrix
 from service.errors import ConfigurationError
 from service.model.misregistration import Misregistration, rotation
 
@@ -83,10 +83,10 @@ _POSITIVE = {"D", "wavelength", "mechCoupling", "pixel_scale"}
 _MAX_NUMBER = 1e6
 """Largest allowed value of any attribute, in its own unit."""
 
-_SAME_SHAPE = 1e-3
+_MAX_SHAPE_DEVIATION = 1e-3
 """Largest accepted deviation of an influence function from its Gaussian, relative to its height."""
 
-_ROUNDING = 1e-9
+_MAX_ROUNDING = 1e-9
 """Stretches below this are rounding errors."""
 
 _SAMPLED_ACTUATORS = 24
@@ -131,14 +131,16 @@ def from_oopao(
     functions = _functions(tel, dm)
     mirror, arrays = _mirror(tel, dm, functions, notes)
     if "positions" in arrays:
-        notes += _where_it_lies(dm.misReg, tel, len(valid))
+        notes += _describe_registration(dm.misReg, tel, len(valid))
     pupil, diameter_m = _lit_pupil(tel, sensor, notes)
     n_actuators = functions.shape[1]
     if M2C is None:
         mirror["basis"] = "zonal"
         n_modes = n_actuators
     else:
-        strokes, turned = oriented(_numpy(M2C), n_actuators, None, "M2C", "(n_actuators, n_modes)")
+        strokes, turned = orient_matrix(
+            _numpy(M2C), n_actuators, None, "M2C", "(n_actuators, n_modes)"
+        )
         notes += turned
         n_modes = strokes.shape[1]
         mirror["mode_to_actuator"] = Dataset("mode_to_actuator")
@@ -180,7 +182,7 @@ def _wavelength_m(tel: Any, wfs: Any, ngs: Any) -> float:  # noqa: ANN401
     source = ngs or getattr(wfs, "src", None) or getattr(tel, "src", None)
     if source is None or not hasattr(source, "wavelength"):
         raise ConfigurationError(
-            "ngs: found no source with a wavelength, expected the one that the sensor looks at"
+            "ngs: found no source with a wavelength, expected the sensor's source"
         )
     return float(source.wavelength)
 
@@ -335,8 +337,8 @@ def _mirror(
     if places is not None and _is_gaussian(dm, places, functions, float(tel.D)):
         return _gaussian(tel, dm, places)
     notes.append(
-        "dm.modes are not the Gaussian functions of dm.coordinates: taken as a cube, so α counts "
-        "from where this mirror lies, and beyond the pupil its surface is unknown"
+        "dm.modes are not the Gaussian functions of dm.coordinates: taken as a cube, so α is "
+        "relative to this mirror's position, and its surface outside the pupil is unknown"
     )
     cube = np.ascontiguousarray(functions.T.reshape(-1, side, side), dtype=np.float32)
     table = {
@@ -382,7 +384,7 @@ def _gaussian(
     places: Array,
 ) -> tuple[dict[str, Any], dict[str, Array]]:
     """Return ``[mirror]`` of OOPAO's own Gaussian mirror at its position without misReg."""
-    places = places.astype(float) * _steps(tel) * _mirrored(dm)
+    places = places.astype(float) * _steps(tel) * _flip_signs(dm)
     table = {
         "layout": "positions",
         "positions": Dataset("positions"),
@@ -393,7 +395,7 @@ def _gaussian(
     return table, {"positions": places}
 
 
-def _mirrored(dm: Any) -> NDArray[np.float64]:  # noqa: ANN401
+def _flip_signs(dm: Any) -> NDArray[np.float64]:  # noqa: ANN401
     """Return the sign of x and y from the flips of OOPAO's influence functions."""
     x, y = (-1.0, -1.0) if getattr(dm, "flip_", False) else (1.0, 1.0)
     return np.array([-x if getattr(dm, "flip_lr", False) else x, y])
@@ -409,18 +411,18 @@ def _is_gaussian(
     if getattr(dm, "sign", 1) != 1:
         return False
     some = np.unique(np.linspace(0, len(places) - 1, _SAMPLED_ACTUATORS).astype(int))
-    drawn = _drawn(dm, places[some].astype(float), len(functions), diameter_m)
-    return bool(np.abs(drawn - functions[:, some].T).max() <= _SAME_SHAPE)
+    drawn = _compute_gaussians(dm, places[some].astype(float), len(functions), diameter_m)
+    return bool(np.abs(drawn - functions[:, some].T).max() <= _MAX_SHAPE_DEVIATION)
 
 
-def _drawn(dm: Any, places_m: Array, n_points: int, diameter_m: float) -> Array:  # noqa: ANN401
+def _compute_gaussians(dm: Any, places_m: Array, n_points: int, diameter_m: float) -> Array:  # noqa: ANN401
     """Return OOPAO's Gaussians ``(n, n_points)`` of actuators that its misReg moves."""
     moved = dm.misReg
     linear = _linear(moved)
     along = np.linspace(-0.5, 0.5, math.isqrt(n_points)) * diameter_m
-    points = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2) * _mirrored(dm)
+    points = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2) * _flip_signs(dm)
     centres = places_m @ linear.T - [float(moved.shiftX), float(moved.shiftY)]
-    # its Gaussian is as wide as the scaled pitch along the axes of the anamorphosis, unturned
+    # OOPAO scales the Gaussian's width with the pitch along unrotated axes of the anamorphosis
     axes = rotation(np.deg2rad(float(moved.anamorphosisAngle))).T
     scales = 1.0 + np.array([float(moved.radialScaling), float(moved.tangentialScaling)])
     pitch = diameter_m / float(dm.nActAlongDiameter) * scales
@@ -435,20 +437,20 @@ def _linear(moved: Any) -> NDArray[np.float64]:  # noqa: ANN401
     """Return what a ``MisRegistration`` does to coordinates, ``(2, 2)``, before its shift."""
     axes = rotation(np.deg2rad(float(moved.anamorphosisAngle)))
     radial, tangential = 1.0 + float(moved.radialScaling), 1.0 + float(moved.tangentialScaling)
-    # its angle is counted the other way than its rotation
+    # OOPAO counts the angle of the anamorphosis opposite to its rotation
     stretch = axes.T @ np.diag([radial, tangential]) @ axes
     return np.asarray(rotation(np.deg2rad(float(moved.rotationAngle))) @ stretch)
 
 
-def _where_it_lies(moved: Any, tel: Any, n_subapertures: int) -> tuple[str, ...]:  # noqa: ANN401
+def _describe_registration(moved: Any, tel: Any, n_subapertures: int) -> tuple[str, ...]:  # noqa: ANN401
     """Return the registration that a mirror has been given, as a note; nothing where none."""
     if np.allclose(_linear(moved), np.eye(2)) and not moved.shiftX and not moved.shiftY:
         return ()
     alpha = registration_of(moved, tel, n_subapertures)
-    stretched = np.abs(alpha.stretches).max() > _ROUNDING
+    stretched = np.abs(alpha.stretches).max() > _MAX_ROUNDING
     text = f", stretched by {alpha.stretches[0]:+.4f}, {alpha.stretches[1]:+.4f}"
     return (
-        "α counts from where OOPAO's mirror lies without its misReg, which is "
+        "α is relative to OOPAO's mirror without its misReg, which is "
         f"α = {alpha}{text if stretched else ''}",
     )
 
@@ -471,7 +473,7 @@ def to_oopao(alpha: Misregistration, tel: Any, wfs: Any) -> dict[str, float]:  #
     """Return a registration as OOPAO's ``MisRegistration`` takes it: metres, degrees, fractions."""
     n_subapertures = int(wfs.nSubap) / int(getattr(wfs, "binning", 1))
     subaperture_m = float(tel.D) / n_subapertures / _steps(tel)
-    # OOPAO stretches first and turns then
+    # OOPAO applies the stretch first, then the rotation
     stretch = rotation(alpha.rotation_rad).T @ alpha.image
     (tangential, radial), axes = np.linalg.eigh((stretch + stretch.T) / 2)
     return {
@@ -501,10 +503,14 @@ def from_saved(arrays: Mapping[str, Array], where: str) -> Imported:
     for name, values in arrays.items():
         owner, _, attribute = name.rpartition(".")
         if owner in objects:
-            setattr(objects[owner], attribute, _checked(f"{where}: {name}", attribute, values))
-    missing = [f"{owner}.{name}" for owner, name in _missing(objects)]
+            setattr(
+                objects[owner], attribute, _check_attribute(f"{where}: {name}", attribute, values)
+            )
+    missing = [f"{owner}.{name}" for owner, name in _list_missing(objects)]
     if missing:
-        raise ConfigurationError(f"{where}: found no {', '.join(missing)}; expected it beside them")
+        raise ConfigurationError(
+            f"{where}: found no {', '.join(missing)}; expected it with the others"
+        )
     side = int(objects["tel"].resolution)
     for name in ("pupil", "pupilReflectivity"):
         shape = np.shape(getattr(objects["tel"], name, ()))
@@ -529,7 +535,7 @@ def from_saved(arrays: Mapping[str, Array], where: str) -> Imported:
     )
 
 
-def _checked(where: str, attribute: str, values: Array) -> object:
+def _check_attribute(where: str, attribute: str, values: Array) -> object:
     """Return an attribute as OOPAO has it: a number, a word, or an array.
 
     Raises
@@ -561,17 +567,19 @@ def _checked(where: str, attribute: str, values: Array) -> object:
     )
     if not low <= float(number) <= _MAX_NUMBER or (attribute in _POSITIVE and number == 0.0):
         found = values if values.size == 1 else f"shape {values.shape}"
-        raise ConfigurationError(f"{where}: found {found}, expected {_expected(attribute)}")
+        raise ConfigurationError(
+            f"{where}: found {found}, expected {_describe_expected(attribute)}"
+        )
     return number
 
 
-def _expected(attribute: str) -> str:
+def _describe_expected(attribute: str) -> str:
     if attribute in _COUNTS:
         return f"a number of at least {_COUNTS[attribute]}"
     return "a number above 0" if attribute in _POSITIVE else "a finite number"
 
 
-def _missing(objects: Mapping[str, SimpleNamespace]) -> Iterator[tuple[str, str]]:
+def _list_missing(objects: Mapping[str, SimpleNamespace]) -> Iterator[tuple[str, str]]:
     """Yield what every import needs of each object and was not saved."""
     kind = getattr(objects["wfs"], "tag", PYRAMID)
     for owner, names in SAVED.items():

@@ -31,7 +31,7 @@ def _oopao(options: argparse.Namespace) -> Imported:
 
 
 def _specula(options: argparse.Namespace) -> Imported:
-    reported, source = _reported(options), options.source
+    reported, source = _make_reported(options), options.source
     return from_specula([path for _, path in options.files], reported, source)
 
 
@@ -54,7 +54,7 @@ def _arrays(options: argparse.Namespace) -> Imported:
     if options.instrument is not None:
         imported = from_described(source, found, options.instrument, options.unit, options.modes)
     else:
-        imported = from_arrays(source, found, _reported(options))
+        imported = from_arrays(source, found, _make_reported(options))
     return replace(imported, inventory=tuple(inventory))
 
 
@@ -118,14 +118,14 @@ def _only(arrays: Mapping[str, Array], where: str) -> Array:
 
 
 def _cacao(options: argparse.Namespace) -> Imported:
-    return from_cacao(options.folder, _reported(options), options.response)
+    return from_cacao(options.folder, _make_reported(options), options.response)
 
 
 def _aot(options: argparse.Namespace) -> Imported:
     positions = None
     if options.positions is not None:
         positions = _positions(options.positions)
-    return from_aot(options.file, _reported(options), options.loop, positions)
+    return from_aot(options.file, _make_reported(options), options.loop, positions)
 
 
 def _positions(path: Path) -> Array:
@@ -139,7 +139,7 @@ def _positions(path: Path) -> Array:
         raise MatrixError(f"{path}: found {error}, expected x and y in a row") from error
 
 
-def _reported(options: argparse.Namespace) -> Reported:
+def _make_reported(options: argparse.Namespace) -> Reported:
     if options.diameter_m is None:
         other = (
             ", or --instrument with a packaged name or a file" if "instrument" in options else ""

@@ -50,14 +50,14 @@ class Registrations:
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return α ``(t, 4)`` in boundary units, stretches ``(t, 2)``, and the times if known."""
-        told = {
+        result = {
             "registration": np.array([at.alpha.vector for at in self.over_time]) * BOUNDARY_SCALE,
             "registration_anamorphosis": np.array([at.alpha.stretches for at in self.over_time]),
         }
         times = [at.t_ns_utc for at in self.over_time if at.t_ns_utc is not None]
         if times:
-            told["registration_t_ns_utc"] = np.array(times, np.int64)
-        return told
+            result["registration_t_ns_utc"] = np.array(times, np.int64)
+        return result
 
     @property
     def mirror(self) -> dict[str, Any]:

@@ -19,8 +19,8 @@ def read_npz(path: Path, *, max_bytes: int | None = MAX_BYTES) -> dict[str, Arra
     Raises
     ------
     MatrixError
-        If it is none, is damaged, holds Python objects, or unpacks to more than ``max_bytes``
-        (None: there is no limit).
+        If it is another kind of file, is damaged, contains Python objects, or unpacks to more than
+        ``max_bytes`` (None for no limit).
     """
     try:
         with zipfile.ZipFile(path) as packed:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.importers.files import Reported, from_arrays
-from pyrcal.offline.importers.imported import Array, Imported, oriented
+from pyrcal.offline.importers.imported import Array, Imported, orient_matrix
 from service.errors import MatrixError, StorageError
 from service.files.container import Container, opened
 
@@ -29,7 +29,7 @@ UNIT = "nm"
 """Unit of SPECULA's commands."""
 
 LENSLETS = (
-    "slopes of lenslets are shares of half their field, which these files do not tell: the strokes "
+    "slopes of lenslets are shares of half their field, which these files do not give: the strokes "
     "are taken as unknown"
 )
 
@@ -93,7 +93,7 @@ def from_specula(paths: Sequence[Path], reported: Reported, source: str = "SPECU
     if places is None or "matrix" not in found:
         missing = "PupData or SubapData" if places is None else "Intmat"
         raise MatrixError(f"{source}: found no {missing}, expected one among the files")
-    matrix, turned = oriented(
+    matrix, turned = orient_matrix(
         found["matrix"], 2 * len(places.rows), None, "Intmat", "(n_slopes, n_modes)"
     )
     notes += turned
@@ -108,7 +108,7 @@ def from_specula(paths: Sequence[Path], reported: Reported, source: str = "SPECU
             f"{source}: found the subapertures of a {kind}, expected those of a {reported.sensor}, "
             "as --sensor says"
         )
-    # what its pyramid calls x runs along the rows of its mask
+    # SPECULA's pyramid counts x along the rows of its mask
     order = "yx" if kind == "pyramid" else "xy"
     if kind != "pyramid" and reported.unit is not None:
         notes.append(LENSLETS)
@@ -116,7 +116,7 @@ def from_specula(paths: Sequence[Path], reported: Reported, source: str = "SPECU
     imported = from_arrays(source, found, replace(reported, order=order, sensor=kind))
     if not np.array_equal(places.by_rows, np.arange(len(places.rows))):
         notes.append("subapertures were not listed row by row: sorted")
-    return imported.noted(*notes)
+    return imported.with_notes(*notes)
 
 
 def _role_of(container: Container) -> tuple[str, Array, tuple[str, ...]]:
@@ -139,9 +139,11 @@ def _cube(container: Container, functions: Array) -> tuple[Array, tuple[str, ...
     """Return an ``IFunc`` as maps with NaN outside its mask: it holds only the points inside."""
     stored = container.find("MASK_INF_FUNC")
     if stored is None:
-        raise MatrixError(f"{container.path}: found no MASK_INF_FUNC beside INFLUENCE_FUNCTION")
+        raise MatrixError(
+            f"{container.path}: found INFLUENCE_FUNCTION without MASK_INF_FUNC, expected both"
+        )
     inside = stored.numbers() > 0.0
-    values, turned = oriented(
+    values, turned = orient_matrix(
         functions, int(inside.sum()), None, "INFLUENCE_FUNCTION", "(n_points, n_functions)"
     )
     cube = np.full((values.shape[1], *inside.shape), np.nan, dtype=np.float32)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pyrcal.offline.figures import check_plots, landed, mirror_outline
+from pyrcal.offline.figures import check_plots, map_to_sensor, mirror_outline
 from service.errors import ConfigurationError
 from service.model.instrument import Instrument
 from service.model.pupil import instrument_pupil, valid_subapertures
@@ -44,7 +44,7 @@ def write_drawing(instrument: Instrument, path: Path) -> None:
         )
     )
     points, style = mirror_outline(instrument)
-    here = landed(points, instrument.start)
+    here = map_to_sensor(points, instrument.start)
     axes.plot(here[:, 0], here[:, 1], style, color=_MIRROR, markersize=5.0, linewidth=1.0)
     reach = 1.05 * max(half, float(np.abs(here).max()))
     axes.set(

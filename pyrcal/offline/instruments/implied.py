@@ -43,7 +43,7 @@ class Implied:
     """Number of singular values that a reconstructor truncates."""
 
 
-def implied(instrument: Instrument, most_gb: float) -> Implied:
+def derive_properties(instrument: Instrument, most_gb: float) -> Implied:
     """Return the properties; the matrix is computed if it needs at most ``most_gb`` of memory.
 
     Raises
@@ -61,10 +61,10 @@ def implied(instrument: Instrument, most_gb: float) -> Implied:
         n_modes=instrument.modes.n_modes,
         expected_gb=work_of(instrument, sensor, pupil).memory_bytes / GB,
     )
-    return known if known.expected_gb > most_gb else _computed(instrument, known)
+    return known if known.expected_gb > most_gb else _compute_matrix(instrument, known)
 
 
-def _computed(instrument: Instrument, known: Implied) -> Implied:
+def _compute_matrix(instrument: Instrument, known: Implied) -> Implied:
     begun = time.perf_counter()
     model = RtcInteractionModel(
         instrument, modal_basis(instrument), pupil_sampling=SAMPLING, detector_nodes=NODES
@@ -85,7 +85,7 @@ def _computed(instrument: Instrument, known: Implied) -> Implied:
     )
 
 
-def described(instrument: Instrument, found: Implied) -> tuple[str, ...]:
+def describe_properties(instrument: Instrument, found: Implied) -> tuple[str, ...]:
     """Return it in lines for a person."""
     n, kind = instrument.wfs.n_subapertures, instrument.wfs.kind
     signals = "slopes" if instrument.slopes.kind is SignalKind.XY else "pixels"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 
 from pyrcal.offline.instruments.drawing import write_drawing
-from pyrcal.offline.instruments.implied import described, implied
-from pyrcal.offline.instruments.template import template
+from pyrcal.offline.instruments.implied import derive_properties, describe_properties
+from pyrcal.offline.instruments.template import make_template
 from pyrcal.terminal import print_lines
 from service.config import load_instrument
 from service.errors import ConfigurationError, ModelError, StorageError
@@ -16,7 +16,7 @@ USABLE, WRONG = 0, 1
 
 
 def main(options: argparse.Namespace) -> int:
-    """Do what was asked of an instrument file; return the exit status.
+    """Run the command on an instrument file; return the exit status.
 
     Raises
     ------
@@ -37,7 +37,7 @@ def main(options: argparse.Namespace) -> int:
 def _new(options: argparse.Namespace) -> int:
     try:
         with options.file.open("x", encoding="utf-8") as file:
-            file.write(template(KINDS[options.kind]))
+            file.write(make_template(KINDS[options.kind]))
     except OSError as error:
         raise StorageError(f"{options.file}: cannot be written: {error.strerror}") from error
     print_lines([f"{options.file}: written; next: pyrcal instrument check {options.file}"])
@@ -47,7 +47,7 @@ def _new(options: argparse.Namespace) -> int:
 def _check(options: argparse.Namespace) -> int:
     try:
         instrument = load_instrument(options.instrument)
-        found = implied(instrument, options.memory_gb)
+        found = derive_properties(instrument, options.memory_gb)
     except ConfigurationError as error:
         print_lines(error.problems)
         return WRONG
@@ -55,6 +55,6 @@ def _check(options: argparse.Namespace) -> int:
         print_lines([f"{options.instrument}: {error}"])
         return WRONG
     print_lines([f"{options.instrument}: {instrument.name}"])
-    print_lines(described(instrument, found))
+    print_lines(describe_properties(instrument, found))
     print_lines(f"note: {remark}" for remark in instrument.remarks)
     return USABLE

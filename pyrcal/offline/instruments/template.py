@@ -15,7 +15,7 @@ EXAMPLES: Mapping[str, Mapping[str, object]] = {
     "[wfs]": {"n_subapertures": 20, "wavelength_m": 750e-9, "modulation_lambda_over_d": 3.0},
     "[mirror]": {"layout": "grid", "n_across": 21, "pitch_m": 0.4, "diameter_m": 8.6},
 }
-"""Values of the keys that a file must have, and of the one mirror that the template draws."""
+"""Example values of the required keys, and of the template's mirror."""
 
 _WIDTH = 98
 
@@ -26,7 +26,7 @@ pyrcal instrument check FILE, pyrcal instrument show FILE PICTURE.png
 """
 
 
-def template(kind: SensorKind) -> str:
+def make_template(kind: SensorKind) -> str:
     """Return a valid instrument file for a kind of sensor, as a template."""
     lines = [*_comment(_HEAD)]
     for table in tables_of(whole_of(kind)):
@@ -38,20 +38,20 @@ def template(kind: SensorKind) -> str:
 
 
 def _table(table: TableText, examples: Mapping[str, object]) -> Iterator[str]:
-    """Yield a table; one inside another, of which there may be none, is behind # altogether."""
+    """Yield a table; an optional nested table is commented out."""
     inner = "." in table.header
     yield from _comment(table.about)
     yield f"{'#' if inner else ''}{table.header}"
     for key in table.keys:
-        yield from _comment(_explained(key))
+        yield from _comment(_describe_key(key))
         value = examples.get(key.name, key.default)
         unset = "#" if inner or key.name not in examples else ""
         yield f"{unset}{key.name} = {'' if value is None else json.dumps(value)}".rstrip()
 
 
-def _explained(key: KeyText) -> str:
-    told = f"({key.type}; needed)" if key.needed else f"({key.type})"
-    return f"{key.meaning} {told}".strip()
+def _describe_key(key: KeyText) -> str:
+    type_words = f"({key.type}; needed)" if key.needed else f"({key.type})"
+    return f"{key.meaning} {type_words}".strip()
 
 
 def _comment(text: str) -> Iterator[str]:

@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from pyrcal.demo.children import GRACE_S, children, interrupted_by_any_end
+from pyrcal.demo.children import GRACE_S, children, interrupt_on_end
 from tests.system.night import session_members, wait_for
 from tests.system.pace import in_time
 
@@ -56,6 +56,6 @@ def test_an_impatient_second_interrupt_leaves_nothing_behind(tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_closed_terminal_or_a_kill_interrupts_like_ctrl_c(number):
     before = signal.getsignal(number)
-    with interrupted_by_any_end(), pytest.raises(KeyboardInterrupt):
+    with interrupt_on_end(), pytest.raises(KeyboardInterrupt):
         signal.raise_signal(number)
     assert signal.getsignal(number) is before

@@ -277,7 +277,7 @@ def test_frames_that_never_came_or_stopped_are_the_reason(truth):
 def test_a_simulator_that_is_slow_or_silent_is_the_reason(truth):
     slow = failed(truth, Circumstances(pace=0.62))
     assert "too slow: the simulator made 0.62 s of telemetry a second" in slow
-    silent = failed(truth, Circumstances(untold_s=8.0))
+    silent = failed(truth, Circumstances(silent_s=8.0))
     assert "the simulator has made nothing for 8 s" in silent
 
 

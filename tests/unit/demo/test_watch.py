@@ -10,11 +10,11 @@ from pyrcal.demo.truth import TruthFile
 from pyrcal.demo.watch import (
     HEADING,
     HOLD_S,
-    STRETCH,
+    MAX_STRETCH,
     Promise,
     Stopwatch,
     TelemetryObserver,
-    awaited,
+    explain_waiting,
     live_line,
     rate_line,
     slow_line,
@@ -136,7 +136,7 @@ def scene(tmp_path, monkeypatch):
 def test_the_clock_starts_when_all_is_ready_and_until_then_it_says_what_it_waits_for(scene):
     watch = scene.watch()
     watch.run()
-    report = watch.closing_report()
+    report = watch.make_final_report()
     assert report.good
     assert report.seconds_to_ready == pytest.approx(6.0, abs=0.6)
     assert report.seconds_to_first_applied == pytest.approx(14.0, abs=0.6)
@@ -157,7 +157,7 @@ def test_when_time_is_up_it_fails_and_names_the_reason(scene):
     scene.right_at_s = 1e9
     watch = scene.watch()
     watch.run()
-    report = watch.closing_report()
+    report = watch.make_final_report()
     assert scene.now_s == pytest.approx(66.0, abs=1.1)
     assert "no estimate of the registration" in report.failures
     assert report.reasons == ["refused windows: 3 of 3; the last: the loop is open"]
@@ -167,27 +167,27 @@ def test_a_slow_machine_gets_its_seconds_of_telemetry_and_is_told_that_it_is_slo
     scene.pace, scene.right_at_s = 0.5, 90.0
     watch = scene.watch()
     watch.run()
-    assert watch.closing_report().good
+    assert watch.make_final_report().good
     assert any("0.5 of real time" in line for line in scene.lines)
 
 
 def test_a_machine_however_slow_comes_to_an_end(scene):
     scene.pace, scene.right_at_s = 0.01, 1e9
     scene.watch(seconds=20.0).run()
-    assert scene.now_s == pytest.approx(6.0 + STRETCH * 20.0, abs=1.1)
+    assert scene.now_s == pytest.approx(6.0 + MAX_STRETCH * 20.0, abs=1.1)
 
 
 def test_thousands_of_modes_get_more_of_the_clock(scene):
     scene.pace, scene.right_at_s = 0.05, 500.0
     watch = scene.watch(seconds=20.0, large=True)
     watch.run()
-    assert watch.closing_report().good
+    assert watch.make_final_report().good
 
 
 def test_a_worker_that_is_behind_gets_more_time(scene):
     scene.alarms, scene.right_at_s = ["worker-behind"], 1e9
     scene.watch(seconds=20.0).run()
-    assert scene.now_s == pytest.approx(6.0 + STRETCH * 20.0, abs=1.1)
+    assert scene.now_s == pytest.approx(6.0 + MAX_STRETCH * 20.0, abs=1.1)
     assert any("worker is behind" in line for line in scene.lines)
 
 
@@ -204,7 +204,7 @@ def test_an_old_answer_is_never_shown_as_a_fresh_one(scene):
     silent = [line for line in scene.lines if "no answer from the service for" in line]
     assert len(silent) >= 8
     assert not any("modes)" in line for line in scene.lines[scene.lines.index(silent[0]) :])
-    failures = watch.closing_report().failures
+    failures = watch.make_final_report().failures
     assert any("the service has not answered for" in text for text in failures)
 
 
@@ -213,7 +213,7 @@ def test_a_model_that_is_never_ready_ends_the_demo_with_the_reason(scene):
     watch = scene.watch()
     watch.run()
     assert 100.0 < scene.now_s < 300.0
-    assert watch.closing_report().reasons[0].startswith("the service was not ready")
+    assert watch.make_final_report().reasons[0].startswith("the service was not ready")
 
 
 class Ended:
@@ -233,7 +233,7 @@ def test_a_process_that_ends_ends_the_demo_with_its_last_words(scene, tmp_path):
     watch.run()
     assert scene.now_s < 10.0
     ending = "the simulator ended with status 3: sim_rtc: no such telescope"
-    assert ending in watch.closing_report().reasons
+    assert ending in watch.make_final_report().reasons
 
 
 SHOWN = {
@@ -305,15 +305,15 @@ def test_a_slow_machine_is_said_to_be_slow_and_a_slow_telescope_is_not_its_fault
 
 
 def test_while_it_prepares_the_demo_says_what_it_waits_for():
-    assert awaited(None) == "the service is starting"
+    assert explain_waiting(None) == "the service is starting"
     wait = {
         "name": "model",
         "responsible": "worker",
         "text": "it is being prepared",
         "blocks": True,
     }
-    assert awaited({"waiting_for": [wait]}) == "for the worker: it is being prepared"
-    assert "telescope" in awaited({"waiting_for": []})
+    assert explain_waiting({"waiting_for": [wait]}) == "for the worker: it is being prepared"
+    assert "telescope" in explain_waiting({"waiting_for": []})
 
 
 def test_a_loop_that_runs_slower_than_usual_is_told():

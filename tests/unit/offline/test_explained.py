@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pyrcal.offline import alternatives, instrument_checks, models, pupil_checks
-from pyrcal.offline.advice import Grounds, recommendation
+from pyrcal.offline.advice import Grounds, recommend_action
 from pyrcal.offline.fit_table import table
 from pyrcal.offline.fitted import Fit
 from pyrcal.offline.left_over import LeftOver
@@ -292,15 +292,16 @@ def test_columns_in_each_others_place_are_named_with_their_sign():
 @pytest.mark.parametrize(
     ("columns", "words"),
     [
-        ([59, *range(59)], "a column too many stands in front"),
+        ([59, *range(59)], "column 1 is mode 0's"),
         pytest.param([*range(1, 60), 0], "the first column is missing", marks=pytest.mark.long),
-        pytest.param(range(59, -1, -1), "the columns stand in reverse", marks=pytest.mark.long),
+        pytest.param(range(59, -1, -1), "in reverse", marks=pytest.mark.long),
     ],
 )
 def test_columns_that_all_stand_elsewhere_are_named(columns, words):
     found = explained(modal_bench(), modal()[:, list(columns)])
     assert not found.accepted
-    assert found.recommendation.startswith(f"do not use it: {words}")
+    assert found.recommendation.startswith("do not use it: ")
+    assert words in found.recommendation
 
 
 # --- what is left over
@@ -332,7 +333,7 @@ def test_modes_that_fit_badly_are_the_cause_where_sets_of_modes_disagree():
     bad = LeftOver(border=None, subapertures=(), modes=((67, 0.71),))
     divided = a_fit(accepted=False, verdict="refused: sets of modes disagree", left_over=bad)
     grounds = Grounds(refusal=Refusal.DIVIDED, structure=0.05, n_sets=8)
-    assert recommendation(divided, grounds) == (
+    assert recommend_action(divided, grounds) == (
         "do not use it: modes that fit worse than the others: 67 (71%) left over; measure these "
         "again, or leave them out (--modes)"
     )
@@ -341,7 +342,9 @@ def test_modes_that_fit_badly_are_the_cause_where_sets_of_modes_disagree():
 def test_a_sigma_next_to_what_is_enough_is_said_to_its_third_place():
     known = a_fit(covariance=np.diag([0.0304**2, 1e-6, 1e-12, 1e-12]))
     grounds = Grounds(refusal=None, structure=0.0, n_sets=8)
-    assert "known to 0.030 subapertures (1 sigma), 0.03 is enough" in recommendation(known, grounds)
+    assert "known to 0.030 subapertures (1 sigma), 0.03 is enough" in recommend_action(
+        known, grounds
+    )
 
 
 def test_too_few_modes_and_too_much_noise_are_reasons_to_measure_more():
@@ -374,13 +377,18 @@ def test_a_fit_that_nobody_asked_to_explain_is_advised_all_the_same():
 def test_a_fit_is_written_whichever_alternative_is_preferred(monkeypatch, tmp_path):
     """Each passes its tests by limits that all pass, so its own numbers come to its flags."""
     for module in (alternatives, instrument_checks, models, pupil_checks):
-        for name in ("BETTER", "FAR_BETTER"):
+        for name in ("PREFERRED_SHARE", "FAR_PREFERRED_SHARE"):
             monkeypatch.setattr(module, name, np.inf, raising=False)
         monkeypatch.setattr(module, "SIGNIFICANT", -np.inf, raising=False)
-    for name in ("NOTABLE_OFFSET_SUBAP", "NOTABLE_OFFSET_SHARE", "LEAST_OFFSET", "NOTABLE_AXES"):
+    for name in (
+        "NOTABLE_OFFSET_SUBAP",
+        "NOTABLE_OFFSET_SHARE",
+        "MIN_OFFSET_EXPLAINED",
+        "NOTABLE_GAIN_RATIO",
+    ):
         monkeypatch.setattr(alternatives, name, -1.0)
     monkeypatch.setattr(instrument_checks, "MIN_EXPLAINED", -1.0)
-    monkeypatch.setattr(pupil_checks, "LEAST_EXPLAINED", -1.0)
+    monkeypatch.setattr(pupil_checks, "MIN_PUPIL_EXPLAINED", -1.0)
     found = explained(modal_bench(), modal())
     preferred = [one.words for one in found.alternatives if one.preferred]
     for words in ("off the sensor's middle", "than Sy", "stop =", "normalisation =", "influence ="):

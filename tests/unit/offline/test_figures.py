@@ -40,14 +40,16 @@ def test_a_point_of_the_mirror_lands_turned_scaled_and_then_shifted():
     alpha = Misregistration(
         shift_x_subap=1.0, shift_y_subap=2.0, rotation_rad=np.pi / 2, magnification=2.0
     )
-    np.testing.assert_allclose(figures.landed(np.array([[3.0, 0.0]]), alpha), [[1.0, 8.0]])
+    np.testing.assert_allclose(figures.map_to_sensor(np.array([[3.0, 0.0]]), alpha), [[1.0, 8.0]])
 
 
 def test_every_actuator_is_in_the_registration_picture(axes):
     instrument = small_instrument()
     figures.registration(axes, a_fit(), instrument)
     drawn = axes.get_lines()[0].get_xydata()
-    expected = figures.landed(instrument.mirror.positions_m / instrument.subaperture_m, ALPHA)
+    expected = figures.map_to_sensor(
+        instrument.mirror.positions_m / instrument.subaperture_m, ALPHA
+    )
     np.testing.assert_allclose(drawn, expected)
     low, high = axes.get_xlim()
     assert low < drawn.min()

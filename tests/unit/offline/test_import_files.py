@@ -549,5 +549,5 @@ def test_fewer_columns_than_actuators_must_be_explained(tmp_path):
     some = np.array([0, 2, 3, 5, 8])
     zonal = from_arrays("it", given, replace(REPORTED, basis="zonal", columns=some))
     np.testing.assert_array_equal(zonal.arrays["modes"], some)
-    with pytest.raises(MatrixError, match="--basis: found it beside modes"):
+    with pytest.raises(MatrixError, match="--basis"):
         from_arrays("it", arrays(), replace(REPORTED, basis="KL"))

@@ -13,7 +13,7 @@ import pytest
 
 import pyrcal
 from pyrcal.__main__ import main
-from pyrcal.offline.importers.imported import Imported, oriented
+from pyrcal.offline.importers.imported import Imported, orient_matrix
 from pyrcal.offline.importers.oopao import (
     SAVED,
     from_oopao,
@@ -22,7 +22,7 @@ from pyrcal.offline.importers.oopao import (
     to_oopao,
 )
 from pyrcal.offline.importers.saved import read_npz
-from pyrcal.offline.models import deciding_sampling
+from pyrcal.offline.models import choose_sampling
 from service.errors import ConfigurationError, MatrixError
 from service.model.instrument import PupilMap
 from service.model.misregistration import Misregistration
@@ -69,19 +69,19 @@ def test_geometric_lenslets_are_mean_gradients(tmp_path):
 def test_a_black_and_white_pupil_decides_on_its_own_points(saved, tmp_path):
     """Four for each of 8 subapertures; a grey one, or one of very many, is as fine as usual."""
     instrument = pyrcal.load_instrument(imported_of(saved).save(tmp_path / "bench").instrument)
-    assert deciding_sampling(instrument) == 4
+    assert choose_sampling(instrument) == 4
     lit = instrument.pupil.lit.copy()
     lit[lit.shape[0] // 2, 0] = 0.5
     grey = replace(instrument, pupil=replace(instrument.pupil, lit=lit))
-    assert deciding_sampling(grey) == 3
+    assert choose_sampling(grey) == 3
     finer = PupilMap(
         lit=np.kron(instrument.pupil.lit, np.ones((6, 6))), pitch_m=instrument.pupil.pitch_m / 6
     )
-    assert deciding_sampling(replace(instrument, pupil=finer)) == 3
+    assert choose_sampling(replace(instrument, pupil=finer)) == 3
 
 
 def test_the_notes_stand_in_the_instrument_file(saved):
-    assert "# α counts from where OOPAO's mirror lies" in imported_of(saved).instrument_text()
+    assert "without its misReg, which is α" in imported_of(saved).instrument_text()
 
 
 def test_a_zonal_calibration_has_the_actuators_for_modes(saved):
@@ -176,7 +176,7 @@ def test_oopao_scales_along_its_angle_then_turns():
 
 
 def test_a_square_matrix_is_taken_as_it_is_and_it_is_said():
-    values, (note,) = oriented(np.arange(9.0).reshape(3, 3), 3, 3, "M2C", "(a, b)")
+    values, (note,) = orient_matrix(np.arange(9.0).reshape(3, 3), 3, 3, "M2C", "(a, b)")
     assert values[0, 1] == 1.0
     assert "M2C is square" in note
 

@@ -6,8 +6,8 @@ import tomllib
 import pytest
 
 from pyrcal.__main__ import main
-from pyrcal.offline.instruments.implied import described, implied
-from pyrcal.offline.instruments.template import EXAMPLES, template
+from pyrcal.offline.instruments.implied import derive_properties, describe_properties
+from pyrcal.offline.instruments.template import EXAMPLES, make_template
 from pyrcal.offline.system_file import SystemFile
 from service.config import load_instrument
 from service.config.instrument_schema import whole_of
@@ -73,7 +73,7 @@ def test_what_a_file_must_have_is_set_and_nothing_else_but_a_mirror(kind):
         needed = {key.name for key in table.keys if key.needed} - {"kind"}
         if "." not in table.header and table.header != "[mirror]":
             assert set(EXAMPLES.get(table.header, {})) >= needed, table.header
-    assert set(tomllib.loads(template(KINDS[kind]))["mirror"]) == set(EXAMPLES["[mirror]"])
+    assert set(tomllib.loads(make_template(KINDS[kind]))["mirror"]) == set(EXAMPLES["[mirror]"])
 
 
 def test_a_file_that_is_there_is_kept(tmp_path, capsys):
@@ -121,10 +121,10 @@ def test_a_good_file_is_told_what_it_implies(capsys):
 
 
 def test_a_matrix_that_takes_more_than_was_allowed_is_not_computed():
-    found = implied(load_instrument("flao-lbt"), most_gb=0.2)
+    found = derive_properties(load_instrument("flao-lbt"), most_gb=0.2)
     assert found.seconds is None
     assert 0.2 < found.expected_gb < 2.0
-    assert "--memory-gb" in described(load_instrument("flao-lbt"), found)[-1]
+    assert "--memory-gb" in describe_properties(load_instrument("flao-lbt"), found)[-1]
 
 
 def test_more_modes_than_slopes_have_no_condition(tmp_path):
@@ -132,7 +132,7 @@ def test_more_modes_than_slopes_have_no_condition(tmp_path):
     path.write_text(
         TINY.read_text("utf-8").replace("n_subapertures = 12", "n_subapertures = 4"), "utf-8"
     )
-    found = implied(load_instrument(path), most_gb=4.0)
+    found = derive_properties(load_instrument(path), most_gb=4.0)
     assert found.n_modes > found.n_slopes
     assert found.condition_number is None
 

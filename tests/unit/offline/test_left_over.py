@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pyrcal.offline.left_over import arms_of
+from pyrcal.offline.left_over import find_arms
 
 N = 36
 Y, X = np.indices((N, N)) - (N - 1) / 2
@@ -23,7 +23,7 @@ def residual_map(arms=()):
 
 @pytest.mark.parametrize("arms", [((0, 0.0), (120, 0.0), (240, 0.0)), ((45, 2.2), (225, -2.2))])
 def test_arms_are_found_radial_or_not(arms):
-    found = sorted(arms_of(residual_map(arms)), key=lambda arm: arm.angle_deg)
+    found = sorted(find_arms(residual_map(arms)), key=lambda arm: arm.angle_deg)
     assert len(found) == len(arms)
     for arm, (angle, offset) in zip(found, arms, strict=True):
         assert abs((arm.angle_deg - angle + 180.0) % 360.0 - 180.0) <= 6.0
@@ -31,5 +31,5 @@ def test_arms_are_found_radial_or_not(arms):
 
 
 def test_a_map_without_arms_and_one_line_alone_have_none():
-    assert arms_of(residual_map()) == ()
-    assert arms_of(residual_map(((30, 0.0),))) == ()
+    assert find_arms(residual_map()) == ()
+    assert find_arms(residual_map(((30, 0.0),))) == ()

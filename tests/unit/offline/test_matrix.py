@@ -71,8 +71,8 @@ def test_starts_at_the_corners_of_the_capture_range_lead_to_the_same_place(signs
 def test_a_start_from_which_nothing_is_found_is_refused():
     found = fit(matrix(), options=from_here(0.0, 0.0, 60.0, 0.0))
     assert not found.accepted
-    assert found.verdict.startswith("refused: the steps did not come to rest")
-    assert "the modes (another basis, another order)" in found.verdict
+    assert found.verdict.startswith("refused: ")
+    assert not found.converged
 
 
 @pytest.mark.parametrize("n_modes", [9, 20])
@@ -92,7 +92,7 @@ def test_modes_may_be_any_of_those_measured():
 
 
 def test_a_mode_that_was_not_measured_cannot_be_used():
-    with pytest.raises(ModelError, match="35 is asked for and was not measured"):
+    with pytest.raises(ModelError, match="modes: 35 "):
         fit(matrix()[:, :30], options=FitOptions(modes=np.array([1, 35])))
 
 

@@ -8,7 +8,7 @@ import pytest
 from pyrcal.offline.fit_table import table
 from pyrcal.offline.instrument_checks import FileValuesFit, FoundOptic
 from pyrcal.offline.models import Optic
-from pyrcal.offline.origins import is_determined, origins, unknown_not_found
+from pyrcal.offline.origins import is_determined, list_origins, list_undetermined_keys
 from pyrcal.offline.report import document
 from service.model.slopes import Orientation, SlopeRecipe
 from tests.unit.offline.made import a_fit, a_report
@@ -47,7 +47,7 @@ def test_a_number_that_the_file_lacks_is_a_finding_where_little_but_noise_is_lef
 def listed(optic, structure, share=None):
     slopes = SlopeRecipe(orientation=Orientation())
     there = None if share is None else file_values(share)
-    return origins(bench(), slopes, slopes, (optic,), there, structure, np.ones(9))
+    return list_origins(bench(), slopes, slopes, (optic,), there, structure, np.ones(9))
 
 
 def test_only_a_finding_is_to_be_written_into_the_file():
@@ -62,9 +62,12 @@ def test_unknown_numbers_that_no_matrix_determines_are_listed():
     about = replace(bench(), unknown=("wfs.wavelength_m", "mirror.coupling"))
     loose = replace(UNKNOWN, optic=Optic.WIDTH, key="coupling", sigma=0.9)
     assert listed(loose, 0.02) == ()
-    assert unknown_not_found(about, listed(loose, 0.02)) == ("wfs.wavelength_m", "mirror.coupling")
+    assert list_undetermined_keys(about, listed(loose, 0.02)) == (
+        "wfs.wavelength_m",
+        "mirror.coupling",
+    )
     tight = replace(loose, sigma=0.01)
-    assert unknown_not_found(about, listed(tight, 0.02)) == ("wfs.wavelength_m",)
+    assert list_undetermined_keys(about, listed(tight, 0.02)) == ("wfs.wavelength_m",)
 
 
 def test_unknown_numbers_that_were_not_found_are_in_table_and_document():

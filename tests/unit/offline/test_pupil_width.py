@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pyrcal.offline.matrix import FitOptions, fit_matrix
-from pyrcal.offline.pupil_width import answers_of, seen_pupil
+from pyrcal.offline.pupil_width import compute_responses, measure_pupil
 from service.estimation.reference import Reference
 from service.model.pupil import lit_subapertures
 from tests.unit.offline.test_mistold import MODES, N, bench, zonal
@@ -24,7 +24,7 @@ def disc(diameter, silent=0.05):
 
 @pytest.mark.parametrize("diameter", [8.0, 10.0, 12.0])
 def test_a_ring_that_hardly_answers_tells_the_diameter(diameter):
-    seen = seen_pupil(disc(diameter), told_subap=WIDE)
+    seen = measure_pupil(disc(diameter), stated_subap=WIDE)
     as_many = 2.0 * np.sqrt(np.sum(diameter / 2 > AWAY) / np.pi)  # a disc of whole cells is rough
     assert seen.diameter_subap == pytest.approx(as_many, abs=0.3)
     assert f"{seen.diameter_subap:.0f} subapertures wide" in seen.words
@@ -34,12 +34,12 @@ def test_dead_pixels_a_spider_or_faint_ones_inside_are_no_narrow_pupil():
     inside = disc(WIDE)
     inside[6:9, 2:12] = 0.0
     for answers in (disc(WIDE), inside, disc(10, silent=0.4)):
-        assert seen_pupil(answers, told_subap=WIDE) is None
+        assert measure_pupil(answers, stated_subap=WIDE) is None
 
 
 def test_a_pupil_as_wide_as_it_is_said_to_be_is_not_named():
-    assert seen_pupil(disc(12), told_subap=12.5) is None
-    assert seen_pupil(np.full((3, 3), np.nan), told_subap=3.0) is None
+    assert measure_pupil(disc(12), stated_subap=12.5) is None
+    assert measure_pupil(np.full((3, 3), np.nan), stated_subap=3.0) is None
 
 
 def test_subapertures_of_which_nothing_is_expected_do_not_count():
@@ -47,7 +47,7 @@ def test_subapertures_of_which_nothing_is_expected_do_not_count():
     measured = np.array([4.0, 4.0, 0.0, 1.0] * 2)
     expected = np.array([4.0, 1.0, 1e-4, np.nan] * 2)
     np.testing.assert_array_equal(
-        answers_of(measured, expected, valid), [[1.0, 2.0], [np.nan, np.nan]]
+        compute_responses(measured, expected, valid), [[1.0, 2.0], [np.nan, np.nan]]
     )
 
 

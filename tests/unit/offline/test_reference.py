@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from pyrcal.offline.reference import checked
+from pyrcal.offline.reference import check_reference
 from service.errors import MatrixError
 from service.estimation.reference import Reference
 
@@ -14,7 +14,7 @@ def matrix(n_columns: int = 6) -> np.ndarray:
 
 def check(reference: Reference, **changes):
     about = {"n_slopes": N_SLOPES, "n_modes": N_MODES, "wavelength_m": 750e-9} | changes
-    return checked(reference, **about)
+    return check_reference(reference, **about)
 
 
 def test_a_good_matrix_passes_unchanged():

@@ -138,8 +138,8 @@ RIVALS = (
 
 def test_what_else_was_tried_is_counted_and_the_largest_move_named():
     text = table(a_report(a_fit(alternatives=RIVALS)))
-    assert "3 tried, 1 preferred: see notes" in line(text, "rivals")
-    assert "not excluded: would move it by up to 0.2 sigma (no anamorphosis fitted)" in text
+    assert "3 tried, 1 preferred: see notes" in line(text, "alternatives")
+    assert "by up to 0.2 sigma (no anamorphosis fitted)" in text
     assert "other weights and modes: by up to 5.7 sigma (the lower half of the modes)" in text
 
 
@@ -159,7 +159,7 @@ def test_what_was_found_rather_than_told_has_its_line():
         key="order", found='"yx"', reported='"xy"', how="scanned: the lowest modes", correct=True
     )
     report = a_report(a_fit(origins=(order,)))
-    assert line(table(report), "found, not told").endswith(
+    assert line(table(report), "determined by fit").endswith(
         'order = "yx" (scanned: the lowest modes; the file says "xy")'
     )
     assert document(report)["found_not_told"] == [
@@ -189,7 +189,7 @@ def test_what_was_found_is_said_once_and_its_key_whole():
     )
     text = table(a_report(fit, notes=notes))
     assert [row for row in text.splitlines() if key in row] == [
-        line(text, "found, not told"),
+        line(text, "determined by fit"),
         f"note: {notes[2]}",
     ]
 

@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from pyrcal.offline.fit_file import fit_file, reference_of
+from pyrcal.offline.fit_file import fit_file, make_reference
 from pyrcal.offline.matrix import FitOptions
 from pyrcal.offline.recorded import Recorded, read_recorded
 from service.config import load_instrument
@@ -120,17 +120,17 @@ def test_a_refusal_names_the_file(instrument, tmp_path):
 
 def test_the_measurement_knows_best_how_often_light_met_the_mirror(instrument):
     matrix = np.ones((224, 3))
-    plain, notes = reference_of(recorded(matrix), instrument)
+    plain, notes = make_reference(recorded(matrix), instrument)
     assert plain.double_pass is True
     assert not notes
-    single, notes = reference_of(recorded(matrix, double_pass=False), instrument)
+    single, notes = make_reference(recorded(matrix, double_pass=False), instrument)
     assert single.double_pass is False
     assert "instrument file says otherwise" in notes[0]
 
 
 def test_modes_and_noise_of_the_file_are_used_and_told(instrument):
     modes, noise = np.array([3, 1, 2]), np.array([0.1, 0.2, 0.3])
-    found, notes = reference_of(recorded(np.ones((224, 3)), modes=modes, noise=noise), instrument)
+    found, notes = make_reference(recorded(np.ones((224, 3)), modes=modes, noise=noise), instrument)
     assert found.modes is modes
     assert found.noise is noise
     assert "the 3 modes the measured file names" in notes[0]
@@ -138,34 +138,34 @@ def test_modes_and_noise_of_the_file_are_used_and_told(instrument):
 
 def test_what_should_be_known_of_the_instrument_is_told(instrument):
     remarked = replace(instrument, remarks=("tiny.toml: odd",))
-    assert reference_of(recorded(np.ones((224, 3))), remarked)[1] == ("tiny.toml: odd",)
+    assert make_reference(recorded(np.ones((224, 3))), remarked)[1] == ("tiny.toml: odd",)
 
 
 def test_noise_of_frames_is_not_taken_for_noise_of_slopes(camera, cube):
     read = replace(read_recorded(cube), noise=np.ones(N_MODES))
-    reference, notes = reference_of(read, camera)
+    reference, notes = make_reference(read, camera)
     assert reference.noise is None
     assert "not used" in notes[0]
 
 
 def test_frames_need_an_instrument_that_delivers_them(instrument, cube):
     with pytest.raises(MatrixError, match=r'need wfs.input = "frames"'):
-        reference_of(read_recorded(cube), instrument)
+        make_reference(read_recorded(cube), instrument)
 
 
 def test_an_instrument_that_delivers_frames_needs_them(camera):
     with pytest.raises(MatrixError, match="expected detector frames"):
-        reference_of(recorded(np.ones((224, 3))), camera)
+        make_reference(recorded(np.ones((224, 3))), camera)
 
 
 def test_frames_need_the_mean_frame(camera, cube):
     with pytest.raises(MatrixError, match="found no flux_frame"):
-        reference_of(replace(read_recorded(cube), flux_frame=None), camera)
+        make_reference(replace(read_recorded(cube), flux_frame=None), camera)
 
 
 def test_where_pupil_images_were_found_is_told(camera, cube):
     auto = replace(camera, frames=FrameWindows())
-    reference, notes = reference_of(read_recorded(cube), auto)
+    reference, notes = make_reference(read_recorded(cube), auto)
     assert reference.matrix.shape == (224, N_MODES)
     assert "pupil_centres_px = [[8." in notes[0]
-    assert not reference_of(read_recorded(cube), camera)[1]
+    assert not make_reference(read_recorded(cube), camera)[1]

@@ -242,7 +242,13 @@ class Index:
         name = f"{self._path.absolute().as_uri()}?mode=ro"
         with self._explained():
             self._connection = sqlite3.connect(name, uri=True, isolation_level=None)
-            self._version(self._connection)
+            try:
+                self._version(self._connection)
+            except BaseException:
+                # SQLite removes its shared-memory file when the last connection is closed
+                self._connection.close()
+                self._connection = None
+                raise
 
     def _version(self, connection: sqlite3.Connection) -> int:
         version: int = connection.execute("PRAGMA user_version").fetchone()[0]

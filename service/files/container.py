@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import warnings
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -199,7 +200,7 @@ def _fits(path: Path) -> Iterator[Container]:
         warnings.filterwarnings("error", message=".*truncated")
         try:
             file = fits.open(raw, memmap=False, lazy_load_hdus=True)
-        except (OSError, ValueError, TypeError, LookupError, Warning) as error:
+        except FITS_DAMAGE as error:
             raise MatrixError(f"{path}: damaged FITS file: {error}") from error
         arrays: dict[str, StoredArray] = {}
         known: dict[str, StoredArray] = {}
@@ -213,7 +214,7 @@ def _fits(path: Path) -> Iterator[Container]:
                     known.setdefault(name.lower(), array)
                     known[str(number)] = array
             facts = {str(key).lower(): value for key, value in file[0].header.items()}
-        except (OSError, ValueError, TypeError, LookupError, Warning, fits.VerifyError) as error:
+        except (*FITS_DAMAGE, fits.VerifyError) as error:
             said = str(error).replace("\n", " ")
             raise MatrixError(f"{path}: damaged FITS file: {said}") from error
         yield Container(
@@ -250,6 +251,9 @@ def _data(hdu: _ImageHdu) -> NDArray[Any]:
     except Exception as error:  # cfitsio's own exceptions have no common class
         raise ValueError(str(error).replace("\n", " ")) from error
 
+
+FITS_DAMAGE = (OSError, EOFError, ValueError, TypeError, LookupError, Warning, zlib.error)
+"""Exceptions that astropy raises for a damaged file, compressed or not."""
 
 NUMPY_DAMAGE = (OSError, EOFError, ValueError, TypeError, OverflowError, SyntaxError, TokenError)
 """Exceptions that a damaged NumPy header raises: it is parsed by Python."""

@@ -266,6 +266,7 @@ def _check(options: argparse.Namespace, sim_words: list[str]) -> None:
         raise ConfigurationError("--plot: found no matplotlib; expected the extra 'plots'")
     if options.port == options.zenoh_port:
         raise ConfigurationError(f"--port and --zenoh-port: both {options.port}, expected two")
+    # tried now, because the service would report an occupied port only after its start
     for name, port in (("--port", options.port), ("--zenoh-port", options.zenoh_port)):
         try:
             socket.create_server(("127.0.0.1", port)).close()

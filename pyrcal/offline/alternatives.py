@@ -213,6 +213,7 @@ def add_alternatives(
     without
         Fit with the file's coupling and modulation; None if they equal the fitted ones.
     """
+    # a fit with a residual below the model differences leaves no room for another explanation
     open_share = OTHER_SHARE * min(1.0, residual_fraction / MIN_EXPLAINED) ** 2
     moves = [width, *(one.moved for one in tried)]
     shares = [open_share, *(one.weight(residual_fraction) for one in tried)]
@@ -305,6 +306,7 @@ def _try_off_centre(few: FitSubset) -> Iterator[Alternative]:
     about, alpha = few.models.instrument, few.here
     here = np.array(about.pupil_shift_subap or (0.0, 0.0))
     if about.stop is Stop.MIRROR:
+        # with the mirror as stop, the pupil is displaced together with the mirror
         here = alpha.vector[:2]
     rates = []
     for step in np.eye(2) * OFFSET_STEP_SUBAP:
@@ -503,6 +505,7 @@ def _fix_nuisances(settled: Settled, steps: dict[int, float]) -> tuple[float, Ar
     held = normal + np.diag(settled.prior * noise)
     places = np.array([4 + place for place in steps])
     free = np.setdiff1d(np.arange(len(normal)), places)
+    # the free unknowns follow the fixed ones along the valley of χ²
     step = np.zeros(len(normal))
     step[places] = list(steps.values())
     step[free] = -np.linalg.solve(
@@ -552,6 +555,7 @@ def _move_with_weights(settled: Settled, weights: Array) -> Array:
         held = other.normal + np.diag(prior)
         return np.linalg.solve(held, other.scores.sum(axis=1) - prior * values)
 
+    # the step with the fit's own weights is subtracted, because it is not exactly zero
     return np.asarray(step(weights) - step(seen.weights))[:4]
 
 

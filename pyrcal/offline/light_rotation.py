@@ -129,6 +129,7 @@ def find_rotation(
     if refusal:
         return CannotTell(reason=refusal)
     rotation_deg = angles[best] + _STEP_DEG * vertex(*correlation[best - 1 : best + 2])
+    # σ of a least-squares rotation: noise of the map over the norm of its derivative
     slope = (turned[best + 1] - turned[best - 1]) / (2 * np.deg2rad(_STEP_DEG))
     scale = float(turned[best] @ seen / (turned[best] @ turned[best]))
     left = seen - scale * turned[best]

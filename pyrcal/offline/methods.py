@@ -173,12 +173,14 @@ def search_minimum(models: FitModels, target: Target, start: Misregistration) ->
     low = Columns(
         matrix=matrix, weights=1.0 / np.sum(matrix[target.rows] ** 2, axis=0), rows=target.rows
     )
+    # the smooth combinations of the modes have the widest capture range
     found: list[Approach] = []
     for tried in (start, *map(start.moved_to, _other_starts(start.vector))):
         found.append(approach(models.far, low, tried))
         models.counter.n += found[-1].n_matrices
         if found[-1].converged and found[-1].misfit < GOOD_MISFIT:
             break
+    # an end that has not converged is used only if no other has
     best = min(found, key=lambda one: (not one.converged, one.misfit))
     rivals = [
         one

@@ -40,6 +40,7 @@ def measure_structure(residual: Array, power: Array, noise: Array | None) -> flo
         unknown.
     """
     n_rows = len(residual)
+    # share of each column's power in the residual
     left = np.sum(residual**2, axis=0) / power
     # With one stroke for all modes, noise is equal in slopes; with strokes that give equal slopes,
     # it is equal in relative terms. The larger estimate is used; in no column may it exceed the

@@ -65,7 +65,7 @@ def measure_pupil(answers: Array, stated_subap: float) -> SeenPupil | None:
     answers
         ``(n, n)`` response of each subaperture over the expected one; NaN if unknown or none is
         expected.
-    told_subap
+    stated_subap
         Stated diameter of the pupil image, subapertures.
     """
     known = np.isfinite(answers)
@@ -80,6 +80,7 @@ def measure_pupil(answers: Array, stated_subap: float) -> SeenPupil | None:
     # the diameter whose circle misclassifies the fewest subapertures
     places = np.argwhere(known)
     away = np.hypot(*(places - places.mean(axis=0)).T)
+    # a narrower pupil leaves silent subapertures outside a circle, dead pixels are scattered
     quiet = silent[known]
     diameters = np.arange(2.0, 2.0 * float(away.max()), STEP_SUBAP)
     outside = away > diameters[:, None] / 2.0

@@ -94,6 +94,8 @@ def fit_system(system: System, alphas: Array, covariances: Array) -> SystemFit:
         left = _compute_misfit(system, alphas, values)
         rates = np.einsum("pij,pjk->pik", roots, system.rates(values)[used])
         seen = _Directions.of(rates.reshape(-1, len(values))[:, free] * unit[free])
+        # the step is solved for the total offset from nominal, so that the unobservable part of
+        # that offset stays zero
         moved = (values[free] - system.nominal[free]) / unit[free]
         whitened = np.einsum("pij,pj->pi", roots, left[used]).ravel()
         step = seen.best(whitened + seen.rates @ moved) - moved

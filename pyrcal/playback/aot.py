@@ -106,7 +106,7 @@ def _n_valid(sensor: Any) -> int:  # noqa: ANN401 - aotpy has no types
 
 
 def _belongs_to(sensor: Any, instrument: Instrument) -> bool:  # noqa: ANN401
-    """Return whether a sensor may be the instrument's: without a mask the reader refuses it."""
+    """Return True if a sensor may be the instrument's; one without a mask is rejected later."""
     mask = getattr(sensor, "subaperture_mask", None)
     if mask is None:
         return True

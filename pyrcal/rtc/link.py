@@ -95,7 +95,7 @@ class RtcLink:
         self._matrices.report()
 
     def is_lost(self) -> bool:
-        """Return whether the connection must be closed and opened again."""
+        """Return True if the connection must be closed and opened again."""
         if not self._lifeline.cut(self._session, time.monotonic()):
             return False
         _log.warning("link.cut-off", text=self._lifeline.text)

@@ -125,7 +125,7 @@ class Lifeline:
         self._seen_s = now_s
 
     def cut(self, session: zenoh.Session, now_s: float) -> bool:
-        """Return whether the session has had no router for so long that it must be closed."""
+        """Return True if the session has had no router for so long that it must be closed."""
         if session.info.routers_zid():
             self._seen_s = now_s
         return now_s - self._seen_s > _MAX_TIME_WITHOUT_ROUTER_S

@@ -71,6 +71,7 @@ def _compute_matrix(instrument: Instrument, known: Implied) -> Implied:
     )
     matrix = model.interaction_matrix(instrument.start)
     seconds = time.perf_counter() - begun
+    # an underdetermined matrix has no condition that a reconstructor could use
     inversion = None
     if known.n_modes <= known.n_slopes:
         inversion = invert(matrix, known.n_modes, max_condition=MAX_CONDITION)

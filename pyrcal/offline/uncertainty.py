@@ -60,8 +60,12 @@ reduced in proportion for smaller residuals, as with other codes, which leave on
 
 POSITION_ERROR_PITCH = 0.02
 """RMS error of an actuator's position along each axis, in pitches, where the instrument file states
-none: an assumption. It is bounded by the residual, of which such errors leave about the same share:
-2 % of a pitch leave 2.2 % of the signal of 40 modes of 144 actuators."""
+none: an assumption. It is bounded by the residual beyond ``EXACT_RESIDUAL``, for such errors leave
+about the same share: 2 % of a pitch leave 2.2 % of the signal of 40 modes of 144 actuators."""
+
+EXACT_RESIDUAL = 0.015
+"""RMS share of the signal that may be left over although all actuators are in place: matrices of
+other codes leave 0.2 to 2 %, most of them about 1 %."""
 
 REGIONAL_SHARE = np.array([0.53, 0.53, 0.165, 1.43])
 """Error of each parameter over the scatter between regions of the pupil: effects of opposite
@@ -289,7 +293,8 @@ def misplacement_sigma(
     if len(seen) < 2:
         return np.zeros(4)
     stated = mirror.position_error_pitch
-    error = min(POSITION_ERROR_PITCH if stated is None else stated, residual)
+    room = float(np.sqrt(max(residual**2 - EXACT_RESIDUAL**2, 0.0)))
+    error = min(POSITION_ERROR_PITCH if stated is None else stated, room)
     each_m = error * mirror.pitch_m / np.sqrt(len(seen))
     turn = each_m / float(np.sqrt(np.mean(seen**2)))
     shift = each_m / subaperture_m

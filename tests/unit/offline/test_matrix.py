@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from pyrcal.offline.matrix import FitOptions
-from pyrcal.offline.uncertainty import FAR_SHARE, STRANGE_RESIDUAL, misplacement_sigma
+from pyrcal.offline.uncertainty import (
+    EXACT_RESIDUAL,
+    FAR_SHARE,
+    STRANGE_RESIDUAL,
+    misplacement_sigma,
+)
 from service.errors import ModelError
 from service.model.instrument import Mirror
 from service.model.kinds import Method, Stop
@@ -237,6 +242,8 @@ def test_misplaced_actuators_are_in_sigma_as_far_as_the_residual_has_room_for_th
     sigma = misplacement_sigma(mirror, 1.5, 0.5, residual=0.1)
     np.testing.assert_allclose(sigma, [0.05, 0.05, 0.0125, 0.0125])
     assert not misplacement_sigma(mirror, 0.5, 0.5, residual=0.1).any()
-    np.testing.assert_allclose(misplacement_sigma(mirror, 1.5, 0.5, residual=0.01), sigma / 5.0)
+    room = np.sqrt(0.03**2 - EXACT_RESIDUAL**2) / 0.05
+    np.testing.assert_allclose(misplacement_sigma(mirror, 1.5, 0.5, residual=0.03), sigma * room)
+    assert not misplacement_sigma(mirror, 1.5, 0.5, residual=EXACT_RESIDUAL).any()
     unstated = replace(mirror, position_error_pitch=None)
     np.testing.assert_allclose(misplacement_sigma(unstated, 1.5, 0.5, residual=0.1), sigma * 0.4)

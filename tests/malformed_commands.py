@@ -763,9 +763,9 @@ def finding_of(reader, words, folder):
     if status == REFUSED:
         if not said.strip():
             return "refused without a line", status
-        # SQLite keeps these beside a database that was read only; the next writer removes them
-        of_sqlite = set(folder.rglob("*.sqlite-*"))
-        left = set(folder.rglob("*")) - before - of_sqlite
+        # SQLite's own files are removed by the next writer; a damaged file is renamed, not lost
+        meant = {*folder.rglob("*.sqlite-*"), *folder.rglob("*.damaged")}
+        left = set(folder.rglob("*")) - before - meant
         if left:
             return f"refused, and {min(one.name for one in left)} left behind", status
     elif "--json" in words:

@@ -58,7 +58,7 @@ def test_the_checker_finds_the_simulator_through_certificates(folder, signed):
         rtc.wait(patience(10.0))
     assert checked.returncode == 0, found
     assert "0 wrong" in found
-    assert ("refused: not signed, changed on its way, sent before" in found) is signed
+    assert ("refused: unsigned, modified and replayed commands" in found) is signed
     assert ("no secret is shared" in found) is not signed
 
 
@@ -79,7 +79,7 @@ def test_the_checker_names_an_rtc_that_believes_what_nobody_has_signed(folder):
             time.sleep(0.2)
     found, _ = checker.communicate()
     assert checker.returncode == 1, found
-    assert "what is not signed was accepted; what was changed on its way was accepted" in found
+    assert "an unsigned command was accepted; a modified command was accepted" in found
 
 
 @pytest.fixture

@@ -32,7 +32,7 @@ def target(values: np.ndarray) -> Target:
 def scanned() -> tuple[Misregistration, tuple[ScanStep, ...], list[str]]:
     told: list[str] = []
     start = Misregistration(rotation_rad=np.deg2rad(0.4))
-    alpha, table = scan(models(), target(matrix()), start, tell=told.append)
+    alpha, table = scan(models(), target(matrix()), start, progress=told.append)
     return alpha, table, told
 
 

@@ -87,17 +87,22 @@ def measured_by_day(words: str, n_average: int) -> tuple[Array, Telescope]:
     return matrix.astype(np.float64) / PASSES, telescope
 
 
-def noise_free(telescope: Telescope) -> Array:
-    """Return the matrix that endless averaging would measure, of one pass."""
+def noise_free(
+    telescope: Telescope,
+    n_modes: int = N_MEASURED,
+    stroke_m: float = STROKE_M,
+    passes: int = PASSES,
+) -> Array:
+    """Return the matrix by push-pull without noise, ``(n_slopes, n_modes)``, of one pass."""
     optics = telescope.optics.at(0.0)
     if not isinstance(optics, DiffractiveOptics):
         raise TypeError(f"study: found {type(optics).__name__}; expected --plant diffractive")
     rng = np.random.default_rng(0)
     columns = []
-    for mode in range(N_MEASURED):
-        stroke = STROKE_M * optics.opd_per_command[:, mode]
+    for mode in range(n_modes):
+        stroke = stroke_m * optics.opd_per_command[:, mode]
         push, pull = (optics.slopes(sign * stroke, None, rng) for sign in (1.0, -1.0))
-        columns.append((push - pull).astype(np.float64) / (2 * STROKE_M * PASSES))
+        columns.append((push - pull).astype(np.float64) / (2 * stroke_m * passes))
     return np.column_stack(columns)
 
 

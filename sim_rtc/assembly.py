@@ -108,12 +108,12 @@ def _modes(options: Options, instrument: Instrument) -> Basis:
 
 
 def _law_of(options: Options, instrument: Instrument) -> Callable[[float], Misregistration] | None:
-    """Return where the instrument's law of pointing has the mirror at a time; None: it has none.
+    """Return the registration by the pointing law as a function of time, or None.
 
     Raises
     ------
     ConfigurationError
-        If the law is of more than the pointing, which nobody tells here.
+        If the law uses values of the observatory, which the simulator does not have.
     """
     law, elevation = instrument.law, options.elevation
     if law is None:

@@ -433,12 +433,12 @@ class Options:
     def n_controlled(self, n_modes: int, most: int | None = None) -> int:
         """Return how many of an instrument's modes are in the loop at the start.
 
-        ``most`` are as many as its sensor's mode allows, unless more are asked for.
+        ``most`` is the number that the sensor mode permits; an explicit request may exceed it.
 
         Raises
         ------
         ConfigurationError
-            If more were asked for than there are.
+            If more were requested than there are.
         """
         if self.given_n_controlled is None:
             usual = FAR_MODES if self.far else USUAL_MODES

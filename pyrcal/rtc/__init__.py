@@ -18,7 +18,6 @@ from pyrcal.rtc.identity import Identity, Reconstructor, new_session
 from pyrcal.rtc.link import STATUS_PERIOD_S, RtcConnection, RtcLink
 from pyrcal.rtc.matrices import Matrices
 from pyrcal.rtc.replies import Computer, FinishedMeasurement
-from pyrcal.rtc.session import open_session
 from pyrcal.rtc.staging import Terms
 from service.config.link_tables import Router
 from service.wire import (
@@ -53,5 +52,4 @@ __all__ = [
     "Terms",
     "check_dither",
     "new_session",
-    "open_session",
 ]

@@ -100,6 +100,7 @@ class BasicComputer:
         self._dither: Dither | None = None
         self._staged: Reconstructor | None = None
         self._swaps: list[tuple[str, int]] = []
+        self._n_exposing = 0
         self._lock = threading.Lock()
 
     @property
@@ -145,6 +146,7 @@ class BasicComputer:
                 self._swaps.append((self._reconstructor.manifest.id, self.seq))
             if self._dither is not None and self.seq >= self._dither.stop_seq:
                 self._dither = None
+            self._n_exposing = n_frames
             played = None if self._dither is None else self._dither.commands(self.seq, n_frames)
         return np.zeros((n_frames, self.n_modes), dtype=np.float32) if played is None else played
 
@@ -179,6 +181,7 @@ class BasicComputer:
                 config_id=self.identity.config_id,
             )
             self.seq += len(rows)
+            self._n_exposing = 0
         return header, rows
 
     def time_ns(self, seq: int) -> int:
@@ -265,8 +268,8 @@ class BasicComputer:
         )
         if refusal:
             return refusal, None
-        # The batch that is being exposed now was begun without the dither.
-        start_seq = self.seq + round(_DITHER_LEAD_S * self._frame_rate_hz)
+        # The batch that is being exposed was begun without the dither, however long it is.
+        start_seq = self.seq + self._n_exposing + round(_DITHER_LEAD_S * self._frame_rate_hz)
         self._dither = Dither(
             request,
             start_seq=start_seq,

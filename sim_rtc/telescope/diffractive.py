@@ -305,9 +305,9 @@ class DiffractivePyramid:
         quadrature: Quadrature | None = None,
         offsets_subap: NDArray[np.float64] | None = None,
     ) -> None:
-        """Take where each image lies beside its place on the pixel grid, ``(2, 2, 2)``.
+        """Prepare the sensor; ``offsets_subap`` ``(2, 2, 2)`` displaces the pupil images.
 
-        Side along y, side along x, (x, y), in subapertures; None if all four lie on it.
+        Indices: side along y, side along x, (x, y); subapertures. None if there are none.
         """
         self._wfs, self._pupil = wfs, pupil
         self.shift_subap = shift_subap

@@ -26,7 +26,7 @@ class TurbulentFrames:
     """Consecutive frames of turbulence: phases, or a linear response to them."""
 
     def __init__(self, parts: list[_Between]) -> None:
-        """Take where the frames lie in each layer."""
+        """Prepare the turbulence of frames at these positions in each layer."""
         self._parts = parts
 
     def phases_m(self, every: int = 1) -> Array32:

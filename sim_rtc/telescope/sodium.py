@@ -35,7 +35,7 @@ class SodiumStar:
     """Spreads the light of a point over the pixels as a layer of sodium would."""
 
     def __init__(self, wfs: ShackHartmann, laser: LaserStar, subaperture_m: float) -> None:
-        """Take the layer, and the lenslets that look at it."""
+        """Prepare the sheets of the layer for these lenslets."""
         n, m = wfs.n_subapertures, wfs.pixels_per_subaperture
         lambda_over_d = wfs.wavelength_m / subaperture_m
         across = math.radians(laser.spot_arcsec / 3600.0) / _FWHM / lambda_over_d

@@ -170,7 +170,7 @@ function tableOf(entries, most = 30) {
     });
     const t = entry.t_ns_utc / 1e6;
     return make("tr", {}, make("th", { scope: "row", text: `${day(t)} ${clock(t)}` }), ...cells,
-      make("td", { text: entry.entered ? entry.source : `${entry.source}, not believed` }));
+      make("td", { text: entry.entered ? entry.source : `${entry.source}, rejected` }));
   });
 }
 

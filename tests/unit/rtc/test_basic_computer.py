@@ -1,0 +1,46 @@
+"""The bookkeeping of an RTC."""
+
+import numpy as np
+import pytest
+
+from pyrcal import rtc
+from service.wire import DitherKind
+
+N_MODES, N_SLOPES = 6, 10
+
+
+def computer():
+    return rtc.BasicComputer(
+        rtc.Identity(system="bench", basis_id="kl-1", config_id="mask-1"),
+        np.zeros((4, N_SLOPES)),
+        gains=np.full(N_MODES, 0.4),
+        leak=0.99,
+        frame_rate_hz=500.0,
+        delay_frames=2.0,
+        max_dither_m=50e-9,
+    )
+
+
+@pytest.mark.parametrize("n_frames", [10, 50])
+def test_a_dither_is_played_from_its_first_frame_whatever_the_batch(n_frames):
+    loop = computer()
+    dither_m = loop.begin_batch(n_frames)
+    request = rtc.DitherRequest(
+        id="d",
+        kind=DitherKind.SINE,
+        duration_s=1.0,
+        modes=(2,),
+        amplitude_m=(10e-9,),
+        frequency_hz=(125.0,),
+    )
+    reply = loop.execute(request)
+    assert reply.accepted
+    played = []
+    for _ in range(200 // n_frames):
+        played.append(dither_m)
+        loop.end_batch(np.zeros((n_frames, N_SLOPES)), dither_m, dither_m)
+        dither_m = loop.begin_batch(n_frames)
+    mode = np.concatenate(played)[:, 2]
+    assert not mode[: reply.start_seq].any()
+    # a sine of a quarter of the frame rate: zero in its first frame, full in the second
+    assert mode[reply.start_seq + 1] == pytest.approx(10e-9 * np.sqrt(2.0))

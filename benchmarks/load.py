@@ -1,6 +1,6 @@
 """REST under load: 50 clients beside 1 kHz of telemetry.
 
-``python -m benchmarks.load [--seconds 60] [--page docs/results/load.md]``
+``python -m benchmarks.load [--seconds 60] [--page docs/results/link.md]``
 
 FLAO at 1 kHz in auto, without keys. 50 clients, each with a connection of its own, request one page
 after the other, and another client orders a stop every two seconds.

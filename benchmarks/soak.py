@@ -1,6 +1,6 @@
 """Service and RTC for a long time: what grows, what is lost, what is written.
 
-``python -m benchmarks.soak [--minutes 60] [--folder var/soak] [--page docs/results/soak.md]``
+``python -m benchmarks.soak [--minutes 60] [--folder var/soak] [--page docs/results/link.md]``
 
 FLAO at 1 kHz in auto, dithered without pause, its registration drifting slowly;
 a stream as the page has it, ten clients that ask one page after the other, and a matrix that is

@@ -1,10 +1,8 @@
-"""RTCs that do not keep to the contract, in simulated time."""
+"""Dialects of RTCs that do not keep to the contract: axes, signs, order and units."""
 
 import numpy as np
 import pytest
 
-from pyrcal_studies.campaign.observatory_dome import Moment
-from pyrcal_studies.campaign.strange_nights import _plan, beyond, deeds_of
 from pyrcal_studies.campaign.strange_rtc import DIALECTS, Mischief, dialect_of
 from service.estimation.frames import FrameBlock
 
@@ -53,34 +51,3 @@ def test_a_flip_mirrors_the_grid_and_negates_the_slopes_along_it():
     told = dialect.spoken(block(slopes, np.zeros((1, 3), dtype=np.float32))).slopes[0]
     assert told[0] == -number[0, 2]
     assert told[N_SLOPES // 2] == N_SLOPES // 2 + number[0, 2]
-
-
-def moment(time_s, wavefront_nm, closed=True):
-    return Moment(
-        time_s=time_s,
-        alpha=None,
-        wavefront_nm=wavefront_nm,
-        n_clipped=0,
-        cm_id="cm",
-        n_controlled=1,
-        closed=closed,
-        dither_nm=0.0,
-    )
-
-
-def test_only_a_closed_loop_that_stays_beyond_the_limit_is_lost():
-    short = [moment(k / 10, 2000.0 if 5 < k < 10 else 100.0) for k in range(30)]
-    assert beyond(short) == []
-    still = [moment(k / 10, 2000.0 if k > 5 else 100.0) for k in range(30)]
-    assert beyond(still) == [(0.6, 2.9)]
-    assert beyond([moment(k / 10, 2000.0, closed=False) for k in range(30)]) == []
-
-
-def test_a_night_is_the_same_every_time_and_everything_happens_in_it():
-    words, latencies, deeds = _plan(7, "small.toml", 40.0)
-    again = _plan(7, "small.toml", 40.0)
-    assert (words, latencies) == again[:2]
-    assert [(d.time_s, d.name) for d in deeds] == [(d.time_s, d.name) for d in again[2]]
-    names = {d.name for k in range(200) for d in deeds_of(np.random.default_rng(k), 40.0)}
-    assert set(Mischief) - DIALECTS <= names
-    assert {f"speaks {dialect}" for dialect in DIALECTS} <= names

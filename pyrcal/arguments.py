@@ -10,7 +10,7 @@ from typing import NoReturn
 from typing_extensions import override
 
 from pyrcal.client import remote
-from pyrcal.fitting import arguments as offline_arguments
+from pyrcal.fitting import arguments as file_arguments
 from pyrcal.playback import arguments as playback_arguments
 from service import __version__, program
 from service.program import OneLineParser
@@ -52,7 +52,7 @@ def command_line() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     program.declare(commands)
     remote.declare(commands)
-    offline_arguments.declare(commands)
+    file_arguments.declare(commands)
     playback_arguments.declare(commands)
     for name, (_, purpose) in OTHER_PROGRAMS.items():
         commands.add_parser(name, help=f"{purpose}: pyrcal {name} --help", add_help=False)

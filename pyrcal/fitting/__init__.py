@@ -1,1 +1,1 @@
-"""Files in, answers out: fits, reconstructors, exports, without a service."""
+"""Fits of measured matrices, and reconstructors, from files; no service is needed."""

@@ -1,4 +1,4 @@
-"""Arguments of the offline commands; quick to import.
+"""Arguments of the commands that work on files; quick to import.
 
 Names of methods and data sets are repeated here as text, so that the modules need not be imported;
 a test compares them.

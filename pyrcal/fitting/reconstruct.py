@@ -27,7 +27,7 @@ from pyrcal.fitting.report import (
     orientation_words,
     read_fit,
 )
-from pyrcal.importers.specula import write_specula
+from pyrcal.fitting.specula import write_specula
 from pyrcal.terminal import show_progress
 from service.control.gains import CalibrationGains
 from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct

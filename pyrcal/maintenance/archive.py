@@ -15,12 +15,11 @@ from typing import Any
 from pyrcal.terminal import show_progress
 from service.archive import Archive
 from service.archive.nights import FOREVER_NS, HOUR_NS, MAX_DOWNSAMPLED
-from service.archive.retention import Item, due, items, remove
+from service.archive.retention import Item, due, items, remove, retention_policy
 from service.archive.serialisation import to_json
 from service.config import Settings, load_settings
 from service.errors import ArchiveError, ConfigurationError, UnknownIdError, say, shown
 from service.files.documents import json_text
-from service.runtime.policy import keeping_of
 from service.tracking.products import MatrixState
 
 DONE, DAMAGED = 0, 1
@@ -138,7 +137,7 @@ def _prune(settings: Settings, *, dry_run: bool, as_json: bool) -> int:
 
     A running service does this itself and holds the lock.
     """
-    retention, archive = keeping_of(settings), Archive(settings.service.data_dir)
+    retention, archive = retention_policy(settings), Archive(settings.service.data_dir)
     with archive:
         archive.look()  # reject a folder without an archive before anything is written
         if not dry_run:
@@ -163,8 +162,8 @@ def _prune(settings: Settings, *, dry_run: bool, as_json: bool) -> int:
 
 def _aot(options: argparse.Namespace, settings: Settings) -> int:
     """Write the measurements of a night, or those around a recording, as AOT FITS."""
-    from pyrcal.fitting.aot import excerpt, write_aot
     from pyrcal.importers.registration import Dated
+    from pyrcal.maintenance.aot import excerpt, write_aot
     from service.instrument import load_instrument
 
     if (options.night is None) is (options.recording is None):

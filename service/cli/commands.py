@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from service.errors import ArchiveError, ConfigurationError, say
 from service.program import data_dir_of_the_one
-from service.web.keys import KeyFile, KeyScope, is_loopback
+from service.web.keys import KeyFile, KeyScope
 
 if TYPE_CHECKING:
     from service.config import Settings
@@ -95,6 +95,8 @@ def _check_that_a_key_can_operate(settings: Settings) -> None:
     ConfigurationError
         If it would be, or the keys there are cannot be read.
     """
+    from service.wire.access import is_loopback  # with NumPy, which `key` does not need
+
     host, keys = settings.api.host, KeyFile(settings.service.data_dir)
     can_operate = any(key.scope.covers(KeyScope.OPERATE) for key in keys.all())
     if not can_operate and not is_loopback(host):

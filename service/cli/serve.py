@@ -22,6 +22,7 @@ from threadpoolctl import threadpool_limits
 from typing_extensions import override
 
 from service.archive import Archive
+from service.archive.retention import retention_policy
 from service.cli.notify import keep_informed, notify
 from service.config import Settings
 from service.config.link_tables import link_security
@@ -35,7 +36,7 @@ from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.actions import Actions, Publishing
 from service.runtime.archiving import restore_tracking
 from service.runtime.clock import ServiceClock
-from service.runtime.policy import keeping_of, policy_of
+from service.runtime.policy import policy_of
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitLimits, FitQueue
 from service.runtime.workers import WorkerPool
@@ -259,7 +260,7 @@ def _supervisor(
         workers=workers,
         archive=archive,
         actions=actions,
-        retention=keeping_of(settings),
+        retention=retention_policy(settings),
         clock=clock,
     )
 

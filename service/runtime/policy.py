@@ -7,7 +7,6 @@ import os
 import numpy as np
 from numpy.typing import NDArray
 
-from service.archive.retention import RetentionPolicy
 from service.config.settings import OffloadTable, Settings
 from service.control.reconstructor import InversionMethod
 from service.files.disk_cache import usual_folder
@@ -216,14 +215,6 @@ def _offloading(table: OffloadTable) -> Offloading | None:
 def _vector(shift_subap: float, rotation_deg: float, magnification: float) -> NDArray[np.float64]:
     """Return ``(4,)`` in numeric units: the same for both shifts."""
     return np.array([shift_subap, shift_subap, np.deg2rad(rotation_deg), magnification])
-
-
-def keeping_of(settings: Settings) -> RetentionPolicy:
-    """Return what of the archive is kept."""
-    table = settings.archive
-    return RetentionPolicy(
-        keep_days=table.keep_days, keep_gb=table.keep_gb, reserve_gb=table.reserve_gb
-    )
 
 
 def compute_of(settings: Settings) -> Compute:

@@ -26,9 +26,10 @@ from service.archive import Actor, AuditEntry, Channel
 from service.errors import ConfigurationError, UnknownIdError
 from service.web.bodies import bounded
 from service.web.connections import UNAVAILABLE_RETRY_S, Middleware, to_its_end
-from service.web.keys import Key, KeyFile, KeyScope, is_loopback
+from service.web.keys import Key, KeyFile, KeyScope
 from service.web.problems import INVALID, UNKNOWN, problem
 from service.web.views import answer, define_view, held, shows
+from service.wire.access import is_loopback
 
 COOKIE = "pyrcal_key"
 """Name of the cookie in which a browser keeps the key."""

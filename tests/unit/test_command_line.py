@@ -294,7 +294,7 @@ def test_the_command_line_offers_what_the_program_has():
 def test_a_start_imports_no_more_than_it_needs():
     """Each of these takes a tenth of a second or more, and a start is to take two."""
     code = (
-        "import sys, service.cli.serve; from service.config import load_instrument; "
+        "import sys, service.cli.serve; from service.instrument import load_instrument; "
         "load_instrument('flao-lbt'); "
         "late = ('scipy.linalg', 'scipy.spatial', 'scipy.ndimage', 'scipy.interpolate', "
         "'scipy.sparse', 'scipy.special', 'matplotlib', 'astropy', 'fastapi', 'uvicorn'); "

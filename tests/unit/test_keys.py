@@ -16,7 +16,8 @@ from service.cli.commands import DATA_DIR
 from service.config import Settings
 from service.errors import ConfigurationError, UnknownIdError
 from service.program import announced, running_services
-from service.web.keys import KeyFile, KeyScope, is_loopback
+from service.web.keys import KeyFile, KeyScope
+from service.wire.access import is_loopback
 
 
 @pytest.fixture(autouse=True)

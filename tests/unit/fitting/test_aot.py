@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from pyrcal.__main__ import main
-from pyrcal.fitting.aot import affine, excerpt, write_aot
 from pyrcal.importers.registration import Dated, registrations_of
+from pyrcal.maintenance.aot import affine, excerpt, write_aot
 from pyrcal.playback.aot import read_telemetry
 from service.archive import Archive
 from service.errors import ConfigurationError, MatrixError
@@ -167,7 +167,7 @@ def test_a_point_of_the_mirror_lands_where_the_model_has_it():
 
 
 def test_the_rtcs_own_listing_is_told_in_our_axes():
-    from pyrcal.fitting.aot import _as_listed
+    from pyrcal.maintenance.aot import _as_listed
 
     turned = Orientation(swap_xy=True, sign_x=-1)
     recipe = SlopeRecipe(order=SlopeOrder.INTERLEAVED, orientation=turned)

@@ -60,7 +60,7 @@ check: $(STAMP) ## lint, formatting, types and import contracts
 paper: $(STAMP) ## the seed paper beside pyrcal: docs/results/heritier2018.md and its figures; 20 minutes, ARGS=--quick three
 	@$(PY) -m pyrcal_studies.heritier2018 $(ARGS)
 
-bench: $(STAMP) ## pyrcal beside OOPAO, HCIPy and SPECULA, each from its package: docs/results/bench.md; a quarter of an hour
+bench: $(STAMP) ## pyrcal beside OOPAO, HCIPy and SPECULA, each from its package: docs/results/speed.md; a quarter of an hour
 	@$(PY) -m benchmarks.bench $(ARGS)
 
 soak: $(STAMP) ## an hour at 1 kHz with company, for what grows or is lost; ARGS="--minutes 5" rehearses

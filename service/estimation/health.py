@@ -8,7 +8,7 @@ pupil can slip by wavelengths and stay there: the sensor sees little light acros
 look healthy, and only the command shows the step. On the diffractive telescope the slowly averaged
 position of the outermost actuators stays below 2.2 times the RMS that turbulence requires in every
 stable loop. A slip takes it to 7 to 18, or leaves it at 3 for seconds while the wavefront is lost
-already (docs/results/edge_slip.md).
+already (docs/results/reliability.md).
 
 **Vibrations** are lines in the slopes; the dither avoids them.
 

@@ -49,7 +49,7 @@ def floor_of(settings: Settings, instrument: Instrument | None = None) -> NDArra
     """Return the model-error floor ``(4,)`` in boundary units: subapertures, degrees, ratio.
 
     What the settings leave open is what campaigns on the diffractive telescope found
-    (docs/results/night.md). Influence functions are wrong by a share of their width: of a mirror
+    (docs/results/tracking.md). Influence functions are wrong by a share of their width: of a mirror
     of few actuators, rotation and magnification are as much more uncertain as it is coarser.
     """
     tracking = settings.tracking

@@ -35,7 +35,7 @@ _BACKLOG: Final = 64
 _log = structlog.get_logger("cacao")
 
 
-def arguments_parser() -> argparse.ArgumentParser:
+def arguments_parser() -> OneLineParser:
     """Return the parser of the command line."""
     parser = OneLineParser(
         prog="pyrcal cacao",

@@ -6,7 +6,6 @@ usage errors are instant.
 
 from __future__ import annotations
 
-import argparse
 import signal
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -24,7 +23,7 @@ is given. Exit status: 0 nothing is wrong; 1 something is; 2 nothing could be ch
 """
 
 
-def check_parser() -> argparse.ArgumentParser:
+def check_parser() -> OneLineParser:
     """Return the parser of the command line."""
     check = OneLineParser(
         prog="pyrcal check-rtc",

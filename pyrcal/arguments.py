@@ -59,7 +59,7 @@ DEFAULTS = {"alarms": "list", "reconstructors": "list", "recordings": "list"}
 """Command of a group that is meant if none is given."""
 
 
-def command_line() -> argparse.ArgumentParser:
+def command_line() -> OneLineParser:
     """Return the parser of ``pyrcal``'s command line; ``command`` names the command."""
     parser = CommandLine(
         prog="pyrcal",

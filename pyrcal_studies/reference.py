@@ -107,7 +107,7 @@ def access() -> str:
         "| role | may | keys below `ao/v1/{system}/` |",
         "| --- | --- | --- |",
         *(
-            f"| {role} | {words[right]} | {_below(keys, getattr(rights, right))} |"
+            f"| {role} | {words[right]} | {_keys_below(keys, getattr(rights, right))} |"
             for role, rights in list_rights(keys).items()
             for right in words
             if getattr(rights, right)
@@ -121,7 +121,7 @@ def access() -> str:
     return page("Access to the link", intro, "\n".join(rows))
 
 
-def _below(keys: Keys, expressions: Iterable[str]) -> str:
+def _keys_below(keys: Keys, expressions: Iterable[str]) -> str:
     return ", ".join(f"`{each.removeprefix(keys.root + '/')}`" for each in expressions)
 
 
@@ -143,14 +143,14 @@ def _default(key: KeyText) -> str:
 def commands() -> str:
     """Return docs/reference/cli.md: every command of every program, with usage and options."""
     root = command_line()
-    others = {
+    others: dict[str, OneLineParser] = {
         "demo": demo_parser(),
         "sim": sim_parser(),
         "check-rtc": check_parser(),
         "cacao": arguments_parser(),
     }
     (action,) = (a for a in root._actions if isinstance(a, argparse._SubParsersAction))  # noqa: SLF001
-    parsers = {name: others.get(name, parser) for name, parser in action.choices.items()}
+    parsers = dict(_below(action)) | others
     leaves = {name: list(_leaves(parser)) for name, parser in parsers.items()}
     shared = _shared_groups([leaf for each in leaves.values() for leaf in each])
     parts = [
@@ -229,8 +229,13 @@ def _leaves(parser: OneLineParser) -> Iterator[OneLineParser]:
     if not below:  # argparse tells its arguments nowhere else
         yield parser
     for action in below:
-        for each in action.choices.values():
+        for _, each in _below(action):
             yield from _leaves(each)
+
+
+def _below(action: argparse._SubParsersAction[Any]) -> Iterator[tuple[str, OneLineParser]]:
+    """Yield the commands of a group, by name."""
+    yield from action.choices.items()
 
 
 def _shared_groups(parsers: Iterable[OneLineParser]) -> dict[str, Group]:

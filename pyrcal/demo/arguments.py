@@ -28,7 +28,7 @@ REPEATED = {
 """Options of the simulator that the demo passes on."""
 
 
-def demo_parser() -> argparse.ArgumentParser:
+def demo_parser() -> OneLineParser:
     """Return the parser of the demo's command line."""
     demo = OneLineParser(
         prog="pyrcal demo",

@@ -23,10 +23,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple, NoReturn, TypeVar
 
-from typing_extensions import override
-
 from service.errors import ConfigurationError, PyrcalError, StorageError, say
 from service.files.durable import lock_file
+from service.parser import OneLineParser
 
 INTERRUPTED = 130
 
@@ -293,54 +292,62 @@ _ENDPOINT = re.compile(r"[\w-]+/\S+")
 
 def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     """Add these commands to a command line."""
-    _describe_run(commands.add_parser("run", help="the service"))
-    _describe_key(commands.add_parser("key", help="make, list, revoke API keys"))
+    _describe_run(commands.add_parser("run", help="run the service"))
+    _describe_key(commands.add_parser("key", help="make, list or revoke API keys"))
 
 
-def _describe_run(run: argparse.ArgumentParser) -> None:
+def _describe_run(run: OneLineParser) -> None:
     run.set_defaults(module="service.cli.commands")
+    run.examples = (
+        "pyrcal run --instrument flao-lbt",
+        "pyrcal run --config /etc/pyrcal/pyrcal.toml --mode hold",
+    )
     run.description = (
         "Run the service. Precedence: command line > environment (PYRCAL_<SECTION>__<KEY>) > "
         "TOML file > defaults."
     )
-    formats = "default: text on a terminal, else a JSON object a line"
+    formats = "auto (default): text on a terminal, else one JSON object a line"
     modes, logs = ["auto", "propose", "hold"], ["auto", "text", "json"]
-    router = "an observatory's own zenoh router"
+    router = "zenoh router of the observatory to connect to"
     run.add_argument("--config", metavar="FILE", help="settings, TOML", type=Path)
     run.add_argument("--instrument", metavar="NAME|FILE", help="packaged name or TOML file")
-    run.add_argument("--mode", help="default: propose", choices=modes)
-    run.add_argument("--data-dir", metavar="DIR", help="products, index, audit trail; default var")
-    usual = "zenoh, default tcp/127.0.0.1:7447"
+    run.add_argument("--mode", help="mode at the start, default propose", choices=modes)
+    run.add_argument(
+        "--data-dir", metavar="DIR", help="folder of archive and audit trail, default var"
+    )
+    usual = "zenoh endpoint to listen on, default tcp/127.0.0.1:7447"
     run.add_argument("--listen", metavar="ENDPOINT", help=usual, type=endpoint)
     run.add_argument("--connect", metavar="ENDPOINT", help=router, type=endpoint)
     run.add_argument("--host", metavar="HOST", help="address of the REST API, default 127.0.0.1")
     run.add_argument("--port", metavar="PORT", help="port of the REST API, default 8080", type=port)
-    dask = "tcp://HOST:PORT of a Dask scheduler whose workers help with large telescopes"
+    dask = "tcp://HOST:PORT of a Dask scheduler, whose workers compute large matrices"
     run.add_argument("--cluster", metavar="ADDRESS", help=dask)
     run.add_argument("--log-format", help=formats, choices=logs)
 
 
-def _describe_key(key: argparse.ArgumentParser) -> None:
+def _describe_key(key: OneLineParser) -> None:
     key.set_defaults(module="service.cli.commands")
     key.description = (
-        "Make, list and revoke the keys of those who may ask a service, in its data_dir. A running "
-        "service goes by them at once. docs/operate/operating.md says how a key is shown."
+        "Make, list and revoke API keys, in the data_dir of the service. A running service uses "
+        "the changed keys at once. docs/operate/operating.md says how a client sends its key."
     )
-    key.epilog = "Exit status: 0 done, 2 it cannot be done."
-    settings = "the service's settings, TOML"
-    where = "the service's data_dir, default that of the one that runs, else var"
-    scopes = "read: read everything; operate: give orders, too; admin: also list and revoke keys"
-    actions = key.add_subparsers(dest="action", required=True)
-    for action, purpose in (
-        ("add", "make a key and print it, this once"),
-        ("revoke", "revoke a key"),
-        ("list", "list the keys and their scopes"),
+    key.epilog = "Exit status: 0 done; 2 it cannot be done."
+    settings = "settings of the service, TOML"
+    where = "default: data_dir of the running service, else var"
+    scopes = "read: read everything; operate: also give orders; admin: also list and revoke keys"
+    actions = key.add_subparsers(dest="action", required=True, metavar="COMMAND")
+    for action, purpose, example in (
+        ("add", "make a key and print it, only once", "add ada --scope operate"),
+        ("revoke", "revoke a key", "revoke ada"),
+        ("list", "list the keys and their scopes", "list"),
     ):
-        parser = actions.add_parser(action, help=purpose)
+        parser = actions.add_parser(action, help=purpose, examples=[f"pyrcal key {example}"])
         parser.add_argument("--config", metavar="FILE", help=settings, type=Path)
         parser.add_argument("--data-dir", metavar="DIR", help=where)
         if action != "list":
-            parser.add_argument("name", metavar="NAME", help="name of the person, program or place")
+            parser.add_argument(
+                "name", metavar="NAME", help="name of the person or program that uses it"
+            )
         if action == "add":
             choices = ("read", "operate", "admin")
             parser.add_argument("--scope", help=scopes, choices=choices, required=True)
@@ -384,12 +391,3 @@ def whole(text: str) -> int:
 
 port = such(whole, lambda n: 0 <= n <= 65535, "a port, 0 to 65535")
 endpoint = such(str, _ENDPOINT.fullmatch, "an endpoint like tcp/127.0.0.1:7447")
-
-
-class OneLineParser(argparse.ArgumentParser):
-    """Says what is wrong in one line, without the usage that would push it off the screen."""
-
-    @override
-    def error(self, message: str) -> NoReturn:
-        """End the program with status 2."""
-        self.exit(2, f"{self.prog}: {message}; {self.prog} --help\n")

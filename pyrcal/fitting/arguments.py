@@ -18,15 +18,16 @@ from service.errors import ConfigurationError
 from service.files import kind_of, numbers_in, parse_alpha, parse_modes
 from service.model.kinds import ArrayLibrary
 from service.model.sensors.registry import KINDS
+from service.parser import OneLineParser
 from service.program import check_settings, port, such, whole
 
 if TYPE_CHECKING:
     from pyrcal.fitting.light_rotation import Arms
 
 _memory_gb = such(float, lambda gb: gb > 0.0, "GB above 0")
-_MEMORY = "refuse what takes more, before it is begun; default %(default)g"
+_MEMORY = "refuse at once what needs more memory; default %(default)g"
 
-_ARRAY = "what computes rows of D; torch and cupy use a GPU, default %(default)s"
+_ARRAY = "library for the matrix; torch and cupy use a GPU; default %(default)s"
 
 _count = such(whole, lambda n: n > 0, "a whole number above 0")
 seconds = such(float, lambda s: 0.0 < s <= 3600.0, "seconds above 0 and up to 3600")
@@ -35,9 +36,11 @@ seconds = such(float, lambda s: 0.0 < s <= 3600.0, "seconds above 0 and up to 36
 def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     """Add these commands to a command line."""
     _describe_archive(
-        commands.add_parser("archive", help="list, verify, prune or export what is archived")
+        commands.add_parser("archive", help="list, verify, prune or export archived matrices")
     )
-    _describe_bundle(commands.add_parser("bundle", help="write or check a calibration as one file"))
+    _describe_bundle(
+        commands.add_parser("bundle", help="write or check a calibration bundle (one file)")
+    )
     _describe_certificates(
         commands.add_parser("certificates", help="make certificates for the link to the RTC")
     )
@@ -49,30 +52,30 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
         commands.add_parser("reconstruct", help="compute a reconstructor for a registration")
     )
     _describe_conventions(
-        commands.add_parser("conventions", help="hold a measured matrix against the conventions")
+        commands.add_parser("conventions", help="check a measured matrix against the conventions")
     )
     _describe_instrument(
         commands.add_parser("instrument", help="write, check or draw an instrument file")
     )
     _describe_import(
-        commands.add_parser("import", help="make an instrument file and a matrix of another code's")
+        commands.add_parser("import", help="import instrument and matrix of another code")
     )
 
 
 _OF_A_FOLDER = (
-    words("--config FILE", "the service's settings, TOML", type=Path),
-    words("--data-dir DIR", "the service's data_dir, default var"),
+    words("--config FILE", "settings of the service, TOML", type=Path),
+    words("--data-dir DIR", "data_dir of the service, default var"),
 )
 """Options of commands that work in a service's folder."""
 
 
-def _describe_archive(archive: argparse.ArgumentParser) -> None:
+def _describe_archive(archive: OneLineParser) -> None:
     archive.set_defaults(module="pyrcal.maintenance.archive")
     archive.description = (
-        "List, check, export and prune the matrices in a service's data_dir. They work while "
+        "List, check, export and prune the matrices in the data_dir of a service. All work while "
         "the service runs, except prune, which the service does by itself."
     )
-    archive.epilog = "Exit status: 0 done, 1 something is damaged, 2 it cannot be done."
+    archive.epilog = "Exit status: 0 done; 1 something is damaged; 2 it cannot be done."
     aot = (
         words("output FILE.fits", type=Path),
         words("--instrument NAME|FILE", "default: that of the settings"),
@@ -81,73 +84,83 @@ def _describe_archive(archive: argparse.ArgumentParser) -> None:
         words("--seconds S", "seconds to take, default %(default)g", type=seconds, default=10.0),
         words("--night DATE", "date of the evening, UTC; default that of the recording"),
     )
-    actions = archive.add_subparsers(dest="action", required=True)
-    for action, purpose, more in (
-        ("list", "list all, oldest first, and why one stays", ()),
-        ("show", "show one", (words("id ID"),)),
-        ("verify", "read all and compare checksums", ()),
-        ("aot", "write α and telemetry as AOT FITS", aot),
-        ("prune", "remove what [archive] lets go", (words("--dry-run", "only say what would go"),)),
+    dry_run = words("--dry-run", "only list what would be removed")
+    actions = archive.add_subparsers(dest="action", required=True, metavar="COMMAND")
+    for action, purpose, more, example in (
+        ("list", "list all matrices, oldest first, and why some are kept", (), "list"),
+        ("show", "show one matrix", (words("id ID", "its id, as in archive list"),), "show cm-3"),
+        ("verify", "read all files and compare checksums", (), "verify --data-dir var"),
+        ("aot", "write registration and telemetry as AOT FITS", aot, "aot night.fits"),
+        ("prune", "remove what [archive] no longer keeps", (dry_run,), "prune --dry-run"),
     ):
-        parser = actions.add_parser(action, help=purpose)
+        parser = actions.add_parser(action, help=purpose, examples=[f"pyrcal archive {example}"])
         add(parser, *_OF_A_FOLDER, words("--json", "print JSON"), *more)
 
 
-def _describe_bundle(bundle: argparse.ArgumentParser) -> None:
+def _describe_bundle(bundle: OneLineParser) -> None:
     bundle.set_defaults(module="pyrcal.maintenance.bundles")
     bundle.description = (
         "Write a reconstructor with its gains, basis, registration, verdict and provenance into "
-        "one file with checksums, or check such a file. Works while the service runs; for one on "
-        "another machine, 'pyrcal export reconstructor in-use --format hdf5' brings the source. "
-        "docs/integrate/bundle.md says what is in it."
+        "one file with checksums, or check such a file. docs/integrate/bundle.md describes it."
     )
-    bundle.epilog = (
-        "Exit status: 0 done, 2 it cannot be done, or the file is not as it was written."
-    )
-    actions = bundle.add_subparsers(dest="action", required=True)
+    bundle.epilog = "Exit status: 0 done; 2 it cannot be done, or a checksum is wrong."
+    actions = bundle.add_subparsers(dest="action", required=True, metavar="COMMAND")
     add(
-        actions.add_parser("write", help="write one"),
+        actions.add_parser(
+            "write",
+            help="write a bundle",
+            examples=["pyrcal bundle write in-use calibration.h5 --interaction-matrix"],
+        ),
         *_OF_A_FOLDER,
         words("source ID|in-use|FILE.h5", "a reconstructor of the archive, or an exported one"),
         words(
-            "output FILE", "FITS where it ends in .fits, else HDF5; never overwritten", type=Path
+            "output FILE", "FITS if its name ends in .fits, else HDF5; never overwritten", type=Path
         ),
         words("--instrument NAME|FILE", "default: that of the settings"),
-        words("--interaction-matrix", "with D at its registration"),
-        words("--reference FILE.npy", "with the RTC's reference slopes (n_slopes,)", type=Path),
+        words("--interaction-matrix", "include the interaction matrix at its registration"),
+        words(
+            "--reference FILE.npy", "include the reference slopes of the RTC (n_slopes,)", type=Path
+        ),
     )
     add(
-        actions.add_parser("check", help="read one, hold it against its checksums, show it"),
-        words("bundle FILE", type=Path),
+        actions.add_parser(
+            "check",
+            help="read a bundle, compare its checksums, show it",
+            examples=["pyrcal bundle check calibration.h5"],
+        ),
+        words("bundle FILE", "the bundle", type=Path),
         words("--json", "print JSON"),
     )
 
 
-def _describe_certificates(certificates: argparse.ArgumentParser) -> None:
+def _describe_certificates(certificates: OneLineParser) -> None:
     certificates.set_defaults(module="pyrcal.maintenance.certificates")
     certificates.description = (
         "Make an authority, a certificate for each role on the link (service, rtc, viewer), and "
-        "the settings that use them. Again in the same folder: the authority that is there signs "
-        "new ones. docs/operate/link.md says where each file belongs."
+        "settings that use them. In a folder that has an authority, that authority signs new "
+        "certificates. docs/operate/link.md says where each file belongs."
     )
-    certificates.epilog = "Exit status: 0 done, 2 it cannot be done."
-    actions = certificates.add_subparsers(dest="action", required=True)
-    hosts = (
-        "names or addresses under which the service is reached, with commas; default %(default)s"
-    )
+    certificates.epilog = "Exit status: 0 done; 2 it cannot be done."
+    actions = certificates.add_subparsers(dest="action", required=True, metavar="COMMAND")
+    hosts = "names or addresses of the service, separated by commas; default %(default)s"
     for action, purpose, more in (
         (
             "new",
-            "make them",
+            "make certificates",
             (
                 words("--host NAME,...", hosts, default="127.0.0.1"),
-                words("--zenoh-port PORT", "default %(default)s", type=port, default=7447),
-                words("--days N", "that they hold, default %(default)s", type=_count, default=365),
+                words(
+                    "--zenoh-port PORT", "of the link, default %(default)s", type=port, default=7447
+                ),
+                words("--days N", "validity, days; default %(default)s", type=_count, default=365),
             ),
         ),
-        ("show", "show whose they are and until when they hold", ()),
+        ("show", "show the owner and the end of each certificate", ()),
     ):
-        add(actions.add_parser(action, help=purpose), words("folder FOLDER", type=Path), *more)
+        parser = actions.add_parser(
+            action, help=purpose, examples=[f"pyrcal certificates {action} certificates"]
+        )
+        add(parser, words("folder FOLDER", "folder of the certificates", type=Path), *more)
 
 
 _FIT = """
@@ -157,42 +170,46 @@ and magnification with 1 sigma, the gain of every mode, the residual, and a verd
 
 _FIT_EPILOG = """
 REFERENCE holds (n_slopes, n_modes), slope per metre of OPD, in the RTC's own order and axes, as
-the array 'interaction_matrix' or the one that --dataset names. What is printed on standard output
-is the answer; progress goes to standard error. Exit status: 0 accepted, 1 fitted but refused (the
-verdict says why), 2 input that cannot be used. docs/integrate/fitting.md explains format,
-orientation and verdicts.
+the array 'interaction_matrix' or the one that --dataset names. The result goes to standard output,
+progress to standard error. Exit status: 0 accepted; 1 fitted but refused (the verdict says why); 2
+input that cannot be used. docs/integrate/fitting.md explains format, orientation and verdicts.
 """
 
 _RECONSTRUCT = """
-Compute the noise-free interaction matrix for a registration, invert it, and write both with
-everything they were made of. As many modes as the basis has may be controlled, however few were
-measured.
+Compute the noise-free interaction matrix for a registration, and the reconstructor. All modes of
+the basis can be controlled, however few were measured.
 """
 
-_INSTRUMENT = words("instrument INSTRUMENT", "TOML file, or a packaged name")
+INSTRUMENT = "instrument file (TOML) or a packaged name"
+"""Meaning of the operand that most of these commands have."""
+
+_INSTRUMENT = words("instrument INSTRUMENT", INSTRUMENT)
 
 _OF_AN_ANSWER = (
     words("--json", "print one JSON object, not a table"),
     words("--plot FILE.png", "write the figures", type=Path),
-    words("--output FILE.h5", "write everything found", type=Path),
-    words("--threads N", "default: one for every core", type=_count, default=os.cpu_count() or 1),
+    words("--output FILE.h5", "write all results", type=Path),
+    words("--threads N", "default: one for each core", type=_count, default=os.cpu_count() or 1),
 )
 """Options of commands that fit a registration."""
 
 
-def _describe_fit(fit: argparse.ArgumentParser) -> None:
+def _describe_fit(fit: OneLineParser) -> None:
     fit.set_defaults(module="pyrcal.fitting.fit")
     fit.description, fit.epilog = _FIT, _FIT_EPILOG
-    methods = (
-        "joint: all four together (default); paper: the ten scans of "
-        "Heritier et al. 2018, Table 1, without free gains; "
-        "sensitivity: projection on sensitivity matrices"
+    fit.examples = (
+        "pyrcal fit flao-lbt matrix.h5 --output fit.h5",
+        "pyrcal fit bench.toml matrix.fits --modes 0:400 --plot fit.png",
     )
-    modes = "basis indices to use, like 0:400 (400 is not) or 3,5,9; default all"
+    methods = (
+        "joint: all parameters together (default); paper: the ten scans of Heritier et al. 2018, "
+        "Table 1, without free gains; sensitivity: projection on sensitivity matrices"
+    )
+    modes = "basis indices to use, like 0:400 (end excluded) or 3,5,9; default all"
     start = "start of the fit: subapertures, degrees, ratio"
-    flux = "mean counts of a pyramid's four images, array flux (4, n, n), to light the model"
-    reference = "a flux map of another day: report how far the light has turned since"
-    arms = "the spider's arms at rotation 0: report the rotation of their shadows in the flux map"
+    flux = "illumination: counts of the four pupil images, array flux (4, n, n)"
+    reference = "earlier flux map: report the rotation of the illumination since then"
+    arms = "spider arms: report the rotation of their shadows in the flux map"
     add(
         fit,
         _INSTRUMENT,
@@ -213,37 +230,38 @@ def _describe_fit(fit: argparse.ArgumentParser) -> None:
         words("--gain-map", "also fit a smooth gain over the pupil"),
         words(
             "--gain G",
-            "integrator gain of the loop that the reconstructor is checked in",
+            "integrator gain for the stability check of the reconstructor, default %(default)g",
             type=float,
             default=0.5,
         ),
-        words("--no-anamorphosis", "take the image for as stretched as the instrument file says"),
-        words("--anamorphosis", "as without it: the stretch is always fitted"),
+        words("--no-anamorphosis", "keep the anamorphosis of the instrument file"),
+        words("--anamorphosis", argparse.SUPPRESS),
         words("--memory-gb GB", _MEMORY, type=_memory_gb, default=6.0),
         *_OF_AN_ANSWER,
     )
 
 
 _FIT_SYSTEM = """
-Find the position of each sensor, mirror and star of a system from the measured interaction matrix
-of every sensor with every mirror: each pair is fitted as by pyrcal fit, and the positions follow by
-weighted least squares. Directions that no pair can observe are listed.
+Estimate the position of each sensor, mirror and star of a system from the measured interaction
+matrix of each sensor with each mirror. Each pair is fitted as by pyrcal fit; the positions follow
+by weighted least squares. Directions that no pair observes are listed.
 """
 
 _FIT_SYSTEM_EPILOG = """
-Exit status: 0 accepted, 1 fitted but refused (the verdict says why), 2 input that cannot be used.
+Exit status: 0 accepted; 1 fitted but refused (the verdict says why); 2 input that cannot be used.
 docs/integrate/systems.md explains the file, the gauge and verdicts.
 """
 
 
-def _describe_fit_system(fit: argparse.ArgumentParser) -> None:
+def _describe_fit_system(fit: OneLineParser) -> None:
     fit.set_defaults(module="pyrcal.fitting.fit_system")
     fit.description, fit.epilog = _FIT_SYSTEM, _FIT_SYSTEM_EPILOG
+    fit.examples = ("pyrcal fit-system system.toml matrices.h5 --json",)
     reference = (
-        "the matrices: a file for each pair, {sensor} and {mirror} in its name standing for "
-        "theirs, or one HDF5 file of all"
+        "the matrices: one HDF5 file, or one file for each pair, with {sensor} and {mirror} in "
+        "place of their names"
     )
-    dataset = "of each matrix; default {sensor}/{mirror}/interaction_matrix in one file of all"
+    dataset = "dataset of each matrix; default {sensor}/{mirror}/interaction_matrix in one file"
     add(
         fit,
         words("system SYSTEM", "TOML file of sensors and mirrors", type=Path),
@@ -253,144 +271,176 @@ def _describe_fit_system(fit: argparse.ArgumentParser) -> None:
     )
 
 
-def _describe_reconstruct(make: argparse.ArgumentParser) -> None:
+def _describe_reconstruct(make: OneLineParser) -> None:
     make.set_defaults(module="pyrcal.fitting.reconstruct")
     make.description = _RECONSTRUCT
-    make.epilog = "Exit status: 0 written, 2 input that cannot be used."
+    make.epilog = "Exit status: 0 written; 2 input that cannot be used."
+    make.examples = (
+        "pyrcal reconstruct flao-lbt fit.h5 --modes 500 --output cm.h5",
+        "pyrcal reconstruct flao-lbt 0.1,-0.05,0.2,1.002 --modes 400 --output cm.h5",
+    )
     alpha = (
         "X,Y,ROT,MAG (subapertures, degrees, ratio), or a file that pyrcal fit wrote with "
         "--json or --output"
     )
     methods = (
-        "svd: least squares, weak singular values left out (default); map: with noise and "
+        "svd: least squares without weak singular values (default); map: with noise and "
         "turbulence as priors"
     )
     noise = "of map: 1 sigma of one slope in one frame, default %(default)g"
-    gains = "leave the columns as the model has them; by default they take the gains of the fit"
+    gains = "use the columns of the model; by default they are multiplied by the fitted gains"
     condition = words(
-        "--max-condition MAX_CONDITION", "of svd, default %(default)g", type=float, default=100.0
+        "--max-condition C",
+        "of svd: largest condition number, default %(default)g",
+        type=float,
+        default=100.0,
     )
     add(
         make,
         _INSTRUMENT,
         words("alpha ALPHA", alpha),
-        words("--modes N", "the first N modes", type=_count, required=True),
-        words("--output FILE.h5", type=Path, required=True),
+        words("--modes N", "control the first N modes", type=_count, required=True),
+        words("--output FILE.h5", "file to write", type=Path, required=True),
         words("--method", methods, choices=("svd", "map"), default="svd"),
         condition,
         words("--slope-noise RMS", noise, type=float, default=0.05),
         words("--memory-gb GB", _MEMORY, type=_memory_gb, default=6.0),
         words("--array LIBRARY", _ARRAY, choices=tuple(ArrayLibrary), default="numpy"),
         words("--no-gains", gains),
-        words("--flux-map FILE", "as of pyrcal fit, to light the model", type=Path),
-        words("--reference FILE", "the measured matrix, for its checksum", type=Path),
+        words("--flux-map FILE", "illumination, as in pyrcal fit", type=Path),
+        words("--reference FILE", "measured matrix, whose checksum is recorded", type=Path),
         words(
             "--specula PUPDATA.fits",
-            "write SPECULA's Intmat and Recmat, too: its PupData or SubapData gives the order",
+            "also write Intmat and Recmat of SPECULA, in the order of its PupData or SubapData",
             type=Path,
         ),
     )
 
 
-def _describe_conventions(hold: argparse.ArgumentParser) -> None:
-    hold.set_defaults(module="pyrcal.conventions")
-    hold.description = (
-        "Hold a measured matrix, and the modes of its instrument file, against the numbered rules "
-        "of docs/understand/conventions.md; say which are broken, and by how much."
+def _describe_conventions(check: OneLineParser) -> None:
+    check.set_defaults(module="pyrcal.conventions")
+    check.description = (
+        "Check a measured matrix, and the modes of its instrument file, against the numbered "
+        "rules of docs/understand/conventions.md; print which are broken, and by how much."
     )
-    hold.epilog = "Exit status: 0 all are kept, 1 some are broken, 2 input that cannot be used."
+    check.epilog = "Exit status: 0 all are kept; 1 some are broken; 2 input that cannot be used."
+    check.examples = ("pyrcal conventions bench.toml matrix.h5",)
     add(
-        hold,
+        check,
         _INSTRUMENT,
         words("reference REFERENCE", "HDF5, FITS or NumPy file", type=Path),
         words("--dataset NAME", "dataset of the matrix, default interaction_matrix"),
     )
 
 
-def _describe_instrument(instrument: argparse.ArgumentParser) -> None:
+def _describe_instrument(instrument: OneLineParser) -> None:
     instrument.set_defaults(module="pyrcal.instruments.program")
     instrument.description = "Write a commented instrument file, check one, or draw it."
     instrument.epilog = (
-        "Exit status: 0 done, 1 something is wrong with the instrument file, 2 a file cannot be "
+        "Exit status: 0 done; 1 something is wrong with the instrument file; 2 a file cannot be "
         "written."
     )
-    kind = words("--kind KIND", "kind of sensor", choices=tuple(KINDS), default="pyramid")
-    memory = "compute the matrix if that takes no more, default %(default)g"
-    actions = instrument.add_subparsers(dest="action", required=True)
-    for action, purpose, more in (
-        ("new", "write a file with every key", (words("file FILE.toml", type=Path), kind)),
+    kind = words(
+        "--kind KIND", "kind of sensor, default pyramid", choices=tuple(KINDS), default="pyramid"
+    )
+    memory = "compute the matrix only if that takes no more, default %(default)g"
+    new = words("file FILE.toml", "file to write", type=Path)
+    picture = words("picture PICTURE.png", "picture to write", type=Path)
+    actions = instrument.add_subparsers(dest="action", required=True, metavar="COMMAND")
+    for action, purpose, more, example in (
+        ("new", "write a file with all keys", (new, kind), "new bench.toml"),
         (
             "check",
-            "say everything that is wrong with it, and what it implies",
+            "print all errors of the file, and what follows from it",
             (_INSTRUMENT, words("--memory-gb GB", memory, type=float, default=4.0)),
+            "check bench.toml",
         ),
         (
             "show",
             "draw pupil, subapertures, actuators",
-            (_INSTRUMENT, words("picture PICTURE.png", type=Path)),
+            (_INSTRUMENT, picture),
+            "show bench.toml bench.png",
         ),
     ):
-        add(actions.add_parser(action, help=purpose), *more)
+        parser = actions.add_parser(action, help=purpose, examples=[f"pyrcal instrument {example}"])
+        add(parser, *more)
 
 
-def _describe_import(bring: argparse.ArgumentParser) -> None:
+def _describe_import(bring: OneLineParser) -> None:
     bring.set_defaults(module="pyrcal.importers.program")
     bring.description = (
-        "Write an instrument file and a measured matrix, as pyrcal fit takes them, from what other "
-        "codes have saved. What is not known is said as unknown; docs/integrate explains each."
+        "Write an instrument file and a measured matrix for pyrcal fit from files of another code. "
+        "Parameters that neither files nor options contain are marked unknown. docs/integrate "
+        "explains each code."
     )
-    bring.epilog = "Exit status: 0 written, 2 input that cannot be used."
-    folder = words("--output DIR", "folder of both files, made", type=Path, required=True)
-    saved = words("file FILE.npz", "np.savez of what docs/integrate/oopao.md lists", type=Path)
-    known = "files, known by what is in them"
-    roles = "a file or folder with arrays of known names, or ROLE=FILE: matrix, valid, light, "
-    roles += "modes, positions, mode_to_actuator"
+    bring.epilog = "Exit status: 0 written; 2 input that cannot be used."
+    folder = words("--output DIR", "new folder for both files", type=Path, required=True)
+    saved = words(
+        "file FILE.npz", "arrays listed in docs/integrate/oopao.md, by np.savez", type=Path
+    )
+    known = "files, recognised by their content"
+    roles = "file or folder with arrays of known names, or ROLE=FILE with a role of matrix, valid, "
+    roles += "light, modes, positions, mode_to_actuator"
     own = words("files FILE", known, type=_role_and_path, nargs="+")
     named = words("files [ROLE=]FILE", roles, type=_role_and_path, nargs="+")
     described = words(
         "--instrument NAME|FILE",
-        "telescope, sensor and mirror as a packaged instrument or a file describes them",
+        "packaged instrument or instrument file that describes telescope, sensor and mirror",
     )
     basis = words(
         "--basis BASIS",
-        "of positions alone: zonal, a column for each actuator, or KL, pyrcal's own modes",
+        "if only positions are given: one column for each actuator, or KL modes",
         choices=("zonal", "KL"),
     )
-    unit = words("--unit UNIT", "of the commands, OPD; default: unknown", choices=("m", "um", "nm"))
-    sources = bring.add_subparsers(dest="source", required=True)
-    for source, purpose, more in (
-        ("oopao", "from objects that were saved", (saved,)),
-        ("specula", "from Intmat, PupData or SubapData, IFunc, M2C", (own, *_REPORTED)),
-        ("synim", "the same, of SynIM", (own, *_REPORTED)),
+    unit = words(
+        "--unit UNIT", "unit of the commands, OPD; default: unknown", choices=("m", "um", "nm")
+    )
+    sources = bring.add_subparsers(dest="source", required=True, metavar="COMMAND")
+    response = words("--response NAME", "such as loRM; default: of single actuators if present")
+    loop = words("--loop N|UID", "if there are several loops: number, from 1, or uid")
+    positions = words("--positions FILE", "of the actuators, x and y in metres", type=Path)
+    arrays = (named, unit, described, basis)
+    for source, purpose, more, example in (
+        ("oopao", "from saved OOPAO objects", (saved,), "system.npz"),
+        (
+            "specula",
+            "from Intmat, PupData or SubapData, IFunc, M2C of SPECULA",
+            (own,),
+            "im.fits pupdata.fits ifunc.fits m2c.fits --diameter-m 8.2",
+        ),
+        (
+            "synim",
+            "from the same files of SynIM",
+            (own,),
+            "im.fits subapdata.fits ifunc.fits --diameter-m 8.2",
+        ),
         (
             "cacao",
-            "from an example folder, or the conf folder of a loop",
-            (
-                words("folder CONF", type=Path),
-                words("--response NAME", "such as loRM; default: of single actuators if there is"),
-                *_REPORTED,
-            ),
+            "from the conf folder of a cacao loop, or an example folder",
+            (words("folder CONF", "conf folder", type=Path), response),
+            "conf --diameter-m 8.2",
         ),
-        (
-            "pyrtc",
-            "from calibrations of pyRTC 2, or bare arrays",
-            (named, unit, described, basis, *_REPORTED),
-        ),
+        ("pyrtc", "from calibrations of pyRTC 2", arrays, "calibration --instrument bench.toml"),
         (
             "aot",
             "from an AOT file",
-            (
-                words("file FILE.fits", type=Path),
-                words("--loop N|UID", "of several loops: its number, from 1, or its uid"),
-                words("--positions FILE", "of actuators, x and y in metres", type=Path),
-                unit,
-                *_REPORTED,
-            ),
+            (words("file FILE.fits", "AOT file", type=Path), loop, positions, unit),
+            "telemetry.fits --diameter-m 8.2",
         ),
-        ("files", "from NumPy, FITS or HDF5 files", (named, unit, described, basis, *_REPORTED)),
-        ("npz", "the same as files", (named, unit, described, basis, *_REPORTED)),
+        (
+            "files",
+            "from NumPy, FITS or HDF5 files",
+            arrays,
+            "matrix=im.npy positions=xy.npy --unit um --diameter-m 8.2",
+        ),
+        ("npz", "same as files", arrays, "arrays.npz --diameter-m 8.2"),
     ):
-        add(sources.add_parser(source, help=purpose), *more, folder)
+        parser = sources.add_parser(
+            source, help=purpose, examples=[f"pyrcal import {source} {example} --output imported"]
+        )
+        add(parser, *more, folder)
+        if source != "oopao":
+            add(parser.add_argument_group(DESCRIPTION), *_DESCRIBED)
 
 
 def _read_by(parse: Callable[[str], object]) -> Callable[[str], object]:
@@ -405,27 +455,31 @@ def _read_by(parse: Callable[[str], object]) -> Callable[[str], object]:
     return read
 
 
-_REPORTED = (
-    words("--diameter-m D", "of the pupil; needed without --instrument", type=float),
+DESCRIPTION = "description options"
+"""Title of the options for values that no file contains."""
+
+_DESCRIBED = (
+    words("--diameter-m D", "of the pupil; required without --instrument", type=float),
     words(
         "--modes FIRST:END",
         "basis index of each column, like 0:400 or 3,5,9; default the first ones",
         type=_read_by(parse_modes),
     ),
-    words("--sensor KIND", "default: as the files say, else pyramid", choices=tuple(KINDS)),
+    words("--sensor KIND", "default: that of the files, else pyramid", choices=tuple(KINDS)),
     words(
         "--stop STOP",
-        "what limits the beam, default %(default)s",
+        "aperture stop, default %(default)s",
         choices=("telescope", "mirror"),
         default="telescope",
     ),
-    words("--obscuration RATIO", "linear; default: read from the mask", type=float),
+    words("--obscuration RATIO", "linear; default: from the mask", type=float),
     words("--wavelength-m W", "default: unknown", type=float),
     words("--modulation RADIUS", "of a pyramid, λ/D; default: unknown", type=float),
-    words("--pupil-subap N", "pupil's diameter, subapertures; default the mask's", type=float),
-    words("--pixels-per-subap N", "of camera frames; default: by the actuators", type=_count),
+    words("--pupil-subap N", "pupil diameter, subapertures; default: from the mask", type=float),
+    words(
+        "--pixels-per-subap N", "of camera frames; default: from the actuator pitch", type=_count
+    ),
 )
-"""Options for values that no file contains."""
 
 
 def _role_and_path(text: str) -> tuple[str | None, Path]:

@@ -1,5 +1,6 @@
 """The manual: its commands are understood, its files are read, its links lead somewhere."""
 
+import argparse
 import json
 import re
 import shlex
@@ -233,6 +234,27 @@ def test_the_layout_on_the_architecture_page_is_that_of_the_code():
     ] == layers
     with_code = {path.parent.name for path in ROOT.glob("*/*.py")} - {"service", "docs"}
     assert with_code | {"docs", "deploy", "tests"} == set(re.findall(r"^(\w+)/", folders, re.M))
+
+
+def test_the_page_of_the_command_line_has_every_command_and_stays_short():
+    """Its limit is 3,000 words; it is generated, and compared with the code elsewhere."""
+    text = (DOCS / "reference" / "cli.md").read_text("utf-8")
+    assert len(text.split()) <= 3000
+    for leaf in leaves(PARSER):
+        (first, *_) = leaf.usage_parts(short=True)
+        assert first in text, first
+    assert "pyrcal import cacao CONF --output DIR" in text  # shares its name with a program
+    assert "pyrcal cacao --config FILE" in text
+
+
+def leaves(parser):
+    """Every command below a parser."""
+    below = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+    for action in below:
+        for each in action.choices.values():
+            yield from leaves(each)
+    if not below:
+        yield parser
 
 
 def test_the_first_screen_of_the_readme_shows_pictures_and_tells_two_commands():

@@ -99,7 +99,7 @@ def _describe_bundle(bundle: argparse.ArgumentParser) -> None:
         "Write a reconstructor with its gains, basis, registration, verdict and provenance into "
         "one file with checksums, or check such a file. Works while the service runs; for one on "
         "another machine, 'pyrcal export reconstructor in-use --format hdf5' brings the source. "
-        "docs/integrate/bundle.md says what is in it."
+        "docs/howto/bundle.md says what is in it."
     )
     bundle.epilog = (
         "Exit status: 0 done, 2 it cannot be done, or the file is not as it was written."
@@ -159,7 +159,7 @@ _FIT_EPILOG = """
 REFERENCE holds (n_slopes, n_modes), slope per metre of OPD, in the RTC's own order and axes, as
 the array 'interaction_matrix' or the one that --dataset names. What is printed on standard output
 is the answer; progress goes to standard error. Exit status: 0 accepted, 1 fitted but refused (the
-verdict says why), 2 input that cannot be used. docs/integrate/fitting.md explains format,
+verdict says why), 2 input that cannot be used. docs/howto/fitting.md explains format,
 orientation and verdicts.
 """
 
@@ -232,7 +232,7 @@ weighted least squares. Directions that no pair can observe are listed.
 
 _FIT_SYSTEM_EPILOG = """
 Exit status: 0 accepted, 1 fitted but refused (the verdict says why), 2 input that cannot be used.
-docs/integrate/systems.md explains the file, the gauge and verdicts.
+docs/howto/systems.md explains the file, the gauge and verdicts.
 """
 
 
@@ -296,7 +296,7 @@ def _describe_conventions(hold: argparse.ArgumentParser) -> None:
     hold.set_defaults(module="pyrcal.conventions")
     hold.description = (
         "Hold a measured matrix, and the modes of its instrument file, against the numbered rules "
-        "of docs/understand/conventions.md; say which are broken, and by how much."
+        "of docs/reference/conventions.md; say which are broken, and by how much."
     )
     hold.epilog = "Exit status: 0 all are kept, 1 some are broken, 2 input that cannot be used."
     add(
@@ -337,11 +337,12 @@ def _describe_import(bring: argparse.ArgumentParser) -> None:
     bring.set_defaults(module="pyrcal.offline.importers.program")
     bring.description = (
         "Write an instrument file and a measured matrix, as pyrcal fit takes them, from what other "
-        "codes have saved. What is not known is said as unknown; docs/integrate explains each."
+        "codes have saved. What is not known is said as unknown. docs/howto/importing.md has "
+        "the details."
     )
     bring.epilog = "Exit status: 0 written, 2 input that cannot be used."
     folder = words("--output DIR", "folder of both files, made", type=Path, required=True)
-    saved = words("file FILE.npz", "np.savez of what docs/integrate/oopao.md lists", type=Path)
+    saved = words("file FILE.npz", "np.savez of what docs/tutorials/oopao.md lists", type=Path)
     known = "files, known by what is in them"
     roles = "a file or folder with arrays of known names, or ROLE=FILE: matrix, valid, light, "
     roles += "modes, positions, mode_to_actuator"

@@ -15,7 +15,7 @@ sigma from every estimator, the filtered alpha, alarms, and the noisy matrix of 
 _EPILOG = """
 TELEMETRY is a recording (pyrcal record, pyrcal sim --record), an AOT file, a folder of pyRTC's
 recorder, or an HDF5 file or .npz with the arrays slopes (n_frames, n_slopes) and commands_m
-(n_frames, n_modes), the number frame_rate_hz, and what else docs/integrate/tracking.md lists. Exit
+(n_frames, n_modes), the number frame_rate_hz, and what else docs/howto/tracking.md lists. Exit
 status: 0 alpha was found, 1 it was not (the table says why; what ordinary telemetry says by itself
 is no alpha that the service would use), 2 input that cannot be used.
 """

@@ -4,7 +4,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from docutils import nodes
+from latex2mathml.converter import convert
 from sphinx.application import Sphinx
+from sphinx.writers.html5 import HTML5Translator
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the API reference imports pyrcal
 
@@ -17,7 +20,6 @@ extensions = [
     "myst_parser",
     "numpydoc",
     "sphinx.ext.autodoc",
-    "sphinx.ext.mathjax",
     "sphinx_design",
 ]
 html_theme = "pydata_sphinx_theme"
@@ -49,6 +51,7 @@ exclude_patterns = ["paper"]
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_type_aliases = {"Array": "Array"}
+html_math_renderer = "mathml"
 numpydoc_show_class_members = False  # the page lists members itself
 
 
@@ -66,6 +69,18 @@ def _remove_inline_scripts(
     ]
 
 
+def _inline_math(writer: HTML5Translator, node: nodes.math) -> None:
+    """Write a formula as MathML, which browsers draw without a script."""
+    writer.body.append(convert(node.astext()))
+    raise nodes.SkipNode
+
+
+def _block_math(writer: HTML5Translator, node: nodes.math_block) -> None:
+    """Write a displayed formula as MathML."""
+    writer.body.append(f'<div class="math">{convert(node.astext(), display="block")}</div>')
+    raise nodes.SkipNode
+
+
 def _remove_source_maps(app: Sphinx, exception: Exception | None) -> None:
     """Remove the theme's source maps, 2 MB that no reader loads."""
     for path in Path(app.outdir).rglob("*.map"):
@@ -74,5 +89,6 @@ def _remove_source_maps(app: Sphinx, exception: Exception | None) -> None:
 
 def setup(app: Sphinx) -> None:
     """Connect the handlers of this file, after those of the theme."""
+    app.add_html_math_renderer("mathml", (_inline_math, None), (_block_math, None))
     app.connect("html-page-context", _remove_inline_scripts, priority=950)
     app.connect("build-finished", _remove_source_maps)

@@ -8,7 +8,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from service.web import page
-from tests.system.browser import AXE, NEEDS_A_BROWSER, NARROW, Page, a_browser
+from tests.system.browser import AXE, NARROW, NEEDS_A_BROWSER, Page, a_browser
 from tests.system.night import ROOT, wait_for
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(300), NEEDS_A_BROWSER]
@@ -57,7 +57,9 @@ def opened(browser, url, size, theme):
     reader.resize(size)
     browser.get("about:blank")
     browser.get(url.partition("/manual")[0] + "/manual/search.html")
-    reader.js(f"void (localStorage.setItem('mode', {theme!r}), localStorage.setItem('theme', {theme!r}))")
+    reader.js(
+        f"void (localStorage.setItem('mode', {theme!r}), localStorage.setItem('theme', {theme!r}))"
+    )
     browser.get(url)
     reader.until("document.readyState === 'complete'")
     yield reader
@@ -95,7 +97,9 @@ def test_the_service_refuses_nothing_that_a_page_needs(manual, browser):
         assert all(name.startswith(manual) for name in names)
         browser.get(f"{manual}/search.html?q=misregistration")
         reader.until("document.querySelectorAll('#search-results li').length > 5", 20.0)
-        refused = [line for line in browser.get_log("browser") if "Content Security" in line["message"]]
+        refused = [
+            line for line in browser.get_log("browser") if "Content Security" in line["message"]
+        ]
         assert refused == []
         icon = "document.querySelector('svg.svg-inline--fa').getBoundingClientRect().height"
         assert 5 < reader.js(icon) < 40

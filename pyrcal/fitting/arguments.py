@@ -101,7 +101,7 @@ def _describe_bundle(bundle: OneLineParser) -> None:
     bundle.set_defaults(module="pyrcal.maintenance.bundles")
     bundle.description = (
         "Write a reconstructor with its gains, basis, registration, verdict and provenance into "
-        "one file with checksums, or check such a file. docs/integrate/bundle.md describes it."
+        "one file with checksums, or check such a file. docs/howto/bundle.md describes it."
     )
     bundle.epilog = "Exit status: 0 done; 2 it cannot be done, or a checksum is wrong."
     actions = bundle.add_subparsers(dest="action", required=True, metavar="COMMAND")
@@ -172,7 +172,7 @@ _FIT_EPILOG = """
 REFERENCE holds (n_slopes, n_modes), slope per metre of OPD, in the RTC's own order and axes, as
 the array 'interaction_matrix' or the one that --dataset names. The result goes to standard output,
 progress to standard error. Exit status: 0 accepted; 1 fitted but refused (the verdict says why); 2
-input that cannot be used. docs/integrate/fitting.md explains format, orientation and verdicts.
+input that cannot be used. docs/howto/fitting.md explains format, orientation and verdicts.
 """
 
 _RECONSTRUCT = """
@@ -249,7 +249,7 @@ by weighted least squares. Directions that no pair observes are listed.
 
 _FIT_SYSTEM_EPILOG = """
 Exit status: 0 accepted; 1 fitted but refused (the verdict says why); 2 input that cannot be used.
-docs/integrate/systems.md explains the file, the gauge and verdicts.
+docs/howto/systems.md explains the file, the gauge and verdicts.
 """
 
 
@@ -321,7 +321,7 @@ def _describe_conventions(check: OneLineParser) -> None:
     check.set_defaults(module="pyrcal.conventions")
     check.description = (
         "Check a measured matrix, and the modes of its instrument file, against the numbered "
-        "rules of docs/understand/conventions.md; print which are broken, and by how much."
+        "rules of docs/reference/conventions.md; print which are broken, and by how much."
     )
     check.epilog = "Exit status: 0 all are kept; 1 some are broken; 2 input that cannot be used."
     check.examples = ("pyrcal conventions bench.toml matrix.h5",)
@@ -376,7 +376,7 @@ def _describe_import(bring: OneLineParser) -> None:
     bring.epilog = "Exit status: 0 written; 2 input that cannot be used."
     folder = words("--output DIR", "new folder for both files", type=Path, required=True)
     saved = words(
-        "file FILE.npz", "arrays listed in docs/integrate/oopao.md, by np.savez", type=Path
+        "file FILE.npz", "arrays listed in docs/tutorials/oopao.md, by np.savez", type=Path
     )
     known = "files, recognised by their content"
     roles = "file or folder with arrays of known names, or ROLE=FILE with a role of matrix, valid, "

@@ -1,4 +1,4 @@
-"""Writes what docs repeat of the code: states, files, the tables of rtc.md, the reference pages.
+"""Writes what docs repeat of the code: states, files, the fields of messages, the reference pages.
 
 Run: ``python -m pyrcal_studies.pages``, then ``git diff``; a test compares.
 """
@@ -92,9 +92,9 @@ def _first_line(path: Path) -> str:
     return text.partition("\n")[0]
 
 
-def rtc() -> str:
-    """Return docs/rtc.md with the tables of the messages' keys as the records have them."""
-    return with_tables((ROOT / "docs" / "rtc.md").read_text(encoding="utf-8"))
+def fields() -> str:
+    """Return docs/rtc/fields.md with the tables of the messages' keys as the records have them."""
+    return with_tables((ROOT / "docs" / "rtc" / "fields.md").read_text(encoding="utf-8"))
 
 
 def openapi() -> str:
@@ -123,7 +123,7 @@ def runbook() -> str:
 PAGES = {
     "reference/states.md": states,
     "reference/house.md": house,
-    "rtc.md": rtc,
+    "rtc/fields.md": fields,
     "openapi.json": openapi,
     "reference/settings.md": reference.settings,
     "reference/access.md": reference.access,

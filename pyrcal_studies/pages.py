@@ -1,4 +1,4 @@
-"""Writes what docs repeat of the code: states, the tables of rtc.md, the reference pages.
+"""Writes what docs repeat of the code: states, the fields of messages, the reference pages.
 
 Run: ``python -m pyrcal_studies.pages``, then ``git diff``; a test compares.
 """
@@ -57,9 +57,9 @@ def states() -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def rtc() -> str:
-    """Return docs/rtc.md with the tables of the messages' keys as the records have them."""
-    return with_tables((ROOT / "docs" / "rtc.md").read_text(encoding="utf-8"))
+def fields() -> str:
+    """Return docs/rtc/fields.md with the tables of the messages' keys as the records have them."""
+    return with_tables((ROOT / "docs" / "rtc" / "fields.md").read_text(encoding="utf-8"))
 
 
 def openapi() -> str:
@@ -87,7 +87,7 @@ def runbook() -> str:
 
 PAGES = {
     "reference/states.md": states,
-    "rtc.md": rtc,
+    "rtc/fields.md": fields,
     "openapi.json": openapi,
     "reference/settings.md": reference.settings,
     "reference/access.md": reference.access,

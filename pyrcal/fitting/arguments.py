@@ -41,6 +41,13 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     _describe_bundle(
         commands.add_parser("bundle", help="write or check a calibration bundle (one file)")
     )
+    _describe_commission(
+        commands.add_parser(
+            "commission",
+            help="judge a commissioning and write its report",
+            examples=["pyrcal commission --check-rtc check.json --fit fit.json"],
+        )
+    )
     _describe_certificates(
         commands.add_parser("certificates", help="make certificates for the link to the RTC")
     )
@@ -95,6 +102,36 @@ def _describe_archive(archive: OneLineParser) -> None:
     ):
         parser = actions.add_parser(action, help=purpose, examples=[f"pyrcal archive {example}"])
         add(parser, *_OF_A_FOLDER, words("--json", "print JSON"), *more)
+
+
+def _describe_commission(commission: OneLineParser) -> None:
+    commission.set_defaults(module="pyrcal.maintenance.commission")
+    commission.description = (
+        "Judge a commissioning: compare the archive of a night, the result of pyrcal check-rtc "
+        "and the fit of a measured matrix with the limits of docs/operate/commissioning.md, and "
+        "write one HTML file with figures. Works while the service runs. Needs the extra 'plots'."
+    )
+    commission.epilog = (
+        "Exit status: 0 all criteria pass; 1 one does not, or has no input; 2 the report cannot "
+        "be made."
+    )
+    add(
+        commission,
+        *_OF_A_FOLDER,
+        words("--instrument NAME|FILE", "default: that of the settings"),
+        words("--check-rtc FILE.json", "output of pyrcal check-rtc --json", type=Path),
+        words("--fit FILE.json", "output of pyrcal fit --json", type=Path),
+        words("--night DATE", "date of the evening, UTC; default: the newest with measurements"),
+        words("--since TIME", "judge from here on, RFC 3339, like 2026-03-01T20:00:00Z"),
+        words("--until TIME", "judge up to here"),
+        words(
+            "--output FILE.html",
+            "default %(default)s",
+            type=Path,
+            default=Path("commissioning.html"),
+        ),
+        words("--json", "print the criteria as JSON"),
+    )
 
 
 def _describe_bundle(bundle: OneLineParser) -> None:

@@ -9,7 +9,7 @@ from fastapi import FastAPI
 
 from service.web import page
 from tests.system.browser import AXE, NARROW, NEEDS_A_BROWSER, Page, a_browser
-from tests.system.night import ROOT, wait_for
+from tests.system.night import wait_for
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(300), NEEDS_A_BROWSER]
 

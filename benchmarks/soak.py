@@ -31,7 +31,7 @@ from benchmarks import soak_page
 from benchmarks.rest import PAGES
 from benchmarks.standing import Sample, Standing, standing
 from pyrcal_studies.sections import write_section
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis

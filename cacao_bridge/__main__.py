@@ -22,8 +22,9 @@ from cacao_bridge.settings import Settings, load
 from pyrcal.rtc.background import Background
 from pyrcal.rtc.link import STATUS_PERIOD_S, RtcConnection, RtcLink
 from pyrcal.terminal import print_lines
-from service.cli.program import leave, log_to_terminal, status_of, stop_signal
 from service.config.link_tables import Router, client_security, secret_of
+from service.parser import OneLineParser
+from service.program import leave, log_to_terminal, status_of, stop_signal
 from service.wire import FrameHeader
 
 _REPORT_PERIOD_S: Final = 10.0
@@ -34,29 +35,38 @@ _BACKLOG: Final = 64
 _log = structlog.get_logger("cacao")
 
 
-def arguments_parser() -> argparse.ArgumentParser:
+def arguments_parser() -> OneLineParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(prog="pyrcal cacao", description=__doc__)
+    parser = OneLineParser(
+        prog="pyrcal cacao",
+        description="Run the bridge between a cacao loop and the service, until it is stopped.",
+        epilog="Exit status: 0 done; 2 it cannot be done. docs/howto/cacao.md explains the "
+        "settings.",
+        examples=(
+            "pyrcal cacao --config bridge.toml",
+            "pyrcal cacao --config bridge.toml --apply",
+        ),
+    )
     parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="settings, TOML")
     parser.add_argument(
         "--apply",
         nargs="?",
         const="waiting",
         metavar="ID",
-        help="let the matrix that waits be written into cacao's streams, and end",
+        help="allow a running bridge to write the waiting matrix into cacao, and end",
     )
     parser.add_argument(
         "--bundle",
         type=Path,
         metavar="FILE",
-        help="have a bundle brought into cacao, all of it or nothing, and end",
+        help="have a running bridge write all of a bundle into cacao, and end",
     )
     parser.add_argument(
         "--rollback",
         action="store_true",
-        help="have what was in use before brought back, all of it, and end",
+        help="have a running bridge restore the previous bundle or matrix, and end",
     )
-    parser.add_argument("--seconds", type=float, help="end after so long")
+    parser.add_argument("--seconds", type=float, metavar="S", help="end after this time")
     return parser
 
 

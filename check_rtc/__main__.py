@@ -6,26 +6,32 @@ usage errors are instant.
 
 from __future__ import annotations
 
-import argparse
 import signal
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from pyrcal.offline.arguments import seconds
+from pyrcal.fitting.arguments import seconds
 from pyrcal.options import add, words
-from service.cli.program import OneLineParser, imported_and_run, leave
+from service.parser import OneLineParser
+from service.program import imported_and_run, leave
 
 _EPILOG = """
-Prints one line for each requirement of docs/rtc.md: the finding, the requirement, its section.
+Prints one line for each check: the finding, and the requirements of docs/rtc.md by number (R-n).
 WRONG: the contract is broken. seen: allowed, but unusual. skipped: not checked, with the reason.
 Checks that move anything ask for consent first; without a terminal they are skipped unless --yes
-is given. Exit status: 0 nothing is wrong, 1 something is, 2 nothing could be checked.
+is given. Exit status: 0 nothing is wrong; 1 something is; 2 nothing could be checked.
 """
 
 
-def check_parser() -> argparse.ArgumentParser:
+def check_parser() -> OneLineParser:
     """Return the parser of the command line."""
-    check = OneLineParser(prog="pyrcal check-rtc")
+    check = OneLineParser(
+        prog="pyrcal check-rtc",
+        examples=(
+            "pyrcal check-rtc --instrument flao-lbt",
+            "pyrcal check-rtc --connect tcp/127.0.0.1:7447 --passive",
+        ),
+    )
     check.description = (
         "Check whether an RTC keeps the contract of docs/rtc.md. The checker takes the place of "
         "the service: end the service first, or --connect to its router with --passive."
@@ -35,21 +41,21 @@ def check_parser() -> argparse.ArgumentParser:
         check,
         words(
             "--instrument NAME|FILE",
-            "instrument with which slopes and commands are compared; default flao-lbt, and with "
-            "--connect the packaged instrument of the system's name",
+            "expected instrument; default flao-lbt, with --connect the packaged one of the "
+            "system's name",
         ),
         words(
             "--system NAME",
-            "name of the system in the keys; default the instrument's name, and with --connect "
-            "that of the RTC found",
+            "name of the system in the keys; default that of the instrument, with --connect that "
+            "of the RTC",
         ),
     )
     add(
         check.add_mutually_exclusive_group(),
-        words("--listen ENDPOINT", "default tcp/127.0.0.1:7447"),
-        words("--connect ENDPOINT", "router to connect to"),
+        words("--listen ENDPOINT", "zenoh endpoint to listen on, default tcp/127.0.0.1:7447"),
+        words("--connect ENDPOINT", "zenoh router to connect to"),
     )
-    secured = "TOML settings of the service, whose [zenoh] connects to a secured link"
+    secured = "settings of the service, TOML, for a secured link"
     add(
         check,
         words("--config FILE", secured, type=Path),

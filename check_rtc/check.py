@@ -22,13 +22,13 @@ from check_rtc.offload import RegistrationFit
 from check_rtc.requirements import REQUIREMENTS, CheckResult, Outcome
 from check_rtc.telemetry_checks import ImageOffsets
 from check_rtc.watch import TelemetryObserver
-from service.config import load_instrument, packaged_instrument
 from service.config.link_tables import ZenohTable, link_security, read_link_tables
 from service.errors import ConfigurationError, LinkError, ModelError, say, shown
 from service.estimation.lockin import LockInEstimate, Spectra
 from service.estimation.slope_convention import SlopeConvention, identify_from_reconstructor
 from service.estimation.windows import ClosedLoop, WindowRefused
 from service.files.disk_cache import DiskCache, usual_folder
+from service.instrument import load_instrument, packaged_instrument
 from service.link.session import Endpoint
 from service.model.instrument import Instrument
 from service.model.interaction import RtcInteractionModel
@@ -138,21 +138,23 @@ def _find_system(endpoint: Endpoint, wait_s: float) -> str:
 
 
 def format_line(result: CheckResult) -> str:
-    """Return a result on one line: finding, requirement, section of the contract."""
+    """Return a result on one line: finding, requirements by number, section of the contract."""
     requirement = result.requirement
+    labels = ", ".join(requirement.labels)
     return (
         f"{result.outcome:8}{result.name:12} {result.found} "
-        f"[contract: {requirement.says}; {CONTRACT_PAGE}#{requirement.anchor}]"
+        f"[{labels}: {requirement.says}; {CONTRACT_PAGE}#{requirement.anchor}]"
     )
 
 
-def as_document(result: CheckResult) -> dict[str, str]:
+def as_document(result: CheckResult) -> dict[str, str | list[str]]:
     """Return a result as a JSON object."""
     requirement = result.requirement
     return {
         "check": result.name,
         "outcome": result.outcome.lower(),
         "found": result.found,
+        "requirements": list(requirement.labels),
         "contract": requirement.says,
         "where": f"{CONTRACT_PAGE}#{requirement.anchor}",
         "moves": requirement.moves.value,

@@ -6,9 +6,9 @@ import os
 import sys
 from collections.abc import Sequence
 
-from pyrcal.arguments import OTHER_PROGRAMS, command_line, with_negative_numbers
-from pyrcal.offline.arguments import check_files
-from service.cli.program import run_command
+from pyrcal.arguments import OTHER_PROGRAMS, command_line
+from pyrcal.fitting.arguments import check_files
+from service.program import run_command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -21,7 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         program, _ = OTHER_PROGRAMS[words[0]]
         os.execv(sys.executable, [sys.executable, "-m", program, *words[1:]])
     return run_command(
-        lambda: command_line().parse_args(with_negative_numbers(words)),
+        lambda: command_line().parse_args(words),
         check_files,
         own_process=arguments is None,
         serves=words[:1] == ["run"],

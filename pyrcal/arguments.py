@@ -4,63 +4,148 @@ from __future__ import annotations
 
 import argparse
 import re
+import sys
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from typing_extensions import override
 
 from pyrcal.client import remote
-from pyrcal.offline import arguments as offline_arguments
+from pyrcal.fitting import arguments as file_arguments
 from pyrcal.playback import arguments as playback_arguments
-from service import __version__
-from service.cli import program
-from service.cli.program import OneLineParser
+from service import __version__, program
+from service.errors import say
+from service.parser import HelpFormatter, OneLineParser, closest
 
 OTHER_PROGRAMS = {
-    "demo": ("pyrcal.demo", "service and simulated telescope, end to end"),
-    "sim": ("sim_rtc", "the simulated RTC"),
+    "demo": ("pyrcal.demo", "run service and simulated telescope together, and judge the outcome"),
+    "sim": ("sim_rtc", "run the simulated RTC and telescope"),
     "check-rtc": ("check_rtc", "check whether an RTC keeps the contract"),
-    "cacao": ("cacao_bridge", "the bridge to a loop of cacao's"),
+    "cacao": ("cacao_bridge", "run the bridge to a cacao loop"),
 }
 """Modules and purposes of programs that run in place of this one, with options of their own."""
 
-
 HEADINGS = {
-    "run": "the service",
-    "status": "ask the service",
-    "approve": "give the service orders",
-    "archive": "what the service has kept, without it",
-    "fit": "files in, answers out, without a service",
-    "demo": "try it, or an RTC of yours",
+    "run": "run the service",
+    "status": "ask a running service",
+    "mode": "operate a running service",
+    "archive": "work with the files of a service",
+    "fit": "work with files, without a service",
+    "demo": "try it, or connect an RTC",
 }
-"""Text before the first command of a group."""
+"""Heading before the first command of a group."""
+
+OLD_WORDS = {
+    "approve": "reconstructors approve",
+    "reject": "reconstructors reject",
+    "publish": "reconstructors publish",
+    "rollback": "reconstructors rollback",
+    "refit": "reconstructors compute",
+    "hold": "mode hold",
+    "acknowledge": "alarms ack",
+    "mute": "alarms mute",
+    "unmute": "alarms unmute",
+    "acquire": "loop acquire",
+    "abort": "loop abort",
+    "measure-noisy": "measure noisy",
+    "give-up": "measure cancel",
+    "record": "recordings start",
+    "end-recording": "recordings end",
+    "remove-recording": "recordings remove",
+}
+"""Commands of versions before the groups, and their names now; they work until 1.0."""
+
+DEFAULTS = {"alarms": "list", "reconstructors": "list", "recordings": "list"}
+"""Command of a group that is meant if none is given."""
 
 
-def command_line() -> argparse.ArgumentParser:
+def command_line() -> OneLineParser:
     """Return the parser of ``pyrcal``'s command line; ``command`` names the command."""
-    parser = OneLineParser(
+    parser = CommandLine(
         prog="pyrcal",
-        description="Calibration service of an adaptive telescope.",
+        description="Calibration service of an adaptive telescope. pyrcal COMMAND --help explains "
+        "each command.",
         formatter_class=_Grouped,
+        examples=(
+            "pyrcal demo",
+            "pyrcal run --instrument flao-lbt",
+            "pyrcal status",
+            "pyrcal fit flao-lbt matrix.h5 --output fit.h5",
+        ),
     )
     parser.add_argument("--version", action="version", version=f"pyrcal {__version__}")
     parser.add_argument(
         "--completion",
         action=_Completion,
         choices=("bash", "zsh", "fish", "tcsh"),
-        help="print what teaches a shell these words: source <(pyrcal --completion bash)",
+        help="print the completion script of a shell: source <(pyrcal --completion bash)",
     )
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(
+        dest="command", required=True, metavar="COMMAND", parser_class=OneLineParser
+    )
     program.declare(commands)
     remote.declare(commands)
-    offline_arguments.declare(commands)
+    file_arguments.declare(commands)
     playback_arguments.declare(commands)
     for name, (_, purpose) in OTHER_PROGRAMS.items():
-        commands.add_parser(name, help=f"{purpose}: pyrcal {name} --help", add_help=False)
+        commands.add_parser(name, help=purpose, add_help=False)
     return parser
 
 
-class _Grouped(argparse.HelpFormatter):
+class CommandLine(OneLineParser):
+    """Parser that also accepts the command words of earlier versions, with a hint."""
+
+    @override
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        given = list(sys.argv[1:] if args is None else args)
+        words, new = current_words(given)
+        if new:
+            old = " ".join(given[: 1 if given[0] in OLD_WORDS else 2])
+            say(f"pyrcal: {old!r} is now 'pyrcal {new}'; the old form works until version 1.0")
+        return super().parse_args(with_negative_numbers(words), namespace)
+
+    @override
+    def explain_choice(self, action: argparse.Action, value: str) -> str:
+        if action.dest != "command":
+            return super().explain_choice(action, value)
+        known = {name: name for name in action.choices or ()}
+        known |= {request.name.split()[-1]: request.name for request in remote.REQUESTS} | OLD_WORDS
+        near = closest(value, known)
+        return f"found {value!r}, which is no command" + near.replace(
+            word := near.rpartition(" ")[2], known.get(word, word)
+        )
+
+
+def current_words(given: Sequence[str]) -> tuple[list[str], str]:
+    """Return the words of a command line in their present form.
+
+    Returns
+    -------
+    The words, and the present name of the command if the given one is an old form; else empty.
+    """
+    first, *others = given or ("",)
+    following = others[0] if others else ""
+    is_option = not following or (following.startswith("-") and following not in {"-h", "--help"})
+    if first in OLD_WORDS:
+        return [*OLD_WORDS[first].split(), *others], OLD_WORDS[first]
+    if first in DEFAULTS and is_option:
+        return [first, DEFAULTS[first], *others], ""
+    if first == "measure" and is_option:
+        return [first, "matrix", *others], "measure matrix"
+    is_id = not (following in _MEMBERS or following.startswith("-") or closest(following, _MEMBERS))
+    if first == "reconstructors" and is_id:
+        return [first, "show", *others], "reconstructors show"
+    return list(given), ""
+
+
+_MEMBERS = {
+    request.name.split()[1]
+    for request in remote.REQUESTS
+    if request.name.startswith("reconstructors ")
+}
+
+
+class _Grouped(HelpFormatter):
     """Help formatter that prints commands under headings."""
 
     @override

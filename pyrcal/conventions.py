@@ -1,4 +1,4 @@
-"""Hold a matrix, a basis or a stream against the numbered rules of docs/understand/conventions.md.
+"""Hold a matrix, a basis or a stream against the numbered rules of docs/reference/conventions.md.
 
 Each finding has the number of its rule, what was measured and what is allowed. What an instrument
 file leaves open (``orientation = "auto"``, ``stroke = "unknown"``) breaks no rule.
@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pyrcal.offline.fitted import Fit
-from pyrcal.offline.matrix import fit_matrix
-from pyrcal.offline.recorded import read_recorded
+from pyrcal.fitting.fitted import Fit
+from pyrcal.fitting.matrix import fit_matrix
+from pyrcal.fitting.recorded import read_recorded
 from pyrcal.terminal import print_lines
-from service.config import load_instrument
 from service.errors import MatrixError, ModelError
 from service.estimation.reference import Reference
 from service.files.disk_cache import cached_basis
+from service.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.misregistration import wrapped
 from service.model.pupil import instrument_pupil, rtc_valid_subapertures
@@ -75,7 +75,7 @@ class RuleCheck:
     """Result of the check of one rule."""
 
     rule: int
-    """Number in docs/understand/conventions.md."""
+    """Number in docs/reference/conventions.md."""
 
     deviation: float
     """Measured deviation, in the unit given in the text."""

@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pyrcal.offline.control_check import DELAY_FRAMES, GAIN, ReconstructorVerdict, check_control
-from service.config import load_instrument
+from pyrcal.fitting.control_check import DELAY_FRAMES, GAIN, ReconstructorVerdict, check_control
 from service.control.reconstructor import MAX_CONDITION
+from service.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.kinds import Influence, InfluenceShape

@@ -3,32 +3,31 @@
 from __future__ import annotations
 
 import argparse
-from collections import Counter
+import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields
-from itertools import chain
 from typing import Any
 
+from cacao_bridge.__main__ import arguments_parser
 from check_rtc.__main__ import check_parser
-from pyrcal.arguments import OTHER_PROGRAMS, command_line
-from pyrcal.offline.system_file import SystemFile
-from service.config.instrument_schema import whole_of
-from service.config.schema_texts import KeyText, tables_of
+from pyrcal.arguments import HEADINGS, OLD_WORDS, command_line
+from pyrcal.client import remote
+from pyrcal.demo.arguments import demo_parser
+from pyrcal.fitting import arguments as offline_arguments
+from pyrcal.fitting.system_file import SystemFile
 from service.config.settings import Settings
-from service.config.sources import Table
+from service.files.toml import Table
+from service.instrument.schema import whole_of
+from service.instrument.schema_texts import KeyText, tables_of
 from service.model.sensors.kind import SensorKind
 from service.model.sensors.registry import KINDS
+from service.parser import OneLineParser, operand_text, option_text, wrap_usage
 from service.tracking.alarms import ALARMS
 from service.wire import Keys
 from service.wire.access import Rights, list_rights
+from sim_rtc.options import sim_parser
 
 Schema = Mapping[str, Any]
-
-_COMMON = "Commands that ask a running service"
-
-_SHARED, _OFTEN = 3, 20
-"""An option that so many commands have in the same words is explained once; one that most of them
-have is not named again."""
 
 Row = tuple[str, str]
 
@@ -63,7 +62,7 @@ def instrument() -> str:
     """Return docs/reference/instrument.md: every key of an instrument file."""
     intro = (
         "A TOML file that describes the telescope, the sensor, the mirror and how the RTC lists "
-        "slopes. [Fitting a measured matrix](../integrate/fitting.md) has the smallest one, and "
+        "slopes. [Fitting a measured matrix](../howto/fitting.md) has the smallest one, and "
         "explains orientation. A reference to data is `path:/dataset`, relative to the file. In "
         "brackets: type and default."
     )
@@ -76,7 +75,7 @@ def system() -> str:
     """Return docs/reference/system.md: every key of a system's file."""
     intro = (
         "A TOML file of several sensors and mirrors, for `pyrcal fit-system`: "
-        "[how it is used](../integrate/systems.md). In brackets: type and default."
+        "[how it is used](../howto/systems.md). In brackets: type and default."
     )
     return page("The file of a system", intro, *_tables(SystemFile))
 
@@ -108,7 +107,7 @@ def access() -> str:
         "| role | may | keys below `ao/v1/{system}/` |",
         "| --- | --- | --- |",
         *(
-            f"| {role} | {words[right]} | {_below(keys, getattr(rights, right))} |"
+            f"| {role} | {words[right]} | {_keys_below(keys, getattr(rights, right))} |"
             for role, rights in list_rights(keys).items()
             for right in words
             if getattr(rights, right)
@@ -122,7 +121,7 @@ def access() -> str:
     return page("Access to the link", intro, "\n".join(rows))
 
 
-def _below(keys: Keys, expressions: Iterable[str]) -> str:
+def _keys_below(keys: Keys, expressions: Iterable[str]) -> str:
     return ", ".join(f"`{each.removeprefix(keys.root + '/')}`" for each in expressions)
 
 
@@ -142,74 +141,128 @@ def _default(key: KeyText) -> str:
 
 
 def commands() -> str:
-    """Return docs/reference/cli.md: every command with its options."""
-    intro = (
-        "`make` puts `pyrcal` into `.venv/bin`. `--help` of each command says the same; "
-        "those of `pyrcal sim` and `demo` are manuals of their own. Options that "
-        "several commands share are explained once, first."
-    )
-    parsers = dict(_parsers(command_line())) | {"pyrcal check-rtc": check_parser()}
-    texts = {name: _texts(parser) for name, parser in parsers.items()}
-    rows = {name: list(_options(parser)) for name, parser in parsers.items()}
-    often = [
-        text for text, n in Counter(chain.from_iterable(texts.values())).items() if n >= _OFTEN
-    ]
-    count = Counter(row for of_one in rows.values() for row in of_one if row[1])
-    everywhere = [row for row, n in count.items() if n >= _OFTEN]
-    shared = {
-        option: text
-        for (option, text), n in sorted(count.items(), key=lambda of: of[1])
-        if _SHARED <= n < _OFTEN and option not in dict(everywhere)
+    """Return docs/reference/cli.md: every command of every program, with usage and options."""
+    root = command_line()
+    others: dict[str, OneLineParser] = {
+        "demo": demo_parser(),
+        "sim": sim_parser(),
+        "check-rtc": check_parser(),
+        "cacao": arguments_parser(),
     }
-    parts = [f"## {_COMMON}", *often, listed(everywhere)]
-    parts += ["## Options that several commands share", listed(shared.items())]
-    for name in parsers:
-        parts += [f"## {name}", *(text for text in texts[name] if text not in often)]
-        explained = ", ".join(option for option, text in rows[name] if shared.get(option) == text)
-        own = [
-            (option, text)
-            for option, text in rows[name]
-            if (option, text) not in everywhere and shared.get(option) != text
-        ]
-        lines = [*own, *([(explained, "")] if explained else [])]
-        parts += [listed(lines)] if lines else []
-    return page("The command line", intro, *parts)
+    (action,) = (a for a in root._actions if isinstance(a, argparse._SubParsersAction))  # noqa: SLF001
+    parsers = dict(_below(action)) | others
+    leaves = {name: list(_leaves(parser)) for name, parser in parsers.items()}
+    shared = _shared_groups([leaf for each in leaves.values() for leaf in each])
+    parts = [
+        "`--help` gives more detail and examples. What a usage shows without "
+        "brackets is required. Exit status: 0 done; 2 wrong command line or unusable input; 130 "
+        f"interrupted; others at each command. INSTRUMENT is an {offline_arguments.INSTRUMENT}.",
+        "Earlier names work until version 1.0, with a hint that names the new one: "
+        f"{', '.join(OLD_WORDS)}.",
+    ]
+    for title, group in shared.items():
+        parts += [f"**{title[:1].upper()}{title[1:]}** {_TAKEN_BY[title]}:"]
+        parts += [_block([], dict(map(_row, group)).items())]
+    for name, parser in parsers.items():
+        parts += (
+            [f"## {HEADINGS[name][:1].upper()}{HEADINGS[name][1:]}"] if name in HEADINGS else []
+        )
+        parts += [f"### pyrcal {name}", *_describe(parser, leaves[name], shared)]
+    return page("The command line", *parts)
 
 
-def _texts(parser: argparse.ArgumentParser) -> list[str]:
-    texts = [" ".join((text or "").split()) for text in (parser.description, parser.epilog)]
-    return [text for text in texts if text]
+Group = list[argparse.Action]
+
+_TAKEN_BY = {
+    remote.CONNECTION: "of all commands that ask or operate a service; exit status 1: refused, "
+    "not done, or not all is well; 3: the service cannot be reached",
+    remote.ORDER: "of all commands that change something in a service",
+    offline_arguments.DESCRIPTION: "of `pyrcal import`, except from OOPAO",
+}
+"""Titles of the groups of options that many commands share, and which commands these are."""
 
 
-def _parsers(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:
-    """Yield every command that is not another program, by its words."""
+def _describe(
+    parser: OneLineParser, leaves: list[OneLineParser], shared: Mapping[str, Group]
+) -> Iterator[str]:
+    """Yield purpose, usage and options of a command, or of all commands of a group."""
+    alone = leaves == [parser]
+    yield " ".join((parser.description or "").split())
+    if parser.prog in _WITH_A_MANUAL:
+        names = ", ".join(action.option_strings[0] for action in parser.shown_actions())
+        yield f"Options, which `--help` explains: {names}."
+        return
+    usages = [list(leaf.usage_parts(shared, short=alone)) for leaf in leaves]
+    hidden = {_row(action) for group in shared.values() for action in group} | {_INSTRUMENT}
+    rows = (_row(action) for leaf in leaves for action in leaf.shown_actions())
+    own = dict.fromkeys(row for row in rows if row not in hidden)
+    if own or usages != [[parser.prog]]:
+        yield _block(usages, own)
+    status = " ".join((parser.epilog or "").split()).partition("Exit status: ")[2].partition(".")[0]
+    if "; 1 " in status and parser.epilog != remote.EPILOG:
+        yield f"Exit status: {status}."
+
+
+_INSTRUMENT = ("INSTRUMENT", offline_arguments.INSTRUMENT)
+
+_WITH_A_MANUAL = {"pyrcal demo", "sim_rtc"}
+"""Programs whose many options are explained by ``--help`` alone."""
+
+
+def _block(usages: Iterable[list[str]], rows: Iterable[Row]) -> str:
+    """Return usages and explained options as preformatted text, as ``--help`` shows them."""
+    lines = [line for parts in usages for line in wrap_usage(parts, 100)]
+    for name, text in rows:
+        first, *others = textwrap.wrap(text, 68) or [""]
+        lines += (
+            [f"  {name:26}  {first}".rstrip()]
+            if len(name) <= 26
+            else [f"  {name}", f"{'':30}{first}"]
+        )
+        lines += [f"{'':30}{other}" for other in others]
+    return "\n".join(["```text", *lines, "```"])
+
+
+def _leaves(parser: OneLineParser) -> Iterator[OneLineParser]:
+    """Yield the commands below a parser, or the parser itself if there are none."""
     below = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]  # noqa: SLF001
     if not below:  # argparse tells its arguments nowhere else
-        yield parser.prog, parser
+        yield parser
     for action in below:
-        for name, each in action.choices.items():
-            if name not in OTHER_PROGRAMS:
-                yield from _parsers(each)
+        for _, each in _below(action):
+            yield from _leaves(each)
 
 
-def _options(parser: argparse.ArgumentParser) -> Iterator[tuple[str, str]]:
-    for action in parser._actions:  # noqa: SLF001 - argparse tells its arguments nowhere else
-        if action.help == argparse.SUPPRESS or "--help" in action.option_strings:
-            continue
-        values = ",".join(map(str, action.choices)) if action.choices else ""
-        value = action.metavar or values or ("" if action.nargs == 0 else action.dest.upper())
-        word = " ".join([", ".join(action.option_strings), str(value)]).strip()
-        if action.dest == "threads":  # its default is of the machine that writes the page
-            yield f"`{word}`", action.help or ""
-            continue
-        yield f"`{word}`", (action.help or "") % {**vars(action), "prog": parser.prog}
+def _below(action: argparse._SubParsersAction[Any]) -> Iterator[tuple[str, OneLineParser]]:
+    """Yield the commands of a group, by name."""
+    yield from action.choices.items()
+
+
+def _shared_groups(parsers: Iterable[OneLineParser]) -> dict[str, Group]:
+    """Return the groups of options that several commands have, by title."""
+    found: dict[str, dict[Row, argparse.Action]] = {}
+    for parser in parsers:
+        for group in parser._action_groups:  # noqa: SLF001
+            if group.title in _TAKEN_BY:
+                rows = {_row(action): action for action in group._group_actions}  # noqa: SLF001
+                found.setdefault(str(group.title), {}).update(rows)
+    return {title: list(rows.values()) for title, rows in found.items()}
+
+
+def _row(action: argparse.Action) -> Row:
+    """Return an argument as the usage writes it, and its meaning."""
+    word = option_text(action) if action.option_strings else operand_text(action)
+    text = action.help or ""
+    if action.dest != "threads":  # its default is that of the machine that writes the page
+        text %= {**vars(action), "prog": ""}
+    return word, f"{text} (required)" if action.option_strings and action.required else text
 
 
 # --- REST
 
 
 def rest(described: Schema) -> str:
-    """Return docs/integrate/rest.md: what may be asked over REST, from its OpenAPI document."""
+    """Return docs/reference/rest.md: what may be asked over REST, from its OpenAPI document."""
     intro = (
         "At `http://127.0.0.1:8080`, unless the settings say otherwise. `/docs` shows every field "
         "and tries it; [openapi.json](../openapi.json) is for programs. Errors are "

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Sequence
-from typing import Any, NoReturn
+from collections.abc import Collection, Iterator, Sequence
+from typing import Any
 
 from typing_extensions import override
 
+from service.parser import OneLineParser
 from sim_rtc.faults import manual as fault_manual
 from sim_rtc.telescope.detector import FLAO_PRESETS
 
-_USAGE = "pyrcal sim [options]    (or: python -m sim_rtc [options])"
+_USAGE = "pyrcal sim [options]"
 
 _DESCRIPTION = """\
 Simulated real-time computer of an adaptive telescope. It closes the loop on frozen-flow turbulence
-at the frame rate, publishes telemetry over zenoh, and takes dithers, loop commands, gain ramps,
-measurements and reconstructors, as the service's wire contract says. Its mirror is mis-registered
-on the sensor by an amount that it tells nobody on the wire.
+at the frame rate, sends telemetry and accepts all commands of docs/rtc.md. The true misregistration
+is not sent.
 """
 
 _PRESETS = "\n".join(
@@ -131,13 +131,12 @@ exit status
 """
 
 
-class Parser(argparse.ArgumentParser):
-    """A parser that reports an error on one line, without the usage."""
+class Parser(OneLineParser):
+    """Parser of the simulator's command line, whose help is a manual."""
 
     def __init__(self) -> None:
         super().__init__(
             prog="sim_rtc",
-            usage=_USAGE,
             description=_DESCRIPTION,
             epilog=_EPILOG,
             formatter_class=_Formatter,
@@ -158,9 +157,8 @@ class Parser(argparse.ArgumentParser):
         return vars(self.parse_args(joined))
 
     @override
-    def error(self, message: str) -> NoReturn:
-        """End the program with status 2."""
-        self.exit(2, f"{self.prog}: {message}\n")
+    def usage_parts(self, left_out: Collection[str] = (), *, short: bool = False) -> Iterator[str]:
+        yield _USAGE
 
 
 class _Formatter(argparse.RawDescriptionHelpFormatter):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import Field, asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -648,15 +648,24 @@ def _refuse_given(options: dict[str, Any], reason: str) -> None:
             raise ConfigurationError(f"{name}: {reason}")
 
 
-def parse_options(given: Sequence[str] | None = None) -> Options:
-    """Return the options; an impossible one ends the program with one line and status 2."""
+def sim_parser() -> manual.Parser:
+    """Return the parser of the command line."""
     parser = manual.Parser()
-    options = [one for one in fields(Options) if one.metadata]
     group: argparse._ActionsContainer = parser
-    for one in options:
+    for one in _option_fields():
         if one.metadata["chapter"] is not None:
             group = parser.add_argument_group(one.metadata["chapter"])
         group.add_argument(*one.metadata["flags"], dest=one.name, **one.metadata["argparse"])
+    return parser
+
+
+def _option_fields() -> list[Field[Any]]:
+    return [one for one in fields(Options) if one.metadata]
+
+
+def parse_options(given: Sequence[str] | None = None) -> Options:
+    """Return the options; an impossible one ends the program with one line and status 2."""
+    parser, options = sim_parser(), _option_fields()
     found = parser.read(sys.argv[1:] if given is None else given)
     for one in options:
         if one.metadata["argparse"].get("action") == "append":

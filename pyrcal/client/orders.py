@@ -62,7 +62,7 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
         or _prompt_user(request, f"{request.asks}? [y/N]", "--yes").lower() in {"y", "yes"}
     )
     if not agreed or (request.needs_why and not why):
-        say(f"pyrcal: {request.name}: nothing was ordered")
+        say(f"pyrcal {request.name}: nothing was ordered")
         return NOT_DONE
     if request.method == "POST":
         headers["Idempotency-Key"] = str(uuid.uuid4())
@@ -137,7 +137,7 @@ def _prompt_user(request: Request, question: str, option: str) -> str:
     """Ask at the terminal and return the answer."""
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         raise ConfigurationError(
-            f"{request.name}: found no {option} and no terminal to ask on, expected {option}"
+            f"{request.name}: found no {option} and no terminal to ask at; expected {option}"
         )
     sys.stderr.write(f"{question} ")
     sys.stderr.flush()

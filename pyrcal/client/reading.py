@@ -25,7 +25,7 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
     one = getattr(options, "id", None)
     path = request.path if one is None else f"{request.path}/{quote(one, safe='')}"
     document = service.get(path, **collect_arguments(options, ("since", "until", "limit"))).document
-    lines = _SCREENS["reconstructor" if one else request.name]
+    lines = _SCREENS[request.name]
     with understood(service):
         text_lines = [] if options.json else list(lines(document))
         well = request.name != "status" or (document["ready"] and not document["alarms"])
@@ -111,11 +111,27 @@ def _audit(document: Document) -> Iterator[str]:
         )
 
 
+def _recordings(document: Document) -> Iterator[str]:
+    rows = [
+        (
+            one["id"],
+            one["state"],
+            clock(one["created_utc"]),
+            f"{one['duration_s']:g} s",
+            f"{one['n_bytes'] / 1e6:.1f} MB",
+            one["why"],
+        )
+        for one in document["recordings"]
+    ]
+    yield from table(rows) if rows else ["no recordings"]
+
+
 _SCREENS = {
     "status": status_lines,
     "alpha": _alpha,
-    "reconstructors": _reconstructors,
-    "reconstructor": reconstructor_lines,
-    "alarms": _alarms,
+    "reconstructors list": _reconstructors,
+    "reconstructors show": reconstructor_lines,
+    "alarms list": _alarms,
+    "recordings list": _recordings,
     "audit": _audit,
 }

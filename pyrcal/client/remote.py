@@ -32,11 +32,12 @@ ORDERS: Final = tomllib.loads(
 URL, KEY = "PYRCAL_URL", "PYRCAL_API_KEY"
 """Environment variables."""
 
-_EPILOG = """
-Exit status: 0 done, 1 refused by the service or not done (of status: not all is well), 2 a wrong
-command line, 3 the service is not reached. PYRCAL_URL and PYRCAL_API_KEY replace --url and the
-key's file.
+EPILOG = """
+Exit status: 0 done; 1 refused by the service or not done (status: an alarm is active or the service
+is not ready); 2 wrong command line; 3 the service cannot be reached. PYRCAL_URL and PYRCAL_API_KEY
+replace --url and --key-file.
 """
+"""End of the help of every command that asks a service."""
 
 
 class Request(NamedTuple):
@@ -68,6 +69,9 @@ class Request(NamedTuple):
     then: str = ""
     """Action after the answer."""
 
+    example: str = ""
+    """Words after the name that make an example for the help."""
+
     follows: str = ""
     """Path that is polled until the work is done; for all reconstructors, that of the copy which is
     sent. Empty if the answer is final."""
@@ -89,16 +93,19 @@ class Request(NamedTuple):
         return [name for name in forms if name not in {"id", "no_wait"}]
 
 
-def _reads(name: str, purpose: str, path: str, *every: Words, by: str = "reading") -> Request:
-    return Request(name, purpose, by, f"GET {path}", every)
+def _reads(
+    name: str, purpose: str, path: str, *every: Words, by: str = "reading", example: str
+) -> Request:
+    return Request(name, purpose, by, f"GET {path}", every, example=example)
 
 
 def _orders(name: str, purpose: str, *every: Words, operation: str = "", **more: Any) -> Request:  # noqa: ANN401
-    """Return the command that gives an order of the service's table, mostly the one of its name."""
-    order = ORDERS[operation or name.replace("-", "_")]
+    """Return the command of an order in the service's table, by default the one of its name."""
+    order = ORDERS[operation or name]
     kind = order["command"]
     if not isinstance(kind, str):
         kind = kind[more.get("always", {}).get("action", "start")]
+    more.setdefault("permitted", re.sub(r"(?<!^)(?=[A-Z])", "_", kind).lower())
     followed = next(iter(order.get("follows", {"state": "/v1/state"}).values()))
     return Request(
         name,
@@ -107,7 +114,6 @@ def _orders(name: str, purpose: str, *every: Words, operation: str = "", **more:
         order["call"],
         every,
         decides_on=order.get("decides_on", [""])[-1],
-        permitted=re.sub(r"(?<!^)(?=[A-Z])", "_", kind).lower(),
         follows=followed if _NO_WAIT in every else "",
         **more,
     )
@@ -132,202 +138,317 @@ def _numbers(kind: type[int] | type[float]) -> Any:  # noqa: ANN401 - argparse's
 
 
 _ID = words("id ID", "id of a reconstructor, or in-use, previous, candidate")
-_ALARM = words("id ALARM", "name of an alarm, as in pyrcal alarms")
+_ALARM = words("id ALARM", "name of an alarm, as in pyrcal alarms list")
 _CANDIDATE = words("id ID", "default: the one proposed last", nargs="?", default="candidate")
 _MODES = words("--modes N,...|controlled|all", "modes of the basis", type=_numbers(int))
-_RECORDING = words("id ID", "id of a recording, as in pyrcal archive list")
+_RECORDING = words("id ID", "id of a recording, as in pyrcal recordings list")
 _LASTS = words("--duration-s S", "duration, seconds", type=float)
-_EACH = words("--amplitude-m M", "RMS of each mode, metres OPD", type=float)
-_LINES = words("--frequency-hz HZ,...", "line of each mode", type=_numbers(float))
-_TOTAL = words("--total-amplitude-m M", "RMS of all random signs", type=float)
-_OVER = words("--over-budget", "allow more than the budget", default=None)
-_NO_WAIT = words("--no-wait", "do not wait for the end")
-_SINCE = words("--since TIME", "RFC 3339, like 2026-03-01T20:00:00Z")
+_EACH = words("--amplitude-m M", "RMS of each mode, metres of OPD", type=float)
+_LINES = words("--frequency-hz HZ,...", "frequency of each mode", type=_numbers(float))
+_TOTAL = words("--total-amplitude-m M", "RMS of all modes together, metres of OPD", type=float)
+_OVER = words("--over-budget", "allow more than the dither budget of the settings", default=None)
+_NO_WAIT = words("--no-wait", "return once the order is accepted")
+_SINCE = words("--since TIME", "from this time on, RFC 3339, like 2026-03-01T20:00:00Z")
 _UNTIL = words("--until TIME", "up to this time")
 
 RECONSTRUCTORS = "/v1/reconstructors"
-_RESUMES = "pyrcal mode propose, or auto, ends it"
+
+GROUPS = {
+    "alarms": "list, acknowledge or mute alarms",
+    "reconstructors": "list, compute, approve, send or roll back reconstructors",
+    "loop": "open or close the loop; acquire the registration from nothing",
+    "dither": "start or stop the dither",
+    "measure": "measure an interaction matrix",
+    "recordings": "record telemetry; list, end or remove recordings",
+}
+"""Purposes of the commands that are groups of others."""
 
 REQUESTS = (
-    _reads("status", "show what the service does, on one screen", "/v1/state"),
-    _reads("alpha", "show the mirror's registration, with 1 sigma", "/v1/alpha"),
-    _reads(
-        "reconstructors",
-        "list the reconstructors, or show one",
-        "/v1/reconstructors",
-        words("id ID", "id of one; or in-use, previous, candidate", nargs="?"),
+    _reads("status", "show the state of the service on one screen", "/v1/state", example=""),
+    _reads("watch", "show state and log live, until Ctrl-C", "/v1/stream", by="watch", example=""),
+    _reads("alpha", "show the registration with 1 sigma", "/v1/alpha", example="--json"),
+    _reads("alarms list", "list the alarms, and what to do about each", "/v1/state", example=""),
+    _orders(
+        "alarms ack",
+        "acknowledge an alarm; it stays until its cause is gone",
+        _ALARM,
+        operation="acknowledge",
+        example="margin --why 'seen, waiting for the next window'",
     ),
-    _reads("alarms", "list the alarms, with what to do", "/v1/state"),
+    _orders(
+        "alarms mute",
+        "hide an alarm for a time; what it forbids stays forbidden",
+        *(_ALARM, words("for_s SECONDS", "up to 43200 (twelve hours)", type=float)),
+        operation="mute",
+        example="disk-low 3600 --why 'disk is being replaced'",
+    ),
+    _orders(
+        "alarms unmute",
+        "show a muted alarm again",
+        _ALARM,
+        operation="unmute",
+        example="disk-low",
+    ),
     _reads(
         "audit",
         "list who ordered what, why, and the outcome",
         "/v1/audit",
         *(_SINCE, _UNTIL, words("--limit N", "number of newest entries; default 200", type=int)),
+        example="--since 2026-03-01T20:00:00Z",
     ),
-    _reads("watch", "show state and log live, until Ctrl-C", "/v1/stream", by="watch"),
     _reads(
         "export",
-        "write the history of alpha, the audit trail or a matrix to a file",
+        "write the history of alpha, the audit trail, a matrix or a recording to a file",
         "",
         words(
             "what",
-            "alpha: its history; the others: from the archive",
+            "what to write",
             choices=("alpha", "audit", "reconstructor", "measurement", "noisy-matrix", "recording"),
         ),
-        words("id ID", "id of a matrix; or in-use, previous", nargs="?"),
-        words("--format F", "alpha, audit: csv, jsonl; matrices: npy, hdf5..."),
-        words("--output FILE", "default: a new name in this folder", type=Path),
+        words("id ID", "id of the matrix or recording; or in-use, previous", nargs="?"),
+        words("--format F", "of alpha, audit: csv, jsonl; of matrices: npy, raw, hdf5, fits"),
+        words("--output FILE", "default: a new name in the current folder", type=Path),
         *(_SINCE, _UNTIL),
         by="export",
-    ),
-    _orders(
-        "approve",
-        "send the proposed reconstructor",
-        *(_CANDIDATE, _NO_WAIT),
-        asks="send it to the RTC",
-    ),
-    _orders(
-        "reject",
-        "discard the proposed reconstructor",
-        _CANDIDATE,
-        needs_why=True,
-    ),
-    _orders(
-        "publish",
-        "send a known reconstructor again",
-        *(_ID, _NO_WAIT),
-        asks="send it to the RTC again",
-    ),
-    _orders(
-        "rollback",
-        "send the previous reconstructor again; mode becomes hold",
-        words("--anyway", "even if the gate refuses it: alpha may be what is wrong", default=None),
-        _NO_WAIT,
-        asks="go back to the one before; mode becomes hold",
-        needs_why=True,
-        then=_RESUMES,
-    ),
-    _orders(
-        "hold",
-        "set mode hold: measure, make and send nothing",
-        operation="mode",
-        always={"mode": "hold"},
-        then=_RESUMES,
+        example="reconstructor in-use --format hdf5 --output cm.h5",
     ),
     _orders(
         "mode",
-        "set how much the service may do by itself",
-        words("mode", choices=("auto", "propose", "hold")),
+        "set what the service may do by itself",
+        words(
+            "mode",
+            "auto: make and send reconstructors; propose: make them, send after approval; hold: "
+            "measure only",
+            choices=("auto", "propose", "hold"),
+        ),
+        example="hold --why 'wind above 15 m/s'",
     ),
     _orders(
         "stop",
-        "stop everything: dither off, nothing made or sent",
-        then="pyrcal resume releases it",
+        "stop everything: end the dither, make and send nothing",
+        then="pyrcal resume ends the stop",
+        example="--why 'dome closing'",
+    ),
+    _orders("resume", "end the stop; mode and dither are then as before", example=""),
+    _reads(
+        "reconstructors list",
+        "list the reconstructors; * marks the one in use",
+        RECONSTRUCTORS,
+        example="",
+    ),
+    _reads(
+        "reconstructors show",
+        "show one reconstructor, with its registration and stability",
+        RECONSTRUCTORS,
+        _ID,
+        example="in-use",
     ),
     _orders(
-        "resume",
-        "end pyrcal stop (pyrcal mode ends hold)",
+        "reconstructors compute",
+        "compute a reconstructor for the present registration",
+        *(words("--n-modes N", "modes to control; default: as many as now", type=int), _NO_WAIT),
+        operation="refit",
+        example="--n-modes 300",
     ),
     _orders(
-        "acknowledge",
-        "acknowledge an alarm; it stays until it is over",
-        _ALARM,
+        "reconstructors approve",
+        "send the proposed reconstructor to the RTC",
+        *(_CANDIDATE, _NO_WAIT),
+        operation="approve",
+        asks="send it to the RTC",
+        example="--why 'margin restored'",
     ),
     _orders(
-        "mute",
-        "hide an alarm for a time; it is still counted",
-        *(_ALARM, words("for_s SECONDS", "twelve hours at most", type=float)),
-    ),
-    _orders("unmute", "show an alarm again", _ALARM),
-    _orders(
-        "dither",
-        "start or stop the dither",
-        words("action", choices=("start", "stop")),
-        words("--kind", "binary: random signs", choices=("sine", "binary")),
-        *(_MODES, _EACH, _LINES, _TOTAL, _LASTS, _OVER),
+        "reconstructors reject",
+        "discard the proposed reconstructor",
+        _CANDIDATE,
+        operation="reject",
+        needs_why=True,
+        example="--why 'alpha is not plausible'",
     ),
     _orders(
-        "refit",
-        "compute a reconstructor for the present alpha",
-        *(words("--n-modes N", "to control; default: as many as now", type=int), _NO_WAIT),
+        "reconstructors publish",
+        "send a reconstructor again that was in use or proposed before",
+        *(_ID, _NO_WAIT),
+        operation="publish",
+        asks="send it to the RTC again",
+        example="previous",
     ),
-    _orders("abort", "end the acquisition", operation="acquisition", always={"action": "abort"}),
     _orders(
-        "acquire",
-        "find alpha from nothing: open the loop, dither, close it step by step",
+        "reconstructors rollback",
+        "send the previous reconstructor again; the mode becomes hold",
+        words("--anyway", "even if the stability check refuses it", default=None),
+        _NO_WAIT,
+        operation="rollback",
+        asks="go back to the previous reconstructor; the mode becomes hold",
+        needs_why=True,
+        then="pyrcal mode propose, or auto, ends mode hold",
+        example="--why 'image is elongated'",
+    ),
+    _orders(
+        "loop open",
+        "have the RTC open the loop",
+        operation="loop",
+        always={"loop": "open"},
+        permitted="open_loop",
+        asks="open the loop; the image is lost",
+        example="--why 'diverging'",
+    ),
+    _orders(
+        "loop close",
+        "have the RTC close the loop",
+        operation="loop",
+        always={"loop": "closed"},
+        asks="close the loop",
+        example="",
+    ),
+    _orders(
+        "loop acquire",
+        "acquire the registration from nothing: open the loop, dither, close it step by step",
         _NO_WAIT,
         operation="acquisition",
         always={"action": "start"},
         asks="open the loop and dither strongly; the image is lost for tens of seconds",
         needs_why=True,
+        example="--why 'mirror was exchanged'",
     ),
     _orders(
-        "measure",
+        "loop abort",
+        "end the acquisition",
+        operation="acquisition",
+        always={"action": "abort"},
+        example="",
+    ),
+    _orders(
+        "dither start",
+        "start the dither",
+        words(
+            "--kind",
+            "sine: one frequency for each mode; binary: random signs",
+            choices=("sine", "binary"),
+        ),
+        *(_MODES, _EACH, _LINES, _TOTAL, _LASTS, _OVER),
+        operation="dither",
+        always={"action": "start"},
+        example="--modes 3,5 --frequency-hz 90,110 --amplitude-m 5e-9",
+    ),
+    _orders(
+        "dither stop",
+        "stop the dither",
+        operation="dither",
+        always={"action": "stop"},
+        example="",
+    ),
+    _orders(
+        "measure matrix",
         "have the RTC measure an interaction matrix; all patterns but sine open the loop",
         words("--pattern NAME", "push-pull-modal, hadamard, sine, ..."),
-        words("--n-average N", "pushes and pulls of each", type=int),
+        words("--n-average N", "pushes and pulls of each mode", type=int),
         *(_MODES, _EACH, _LINES, _LASTS, _NO_WAIT),
+        operation="measure",
         asks="have the RTC measure; all patterns but sine open the loop",
+        example="--pattern sine --modes controlled",
     ),
     _orders(
-        "measure-noisy",
-        "measure a noisy interaction matrix on sky, by random signs",
+        "measure noisy",
+        "measure a noisy interaction matrix on sky, by a dither of random signs",
         *(_MODES, _TOTAL, _LASTS, _OVER, _NO_WAIT),
+        operation="measure_noisy",
+        example="--duration-s 60",
+    ),
+    _orders(
+        "measure cancel",
+        "stop waiting for a measured matrix",
+        words("id ID", "id of the measurement"),
+        operation="give_up",
+        example="im-1",
+    ),
+    _reads(
+        "recordings list",
+        "list the recordings, oldest first",
+        "/v1/recordings",
+        example="",
     ),
     _records(
-        "record",
+        "recordings start",
         "record telemetry from now on, byte for byte; default one minute",
         "POST /v1/recordings",
         *(
             _LASTS,
-            words("--before-s S", "include the last S seconds, 60 at most", type=float),
+            words("--before-s S", "include the last S seconds, up to 60", type=float),
             _NO_WAIT,
         ),
         follows="/v1/recordings/{id}",
+        example="--duration-s 30 --before-s 10 --why 'vibration at 40 Hz'",
     ),
     _records(
-        "end-recording",
+        "recordings end",
         "end a recording; its file stays",
         "POST /v1/recordings/{id}/end",
         _RECORDING,
+        example="tm-1",
     ),
     _records(
-        "remove-recording",
+        "recordings remove",
         "remove a recording for good",
         "DELETE /v1/recordings/{id}",
         _RECORDING,
         asks="remove it for good",
-    ),
-    _orders(
-        "give-up",
-        "stop waiting for a measured matrix",
-        words("id ID", "id of the measurement"),
+        example="tm-1",
     ),
 )
 """Commands, in the order of ``pyrcal --help``."""
 
+CONNECTION, ORDER = "connection options", "order options"
+"""Titles of options that many commands share."""
+
 
 def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     """Add these commands to a command line."""
+    groups: dict[str, Any] = {}
     for request in REQUESTS:
-        parser = commands.add_parser(
-            request.name, help=request.purpose, description=request.purpose, epilog=_EPILOG
+        name, _, word = request.name.partition(" ")
+        if word and name not in groups:
+            group = commands.add_parser(
+                name, help=GROUPS[name], description=_sentence(GROUPS[name])
+            )
+            group.examples = [
+                f"pyrcal {r.name} {r.example}".rstrip()
+                for r in REQUESTS
+                if r.name.startswith(f"{name} ")
+            ]
+            groups[name] = group.add_subparsers(dest="word", required=True, metavar="COMMAND")
+        parser = (groups[name] if word else commands).add_parser(
+            word or name,
+            help=request.purpose,
+            description=_sentence(request.purpose),
+            epilog=EPILOG,
+            examples=[f"pyrcal {request.name} {request.example}".rstrip()],
         )
         parser.set_defaults(request=request, module=__name__)
         add(parser, *request.words)
         if request.module == "orders":
-            add(parser, words("--why WHY", "reason, kept in the audit trail", default=""))
-            add(parser, words("--who WHO", "your name; default: the login name"))
-        if request.asks:
-            add(parser, words("--yes", "do it without asking"))
+            order = parser.add_argument_group(ORDER)
+            required = " (prompted for at a terminal)" if request.needs_why else ""
+            add(
+                order,
+                words("--why WHY", f"reason, kept in the audit trail{required}", default=""),
+                words("--who WHO", "your name; default: the login name"),
+            )
+            if request.asks:
+                add(order, words("--yes", "do it without confirmation"))
         add(
-            parser,
-            words("--json", "print what REST answers"),
+            parser.add_argument_group(CONNECTION),
+            words("--json", "print the answer of the REST interface"),
             words("--url URL", f"address of the service; default {URL}, else {USUAL_URL}"),
             words(
                 "--key-file FILE", f"file with the API key; default: the key in {KEY}", type=Path
             ),
         )
+
+
+def _sentence(purpose: str) -> str:
+    return f"{purpose[:1].upper()}{purpose[1:]}."
 
 
 def main(options: argparse.Namespace) -> int:
@@ -348,7 +469,7 @@ def main(options: argparse.Namespace) -> int:
             service, request, options
         )
     except RefusedError as error:
-        say(f"pyrcal: {request.name}: {error}")
+        say(f"pyrcal {request.name}: {error}")
         return NOT_DONE
     except UnreachableError as error:
         say(f"pyrcal: {error}")

@@ -14,19 +14,20 @@ from pathlib import Path
 import structlog
 from threadpoolctl import threadpool_limits
 
-from pyrcal.offline.figures import check_plots
+from pyrcal.fitting.figures import check_plots
 from pyrcal.playback.aot import read_telemetry
 from pyrcal.playback.arrays import Arrays, open_arrays
 from pyrcal.playback.player import Player, Track
 from pyrcal.playback.pyrtc import is_session, read_session
 from pyrcal.playback.report import document, fill, plot, table
 from pyrcal.terminal import show_progress
-from service.config import load_instrument, load_settings
+from service.config import load_settings
 from service.config.settings import Settings
 from service.errors import ConfigurationError, say
 from service.files.documents import json_text
 from service.files.recording import FORMAT, Message, Recording
 from service.files.whole import open_hdf5, write_whole
+from service.instrument import load_instrument
 from service.model.instrument import Instrument
 
 FOUND, NOTHING_FOUND = 0, 1
@@ -63,7 +64,7 @@ def track(
     """Return α over time from recorded telemetry, by the service's own estimators.
 
     ``path`` is a recording of pyrcal, arrays in ``.npz`` or HDF5, an AOT file or a session of pyRTC
-    (docs/integrate/tracking.md). ``instrument`` is the result or the argument of
+    (docs/howto/tracking.md). ``instrument`` is the result or the argument of
     ``load_instrument``. ``settings`` are the defaults if None.
 
     Raises

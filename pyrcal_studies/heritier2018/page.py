@@ -67,7 +67,7 @@ def _opening(budget: Budget, store: Store, minutes: float) -> str:
         f"{datetime.now(UTC).date().isoformat()}; all steps together take about {minutes:.0f} "
         "minutes of one idle core.\n"
         "- **Telescope**: a diffractive simulation of FLAO at the LBT "
-        "(`service/instruments/flao-lbt.toml`) with another pupil grid and other influence "
+        "(`service/instrument/packaged/flao-lbt.toml`) with another pupil grid and other influence "
         "functions than the model, uneven light (10 %) and displaced actuators. Its registration "
         f"is that of equation 10. {len(budget.seeds)} telescopes differ in their imperfections, "
         "noise and turbulence.\n"
@@ -88,7 +88,7 @@ def _opening(budget: Budget, store: Store, minutes: float) -> str:
 def _figures(budget: Budget, store: Store) -> Iterable[str]:
     yield (
         "Figures 1 and 2 of the paper are diagrams of the method and of the model: see "
-        "[method](../understand/method.md). Figures 3 to 14 follow."
+        "[method](../explanation/method.md). Figures 3 to 14 follow."
     )
     for number in DRAWN:
         title, text = captions.CAPTIONS[number](budget, store)

@@ -13,6 +13,7 @@ from service.archive.archive import Archive
 from service.archive.index import AuditEntry
 from service.archive.nights import DAY_NS
 from service.archive.store import Folder
+from service.config.settings import Settings
 
 NEWEST_KEPT = 10
 """Newest products of each kind that are kept for a rollback, whatever their age."""
@@ -33,6 +34,14 @@ class RetentionPolicy:
 
 
 EVERYTHING = RetentionPolicy()
+
+
+def retention_policy(settings: Settings) -> RetentionPolicy:
+    """Return the limits that the settings name in ``[archive]``."""
+    table = settings.archive
+    return RetentionPolicy(
+        keep_days=table.keep_days, keep_gb=table.keep_gb, reserve_gb=table.reserve_gb
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

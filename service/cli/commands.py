@@ -15,9 +15,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from service.cli.program import data_dir_of_the_one
 from service.errors import ArchiveError, ConfigurationError, say
-from service.web.keys import KeyFile, KeyScope, is_loopback
+from service.program import data_dir_of_the_one
+from service.web.keys import KeyFile, KeyScope
 
 if TYPE_CHECKING:
     from service.config import Settings
@@ -66,7 +66,7 @@ def _run(options: argparse.Namespace) -> int:
         if key in given:
             given[key] = [given[key]]
     settings = load_settings(options.config, os.environ, given)
-    from service.config.instrument_schema import read_instrument_file
+    from service.instrument.schema import read_instrument_file
 
     read_instrument_file(settings.service.instrument)
     _check_that_a_key_can_operate(settings)
@@ -74,8 +74,8 @@ def _run(options: argparse.Namespace) -> int:
     from service.runtime.processes import Worker
 
     early = Worker().begin() if options.own_process else Worker()
-    from service.config import load_instrument
-    from service.config.policy import compute_of
+    from service.instrument import load_instrument
+    from service.runtime.policy import compute_of
     from service.runtime.worker import start_worker
 
     instrument, compute = load_instrument(settings.service.instrument), compute_of(settings)
@@ -95,6 +95,8 @@ def _check_that_a_key_can_operate(settings: Settings) -> None:
     ConfigurationError
         If it would be, or the keys there are cannot be read.
     """
+    from service.wire.access import is_loopback  # with NumPy, which `key` does not need
+
     host, keys = settings.api.host, KeyFile(settings.service.data_dir)
     can_operate = any(key.scope.covers(KeyScope.OPERATE) for key in keys.all())
     if not can_operate and not is_loopback(host):

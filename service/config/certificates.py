@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from service.config.sources import refuse
-from service.link.guard import Certificate
+from service.files.toml import refuse
+from service.wire.access import Certificate
 
 
 def read_certificate(path: Path, key: str) -> Certificate:

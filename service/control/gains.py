@@ -5,7 +5,7 @@ has another cause and goes somewhere else:
 
 - the **calibration gain** is the stroke of the mirror over that of the model, mode by mode. It is
   constant, above or below 1, and goes into D: ``D_tuned = D diag(g)``, the last step of Heritier
-  et al. 2018.
+  et al. 2018, section 4.3.
 - the **optical gain** is the response of a pyramid in residual turbulence over that in a flat
   wavefront. It is at most 1, changes with the seeing, and goes into the loop gains. Its table is
   published with a reconstructor and never multiplied into it.

@@ -1,9 +1,10 @@
-"""Demodulate telemetry at lines and at frequencies next to them.
+"""Demodulation of telemetry at the lines of a dither and at frequencies next to them.
 
-Relative to its line every side bin rotates slowly. Within a segment of frames the window's weight
-``h_k``, ``h_k cos(v k)`` and ``h_k sin(v k)`` are, for any offset v, combinations of a few smooth
-shapes. Frames are multiplied by each line times each of these shapes. The bins follow from these
-sums, a tenth as many as there are frames, up to rounding.
+The direct way multiplies every frame by the sine and cosine of every bin. It is too slow for 37
+bins per line in real time. Relative to its line a bin rotates slowly, so within a short segment of
+frames the weights ``h_k``, ``h_k cos(v k)`` and ``h_k sin(v k)`` (Hann window h, any offset v) are
+combinations of a few smooth shapes. Frames are therefore multiplied by each line times each of
+these shapes only; the bins are combinations of the sums, a tenth of the work, exact up to rounding.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ _N_SHAPES = 1 + 2 * len(_OFFSETS_HZ)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DemodulationBank:
-    """Lines, and ``SIDE_OFFSETS_HZ`` next to each, in a Hann window."""
+    """The bins of a window: each line and ``SIDE_OFFSETS_HZ`` next to it, with a Hann weight."""
 
     lines_hz: tuple[float, ...]
     frame_rate_hz: float
@@ -47,11 +48,11 @@ class DemodulationBank:
     """Length of the window."""
 
     def empty(self, n_columns: int) -> Array:
-        """Return the sums of no frames, ``(n_shapes, 2 * n_lines, n_columns)``."""
+        """Return sums over no frames yet, ``(n_shapes, 2 * n_lines, n_columns)``."""
         return np.zeros((_N_SHAPES, 2 * len(self.lines_hz), n_columns), np.float32)
 
     def add(self, sums: Array, columns: Array, place: int) -> None:
-        """Add frames ``(n, n_columns)`` to sums; the first has this place in the window."""
+        """Add frames ``(n, n_columns)`` to the sums; the first is frame ``place`` of the window."""
         length = _smooth(self.frame_rate_hz, self.n_frames).shape[1]
         end = place + len(columns)
         cuts = [place, *range(place // length * length + length, end, length), end]
@@ -91,7 +92,7 @@ class DemodulationBank:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Segment:
-    """The two steps that lead from the frames of a stretch to the bins."""
+    """Matrices that lead from the frames of a segment to shapes, and from shapes to bins."""
 
     lines: Array
     """``(n_smooth * 2 * n_lines, length)`` each smooth shape times the two parts of each line."""
@@ -102,7 +103,7 @@ class _Segment:
 
 @lru_cache(maxsize=48)
 def _segment(bank: DemodulationBank, index: int) -> _Segment:
-    """Return what leads from the frames of a stretch to the bins: the same in every window."""
+    """Return the matrices of one segment, which are the same in every window."""
     smooth = _smooth(bank.frame_rate_hz, bank.n_frames)
     length = smooth.shape[1]
     frames = index * length + np.arange(length)
@@ -117,9 +118,9 @@ def _segment(bank: DemodulationBank, index: int) -> _Segment:
 
 @lru_cache(maxsize=4)
 def _smooth(frame_rate_hz: float, n_frames: int) -> Array:
-    """Return ``(n_smooth, length)`` orthonormal shapes: all that bins can be in a stretch."""
+    """Return orthonormal shapes ``(n_smooth, length)`` that span all bins within a segment."""
     length = max(round(SEGMENT_S * frame_rate_hz), MIN_SEGMENT_FRAMES)
-    # a Hann window is a mean and a turn more or less
+    # A Hann window is a constant plus one period: it shifts a frequency by one bin either way.
     weight_hz = np.array([-1.0, 0.0, 1.0]) * frame_rate_hz / n_frames
     slow_hz = np.add.outer([0.0, *_OFFSETS_HZ], weight_hz)
     turns = 2 * np.pi * np.outer(slow_hz / frame_rate_hz, np.arange(length))
@@ -134,7 +135,7 @@ def _lines(bank: DemodulationBank, frames: Array) -> Array:
 
 
 def cosines_and_sines(turns: Array) -> tuple[Array, Array]:
-    """Return both of so many turns, whole ones taken off before precision is."""
+    """Return cosine and sine of turns; whole turns are removed first, to keep single precision."""
     angles = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
     return np.cos(angles), np.sin(angles)
 

@@ -101,8 +101,8 @@ class LockInPlan(WindowPlan):
 class Spectra(Telemetry):
     """One window of telemetry at the plan's bins: sums of ``h_k x_k exp(-i w k)``, Hann h.
 
-    Frames that never came count as zeros, which the side bins notice. Of joined windows it is the
-    mean.
+    Missing frames count as zeros, which raises the noise in the side bins. Joined windows are
+    averaged.
     """
 
     plan: LockInPlan
@@ -123,7 +123,7 @@ class Spectra(Telemetry):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LockInSums:
-    """Sums so far."""
+    """Sums over the frames of a window so far."""
 
     slopes: Array
     """Sums in the layout of :meth:`DemodulationBank.empty`, like those of the commands; modified in
@@ -136,7 +136,7 @@ class LockInSums:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LockIn(WindowCutter[LockInPlan, LockInSums, Spectra]):
-    """Windows of sines under way."""
+    """Cuts telemetry into windows and sums them at the plan's bins."""
 
     @override
     def begin(self, block: FrameBlock) -> LockInSums:
@@ -152,7 +152,7 @@ class LockIn(WindowCutter[LockInPlan, LockInSums, Spectra]):
     def add(self, sums: LockInSums, block: FrameBlock, place: int) -> LockInSums:
         """Return the sums with a block that begins at this place of the window."""
         bank = self.plan.demodulation
-        # no block without dither columns comes this far
+        # Blocks without dither columns were refused before.
         dither = block.commands_m if block.dither_m is None else block.dither_m
         bank.add(sums.slopes, block.slopes, place)
         bank.add(sums.commands, block.commands_m, place)
@@ -181,9 +181,9 @@ class LockIn(WindowCutter[LockInPlan, LockInSums, Spectra]):
 def joined(one: Spectra, other: Spectra) -> Spectra | None:
     """Return two windows of the same dither, one right after the other, as a longer one.
 
-    Their mean, each bin turned to the phase it has in the first: what the loop and the sensor make
-    of a line is the same in both, and the noise at the side bins falls as it does at the lines.
-    None: they are of different loops or dithers, or too far apart.
+    It is their mean, with each bin of the second turned to its phase in the first. The response
+    to a line is the same in both; the noise falls in the side bins as it does at the lines. None
+    if they are of different loops or dithers, or too far apart.
     """
     later = other.first_seq - one.first_seq
     follows = later // one.plan.n_frames in {one.n_windows, one.n_windows + 1}
@@ -205,14 +205,14 @@ def joined(one: Spectra, other: Spectra) -> Spectra | None:
 
 
 N_STEPS = 5
-"""Gauss-Newton steps inside one linearisation: gains and α are multiplied with one another."""
+"""Gauss-Newton steps within one linearisation; the model is bilinear in gains and α."""
 
 _MAX_TERMS = 40
 """Largest number of terms of a series. If more are needed, the loop's equations are solved instead.
 """
 
 _DIVERGENCE_RATIO = 10.0
-"""A term this much larger than the first is one of a series that does not end."""
+"""Ratio of a term to the first one above which the series counts as divergent."""
 
 _ROUNDING = 1e-7
 """Relative rounding error of single precision."""
@@ -234,15 +234,15 @@ MAX_LAG_FRAMES = 0.2
 class LockInEstimate(DitheredEstimate):
     """Registration from one window of sines.
 
-    Gains and lags are of the lines: complex, for a lag turns a line's phase. The misfit is the
-    residual power at the lines over that at the side bins.
+    There is one gain and one lag for each line. Gains are complex, because a lag turns the phase of
+    a line. The misfit is the residual power at the lines over that at the side bins.
     """
 
     dither_m: float = 0.0
-    """RMS of all lines together as they were on the mirror, metres OPD; 0: not known."""
+    """RMS of all lines together, as applied to the mirror, metres OPD; 0 if it is unknown."""
 
     window_s: float = 0.0
-    """Length of the window, seconds; 0: not known."""
+    """Length of the window, seconds; 0 if it is unknown."""
 
 
 def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop) -> LockInEstimate:
@@ -260,10 +260,11 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
     slopes = spectra.slopes[:, 0]
     seen = _images(linearisation, spectra.commands[:, 0])
     known = _apply(matrix, _instrument(spectra, coupling, loop, np.ones(len(slopes))))
-    # the first guess: <D Z, S> / <D Z, D C>
+    # First guess of the gains: <D Z, S> / <D Z, D C>.
     gains = np.sum(known.conj() * slopes, axis=1) / np.sum(known.conj() * seen[:, 0], axis=1)
     known = _images(linearisation, _instrument(spectra, coupling, loop, gains))
-    if linearisation.noise_shape is not None:  # an instrument may be weighted by anything
+    # An instrumental variable may have any weight; the inverse variance gives the smallest σ.
+    if linearisation.noise_shape is not None:
         known /= linearisation.noise_shape**2
     n = known.shape[1] - 1
     step = np.zeros(n)
@@ -307,7 +308,7 @@ _FEW_MOVED_RATIO = 6
 def _select_moved_modes(
     spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop
 ) -> tuple[Spectra, Linearisation]:
-    """Return both without modes that nothing moves, where that is most of a large telescope."""
+    """Return both without the modes that are never commanded, if these are most modes."""
     moves = np.any(spectra.commands, axis=(0, 1)) | np.any(spectra.dither, axis=0)
     moves[: len(loop.reconstructor)] = True
     if _FEW_MOVED_RATIO * np.count_nonzero(moves) > len(moves):
@@ -318,7 +319,7 @@ def _select_moved_modes(
 
 
 def _instrument(spectra: Spectra, coupling: Array, loop: ClosedLoop, gains: Array) -> Array:
-    """Return ``(n_lines, n_modes)`` the command each line's dither alone would cause."""
+    """Return the commands ``(n_lines, n_modes)`` that the dither of each line alone causes."""
     return closed_loop_responses(spectra.dither, coupling, loop, spectra.plan.frequencies_hz, gains)
 
 
@@ -334,8 +335,9 @@ def closed_loop_responses(
     ``Z = [I + g R D γ e^{-iwd} / (1 - leak e^{-iw})]^{-1} U``, solved in the controlled modes;
     ``coupling`` is R D ``(n_controlled, n_modes)``, ``gains`` ``(n_lines,)`` the sensor's.
 
-    The instrument need not be better known than D: single precision is enough, and so is the
-    series ``1 - F + F^2 - ...`` where it converges, as it does above a sixth of the frame rate.
+    Single precision is enough, because D is not known better. Where the series
+    ``1 - F + F^2 - ...`` converges, which it does above a sixth of the frame rate, it replaces the
+    solution.
     """
     n = len(coupling)
     w = 2 * np.pi * np.array(frequencies_hz) / loop.frame_rate_hz
@@ -353,12 +355,12 @@ def closed_loop_responses(
 
 
 def _sum_series(first: Array, answer: Array, coupling: Array) -> Array | None:
-    """Return ``(1 + F)^-1 first`` as a series, ``F = answer * coupling``; None: not that way."""
+    """Return ``(1 + F)^-1 first`` as a series, ``F = answer * coupling``; None if it diverges."""
     reply, largest = first, np.abs(first).max(initial=0.0)
     for _ in range(_MAX_TERMS):
         before, reply = reply, first - answer * _apply(coupling, reply.T).T
         change, size = (np.abs(x).max(initial=0.0) for x in (reply - before, reply))
-        if change <= _ROUNDING * size:  # zeros are settled, too
+        if change <= _ROUNDING * size:  # "<=" because zeros have converged, too
             return np.asarray(reply)
         if not change < _DIVERGENCE_RATIO * largest:
             return None
@@ -366,7 +368,7 @@ def _sum_series(first: Array, answer: Array, coupling: Array) -> Array | None:
 
 
 def _images(linearisation: Linearisation, vectors: Array) -> Array:
-    """Return what the sensor makes of modal vectors, ``(n_lines, 5 or 7, n_slopes)``.
+    """Return the sensor's response to modal vectors, ``(n_lines, 5 or 7, n_slopes)``.
 
     Index 0 is D v, then the derivatives of D applied to v.
     """

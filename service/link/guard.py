@@ -14,7 +14,6 @@ import re
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -22,8 +21,7 @@ import structlog
 import zenoh
 
 from service.link.statistics import EndingCertificate, Refusal
-
-DAY_S: Final = 86400.0
+from service.wire.access import DAY_S, LinkSecurity
 
 REFUSAL_REPORT_DURATION_S: Final = 60.0
 """Time for which a refusal is reported."""
@@ -45,39 +43,6 @@ MIN_ALARM_CONNECTIONS: Final = 20
 _SOCKET_TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
 _CLOSE_WAIT: Final = "08"
 """State in the kernel's table of a connection that only the other side has closed."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Certificate:
-    """A certificate that the link depends on."""
-
-    path: str
-    name: str
-    """Its common name: what access goes by."""
-
-    ends_s: float
-    """Expiry, seconds since the Unix epoch, UTC."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LinkSecurity:
-    """Security of a link; by default there is none."""
-
-    zenoh: Mapping[str, object] = field(default_factory=dict)
-    """Configuration of zenoh for certificates, users and access."""
-
-    roles: Mapping[str, str] = field(default_factory=dict)
-    """The role of each name that has one; empty: no names are known."""
-
-    certificates: tuple[Certificate, ...] = ()
-    secret: bytes | None = None
-    """Key that signs messages; None if messages are neither signed nor checked."""
-
-    warn_s: float = 30 * DAY_S
-    """Time before its expiry from which a certificate is reported, seconds."""
-
-
-NO_SECURITY: Final = LinkSecurity()
 
 
 class LinkGuard:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from service import wire
 from service.errors import LinkError, WireError
-from service.link.guard import NO_SECURITY, LinkSecurity
+from service.wire.access import NO_SECURITY, LinkSecurity
 from service.wire.signing import Signatures
 
 FETCHED_HISTORY_S = 0.5

@@ -1,4 +1,4 @@
-"""Karhunen-Loeve modes of a mirror: what turbulence makes strongest, mode after mode."""
+"""Karhunen-Loeve modes of a mirror: its shapes in the order of their variance in turbulence."""
 
 from __future__ import annotations
 
@@ -26,13 +26,14 @@ Array = NDArray[np.float64]
 
 _PISTON_RATIO = 1e-9
 _DEGENERACY_RATIO = 1e-3
-"""The square grid splits pairs that the mirror's symmetry makes equal by less than this."""
+"""Relative difference below which two variances count as equal. By symmetry of the mirror they are;
+the square grid of points separates them slightly."""
 
 _POINTS_PER_SUBAPERTURE = 4
-"""Points a subaperture on which modes are orthonormal."""
+"""Number of points per subaperture on which the modes are made orthonormal."""
 
 WHOLE_BYTES = 2.5e8
-"""Functions of which a table over the pupil is larger are known tile by tile, if they end."""
+"""Size in bytes above which influence functions of finite extent are stored tile by tile."""
 
 
 def karhunen_loeve(instrument: Instrument, surface: Surface) -> tuple[Array, Array]:
@@ -100,7 +101,7 @@ def _gram(surface: Surface, strokes: Array, pupil: PupilGrid) -> Array:
 
 
 def _heights(surface: Surface, coefficients: Array, points: Array) -> Array:
-    """Return shapes at points; the surface's own functions are never there for all of them."""
+    """Return shapes at points, computed in blocks of points to limit memory."""
     return by_rows(map, lambda some: surface.basis(some) @ coefficients, points)
 
 
@@ -109,7 +110,7 @@ def _influence(surface: Surface) -> Array:
 
 
 def _local(surface: Surface, pupil: PupilGrid) -> LocalShapes | None:
-    """Return the actuators' functions tile by tile; None: they do not end, or are small whole."""
+    """Return the influence functions tile by tile; None if that saves no memory."""
     n_points, n_functions = int(pupil.lit.sum()), len(surface.positions)
     if not isinstance(surface, Gaussian) or 8.0 * n_points * n_functions < WHOLE_BYTES:
         return None
@@ -122,9 +123,9 @@ def _local(surface: Surface, pupil: PupilGrid) -> LocalShapes | None:
 
 
 def _parity_sectors(positions_m: Array) -> list[Any]:
-    """Return bases ``(n_actuators, n)``, sparse, of the strokes even and odd under y -> -y.
+    """Return sparse bases ``(n_actuators, n)`` of the strokes even and odd under y -> -y.
 
-    One sector with everything when the layout has no such symmetry.
+    Without this symmetry there is one basis of all strokes.
     """
     n = len(positions_m)
     distance, image = scipy.spatial.KDTree(positions_m).query(positions_m * [1.0, -1.0])
@@ -132,7 +133,8 @@ def _parity_sectors(positions_m: Array) -> list[Any]:
         return [scipy.sparse.eye_array(n, format="csc")]
     on_axis = np.flatnonzero(image == np.arange(n))
     first = np.flatnonzero(image > np.arange(n))
-    # the axis' own come where they stand among the pairs, so that every mirror keeps its basis
+    # Actuators on the axis keep their place among the pairs. This order decides the basis, which
+    # must not change.
     leading = np.sort(np.concatenate([on_axis, first]))
     mirror = scipy.sparse.csc_array((np.ones(n), (image, np.arange(n))), shape=(n, n))
     whole = scipy.sparse.eye_array(n, format="csc")
@@ -156,7 +158,7 @@ def _diagonalise(
         whiten = sector @ (axes[:, kept] / np.sqrt(power[kept]))
         against = scipy.linalg.orth((left_out @ whiten).T)
         variance, vectors = scipy.linalg.eigh(_without(whiten.T @ covariance @ whiten, against))
-        n_out = against.shape[1]  # their variance is 0 now, the smallest
+        n_out = against.shape[1]  # excluded directions have variance 0 and come first
         strokes = whiten @ vectors[:, n_out:]
         found += [
             (one, parity, mode) for one, mode in zip(variance[n_out:], strokes.T, strict=True)
@@ -176,7 +178,7 @@ def _without(covariance: Array, directions: Array) -> Array:
 
 
 def _even_before_odd(found: list[tuple[float, int, Array]]) -> list[tuple[float, int, Array]]:
-    """Settle the order inside pairs of equal variance, which rounding would otherwise decide."""
+    """Sort pairs of equal variance, even modes first; otherwise rounding would decide."""
     ordered: list[tuple[float, int, Array]] = []
     start = 0
     for stop in range(1, len(found) + 1):
@@ -198,7 +200,7 @@ def _unit_rms(strokes: Array, gram: Array) -> Array:
 def _tilts_along_axes(strokes: Array, positions_m: Array) -> Array:
     """Turn the first two modes in their plane until mode 1 holds no tilt along x.
 
-    They are equally strong, so without a symmetry their orientation is any. The turn leaves both
+    Both have the same variance, so without a symmetry their orientation is arbitrary. They stay
     orthonormal.
     """
     along = positions_m[:, 0] @ strokes[:, :2]

@@ -123,7 +123,7 @@ def n_proven_modes(state: TrackerState, n_modes: int) -> int:
 def check_proven(state: TrackerState, record: ReconstructorRecord) -> str | None:
     """Return why a matrix would control unproven modes, or None."""
     if state.operations.acquisition.under_way:
-        return None  # it closes the loop on smooth modes first, and watches it
+        return None  # An acquisition closes the loop on smooth modes first, and watches it.
     proven = proven_modes(state)
     missing = [mode for mode in range(record.n_modes) if mode not in proven]
     if not missing:
@@ -194,7 +194,8 @@ def _to_compare(context: StepContext, rtc: Status, shown: list[int]) -> list[int
     healthy = [m for m in range(rtc.n_modes) if m not in odd and m not in shown]
     found: dict[int, None] = {}
     for doubted in (one.mode for one in proof.doubtful if one.mode in shown):
-        # the loop answers a dither of its own modes: rather those that it leaves alone, too
+        # The loop counteracts the dither of controlled modes, so a mode is compared with modes that
+        # are controlled like itself.
         side = doubted in controlled
         healthy.sort(key=lambda m: ((m in controlled) != side, abs(m - doubted)))
         found |= dict.fromkeys(healthy[:N_NEIGHBOURS])
@@ -220,7 +221,8 @@ def lines_clear(context: StepContext, rtc: Status, window_s: float) -> tuple[flo
     step, edge_hz = step_of(rtc, window_s), float(SIDE_OFFSETS_HZ.max()) + 1.0
     low = max(PROVING_LINE_RANGE[0] * rtc.frame_rate_hz, edge_hz)
     high = min(PROVING_LINE_RANGE[1] * rtc.frame_rate_hz, rtc.frame_rate_hz / 2 - edge_hz)
-    # whole hertz apart: what is played is looked at second by second, and lines must not mix there
+    # Whole hertz apart: the dither on the mirror is verified second by second, and lines must not
+    # mix within one second.
     spacing = np.ceil(max(MIN_LINE_SPACING_STEPS * step, (high - low) / MAX_SHOWN_MODES))
     avoid = (*context.policy.dither_avoid_hz, *context.loop.vibrations_hz)
     lines = np.arange(np.ceil(low), high, spacing)
@@ -234,9 +236,8 @@ def lines_clear(context: StepContext, rtc: Status, window_s: float) -> tuple[flo
 def note_shown(context: StepContext, modes: tuple[int, ...]) -> None:
     """Record that a dither was requested to verify these modes."""
     proof = context.matrices.mode_proof
-    if (
-        context.state.alarm(alarms.WORKER_BEHIND) is None
-    ):  # which gives windows up: no fault of theirs
+    # A worker that is behind discards windows; the modes are not to blame for that.
+    if context.state.alarm(alarms.WORKER_BEHIND) is None:
         proof = _after_miss(proof)
     shown = replace(proof, shown=frozenset(modes), shown_ns_utc=context.now_ns)
     context.matrices = replace(context.matrices, mode_proof=shown)
@@ -246,14 +247,14 @@ def note_shown(context: StepContext, modes: tuple[int, ...]) -> None:
 
 
 def awaits_result(context: StepContext, window_s: float) -> bool:
-    """Return whether what the last such dither has shown may still be on its way."""
+    """Return whether the result of the last dither for verification may still arrive."""
     proof = context.matrices.mode_proof
     waited_s = (context.now_ns - proof.shown_ns_utc) / SECOND_NS
     return bool(proof.shown) and waited_s < window_s + RESULT_TIMEOUT_S
 
 
 def learn_modes(context: StepContext, estimate: LockInEstimate | RandomEstimate) -> None:
-    """Take over which modes of a window answer as they should, whatever it says of α."""
+    """Record which modes of a window respond as the model predicts, even if its α is rejected."""
     rtc, proof = context.rtc, context.matrices.mode_proof
     if rtc is None or estimate.session != rtc.session or estimate.gain_sigma is None:
         return
@@ -298,7 +299,7 @@ def _without(ratios: dict[int, ModeRatio], modes: frozenset[int]) -> dict[int, M
 def _judge_ratios(
     proof: ModeProof, compared: dict[int, ModeRatio], bad: frozenset[int]
 ) -> tuple[frozenset[int], tuple[ModeRatio, ...]]:
-    """Return which modes are uneven, and which may be, by this window and those before it."""
+    """Return the modes that are certainly uneven, and those that may be, after this window."""
     before = {one.mode: one for one in proof.doubtful}
     together = add_ratios(before, compared)
     uneven = {mode for mode, one in together.items() if one.certain}
@@ -314,7 +315,7 @@ def _answers(
     bad: frozenset[int],
     accused: frozenset[int],
 ) -> tuple[ModeAnswer, ...]:
-    """Return how the accused modes have answered, those of this window as it says."""
+    """Return the responses of the accused modes, this window's replacing earlier ones."""
     like = estimate.answers_as or estimate.modes
     found = {answer.mode: answer for answer in proof.answers if answer.mode in accused}
     for mode, gain, other in zip(estimate.modes, gains.tolist(), like, strict=True):
@@ -324,7 +325,7 @@ def _answers(
 
 
 def note_recognised(context: StepContext, event: ev.ModesRecognised) -> None:
-    """Take over which modes of the matrix in use the model has recognised."""
+    """Record which modes of the matrix in use the model has recognised."""
     proof = replace(
         context.matrices.mode_proof,
         strange=frozenset(event.strange),
@@ -340,10 +341,10 @@ def note_recognised(context: StepContext, event: ev.ModesRecognised) -> None:
 
 
 def proof_to_keep(state: TrackerState) -> ModeProof | None:
-    """Return what the next service should know of modes; None: nothing has been seen.
+    """Return the results on modes to keep over a restart; None if there are none.
 
-    Whom the matrix in use disproves is accused no more: the next service does not know that matrix
-    at first.
+    Modes of the matrix in use are not kept as suspected, because after a restart the service does
+    not know that matrix at first.
     """
     proof, proven = state.matrices.mode_proof, proven_modes(state)
     kept = replace(
@@ -358,13 +359,13 @@ def proof_to_keep(state: TrackerState) -> ModeProof | None:
 
 
 def restore_proof(context: StepContext, proof: ModeProof, session: str) -> None:
-    """Hold what the service before this one has seen of modes, until the RTC says who it is."""
+    """Restore the results of the previous run; they count once the RTC has identified itself."""
     restored = replace(proof, session=session)
     context.matrices = replace(context.matrices, mode_proof=restored)
 
 
 def forget_session(context: StepContext) -> None:
-    """Discard what modes have shown in the previous session, because the RTC may be another.
+    """Discard the results on modes of the previous session, because the RTC may have changed.
 
     Restored results wait for the RTC's status, which identifies the session.
     """
@@ -391,9 +392,8 @@ def believe_restored(context: StepContext, rtc: Status) -> None:
 def _classify(
     gains: NDArray[np.float64], size: NDArray[np.float64], sigma: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which modes answer as they should, and which certainly do not; the rest may do."""
-    # The optical gain is common to all modes, so that a single mode is judged relative to the
-    # median.
+    """Return which modes respond as the model predicts, and which certainly do not."""
+    # The optical gain is common to all modes, so each mode is judged relative to the median.
     typical = float(np.median(size))
     low, high = (
         max(PLAUSIBLE_RESPONSE_RATIO[0] * typical, MIN_RESPONSE_RATIO),
@@ -416,7 +416,7 @@ def _limit_to_proven(context: StepContext, rtc: Status, bad: frozenset[int]) -> 
 
 
 def contrary_text(context: StepContext) -> str | None:
-    """Return a description of the modes to be controlled that contradict the file, or None."""
+    """Return a description of the wanted modes that contradict the instrument file, or None."""
     if context.rtc is None:
         return context.alarm_text(alarms.MODES_CONTRARY)
     in_the_way = _contrary_in_the_way(context, context.rtc)
@@ -438,7 +438,7 @@ def _contrary_in_the_way(context: StepContext, rtc: Status) -> list[int]:
 
 
 def _in_words(proof: ModeProof, modes: list[int]) -> str:
-    """Return how modes have answered, in brackets."""
+    """Return the responses of modes, in brackets."""
     answers = {answer.mode: answer for answer in proof.answers}
     listed = [answers[mode] for mode in modes[:MAX_LISTED_MODES] if mode in answers]
     parts = []
@@ -455,10 +455,10 @@ def _in_words(proof: ModeProof, modes: list[int]) -> str:
 
 
 def explain_uneven(context: StepContext) -> str | None:
-    """Return which modes answer more or less strongly than their neighbours, or None."""
+    """Return which modes respond more or less strongly than their neighbours, or None."""
     proof = context.matrices.mode_proof
     if proof.session:
-        return None  # whose modes they are is not known yet
+        return None  # it is not known yet whether this is the same RTC
     found = [f"{proof.own_uneven}: matrices allow for it"] if proof.own_uneven else []
     if proof.uneven:
         one = "answers" if len(proof.uneven) == 1 else "answer"
@@ -471,12 +471,12 @@ def explain_uneven(context: StepContext) -> str | None:
 
 
 def _after_miss(proof: ModeProof) -> ModeProof:
-    """Return the account after a dither that has shown nothing."""
+    """Return the results after a dither that has verified no mode."""
     return replace(proof, n_tries=proof.n_tries + 1) if proof.shown else proof
 
 
 def give_up_unseen(context: StepContext, rtc: Status) -> None:
-    """Leave modes alone for a while that several dithers have not shown."""
+    """Exclude modes for a while that several dithers have not verified."""
     proof = context.matrices.mode_proof
     if proof.n_tries < MAX_PROOF_TRIES:
         return
@@ -512,7 +512,7 @@ def _wanted_modes(context: StepContext, rtc: Status) -> int:
 
 
 def _target_modes(context: StepContext, rtc: Status) -> int:
-    """Return how many modes are controlled, are to be, or await an operator's word."""
+    """Return how many modes are controlled, wanted, or in a proposal that awaits an operator."""
     proposed = (
         r.n_modes for r in context.matrices.reconstructors if r.state is MatrixState.PROPOSED
     )

@@ -1,8 +1,9 @@
-"""Decide who may ask over HTTP, and for what.
+"""Check the host, the origin and the API key of each HTTP request.
 
-A page in an operator's browser can send requests to this service: from another origin, or under a
-name of its own that it has had resolved to this address. Programs send no ``Origin``. Whatever is
-asked needs a key of the scope its route has, once there are keys.
+A page of another site, open in an operator's browser, can send requests to this service: from its
+own origin, or under a host name that its owner resolves to this address (DNS rebinding). Both are
+refused. Programs send no ``Origin``. Once there are API keys, each request needs one whose scope
+covers that of the route.
 """
 
 from __future__ import annotations
@@ -26,22 +27,23 @@ from service.archive import Actor, AuditEntry, Channel
 from service.errors import ConfigurationError, UnknownIdError
 from service.web.bodies import bounded
 from service.web.connections import UNAVAILABLE_RETRY_S, Middleware, to_its_end
-from service.web.keys import Key, KeyFile, KeyScope, is_loopback
+from service.web.keys import Key, KeyFile, KeyScope
 from service.web.problems import INVALID, UNKNOWN, problem
 from service.web.views import answer, define_view, held, shows
+from service.wire.access import is_loopback
 
 COOKIE = "pyrcal_key"
 """Name of the cookie in which a browser keeps the key."""
 
 MAX_AUDITED_REFUSALS, AUDIT_PERIOD_S = 20, 60.0
-"""Refusals that are written to the audit trail within so many seconds, which only grows; the
-others are counted."""
+"""Largest number of refusals in the audit trail within this period, seconds; the others are
+counted. The trail is never shortened."""
 
 MAX_HEADERS = 100
 """Headers of a request; browsers send about twenty, proxies a few more."""
 
 _CLOSE_CONNECTION = {"Connection": "close"}
-"""Header after which the connection is closed: what follows on it cannot be trusted."""
+"""Header that closes the connection: after a malformed request its other bytes are unreliable."""
 
 _READS = {"GET", "HEAD", "OPTIONS"}
 _OWN_SITES = {"same-origin", "none"}
@@ -71,33 +73,33 @@ SCHEMES: dict[str, dict[str, str]] = {
         "description": "The same, kept by a browser that logged in; orders need its Origin, too",
     },
 }
-"""Ways to send a key, as in OpenAPI. None is needed on loopback while there are no keys."""
+"""Ways to send a key, as in OpenAPI. Loopback needs none as long as no key exists."""
 
 
 def scope_of(route: RouteContext, method: str) -> KeyScope | None:
-    """Return the scope a route needs; None: no key.
+    """Return the scope that a route needs; None if it needs no key.
 
-    A route that does not say lets read what only reads, and operators do the rest. What is no
-    route of REST is a file of the package.
+    By default a method that only reads needs ``read``, any other ``operate``. Files of the page are
+    served without a key.
     """
     if not isinstance(route.original_route, APIRoute):
         return None
-    said = (route.openapi_extra or {}).get("security")
-    if said is None:
+    security = (route.openapi_extra or {}).get("security")
+    if security is None:
         return KeyScope.READ if method in _READS else KeyScope.OPERATE
-    return KeyScope(said[0]["bearer"][0]) if said else None
+    return KeyScope(security[0]["bearer"][0]) if security else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hosts:
-    """Names and addresses of this service; loopback is always one."""
+    """Host names and addresses that requests may name; loopback is always allowed."""
 
     bound: str = "127.0.0.1"
-    """Address it listens on. With that of all interfaces any address will do, for a page that was
-    loaded from an address cannot have had it resolved to another."""
+    """Address that the service listens on. If it listens on all interfaces, any numeric address is
+    allowed: only host names can be rebound."""
 
     allowed: tuple[str, ...] = ()
-    """Further names, without a port."""
+    """Further host names, without a port."""
 
     @property
     def local(self) -> bool:
@@ -105,7 +107,7 @@ class Hosts:
         return is_loopback(self.bound)
 
     def know(self, host: str) -> bool:
-        """Return whether the value of a ``Host`` header is one of them."""
+        """Return whether the value of a ``Host`` header is allowed."""
         match = _HOST.fullmatch(host)
         if match is None:
             return False
@@ -120,7 +122,7 @@ class Hosts:
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Why a request may not be made."""
+    """Reason why a request is refused, and its HTTP status."""
 
     status: HTTPStatus
     kind: str
@@ -129,34 +131,34 @@ class Refusal:
     detail: str
     headers: Mapping[str, str] = field(default_factory=dict)
     who: str = ""
-    """Name of the key that was shown, where there is such a key."""
+    """Name of the key in the request; empty if it had no valid one."""
 
 
-class Refusals:
-    """Writes refusals to the audit trail: of a flood the first ones, and how many more.
+class RefusalLog:
+    """Record of refused requests in the audit trail, limited in rate.
 
     Parameters
     ----------
     audit
-        Takes an entry of the trail.
+        Stores an entry of the trail.
     """
 
     def __init__(self, audit: Callable[[AuditEntry], object]) -> None:
         self._audit = audit
         self._since_s = -AUDIT_PERIOD_S
-        self._left = self._untold = 0
+        self._remaining = self._n_omitted = 0
 
-    def tell(self, request: Request, refusal: Refusal) -> None:
-        """Take down a refusal, unless as many were within the last minute."""
+    def record(self, request: Request, refusal: Refusal) -> None:
+        """Add a refusal to the audit trail, or count it if the trail has enough of this period."""
         now_s = time.monotonic()
         if now_s - self._since_s >= AUDIT_PERIOD_S:
-            self._since_s, self._left = now_s, MAX_AUDITED_REFUSALS
-        if self._left == 0:
-            self._untold += 1
+            self._since_s, self._remaining = now_s, MAX_AUDITED_REFUSALS
+        if self._remaining == 0:
+            self._n_omitted += 1
             return
-        self._left -= 1
-        more = f"; {self._untold} more were refused meanwhile" if self._untold else ""
-        self._untold = 0
+        self._remaining -= 1
+        more = f"; {self._n_omitted} more were refused meanwhile" if self._n_omitted else ""
+        self._n_omitted = 0
         address = address_of(request)
         entry = AuditEntry(
             t_ns_utc=time.time_ns(),
@@ -174,12 +176,12 @@ class Refusals:
 
 
 def address_of(request: Request) -> str:
-    """Return the address of a client; empty: unknown."""
+    """Return the address of a client; empty if it is unknown."""
     return "" if request.client is None else request.client.host
 
 
 def actor_of(request: Request) -> Actor:
-    """Return who asks, once they are let through."""
+    """Return the sender of an admitted request, for the audit trail."""
     key: Key | None = request.user
     return Actor(
         address=address_of(request),
@@ -189,9 +191,9 @@ def actor_of(request: Request) -> Actor:
 
 
 def channel_of(request: Request) -> Channel:
-    """Return what a request came through."""
+    """Return the interface that a request used: the page, the command line, or REST."""
     sent = request.headers
-    if "origin" in sent or "sec-fetch-site" in sent:  # only browsers say so
+    if "origin" in sent or "sec-fetch-site" in sent:  # only browsers send these
         return Channel.PAGE
     return Channel.CLI if sent.get("user-agent", "").startswith("pyrcal") else Channel.REST
 
@@ -226,7 +228,7 @@ class Authentication(Middleware):
         super().__init__(app)
         self._hosts = hosts
         self._keys = keys
-        self._refusals = Refusals(audit)
+        self._refusals = RefusalLog(audit)
         self._routes: tuple[RouteContext, ...] = ()
         self._trouble = ""
 
@@ -236,19 +238,19 @@ class Authentication(Middleware):
 
     async def _admit(self, scope: Scope, receive: Receive, send: Send) -> None:
         request, scope["user"] = Request(scope), None
-        refusal = self._stranger(request)
+        refusal = self._check_origin(request)
         if refusal is None and (needed := self._scope_of(request)) is not None:
             scope["user"], refusal = self._check_key(request, needed)
             send = self._while_valid(scope["user"], send)
         if refusal is not None:
-            self._refusals.tell(request, refusal)
-            told = (refusal.status, refusal.kind, refusal.detail, refusal.headers)
-            return await problem(request, *told)(scope, receive, send)
+            self._refusals.record(request, refusal)
+            fields = (refusal.status, refusal.kind, refusal.detail, refusal.headers)
+            return await problem(request, *fields)(scope, receive, send)
         return await bounded(self._app, scope, receive, send)
 
-    def _stranger(self, request: Request) -> Refusal | None:
-        """Return why a request is not for this service, or not of its own page; None: it is."""
-        if (refusal := _misshapen(request)) is not None:
+    def _check_origin(self, request: Request) -> Refusal | None:
+        """Return why host or origin of a request are refused, or None."""
+        if (refusal := _check_headers(request)) is not None:
             return refusal
         host, origin = request.headers.get("host", ""), request.headers.get("origin")
         if not self._hosts.know(host):
@@ -264,7 +266,8 @@ class Authentication(Middleware):
             )
             return Refusal(HTTPStatus.FORBIDDEN, "foreign-origin", detail)
         site = request.headers.get("sec-fetch-site", "same-origin").lower()
-        # a link from another page may be followed; a browser that hides the origin may not order
+        # Links from other pages may be followed. Orders need an origin, or a browser could be made
+        # to send them without one.
         if request.method not in _READS and origin is None and site not in _OWN_SITES:
             detail = (
                 f"found Sec-Fetch-Site {site!r:.100} and no Origin, expected a request of this "
@@ -274,14 +277,14 @@ class Authentication(Middleware):
         return None
 
     def _check_key(self, request: Request, needed: KeyScope) -> tuple[Key | None, Refusal | None]:
-        """Return the key a request is made with, and why it may not be made."""
-        secret, by_cookie = shown_key(request)
+        """Return the key of a request, and the refusal if it does not permit the request."""
+        secret, by_cookie = read_key(request)
         try:
-            if self._keys is None or self._holds(None):
+            if self._keys is None or self._is_valid(None):
                 return None, None
             key = None if secret is None else self._keys.key_of(secret)
         except ConfigurationError as error:
-            if self._trouble != str(error):  # once, not with each request
+            if self._trouble != str(error):  # logged once, not with each request
                 self._trouble = str(error)
                 structlog.get_logger().error("api.keys", text=self._trouble)
             detail = "the file of the API keys cannot be read; the service's log says more"
@@ -291,15 +294,15 @@ class Authentication(Middleware):
             return None, _without_key(needed, shown=secret is not None)
         if not key.scope.covers(needed):
             detail = f"key {key.name} is of scope {key.scope}, this needs one of scope {needed}"
-            told = _challenge(f', error="insufficient_scope", scope="{needed}"')
-            return key, Refusal(HTTPStatus.FORBIDDEN, "scope", detail, told, key.name)
+            headers = _challenge(f', error="insufficient_scope", scope="{needed}"')
+            return key, Refusal(HTTPStatus.FORBIDDEN, "scope", detail, headers, key.name)
         if by_cookie and request.method not in _READS and "origin" not in request.headers:
             detail = "found a browser's cookie and no Origin, expected both: is it this page's?"
             return key, Refusal(HTTPStatus.FORBIDDEN, "foreign-origin", detail, who=key.name)
         return key, None
 
     def _scope_of(self, request: Request) -> KeyScope | None:
-        """Return the scope a request needs; None: no key."""
+        """Return the scope that a request needs; None if it needs no key."""
         self._routes = self._routes or tuple(iter_route_contexts(request.app.routes))
         for route in self._routes:
             if route.path_regex.match(request.scope["path"]) and (
@@ -309,7 +312,7 @@ class Authentication(Middleware):
         return KeyScope.READ if request.method in _READS else KeyScope.OPERATE
 
     def _while_valid(self, key: Key | None, send: Send) -> Send:
-        """Return what ends an answer that comes bit by bit when its key is good no longer."""
+        """Return a sender that ends a streamed response as soon as its key is revoked."""
         ended = False
 
         async def sent(message: Message) -> None:
@@ -318,7 +321,7 @@ class Authentication(Middleware):
                 return
             if message.get("more_body", False):
                 try:
-                    ended = not self._holds(key)
+                    ended = not self._is_valid(key)
                 except ConfigurationError:
                     ended = True
                 if ended:
@@ -327,13 +330,13 @@ class Authentication(Middleware):
 
         return sent
 
-    def _holds(self, key: Key | None) -> bool:
-        """Return True if a key is valid at this moment; for None, if no key is required.
+    def _is_valid(self, key: Key | None) -> bool:
+        """Return whether a key is valid now; for None, whether no key is required.
 
         Raises
         ------
         ConfigurationError
-            If the keys cannot be read.
+            If the file of keys cannot be read.
         """
         keys = () if self._keys is None else self._keys.all()
         if key is None:
@@ -341,33 +344,34 @@ class Authentication(Middleware):
         return key in keys
 
 
-def _misshapen(request: Request) -> Refusal | None:
-    """Return why no honest client sends such a header, or None."""
+def _check_headers(request: Request) -> Refusal | None:
+    """Return why the headers of a request are refused, or None."""
     n_headers = len(request.headers)
     if n_headers > MAX_HEADERS:
         detail = f"found {n_headers} headers, expected at most {MAX_HEADERS}"
         status = HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE
         return Refusal(status, "headers", detail, _CLOSE_CONNECTION)
     if {"content-length", "transfer-encoding"}.issubset(request.headers):
-        # a proxy that goes by the one and a server that goes by the other see other requests
+        # A proxy that uses one of them and a server that uses the other would see two different
+        # requests (request smuggling).
         detail = "found Content-Length and Transfer-Encoding, expected one of them"
         return Refusal(HTTPStatus.BAD_REQUEST, "two-lengths", detail, _CLOSE_CONNECTION)
     return None
 
 
 def _without_key(needed: KeyScope, *, shown: bool) -> Refusal:
-    """Return the refusal of a request without a key, or with one that is none."""
+    """Return the refusal of a request without a key, or with an invalid one."""
     expected = f"expected a key of scope {needed}"
     if not shown:
         detail = f"found no key, {expected}: Authorization: Bearer KEY, or log in at the page"
         return Refusal(HTTPStatus.UNAUTHORIZED, "no-key", detail, _challenge())
     detail = f"found a key that is none, or no longer, {expected}"
-    told = _challenge(', error="invalid_token"')
-    return Refusal(HTTPStatus.UNAUTHORIZED, "wrong-key", detail, told)
+    headers = _challenge(', error="invalid_token"')
+    return Refusal(HTTPStatus.UNAUTHORIZED, "wrong-key", detail, headers)
 
 
-def shown_key(request: Request) -> tuple[str | None, bool]:
-    """Return the key that a request shows, and whether it is a browser's cookie."""
+def read_key(request: Request) -> tuple[str | None, bool]:
+    """Return the key in a request, or None, and whether it came as a cookie."""
     scheme, _, secret = request.headers.get("authorization", "").partition(" ")
     if scheme.lower() == "bearer":
         return secret.strip(), False
@@ -375,7 +379,7 @@ def shown_key(request: Request) -> tuple[str | None, bool]:
 
 
 def _challenge(more: str = "") -> dict[str, str]:
-    """Return the header that says how to show a key (RFC 6750)."""
+    """Return the header that describes how to send a key (RFC 6750)."""
     return {"WWW-Authenticate": f'Bearer realm="pyrcal"{more}'}
 
 
@@ -385,7 +389,7 @@ def _same(origin: str, host: str) -> bool:
     return port is not None and authority.removesuffix(port) == host.removesuffix(port)
 
 
-# --- who asks, a browser that keeps a key, and whose keys there are
+# --- routes: the session of a browser, and the list of keys
 
 
 router = APIRouter(prefix="/v1", tags=["access"], responses={**INVALID})
@@ -412,9 +416,7 @@ class Holders:
 
 
 SESSION = define_view("SessionView", Session)
-define_view(
-    "KeyView", Key, "name scope created_ns_utc", "A key, but for what only its owner knows."
-)
+define_view("KeyView", Key, "name scope created_ns_utc", "An API key, without its secret.")
 KEYS = define_view("KeysView", Holders)
 
 
@@ -423,25 +425,25 @@ async def session(request: Request) -> Response:
     """Return the name and scope of the key."""
     key: Key | None = request.user
     if key is None:
-        return _not_kept(answer(Session(name=None, scope=KeyScope.ADMIN)))
-    return _not_kept(answer(Session(name=key.name, scope=key.scope)))
+        return _forbid_caching(answer(Session(name=None, scope=KeyScope.ADMIN)))
+    return _forbid_caching(answer(Session(name=key.name, scope=key.scope)))
 
 
-def _not_kept(answered: Response) -> Response:
-    """Return an answer about keys: a browser that others use after this one must not have it."""
+def _forbid_caching(answered: Response) -> Response:
+    """Forbid browsers to cache a response about keys, because others may use the same browser."""
     answered.headers["Cache-Control"] = "no-store"
     return answered
 
 
 @router.post("/session", openapi_extra=needs(KeyScope.READ), responses={200: shows(SESSION)})
 async def log_in(request: Request) -> Response:
-    """Have the browser keep the key in ``Authorization``, out of reach of scripts.
+    """Store the key of ``Authorization`` in a cookie of the browser that scripts cannot read.
 
-    The cookie goes to this host alone, with nothing that another site's page asks for, and lasts
-    until the browser is closed.
+    The browser sends the cookie to this host only, never with requests from pages of other sites,
+    and deletes it when it is closed.
     """
     answered = await session(request)
-    secret, _ = shown_key(request)
+    secret, _ = read_key(request)
     if request.user is not None and secret is not None:
         safe = request.url.scheme == "https" or request.headers.get("origin", "")[:6] == "https:"
         answered.set_cookie(COOKIE, secret, secure=safe, httponly=True, samesite="strict")
@@ -451,21 +453,21 @@ async def log_in(request: Request) -> Response:
 
 @router.delete("/session", status_code=204, openapi_extra=OPEN)
 async def log_out(response: Response) -> None:
-    """Have the browser forget the key."""
+    """Delete the cookie with the key."""
     response.delete_cookie(COOKIE, httponly=True, samesite="strict")
 
 
 @router.get("/keys", openapi_extra=needs(KeyScope.ADMIN), responses={200: shows(KEYS)})
 async def keys(request: Request, file: KeysDep) -> Response:
     """Return the names and scopes of all keys."""
-    return _not_kept(answer(Holders(keys=file.all() if request.user is not None else ())))
+    return _forbid_caching(answer(Holders(keys=file.all() if request.user is not None else ())))
 
 
 @router.delete(
     "/keys/{name}", status_code=204, openapi_extra=needs(KeyScope.ADMIN), responses=UNKNOWN
 )
 async def revoke(
-    request: Request, file: KeysDep, name: Annotated[str, Path(description="Of the key")]
+    request: Request, file: KeysDep, name: Annotated[str, Path(description="Name of the key")]
 ) -> None:
     """Revoke a key at once, open streams included."""
     if request.user is None:

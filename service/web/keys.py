@@ -16,7 +16,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
 from hashlib import sha256
-from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated
 
@@ -187,11 +186,3 @@ class KeyFile:
 
 def _digest(secret: str) -> str:
     return sha256(secret.encode(errors="surrogateescape")).hexdigest()
-
-
-def is_loopback(host: str) -> bool:
-    """Return whether what listens there can be asked by this machine alone."""
-    try:
-        return host == "localhost" or ip_address(host).is_loopback
-    except ValueError:
-        return False

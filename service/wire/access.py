@@ -8,14 +8,18 @@ everything else.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
+from ipaddress import ip_address
 from typing import Final
 
 from service.wire.keys import Keys, Role
 
 ADVANCED_SUFFIX: Final = "/@adv/**"
 """Suffix of the keys on which zenoh's advanced publishers and subscribers exchange messages."""
+
+
+DAY_S: Final = 86400.0
 
 
 class LinkRole(StrEnum):
@@ -148,3 +152,44 @@ def access_control(
             for role in roles
         ],
     }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Certificate:
+    """A certificate that the link depends on."""
+
+    path: str
+    name: str
+    """Its common name: what access goes by."""
+
+    ends_s: float
+    """Expiry, seconds since the Unix epoch, UTC."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkSecurity:
+    """Security of a link; by default there is none."""
+
+    zenoh: Mapping[str, object] = field(default_factory=dict)
+    """Configuration of zenoh for certificates, users and access."""
+
+    roles: Mapping[str, str] = field(default_factory=dict)
+    """The role of each name that has one; empty: no names are known."""
+
+    certificates: tuple[Certificate, ...] = ()
+    secret: bytes | None = None
+    """Key that signs messages; None if messages are neither signed nor checked."""
+
+    warn_s: float = 30 * DAY_S
+    """Time before its expiry from which a certificate is reported, seconds."""
+
+
+NO_SECURITY: Final = LinkSecurity()
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether what listens there can be asked by this machine alone."""
+    try:
+        return host == "localhost" or ip_address(host).is_loopback
+    except ValueError:
+        return False

@@ -1,5 +1,7 @@
+import argparse
 import json
 import os
+import shlex
 import socket
 import subprocess
 import sys
@@ -8,9 +10,19 @@ from pathlib import Path
 
 import pytest
 
+from cacao_bridge.__main__ import arguments_parser
+from check_rtc.__main__ import check_parser
 from pyrcal.__main__ import main
-from pyrcal.arguments import HEADINGS, command_line
-from pyrcal.offline.matrix import FitOptions
+from pyrcal.arguments import (
+    HEADINGS,
+    OLD_WORDS,
+    OTHER_PROGRAMS,
+    command_line,
+    current_words,
+    with_negative_numbers,
+)
+from pyrcal.demo.arguments import demo_parser
+from pyrcal.fitting.matrix import FitOptions
 from service import __version__
 from service.config import Settings, load_settings
 from service.control.reconstructor import MAX_CONDITION, Recipe
@@ -94,6 +106,127 @@ def test_an_option_that_makes_no_sense_is_named_with_what_was_expected(capsys, w
     assert end.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert named in line
+
+
+def leaves(parser):
+    """Every command of a parser that has no commands below it, by its words."""
+    below = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+    for action in below:
+        for name, each in action.choices.items():
+            if name not in OTHER_PROGRAMS:
+                yield from leaves(each)
+    if not below:
+        yield parser
+
+
+COMMANDS = list(leaves(command_line()))
+
+
+@pytest.mark.parametrize("parser", COMMANDS, ids=lambda parser: parser.prog)
+def test_every_help_has_an_example_that_the_command_takes(parser):
+    assert parser.examples
+    assert "examples:" in parser.format_help()
+    for example in parser.examples:
+        program, *words = shlex.split(example)
+        options = command_line().parse_args(words)
+        assert program == "pyrcal"
+        assert example.startswith(parser.prog)
+        assert options.module
+
+
+@pytest.mark.parametrize(
+    ("make", "read"),
+    [
+        (check_parser, lambda words: check_parser().parse_args(words)),
+        (demo_parser, lambda words: demo_parser().parse_args(with_negative_numbers(words))),
+        (arguments_parser, lambda words: arguments_parser().parse_args(words)),
+    ],
+)
+def test_the_examples_of_other_programs_are_taken_by_them(make, read):
+    for example in make().examples:
+        read(shlex.split(example)[2:])
+
+
+def test_required_options_are_marked():
+    for parser in COMMANDS:
+        required = [a for a in parser._actions if a.required and a.option_strings]
+        assert parser.format_help().count("(required)") == len(required)
+        assert not any(f"[{a.option_strings[0]} " in parser.format_usage() for a in required)
+
+
+IN_FULL = {
+    "hold": [],
+    "approve": ["cm-1", "--yes"],
+    "reject": [],
+    "publish": ["previous"],
+    "rollback": ["--anyway", "--why", "so"],
+    "refit": ["--n-modes", "3"],
+    "acknowledge": ["margin"],
+    "mute": ["margin", "600"],
+    "unmute": ["margin"],
+    "acquire": [],
+    "abort": [],
+    "measure": ["--pattern", "sine"],
+    "measure-noisy": ["--duration-s", "9"],
+    "give-up": ["im-1"],
+    "record": ["--before-s", "5"],
+    "end-recording": ["tm-1"],
+    "remove-recording": ["tm-1"],
+    "reconstructors": ["cm-1"],
+}
+
+
+def test_every_old_word_is_tried_below():
+    assert set(OLD_WORDS) | {"measure", "reconstructors"} == set(IN_FULL)
+
+
+@pytest.mark.parametrize("old", IN_FULL)
+def test_an_old_word_is_its_new_command_with_one_line_of_hint(capsys, old):
+    words, new = current_words([old, *IN_FULL[old]])
+    assert words == [*new.split(), *IN_FULL[old]]
+    now = command_line().parse_args(words)
+    assert capsys.readouterr() == ("", "")
+    assert command_line().parse_args([old, *IN_FULL[old]]) == now
+    said = capsys.readouterr()
+    assert (said.out, said.err.count("\n")) == ("", 1)
+    assert f"pyrcal {new}" in said.err
+
+
+@pytest.mark.parametrize("group", ["alarms", "reconstructors", "recordings"])
+def test_a_group_alone_lists_without_a_hint(capsys, group):
+    for more in ([], ["--json"]):
+        options = command_line().parse_args([group, *more])
+        assert options.request.name == f"{group} list"
+        assert options.json is bool(more)
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("words", "close"),
+    [
+        (["aprove"], "reconstructors approve"),
+        (["acknowlege"], "alarms ack"),
+        (["statsu"], "status"),
+        (["reconstructors", "aprove"], "approve"),
+        (["fit", "a", "b", "--metod", "joint"], "--method"),
+        (["fit", "a", "b", "--method", "joints"], "joint"),
+        (["run", "--prot", "1"], "--port"),
+        (["dither", "strat"], "start"),
+        (["import", "spekula"], "specula"),
+    ],
+)
+def test_an_error_names_the_closest_word(capsys, words, close):
+    with pytest.raises(SystemExit) as end:
+        main(words)
+    assert end.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"did you mean {close};" in line
+
+
+def test_a_word_like_no_other_is_not_guessed(capsys):
+    with pytest.raises(SystemExit):
+        main(["xyzzy"])
+    assert "mean" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("words", [["--help"], ["run", "--help"], ["status", "--help"]])
@@ -220,7 +353,7 @@ AT_ONCE = [
     (["run", "--prot", "1"], 2),
     (["reconstruct", "flao-lbt", "0,0,0,1"], 2),
     (["status", "--url", "http://127.0.0.1:1"], 3),
-    (["approve", "--help"], 0),
+    (["reconstructors", "approve", "--help"], 0),
     (["watch", "--url", "http://127.0.0.1:1"], 3),
     (["run", "--config", "none.toml"], 2),
     (["run", "--port", "99999"], 2),
@@ -294,7 +427,7 @@ def test_the_command_line_offers_what_the_program_has():
 def test_a_start_imports_no_more_than_it_needs():
     """Each of these takes a tenth of a second or more, and a start is to take two."""
     code = (
-        "import sys, service.cli.serve; from service.config import load_instrument; "
+        "import sys, service.cli.serve; from service.instrument import load_instrument; "
         "load_instrument('flao-lbt'); "
         "late = ('scipy.linalg', 'scipy.spatial', 'scipy.ndimage', 'scipy.interpolate', "
         "'scipy.sparse', 'scipy.special', 'matplotlib', 'astropy', 'fastapi', 'uvicorn'); "

@@ -1,5 +1,6 @@
 """The manual: its commands are understood, its files are read, its links lead somewhere."""
 
+import argparse
 import json
 import re
 import shlex
@@ -19,9 +20,10 @@ from cacao_bridge.settings import load as load_bridge
 from check_rtc.__main__ import check_parser
 from pyrcal.arguments import command_line, with_negative_numbers
 from pyrcal.demo.arguments import demo_parser
-from pyrcal.offline.system_file import load_system
+from pyrcal.fitting.system_file import load_system
 from service.api import create_app
-from service.config import load_instrument, load_settings
+from service.config import load_settings
+from service.instrument import load_instrument
 from service.tracking.alarms import ALARMS
 from service.web import page
 from sim_rtc.options import parse_options
@@ -171,7 +173,7 @@ def test_a_file_of_the_manual_is_read(text, tmp_path):
         assert load_instrument(path).modes.n_modes > 100
     elif text.startswith("[system]"):
         for name in re.findall(r'"(\w+\.toml)"', text):
-            other = DOCS / "integrate" / "systems.md"
+            other = DOCS / "howto" / "systems.md"
             (tmp_path / name).write_text(next(blocks_of(other, "toml"))[0], encoding="utf-8")
         assert len(load_system(path).pairs) > 1
     elif text.startswith("[wire]"):
@@ -216,7 +218,7 @@ def test_the_layout_on_the_architecture_page_is_that_of_the_code():
     """Its layers are those that the import contracts hold; its folders are those with code."""
     (layout,) = re.findall(
         r"^## Layout\n```\n(.*?)^```",
-        (DOCS / "understand" / "architecture.md").read_text("utf-8"),
+        (DOCS / "developer" / "architecture.md").read_text("utf-8"),
         re.M | re.S,
     )
     drawn, folders = re.split(r"\n(?=pyrcal/)", layout)
@@ -232,6 +234,27 @@ def test_the_layout_on_the_architecture_page_is_that_of_the_code():
     ] == layers
     with_code = {path.parent.name for path in ROOT.glob("*/*.py")} - {"service", "docs"}
     assert with_code | {"docs", "deploy", "tests"} == set(re.findall(r"^(\w+)/", folders, re.M))
+
+
+def test_the_page_of_the_command_line_has_every_command_and_stays_short():
+    """Its limit is 3,000 words; it is generated, and compared with the code elsewhere."""
+    text = (DOCS / "reference" / "cli.md").read_text("utf-8")
+    assert len(text.split()) <= 3000
+    for leaf in leaves(PARSER):
+        (first, *_) = leaf.usage_parts(short=True)
+        assert first in text, first
+    assert "pyrcal import cacao CONF --output DIR" in text  # shares its name with a program
+    assert "pyrcal cacao --config FILE" in text
+
+
+def leaves(parser):
+    """Every command below a parser."""
+    below = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+    for action in below:
+        for each in action.choices.values():
+            yield from leaves(each)
+    if not below:
+        yield parser
 
 
 def test_the_first_screen_of_the_readme_shows_pictures_and_tells_two_commands():

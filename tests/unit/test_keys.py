@@ -13,10 +13,11 @@ from pyrcal.__main__ import main
 from pyrcal.terminal import login
 from service.archive import Archive
 from service.cli.commands import DATA_DIR
-from service.cli.program import announced, running_services
 from service.config import Settings
 from service.errors import ConfigurationError, UnknownIdError
-from service.web.keys import KeyFile, KeyScope, is_loopback
+from service.program import announced, running_services
+from service.web.keys import KeyFile, KeyScope
+from service.wire.access import is_loopback
 
 
 @pytest.fixture(autouse=True)

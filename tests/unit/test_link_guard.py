@@ -7,9 +7,10 @@ import pytest
 import zenoh
 
 from service.link import guard
-from service.link.guard import Certificate, LinkGuard, LinkSecurity
+from service.link.guard import LinkGuard
 from service.link.guard import describe_expiry as ending
 from service.link.guard import describe_refusals as refused
+from service.wire.access import Certificate, LinkSecurity
 
 
 def test_a_refusal_is_spoken_of_for_a_minute_and_counted(monkeypatch):

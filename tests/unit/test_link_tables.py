@@ -17,9 +17,8 @@ from service.config.link_tables import (
     secret_of,
 )
 from service.errors import ConfigurationError
-from service.link.guard import LinkSecurity
 from service.wire import Keys
-from service.wire.access import LinkRole, Rights, access_control, list_rights
+from service.wire.access import LinkRole, LinkSecurity, Rights, access_control, list_rights
 
 
 @pytest.fixture(scope="module")

@@ -115,33 +115,39 @@ def becomes(service, name, state):
 
 
 ORDERS = [
-    (["hold"], "SetMode", {"mode": Mode.HOLD}),
+    (["mode", "hold"], "SetMode", {"mode": Mode.HOLD}),
     (["mode", "auto"], "SetMode", {"mode": Mode.AUTO}),
     (["stop"], "StopEverything", {}),
     (["resume"], "Resume", {}),
     (["dither", "stop"], "StopDither", {}),
+    (["loop", "open", "--yes"], "SetLoop", {"loop": "open"}),
+    (["loop", "close", "--yes"], "SetLoop", {"loop": "closed"}),
     (["dither", "start", "--modes", "3,5", "--frequency-hz", "90,110"], "StartDither",
      {"modes": (3, 5), "frequency_hz": (90.0, 110.0), "over_budget": False}),
     (["dither", "start", "--kind", "binary", "--modes", "all", "--over-budget"], "StartDither",
      {"modes": "all", "over_budget": True}),
-    (["refit", "--n-modes", "300", "--no-wait"], "Refit", {"n_modes": 300}),
-    (["abort"], "AbortAcquisition", {}),
-    (["acquire", "--yes", "--no-wait"], "Acquire", {}),
-    (["approve", "--yes", "--no-wait"], "Approve", {"id": "cm-1"}),
-    (["reject"], "Reject", {"id": "cm-1"}),
-    (["publish", "previous", "--yes", "--no-wait"], "Publish", {"id": "cm-0"}),
-    (["rollback", "--yes", "--no-wait"], "Rollback", {}),
-    (["measure", "--yes", "--no-wait", "--n-average", "3"], "Measure", {"n_average": 3}),
-    (["measure-noisy", "--no-wait", "--duration-s", "9"], "MeasureNoisy", {"duration_s": 9.0}),
-    (["acknowledge", "margin"], "AcknowledgeAlarm", {"name": "margin", "severity": None}),
-    (["mute", "margin", "600"], "MuteAlarm", {"name": "margin", "for_s": 600.0}),
-    (["unmute", "margin"], "UnmuteAlarm", {"name": "margin"}),
-    (["give-up", "im-1"], "GiveUp", {"id": "im-1"}),
+    (["reconstructors", "compute", "--n-modes", "300", "--no-wait"], "Refit", {"n_modes": 300}),
+    (["loop", "abort"], "AbortAcquisition", {}),
+    (["loop", "acquire", "--yes", "--no-wait"], "Acquire", {}),
+    (["reconstructors", "approve", "--yes", "--no-wait"], "Approve", {"id": "cm-1"}),
+    (["reconstructors", "reject"], "Reject", {"id": "cm-1"}),
+    (["reconstructors", "publish", "previous", "--yes", "--no-wait"], "Publish", {"id": "cm-0"}),
+    (["reconstructors", "rollback", "--yes", "--no-wait"], "Rollback", {}),
+    (["measure", "matrix", "--yes", "--no-wait", "--n-average", "3"], "Measure", {"n_average": 3}),
+    (["measure", "noisy", "--no-wait", "--duration-s", "9"], "MeasureNoisy", {"duration_s": 9.0}),
+    (["alarms", "ack", "margin"], "AcknowledgeAlarm", {"name": "margin", "severity": None}),
+    (["alarms", "mute", "margin", "600"], "MuteAlarm", {"name": "margin", "for_s": 600.0}),
+    (["alarms", "unmute", "margin"], "UnmuteAlarm", {"name": "margin"}),
+    (["measure", "cancel", "im-1"], "GiveUp", {"id": "im-1"}),
 ]  # fmt: skip
 
 
 def test_every_order_of_the_table_is_tried_below():
-    tried = {words[0] for words, _, _ in ORDERS} | {"record", "end-recording", "remove-recording"}
+    tried = {
+        " ".join(words[: 1 if words[0] in {"mode", "stop", "resume"} else 2])
+        for words, _, _ in ORDERS
+    }
+    tried |= {"recordings start", "recordings end", "recordings remove"}
     assert tried == {one.name for one in REQUESTS if one.module == "orders"}
 
 
@@ -158,14 +164,14 @@ def test_an_order_reaches_the_service_with_who_and_why(capsys, service, words, k
 
 def test_without_a_name_it_is_the_login_name(service, monkeypatch):
     monkeypatch.setattr("getpass.getuser", lambda: "grace")
-    assert main(["hold"]) == 0
+    assert main(["mode", "hold"]) == 0
     assert service.commands[0].by == "grace"
 
 
 def test_a_refusal_is_said_in_full_and_is_no_success(capsys, service):
     service.refusal = CommandError("not now: the \x1b[2J moon")
     assert main(["stop"]) == 1
-    assert capsys.readouterr().err == "pyrcal: stop: not now: the \\x1b[2J moon\n"
+    assert capsys.readouterr().err == "pyrcal stop: not now: the \\x1b[2J moon\n"
 
 
 def test_all_that_rest_finds_wrong_is_said(capsys, service):
@@ -175,7 +181,7 @@ def test_all_that_rest_finds_wrong_is_said(capsys, service):
 
 
 def test_what_is_decided_on_is_shown_and_the_service_told_which_it_was(capsys, service):
-    assert main(["approve", "--yes", "--no-wait"]) == 0
+    assert main(["reconstructors", "approve", "--yes", "--no-wait"]) == 0
     told = capsys.readouterr().err
     assert "cm-1: proposed, 400 modes" in told
     assert "worst pole radius 0.800 of at most 0.95: accepted" in told
@@ -186,12 +192,19 @@ def test_what_changes_while_somebody_decides_is_not_decided(capsys, service, mon
     monkeypatch.setattr(
         orders, "_prompt_user", lambda *_: becomes(service, "cm-1", "failed") or "yes"
     )
-    assert main(["approve", "--no-wait"]) == 1
+    assert main(["reconstructors", "approve", "--no-wait"]) == 1
     assert "read it again" in capsys.readouterr().err
     assert service.commands == []
 
 
-@pytest.mark.parametrize("words", [["approve"], ["reject"], ["rollback", "--why", "so"]])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["reconstructors", "approve"],
+        ["reconstructors", "reject"],
+        ["reconstructors", "rollback", "--why", "so"],
+    ],
+)
 def test_where_nobody_can_be_asked_nothing_is_ordered(capsys, service, words):
     assert main(words) == 2
     assert "expected --" in capsys.readouterr().err
@@ -201,7 +214,7 @@ def test_where_nobody_can_be_asked_nothing_is_ordered(capsys, service, words):
 @pytest.mark.parametrize(("said", "status"), [("", 1), ("n", 1), ("yes", 0)])
 def test_only_a_yes_is_one(service, monkeypatch, said, status):
     monkeypatch.setattr(orders, "_prompt_user", lambda *_: said)
-    assert main(["publish", "cm-0", "--no-wait"]) == status
+    assert main(["reconstructors", "publish", "cm-0", "--no-wait"]) == status
     assert len(service.commands) == (status == 0)
 
 
@@ -209,7 +222,7 @@ def test_only_a_yes_is_one(service, monkeypatch, said, status):
 def test_an_approval_is_done_when_the_rtc_has_applied_it(capsys, service, monkeypatch, end, status):
     becomes(service, "cm-1", MatrixState.PUBLISHED)
     at_the_next_look(monkeypatch, lambda: becomes(service, "cm-1", end))
-    assert main(["approve", "cm-1", "--yes"]) == status
+    assert main(["reconstructors", "approve", "cm-1", "--yes"]) == status
     assert capsys.readouterr().out.splitlines()[-1].startswith(f"cm-1 is {end}")
 
 
@@ -242,19 +255,23 @@ class Keeping:
 def test_telemetry_is_kept_and_followed_ended_and_removed(capsys, service):
     kept = service.recordings = Keeping()
     who = ["--why", "odd edge", "--who", "Ada"]
-    assert main(["record", "--duration-s", "5", *who]) == 0
+    assert main(["recordings", "start", "--duration-s", "5", *who]) == 0
     assert capsys.readouterr().out.splitlines() == [
         "tm-1 keeps telemetry for 5 s",
         "tm-1 is stored",
     ]
-    assert main(["end-recording", "tm-1", *who]) == 0
-    assert main(["remove-recording", "tm-1", "--yes", *who]) == 0
+    assert main(["recordings", "list"]) == 0
+    assert "tm-1  stored" in capsys.readouterr().out
+    assert main(["recordings", "end", "tm-1", *who]) == 0
+    assert main(["recordings", "remove", "tm-1", "--yes", *who]) == 0
     begun = (5.0, "Ada", "odd edge", 0.0)  # nothing of before
     assert kept.told == [begun, ("Ada has ended it", "tm-1"), ("tm-1",)]
     assert capsys.readouterr().out.splitlines() == ["tm-1 has ended: 0 MB", "tm-1 is removed"]
 
 
-@pytest.mark.parametrize("words", [["rollback", "--why", "so"], ["publish", "cm-0"]])
+@pytest.mark.parametrize(
+    "words", [["reconstructors", "rollback", "--why", "so"], ["reconstructors", "publish", "cm-0"]]
+)
 def test_what_goes_out_again_is_followed_until_the_rtc_has_applied_it(
     capsys, service, monkeypatch, words
 ):
@@ -270,7 +287,7 @@ def test_what_goes_out_again_is_followed_until_the_rtc_has_applied_it(
 
 def test_an_rtc_that_never_applies_it_is_not_waited_for_for_ever(capsys, service):
     becomes(service, "cm-1", MatrixState.STAGED)
-    assert main(["approve", "cm-1", "--yes"]) == 1
+    assert main(["reconstructors", "approve", "cm-1", "--yes"]) == 1
     assert "cm-1 is staged: waits, still" in capsys.readouterr().out
 
 
@@ -284,7 +301,7 @@ def at(service, stage):
 def test_an_acquisition_is_followed_to_its_end(capsys, service, monkeypatch, end, status):
     at(service, AcquisitionStage.COARSE)
     at_the_next_look(monkeypatch, lambda: at(service, end))
-    assert main(["acquire", "--yes", "--why", "first light"]) == status
+    assert main(["loop", "acquire", "--yes", "--why", "first light"]) == status
     told = capsys.readouterr()
     assert "acquisition, coarse: so far" in told.err
     assert told.out.splitlines()[-1] == f"acquisition, {end}: so far"
@@ -296,9 +313,9 @@ def test_an_acquisition_is_followed_to_its_end(capsys, service, monkeypatch, end
 def test_every_screen_is_there_and_json_is_what_rest_answers(capsys, service):
     for words, part in (
         (["alpha"], "shift x       +0.2000 ± 0.0104 subap"),
-        (["reconstructors"], "cm-1   proposed    400 modes"),
-        (["reconstructors", "in-use"], "rtc-0: applied"),
-        (["alarms"], "no status: look at it"),
+        (["reconstructors", "list"], "cm-1   proposed    400 modes"),
+        (["reconstructors", "show", "in-use"], "rtc-0: applied"),
+        (["alarms", "list"], "no status: look at it"),
         (
             ["audit", "--limit", "2"],
             "1970-01-01 00:00:02Z  Ada: Stop: a\\x1b[2Jb (because: clouds)",
@@ -327,22 +344,31 @@ def test_a_refit_is_followed_until_there_is_a_reconstructor(
         service.refits.end(effect, MatrixMade(record=made, wanted=True))
 
     at_the_next_look(monkeypatch, happens)
-    assert main(["refit"]) == status
+    assert main(["reconstructors", "compute"]) == status
     told = capsys.readouterr().out
     assert "cm-7, 300 modes" in told
     assert "pole radius 0.9" in told
 
 
-@pytest.mark.parametrize("words", [["approve"], ["rollback"], ["acquire"], ["measure"]])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["reconstructors", "approve"],
+        ["reconstructors", "rollback"],
+        ["loop", "acquire"],
+        ["measure", "matrix"],
+    ],
+)
 def test_what_may_not_be_ordered_now_is_refused_before_anybody_is_asked(
     capsys, service, monkeypatch, words
 ):
     monkeypatch.setattr(orders, "_prompt_user", lambda *_: pytest.fail("somebody was asked"))
     service.change(stopped_because="everything was stopped by Ada (wind)")
     assert main(words) == 1
-    reason = service.now.permitted[words[0]].reason
-    assert reason == "everything was stopped by Ada (wind); release the stop first"
-    assert f"pyrcal: {words[0]}: {reason}" in capsys.readouterr().err
+    permitted = {"matrix": "measure"}.get(words[1], words[1])
+    reason = service.now.permitted[permitted].reason
+    assert "Ada (wind)" in reason
+    assert f"pyrcal {' '.join(words)}: {reason}" in capsys.readouterr().err
     assert service.commands == []
     main(["status"])
     shown = capsys.readouterr().out
@@ -351,7 +377,7 @@ def test_what_may_not_be_ordered_now_is_refused_before_anybody_is_asked(
 
 
 def test_what_nobody_has_heard_of_is_a_refusal(capsys, service):
-    assert main(["reconstructors", "cm-9/../x y"]) == 1
+    assert main(["reconstructors", "show", "cm-9/../x y"]) == 1
     assert "cm-9/../x y" in capsys.readouterr().err
     service.change(registration=None)
     assert main(["alpha"]) == 1

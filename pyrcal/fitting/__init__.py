@@ -1,0 +1,1 @@
+"""Fits of measured matrices, and reconstructors, from files; no service is needed."""

@@ -1,0 +1,575 @@
+"""Arguments of the commands that work on files; quick to import.
+
+Names of methods and data sets are repeated here as text, so that the modules need not be imported;
+a test compares them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pyrcal.options import add, words
+from service.errors import ConfigurationError
+from service.files import kind_of, numbers_in, parse_alpha, parse_modes
+from service.model.kinds import ArrayLibrary
+from service.model.sensors.registry import KINDS
+from service.parser import OneLineParser
+from service.program import check_settings, port, such, whole
+
+if TYPE_CHECKING:
+    from pyrcal.fitting.light_rotation import Arms
+
+_memory_gb = such(float, lambda gb: gb > 0.0, "GB above 0")
+_MEMORY = "refuse at once what needs more memory; default %(default)g"
+
+_ARRAY = "library for the matrix; torch and cupy use a GPU; default %(default)s"
+
+_count = such(whole, lambda n: n > 0, "a whole number above 0")
+seconds = such(float, lambda s: 0.0 < s <= 3600.0, "seconds above 0 and up to 3600")
+
+
+def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
+    """Add these commands to a command line."""
+    _describe_archive(
+        commands.add_parser("archive", help="list, verify, prune or export archived matrices")
+    )
+    _describe_bundle(
+        commands.add_parser("bundle", help="write or check a calibration bundle (one file)")
+    )
+    _describe_commission(
+        commands.add_parser(
+            "commission",
+            help="judge a commissioning and write its report",
+            examples=["pyrcal commission --check-rtc check.json --fit fit.json"],
+        )
+    )
+    _describe_certificates(
+        commands.add_parser("certificates", help="make certificates for the link to the RTC")
+    )
+    _describe_fit(commands.add_parser("fit", help="fit the registration to a measured matrix"))
+    _describe_fit_system(
+        commands.add_parser("fit-system", help="fit several sensors and mirrors together")
+    )
+    _describe_reconstruct(
+        commands.add_parser("reconstruct", help="compute a reconstructor for a registration")
+    )
+    _describe_conventions(
+        commands.add_parser("conventions", help="check a measured matrix against the conventions")
+    )
+    _describe_instrument(
+        commands.add_parser("instrument", help="write, check or draw an instrument file")
+    )
+    _describe_import(
+        commands.add_parser("import", help="import instrument and matrix of another code")
+    )
+
+
+_OF_A_FOLDER = (
+    words("--config FILE", "settings of the service, TOML", type=Path),
+    words("--data-dir DIR", "data_dir of the service, default var"),
+)
+"""Options of commands that work in a service's folder."""
+
+
+def _describe_archive(archive: OneLineParser) -> None:
+    archive.set_defaults(module="pyrcal.maintenance.archive")
+    archive.description = (
+        "List, check, export and prune the matrices in the data_dir of a service. All work while "
+        "the service runs, except prune, which the service does by itself."
+    )
+    archive.epilog = "Exit status: 0 done; 1 something is damaged; 2 it cannot be done."
+    aot = (
+        words("output FILE.fits", type=Path),
+        words("--instrument NAME|FILE", "default: that of the settings"),
+        words("--recording FILE", "a file of pyrcal sim --record", type=Path),
+        words("--skip S", "seconds of the recording to skip", type=seconds, default=0.0),
+        words("--seconds S", "seconds to take, default %(default)g", type=seconds, default=10.0),
+        words("--night DATE", "date of the evening, UTC; default that of the recording"),
+    )
+    dry_run = words("--dry-run", "only list what would be removed")
+    actions = archive.add_subparsers(dest="action", required=True, metavar="COMMAND")
+    for action, purpose, more, example in (
+        ("list", "list all matrices, oldest first, and why some are kept", (), "list"),
+        ("show", "show one matrix", (words("id ID", "its id, as in archive list"),), "show cm-3"),
+        ("verify", "read all files and compare checksums", (), "verify --data-dir var"),
+        ("aot", "write registration and telemetry as AOT FITS", aot, "aot night.fits"),
+        ("prune", "remove what [archive] no longer keeps", (dry_run,), "prune --dry-run"),
+    ):
+        parser = actions.add_parser(action, help=purpose, examples=[f"pyrcal archive {example}"])
+        add(parser, *_OF_A_FOLDER, words("--json", "print JSON"), *more)
+
+
+def _describe_commission(commission: OneLineParser) -> None:
+    commission.set_defaults(module="pyrcal.maintenance.commission")
+    commission.description = (
+        "Judge a commissioning: compare the archive of a night, the result of pyrcal check-rtc "
+        "and the fit of a measured matrix with the limits of docs/operate/commissioning.md, and "
+        "write one HTML file with figures. Works while the service runs. Needs the extra 'plots'."
+    )
+    commission.epilog = (
+        "Exit status: 0 all criteria pass; 1 one does not, or has no input; 2 the report cannot "
+        "be made."
+    )
+    add(
+        commission,
+        *_OF_A_FOLDER,
+        words("--instrument NAME|FILE", "default: that of the settings"),
+        words("--check-rtc FILE.json", "output of pyrcal check-rtc --json", type=Path),
+        words("--fit FILE.json", "output of pyrcal fit --json", type=Path),
+        words("--night DATE", "date of the evening, UTC; default: the newest with measurements"),
+        words("--since TIME", "judge from here on, RFC 3339, like 2026-03-01T20:00:00Z"),
+        words("--until TIME", "judge up to here"),
+        words(
+            "--output FILE.html",
+            "default %(default)s",
+            type=Path,
+            default=Path("commissioning.html"),
+        ),
+        words("--json", "print the criteria as JSON"),
+    )
+
+
+def _describe_bundle(bundle: OneLineParser) -> None:
+    bundle.set_defaults(module="pyrcal.maintenance.bundles")
+    bundle.description = (
+        "Write a reconstructor with its gains, basis, registration, verdict and provenance into "
+        "one file with checksums, or check such a file. docs/howto/bundle.md describes it."
+    )
+    bundle.epilog = "Exit status: 0 done; 2 it cannot be done, or a checksum is wrong."
+    actions = bundle.add_subparsers(dest="action", required=True, metavar="COMMAND")
+    add(
+        actions.add_parser(
+            "write",
+            help="write a bundle",
+            examples=["pyrcal bundle write in-use calibration.h5 --interaction-matrix"],
+        ),
+        *_OF_A_FOLDER,
+        words("source ID|in-use|FILE.h5", "a reconstructor of the archive, or an exported one"),
+        words(
+            "output FILE", "FITS if its name ends in .fits, else HDF5; never overwritten", type=Path
+        ),
+        words("--instrument NAME|FILE", "default: that of the settings"),
+        words("--interaction-matrix", "include the interaction matrix at its registration"),
+        words(
+            "--reference FILE.npy", "include the reference slopes of the RTC (n_slopes,)", type=Path
+        ),
+    )
+    add(
+        actions.add_parser(
+            "check",
+            help="read a bundle, compare its checksums, show it",
+            examples=["pyrcal bundle check calibration.h5"],
+        ),
+        words("bundle FILE", "the bundle", type=Path),
+        words("--json", "print JSON"),
+    )
+
+
+def _describe_certificates(certificates: OneLineParser) -> None:
+    certificates.set_defaults(module="pyrcal.maintenance.certificates")
+    certificates.description = (
+        "Make an authority, a certificate for each role on the link (service, rtc, viewer), and "
+        "settings that use them. In a folder that has an authority, that authority signs new "
+        "certificates. docs/operate/link.md says where each file belongs."
+    )
+    certificates.epilog = "Exit status: 0 done; 2 it cannot be done."
+    actions = certificates.add_subparsers(dest="action", required=True, metavar="COMMAND")
+    hosts = "names or addresses of the service, separated by commas; default %(default)s"
+    for action, purpose, more in (
+        (
+            "new",
+            "make certificates",
+            (
+                words("--host NAME,...", hosts, default="127.0.0.1"),
+                words(
+                    "--zenoh-port PORT", "of the link, default %(default)s", type=port, default=7447
+                ),
+                words("--days N", "validity, days; default %(default)s", type=_count, default=365),
+            ),
+        ),
+        ("show", "show the owner and the end of each certificate", ()),
+    ):
+        parser = actions.add_parser(
+            action, help=purpose, examples=[f"pyrcal certificates {action} certificates"]
+        )
+        add(parser, words("folder FOLDER", "folder of the certificates", type=Path), *more)
+
+
+_FIT = """
+Fit the registration of the mirror on the sensor to a measured interaction matrix: shift, rotation
+and magnification with 1 sigma, the gain of every mode, the residual, and a verdict.
+"""
+
+_FIT_EPILOG = """
+REFERENCE holds (n_slopes, n_modes), slope per metre of OPD, in the RTC's own order and axes, as
+the array 'interaction_matrix' or the one that --dataset names. The result goes to standard output,
+progress to standard error. Exit status: 0 accepted; 1 fitted but refused (the verdict says why); 2
+input that cannot be used. docs/howto/fitting.md explains format, orientation and verdicts.
+"""
+
+_RECONSTRUCT = """
+Compute the noise-free interaction matrix for a registration, and the reconstructor. All modes of
+the basis can be controlled, however few were measured.
+"""
+
+INSTRUMENT = "instrument file (TOML) or a packaged name"
+"""Meaning of the operand that most of these commands have."""
+
+_INSTRUMENT = words("instrument INSTRUMENT", INSTRUMENT)
+
+_OF_AN_ANSWER = (
+    words("--json", "print one JSON object, not a table"),
+    words("--plot FILE.png", "write the figures", type=Path),
+    words("--output FILE.h5", "write all results", type=Path),
+    words("--threads N", "default: one for each core", type=_count, default=os.cpu_count() or 1),
+)
+"""Options of commands that fit a registration."""
+
+
+def _describe_fit(fit: OneLineParser) -> None:
+    fit.set_defaults(module="pyrcal.fitting.fit")
+    fit.description, fit.epilog = _FIT, _FIT_EPILOG
+    fit.examples = (
+        "pyrcal fit flao-lbt matrix.h5 --output fit.h5",
+        "pyrcal fit bench.toml matrix.fits --modes 0:400 --plot fit.png",
+    )
+    methods = (
+        "joint: all parameters together (default); paper: the ten scans of Heritier et al. 2018, "
+        "Table 1, without free gains; sensitivity: projection on sensitivity matrices"
+    )
+    modes = "basis indices to use, like 0:400 (end excluded) or 3,5,9; default all"
+    start = "start of the fit: subapertures, degrees, ratio"
+    flux = "illumination: counts of the four pupil images, array flux (4, n, n)"
+    reference = "earlier flux map: report the rotation of the illumination since then"
+    arms = "spider arms: report the rotation of their shadows in the flux map"
+    add(
+        fit,
+        _INSTRUMENT,
+        words("reference REFERENCE", "HDF5, FITS or NumPy file", type=Path),
+        words("--dataset NAME", "dataset of the matrix, default interaction_matrix"),
+        words("--method", methods, choices=("joint", "paper", "sensitivity"), default="joint"),
+        words("--modes FIRST:END", modes, type=_read_by(parse_modes)),
+        words("--start X,Y,ROT,MAG", start, type=_read_by(parse_alpha)),
+        words("--flux-map FILE", flux, type=Path),
+    )
+    add(
+        fit.add_mutually_exclusive_group(),
+        words("--flux-reference FILE", reference, type=Path),
+        words("--arms WIDTH:DEG,DEG...", arms, type=_read_by(parse_arms)),
+    )
+    add(
+        fit,
+        words("--gain-map", "also fit a smooth gain over the pupil"),
+        words(
+            "--gain G",
+            "integrator gain for the stability check of the reconstructor, default %(default)g",
+            type=float,
+            default=0.5,
+        ),
+        words("--no-anamorphosis", "keep the anamorphosis of the instrument file"),
+        words("--anamorphosis", argparse.SUPPRESS),
+        words("--memory-gb GB", _MEMORY, type=_memory_gb, default=6.0),
+        *_OF_AN_ANSWER,
+    )
+
+
+_FIT_SYSTEM = """
+Estimate the position of each sensor, mirror and star of a system from the measured interaction
+matrix of each sensor with each mirror. Each pair is fitted as by pyrcal fit; the positions follow
+by weighted least squares. Directions that no pair observes are listed.
+"""
+
+_FIT_SYSTEM_EPILOG = """
+Exit status: 0 accepted; 1 fitted but refused (the verdict says why); 2 input that cannot be used.
+docs/howto/systems.md explains the file, the gauge and verdicts.
+"""
+
+
+def _describe_fit_system(fit: OneLineParser) -> None:
+    fit.set_defaults(module="pyrcal.fitting.fit_system")
+    fit.description, fit.epilog = _FIT_SYSTEM, _FIT_SYSTEM_EPILOG
+    fit.examples = ("pyrcal fit-system system.toml matrices.h5 --json",)
+    reference = (
+        "the matrices: one HDF5 file, or one file for each pair, with {sensor} and {mirror} in "
+        "place of their names"
+    )
+    dataset = "dataset of each matrix; default {sensor}/{mirror}/interaction_matrix in one file"
+    add(
+        fit,
+        words("system SYSTEM", "TOML file of sensors and mirrors", type=Path),
+        words("reference REFERENCE", reference, type=Path),
+        words("--dataset NAME", dataset),
+        *_OF_AN_ANSWER,
+    )
+
+
+def _describe_reconstruct(make: OneLineParser) -> None:
+    make.set_defaults(module="pyrcal.fitting.reconstruct")
+    make.description = _RECONSTRUCT
+    make.epilog = "Exit status: 0 written; 2 input that cannot be used."
+    make.examples = (
+        "pyrcal reconstruct flao-lbt fit.h5 --modes 500 --output cm.h5",
+        "pyrcal reconstruct flao-lbt 0.1,-0.05,0.2,1.002 --modes 400 --output cm.h5",
+    )
+    alpha = (
+        "X,Y,ROT,MAG (subapertures, degrees, ratio), or a file that pyrcal fit wrote with "
+        "--json or --output"
+    )
+    methods = (
+        "svd: least squares without weak singular values (default); map: with noise and "
+        "turbulence as priors"
+    )
+    noise = "of map: 1 sigma of one slope in one frame, default %(default)g"
+    gains = "use the columns of the model; by default they are multiplied by the fitted gains"
+    condition = words(
+        "--max-condition C",
+        "of svd: largest condition number, default %(default)g",
+        type=float,
+        default=100.0,
+    )
+    add(
+        make,
+        _INSTRUMENT,
+        words("alpha ALPHA", alpha),
+        words("--modes N", "control the first N modes", type=_count, required=True),
+        words("--output FILE.h5", "file to write", type=Path, required=True),
+        words("--method", methods, choices=("svd", "map"), default="svd"),
+        condition,
+        words("--slope-noise RMS", noise, type=float, default=0.05),
+        words("--memory-gb GB", _MEMORY, type=_memory_gb, default=6.0),
+        words("--array LIBRARY", _ARRAY, choices=tuple(ArrayLibrary), default="numpy"),
+        words("--no-gains", gains),
+        words("--flux-map FILE", "illumination, as in pyrcal fit", type=Path),
+        words("--reference FILE", "measured matrix, whose checksum is recorded", type=Path),
+        words(
+            "--specula PUPDATA.fits",
+            "also write Intmat and Recmat of SPECULA, in the order of its PupData or SubapData",
+            type=Path,
+        ),
+    )
+
+
+def _describe_conventions(check: OneLineParser) -> None:
+    check.set_defaults(module="pyrcal.conventions")
+    check.description = (
+        "Check a measured matrix, and the modes of its instrument file, against the numbered "
+        "rules of docs/reference/conventions.md; print which are broken, and by how much."
+    )
+    check.epilog = "Exit status: 0 all are kept; 1 some are broken; 2 input that cannot be used."
+    check.examples = ("pyrcal conventions bench.toml matrix.h5",)
+    add(
+        check,
+        _INSTRUMENT,
+        words("reference REFERENCE", "HDF5, FITS or NumPy file", type=Path),
+        words("--dataset NAME", "dataset of the matrix, default interaction_matrix"),
+    )
+
+
+def _describe_instrument(instrument: OneLineParser) -> None:
+    instrument.set_defaults(module="pyrcal.instruments.program")
+    instrument.description = "Write a commented instrument file, check one, or draw it."
+    instrument.epilog = (
+        "Exit status: 0 done; 1 something is wrong with the instrument file; 2 a file cannot be "
+        "written."
+    )
+    kind = words(
+        "--kind KIND", "kind of sensor, default pyramid", choices=tuple(KINDS), default="pyramid"
+    )
+    memory = "compute the matrix only if that takes no more, default %(default)g"
+    new = words("file FILE.toml", "file to write", type=Path)
+    picture = words("picture PICTURE.png", "picture to write", type=Path)
+    actions = instrument.add_subparsers(dest="action", required=True, metavar="COMMAND")
+    for action, purpose, more, example in (
+        ("new", "write a file with all keys", (new, kind), "new bench.toml"),
+        (
+            "check",
+            "print all errors of the file, and what follows from it",
+            (_INSTRUMENT, words("--memory-gb GB", memory, type=float, default=4.0)),
+            "check bench.toml",
+        ),
+        (
+            "show",
+            "draw pupil, subapertures, actuators",
+            (_INSTRUMENT, picture),
+            "show bench.toml bench.png",
+        ),
+    ):
+        parser = actions.add_parser(action, help=purpose, examples=[f"pyrcal instrument {example}"])
+        add(parser, *more)
+
+
+def _describe_import(bring: OneLineParser) -> None:
+    bring.set_defaults(module="pyrcal.importers.program")
+    bring.description = (
+        "Write an instrument file and a measured matrix for pyrcal fit from files of another code. "
+        "Parameters that neither files nor options contain are marked unknown. docs/integrate "
+        "explains each code."
+    )
+    bring.epilog = "Exit status: 0 written; 2 input that cannot be used."
+    folder = words("--output DIR", "new folder for both files", type=Path, required=True)
+    saved = words(
+        "file FILE.npz", "arrays listed in docs/tutorials/oopao.md, by np.savez", type=Path
+    )
+    known = "files, recognised by their content"
+    roles = "file or folder with arrays of known names, or ROLE=FILE with a role of matrix, valid, "
+    roles += "light, modes, positions, mode_to_actuator"
+    own = words("files FILE", known, type=_role_and_path, nargs="+")
+    named = words("files [ROLE=]FILE", roles, type=_role_and_path, nargs="+")
+    described = words(
+        "--instrument NAME|FILE",
+        "packaged instrument or instrument file that describes telescope, sensor and mirror",
+    )
+    basis = words(
+        "--basis BASIS",
+        "if only positions are given: one column for each actuator, or KL modes",
+        choices=("zonal", "KL"),
+    )
+    unit = words(
+        "--unit UNIT", "unit of the commands, OPD; default: unknown", choices=("m", "um", "nm")
+    )
+    sources = bring.add_subparsers(dest="source", required=True, metavar="COMMAND")
+    response = words("--response NAME", "such as loRM; default: of single actuators if present")
+    loop = words("--loop N|UID", "if there are several loops: number, from 1, or uid")
+    positions = words("--positions FILE", "of the actuators, x and y in metres", type=Path)
+    arrays = (named, unit, described, basis)
+    for source, purpose, more, example in (
+        ("oopao", "from saved OOPAO objects", (saved,), "system.npz"),
+        (
+            "specula",
+            "from Intmat, PupData or SubapData, IFunc, M2C of SPECULA",
+            (own,),
+            "im.fits pupdata.fits ifunc.fits m2c.fits --diameter-m 8.2",
+        ),
+        (
+            "synim",
+            "from the same files of SynIM",
+            (own,),
+            "im.fits subapdata.fits ifunc.fits --diameter-m 8.2",
+        ),
+        (
+            "cacao",
+            "from the conf folder of a cacao loop, or an example folder",
+            (words("folder CONF", "conf folder", type=Path), response),
+            "conf --diameter-m 8.2",
+        ),
+        ("pyrtc", "from calibrations of pyRTC 2", arrays, "calibration --instrument bench.toml"),
+        (
+            "aot",
+            "from an AOT file",
+            (words("file FILE.fits", "AOT file", type=Path), loop, positions, unit),
+            "telemetry.fits --diameter-m 8.2",
+        ),
+        (
+            "files",
+            "from NumPy, FITS or HDF5 files",
+            arrays,
+            "matrix=im.npy positions=xy.npy --unit um --diameter-m 8.2",
+        ),
+        ("npz", "same as files", arrays, "arrays.npz --diameter-m 8.2"),
+    ):
+        parser = sources.add_parser(
+            source, help=purpose, examples=[f"pyrcal import {source} {example} --output imported"]
+        )
+        add(parser, *more, folder)
+        if source != "oopao":
+            add(parser.add_argument_group(DESCRIPTION), *_DESCRIBED)
+
+
+def _read_by(parse: Callable[[str], object]) -> Callable[[str], object]:
+    """Return a reader whose refusals argparse prints as they are."""
+
+    def read(text: str) -> object:
+        try:
+            return parse(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+
+    return read
+
+
+DESCRIPTION = "description options"
+"""Title of the options for values that no file contains."""
+
+_DESCRIBED = (
+    words("--diameter-m D", "of the pupil; required without --instrument", type=float),
+    words(
+        "--modes FIRST:END",
+        "basis index of each column, like 0:400 or 3,5,9; default the first ones",
+        type=_read_by(parse_modes),
+    ),
+    words("--sensor KIND", "default: that of the files, else pyramid", choices=tuple(KINDS)),
+    words(
+        "--stop STOP",
+        "aperture stop, default %(default)s",
+        choices=("telescope", "mirror"),
+        default="telescope",
+    ),
+    words("--obscuration RATIO", "linear; default: from the mask", type=float),
+    words("--wavelength-m W", "default: unknown", type=float),
+    words("--modulation RADIUS", "of a pyramid, λ/D; default: unknown", type=float),
+    words("--pupil-subap N", "pupil diameter, subapertures; default: from the mask", type=float),
+    words(
+        "--pixels-per-subap N", "of camera frames; default: from the actuator pitch", type=_count
+    ),
+)
+
+
+def _role_and_path(text: str) -> tuple[str | None, Path]:
+    """Return what a file is for, where that is said, and the file."""
+    role, sign, path = text.partition("=")
+    return (role, Path(path)) if sign else (None, Path(text))
+
+
+def parse_arms(text: str) -> Arms:
+    """Return the spider's arms ``WIDTH:DEG,DEG,...``: subapertures, degrees from +x towards +y.
+
+    Raises
+    ------
+    ValueError
+        If it is not a width above 0 and at least one finite angle.
+    """
+    first, _, rest = text.partition(":")
+    width, angles = numbers_in(first), numbers_in(rest)
+    if not angles or len(width) != 1 or width[0] <= 0.0:
+        expected = "expected WIDTH:DEG,DEG,... of the spider's arms, like 0.9:90,210,330"
+        raise ValueError(f"found {text.strip()!r}, {expected}")
+    from pyrcal.fitting.light_rotation import Arms
+
+    return Arms(angles_rad=tuple(math.radians(a) for a in angles), width_subap=width[0])
+
+
+def check_files(options: argparse.Namespace) -> None:
+    """Refuse files that cannot be what they are given as, before anything large is imported.
+
+    Raises
+    ------
+    PyrcalError
+        One line that names the file.
+    """
+    check_settings(options)
+    if options.command in {"fit", "reconstruct"}:
+        from service.instrument.schema import read_instrument_file
+
+        read_instrument_file(options.instrument)
+    for path in _paths(options, "output", "plot"):
+        if not path.absolute().parent.is_dir():
+            raise ConfigurationError(f"{path}: found no folder {path.parent}, expected it to exist")
+    measured = ("reference",) if options.command == "fit" else ()
+    for path in _paths(options, "flux_map", "flux_reference", *measured):
+        kind_of(path)
+    if options.command == "reconstruct" and not Path(options.alpha).is_file():
+        try:
+            parse_alpha(options.alpha)
+        except ValueError as error:
+            raise ConfigurationError(f"ALPHA: no such file, and {error}") from error
+
+
+def _paths(options: argparse.Namespace, *names: str) -> list[Path]:
+    """Return the files of these names that were given."""
+    found = [getattr(options, name, None) for name in names]
+    return [path for path in found if path is not None]

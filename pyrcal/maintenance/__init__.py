@@ -1,0 +1,1 @@
+"""Commands on what a service keeps: its archive, bundles for other machines, certificates."""

@@ -1,1 +1,0 @@
-"""Files in, answers out: fits, reconstructors, exports, without a service."""

@@ -1,0 +1,160 @@
+"""Argument parser of all programs of pyrcal: usage, help with examples, errors on one line.
+
+The usage names operands first, in their order, then required options, then the others. An error
+names the closest valid word. Quick to import.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import textwrap
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from typing import Any, NoReturn
+
+from typing_extensions import override
+
+
+class HelpFormatter(argparse.HelpFormatter):
+    """Formatter that marks required options and keeps lines that begin with two blanks."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=30, width=_text_width())
+
+    @override
+    def _get_help_string(self, action: argparse.Action) -> str:
+        text = action.help or ""
+        return f"{text} (required)".strip() if action.option_strings and action.required else text
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """Parser that reports an error on one line, without the usage.
+
+    Parameters
+    ----------
+    examples
+        Command lines that end the help.
+    """
+
+    def __init__(self, *given: Any, examples: Sequence[str] = (), **more: Any) -> None:  # noqa: ANN401 - argparse's own
+        more.setdefault("formatter_class", HelpFormatter)
+        super().__init__(*given, **more)
+        self.examples = tuple(examples)
+        self._positionals.title = "arguments"
+
+    def usage_parts(self, left_out: Collection[str] = (), *, short: bool = False) -> Iterator[str]:
+        """Yield the usage part by part, without the groups of options ``left_out`` by title.
+
+        ``short``: options that are not required become one part.
+        """
+        yield self.prog
+        groups = [group for group in self._action_groups if group.title in left_out]
+        hidden = {id(action) for group in groups for action in group._group_actions}  # noqa: SLF001
+        shown = self.shown_actions()
+        yield from (operand_text(action) for action in shown if not action.option_strings)
+        options = [a for a in shown if a.option_strings and id(a) not in hidden]
+        yield from (option_text(action) for action in options if action.required)
+        exclusive = [group._group_actions for group in self._mutually_exclusive_groups]  # noqa: SLF001
+        if short and not all(action.required for action in options):
+            yield "[options]"
+            return
+        for action in options:
+            among = next((each for each in exclusive if action in each), [action])
+            if not action.required and action is among[0]:
+                yield f"[{' | '.join(map(option_text, among))}]"
+
+    def shown_actions(self) -> list[argparse.Action]:
+        """Return the operands and options that users give, without ``--help``."""
+        return [
+            a for a in self._actions if a.help != argparse.SUPPRESS and "-h" not in a.option_strings
+        ]
+
+    @override
+    def format_usage(self) -> str:
+        return "\n".join(wrap_usage(["usage:", *self.usage_parts()], _text_width())) + "\n"
+
+    @override
+    def format_help(self) -> str:
+        self.usage = argparse.SUPPRESS
+        text = f"{self.format_usage()}\n{super().format_help().lstrip()}"
+        if not self.examples:
+            return text
+        return "\n".join(
+            [f"{text.rstrip()}\n", "examples:", *(f"  {e}" for e in self.examples), ""]
+        )
+
+    @override
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        options, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            known = (word for action in self._actions for word in action.option_strings)
+            kind = "an unknown option" if unknown[0].startswith("-") else "one argument too many"
+            self.error(f"found {unknown[0]!r}, {kind}{closest(unknown[0], known)}")
+        return options, unknown
+
+    @override
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            raise argparse.ArgumentError(action, self.explain_choice(action, str(value)))
+
+    def explain_choice(self, action: argparse.Action, value: str) -> str:
+        """Return what is wrong with a value that is none of the choices."""
+        known = list(map(str, action.choices or ()))
+        listed = ", ".join(map(repr, known))
+        return f"found {value!r}, expected one of {listed}{closest(value, known)}"
+
+    @override
+    def error(self, message: str) -> NoReturn:
+        """End the program with status 2."""
+        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
+def closest(found: str, known: Iterable[str]) -> str:
+    """Return the end of a message: the known word that is most like the one found, if any is."""
+    from difflib import get_close_matches
+
+    near = get_close_matches(found, list(known), n=1)
+    return f"; did you mean {near[0]}" if near else ""
+
+
+def wrap_usage(parts: Iterable[str], width: int) -> list[str]:
+    """Return the parts of a usage on lines of a width; no part is broken."""
+    text = " ".join(part.replace(" ", "\N{NO-BREAK SPACE}") for part in parts)
+    lines = textwrap.wrap(
+        text, width, subsequent_indent=" " * 8, break_long_words=False, break_on_hyphens=False
+    )
+    return [line.replace("\N{NO-BREAK SPACE}", " ") for line in lines]
+
+
+def _text_width() -> int:
+    return max(min(shutil.get_terminal_size().columns, 100) - 2, 40)
+
+
+def operand_text(action: argparse.Action) -> str:
+    """Return an operand as the usage shows it."""
+    if isinstance(action, argparse._SubParsersAction):  # noqa: SLF001 - argparse tells it nowhere else
+        return (
+            "COMMAND ..." if len(action.choices) > _FEW else f"{{{'|'.join(action.choices)}}} ..."
+        )
+    name = _value(action)
+    forms = {"?": f"[{name}]", "*": f"[{name} ...]", "+": f"{name} ..."}
+    return forms.get(str(action.nargs), name)
+
+
+_FEW = 8
+"""Largest number of commands that a usage names one by one."""
+
+
+def option_text(action: argparse.Action) -> str:
+    """Return an option as the usage shows it, without brackets."""
+    if action.nargs == 0:
+        return action.option_strings[0]
+    value = _value(action)
+    return f"{action.option_strings[0]} {f'[{value}]' if action.nargs == '?' else value}"
+
+
+def _value(action: argparse.Action) -> str:
+    """Return the placeholder of a value: its own, the choices, or the option's name."""
+    if action.metavar:
+        return str(action.metavar)
+    return f"{{{'|'.join(map(str, action.choices))}}}" if action.choices else action.dest.upper()

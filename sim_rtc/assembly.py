@@ -162,7 +162,7 @@ def at_held_rate(options: Options, instrument: Instrument) -> Options:
 
 
 def in_sensor_mode(options: Options, instrument: Instrument) -> Instrument:
-    """Return the instrument in the mode of its sensor that is asked for; else in its first.
+    """Return the instrument in the requested mode of its sensor, by default the first one.
 
     Raises
     ------
@@ -192,8 +192,8 @@ def build_telescope(
 ) -> Telescope:
     """Return the telescope of these options.
 
-    Optics to come are computed by ``executor``, a thread beside the loop unless given: then a
-    movement of the registration may come late. ``batch_frames`` are processed together if the
+    Optics of later registrations are computed by ``executor``, by default a thread of its own: then
+    a movement of the registration may come late. ``batch_frames`` are processed together if the
     plant is linear.
 
     Raises
@@ -438,7 +438,7 @@ def build_drive(options: Options, instrument: Instrument, basis: Basis) -> Mirro
     Raises
     ------
     ConfigurationError
-        If limits are asked for of a mirror whose actuators are not known.
+        If limits are given for a mirror whose actuators are not known.
     """
     if options.plant != "diffractive" and not options.needs_drive:
         return None

@@ -68,7 +68,7 @@ def _is_zonal(mirror: Mirror | TabulatedModes) -> TypeGuard[Mirror]:
 def write_live_instrument(instrument: str | Path, path: Path, n_modes: int | None = None) -> None:
     """Write an instrument file like another one, for an RTC that sends slopes.
 
-    Files that it refers to are named by their absolute paths, so that it may lie anywhere.
+    Files that it refers to are named by their absolute paths, so that it can be moved.
     ``n_modes`` is as in ``with_modes``.
 
     Raises

@@ -114,10 +114,10 @@ DATA_DIR = "var"
 """The settings' own default; reading all of them would take three times as long."""
 
 _WITHOUT = {
-    False: "on loopback none is needed: pyrcal key add NAME makes one",
+    False: "clients on this machine need none; pyrcal key add NAME makes one",
     True: (
-        "there is no key, so nobody may ask: pyrcal key add makes one; without the file this "
-        "machine needs none"
+        "the file has no key, so every request is refused: make one with pyrcal key add NAME, or "
+        "remove the file to admit clients on this machine without a key"
     ),
 }
 """Meaning of a missing option, with and without a file."""
@@ -140,7 +140,7 @@ def _key(options: argparse.Namespace) -> int:
     elif options.action == "revoke":
         file.revoke(options.name)
         _recorded(file, "key.revoked", options.name)
-        say(f"{file.path}: the key of {options.name} is worthless from now on")
+        say(f"{file.path}: the key of {options.name} is revoked")
     else:
         keys = file.all()
         for key in keys:

@@ -166,7 +166,7 @@ def _diagonalise(
     found.sort(key=lambda mode: -mode[0])
     ordered = _even_before_odd(found)[:n_modes]
     if len(ordered) < n_modes:
-        raise ModelError(f"modes: the mirror has {len(ordered)} modes, {n_modes} were asked for")
+        raise ModelError(f"modes: the mirror has {len(ordered)} modes, {n_modes} were requested")
     return np.column_stack([mode[2] for mode in ordered]), np.array([mode[0] for mode in ordered])
 
 

@@ -61,8 +61,8 @@ INTERVALS_KEPT = 16
 MOVING = "the mirror's image was being moved"
 BOTH_SIDES = "its telemetry may be from both sides of a jump"
 BEFORE_DOUBT = (
-    "it began before α came into doubt and agrees with what was known then: only one taken since "
-    "can tell"
+    "it began before α came into doubt and agrees with the α of that time: only a window taken "
+    "since then can decide"
 )
 
 _ROUNDING_NS = 1_000_000

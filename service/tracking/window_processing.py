@@ -155,7 +155,7 @@ def process_window(context: StepContext, measured: WindowEstimate) -> None:
     if registration.suspected_jump is not None:
         text = (
             f"the window {_distance_text(registration.suspected_jump, registration)} from α was "
-            f"not confirmed: the one after it lies {_distance_text(measured, registration)} away"
+            f"not confirmed: the next one is {_distance_text(measured, registration)} away"
         )
         n_outlying = context.windows.outlying + 1
         context.windows = replace(context.windows, outlying=n_outlying)
@@ -189,7 +189,7 @@ def _suspect_jump(
     """
     innovation = far.mahalanobis_squared
     text = (
-        f"a window lies {_distance_text(measured, registration)} from α "
+        f"a window is {_distance_text(measured, registration)} from α "
         f"(innovation {innovation:.0f}, expected 4, "
         f"rotation {np.sqrt(far.rotation):.1f} sigma): the next one decides; nothing is made or "
         "sent meanwhile"

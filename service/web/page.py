@@ -343,7 +343,7 @@ class Stream:
         """Streams that are open."""
 
     async def listen(self, heard: str) -> AsyncIterator[bytes]:
-        """Yield server-sent events after the log line with the id ``heard``."""
+        """Yield server-sent events that follow the log line with this id, the last one received."""
         ids: list[str] | None = None
         version, quiet_since = 0, 0
         yield f"retry: {RETRY_MS}\n\n".encode()

@@ -68,7 +68,7 @@ class Imperfections:
     image_offsets_px: tuple[float, ...] = ()
     """Displacement x, y of each pupil image of a pyramid from its place on the pixel grid, detector
     pixels, of the images at -x -y, +x -y, -x +y, +x +y. Their mean would be a shift of the
-    registration and is taken out. Empty if the images lie on the grid."""
+    registration and is taken out. Empty if the images are on the grid."""
 
     image_offset_rms_px: float = 0.0
     """RMS of the eight displacements, detector pixels, if they are drawn at random."""
@@ -114,7 +114,7 @@ class SlopeErrors:
         rng: np.random.Generator,
         recipe: SlopeRecipe = PLAIN,
     ) -> None:
-        """Take where the pixels of valid subapertures stand in the light, as a ``SensorKind`` says.
+        """Set the indices of the pixels of valid subapertures in the flux, of a ``SensorKind``.
 
         ``pixels`` is ``(n_pixels, n_valid)``.
         """
@@ -174,7 +174,7 @@ class SlopeErrors:
 def image_offsets(imperfections: Imperfections, rng: np.random.Generator) -> Array | None:
     """Return the displacements (x, y) of the four pupil images ``(4, 2)``, detector pixels.
 
-    Of the images at -x -y, +x -y, -x +y, +x +y; their mean is 0. None if they lie on the pixel
+    Of the images at -x -y, +x -y, -x +y, +x +y; their mean is 0. None if they are on the pixel
     grid.
     """
     given, rms_px = imperfections.image_offsets_px, imperfections.image_offset_rms_px

@@ -110,7 +110,7 @@ class Plant(ABC):
     """``(n_points,)`` static OPD that the sensor sees and the science does not."""
 
     image_offsets_px: Array | None = None
-    """``(4, 2)`` displacement (x, y) of each pupil image; None if they lie on the pixel grid."""
+    """``(4, 2)`` displacement (x, y) of each pupil image; None if they are on the pixel grid."""
 
     @abstractmethod
     def optics(self, alpha: Misregistration) -> Optics:

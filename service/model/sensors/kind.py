@@ -368,7 +368,9 @@ class SensorKind(ABC):
         """Return what an instrument's light says of the pupil, or why it says nothing."""
         from service.model.sensors.sensor import CannotTell
 
-        return CannotTell(reason=f"the light of a {self.name} does not tell where the pupil lies")
+        return CannotTell(
+            reason=f"the position of the pupil cannot be estimated from the flux of a {self.name}"
+        )
 
 
 def _mean(term: Term) -> float:

@@ -257,7 +257,7 @@ def test_a_dither_weaker_than_half_its_request_is_named_with_both_numbers():
     block = telemetry(1100)
     weak = replace(block, dither_m=block.dither_m * np.float32([1, 0.4, 1, 1, 1]))
     reason = only_refusal(weak).reason
-    assert "mode 1 carries 3.20 nm of dither at 270.0 Hz, 8.00 nm were asked for" in reason
+    assert "mode 1 carries 3.20 nm of dither at 270.0 Hz, 8.00 nm were requested" in reason
     assert "see whether the RTC clips it" in reason
 
 

@@ -216,7 +216,7 @@ def test_a_clipped_dither_is_refused_with_the_mode_and_both_amplitudes():
     dither[:, 35] *= 0.2
     refused = only_window(RandomDither(plan=plan()), replace(block, dither_m=dither))
     assert isinstance(refused, WindowRefused)
-    assert "mode 35 carries 1.00 nm of dither, 5.00 nm were asked for" in refused.reason
+    assert "mode 35 carries 1.00 nm of dither, 5.00 nm were requested" in refused.reason
 
 
 def test_another_reconstructor_inside_the_window_ends_it():

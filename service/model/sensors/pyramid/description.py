@@ -128,7 +128,7 @@ def _in_mode(sensor: Pyramid, mode: PyramidMode, where: str) -> SensorMode:
     if mode.n_subapertures is None and n % binning:
         raise ModelError(
             f"{where}.binning: found {binning} of {n} subapertures, which it does not divide; "
-            f"expected n_subapertures beside it, the binned grid's: about {n / binning:.1f}"
+            f"expected n_subapertures as well, that of the binned grid: about {n / binning:.1f}"
         )
     across = mode.n_subapertures or n // binning
     diameter = sensor.pupil_diameter / binning

@@ -47,7 +47,9 @@ class ShackHartmannKind(SensorKind):
                 "[wfs.laser] with height_m, thickness_m, spot_arcsec and launcher_m"
             )
         if "guide_star_height_m" in written and "laser" in written:
-            raise ModelError("guide_star_height_m: has no meaning beside the table [wfs.laser]")
+            raise ModelError(
+                "guide_star_height_m: has no effect together with the table [wfs.laser]; remove it"
+            )
         return written
 
     @override
@@ -83,7 +85,7 @@ class ShackHartmannKind(SensorKind):
         if table.centroid is Centroid.THRESHOLD and "partly_lit" not in given:
             yield (
                 "partly_lit",
-                'not given, taken as "leave out": beside a threshold, fits leave out subapertures '
+                'not given, taken as "leave out": with a threshold, fits leave out subapertures '
                 "that the edge of the pupil cuts",
             )
 

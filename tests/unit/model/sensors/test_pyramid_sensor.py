@@ -140,7 +140,7 @@ def test_a_kind_without_light_frames_or_working_point_says_so():
     plain, instrument = Plain(), small_instrument()
     seen = plain.light(instrument)
     assert isinstance(seen, CannotTell)
-    assert seen.reason == "the light of a plain does not tell where the pupil lies"
+    assert "of a plain" in seen.reason
     assert plain.working_point(instrument, n_controlled=10, sampling=2) is None
     assert not plain.edge_slips
     assert plain.fitted_key(instrument.wfs) is None

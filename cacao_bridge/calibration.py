@@ -3,8 +3,8 @@
 cacao copies its modes when the process that multiplies them starts, and does not read the streams
 again. A matrix is therefore in use once that process has been replaced after the streams were
 written. The process is recorded in a folder and survives this program. Parts of the calibration
-that act at once (:mod:`cacao_bridge.parts`) are written afterwards; a program that ends in between writes the
-rest when it runs again.
+that act at once (:mod:`cacao_bridge.parts`) are written afterwards; a program that ends in between
+writes the rest when it runs again.
 """
 
 from __future__ import annotations

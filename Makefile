@@ -60,7 +60,7 @@ check: $(STAMP) ## lint, formatting, types and import contracts
 paper: $(STAMP) ## the seed paper beside pyrcal: docs/results/heritier2018.md and its figures; 20 minutes, ARGS=--quick three
 	@$(PY) -m pyrcal_studies.heritier2018 $(ARGS)
 
-bench: $(STAMP) ## pyrcal beside OOPAO, HCIPy and SPECULA, each from its package: docs/results/bench.md; a quarter of an hour
+bench: $(STAMP) ## pyrcal beside OOPAO, HCIPy and SPECULA, each from its package: docs/results/speed.md; a quarter of an hour
 	@$(PY) -m benchmarks.bench $(ARGS)
 
 soak: $(STAMP) ## an hour at 1 kHz with company, for what grows or is lost; ARGS="--minutes 5" rehearses
@@ -76,7 +76,7 @@ wheel: ## dist/pyrcal-*.whl, the manual inside, built of locked packages
 
 lock: $(TOOLS) ## deploy/*.lock anew, of pyproject.toml and constraints.txt: each package with its hashes
 	@$(TOOLS)/uv pip compile $(LOCKED) pyproject.toml -o deploy/requirements.lock
-	@printf 'setuptools\nsphinx\nmyst-parser\n' | $(TOOLS)/uv pip compile $(LOCKED) - -o deploy/build.lock
+	@printf 'setuptools\n' | $(TOOLS)/uv pip compile $(LOCKED) --extra docs pyproject.toml - -o deploy/build.lock
 
 sbom: $(TOOLS) ## build/sbom.json: what the service runs on, as CycloneDX
 	@$(TOOLS)/cyclonedx-py requirements deploy/requirements.lock --pyproject pyproject.toml \
@@ -94,8 +94,8 @@ clean: ## remove what make made; never var/, which holds calibration products
 	    .import_linter_cache .coverage
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-$(MANUAL): $(STAMP) docs/conf.py docs/manual.css $(wildcard docs/*.md docs/*/*.md docs/*/*.png docs/*/*/*.png docs/*/*.svg)
-	@$(PY) -m sphinx -q -d build/manual docs $(@D) && touch $@
+$(MANUAL): $(STAMP) docs/conf.py $(wildcard docs/static/* docs/templates/* docs/*.md docs/*/*.md docs/*/*.png docs/*/*/*.png docs/*/*.svg)
+	@$(PY) -m sphinx -q -W --keep-going -d build/manual docs $(@D) && touch $@
 
 # A working environment is brought up to date in place; one made elsewhere or broken is made anew.
 $(STAMP): pyproject.toml constraints.txt

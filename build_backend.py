@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 from setuptools import build_meta
@@ -32,7 +33,6 @@ __all__ = [
 
 ROOT = Path(__file__).parent
 MANUAL = ROOT / "service" / "web" / "manual"
-SPHINX = ["sphinx>=8.2", "myst-parser>=4.0"]
 
 Settings = dict[str, str | list[str] | None] | None
 
@@ -41,16 +41,22 @@ def _manual_is_built() -> bool:
     return (MANUAL / "index.html").is_file()
 
 
+def _needed_by_the_manual() -> list[str]:
+    """Return Sphinx with its extensions, and what pyrcal needs: the API reference imports it."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    return [*project["dependencies"], *project["optional-dependencies"]["docs"]]
+
+
 def get_requires_for_build_wheel(config_settings: Settings = None) -> list[str]:
     """Return what a wheel needs: Sphinx, unless the manual is there."""
     needed = build_meta.get_requires_for_build_wheel(config_settings)
-    return needed if _manual_is_built() else [*needed, *SPHINX]
+    return needed if _manual_is_built() else [*needed, *_needed_by_the_manual()]
 
 
 def get_requires_for_build_sdist(config_settings: Settings = None) -> list[str]:
     """Return what a source archive needs, which has the manual, too."""
     needed = build_meta.get_requires_for_build_sdist(config_settings)
-    return needed if _manual_is_built() else [*needed, *SPHINX]
+    return needed if _manual_is_built() else [*needed, *_needed_by_the_manual()]
 
 
 def build_wheel(
@@ -69,5 +75,6 @@ def build_sdist(sdist_directory: str, config_settings: Settings = None) -> str:
 
 def _build_manual() -> None:
     if not _manual_is_built():
-        command = [sys.executable, "-m", "sphinx", "-q", "-d", "build/manual", "docs", str(MANUAL)]
+        options = ["-q", "-W", "-d", "build/manual"]
+        command = [sys.executable, "-m", "sphinx", *options, "docs", str(MANUAL)]
         subprocess.run(command, cwd=ROOT, check=True)

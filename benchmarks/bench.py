@@ -1,9 +1,9 @@
 """pyrcal beside OOPAO, HCIPy and SPECULA: the same work, alternating, in one run.
 
-Run: ``make bench``, or ``python -m benchmarks.bench [--rounds 5] [--elt] [--page FILE.md]``. Each
+Run: ``make bench``, or ``python -m benchmarks.bench [--rounds 5] [--page FILE.md]``. Each
 peer comes from its package into an environment of its own under ``var/peers`` and works in a
 process of its own; all have one thread, and processor time is counted: a machine that others use is
-slower for all. Writes the page of results and its plot.
+slower for all. Writes the section ``bench`` of docs/results/speed.md and its plot.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ import numpy as np
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from benchmarks import plant
-from benchmarks.bench_alone import alone_rows, elt_section, peak_mb
-from benchmarks.bench_page import Row, page, plot
+from benchmarks.bench_alone import alone_rows, peak_mb
+from benchmarks.bench_page import Row, plot, section
 from benchmarks.peer_rounds import cpu_s
 from pyrcal.fitting.fit_file import fit_file, make_reference
 from pyrcal.fitting.fitted import Fit
@@ -48,6 +48,7 @@ from pyrcal_studies.peers_cases import (
 from pyrcal_studies.peers_files import LISTINGS, write_instrument, write_reference
 from pyrcal_studies.peers_fits import error
 from pyrcal_studies.peers_pushpull import Array, Measured, read_product, write_job
+from pyrcal_studies.sections import RESULTS, write_section
 from service.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
@@ -74,7 +75,7 @@ FOUND = (0.01, 0.01, 0.03, 0.002)
 """What is off by less has been found."""
 
 PRODUCT = 2000
-PAGE = ROOT / "docs" / "results" / "bench.md"
+PAGE = RESULTS / "speed.md"
 
 
 class PeerProcess:
@@ -212,7 +213,7 @@ def registrations(oopao: PeerProcess, folder: Path) -> list[Row]:
         rows.append(
             Row(
                 what=f"α of {N_SPRINT} modes, {', '.join(f'{value:g}' for value in alpha)}",
-                peer="OOPAO SPRINT, its sensitivities made before",
+                peer="SPRINT, sensitivities made before",
                 own_s=(took_s,),
                 peer_s=(answer["seconds"],),
                 remark=f"{_off(off)}; the fit {_off(error(_told(report.fit), alpha))}",
@@ -226,7 +227,7 @@ def registrations(oopao: PeerProcess, folder: Path) -> list[Row]:
     rows += [
         Row(
             what=f"α of 400 modes: {what}",
-            peer=f"OOPAO SPRINT with {N_SPRINT} modes, sensitivities and estimate",
+            peer=f"SPRINT with {N_SPRINT} modes, sensitivities included",
             own_s=(took_s,),
             peer_s=(sprint_s,),
             remark=f"the fit {_off(error(_told(fit), in_degrees(SMALL)))}",
@@ -339,13 +340,10 @@ def facts(rounds: Rounds, peers: Sequence[PeerProcess]) -> list[str]:
 
 
 def main() -> int:
-    """Measure, write the page and the plot, print the page."""
+    """Measure, then write the section and the plot."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.bench")
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument(
-        "--elt", action="store_true", help="the steps of pyrcal_studies.elt as well"
-    )
-    parser.add_argument("--page", type=Path, default=PAGE)
+    parser.add_argument("--page", type=Path, default=PAGE, help="page with a section 'bench'")
     given = parser.parse_args()
     with ExitStack() as stack, threadpool_limits(1):
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -359,12 +357,10 @@ def main() -> int:
             {n: float(np.median(rounds.own_s[f"shift{n}"])) for n in (N_MODES, N_ALL)},
             {peer.peer: peer.peak_mb for peer in peers},
         )
-    text = page(rows, alone, told)
-    if given.elt:
-        text += elt_section()
-    given.page.write_text(text, encoding="utf-8")
-    plot(given.page.with_suffix(".png"), rows)
-    print(given.page.read_text(encoding="utf-8"))
+    text = section(rows, alone, told)
+    print(text)
+    write_section(given.page, "bench", text)
+    plot(given.page.with_name("bench.png"), rows)
     return 0
 
 

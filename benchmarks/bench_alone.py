@@ -1,4 +1,4 @@
-"""Figures of ``benchmarks.bench`` without a peer: floors, memory, telemetry, the ELT."""
+"""Figures of ``benchmarks.bench`` without a peer: floors, memory, telemetry."""
 
 from __future__ import annotations
 
@@ -55,13 +55,6 @@ def alone_rows(
         )
     )
     return [*rows, _ingest()]
-
-
-def elt_section() -> str:
-    """Return what ``pyrcal_studies.elt`` says: five minutes of processor time, and 4 GB."""
-    command = [sys.executable, "-m", "pyrcal_studies.elt"]
-    said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    return f"\n## A telescope of 39 m\n\n{said.strip()}\n"
 
 
 def peak_mb(pid: int | str) -> float:

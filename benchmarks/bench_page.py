@@ -1,9 +1,10 @@
-"""The page of results of ``benchmarks.bench``, and its plot."""
+"""The section ``bench`` of docs/results/speed.md, written by ``benchmarks.bench``, and its plot."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -40,31 +41,20 @@ class Alone:
     asked: str
 
 
-def page(rows: Sequence[Row], alone: Sequence[Alone], facts: Sequence[str]) -> str:
-    """Return the page in Markdown."""
-    head = (
-        "# pyrcal beside other codes\n\n"
-        "`make bench` writes this page: the same work, alternating, in one run; processor time of "
-        "one thread, seconds; the ratio is the median over the rounds, with its range. Peers push "
-        "and pull a few modes in each round, scaled to all; derivatives are two matrices each. "
-        "*Differ*: what the model does not explain of the peer's columns, 4 points a subaperture, "
-        "28 points of modulation, at a registration of .31, -.17 subapertures, .6 deg, 1.004. "
-        "α: SPRINT (6 iterations) reads matrices of its own model, `pyrcal fit` the same matrices, "
-        "of another code, beginning with their axes.\n"
-    )
-    lines = ["| what | pyrcal | peer | | times | |", "| --- | --- | --- | --- | --- | --- |"]
-    for row in rows:
-        middle, low, high = row.spread
-        spread = f" ({_figure(low)} to {_figure(high)})" if len(row.own_s) > 1 else ""
-        own, peer = (_figure(float(np.median(times))) for times in (row.own_s, row.peer_s))
-        lines.append(
-            f"| {row.what} | {own} | {row.peer} | {peer} | **{_figure(middle)}**{spread} "
-            f"| {row.remark} |"
-        )
-    lines += ["", "| pyrcal alone | found | asked |", "| --- | --- | --- |"]
-    lines += [f"| {one.what} | {one.found} | {one.asked} |" for one in alone]
-    told = "\n".join(f"- {fact}" for fact in facts)
-    return f"{head}\n![ratios](bench.png)\n\n" + "\n".join(lines) + f"\n\n{told}\n"
+def section(rows: Sequence[Row], alone: Sequence[Alone], facts: Sequence[str]) -> str:
+    """Return the section of docs/results/speed.md in Markdown: one row for each piece of work."""
+    lines = [
+        "| Work | pyrcal, s | Other code, s | Ratio: median (range over rounds) |",
+        "| --- | --- | --- | --- |",
+    ]
+    for what, group in groupby(rows, lambda row: row.what):
+        compared = list(group)
+        own = _figure(float(np.median(compared[0].own_s)))
+        peers = "; ".join(f"{row.peer} {_figure(float(np.median(row.peer_s)))}" for row in compared)
+        lines.append(f"| {what} | {own} | {peers} | {'; '.join(map(_ratio, compared))} |")
+    remarks = list(dict.fromkeys(f"{row.peer}: {row.remark}" for row in rows))
+    remarks += [f"{one.what}: {one.found}; target {one.asked}" for one in alone]
+    return "\n".join([*lines, "", *(f"- {line}" for line in [*remarks, *facts])])
 
 
 def plot(path: Path, rows: Sequence[Row]) -> None:
@@ -89,6 +79,12 @@ def plot(path: Path, rows: Sequence[Row]) -> None:
     axes.set_xlabel("processor time of the peer over pyrcal's")
     axes.grid(axis="x", alpha=0.4)
     figure.savefig(path, dpi=90)
+
+
+def _ratio(row: Row) -> str:
+    middle, low, high = row.spread
+    spread = f" ({_figure(low)} to {_figure(high)})" if len(row.own_s) > 1 else ""
+    return f"{_figure(middle)}{spread}"
 
 
 def _figure(value: float) -> str:

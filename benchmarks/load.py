@@ -1,6 +1,6 @@
 """REST under load: 50 clients beside 1 kHz of telemetry.
 
-``python -m benchmarks.load [--seconds 60] [--page docs/results/load.md]``
+``python -m benchmarks.load [--seconds 60] [--page docs/results/link.md]``
 
 FLAO at 1 kHz in auto, without keys. 50 clients, each with a connection of its own, request one page
 after the other, and another client orders a stop every two seconds.
@@ -23,6 +23,7 @@ import httpx
 from benchmarks import load_page
 from benchmarks.rest import PAGES
 from benchmarks.standing import Sample, Standing, standing
+from pyrcal_studies.sections import write_section
 
 CLIENTS = 50
 PAUSE_S = 0.5
@@ -110,21 +111,23 @@ def phase(found: Standing, seconds: float) -> Phase:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run, write page and plot; return 1 where a figure is not reached."""
+    """Run, write section and plot; return 1 where a figure is not reached."""
     parser = argparse.ArgumentParser(prog="make load")
     parser.add_argument("--seconds", type=float, default=60.0, help="duration of the run")
     parser.add_argument("--folder", type=Path, default=Path("var/load"), help="is emptied first")
-    parser.add_argument("--page", type=Path, help="of results, Markdown; the plot beside it")
+    parser.add_argument("--page", type=Path, help="page with a section 'load'")
     options = parser.parse_args(arguments)
     with standing(options.folder) as found:
         for page in PAGES:  # of its life the service has only one first answer of each kind
             found.ask(page)
         run = phase(found, options.seconds)
     rows = load_page.judge(run)
-    text = load_page.page(run, rows, os.cpu_count() or 1)
-    path = options.page or options.folder / "load.md"
-    path.write_text(text, encoding="utf-8")
-    load_page.plot(path.with_suffix(".png"), run)
+    text = load_page.section(run, rows, os.cpu_count() or 1)
+    (options.folder / "load.md").write_text(text, encoding="utf-8")
+    load_page.plot(options.folder / "load.png", run)
+    if options.page:
+        write_section(options.page, "load", text)
+        load_page.plot(options.page.with_name("load.png"), run)
     sys.stdout.write(text)
     return int(not all(row.reached for row in rows))
 

@@ -1,4 +1,4 @@
-"""The page of results of ``benchmarks.load``, and its plot."""
+"""The section ``load`` of docs/results/link.md, written by ``benchmarks.load``, and its plot."""
 
 from __future__ import annotations
 
@@ -51,18 +51,11 @@ def judge(phase: Phase) -> list[Row]:
     ]
 
 
-def page(phase: Phase, rows: Sequence[Row], cores: int) -> str:
-    """Return the page in Markdown."""
+def section(phase: Phase, rows: Sequence[Row], cores: int) -> str:
+    """Return the section in Markdown."""
+    head = f"| {phase.after.t_s - phase.before.t_s:.0f} s | Measured | Target |"
     lines = [f"| {row.what} | {row.found} | {row.asked} |" for row in rows]
-    return (
-        "# REST under load\n\n"
-        "`make load` writes this page: FLAO at 1 kHz in auto, no keys; 50 clients, each asking "
-        f"one page after the other with half a second between. {cores} cores, which clients and "
-        "simulator share with the service.\n\n"
-        "| what | found | asked |\n| --- | --- | --- |\n"
-        + "\n".join(lines)
-        + f"\n\n{_facts(phase)}\n\n![how long answers take](load.png)\n"
-    )
+    return "\n".join([head, "| --- | --- | --- |", *lines, "", f"{_facts(phase)}; {cores} cores"])
 
 
 def _facts(phase: Phase) -> str:

@@ -1,6 +1,6 @@
 """Service and RTC for a long time: what grows, what is lost, what is written.
 
-``python -m benchmarks.soak [--minutes 60] [--folder var/soak] [--page docs/results/soak.md]``
+``python -m benchmarks.soak [--minutes 60] [--folder var/soak] [--page docs/results/link.md]``
 
 FLAO at 1 kHz in auto, dithered without pause, its registration drifting slowly;
 a stream as the page has it, ten clients that ask one page after the other, and a matrix that is
@@ -30,6 +30,7 @@ import httpx
 from benchmarks import soak_page
 from benchmarks.rest import PAGES
 from benchmarks.standing import Sample, Standing, standing
+from pyrcal_studies.sections import write_section
 from service.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
@@ -129,18 +130,20 @@ def _watch(found: Standing, minutes: float, path: Path) -> Iterator[Sample]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run, write page and plot; return 1 where a figure is not reached."""
+    """Run, write section and plot; return 1 where a figure is not reached."""
     parser = argparse.ArgumentParser(prog="make soak")
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--folder", type=Path, default=Path("var/soak"), help="is emptied first")
-    parser.add_argument("--page", type=Path, help="of results, Markdown; the plot beside it")
+    parser.add_argument("--page", type=Path, help="page with a section 'soak'")
     options = parser.parse_args(arguments)
     samples, counts = soak(options.minutes, options.folder)
     rows = soak_page.judge(samples)
-    text = soak_page.page(samples, rows, counts, os.cpu_count() or 1)
-    page = options.page or options.folder / "soak.md"
-    page.write_text(text, encoding="utf-8")
-    soak_page.plot(page.with_suffix(".png"), samples)
+    text = soak_page.section(samples, rows, counts, os.cpu_count() or 1)
+    (options.folder / "soak.md").write_text(text, encoding="utf-8")
+    soak_page.plot(options.folder / "soak.png", samples)
+    if options.page:
+        write_section(options.page, "soak", text)
+        soak_page.plot(options.page.with_name("soak.png"), samples)
     sys.stdout.write(text)
     return int(not all(row.reached for row in rows))
 

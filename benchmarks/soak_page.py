@@ -1,4 +1,4 @@
-"""The page of results of ``benchmarks.soak``, and its plot."""
+"""The section ``soak`` of docs/results/link.md, written by ``benchmarks.soak``, and its plot."""
 
 from __future__ import annotations
 
@@ -82,17 +82,17 @@ def judge(samples: Sequence[Sample]) -> list[Row]:
         ),
         Row(
             what="archive, first hour",
-            found=f"{hour_mb:.1f} MB, by the {written_mb:.1f} MB that were written",
+            found=f"{hour_mb:.1f} MB, from the {written_mb:.1f} MB written",
             asked=f"<= {ARCHIVE_MB:g} MB",
             reached=hour_mb <= ARCHIVE_MB,
         ),
     ]
 
 
-def page(
+def section(
     samples: Sequence[Sample], rows: Sequence[Row], counts: Mapping[str, int], cores: int
 ) -> str:
-    """Return the page in Markdown."""
+    """Return the section in Markdown."""
     first, last, kept = samples[0], samples[-1], warm(samples)
     elapsed_s = last.t_s - first.t_s
     load = np.array([sample.load for sample in samples])
@@ -100,8 +100,8 @@ def page(
     lines = [f"| {row.what} | {row.found} | {row.asked} |" for row in rows]
     facts = [
         f"{cores} cores, load {load.min():.1f} to {load.max():.1f}, mean {load.mean():.1f}",
-        f"{last.windows - first.windows} windows taken in, "
-        f"{last.reconstructors} reconstructors on the shelf at the end",
+        f"{last.windows - first.windows} windows used, "
+        f"{last.reconstructors} reconstructors in the archive at the end",
         f"service {_core(first, last, 'service_cpu_s')} of a core, its worker "
         f"{_core(first, last, 'worker_cpu_s')}",
         f"memory of the service {kept[0].service_mb:.0f} MB after {kept[0].t_s / 60.0:.0f} "
@@ -109,19 +109,11 @@ def page(
         f"most {max(sample.others_mb for sample in samples):.0f} MB, growth of the worker "
         f"{growth(kept, 'others_mb').per(600.0)} in 10 minutes",
         f"threads {_range(kept, 'threads')}, descriptors {_range(kept, 'files')}",
-        "asked: " + ", ".join(f"{count} {what}" for what, count in sorted(counts.items())),
+        "requests: " + ", ".join(f"{count} {what}" for what, count in sorted(counts.items())),
         "alarms seen: " + (", ".join(alarms) or "none"),
     ]
-    told = "\n".join(f"- {fact}" for fact in facts)
-    return (
-        "# A long run\n\n"
-        "`make soak` writes this page: FLAO at 1 kHz in auto, dithered without pause, its "
-        "registration drifting by .12 subapertures and .12 deg an hour; a stream of the page, "
-        "ten clients, an upload to fit every five minutes. Here "
-        f"**{elapsed_s / 60.0:.0f} minutes**.\n\n"
-        "| what | found | asked |\n| --- | --- | --- |\n" + "\n".join(lines) + "\n\n"
-        f"{told}\n\n![memory, archive and load over time](soak.png)\n"
-    )
+    head = f"| {elapsed_s / 60.0:.0f} minutes | Measured | Target |\n| --- | --- | --- |"
+    return "\n".join([head, *lines, "", *(f"- {fact}" for fact in facts)])
 
 
 def plot(path: Path, samples: Sequence[Sample]) -> None:

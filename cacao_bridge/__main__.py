@@ -40,7 +40,7 @@ def arguments_parser() -> OneLineParser:
     parser = OneLineParser(
         prog="pyrcal cacao",
         description="Run the bridge between a cacao loop and the service, until it is stopped.",
-        epilog="Exit status: 0 done; 2 it cannot be done. docs/integrate/cacao.md explains the "
+        epilog="Exit status: 0 done; 2 it cannot be done. docs/howto/cacao.md explains the "
         "settings.",
         examples=(
             "pyrcal cacao --config bridge.toml",

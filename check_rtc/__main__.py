@@ -16,7 +16,7 @@ from service.parser import OneLineParser
 from service.program import imported_and_run, leave
 
 _EPILOG = """
-Prints one line for each requirement of docs/rtc.md: the finding, the requirement, its section.
+Prints one line for each check: the finding, and the requirements of docs/rtc.md by number (R-n).
 WRONG: the contract is broken. seen: allowed, but unusual. skipped: not checked, with the reason.
 Checks that move anything ask for consent first; without a terminal they are skipped unless --yes
 is given. Exit status: 0 nothing is wrong; 1 something is; 2 nothing could be checked.

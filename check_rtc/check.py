@@ -138,21 +138,23 @@ def _find_system(endpoint: Endpoint, wait_s: float) -> str:
 
 
 def format_line(result: CheckResult) -> str:
-    """Return a result on one line: finding, requirement, section of the contract."""
+    """Return a result on one line: finding, requirements by number, section of the contract."""
     requirement = result.requirement
+    labels = ", ".join(requirement.labels)
     return (
         f"{result.outcome:8}{result.name:12} {result.found} "
-        f"[contract: {requirement.says}; {CONTRACT_PAGE}#{requirement.anchor}]"
+        f"[{labels}: {requirement.says}; {CONTRACT_PAGE}#{requirement.anchor}]"
     )
 
 
-def as_document(result: CheckResult) -> dict[str, str]:
+def as_document(result: CheckResult) -> dict[str, str | list[str]]:
     """Return a result as a JSON object."""
     requirement = result.requirement
     return {
         "check": result.name,
         "outcome": result.outcome.lower(),
         "found": result.found,
+        "requirements": list(requirement.labels),
         "contract": requirement.says,
         "where": f"{CONTRACT_PAGE}#{requirement.anchor}",
         "moves": requirement.moves.value,

@@ -52,107 +52,146 @@ class Moves(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Requirement:
-    """Requirement of the contract."""
+    """What one check verifies: requirements of a section of the contract."""
+
+    numbers: tuple[int, ...]
+    """Numbers of the requirements in docs/rtc.md: 4 is R-4."""
 
     says: str
-    """Text of the requirement, one line."""
+    """Summary of the requirements, one line."""
 
     anchor: str
-    """Anchor of its section in docs/rtc.md."""
+    """Anchor of their section in docs/rtc.md."""
 
     moves: Moves = Moves.NOTHING
 
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Requirements as docs/rtc.md names them, such as R-4."""
+        return tuple(f"R-{number}" for number in self.numbers)
+
 
 REQUIREMENTS: Final[dict[str, Requirement]] = {
-    "connection": Requirement("the token alive/rtc is declared and stays", "connection"),
-    "messages": Requirement("every message agrees with its table", "messages"),
+    "connection": Requirement((4,), "the token alive/rtc is declared and stays", "connection"),
+    "messages": Requirement((7, 8, 9, 11, 12), "every message agrees with its table", "messages"),
     "frames": Requirement(
+        (19, 20),
         "frames come at the rate that status and dt_ns report, 10 to 100 messages a second",
         "frames",
     ),
-    "sizes": Requirement("the sizes of frames are those of the status and constant", "frames"),
-    "numbers": Requirement("all numbers are finite, and slopes change with each frame", "frames"),
+    "sizes": Requirement(
+        (15,), "the sizes of frames are those of the status and constant", "frames"
+    ),
+    "numbers": Requirement(
+        (21,), "all numbers are finite, and slopes change with each frame", "frames"
+    ),
     "sequence": Requirement(
-        "each frame comes once, none is lost, seq0 never decreases", "sessions-sequence-time"
+        (25,), "each frame comes once, none is lost, seq0 never decreases", "sessions-sequence-time"
     ),
-    "clock": Requirement("t0_ns increases by dt_ns per frame", "sessions-sequence-time"),
-    "delivery": Requirement("a batch is sent as soon as its last frame is complete", "timing"),
+    "clock": Requirement((26,), "t0_ns increases by dt_ns per frame", "sessions-sequence-time"),
+    "delivery": Requirement(
+        (19,), "a batch is sent as soon as its last frame is complete", "timing"
+    ),
     "session": Requirement(
-        "one session, until the RTC restarts or resets its integrator", "sessions-sequence-time"
+        (5, 22, 23),
+        "one session, until the RTC restarts or resets its integrator",
+        "sessions-sequence-time",
     ),
-    "status": Requirement("a status 1 to 10 times a second that agrees with the frames", "status"),
+    "status": Requirement(
+        (36, 37, 38), "a status 1 to 10 times a second that agrees with the frames", "status"
+    ),
     "images": Requirement(
-        "the pupil images in the flux of the status are where the instrument file says", "status"
+        (41,),
+        "the pupil images in the flux of the status are where the instrument file says",
+        "status",
     ),
     "ids": Requirement(
+        (31,),
         "one basis and one configuration, in frames, status and manifest",
         "slopes-commands-orientation",
     ),
     "matrix": Requirement(
-        "rtc/cm/applied answers with manifest and chunks of the matrix in use", "reconstructors"
+        (39, 75),
+        "rtc/cm/applied answers with manifest and chunks of the matrix in use",
+        "reconstructors",
     ),
-    "law": Requirement("leak, gain and delay in the frames are those of the status", "the-loop"),
-    "obedience": Requirement("every mode follows the commands of the loop", "the-loop"),
+    "law": Requirement(
+        (14, 16, 32, 35), "leak, gain and delay in the frames are those of the status", "the-loop"
+    ),
+    "obedience": Requirement((33,), "every mode follows the commands of the loop", "the-loop"),
     "orientation": Requirement(
-        "sign, order, axes and unit are those of the instrument file", "slopes-commands-orientation"
+        (28, 29, 30),
+        "sign, order, axes and unit are those of the instrument file",
+        "slopes-commands-orientation",
     ),
     "late-join": Requirement(
-        "cm/current is queried once a session, when alive/service appears", "reconstructors"
+        (74,), "cm/current is queried once a session, when alive/service appears", "reconstructors"
     ),
     "replies": Requirement(
+        (42, 43, 44, 49),
         "every command has a reply within 1 s, refusals begin with their code, and a repeated id "
         "has the same reply",
         "commands",
         Moves.WORDS,
     ),
     "signatures": Requirement(
+        (79, 81),
         "with a shared secret, unsigned, modified and replayed commands are refused",
         "signatures",
         Moves.WORDS,
     ),
     "dither": Requirement(
+        (17, 40, 45, 46, 50),
         "a dither begins at start_seq as requested, is in the status, and stops on request",
         "dither",
         Moves.MIRROR,
     ),
     "columns": Requirement(
+        (13,),
         "row k has slopes and command of the same exposure, with the sign of the matrix",
         "frames",
         Moves.MIRROR,
     ),
     "commit": Requirement(
+        (18, 67, 68, 69, 70),
         "a matrix is applied within 2 s of its commit, from the frame acknowledged",
         "reconstructors",
         Moves.MATRIX,
     ),
     "chunks": Requirement(
+        (65,),
         "a commit may come before its chunks; chunks that are missing after 2 s are queried",
         "reconstructors",
         Moves.MATRIX,
     ),
     "rejection": Requirement(
+        (11, 66, 71, 72),
         "a wrong checksum, basis or manifest and a used id are rejected, and a repeated commit is "
         "acknowledged again",
         "reconstructors",
         Moves.MATRIX,
     ),
     "reconnect": Requirement(
+        (1, 23),
         "the RTC reconnects after the router was away, in the same session",
         "connection",
         Moves.WORDS,
     ),
     "loop": Requirement(
+        (22, 51, 52),
         "opening the loop begins a session with a zero integrator; closing continues it; the "
         "matrix stays in use",
         "loop",
         Moves.LOOP,
     ),
     "measure": Requirement(
+        (56, 57, 58),
         "a measured matrix is in slope per metre, and the loop is closed again",
         "measure",
         Moves.LOOP,
     ),
     "offload": Requirement(
+        (45, 61, 62, 63),
         "a demand moves the image as requested, once, and it is still from start_seq on",
         "offload",
         Moves.IMAGE,

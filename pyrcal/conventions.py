@@ -1,4 +1,4 @@
-"""Hold a matrix, a basis or a stream against the numbered rules of docs/understand/conventions.md.
+"""Hold a matrix, a basis or a stream against the numbered rules of docs/reference/conventions.md.
 
 Each finding has the number of its rule, what was measured and what is allowed. What an instrument
 file leaves open (``orientation = "auto"``, ``stroke = "unknown"``) breaks no rule.
@@ -75,7 +75,7 @@ class RuleCheck:
     """Result of the check of one rule."""
 
     rule: int
-    """Number in docs/understand/conventions.md."""
+    """Number in docs/reference/conventions.md."""
 
     deviation: float
     """Measured deviation, in the unit given in the text."""

@@ -1,4 +1,4 @@
-"""The tables of docs/rtc.md: every key of every message, from the records of service.wire."""
+"""Tables of docs/rtc/fields.md: every key of every message, from the records of service.wire."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from msgspec import inspect as types
 
+from check_rtc.requirements import REQUIREMENTS
 from service.instrument.schema_texts import described
 from service.wire import (
     ATTACHMENT_LIMIT,
@@ -207,10 +208,20 @@ def _limits() -> str:
     return table(("what", "at most"), rows)
 
 
+def _verification() -> str:
+    """Return the requirements that each check of ``pyrcal check-rtc`` verifies."""
+    rows = [
+        (f"`{name}`", one.says, ", ".join(one.labels), one.moves.value)
+        for name, one in REQUIREMENTS.items()
+    ]
+    return table(("check", "what it verifies", "requirements", "what it moves"), rows)
+
+
 _TABLES: Final[dict[str, Callable[[], str]]] = {
     **{
         name: (lambda name=name: table(HEAD, rows_of(name)))  # type: ignore[misc]
         for name in (*MESSAGES, *PARTS)
     },
     "limits": _limits,
+    "verification": _verification,
 }

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def page() -> str:
-    """Return docs/understand/tracker.md: what each event and command does."""
+    """Return docs/developer/tracker.md: what each event and command does."""
     commands = get_args(Command)
     events = [kind for kind in get_args(Event) if kind not in commands]
     parts = [

@@ -3,7 +3,7 @@
 Runs mis-registered loops on the diffractive telescope, prints the wavefront error of every half
 second, when the watch on the outer ring speaks, and what the gate knew beforehand: the worst pole
 radius and the motion of the outer ring per unit of slope noise. A case is modes:registration:leak;
-without one all of docs/results/edge_slip.md are run.
+without one all of docs/results/reliability.md are run.
 Run: ``python -m pyrcal_studies.edge_slip --case 594:0,0,0,1.025:1.0 --case 400:0.3,0,0,1:1.0``.
 """
 

@@ -3,7 +3,7 @@
 ``python -m pyrcal_studies.image_offsets`` draws displacements of the images, measures a matrix of
 each draw with an FFT pyramid that shares no code with the model, and fits it: slopes with the
 displacements in the instrument file and without, and detector frames whose images are located in
-the mean frame. It prints the table of docs/results/image_offsets.md, a row for each size of the
+the mean frame. It prints the table of docs/results/accuracy.md, a row for each size of the
 displacements as soon as it is done. A draw takes 2 to 3 seconds of processor time.
 """
 

@@ -291,7 +291,7 @@ def _answers(name: str, questions: list[tuple[ZonalCase, Mistelling]]) -> list[d
 
 
 def page(found: list[dict[str, Any]]) -> str:
-    """Return the page in Markdown; docs/results/mistold_fits.md says what was done."""
+    """Return the page in Markdown; docs/results/accuracy.md says what was done."""
     return "\n".join(["# Matrices of other codes with one thing told wrong", "", *_shown(found)])
 
 

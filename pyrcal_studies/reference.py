@@ -62,7 +62,7 @@ def instrument() -> str:
     """Return docs/reference/instrument.md: every key of an instrument file."""
     intro = (
         "A TOML file that describes the telescope, the sensor, the mirror and how the RTC lists "
-        "slopes. [Fitting a measured matrix](../integrate/fitting.md) has the smallest one, and "
+        "slopes. [Fitting a measured matrix](../howto/fitting.md) has the smallest one, and "
         "explains orientation. A reference to data is `path:/dataset`, relative to the file. In "
         "brackets: type and default."
     )
@@ -75,7 +75,7 @@ def system() -> str:
     """Return docs/reference/system.md: every key of a system's file."""
     intro = (
         "A TOML file of several sensors and mirrors, for `pyrcal fit-system`: "
-        "[how it is used](../integrate/systems.md). In brackets: type and default."
+        "[how it is used](../howto/systems.md). In brackets: type and default."
     )
     return page("The file of a system", intro, *_tables(SystemFile))
 
@@ -177,6 +177,7 @@ _TAKEN_BY = {
     remote.CONNECTION: "of all commands that ask or operate a service; exit status 1: refused, "
     "not done, or not all is well; 3: the service cannot be reached",
     remote.ORDER: "of all commands that change something in a service",
+    offline_arguments.ARCHIVE: "of `pyrcal archive`, `commission`, `bundle write`",
     offline_arguments.DESCRIPTION: "of `pyrcal import`, except from OOPAO",
 }
 """Titles of the groups of options that many commands share, and which commands these are."""
@@ -200,7 +201,7 @@ def _describe(
         yield _block(usages, own)
     status = " ".join((parser.epilog or "").split()).partition("Exit status: ")[2].partition(".")[0]
     if "; 1 " in status and parser.epilog != remote.EPILOG:
-        yield f"Exit status: {status}."
+        yield f"Exit status: {status.partition('; 2 ')[0]}."
 
 
 _INSTRUMENT = ("INSTRUMENT", offline_arguments.INSTRUMENT)
@@ -262,7 +263,7 @@ def _row(action: argparse.Action) -> Row:
 
 
 def rest(described: Schema) -> str:
-    """Return docs/integrate/rest.md: what may be asked over REST, from its OpenAPI document."""
+    """Return docs/reference/rest.md: what may be asked over REST, from its OpenAPI document."""
     intro = (
         "At `http://127.0.0.1:8080`, unless the settings say otherwise. `/docs` shows every field "
         "and tries it; [openapi.json](../openapi.json) is for programs. Errors are "

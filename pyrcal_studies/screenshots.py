@@ -1,6 +1,6 @@
-"""Walks through docs/tutorial.md with a demo and a headless browser, and takes its pictures anew.
+"""Walks through docs/start/demo.md with a demo and a headless browser, and takes its pictures anew.
 
-Run: ``python -m pyrcal_studies.screenshots``, then look at ``docs/tutorial/*.png``: three minutes.
+Run: ``python -m pyrcal_studies.screenshots``, then look at ``docs/start/*.png``: three minutes.
 It needs Debian's chromium and chromium-driver, selenium and Pillow. A slow machine wants the jump
 later than after 90 s: ``python -m pyrcal_studies.screenshots 200``.
 """
@@ -22,7 +22,7 @@ import httpx
 from PIL import Image
 from selenium import webdriver
 
-PICTURES = Path(__file__).parents[1] / "docs" / "tutorial"
+PICTURES = Path(__file__).parents[1] / "docs" / "start"
 SIZE = (1280, 860)
 N_COLOURS = 48
 """A page of few colours: a picture stays below 100 kB."""

@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 ENOUGH_SUBAP = 0.03
 """Sufficient 1 σ of the mirror's position at the pupil's edge: 3 σ are then a tenth of a
-subaperture, where closed-loop performance begins to degrade (Heritier et al. 2018, section 3.2)."""
+subaperture, the accuracy that Heritier et al. 2018, section 3.2, require of a shift."""
 
 FEWEST_SETS = 2
 """Sets of modes that can check each other."""

@@ -41,6 +41,13 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     _describe_bundle(
         commands.add_parser("bundle", help="write or check a calibration bundle (one file)")
     )
+    _describe_commission(
+        commands.add_parser(
+            "commission",
+            help="judge a commissioning and write its report",
+            examples=["pyrcal commission --check-rtc check.json --fit fit.json"],
+        )
+    )
     _describe_certificates(
         commands.add_parser("certificates", help="make certificates for the link to the RTC")
     )
@@ -61,6 +68,9 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
         commands.add_parser("import", help="import instrument and matrix of another code")
     )
 
+
+ARCHIVE = "archive options"
+"""Title of the options that say where a service keeps its files."""
 
 _OF_A_FOLDER = (
     words("--config FILE", "settings of the service, TOML", type=Path),
@@ -94,24 +104,54 @@ def _describe_archive(archive: OneLineParser) -> None:
         ("prune", "remove what [archive] no longer keeps", (dry_run,), "prune --dry-run"),
     ):
         parser = actions.add_parser(action, help=purpose, examples=[f"pyrcal archive {example}"])
-        add(parser, *_OF_A_FOLDER, words("--json", "print JSON"), *more)
+        add(parser, *more, words("--json", "print JSON"))
+        add(parser.add_argument_group(ARCHIVE), *_OF_A_FOLDER)
+
+
+def _describe_commission(commission: OneLineParser) -> None:
+    commission.set_defaults(module="pyrcal.maintenance.commission")
+    commission.description = (
+        "Judge a commissioning from the archive of a night, pyrcal check-rtc and a fit, by the "
+        "limits of docs/operate/commissioning.md, and write a report. Needs the extra 'plots'."
+    )
+    commission.epilog = (
+        "Exit status: 0 all criteria pass; 1 one does not, or has no input; 2 the report cannot "
+        "be made."
+    )
+    add(
+        commission,
+        words("--instrument NAME|FILE", "default: that of the settings"),
+        words("--check-rtc FILE.json", "output of pyrcal check-rtc --json", type=Path),
+        words("--fit FILE.json", "output of pyrcal fit --json", type=Path),
+        words("--night DATE", "date of the evening, UTC; default the newest with measurements"),
+        words("--since TIME", "from this time on, RFC 3339"),
+        words("--until TIME", "up to this time"),
+        words(
+            "--output FILE.html",
+            "default %(default)s",
+            type=Path,
+            default=Path("commissioning.html"),
+        ),
+        words("--json", "print the criteria as JSON"),
+    )
+    add(commission.add_argument_group(ARCHIVE), *_OF_A_FOLDER)
 
 
 def _describe_bundle(bundle: OneLineParser) -> None:
     bundle.set_defaults(module="pyrcal.maintenance.bundles")
     bundle.description = (
         "Write a reconstructor with its gains, basis, registration, verdict and provenance into "
-        "one file with checksums, or check such a file. docs/integrate/bundle.md describes it."
+        "one file with checksums, or check such a file. docs/howto/bundle.md describes it."
     )
     bundle.epilog = "Exit status: 0 done; 2 it cannot be done, or a checksum is wrong."
     actions = bundle.add_subparsers(dest="action", required=True, metavar="COMMAND")
+    write = actions.add_parser(
+        "write",
+        help="write a bundle",
+        examples=["pyrcal bundle write in-use calibration.h5 --interaction-matrix"],
+    )
     add(
-        actions.add_parser(
-            "write",
-            help="write a bundle",
-            examples=["pyrcal bundle write in-use calibration.h5 --interaction-matrix"],
-        ),
-        *_OF_A_FOLDER,
+        write,
         words("source ID|in-use|FILE.h5", "a reconstructor of the archive, or an exported one"),
         words(
             "output FILE", "FITS if its name ends in .fits, else HDF5; never overwritten", type=Path
@@ -122,13 +162,14 @@ def _describe_bundle(bundle: OneLineParser) -> None:
             "--reference FILE.npy", "include the reference slopes of the RTC (n_slopes,)", type=Path
         ),
     )
+    add(write.add_argument_group(ARCHIVE), *_OF_A_FOLDER)
     add(
         actions.add_parser(
             "check",
             help="read a bundle, compare its checksums, show it",
             examples=["pyrcal bundle check calibration.h5"],
         ),
-        words("bundle FILE", "the bundle", type=Path),
+        words("bundle FILE", type=Path),
         words("--json", "print JSON"),
     )
 
@@ -172,7 +213,7 @@ _FIT_EPILOG = """
 REFERENCE holds (n_slopes, n_modes), slope per metre of OPD, in the RTC's own order and axes, as
 the array 'interaction_matrix' or the one that --dataset names. The result goes to standard output,
 progress to standard error. Exit status: 0 accepted; 1 fitted but refused (the verdict says why); 2
-input that cannot be used. docs/integrate/fitting.md explains format, orientation and verdicts.
+input that cannot be used. docs/howto/fitting.md explains format, orientation and verdicts.
 """
 
 _RECONSTRUCT = """
@@ -249,7 +290,7 @@ by weighted least squares. Directions that no pair observes are listed.
 
 _FIT_SYSTEM_EPILOG = """
 Exit status: 0 accepted; 1 fitted but refused (the verdict says why); 2 input that cannot be used.
-docs/integrate/systems.md explains the file, the gauge and verdicts.
+docs/howto/systems.md explains the file, the gauge and verdicts.
 """
 
 
@@ -321,7 +362,7 @@ def _describe_conventions(check: OneLineParser) -> None:
     check.set_defaults(module="pyrcal.conventions")
     check.description = (
         "Check a measured matrix, and the modes of its instrument file, against the numbered "
-        "rules of docs/understand/conventions.md; print which are broken, and by how much."
+        "rules of docs/reference/conventions.md; print which are broken, and by how much."
     )
     check.epilog = "Exit status: 0 all are kept; 1 some are broken; 2 input that cannot be used."
     check.examples = ("pyrcal conventions bench.toml matrix.h5",)
@@ -376,7 +417,7 @@ def _describe_import(bring: OneLineParser) -> None:
     bring.epilog = "Exit status: 0 written; 2 input that cannot be used."
     folder = words("--output DIR", "new folder for both files", type=Path, required=True)
     saved = words(
-        "file FILE.npz", "arrays listed in docs/integrate/oopao.md, by np.savez", type=Path
+        "file FILE.npz", "arrays listed in docs/tutorials/oopao.md, by np.savez", type=Path
     )
     known = "files, recognised by their content"
     roles = "file or folder with arrays of known names, or ROLE=FILE with a role of matrix, valid, "

@@ -41,7 +41,7 @@ exactly."""
 MAX_POINTS_ACROSS = 160
 """Largest number of points across a binary pupil map that the fit uses at full resolution. With 16
 subapertures of six points each, three points left an error of 0.0014 subapertures, 3.7 σ, six
-points 0.0001 (docs/results/peers.md). On larger maps a step is negligible."""
+points 0.0001 (docs/results/accuracy.md). On larger maps a step is negligible."""
 
 SENSOR_STEP = 0.03
 """Step of the sensor number's logarithm for a one-sided finite difference. A fit ends within 0.01

@@ -194,7 +194,7 @@ def _apply_orientation(instrument: Instrument, fit: KnownFit) -> Instrument:
     elif recipe.orientation is None:
         say(
             'note: slopes.orientation is "auto" and no fit has found it: the reconstructor is for '
-            "slopes in the axes of docs/integrate/fitting.md"
+            "slopes in the axes of docs/howto/fitting.md"
         )
     return replace(instrument, slopes=recipe)
 

@@ -255,7 +255,7 @@ def _pyramid(
     if not wfs.postProcessing.startswith("slopesMaps"):
         raise ConfigurationError(
             f"wfs.postProcessing: found {wfs.postProcessing!r}, expected 'slopesMaps' or another "
-            "one that makes slopes; or give its frames: docs/integrate/fitting.md"
+            "one that makes slopes; or give its frames: docs/howto/fitting.md"
         )
     if wfs.postProcessing != "slopesMaps":
         notes.append(

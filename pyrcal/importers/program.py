@@ -42,7 +42,7 @@ def _arrays(options: argparse.Namespace) -> Imported:
     for role, path in _files(options.files):
         arrays = _by_role(role, path, options.source)
         if not arrays:
-            inventory.append(f"ignored {path}: no name of a role, see docs/integrate/importing.md")
+            inventory.append(f"ignored {path}: no name of a role, see docs/howto/importing.md")
         if "matrix" in arrays and options.modes is None:
             options.modes = _modes_of_name(path, arrays["matrix"], inventory)
         twice = found.keys() & arrays.keys()

@@ -18,7 +18,7 @@ _EPILOG = """
 TELEMETRY is a recording (pyrcal recordings start, pyrcal sim --record), an AOT file, a folder of
 the pyRTC recorder, or an HDF5 file or .npz with the arrays slopes (n_frames, n_slopes) and
 commands_m (n_frames, n_modes), the number frame_rate_hz, and the optional arrays of
-docs/integrate/tracking.md. Exit status: 0 alpha was estimated; 1 it was not (the table says why); 2
+docs/howto/tracking.md. Exit status: 0 alpha was estimated; 1 it was not (the table says why); 2
 input that cannot be used.
 """
 

@@ -64,7 +64,7 @@ def track(
     """Return α over time from recorded telemetry, by the service's own estimators.
 
     ``path`` is a recording of pyrcal, arrays in ``.npz`` or HDF5, an AOT file or a session of pyRTC
-    (docs/integrate/tracking.md). ``instrument`` is the result or the argument of
+    (docs/howto/tracking.md). ``instrument`` is the result or the argument of
     ``load_instrument``. ``settings`` are the defaults if None.
 
     Raises

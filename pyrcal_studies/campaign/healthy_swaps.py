@@ -10,7 +10,8 @@ A healthy swap replaces the matrix of a slightly misregistered mirror by the rig
 changes by a factor of two in 10 s, the wind is 5 to 30 m/s, the frame rate 200 to 2000 Hz, and a
 gust raises the residual 1.6 times for one second at a random moment around the swap. A worse
 matrix raises the residual of the same stretch of turbulence by 1.5; a diverging one makes the loop
-unstable. Telemetry goes to the service's own comparison, in blocks of 50 ms.
+unstable. Telemetry goes to the service's own comparison, in blocks of 50 ms, and to its watch of
+the loop, which must raise no alarm while a healthy matrix is in use.
 """
 
 from __future__ import annotations
@@ -33,8 +34,10 @@ from threadpoolctl import threadpool_limits
 from pyrcal_studies.campaign.observatory_dome import Dome
 from pyrcal_studies.campaign.small import SMALL, bench_of
 from service.control.reconstructor import Recipe, reconstruct
+from service.estimation import health
 from service.estimation.comparison import REFERENCE_PERIOD_S
 from service.estimation.frames import FrameBlock
+from service.estimation.health import LoopHealth
 from service.estimation.probation import Comparison, observe
 from service.model.misregistration import Misregistration
 
@@ -454,20 +457,29 @@ def _flipped(matrix: Array, mode: int) -> Array:
     return flipped
 
 
-def judge(trial: Trial, played: Played, n_before: int, before: Array, after: Array) -> Comparison:
+Watched = tuple[Comparison, bool]
+"""A comparison that has ended, and whether the loop was called diverging meanwhile."""
+
+
+def judge(trial: Trial, played: Played, n_before: int, before: Array, after: Array) -> Watched:
     """Return the comparison after it has seen all telemetry, or found something."""
-    state, modes = Comparison(), np.arange(N_CONTROLLED)
+    state, loop, modes = Comparison(), LoopHealth(), np.arange(N_CONTROLLED)
+    variance = np.mean(np.square(played.commands_m[:n_before], dtype=float), axis=0)
     matrices = {"before": np.asarray(before, np.float32), "after": np.asarray(after, np.float32)}
+    diverges = False
     for block in blocks_of(trial, played, n_before):
         state = observe(state, block, modes, matrix=matrices[str(block.cm_id)])
-        if state.found is not None:
+        loop = health.observe(loop, block, variance, modes)
+        diverges = diverges or loop.diverging
+        if state.found is not None and trial.kind != "healthy":
             break
-    return state
+    return state, diverges
 
 
-def _row(trial: Trial, state: Comparison, **more: object) -> dict[str, object]:
+def _row(trial: Trial, watched: Watched, **more: object) -> dict[str, object]:
+    state, diverges = watched
     found = state.found
-    row = asdict(trial) | more
+    row = asdict(trial) | more | {"loop_diverging": diverges}
     if found is None:
         return row | {"verdict": "none"}
     return row | {
@@ -506,6 +518,8 @@ class SimulatedNight:
             words.append("--imperfections=realistic")
         self.dome, self._n_swaps = Dome(words), 0
         self._matrices: dict[str | None, Array32] = {}
+        self._variance = bench_of(SMALL).describe().mode_variance_m2
+        self.loop, self.diverges = LoopHealth(), False
         self.state = Comparison()
         self._swap(self._matrix(0.1))
         self._pass(CLOSING_S)
@@ -520,7 +534,7 @@ class SimulatedNight:
             found_before = self.state.found
             self._pass(SWAP_EVERY_S)
             found = self.state if self.state.found is not found_before else Comparison()
-            yield _row(self._trial, found, swap_s=begun_s, swap=k)
+            yield _row(self._trial, (found, self.diverges), swap_s=begun_s, swap=k)
 
     def worse(self, share: float, healthy_nm: float | None = None) -> dict[str, object]:
         """Swap a matrix of so much of the loop gain in.
@@ -533,7 +547,7 @@ class SimulatedNight:
         self._swap(np.asarray(share * right, np.float32))
         self._pass(4.5)
         ratio = self._wavefront_nm(4.0) / (before_nm if healthy_nm is None else healthy_nm)
-        return _row(self._trial, self.state, way="slow", ratio=ratio)
+        return _row(self._trial, (self.state, self.diverges), way="slow", ratio=ratio)
 
     def healthy_nm(self) -> float:
         """Return the wavefront error of the 4 s after a swap to the same matrix."""
@@ -572,10 +586,13 @@ class SimulatedNight:
 
     def _pass(self, seconds: float) -> None:
         end_s, modes = self.dome.time_s + seconds - 1e-6, np.arange(N_SMALL)
+        self.diverges = False
         while self.dome.time_s < end_s:
             for block in self.dome.play():
                 matrix = self._matrices.get(block.cm_id)
                 self.state = observe(self.state, block, modes, matrix=matrix)
+                self.loop = health.observe(self.loop, block, self._variance, modes)
+                self.diverges = self.diverges or self.loop.diverging
 
     def _wavefront_nm(self, seconds: float) -> float:
         since_s = self.dome.time_s - seconds

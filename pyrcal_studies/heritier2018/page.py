@@ -88,7 +88,7 @@ def _opening(budget: Budget, store: Store, minutes: float) -> str:
 def _figures(budget: Budget, store: Store) -> Iterable[str]:
     yield (
         "Figures 1 and 2 of the paper are diagrams of the method and of the model: see "
-        "[method](../understand/method.md). Figures 3 to 14 follow."
+        "[method](../explanation/method.md). Figures 3 to 14 follow."
     )
     for number in DRAWN:
         title, text = captions.CAPTIONS[number](budget, store)

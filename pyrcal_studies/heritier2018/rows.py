@@ -163,7 +163,7 @@ def _figures(budget: Budget, store: Store) -> Iterator[Row]:
     yield (
         "Figure 1",
         "diagram of the method",
-        "`docs/understand/method.md`",
+        "`docs/explanation/method.md`",
         "-",
         "-",
         "same method",
@@ -171,7 +171,7 @@ def _figures(budget: Budget, store: Store) -> Iterator[Row]:
     yield (
         "Figure 2",
         "diagram of the model",
-        "`docs/understand/architecture.md`",
+        "`docs/developer/architecture.md`",
         "-",
         "-",
         "same inputs",

@@ -405,7 +405,7 @@ PRECISION_TABLE = (
 """``(n_magnitudes, 4)`` κ of ``σ = κ / (A sqrt(T))``, numeric units times m sqrt(s).
 
 Measured with four modes on the simulated diffractive telescope at 1 kHz: the larger of the values
-of the design study and of docs/results/night.md.
+of the design study and of docs/results/tracking.md.
 """
 
 MEMORY_WINDOWS = 8.0

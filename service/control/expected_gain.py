@@ -10,7 +10,7 @@ and ``B_h`` of the others, the residual of the controlled modes is
 Its variance is summed over all temporal frequencies, for the reconstructor in use and for the
 inverse of the present D. Modes are assumed to be independent. Under frozen flow a reconstructor
 shifted along the wind predicts the turbulence and gains what it loses when shifted against the
-wind; the model gives the mean of both (docs/results/update_policy.md). Swings of the optical gain
+wind; the model gives the mean of both (docs/results/tracking.md). Swings of the optical gain
 and edge slip are not in the model: stability is judged by the gate.
 """
 

@@ -5,7 +5,7 @@ has another cause and goes somewhere else:
 
 - the **calibration gain** is the stroke of the mirror over that of the model, mode by mode. It is
   constant, above or below 1, and goes into D: ``D_tuned = D diag(g)``, the last step of Heritier
-  et al. 2018.
+  et al. 2018, section 4.3.
 - the **optical gain** is the response of a pyramid in residual turbulence over that in a flat
   wavefront. It is at most 1, changes with the seeing, and goes into the loop gains. Its table is
   published with a reconstructor and never multiplied into it.
@@ -16,7 +16,7 @@ The optical gain of all modes is inferred from that of the few that were dithere
 residual with structure function D responds as to an incoherent source of mutual coherence
 ``exp(-D/2)``. The logarithm of a mode's optical gain is therefore the strength of the residual
 times a shape that depends on the modulation and the mode's spatial frequency. The shape was
-measured on the simulated diffractive telescope (docs/results/optical_gain.md). The strength, a
+measured on the simulated diffractive telescope (docs/results/tracking.md). The strength, a
 common factor and a smooth departure from the shape are fitted as a Gaussian process, whose
 uncertainty grows with the distance from the dithered modes.
 """
@@ -117,7 +117,7 @@ REFERENCE_GAINS = (
 )  # fmt: skip
 """Optical gains of FLAO's ``REFERENCE_MODES`` at 1" of seeing, which define the shape.
 
-Measured on the simulated diffractive telescope (docs/results/optical_gain.md).
+Measured on the simulated diffractive telescope (docs/results/tracking.md).
 """
 
 STRENGTH_SIGMA = 0.5

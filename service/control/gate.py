@@ -9,7 +9,7 @@ are hardly illuminated, so noise drives them, which pole radii do not show. If s
 reaches a quarter of the wavelength, a pyramid may lock the edge of the mirror on the next fringe,
 and a loop without leak never recovers. On the simulated diffractive telescope every loop without
 leak slipped above 300 nm per unit of slope noise, one at 201 nm, and none below
-(docs/results/edge_slip.md).
+(docs/results/reliability.md).
 """
 
 from __future__ import annotations
@@ -317,7 +317,7 @@ def _make_verdict(worst: float, aligned: float, bound: float, n_points: int) -> 
 MAX_EDGE_MOTION_M = 195e-9
 """Largest motion of an outer actuator per unit of slope noise in a loop without leak, metres.
 
-The smallest motion with a slip was 201 nm (docs/results/edge_slip.md).
+The smallest motion with a slip was 201 nm (docs/results/reliability.md).
 """
 
 MAX_HELD_EDGE_MOTION_M = 199e-9

@@ -1,6 +1,6 @@
 """Compare telemetry before and after a swap.
 
-Numbers are from docs/results/probation.md.
+Numbers are from docs/results/reliability.md.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ the larger estimate counts."""
 
 PRIOR_SCATTER = 0.2
 """1 σ of the logarithm of power in a group that is assumed before any is measured; 0.1 to 0.25 were
-measured (docs/results/probation.md)."""
+measured (docs/results/reliability.md)."""
 
 PRIOR_VALUES = 4
 """Measured values that this assumption counts for."""

@@ -19,7 +19,7 @@ from service.model.misregistration import Determination
 MODEL_ERROR_VARIANCE_RATIO = 15.0
 """Variance of α per unit of misfit above 1, over that of its scatter: what the model leaves over is
 smooth across the pupil and pulls at α more than noise of the same power. From campaigns on the
-diffractive telescope, two truths and two models (docs/results/night.md)."""
+diffractive telescope, two truths and two models (docs/results/tracking.md)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

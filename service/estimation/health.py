@@ -1,14 +1,16 @@
 """Watch the loop, the mirror's edge, vibrations, and frozen slopes.
 
 **The loop** is watched on the commands of the highest controlled modes: a misregistered loop
-becomes unstable there first, while slopes and wavefront error look healthy almost to the end.
+becomes unstable there first, while slopes and wavefront error look healthy almost to the end. Their
+power is compared with what turbulence requires, and with that of the seconds before: a pyramid
+that saturates bounds the commands of a lost loop at 3 to 8 times the expected turbulence.
 
 **The outer ring** of the mirror is watched on the commands as well. A segment at the edge of the
 pupil can slip by wavelengths and stay there: the sensor sees little light across it, its slopes
 look healthy, and only the command shows the step. On the diffractive telescope the slowly averaged
 position of the outermost actuators stays below 2.2 times the RMS that turbulence requires in every
 stable loop. A slip takes it to 7 to 18, or leaves it at 3 for seconds while the wavefront is lost
-already (docs/results/edge_slip.md).
+already (docs/results/reliability.md).
 
 **Vibrations** are lines in the slopes; the dither avoids them.
 
@@ -25,9 +27,12 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from service.estimation.comparison import REFERENCE_PERIOD_S
 from service.estimation.description import EdgeWatch
 from service.estimation.estimator import UNMARKED, Change, Detector, FrameContext, LoopContext, Mark
 from service.estimation.frames import FrameBlock
+from service.estimation.probation import MIN_HISTORY_S, MIN_PART_FRAMES, PART_S
+from service.estimation.residual import N_LOST_PARTS, RUNAWAY_POWER_RATIO, runs_away
 from service.model.kinds import SignalKind
 from service.model.misregistration import unit_like
 from service.model.slopes import TO_SLOPES
@@ -51,21 +56,92 @@ ABSURD_RATIO = 1e4
 
 _MEMORY_S = 0.5
 
+MIN_UPPER_MODES = 10
+"""Modes in the upper half; fewer wander by more than ``RUNAWAY_POWER_RATIO`` in a healthy loop."""
+
+CALM_SHARE_OF_RUNAWAY = 0.5
+"""Share of ``RUNAWAY_POWER_RATIO`` below which commands that ran away have come back."""
+
 _CALMING_S = 0.05
 """The same for a loop that diverged and carries less: one that was a thousand times beyond and
 holds again shows it within a second, not after seven memories."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class UpperPower:
+    """Power of the commands in the upper half of the modes, now and in the seconds before."""
+
+    n_modes: int = 0
+    """Modes in the loop."""
+
+    parts_m2: tuple[float, ...] = ()
+    """Power in consecutive parts of ``PART_S``, oldest first, bounded."""
+
+    open_m2: float = 0.0
+    """Sum over the frames of the part that is not complete yet."""
+
+    n_open: int = 0
+    """Frames of that part."""
+
+    lost_from_m2: float | None = None
+    """Usual power before the commands ran away; None if they have not."""
+
+    @property
+    def ratio(self) -> float | None:
+        """RMS of the commands over that before they ran away; None if they have not."""
+        if self.lost_from_m2 is None:
+            return None
+        return float(np.sqrt(np.median(self.parts_m2[-N_LOST_PARTS:]) / self.lost_from_m2))
+
+    def plus(self, upper_m: Array, n_modes: int, dt_s: float) -> UpperPower:
+        """Return it after the commands ``(n_frames, n_upper)`` of a loop of so many modes."""
+        state = self if n_modes == self.n_modes else UpperPower(n_modes=n_modes)
+        if upper_m.shape[1] < MIN_UPPER_MODES:
+            return state
+        n_part = max(round(PART_S / dt_s), MIN_PART_FRAMES)
+        powers, start = np.einsum("km,km->k", upper_m, upper_m), 0
+        while start < len(powers):
+            stop = start + n_part - state.n_open
+            some = powers[start:stop]
+            state = replace(
+                state,
+                open_m2=state.open_m2 + float(some.sum()),
+                n_open=state.n_open + len(some),
+            )
+            if state.n_open == n_part:
+                state = state.close_part(n_part * dt_s)
+            start = stop
+        return state
+
+    def close_part(self, part_s: float) -> UpperPower:
+        """Return it with one more complete part, and whether the commands run away now."""
+        n_kept = round(REFERENCE_PERIOD_S / part_s) + N_LOST_PARTS
+        parts = (*self.parts_m2, self.open_m2 / self.n_open)[-n_kept:]
+        state = replace(self, parts_m2=parts, open_m2=0.0, n_open=0)
+        before, last = parts[:-N_LOST_PARTS], parts[-N_LOST_PARTS:]
+        if self.lost_from_m2 is not None:
+            # a loop that comes back begins a history of its own
+            calm = max(last) < CALM_SHARE_OF_RUNAWAY * RUNAWAY_POWER_RATIO * self.lost_from_m2
+            return replace(state, parts_m2=(), lost_from_m2=None) if calm else state
+        if len(before) * part_s < MIN_HISTORY_S:
+            return state
+        usual_m2 = float(np.median(before))
+        return replace(state, lost_from_m2=usual_m2) if runs_away(last, usual_m2) else state
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LoopHealth(Detector):
     """Forgetting mean of how far the high modes are beyond what turbulence asks of them."""
 
-    resets = Change.GONE | Change.SESSION | Change.OPEN | Change.MATRIX
+    resets = Change.GONE | Change.SESSION | Change.OPEN | Change.MATRIX | Change.LOOP
     unless = Mark.STANDS
     only_closed = True
 
     ratio: float = 0.0
     """RMS of the command in the upper half of the controlled modes over its expectation."""
+
+    power: UpperPower = field(default_factory=UpperPower)
+    """The same power beside that of the seconds before."""
 
     diverging: bool = False
     absurd: bool = False
@@ -79,7 +155,14 @@ class LoopHealth(Detector):
 
     @override
     def begun_anew(self, loop: LoopContext, why: Change) -> LoopHealth:
-        """Return it with nothing; what another matrix made of the loop says nothing of this one."""
+        """Return it with nothing; what another matrix made of the loop says nothing of this one.
+
+        The power before stays the reference of another matrix: turbulence is the same. With other
+        gains it is none, because the noise in the commands goes with the gain.
+        """
+        if why == Change.LOOP:
+            known = self.power.lost_from_m2 is None
+            return replace(self, power=UpperPower()) if known else self
         return replace(self, ratio=0.0) if why == Change.MATRIX else LoopHealth()
 
     @override
@@ -102,9 +185,14 @@ class LoopHealth(Detector):
             f"commands are {self.ratio:.3g} times what turbulence asks: {self.unit}; nothing is "
             "measured, made or sent until the RTC sends metres"
         )
+        beyond = (
+            f"{self.ratio:.0f} times what turbulence asks of them"
+            if self.power.ratio is None
+            else f"{self.power.ratio:.1f} times the commands of the seconds before"
+        )
         diverging = (
-            f"the loop is diverging: its high modes carry {self.ratio:.0f} times what turbulence "
-            "asks of them; open the loop, lower the gain or control fewer modes"
+            f"the loop is diverging: its high modes carry {beyond}; open the loop, lower the gain "
+            "or control fewer modes"
         )
         lost = (
             f"the loop is lost: its high modes carry {self.ratio:.0f} times what turbulence asks "
@@ -143,16 +231,27 @@ def observe(
     absurd = _absurd(health, levels)
     if absurd != health.absurd:
         health = LoopHealth(ratio=float(np.sqrt(np.mean(levels**2))))
+    own = commands if block.dither_m is None else commands - block.dither_m[:, upper]
+    upper_power = health.power.plus(own, len(in_loop), block.dt_ns * 1e-9)
+    if absurd:
+        upper_power = UpperPower()
     power = float(np.mean(levels**2))
     calming = health.diverging and power < health.ratio**2
     memory_s = _CALMING_S if calming else _MEMORY_S
     fade = float(np.exp(-block.n_frames * block.dt_ns * 1e-9 / memory_s))
     ratio = float(np.sqrt(fade * health.ratio**2 + (1.0 - fade) * power))
     limit = CALM_RATIO if health.diverging else DIVERGING_RATIO
-    diverging = not absurd and ratio > limit
+    diverging = not absurd and (ratio > limit or upper_power.ratio is not None)
     beyond_s = _beyond_s(health, levels, block.dt_ns * 1e-9)
     lost = diverging and (health.lost or beyond_s >= LOST_S)
-    return LoopHealth(ratio=ratio, diverging=diverging, absurd=absurd, beyond_s=beyond_s, lost=lost)
+    return LoopHealth(
+        ratio=ratio,
+        power=upper_power,
+        diverging=diverging,
+        absurd=absurd,
+        beyond_s=beyond_s,
+        lost=lost,
+    )
 
 
 def _beyond_s(health: LoopHealth, levels: NDArray[np.float64], dt_s: float) -> float:

@@ -2,7 +2,7 @@
 
 Under frozen flow the passive estimate measures ``α + b``: an estimate scatters by 0.3 to 0.5 % of a
 subaperture and is biased by up to 9 % on the diffractive telescope, 24 % on the linear plant
-(docs/results/passive.md). The bias is constant until wind, flux or gain change. A dithered window
+(docs/results/tracking.md). The bias is constant until wind, flux or gain change. A dithered window
 measures α alone. Between windows b is learnt, so that a sparse dither suffices.
 
 b has four components. Those of rotation and magnification are small, but like those of the shifts

@@ -8,7 +8,7 @@ instrumental variables) of the commands, and sums over every frame make a noisy 
 of it: a measurement to fit a model to, never a matrix to control with.
 
 The turbulence that is left in the filtered commands biases the shifts by the wind, steadily, and no
-integration removes it: docs/results/passive.md has by how much.
+integration removes it: docs/results/tracking.md has by how much.
 """
 
 from __future__ import annotations

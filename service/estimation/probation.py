@@ -15,7 +15,7 @@ Turbulence makes all of these vary with a healthy loop. How much is measured bef
 from the median of all parts. Before that only what no turbulence does counts: divergence at once,
 and a factor of several that lasts longer than a gust.
 
-Numbers are from docs/results/probation.md.
+Numbers are from docs/results/reliability.md.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ loop holds well.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,6 +51,19 @@ times as much as in the seconds before."""
 RUNAWAY_POWER_RATIO = 6.25
 """Power of the commands of the upper half of the modes, over that before, which only a loop that
 is lost exceeds in each of ``N_LOST_PARTS`` parts: seeing that doubles makes it 3.2, a gust 2.6."""
+
+
+def runs_away(powers_m2: Sequence[float], usual_m2: float) -> bool:
+    """Return True if the commands have become far larger than they were, and stay so.
+
+    ``powers_m2`` are the powers of the upper half of the modes in consecutive parts, oldest first,
+    and ``usual_m2`` is that before. A pyramid that saturates measures a small residual in a lost
+    loop, so that its commands alone show the loss. Those of the lower half, tip and tilt above all,
+    wander far in a healthy loop and do not count.
+    """
+    last = powers_m2[-N_LOST_PARTS:]
+    limit = RUNAWAY_POWER_RATIO * usual_m2
+    return len(last) == N_LOST_PARTS and all(power > limit for power in last)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -189,28 +203,30 @@ class ResidualLevel:
         logs = [log_ratio(self.total, part, known) for part in parts if part.n_seen]
         return np.array(logs) - usual
 
-    def _runs_away(self, part: Residual) -> bool:
-        """Return whether the upper half of the modes is commanded far more than before."""
+    def _upper_powers(self, parts: tuple[Residual, ...]) -> tuple[list[float], float]:
+        """Return the power of the commands of the upper half of the modes: parts, and before."""
         usual = self.total.commanded / self.total.n_seen
         upper = np.flatnonzero(usual > 0.0)
         upper = upper[len(upper) // 2 :]
-        if not len(upper) or len(part.commanded) != len(usual) or not part.n_seen:
-            return False
-        power = float(part.commanded[upper].sum()) / part.n_seen
-        return power > RUNAWAY_POWER_RATIO * float(usual[upper].sum())
+        comparable = [p for p in parts if len(p.commanded) == len(usual) and p.n_seen]
+        if len(comparable) < len(parts) or not len(upper):
+            return [], 0.0
+        return (
+            [float(p.commanded[upper].sum()) / p.n_seen for p in parts],
+            float(usual[upper].sum()),
+        )
 
     def lost(self, parts: tuple[Residual, ...]) -> bool:
         """Return True if the loop no longer corrects.
 
         Its residual is far larger than before, and either as large as the turbulence that the
-        mirror followed then, or the mirror itself moves by far more. A saturated pyramid measures a
-        small residual in a lost loop: then the commands of the upper half of the modes show the
-        loss, because they wander less than those of tip and tilt.
+        mirror followed then, or the mirror itself moves by far more. Where the sensor saturates,
+        its commands run away (``runs_away``).
         """
         last = total_of(parts[-N_LOST_PARTS:])
         if last is None or not last.n_seen:
             return False
-        if len(parts) >= N_LOST_PARTS and all(map(self._runs_away, parts[-N_LOST_PARTS:])):
+        if runs_away(*self._upper_powers(parts[-N_LOST_PARTS:])):
             return True
         followed = self.total.commanded.sum() / self.total.n_seen
         before = self.total.seen.sum() / self.total.n_seen

@@ -41,8 +41,8 @@ class Misregistration:
     """Registration of the mirror's actuators on the sensor's subapertures.
 
     A mirror point ``p`` lands on the sensor at ``S(anamorphosis) magnification R(rotation) p +
-    shift`` (Heritier et al. 2018, section 4.1; S is ours, 1 where the image is not stretched). The
-    default is perfect registration.
+    shift`` (Heritier et al. 2018, section 4.1, equation 6; S is ours, 1 where the image is not
+    stretched). The default is perfect registration.
     """
 
     shift_x_subap: float = 0.0

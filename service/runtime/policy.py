@@ -49,7 +49,7 @@ def floor_of(settings: Settings, instrument: Instrument | None = None) -> NDArra
     """Return the model-error floor ``(4,)`` in boundary units: subapertures, degrees, ratio.
 
     What the settings leave open is what campaigns on the diffractive telescope found
-    (docs/results/night.md). Influence functions are wrong by a share of their width: of a mirror
+    (docs/results/tracking.md). Influence functions are wrong by a share of their width: of a mirror
     of few actuators, rotation and magnification are as much more uncertain as it is coarser.
     """
     tracking = settings.tracking
@@ -152,10 +152,11 @@ def tolerance_scale(
 ) -> NDArray[np.float64]:
     """Return ``(4,)`` how much more misregistration a loop tolerates than that of the reference.
 
-    A loop tolerates a given share of the width of its finest mode (Heritier et al. 2018, section
-    3.2). That width is ``N sqrt(pi / (4 n))`` subapertures for n modes on N subapertures. A shift
-    displaces the image as a whole, rotation and magnification displace its rim by N / 2 times the
-    parameter. Never below 1: what is allowed for the reference was safe on every telescope tried.
+    The tolerance depends on the controlled modes (Heritier et al. 2018, section 3.2). Here it is a
+    fixed share of the width of the finest controlled mode, which is ``N sqrt(pi / (4 n))``
+    subapertures for n modes on N subapertures. A shift displaces the image as a whole, rotation and
+    magnification displace its rim by N / 2 times the parameter. Never below 1: what is allowed for
+    the reference was safe on every telescope tried.
     """
     if instrument is None:
         return np.ones(4)

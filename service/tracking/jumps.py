@@ -30,7 +30,7 @@ proportional share."""
 
 MODEL_ERROR_VARYING_SHARE = 0.3
 """Share of the model error that differs from window to window: bright stars scatter by 0.1 % of a
-subaperture and 6 mdeg, twice what their own data say (docs/results/night.md)."""
+subaperture and 6 mdeg, twice what their own data say (docs/results/tracking.md)."""
 
 USUAL_MODEL_ERROR_RATIO = 1.5
 """Times the instrument's floor that windows of simulated telescopes find as their model error, and

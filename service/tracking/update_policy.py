@@ -22,9 +22,9 @@ MIN_AGREEING_WINDOWS = 2
 """Windows that must agree before anything is made from them."""
 
 VERDICT_MARGIN = np.array([0.05, 0.05, np.deg2rad(0.05), 0.005])
-"""Half of the accuracy that 594 modes need, 10 % of a subaperture and 0.1 deg (Heritier et al.
-2018, section 3.2), and 0.5 % of magnification: a verdict is as good so far
-beyond α ± 3σ (numeric units)."""
+"""Half of the accuracy that Heritier et al. 2018, section 3.2, require (10 % of a subaperture and
+0.1 deg), and 0.5 % of magnification: a verdict still holds this far beyond α ± 3σ (numeric
+units)."""
 
 THRESHOLD_DECAY_S = 60.0
 """Time over which the thresholds, doubled by an update, return to their own values."""

@@ -72,10 +72,10 @@ HEADERS: Final = {
 
 MANUAL_HEADERS: Final = {
     **HEADERS,
-    # it can be searched
-    "Content-Security-Policy": HEADERS["Content-Security-Policy"].replace(
-        "form-action 'none'", "form-action 'self'"
-    ),
+    # its search is a form, its theme has icons as fonts and in its style sheet
+    "Content-Security-Policy": HEADERS["Content-Security-Policy"]
+    .replace("form-action 'none'", "form-action 'self'; font-src 'self'")
+    .replace("img-src 'self'", "img-src 'self' data:"),
 }
 
 SWAGGER_HEADERS: Final = {

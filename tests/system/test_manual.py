@@ -33,7 +33,7 @@ def desk(tmp_path_factory):
     folder = tmp_path_factory.mktemp("desk")
     bench = next(  # the smallest one comes first, one with lenslets after it
         text
-        for text, _ in blocks_of(ROOT / "docs" / "integrate" / "fitting.md", "toml")
+        for text, _ in blocks_of(ROOT / "docs" / "howto" / "fitting.md", "toml")
         if text.startswith("[instrument]")
     )
     (folder / "bench.toml").write_text(bench, encoding="utf-8")

@@ -12,7 +12,7 @@ from fastapi import Request
 from pyrcal_studies.openapi import document
 from service.api import create_app
 from service.web import authentication, page
-from service.web.authentication import COOKIE, Hosts, Refusal, Refusals
+from service.web.authentication import COOKIE, Hosts, Refusal, RefusalLog
 from service.web.keys import KeyFile, KeyScope
 from tests.unit.test_api import LINK, STATE, FakeService, Snapshot, assert_problem
 from tests.unit.test_api_admission import serving
@@ -256,7 +256,7 @@ async def test_an_answer_is_given_again_to_its_own_key_alone(client, service, ke
 async def test_a_flood_of_refusals_is_counted_not_written(monkeypatch):
     now_s, told = 1000.0, []
     monkeypatch.setattr(authentication.time, "monotonic", lambda: now_s)
-    refusals = Refusals(told.append)
+    refusals = RefusalLog(told.append)
     scope = {
         "type": "http",
         "method": "GET",
@@ -267,11 +267,11 @@ async def test_a_flood_of_refusals_is_counted_not_written(monkeypatch):
     request = Request({**scope, "client": ("10.0.0.7", 5)})
     refusal = Refusal(HTTPStatus.UNAUTHORIZED, "no-key", "found no key")
     for _ in range(520):
-        refusals.tell(request, refusal)
+        refusals.record(request, refusal)
     assert [entry.name for entry in told] == ["request.no-key"] * 20
     now_s += 61.0
     for _ in range(2):
-        refusals.tell(request, refusal)
+        refusals.record(request, refusal)
     assert [entry.answer for entry in told[20:]] == [
         "401: found no key; 500 more were refused meanwhile",
         "401: found no key",

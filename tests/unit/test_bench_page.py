@@ -1,6 +1,8 @@
 """The page of ``make bench``: what it says follows from what was measured."""
 
-from benchmarks.bench_page import Alone, Row, page, plot
+from dataclasses import replace
+
+from benchmarks.bench_page import Alone, Row, plot, section
 
 ROW = Row(
     what="D of 594 modes",
@@ -11,12 +13,15 @@ ROW = Row(
 )
 
 
-def test_the_ratio_is_of_each_round_and_its_median_and_range_are_told():
+def test_the_ratio_is_of_each_round_and_peers_share_a_row():
     assert ROW.spread == (300.0, 200.0, 400.0)
-    text = page([ROW], [Alone(what="memory", found="296 MB", asked="-")], ["one thread"])
-    assert "| 0.2 | OOPAO, push-pull | 60 | **300** (200 to 400) | 1.5 % differ |" in text
-    assert "| memory | 296 MB | - |" in text
-    assert text.endswith("- one thread\n")
+    other = replace(ROW, peer="HCIPy", peer_s=(40.0, 50.0, 40.0))
+    text = section([ROW, other], [Alone(what="memory", found="296 MB", asked="-")], ["one thread"])
+    row = "| 0.2 | OOPAO, push-pull 60; HCIPy 40 | 300 (200 to 400); 200 (200 to 200) |"
+    assert row in text
+    assert "- OOPAO, push-pull: 1.5 % differ\n- HCIPy: 1.5 % differ\n" in text
+    assert "- memory: 296 MB; target -" in text
+    assert text.endswith("- one thread")
 
 
 def test_it_is_drawn(tmp_path):

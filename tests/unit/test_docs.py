@@ -173,7 +173,7 @@ def test_a_file_of_the_manual_is_read(text, tmp_path):
         assert load_instrument(path).modes.n_modes > 100
     elif text.startswith("[system]"):
         for name in re.findall(r'"(\w+\.toml)"', text):
-            other = DOCS / "integrate" / "systems.md"
+            other = DOCS / "howto" / "systems.md"
             (tmp_path / name).write_text(next(blocks_of(other, "toml"))[0], encoding="utf-8")
         assert len(load_system(path).pairs) > 1
     elif text.startswith("[wire]"):
@@ -218,7 +218,7 @@ def test_the_layout_on_the_architecture_page_is_that_of_the_code():
     """Its layers are those that the import contracts hold; its folders are those with code."""
     (layout,) = re.findall(
         r"^## Layout\n```\n(.*?)^```",
-        (DOCS / "understand" / "architecture.md").read_text("utf-8"),
+        (DOCS / "developer" / "architecture.md").read_text("utf-8"),
         re.M | re.S,
     )
     drawn, folders = re.split(r"\n(?=pyrcal/)", layout)

@@ -65,7 +65,7 @@ SIGNATURES = {
     "track": "path, instrument, settings",
     "write_bundle": "path, bundle",
 }
-"""Parameters of the functions that may be relied on: docs/integrate/library.md."""
+"""Parameters of the functions that may be relied on: docs/reference/python.md."""
 
 
 def parameters(name):

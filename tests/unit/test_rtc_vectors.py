@@ -233,7 +233,7 @@ def test_the_page_has_every_key_and_every_word():
 
 def test_every_alarm_that_the_page_names_is_one():
     page = PAGE.read_text(encoding="utf-8")
-    table = page.partition("| alarm | the RTC |")[2].partition("What the service waits for")[0]
+    table = page.partition("| Alarm | Requirements |")[2].partition("What the service waits for")[0]
     named = re.findall(r"^\| `([a-z-]+)` \|", table, flags=re.MULTILINE)
     assert len(named) > 10
     assert set(named) <= set(ALARMS)

@@ -45,7 +45,7 @@ def test_what_a_page_names_is_there(page):
 
 def test_the_architecture_names_files_of_the_service():
     """With the folder it is that file; a bare name follows one of the same folder."""
-    text = (DOCS / "understand" / "architecture.md").read_text("utf-8")
+    text = (DOCS / "developer" / "architecture.md").read_text("utf-8")
     folder, missing = "", []
     for name in re.findall(r"`([\w/]+\.(?:py|toml))`", text):
         folder = f"{name.rpartition('/')[0]}/" if "/" in name else folder

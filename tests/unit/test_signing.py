@@ -49,7 +49,7 @@ def test_a_signature_as_the_page_says_it_by_hand():
 
 
 def test_the_mac_that_the_page_gives_to_test_against_is_right():
-    page = (ROOT / "docs" / "rtc.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "rtc" / "README.md").read_text(encoding="utf-8")
     signed = rtc(start=7, secret=b"0123456789abcdef" * 2).sign(KEYS.status, STATUS)
     assert f"`{signed[-32:].hex()}`" in page
 

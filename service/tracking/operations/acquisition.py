@@ -278,7 +278,7 @@ def _on_refused(context: StepContext, record: ReconstructorRecord) -> None:
     if acquisition.stage is AcquisitionStage.WIDENING:
         stages.set_acquisition(context, replace(acquisition, max_modes=acquisition.n_modes))
     # With this leak a slipped segment at the edge recovers within a tenth of a second
-    # (docs/results/edge_slip.md).
+    # (docs/results/reliability.md).
     elif slippery and rtc is not None and rtc.leak > MAX_SLIP_SAFE_LEAK:
         text = f"a leak of {MAX_SLIP_SAFE_LEAK} is to keep the outer ring in place"
         context.log("acquisition.leak", text)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from service.control.loop import pole_radius
+from service.estimation.estimator import Change, LoopContext
 from service.estimation.health import (
     CALM_RATIO,
     DIVERGING_RATIO,
     LOST_RATIO,
     LOST_S,
+    MIN_UPPER_MODES,
     LoopHealth,
     observe,
 )
@@ -116,6 +120,61 @@ def test_the_split_into_blocks_hardly_matters():
     for start in range(0, 400, 10):
         health = observe(health, part(block, start, start + 10), VARIANCE, IN_LOOP)
     assert health.ratio == pytest.approx(whole.ratio, rel=0.05)
+
+
+def after_parts(health: LoopHealth, *parts: tuple[float, int], in_loop=IN_LOOP) -> LoopHealth:
+    """Parts of 0.1 s: so many at each factor, whatever the expectation is."""
+    for factor, n_blocks in parts:
+        for _ in range(n_blocks):
+            health = observe(health, times_expectation(factor), VARIANCE, in_loop)
+    return health
+
+
+def test_commands_that_grow_beyond_those_of_the_seconds_before_are_a_lost_loop_below_the_limit():
+    """A pyramid that saturates bounds them: 2.5 in RMS counts, in each of three parts."""
+    quiet = after_parts(LoopHealth(), (0.8, 40))
+    assert not after_parts(quiet, (2.4, 2)).diverging
+    assert after_parts(quiet, (2.4, 3)).diverging
+    assert not after_parts(quiet, (1.8, 30)).diverging
+    lost = after_parts(quiet, (2.4, 3))
+    assert lost.ratio < DIVERGING_RATIO
+    assert lost.power.ratio == pytest.approx(3.0, rel=0.1)
+
+
+def test_commands_that_ran_away_and_came_back_end_the_alarm_and_begin_a_new_history():
+    lost = after_parts(LoopHealth(), (0.8, 40), (2.4, 60))
+    assert lost.diverging
+    assert after_parts(lost, (0.8, 2)).diverging
+    calm = after_parts(lost, (0.8, 3))
+    assert not calm.diverging
+    assert calm.power.parts_m2 == ()
+
+
+def test_few_modes_and_a_short_history_show_no_commands_that_run_away():
+    few = IN_LOOP[: 2 * MIN_UPPER_MODES - 1]
+    assert not after_parts(LoopHealth(), (0.8, 40), (2.4, 10), in_loop=few[:-1]).diverging
+    assert after_parts(LoopHealth(), (0.8, 40), (2.4, 10), in_loop=few).diverging
+    assert not after_parts(LoopHealth(), (0.8, 4), (2.4, 20)).diverging
+
+
+def test_another_gain_drops_the_history_and_another_matrix_keeps_it():
+    quiet, loop = after_parts(LoopHealth(), (0.8, 40)), LoopContext(description=None)
+    assert not after_parts(quiet.begun_anew(loop, Change.LOOP), (2.4, 5)).diverging
+    assert after_parts(quiet.begun_anew(loop, Change.MATRIX), (2.4, 5)).diverging
+    lost = after_parts(quiet, (2.4, 5))
+    assert lost.begun_anew(loop, Change.LOOP).diverging
+    assert not lost.begun_anew(loop, Change.OPEN).diverging
+
+
+def test_a_dither_is_none_of_the_commands_that_run_away():
+    quiet = after_parts(LoopHealth(), (0.8, 40))
+    plain = times_expectation(0.8)
+    dither = np.zeros_like(plain.commands_m)
+    dither[:, UPPER] = 5.0 * np.sqrt(VARIANCE[UPPER])
+    moved = replace(plain, commands_m=plain.commands_m + dither, dither_m=dither)
+    for _ in range(5):
+        quiet = observe(quiet, moved, VARIANCE, IN_LOOP)
+    assert not quiet.diverging
 
 
 def observed(**loop) -> list[bool]:

@@ -110,7 +110,7 @@ def test_the_command_says_which_rules_are_broken(files, tmp_path, capsys):
 
 
 def test_the_rules_have_the_numbers_of_the_page():
-    page = (ROOT / "docs" / "understand" / "conventions.md").read_text("utf-8")
+    page = (ROOT / "docs" / "reference" / "conventions.md").read_text("utf-8")
     texts = dict(re.findall(r"^(\d+)\. (.*)", page, re.M))
     for rule, word in (
         (conventions.AXES, "reference frame"),

@@ -1,7 +1,7 @@
 """OOPAO's own objects, saved by OOPAO 1.0.0, become an instrument file, modes and a matrix.
 
 ``tests/data/imported`` holds a pyramid and a Shack-Hartmann of 8 subapertures, whose mirror OOPAO
-has moved by 0.2 of its subapertures and turned by 2 degrees: saved as docs/integrate/oopao.md says.
+has moved by 0.2 of its subapertures and turned by 2 degrees: saved as docs/tutorials/oopao.md says.
 """
 
 import re
@@ -140,7 +140,7 @@ def test_what_was_not_saved_is_named(saved):
 
 
 def test_the_page_saves_what_is_looked_at():
-    page = (ROOT / "docs" / "integrate" / "oopao.md").read_text("utf-8")
+    page = (ROOT / "docs" / "tutorials" / "oopao.md").read_text("utf-8")
     (names,) = re.findall(r"^names = (\{.*?^\})", page, re.M | re.S)
     told = {owner: set(of_it.split()) for owner, of_it in eval(names).items()}
     assert told == {owner: set(of_it) for owner, of_it in SAVED.items()}

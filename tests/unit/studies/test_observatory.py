@@ -13,6 +13,7 @@ from pyrcal_studies.campaign.small import N_TARGET, SETTINGS, SMALL, bench_of, l
 from pyrcal_studies.campaign.system_measures import row_of
 from service.config import load_settings
 from service.errors import CommandError
+from service.estimation.health import DIVERGING_RATIO, LoopHealth, observe
 from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
 from service.tracking import alarms
@@ -268,3 +269,37 @@ def test_a_loop_lost_to_a_jump_is_opened_within_a_second_and_back_on_all_modes_w
     assert all(one.closed and one.n_controlled == N_TARGET for one in after)
     errors = [np.sqrt(np.mean([m.wavefront_nm**2 for m in part])) for part in (before, after)]
     assert errors[1] < 1.1 * errors[0]
+
+
+def watched(*words, seconds) -> list[tuple[float, LoopHealth]]:
+    """Return the watch of the loop on the diffractive telescope, block by block."""
+    dome = Dome([f"--instrument={SMALL}", "--plant=diffractive", "--rate=500", *words])
+    modes = np.array(dome.computer.status().in_loop)
+    variance = bench_of(SMALL).describe().mode_variance_m2
+    loop, seen = LoopHealth(), []
+    while dome.time_s < seconds:
+        for block in dome.play():
+            loop = observe(loop, block, variance, modes)
+            seen.append((dome.time_s, loop))
+    return seen
+
+
+def test_a_jump_that_saturates_the_pyramid_is_called_diverging_within_half_a_second():
+    """A subaperture: 0.1 to 2 um of wavefront error, and slopes only twice as large as before."""
+    words = ("--seed=4", "--mag=8", "--seeing=0.6", "--n-controlled=60", "--jump=2.5:1,0,0,0")
+    seen = watched(*words, seconds=3.2)
+    assert not any(loop.diverging for time_s, loop in seen if time_s <= 2.5)
+    assert all(loop.diverging for time_s, loop in seen if time_s > 3.0)
+    # that of the expected turbulence alone does not see it
+    assert max(loop.ratio for _, loop in seen) < DIVERGING_RATIO
+
+
+def test_seeing_that_doubles_and_a_gust_are_no_jump():
+    gust = (
+        "--seeing-at=1.9:0.6",
+        "--seeing-at=2:1.05",
+        "--seeing-at=3:1.05",
+        "--seeing-at=3.1:0.6",
+    )
+    words = ("--seed=4", "--mag=8", "--seeing=0.6", "--n-controlled=60")
+    assert not any(loop.diverging for _, loop in watched(*words, *gust, seconds=4.0))

@@ -3,7 +3,7 @@
 There is no spot: with an unlimited field of fine pixels the centroid is the mean gradient of the
 phase, weighted by the light at each point. A field of six λ/d weighs the rim of a lenslet
 differently, which rotates a fit of mean gradients by some thousandths of a degree
-(docs/results/peers.md).
+(docs/results/accuracy.md).
 """
 
 from __future__ import annotations

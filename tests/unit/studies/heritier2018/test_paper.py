@@ -17,13 +17,46 @@ PAGE = ROOT / "docs" / "results" / "heritier2018.md"
 NAME = "heritier2018.tex"
 
 
-def source() -> str:
-    """Return the paper as plain text."""
+def tex() -> str:
+    """Return the paper's source."""
     given = os.environ.get("PYRCAL_PAPER")
     path = Path(given) if given else ROOT.parent / "shared" / "paper" / NAME
     if not path.is_file():
         pytest.skip(f"the paper's source is not at hand: PYRCAL_PAPER or ../shared/paper/{NAME}")
-    return paper.plain(path.read_text(encoding="utf-8"))
+    return path.read_text(encoding="utf-8")
+
+
+def source() -> str:
+    """Return the paper as plain text."""
+    return paper.plain(tex())
+
+
+def numbered(text: str) -> dict[str, set[str]]:
+    """Return the numbers that LaTeX gives to sections, equations, tables and figures."""
+    sections, chapter, part = set(), 0, 0
+    for level in re.findall(r"\\(section|subsection)\{", text):
+        chapter, part = (chapter + 1, 0) if level == "section" else (chapter, part + 1)
+        sections.add(f"{chapter}.{part}" if part else f"{chapter}")
+    found = {"section": sections}
+    for kind in ("equation", "table", "figure"):
+        count = len(re.findall(rf"\\begin\{{{kind}\*?\}}", text))
+        found[kind] = {str(number) for number in range(1, count + 1)}
+    return found
+
+
+def citations() -> list[tuple[str, str, str]]:
+    """Return file, kind and number of each place of the paper that code and documents cite."""
+    found = []
+    for folder in ("service", "pyrcal", "sim_rtc", "pyrcal_studies", "docs"):
+        for path in sorted((ROOT / folder).rglob("*")):
+            if path.suffix not in {".py", ".md", ".toml"}:
+                continue
+            text = re.sub(r"\s+", " ", path.read_text(encoding="utf-8"))
+            # what follows the name up to the end of the sentence or the parenthesis
+            for cited in re.findall(r"Heritier et al\. 2018[^.;]?((?:[^.;)]|\.\d)*)", text):
+                places = re.findall(r"(section|equation|table|figure)s? ([\d.]*\d)", cited.lower())
+                found += [(str(path.relative_to(ROOT)), *place) for place in places]
+    return found
 
 
 def tight(text: str) -> str:
@@ -68,6 +101,14 @@ def test_the_scans_are_those_of_table_1():
         for name, step in SCANNED
     ]
     assert ours == [(step.symbol, pytest.approx(step.step)) for step in paper.TABLE_1]
+
+
+def test_the_paper_has_the_places_that_are_cited():
+    numbers = numbered(tex())
+    assert [len(numbers[kind]) for kind in ("equation", "table", "figure")] == [10, 2, 14]
+    cited = citations()
+    assert len(cited) >= 15
+    assert [one for one in cited if one[2] not in numbers[one[1]]] == []
 
 
 def test_start_and_truth_are_equations_9_and_10():

@@ -1,0 +1,372 @@
+"""The report of ``pyrcal commission``: one HTML file with its figures inside."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pyrcal.fitting.figures import check_plots
+from pyrcal.maintenance.acceptance import (
+    Commissioning,
+    Criterion,
+    Outcome,
+    compare_residuals,
+    residuals_per_mode,
+)
+from service import __version__
+from service.errors import ConfigurationError
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
+from service.tracking.alarms import ALARMS
+from service.tracking.registration import Source
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_LABELS = ("shift x, subap", "shift y, subap", "rotation, deg", "magnification")
+
+_BLUE, _GREY, _RED, _GREEN, _AMBER = "#1f6fb2", "#7f8c8d", "#c0392b", "#1d7f4e", "#d98a00"
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #1d2433; background: #fff;
+       max-width: 1000px; margin: 24px auto; padding: 0 20px; }
+h1 { font-size: 26px; margin-bottom: 4px; } h2 { font-size: 19px; margin-top: 34px; }
+table { border-collapse: collapse; width: 100%; margin: 10px 0; font-size: 14px; }
+th, td { border-bottom: 1px solid #d8dde6; padding: 5px 8px; text-align: left;
+         vertical-align: top; overflow-wrap: break-word; }
+th { background: #f3f5f9; } .scroll { overflow-x: auto; }
+.pass { color: #14633b; font-weight: 600; } .fail { color: #b3261e; font-weight: 600; }
+.missing { color: #8a5a00; font-weight: 600; }
+.verdict { padding: 10px 14px; border-radius: 6px; font-weight: 600; margin: 14px 0; }
+.verdict.pass { background: #e3f4ea; } .verdict.fail { background: #fbe6e4; }
+figure { margin: 14px 0; } figcaption { color: #4a5366; font-size: 13px; }
+svg { max-width: 100%; height: auto; } .note { color: #4a5366; }
+@media print { body { max-width: none; } figure { break-inside: avoid; } }
+"""
+
+
+def write_page(data: Commissioning, criteria: Sequence[Criterion], path: Path) -> None:
+    """Write the report.
+
+    Raises
+    ------
+    ConfigurationError
+        If matplotlib is not installed, or the file cannot be written.
+    """
+    check_plots("pyrcal commission")
+    text = format_page(data, criteria)
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ConfigurationError(f"--output: cannot write {path}: {error}") from error
+
+
+def format_page(data: Commissioning, criteria: Sequence[Criterion]) -> str:
+    """Return the report as HTML that needs no other file."""
+    n_passed = sum(one.outcome is Outcome.PASS for one in criteria)
+    accepted = n_passed == len(criteria)
+    verdict = "ACCEPTED" if accepted else "NOT ACCEPTED"
+    parts = [
+        f"<h1>Commissioning of {escape(data.instrument.name)}</h1>",
+        f'<p class="note">{_time(data.first_ns)} to {_time(data.last_ns)} UTC. Written '
+        f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC by pyrcal {__version__}.</p>",
+        f'<p class="verdict {"pass" if accepted else "fail"}">{verdict}: '
+        f"{n_passed} of {len(criteria)} criteria passed</p>",
+        "<h2>Acceptance</h2>",
+        _criteria_table(criteria),
+        "<h2>Instrument and sources</h2>",
+        _table(("", ""), _instrument_rows(data)),
+        "<h2>RTC against the contract</h2>",
+        _checks(data),
+        "<h2>Fit of the measured interaction matrix</h2>",
+        _fit(data),
+        "<h2>Registration over time</h2>",
+        _figure(
+            _draw_alpha(data),
+            "α with 1 σ after each measurement, and the single measurements. Dashed lines: a "
+            "matrix of the service came into use."
+            + (" Dotted: the fit of the measured matrix." if data.fit else ""),
+        ),
+        "<h2>Matrices and their probation</h2>",
+        _matrices(data),
+        "<h2>Wavefront before and after</h2>",
+        _figure(
+            _draw_wavefront(data),
+            "Residual per controlled mode as the matrix in use measures it (not corrected for "
+            "optical gain), and the largest closed-loop pole radius over its bound.",
+        ),
+        "<h2>Alarms</h2>",
+        _alarms(data),
+    ]
+    title = escape(f"Commissioning of {data.instrument.name}")
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{title}</title><style>{_STYLE}</style></head><body>\n"
+        + "\n".join(parts)
+        + "\n</body></html>\n"
+    )
+
+
+def _criteria_table(criteria: Sequence[Criterion]) -> str:
+    rows = (
+        (
+            one.group,
+            one.name,
+            one.found,
+            one.limit,
+            _Html(f'<span class="{one.outcome}">{one.outcome}</span>'),
+            "" if one.outcome is Outcome.PASS else one.remedy,
+        )
+        for one in criteria
+    )
+    return _table(("Part", "Criterion", "Measured", "Limit", "Outcome", "If not passed"), rows)
+
+
+def _instrument_rows(data: Commissioning) -> Iterable[tuple[str, str]]:
+    instrument = data.instrument
+    yield "Instrument", instrument.name
+    yield "Telescope", f"{instrument.diameter_m:g} m, obscuration {instrument.obscuration_ratio:g}"
+    yield (
+        "Sensor",
+        f"{instrument.wfs.kind}, {instrument.wfs.n_subapertures} subapertures across",
+    )
+    yield "Modes wanted", f"{data.settings.control.n_modes_target}"
+    yield "Mode of the service at the start", data.settings.service.mode
+    for what, where in data.origins.items():
+        yield f"Source: {what}", where
+
+
+def _checks(data: Commissioning) -> str:
+    if data.checks is None:
+        return "<p>No result of pyrcal check-rtc was given.</p>"
+    classes = {"ok": "pass", "wrong": "fail", "seen": "missing", "skipped": "note"}
+    rows = (
+        (
+            str(one["check"]),
+            ", ".join(map(str, one.get("requirements", ()))),
+            _Html(
+                f'<span class="{classes.get(one["outcome"], "note")}">'
+                f"{escape(str(one['outcome']))}</span>"
+            ),
+            str(one["found"]),
+        )
+        for one in data.checks
+    )
+    return _table(("Check", "Requirements", "Outcome", "Finding"), rows)
+
+
+def _fit(data: Commissioning) -> str:
+    if data.fit is None:
+        return "<p>No result of pyrcal fit was given.</p>"
+    fit = data.fit
+    rows = [
+        (label, f"{fit[name]:.5g}", f"{fit['sigma'][name]:.2g}")
+        for label, name in zip(_LABELS, PARAMETERS, strict=True)
+    ]
+    control = fit["reconstructor"]
+    text = f"<p>Registration: {escape(str(fit['verdict']))}.</p>"
+    if control is not None:
+        text += (
+            f"<p>Reconstructor: {control['stable_modes']} of {control['n_modes']} modes are "
+            f"stable at gain {control['gain']:g}. {escape(str(control['reason']))}</p>"
+        )
+    return (
+        text
+        + _table(("Parameter, unit", "Fit", "1 σ"), rows)
+        + _figure(_draw_gains(fit), "Gain of each mode of the measured matrix over the model's.")
+    )
+
+
+def _matrices(data: Commissioning) -> str:
+    verdicts: dict[str, str] = {}
+    for _, state, text in data.probations:
+        name, _, words = text.partition(": ")
+        verdicts[name] = f"{state}: {words}"
+    rows = (
+        (
+            one.id,
+            str(one.n_modes),
+            str(one.state),
+            "" if one.gate is None else f"{one.gate.worst_pole_radius:.3f} of {one.gate.bound:g}",
+            verdicts.get(one.id, ""),
+            one.reason,
+        )
+        for one in sorted(data.matrices, key=lambda one: one.created_ns_utc)
+    )
+    return _table(("Matrix", "Modes", "State", "Largest pole radius", "Probation", "Reason"), rows)
+
+
+def _alarms(data: Commissioning) -> str:
+    if not data.alarms:
+        return "<p>None.</p>"
+    rows = (
+        (
+            name,
+            str(ALARMS[name].severity) if name in ALARMS else "a rule of the settings",
+            _time(begin_ns),
+            f"{(end_ns - begin_ns) * 1e-9:.0f} s",
+            "" if name not in ALARMS else ALARMS[name].means,
+        )
+        for name, begin_ns, end_ns in data.alarms
+    )
+    return _figure(_draw_alarms(data), "Alarms over time, by severity.") + _table(
+        ("Alarm", "Severity", "Began (UTC)", "Lasted", "Meaning"), rows
+    )
+
+
+# --- figures
+
+
+def _draw(n_rows: int, height_in: float) -> tuple[Figure, list[Axes]]:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.6, height_in), layout="constrained")
+    axes = figure.subplots(n_rows, 1, sharex=True, squeeze=False)[:, 0]
+    for one in axes:
+        one.spines[["top", "right"]].set_visible(False)
+        one.grid(alpha=0.25)
+    return figure, list(axes)
+
+
+def _draw_alpha(data: Commissioning) -> Figure:
+    figure, axes = _draw(4, 7.6)
+    entered = [one for one in data.estimates if one.entered]
+    minutes = _minutes(data, [one.t_ns_utc for one in entered])
+    filtered = np.array([one.filtered.vector for one in entered]).reshape(-1, 4) * BOUNDARY_SCALE
+    sigma = np.array([one.filtered_sigma for one in entered]).reshape(-1, 4) * BOUNDARY_SCALE
+    for k, (axis, label) in enumerate(zip(axes, _LABELS, strict=True)):
+        _mark_swaps(axis, data)
+        low, high = filtered[:, k] - sigma[:, k], filtered[:, k] + sigma[:, k]
+        axis.fill_between(minutes, low, high, color=_BLUE, alpha=0.2, lw=0, label="1 σ")
+        axis.plot(minutes, filtered[:, k], color=_BLUE, lw=1.6, marker=".", ms=4, label="α")
+        for source, colour, name in (
+            (Source.LOCK_IN, _GREY, "windows"),
+            (Source.RANDOM, _AMBER, "random signs"),
+        ):
+            mine = [one for one in data.estimates if one.source is source]
+            if mine:
+                axis.plot(
+                    _minutes(data, [one.t_ns_utc for one in mine]),
+                    [one.measured.vector[k] * BOUNDARY_SCALE[k] for one in mine],
+                    ls="",
+                    marker="+",
+                    ms=6,
+                    color=colour,
+                    label=name,
+                )
+        if data.fit is not None:
+            axis.axhline(data.fit[PARAMETERS[k]], color=_GREEN, lw=1.0, ls=":", label="fit")
+        axis.set_ylabel(label)
+    axes[0].legend(loc="upper left", ncols=5, fontsize=8, frameon=False)
+    axes[-1].set_xlabel("minutes")
+    return figure
+
+
+def _draw_wavefront(data: Commissioning) -> Figure:
+    figure, (residual, margin) = _draw(2, 4.6)
+    per_mode = residuals_per_mode(data)
+    residual.plot(
+        _minutes(data, [t_ns for t_ns, _ in per_mode]),
+        [1e9 * value_m for _, value_m in per_mode],
+        color=_BLUE,
+        marker=".",
+        lw=1.4,
+    )
+    before, after = compare_residuals(data)
+    limits = [data.swaps_ns[0], data.swaps_ns[-1]] if data.swaps_ns else []
+    for values, times in (
+        (before, (data.first_ns, *limits[:1])),
+        (after, (*limits[1:], data.last_ns)),
+    ):
+        if values and len(times) == 2:
+            median_nm = 1e9 * float(np.median(values))
+            residual.plot(_minutes(data, times), [median_nm] * 2, color=_GREEN, lw=1.2, ls="--")
+    residual.set_ylabel("nm RMS per mode")
+    residual.set_ylim(bottom=0.0)
+    judged = [(one.t_ns_utc, one.margin) for one in data.samples if one.margin is not None]
+    margin.plot(
+        _minutes(data, [t_ns for t_ns, _ in judged]),
+        [ratio for _, ratio in judged],
+        color=_BLUE,
+        marker=".",
+        lw=1.4,
+    )
+    margin.axhline(1.0, color=_RED, lw=1.0)
+    margin.set(ylabel="pole radius / bound", xlabel="minutes")
+    for axis in (residual, margin):
+        _mark_swaps(axis, data)
+    return figure
+
+
+def _draw_gains(fit: dict[str, Any]) -> Figure:
+    figure, (axis,) = _draw(1, 2.4)
+    gains = [np.nan if one is None else one for one in fit["gains"]]
+    axis.plot(gains, color=_BLUE, marker=".", ms=3, lw=0.8)
+    axis.axhline(1.0, color=_GREY, lw=0.8)
+    axis.set(xlabel="fitted mode", ylabel="gain")
+    return figure
+
+
+def _draw_alarms(data: Commissioning) -> Figure:
+    names = list(dict.fromkeys(name for name, *_ in data.alarms))
+    figure, (axis,) = _draw(1, 1.0 + 0.28 * len(names))
+    colours = {"critical": _RED, "serious": _AMBER, "warning": _GREY}
+    for name, begin_ns, end_ns in data.alarms:
+        severity = str(ALARMS[name].severity) if name in ALARMS else "warning"
+        begin, end = _minutes(data, (begin_ns, end_ns))
+        axis.barh(names.index(name), max(end - begin, 0.02), left=begin, color=colours[severity])
+    axis.set_yticks(range(len(names)), names)
+    axis.invert_yaxis()
+    axis.set(xlabel="minutes", xlim=_minutes(data, (data.first_ns, data.last_ns)))
+    return figure
+
+
+def _mark_swaps(axis: Axes, data: Commissioning) -> None:
+    for minutes in _minutes(data, data.swaps_ns):
+        axis.axvline(minutes, color=_GREEN, lw=1.0, ls="--")
+
+
+def _minutes(data: Commissioning, times_ns: Iterable[int]) -> list[float]:
+    return [(t_ns - data.first_ns) / 60e9 for t_ns in times_ns]
+
+
+# --- HTML
+
+
+class _Html(str):
+    """Text that is HTML already."""
+
+    __slots__ = ()
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    def cells(kind: str, row: Sequence[str]) -> str:
+        texts = (one if isinstance(one, _Html) else escape(one) for one in row)
+        return "<tr>" + "".join(f"<{kind}>{text}</{kind}>" for text in texts) + "</tr>"
+
+    top = f"<thead>{cells('th', head)}</thead>" if any(head) else ""
+    body = "\n".join(cells("td", row) for row in rows)
+    return f'<div class="scroll"><table>{top}<tbody>{body}</tbody></table></div>'
+
+
+def _figure(figure: Figure, caption: str) -> str:
+    from matplotlib import rc_context
+
+    stream = io.StringIO()
+    # Text stays text, so that the report can be searched; a fixed salt makes it reproducible.
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "pyrcal"}):
+        figure.savefig(stream, format="svg", metadata={"Date": None})
+    svg = stream.getvalue()
+    svg = svg[svg.index("<svg") :]
+    return f"<figure>{svg}<figcaption>{escape(caption)}</figcaption></figure>"
+
+
+def _time(t_ns: int) -> str:
+    return f"{datetime.fromtimestamp(t_ns // 1_000_000_000, UTC):%Y-%m-%d %H:%M:%S}"

@@ -1,0 +1,77 @@
+"""The measured values that README and the index quote are those of the pages of results."""
+
+import re
+import tomllib
+
+import pytest
+
+from tests.unit.test_house import ROOT
+from tests.unit.test_shelf import anchors
+
+RESULTS = ROOT / "docs" / "results"
+ENTRIES = tomllib.loads((RESULTS / "measured.toml").read_text("utf-8"))
+NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?![\w]|\.\d)")
+"""A number by itself: no part of a name, a date or a longer number."""
+
+QUOTING = {
+    "README.md": re.compile(r"\]\(docs/results/([\w.]+\.md(?:#[\w-]+)?)\)"),
+    "docs/results/README.md": re.compile(r"\[[^]]+\]\(([\w]+\.md)\)"),
+}
+
+
+def section_text(name):
+    """The text of a section, without its subsections' siblings; of a page without an anchor."""
+    page, _, anchor = name.partition("#")
+    text = (RESULTS / page).read_text("utf-8")
+    if not anchor:
+        return text
+    parts = re.split(r"^(?=## )", text, flags=re.M)
+    (index,) = [k for k, title in enumerate(t for t in anchors(RESULTS / page)) if title == anchor]
+    titles = re.findall(r"^#+ .*$", text, re.M)
+    (part,) = [part for part in parts if titles[index] in part.splitlines()]
+    return part
+
+
+def numbers(text):
+    return {n.rstrip(".") for n in NUMBER.findall(re.sub(r"\]\([^)]*\)|`[^`]*`", "", text))}
+
+
+@pytest.mark.parametrize("name", ENTRIES)
+def test_a_quoted_value_is_printed_in_its_section(name):
+    entry = ENTRIES[name]
+    printed = numbers(section_text(entry["section"]))
+    for value in entry["values"]:
+        source = entry.get("from", {}).get(value, value)
+        assert source in printed, (value, source)
+        if source != value:
+            digits = len(value.partition(".")[2])
+            assert round(float(source) * entry["unit"], digits) == float(value)
+
+
+def quotes():
+    """Each line that quotes results: (file, line, section or page that it links)."""
+    for file, link in QUOTING.items():
+        for line in re.split(r"\n(?=[|-] |#)", (ROOT / file).read_text("utf-8")):
+            for section in link.findall(line) if line.startswith(("| ", "- **")) else ():
+                yield pytest.param(line, section, id=f"{file}-{section}")
+
+
+@pytest.mark.parametrize(("line", "section"), list(quotes()))
+def test_every_number_that_is_quoted_has_an_entry(line, section):
+    known = {
+        value
+        for entry in ENTRIES.values()
+        if entry["section"] == section or entry["section"].partition("#")[0] == section
+        for value in entry["values"]
+    }
+    cells = line.split("|")
+    quoted = "|".join(cells[2:-1]) if line.startswith("| ") else line
+    if len(cells) == 5:  # the index: page, question, number
+        quoted = cells[3]
+    assert numbers(quoted) - known == set()
+
+
+def test_each_table_of_measured_values_is_quoted():
+    linked = {param.values[1] for param in quotes()}
+    for entry in ENTRIES.values():
+        assert {entry["section"], entry["section"].partition("#")[0]} & linked

@@ -21,8 +21,8 @@ from service.control.expected_gain import (
     ExpectedGain,
     Sky,
     estimate_slope_noise,
-    expected_gain,
     extrapolate_variance_m2,
+    predict_gain,
 )
 from service.control.loop import ControlLoop
 from service.control.reconstructor import invert
@@ -127,7 +127,7 @@ def predicted(
         optical_gain=np.full(model.basis.n_modes, 1.0 if given.plant == "linear" else OPTICAL_GAIN),
     )
     in_use, fresh = matrices
-    return expected_gain(in_use, fresh, model.interaction_matrix(alpha), timing, sky)
+    return predict_gain(in_use, fresh, model.interaction_matrix(alpha), timing, sky)
 
 
 def row(

@@ -18,9 +18,9 @@ from service.estimation.kalman import (
     Joint,
     allow_scatter,
     begin_joint,
-    corrected,
+    correct_state,
     forget,
-    predicted,
+    predict_state,
 )
 from service.estimation.lockin import LockIn, LockInPlan, Spectra
 from service.estimation.passive import PASSIVE_MEMORY_S, Passive, accumulate
@@ -143,7 +143,7 @@ class Watch:
         measured, noise = found.alpha.vector, found.covariance
         prior = self._forward(t_s)
         self._joint = (
-            begin_joint(measured, noise) if prior is None else corrected(prior, measured, noise)
+            begin_joint(measured, noise) if prior is None else correct_state(prior, measured, noise)
         )
         self._near = found.alpha
         yield Look(
@@ -168,7 +168,7 @@ class Watch:
             if not prior.biases:
                 prior = forget(prior, found.bias)
             prior = allow_scatter(prior, found.bias, found.bias_excess)
-            self._joint = corrected(prior, found.alpha.vector, found.covariance, found.bias)
+            self._joint = correct_state(prior, found.alpha.vector, found.covariance, found.bias)
             measured["followed"] = self._joint.alpha
             own = np.diag(self._joint.alpha_covariance)
             sigma["followed"] = np.sqrt(own + self._floor**2)
@@ -176,4 +176,4 @@ class Watch:
 
     def _forward(self, t_s: float) -> Joint | None:
         elapsed_s, self._joint_s = t_s - self._joint_s, t_s
-        return None if self._joint is None else predicted(self._joint, self._drift, elapsed_s)
+        return None if self._joint is None else predict_state(self._joint, self._drift, elapsed_s)

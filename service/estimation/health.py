@@ -343,11 +343,11 @@ def observe_edge(health: EdgeHealth, block: FrameBlock, watch: EdgeWatch) -> Edg
     inner = np.einsum("km,km->k", moved @ watch.inner, moved)
     each = zip(moved, inner, n_frames * (block.dt_ns * 1e-9), strict=True)
     for command, mean_square, lasted_s in each:
-        health = _seen(health, watch, command, float(mean_square), float(lasted_s))
+        health = _update_health(health, watch, command, float(mean_square), float(lasted_s))
     return health
 
 
-def _seen(
+def _update_health(
     health: EdgeHealth,
     watch: EdgeWatch,
     command: NDArray[np.float32],

@@ -209,7 +209,7 @@ class Passive(PassiveSums):
         return accumulate(self, frames.moving)
 
     @override
-    def emptied(self, *, rests: bool) -> Passive:
+    def empty(self, *, rests: bool) -> Passive:
         """Return them with nothing multiplied, nor anything that waits where they rest."""
         anew = replace(self, sums=(), n_effective=0.0)
         return replace(anew, waiting=(), begun=False) if rests else anew
@@ -484,7 +484,7 @@ def fit_matrix(
     spread = (scores @ found.shape).reshape(4, -1) @ scores.reshape(4, -1).T
     covariance = variance * normal @ spread @ normal
     return PassiveEstimate(
-        alpha=near.stepped(step),
+        alpha=near.add_step(step),
         covariance=(1.0 - CORRELATION_SHRINKAGE) * covariance
         + CORRELATION_SHRINKAGE * np.diag(np.diag(covariance)),
         optical_gain=seen.gains,

@@ -171,7 +171,7 @@ def _assumed(
 ) -> Iterator[str]:
     """Yield what the file does not say, and what is taken instead."""
     wfs = said.section(said.kind.table)
-    for key, text in said.kind.assumed(wfs.said, wfs.given):
+    for key, text in said.kind.list_assumptions(wfs.said, wfs.given):
         yield f"{wfs.where(key)}: {text}"
     values = {f"wfs.{key}": getattr(sensor, key, None) for key in said.kind.unknown}
     values["mirror.coupling"] = mirror.shape.coupling if isinstance(mirror, Mirror) else None
@@ -257,7 +257,7 @@ def _loop(file: schema.Section[LoopFacts], n_modes: int) -> LoopFacts | None:
 
 def _sensor(file: schema.Section[SensorTable], kind: SensorKind, pupil: Pupil) -> SensorDescription:
     with schema.refused_at(file.path, file.name):
-        sensor = kind.described(file.said, file.given)
+        sensor = kind.read_sensor(file.said, file.given)
         kind.check(sensor, pupil.subaperture_m)
     if file.said.valid_subapertures == "auto":
         return sensor

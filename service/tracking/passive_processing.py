@@ -76,7 +76,7 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
     if far > jumps.MAX_PASSIVE_INNOVATION:
         _ask_for_window(context, registration, event, prior, far)
         return
-    joint = kalman.corrected(prior, measured, estimate.covariance, block)
+    joint = kalman.correct_state(prior, measured, estimate.covariance, block)
     joint = kalman.update_scatter(joint, block, far)
     registration = _registration_after_passive(context, registration, joint, event)
     validity.store_registration(context, registration)

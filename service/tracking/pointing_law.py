@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.model.misregistration import Misregistration, step_text, wrapped
+from service.model.misregistration import Misregistration, step_text, wrap_angle
 from service.model.pointing_law import ANGLES, PointingLaw, Reported
 from service.tracking import events as ev
 from service.tracking.events import Event
@@ -115,7 +115,7 @@ def start_of_fit(
     now, then = state.alpha.law.nominal, law_at(state, t_ns_utc)
     if now is None or then is None:
         return alpha
-    return then if alpha is None else alpha.stepped(difference(now, then))
+    return then if alpha is None else alpha.add_step(difference(now, then))
 
 
 def registration_ahead(state: TrackerState, registration: Registration) -> Registration:
@@ -133,7 +133,7 @@ def registration_ahead(state: TrackerState, registration: Registration) -> Regis
     added = third**2 + 2.0 * sigma * third  # the root of σ² and this is σ and a third
     return replace(
         registration,
-        alpha=registration.alpha.stepped(step),
+        alpha=registration.alpha.add_step(step),
         covariance=registration.covariance + np.diag(added),
     )
 
@@ -172,13 +172,13 @@ def law_at(state: TrackerState, t_ns_utc: int) -> Misregistration | None:
         return way[min(later, len(way) - 1)][1]
     (before_ns, before), (after_ns, after) = way[later - 1], way[later]
     share = (t_ns_utc - before_ns) / (after_ns - before_ns)
-    return before.stepped(share * difference(before, after))
+    return before.add_step(share * difference(before, after))
 
 
 def difference(one: Misregistration, other: Misregistration) -> Array:
     """Return the step ``(4,)`` from one to the other, numeric units, by the shorter turn."""
     step = other.vector - one.vector
-    step[2] = wrapped(float(step[2]))
+    step[2] = wrap_angle(float(step[2]))
     return step
 
 
@@ -192,7 +192,7 @@ def _to_present(
     then = law_at(state, middle_ns)
     if now is None or then is None:
         return alpha
-    return alpha.stepped(difference(then, now))
+    return alpha.add_step(difference(then, now))
 
 
 def _nominal(context: StepContext, law: PointingLaw) -> Misregistration | str:
@@ -294,7 +294,7 @@ def _carry(context: StepContext, now: Misregistration) -> None:
             registration = moved(registration, difference(registration.nominal, now))
         store_registration(context, replace(registration, nominal=now))
     if acquisition.alpha is not None and before is not None and before != now:
-        found = acquisition.alpha.stepped(difference(before, now))
+        found = acquisition.alpha.add_step(difference(before, now))
         set_acquisition(context, replace(acquisition, alpha=found))
     state = LawState(
         nominal=now,

@@ -117,7 +117,7 @@ def shift_estimate(context: StepContext, step: Array, spread: Array, still_ns_ut
         context,
         replace(
             registration,
-            alpha=registration.alpha.stepped(step),
+            alpha=registration.alpha.add_step(step),
             covariance=registration.covariance + np.diag(spread**2),
             n_windows=0,
             previous_estimate=None,
@@ -162,7 +162,7 @@ def in_subapertures(registration: Registration, scale: Array, config_id: str) ->
     known = registration.stretches
     return replace(
         registration,
-        alpha=registration.alpha.moved_to(registration.alpha.vector * scale),
+        alpha=registration.alpha.with_vector(registration.alpha.vector * scale),
         covariance=registration.covariance * np.outer(scale, scale),
         stretches=known and replace(known, shared=known.shared * scale),
         floor=registration.floor * scale,

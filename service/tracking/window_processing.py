@@ -168,7 +168,7 @@ def process_window(context: StepContext, measured: WindowEstimate) -> None:
         return
     prior = filtering.predict_for(context, registration, measured)
     update = FilterUpdate(
-        joint=kalman.corrected(prior, measured.numbers, measured.noise),
+        joint=kalman.correct_state(prior, measured.numbers, measured.noise),
         n_windows=filtering.n_agreeing(context, registration, prior),
         innovation=_innovation(prior, measured),
         scatter=kalman.learnt(registration.scatter, far.mahalanobis_squared),
@@ -238,9 +238,9 @@ def _jump(
     # The earlier estimates contain no information on the new registration.
     joint = kalman.widen_after_jump(prior, noise)
     if whole:
-        joint = kalman.corrected(joint, first.alpha.vector, noise)
+        joint = kalman.correct_state(joint, first.alpha.vector, noise)
     update = FilterUpdate(
-        joint=kalman.corrected(joint, measured.numbers, measured.noise),
+        joint=kalman.correct_state(joint, measured.numbers, measured.noise),
         # Two windows are required before a matrix is made (docs/decisions/0025-jumps.md).
         n_windows=2 if whole or both.excess > jumps.MAX_TURBULENCE_EXCESS else 1,
         innovation=_innovation(prior, measured),

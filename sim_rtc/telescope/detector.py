@@ -224,7 +224,7 @@ def binned(instrument: Instrument, binning: int) -> Instrument:
         )
     return replace(
         instrument,
-        wfs=kind_of(instrument).binned(wfs, binning),
+        wfs=kind_of(instrument).bin_sensor(wfs, binning),
     )
 
 

@@ -266,7 +266,7 @@ def distorted(points: Array, weights: Array, imperfections: Imperfections) -> Ar
 def true_sensor(instrument: Instrument, imperfections: Imperfections) -> SensorDescription:
     """Return the sensor as it really is: with another modulation, where it has one."""
     wfs = instrument.wfs
-    key = kind_of(instrument).fitted_key(wfs)
+    key = kind_of(instrument).find_fitted_key(wfs)
     if key is None:
         return wfs
     return replace(wfs, **{key: getattr(wfs, key) * (1.0 + imperfections.modulation_error)})

@@ -212,7 +212,7 @@ def _displaced(instrument: Instrument, offsets_subap: Array) -> SensorDescriptio
         If it has one image only.
     """
     try:
-        return kind_of(instrument).displaced(instrument, offsets_subap)
+        return kind_of(instrument).displace_images(instrument, offsets_subap)
     except ModelError as error:
         raise ConfigurationError(f"--image-offsets: {error}") from error
 

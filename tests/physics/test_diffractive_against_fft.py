@@ -9,7 +9,7 @@ from pyrcal_studies.fft_pyramid import FftPyramid
 from service.instrument import load_instrument
 from service.model.pupil import valid_subapertures
 from service.model.sensors.pyramid.optics import PyramidOptics
-from service.model.sensors.pyramid.signals import normalised_jacobian, reference_slopes
+from service.model.sensors.pyramid.signals import differentiate_signals, reference_slopes
 from sim_rtc.telescope.diffractive import DiffractivePyramid, Quadrature, centred_pupil
 from tests.numerics import flao_basis
 
@@ -83,7 +83,7 @@ def test_ten_modes_are_seen_as_an_fft_pyramid_sees_them(
 def test_one_nanometre_is_seen_as_the_linear_jacobian_says(instrument, pupil, valid, shapes):
     """0.1 % on the same grid, push-pull."""
     linear = PyramidOptics(wfs=instrument.wfs, pupil=pupil, n_nodes=2, n_modulation=28)
-    jacobian = normalised_jacobian(linear.response(valid, SHIFT), valid)
+    jacobian = differentiate_signals(linear.response(valid, SHIFT), valid)
     jacobian *= np.float32(2 * np.pi / instrument.wfs.wavelength_m)
     sensor = DiffractivePyramid(instrument.wfs, pupil, SHIFT, Quadrature(n_modulation=28))
     for shape in shapes:

@@ -53,7 +53,7 @@ class ShackHartmannKind(SensorKind):
         return written
 
     @override
-    def described(self, table: ShackHartmannTable, given: frozenset[str]) -> ShackHartmann:
+    def read_sensor(self, table: ShackHartmannTable, given: frozenset[str]) -> ShackHartmann:
         from service.model.sensors.shack_hartmann.description import shack_hartmann_of
 
         return shack_hartmann_of(table)
@@ -77,7 +77,7 @@ class ShackHartmannKind(SensorKind):
         return LeftOut(cut, "cut by the edge of the pupil, left out by wfs.partly_lit")
 
     @override
-    def assumed(
+    def list_assumptions(
         self, table: ShackHartmannTable, given: frozenset[str]
     ) -> Iterator[tuple[str, str]]:
         if "pixel_scale_arcsec" not in given:

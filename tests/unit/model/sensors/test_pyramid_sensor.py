@@ -143,12 +143,12 @@ def test_a_kind_without_light_frames_or_working_point_says_so():
     assert "of a plain" in seen.reason
     assert plain.working_point(instrument, n_controlled=10, sampling=2) is None
     assert not plain.edge_slips
-    assert plain.fitted_key(instrument.wfs) is None
+    assert plain.find_fitted_key(instrument.wfs) is None
     assert plain.frames(None, frozenset()) is None
     with pytest.raises(ModelError, match="expected signals of a plain"):
         plain.signals_of_frames(instrument, np.zeros((1, 2, 2)), np.zeros((2, 2)))
     with pytest.raises(ModelError, match="expected none"):
-        plain.binned(instrument.wfs, 2)
+        plain.bin_sensor(instrument.wfs, 2)
 
 
 def test_every_kind_is_found_under_the_name_its_records_have():

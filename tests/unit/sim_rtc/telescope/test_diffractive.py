@@ -11,7 +11,7 @@ from service.model.kinds import KarhunenLoeve, Stop
 from service.model.misregistration import Misregistration
 from service.model.pupil import valid_subapertures
 from service.model.sensors.pyramid.optics import PyramidOptics
-from service.model.sensors.pyramid.signals import normalised_jacobian, reference_slopes
+from service.model.sensors.pyramid.signals import differentiate_signals, reference_slopes
 from sim_rtc.computer.feed import BATCH_FRAMES, PhaseFeed
 from sim_rtc.computer.loop import LoopTerms, ModalLoop
 from sim_rtc.telescope.atmosphere import Layer, frozen_layers
@@ -92,7 +92,7 @@ def test_small_phases_give_the_slopes_of_the_linear_jacobian(small_instrument, p
     wfs, shift = small_instrument.wfs, (0.1, 0.2)
     linear = PyramidOptics(wfs=wfs, pupil=pupil, n_nodes=2, n_modulation=28)
     valid = valid_subapertures(small_instrument)
-    jacobian = normalised_jacobian(linear.response(valid, shift), valid)
+    jacobian = differentiate_signals(linear.response(valid, shift), valid)
     sensor = DiffractivePyramid(wfs, pupil, shift, Quadrature(n_modulation=28, dtype=precision))
     for opd_m in phases(pupil, 1e-9, n=5):
         push, pull = (reference_slopes(sensor.images(s * opd_m), valid)[0] for s in (1, -1))

@@ -20,7 +20,7 @@ from service.model.interaction import InteractionModel
 from service.model.modes import karhunen_loeve_basis
 from service.model.sensors.pyramid.description import pyramid_in
 from service.model.sensors.pyramid.signals import reference_slopes
-from sim_rtc.telescope.diffractive import DiffractivePyramid, centred_pupil
+from sim_rtc.telescope.diffractive import DiffractivePyramid, build_centred_pupil
 
 MODES = (0, 1, 2, 5, 20, 50, 100, 200, 300, 399)
 STROKE_M = 20e-9
@@ -38,7 +38,7 @@ def main() -> None:
     basis = karhunen_loeve_basis(instrument)
     model = InteractionModel(instrument, basis, pupil_sampling=JUDGE_SAMPLING, detector_nodes=1)
     judge = hcipy_slopes(model)
-    pupil = centred_pupil(instrument, 3)
+    pupil = build_centred_pupil(instrument, 3)
     pyramid = DiffractivePyramid(pyramid_in(instrument), pupil)
 
     def judged(mode: int, sign: float) -> Array:

@@ -30,7 +30,7 @@ from service.model.sensors.pyramid.detector_windows import (
     slopes_per_unit,
 )
 from service.model.slopes import SlopeRecipe
-from sim_rtc.telescope.diffractive import DiffractivePyramid, centred_pupil
+from sim_rtc.telescope.diffractive import DiffractivePyramid, build_centred_pupil
 
 Array = NDArray[np.float64]
 
@@ -84,7 +84,7 @@ def centres_px(separation_px: int) -> Array:
 
 def exposed(instrument: Instrument, n: int, offsets_px: Array, modes: NDArray[np.intp]) -> Light:
     """Return the light on windows of ``n`` pixels, each image moved by its own offset."""
-    pupil = centred_pupil(instrument, SAMPLING)
+    pupil = build_centred_pupil(instrument, SAMPLING)
     sensor = DiffractivePyramid(replace(pyramid_in(instrument), n_subapertures=n), pupil)
     sensors = [sensor.at((column, row)) for row, column in offsets_px]
 

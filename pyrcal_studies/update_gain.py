@@ -35,7 +35,7 @@ from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.computer.feed import BATCH_FRAMES
 from sim_rtc.computer.loop import LoopTerms, ModalLoop
 from sim_rtc.options import parse_options
-from sim_rtc.telescope.atmosphere import fried_parameter_m
+from sim_rtc.telescope.atmosphere import compute_fried_parameter_m
 
 Array32 = NDArray[np.float32]
 
@@ -108,7 +108,7 @@ def predicted(
 ) -> ExpectedGain:  # fmt: skip
     """Return what the service would say, knowing seeing, wind, star and optical gain."""
     instrument, turbulence = model.instrument, model.instrument.modes
-    r0_m = fried_parameter_m(SEEING_ARCSEC)
+    r0_m = compute_fried_parameter_m(SEEING_ARCSEC)
     stronger = (turbulence.r0_m / r0_m) ** (5 / 3)
     noise = estimate_slope_noise(
         instrument, magnitude=float(given.mag), frame_rate_hz=1000.0, n_valid=model.n_slopes // 2

@@ -134,12 +134,12 @@ def _key(options: argparse.Namespace) -> int:
     file = KeyFile(data_dir(options))
     if options.action == "add":
         secret = file.add(options.name, KeyScope(options.scope))
-        _recorded(file, "key.added", f"{options.name} may {options.scope}")
+        _record_in_audit_trail(file, "key.added", f"{options.name} may {options.scope}")
         say(f"{file.path}: {options.name} may {options.scope}; this is the key, shown only now:")
         print(secret)
     elif options.action == "revoke":
         file.revoke(options.name)
-        _recorded(file, "key.revoked", options.name)
+        _record_in_audit_trail(file, "key.revoked", options.name)
         say(f"{file.path}: the key of {options.name} is revoked")
     else:
         keys = file.all()
@@ -151,7 +151,7 @@ def _key(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _recorded(file: KeyFile, name: str, text: str) -> None:
+def _record_in_audit_trail(file: KeyFile, name: str, text: str) -> None:
     """Record in the audit trail what was done, while a service may be running.
 
     Before the first start of a service there is no trail. If the disk refuses, the command says so

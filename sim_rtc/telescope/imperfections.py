@@ -143,7 +143,7 @@ class SlopeErrors:
         read.reshape(-1)[self._dark] = 0
         return read
 
-    def applied(self, slopes: Array32) -> Array32:
+    def add_errors(self, slopes: Array32) -> Array32:
         """Return the slopes with these errors; the first axis of ``slopes`` is ``n_slopes``."""
         if self.absent:
             return slopes
@@ -219,7 +219,7 @@ class ShapeErrors:
         )
         self._steps = self._steps[(self._steps >= 0).all(axis=1)]
 
-    def applied(self, shapes: Array32, on_mirror: Array) -> Array32:
+    def add_errors(self, shapes: Array32, on_mirror: Array) -> Array32:
         """Return shapes ``(n_points, n_modes)`` with these errors.
 
         ``on_mirror`` ``(n_points, 2)`` are the points where the shapes are seen, on the mirror.
@@ -240,7 +240,7 @@ class ShapeErrors:
         return np.asarray(np.sqrt(np.mean(steps**2, axis=0)))
 
 
-def distorted(points: Array, weights: Array, imperfections: Imperfections) -> Array:
+def distort_points(points: Array, weights: Array, imperfections: Imperfections) -> Array:
     """Return where in the pupil the light at these points of its image comes from.
 
     ``points`` is ``(n_points, 2)``. What a shift, a turn or a change of size could describe is

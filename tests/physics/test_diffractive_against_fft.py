@@ -10,7 +10,7 @@ from service.instrument import load_instrument
 from service.model.pupil import valid_subapertures
 from service.model.sensors.pyramid.optics import PyramidOptics
 from service.model.sensors.pyramid.signals import differentiate_signals, reference_slopes
-from sim_rtc.telescope.diffractive import DiffractivePyramid, Quadrature, centred_pupil
+from sim_rtc.telescope.diffractive import DiffractivePyramid, Quadrature, build_centred_pupil
 from tests.numerics import flao_basis
 
 MODES = [0, 1, 2, 5, 12, 35, 110, 230, 400, 593]
@@ -27,7 +27,7 @@ def instrument():
 
 @pytest.fixture(scope="module")
 def pupil(instrument):
-    return centred_pupil(instrument, 3)
+    return build_centred_pupil(instrument, 3)
 
 
 @pytest.fixture(scope="module")

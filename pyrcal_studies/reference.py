@@ -177,6 +177,7 @@ _TAKEN_BY = {
     remote.CONNECTION: "of all commands that ask or operate a service; exit status 1: refused, "
     "not done, or not all is well; 3: the service cannot be reached",
     remote.ORDER: "of all commands that change something in a service",
+    offline_arguments.ARCHIVE: "of `pyrcal archive`, `commission`, `bundle write`",
     offline_arguments.DESCRIPTION: "of `pyrcal import`, except from OOPAO",
 }
 """Titles of the groups of options that many commands share, and which commands these are."""
@@ -200,7 +201,7 @@ def _describe(
         yield _block(usages, own)
     status = " ".join((parser.epilog or "").split()).partition("Exit status: ")[2].partition(".")[0]
     if "; 1 " in status and parser.epilog != remote.EPILOG:
-        yield f"Exit status: {status}."
+        yield f"Exit status: {status.partition('; 2 ')[0]}."
 
 
 _INSTRUMENT = ("INSTRUMENT", offline_arguments.INSTRUMENT)
@@ -287,9 +288,10 @@ def rest(described: Schema) -> str:
 def runbook(acts: Mapping[str, str]) -> str:
     """Return docs/operate/runbook.md: what to do about each alarm; ``acts``: what it may forbid."""
     parts = [
-        "An alarm lasts as long as what it tells of. It is on the page, in `GET /v1/state`, on "
-        "the wire (`ao/v1/{system}/alarm`), and in [the metrics](monitoring.md). Its text has the "
-        "numbers; here is what each means, what to do, and in brackets the file that finds it.",
+        "An alarm is active as long as its cause. It is shown on the page, in `GET /v1/state`, on "
+        "the link (`ao/v1/{system}/alarm`), and in [the metrics](monitoring.md). Its text has the "
+        "numbers. This page lists for each alarm what has happened, why it matters and what to "
+        "do; in brackets is the file of the service that detects it.",
         "## What an alarm may forbid",
         listed((f"`{act}`", text) for act, text in acts.items()),
     ]
@@ -298,7 +300,6 @@ def runbook(acts: Mapping[str, str]) -> str:
         head = [f"*{kind.severity.value}* (`service/{kind.origin}`)"]
         head.append(f"forbids {forbids}" if forbids else "")
         head.append(f"the {kind.responsible} can end it" if kind.responsible else "")
-        means = kind.means[:1].upper() + kind.means[1:]
-        do = f"**Do**: {kind.do}."
-        parts += [f"## {name}", "; ".join(part for part in head if part), f"{means}.", do]
+        do = f"**Do**: {kind.do}"
+        parts += [f"## {name}", "; ".join(part for part in head if part), kind.means, do]
     return page("Runbook: what to do about an alarm", *parts)

@@ -54,7 +54,7 @@ ARM_SUBAP = 0.5
 """Width of the arms in the trial model, subapertures; the best width is extrapolated from it."""
 
 PLAUSIBLE_DISPLACEMENT_PX = 0.5
-"""Displacement of a pupil image beyond which it stands for something else: real pyramids have up to
+"""Displacement of a pupil image that indicates another error of the model: real pyramids have up to
 0.3 pixel, and images whose response the model explains to 70 % only were fitted 1.7 pixels off."""
 
 MODULATION_STEP = 0.1

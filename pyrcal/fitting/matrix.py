@@ -403,7 +403,7 @@ def _find_axes(
     search = search_about(about, stated)
     if options.start is None and search.best.correlation < DOUBTFUL_CORRELATION:
         corners = [
-            about.moved_to(about.vector + FAR_SUBAP * np.array([x, y, 0.0, 0.0]))
+            about.with_vector(about.vector + FAR_SUBAP * np.array([x, y, 0.0, 0.0]))
             for x, y in product((-1.0, 0.0, 1.0), repeat=2)
             if x or y
         ]

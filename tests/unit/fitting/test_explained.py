@@ -115,7 +115,7 @@ def test_the_move_told_of_the_right_stop_leads_to_the_truth():
 
 
 def test_the_move_told_of_an_image_that_is_not_stretched_is_the_fits():
-    stretched = matrix(ELSEWHERE.stretched(np.array([0.003, -0.002])), noise=0.05)
+    stretched = matrix(ELSEWHERE.with_anamorphosis(np.array([0.003, -0.002])), noise=0.05)
     found = fit(stretched, options=EXPLAIN)
     without = fit(stretched, options=FitOptions(anamorphosis=False))
     moved = without.alpha.vector - found.alpha.vector

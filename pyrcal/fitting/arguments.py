@@ -107,9 +107,8 @@ def _describe_archive(archive: OneLineParser) -> None:
 def _describe_commission(commission: OneLineParser) -> None:
     commission.set_defaults(module="pyrcal.maintenance.commission")
     commission.description = (
-        "Judge a commissioning: compare the archive of a night, the result of pyrcal check-rtc "
-        "and the fit of a measured matrix with the limits of docs/operate/commissioning.md, and "
-        "write one HTML file with figures. Works while the service runs. Needs the extra 'plots'."
+        "Compare the archive of a night, the result of pyrcal check-rtc and a fit with the limits "
+        "of docs/operate/commissioning.md, and write one HTML file. Needs the extra 'plots'."
     )
     commission.epilog = (
         "Exit status: 0 all criteria pass; 1 one does not, or has no input; 2 the report cannot "
@@ -121,9 +120,9 @@ def _describe_commission(commission: OneLineParser) -> None:
         words("--instrument NAME|FILE", "default: that of the settings"),
         words("--check-rtc FILE.json", "output of pyrcal check-rtc --json", type=Path),
         words("--fit FILE.json", "output of pyrcal fit --json", type=Path),
-        words("--night DATE", "date of the evening, UTC; default: the newest with measurements"),
-        words("--since TIME", "judge from here on, RFC 3339, like 2026-03-01T20:00:00Z"),
-        words("--until TIME", "judge up to here"),
+        words("--night DATE", "date of the evening, UTC; default: the newest"),
+        words("--since TIME", "begin, RFC 3339, like 2026-03-01T20:00:00Z"),
+        words("--until TIME", "end"),
         words(
             "--output FILE.html",
             "default %(default)s",

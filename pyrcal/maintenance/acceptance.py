@@ -38,7 +38,7 @@ ELLIPSE_95: Final = 9.488
 """95th percentile of chi-squared with 4 degrees of freedom: innovation of a consistent window."""
 
 MIN_COVERAGE: Final = 0.85
-"""Smallest share of windows inside their 95 % ellipse; 94 to 100 % in docs/results/night.md."""
+"""Smallest share of windows inside their 95 % ellipse; docs/results/tracking.md has 96 to 100 %."""
 
 MIN_FRESH_SHARE: Final = 0.9
 """Smallest share of the time, after α was first known, during which α was not stale."""
@@ -152,7 +152,7 @@ def _line(
 
 
 def _judge_rtc(data: Commissioning) -> Iterator[Criterion]:
-    remedy = "correct the RTC; each line of pyrcal check-rtc names the requirements (R-n)"
+    remedy = "correct the RTC: pyrcal check-rtc names the requirements of each check"
     if data.checks is None:
         text = "no result was given"
         yield _line("RTC", "checks that found a violation", None, text, "0", remedy)

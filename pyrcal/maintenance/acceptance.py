@@ -241,16 +241,9 @@ def _judge_tracking(data: Commissioning) -> Iterator[Criterion]:
         f"at least {MIN_WINDOWS}",
         "let it dither longer; the log says why windows are rejected (window.refused)",
     )
-    dither = data.settings.dither
-    target = np.array(
-        [
-            dither.sigma_shift_subap,
-            dither.sigma_shift_subap,
-            dither.sigma_rotation_deg,
-            dither.sigma_magnification,
-        ]
-    )
-    target = np.maximum(target / BOUNDARY_SCALE, data.policy.floor)
+    # The precision that the service itself requires of α; its σ includes the model error.
+    policy = data.policy
+    target = np.hypot(policy.tolerance * policy.dither_sigma, policy.floor)
     enough = len(windows) >= MIN_WINDOWS
     median = np.median([one.filtered_sigma for one in windows], axis=0) if windows else target
     yield _line(

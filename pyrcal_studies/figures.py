@@ -18,6 +18,7 @@ import scipy
 from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import FancyBboxPatch, Rectangle
 from numpy.typing import NDArray
 from PIL import Image
@@ -113,8 +114,8 @@ def slope_maps(column: NDArray[np.floating], valid: NDArray[np.bool_]) -> Array:
 
 def _slope_panels(columns: dict[str, Array], unit: str) -> Figure:
     """Draw Sx above Sy for each named pair of maps, all with one colour scale."""
-    figure = Figure(figsize=(2.6 * len(columns) + 1.0, 5.0), layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.15)
+    engine = ConstrainedLayoutEngine(w_pad=0.15)
+    figure = Figure(figsize=(2.6 * len(columns) + 1.0, 5.0), layout=engine)
     grid = figure.subplots(2, len(columns), squeeze=False)
     limit = max(float(np.nanmax(np.abs(maps))) for maps in columns.values())
     for k, (name, maps) in enumerate(columns.items()):
@@ -181,7 +182,7 @@ def poles() -> Figure:
     """Draw the pole radius of FLAO's loop against each parameter of the registration."""
     _, model = _flao()
     nominal = model.interaction_matrix(alpha_of())
-    ranges = {
+    ranges: dict[str, tuple[Array, Callable[[float], Misregistration]]] = {
         "shift x (subapertures)": (np.linspace(0.0, 0.5, 6), lambda v: alpha_of(x=v)),
         "rotation (deg)": (np.linspace(0.0, 1.6, 5), lambda v: alpha_of(deg=v)),
         "magnification - 1 (%)": (np.linspace(0.0, 5.0, 6), lambda v: alpha_of(mag=1 + v / 100)),
@@ -220,7 +221,8 @@ def wavefront_against_shift() -> Figure:
     figure = Figure(figsize=(6.4, 3.8), layout="constrained")
     axes = figure.subplots()
     for n_modes, mark in ((40, "s"), (80, "o")):
-        old, right = [], []
+        old: list[float] = []
+        right: list[float] = []
         for shift in shifts:
             alpha = alpha_of(x=float(shift))
             for found, held in ((old, alpha_of()), (right, alpha)):

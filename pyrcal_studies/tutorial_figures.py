@@ -106,7 +106,8 @@ def papyrus_fit() -> Figure:
 def residual_maps(fit: Fit) -> Figure:
     """Draw slope maps of single modes: model, measurement, difference."""
     figure = Figure(figsize=(9.4, 3.0), layout="constrained")
-    fit_figures.slope_maps(figure.subfigures(1, 1), fit)
+    (part,) = figure.subfigures(1, 1, squeeze=False).ravel()
+    fit_figures.slope_maps(part, fit)
     return figure
 
 
@@ -189,7 +190,7 @@ def _frames(kind: str, columns: tuple[int, ...], titles: str) -> Figure:
         else:
             (path,) = Path(folder).glob("int_mat*")
             cube = np.load(path).T.reshape(-1, 240, 240)
-    figure = Figure(figsize=(9.4, 3.3), layout="constrained")
+    figure = Figure(figsize=(9.4, 3.8), layout="constrained")
     for axes, column in zip(figure.subplots(1, len(columns)), columns, strict=True):
         limit = np.percentile(np.abs(cube[column]), 99.5)
         axes.imshow(cube[column], cmap="RdBu_r", vmin=-limit, vmax=limit, origin="lower")
@@ -236,31 +237,6 @@ def lenslets() -> Figure:
     grid[2].plot(columns - half, rows - half, "s", color="#e6e1cf", ms=7, mew=0)
     grid[2].plot(*points.T, ".", color="tab:blue", ms=3)
     grid[2].set(title=f"{len(points)} actuators", xlabel="x (subapertures)", aspect="equal")
-    return figure
-
-
-def lenslets_noise() -> Figure:
-    """Draw error and σ of a fit against the noise of the matrix."""
-    instrument = _from_page("shack_hartmann")
-    truth = Misregistration(shift_x_subap=0.20, rotation_rad=np.deg2rad(0.5), magnification=1.004)
-    matrix = np.asarray(pyrcal.interaction_matrix(instrument, truth), dtype=float)
-    noises, rng = (0.05, 0.2, 0.5, 1.0), np.random.default_rng(1)
-    errors, sigmas = [], []
-    for level in noises:
-        noise = rng.normal(size=matrix.shape)
-        noise *= level * np.linalg.norm(matrix, axis=0) / np.linalg.norm(noise, axis=0)
-        fit = pyrcal.fit(instrument, matrix + noise, modes=range(matrix.shape[1]))
-        found = fit.alpha.to_boundary()
-        errors.append([abs(found[name] - value) for name, value in truth.to_boundary().items()])
-        sigmas.append(list(fit.sigma_to_boundary().values()))
-    figure = Figure(figsize=(9.4, 2.8), layout="constrained")
-    names = ("shift x (subapertures)", "rotation (deg)", "magnification")
-    for axes, k, name in zip(figure.subplots(1, 3), (0, 2, 3), names, strict=True):
-        axes.loglog(np.array(noises) * 100, np.array(sigmas)[:, k], "o-", label="1 σ of the fit")
-        axes.loglog(np.array(noises) * 100, np.array(errors)[:, k], "x", label="true error")
-        axes.set(xlabel="noise (% of the signal)", ylabel=name)
-        axes.grid(alpha=0.3, which="both")
-    figure.axes[0].legend(fontsize="small")
     return figure
 
 
@@ -341,7 +317,6 @@ FIGURES: dict[str, Callable[[], Figure]] = {
         papyrus_frames,
         papyrus_fit,
         lenslets,
-        lenslets_noise,
         petals,
         elt_poles,
         rtc_timing,

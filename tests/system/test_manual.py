@@ -84,7 +84,12 @@ def typed(page):
 
 @pytest.mark.parametrize(
     "page",
-    [page for page in PAGES if any(words[0] in ALONE for words in typed(page))],
+    [
+        page
+        for page in PAGES
+        if page.parent.name != "tutorials"  # tests/system/test_tutorials.py
+        and any(words[0] in ALONE for words in typed(page))
+    ],
     ids=lambda page: page.stem,
 )
 def test_what_works_on_files_works_as_it_is_written(page, desk, tmp_path):

@@ -36,6 +36,9 @@ DOCS = ROOT / "docs"
 RECORDS = {"decisions", "results", "rtc"}
 """Folders of docs that nobody works through with their hands at the keys."""
 
+TUTORIALS = tuple(f"{page.stem}-" for page in (DOCS / "tutorials").glob("*.md"))
+"""Pages whose blocks build on each other: tests/system/test_tutorials.py runs them."""
+
 PAGES = [
     ROOT / "README.md",
     *sorted(page for page in DOCS.rglob("*.md") if page.parent.name not in RECORDS),
@@ -182,7 +185,9 @@ def test_a_file_of_the_manual_is_read(text, tmp_path):
         assert load_settings(path, {})
 
 
-@pytest.mark.parametrize("text", list(blocks("python", run=True)))
+@pytest.mark.parametrize(
+    "text", [block for block in blocks("python", run=True) if not block.id.startswith(TUTORIALS)]
+)
 def test_what_the_manual_writes_in_python_runs(text, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     exec(compile(text, "the manual", "exec"), {"matrix": np.eye(3)})

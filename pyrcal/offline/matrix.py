@@ -43,7 +43,7 @@ from pyrcal.offline.methods import (
     settle_at,
 )
 from pyrcal.offline.models import FitModels
-from pyrcal.offline.noise import measure_structure
+from pyrcal.offline.noise import bound_noise_share, measure_structure
 from pyrcal.offline.origins import Origin, list_origins, list_undetermined_keys
 from pyrcal.offline.pupil_checks import FitSubset, fit_smooth_gain, try_pupils
 from pyrcal.offline.pupil_width import SeenPupil, compute_responses, measure_pupil
@@ -55,6 +55,7 @@ from pyrcal.offline.uncertainty import (
     MAGNIFICATION_FLOOR,
     WEAK_MODULATION_FLOOR,
     misplacement_sigma,
+    nonlinearity_sigma,
     pupil_places,
     pupil_regions,
     uncertainty,
@@ -536,6 +537,10 @@ def _make_fit(
         sure = sure.with_moves(error[np.newaxis], np.ones(1))
     misplaced = _misplacement_sigma(models.instrument, structured)
     sure = sure.with_moves(misplaced[np.newaxis], np.ones(1))
+    noise_share = bound_noise_share(seen.residual, solution.matrix[target.rows] * seen.gains)
+    if kind_of(models.instrument).is_weakly_modulated(models.instrument.wfs):
+        beyond = nonlinearity_sigma(residual_fraction, noise_share)
+        sure = sure.with_moves(beyond[np.newaxis], np.ones(1))
     stretch_sigma = nuisances.stretch_sigma(sure.nuisance_sigma)
     findings = FitFindings(
         solution=solution,
@@ -627,6 +632,8 @@ def _make_fit(
         n_sets=len(sure.subset_steps),
         columns=columns,
         numbers_share=1.0 if without is None else without.share,
+        noise_share=noise_share,
+        large_pokes=without is not None and without.is_undecided,
     )
     if not options.explain:
         return replace(fit, recommendation=recommend_action(fit, grounds))

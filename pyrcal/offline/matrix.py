@@ -552,7 +552,7 @@ def _make_fit(
         alternatives=tried,
         landing=found.landing,
         rivals=others,
-        off_centre=find_decentred_pupil(few, others),
+        off_centre=find_decentred_pupil(tried, others),
         optics=optics,
         narrow=_find_narrow_pupil(settled),
         with_file_values=without,

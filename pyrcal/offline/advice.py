@@ -60,7 +60,8 @@ class Grounds:
     """Largest share of the residual's power that is noise, 0 to 1."""
 
     large_pokes: bool = False
-    """True if a fitted modulation explains part of what pokes beyond the linear range leave."""
+    """True if another modulation than the file's explains part of what is left over, as of pokes
+    beyond the linear range of a weakly modulated pyramid."""
 
 
 class Advice(StrEnum):
@@ -142,7 +143,7 @@ def _explain_uncertainty(fit: Fit, grounds: Grounds, edge: float, radius: float)
                 f"{left}: the sensor may be beyond its linear range; poke with a smaller stroke, "
                 "and push and pull"
             )
-        return f"{left}: the model differs from the bench"
+        return f"{left}: the model differs from the bench, and only more modes average that out"
     terms = systematic_terms(fit.alternatives, fit.residual_fraction, fit.sigma)
     most = max(terms, key=lambda term: _at_edge(term.sigma, radius), default=None)
     if most is None or _at_edge(most.sigma, radius) < 0.5 * edge:

@@ -538,7 +538,12 @@ def _make_fit(
     misplaced = _misplacement_sigma(models.instrument, structured)
     sure = sure.with_moves(misplaced[np.newaxis], np.ones(1))
     noise_share = bound_noise_share(seen.residual, solution.matrix[target.rows] * seen.gains)
-    if kind_of(models.instrument).is_weakly_modulated(models.instrument.wfs):
+    # large pokes look like a wider modulation, which the fit may have taken for the true one
+    weakly_modulated = any(
+        kind_of(about).is_weakly_modulated(about.wfs)
+        for about in (models.instrument, as_in_file.instrument)
+    )
+    if weakly_modulated:
         beyond = nonlinearity_sigma(residual_fraction, noise_share)
         sure = sure.with_moves(beyond[np.newaxis], np.ones(1))
     stretch_sigma = nuisances.stretch_sigma(sure.nuisance_sigma)
@@ -633,7 +638,7 @@ def _make_fit(
         columns=columns,
         numbers_share=1.0 if without is None else without.share,
         noise_share=noise_share,
-        large_pokes=without is not None and without.is_undecided,
+        large_pokes=weakly_modulated and without is not None and without.is_undecided,
     )
     if not options.explain:
         return replace(fit, recommendation=recommend_action(fit, grounds))

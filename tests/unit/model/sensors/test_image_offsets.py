@@ -13,7 +13,12 @@ from service.errors import ModelError
 from service.model.interaction import InteractionModel
 from service.model.kinds import Normalisation, SlopeOrder, Stop
 from service.model.misregistration import Misregistration
-from service.model.sensors.pyramid.description import displaced, image_offsets, turned_offsets
+from service.model.sensors.pyramid.description import (
+    EDGE_SHIFT,
+    displaced,
+    image_offsets,
+    turned_offsets,
+)
 from service.model.sensors.registry import kind_of
 from service.model.slopes import Orientation
 from tests.numerics import small_basis, small_instrument
@@ -106,6 +111,17 @@ def test_unknown_places_widen_the_floor_and_known_ones_do_not():
     assert kind.image_floor(unknown)[0] == pytest.approx(0.25 * 0.15)
     told = replace(about, wfs=displaced(about, np.zeros(8)))
     assert kind.image_sigma_subap(told) is None
+
+
+def test_turned_edges_widen_a_shift_by_the_square_of_the_displacement():
+    about = small_instrument()
+    kind, separation = kind_of(about), about.wfs.image_separation_subap
+    sheared = np.array([[0.1, 0.2], [0.1, -0.2], [-0.1, -0.2], [-0.1, 0.2]])
+    found = kind.turned_edge_sigma(about, sheared + np.array([0.3, 0.4]))
+    np.testing.assert_allclose(found, [EDGE_SHIFT * 0.025 / separation] * 2 + [0.0, 0.0])
+    stated = replace(about, wfs=displaced(about, sheared.T.ravel()))
+    np.testing.assert_allclose(kind.turned_edge_sigma(stated, np.zeros((4, 2))), found)
+    np.testing.assert_allclose(kind.turned_edge_sigma(stated, sheared), 4.0 * found)
 
 
 def test_a_sensor_of_one_image_has_none_to_be_moved():

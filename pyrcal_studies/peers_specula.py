@@ -96,7 +96,7 @@ class Specula:
         pyramid, separation = self._pyramid, self._bench.pupil_separation_subap
         n = len(pyramid.pyr_tlt)
         along = (np.arange(n) - (n - 1) / 2) / (pyramid.tilt_scale * separation / 2)
-        high = roof(*np.meshgrid(along, along), separation, offsets_px, _LIGHTS)
+        high = roof(along, along[:, None], separation, offsets_px, _LIGHTS)
         faces = np.exp(2j * np.pi * (high - high.max()))
         pyramid.shifted_masked_exp = np.fft.fftshift(faces * pyramid.fp_mask)
 

@@ -15,6 +15,7 @@ from service.model.kinds import Normalisation, SlopeOrder, Stop
 from service.model.misregistration import Misregistration
 from service.model.sensors.pyramid.description import (
     EDGE_SHIFT,
+    EDGE_TURN,
     displaced,
     image_offsets,
     turned_offsets,
@@ -113,12 +114,14 @@ def test_unknown_places_widen_the_floor_and_known_ones_do_not():
     assert kind.image_sigma_subap(told) is None
 
 
-def test_turned_edges_widen_a_shift_by_the_square_of_the_displacement():
+def test_turned_edges_widen_shift_and_rotation_by_the_square_of_the_displacement():
     about = small_instrument()
     kind, separation = kind_of(about), about.wfs.image_separation_subap
     sheared = np.array([[0.1, 0.2], [0.1, -0.2], [-0.1, -0.2], [-0.1, 0.2]])
     found = kind.turned_edge_sigma(about, sheared + np.array([0.3, 0.4]))
-    np.testing.assert_allclose(found, [EDGE_SHIFT * 0.025 / separation] * 2 + [0.0, 0.0])
+    shift = EDGE_SHIFT * 0.025 / separation
+    turn = EDGE_TURN * shift / (about.wfs.pupil_diameter / 2.0)
+    np.testing.assert_allclose(found, [shift, shift, turn, 0.0])
     stated = replace(about, wfs=displaced(about, sheared.T.ravel()))
     np.testing.assert_allclose(kind.turned_edge_sigma(stated, np.zeros((4, 2))), found)
     np.testing.assert_allclose(kind.turned_edge_sigma(stated, sheared), 4.0 * found)

@@ -195,12 +195,18 @@ def measured(draws: list[Draw]) -> Iterator[tuple[Draw, Measured]]:
         for draw in draws:
             yield draw, _tiny_matrix(draw) if code == "diffractive" else _fft_matrix(draw)
         return
+    missing = [draw for draw in draws if not draw.product.exists()]
+    if missing:
+        _run_peer(code, missing)
+    for draw in draws:
+        yield draw, _with_noise(draw, read_product(draw.product)[0])
+
+
+def _run_peer(code: str, draws: list[Draw]) -> None:
     interpreter, folder = environment(code), FOLDER / code
     folder.mkdir(parents=True, exist_ok=True)
     for draw in draws:
-        if not draw.product.exists():
-            job = folder / f"{draw.product.stem}{JOB}"
-            write_job(job, draw.bench, shapes_m=draw.shapes_m)
+        write_job(folder / f"{draw.product.stem}{JOB}", draw.bench, shapes_m=draw.shapes_m)
     subprocess.run(
         [str(interpreter), "-m", "pyrcal_studies.peers_pushpull", code, str(folder)],
         cwd=ROOT,
@@ -208,8 +214,6 @@ def measured(draws: list[Draw]) -> Iterator[tuple[Draw, Measured]]:
         stdout=subprocess.DEVNULL,
         check=True,
     )
-    for draw in draws:
-        yield draw, _with_noise(draw, read_product(draw.product)[0])
 
 
 def _with_noise(draw: Draw, found: Measured) -> Measured:

@@ -339,6 +339,8 @@ class SensorKind(ABC):
         ``displaced_subap`` ``(4, 2)`` is added to what the instrument file states. Numeric units; 0
         for a sensor with one image.
         """
+        import numpy as np
+
         return np.zeros(4)
 
     def offsets_px(

@@ -132,3 +132,5 @@ def test_a_sensor_of_one_image_has_none_to_be_moved():
 
     with pytest.raises(ModelError):
         ShackHartmannKind().displaced(small_instrument(), np.zeros(8))
+    edges = ShackHartmannKind().turned_edge_sigma(small_instrument(), np.ones((4, 2)))
+    assert not edges.any()

@@ -536,7 +536,9 @@ def _make_fit(
         error = by_smear * found.smear.sigma / found.smear.share
         sure = sure.with_moves(error[np.newaxis], np.ones(1))
     misplaced = _misplacement_sigma(models.instrument, structured)
-    sure = sure.with_moves(misplaced[np.newaxis], np.ones(1))
+    images = nuisances.images.T @ solution.nuisances[nuisances.image_places]
+    turned = kind_of(models.instrument).turned_edge_sigma(models.instrument, images.reshape(2, 4).T)
+    sure = sure.with_moves(np.array([misplaced, turned]), np.ones(2))
     noise_share = bound_noise_share(seen.residual, solution.matrix[target.rows] * seen.gains)
     # large pokes look like a wider modulation, which the fit may have taken for the true one
     weakly_modulated = any(

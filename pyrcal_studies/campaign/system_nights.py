@@ -30,11 +30,12 @@ from pyrcal_studies.campaign.rows import (
     words,
 )
 from pyrcal_studies.campaign.system_cases import Case, Plan
-from pyrcal_studies.campaign.system_measures import recovery_of, row_of, wavefront_rms_nm
+from pyrcal_studies.campaign.system_measures import row_of, wavefront_rms_nm
 from pyrcal_studies.campaign.system_table import table
-from service.cli.program import status_of
-from service.config import load_instrument, load_settings
-from service.config.policy import policy_of
+from service.config import load_settings
+from service.instrument import load_instrument
+from service.program import status_of
+from service.runtime.policy import policy_of
 from service.runtime.worker import Compute, OpticsWorker, Sampling
 from service.tracking.state import Mode
 from service.wire import DitherRequest
@@ -78,8 +79,6 @@ def play(plan: Plan) -> Row:
             night.restart_rtc()
         night.advance(plan.seconds - night.time_s)
         row = row_of(night, plan.jump_times_s)
-        if plan.case is Case.LOST:
-            row |= recovery_of(night, plan.period_s)
         if plan.case is Case.BUDGET:
             row["twin_nm"] = _without_dither_nm(night, plan, row["steady_from_s"])
     return asdict(plan) | row | {"took_s": time.monotonic() - begun}

@@ -219,6 +219,12 @@ def _fit_usable(
     else:
         start = pose if pose is not None else instrument.start
     found = _run_method(models, target, instrument.with_anamorphosis(start), options, report_stage)
+    n_lost = np.count_nonzero(found.settled.solution.projection.gains == 0.0)
+    if 2 * n_lost > used.n_modes:
+        raise ModelError(
+            f"{instrument.name}: the fit ended where {n_lost} of {used.n_modes} modes change no "
+            "slope; start closer to the true registration (--start), or leave the start out"
+        )
     noisy = find_noise_columns(
         found.settled.solution, found.settled.target, instrument.slopes.kind.n_planes
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import textwrap
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -290,19 +290,6 @@ def _sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:].rstrip('.')}."
 
 
-def _meanwhile(blocks: Collection[str]) -> str:
-    """Return what an alarm prevents while it lasts, in words; empty if nothing."""
-    if "ask" in blocks:
-        return "nothing of the RTC is used, and nothing is made or sent"
-    texts = {
-        "measure": "α is not measured",
-        "decide": "nothing is made or sent without an order",
-        "hold": "after some seconds the service acquires by itself",
-        "send_new": "no matrix is sent" if "send_known" in blocks else "no new matrix is sent",
-    }
-    return "; ".join(text for act, text in texts.items() if act in blocks)
-
-
 def runbook(acts: Mapping[str, str]) -> str:
     """Return docs/operate/runbook.md: what to do about each alarm; ``acts``: what it may forbid."""
     parts = [
@@ -311,15 +298,20 @@ def runbook(acts: Mapping[str, str]) -> str:
         "in danger, or its telemetry cannot be used. *Serious*: the service does less than it "
         "should. *Warning*: it does its work.",
         "## What an alarm may forbid",
-        "The names are those of `blocks` in a rule of your own.",
+        "Each alarm names what it `blocks`, as a rule of your own does.",
         listed((f"`{act}`", text) for act, text in acts.items()),
     ]
     for name, kind in ALARMS.items():
-        effect = _meanwhile(kind.blocks)
+        blocks = [f"`{act}`" for act in acts if act in kind.blocks]
         head = kind.severity.value.capitalize()
         if kind.responsible:
             who = kind.responsible.value
             head += f"; the {'RTC' if who == 'rtc' else who} can end it"
-        texts = (f"*{head}.*", _sentence(kind.means), f"**Meanwhile** {effect}." if effect else "")
-        parts += [f"## {name}", " ".join(filter(None, texts)), f"**Do**: {_sentence(kind.do)}"]
+        if blocks:
+            head += f"; blocks {', '.join(blocks)}"
+        parts += [
+            f"## {name}",
+            f"*{head}.* {_sentence(kind.means)}",
+            f"**Do**: {_sentence(kind.do)}",
+        ]
     return page("Runbook: what to do about an alarm", *parts)

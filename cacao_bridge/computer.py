@@ -15,7 +15,7 @@ from cacao_bridge.calibration import Calibration
 from cacao_bridge.dither import Mirror, Player, check_request
 from cacao_bridge.rows import LEAST_KEPT, Rows
 from cacao_bridge.settings import OF_THE_SUM, Settings
-from cacao_bridge.streams import GoneError, Stream, StreamError, path_of, settled
+from cacao_bridge.streams import GoneError, Stream, StreamError, path_of, read_settled
 from pyrcal.rtc.identity import Identity, Reconstructor, new_session
 from pyrcal.rtc.replies import FinishedMeasurement
 from pyrcal.rtc.staging import Terms
@@ -127,7 +127,7 @@ class Cacao:
             self._read_slopes()
             self._read_commands()
             self._look_after_matrices()
-            self._complain(self._standing() or self._off_rate() or self._law_trouble)
+            self._complain(self._check_counters() or self._off_rate() or self._law_trouble)
         except (StreamError, OSError) as error:
             self._complain(str(error))
             self._unlink()
@@ -208,7 +208,7 @@ class Cacao:
             raise GoneError(f"{commands.name}: set to zero (loopZERO): the integrator was reset")
         before = self._offset
         if self._loop.counter_offset is None:
-            self._offset = settled(lambda: _behind(commands, slopes.inode), before)
+            self._offset = read_settled(lambda: _behind(commands, slopes.inode), before)
         if self._offset is None:
             if _behind(commands, slopes.inode) is None:
                 told = f"its trace names no frame of {slopes.name}"
@@ -244,7 +244,7 @@ class Cacao:
                 self._rows.skip(self._rows.newest if found is None else found[1])
                 self._swaps.append((taken_up, self._rows.next))
 
-    def _standing(self) -> str:
+    def _check_counters(self) -> str:
         for name, moved_s in self._moved_s.items():
             stream = self._streams[name]
             if time.monotonic() - moved_s > _STANDS_S:

@@ -391,7 +391,7 @@ class Stream:
         """
         if self._shift is None and (shift := self._find_shift()) is not None:
             self._shift, self._offset = shift, None  # learned before from frames all alike
-        turn, now_s = settled(self._seen_turn, self._offset), time.monotonic()
+        turn, now_s = read_settled(self._read_turn, self._offset), time.monotonic()
         if turn is not None and self._offset in {None, turn}:
             self._offset, self._adrift_s = turn, math.inf
             return turn
@@ -401,7 +401,7 @@ class Stream:
         why = self.orphaned or "do two processes write it?"
         raise StreamError(f"{self.name}: ring and counter drift apart: {why}")
 
-    def _seen_turn(self) -> int | None:
+    def _read_turn(self) -> int | None:
         idle, place = not self._writing[0], self._place
         counter = self.counter
         if not idle or self._writing[0] or (place, counter) != (self._place, self.counter):
@@ -473,7 +473,7 @@ class Stream:
                 libc.sem_post(ctypes.byref(semaphore))
 
 
-def settled(look: Callable[[], int | None], known: int | None) -> int | None:
+def read_settled(look: Callable[[], int | None], known: int | None) -> int | None:
     """Return a consistent view of numbers that a process writes one after the other.
 
     A value that was ``known`` is accepted when it is read again, another one when it is read

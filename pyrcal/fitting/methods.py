@@ -169,7 +169,7 @@ class Landing:
 
 def search_minimum(models: FitModels, target: Target, start: Misregistration) -> Landing:
     """Return the result from a start; if it explains little, the best of many starts."""
-    matrix = models.low_order.measured(target.matrix)
+    matrix = models.low_order.combine_columns(target.matrix)
     low = Columns(
         matrix=matrix, weights=1.0 / np.sum(matrix[target.rows] ** 2, axis=0), rows=target.rows
     )

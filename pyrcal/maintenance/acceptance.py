@@ -284,7 +284,7 @@ def _judge_matrices(data: Commissioning) -> Iterator[Criterion]:
         n_applied >= 1,
         f"{n_applied}",
         "at least 1",
-        "approve a proposal (pyrcal approve), or set the mode to auto",
+        "approve a proposal (pyrcal reconstructors approve), or set the mode to auto",
     )
     bad = [
         one.id for one in data.matrices if one.state in {MatrixState.REJECTED, MatrixState.FAILED}

@@ -97,7 +97,7 @@ class Archive:
         """
         try:
             self.directory.mkdir(mode=FOLDER_MODE, parents=True, exist_ok=True)
-            self._lock = _locked(self.directory / "lock")
+            self._lock = _lock_archive(self.directory / "lock")
         except OSError as error:
             self.close()
             raise ArchiveError(f"{self.directory}: cannot be used: {error}") from error
@@ -232,7 +232,7 @@ class Archive:
         return self.index.audit_trail(part or Range())
 
 
-def _locked(path: Path) -> IO[str]:
+def _lock_archive(path: Path) -> IO[str]:
     file = path.open("a")
     try:
         lock_file(file, path.parent)

@@ -177,7 +177,7 @@ class TrackingFile:
             expected = values.pop("sha256")
             if expected != _sha256(values):
                 raise ValueError(f"found checksum {_sha256(values)}, expected {expected}")
-            return _saved_of(values)
+            return _convert_saved(values)
         except (OSError, AttributeError, *NOT_UNDERSTOOD) as error:
             aside = self._path.with_suffix(".damaged")
             self._path.replace(aside)
@@ -205,7 +205,7 @@ def _kept(saved: Saved) -> dict[str, Any]:
     return {"version": VERSION, **values}
 
 
-def _saved_of(values: dict[str, Any]) -> Saved:
+def _convert_saved(values: dict[str, Any]) -> Saved:
     if values.pop("version") != VERSION:
         raise ValueError(f"expected version {VERSION}")
     known = values["registration"]

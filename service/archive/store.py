@@ -256,7 +256,7 @@ class Store(Folder, Generic[Record]):
     def _record(self, product_id: str) -> Record:
         """Return the record in a file, as it was when the file was made."""
         path = self.path_of(product_id)
-        with _opened(path) as file:
+        with _open_product(path) as file:
             record = from_json(file.attrs["record"], self.kind)
         if record.id != product_id:
             text = f"found {self.noun} {record.id} in it, expected {product_id}"
@@ -266,7 +266,7 @@ class Store(Folder, Generic[Record]):
     def _matrix(self, product_id: str, sha256: str | None = None) -> NDArray[np.float32]:
         """Return the matrix in a file, which must have this checksum, or else that in the file."""
         path = self.path_of(product_id)
-        with _opened(path) as file:
+        with _open_product(path) as file:
             matrix = np.asarray(file[self.dataset][()], np.float32)
             expected = sha256 or file.attrs["sha256"]
         found = checksum(matrix)
@@ -287,7 +287,7 @@ class Store(Folder, Generic[Record]):
         wrong = {}
         for name in product_ids:
             try:
-                with _opened(self.path_of(name)) as file:
+                with _open_product(self.path_of(name)) as file:
                     len(file[self.dataset])
             except ArchiveError as error:
                 wrong[name] = str(error)
@@ -295,7 +295,7 @@ class Store(Folder, Generic[Record]):
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[h5py.File]:
+def _open_product(path: Path) -> Iterator[h5py.File]:
     try:
         with open_hdf5(path) as file:
             yield file

@@ -179,7 +179,7 @@ def poses_of(
     turned = _Turned.of(_any_way_round(instrument, basis, mapper), mapper, about)
     low = replace(
         reference,
-        matrix=turned.lowest.measured(reference.matrix),
+        matrix=turned.lowest.combine_columns(reference.matrix),
         modes=None,
         noise=None,
     )
@@ -318,7 +318,7 @@ class LowOrder:
     combinations: Array
     """``(n_modes, n_low)`` of measured columns of unit size."""
 
-    def measured(self, matrix: Array) -> Array:
+    def combine_columns(self, matrix: Array) -> Array:
         """Return the combinations ``(n_slopes, n_low)`` of measured columns, in any order of rows.
 
         Only the columns' shapes count: their unit and gains are taken from the model.

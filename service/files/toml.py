@@ -201,7 +201,7 @@ def read_dataset(reference: str, folder: Path, where: str) -> NDArray[Any]:
         refuse(where, repr(reference), expected)
     try:
         with opened(folder / parts["path"]) as container:
-            stored = _named(container, parts["name"], where)
+            stored = _find_array(container, parts["name"], where)
             if stored.dtype.kind not in "biuf":
                 refuse(where, f"type {stored.dtype} in {stored.where}", "numbers")
             values = stored.read()
@@ -210,7 +210,7 @@ def read_dataset(reference: str, folder: Path, where: str) -> NDArray[Any]:
     return values.astype(values.dtype.newbyteorder("="), copy=False)
 
 
-def _named(container: Container, name: str | None, where: str) -> StoredArray:
+def _find_array(container: Container, name: str | None, where: str) -> StoredArray:
     found = container.find(name) if name else next(iter(container.arrays.values()), None)
     if found is None:
         missing = f"no dataset /{name.strip('/')}" if name else "no image"

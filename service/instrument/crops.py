@@ -44,7 +44,7 @@ def local_functions(
     if known is None:
         shape = _table_of(file, heights)
         known, parts = np.zeros(shape, np.bool_), []
-        for at, part in _placed(heights, _origins(file, heights, shape), shape):
+        for at, part in _place_crops(heights, _origins(file, heights, shape), shape):
             known[at] = True
             parts.append((at, part))
     else:
@@ -92,7 +92,7 @@ def modes_of_crops(
             f"at most {MAX_BYTES / 1e9:.2g} GB: a coarser table, or fewer modes",
         )
     modes, known = np.zeros((n_modes, *shape), crops.dtype), np.zeros(shape, np.bool_)
-    for k, (at, part) in enumerate(_placed(crops, _origins(file, crops, shape), shape)):
+    for k, (at, part) in enumerate(_place_crops(crops, _origins(file, crops, shape), shape)):
         known[at] = True
         if strokes is None:
             modes[k][at] = part
@@ -149,7 +149,7 @@ def _origins(
     return origins.astype(np.intp)
 
 
-def _placed(
+def _place_crops(
     crops: NDArray[np.floating], origins: NDArray[np.intp], shape: tuple[int, int]
 ) -> Iterator[tuple[tuple[slice, slice], NDArray[np.floating]]]:
     """Yield the position of each crop on the table, and the part of it that is inside."""

@@ -34,7 +34,7 @@ def _term(value: object, *, north_step: float, turn: float = 0.0) -> Term:
     It may differ by ``north_step`` after a whole turn of azimuth, or by a multiple of ``turn``.
     """
     try:
-        term = _checked(value)
+        term = _convert_term(value)
         step = term.north_step()
     except ModelError as error:
         raise ValueError(str(error)) from error
@@ -48,7 +48,7 @@ def _term(value: object, *, north_step: float, turn: float = 0.0) -> Term:
     return term
 
 
-def _checked(value: object) -> Term:
+def _convert_term(value: object) -> Term:
     match value:
         case bool():
             raise ModelError(f"found {value}, expected a number, an expression or {_FORM}")

@@ -87,7 +87,7 @@ def read_mirror(
         mirror, notes = _analytic(file)
         _check_width(file, mirror.positions_m, pupil)
         return mirror, (*notes, *_about_segments(file, mirror))
-    return _tabulated(file, pupil)
+    return _read_table(file, pupil)
 
 
 def _read(file: MirrorSection, key: str) -> NDArray[np.floating]:
@@ -228,7 +228,7 @@ def _segments(file: MirrorSection, positions_m: NDArray[np.float64]) -> tuple[fl
 def _rings(file: MirrorSection) -> NDArray[np.float64]:
     table = file.said
     if table.ring_actuators is not None or table.ring_radii_m is not None:
-        return _listed_rings(file)
+        return _read_rings(file)
     if table.last_ring < table.first_ring:
         refuse(
             file.where("last_ring"),
@@ -240,7 +240,7 @@ def _rings(file: MirrorSection) -> NDArray[np.float64]:
     return positions
 
 
-def _listed_rings(file: MirrorSection) -> NDArray[np.float64]:
+def _read_rings(file: MirrorSection) -> NDArray[np.float64]:
     numbers, radii_m = _mandatory(file, ("ring_actuators", "ring_radii_m"))
     if len(numbers) != len(radii_m):
         refuse(
@@ -279,7 +279,7 @@ def _beside_gaps(file: MirrorSection, positions_m: NDArray[np.float64]) -> NDArr
     return positions_m[kept]
 
 
-def _listed_positions(file: MirrorSection) -> NDArray[np.float64]:
+def _read_positions(file: MirrorSection) -> NDArray[np.float64]:
     where = file.where("positions")
     _mandatory(file, ("positions",))
     values = _read(file, "positions")
@@ -296,7 +296,7 @@ _LAYOUTS: dict[str, Callable[[MirrorSection], NDArray[np.float64]]] = {
     "rings": _rings,
     "grid": _grid,
     "hexagonal": _hexagonal,
-    "positions": _listed_positions,
+    "positions": _read_positions,
 }
 
 
@@ -431,7 +431,7 @@ def _nearest(positions_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDA
 # --- measured
 
 
-def _tabulated(file: MirrorSection, pupil: Pupil) -> tuple[TabulatedModes, tuple[str, ...]]:
+def _read_table(file: MirrorSection, pupil: Pupil) -> tuple[TabulatedModes, tuple[str, ...]]:
     key = "modes" if file.said.modes is not None else "influence_functions"
     if file.said.modes_pitch_m is None:
         raise ConfigurationError(
@@ -462,7 +462,7 @@ def _tabulated(file: MirrorSection, pupil: Pupil) -> tuple[TabulatedModes, tuple
     remarks = (
         *of_strokes,
         *broken,
-        *_judged(file, pupil, key, known, file.said.modes_pitch_m),
+        *_check_table(file, pupil, key, known, file.said.modes_pitch_m),
         *remarks_on_crops(file, crops),
     )
     modes = TabulatedModes(
@@ -518,7 +518,7 @@ def _strokes(
     return strokes, notes
 
 
-def _judged(
+def _check_table(
     file: MirrorSection, pupil: Pupil, key: str, known: NDArray[np.bool_], pitch_m: float
 ) -> tuple[str, ...]:
     """Refuse a table that cannot be of this pupil; return notes on one that is poor."""

@@ -46,10 +46,10 @@ def read_pupil(file: Section[AboutTable], subaperture_m: float) -> PupilMap | No
             raise ConfigurationError(
                 f"{file.where(key)}: has no effect together with instrument.pupil; remove it"
             )
-    return _checked(file, subaperture_m)
+    return _read_pupil_map(file, subaperture_m)
 
 
-def _checked(file: Section[AboutTable], subaperture_m: float) -> PupilMap:
+def _read_pupil_map(file: Section[AboutTable], subaperture_m: float) -> PupilMap:
     where, diameter_m = file.where("pupil"), file.said.diameter_m
     lit = np.asarray(file.array("pupil"), dtype=np.float64)
     if lit.ndim != 2 or min(lit.shape) < 2:

@@ -90,7 +90,7 @@ def _parts(said: schema.InstrumentFile) -> Mapping[str, Callable[[], Any]]:
             section(schema.SlopesTable), kind, has_frames=frames() is not None
         ),
         "loop": lambda: _loop(section(LoopFacts), modes().n_modes),
-        "remarks": lambda: (*mirror()[1], *_assumed(said, sensor(), mirror()[0])),
+        "remarks": lambda: (*mirror()[1], *_list_assumptions(said, sensor(), mirror()[0])),
     }
 
 
@@ -130,14 +130,14 @@ def _in_first_mode(
     whole = replace(
         instrument,
         sensor_modes=tuple(
-            _completed(mode, mask, f"{file.where('mode')}[{k}]", file.path.parent, instrument)
+            _complete_mode(mode, mask, f"{file.where('mode')}[{k}]", file.path.parent, instrument)
             for k, (mode, mask) in enumerate(modes)
         ),
     )
     return whole.sensor_modes[0].of(whole)
 
 
-def _completed(
+def _complete_mode(
     mode: SensorMode, reference: str, where: str, folder: Path, instrument: Instrument
 ) -> SensorMode:
     """Return a mode with its own mask, and what it does not say of the loop as ``[loop]`` has it.
@@ -166,7 +166,7 @@ def _completed(
     return replace(mode, wfs=wfs, loop=told)
 
 
-def _assumed(
+def _list_assumptions(
     said: schema.InstrumentFile, sensor: SensorDescription, mirror: Mirror | TabulatedModes
 ) -> Iterator[str]:
     """Yield what the file does not say, and what is taken instead."""

@@ -36,7 +36,7 @@ WHOLE_BYTES = 2.5e8
 """Size in bytes above which influence functions of finite extent are stored tile by tile."""
 
 
-def karhunen_loeve(instrument: Instrument, surface: Surface) -> tuple[Array, Array]:
+def compute_modes(instrument: Instrument, surface: Surface) -> tuple[Array, Array]:
     """Return strokes ``(n_actuators, n_modes)`` and variances of the mirror's first KL modes.
 
     The modes are piston-free and of unit RMS; mode 0 is the tilt along +x, mode 1 the tilt along

@@ -14,7 +14,7 @@ from typing_extensions import override
 from service.errors import ModelError
 from service.model.far_field import PlateSum
 from service.model.instrument import Instrument, Mirror, TabulatedModes
-from service.model.karhunen_loeve import karhunen_loeve, surface_statistics
+from service.model.karhunen_loeve import compute_modes, surface_statistics
 from service.model.kinds import BasisKind
 from service.model.local_table import LocalTable, local_table
 from service.model.surface import Gaussian, Surface, mirror_surface
@@ -238,7 +238,7 @@ def karhunen_loeve_basis(instrument: Instrument) -> ModalBasis:
     """
     mirror = instrument.analytic_mirror
     surface = mirror_surface(mirror, instrument.subaperture_m)
-    strokes, variance = karhunen_loeve(instrument, surface)
+    strokes, variance = compute_modes(instrument, surface)
     return ModalBasis(
         surface=surface,
         mode_to_actuator=strokes,

@@ -141,7 +141,7 @@ def policy_of(settings: Settings, instrument: Instrument | None = None) -> Polic
             )
             for rule in settings.rules
         ),
-        offloading=_offloading(settings.offload),
+        offloading=_convert_offloading(settings.offload),
         sensor_modes={} if instrument is None else _sensor_modes(instrument),
         law=None if instrument is None else instrument.law,
     )
@@ -201,7 +201,7 @@ def _sensor_modes(instrument: Instrument) -> dict[str, SensorModePolicy]:
     }
 
 
-def _offloading(table: OffloadTable) -> Offloading | None:
+def _convert_offloading(table: OffloadTable) -> Offloading | None:
     if not table.enabled:
         return None
     return Offloading(

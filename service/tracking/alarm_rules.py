@@ -133,7 +133,7 @@ def _not_found(context: StepContext) -> str | None:
             f"No window gives a registration: {context.windows.refused_because}. Order and signs "
             "of modes and slopes are not the cause: the model recognises the modes of the RTC's "
             f"own matrix{left}. Set mirror.nominal_rotation_deg to the rotation of a fit of a "
-            "measured matrix (pyrcal fit), or run pyrcal acquire, which opens the loop and "
+            "measured matrix (pyrcal fit), or run pyrcal loop acquire, which opens the loop and "
             "searches from far away."
         )
     return (

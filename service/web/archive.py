@@ -244,7 +244,9 @@ class RecordingAcceptedView(AcceptedView):
     """Id of the recording."""
 
 
-async def _tried(client: Client, name: str, instruction: Instruction, order: Awaitable[T]) -> T:
+async def _await_order(
+    client: Client, name: str, instruction: Instruction, order: Awaitable[T]
+) -> T:
     """Wait for an order; it is on record, and so is why it is refused."""
     entry = client.actor.entry(name, by=instruction.by, why=instruction.reason)
     try:
@@ -269,7 +271,7 @@ async def begin(
     who = client.actor.entry("", by=choice.by).who
     recordings = client.service.recordings
     begun = recordings.begin(choice.duration_s, who, choice.reason, choice.before_s)
-    made = await _tried(client, "recording.begin", choice, begun)
+    made = await _await_order(client, "recording.begin", choice, begun)
     past = f"the last {made.before_s:.1f} s, and " if choice.before_s else ""
     text = f"{made.id} keeps {past}telemetry for {made.duration_s:g} s"
     accepted = client.accepted(text, recording=f"/v1/recordings/{made.id}")
@@ -295,7 +297,7 @@ async def end(client: ClientDep, recording_id: RecordingId, instruction: Said) -
     """End a recording early."""
     recordings = client.service.recordings
     reason = f"{instruction.by or client.actor.key or 'an operator'} has ended it"
-    record = await _tried(
+    record = await _await_order(
         client, "recording.end", instruction, recordings.end(reason, recording_id)
     )
     text = f"{recording_id} has ended: {record.n_bytes / 1e6:.0f} MB"
@@ -306,7 +308,7 @@ async def end(client: ClientDep, recording_id: RecordingId, instruction: Said) -
 async def remove(client: ClientDep, recording_id: RecordingId, instruction: Said) -> AcceptedView:
     """Remove a recording for good."""
     removed = client.service.recordings.remove(recording_id)
-    await _tried(client, "recording.remove", instruction, removed)
+    await _await_order(client, "recording.remove", instruction, removed)
     return client.accepted(f"{recording_id} is removed", recordings="/v1/recordings")
 
 

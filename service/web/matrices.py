@@ -38,7 +38,7 @@ _ALIASES = {
 """Names for what changes, and what is said where there is none."""
 
 
-async def _named(
+async def _resolve_id(
     service: views.ServiceDep,
     matrix_id: Annotated[
         str,
@@ -58,7 +58,7 @@ async def _named(
     return views.found_or_refuse(found or None, f"{matrix_id}: {_ALIASES[matrix_id]}")
 
 
-MatrixId = Annotated[str, Depends(_named)]
+MatrixId = Annotated[str, Depends(_resolve_id)]
 """Reconstructor named in a path."""
 
 
@@ -66,7 +66,7 @@ async def _other(
     service: views.ServiceDep,
     other: Annotated[str, Path(description="Id of another, or in-use, previous, candidate")],
 ) -> str:
-    return await _named(service, other)
+    return await _resolve_id(service, other)
 
 
 OtherId = Annotated[str, Depends(_other)]
@@ -350,8 +350,8 @@ def _singular_values(
     nominal = None
     if products is not None:
         modelled = np.linalg.eigvalsh(products[: len(matrix), : len(matrix)].astype(np.float64))
-        nominal = _rounded(np.sqrt(np.maximum(modelled[::-1], 0.0)))
-    return SingularValues(id=matrix_id, values=_rounded(inverted), nominal=nominal)
+        nominal = _round(np.sqrt(np.maximum(modelled[::-1], 0.0)))
+    return SingularValues(id=matrix_id, values=_round(inverted), nominal=nominal)
 
 
 def _products(matrix: Numbers) -> NDArray[np.float64]:
@@ -363,7 +363,7 @@ def _products(matrix: Numbers) -> NDArray[np.float64]:
     return found
 
 
-def _rounded(values: NDArray[np.float64]) -> list[float]:
+def _round(values: NDArray[np.float64]) -> list[float]:
     return [float(f"{value:.4g}") for value in values]
 
 
@@ -378,11 +378,11 @@ async def compare(
     return await unless_kept(
         request,
         tag_of(matrix_id, other),
-        lambda: views.answer(_compared(service, matrix_id, other)),
+        lambda: views.answer(_compare(service, matrix_id, other)),
     )
 
 
-def _compared(service: Supervisor, matrix_id: str, other: str) -> MatrixComparison:
+def _compare(service: Supervisor, matrix_id: str, other: str) -> MatrixComparison:
     """Compare two reconstructors; waits for the disk.
 
     Raises
@@ -407,8 +407,8 @@ def _compared(service: Supervisor, matrix_id: str, other: str) -> MatrixComparis
         id=matrix_id,
         other=other,
         modes=list(range(n_modes)),
-        gain=_rounded(gain),
-        cosine=_rounded(cosine),
+        gain=_round(gain),
+        cosine=_round(cosine),
         difference=float(difference),
     )
 

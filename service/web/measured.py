@@ -177,7 +177,7 @@ def _understood(parse: Callable[[str], object]) -> AfterValidator:
     return AfterValidator(check)
 
 
-def _packaged(name: str) -> None:
+def _check_packaged(name: str) -> None:
     if name.endswith(".toml"):
         raise ValueError(
             f"found {name!r}, expected a packaged name; a file of your own goes into the upload"
@@ -206,7 +206,8 @@ class FitParameters(Parameters):
     """True to fit the anamorphosis of the mirror's image."""
 
     instrument: (
-        Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,64}$"), _understood(_packaged)] | None
+        Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,64}$"), _understood(_check_packaged)]
+        | None
     ) = None
     """A packaged instrument; default: the service's own, or the one in the upload."""
 

@@ -367,14 +367,18 @@ Numbers = float | None | Mapping[str, float]
 
 
 def _gauge(name: str, text: str, value: Numbers, label: str = "") -> Metric:
-    return _filled(GaugeMetricFamily(f"pyrcal_{name}", text, labels=[label] * bool(label)), value)
+    return _fill_metric(
+        GaugeMetricFamily(f"pyrcal_{name}", text, labels=[label] * bool(label)), value
+    )
 
 
 def _counter(name: str, text: str, value: Numbers, label: str = "") -> Metric:
-    return _filled(CounterMetricFamily(f"pyrcal_{name}", text, labels=[label] * bool(label)), value)
+    return _fill_metric(
+        CounterMetricFamily(f"pyrcal_{name}", text, labels=[label] * bool(label)), value
+    )
 
 
-def _filled(family: GaugeMetricFamily | CounterMetricFamily, value: Numbers) -> Metric:
+def _fill_metric(family: GaugeMetricFamily | CounterMetricFamily, value: Numbers) -> Metric:
     """Return a metric with its number, or one for each value of its label."""
     for key, number in value.items() if isinstance(value, Mapping) else [("", value)]:
         labels = [key] if isinstance(value, Mapping) else []

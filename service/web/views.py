@@ -130,7 +130,7 @@ def to_json(record: object, of: View | None = None) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=1500)
-def _lasting(record: HistoryEntry | LogEntry | archive.AuditEntry) -> dict[str, Any]:
+def _cache_view(record: HistoryEntry | LogEntry | archive.AuditEntry) -> dict[str, Any]:
     """Return the view of a record that never changes and is requested often."""
     return to_json(record)
 
@@ -209,7 +209,7 @@ def _plain(value: Any, of: View | None) -> Any:  # noqa: ANN401  any value of a 
     if isinstance(value, float):
         return finite(value)
     if isinstance(value, _LASTING):
-        return _lasting(value)
+        return _cache_view(value)
     if isinstance(value, Misregistration):
         four = named_parameters(value.vector)
         told = value.anamorphosis

@@ -225,7 +225,7 @@ class FrozenLayer:
         radius = np.hypot(along, across).max()
         self._n_rows = int(np.ceil(2 * radius)) + 2 * _MARGIN_ROWS + 1
         centre = (self._n_rows - 1) / 2
-        self._reading = _reading(along + centre, across + centre, self._n_rows)
+        self._reading = _build_reader(along + centre, across + centre, self._n_rows)
         self._length = scipy.fft.next_fast_len(int(_LENGTH * self._n_rows), real=True)
         self._block_steps = self._length - self._n_rows + 1
         self._screen = ExtrudedScreen(
@@ -376,7 +376,7 @@ def cubic_weights(fraction: Array) -> Array:
     )
 
 
-def _reading(row: Array, column: Array, n_rows: int) -> scipy.sparse.csr_array:
+def _build_reader(row: Array, column: Array, n_rows: int) -> scipy.sparse.csr_array:
     """Return the matrix ``(n_points, n_rows²)`` that reads points of a window, newest row first."""
     row0, column0 = np.floor(row), np.floor(column)
     rows = row0[:, None].astype(np.intp) + _TAPS

@@ -133,7 +133,7 @@ class Plain(SensorKind):
     """A kind that has only what it must."""
 
     name = "plain"
-    described = sensor = pixels = noise_terms = aot = None
+    read_sensor = sensor = pixels = noise_terms = aot = None
 
 
 def test_a_kind_without_light_frames_or_working_point_says_so():

@@ -61,7 +61,7 @@ class CurvatureKind(SensorKind):
     signals = (SignalKind.XY,)
     sensor = pixels = noise_terms = aot = None
 
-    def described(self, table, given):
+    def read_sensor(self, table, given):
         return Curvature(**{one.name: getattr(table, one.name) for one in fields(Numbers)})
 
 

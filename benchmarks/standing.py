@@ -19,7 +19,7 @@ from typing import Any
 
 import httpx
 
-from pyrcal.demo.children import Child, children, interrupt_on_end
+from pyrcal.demo.children import Child, interrupt_on_end, run_children
 
 START_TIMEOUT_S = 240.0
 """For the optics of a first start, and a first matrix, on a machine that has other work."""
@@ -145,7 +145,7 @@ def standing(folder: Path, *simulator: str) -> Iterator[Standing]:
     run = ["-m", "pyrcal", "run", "--mode", "auto", "--listen", endpoint, "--port", str(port)]
     sim = ["-m", "pyrcal", "sim", "--connect", endpoint, "--quiet", "--seed", "5", *simulator]
     commands = {"service": [*run, "--data-dir", str(data)], "simulator": sim}
-    with interrupt_on_end(), children(folder, commands) as (service, rtc):
+    with interrupt_on_end(), run_children(folder, commands) as (service, rtc):
         found = Standing(f"http://127.0.0.1:{port}", data, service, rtc)
         found.wait_until_tracking()
         yield found

@@ -1,10 +1,10 @@
 """Write matrices into cacao's streams.
 
 cacao copies its modes when the process that multiplies them starts, and does not read the streams
-again. A matrix is therefore in use once that process is another than when the streams were written.
-The process is recorded in a folder and survives this program. Parts of the calibration that act at
-once (:mod:`cacao_bridge.parts`) are written afterwards; a program that ends in between writes the
-rest when it runs again.
+again. A matrix is therefore in use once that process has been replaced after the streams were
+written. The process is recorded in a folder and survives this program. Parts of the calibration
+that act at once (:mod:`cacao_bridge.parts`) are written afterwards; a program that ends in between
+writes the rest when it runs again.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _log = structlog.get_logger("cacao")
 _STATE: Final = "state.json"
 _CONSENT: Final = "apply"
 _ORDER: Final = "order"
-"""File that names the matrix an operator wants, with everything that belongs to it."""
+"""File that names the matrix to be written on an operator's order, with all its parts."""
 
 _KEYWORD: Final = "PYRCAL"
 

@@ -194,7 +194,9 @@ class Cacao:
         slopes, commands = self._streams["slopes"], self._streams["commands"]
         if commands.writer != self._commands_writer:
             who = f"{self._commands_writer} to {commands.writer}"
-            raise GoneError(f"{commands.name}: from process {who}: the loop began anew")
+            raise GoneError(
+                f"{commands.name}: written by another process ({who}): the loop was restarted"
+            )
         frames = commands.after(self._commands_at)
         if frames is None:
             return
@@ -203,7 +205,7 @@ class Cacao:
         moves = np.concatenate([[self._moves], frames.values.any(axis=1)])
         self._moves = bool(moves[-1])
         if np.any(moves[:-1] & ~moves[1:]):
-            raise GoneError(f"{commands.name}: set to zero (loopZERO): the integrator began anew")
+            raise GoneError(f"{commands.name}: set to zero (loopZERO): the integrator was reset")
         before = self._offset
         if self._loop.counter_offset is None:
             self._offset = settled(lambda: _behind(commands, slopes.inode), before)
@@ -247,7 +249,7 @@ class Cacao:
             stream = self._streams[name]
             if time.monotonic() - moved_s > _STANDS_S:
                 why = stream.orphaned or ("" if name == "slopes" else "is the loop on (loopON)?")
-                return f"{stream.name}: its counter stands at {stream.counter}; {why}".rstrip("; ")
+                return f"{stream.name}: its counter stays at {stream.counter}; {why}".rstrip("; ")
         return ""
 
     def _off_rate(self) -> str:

@@ -37,7 +37,7 @@ class Parts:
         return frozenset(name for name, has in can.items() if has)
 
     def keep_of(self, name: str, bundle: Bundle) -> None:
-        """Keep what a bundle has beside its matrix, in the layout of cacao's streams.
+        """Keep the parts of a bundle other than its matrix, in the layout of cacao's streams.
 
         Raises
         ------

@@ -88,15 +88,15 @@ _SEMAPHORE_BYTES: Final = 32
 _N_SEMAPHORES: Final = 10
 _MOST_SEMAPHORE: Final = 10
 _TRIES: Final = 20
-"""Looks at a frame that is being written, before it is given up for this time."""
+"""Attempts to read a frame that is being written, before it is skipped."""
 
 _LOOKS: Final = 4
-"""Looks at a ring that must agree before it is read for the first time."""
+"""Consistent readings of a ring that are required before its first use."""
 
 _LOOK_S: Final = 3e-4
 """Between two of them."""
 
-_MAKE_ANEW: Final = "make it anew with milk and cacao of that format"
+_MAKE_ANEW: Final = "create it again with milk and cacao of that format"
 _ADRIFT_S: Final = 0.5
 """For which a writer may be put aside in the midst of a frame: less than a ring should hold."""
 
@@ -109,7 +109,7 @@ class StreamError(PyrcalError):
 
 
 class GoneError(StreamError):
-    """The file was deleted, made anew or cut off since it was opened: open it again."""
+    """The file was deleted, created again or truncated since it was opened: open it again."""
 
 
 class Frames(NamedTuple):
@@ -272,13 +272,13 @@ class Stream:
         Raises
         ------
         GoneError
-            If it was deleted, made anew, or cut off.
+            If it was deleted, created again, or truncated.
         StreamError
             If two processes write it in turns.
         """
         now = os.fstat(self._fd)
         if now.st_nlink == 0:
-            raise GoneError(f"{self.name}: deleted or made anew")
+            raise GoneError(f"{self.name}: deleted or created again")
         if now.st_size != self._n_bytes:
             raise GoneError(f"{self.name}: found {now.st_size} bytes, before {self._n_bytes}")
         writer, now_s = self.writer, time.monotonic()
@@ -323,7 +323,7 @@ class Stream:
     def made_by(self, inode: int) -> tuple[int, int] | None:
         """Return the newest frame's counter, and the frame of another stream that led to it.
 
-        None: its trace does not tell of a stream with that inode, or is being written.
+        None if its trace has no stream with that inode, or is being written.
         """
         for _ in range(_TRIES):
             counter, trace = self.counter, self._trace[["trigger_inode", "cnt0"]].tolist()
@@ -385,9 +385,9 @@ class Stream:
     def _turn(self) -> int | None:
         """Return the offset of a frame's counter from its place in the ring; it must stay.
 
-        A writer moves the place first: what is seen is believed when it is seen again, and the
-        first time when it is the same several times. None: not now; a busy machine may put a
-        writer aside in the midst of a frame.
+        A writer moves the place first, so a value is accepted when it is read again, and the
+        first time when it is read several times in a row. None if that fails; a busy machine may
+        suspend a writer within a frame.
         """
         if self._shift is None and (shift := self._find_shift()) is not None:
             self._shift, self._offset = shift, None  # learned before from frames all alike
@@ -412,8 +412,8 @@ class Stream:
         """Return how far the newest frame's slot is from the one that the writer's index names.
 
         The library's index names the newest slot; other writers leave it at the next one to be
-        written, the oldest. The data of the stream itself tells. None: not now, as frames are
-        written too fast, or not yet, as several slots hold the same numbers.
+        written, the oldest. The data of the stream itself decides. None if frames are written too
+        fast, or if several slots still hold the same numbers.
         """
         for _ in range(_TRIES):
             counter, place = self.counter, self._place
@@ -439,7 +439,7 @@ class Stream:
         Raises
         ------
         StreamError
-            If it is gone, or never stands still.
+            If it is gone, or never settles.
         """
         frames = self.after(self.counter - 1)
         if frames is None:
@@ -476,8 +476,8 @@ class Stream:
 def settled(look: Callable[[], int | None], known: int | None) -> int | None:
     """Return a consistent view of numbers that a process writes one after the other.
 
-    What was ``known`` is believed when it is seen again, anything else when it is the same several
-    times; None: it is never still.
+    A value that was ``known`` is accepted when it is read again, another one when it is read
+    several times in a row; None if it never settles.
     """
     seen: list[int | None] = []
     for _ in range(_TRIES):
@@ -491,7 +491,7 @@ def settled(look: Callable[[], int | None], known: int | None) -> int | None:
 
 
 def create(path: Path, values: Array32, keywords: Mapping[str, tuple[str, str]]) -> None:
-    """Make a stream anew, whole or not at all; one of that name is replaced.
+    """Create a stream, completely or not at all; one of that name is replaced.
 
     Parameters
     ----------

@@ -13,7 +13,7 @@ from pathlib import Path
 from pyrcal.fitting.arguments import seconds
 from pyrcal.options import add, words
 from service.parser import OneLineParser
-from service.program import imported_and_run, leave
+from service.program import import_and_run, leave
 
 _EPILOG = """
 Prints one line for each check: the finding, and the requirements of docs/rtc.md by number (R-n).
@@ -88,7 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     # On both signals the checks are unwound, which stops the dither and closes the loop again.
     signals = (signal.SIGINT, signal.SIGTERM)
-    return imported_and_run(load, own_process=arguments is None, received=signals)
+    return import_and_run(load, own_process=arguments is None, received=signals)
 
 
 if __name__ == "__main__":

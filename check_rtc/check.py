@@ -235,7 +235,7 @@ def make_registration_fit(instrument: Instrument) -> RegistrationFit:
 def _ask_consent(moved: tuple[str, ...], *, yes: bool) -> bool:
     """Print what will be moved and return True if the user agrees.
 
-    Without a terminal nobody can answer, so only ``yes`` counts.
+    Without a terminal there is no answer, so only ``yes`` counts.
     """
     for each in moved:
         say(f"will move: {each}")

@@ -65,7 +65,7 @@ MIN_RESPONSE_RATIO: Final = 0.1
 """Smallest response over command, noise added, of a mirror that moves."""
 
 _NOISE_BINS: Final = (-4.0, -3.0, 3.0, 4.0)
-"""Frequency bins beside a line in which its noise is measured; the nearest have its leakage."""
+"""Frequency bins near a line in which its noise is measured; the nearest have its leakage."""
 
 _STOP_TIMEOUT_S: Final = 2.0
 """Longest time from the command to stop until frames and status show no dither."""

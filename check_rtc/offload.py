@@ -16,7 +16,7 @@ from service.errors import LinkError, WireError
 from service.estimation.estimate import Estimate
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import LockIn, LockInPlan, Spectra
-from service.estimation.loop import closed_loop
+from service.estimation.loop import build_loop
 from service.estimation.windows import ClosedLoop, WindowRefused
 from service.model.misregistration import BOUNDARY_SCALE
 from service.wire import (
@@ -76,7 +76,7 @@ def check_offload(
         reply = client.connection.command(request)
         if not reply.accepted or reply.start_seq is None:
             return skipped("offload", f"there was no dither: {reply.reason}")
-        loop = closed_loop(status, status.cm_id, matrix)
+        loop = build_loop(status, status.cm_id, matrix)
         return _check_move(
             client, request, reply.start_seq, lambda spectra: fit_registration(spectra, loop)
         )

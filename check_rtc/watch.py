@@ -18,7 +18,7 @@ from service.errors import WireError
 from service.estimation import control_law, loopcheck
 from service.estimation.control_law import ControlLawCheck, IdentifiedLaw
 from service.estimation.frames import FrameBlock
-from service.estimation.loop import closed_loop, last_seq, same_loop
+from service.estimation.loop import build_loop, last_seq, same_loop
 from service.estimation.loopcheck import CommandResidual, LoopCheck
 from service.estimation.windows import ClosedLoop
 from service.link.intake import Intake
@@ -218,7 +218,7 @@ class LoopObserver:
             return None
         if not status.in_loop or len(matrix) > status.n_modes:
             return None
-        return closed_loop(status, cm_id, matrix)
+        return build_loop(status, cm_id, matrix)
 
     def _judge(self, terms: ClosedLoop, seq: int) -> None:
         """Add results for the frames up to ``seq``, which this and the last status enclose."""
@@ -229,7 +229,7 @@ class LoopObserver:
                 self.obediences.append(obeyed)
         if self._law.cm_id != terms.cm_id:
             return
-        self._law, found = control_law.judged(self._law, terms, seq)
+        self._law, found = control_law.judge_frames(self._law, terms, seq)
         if found is not None:
             self.laws.append(found)
 

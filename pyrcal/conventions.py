@@ -24,7 +24,7 @@ from service.estimation.reference import Reference
 from service.files.disk_cache import cached_basis
 from service.instrument import load_instrument
 from service.model.instrument import Instrument
-from service.model.misregistration import wrapped
+from service.model.misregistration import wrap_angle
 from service.model.pupil import instrument_pupil, rtc_valid_subapertures
 from service.model.slopes import FLIPS
 
@@ -254,7 +254,7 @@ def _axes(instrument: Instrument, fit: Fit) -> Iterator[RuleCheck]:
         )
     nominal = instrument.mirror.nominal_rotation_rad
     if nominal is not None:
-        away = float(np.rad2deg(abs(wrapped(fit.alpha.rotation_rad - nominal))))
+        away = float(np.rad2deg(abs(wrap_angle(fit.alpha.rotation_rad - nominal))))
         yield RuleCheck(
             rule=ROTATION,
             deviation=away,

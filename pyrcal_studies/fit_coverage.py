@@ -85,7 +85,7 @@ def measured(
             light = optics.sensor.images(opd) / np.float32(optics.light_at_rest)
             slopes.append(reference_slopes(detector.read(light, noise_rng), plant.valid)[0])
         column = (slopes[0] - slopes[1]) / (2.0 * STROKE_M)
-        columns.append(optics.errors.applied(column.astype(np.float32)))
+        columns.append(optics.errors.add_errors(column.astype(np.float32)))
     return alpha, np.array(columns).T
 
 

@@ -234,7 +234,7 @@ def drawn(n_cases: int) -> list[Case]:
     steps = RANGE * rng.uniform(-1.0, 1.0, (n_cases, 4))
     nominal = Misregistration()
     return [
-        Case(peer="oopao", truth=f"drawn-{k}", drawn=nominal.stepped(step), n_subapertures=20)
+        Case(peer="oopao", truth=f"drawn-{k}", drawn=nominal.add_step(step), n_subapertures=20)
         for k, step in enumerate(steps)
     ]
 

@@ -26,7 +26,7 @@ from service.estimation.random_dither import (
     RandomDither,
     RandomEstimate,
     RandomPlan,
-    joined,
+    join_random_windows,
     noisy_matrix,
 )
 from service.estimation.windows import WindowRefused
@@ -64,7 +64,7 @@ def main() -> None:
             if isinstance(window, WindowRefused):
                 outcome = window
             else:
-                total = window if total is None else joined(total, window)
+                total = window if total is None else join_random_windows(total, window)
                 outcome = bench.fit_random(window, start)
             rows.append(_row(outcome, true) | {"wavefront_nm": wavefront_nm})
             if isinstance(outcome, RandomEstimate):

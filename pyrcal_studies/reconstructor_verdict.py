@@ -121,7 +121,7 @@ CASES = (
 
 def model_matrix(case: Case, instrument: Instrument, true: Misregistration) -> Array:
     """Return the wrong model's matrix ``(n_slopes, N_MODES)``."""
-    alpha = true.moved_to(true.vector + np.array(case.off) * [1.0, 1.0, np.pi / 180.0, 1.0])
+    alpha = true.with_vector(true.vector + np.array(case.off) * [1.0, 1.0, np.pi / 180.0, 1.0])
     # the RTC's mask is known, whatever else the model has wrong
     wfs = replace(instrument.wfs, valid_subapertures=rtc_valid_subapertures(instrument))
     about = replace(instrument, wfs=replace(wfs, **case.wfs), **case.changes)

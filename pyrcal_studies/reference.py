@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -177,6 +177,7 @@ _TAKEN_BY = {
     remote.CONNECTION: "of all commands that ask or operate a service; exit status 1: refused, "
     "not done, or not all is well; 3: the service cannot be reached",
     remote.ORDER: "of all commands that change something in a service",
+    offline_arguments.ARCHIVE: "of `pyrcal archive`, `commission`, `bundle write`",
     offline_arguments.DESCRIPTION: "of `pyrcal import`, except from OOPAO",
 }
 """Titles of the groups of options that many commands share, and which commands these are."""
@@ -200,7 +201,7 @@ def _describe(
         yield _block(usages, own)
     status = " ".join((parser.epilog or "").split()).partition("Exit status: ")[2].partition(".")[0]
     if "; 1 " in status and parser.epilog != remote.EPILOG:
-        yield f"Exit status: {status}."
+        yield f"Exit status: {status.partition('; 2 ')[0]}."
 
 
 _INSTRUMENT = ("INSTRUMENT", offline_arguments.INSTRUMENT)
@@ -284,21 +285,41 @@ def rest(described: Schema) -> str:
 # --- alarms
 
 
+def _sentence(text: str) -> str:
+    """Return a text that begins with a capital and ends with a full stop."""
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
+
+
+def _meanwhile(blocks: Collection[str]) -> str:
+    """Return what an alarm prevents while it lasts, in words; empty if nothing."""
+    if "ask" in blocks:
+        return "nothing of the RTC is used, and nothing is made or sent"
+    texts = {
+        "measure": "α is not measured",
+        "decide": "nothing is made or sent without an order",
+        "hold": "after some seconds the service acquires by itself",
+        "send_new": "no matrix is sent" if "send_known" in blocks else "no new matrix is sent",
+    }
+    return "; ".join(text for act, text in texts.items() if act in blocks)
+
+
 def runbook(acts: Mapping[str, str]) -> str:
     """Return docs/operate/runbook.md: what to do about each alarm; ``acts``: what it may forbid."""
     parts = [
-        "An alarm lasts as long as what it tells of. It is on the page, in `GET /v1/state`, on "
-        "the wire (`ao/v1/{system}/alarm`), and in [the metrics](monitoring.md). Its text has the "
-        "numbers; here is what each means, what to do, and in brackets the file that finds it.",
+        "An alarm lasts as long as its cause. The page, `pyrcal alarms list` and "
+        "[the metrics](monitoring.md) show it; its text has the numbers. *Critical*: the loop is "
+        "in danger, or its telemetry cannot be used. *Serious*: the service does less than it "
+        "should. *Warning*: it does its work.",
         "## What an alarm may forbid",
+        "The names are those of `blocks` in a rule of your own.",
         listed((f"`{act}`", text) for act, text in acts.items()),
     ]
     for name, kind in ALARMS.items():
-        forbids = ", ".join(f"`{act}`" for act in acts if act in kind.blocks)
-        head = [f"*{kind.severity.value}* (`service/{kind.origin}`)"]
-        head.append(f"forbids {forbids}" if forbids else "")
-        head.append(f"the {kind.responsible} can end it" if kind.responsible else "")
-        means = kind.means[:1].upper() + kind.means[1:]
-        do = f"**Do**: {kind.do}."
-        parts += [f"## {name}", "; ".join(part for part in head if part), f"{means}.", do]
+        effect = _meanwhile(kind.blocks)
+        head = kind.severity.value.capitalize()
+        if kind.responsible:
+            who = kind.responsible.value
+            head += f"; the {'RTC' if who == 'rtc' else who} can end it"
+        texts = (f"*{head}.*", _sentence(kind.means), f"**Meanwhile** {effect}." if effect else "")
+        parts += [f"## {name}", " ".join(filter(None, texts)), f"**Do**: {_sentence(kind.do)}"]
     return page("Runbook: what to do about an alarm", *parts)

@@ -29,7 +29,7 @@ from service.model.kinds import Stop
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import modal_basis
 from service.model.sensors.sensor import Mapper
-from service.model.tabulated import filled
+from service.model.tabulated import fill_table
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -52,7 +52,7 @@ def _nearest(cube: Array, known: Mask) -> Array:
 
 
 def _odd(cube: Array, known: Mask) -> Array:
-    return np.asarray(filled(cube, known, (0, 0)).T.reshape(cube.shape), dtype=np.float64)
+    return np.asarray(fill_table(cube, known, (0, 0)).T.reshape(cube.shape), dtype=np.float64)
 
 
 FILLS: dict[str, Callable[[Array, Mask], Array]] = {

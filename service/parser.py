@@ -113,7 +113,7 @@ def closest(found: str, known: Iterable[str]) -> str:
     """Return the end of a message: the known word that is most like the one found, if any is."""
     from difflib import get_close_matches
 
-    near = get_close_matches(found, list(known), n=1)
+    near = get_close_matches(found, list(known), n=1, cutoff=0.7)
     return f"; did you mean {near[0]}" if near else ""
 
 

@@ -87,7 +87,7 @@ def run_command(
     if own_process:
         _leave_when_asked(0 if serves else INTERRUPTED)
 
-    def performed(options: argparse.Namespace) -> int:
+    def perform(options: argparse.Namespace) -> int:
         check(options)
         command = import_module(options.module)
         if own_process and not serves:
@@ -100,7 +100,7 @@ def run_command(
         try:
             options = read()
             options.own_process = own_process
-            status = status_of(lambda: performed(options))
+            status = status_of(lambda: perform(options))
             if own_process and serves:
                 leave(status)
             return status
@@ -120,7 +120,7 @@ def _leave_when_asked(status: int) -> None:
         signal.signal(number, lambda *_: leave(status))
 
 
-def imported_and_run(
+def import_and_run(
     load: Callable[[], Callable[[], int]],
     *,
     own_process: bool,
@@ -209,7 +209,7 @@ def notes_folder() -> Path:
 
 
 @contextmanager
-def announced(data_dir: Path, url: str) -> Iterator[None]:
+def announce(data_dir: Path, url: str) -> Iterator[None]:
     """Leave a note while the block lasts; log if the machine takes none."""
     import structlog
 
@@ -238,7 +238,7 @@ def announced(data_dir: Path, url: str) -> Iterator[None]:
             path.unlink(missing_ok=True)
 
 
-def running_services() -> tuple[RunningService, ...]:
+def find_running_services() -> tuple[RunningService, ...]:
     """Return the services of this user that run now, and remove what others have left behind."""
     folder, found = notes_folder(), []
     if not _is_own(folder):
@@ -263,7 +263,7 @@ def data_dir_of_the_one() -> Path | None:
     ConfigurationError
         If there are several: somebody has to say which is meant.
     """
-    every = running_services()
+    every = find_running_services()
     if len({one.data_dir for one in every}) > 1:
         which = "; ".join(f"{one.data_dir} ({one.url})" for one in every)
         raise ConfigurationError(
@@ -375,13 +375,13 @@ def such(
 ) -> Callable[[str], _Read]:
     """Return a function that reads a text and refuses what is no number, or not as expected."""
 
-    def reading(text: str) -> _Read:
+    def read_checked(text: str) -> _Read:
         with suppress(ValueError):
             if holds(found := read(text)):
                 return found
         raise argparse.ArgumentTypeError(f"found {text!r}, expected {expected}")
 
-    return reading
+    return read_checked
 
 
 def whole(text: str) -> int:

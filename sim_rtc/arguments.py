@@ -43,7 +43,7 @@ def option(
     many
         Whether it may be given more than once: the field has all its values.
     absent
-        What stands for an option without a default that was not given.
+        Value of an option without a default that was not given.
     chapter
         Of ``--help``, which begins here.
     """

@@ -32,8 +32,8 @@ from sim_rtc.computer.telemetry import LoopSettings
 from sim_rtc.held_rate import DITHERED_FROM_HZ, frame_s, held_rate_hz, slow_motion
 from sim_rtc.options import Options
 from sim_rtc.rehearsal import with_modes
-from sim_rtc.telescope.atmosphere import fried_parameter_m, frozen_layers
-from sim_rtc.telescope.detector import Detector, PixelDetector, binned
+from sim_rtc.telescope.atmosphere import build_layers, compute_fried_parameter_m
+from sim_rtc.telescope.detector import Detector, PixelDetector, bin_pixels
 from sim_rtc.telescope.diffractive import DiffractivePlant
 from sim_rtc.telescope.imperfections import Imperfections
 from sim_rtc.telescope.influence import read_influence
@@ -132,11 +132,13 @@ def _law_of(options: Options, instrument: Instrument) -> Callable[[float], Misre
     return nominal
 
 
-def _binned(options: Options, basis: Basis, instrument: Instrument) -> tuple[Basis, Instrument]:
+def _bin_instrument(
+    options: Options, basis: Basis, instrument: Instrument
+) -> tuple[Basis, Instrument]:
     """Return modes and instrument in the subapertures that a preset bins."""
     if options.binning == 1 or not isinstance(basis, ModalBasis):
         return basis, instrument
-    coarse = binned(instrument, options.binning)
+    coarse = bin_pixels(instrument, options.binning)
     surface = mirror_surface(coarse.analytic_mirror, coarse.subaperture_m)
     return basis.of_surface(surface), coarse
 
@@ -146,7 +148,7 @@ def at_held_rate(options: Options, instrument: Instrument) -> Options:
 
     If that is too low for a dither, the loop keeps the requested rate, in slow motion.
     """
-    instrument = _supported(options, instrument)
+    instrument = _select_mode(options, instrument)
     n_modes = instrument.modes.n_modes
     n_valid = int(rtc_valid_subapertures(instrument).sum())
     one_frame_s = frame_s(
@@ -162,7 +164,7 @@ def at_held_rate(options: Options, instrument: Instrument) -> Options:
 
 
 def in_sensor_mode(options: Options, instrument: Instrument) -> Instrument:
-    """Return the instrument in the mode of its sensor that is asked for; else in its first.
+    """Return the instrument in the requested mode of its sensor, by default the first one.
 
     Raises
     ------
@@ -192,8 +194,8 @@ def build_telescope(
 ) -> Telescope:
     """Return the telescope of these options.
 
-    Optics to come are computed by ``executor``, a thread beside the loop unless given: then a
-    movement of the registration may come late. ``batch_frames`` are processed together if the
+    Optics of later registrations are computed by ``executor``, by default a thread of its own: then
+    a movement of the registration may come late. ``batch_frames`` are processed together if the
     plant is linear.
 
     Raises
@@ -201,9 +203,9 @@ def build_telescope(
     ConfigurationError
         If the instrument is not simulated, or more modes are to be controlled than it has.
     """
-    instrument = _supported(options, instrument)
+    instrument = _select_mode(options, instrument)
     plant_rng, sky_rng, noise_rng, alpha_rng = np.random.default_rng(options.seed).spawn(4)
-    basis, instrument = _binned(options, _modes(options, instrument), instrument)
+    basis, instrument = _bin_instrument(options, _modes(options, instrument), instrument)
     n_modes = basis.n_modes
     n_controlled = options.n_controlled(n_modes, most_of(instrument))
     law = _law_of(options, instrument)
@@ -256,7 +258,7 @@ def build_telescope(
     )
 
 
-def _supported(options: Options, instrument: Instrument) -> Instrument:
+def _select_mode(options: Options, instrument: Instrument) -> Instrument:
     """Return the instrument in the mode of its sensor that is simulated.
 
     A measured plant sends what was measured, whatever its order and axes.
@@ -287,7 +289,7 @@ def build_detector(
         # the light of a measured matrix was not measured with it
         reports_light=not isinstance(plant, MeasuredPlant),
     )
-    detector.sigma = np.abs(plant.listed(detector.sigma))
+    detector.sigma = np.abs(plant.sort_rows(detector.sigma))
     return detector
 
 
@@ -409,12 +411,12 @@ def build_sky(
 ) -> Sky:
     """Return the turbulence and vibrations on this plant's sensor and mirror."""
     scene, seeing = options.scene, options.seeing
-    layers = frozen_layers(
+    layers = build_layers(
         options.layers,
         points_m=plant.points_m,
         pitch_m=plant.pitch_m,
         turbulence=KarhunenLoeve(
-            r0_m=fried_parameter_m(seeing.start_arcsec), outer_scale_m=options.outer_scale_m
+            r0_m=compute_fried_parameter_m(seeing.start_arcsec), outer_scale_m=options.outer_scale_m
         ),
         rng=rng,
     )
@@ -438,7 +440,7 @@ def build_drive(options: Options, instrument: Instrument, basis: Basis) -> Mirro
     Raises
     ------
     ConfigurationError
-        If limits are asked for of a mirror whose actuators are not known.
+        If limits are given for a mirror whose actuators are not known.
     """
     if options.plant != "diffractive" and not options.needs_drive:
         return None

@@ -325,8 +325,10 @@ class WireFaults:
         """Return the messages to send now: this batch or its damaged form, and held ones."""
         due = [message for due_s, message in self._held if due_s <= time_s]
         self._held = [held for held in self._held if held[0] > time_s]
-        header, rows = self._damaged(header, rows, time_s)
-        sent = due + self._on_the_way(self._garbled(encode_frames(header, rows), time_s), time_s)
+        header, rows = self._damage_batch(header, rows, time_s)
+        sent = due + self._on_the_way(
+            self._garble_batch(encode_frames(header, rows), time_s), time_s
+        )
         if self._plan.active(FaultKind.SECOND, time_s):
             other = replace(header, session=self._second_session)
             sent.append(encode_frames(other, rows))
@@ -336,7 +338,7 @@ class WireFaults:
         """Return the basis that frames and status name."""
         return _OTHER_BASIS if self._plan.active(FaultKind.BASIS, time_s) else basis_id
 
-    def _damaged(
+    def _damage_batch(
         self, header: FrameHeader, rows: Array32, time_s: float
     ) -> tuple[FrameHeader, Array32]:
         n_slopes = header.n_slopes
@@ -356,7 +358,7 @@ class WireFaults:
             header = replace(header, n_slopes=n_slopes - 1)
         return replace(header, basis_id=self.basis_id(header.basis_id, time_s)), rows
 
-    def _garbled(self, message: Sendable, time_s: float) -> Sendable:
+    def _garble_batch(self, message: Sendable, time_s: float) -> Sendable:
         if not self._struck(FaultKind.GARBAGE, time_s):
             return message
         self._n_garbled += 1

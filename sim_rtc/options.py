@@ -213,7 +213,7 @@ class Options:
     seed: int | None = option("--seed N", "of everything random", count(0))
     imperfection_set: str | None = option(
         "--imperfections --truth-model",
-        "how far the telescope is from the drawing (default: usual)",
+        "departures of the telescope from the instrument file (default: usual)",
         choices=list(SETS),
         chapter="imperfections",
     )
@@ -495,7 +495,7 @@ class Options:
         """Layers of turbulence."""
         n_own = len(self.wind)
         if n_own and self.profile is not None:
-            raise ConfigurationError("--profile: found beside --wind; expected one of them")
+            raise ConfigurationError("--profile: found together with --wind; expected one of them")
         if n_own > 3:
             raise ConfigurationError(f"--wind: found {n_own} layers; expected at most 3")
         return self.wind or PROFILES[self.profile or "single"]
@@ -534,7 +534,7 @@ class Options:
             )
         if self.image_offsets_px is not None and self.image_offset_rms_px is not None:
             raise ConfigurationError(
-                "--image-offset-rms: found beside --image-offsets; expected one of them"
+                "--image-offset-rms: found together with --image-offsets; expected one of them"
             )
         if self.optical_gain is not None:
             if self.plant == "diffractive":
@@ -582,12 +582,10 @@ class Options:
                 "--replay: plays a file as it is; found --record or --fault too"
             )
         if self.far and self.alpha is not None:
-            raise ConfigurationError("--far: found beside --alpha; expected one of them")
+            raise ConfigurationError("--far: found together with --alpha; expected one of them")
         self._check_measured()
         if self.influence_pitch_m is not None and self.influence_cube is None:
-            raise ConfigurationError(
-                "--influence-pitch: found alone; expected --influence beside it"
-            )
+            raise ConfigurationError("--influence-pitch: found alone; expected --influence as well")
         chosen = self
         if self.preset is not None:
             preset = asdict(preset_for(self.magnitude))
@@ -610,10 +608,10 @@ class Options:
                 "--modes": self.given_modes,
                 "--write-instrument": self.write_instrument,
             }
-            _refuse_given(options, "expected --plant measured beside it")
+            _refuse_given(options, "expected --plant measured as well")
             return
         if self.matrix is None:
-            raise ConfigurationError("--plant measured: expected --matrix FILE beside it")
+            raise ConfigurationError("--plant measured: expected --matrix FILE as well")
         unusable = {
             "--far": self.far,
             "--spiders": self.spiders,
@@ -631,7 +629,7 @@ class Options:
             "--stage": self.stage,
         }
         if self.alpha is None:
-            reason = "the registration of a measured matrix is not known; expected --alpha beside "
+            reason = "the registration of a measured matrix is not known; expected --alpha with "
             _refuse_given(moving, f"{reason}it, as pyrcal fit finds it in that matrix")
 
 

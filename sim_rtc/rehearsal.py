@@ -68,7 +68,7 @@ def _is_zonal(mirror: Mirror | TabulatedModes) -> TypeGuard[Mirror]:
 def write_live_instrument(instrument: str | Path, path: Path, n_modes: int | None = None) -> None:
     """Write an instrument file like another one, for an RTC that sends slopes.
 
-    Files that it refers to are named by their absolute paths, so that it may lie anywhere.
+    Files that it refers to are named by their absolute paths, so that it can be moved.
     ``n_modes`` is as in ``with_modes``.
 
     Raises
@@ -105,25 +105,27 @@ def _lines(tables: Mapping[str, Any], folder: Path, above: str = "") -> Iterator
         lists = {key: value for key, value in table.items() if _is_list_of_tables(value)}
         for key, value in table.items():
             if key not in inside and key not in lists:
-                yield f"{key} = {_written(value, folder)}"
+                yield f"{key} = {_format_value(value, folder)}"
         yield from _lines(inside, folder, f"{above}{name}.")
         for key, rows in lists.items():
             for row in rows:
                 yield f"\n[[{above}{name}.{key}]]"
-                yield from (f"{each} = {_written(value, folder)}" for each, value in row.items())
+                yield from (
+                    f"{each} = {_format_value(value, folder)}" for each, value in row.items()
+                )
 
 
 def _is_list_of_tables(value: object) -> bool:
     return isinstance(value, list) and bool(value) and isinstance(value[0], Mapping)
 
 
-def _written(value: object, folder: Path) -> str:
+def _format_value(value: object, folder: Path) -> str:
     """Return a value as TOML has it; a reference to a file by its absolute path."""
     if isinstance(value, Mapping):
-        inside = (f"{key} = {_written(each, folder)}" for key, each in value.items())
+        inside = (f"{key} = {_format_value(each, folder)}" for key, each in value.items())
         return "{ " + ", ".join(inside) + " }"
     if isinstance(value, list):
-        return "[" + ", ".join(_written(each, folder) for each in value) + "]"
+        return "[" + ", ".join(_format_value(each, folder) for each in value) + "]"
     if isinstance(value, str):
         name, colon, inside_file = value.partition(":/")
         file = folder / name

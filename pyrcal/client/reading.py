@@ -52,12 +52,13 @@ def understood(service: Service) -> Iterator[None]:
 
 def reconstructor_lines(one: Document) -> Iterator[str]:
     """Yield all that an operator needs to decide about a reconstructor."""
-    yield f"{one['id']}: {one['state']}, {one['n_modes']} modes, made {clock(one['created_utc'])}"
+    created = clock(one["created_utc"])
+    yield f"{one['id']}: {one['state']}, {one['n_modes']} modes, computed {created}"
     if one["reason"]:
-        yield f"because      {one['reason']}"
-    yield f"gate         {verdict(one['gate'])}"
+        yield f"reason       {one['reason']}"
+    yield f"stability    {verdict(one['gate'])}"
     if one["alpha"] is not None:
-        yield "made for"
+        yield "computed for"
         yield from (f"  {line}" for line in registration_lines(one))
 
 
@@ -74,14 +75,14 @@ def _reconstructors(document: Document) -> Iterator[str]:
         for one in document["reconstructors"]
     ]
     yield from table(rows)
-    yield "* in use" if any(row[0] for row in rows) else "the one in use is unknown"
+    yield "* in use" if any(row[0] for row in rows) else "it is not known which one is in use"
 
 
 def _alpha(document: Document) -> Iterator[str]:
     why = f": {document['validity_reason']}" if document["validity_reason"] else ""
     yield f"{document['validity']}{why}"
     yield from registration_lines(document)
-    yield f"last telemetry in it {span(document['age_s'])} ago, of {document['n_windows']} windows"
+    yield f"from {document['n_windows']} windows, the last telemetry {span(document['age_s'])} ago"
     if document["valid_until_utc"]:
         yield f"valid until {clock(document['valid_until_utc'])}"
 
@@ -90,15 +91,15 @@ def _alarms(state: Document) -> Iterator[str]:
     lasting, gone, muted = worst_first(state), state["stale_alarms"], state["muted_alarms"]
     for alarm in lasting:
         yield alarm_line(alarm, state)
-        yield f"    do: {alarm['do']}"
+        yield f"    To do: {alarm['do']}"
     for alarm in gone:
-        yield f"{alarm['name']} ({alarm['worst_severity']}) is over, and was not acknowledged:"
+        yield f"{alarm['worst_severity']} {alarm['name']} is over, but was not acknowledged:"
         yield f"    {alarm['text']}"
     for note in muted:
         who, until = note["muted"]["by"] or "an unnamed operator", clock(note["muted"]["until_utc"])
         yield f"{note['name']} is muted until {until} by {who}"
-    counts = ((lasting, "active"), (gone, "over, unseen"), (muted, "muted"))
-    yield ", ".join(f"{len(some)} {word}" for some, word in counts if some) or "no alarm lasts"
+    counts = ((lasting, "active"), (gone, "over, not acknowledged"), (muted, "muted"))
+    yield ", ".join(f"{len(some)} {word}" for some, word in counts if some) or "no alarm"
 
 
 def _audit(document: Document) -> Iterator[str]:

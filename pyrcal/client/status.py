@@ -17,21 +17,36 @@ _ALPHA = {
 
 
 def status_lines(state: Document) -> list[str]:
-    """Return the screen: first whether all is well, then the details."""
-    ready = "ready" if state["ready"] else f"NOT READY: {state['ready_reason']}"
+    """Return the screen: whether all is well, alarms with what to do, then the details."""
+    ready = "READY" if state["ready"] else f"NOT READY: {state['ready_reason']}"
     does, up = state["operating"], span(state["uptime_s"])
     doing = f"{does['service_state']}, {does['current_operation']}"
-    lines = [f"{state['system']}: {doing}; mode {state['mode']}, up {up}: {ready}"]
-    lines += [f"ALARM {alarm_line(alarm, state)}" for alarm in worst_first(state)]
-    gone = ", ".join(alarm["name"] for alarm in state["stale_alarms"])
-    lines += [f"over and not acknowledged: {gone}; see pyrcal alarms"] if gone else []
+    lines = [f"{state['system']}: {ready}", f"{doing}; {_mode_text(state['mode'])}; up {up}"]
+    for alarm in worst_first(state):
+        lines += [f"ALARM {alarm_line(alarm, state)}", f"      To do: {alarm['do']}"]
+    for alarm in state["stale_alarms"]:
+        name = alarm["name"]
+        lines.append(f"over, not acknowledged: {name} (pyrcal alarms ack {name})")
     alarms = {alarm["name"] for alarm in state["alarms"]}
     lines += [
-        f"waits for the {wait['responsible']}: {wait['text']}"
+        f"Waiting for the {wait['responsible']}: {wait['text']}"
         for wait in state["waiting_for"]
         if wait["name"] not in alarms
     ]
     return [*lines, "", *_rtc(state), *_alpha(state), *_matrix(state), *_activity_lines(state)]
+
+
+_MODES = {
+    "auto": "the service sends new matrices by itself",
+    "propose": "new matrices wait for an approval",
+    "hold": "no matrices are made or sent",
+}
+
+
+def _mode_text(mode: str) -> str:
+    """Return the mode and its meaning."""
+    meaning = _MODES.get(mode)
+    return f"mode {mode}" if meaning is None else f"mode {mode} ({meaning})"
 
 
 def worst_first(state: Document) -> list[Document]:
@@ -46,46 +61,53 @@ _SEVERITIES = ("warning", "serious", "critical")
 
 
 def alarm_line(alarm: Document, state: Document) -> str:
-    """Return an alarm on one line: text, severity, duration, whether it was seen."""
+    """Return an alarm on one line: severity, name, duration, whether it was seen, text."""
     lasts = span(max(0.0, (state["now_ns"] - alarm["since_ns_utc"]) / 1e9))
     seen = "" if alarm["acknowledged"] is None else ", acknowledged"
-    return f"{alarm['name']} ({alarm['severity']}{seen}) for {lasts}: {alarm['text']}"
+    return f"{alarm['severity']} {alarm['name']} (for {lasts}{seen}): {alarm['text']}"
 
 
 def _rtc(state: Document) -> list[str]:
     rtc, link = state["rtc"], state["link"]
-    loop = "none seen yet, or it has vanished"
+    loop = "not connected"
     if rtc is not None:
         loop = (
             f"loop {rtc['loop']} at {rtc['frame_rate_hz']:g} Hz, {rtc['n_controlled']} of "
-            f"{rtc['n_modes']} modes"
+            f"{rtc['n_modes']} modes controlled"
         )
     age_s = link["frame_age_s"]
     last = "" if age_s is None else f", the last {span(age_s)} ago"
     frames = f"{link['frames_received']} received, {link['frames_lost']} lost{last}"
-    return [f"RTC      {loop}", f"frames   {frames}"]
+    return [_line("RTC", loop), _line("Frames", frames)]
+
+
+def _line(label: str, text: str) -> str:
+    return f"{label:13} {text}"
 
 
 def _alpha(state: Document) -> list[str]:
     known = state["registration"]
-    windows = f"{state['windows_accepted']} accepted, {state['windows_refused']} refused"
-    lines = [f"windows  {windows}", *_refusal(state)]
+    windows = f"{state['windows_accepted']} accepted, {state['windows_refused']} rejected"
+    lines = [_line("Windows", windows), *_refusal(state)]
     if known is None:
-        return ["alpha    not known yet", *lines]
-    worth = f"{known['validity']}, {span(known['age_s'])} old"
+        return [_line("Registration", "not measured yet"), *lines]
     why = f" ({known['validity_reason']})" if known["validity_reason"] else ""
-    four = (f"         {line}" for line in registration_lines(known))
-    return [f"alpha    {worth}{why}", *four, *lines]
+    age = f"{known['validity']}, {span(known['age_s'])} old{why}"
+    return [
+        _line("Registration", age),
+        *(_line("", line) for line in registration_lines(known)),
+        *lines,
+    ]
 
 
 def _refusal(state: Document) -> list[str]:
-    """Return time and reason of the last refused window."""
+    """Return time and reason of the last rejected window."""
     last = state["window_refusal"]
     if last is None:
         return []
     gone_s = max(0.0, (state["now_ns"] - last["t_ns_utc"]) / 1e9)
     often = f" ({last['n_times']} times within a minute)" if last["n_times"] > 1 else ""
-    return [f"         refused {span(gone_s)} ago{often}: {last['text']}"]
+    return [_line("", f"last rejection {span(gone_s)} ago{often}: {last['text']}")]
 
 
 def registration_lines(known: Document) -> list[str]:
@@ -108,38 +130,41 @@ def registration_lines(known: Document) -> list[str]:
 
 
 def _matrix(state: Document) -> list[str]:
-    return [f"matrix   {state['in_use'] or 'unknown'} in use, {verdict(state['margin'])}"]
+    return [_line("Matrix in use", f"{state['in_use'] or 'unknown'}; {verdict(state['margin'])}")]
 
 
 def verdict(margin: Document | None) -> str:
-    """Return the stability gate's verdict on a reconstructor as text."""
+    """Return the result of the stability check of a reconstructor as text."""
     if margin is None:
-        return "not judged"
+        return "stability not checked"
     outcome = "accepted" if margin["accepted"] else f"REFUSED: {margin['reason']}"
     radius = _number(margin["worst_pole_radius"], ".3f")
-    return f"worst pole radius {radius} of at most {margin['bound']:g}: {outcome}"
+    return f"worst pole radius {radius}, limit {margin['bound']:g}: {outcome}"
 
 
 def _activity_lines(state: Document) -> list[str]:
     dither_policy, acquisition = state["dither_policy"], state["acquisition"]
-    lines = [f"dither   {dither_policy['phase']}: {dither_policy['reason']}"]
+    lines = [_line("Dither", f"{dither_policy['phase']}: {dither_policy['reason']}")]
     if acquisition["under_way"]:
-        lines.append(f"doing    acquisition, {acquisition['stage']}: {acquisition['text']}")
+        lines.append(
+            _line("Under way", f"acquisition, {acquisition['stage']}: {acquisition['text']}")
+        )
     if state["measuring"] is not None:
-        lines.append(f"doing    {state['measuring']['id']} is being measured")
+        lines.append(_line("Under way", f"measurement of the matrix {state['measuring']['id']}"))
     if state["noisy_measurement"] is not None:
-        lines.append(f"doing    {state['noisy_measurement']['id']}, a noisy matrix, is under way")
+        noisy = state["noisy_measurement"]["id"]
+        lines.append(_line("Under way", f"measurement of the noisy matrix {noisy}"))
     return [*lines, *_refusal_lines(state)]
 
 
 def _refusal_lines(state: Document) -> list[str]:
-    """Return the reasons that refuse several orders now, and the first remedy."""
+    """Return the reasons that refuse several orders now, with the first remedy."""
     orders: dict[str, list[str]] = {}
     for name, permission in state["permitted"].items():
         if not permission["allowed"]:
             orders.setdefault(permission["reason"], []).append(name.replace("_", " "))
     several = (item for item in orders.items() if len(item[1]) > FEW)
-    return [f"refused  {', '.join(names)}: {reason}" for reason, names in several]
+    return [_line("Not possible", f"{', '.join(names)}: {reason}") for reason, names in several]
 
 
 def _number(value: float | None, form: str) -> str:

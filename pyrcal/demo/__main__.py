@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 from pyrcal.arguments import with_negative_numbers
 from pyrcal.demo.arguments import demo_parser
-from service.program import imported_and_run
+from service.program import import_and_run
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -20,7 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         return lambda: run_demo(options)
 
-    return imported_and_run(load, own_process=arguments is None)
+    return import_and_run(load, own_process=arguments is None)
 
 
 if __name__ == "__main__":

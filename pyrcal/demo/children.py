@@ -51,7 +51,7 @@ class Child:
 
 
 @contextmanager
-def children(directory: Path, commands: Mapping[str, Sequence[str]]) -> Iterator[list[Child]]:
+def run_children(directory: Path, commands: Mapping[str, Sequence[str]]) -> Iterator[list[Child]]:
     """Run processes of this Python by name while the ``with`` block lasts."""
     started: list[Child] = []
     try:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import httpx
 
 from pyrcal.demo.arguments import FORWARDED, REPEATED
-from pyrcal.demo.children import children, interrupt_on_end
+from pyrcal.demo.children import interrupt_on_end, run_children
 from pyrcal.demo.report import table
 from pyrcal.demo.truth import TruthFile
 from pyrcal.demo.watch import REQUEST_TIMEOUT_S, USUAL_RATE_HZ, Promise, TelemetryObserver
@@ -117,7 +117,7 @@ def run_demo(options: argparse.Namespace) -> int:
     with (
         httpx.Client(base_url=url, timeout=REQUEST_TIMEOUT_S) as client,
         interrupt_on_end(),
-        children(options.dir, commands) as started,
+        run_children(options.dir, commands) as started,
     ):
         truth = TruthFile(options.dir / "truth.jsonl")
         watch = TelemetryObserver(client, truth, started, _make_promise(options), _say)

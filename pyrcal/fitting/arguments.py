@@ -69,6 +69,9 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     )
 
 
+ARCHIVE = "archive options"
+"""Title of the options that say where a service keeps its files."""
+
 _OF_A_FOLDER = (
     words("--config FILE", "settings of the service, TOML", type=Path),
     words("--data-dir DIR", "data_dir of the service, default var"),
@@ -101,15 +104,15 @@ def _describe_archive(archive: OneLineParser) -> None:
         ("prune", "remove what [archive] no longer keeps", (dry_run,), "prune --dry-run"),
     ):
         parser = actions.add_parser(action, help=purpose, examples=[f"pyrcal archive {example}"])
-        add(parser, *_OF_A_FOLDER, words("--json", "print JSON"), *more)
+        add(parser, *more, words("--json", "print JSON"))
+        add(parser.add_argument_group(ARCHIVE), *_OF_A_FOLDER)
 
 
 def _describe_commission(commission: OneLineParser) -> None:
     commission.set_defaults(module="pyrcal.maintenance.commission")
     commission.description = (
-        "Judge a commissioning: compare the archive of a night, the result of pyrcal check-rtc "
-        "and the fit of a measured matrix with the limits of docs/operate/commissioning.md, and "
-        "write one HTML file with figures. Works while the service runs. Needs the extra 'plots'."
+        "Judge a commissioning from the archive of a night, pyrcal check-rtc and a fit, by the "
+        "limits of docs/operate/commissioning.md, and write a report. Needs the extra 'plots'."
     )
     commission.epilog = (
         "Exit status: 0 all criteria pass; 1 one does not, or has no input; 2 the report cannot "
@@ -117,13 +120,12 @@ def _describe_commission(commission: OneLineParser) -> None:
     )
     add(
         commission,
-        *_OF_A_FOLDER,
         words("--instrument NAME|FILE", "default: that of the settings"),
         words("--check-rtc FILE.json", "output of pyrcal check-rtc --json", type=Path),
         words("--fit FILE.json", "output of pyrcal fit --json", type=Path),
-        words("--night DATE", "date of the evening, UTC; default: the newest with measurements"),
-        words("--since TIME", "judge from here on, RFC 3339, like 2026-03-01T20:00:00Z"),
-        words("--until TIME", "judge up to here"),
+        words("--night DATE", "date of the evening, UTC; default the newest with measurements"),
+        words("--since TIME", "from this time on, RFC 3339"),
+        words("--until TIME", "up to this time"),
         words(
             "--output FILE.html",
             "default %(default)s",
@@ -132,6 +134,7 @@ def _describe_commission(commission: OneLineParser) -> None:
         ),
         words("--json", "print the criteria as JSON"),
     )
+    add(commission.add_argument_group(ARCHIVE), *_OF_A_FOLDER)
 
 
 def _describe_bundle(bundle: OneLineParser) -> None:
@@ -142,13 +145,13 @@ def _describe_bundle(bundle: OneLineParser) -> None:
     )
     bundle.epilog = "Exit status: 0 done; 2 it cannot be done, or a checksum is wrong."
     actions = bundle.add_subparsers(dest="action", required=True, metavar="COMMAND")
+    write = actions.add_parser(
+        "write",
+        help="write a bundle",
+        examples=["pyrcal bundle write in-use calibration.h5 --interaction-matrix"],
+    )
     add(
-        actions.add_parser(
-            "write",
-            help="write a bundle",
-            examples=["pyrcal bundle write in-use calibration.h5 --interaction-matrix"],
-        ),
-        *_OF_A_FOLDER,
+        write,
         words("source ID|in-use|FILE.h5", "a reconstructor of the archive, or an exported one"),
         words(
             "output FILE", "FITS if its name ends in .fits, else HDF5; never overwritten", type=Path
@@ -159,13 +162,14 @@ def _describe_bundle(bundle: OneLineParser) -> None:
             "--reference FILE.npy", "include the reference slopes of the RTC (n_slopes,)", type=Path
         ),
     )
+    add(write.add_argument_group(ARCHIVE), *_OF_A_FOLDER)
     add(
         actions.add_parser(
             "check",
             help="read a bundle, compare its checksums, show it",
             examples=["pyrcal bundle check calibration.h5"],
         ),
-        words("bundle FILE", "the bundle", type=Path),
+        words("bundle FILE", type=Path),
         words("--json", "print JSON"),
     )
 

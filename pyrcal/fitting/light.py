@@ -126,7 +126,7 @@ def _read(
             raise MatrixError(f"{path}: no dataset {FLUX}; it holds {container.listing()}")
         if stored.shape != light.shape:
             raise MatrixError(f"{stored.where}: found shape {stored.shape}, expected {light.shape}")
-        counts = light.turned(stored.numbers())
+        counts = light.orient_counts(stored.numbers())
     position = light.find_pupil(counts)
     if isinstance(position, CannotTell):
         raise MatrixError(f"{path}: {position.reason}")

@@ -175,7 +175,7 @@ def search_minimum(models: FitModels, target: Target, start: Misregistration) ->
     )
     # the smooth combinations of the modes have the widest capture range
     found: list[Approach] = []
-    for tried in (start, *map(start.moved_to, _other_starts(start.vector))):
+    for tried in (start, *map(start.with_vector, _other_starts(start.vector))):
         found.append(approach(models.far, low, tried))
         models.counter.n += found[-1].n_matrices
         if found[-1].converged and found[-1].misfit < GOOD_MISFIT:
@@ -502,7 +502,7 @@ def scan(
         table.append(_scan_parameter(chi, parameter, float(values[index]), step, half_width))
         values[index] = table[-1].minimum
         progress(f"step {len(table)}: {parameter} by {step:g}: {table[-1].minimum:.4f}")
-    return start.moved_to(values / BOUNDARY_SCALE), tuple(table)
+    return start.with_vector(values / BOUNDARY_SCALE), tuple(table)
 
 
 def _compute_chi(
@@ -516,7 +516,7 @@ def _compute_chi(
 ) -> float:
     """Return χ_N with one parameter at a tried value, boundary units."""
     there = np.where(np.arange(4) == index, tried, known)
-    return chi_n(target, models.matrix(model, start.moved_to(there / BOUNDARY_SCALE)))
+    return chi_n(target, models.matrix(model, start.with_vector(there / BOUNDARY_SCALE)))
 
 
 def chi_n(target: Target, matrix: NDArray[Any]) -> float:

@@ -178,7 +178,7 @@ class FitModels:
     @property
     def sensor_key(self) -> str | None:
         """Key of the sensor number that the matrix can determine; None if it has none."""
-        return kind_of(self.instrument).fitted_key(self.instrument.wfs)
+        return kind_of(self.instrument).find_fitted_key(self.instrument.wfs)
 
     @property
     def sensor_number(self) -> float:
@@ -214,7 +214,7 @@ class FitModels:
         In subapertures, axes of conventions.md: along x of the images at -x -y, +x -y, -x +y, +x
         +y, then along y.
         """
-        wfs = kind_of(self.instrument).displaced(self.instrument, offsets)
+        wfs = kind_of(self.instrument).displace_images(self.instrument, offsets)
         return replace(self, instrument=replace(self.instrument, wfs=wfs))
 
     def optics_derivatives(

@@ -210,7 +210,7 @@ def _apply_sensor(instrument: Instrument, fit: KnownFit) -> Instrument:
         if np.abs(fit.image_offsets_px).max() > NOTABLE_DISPLACEMENT_PX:
             words = displacement_words(fit.image_offsets_px)
             say(f"note: made with {words}, as {fit.origin} found")
-    sensor_key = kind.fitted_key(instrument.wfs)
+    sensor_key = kind.find_fitted_key(instrument.wfs)
     if sensor_key is None or sensor_key not in fit.instrument_found:
         return instrument
     number = fit.instrument_found[sensor_key]

@@ -414,7 +414,7 @@ def _of_document(values: dict[str, Any], path: Path) -> KnownFit:
     sign_x, sign_y = sign if isinstance(sign, list) else (sign, sign)
     alpha = Misregistration.from_boundary(values)
     if values.get("anamorphosis") is not None:
-        alpha = alpha.stretched(np.array(values["anamorphosis"], dtype=np.float64))
+        alpha = alpha.with_anamorphosis(np.array(values["anamorphosis"], dtype=np.float64))
     return KnownFit(
         alpha=alpha,
         covariance=np.array(values["covariance"], dtype=np.float64) / COVARIANCE_SCALE,

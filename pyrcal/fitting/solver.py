@@ -240,8 +240,8 @@ class Nuisances:
 
     def at(self, start: Misregistration, vector: Array, values: Array) -> Misregistration:
         """Return the registration of a 4-vector and the stretches among the values."""
-        moved = start.moved_to(vector)
-        return moved.stretched(values[STRETCHES]) if self.anamorphosis else moved
+        moved = start.with_vector(vector)
+        return moved.with_anamorphosis(values[STRETCHES]) if self.anamorphosis else moved
 
     def stretch_sigma(self, sigma: Array) -> Array | None:
         """Return the ``(2,)`` among 1 σ of all; None when they are not unknown."""

@@ -200,8 +200,12 @@ class System:
             values[self.of_mirror(pair.mirror)],
         )
         width_m = self.sensors[pair.sensor].instrument.subaperture_m
-        along_light = _star(of_sensor).seen(self.mirrors[pair.mirror].altitude_m)
-        return _place(of_sensor), along_light.scaled(width_m), _place(of_mirror).scaled(width_m)
+        along_light = _star(of_sensor).project_plane(self.mirrors[pair.mirror].altitude_m)
+        return (
+            _place(of_sensor),
+            along_light.scale_unit(width_m),
+            _place(of_mirror).scale_unit(width_m),
+        )
 
     def drawn(self, pair: Pair) -> Similarity:
         """Return the part of the nominal map that the pair's instrument file already contains.
@@ -276,7 +280,7 @@ class System:
         sided = mirror.positions_m * [1.0, mirror.y_sign]
         return replace(
             mirror,
-            positions_m=drawn.scaled(1.0 / width_m).points(sided),
+            positions_m=drawn.scale_unit(1.0 / width_m).points(sided),
             pitch_m=mirror.pitch_m * abs(drawn.turn),
             nominal_rotation_rad=0.0,
             parity=1,

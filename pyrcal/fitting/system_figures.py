@@ -61,7 +61,7 @@ def footprints(axes: Axes, report: SystemReport, number: int) -> None:
     for sensor in system.sensors:
         radius_m = sensor.instrument.diameter_m / 2
         edge = radius_m * np.column_stack([np.cos(angle), np.sin(angle)])
-        met = sensor.star.seen(placed.altitude_m).inverse.points(edge)
+        met = sensor.star.project_plane(placed.altitude_m).inverse.points(edge)
         axes.plot(met[:, 0], met[:, 1], linewidth=1.0, label=sensor.name)
     axes.set(title=f"{placed.name}, {placed.altitude_m:g} m", aspect="equal", xlabel="x, m")
     axes.set_ylabel("y, m")

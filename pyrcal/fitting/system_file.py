@@ -209,7 +209,7 @@ def _check_mirror(where: str, mirror: PlacedMirror, system: System) -> None:
     """Refuse a mirror that no star is above, or of which at its altitude too little is known."""
     for sensor in system.sensors:
         try:
-            sensor.star.seen(mirror.altitude_m)
+            sensor.star.project_plane(mirror.altitude_m)
         except ModelError as error:
             raise ConfigurationError(f"{where}.altitude_m: {error} of {sensor.name}") from error
     about = mirror.instrument

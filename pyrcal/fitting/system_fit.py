@@ -16,7 +16,7 @@ import scipy
 from numpy.typing import NDArray
 
 from pyrcal.fitting.system import HEIGHT, MAGNIFICATION, ROTATION, SHIFTS, STAR, System
-from service.model.misregistration import wrapped
+from service.model.misregistration import wrap_angle
 
 Array = NDArray[np.float64]
 
@@ -124,7 +124,7 @@ def fit_system(system: System, alphas: Array, covariances: Array) -> SystemFit:
 def _compute_misfit(system: System, alphas: Array, values: Array) -> Array:
     """Return measured less expected α, with rotation differences wrapped to half a turn."""
     left = alphas - system.alphas(values)
-    left[:, 2] = [wrapped(angle) for angle in left[:, 2]]
+    left[:, 2] = [wrap_angle(angle) for angle in left[:, 2]]
     return left
 
 

@@ -466,7 +466,7 @@ def registration_of(moved: Any, tel: Any, n_subapertures: int) -> Misregistratio
         shift_y_subap=-float(moved.shiftY) * per_subaperture,
         rotation_rad=turn,
         magnification=size,
-    ).stretched(stretch[0] / size - [1.0, 0.0])
+    ).with_anamorphosis(stretch[0] / size - [1.0, 0.0])
 
 
 def to_oopao(alpha: Misregistration, tel: Any, wfs: Any) -> dict[str, float]:  # noqa: ANN401

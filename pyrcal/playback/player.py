@@ -21,7 +21,12 @@ from service.errors import ModelError, UnknownIdError, WireError
 from service.estimation.dither_windows import EndedWindow
 from service.estimation.frames import FrameBlock
 from service.estimation.passive_sums import PASSIVE_INTERVAL_S
-from service.estimation.random_dither import Correlated, NoisyMatrix, joined, noisy_matrix
+from service.estimation.random_dither import (
+    Correlated,
+    NoisyMatrix,
+    join_random_windows,
+    noisy_matrix,
+)
 from service.files.recording import Message, RecordedKind
 from service.link.intake import Intake
 from service.link.matrices import MeasuredMatrix
@@ -251,7 +256,9 @@ class Player:
 
     def _correlate(self, window: Correlated) -> None:
         try:
-            self._random = window if self._random is None else joined(self._random, window)
+            self._random = (
+                window if self._random is None else join_random_windows(self._random, window)
+            )
         except ModelError:  # another dither began: only the last one's matrix is kept
             self._random = window
 

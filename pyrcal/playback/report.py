@@ -16,7 +16,7 @@ from pyrcal.playback.player import Track
 from pyrcal.terminal import table as aligned
 from service.errors import ConfigurationError
 from service.files.container import put_array
-from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, wrapped
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, wrap_angle
 from service.tracking import alarms
 from service.tracking.policy import SECOND_NS
 from service.tracking.registration import HistoryEntry, Source
@@ -94,7 +94,7 @@ def _file_rows(track: Track, found: Array | None) -> list[Sequence[str]]:
     ]
     if found is not None:
         apart = found - last
-        apart[2] = wrapped(apart[2])
+        apart[2] = wrap_angle(apart[2])
         rows.append(("found less the file's own", *_cells(apart * BOUNDARY_SCALE)))
     return rows
 

@@ -164,7 +164,7 @@ class ModalDome(Dome):
 
     @override
     def status(self) -> Status:
-        status = self._clock.stamped(self.computer.status())
+        status = self._clock.stamp_status(self.computer.status())
         return decode(Status, encode(replace(status, max_dither_modes=MAX_DITHER_MODES)))
 
     @override

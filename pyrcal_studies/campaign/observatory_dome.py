@@ -151,7 +151,7 @@ class Dome:
     def status(self) -> Status:
         """Return what the RTC says of itself, as it comes out of the wire."""
         status = replace(
-            self._clock.stamped(self.computer.status()),
+            self._clock.stamp_status(self.computer.status()),
             magnitude=self.magnitude,
             flux=self.telescope.detector.flux(self.computer.images),
         )

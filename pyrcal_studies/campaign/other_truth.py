@@ -27,7 +27,7 @@ from service.wire import Manifest, checksum, layout_of
 from sim_rtc.assembly import Telescope
 from sim_rtc.computer.feed import Block
 from sim_rtc.computer.loop import LoopBlock, LoopTerms, ModalLoop
-from sim_rtc.computer.reconstructors import truncated_inverse
+from sim_rtc.computer.reconstructors import compute_truncated_inverse
 from sim_rtc.computer.telemetry import Batch
 from sim_rtc.options import Options
 from sim_rtc.telescope.linear import LinearOptics
@@ -179,7 +179,7 @@ class OtherBlock(Block):
             self.camera.read(result.slopes)
             return result
         return loop.run_frames(
-            self.batch_frames, lambda *_: standing, terms, dither_m, self._played(row)
+            self.batch_frames, lambda *_: standing, terms, dither_m, self._read_played_rows(row)
         )
 
 
@@ -264,7 +264,7 @@ class OtherDome(Dome):
         telescope = super()._built(options)
         optics = self._other(telescope.plant.optics(self._calibrated))
         n_controlled = options.n_controlled(self.instrument.modes.n_modes)
-        matrix = truncated_inverse(true_response(optics, n_controlled))
+        matrix = compute_truncated_inverse(true_response(optics, n_controlled))
         own = Reconstructor.own(
             f"own-{n_controlled}-{checksum(matrix)[:8]}",
             matrix,

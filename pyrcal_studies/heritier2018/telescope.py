@@ -194,7 +194,7 @@ def incoming(occasion: Occasion, n_frames: int) -> tuple[Array32, Array32 | None
     """
     options = occasion.options()
     time_s = np.arange(n_frames) / options.frame_rate_hz
-    return sky(occasion).seen(time_s)
+    return sky(occasion).sample(time_s)
 
 
 def sky(occasion: Occasion) -> Sky:

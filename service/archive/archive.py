@@ -121,7 +121,7 @@ class Archive:
         told += [line for folder in self.stores for line in folder.adopt(anew=anew)]
         if anew and (n_products := len(self.reconstructors.records())):
             lost = self.directory / "index.sqlite"
-            text = f"was not there: made anew of {n_products} products; the audit trail begins here"
+            text = f"missing; rebuilt from {n_products} products; the audit trail begins here"
             told.append(f"{lost}: {text}")
         self._on_disk = True
         return told

@@ -344,7 +344,7 @@ class Recordings(Folder):
     @override
     def kept(self, records: Iterable[RecordingRecord]) -> dict[str, str]:
         """Return who has requested each."""
-        return {one.id: f"asked for by {one.who}: {one.why}" for one in records}
+        return {one.id: f"requested by {one.who}: {one.why}" for one in records}
 
     def matrix(self, recording_id: str) -> None:
         """Read a whole recording, as those of other folders read a matrix.

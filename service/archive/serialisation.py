@@ -182,8 +182,8 @@ class TrackingFile:
             aside = self._path.with_suffix(".damaged")
             self._path.replace(aside)
             raise ArchiveError(
-                f"{self._path}: damaged, now {aside.name}; α is measured anew, mode and dither are "
-                f"as the settings say: {error!s:.200}"
+                f"{self._path}: damaged, moved to {aside.name}; the service starts without α, with "
+                f"mode and dither of the settings: {error!s:.200}"
             ) from error
 
 

@@ -130,7 +130,7 @@ class Store(Folder, Generic[Record]):
         super().remove(product_id)
 
     def adopt(self, *, anew: bool) -> list[str]:
-        """Take in complete files that the index lacks; ``anew`` if it was just made.
+        """Index complete files that the index lacks; the argument is True for a new index.
 
         Returns
         -------

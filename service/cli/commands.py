@@ -114,10 +114,10 @@ DATA_DIR = "var"
 """The settings' own default; reading all of them would take three times as long."""
 
 _WITHOUT = {
-    False: "on loopback none is needed: pyrcal key add NAME makes one",
+    False: "clients on this machine need none; pyrcal key add NAME makes one",
     True: (
-        "there is no key, so nobody may ask: pyrcal key add makes one; without the file this "
-        "machine needs none"
+        "the file has no key, so every request is refused: make one with pyrcal key add NAME, or "
+        "remove the file to admit clients on this machine without a key"
     ),
 }
 """Meaning of a missing option, with and without a file."""
@@ -134,13 +134,13 @@ def _key(options: argparse.Namespace) -> int:
     file = KeyFile(data_dir(options))
     if options.action == "add":
         secret = file.add(options.name, KeyScope(options.scope))
-        _recorded(file, "key.added", f"{options.name} may {options.scope}")
+        _record_in_audit_trail(file, "key.added", f"{options.name} may {options.scope}")
         say(f"{file.path}: {options.name} may {options.scope}; this is the key, shown only now:")
         print(secret)
     elif options.action == "revoke":
         file.revoke(options.name)
-        _recorded(file, "key.revoked", options.name)
-        say(f"{file.path}: the key of {options.name} is worthless from now on")
+        _record_in_audit_trail(file, "key.revoked", options.name)
+        say(f"{file.path}: the key of {options.name} is revoked")
     else:
         keys = file.all()
         for key in keys:
@@ -151,7 +151,7 @@ def _key(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _recorded(file: KeyFile, name: str, text: str) -> None:
+def _record_in_audit_trail(file: KeyFile, name: str, text: str) -> None:
     """Record in the audit trail what was done, while a service may be running.
 
     Before the first start of a service there is no trail. If the disk refuses, the command says so

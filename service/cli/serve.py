@@ -31,7 +31,7 @@ from service.errors import ConfigurationError, PyrcalError, shown
 from service.files.fit_folder import FitRequest
 from service.files.last_telemetry import LastTelemetry
 from service.model.instrument import Instrument, instrument_sha256
-from service.program import announced, leave
+from service.program import announce, leave
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.actions import Actions, Publishing
 from service.runtime.archiving import restore_tracking
@@ -110,7 +110,7 @@ async def _serve(settings: Settings, instrument: Instrument, workers: WorkerPool
             settings.archive.last_telemetry_s, settings.archive.last_telemetry_mb * 1_000_000
         )
         bridge = Bridge(endpoint, last)
-        with archive, announced(archive.directory, where), bridge:
+        with archive, announce(archive.directory, where), bridge:
             modes = [mode.config_id for mode in instrument.sensor_modes]
             bridge.expect(instrument.basis_id, instrument.config_id, modes)
             supervisor = _supervisor(settings, instrument, system, bridge, workers, archive)

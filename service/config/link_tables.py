@@ -92,7 +92,7 @@ class AccessTable(Table):
 
 
 class SigningTable(Table):
-    """``[zenoh.signing]``: service and RTC sign their messages, whoever runs the router."""
+    """``[zenoh.signing]``: signatures of service and RTC, in case the router is not trusted."""
 
     key_file: Path
     """File whose first line is the shared secret; no other user may read it."""
@@ -135,8 +135,8 @@ class ZenohTable(CredentialsTable):
         open_ones = [each for each in self.connect or self.listen if not _ENCRYPTED.match(each)]
         if self.tls is not None and open_ones:
             raise ValueError(
-                f"found {', '.join(open_ones)} beside [zenoh.tls], expected tls/HOST:PORT: "
-                "nobody is let in without a certificate"
+                f"found {', '.join(open_ones)} together with [zenoh.tls], expected tls/HOST:PORT: "
+                "all connections need a certificate"
             )
         return self
 
@@ -149,7 +149,7 @@ class ZenohTable(CredentialsTable):
             if host is not None and not is_loopback(host):
                 raise ValueError(
                     f"found listen {endpoint}, which other machines can reach, without "
-                    "[zenoh.tls]: whoever reaches it can put a matrix on the mirror; "
+                    "[zenoh.tls]: any program that reaches it can send matrices to the mirror; "
                     "pyrcal certificates new FOLDER --host NAME makes certificates, and settings "
                     f"that use them (docs/operate/link.md), or listen on {DEFAULT_ENDPOINT}"
                 )

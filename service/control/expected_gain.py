@@ -92,7 +92,7 @@ def extrapolate_variance_m2(variance_m2: Array) -> float:
     return float(scale * (n + 0.5) ** (1.0 + _VARIANCE_EXPONENT) / -(1.0 + _VARIANCE_EXPONENT))
 
 
-def expected_gain(
+def predict_gain(
     in_use: NDArray[np.float32],
     fresh: NDArray[np.float32],
     interaction_matrix: NDArray[np.float32],

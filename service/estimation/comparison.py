@@ -279,7 +279,7 @@ def group_parts(parts: tuple[Part, ...], part_s: float) -> tuple[Part, ...]:
     return tuple(reduce(Part.plus, group) for group in groups)
 
 
-def compared(
+def compare_telemetry(
     before: Before,
     parts: tuple[Part, ...],
     modes: NDArray[np.intp],

@@ -108,7 +108,7 @@ class ControlLawCheck(Detector):
         terms = loop.terms(rtc.cm_id)
         if terms is None:
             return self
-        law, found = judged(self, terms, last_seq(rtc))
+        law, found = judge_frames(self, terms, last_seq(rtc))
         if found is None:
             return law
         if found.wrong:
@@ -168,7 +168,7 @@ def _has_time(law: ControlLawCheck, block: FrameBlock) -> bool:
     return block.next_seq <= first_seq and block.cm_id == law.cm_id
 
 
-def judged(
+def judge_frames(
     law: ControlLawCheck, loop: ClosedLoop, last_seq: int
 ) -> tuple[ControlLawCheck, IdentifiedLaw | None]:
     """Return what the frames up to one say of the loop; None: nothing, or nothing new."""

@@ -315,8 +315,8 @@ def _found(monitor: DitherMonitor) -> tuple[DitherMeasurement, bool]:
         *_strays(stray, wanted_total),
         *_find_hidden_modes(asked, own, told, moved),
     ]
-    head = f"the frames hold {1e9 * total:.3g} nm RMS of dither in all, {1e9 * wanted_total:.3g} nm"
-    text = f"{head} were asked for: {'; '.join(said)}" if said else ""
+    head = f"the frames hold {1e9 * total:.3g} nm RMS of dither in total, requested were"
+    text = f"{head} {1e9 * wanted_total:.3g} nm: {'; '.join(said)}" if said else ""
     return DitherMeasurement(found_m=total, asked_m=wanted_total, text=text), doubted
 
 
@@ -349,7 +349,7 @@ def _strays(stray: Array, wanted_m: float) -> list[str]:
     worst = worst[stray[worst] > 0.0]
     named = ", ".join(str(mode) for mode in sorted(worst[:_MAX_LISTED_MODES].tolist()))
     more = ", ..." if len(worst) > _MAX_LISTED_MODES else ""
-    return [f"modes not asked for ({named}{more}) carry {1e9 * together:.3g} nm"]
+    return [f"modes that were not requested ({named}{more}) carry {1e9 * together:.3g} nm"]
 
 
 def _find_hidden_modes(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from service.estimation.description import Description, EdgeWatch
 from service.estimation.frames import FrameBlock
-from service.estimation.loop import closed_loop
+from service.estimation.loop import build_loop
 from service.estimation.windows import ClosedLoop, ExpectedDither, Telemetry
 from service.wire import Status
 
@@ -110,7 +110,7 @@ class LoopContext:
             return None
         if matrix.shape[1] != rtc.n_slopes or len(matrix) > rtc.n_modes:
             return None
-        return closed_loop(rtc, cm_id, matrix)
+        return build_loop(rtc, cm_id, matrix)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

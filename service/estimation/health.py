@@ -329,9 +329,9 @@ class EdgeHealth(Detector):
     def conditions(self) -> tuple[str | None, ...]:
         """Text of the alarm for a slipped edge."""
         slipped = (
-            f"an outer actuator stands {self.ratio:.0f} sigma from where turbulence would have it: "
-            "the edge has slipped, whatever the slopes say; open the loop and close it again with "
-            "fewer modes or a leak of 0.99"
+            f"an outer actuator is {self.ratio:.0f} sigma from its expected position: "
+            "the edge has slipped by wavelengths, which the slopes do not show; open the loop and "
+            "close it again with fewer modes or a leak of 0.99"
         )
         return (slipped if self.slipped else None,)
 
@@ -343,11 +343,11 @@ def observe_edge(health: EdgeHealth, block: FrameBlock, watch: EdgeWatch) -> Edg
     inner = np.einsum("km,km->k", moved @ watch.inner, moved)
     each = zip(moved, inner, n_frames * (block.dt_ns * 1e-9), strict=True)
     for command, mean_square, lasted_s in each:
-        health = _seen(health, watch, command, float(mean_square), float(lasted_s))
+        health = _update_health(health, watch, command, float(mean_square), float(lasted_s))
     return health
 
 
-def _seen(
+def _update_health(
     health: EdgeHealth,
     watch: EdgeWatch,
     command: NDArray[np.float32],
@@ -578,8 +578,8 @@ class Standstill(Detector):
         since = datetime.fromtimestamp(self.since_ns_utc * 1e-9, UTC)
         text = (
             f"the slopes {what} since frame {self.first_seq}, {since:%H:%M:%S} UTC: the camera "
-            "stands, or its images do not reach the RTC; open the loop, then see to the camera: "
-            "the mirror is moved by what is no measurement"
+            "has stopped, or its images do not reach the RTC, so the mirror is driven by no "
+            "measurement; open the loop, then check the camera and its link"
         )
         return (text,)
 

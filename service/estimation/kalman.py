@@ -99,7 +99,7 @@ class Joint:
         """``(4,)`` what a passive estimate reads more than α."""
         return self.mean[self.place(block)]
 
-    def seen(self, block: BiasBlock | None) -> Array:
+    def observation_rows(self, block: BiasBlock | None) -> Array:
         """Return the four rows a look sees, α and its bias; None: all of α, as a window does."""
         if block is None:
             return np.eye(self.n_alpha, len(self.mean))
@@ -145,7 +145,7 @@ def expect_stretches(joint: Joint, nominal: Array) -> Joint:
     What was measured with it follows as far as it depends on it.
     """
     sees = np.eye(2, len(joint.mean), 4)
-    return _seen(joint, sees, nominal, np.square(STRETCH_SIGMA) * np.eye(2))
+    return _update(joint, sees, nominal, np.square(STRETCH_SIGMA) * np.eye(2))
 
 
 def forget(joint: Joint, block: BiasBlock, excess: Array | None = None) -> Joint:
@@ -181,7 +181,9 @@ def allow_scatter(joint: Joint, block: BiasBlock, excess: Array) -> Joint:
     return replace(joint, covariance=covariance).with_bias(told)
 
 
-def predicted(joint: Joint, drift: Drift, elapsed_s: float, flexure: Array | None = None) -> Joint:
+def predict_state(
+    joint: Joint, drift: Drift, elapsed_s: float, flexure: Array | None = None
+) -> Joint:
     """Bring the estimate forward: α walks, the bias decays towards knowing nothing of it.
 
     ``flexure`` ``(4,)`` is the 1 σ of what the telescope's own motion has added meanwhile.
@@ -208,21 +210,23 @@ def innovation(
 
     With a bias, of a passive estimate; without, of a dithered window.
     """
-    sees = prior.seen(block)[: len(measured)]
+    sees = prior.observation_rows(block)[: len(measured)]
     difference = measured - sees @ prior.mean
     total = sees @ prior.covariance @ sees.T + noise
     return float(difference @ np.linalg.solve(total, difference))
 
 
-def corrected(prior: Joint, measured: Array, noise: Array, block: BiasBlock | None = None) -> Joint:
+def correct_state(
+    prior: Joint, measured: Array, noise: Array, block: BiasBlock | None = None
+) -> Joint:
     """Fold in a measurement ``(4,)`` with the covariance ``(4, 4)`` of its own scatter.
 
     A window's may be ``(6,)``: with its anamorphosis, where that is followed.
     """
-    return _seen(prior, prior.seen(block)[: len(measured)], measured, noise)
+    return _update(prior, prior.observation_rows(block)[: len(measured)], measured, noise)
 
 
-def _seen(prior: Joint, sees: Array, measured: Array, noise: Array) -> Joint:
+def _update(prior: Joint, sees: Array, measured: Array, noise: Array) -> Joint:
     total = sees @ prior.covariance @ sees.T + noise
     gain = np.linalg.solve(total, sees @ prior.covariance).T
     keep = np.eye(len(prior.mean)) - gain @ sees

@@ -178,7 +178,7 @@ class LockIn(WindowCutter[LockInPlan, LockInSums, Spectra]):
         )
 
 
-def joined(one: Spectra, other: Spectra) -> Spectra | None:
+def join_windows(one: Spectra, other: Spectra) -> Spectra | None:
     """Return two windows of the same dither, one right after the other, as a longer one.
 
     It is their mean, with each bin of the second turned to its phase in the first. The response
@@ -280,7 +280,7 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
     every = (every + every.T) / 2
     turns = 2 * np.pi * np.array(spectra.plan.frequencies_hz) / loop.frame_rate_hz
     return LockInEstimate(
-        alpha=linearisation.stepped(step),
+        alpha=linearisation.add_step(step),
         covariance=every[:4, :4],
         with_stretches=every[:n, :n] if n > 4 else None,
         stretched=float(np.abs(step[4:]).max(initial=0.0)),
@@ -320,10 +320,12 @@ def _select_moved_modes(
 
 def _instrument(spectra: Spectra, coupling: Array, loop: ClosedLoop, gains: Array) -> Array:
     """Return the commands ``(n_lines, n_modes)`` that the dither of each line alone causes."""
-    return closed_loop_responses(spectra.dither, coupling, loop, spectra.plan.frequencies_hz, gains)
+    return compute_total_commands(
+        spectra.dither, coupling, loop, spectra.plan.frequencies_hz, gains
+    )
 
 
-def closed_loop_responses(
+def compute_total_commands(
     dither: Array,
     coupling: Array,
     loop: ClosedLoop,

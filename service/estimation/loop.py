@@ -26,7 +26,7 @@ SAME_RATE = 1e-5
 status to the next."""
 
 
-def closed_loop(rtc: Status, cm_id: str, matrix: NDArray[np.float32]) -> ClosedLoop:
+def build_loop(rtc: Status, cm_id: str, matrix: NDArray[np.float32]) -> ClosedLoop:
     """Return the loop closed by a status and a matrix ``(n_controlled, n_slopes)``."""
     return ClosedLoop(
         cm_id=cm_id,

@@ -212,7 +212,7 @@ class CommandResidual:
         worst = int(off[np.argmin(shares)])
         return (
             f"commands are off the loop equation: {len(off)} of {len(self.share)} modes "
-            f"({_spans(off)}) take {np.median(shares):.2f} of the steps asked for (median; least "
+            f"({_spans(off)}) take {np.median(shares):.2f} of the commanded steps (median; least "
             f"mode {worst}: {self.share[worst]:.2f}) and stay where they are in up to "
             f"{self.held[off].max():.0%} of the frames: the mirror is saturated, or the RTC's "
             f"gains, its delay or its reconstructor are not those it names ({self.cm_id})"

@@ -29,12 +29,12 @@ from service.estimation.solver import vertex
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.kinds import SlopeOrder
-from service.model.misregistration import Misregistration, rotation, wrapped
+from service.model.misregistration import Misregistration, rotation, wrap_angle
 from service.model.modes import Basis
 from service.model.pupil import rtc_valid_subapertures
 from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import Mapper
-from service.model.slopes import FLIPS, Orientation, SlopeRecipe, turned_mask
+from service.model.slopes import FLIPS, Orientation, SlopeRecipe, orient_mask
 
 Array = NDArray[np.float64]
 
@@ -68,10 +68,10 @@ class Pose:
     def turned_class(self) -> tuple[SlopeOrder, int, int, bool]:
         """The class of poses that differ by quarter turns of everything."""
         axes = self.slopes.assumed_orientation
-        return self.slopes.order, axes.sign_x, axes.sign_y, self.mirrored
+        return self.slopes.order, axes.sign_x, axes.sign_y, self.is_mirrored
 
     @property
-    def mirrored(self) -> bool:
+    def is_mirrored(self) -> bool:
         """Return True if the grid of the slopes is mirrored."""
         return self.n_changes % 2 == 1
 
@@ -85,7 +85,7 @@ class Pose:
         """Changes of the axes, then turn of the mirror: the least is the likeliest."""
         return self.n_changes, abs(self.rotation_rad)
 
-    def reported(self) -> str:
+    def describe_orientation(self) -> str:
         """Return it in the words of the instrument file."""
         return f"{format_setting(self.slopes)} at {np.rad2deg(self.rotation_rad):.0f} deg"
 
@@ -123,7 +123,7 @@ class Search:
                 "in another order, or the matrix another instrument's"
             )
         if self.ties:
-            named = "; ".join(pose.reported() for pose in (self.best, *self.ties))
+            named = "; ".join(pose.describe_orientation() for pose in (self.best, *self.ties))
             return (
                 f"the orientation is ambiguous: {named} explain the lowest orders equally well; "
                 "state [slopes] orientation, or measure more of the low modes"
@@ -137,9 +137,9 @@ def check_stated_orientation(stated: Pose, found: Pose) -> str:
         return ""
     told = (
         f"with {format_setting(stated.slopes)} the lowest orders correlate with the model by "
-        f"{stated.correlation:.2f}, with {found.reported()} by {found.correlation:.2f}"
+        f"{stated.correlation:.2f}, with {found.describe_orientation()} by {found.correlation:.2f}"
     )
-    if found.mirrored is not stated.mirrored:
+    if found.is_mirrored is not stated.is_mirrored:
         return (
             f"{told}: the slopes' grid is mirrored, or the actuators' coordinates are (parity = "
             "-1) or are exchanged"
@@ -194,7 +194,7 @@ def _any_way_round(instrument: Instrument, basis: Basis, mapper: Mapper) -> Inte
     mask = rtc_valid_subapertures(instrument)
     flags = (False, True)
     turned = [
-        turned_mask(mask, Orientation(swap_xy=swap, flip_x=flip_x, flip_y=flip_y))
+        orient_mask(mask, Orientation(swap_xy=swap, flip_x=flip_x, flip_y=flip_y))
         for swap, flip_x, flip_y in product(flags, flags, flags)
     ]
     every = replace(instrument.wfs, valid_subapertures=np.any(turned, axis=0))
@@ -232,7 +232,7 @@ def _judge_classes(poses: list[Pose], nominal_rad: float | None) -> Search:
 
     def preference(pose: Pose) -> tuple[float, float]:
         if nominal_rad is not None:
-            return abs(wrapped(pose.rotation_rad - nominal_rad)), pose.n_changes
+            return abs(wrap_angle(pose.rotation_rad - nominal_rad)), pose.n_changes
         return pose.effort
 
     classes: dict[object, list[Pose]] = {}
@@ -265,7 +265,9 @@ class _Turned:
 
         # one product for all: each by itself would read the whole sensor again
         shapes = np.concatenate(list(mapper(at, ANGLES_RAD.tolist())), axis=1)
-        seen = model.seen(Misregistration(), shapes).reshape(model.n_slopes, len(ANGLES_RAD), -1)
+        seen = model.measure_signals(Misregistration(), shapes).reshape(
+            model.n_slopes, len(ANGLES_RAD), -1
+        )
         columns = np.ascontiguousarray(seen.transpose(2, 1, 0), dtype=np.float64)
         return cls(lowest=lowest, columns=columns, valid=model.valid)
 
@@ -281,7 +283,7 @@ class _Turned:
         before, at, after = np.take(correlation, [best - 1, best, best + 1], mode="wrap")
         step = vertex(before, at, after)
         angle = ANGLES_RAD[best] + step * (ANGLES_RAD[1] - ANGLES_RAD[0])
-        return Pose(slopes=slopes, rotation_rad=wrapped(float(angle)), correlation=float(at))
+        return Pose(slopes=slopes, rotation_rad=wrap_angle(float(angle)), correlation=float(at))
 
 
 POLYNOMIAL_DEGREE = 5
@@ -360,7 +362,7 @@ def low_order_of(model: InteractionModel) -> LowOrder:
     combined = combined @ (axes[kept].T / size[kept])
     if combined.shape[1] < MIN_COMBINATIONS:
         combined = np.eye(len(response))[:, :MAX_SINGLE_MODES]
-    shapes = model.basis.combined(combined / response[:, None])
+    shapes = model.basis.combine_modes(combined / response[:, None])
     return LowOrder(shapes=shapes, combinations=combined)
 
 

@@ -88,7 +88,7 @@ class LeftOver:
     slopes: NDArray[np.float32]
     """``(n_slopes, n)`` slope per metre."""
 
-    def added_to(self, linearisation: Linearisation) -> Linearisation:
+    def add_to(self, linearisation: Linearisation) -> Linearisation:
         """Return a linearisation whose matrix has it: the response as it was measured."""
         matrix = linearisation.matrix.copy()
         matrix[:, self.columns] += self.slopes
@@ -366,7 +366,7 @@ def _fit_registration(
             seen[:, usable], response[:, modes[usable]], near.derivatives[:, :, modes[usable]]
         )
         step = np.clip(step, -MAX_STEP, MAX_STEP)
-        alpha = alpha.stepped(step)
+        alpha = alpha.add_step(step)
         if np.all(np.abs(step) < SETTLED_STEP):
             break
     return alpha, near

@@ -142,8 +142,8 @@ def high_pass(delay_frames: float) -> HighPass:
     if delay_frames < MIN_DELAY_FRAMES:
         raise ModelError(
             f"passive estimate: found a delay of {delay_frames:g} frames, expected at least "
-            f"{MIN_DELAY_FRAMES}: a loop as quick answers noise before it can be told from the "
-            "response"
+            f"{MIN_DELAY_FRAMES}: a faster loop answers noise in the frames in which its "
+            "response is measured"
         )
     ahead = int(delay_frames) - 1
     turns = (np.arange(4096) + 0.5) / 8192
@@ -209,7 +209,7 @@ class Passive(PassiveSums):
         return accumulate(self, frames.moving)
 
     @override
-    def emptied(self, *, rests: bool) -> Passive:
+    def empty(self, *, rests: bool) -> Passive:
         """Return them with nothing multiplied, nor anything that waits where they rest."""
         anew = replace(self, sums=(), n_effective=0.0)
         return replace(anew, waiting=(), begun=False) if rests else anew
@@ -234,7 +234,7 @@ class Passive(PassiveSums):
         if self.delay_frames < MIN_DELAY_FRAMES:
             return (
                 f"no passive estimate: the loop's delay is {self.delay_frames:g} frames, "
-                f"{MIN_DELAY_FRAMES} are needed to tell the mirror's response from noise"
+                f"{MIN_DELAY_FRAMES} are needed to separate the response of the mirror from noise"
             )
         return None
 
@@ -484,7 +484,7 @@ def fit_matrix(
     spread = (scores @ found.shape).reshape(4, -1) @ scores.reshape(4, -1).T
     covariance = variance * normal @ spread @ normal
     return PassiveEstimate(
-        alpha=near.stepped(step),
+        alpha=near.add_step(step),
         covariance=(1.0 - CORRELATION_SHRINKAGE) * covariance
         + CORRELATION_SHRINKAGE * np.diag(np.diag(covariance)),
         optical_gain=seen.gains,

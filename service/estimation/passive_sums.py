@@ -74,7 +74,7 @@ class PassiveSums(Estimator):
         """End of exposure of the last frame; 0: none has come."""
         return 0 if self.tail is None else self.tail.next_t_ns - self.tail.dt_ns
 
-    def emptied(self, *, rests: bool) -> Self:
+    def empty(self, *, rests: bool) -> Self:
         """Return it with nothing summed; what waits is of the sums that begin, unless it rests."""
         raise NotImplementedError
 
@@ -111,10 +111,10 @@ class PassiveSums(Estimator):
         rate_hz = loop.rtc.frame_rate_hz
         if not beside or sums.tail is None:
             waiting_ns = round(sums.n_waiting * 1e9 / rate_hz)
-            return replace(sums.emptied(rests=False), since_ns_utc=now_ns - waiting_ns), sums
+            return replace(sums.empty(rests=False), since_ns_utc=now_ns - waiting_ns), sums
         rest_s = PASSIVE_INTERVAL_S * (LONG_RESTS if has_windows else RESTS)
         begun = replace(
-            sums.emptied(rests=True),
+            sums.empty(rests=True),
             from_seq=sums.tail.next_seq + round(rest_s * rate_hz),
             since_ns_utc=now_ns + round(rest_s * 1e9),
         )

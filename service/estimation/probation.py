@@ -38,7 +38,7 @@ from service.estimation.comparison import (
     Part,
     ProbationFinding,
     Verdict,
-    compared,
+    compare_telemetry,
     not_compared,
 )
 from service.estimation.description import EdgeWatch
@@ -376,7 +376,9 @@ def _judge_parts(state: Comparison, block: FrameBlock) -> Comparison:
     looked_at = state.parts[-N_RETURN_PARTS:] if state.returned else state.parts
     over = after_s >= MAX_PROBATION_S - PART_S
     decides = over or state.returned
-    found = compared(before, looked_at, modes.astype(np.intp), block.cm_id, decides=decides)
+    found = compare_telemetry(
+        before, looked_at, modes.astype(np.intp), block.cm_id, decides=decides
+    )
     waits = found.verdict is (Verdict.WORSE if state.returned else Verdict.AS_GOOD)
     if waits and not over and not (state.returned and found.lost):
         return state

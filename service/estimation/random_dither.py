@@ -173,7 +173,7 @@ class RandomDither(WindowCutter[RandomPlan, Correlations | None, Correlated]):
         return replace(done, n_pairs=done.n_pairs + len(fresh))
 
 
-def joined(one: Correlated, other: Correlated) -> Correlated:
+def join_random_windows(one: Correlated, other: Correlated) -> Correlated:
     """Return two windows of the same dither as one.
 
     Raises
@@ -331,7 +331,7 @@ def fit_random(window: Correlated, linearisation: Linearisation) -> RandomEstima
     spread = _scatter(_scores(parts, seen), normal)
     every = inverse @ spread @ inverse.T
     return RandomEstimate(
-        alpha=linearisation.stepped(step),
+        alpha=linearisation.add_step(step),
         covariance=every[:4, :4],
         with_stretches=every if len(step) > 4 else None,
         stretched=float(np.abs(step[4:]).max(initial=0.0)),

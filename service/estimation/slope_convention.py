@@ -27,11 +27,11 @@ from service.estimation.orientation import (
 )
 from service.estimation.reference import Reference
 from service.model.instrument import Instrument
-from service.model.misregistration import Misregistration, unit_like, wrapped
+from service.model.misregistration import Misregistration, unit_like, wrap_angle
 from service.model.modes import Basis
 from service.model.pupil import rtc_valid_subapertures
 from service.model.sensors.sensor import Mapper
-from service.model.slopes import FLIPS, SlopeRecipe, to_conventions, turned_mask
+from service.model.slopes import FLIPS, SlopeRecipe, orient_mask, to_conventions
 
 Array = NDArray[Any]
 
@@ -183,7 +183,7 @@ def _judge_candidates(
         return SlopeConvention(wrong="" if stated else text)
     alike = [pose for pose in poses if pose.correlation > best.correlation - MIN_CORRELATION_LEAD]
     near = [
-        pose for pose in alike if abs(wrapped(pose.rotation_rad - start_rad)) <= MAX_ROTATION_RAD
+        pose for pose in alike if abs(wrap_angle(pose.rotation_rad - start_rad)) <= MAX_ROTATION_RAD
     ]
     settings = {pose.slopes: pose.rotation_rad for pose in near}
     if reported in settings:
@@ -269,7 +269,7 @@ def _planes(rows: Array, slopes: SlopeRecipe, mask: NDArray[np.bool_]) -> Array:
     listed = to_conventions(rows.T, slopes, mask)
     n_planes = slopes.kind.n_planes
     planes = np.zeros((n_planes, *mask.shape, len(rows)), dtype=listed.dtype)
-    seen = turned_mask(mask, slopes.assumed_orientation)
+    seen = orient_mask(mask, slopes.assumed_orientation)
     planes[:, seen] = listed.reshape(n_planes, -1, len(rows))
     return planes
 

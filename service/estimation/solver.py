@@ -197,7 +197,7 @@ def approach(
     misfit, n = columns.misfit(matrix), 1
     converged = False
     for _ in range(MAX_FAR_STEPS):
-        derivatives = model.derivatives(start.moved_to(vector))
+        derivatives = model.derivatives(start.with_vector(vector))
         seen, n = columns.project(matrix, derivatives), n + 4
         if not seen.gains.any():
             break
@@ -207,7 +207,7 @@ def approach(
         converged, tried = bool(np.all(np.abs(step) < approached)), step
         for _ in range(_HALVINGS):
             if allowed(vector + tried):
-                found = model.interaction_matrix(start.moved_to(vector + tried))
+                found = model.interaction_matrix(start.with_vector(vector + tried))
                 left, n = columns.misfit(found), n + 1
                 if left <= misfit * (1.0 + 1e-9):
                     vector, matrix, misfit = vector + tried, found, left
@@ -217,7 +217,7 @@ def approach(
             break
         if converged:
             break
-    alpha = start.moved_to(vector)
+    alpha = start.with_vector(vector)
     return Approach(alpha=alpha, misfit=misfit, converged=converged, n_matrices=n)
 
 

@@ -74,7 +74,7 @@ class WindowPlan:
         place = f" at {lines[worst]}" if lines else ""
         return (
             f"mode {self.modes[worst]} carries {applied_m[worst] * 1e9:.2f} nm of dither{place}, "
-            f"{self.amplitude_m[worst] * 1e9:.2f} nm were asked for: {see}"
+            f"{self.amplitude_m[worst] * 1e9:.2f} nm were requested: {see}"
         )
 
 

@@ -150,7 +150,7 @@ def parse_alpha(text: str) -> Misregistration:
     from service.model.misregistration import PARAMETERS, Misregistration
 
     alpha = Misregistration.from_boundary(dict(zip(PARAMETERS, values[:4], strict=True)))
-    return alpha if len(values) == 4 else alpha.stretched(np.array(values[4:]))
+    return alpha if len(values) == 4 else alpha.with_anamorphosis(np.array(values[4:]))
 
 
 def numbers_in(text: str) -> list[float]:

@@ -272,7 +272,7 @@ def _write_fits(path: Path, arrays: Mapping[str, Array]) -> None:
         from astropy.io import fits  # takes long to import
     except ImportError as error:
         raise ConfigurationError(
-            f"{path}: FITS needs astropy; expected it beside pyrcal: pip install astropy"
+            f"{path}: FITS needs astropy; expected it to be installed: pip install astropy"
         ) from error
     first = fits.PrimaryHDU()
     first.header["FORMAT"] = (FORMAT, "one calibration, all its parts")

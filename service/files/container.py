@@ -192,7 +192,7 @@ def _fits(path: Path) -> Iterator[Container]:
         from astropy.io import fits  # takes long to import: who has HDF5 need not wait
     except ImportError as error:
         raise MatrixError(
-            f"{path}: a FITS file needs astropy; expected it beside pyrcal: pip install astropy"
+            f"{path}: a FITS file needs astropy; expected it to be installed: pip install astropy"
         ) from error
     with path.open("rb") as raw, warnings.catch_warnings():
         # astropy warns of a truncated file and goes on; what else it warns of does no harm

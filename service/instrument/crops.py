@@ -106,7 +106,7 @@ def _table_of(file: Section[MirrorTable], crops: NDArray[np.floating]) -> tuple[
     shape = file.said.influence_table
     if shape is None:
         raise ConfigurationError(
-            f"{file.where('influence_table')}: missing beside mirror.influence_origin"
+            f"{file.where('influence_table')}: missing; mirror.influence_origin requires it"
         )
     if not np.isfinite(crops).all():
         refuse(file.where("influence_functions"), "a height that is not finite", "numbers alone")

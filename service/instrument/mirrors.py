@@ -113,11 +113,15 @@ def _check_keys(file: MirrorSection) -> None:
         expected = f"one of {', '.join(_KINDS)}"
         refuse(f"{file.path}: mirror", " and ".join(kinds) or "none of them", expected)
     for key in sorted(_FOREIGN[kinds[0]] & given):
-        raise ConfigurationError(f"{file.where(key)}: has no meaning beside mirror.{kinds[0]}")
+        raise ConfigurationError(
+            f"{file.where(key)}: has no effect together with mirror.{kinds[0]}; remove it"
+        )
     if table.mode_to_actuator is not None and "basis" in given:
-        refuse(file.where("basis"), "it beside mirror.mode_to_actuator", "only one of the two")
+        refuse(
+            file.where("basis"), "it together with mirror.mode_to_actuator", "only one of the two"
+        )
     if "modes_kind" in given and table.layout is not None and table.mode_to_actuator is None:
-        refuse(file.where("modes_kind"), "it", "it beside modes of one's own only")
+        refuse(file.where("modes_kind"), "it", "it only with own modes")
 
 
 def _mount(table: MirrorTable) -> dict[str, Any]:
@@ -245,7 +249,9 @@ def _listed_rings(file: MirrorSection) -> NDArray[np.float64]:
             f"one for each of the {len(numbers)} rings of ring_actuators",
         )
     for key in sorted({"first_ring", "last_ring"} & file.given):
-        raise ConfigurationError(f"{file.where(key)}: has no meaning beside mirror.ring_actuators")
+        raise ConfigurationError(
+            f"{file.where(key)}: has no effect together with mirror.ring_actuators; remove it"
+        )
     _check_number(sum(numbers), f"{file.path}: mirror")
     return np.concatenate([ring_of(n, radius) for n, radius in zip(numbers, radii_m, strict=True)])
 

@@ -34,7 +34,7 @@ def read_pupil(file: Section[AboutTable], subaperture_m: float) -> PupilMap | No
         missing, other = ("spiders_m", "spiders_deg")
         if about.spiders_m is not None:
             missing, other = other, missing
-        raise ConfigurationError(f"{file.where(missing)}: missing beside instrument.{other}")
+        raise ConfigurationError(f"{file.where(missing)}: missing; instrument.{other} requires it")
     if about.pupil is None:
         if about.pupil_pitch_m is not None:
             raise ConfigurationError(
@@ -44,7 +44,7 @@ def read_pupil(file: Section[AboutTable], subaperture_m: float) -> PupilMap | No
     for key in ("obscuration_ratio", "spiders_m"):
         if key in file.given:
             raise ConfigurationError(
-                f"{file.where(key)}: has no meaning beside instrument.pupil, whose map has it"
+                f"{file.where(key)}: has no effect together with instrument.pupil; remove it"
             )
     return _checked(file, subaperture_m)
 
@@ -78,7 +78,7 @@ def _checked(file: Section[AboutTable], subaperture_m: float) -> PupilMap:
         if abs(aside_m) > _OFF_CENTRE * diameter_m:
             refuse(
                 where,
-                f"light {aside_m:+.3g} m beside the middle of the array along {name}",
+                f"light {aside_m:+.3g} m from the centre of the array along {name}",
                 "a map that is centred on the pupil",
             )
     return PupilMap(lit=lit, pitch_m=pitch_m)

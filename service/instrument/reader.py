@@ -124,8 +124,8 @@ def _in_first_mode(
         return instrument
     if instrument.config_id is not None:
         raise ConfigurationError(
-            f"{file.path}: instrument.config_id: has no meaning beside [[wfs.mode]], each of which "
-            "has its own: remove one of the two"
+            f"{file.path}: instrument.config_id: has no effect together with [[wfs.mode]], each "
+            "of which has its own: remove one of the two"
         )
     whole = replace(
         instrument,
@@ -171,7 +171,7 @@ def _assumed(
 ) -> Iterator[str]:
     """Yield what the file does not say, and what is taken instead."""
     wfs = said.section(said.kind.table)
-    for key, text in said.kind.assumed(wfs.said, wfs.given):
+    for key, text in said.kind.list_assumptions(wfs.said, wfs.given):
         yield f"{wfs.where(key)}: {text}"
     values = {f"wfs.{key}": getattr(sensor, key, None) for key in said.kind.unknown}
     values["mirror.coupling"] = mirror.shape.coupling if isinstance(mirror, Mirror) else None
@@ -200,7 +200,7 @@ def _modes(file: schema.Section[KarhunenLoeve], mirror: Mirror | TabulatedModes)
     where, own, table = file.where("n_modes"), own_modes(mirror), file.said
     if own is not None:
         if "n_modes" in file.given:
-            refuse(where, f"it beside a basis of its own {own} modes", "it for KL modes only")
+            refuse(where, f"it together with an own basis of {own} modes", "it for KL modes only")
         return replace(table, n_modes=own)
     n_max = len(mirror.positions_m) - 1 if isinstance(mirror, Mirror) else 0
     if "n_modes" not in file.given:
@@ -223,12 +223,12 @@ def _slopes(
         refuse(file.where("kind"), f"{table.kind} of a {sensor.name}", " or ".join(sensor.signals))
     if not sensor.normalised and "normalisation" in file.given:
         raise ConfigurationError(
-            f'{file.where("normalisation")}: has no meaning beside wfs.kind = "{sensor.name}"'
+            f'{file.where("normalisation")}: has no effect with kind = "{sensor.name}"; remove it'
         )
     if has_frames and "order" in file.given:
         raise ConfigurationError(
-            f'{file.where("order")}: has no meaning beside wfs.input = "frames", '
-            "whose slopes are made here"
+            f'{file.where("order")}: has no effect with wfs.input = "frames", '
+            "whose slopes are computed by the service; remove it"
         )
     orientation = None
     if table.orientation is not None:
@@ -238,7 +238,7 @@ def _slopes(
     orders = table.kind.orders
     order = table.order or orders[0]
     if order not in orders:
-        refuse(file.where("order"), f'{order} beside kind = "{table.kind}"', " or ".join(orders))
+        refuse(file.where("order"), f'{order} with kind = "{table.kind}"', " or ".join(orders))
     return SlopeRecipe(order=order, orientation=orientation, normalisation=table.normalisation)
 
 
@@ -257,13 +257,13 @@ def _loop(file: schema.Section[LoopFacts], n_modes: int) -> LoopFacts | None:
 
 def _sensor(file: schema.Section[SensorTable], kind: SensorKind, pupil: Pupil) -> SensorDescription:
     with schema.refused_at(file.path, file.name):
-        sensor = kind.described(file.said, file.given)
+        sensor = kind.read_sensor(file.said, file.given)
         kind.check(sensor, pupil.subaperture_m)
     if file.said.valid_subapertures == "auto":
         return sensor
     if "flux_threshold" in file.given:
         raise ConfigurationError(
-            f"{file.where('flux_threshold')}: has no meaning beside a mask file "
+            f"{file.where('flux_threshold')}: has no effect together with a mask file "
             "(wfs.valid_subapertures): remove one of the two"
         )
     where = file.where("valid_subapertures")

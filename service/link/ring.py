@@ -97,7 +97,7 @@ class FrameRing:
         if ahead > far:
             return LEAP, (
                 f"seq0 leaps from {self._head} to {header.seq0} in session {self.session}: it is "
-                f"believed when {LEAP_CONFIRMATIONS} more batches confirm it"
+                f"accepted when {LEAP_CONFIRMATIONS} more batches confirm it"
             )
         old = header.seq0 + header.n <= self._head
         # A late frame has an old number and an old time. A reused number with a new time is an

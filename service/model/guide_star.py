@@ -31,7 +31,7 @@ class GuideStar:
     height_m: float = inf
     """Height of a laser guide star along the line of sight, metres; infinite for a natural star."""
 
-    def seen(self, altitude_m: float) -> Similarity:
+    def project_plane(self, altitude_m: float) -> Similarity:
         """Return where points of a plane at this altitude are seen on the pupil, metres.
 
         Raises

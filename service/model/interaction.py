@@ -22,7 +22,7 @@ from service.model.arrays import NUMPY, Arrays
 from service.model.instrument import Instrument
 from service.model.kinds import Stop
 from service.model.local import Drawing, LocalShapes, Patch, Shapes, beside, tiles_of
-from service.model.misregistration import Misregistration, rotation, stretching
+from service.model.misregistration import Misregistration, rotation, stretch_matrix
 from service.model.modes import Basis, local_of
 from service.model.pupil import Illumination, instrument_pupil
 from service.model.sensors.kind import WorkingPoint
@@ -112,7 +112,7 @@ class Linearisation:
         moved += self.matrix
         return np.asarray(moved)
 
-    def stepped(self, step: Array) -> Misregistration:
+    def add_step(self, step: Array) -> Misregistration:
         """Return the registration one ``step`` ``(4,)`` or ``(6,)`` from ``alpha``.
 
         Raises
@@ -120,13 +120,13 @@ class Linearisation:
         numpy.linalg.LinAlgError
             If the step leads to a singular stretch: the fit did not determine it.
         """
-        moved = self.alpha.stepped(step[:4])
+        moved = self.alpha.add_step(step[:4])
         if len(step) == 4:
             return moved
         stretches = self.alpha.stretches + step[4:]
         if np.any(np.abs(stretches) > LARGEST_STRETCH):
             raise np.linalg.LinAlgError(f"an anamorphosis of {np.abs(stretches).max():.2g}")
-        return moved.stretched(stretches)
+        return moved.with_anamorphosis(stretches)
 
 
 class InteractionModel:
@@ -222,12 +222,12 @@ class InteractionModel:
         ----------
         Heritier et al. 2018, equation 1: D = M_WFS M_DM.
         """
-        return self._as_listed(self.seen(alpha, self._rendered(alpha)))
+        return self._as_listed(self.measure_signals(alpha, self._render_modes(alpha)))
 
     def derivatives(self, alpha: Misregistration) -> Array:
         """Return dD/dα ``(4, n_slopes, n_modes)``: per subaperture, radian, magnification."""
         if self.instrument.stop is Stop.TELESCOPE:
-            rates = self._seen_together(alpha, self._rates_of_modes(alpha))
+            rates = self._measure_shapes(alpha, self._rates_of_modes(alpha))
         else:
             _, *rates = self._with_rates(alpha)
         return np.stack([self._as_listed(rate) for rate in rates])
@@ -240,10 +240,10 @@ class InteractionModel:
         """
         turn = rotation(alpha.rotation_rad)
         stretches = self.instrument.with_anamorphosis(alpha).stretches
-        back = np.linalg.inv(stretching(stretches)) @ turn
+        back = np.linalg.inv(stretch_matrix(stretches)) @ turn
         along, askew = -turn.T * [1.0, -1.0] @ back, -turn.T[:, ::-1] @ back
-        moved = [self._moved(alpha, partial(_stretching, by=by)) for by in (along, askew)]
-        rates = self._seen_together(alpha, moved)
+        moved = [self._move_modes(alpha, partial(_stretch_rate, by=by)) for by in (along, askew)]
+        rates = self._measure_shapes(alpha, moved)
         return np.stack([self._as_listed(rate) for rate in rates])
 
     def image_derivatives(self, alpha: Misregistration) -> Array:
@@ -255,7 +255,7 @@ class InteractionModel:
         response = self._at(self._image_shift(alpha))
         if not isinstance(response, SeveralImages):
             return np.empty((0, self.n_slopes, self.basis.n_modes))
-        rates = response.image_rates(self._rendered(alpha))
+        rates = response.image_rates(self._render_modes(alpha))
         return np.stack([self._as_listed(rate) for rate in rates])
 
     def width_derivative(self, alpha: Misregistration) -> Array:
@@ -264,7 +264,7 @@ class InteractionModel:
         ``(n_slopes, n_modes)``; the strokes of the actuators stay.
         """
         shapes = self._by_rows(self.basis.render_wider, self._mirror_points(alpha))
-        return self.seen(alpha, shapes)
+        return self.measure_signals(alpha, shapes)
 
     def linearise(self, alpha: Misregistration) -> Linearisation:
         """Return D(α) and its derivatives together, by an anamorphosis where it is followed."""
@@ -292,7 +292,7 @@ class InteractionModel:
         shape = np.ones(self.n_slopes) if self.noise_shape is None else self.noise_shape
         return noise * self.instrument.slopes.kind.noise * shape
 
-    def seen(self, alpha: Misregistration, shapes: Shapes) -> Array:
+    def measure_signals(self, alpha: Misregistration, shapes: Shapes) -> Array:
         """Return the signals ``(n_slopes, n_shapes)`` of shapes ``(n_points, n_shapes)``, metres.
 
         In the axes of conventions.md, at the points of ``pupil``.
@@ -336,11 +336,11 @@ class InteractionModel:
         beside = np.array(self._image_shift(alpha)) - alpha.vector[:2]
         return self.instrument.with_anamorphosis(alpha).on_mirror(points + beside)
 
-    def _rendered(self, alpha: Misregistration) -> Shapes:
+    def _render_modes(self, alpha: Misregistration) -> Shapes:
         shift = self._image_shift(alpha)
         moved = alpha.vector - np.array([*shift, 0.0, 0.0])
         stretches = self.instrument.with_anamorphosis(alpha).stretches
-        return self._modes.get((*moved, *stretches), lambda: self._moved(alpha, None))
+        return self._modes.get((*moved, *stretches), lambda: self._move_modes(alpha, None))
 
     def _as_listed(self, rows: Array) -> Array:
         """Return rows ``(n_slopes, ...)`` in the order and signs that this model's caller uses."""
@@ -348,10 +348,10 @@ class InteractionModel:
 
     def _with_rates(self, alpha: Misregistration) -> list[Array]:
         """Return D and its four derivatives."""
-        rendered, rates = self._rendered(alpha), self._rates_of_modes(alpha)
+        rendered, rates = self._render_modes(alpha), self._rates_of_modes(alpha)
         if self.instrument.stop is Stop.TELESCOPE:
-            return self._seen_together(alpha, [rendered, *rates])
-        turned = self._seen_together(alpha, rates)
+            return self._measure_shapes(alpha, [rendered, *rates])
+        turned = self._measure_shapes(alpha, rates)
         return [*self._at(self._image_shift(alpha)).with_shift_rates(rendered), *turned]
 
     def _rates_of_modes(self, alpha: Misregistration) -> list[Shapes]:
@@ -359,18 +359,18 @@ class InteractionModel:
 
         With the mirror as stop a shift does not: it moves the pupil's images.
         """
-        ways: list[Way] = [_turning, partial(_growing, magnification=alpha.magnification)]
+        ways: list[Way] = [_rotation_rate, partial(_scale_rate, magnification=alpha.magnification)]
         if self.instrument.stop is Stop.TELESCOPE:
             steps = -self.instrument.with_anamorphosis(alpha).on_mirror(np.eye(2))
-            ways[:0] = [partial(_shifting, step=step) for step in steps]
-        if len(ways) > _AXES and isinstance(self._rendered(alpha), np.ndarray):
+            ways[:0] = [partial(_shift_rate, step=step) for step in steps]
+        if len(ways) > _AXES and isinstance(self._render_modes(alpha), np.ndarray):
             return self._along(alpha, ways)
-        return [self._moved(alpha, way) for way in ways]
+        return [self._move_modes(alpha, way) for way in ways]
 
     def _along(self, alpha: Misregistration, ways: list[Way]) -> list[Shapes]:
         """Return the rates of modes that are arrays along several ways, from their gradient."""
-        steps = [partial(_shifting, step=step) for step in np.eye(_AXES)]
-        along_x, along_y = (self._moved(alpha, step) for step in steps)
+        steps = [partial(_shift_rate, step=step) for step in np.eye(_AXES)]
+        along_x, along_y = (self._move_modes(alpha, step) for step in steps)
         points = self._mirror_points(alpha)
         found: list[Shapes] = []
         for way in ways:
@@ -378,13 +378,13 @@ class InteractionModel:
             found.append(along_x * x[:, None] + along_y * y[:, None])
         return found
 
-    def _seen_together(self, alpha: Misregistration, shapes: list[Shapes]) -> list[Array]:
+    def _measure_shapes(self, alpha: Misregistration, shapes: list[Shapes]) -> list[Array]:
         """Return the signals of each of some shapes, with one response for all if none is kept."""
         if self.sensor.keeps_gradient:
-            return [self.seen(alpha, one) for one in shapes]
-        return np.split(self.seen(alpha, beside(shapes)), len(shapes), axis=1)
+            return [self.measure_signals(alpha, one) for one in shapes]
+        return np.split(self.measure_signals(alpha, beside(shapes)), len(shapes), axis=1)
 
-    def _moved(self, alpha: Misregistration, way: Way | None) -> Shapes:
+    def _move_modes(self, alpha: Misregistration, way: Way | None) -> Shapes:
         """Return the modes where α puts them or, with a way, their rates along it."""
         if self._tiles:
             return self._by_tiles(alpha, way)
@@ -433,22 +433,22 @@ def _made_again(model_of: Callable[[Basis], InteractionModel], basis: Basis) -> 
 
 
 def _drawn(model: InteractionModel, *, alpha: Misregistration, way: Way | None) -> Shapes:
-    return model._moved(alpha, way)  # noqa: SLF001 - its own, in another process
+    return model._move_modes(alpha, way)  # noqa: SLF001 - its own, in another process
 
 
-def _turning(at: Array) -> Array:
+def _rotation_rate(at: Array) -> Array:
     return at[:, ::-1] * [1.0, -1.0]
 
 
-def _growing(at: Array, *, magnification: float) -> Array:
+def _scale_rate(at: Array, *, magnification: float) -> Array:
     return -at / magnification
 
 
-def _shifting(at: Array, *, step: Array) -> Array:
+def _shift_rate(at: Array, *, step: Array) -> Array:
     return np.broadcast_to(step, at.shape)
 
 
-def _stretching(at: Array, *, by: Array) -> Array:
+def _stretch_rate(at: Array, *, by: Array) -> Array:
     return at @ by
 
 
@@ -488,7 +488,7 @@ class RtcInteractionModel(InteractionModel):
     @override
     def _as_listed(self, rows: Array) -> Array:
         """Return rows as the RTC lists slopes, columns as its modes answer."""
-        listed = self._listed(rows)
+        listed = self._sort_rows(rows)
         if self._mode_response is None:
             return listed
         return np.asarray(listed * self._mode_response.astype(listed.dtype))
@@ -496,16 +496,16 @@ class RtcInteractionModel(InteractionModel):
     @override
     def unknown_rows(self, alpha: Misregistration) -> NDArray[np.bool_]:
         """Return which of the RTC's slopes are near unknown surface, ``(n_slopes,)``."""
-        marks = self._listed(super().unknown_rows(alpha).astype(np.float32))
+        marks = self._sort_rows(super().unknown_rows(alpha).astype(np.float32))
         return np.asarray(marks != 0.0)
 
     @override
     @cached_property
     def noise_shape(self) -> NDArray[np.float64] | None:
         shape = kind_of(self.instrument).noise_shape(self.instrument)
-        return None if shape is None else np.abs(self._listed(shape))
+        return None if shape is None else np.abs(self._sort_rows(shape))
 
-    def _listed(self, rows: Array) -> Array:
+    def _sort_rows(self, rows: Array) -> Array:
         recipe = self.instrument.slopes
         mask = rtc_mask(self.valid, recipe.assumed_orientation)
         return to_rtc(rows, recipe, mask)

@@ -164,9 +164,9 @@ def _diagonalise(
             (one, parity, mode) for one, mode in zip(variance[n_out:], strokes.T, strict=True)
         ]
     found.sort(key=lambda mode: -mode[0])
-    ordered = _even_before_odd(found)[:n_modes]
+    ordered = _sort_even_first(found)[:n_modes]
     if len(ordered) < n_modes:
-        raise ModelError(f"modes: the mirror has {len(ordered)} modes, {n_modes} were asked for")
+        raise ModelError(f"modes: the mirror has {len(ordered)} modes, {n_modes} were requested")
     return np.column_stack([mode[2] for mode in ordered]), np.array([mode[0] for mode in ordered])
 
 
@@ -177,7 +177,7 @@ def _without(covariance: Array, directions: Array) -> Array:
     return np.asarray(covariance - along @ directions.T - directions @ along.T + both)
 
 
-def _even_before_odd(found: list[tuple[float, int, Array]]) -> list[tuple[float, int, Array]]:
+def _sort_even_first(found: list[tuple[float, int, Array]]) -> list[tuple[float, int, Array]]:
     """Sort pairs of equal variance, even modes first; otherwise rounding would decide."""
     ordered: list[tuple[float, int, Array]] = []
     start = 0

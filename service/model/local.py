@@ -118,7 +118,7 @@ class LocalShapes:
     def array(self) -> Array:
         """Return the shapes ``(n_points, n_shapes)``."""
         if self.combination is None or self.n_layers > 1:
-            return np.asarray(self.combined(self.sparse()))
+            return np.asarray(self.combine_functions(self.sparse()))
         weights = [patch.weights.dtype for patch in self.patches]
         found = np.zeros(self.shape, np.result_type(self.combination, *weights))
         for patch in self.patches:
@@ -143,19 +143,19 @@ class LocalShapes:
     def __rmatmul__(self, rows: Any) -> Array:  # noqa: ANN401 - scipy has no types
         """Return ``rows`` times the shapes, ``(n_rows, n_shapes)``."""
         if scipy.sparse.issparse(rows):
-            return self.combined(rows @ self.sparse())
+            return self.combine_functions(rows @ self.sparse())
         by_function = np.zeros((self.n_all_functions, len(rows)), rows.dtype)
         for patch in self.patches:
             heights = patch.weights[patch.tile.lit]
             by_function[patch.functions] += heights.T @ rows[:, patch.tile.places].T
-        return self.combined(by_function.T)
+        return self.combine_functions(by_function.T)
 
     @property
     def n_all_functions(self) -> int:
         """Functions of all layers."""
         return self.n_layers * self.n_functions
 
-    def combined(self, by_function: Any) -> Array:  # noqa: ANN401 - scipy has no types
+    def combine_functions(self, by_function: Any) -> Array:  # noqa: ANN401 - scipy has no types
         """Return what is known of the functions, ``(n_rows, n_all_functions)``, of the shapes."""
         known = by_function.toarray() if scipy.sparse.issparse(by_function) else by_function
         if self.combination is None:

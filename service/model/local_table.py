@@ -19,8 +19,8 @@ from service.errors import ModelError
 from service.model.instrument import Instrument, LocalFunctions, TabulatedModes
 from service.model.local import LocalShapes, Patch, tiles_of
 from service.model.pupil import instrument_pupil
-from service.model.tabulated import TabulatedBasis, continuation, margin_of, padded
-from service.model.turbulence import SAMPLING, expected_variance, local_statistics
+from service.model.tabulated import TabulatedBasis, continuation, margin_of, pad_mask
+from service.model.turbulence import SAMPLING, local_statistics, predict_variance
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -43,7 +43,7 @@ class LocalTable(TabulatedBasis):
     def variance_m2(self) -> Array:
         strokes = np.asarray(self.coefficients, np.float64)
         gram, covariance = local_statistics(self.instrument, self._on_pupil())
-        return expected_variance(strokes.T @ gram @ strokes, strokes.T @ covariance @ strokes)
+        return predict_variance(strokes.T @ gram @ strokes, strokes.T @ covariance @ strokes)
 
     @cached_property
     def in_single(self) -> LocalTable:
@@ -63,7 +63,7 @@ class LocalTable(TabulatedBasis):
         return near.astype(np.intp), np.asarray(found[:, near].toarray())
 
     @override
-    def _combined(self, splines: Any) -> Array:
+    def _combine_splines(self, splines: Any) -> Array:
         return np.asarray((splines @ self.functions) @ self.coefficients)
 
     def _on_pupil(self) -> LocalShapes:
@@ -88,7 +88,7 @@ def local_table(instrument: Instrument, table: TabulatedModes) -> LocalTable:
     if local is None:
         raise ModelError("modes: found a table of modes; expected functions that end")
     step, margin = margin_of(instrument, table)
-    known = padded(table.known, margin)
+    known = pad_mask(table.known, margin)
     samples = _continue_samples(
         _place_samples(local, table.known.shape, margin, known.shape), known
     )

@@ -96,14 +96,14 @@ def _near(instrument: Instrument) -> float:
         n_functions, n_samples = mirror.local.n_functions, len(mirror.local.heights)
         reach = step * (float(np.sqrt(n_samples / n_functions / np.pi)) + 4.0)
         each = np.pi / 4 * instrument.wfs.pupil_diameter**2 / n_functions
-        return float(min(n_functions, _reached(reach) / each))
+        return float(min(n_functions, _area_within(reach) / each))
     surface = mirror_surface(mirror, instrument.subaperture_m)
     n_actuators = float(len(mirror.positions_m))
     if not isinstance(surface, Gaussian):
         return n_actuators
-    return float(min(n_actuators, _reached(surface.reach) / surface.pitch**2))
+    return float(min(n_actuators, _area_within(surface.reach) / surface.pitch**2))
 
 
-def _reached(reach: float) -> float:
+def _area_within(reach: float) -> float:
     """Return the area within this distance of a tile, subapertures."""
     return float(TILE_SUBAP**2 + 4 * TILE_SUBAP * reach + np.pi * reach**2)

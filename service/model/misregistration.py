@@ -31,7 +31,7 @@ def unit_like(too_large: float, within_decades: float) -> str:
     return unit if abs(METRE_DECADES[unit] - decades) < within_decades else ""
 
 
-def wrapped(angle_rad: float) -> float:
+def wrap_angle(angle_rad: float) -> float:
     """Return the angle in -pi..pi."""
     return float((angle_rad + np.pi) % (2 * np.pi) - np.pi)
 
@@ -104,15 +104,15 @@ class Misregistration:
         x, y, turned, size = map(float, vector)
         return cls(shift_x_subap=x, shift_y_subap=y, rotation_rad=turned, magnification=size)
 
-    def moved_to(self, vector: NDArray[np.float64]) -> Self:
+    def with_vector(self, vector: NDArray[np.float64]) -> Self:
         """Return the registration with another 4-vector; the anamorphosis stays."""
         return replace(self.from_vector(vector), anamorphosis=self.anamorphosis)
 
-    def stepped(self, step: NDArray[np.float64]) -> Self:
+    def add_step(self, step: NDArray[np.float64]) -> Self:
         """Return the registration a step ``(4,)`` further, numeric units."""
-        return self.moved_to(self.vector + step)
+        return self.with_vector(self.vector + step)
 
-    def stretched(self, stretches: NDArray[np.float64]) -> Self:
+    def with_anamorphosis(self, stretches: NDArray[np.float64]) -> Self:
         """Return the registration with another anamorphosis ``(2,)``."""
         return replace(self, anamorphosis=(float(stretches[0]), float(stretches[1])))
 
@@ -129,12 +129,12 @@ class Misregistration:
     def image(self) -> NDArray[np.float64]:
         """``(2, 2)`` from a point of the mirror to the sensor, before the shift."""
         turned = self.magnification * rotation(self.rotation_rad)
-        return turned if self.anamorphosis is None else stretching(self.stretches) @ turned
+        return turned if self.anamorphosis is None else stretch_matrix(self.stretches) @ turned
 
     def on_mirror(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return mirror positions of sensor points ``(n_points, 2)``, without the shift."""
         if self.anamorphosis is not None:
-            points = points @ np.linalg.inv(stretching(self.stretches))
+            points = points @ np.linalg.inv(stretch_matrix(self.stretches))
         return points @ rotation(self.rotation_rad) / self.magnification
 
     @classmethod
@@ -179,7 +179,7 @@ def at_boundary(four: NDArray[np.float64]) -> dict[str, float]:
     return dict(zip(PARAMETERS, (four * BOUNDARY_SCALE).tolist(), strict=True))
 
 
-def stretching(stretches: NDArray[np.float64]) -> NDArray[np.float64]:
+def stretch_matrix(stretches: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return S of an anamorphosis ``(2,)``: symmetric, so that rows are stretched by it, too."""
     along, askew = stretches
     return np.array([[1.0 + along, askew], [askew, 1.0 - along]])

@@ -18,8 +18,8 @@ from service.model.karhunen_loeve import karhunen_loeve, surface_statistics
 from service.model.kinds import BasisKind
 from service.model.local_table import LocalTable, local_table
 from service.model.surface import Gaussian, Surface, mirror_surface
-from service.model.tabulated import TabulatedBasis, smoothed, tabulated_basis
-from service.model.turbulence import expected_variance
+from service.model.tabulated import TabulatedBasis, build_table_basis, smooth_shapes
+from service.model.turbulence import predict_variance
 
 Array = NDArray[np.float64]
 
@@ -75,7 +75,7 @@ class ModalBasis:
         """
         if isinstance(self.surface, Gaussian):
             return self.surface.wider(points * [1.0, self.y_sign]) @ self.coefficients
-        return smoothed(self.render, points)
+        return smooth_shapes(self.render, points)
 
     @cached_property
     def _plates(self) -> PlateSum | None:
@@ -140,7 +140,7 @@ class ModalBasis:
             variance_m2=self.variance_m2[indices],
         )
 
-    def combined(self, weights: Array) -> ModalBasis:
+    def combine_modes(self, weights: Array) -> ModalBasis:
         """Return a basis of combinations of the modes, ``weights`` ``(n_modes, n_combined)``.
 
         Modes are taken to vary apart from one another.
@@ -177,7 +177,7 @@ def modal_basis(instrument: Instrument) -> Basis:
     finest = instrument.finest
     mirror = finest.mirror
     if isinstance(mirror, TabulatedModes):
-        made = tabulated_basis if mirror.local is None else local_table
+        made = build_table_basis if mirror.local is None else local_table
         return in_subapertures(made(finest, mirror), instrument)
     return in_subapertures(analytic_basis(finest), instrument)
 
@@ -207,15 +207,15 @@ def analytic_basis(instrument: Instrument) -> ModalBasis:
     """
     mirror = instrument.analytic_mirror
     if mirror.mode_to_actuator is not None:
-        return _given_basis(instrument, mirror, mirror.mode_to_actuator)
+        return _build_given_basis(instrument, mirror, mirror.mode_to_actuator)
     match mirror.basis:
         case BasisKind.ZONAL:
-            return _given_basis(instrument, mirror, np.eye(len(mirror.positions_m)))
+            return _build_given_basis(instrument, mirror, np.eye(len(mirror.positions_m)))
         case BasisKind.KARHUNEN_LOEVE:
             return karhunen_loeve_basis(instrument)
 
 
-def _given_basis(instrument: Instrument, mirror: Mirror, strokes: Array) -> ModalBasis:
+def _build_given_basis(instrument: Instrument, mirror: Mirror, strokes: Array) -> ModalBasis:
     """Return the modes with these actuator strokes ``(n_actuators, n_modes)``, as they are."""
     surface = mirror_surface(mirror, instrument.subaperture_m)
     gram, covariance = surface_statistics(instrument, surface)
@@ -223,7 +223,7 @@ def _given_basis(instrument: Instrument, mirror: Mirror, strokes: Array) -> Moda
         surface=surface,
         mode_to_actuator=strokes,
         coefficients=surface.coefficients(strokes),
-        variance_m2=expected_variance(strokes.T @ gram @ strokes, strokes.T @ covariance @ strokes),
+        variance_m2=predict_variance(strokes.T @ gram @ strokes, strokes.T @ covariance @ strokes),
         y_sign=mirror.y_sign,
     )
 

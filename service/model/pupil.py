@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.model.instrument import Instrument, PupilMap
-from service.model.slopes import rtc_mask, turned_mask
+from service.model.slopes import orient_mask, rtc_mask
 
 _EDGE_NODES = 32
 """Gauss-Legendre nodes across a cell: area fractions good to about 1e-4."""
@@ -225,7 +225,7 @@ def valid_subapertures(instrument: Instrument) -> NDArray[np.bool_]:
     own = instrument.wfs.valid_subapertures
     if own is None:
         return lit_subapertures(instrument)
-    return turned_mask(own, instrument.slopes.assumed_orientation)
+    return orient_mask(own, instrument.slopes.assumed_orientation)
 
 
 def rtc_valid_subapertures(instrument: Instrument) -> NDArray[np.bool_]:

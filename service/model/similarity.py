@@ -45,7 +45,7 @@ class Similarity:
         """The map back."""
         return Similarity(turn=1.0 / self.turn, shift=-self.shift / self.turn)
 
-    def scaled(self, unit: float) -> Similarity:
+    def scale_unit(self, unit: float) -> Similarity:
         """Return the same map of lengths in another unit, ``unit`` of the old ones long."""
         return Similarity(turn=self.turn, shift=self.shift / unit)
 

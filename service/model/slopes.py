@@ -125,7 +125,7 @@ def to_conventions(
         How it lists them.
     mask
         ``(n, n)`` [y, x] valid subapertures in the RTC's own axes. The result is listed by
-        ``turned_mask(mask, recipe.assumed_orientation)``.
+        ``orient_mask(mask, recipe.assumed_orientation)``.
 
     Raises
     ------
@@ -154,7 +154,7 @@ def to_rtc(
     return listed
 
 
-def turned_mask(mask: NDArray[Scalar], orientation: Orientation) -> NDArray[Scalar]:
+def orient_mask(mask: NDArray[Scalar], orientation: Orientation) -> NDArray[Scalar]:
     """Return a map ``(n, n)`` [y, x] in the RTC's axes, in those of conventions.md."""
     flipped = _flip(mask, orientation)
     return flipped.T if orientation.swap_xy else flipped
@@ -183,8 +183,8 @@ def _list_signals(
         )
     planes = np.full((n_planes, *mask.shape), -1, dtype=np.intp)
     planes[:, mask] = _places(order, mask)
-    valid = turned_mask(mask, orientation)
-    turned = np.array([turned_mask(plane, orientation)[valid] for plane in planes])
+    valid = orient_mask(mask, orientation)
+    turned = np.array([orient_mask(plane, orientation)[valid] for plane in planes])
     sign_x, sign_y = orientation.sign_x, orientation.sign_y
     signs = np.array([sign_x, sign_y], np.int8) * (-1) ** np.array(
         [orientation.flip_x, orientation.flip_y]

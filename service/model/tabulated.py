@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.model.instrument import Instrument, TabulatedModes
-from service.model.turbulence import expected_variance, pupil_statistics
+from service.model.turbulence import predict_variance, pupil_statistics
 
 Array = NDArray[np.float64]
 Table = NDArray[np.floating]
@@ -68,19 +68,19 @@ class TabulatedBasis:
     @cached_property
     def variance_m2(self) -> Array:
         """``(n_modes,)`` expected variance of each mode under the turbulence, its unit squared."""
-        return expected_variance(*pupil_statistics(self.instrument, self.render))
+        return predict_variance(*pupil_statistics(self.instrument, self.render))
 
     def render(self, points: Array) -> Array:
         """Return the modes ``(n_points, n_modes)`` at mirror ``points`` ``(n_points, 2)``."""
-        return self._combined(self._splines_at(points, None))
+        return self._combine_splines(self._splines_at(points, None))
 
     def render_slope(self, points: Array, direction: Array) -> Array:
         """Return the derivative of the modes along ``direction``, ``(n_points, n_modes)``."""
-        return self._combined(self._splines_at(points, direction))
+        return self._combine_splines(self._splines_at(points, direction))
 
     def render_wider(self, points: Array) -> Array:
         """Return how the modes change when their influence functions become wider."""
-        return smoothed(self.render, points)
+        return smooth_shapes(self.render, points)
 
     def known(self, points: Array) -> NDArray[np.bool_]:
         """Return whether the table knows the surface at every point, ``(n_points,)``."""
@@ -101,7 +101,7 @@ class TabulatedBasis:
             return self
         return replace(self, coefficients=np.ascontiguousarray(self.coefficients[:, indices]))
 
-    def combined(self, weights: Array) -> TabulatedBasis:
+    def combine_modes(self, weights: Array) -> TabulatedBasis:
         """Return a basis of combinations of the modes, ``weights`` ``(n_modes, n_combined)``."""
         weights = weights.astype(self.coefficients.dtype)
         return replace(self, coefficients=self.coefficients @ weights)
@@ -142,12 +142,12 @@ class TabulatedBasis:
             shape=(n_points, self.surface_known.size),
         )
 
-    def _combined(self, splines: Any) -> Array:  # noqa: ANN401 - scipy has no types
+    def _combine_splines(self, splines: Any) -> Array:  # noqa: ANN401 - scipy has no types
         """Return the modes where the table's points weigh so much."""
         return np.asarray(splines @ self.coefficients)
 
 
-def tabulated_basis(instrument: Instrument, table: TabulatedModes) -> TabulatedBasis:
+def build_table_basis(instrument: Instrument, table: TabulatedModes) -> TabulatedBasis:
     """Return the spline through a table of modes, continued smoothly where nothing is known.
 
     Raises
@@ -158,8 +158,8 @@ def tabulated_basis(instrument: Instrument, table: TabulatedModes) -> TabulatedB
     if table.cube is None:
         raise ModelError("modes: found functions that end; expected a table of modes")
     step, margin = margin_of(instrument, table)
-    known = padded(table.known, margin)
-    samples = filled(table.cube, table.known, margin)
+    known = pad_mask(table.known, margin)
+    samples = fill_table(table.cube, table.known, margin)
     for mode in samples.T:
         mode[:] = scipy.ndimage.spline_filter(
             mode.reshape(known.shape), order=3, output=mode.dtype
@@ -190,12 +190,12 @@ def margin_of(instrument: Instrument, table: TabulatedModes) -> tuple[float, tup
     reach = (instrument.wfs.pupil_diameter / 2 + MARGIN_SUBAP) / step
     ny, nx = table.known.shape
     margin = (int(np.ceil(reach - (ny - 1) / 2)), int(np.ceil(reach - (nx - 1) / 2)))
-    if not padded(table.known, margin).any():
+    if not pad_mask(table.known, margin).any():
         raise ModelError("modes: found a table that knows nothing of the surface over the pupil")
     return step, margin
 
 
-def smoothed(render: Callable[[Array], Array], points: Array) -> Array:
+def smooth_shapes(render: Callable[[Array], Array], points: Array) -> Array:
     """Return how shapes ``(n_points, n_modes)`` change when they are smoothed a little.
 
     A Gaussian of width w that becomes wider changes by ``w²/2`` times its Laplacian, per logarithm
@@ -231,12 +231,12 @@ def known_samples(cube: Table) -> Mask:
     return np.asarray(np.isfinite(cube).all(axis=0) & ~zeros)
 
 
-def padded(mask: Mask, margin: tuple[int, int]) -> Mask:
+def pad_mask(mask: Mask, margin: tuple[int, int]) -> Mask:
     """Return the mask with ``margin`` unknown rows and columns around it; negative ones cut."""
     return np.asarray(_resize(mask[None], margin)[0])
 
 
-def filled(cube: Table, known: Mask, margin: tuple[int, int]) -> Table:
+def fill_table(cube: Table, known: Mask, margin: tuple[int, int]) -> Table:
     """Return shapes ``(ny * nx, n_modes)`` on a table with ``margin`` more rows and columns around.
 
     Unknown samples continue the surface oddly about the nearest known one, as a tangent would:
@@ -244,7 +244,7 @@ def filled(cube: Table, known: Mask, margin: tuple[int, int]) -> Table:
     """
     shapes = _resize(np.where(known, cube, cube.dtype.type(0)), margin)
     samples = np.ascontiguousarray(shapes.reshape(len(shapes), -1).T)
-    target, weights = continuation(padded(known, margin))
+    target, weights = continuation(pad_mask(known, margin))
     samples[target] = weights.astype(samples.dtype) @ samples
     return samples
 

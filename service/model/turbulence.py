@@ -144,7 +144,7 @@ class Spread:
         return np.asarray(scipy.fft.irfft(back, size, axis=1)[:, :n][self._lit])
 
 
-def expected_variance(gram: Array, covariance: Array) -> Array:
+def predict_variance(gram: Array, covariance: Array) -> Array:
     """Return the variance ``(n_shapes,)`` of each coefficient when turbulence is fitted, metres².
 
     Of statistics of the pupil. The shapes need be neither orthogonal nor independent: the fit is

@@ -331,7 +331,7 @@ def _other_version(where: str, who: str, found: object, expected: Versions | Non
         meant = ", ".join(f"{name} {here[name]}" for name in names)
         told = f"found {what}, expected {meant}"
     else:
-        told = f"found no pyrcal that can be asked for its version ({shown(str(found))})"
+        told = f"found no pyrcal that reports its version ({shown(str(found))})"
     return f"{where}: {who}: {told}; start scheduler and workers from this very installation"
 
 

@@ -94,9 +94,9 @@ class PendingWindow:
 
 def _join(one: EndedWindow, other: EndedWindow) -> EndedWindow | None:
     if isinstance(one, lockin.Spectra) and isinstance(other, lockin.Spectra):
-        return lockin.joined(one, other)
+        return lockin.join_windows(one, other)
     if isinstance(one, Correlated) and isinstance(other, Correlated) and one.is_like(other):
-        return random_dither.joined(one, other)
+        return random_dither.join_random_windows(one, other)
     return None
 
 
@@ -337,7 +337,9 @@ class NoisySums:
         total = self._total if self._id == record.id else None
         self._id = record.id
         try:
-            self._total = window if total is None else random_dither.joined(total, window)
+            self._total = (
+                window if total is None else random_dither.join_random_windows(total, window)
+            )
         except ModelError:  # the RTC has started anew: what came before is of another loop
             self._total = window
 

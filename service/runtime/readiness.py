@@ -253,9 +253,9 @@ def _for_messages(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
         yield Prerequisite(name="rtc", responsible=Responsible.RTC, text=text)
     elif link.session is None or no_status:
         text = (
-            f"its token is there, and nothing comes: send {where}/tel/frames and tel/status (after "
-            f"{FIRST_REOPENING_DELAY_S:.0f} s the link is opened anew: "
-            "a connection may be left over)"
+            f"its token is present, but no message arrives; it must send {where}/tel/frames and "
+            f"tel/status (after {FIRST_REOPENING_DELAY_S:.0f} s the service opens the link again, "
+            "in case an old connection is left)"
         )
         yield Prerequisite(name="telemetry", responsible=Responsible.RTC, text=text)
     elif link.frame_age_s is None or link.frame_age_s >= FRAMES_TIMEOUT_S:

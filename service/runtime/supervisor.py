@@ -388,7 +388,9 @@ class Supervisor:
                 self._note("link.lost", f"{error}; tried again every 5 s", Level.ALARM)
                 await asyncio.sleep(5.0)
             else:
-                text = "the RTC's token was there and nothing came: the link was opened anew"
+                text = (
+                    "the RTC's token was present and no message arrived: the link was opened again"
+                )
                 self._note("link.reopened", text, Level.WARNING)
                 return
 

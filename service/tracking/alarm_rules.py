@@ -297,7 +297,7 @@ def _own_definition(rule: Rule) -> AlarmDefinition:
     return AlarmDefinition(
         severity=rule.severity,
         means=rule.text,
-        do="see to it, or change the rule in the settings",
+        do="Remove the cause, or change the rule in the settings.",
         blocks=rule.blocks,
         because=rule.text if rule.blocks else "",
     )
@@ -317,8 +317,8 @@ def set_value(context: StepContext, command: cmd.SetValue) -> None:
     if command.name not in asked:
         near = get_close_matches(command.name, asked, n=1)
         names = ", ".join(sorted(asked)) or "none"
-        hint = f", did you mean {near[0]}?" if near else f"; asked for: {names}"
-        raise UnknownIdError(f"value {command.name}: no rule asks for it{hint}")
+        hint = f", did you mean {near[0]}?" if near else f"; expected: {names}"
+        raise UnknownIdError(f"value {command.name}: no rule uses it{hint}")
     kind, because = asked[command.name]
     if kind_of(command.value) != kind:
         found = format_value(command.value)

@@ -199,7 +199,9 @@ def follow_status(context: StepContext, rtc: Status) -> None:
     # The first loss is retried at once; an RTC that begins late needs more time.
     if context.dithers.losses:
         context.put_off(dither_s=_patience_s(context.state))
-    text = f"the RTC's status shows no {dither.id} although it was accepted: it is asked for again"
+    text = (
+        f"the RTC's status shows no {dither.id} although the RTC accepted it: it is requested again"
+    )
     _note_lost(context, dither, text)
 
 
@@ -467,7 +469,7 @@ def _take_over_played(context: StepContext, asked: Dither, shown: DitherStatus) 
         _set_policy(context, replace(context.dither_policy, loud_id=running.id, loud_text=""))
     text = (
         f"{asked.id}: the RTC plays modes {plays.modes}, {running.frequency_hz} Hz, "
-        f"{plays.amplitude_m} m from frame {running.start_seq}; asked for were modes "
+        f"{plays.amplitude_m} m from frame {running.start_seq}; requested were modes "
         f"{wanted.modes}, {asked.frequency_hz} Hz, {wanted.amplitude_m} m from {asked.start_seq}"
     )
     _set_dither(context, running)
@@ -509,9 +511,8 @@ def _note_unwanted(context: StepContext, running: str) -> None:
 
 def _raise_over_budget(context: StepContext, running: str, loud: str) -> None:
     text = (
-        f"{loud}: it was asked to stop {running}, and another is tried after "
-        f"{FAILED_DITHER_PAUSE_S:.0f} s; look "
-        "at the RTC's dither, or stop the dither to do without"
+        f"{loud}: the RTC was ordered to stop {running}, and another is tried after "
+        f"{FAILED_DITHER_PAUSE_S:.0f} s; check the dither of the RTC, or stop the dither"
     )
     _set_policy(context, replace(context.dither_policy, loud_ns_utc=context.now_ns))
     context.raise_alarm(alarms.OVER_BUDGET, text)

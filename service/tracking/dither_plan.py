@@ -143,7 +143,7 @@ def choose_next(context: StepContext, rtc: Status) -> tuple[WantedDither, Dither
     if phase is DitherPhase.ACQUIRE and not context.acquisition.under_way:
         choice = _with_others(context, rtc, choice)
         if choice.modes:
-            reason = f"{reason}; weak lines show more modes beside"
+            reason = f"{reason}; further modes are dithered weakly to be verified"
     return WantedDither(phase=phase, reason=reason, parameters=choice, next_ns_utc=next_ns), plan
 
 
@@ -296,7 +296,7 @@ def check_dithered_modes(
         return elsewhere
     if total_m(dither.request) <= AMPLITUDE_HYSTERESIS_RATIO * quiet_budget_m(rtc, policy):
         return ""
-    return "the loop controls its modes now and amplifies it: a weaker one is asked for"
+    return "the loop controls its modes now and amplifies it: a weaker one is requested"
 
 
 def window_lengths_s(policy: Policy) -> tuple[float, ...]:
@@ -484,7 +484,7 @@ def check_dither_wanted(context: StepContext, rtc: Status) -> str | None:
         return "everything is stopped"
     followed = state.dithers.dither is not None and state.dithers.dither.id == running
     if state.dithers.stopped and not followed:
-        return "the operator wants no dither"
+        return "an operator has stopped the dither"
     forbidden = not context.policy.dither_enabled
     if forbidden and state.dithers.dither is None and running.startswith(OWN_DITHER):
         return "the settings forbid a dither"

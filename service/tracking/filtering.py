@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from service.control.gains import ModeGain
 from service.estimation import kalman
 from service.estimation.estimate import DitheredEstimate, model_error
-from service.estimation.kalman import Drift, Joint, begin_joint, predicted
+from service.estimation.kalman import Drift, Joint, begin_joint, predict_state
 from service.estimation.lockin import MAX_LAG_FRAMES
 from service.estimation.random_dither import RandomEstimate
 from service.estimation.windows import OTHER_SESSION, RefusalKind, Why
@@ -196,7 +196,7 @@ def predict(context: StepContext, registration: Registration, t_ns_utc: int) -> 
     policy = context.policy
     drift = Drift(alpha_rate=policy.drift_rate, bias_memory_s=policy.bias_memory_s)
     bent = validity.flexure(registration.pointing, context.alpha.pointing, policy)
-    return predicted(joint_of(registration), drift, elapsed_ns / SECOND_NS, bent)
+    return predict_state(joint_of(registration), drift, elapsed_ns / SECOND_NS, bent)
 
 
 def predict_for(context: StepContext, registration: Registration, window: WindowEstimate) -> Joint:
@@ -228,8 +228,8 @@ def joint_of(registration: Registration) -> Joint:
 
 def alpha_of(joint: Joint, before: Misregistration) -> Misregistration:
     """Return α as filtered; an anamorphosis that the filter does not track is left as it was."""
-    alpha = before.moved_to(joint.alpha)
-    return alpha.stretched(joint.stretches) if joint.n_alpha > 4 else alpha
+    alpha = before.with_vector(joint.alpha)
+    return alpha.with_anamorphosis(joint.stretches) if joint.n_alpha > 4 else alpha
 
 
 def stretches_of(joint: Joint) -> KnownStretches | None:

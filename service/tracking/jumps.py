@@ -258,7 +258,7 @@ def to_previous_estimate(registration: Registration) -> PreviousEstimate:
 
 def sum_of(registration: Registration, joint: Joint, block: BiasBlock) -> PreviousEstimate:
     """Return the expected passive estimate: α and its bias together."""
-    sees = joint.seen(block)
+    sees = joint.observation_rows(block)
     return PreviousEstimate(
         alpha=Misregistration.from_vector(sees @ joint.mean),
         covariance=sees @ joint.covariance @ sees.T,

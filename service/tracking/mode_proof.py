@@ -465,7 +465,7 @@ def explain_uneven(context: StepContext) -> str | None:
         noun = "mode" if len(proof.uneven) == 1 else "modes"
         found.append(
             f"{noun} {format_modes(proof.uneven)} {one} the dither more than {UNEVEN_RATIO:g} "
-            "times as strongly or as weakly as the modes beside"
+            "times as strongly or as weakly as their neighbours"
         )
     return "; ".join(found) or None
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, step_text, wrapped
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, step_text, wrap_angle
 from service.tracking import events as ev
 from service.tracking import validity
 from service.tracking.alarms import Interlock
@@ -197,5 +197,5 @@ def _cross_talk(step: Array, limits: Offloading) -> Array:
 
 def _apart(alpha: Array, other: Array) -> Array:
     apart = alpha - other
-    apart[2] = wrapped(float(apart[2]))
+    apart[2] = wrap_angle(float(apart[2]))
     return np.asarray(apart)

@@ -291,7 +291,7 @@ def _gains(rtc: Status, groups: tuple[GainGroup, ...], n_modes: int) -> tuple[fl
     if rtc.loop == "open" and named < n_modes:
         raise CommandError(
             f"found gains for {named} modes; expected all {n_modes} while the loop is open, "
-            "for its status does not tell the others"
+            "whose gains its status does not report"
         )
     gains = list(extend_gains(rtc, n_modes))
     for group in groups:

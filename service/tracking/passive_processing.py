@@ -76,7 +76,7 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
     if far > jumps.MAX_PASSIVE_INNOVATION:
         _ask_for_window(context, registration, event, prior, far)
         return
-    joint = kalman.corrected(prior, measured, estimate.covariance, block)
+    joint = kalman.correct_state(prior, measured, estimate.covariance, block)
     joint = kalman.update_scatter(joint, block, far)
     registration = _registration_after_passive(context, registration, joint, event)
     validity.store_registration(context, registration)
@@ -145,8 +145,8 @@ def _show_passive_alone(context: StepContext, event: ev.PassiveFitted) -> None:
     step = event.estimate.alpha.vector - context.start_of_fits.vector
     if np.any(np.abs(step) > filtering.CAPTURE_RANGE):
         text = (
-            f"it cannot tell: {event.estimate.alpha} is too far from where its fit "
-            "begins, the nominal rotation; let the service acquire, or dither"
+            f"no estimate: {event.estimate.alpha} is too far from the start of its fit, "
+            "the nominal rotation; let the service acquire, or dither"
         )
         _show_passive(context, event, np.full(4, np.inf), np.zeros(4), text)
         return
@@ -247,7 +247,7 @@ def _ask_for_window(
     # Normally a dithered window decides within seconds, and no operator need act.
     if why_none is not None or was_doubted:
         cannot = "no window since the last disagreement" if why_none is None else why_none
-        context.raise_alarm(alarms.DISAGREES, f"{text}: {cannot}; α stands as windows have it")
+        context.raise_alarm(alarms.DISAGREES, f"{text}: {cannot}; α stays as measured by windows")
     validity.age_registration(context)
     _show_passive(context, event, event.estimate.sigma, np.zeros(4), text, consistent=False)
 

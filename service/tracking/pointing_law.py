@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.model.misregistration import Misregistration, step_text, wrapped
+from service.model.misregistration import Misregistration, step_text, wrap_angle
 from service.model.pointing_law import ANGLES, PointingLaw, Reported
 from service.tracking import events as ev
 from service.tracking.events import Event
@@ -115,7 +115,7 @@ def start_of_fit(
     now, then = state.alpha.law.nominal, law_at(state, t_ns_utc)
     if now is None or then is None:
         return alpha
-    return then if alpha is None else alpha.stepped(difference(now, then))
+    return then if alpha is None else alpha.add_step(difference(now, then))
 
 
 def registration_ahead(state: TrackerState, registration: Registration) -> Registration:
@@ -133,7 +133,7 @@ def registration_ahead(state: TrackerState, registration: Registration) -> Regis
     added = third**2 + 2.0 * sigma * third  # the root of σ² and this is σ and a third
     return replace(
         registration,
-        alpha=registration.alpha.stepped(step),
+        alpha=registration.alpha.add_step(step),
         covariance=registration.covariance + np.diag(added),
     )
 
@@ -172,13 +172,13 @@ def law_at(state: TrackerState, t_ns_utc: int) -> Misregistration | None:
         return way[min(later, len(way) - 1)][1]
     (before_ns, before), (after_ns, after) = way[later - 1], way[later]
     share = (t_ns_utc - before_ns) / (after_ns - before_ns)
-    return before.stepped(share * difference(before, after))
+    return before.add_step(share * difference(before, after))
 
 
 def difference(one: Misregistration, other: Misregistration) -> Array:
     """Return the step ``(4,)`` from one to the other, numeric units, by the shorter turn."""
     step = other.vector - one.vector
-    step[2] = wrapped(float(step[2]))
+    step[2] = wrap_angle(float(step[2]))
     return step
 
 
@@ -192,7 +192,7 @@ def _to_present(
     then = law_at(state, middle_ns)
     if now is None or then is None:
         return alpha
-    return alpha.stepped(difference(then, now))
+    return alpha.add_step(difference(then, now))
 
 
 def _nominal(context: StepContext, law: PointingLaw) -> Misregistration | str:
@@ -201,20 +201,20 @@ def _nominal(context: StepContext, law: PointingLaw) -> Misregistration | str:
     missing = sorted(law.names - reported.keys())
     if missing and context.alpha.pointing is None:
         return (
-            "the instrument file has a law of pointing, and nobody tells where the telescope "
-            "points: have the RTC's status tell it, or PUT /v1/pointing; until then α is followed "
-            "as if it stood still"
+            "the instrument file has a pointing law, but no pointing is reported; have the RTC "
+            "report it in its status, or use PUT /v1/pointing; until then α is followed without "
+            "the law"
         )
     if missing:
         names = " and ".join(missing)
         return (
-            f"the law of pointing needs {names}, which nobody tells: PUT /v1/values/{missing[0]}; "
-            "until then α is followed as if it stood still"
+            f"the pointing law needs {names}, which is not reported; use PUT /v1/values/"
+            f"{missing[0]}; until then α is followed without the law"
         )
     try:
         found = law.at(reported)
     except ModelError as error:
-        return f"the law of pointing gives no registration: {error}; mend [law], or what is told"
+        return f"the pointing law gives no registration: {error}; correct [law] or what is reported"
     modes = context.policy.sensor_modes
     scale = context.policy.alpha_scale(next(iter(modes), None), context.loop.config_id)
     return found if scale is None else Misregistration.from_vector(found.vector * scale)
@@ -259,9 +259,9 @@ def _hold(context: StepContext, before: Misregistration, now: Misregistration) -
     if leap is None or _is_far(leap.to, now, (context.now_ns - leap.worked_out_ns_utc) / SECOND_NS):
         leap = LawLeap(to=now, since_ns_utc=context.now_ns, worked_out_ns_utc=context.now_ns)
         text = (
-            f"what the law of pointing is told leapt, and would move α by "
-            f"{step_text(difference(before, now))} at once: α is let be until it has stood for "
-            f"{LEAP_CONFIRMATION_S:.0f} s; see who tells the pointing"
+            f"the pointing or values reported for the pointing law jumped, which would move α by "
+            f"{step_text(difference(before, now))} at once; α is left unchanged until they have "
+            f"been steady for {LEAP_CONFIRMATION_S:.0f} s; check the program that reports them"
         )
         _set(context, replace(law, problem=text, leap=leap))
         return
@@ -271,7 +271,7 @@ def _hold(context: StepContext, before: Misregistration, now: Misregistration) -
         return
     _set(context, replace(law, way=()))
     _carry(context, now)
-    because = "what the law of pointing is told has leapt"
+    because = "the values reported for the pointing law jumped"
     registration, t_ns = context.registration, 0 if context.rtc is None else context.rtc.t_ns
     if registration is not None:
         doubted = replace(registration, doubt=because, doubt_voids=True, suspected_jump=None)
@@ -280,7 +280,9 @@ def _hold(context: StepContext, before: Misregistration, now: Misregistration) -
         request_window(context, because)
         age_registration(context)
     void_until(context, t_ns, because, Purpose.MEASURE)
-    context.warn("law.leapt", f"{because}: α is where the law has it now, until a window tells")
+    context.warn(
+        "law.leapt", f"{because}: α follows the law from now on, until a window confirms it"
+    )
 
 
 def _carry(context: StepContext, now: Misregistration) -> None:
@@ -292,7 +294,7 @@ def _carry(context: StepContext, now: Misregistration) -> None:
             registration = moved(registration, difference(registration.nominal, now))
         store_registration(context, replace(registration, nominal=now))
     if acquisition.alpha is not None and before is not None and before != now:
-        found = acquisition.alpha.stepped(difference(before, now))
+        found = acquisition.alpha.add_step(difference(before, now))
         set_acquisition(context, replace(acquisition, alpha=found))
     state = LawState(
         nominal=now,

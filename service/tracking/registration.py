@@ -372,7 +372,7 @@ def moved(registration: Registration, step: Array) -> Registration:
     """Return what is known of α with all of it a step ``(4,)`` further, numeric units."""
     return replace(
         registration,
-        alpha=registration.alpha.stepped(step),
+        alpha=registration.alpha.add_step(step),
         previous_estimate=_previous_moved(registration.previous_estimate, step),
         suspected_jump=_moved(registration.suspected_jump, step),
         biases=tuple(
@@ -387,14 +387,14 @@ def _previous_moved(previous: PreviousEstimate | None, step: Array) -> PreviousE
         return None
     return replace(
         previous,
-        alpha=previous.alpha.stepped(step),
+        alpha=previous.alpha.add_step(step),
         next_window=_moved(previous.next_window, step),
         previous_estimate=_previous_moved(previous.previous_estimate, step),
     )
 
 
 def _moved(estimate: _Timed | None, step: Array) -> _Timed | None:
-    return None if estimate is None else replace(estimate, alpha=estimate.alpha.stepped(step))
+    return None if estimate is None else replace(estimate, alpha=estimate.alpha.add_step(step))
 
 
 class OffloadState(StrEnum):

@@ -180,7 +180,7 @@ def on_services(context: StepContext, event: ev.ServicesMet) -> None:
     else:
         does = "drives the RTC" if event.drives else "stands by"
         text = (
-            f"more than one service of system {context.state.system}: beside this one, which "
+            f"more than one service of system {context.state.system}: besides this one, which "
             f"{does}, "
             f"{who}: end all but one"
         )

@@ -61,8 +61,8 @@ INTERVALS_KEPT = 16
 MOVING = "the mirror's image was being moved"
 BOTH_SIDES = "its telemetry may be from both sides of a jump"
 BEFORE_DOUBT = (
-    "it began before α came into doubt and agrees with what was known then: only one taken since "
-    "can tell"
+    "it began before α came into doubt and agrees with the α of that time: only a window taken "
+    "since then can decide"
 )
 
 _ROUNDING_NS = 1_000_000
@@ -117,7 +117,7 @@ def shift_estimate(context: StepContext, step: Array, spread: Array, still_ns_ut
         context,
         replace(
             registration,
-            alpha=registration.alpha.stepped(step),
+            alpha=registration.alpha.add_step(step),
             covariance=registration.covariance + np.diag(spread**2),
             n_windows=0,
             previous_estimate=None,
@@ -162,7 +162,7 @@ def in_subapertures(registration: Registration, scale: Array, config_id: str) ->
     known = registration.stretches
     return replace(
         registration,
-        alpha=registration.alpha.moved_to(registration.alpha.vector * scale),
+        alpha=registration.alpha.with_vector(registration.alpha.vector * scale),
         covariance=registration.covariance * np.outer(scale, scale),
         stretches=known and replace(known, shared=known.shared * scale),
         floor=registration.floor * scale,

@@ -155,7 +155,7 @@ def process_window(context: StepContext, measured: WindowEstimate) -> None:
     if registration.suspected_jump is not None:
         text = (
             f"the window {_distance_text(registration.suspected_jump, registration)} from α was "
-            f"not confirmed: the one after it lies {_distance_text(measured, registration)} away"
+            f"not confirmed: the next one is {_distance_text(measured, registration)} away"
         )
         n_outlying = context.windows.outlying + 1
         context.windows = replace(context.windows, outlying=n_outlying)
@@ -168,7 +168,7 @@ def process_window(context: StepContext, measured: WindowEstimate) -> None:
         return
     prior = filtering.predict_for(context, registration, measured)
     update = FilterUpdate(
-        joint=kalman.corrected(prior, measured.numbers, measured.noise),
+        joint=kalman.correct_state(prior, measured.numbers, measured.noise),
         n_windows=filtering.n_agreeing(context, registration, prior),
         innovation=_innovation(prior, measured),
         scatter=kalman.learnt(registration.scatter, far.mahalanobis_squared),
@@ -189,7 +189,7 @@ def _suspect_jump(
     """
     innovation = far.mahalanobis_squared
     text = (
-        f"a window lies {_distance_text(measured, registration)} from α "
+        f"a window is {_distance_text(measured, registration)} from α "
         f"(innovation {innovation:.0f}, expected 4, "
         f"rotation {np.sqrt(far.rotation):.1f} sigma): the next one decides; nothing is made or "
         "sent meanwhile"
@@ -238,9 +238,9 @@ def _jump(
     # The earlier estimates contain no information on the new registration.
     joint = kalman.widen_after_jump(prior, noise)
     if whole:
-        joint = kalman.corrected(joint, first.alpha.vector, noise)
+        joint = kalman.correct_state(joint, first.alpha.vector, noise)
     update = FilterUpdate(
-        joint=kalman.corrected(joint, measured.numbers, measured.noise),
+        joint=kalman.correct_state(joint, measured.numbers, measured.noise),
         # Two windows are required before a matrix is made (docs/decisions/0025-jumps.md).
         n_windows=2 if whole or both.excess > jumps.MAX_TURBULENCE_EXCESS else 1,
         innovation=_innovation(prior, measured),

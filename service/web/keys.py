@@ -99,8 +99,8 @@ class KeyFile:
             return ()
         except (OSError, UnicodeDecodeError, msgspec.MsgspecError) as error:
             raise ConfigurationError(
-                f"{self.path}: cannot be read: {error}; it must belong to whom the service runs "
-                "as. Made anew by pyrcal key add when it has been moved away"
+                f"{self.path}: cannot be read: {error}; the user who runs the service must own it; "
+                "if it is damaged, move it away and make new keys with pyrcal key add"
             ) from error
         return keys
 

@@ -169,7 +169,7 @@ def _as_fits(numbers: Numbers, matrix_id: str) -> bytes:
     try:
         from astropy.io import fits
     except ImportError:
-        text = "FITS: found no astropy, expected it beside pyrcal: pip install astropy"
+        text = "FITS: found no astropy, expected it to be installed: pip install astropy"
         raise CommandError(text) from None
     image, buffer = fits.PrimaryHDU(numbers), io.BytesIO()
     image.header["OBJECT"] = matrix_id

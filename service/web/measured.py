@@ -273,7 +273,7 @@ async def fit(
     body = _body(request)
     if parameters.measurement is not None:
         if content_length:
-            raise errors.MatrixError("found a body beside ?measurement=, expected one of the two")
+            raise errors.MatrixError("found a body and ?measurement=, expected one of the two")
         path = await run_in_threadpool(service.archive.measured.file, parameters.measurement)
         body, content_length = _kept(path), path.stat().st_size
     name = parameters.name or parameters.measurement or ""

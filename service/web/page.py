@@ -36,7 +36,7 @@ from service.model.instrument import Instrument, Mirror
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.model.pupil import rtc_valid_subapertures
-from service.model.slopes import as_maps, slopes_of, to_conventions, turned_mask
+from service.model.slopes import as_maps, orient_mask, slopes_of, to_conventions
 from service.runtime.supervisor import Supervisor
 from service.tracking.state import LogEntry
 from service.tracking.step_context import LOG_LENGTH
@@ -285,7 +285,7 @@ def _maps(block: FrameBlock, instrument: Instrument) -> SlopeMaps:
     recipe, orientation = instrument.slopes, instrument.slopes.assumed_orientation
     ours = slopes_of(to_conventions(block.slopes.T, recipe, valid), recipe.kind)
     rms = np.sqrt(np.mean(np.square(ours, dtype=np.float64), axis=-1)).reshape(-1)
-    maps = np.round(as_maps(rms, turned_mask(valid, orientation)), 4)
+    maps = np.round(as_maps(rms, orient_mask(valid, orientation)), 4)
     return SlopeMaps(
         t_ns_utc=block.t0_ns_utc,
         n_frames=block.n_frames,
@@ -343,7 +343,7 @@ class Stream:
         """Streams that are open."""
 
     async def listen(self, heard: str) -> AsyncIterator[bytes]:
-        """Yield server-sent events after the log line with the id ``heard``."""
+        """Yield server-sent events that follow the log line with this id, the last one received."""
         ids: list[str] | None = None
         version, quiet_since = 0, 0
         yield f"retry: {RETRY_MS}\n\n".encode()

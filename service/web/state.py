@@ -109,7 +109,7 @@ class ReadyView(BaseModel):
     "/healthz",
     openapi_extra=OPEN,
     response_model=HealthView,
-    responses={503: problem_response("A part of the service stands still: the detail says which")},
+    responses={503: problem_response("A part of the service has stopped; the detail names it")},
 )
 async def healthz(request: Request, service: ServiceDep) -> HealthView | Response:
     """Say whether the service goes on: it takes telemetry in and ticks, with an RTC or without."""

@@ -80,7 +80,7 @@ class Block(ABC):
     ) -> LoopBlock:
         """Run the batch that begins at ``row`` through the loop."""
 
-    def _played(self, row: int) -> Array32 | None:
+    def _read_played_rows(self, row: int) -> Array32 | None:
         """Return the rows of the batch that begins at ``row``."""
         return None if self.played_m is None else self.played_m[row : row + self.batch_frames]
 
@@ -128,7 +128,7 @@ class OpenLoopBlock(Block):
     ) -> LoopBlock:
         slopes = self.slopes[row : row + self.batch_frames]
         modes = self.open_modes.rows(self.slopes, row, len(slopes), terms.reconstructor)
-        return loop.run(slopes, terms, dither_m, self._played(row), modes)
+        return loop.run(slopes, terms, dither_m, self._read_played_rows(row), modes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -158,7 +158,9 @@ class PhaseBlock(Block):
             opd_m += self.phases_m[row + k]
             return self.optics.slopes(opd_m, self.detector, self.rng)
 
-        return loop.run_frames(self.batch_frames, sense, terms, dither_m, self._played(row))
+        return loop.run_frames(
+            self.batch_frames, sense, terms, dither_m, self._read_played_rows(row)
+        )
 
 
 class Source(TypedDict):
@@ -269,7 +271,7 @@ class PhaseFeed(Feed):
     def _block(self, first_frame: int, time_s: Array, optics: Optics) -> PhaseBlock:
         if not isinstance(optics, DiffractiveOptics):
             raise TypeError(f"feed: found {type(optics).__name__}; expected DiffractiveOptics")
-        phases, played = self._sky.seen(time_s)
+        phases, played = self._sky.sample(time_s)
         phases += optics.stuck_opd_m
         return PhaseBlock(
             first_frame=first_frame,

@@ -142,7 +142,7 @@ class ModalLoop:
             open_modes = open_slopes @ terms.reconstructor.T
         block = LoopBlock.of(open_slopes, dither_m, played_m, self._decided.shape[1])
         added = dither_m is not None or played_m is not None
-        moved = self._moved(block.commands_m if added else None, len(terms.gains))
+        moved = self._count_movable_modes(block.commands_m if added else None, len(terms.gains))
         response = modal_response[:, :moved]
 
         def estimate(first: int, commands: Array32) -> Array32:
@@ -155,7 +155,7 @@ class ModalLoop:
         block.slopes += open_slopes
         return block
 
-    def _moved(self, added_m: Array32 | None, n_controlled: int) -> int:
+    def _count_movable_modes(self, added_m: Array32 | None, n_controlled: int) -> int:
         """Return how many of the first modes may move: nothing corrects those beyond the loop."""
         if self._drive is not None:
             return int(self._decided.shape[1])

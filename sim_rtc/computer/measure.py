@@ -212,7 +212,7 @@ class MeasurementRules:
     def _zonal_refusal(self, request: MeasureRequest) -> str:
         if self.mode_to_actuator is None:
             return "unsupported: the actuators of this mirror are not known, ask for modal"
-        return self._uneven_refusal(request, "actuator")
+        return self._check_evenness(request, "actuator")
 
     def _system_refusal(self, request: MeasureRequest, n_controlled: int) -> str:
         if max(request.modes) >= n_controlled:
@@ -220,9 +220,9 @@ class MeasurementRules:
                 f"range: mode {max(request.modes)} has no row in the reconstructor in use, "
                 f"expected 0 to {n_controlled - 1}"
             )
-        return self._uneven_refusal(request, "system mode")
+        return self._check_evenness(request, "system mode")
 
-    def _uneven_refusal(self, request: MeasureRequest, shape: str) -> str:
+    def _check_evenness(self, request: MeasureRequest, shape: str) -> str:
         if len(set(request.amplitude_m)) > 1:
             return f"range: several values in amplitude_m, expected the same for every {shape}"
         return ""

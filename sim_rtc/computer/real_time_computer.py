@@ -328,21 +328,21 @@ class RealTimeComputer:
         with self._lock:
             reason = reason or self._activities.on_the_mirror()
             if reason:
-                return refused(request.id, reason)
+                return refuse(request.id, reason)
             start_seq = self._seq + _LEAD_BATCHES * self.batch_frames
             self._activities.begin_dither(request, start_seq)
-        return accepted(request.id, start_seq)
+        return accept(request.id, start_seq)
 
     def _stop_dither(self, request: DitherStop) -> Reply:
         with self._lock:
             self._activities.end_dither()
-            return accepted(request.id, self._seq)
+            return accept(request.id, self._seq)
 
     def _start_measurement(self, request: MeasureRequest) -> Reply:
         in_use = self._active.matrix
         reason = self._rules.refusal(request, len(in_use))
         if reason:
-            return refused(request.id, reason)
+            return refuse(request.id, reason)
         measurement = self._rules.measurement(request, in_use)
         with self._lock:
             activities, was_closed = self._activities, self._settings.closed
@@ -350,14 +350,14 @@ class RealTimeComputer:
             if not reason and not measurement.needs_open_loop and not was_closed:
                 reason = f"unsupported: {request.pattern} while the loop is open; close it first"
             if reason:
-                return refused(request.id, reason)
+                return refuse(request.id, reason)
             if measurement.needs_open_loop and was_closed:
                 self._set(replace(self._settings, closed=False))
                 self._start_over()
             start_seq = self._seq + _LEAD_BATCHES * self.batch_frames + _SETTLING_FRAMES
             measurement.start_seq = start_seq
             activities.begin_measurement(measurement, closes_again=was_closed)
-        return accepted(request.id, start_seq)
+        return accept(request.id, start_seq)
 
     def _start_ramp(self, request: RampRequest) -> Reply:
         with self._lock:
@@ -366,31 +366,31 @@ class RealTimeComputer:
                 request, settings, len(self._active.matrix)
             )
             if reason:
-                return refused(request.id, reason)
+                return refuse(request.id, reason)
             rate_hz = settings.frame_rate_hz
             ramp = GainRamp(settings.gains, request, frame_rate_hz=rate_hz)
             self._set(self._activities.begin_ramp(ramp, settings))
-            return accepted(request.id, self._seq)
+            return accept(request.id, self._seq)
 
     def _offload(self, request: OffloadRequest) -> Reply:
         if self._move is None:
-            return refused(request.id, "unsupported: nothing moves the mirror's image (--stage)")
+            return refuse(request.id, "unsupported: nothing moves the mirror's image (--stage)")
         asked = [getattr(request, name) for name in PARAMETERS]
         there_s = self._move(np.array(asked) / BOUNDARY_SCALE)
         there = round(there_s * self._settings.frame_rate_hz)
-        return accepted(request.id, there + BLOCK_FRAMES)  # the block that is under way then ends
+        return accept(request.id, there + BLOCK_FRAMES)  # the block that is under way then ends
 
     def _change_loop(self, request: LoopRequest) -> Reply:
         reason = loop_refusal(request, self._n_modes)
         with self._lock:
             reason = reason or self._activities.forbids(request)
             if reason:
-                return refused(request.id, reason)
+                return refuse(request.id, reason)
             was_closed = self._settings.closed
             if was_closed and request.loop is Loop.OPEN:
                 self._start_over()
-            self._set(changed(self._settings, request))
-            return accepted(request.id, self._seq)
+            self._set(change_settings(self._settings, request))
+            return accept(request.id, self._seq)
 
     def _start_over(self) -> None:
         """Zero the integrator, which by the wire's rules begins a new session."""
@@ -400,12 +400,12 @@ class RealTimeComputer:
         self._staged.clear()
 
 
-def accepted(request_id: str, start_seq: int) -> Reply:
+def accept(request_id: str, start_seq: int) -> Reply:
     """Return the reply to an order that is carried out from this frame on."""
     return Reply(id=request_id, accepted=True, reason="", start_seq=start_seq)
 
 
-def refused(request_id: str, reason: str) -> Reply:
+def refuse(request_id: str, reason: str) -> Reply:
     """Return the reply to an order that is not carried out."""
     return Reply(id=request_id, accepted=False, reason=reason, start_seq=None)
 
@@ -424,7 +424,7 @@ def loop_refusal(request: LoopRequest, n_modes: int) -> str:
     return ""
 
 
-def changed(settings: LoopSettings, request: LoopRequest) -> LoopSettings:
+def change_settings(settings: LoopSettings, request: LoopRequest) -> LoopSettings:
     """Return the settings after a request that :func:`loop_refusal` accepts."""
     return replace(
         settings,

@@ -24,7 +24,7 @@ Array32 = NDArray[np.float32]
 _SMALLEST_SINGULAR_RATIO = 1e-3
 
 
-def truncated_inverse(interaction: Array32) -> Array32:
+def compute_truncated_inverse(interaction: Array32) -> Array32:
     """Return the pseudo-inverse of D ``(n_slopes, n_modes)`` without its weakest directions."""
     u, values, vh = scipy.linalg.svd(interaction.astype(np.float64), full_matrices=False)
     kept = values > _SMALLEST_SINGULAR_RATIO * values[0]
@@ -51,7 +51,7 @@ def own_reconstructor(
 
     ``alpha`` is the registration that D belongs to; None if it is not known.
     """
-    matrix = truncated_inverse(interaction.astype(np.float32))
+    matrix = compute_truncated_inverse(interaction.astype(np.float32))
     name = f"initial-{len(matrix)}-{checksum(matrix)[:8]}"
     told = None if alpha is None else alpha.to_boundary()
     return Reconstructor.own(name, matrix, identity, created_ns=time.time_ns(), alpha=told)

@@ -158,7 +158,7 @@ class Regression:
         Raises
         ------
         numpy.linalg.LinAlgError
-            If a mode that was asked for never moved.
+            If a requested mode never moved.
         """
         power = np.diag(self._powers)
         moved = np.flatnonzero(power > _SILENT * power[self._modes].mean())

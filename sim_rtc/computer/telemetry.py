@@ -106,7 +106,7 @@ class FrameClock:
         """Return the end of exposure of frame ``seq``, nanoseconds since the Unix epoch, UTC."""
         return self.start_ns_utc + (seq + 1) * self.dt_ns
 
-    def stamped(self, status: Status) -> Status:
+    def stamp_status(self, status: Status) -> Status:
         """Return a status with the time of its last frame."""
         return replace(status, t_ns=self.end_of_exposure_ns(status.seq or 0))
 

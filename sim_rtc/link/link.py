@@ -159,7 +159,7 @@ class Link(Background):
 
     def _status(self) -> bytes:
         time_s = self._plan.now_s
-        status = self._clock.stamped(self._computer.status())
+        status = self._clock.stamp_status(self._computer.status())
         return encode(
             replace(
                 status,

@@ -59,7 +59,7 @@ class FaultyMatrices(Matrices):
         if fault is None or self._n_rejected.get(fault, 0) >= fault.value("COUNT"):
             return ""
         self._n_rejected[fault] = self._n_rejected.get(fault, 0) + 1
-        return "range: refused as a fault asked for"
+        return "range: refused, as --fault requests"
 
     @override
     def _stage(self, reconstructor: Reconstructor) -> None:

@@ -74,7 +74,7 @@ class Replay:
             return
         with session:
             answer_commands(session, self._keys, _refuse)
-            answer_applied(session, self._keys, self._applied)
+            answer_applied(session, self._keys, self._find_last_matrix)
             session.declare_subscriber(self._keys.all_commits, self._on_commit)
             zenoh.ext.declare_advanced_subscriber(
                 session,
@@ -99,7 +99,7 @@ class Replay:
         status = status_publisher(session, self._keys)
         n_messages = 0
         with Token(session, self._keys, None) as token:
-            for message in self._timed(stopped):
+            for message in self._wait_for_messages(stopped):
                 n_messages += 1
                 self._acknowledge_refusals(session)
                 match message.kind:
@@ -116,7 +116,7 @@ class Replay:
                         self._matrix = message
         return n_messages
 
-    def _timed(self, stopped: threading.Event) -> Iterator[Message]:
+    def _wait_for_messages(self, stopped: threading.Event) -> Iterator[Message]:
         """Yield the messages, each when it is due."""
         start_s, first_s = time.monotonic(), None
         for message in self._recording.messages():
@@ -128,7 +128,7 @@ class Replay:
                 return
             yield message
 
-    def _applied(self) -> tuple[bytes, list[bytes]] | None:
+    def _find_last_matrix(self) -> tuple[bytes, list[bytes]] | None:
         """Return manifest and chunks of the matrix that was played last."""
         matrix = self._matrix
         if matrix is None:

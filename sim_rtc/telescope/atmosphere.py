@@ -52,7 +52,7 @@ class Layer:
     """Direction the layer moves towards, degrees from sensor +x towards +y."""
 
 
-def fried_parameter_m(seeing_arcsec: float) -> float:
+def compute_fried_parameter_m(seeing_arcsec: float) -> float:
     """Return r0 at 500 nm, metres, of this seeing (FWHM at 500 nm, infinite outer scale)."""
     return _SEEING_COEFFICIENT * _SEEING_WAVELENGTH_M / (seeing_arcsec * _ARCSEC_RAD)
 
@@ -261,7 +261,7 @@ class FrozenLayer:
         self._asked.clear()
         together = _BLOCKS_TOGETHER * self._block_steps
         n_new = -(-n_missing // together) * together
-        self._rows = np.concatenate([self._rows[passed:], *self._extruded(n_new)])
+        self._rows = np.concatenate([self._rows[passed:], *self._extrude_rows(n_new)])
 
     def phases(self, steps: NDArray[np.intp], weights: Array32, *, apart: bool = False) -> Array32:
         """Return sums of the OPD at steps, ``(n_frames, n_points)``, metres, without their piston.
@@ -280,7 +280,7 @@ class FrozenLayer:
         known = self._answers.get(response)
         n_known = 0 if known is None else len(known)
         if n_known < self._n_steps:
-            new = self._filtered(self._rows[n_known:], response.spectra(self))
+            new = self._filter_rows(self._rows[n_known:], response.spectra(self))
             self._answers[response] = new if known is None else np.concatenate([known, new])
         self._asked.add(response)
         return self._answers[response][first_step - self._first_step :]
@@ -309,7 +309,7 @@ class FrozenLayer:
         """Return the phase at the pupil's points, of windows, ``(n_windows, n_points)``."""
         return np.asarray((self._reading @ windows.T).T)
 
-    def _filtered(self, rows: Array32, spectra: Complex64) -> Array32:
+    def _filter_rows(self, rows: Array32, spectra: Complex64) -> Array32:
         """Return the outputs ``(n_steps, n_outputs)`` of all windows in these rows."""
         n_steps = len(rows) - self._n_rows + 1
         n_blocks = -(-n_steps // self._block_steps)
@@ -321,7 +321,7 @@ class FrozenLayer:
         answers = scipy.fft.irfft(parts @ spectra, self._length, axis=0)[self._n_rows - 1 :]
         return np.asarray(answers.transpose(1, 0, 2).reshape(-1, spectra.shape[2])[:n_steps])
 
-    def _extruded(self, n_rows: int) -> list[Array32]:
+    def _extrude_rows(self, n_rows: int) -> list[Array32]:
         """Return the next rows, oldest first, in pieces."""
         pieces = []
         for start in range(0, n_rows, _ROWS_TOGETHER):
@@ -332,7 +332,7 @@ class FrozenLayer:
         return pieces
 
 
-def frozen_layers(
+def build_layers(
     layers: tuple[Layer, ...],
     *,
     points_m: Array,

@@ -206,7 +206,7 @@ def preset_for(magnitude: float) -> Preset:
     )
 
 
-def binned(instrument: Instrument, binning: int) -> Instrument:
+def bin_pixels(instrument: Instrument, binning: int) -> Instrument:
     """Return the instrument with this many detector pixels to a side of a subaperture.
 
     Raises
@@ -224,7 +224,7 @@ def binned(instrument: Instrument, binning: int) -> Instrument:
         )
     return replace(
         instrument,
-        wfs=kind_of(instrument).binned(wfs, binning),
+        wfs=kind_of(instrument).bin_sensor(wfs, binning),
     )
 
 

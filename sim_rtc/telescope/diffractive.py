@@ -31,7 +31,7 @@ from sim_rtc.telescope.plant import (
     Departures,
     Optics,
     SimulatedPlant,
-    between,
+    interpolate,
     registration_between,
 )
 
@@ -110,8 +110,8 @@ class DiffractiveOptics(Optics):
         return replace(
             self,
             alpha=registration_between(self, other, share),
-            opd_per_command=between(self.opd_per_command, other.opd_per_command, share),
-            stuck_opd_m=between(self.stuck_opd_m, other.stuck_opd_m, share),
+            opd_per_command=interpolate(self.opd_per_command, other.opd_per_command, share),
+            stuck_opd_m=interpolate(self.stuck_opd_m, other.stuck_opd_m, share),
             sensor=sensor,
             **_at_rest(sensor, self.valid, self.errors, len(self.static_opd_m)),
         )
@@ -148,7 +148,7 @@ class DiffractiveOptics(Optics):
         if detector is not None:
             light = detector.read(light / np.float32(self.light_at_rest), rng)
         slopes = self.sensor.signals(light, self.valid, self.errors.recipe)
-        return self.errors.applied((slopes - self.slopes_at_rest).astype(np.float32, copy=False))
+        return self.errors.add_errors((slopes - self.slopes_at_rest).astype(np.float32, copy=False))
 
 
 class DiffractivePlant(SimulatedPlant):
@@ -166,7 +166,9 @@ class DiffractivePlant(SimulatedPlant):
         """Take the instrument as it is binned: the finest pixels set how finely it is computed."""
         lenslets = isinstance(instrument.wfs, ShackHartmann)
         sampling = LENSLET_SAMPLING if lenslets else _SAMPLING * binning
-        super().__init__(instrument, basis, centred_pupil(instrument, sampling), made, binning)
+        super().__init__(
+            instrument, basis, build_centred_pupil(instrument, sampling), made, binning
+        )
         self._sensor: DiffractiveSensor
         if isinstance(self._wfs, ShackHartmann):
             self._sensor = DiffractiveLenslets(self._wfs, self._pupil, instrument.subaperture_m)
@@ -421,7 +423,7 @@ class DiffractivePyramid:
         return along_y, along_x
 
 
-def centred_pupil(instrument: Instrument, sampling: int) -> PupilGrid:
+def build_centred_pupil(instrument: Instrument, sampling: int) -> PupilGrid:
     """Return the pupil on an odd grid, with a point at its centre.
 
     The service's grids are even: half a point away. A cell's amplitude is the fraction of its area

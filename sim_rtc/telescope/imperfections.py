@@ -68,7 +68,7 @@ class Imperfections:
     image_offsets_px: tuple[float, ...] = ()
     """Displacement x, y of each pupil image of a pyramid from its place on the pixel grid, detector
     pixels, of the images at -x -y, +x -y, -x +y, +x +y. Their mean would be a shift of the
-    registration and is taken out. Empty if the images lie on the grid."""
+    registration and is taken out. Empty if the images are on the grid."""
 
     image_offset_rms_px: float = 0.0
     """RMS of the eight displacements, detector pixels, if they are drawn at random."""
@@ -114,7 +114,7 @@ class SlopeErrors:
         rng: np.random.Generator,
         recipe: SlopeRecipe = PLAIN,
     ) -> None:
-        """Take where the pixels of valid subapertures stand in the light, as a ``SensorKind`` says.
+        """Set the indices of the pixels of valid subapertures in the flux, of a ``SensorKind``.
 
         ``pixels`` is ``(n_pixels, n_valid)``.
         """
@@ -143,7 +143,7 @@ class SlopeErrors:
         read.reshape(-1)[self._dark] = 0
         return read
 
-    def applied(self, slopes: Array32) -> Array32:
+    def add_errors(self, slopes: Array32) -> Array32:
         """Return the slopes with these errors; the first axis of ``slopes`` is ``n_slopes``."""
         if self.absent:
             return slopes
@@ -174,7 +174,7 @@ class SlopeErrors:
 def image_offsets(imperfections: Imperfections, rng: np.random.Generator) -> Array | None:
     """Return the displacements (x, y) of the four pupil images ``(4, 2)``, detector pixels.
 
-    Of the images at -x -y, +x -y, -x +y, +x +y; their mean is 0. None if they lie on the pixel
+    Of the images at -x -y, +x -y, -x +y, +x +y; their mean is 0. None if they are on the pixel
     grid.
     """
     given, rms_px = imperfections.image_offsets_px, imperfections.image_offset_rms_px
@@ -219,7 +219,7 @@ class ShapeErrors:
         )
         self._steps = self._steps[(self._steps >= 0).all(axis=1)]
 
-    def applied(self, shapes: Array32, on_mirror: Array) -> Array32:
+    def add_errors(self, shapes: Array32, on_mirror: Array) -> Array32:
         """Return shapes ``(n_points, n_modes)`` with these errors.
 
         ``on_mirror`` ``(n_points, 2)`` are the points where the shapes are seen, on the mirror.
@@ -240,7 +240,7 @@ class ShapeErrors:
         return np.asarray(np.sqrt(np.mean(steps**2, axis=0)))
 
 
-def distorted(points: Array, weights: Array, imperfections: Imperfections) -> Array:
+def distort_points(points: Array, weights: Array, imperfections: Imperfections) -> Array:
     """Return where in the pupil the light at these points of its image comes from.
 
     ``points`` is ``(n_points, 2)``. What a shift, a turn or a change of size could describe is
@@ -266,7 +266,7 @@ def distorted(points: Array, weights: Array, imperfections: Imperfections) -> Ar
 def true_sensor(instrument: Instrument, imperfections: Imperfections) -> SensorDescription:
     """Return the sensor as it really is: with another modulation, where it has one."""
     wfs = instrument.wfs
-    key = kind_of(instrument).fitted_key(wfs)
+    key = kind_of(instrument).find_fitted_key(wfs)
     if key is None:
         return wfs
     return replace(wfs, **{key: getattr(wfs, key) * (1.0 + imperfections.modulation_error)})

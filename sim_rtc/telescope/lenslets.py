@@ -60,12 +60,12 @@ class DiffractiveLenslets:
 
         self._pixel = wfs.pixel_lambda_over_d(subaperture_m)
         self._star = None if wfs.laser is None else SodiumStar(wfs, wfs.laser, subaperture_m)
-        self._angles, angle = self._sampled_field()
+        self._angles, angle = self._sample_field()
         self._n_nodes = max(8, int(np.ceil(len(self._angles) * angle)) + 4)
-        self._on_x, self._on_y = (self._between(shift) for shift in shift_subap)
+        self._on_x, self._on_y = (self._interpolate_nodes(shift) for shift in shift_subap)
         self._amplitude: Array = self._under(pupil.amplitude)
         self._wavenumber = np.float32(2 * np.pi / wfs.wavelength_m)
-        self._edge, self._inside = _continued(pupil.lit)
+        self._edge, self._inside = _extend_points(pupil.lit)
         self._transform = self._to_angles(angle)
         self._flat = self.images(np.zeros(int(pupil.lit.sum()), dtype=np.float32))
 
@@ -108,7 +108,7 @@ class DiffractiveLenslets:
         along = np.stack([spots.sum(axis=1) @ places, spots.sum(axis=2) @ places])
         return np.asarray((along / total).reshape(-1))
 
-    def _between(self, shift: float) -> Array:
+    def _interpolate_nodes(self, shift: float) -> Array:
         """Return how nodes under lenslets read the pupil's grid, ``(n n_nodes, n_grid)``."""
         n, grid = self._wfs.n_subapertures, self._pupil.coordinates
         places = (np.arange(n * self._n_nodes) + 0.5) / self._n_nodes - n / 2 - shift
@@ -119,7 +119,7 @@ class DiffractiveLenslets:
         """Return a map of the pupil's grid at the nodes of all lenslets."""
         return np.asarray(self._on_y @ on_grid.astype(np.float32, copy=False) @ self._on_x.T)
 
-    def _sampled_field(self) -> tuple[Array, float]:
+    def _sample_field(self) -> tuple[Array, float]:
         """Return where light is sampled along an axis, λ/d, and the distance between samples."""
         if self._star is not None:
             return self._star.angles, ANGLE_STEP
@@ -135,7 +135,7 @@ class DiffractiveLenslets:
         return np.asarray(transform.astype(np.complex64))
 
 
-def _continued(lit: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _extend_points(lit: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return lit points whose wavefronts continue it straight, twice the first less the second.
 
     Both ``(n_grid, n_grid)``: the nearest lit point and its neighbour across; where it is lit both

@@ -26,7 +26,7 @@ from sim_rtc.telescope.plant import (
     Departures,
     Optics,
     SimulatedPlant,
-    between,
+    interpolate,
     registration_between,
 )
 
@@ -77,10 +77,12 @@ class LinearOptics(Optics):
                 for weight, response in optics.responses
                 if part > 0.0
             ),
-            slopes_per_command=between(self.slopes_per_command, other.slopes_per_command, share),
-            opd_per_command=between(self.opd_per_command, other.opd_per_command, share),
+            slopes_per_command=interpolate(
+                self.slopes_per_command, other.slopes_per_command, share
+            ),
+            opd_per_command=interpolate(self.opd_per_command, other.opd_per_command, share),
             images=(1.0 - share) * self.images + share * other.images,
-            stuck_opd_m=between(self.stuck_opd_m, other.stuck_opd_m, share),
+            stuck_opd_m=interpolate(self.stuck_opd_m, other.stuck_opd_m, share),
         )
 
 
@@ -90,7 +92,7 @@ class LinearPlant(SimulatedPlant):
     def __init__(
         self, instrument: Instrument, basis: ModalBasis, **made: Unpack[Departures]
     ) -> None:
-        sampling, n_nodes = sampling_of(instrument), _NODES * instrument.binning
+        sampling, n_nodes = choose_sampling(instrument), _NODES * instrument.binning
         pupil = instrument_pupil(instrument, sampling)
         super().__init__(instrument, basis, pupil, made, instrument.binning)
         self._sensor = kind_of(instrument).sensor(
@@ -110,7 +112,7 @@ class LinearPlant(SimulatedPlant):
         """
         response = self._sensor.at(self._image_shift(alpha))
         light = self.slope_errors.read(response.light)
-        jacobian = self.slope_errors.applied(response.lit(light).jacobian())
+        jacobian = self.slope_errors.add_errors(response.lit(light).jacobian())
         shapes, stuck_opd_m = self._render(alpha)
         modes = np.ascontiguousarray(shapes)
         matrix = jacobian @ modes
@@ -133,7 +135,7 @@ class LinearPlant(SimulatedPlant):
         return DrawnSurface(mirror=mirror, subaperture_m=self._instrument.subaperture_m), strokes
 
 
-def sampling_of(instrument: Instrument) -> int:
+def choose_sampling(instrument: Instrument) -> int:
     """Return points along a subaperture, of which K ``(n_slopes, n_points)`` has a size to keep."""
     n_valid = int(valid_subapertures(instrument).sum())
     n_slopes = instrument.slopes.kind.n_planes * n_valid

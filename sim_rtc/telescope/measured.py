@@ -40,7 +40,7 @@ from service.model.sensors.sensor import Fineness
 from service.model.slopes import rtc_mask, to_conventions, to_rtc
 from sim_rtc.telescope.atmosphere import PhaseResponse
 from sim_rtc.telescope.imperfections import SETS, Imperfections, SlopeErrors
-from sim_rtc.telescope.linear import LinearOptics, optical_gain, sampling_of
+from sim_rtc.telescope.linear import LinearOptics, choose_sampling, optical_gain
 from sim_rtc.telescope.plant import Plant
 
 Array = NDArray[np.float64]
@@ -96,7 +96,7 @@ def read_measured_matrix(
     matrix = np.asarray(reference.matrix, dtype=np.float64) / reference.passes
     _check(matrix, instrument, recorded.where)
     matrix, note = _of_modes(matrix, recorded.modes, instrument, basis, recorded.where)
-    matrix, size_note = _sized(matrix, instrument, basis)
+    matrix, size_note = _scale_matrix(matrix, instrument, basis)
     return MeasuredMatrix(
         matrix=matrix, sha256=recorded.sha256, notes=tuple(filter(None, (*notes, note, size_note)))
     )
@@ -148,7 +148,7 @@ def _of_modes(
     )
 
 
-def _sized(matrix: Array, instrument: Instrument, basis: Basis) -> tuple[Array, str]:
+def _scale_matrix(matrix: Array, instrument: Instrument, basis: Basis) -> tuple[Array, str]:
     """Return the matrix in slopes per metre, and how its size compares with the model's."""
     model = InteractionModel(instrument, basis).interaction_matrix(instrument.start)
     sizes = np.linalg.norm(matrix, axis=0)
@@ -191,7 +191,7 @@ class MeasuredPlant(Plant):
         self._basis, self._passes = basis, np.float32(passes)
         self.measured = measured
         """The matrix, and what was decided about its file."""
-        sampling = sampling_of(instrument)
+        sampling = choose_sampling(instrument)
         self._pupil = instrument_pupil(instrument, sampling)
         self._points = self._pupil.points
         width_m = (
@@ -210,7 +210,7 @@ class MeasuredPlant(Plant):
         self.sensor_opd_m = np.zeros(len(self._points), dtype=np.float32)
         self._sensor = kind_of(instrument).sensor(instrument, self._pupil, Fineness())
         self._gain = optical_gain(basis.n_modes, imperfections)
-        self._beyond_model: Array32 = self._matrix - self._modelled(start)[1]
+        self._beyond_model: Array32 = self._matrix - self._model_matrices(start)[1]
 
     @property
     def knows_orientation(self) -> bool:
@@ -222,7 +222,7 @@ class MeasuredPlant(Plant):
         return self.measured.matrix.astype(np.float32)
 
     @override
-    def listed(self, rows: NDArray[Any]) -> NDArray[Any]:
+    def sort_rows(self, rows: NDArray[Any]) -> NDArray[Any]:
         recipe = self._instrument.slopes
         return to_rtc(rows, recipe, rtc_mask(self.valid, recipe.assumed_orientation))
 
@@ -237,7 +237,7 @@ class MeasuredPlant(Plant):
         content = _content(modes, self.weights)
         response = self._sensor.at(self._image_shift(alpha))
         if self.knows_orientation:
-            jacobian, model = self._modelled(alpha)
+            jacobian, model = self._model_matrices(alpha)
             matrix: Array32 = model + self._beyond_model
             jacobian += (matrix * self._gain - model) @ content
         else:
@@ -252,10 +252,10 @@ class MeasuredPlant(Plant):
             stuck_opd_m=np.zeros(len(modes), dtype=np.float32),
         )
 
-    def _modelled(self, alpha: Misregistration) -> tuple[Array32, Array32]:
+    def _model_matrices(self, alpha: Misregistration) -> tuple[Array32, Array32]:
         """Return K ``(n_slopes, n_points)`` and the model's D, rows as the RTC lists its slopes."""
         jacobian = self._sensor.at(self._image_shift(alpha)).jacobian()
-        rows = self.listed(np.asarray(jacobian, dtype=np.float32))
+        rows = self.sort_rows(np.asarray(jacobian, dtype=np.float32))
         return rows, rows @ self._render(alpha)
 
     def _render(self, alpha: Misregistration) -> Array32:

@@ -154,7 +154,7 @@ def _tension_kernel(scaled: Array) -> Array:
     return np.asarray(np.where(near, half * (np.log(x / 2) + _EULER - 1.0), exact))
 
 
-def misplaced(mirror: Mirror, position_error: float, rng: np.random.Generator) -> Mirror:
+def misplace_actuators(mirror: Mirror, position_error: float, rng: np.random.Generator) -> Mirror:
     """Return the mirror with random position errors that contain no shift, rotation or scale.
 
     ``position_error`` is RMS per axis in pitches. A common movement of all actuators would be a

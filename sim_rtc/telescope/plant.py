@@ -24,13 +24,13 @@ from sim_rtc.telescope.imperfections import (
     Imperfections,
     ShapeErrors,
     SlopeErrors,
-    distorted,
+    distort_points,
     image_offsets,
     non_common_path,
     true_sensor,
 )
 from sim_rtc.telescope.influence import InfluenceCube
-from sim_rtc.telescope.mirror import MirrorFaults, PlantSurface, disobedient, misplaced
+from sim_rtc.telescope.mirror import MirrorFaults, PlantSurface, disobedient, misplace_actuators
 from sim_rtc.telescope.scene import Scene
 
 Array = NDArray[np.float64]
@@ -110,13 +110,13 @@ class Plant(ABC):
     """``(n_points,)`` static OPD that the sensor sees and the science does not."""
 
     image_offsets_px: Array | None = None
-    """``(4, 2)`` displacement (x, y) of each pupil image; None if they lie on the pixel grid."""
+    """``(4, 2)`` displacement (x, y) of each pupil image; None if they are on the pixel grid."""
 
     @abstractmethod
     def optics(self, alpha: Misregistration) -> Optics:
         """Return the optics at ``alpha``; takes seconds."""
 
-    def listed(self, rows: NDArray[Any]) -> NDArray[Any]:
+    def sort_rows(self, rows: NDArray[Any]) -> NDArray[Any]:
         """Return rows ``(n_slopes, ...)`` of conventions.md as this telescope lists its slopes."""
         return rows
 
@@ -163,11 +163,11 @@ class SimulatedPlant(Plant):
         self._instrument = replace(instrument, wfs=self._wfs)
         if self.image_offsets_px is not None:
             offsets_subap = (self.image_offsets_px / binning).T.ravel()
-            self._wfs = _displaced(self._instrument, offsets_subap)
+            self._wfs = _displace_images(self._instrument, offsets_subap)
             self._instrument = replace(instrument, wfs=self._wfs)
-        self._pupil = uneven(pupil, imperfections.unevenness, uneven_rng)
+        self._pupil = light_unevenly(pupil, imperfections.unevenness, uneven_rng)
         drawn, influence = instrument.analytic_mirror, made.get("influence")
-        mirror = misplaced(drawn, imperfections.position_error, position_rng)
+        mirror = misplace_actuators(drawn, imperfections.position_error, position_rng)
         strokes = basis.mode_to_actuator
         if influence is None:
             self._surface, strokes = self._own_surface(mirror, strokes)
@@ -178,7 +178,7 @@ class SimulatedPlant(Plant):
         self._shape_errors = ShapeErrors(
             pupil.lit, strokes.shape[1], imperfections.model_error, later_rngs[0]
         )
-        self._points = distorted(pupil.points, pupil.weights, imperfections)
+        self._points = distort_points(pupil.points, pupil.weights, imperfections)
         self.points_m = self._points * width_m
         self.pitch_m = width_m / pupil.sampling
         self.weights = pupil.weights
@@ -199,11 +199,11 @@ class SimulatedPlant(Plant):
             for start in range(0, len(on_mirror), _RENDER_ROWS)
         ]
         shapes = np.concatenate([block.astype(np.float32) for block in blocks])
-        modes = self._shape_errors.applied(shapes[:, :-1], on_mirror)
+        modes = self._shape_errors.add_errors(shapes[:, :-1], on_mirror)
         return modes, np.ascontiguousarray(shapes[:, -1])
 
 
-def _displaced(instrument: Instrument, offsets_subap: Array) -> SensorDescription:
+def _displace_images(instrument: Instrument, offsets_subap: Array) -> SensorDescription:
     """Return the sensor with its pupil images displaced ``(8,)``: along x, then along y.
 
     Raises
@@ -212,12 +212,12 @@ def _displaced(instrument: Instrument, offsets_subap: Array) -> SensorDescriptio
         If it has one image only.
     """
     try:
-        return kind_of(instrument).displaced(instrument, offsets_subap)
+        return kind_of(instrument).displace_images(instrument, offsets_subap)
     except ModelError as error:
         raise ConfigurationError(f"--image-offsets: {error}") from error
 
 
-def between(first: Array32, last: Array32, share: float) -> Array32:
+def interpolate(first: Array32, last: Array32, share: float) -> Array32:
     """Return the array part of the way from ``first`` to ``last``."""
     mixed = last - first
     mixed *= np.float32(share)
@@ -232,7 +232,7 @@ def registration_between(first: Optics, last: Optics, share: float) -> Misregist
     )
 
 
-def uneven(pupil: PupilGrid, unevenness: float, rng: np.random.Generator) -> PupilGrid:
+def light_unevenly(pupil: PupilGrid, unevenness: float, rng: np.random.Generator) -> PupilGrid:
     """Return the pupil lit by a random smooth map: polynomials up to third order, mean kept."""
     u = pupil.coordinates / np.abs(pupil.coordinates).max()
     x, y = u[None, :], u[:, None]

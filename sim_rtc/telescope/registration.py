@@ -164,7 +164,7 @@ class Schedule:
         for jump in self.jumps:
             if jump.time_s <= time_s:
                 vector = vector + jump.vector
-        return self.start.moved_to(vector)
+        return self.start.with_vector(vector)
 
     def alpha_before(self, time_s: float) -> Misregistration:
         """Return the registration as this time is reached, a jump at that very time left out."""
@@ -268,7 +268,7 @@ class MovingOptics:
         self._seen_s = time_s
         if not self._demands.empty():
             there_s, vector = self._demands.get()
-            start = self._schedule.start.stepped(vector)
+            start = self._schedule.start.add_step(vector)
             self._schedule = replace(self._schedule, start=start)
             self._next = self._executor.submit(self._compute, there_s, None)
         if self._next is not None and self._next.done() and time_s >= self._next.result().start_s:

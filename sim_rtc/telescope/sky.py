@@ -70,7 +70,7 @@ class Sky:
     played: PlayedTurbulence | None = None
     """Turbulence played on the mirror by day, when there is none in the air; None at night."""
 
-    def seen(self, time_s: Array) -> tuple[Array32, Array32 | None]:
+    def sample(self, time_s: Array) -> tuple[Array32, Array32 | None]:
         """Return the incoming OPD ``(n_frames, n_points)`` and the played commands, metres.
 
         The commands are ``(n_frames, n_modes)``; None: nothing is played.

@@ -9,8 +9,8 @@ from pyrcal_studies.fft_pyramid import FftPyramid
 from service.instrument import load_instrument
 from service.model.pupil import valid_subapertures
 from service.model.sensors.pyramid.optics import PyramidOptics
-from service.model.sensors.pyramid.signals import normalised_jacobian, reference_slopes
-from sim_rtc.telescope.diffractive import DiffractivePyramid, Quadrature, centred_pupil
+from service.model.sensors.pyramid.signals import differentiate_signals, reference_slopes
+from sim_rtc.telescope.diffractive import DiffractivePyramid, Quadrature, build_centred_pupil
 from tests.numerics import flao_basis
 
 MODES = [0, 1, 2, 5, 12, 35, 110, 230, 400, 593]
@@ -27,7 +27,7 @@ def instrument():
 
 @pytest.fixture(scope="module")
 def pupil(instrument):
-    return centred_pupil(instrument, 3)
+    return build_centred_pupil(instrument, 3)
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +83,7 @@ def test_ten_modes_are_seen_as_an_fft_pyramid_sees_them(
 def test_one_nanometre_is_seen_as_the_linear_jacobian_says(instrument, pupil, valid, shapes):
     """0.1 % on the same grid, push-pull."""
     linear = PyramidOptics(wfs=instrument.wfs, pupil=pupil, n_nodes=2, n_modulation=28)
-    jacobian = normalised_jacobian(linear.response(valid, SHIFT), valid)
+    jacobian = differentiate_signals(linear.response(valid, SHIFT), valid)
     jacobian *= np.float32(2 * np.pi / instrument.wfs.wavelength_m)
     sensor = DiffractivePyramid(instrument.wfs, pupil, SHIFT, Quadrature(n_modulation=28))
     for shape in shapes:

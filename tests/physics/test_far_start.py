@@ -7,7 +7,7 @@ import numpy as np
 from service.files.disk_cache import DiskCache, usual_folder
 from service.instrument import packaged_instrument
 from service.model.interaction import InteractionModel
-from sim_rtc.computer.reconstructors import truncated_inverse
+from sim_rtc.computer.reconstructors import compute_truncated_inverse
 from sim_rtc.options import FAR_MODES, USUAL_MODES, parse_options
 from sim_rtc.telescope.registration import far_registration
 
@@ -29,7 +29,7 @@ def test_the_matrix_of_a_perfect_registration_holds_120_modes_there_and_loses_40
         true = model.interaction_matrix(far_registration(rng))
         few, many = (
             largest_pole_radius(
-                truncated_inverse(nominal[:, :n]) @ true[:, :n], options, optical_gain=0.75
+                compute_truncated_inverse(nominal[:, :n]) @ true[:, :n], options, optical_gain=0.75
             )
             for n in (FAR_MODES, USUAL_MODES)
         )

@@ -81,6 +81,6 @@ def test_the_matrix_of_a_pair_is_that_of_rays(system, pair, seed):
     theirs = brute[:, model.valid].reshape(len(ours), -1)[rows]
     error = np.linalg.norm(ours[rows] - theirs, axis=0) / np.linalg.norm(theirs, axis=0)
     assert np.all(error < 0.002), error
-    aside = alpha.stepped(np.array([0.02, 0.0, 0.0, 0.0]))
+    aside = alpha.add_step(np.array([0.02, 0.0, 0.0, 0.0]))
     other = np.linalg.norm(model.interaction_matrix(aside)[rows] - theirs, axis=0)
     assert np.all(other > 0.015 * np.linalg.norm(theirs, axis=0))

@@ -76,9 +76,9 @@ def test_the_filters_covariance_stays_symmetric_and_positive(mean, prior, measur
     drift = kalman.Drift(alpha_rate=np.full(4, 1e-3))
     found = kalman.forget(kalman.begin_joint(mean, prior), PASSIVE_BIAS)
     for measured, noise in measurements:
-        found = kalman.predicted(found, drift, 1.0)
-        found = kalman.corrected(
-            kalman.corrected(found, measured, noise), measured, noise, PASSIVE_BIAS
+        found = kalman.predict_state(found, drift, 1.0)
+        found = kalman.correct_state(
+            kalman.correct_state(found, measured, noise), measured, noise, PASSIVE_BIAS
         )
     np.testing.assert_array_equal(found.covariance, found.covariance.T)
     power = np.linalg.eigvalsh(found.covariance)
@@ -88,7 +88,7 @@ def test_the_filters_covariance_stays_symmetric_and_positive(mean, prior, measur
 @given(vectors, covariances, vectors, covariances)
 def test_a_measurement_never_adds_uncertainty(mean, prior, measured, noise):
     begun = kalman.begin_joint(mean, prior)
-    found = kalman.corrected(begun, measured, noise).alpha_covariance
+    found = kalman.correct_state(begun, measured, noise).alpha_covariance
     slack = 1e-9 * np.trace(prior + noise)
     assert np.linalg.eigvalsh(prior - found)[0] > -slack
     assert np.linalg.eigvalsh(noise - found)[0] > -slack
@@ -107,8 +107,8 @@ def test_the_innovation_does_not_depend_on_the_units(mean, prior, measured, nois
         atol=1e-12,
     )
     np.testing.assert_allclose(
-        kalman.corrected(scaled, there, noisier).alpha,
-        units @ kalman.corrected(plain, measured, noise).alpha,
+        kalman.correct_state(scaled, there, noisier).alpha,
+        units @ kalman.correct_state(plain, measured, noise).alpha,
         rtol=1e-5,
         atol=1e-6,
     )

@@ -12,10 +12,10 @@ from service.model.misregistration import Misregistration, rotation
 from service.model.slopes import (
     Orientation,
     SlopeRecipe,
+    orient_mask,
     rtc_mask,
     to_conventions,
     to_rtc,
-    turned_mask,
 )
 from tests.numerics import small_linearisation, small_model
 
@@ -91,6 +91,6 @@ def test_an_rtcs_list_of_slopes_is_a_permutation_with_signs(mask, orientation, o
     np.testing.assert_array_equal(
         to_rtc(there, SlopeRecipe(order=order, orientation=orientation), mask), listed
     )
-    turned = turned_mask(mask, orientation)
+    turned = orient_mask(mask, orientation)
     assert turned.sum() == mask.sum()
     np.testing.assert_array_equal(rtc_mask(turned, orientation), mask)

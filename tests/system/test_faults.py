@@ -116,7 +116,7 @@ def test_a_refusal_is_told_with_its_reason_and_the_next_matrix_is_taken(night):
     night.rtc(*faults("refuse@0:1", "dither-late@0:1,10"))
     wait_for(lambda: night.ids("rejected"), 40.0, "a rejected reconstructor")
     (rejected,) = [r for r in night.shelf if r["state"] == "rejected"]
-    assert rejected["reason"] == "range: refused as a fault asked for"
+    assert rejected["reason"] == "range: refused, as --fault requests"
     assert night.state["registration"] is not None
     assert night.n_modes_in_use() == 0
     night.post("/v1/refit", {"n_modes": N_START})

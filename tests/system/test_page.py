@@ -154,7 +154,7 @@ def test_what_was_decided_on_a_state_that_has_changed_is_not_done(page):
     page.open()
     page.until("document.querySelector('[data-order=rollback]').ariaDisabled === 'false'", 20.0)
     page.press("r")
-    page.says("#order", "goes out again")
+    page.says("#order", "under a new id")
     body = {"reason": "somebody was faster", "by": "another operator"}
     page.night.client.post("/v1/rollback", json=body).raise_for_status()
     theirs = page.night.state["in_use"]
@@ -203,10 +203,10 @@ def test_a_night_has_trends_and_notes_and_an_older_matrix_goes_out_again(page):
     page.open()
     page.turn("history")
     page.until("document.querySelectorAll('#trends .plot canvas').length === 6", 20.0)
-    page.says("#trends", "seen in the slopes")
+    page.says("#trends", "from the slopes")
     page.until("/\\d+ samples/.test(document.querySelector('#against .said').innerText)", 30.0)
     page.click("#nights [name=note]")
-    page.dialog("kept for ever")
+    page.dialog("cannot be changed")
     page.send("dome shutter moved")
     page.says("#lives", "dome shutter moved")
     page.says("#trail", "annotation: dome shutter moved")
@@ -258,14 +258,14 @@ def test_a_change_is_seen_within_a_second(page):
 def test_everything_is_stopped_and_released_in_two_clicks_each(page):
     page.open()
     page.click("#stop")
-    page.says("#order", "Nothing is made or sent")
+    page.says("#order", "Nothing is computed or sent")
     page.click("#order [value=send]")
     page.says("#operation", "STOPPED")
     page.says("#alarms", "stopped")
     assert page.night.state["stopped_because"]
     page.says("#answer", "everything was stopped")
     page.press("r")
-    page.says("#answer", "Roll back cannot be ordered now: everything was stopped")
+    page.says("#answer", "Roll back is not possible now: everything was stopped")
     page.click("#stop")
     page.click("#order [value=send]")
     page.says("#answer", "released")
@@ -284,7 +284,7 @@ def test_once_there_are_keys_the_page_asks_for_one_and_says_why_it_may_not_order
         field.send_keys(secret)
         page.click("#login [type=submit]")
 
-    page.says("#lost", "wants a key")
+    page.says("#lost", "requires a key")
     log_in("pyrcal_guess")
     page.says("#login", "found a key that is none")
     assert page.faults_of_access() == []
@@ -292,7 +292,7 @@ def test_once_there_are_keys_the_page_asks_for_one_and_says_why_it_may_not_order
     page.until("document.querySelector('#lost').hidden")
     page.says("#who", "looks (read)")
     page.press("h")
-    page.says("#answer", "Hold cannot be ordered now: key looks may look, not order")
+    page.says("#answer", "Hold is not possible now: key looks is read-only")
     assert "key looks may look" in page.js("document.querySelector('#stop').title")
     keys.revoke("looks")
     log_in(order)
@@ -335,11 +335,11 @@ def test_an_rtc_that_is_gone_is_seen_with_what_to_do(page):
     page.night.telescope.kill()
     page.says("#alarms", "rtc-vanished", 10.0)
     page.says("#alarm-count", "1 alarm")
-    page.says("#rtc", "waiting for the RTC")
+    page.says("#rtc", "RTC not connected")
     page.says("#operation", "DEGRADED")
     assert page.js("document.querySelector('#loop').classList.contains('old')")
     page.says("#live", "rtc-vanished")
-    assert "cannot be used now: no RTC is there" in page.js(
+    assert "not possible now: no RTC is there" in page.js(
         "document.querySelector('[data-order=rollback]').title"
     )
     assert page.faults_of_access() == []
@@ -352,7 +352,7 @@ def test_an_alarm_is_acknowledged_and_muted_also_by_keys_alone(page):
     page.dialog("restart it")
     page.send("power is off\tAda")
     page.says("#answer", "rtc-vanished is acknowledged; it stays until it is over")
-    page.says("#alarms", "Ada knows since")
+    page.says("#alarms", "acknowledged by Ada")
     page.says("#alarms", "power is off")
     assert page.faults_of_access() == []
     page.click(f"{vanished}[data-about=mute]")

@@ -110,6 +110,20 @@ def test_it_is_under_the_header_on_every_view_and_nobody_is_kept_out(page, view)
     assert page.faults_of_access() == []
 
 
+def test_below_a_critical_alarm_no_card_grows_with_its_own_chart(page):
+    page.service.calm()
+    page.resize(LAPTOP)
+    page.turn("history")
+    page.service.alarm("slopes-stand", "found")
+    page.says("#critical h2", "slopes-stand")
+    page.turn("operate")
+    heights = []
+    for _ in range(8):
+        heights.append(page.js("document.querySelector('#registration').offsetHeight"))
+        time.sleep(1.0)
+    assert len(set(heights[2:])) == 1, heights
+
+
 def test_once_somebody_knows_it_gives_way_but_stays(page):
     page.service.alarm("loop-diverging", "found")
     page.until("document.querySelector('#critical').checkVisibility()")
@@ -123,7 +137,7 @@ def test_once_somebody_knows_it_gives_way_but_stays(page):
     )
     before = bottom_px(page, "#critical")
     page.service.acknowledge("loop-diverging", OperatorNote(by="Ada", reason="", t_ns_utc=1))
-    page.says("#critical", "Ada knows")
+    page.says("#critical", "acknowledged by Ada")
     assert bottom_px(page, "#critical") < 0.75 * before
     assert size_px(page, "#critical .cause") == largest_px(page)
     page.service.calm()
@@ -272,13 +286,13 @@ def test_to_mute_one_asks_for_how_long_and_why(page):
     page.click("#alarms [data-about=mute]")
     page.dialog("Mute worker-behind")
     needed = page.js("[...document.querySelectorAll('#order label')].map(e => e.innerText)")
-    assert [label.split()[-1] == "needed" for label in needed[-2:]] == [True, False]
-    assert needed[0].startswith("For needed")
+    assert [label.split()[-1] == "required" for label in needed[-2:]] == [True, False]
+    assert needed[0].startswith("For required")
     page.send()
-    page.says("#order .refused", "Not sent: For is needed")
+    page.says("#order .refused", "Not sent: For is required")
     page.press("4 hours")
     page.send()
-    page.says("#order .refused", "Not sent: Why is needed")
+    page.says("#order .refused", "Not sent: Reason is required")
     assert page.service.commands == []
     page.send("a slow machine")
     page.until("!document.querySelector('#order').open")
@@ -340,7 +354,7 @@ def test_every_dialog_begins_at_the_reason_and_says_whether_it_is_needed(page, o
     page.dialog("Ctrl+Enter")
     assert page.js("document.activeElement.id") == "reason"
     assert page.js("document.activeElement.required") == needed
-    word = "needed" if needed else "if you like"
+    word = "required" if needed else "optional"
     assert page.text("#order label:has(#reason)").split(" ", 1)[1] == word
     page.press(" \n")
     time.sleep(0.1)
@@ -359,14 +373,14 @@ def test_a_button_says_in_the_services_words_why_it_cannot_be_used(page, change)
     orders = {"acquire": "acquire", "rollback": "rollback", "dither-start": "start_dither"}
     for button, order in (orders | {"dither-stop": "stop_dither"}).items():
         reason = shown[order].reason
-        words = f"cannot be used now: {reason}" if reason else ""
+        words = f"not possible now: {reason}" if reason else ""
         page.until(f"document.querySelector('[data-order={button}]').title === {words!r}")
         disabled = page.js(f"document.querySelector('[data-order={button}]').ariaDisabled")
         assert disabled == str(bool(reason)).lower()
     page.press("r")
     reason = shown["rollback"].reason
     if reason:
-        page.says("#answer", f"Roll back cannot be ordered now: {reason}")
+        page.says("#answer", f"Roll back is not possible now: {reason}")
     else:
         page.dialog("Roll back to")
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from service.tracking.alarms import Alarm, AlarmRecord, OperatorNote, Severity
+from service.tracking.alarms import ALARMS, Alarm, AlarmRecord, OperatorNote, Severity
 from service.tracking.commands import AcknowledgeAlarm, MuteAlarm, UnmuteAlarm
 from service.tracking.operations.running import ServiceState
 from tests.unit.test_api import (  # noqa: F401
@@ -34,10 +34,10 @@ async def test_alarms_are_those_that_last_went_unseen_or_are_muted(client, servi
     assert lasting["alarm_state"] == "acknowledged"
     assert (lasting["acknowledged"]["by"], lasting["acknowledged"]["reason"]) == ("Ada", "known")
     assert lasting["acknowledged"]["t_utc"] == "1970-01-01T00:01:20.000000Z"
-    assert (lasting["do"], lasting["text"]) == ("close it", "open")
+    assert (lasting["do"], lasting["text"]) == (ALARMS["loop-open"].do, "open")
     assert (stale["severity"], stale["worst_severity"]) == (None, "critical")
     assert (stale["alarm_state"], stale["text"]) == ("stale", "bad")
-    assert "lower the gain" in stale["do"]
+    assert stale["do"] == ALARMS["margin"].do
     assert (muted["name"], muted["muted"]["until_ns_utc"]) == ("edge-slip", 99 * SECOND)
     assert body["worst_severity"] == "critical"
     state = await body_of(client, "/v1/state")

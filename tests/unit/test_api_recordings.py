@@ -198,7 +198,7 @@ async def test_it_stays_until_somebody_removes_it_and_no_matrix_goes_for_it(
     await client.post(f"/v1/recordings/{name}/end", json={})
     every = items(service.archive)
     (item,) = [one for one in every if one.kind == "recording"]
-    assert item.kept_because == "asked for by Ada: strange edge"
+    assert item.kept_because == "requested by Ada: strange edge"
     assert not list(due(every, RetentionPolicy(keep_days=1e-9, keep_gb=1e-9), 2**62))
     shown = ["archive", "show", name, "--data-dir", str(service.archive.directory)]
     capsys.readouterr()  # of the log

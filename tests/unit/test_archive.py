@@ -292,7 +292,7 @@ def test_a_lost_index_is_made_anew_from_the_sound_products(tmp_path):
         assert [r.id for r in archive.reconstructors.records()] == ["d"]
         np.testing.assert_array_equal(archive.reconstructors.matrix("d"), MATRIX)
     assert len(damaged) == 4
-    assert "made anew of 1 products" in damaged[3]
+    assert "rebuilt from 1 products" in damaged[3]
     assert "a.h5: damaged: found checksum" in damaged[0]
     assert "c.h5: damaged" in damaged[1]
     assert "z.h5: found reconstructor b in it, expected z" in damaged[2]
@@ -457,7 +457,7 @@ def test_a_lost_index_is_made_anew_with_what_became_of_every_matrix(archive):
     for leftover in archive.directory.glob("index.sqlite*"):
         leftover.unlink()
     (told,) = archive.open()
-    assert "index.sqlite: was not there: made anew of 4 products" in told
+    assert "index.sqlite: missing; rebuilt from 4 products" in told
     assert "the audit trail begins here" in told
     found = {record.id: record for record in archive.reconstructors.records()}
     assert {name: record.state for name, record in found.items()} == became

@@ -61,7 +61,7 @@ def test_they_are_what_they_were_without_the_index_too(archive, folder):
     for leftover in folder.glob("index.sqlite*"):
         leftover.unlink()
     (told,) = archive.open()
-    assert "made anew of 1 products" in told
+    assert "rebuilt from 1 products" in told
     (made,) = archive.reconstructors.records()
     assert (made.state, made.gate) == (MatrixState.APPLIED, with_index.gate)
     np.testing.assert_array_equal(made.alpha.vector, with_index.alpha.vector)

@@ -268,7 +268,7 @@ def test_the_packaged_papyrus_is_what_its_twin_and_its_data_say():
     [
         ("ring_actuators = [6, 12]", "ring_radii_m: missing"),
         ("ring_actuators = [6, 12]\nring_radii_m = [1.0]", "found 1 radii"),
-        ("ring_actuators = [6]\nring_radii_m = [1.0]\nlast_ring = 3", "last_ring: has no meaning"),
+        ("ring_actuators = [6]\nring_radii_m = [1.0]\nlast_ring = 3", "last_ring: has no effect"),
         ("ring_actuators = [3]\nring_radii_m = [1.0]", "found 3 actuators"),
     ],
 )
@@ -466,7 +466,7 @@ def test_a_mask_that_cannot_be_used_is_refused(write, tmp_path, reference, expec
 def test_a_flux_threshold_beside_a_mask_file_is_refused(write):
     wfs = WFS + 'valid_subapertures = "mask.h5:/valid"\nflux_threshold = 0.5\n'
     message = refusal(load_instrument, write(ABOUT + wfs + MIRROR + MODES))
-    assert "wfs.flux_threshold: has no meaning beside a mask file" in message
+    assert "wfs.flux_threshold: has no effect" in message
 
 
 @pytest.mark.parametrize(
@@ -546,7 +546,7 @@ def test_a_binned_mode_has_a_mask_of_its_own(write, tmp_path):
         ("", "binning = 2\n", "wfs.mode.0.config_id: missing"),
         ("", 'config_id = "b"\nbinnign = 2\n', "unknown key, did you mean binning?"),
         ("", 'config_id = "b"\nn_controlled = 51\n', "mode[0].n_controlled: found 51, expected at"),
-        ('config_id = "b"\n', 'config_id = "b"\n', "has no meaning beside [[wfs.mode]]"),
+        ('config_id = "b"\n', 'config_id = "b"\n', "instrument.config_id: has no effect"),
     ],
 )
 def test_modes_that_cannot_be_are_refused_in_one_line(write, about, modes, expected):
@@ -824,7 +824,7 @@ def test_functions_that_are_cropped_too_far_are_remarked_on(write, tmp_path):
         (
             ("influence_table = [90, 92]\n", ""),
             None,
-            "influence_table: missing beside mirror.influ",
+            "influence_table: missing; mirror.influ",
         ),
         (("[90, 92]", "[90000, 92000]"), None, "100 modes over 90000 x 92000 points, 6624.0 GB"),
         (("[90, 92]", "[90]"), None, "mirror.influence_table"),
@@ -832,7 +832,7 @@ def test_functions_that_are_cropped_too_far_are_remarked_on(write, tmp_path):
         (("", ""), np.zeros((3, 2)), "found shape (3, 2), expected (100, 2): row and column"),
         (("", ""), np.full((100, 2), 0.5), "rows or columns that are no whole numbers"),
         (("", ""), np.full((100, 2), 95), "found function 0 at row 95, column 95, expected all"),
-        (("influence_functions", "modes"), None, "has no meaning beside mirror.modes"),
+        (("influence_functions", "modes"), None, "has no effect together with mirror.modes"),
     ],
 )
 def test_crops_that_cannot_be_placed_are_refused(write, tmp_path, change, origin, expected):
@@ -872,16 +872,16 @@ def test_without_astropy_a_fits_file_is_refused_with_what_to_install(write, tmp_
         load_instrument, write(ABOUT + WFS + CUBE.replace("cube.h5:/modes", "cube.fits"))
     )
     assert "mirror.modes: " in message
-    assert "needs astropy; expected it beside pyrcal: pip install astropy" in message
+    assert "pip install astropy" in message
 
 
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (WFS + CUBE + "[modes]\nn_modes = 3\n", "modes.n_modes: found it beside a basis"),
+        (WFS + CUBE + "[modes]\nn_modes = 3\n", "modes.n_modes: found it together with"),
         (WFS + CUBE + 'layout = "rings"\n', "found layout and modes, expected one of"),
-        (WFS + CUBE + "pitch_m = 0.3\n", "mirror.pitch_m: has no meaning beside mirror.modes"),
-        (WFS + CUBE + 'basis = "zonal"\n', "mirror.basis: has no meaning beside mirror.modes"),
+        (WFS + CUBE + "pitch_m = 0.3\n", "mirror.pitch_m: has no effect"),
+        (WFS + CUBE + 'basis = "zonal"\n', "mirror.basis: has no effect"),
         (
             WFS + CUBE.replace("modes_pitch_m = 0.1\n", ""),
             "mirror.modes_pitch_m: missing, mirror.modes needs the step of its grid",
@@ -907,10 +907,10 @@ def test_without_astropy_a_fits_file_is_refused_with_what_to_install(write, tmp_
         (WFS + ALPAO + 'mode_to_actuator = "cube.h5:/nan"\n', "strokes that are not finite"),
         (
             WFS + ALPAO + 'mode_to_actuator = "cube.h5:/m2c"\nbasis = "KL"\n',
-            "mirror.basis: found it beside mirror.mode_to_actuator, expected only one of the two",
+            "mirror.basis: found it together with mirror.mode_to_actuator",
         ),
-        (WFS + ALPAO + 'modes_kind = "surface"\n', "mirror.modes_kind: found it, expected it besi"),
-        (WFS + ALPAO + "modes_pitch_m = 0.1\n", "mirror.modes_pitch_m: has no meaning beside"),
+        (WFS + ALPAO + 'modes_kind = "surface"\n', "mirror.modes_kind: found it, expected it "),
+        (WFS + ALPAO + "modes_pitch_m = 0.1\n", "mirror.modes_pitch_m: has no effect"),
         (
             WFS + ALPAO + 'mode_to_actuator = "cube.h5:/m2c"\n[loop]\nn_controlled = 8\n',
             "loop.n_controlled: found 8, expected at most the 7 modes of the basis",
@@ -944,15 +944,15 @@ def test_without_astropy_a_fits_file_is_refused_with_what_to_install(write, tmp_
         ),
         (
             WFS + 'input = "frames"\n' + MIRROR + MODES + '[slopes]\norder = "xy"\n',
-            "slopes.order: has no meaning beside wfs.input",
+            "slopes.order: has no effect with wfs.input",
         ),
         (
             WFS + MIRROR + MODES + '[slopes]\nkind = "intensity"\norder = "xy"\n',
-            'slopes.order: found xy beside kind = "intensity", expected images or images-yx or',
+            'slopes.order: found xy with kind = "intensity", expected images or images-yx or',
         ),
         (
             WFS + MIRROR + MODES + '[slopes]\norder = "detector"\n',
-            'slopes.order: found detector beside kind = "xy", expected xy or yx or interleaved',
+            'slopes.order: found detector with kind = "xy", expected xy or yx or interleaved',
         ),
         (
             WFS + MIRROR + MODES + "[slopes]\norientation = { sign = 0 }\n",

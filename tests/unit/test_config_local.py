@@ -101,7 +101,7 @@ def test_d_and_its_derivatives_are_those_of_whole_tables(loaded, given, monkeypa
     monkeypatch.setattr(interaction, "_MAX_DENSE_PRODUCT", 0.0)
     ending, whole = (model(loaded(given, local)) for local in (True, False))
     assert (ending.instrument.mirror.cube, whole.instrument.mirror.local) == (None, None)
-    assert isinstance(ending._rendered(SOMEWHERE), LocalShapes)
+    assert isinstance(ending._render_modes(SOMEWHERE), LocalShapes)
     found, expected = ending.linearise(SOMEWHERE), whole.linearise(SOMEWHERE)
     assert apart(found.matrix, expected.matrix) < 3e-6
     assert apart(found.rates, expected.rates) < 3e-6

@@ -63,8 +63,8 @@ def test_every_order_of_the_page_is_one_of_the_service():
     (said,) = said_of([{"permitted": refused}])
     assert {name for name, (disabled, _) in said.items() if disabled == "false"} == FREE
     for name in said.keys() - FREE:
-        assert re.fullmatch(r"cannot be used now: (\w+) is refused", said[name][1])
-    assert said["dither-start"][1] == "cannot be used now: start_dither is refused"
+        assert re.fullmatch(r"not possible now: (\w+) is refused", said[name][1])
+    assert said["dither-start"][1] == "not possible now: start_dither is refused"
 
 
 def test_a_button_is_disabled_for_the_reason_that_the_tracker_has():
@@ -79,7 +79,7 @@ def test_a_button_is_disabled_for_the_reason_that_the_tracker_has():
     for state, said in zip(told, said_of([{"permitted": one} for one in told]), strict=True):
         for button, order in pairs.items():
             reason = state[order]["reason"]
-            title = f"cannot be used now: {reason}" if reason else ""
+            title = f"not possible now: {reason}" if reason else ""
             assert said[button] == [str(bool(reason)).lower(), title]
 
 

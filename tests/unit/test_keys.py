@@ -15,7 +15,7 @@ from service.archive import Archive
 from service.cli.commands import DATA_DIR
 from service.config import Settings
 from service.errors import ConfigurationError, UnknownIdError
-from service.program import announced, running_services
+from service.program import announce, find_running_services
 from service.web.keys import KeyFile, KeyScope
 from service.wire.access import is_loopback
 
@@ -36,7 +36,7 @@ def notes(monkeypatch, tmp_path):
 
 def test_a_key_is_made_where_the_service_runs(tmp_path, notes, capsys):
     folder = tmp_path / "elsewhere"
-    with announced(folder, "http://127.0.0.1:8080"):
+    with announce(folder, "http://127.0.0.1:8080"):
         assert main(["key", "add", "ada", "--scope", "operate"]) == 0
     assert str(folder / "keys.json") in capsys.readouterr().err
     assert [key.name for key in KeyFile(folder).all()] == ["ada"]
@@ -49,14 +49,14 @@ def test_a_note_of_a_service_that_was_killed_counts_for_nothing(tmp_path, notes)
     notes.mkdir(parents=True, mode=0o700)
     left = notes / "7.json"
     left.write_text(json.dumps({"data_dir": str(tmp_path / "gone"), "url": ""}))
-    assert running_services() == ()
+    assert find_running_services() == ()
     assert not left.exists()
 
 
 def test_of_several_services_somebody_says_which(tmp_path, notes, monkeypatch, capsys):
-    with announced(tmp_path / "one", "http://127.0.0.1:1"):
+    with announce(tmp_path / "one", "http://127.0.0.1:1"):
         monkeypatch.setattr(os, "getpid", lambda: 2)
-        with announced(tmp_path / "two", "http://127.0.0.1:2"):
+        with announce(tmp_path / "two", "http://127.0.0.1:2"):
             assert main(["key", "list"]) == 2
             told = capsys.readouterr().err
             assert main(["key", "list", "--data-dir", str(tmp_path / "two")]) == 0
@@ -67,9 +67,9 @@ def test_of_several_services_somebody_says_which(tmp_path, notes, monkeypatch, c
 def test_a_folder_others_may_write_into_is_not_believed(tmp_path, notes):
     notes.mkdir(parents=True)
     notes.chmod(0o777)
-    with announced(tmp_path / "one", "http://127.0.0.1:1"):
+    with announce(tmp_path / "one", "http://127.0.0.1:1"):
         assert not list(notes.iterdir())
-    assert running_services() == ()
+    assert find_running_services() == ()
 
 
 def test_a_key_is_found_by_itself_and_not_to_be_had_from_the_file(tmp_path):
@@ -196,7 +196,7 @@ def test_keys_are_made_listed_and_revoked(capsys, tmp_path):
     assert main(["key", "revoke", "ada"]) == 0
     assert main(["key", "list"]) == 0
     told = capsys.readouterr()
-    assert (told.out, "so nobody may ask" in told.err) == ("", True)
+    assert (told.out, "the file has no key" in told.err) == ("", True)
     assert main(["key", "revoke", "ada"]) == 2
     assert "no such key" in capsys.readouterr().err
 

@@ -209,7 +209,7 @@ def tls(folder, **files):
 
 def test_beside_certificates_there_is_no_way_without(folder):
     found = refusal(folder, '[zenoh]\nlisten = ["tcp/127.0.0.1:7447"]\n' + tls(folder))
-    assert "found tcp/127.0.0.1:7447 beside [zenoh.tls], expected tls/HOST:PORT" in found
+    assert "found tcp/127.0.0.1:7447 together with [zenoh.tls], expected tls/HOST:PORT" in found
 
 
 def test_a_secret_that_could_be_guessed_is_refused(tmp_path):

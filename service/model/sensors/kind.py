@@ -102,7 +102,7 @@ class SensorKind(ABC):
         return written
 
     @abstractmethod
-    def described(self, table: Any, given: frozenset[str]) -> SensorDescription:  # noqa: ANN401 - its own
+    def read_sensor(self, table: Any, given: frozenset[str]) -> SensorDescription:  # noqa: ANN401 - its own
         """Return the sensor that a table describes, its mask apart; ``given``: keys written.
 
         Raises
@@ -144,7 +144,7 @@ class SensorKind(ABC):
         """Return how signals are made of the frames that the RTC sends; None: it sends signals."""
         return None
 
-    def assumed(self, table: Any, given: frozenset[str]) -> Iterator[tuple[str, str]]:  # noqa: ANN401
+    def list_assumptions(self, table: Any, given: frozenset[str]) -> Iterator[tuple[str, str]]:  # noqa: ANN401
         """Yield keys that the table leaves out, and what is taken instead."""
         yield from ()
 
@@ -189,7 +189,7 @@ class SensorKind(ABC):
         """Return the numbers that make another configuration of it when they change."""
         return (sensor.wavelength_m,)
 
-    def binned(self, sensor: Any, binning: int) -> SensorDescription:  # noqa: ANN401 - its own
+    def bin_sensor(self, sensor: Any, binning: int) -> SensorDescription:  # noqa: ANN401 - its own
         """Return the sensor with so many subapertures made one along each axis.
 
         Raises
@@ -274,7 +274,7 @@ class SensorKind(ABC):
         """Return how many pupil points along a subaperture the smoothest shapes need."""
         return 1
 
-    def fitted_key(self, sensor: Any) -> str | None:  # noqa: ANN401 - its own
+    def find_fitted_key(self, sensor: Any) -> str | None:  # noqa: ANN401 - its own
         """Return the key of a sensor parameter that is fitted together with α, by its logarithm.
 
         Fitting it keeps a wrong value in the file from biasing α. None if there is no such
@@ -310,7 +310,9 @@ class SensorKind(ABC):
 
         return np.zeros(4)
 
-    def displaced(self, instrument: Instrument, offsets: NDArray[np.float64]) -> SensorDescription:
+    def displace_images(
+        self, instrument: Instrument, offsets: NDArray[np.float64]
+    ) -> SensorDescription:
         """Return the sensor with its pupil images displaced by ``offsets`` ``(2 n_images,)``.
 
         Subapertures, axes of conventions.md: of each image along x, then of each along y.
@@ -368,7 +370,9 @@ class SensorKind(ABC):
         """Return what an instrument's light says of the pupil, or why it says nothing."""
         from service.model.sensors.sensor import CannotTell
 
-        return CannotTell(reason=f"the light of a {self.name} does not tell where the pupil lies")
+        return CannotTell(
+            reason=f"the position of the pupil cannot be estimated from the flux of a {self.name}"
+        )
 
 
 def _mean(term: Term) -> float:

@@ -209,7 +209,7 @@ class Light(Protocol):
     def counts(self, light: NDArray[Any]) -> NDArray[Any]:
         """Return a response's light as counts are laid out."""
 
-    def turned(self, counts: NDArray[Any]) -> NDArray[Any]:
+    def orient_counts(self, counts: NDArray[Any]) -> NDArray[Any]:
         """Return counts in the RTC's axes, in those of conventions.md."""
 
     def find_pupil(self, counts: NDArray[Any]) -> PupilPosition | CannotTell:

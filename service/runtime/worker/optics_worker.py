@@ -14,8 +14,8 @@ from service.control.expected_gain import (
     ExpectedGain,
     Sky,
     estimate_slope_noise,
-    expected_gain,
     extrapolate_variance_m2,
+    predict_gain,
 )
 from service.control.gains import CalibrationGains
 from service.control.gate import GateVerdict, judge
@@ -471,7 +471,7 @@ class OpticsWorker:
             slope_noise=noise * kind.noise,
         )
         try:
-            return expected_gain(in_use, fresh, seen, loop, sky)
+            return predict_gain(in_use, fresh, seen, loop, sky)
         except np.linalg.LinAlgError:
             return None
 
@@ -494,7 +494,7 @@ class OpticsWorker:
         loop = replace(conditions.loop, outer=outer_of(self._model), noise=noise)
         at_work = self._sensor.at_unit_gain(alpha)
         if self._left_over is not None:
-            at_work = self._left_over.added_to(at_work)
+            at_work = self._left_over.add_to(at_work)
         covariance, bound = conditions.covariance, conditions.bound
         return judge(reconstructor, at_work, alpha, covariance, loop, bound=bound)
 

@@ -38,7 +38,10 @@ from service.wire import DitherRequest, LoopRequest, Reply, Status
 MIN_FINAL_WINDOWS = 2
 """Ordinary windows that must agree with the last reconstructor in the loop."""
 
-NO_RTC = "no RTC is there: when one is, it begins anew or says why not; the loop may be open"
+NO_RTC = (
+    "no RTC is present; once there is one, the acquisition restarts or reports why not; the loop "
+    "may be open"
+)
 
 _LASTING_STAGES = (AcquisitionStage.FAILED, AcquisitionStage.INTERRUPTED)
 """Stages that remain until an operator, or windows, end them."""
@@ -399,10 +402,10 @@ def _resume_interrupted(context: StepContext) -> None:
     why_not = _check_automatic_resumption(context, rtc)
     if why_not is not None:
         do = (
-            "The loop may be open, and its matrix is for a registration that was not believed: "
+            "The loop may be open, and its matrix is for a registration that was rejected: "
             "acquire again, or close the loop on a matrix of your own"
         )
-        _note_interrupted(context, f"it does not begin anew by itself: {why_not}", do)
+        _note_interrupted(context, f"it does not restart by itself: {why_not}", do)
         return
     cause = _cause(context.acquisition)
     stages.set_acquisition(context, replace(context.acquisition, interruption=None))

@@ -70,8 +70,8 @@ MAX_ATTEMPTS = 3
 """Largest number of times that one acquisition opens the loop."""
 
 HELD_OFF_TEXT = (
-    "; none begins by itself until windows agree in a closed loop, the mode is set anew, or one is "
-    "asked for"
+    "; none starts by itself until windows agree in a closed loop, the mode is set again, or an "
+    "operator orders one"
 )
 """End of the text of an acquisition that an operator ended."""
 
@@ -329,7 +329,7 @@ def restart_acquisition(context: StepContext, reason: str, *, slipped: bool = Fa
         most, lost_with = half_of_modes(acquisition.n_modes), None
         limit_modes(context, most, reason)
     goal = acquisition.n_modes if acquisition.found is None else acquisition.found.n_controlled
-    validity.invalidate_telemetry(context, "the acquisition had not begun anew")
+    validity.invalidate_telemetry(context, "the acquisition had not restarted")
     stop_running_dither(context)
     validity.forget_registration(context)
     set_acquisition(

@@ -207,7 +207,7 @@ def _current_operation(state: TrackerState, now_ns: int) -> tuple[CurrentOperati
         if running.kind in OPERATION_OF:
             return OPERATION_OF[running.kind], running.text
     if state.operator.mode is Mode.HOLD:
-        return CurrentOperation.HOLD, "mode is hold: nothing is made or sent unless asked for"
+        return CurrentOperation.HOLD, "mode is hold: nothing is made or sent unless ordered"
     if _explain_idleness(state):
         return CurrentOperation.IDLE, "there is no closed loop"
     if state.alpha.registration is None:

@@ -31,7 +31,7 @@ export function runbookOf(name) {
 
 // The first clause stands by itself: it is what is read from afar.
 export function firstClause(text) {
-  return text.split(/[;:(]|\. /)[0].trim();
+  return text.split(/[;:(]|\. /)[0].trim().replace(/\.$/, "");
 }
 
 function sentence(text) {
@@ -90,7 +90,7 @@ export class CriticalBanner {
     const part = (selector) => this.#root.querySelector(selector);
     const { acknowledged: seen, muted } = alarm;
     const since = milliseconds(alarm.since_ns_utc);
-    const known = muted ? `; muted by ${muted.by} until ${clock(milliseconds(muted.until_ns_utc))} UTC` : seen ? `; ${seen.by} knows` : "";
+    const known = muted ? `; muted by ${muted.by} until ${clock(milliseconds(muted.until_ns_utc))} UTC` : seen ? `; acknowledged by ${seen.by}` : "";
     put(part("h2"), `${muted ? SYMBOLS.muted : SYMBOLS.critical} ${alarm.name}`);
     put(part(".cause"), sentence(firstClause(alarm.cause || alarm.text)));
     put(part(".remedy span"), firstClause(alarm.do));

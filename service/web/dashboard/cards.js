@@ -33,7 +33,7 @@ export function showHeader(service, orders) {
 function rtcLine(state, fresh) {
   const rtc = state?.rtc;
   if (!fresh || !state) return `RTC ${DASH}`;
-  if (!rtc) return "waiting for the RTC's status";
+  if (!rtc) return "RTC not connected";
   return `RTC ${number(rtc.frame_rate_hz, 0)} Hz, ${state.link.frames_lost} lost`;
 }
 
@@ -44,9 +44,9 @@ export function showConnection(service) {
   if (banner.hidden === lost) banner.hidden = !lost;
   document.body.classList.toggle("lost", lost);
   if (!lost) return;
-  const text = service.locked ? `${SYMBOLS.lost} This service wants a key: log in, at the top of the page.`
-    : service.state ? `${SYMBOLS.lost} CONNECTION LOST: nothing below is of now; the last was heard ${span(service.age_s)} ago. Trying again.`
-    : `${SYMBOLS.busy} Waiting for the service: nothing has been heard yet. Trying again.`;
+  const text = service.locked ? `${SYMBOLS.lost} This service requires a key: log in at the top of the page.`
+    : service.state ? `${SYMBOLS.lost} CONNECTION LOST: what is shown is ${span(service.age_s)} old. Trying again.`
+    : `${SYMBOLS.busy} Waiting for the service: no answer yet. Trying again.`;
   put(banner, text);
 }
 
@@ -123,7 +123,7 @@ function gauge(root, share, text) {
   const bar = root.querySelector("meter");
   bar.hidden = !present(share);
   if (present(share)) bar.value = Math.min(Math.max(share, 0), 1.2);
-  const word = !present(share) || share <= bar.low ? "" : share <= 1 ? ", near" : ", beyond";
+  const word = !present(share) || share <= bar.low ? "" : share <= 1 ? ", near the limit" : ", beyond the limit";
   put(root.querySelector("span"), `${text}${word}`);
 }
 
@@ -132,8 +132,8 @@ export function showProvenance(service, orders) {
   const record = orders.inUse;
   $("#provenance").classList.toggle("old", !fresh);
   if (!state?.in_use) return put($("#provenance"), `in use: ${DASH} (the RTC has not reported its matrix)`);
-  if (!record) return put($("#provenance"), `in use: ${state.in_use}, of which nothing is known`);
-  if (!record.alpha) return put($("#provenance"), `in use: ${record.id}, ${record.n_modes} modes; the RTC's own, for an unknown registration`);
+  if (!record) return put($("#provenance"), `in use: ${state.in_use}, without a record in this service`);
+  if (!record.alpha) return put($("#provenance"), `in use: ${record.id}, ${record.n_modes} modes; the RTC's own, registration unknown`);
   const frame = present(record.applied_frame_seq) ? `, applied at frame ${record.applied_frame_seq}` : "";
   const sent = record.published_ns_utc ? `, sent ${when(record.published_ns_utc, now)}` : "";
   const trial = [state.probation?.id, state.probation?.rollback].includes(record.id) ? `; probation: ${state.probation.state}` + (state.probation.state === "passed" ? "" : `, ${state.probation.text}`) : "";
@@ -147,7 +147,7 @@ function when(ns, now) {
 
 export function showReconstructors(service, orders) {
   const { now } = service;
-  const roles = [["waiting", orders.proposal], ["in use", orders.inUse], ["before", orders.before]];
+  const roles = [["waiting", orders.proposal], ["in use", orders.inUse], ["previous", orders.before]];
   const others = service.reconstructors.filter((r) => !roles.some(([, role]) => role?.id === r.id)).slice(-12).reverse();
   const rows = [...roles, ...others.map((r) => [r.state, r])].filter(([, r]) => r).map(([role, r]) => make(
     "tr", { className: role === "in use" ? "in-use" : "" },
@@ -155,11 +155,11 @@ export function showReconstructors(service, orders) {
     make("td", { text: r.id }),
     make("td", { className: "n", text: String(r.n_modes) }),
     make("td", r.alpha ? { text: shortly(r.alpha, r.sigma), title: registrationOf(r.alpha, r.sigma) } : { text: r.origin }),
-    make("td", { text: `${r.gate && !r.gate.accepted ? "REFUSED, " : ""}${margin(r.gate)?.text ?? "not judged"}`, title: verdict(r.gate) }),
+    make("td", { text: `${r.gate && !r.gate.accepted ? "REFUSED, " : ""}${margin(r.gate)?.text ?? "not checked"}`, title: verdict(r.gate) }),
     make("td", { text: r.created_ns_utc > 0 ? ago(milliseconds(r.created_ns_utc), now, true) : DASH }),
     make("td", { text: r.reason || DASH, title: r.reason }),
   ));
-  if (!rows.length) rows.push(make("tr", {}, make("td", { colspan: "7", text: "no reconstructor is known yet" })));
+  if (!rows.length) rows.push(make("tr", {}, make("td", { colspan: "7", text: "no reconstructor yet" })));
   $("#reconstructors tbody").replaceChildren(...rows);
 }
 

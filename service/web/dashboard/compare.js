@@ -46,24 +46,24 @@ export class Compare {
     const records = ids.map((id) => this.#service.reconstructors.find((r) => r.id === id));
     this.root.querySelector("ul").replaceChildren(...records.filter(Boolean).map((r) => {
       const made = milliseconds(r.created_ns_utc);
-      return make("li", { text: `${r.id}: made ${day(made)} ${clock(made)} UTC for ${registrationOf(r.alpha, r.sigma)}; ${verdict(r.gate)}` });
+      return make("li", { text: `${r.id}: computed ${day(made)} ${clock(made)} UTC for ${registrationOf(r.alpha, r.sigma)}; ${verdict(r.gate)}` });
     }));
     const said = this.root.querySelector(".said");
     if (!ids[0] || !ids[1] || ids[0] === ids[1]) return put(said, "choose two");
     const path = ids.map(encodeURIComponent);
-    put(said, "◐ being read");
+    put(said, "◐ reading");
     const answers = await Promise.all([
       this.#service.get(`v1/reconstructors/${path[0]}/compared-with/${path[1]}`, "no-cache").catch(() => null),
       ...path.map((id) => this.#service.get(`v1/reconstructors/${id}/singular-values`, "default").catch(() => null))]);
     if (mine !== this.#reading) return;
     const [compared, ...singular] = answers;
-    put(said, compared ? `they differ by ${number(100 * compared.difference, 1)} % of the second, over ${compared.modes.length} modes` : "the numbers of one of them are not there any more, or of other slopes");
+    put(said, compared ? `they differ by ${number(100 * compared.difference, 1)} % of the second, over ${compared.modes.length} modes` : "the numbers of one of them are no longer archived, or of other slopes");
     this.#draw(compared, singular, ids);
   }
 
   #draw(compared, singular, ids) {
     if (compared) {
-      const lines = [{ name: "gain, first over second", values: compared.gain }, { name: "cosine between rows", values: compared.cosine }];
+      const lines = [{ name: "gain, first / second", values: compared.gain }, { name: "cosine between rows", values: compared.cosine }];
       this.figures.rows.show({ x: compared.modes, label: "Gain and cosine of each mode", lines, least: 0.02 });
       this.root.querySelector(".rows-said").replaceChildren(keyOf(lines.map((line) => line.name)));
     }
@@ -72,7 +72,7 @@ export class Compare {
     const n = Math.max(...there.map(({ values }) => values.length));
     const most = Math.max(...there.map(({ values }) => values[0]));
     const lines = there.map(({ name, values }) => ({ name, values: Array.from({ length: n }, (_, k) => (k in values ? values[k] / most : null)) }));
-    this.figures.singular.show({ x: Array.from({ length: n }, (_, k) => k + 1), log: true, label: "Singular values over the largest", lines });
+    this.figures.singular.show({ x: Array.from({ length: n }, (_, k) => k + 1), log: true, label: "Singular values relative to the largest", lines });
     this.root.querySelector(".singular-said").replaceChildren(keyOf(lines.map(({ name, values }) => `${name} (${number(values[0] / values.findLast((v) => v !== null), 1)})`)));
   }
 }

@@ -12,7 +12,7 @@ function lineOf(alarm) {
   const { name, acknowledged: seen, worst_severity: worst, over_ns_utc: over } = alarm;
   const word = alarm.severity ?? `over, was ${worst}`;
   const been = alarm.severity && alarm.severity !== worst ? `, has been ${worst}` : "";
-  const known = seen && `${seen.by} knows since ${clock(milliseconds(seen.t_ns_utc))} UTC${seen.reason ? `: ${seen.reason}` : ""}`;
+  const known = seen && `acknowledged by ${seen.by} at ${clock(milliseconds(seen.t_ns_utc))} UTC${seen.reason ? `: ${seen.reason}` : ""}`;
   const runbook = runbookOf(name);
   return make("li", { className: alarm.alarm_state, title: alarm.do, data_tone: over ? "" : toneOf(alarm.severity) },
     make("strong", { text: `${over ? SYMBOLS.over : SYMBOLS[alarm.severity]} ${name}` }),

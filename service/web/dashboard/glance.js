@@ -41,7 +41,7 @@ export class Glance {
   // What is waiting, in use, was before: as far as each is there and has been read.
   #showSingular() {
     const { proposal, inUse, before } = this.#orders;
-    const roles = [["in use", inUse], ["waiting", proposal], ["before", before]].filter(([, record]) => record);
+    const roles = [["in use", inUse], ["waiting", proposal], ["previous", before]].filter(([, record]) => record);
     const ids = new Set(roles.map(([, { id }]) => id));
     for (const id of this.#singular.keys()) if (!ids.has(id)) this.#singular.delete(id);
     for (const id of ids) if (!this.#singular.has(id)) this.#readSingular(id);
@@ -71,9 +71,9 @@ export class Glance {
   async #readGains() {
     const { optical_gain: gains, measured } = await this.#service.get("v1/gains");
     const at = new Map(measured.map((one) => [one.mode, one.gain]));
-    this.lines.gains.show({ x: gains.map((_, mode) => mode), label: "Gain of the sensor for each mode",
+    this.lines.gains.show({ x: gains.map((_, mode) => mode), label: "Optical gain of each mode",
       lines: [{ name: "expected", values: gains }, { name: "measured", values: gains.map((_, mode) => at.get(mode) ?? null), dots: true }] });
-    this.root.querySelector(".gains-said").replaceChildren(keyOf(measured.length ? ["between", "measured"] : ["expected; none measured"]));
+    this.root.querySelector(".gains-said").replaceChildren(keyOf(measured.length ? ["interpolated", "measured"] : ["expected; none measured"]));
   }
 
   async #readSlopes() {
@@ -81,7 +81,7 @@ export class Glance {
     const known = rms.flat().filter(present);
     const most = Math.max(...known);
     grid(this.root.querySelector(".slopes"), rms.map((row) => row.map((v) => (present(v) ? (100 * v) / most : null))),
-      { label: `Residual slopes, RMS in each subaperture, Sx beside Sy: at most ${number(most, 3)}` });
+      { label: `Residual slopes, RMS in each subaperture, Sx next to Sy: at most ${number(most, 3)}` });
     put(this.root.querySelector(".slopes-said"), `Sx | Sy, RMS, dark 0 to light ${number(most, 2)}`);
   }
 }

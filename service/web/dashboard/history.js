@@ -49,13 +49,13 @@ export class History {
     try {
       ({ nights } = await this.#service.get("v1/nights"));
     } catch {
-      put(this.root.querySelector(".read"), "the nights cannot be read now: try again");
+      put(this.root.querySelector(".read"), "the nights cannot be read now; try again");
       return;
     }
     const chosen = this.night.value;
     this.#nights = nights.reverse();
     this.night.replaceChildren(...this.#nights.map((n) => make("option", { value: n.date, text: n.date })));
-    if (!nights.length) put(this.root.querySelector(".read"), "no night has been kept yet");
+    if (!nights.length) put(this.root.querySelector(".read"), "no night has been archived yet");
     else if (!this.#nights.some((n) => n.date === chosen)) this.#whole();
     else {
       this.night.value = chosen;
@@ -85,7 +85,7 @@ export class History {
   #typed() {
     const [from, to] = this.times.map((time) => this.#moment(time.value));
     if (from && to && from < to) this.#span(from, to);
-    else put(this.root.querySelector(".read"), "from has to be before to, in a night that begins at noon");
+    else put(this.root.querySelector(".read"), "the start must be before the end, within a night from noon to noon");
   }
 
   // A time of the clock in the night that is shown, which begins at its noon; 0: none was typed.
@@ -105,14 +105,14 @@ export class History {
   async #read(narrow = false) {
     const mine = ++this.#reading;
     const time = this.#time;
-    put(this.root.querySelector(".read"), "◐ being read");
+    put(this.root.querySelector(".read"), "◐ reading");
     let past;
     try {
       const [history, marks, trends] = await Promise.all([`alpha/history?${time}&points=2000`, `marks?${time}&limit=2000`, `trends?${time}&points=2000`]
         .map((what) => this.#service.get(`v1/${what}`, "no-cache")));
       past = { entries: history.entries, marks: marks.marks, samples: trends.samples, interval: trends.interval_s };
     } catch {
-      if (mine === this.#reading) put(this.root.querySelector(".read"), "this time cannot be read now: try again");
+      if (mine === this.#reading) put(this.root.querySelector(".read"), "this time cannot be read now; try again");
       return;
     }
     if (mine !== this.#reading) return;
@@ -152,7 +152,7 @@ export class History {
     else this.charts.tell(entry?.filtered, entry?.filtered_sigma);
     const night = this.#chosen;
     const what = night ? `${night.n_estimates} measurements that night, ${night.n_swaps} swaps, ${night.n_jumps} jumps, ${night.n_alarms} alarms` : "";
-    put(this.root.querySelector(".read"), `${day(this.#from)} ${clock(this.#from)} to ${day(this.#to)} ${clock(this.#to)} UTC; ${what}; beside the charts the last of this time`);
+    put(this.root.querySelector(".read"), `${day(this.#from)} ${clock(this.#from)} to ${day(this.#to)} ${clock(this.#to)} UTC; ${what}; next to the charts the last values of this time`);
   }
 
   // --- what lasted
@@ -211,7 +211,7 @@ export class History {
     }
     const links = this.root.querySelector("#trail .links");
     links.replaceChildren(...["csv", "jsonl"].map((kind) =>
-      make("a", { href: `v1/audit?${this.#time}&format=${kind}`, download: "", text: `all of it, ${kind}` })));
+      make("a", { href: `v1/audit?${this.#time}&format=${kind}`, download: "", text: `download all, ${kind}` })));
     this.#showLines();
   }
 

@@ -12,7 +12,7 @@ export class Large {
     this.#service = service;
     this.#orders = orders;
     this.root = root;
-    this.rows = Object.fromEntries(["loop", "α", "wavefront", "margin", "frames", "alarms", "waits for"].map((label) => {
+    this.rows = Object.fromEntries(["loop", "α", "wavefront", "stability", "frames", "alarms", "waiting for"].map((label) => {
       const value = make("dd", { text: DASH });
       root.querySelector("dl").append(make("dt", { text: label }), value);
       return [label, value];
@@ -46,10 +46,10 @@ export class Large {
       loop: rtc ? [`${rtc.loop}, ${rtc.n_controlled} modes`, rtc.loop === "open" ? "warn" : ""] : ["no RTC", "warn"],
       α: known ? [`${known.validity}, ${age}`, known.validity === "fresh" ? "" : "warn"] : ["not known", "warn"],
       wavefront: [expected ? nanometres(expected.wavefront_m) : DASH],
-      margin: [margin(state.margin)?.text ?? DASH, state.margin && !state.margin.accepted ? "bad" : ""],
+      stability: [margin(state.margin)?.text ?? DASH, state.margin && !state.margin.accepted ? "bad" : ""],
       frames: rtc ? [`${number(rtc.frame_rate_hz, 0)} Hz, ${link.frames_lost} lost`] : [DASH],
       alarms: alarms.length ? [alarms.map((a) => `${SYMBOLS[a.severity]} ${a.name}`).join(", "), toneOf(alarms[0].severity)] : ["none"],
-      "waits for": this.#orders.proposal ? ["you: approve or reject"] : [waits ? `${waits.responsible}: ${waits.name}` : "nothing"],
+      "waiting for": this.#orders.proposal ? ["you: approve or reject"] : [waits ? `${waits.responsible}: ${waits.name}` : "nothing"],
     };
   }
 }

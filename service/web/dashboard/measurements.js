@@ -43,7 +43,7 @@ export class Measurements {
       this.#fits = fits.fits.reverse();
       this.#show();
     } catch {
-      put(this.root.querySelector(".read"), "what there is cannot be read; trying again");
+      put(this.root.querySelector(".read"), "the list cannot be read; trying again");
     }
     const running = this.#fits.filter((f) => UNFINISHED.has(f.state)).length;
     const due = running || this.#matrices.some((m) => UNDER_WAY.has(m.state)) || !this.#service.fresh;
@@ -63,7 +63,7 @@ export class Measurements {
   #show() {
     const { now } = this.#service;
     const n = this.#matrices.length;
-    put(this.root.querySelector(".read"), n ? `${n}, newest first` : "none has been measured for this service yet");
+    put(this.root.querySelector(".read"), n ? `${n}, newest first` : "no matrix or recording yet");
     fill(this.root.querySelector("#matrices tbody"), this.#matrices.map((m) => ("who" in m ? recordingRow(m, now) : this.#matrixRow(m, now))), 6, "none");
     fill(this.root.querySelector("#fits tbody"), this.#fits.map((f) => this.#fitRow(f, now)), 4, "none since the service started");
   }
@@ -73,7 +73,7 @@ export class Measurements {
     const path = `v1/${noisy ? "noisy-matrix" : "measurements"}/${encodeURIComponent(matrix.id)}`;
     const found = matrix.finding;
     const size = `${matrix.n_modes ?? matrix.modes.length} modes`;
-    const stroke = noisy ? `${nanometres(matrix.total_m)} in all` : nanometres(matrix.amplitude_m?.[0]);
+    const stroke = noisy ? `${nanometres(matrix.total_m)} in total` : nanometres(matrix.amplitude_m?.[0]);
     const says = found ? `signal ${number(found.snr, 1)} × noise; ${shortly(found.alpha, found.sigma)}` : matrix.reason || DASH;
     const acts = make("td", { className: "acts" });
     if (matrix.state === "stored" && noisy) acts.append(download(`${path}/file`, "HDF5"));
@@ -151,8 +151,8 @@ export class Measurements {
   #offer() {
     const [file] = this.form.matrix.files;
     const with_ = [...this.form.instrument.files].map((f) => f.name);
-    const whose = with_.length ? `for ${with_.join(", ")}` : "for this service's own instrument";
-    this.#say(file ? `${file.name}, ${number(file.size / 1e6, 1)} MB, ${whose}` : "no file chosen yet: choose one, or drop it here");
+    const whose = with_.length ? `for ${with_.join(", ")}` : "for the instrument of this service";
+    this.#say(file ? `${file.name}, ${number(file.size / 1e6, 1)} MB, ${whose}` : "no file chosen yet; choose one, or drop it here");
   }
 
   #say(text) {
@@ -187,7 +187,7 @@ export class Measurements {
       this.#sending = null;
       progress.hidden = end.hidden = true;
       const told = read(sending.responseText);
-      const over = sending.status === 202 ? `${told.id} is in the queue` : `Not taken: ${told.detail ?? "it was given up, or the service does not answer"}`;
+      const over = sending.status === 202 ? `${told.id} is in the queue` : `Refused: ${told.detail ?? "the upload was cancelled, or the service does not answer"}`;
       this.#say(over);
       this.look();
       if (told.id) this.#open(told.id);
@@ -208,12 +208,12 @@ export class Measurements {
       if (this.#shown !== id) return; // another one is asked for meanwhile
       found = answer && (await answer.json().catch(() => null));
       if (answer && answer.status !== 202) break;
-      put(root.querySelector(".verdict"), `◐ ${found?.name || id}: ${found?.stage || found?.state || "asked for"}`);
+      put(root.querySelector(".verdict"), `◐ ${found?.name || id}: ${found?.stage || found?.state || "requested"}`);
       await new Promise((done) => setTimeout(done, LOOK_MS));
     }
     this.#show();
     const of = this.#fits.find((f) => f.id === id);
-    put(root.querySelector("h2"), `Found: ${of?.name || id}`);
+    put(root.querySelector("h2"), `Result: ${of?.name || id}`);
     put(root.querySelector(".verdict"), found?.verdict ?? `✕ ${found?.reason ?? found?.detail ?? "no answer"}`);
     root.querySelector(".drawn").hidden = !found?.verdict;
     if (!found?.verdict) return;
@@ -252,14 +252,14 @@ export class Measurements {
 
   #draw(root, found, drawn) {
     const { measured, synthetic } = drawn.singular_values;
-    this.figures.singular.show({ x: measured.map((_, k) => k + 1), log: true, label: "Singular values over the largest",
+    this.figures.singular.show({ x: measured.map((_, k) => k + 1), log: true, label: "Singular values relative to the largest",
       lines: [{ name: "measured", values: measured }, { name: "model", values: synthetic }] });
-    this.figures.gains.show({ x: drawn.modes, label: "Gain of each mode", lines: [{ name: "measured over model", values: found.gains, dots: true }] });
+    this.figures.gains.show({ x: drawn.modes, label: "Gain of each mode", lines: [{ name: "measured / model", values: found.gains, dots: true }] });
     const left = drawn.residual_map.flat().filter((v) => v !== null);
     const most = Math.max(1, ...left);
     const four = drawn.residual_map.length === drawn.residual_map[0].length;
-    const shown = four ? "the four images" : "Sx beside Sy";
-    grid(root.querySelector(".left canvas"), drawn.residual_map, { most, label: `Left over in each subaperture, ${shown}: 0 to ${most} %` });
+    const shown = four ? "the four images" : "Sx next to Sy";
+    grid(root.querySelector(".left canvas"), drawn.residual_map, { most, label: `Residual in each subaperture, ${shown}: 0 to ${most} %` });
     put(root.querySelector(".left .legend"), `${four ? "Four images" : "Sx | Sy"}, dark 0 to light ${most} % of the measured RMS`);
     root.querySelector(".maps").replaceChildren(...drawn.maps.map((one) => {
       const canvases = ["measured", "synthetic", "difference"].map((name) => {
@@ -280,7 +280,7 @@ function recordingRow(recording, now) {
   const acts = make("td", { className: "acts" });
   acts.append(state === "stored" ? download(`v1/recordings/${encodeURIComponent(id)}/file`, "HDF5", `${id}.h5`) : "ends by itself");
   const at = born(recording);
-  const lacks = [dropped && `${dropped} messages dropped`, reason].filter(Boolean).join("; ");
+  const lacks = [dropped && `${dropped} messages lost`, reason].filter(Boolean).join("; ");
   return make("tr", {},
     make("th", { scope: "row", text: id }),
     make("td", { text: "telemetry" }),

@@ -65,7 +65,7 @@ export class MirrorOnSensor {
     let text = "the registration is not known";
     if (alpha) {
       const far = this.#places.map(({ from, to }) => Math.hypot(to[0] - from[0], to[1] - from[1]));
-      const most = far.length ? `farthest actuator ${(100 * Math.max(...far)).toFixed(1)} % of a subaperture from its place` : "no actuators are known: modes were measured";
+      const most = far.length ? `farthest actuator ${(100 * Math.max(...far)).toFixed(1)} % of a subaperture from its nominal position` : "actuator positions are not known (measured modes)";
       text = `${most}${stretched(alpha)}`;
     }
     this.text = text;
@@ -166,7 +166,7 @@ export class MirrorOnSensor {
     if (k === this.#marked) return;
     this.#marked = k;
     const place = this.#places[k];
-    let text = "point at an actuator";
+    let text = "Point at an actuator to see its displacement.";
     if (place) {
       const moved = place.to ? place.to.map((value, axis) => 100 * (value - place.from[axis])) : [null, null];
       const words = moved.map((value) => (present(value) ? `${value >= 0.05 ? "+" : ""}${fixed(value, 1)}` : DASH));

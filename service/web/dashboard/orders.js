@@ -81,14 +81,14 @@ export class Orders {
     if (this.#dialog.open || this.#opening) return;
     const why = this.whyNot(name);
     if (why) {
-      this.say(`${TITLES[name] ?? name} cannot be ordered now: ${why}`);
+      this.say(`${TITLES[name] ?? name} is not possible now: ${why}`);
       return;
     }
     this.#opening = true;
     try {
       await this.#look(name, value);
     } catch (error) {
-      this.say(`${TITLES[name] ?? name} cannot be ordered now: ${error.message}`);
+      this.say(`${TITLES[name] ?? name} is not possible now: ${error.message}`);
       return;
     } finally {
       this.#opening = false;
@@ -121,7 +121,7 @@ export class Orders {
     const field = event.target;
     if (field !== this.#dialog.querySelector(":invalid:not(form)")) return;
     const label = field.parentElement.querySelector("span").firstChild.textContent.trim();
-    put(this.#dialog.querySelector(".refused"), field.validity.valueMissing ? `Not sent: ${label} is needed` : `Not sent: ${label}: ${field.validationMessage}`);
+    put(this.#dialog.querySelector(".refused"), field.validity.valueMissing ? `Not sent: ${label} is required` : `Not sent: ${label}: ${field.validationMessage}`);
     field.focus();
   }
 
@@ -207,15 +207,15 @@ export class Orders {
     const { name, value, title } = this.#order;
     let why = this.whyNot(name);
     if (!why) await this.#look(name, value).catch((error) => (why = error.message));
-    const text = why ? `it cannot be ordered now: ${why}. Cancel and try again.` : "the dialog shows the new state: send or cancel.";
+    const text = why ? `it is not possible now: ${why}. Cancel and try again.` : "the dialog shows the new state; send or cancel.";
     put(this.#dialog.querySelector(".refused"), `The state has changed, and nothing was sent; ${text}`);
     this.#dialog.querySelector("[value=send]").disabled = Boolean(why);
-    this.say(`${title}: nothing was sent, the state had changed`);
+    this.say(`${title}: nothing was sent, because the state had changed`);
   }
 
   #waits(waits) {
     this.#dialog.querySelector("[value=send]").disabled = waits;
-    put(this.#dialog.querySelector(".asked"), waits ? "◐ ordered, waiting for the result" : "");
+    put(this.#dialog.querySelector(".asked"), waits ? "◐ sent, waiting for the result" : "");
   }
 }
 
@@ -230,7 +230,7 @@ function fieldOf({ name, label, options, value = "", needed = false, ...rest }) 
 }
 
 function need(needed) {
-  return needed ? "needed" : "if you like";
+  return needed ? "required" : "optional";
 }
 
 function newKey() {
@@ -279,8 +279,8 @@ function alarmOf(state, name) {
 
 const TITLES = {
   approve: "Approve", reject: "Reject", rollback: "Roll back", hold: "Hold", mode: "Mode", acquire: "Acquire",
-  abort: "Abort the acquisition", "give-up": "Give up", "dither-start": "Start the dither", "dither-stop": "Stop the dither",
-  stop: "Stop everything", resume: "Release", measure: "Measure", noisy: "Noisy matrix", record: "Keep telemetry", "open-loop": "End the gain ramp",
+  abort: "Abort the acquisition", "give-up": "Cancel the measurement", "dither-start": "Start the dither", "dither-stop": "Stop the dither",
+  stop: "Stop everything", resume: "End the stop", measure: "Measure", noisy: "Noisy matrix", record: "Record telemetry", "open-loop": "End the gain ramp",
   acknowledge: "Acknowledge", "acknowledge-all": "Acknowledge all", mute: "Mute", unmute: "Unmute",
 };
 
@@ -293,9 +293,9 @@ const ORDERS = {
       title: "Stop everything",
       facts: [
         orders.work && `${orders.work.title} is ended.`,
-        dither && `${dither.id} is stopped; no other is started.`,
-        `Nothing is made or sent, whoever asks (mode is ${mode}); ${inUse ?? "what the RTC uses"} stays in use, telemetry is still used.`,
-        "It lasts until it is released, even over a restart of the service. Mode and dither are then as before.",
+        dither && `${dither.id} is stopped; no other one starts.`,
+        `Nothing is computed or sent, even on order (mode is ${mode}). ${inUse ?? "The present matrix"} stays in use, and telemetry is still used.`,
+        "The stop lasts until you end it, also over a restart of the service. Mode and dither are then as before.",
       ],
       button: "Stop everything",
       method: "POST",
@@ -310,9 +310,9 @@ const ORDERS = {
       title: `Acknowledge ${name}`,
       facts: [
         alarm.text,
-        alarm.do && `What to do: ${alarm.do}.`,
-        lasts ? "It stays on this page, with who acknowledged it, until it is over." : "It is over and was not acknowledged. It leaves this page.",
-        lasts && "If it becomes worse, it has to be acknowledged again.",
+        alarm.do && `What to do: ${alarm.do}`,
+        lasts ? "It stays on this page, with your name, until it is over." : "It is over and was not acknowledged. It leaves this page.",
+        lasts && "If it becomes more severe, it must be acknowledged again.",
       ],
       button: "Acknowledge",
       method: "POST",
@@ -327,7 +327,7 @@ const ORDERS = {
       title: `Acknowledge ${alarms.length} alarms`,
       facts: [
         ...alarms.map((alarm) => `${alarm.severity ? SYMBOLS[alarm.severity] : SYMBOLS.over} ${alarm.name}${alarm.severity ? "" : " (over)"}: ${alarm.text}`),
-        "Those that last stay on this page, with who acknowledged them; those that are over leave it.",
+        "Active alarms stay on this page, with your name; those that are over leave it.",
       ],
       button: "Acknowledge all",
       parts: alarms.map(({ name, worst_severity: severity }) => ({ name, path: `v1/alarms/${encodeURIComponent(name)}/acknowledge`, body: { severity } })),
@@ -341,7 +341,7 @@ const ORDERS = {
       fields: [{ name: "for_s", label: "For", options: MUTE_TIMES, needed: true }],
       facts: ({ for_s: seconds }) => [
         alarm.text,
-        `It is not listed here until ${seconds ? `${clock(orders.service.now + seconds * 1000)} UTC` : DASH}, however often it comes; muted alarms are counted.`,
+        `It is hidden until ${seconds ? `${clock(orders.service.now + seconds * 1000)} UTC` : DASH}, even if it occurs again; muted alarms are counted.`,
         "What it forbids stays forbidden.",
       ],
       button: "Mute",
@@ -356,7 +356,7 @@ const ORDERS = {
     needs(muted, `${name} is not muted`);
     return {
       title: `Unmute ${name}`,
-      facts: [`${muted.by} muted it${muted.reason ? `: ${muted.reason}` : ""}. It is listed again from now on.`],
+      facts: [`${muted.by} muted it${muted.reason ? `: ${muted.reason}` : ""}. It is shown again from now on.`],
       button: "Unmute",
       method: "POST",
       path: `v1/alarms/${encodeURIComponent(name)}/unmute`,
@@ -364,12 +364,12 @@ const ORDERS = {
   },
   resume(orders) {
     return {
-      title: "Release what was stopped",
+      title: "End the stop",
       facts: [
         `Stopped: ${orders.state.stopped_because}.`,
-        `Mode is ${orders.state.mode} again, and it may dither, make and send as that allows.`,
+        `Mode is ${orders.state.mode} again; the service dithers, computes and sends as it allows.`,
       ],
-      button: "Release",
+      button: "End the stop",
       method: "POST",
       path: "v1/resume",
     };
@@ -380,13 +380,13 @@ const ORDERS = {
     return {
       title: `Approve ${record.id}`,
       facts: [
-        `The RTC gets ${record.id}, ${record.n_modes} modes, and swaps it in between two frames.`,
-        inUse && `It takes the place of ${inUse.id}, ${inUse.n_modes} modes.`,
-        `Made for ${registrationOf(record.alpha, record.sigma)}.`,
+        `The RTC receives ${record.id}, ${record.n_modes} modes, and applies it between two frames.`,
+        inUse && `It replaces ${inUse.id}, ${inUse.n_modes} modes.`,
+        `Computed for ${registrationOf(record.alpha, record.sigma)}.`,
         `Largest closed-loop pole radius within α ± 3σ: ${verdict(record.gate)}.`,
-        present(orders.wins) && `By the linear model it wins ${nanometres(orders.wins)} of wavefront error.`,
-        "It is judged again first if the loop has changed, and not sent if it would not hold.",
-        orders.state.no_return && `There is no way back: ${orders.state.no_return}.`,
+        present(orders.wins) && `According to the linear model it reduces the wavefront error by ${nanometres(orders.wins)}.`,
+        "If the loop has changed, it is checked again before, and not sent if it would be unstable.",
+        orders.state.no_return && `A rollback will not be possible: ${orders.state.no_return}.`,
       ],
       button: "Approve and send",
       method: "POST",
@@ -398,8 +398,8 @@ const ORDERS = {
     return {
       title: `Reject ${record.id}`,
       facts: [
-        `${described(record, orders.wins)} is discarded; what is in use stays.`,
-        "More modes than are controlled now are then not proposed again for an hour.",
+        `${described(record, orders.wins)} is discarded; the matrix in use stays.`,
+        "For an hour, no matrix with more modes than now is proposed.",
       ],
       button: "Reject",
       asked: true,
@@ -412,15 +412,15 @@ const ORDERS = {
     return {
       title: `Roll back to ${before.id}`,
       facts: [
-        `${before.id}, ${before.n_modes} modes, goes out again under a new id${inUse ? ` in place of ${inUse.id}, ${inUse.n_modes} modes` : ""}.`,
-        before.alpha ? `Made for ${registrationOf(before.alpha, before.sigma)}.` : `It is ${before.origin}.`,
-        `When it was judged last: ${verdict(before.gate)}. The gate judges it anew where it can.`,
+        `${before.id}, ${before.n_modes} modes, is sent again under a new id${inUse ? ` in place of ${inUse.id}, ${inUse.n_modes} modes` : ""}.`,
+        before.alpha ? `Computed for ${registrationOf(before.alpha, before.sigma)}.` : `It is ${before.origin}.`,
+        `Last stability check: ${verdict(before.gate)}. It is checked again if possible.`,
         state.mode === "hold" ? "Mode stays hold." : `Mode becomes hold (it is ${state.mode}), so that the service does not undo it.`,
       ],
       fields: [{
         name: "anyway",
-        label: "If the gate refuses it",
-        options: [["", "nothing is sent"], ["yes", "it goes out all the same: α may be what is wrong"]],
+        label: "If the check refuses it",
+        options: [["", "nothing is sent"], ["yes", "it is sent all the same (if α is wrong)"]],
       }],
       button: "Roll back",
       asked: true,
@@ -436,8 +436,8 @@ const ORDERS = {
       title: `Mode ${mode}`,
       facts: [
         `Mode ${mode}: ${MODES[mode]}. It is ${state.mode} now.`,
-        proposal && mode === "auto" && `${proposal.id} waits for an approval; in auto another one is made and sent when it wins enough.`,
-        "It stands until it is changed again, even over a restart of the service.",
+        proposal && mode === "auto" && `${proposal.id} waits for an approval; in auto another one is computed and sent when it improves enough.`,
+        "It lasts until it is changed, also over a restart of the service.",
       ],
       button: `Set mode ${mode}`,
       method: "PUT",
@@ -451,9 +451,9 @@ const ORDERS = {
     return {
       title: "Stop the dither",
       facts: [
-        dither ? `${dither.id} is stopped: modes ${dither.modes.slice(0, 8).join(", ")}${dither.modes.length > 8 ? " and more" : ""}.` : "None plays now.",
-        "None starts by itself until one is ordered, even over a restart of the service.",
-        until ? `α is not measured by a dither any more, and stale by ${clock(until)} UTC unless ordinary telemetry keeps it.` : "α is not measured by a dither any more.",
+        dither ? `${dither.id} is stopped: modes ${dither.modes.slice(0, 8).join(", ")}${dither.modes.length > 8 ? " and more" : ""}.` : "No dither is playing now.",
+        "None starts by itself until you start one, also over a restart of the service.",
+        until ? `α is no longer measured, and stale after ${clock(until)} UTC unless telemetry without dither keeps it.` : "α is no longer measured by a dither.",
       ],
       button: "Stop the dither",
       method: "POST",
@@ -465,8 +465,8 @@ const ORDERS = {
     return {
       title: "Start the dither",
       facts: [
-        `The service chooses modes, lines and strength: at most ${nanometres(orders.state.dither_policy.budget_m)} RMS of all modes together.`,
-        "It dithers again by itself from then on, as the settings allow.",
+        `The service chooses modes, frequencies and amplitudes: at most ${nanometres(orders.state.dither_policy.budget_m)} RMS of all modes together.`,
+        "From then on it dithers by itself, as the settings allow.",
       ],
       button: "Start the dither",
       method: "POST",
@@ -480,9 +480,9 @@ const ORDERS = {
       title: "Acquire",
       facts: [
         `The loop, now ${rtc.loop} with ${rtc.n_controlled} modes, is opened: the image is lost for some tens of seconds.`,
-        "Smooth modes are dithered far above the budget while it is open, until two windows agree where the mirror is.",
-        "The loop is closed on at most 150 modes first, then on more; these matrices need no further approval, but pass the gate.",
-        registration ? "The present α is given up." : `α is ${DASH}: nothing is lost by it.`,
+        "Smooth modes are dithered far above the budget while it is open, until two windows agree on the registration.",
+        "The loop is closed with at most 150 modes first, then with more. These matrices need no approval, but must pass the stability check.",
+        registration ? "The present α is discarded." : "α is not known, so none is lost.",
       ],
       button: "Open the loop and acquire",
       asked: true,
@@ -496,8 +496,8 @@ const ORDERS = {
       title: "Abort the acquisition",
       facts: [
         `It is at ${orders.state.acquisition.stage}: ${orders.state.acquisition.text}.`,
-        "The loop is left as it was found if that held; else it stays open, or closed on a matrix that passed the gate.",
-        "None begins by itself until two windows agree in a closed loop, or the mode is set anew.",
+        "The loop returns to its former state if that was stable; otherwise it stays open, or closed with a matrix that passed the stability check.",
+        "None begins by itself until two windows agree in a closed loop, or the mode is set again.",
       ],
       button: "Abort",
       method: "POST",
@@ -509,12 +509,12 @@ const ORDERS = {
     const { measuring, noisy_measurement } = orders.state;
     const one = measuring ?? noisy_measurement;
     return {
-      title: `Give up ${one.id}`,
+      title: `Cancel ${one.id}`,
       facts: [
-        `${one.id} is ${one.state}; its matrix is given up.`,
-        measuring && "The RTC may measure to the end, and refuse other commands until then; its matrix is ignored.",
+        `${one.id} is ${one.state}; its matrix is discarded.`,
+        measuring && "The RTC may finish the measurement, and refuse other commands until then.",
       ],
-      button: "Give up",
+      button: "Cancel the measurement",
       method: "DELETE",
       path: `v1/${measuring ? "measurements" : "noisy-matrix"}/${encodeURIComponent(one.id)}`,
     };
@@ -524,8 +524,8 @@ const ORDERS = {
     return {
       title: "End the gain ramp",
       facts: [
-        `${orders.work.text}: the RTC ends it only when its loop is opened.`,
-        "The loop is opened: the image is lost until it is closed again. Gains stay as the ramp has left them.",
+        `${orders.work.text}: the RTC ends it only when its loop opens.`,
+        "The loop is opened: the image is lost until it is closed again. The gains stay as the ramp has set them.",
       ],
       button: "Open the loop",
       asked: true,
@@ -539,16 +539,16 @@ const ORDERS = {
     return {
       title: "Measure an interaction matrix",
       fields: [
-        { name: "pattern", label: "How", options: Object.entries(PATTERNS), value: "push-pull-modal" },
-        { name: "modes", label: "Modes, the first", min: 1, max: rtc.n_modes, placeholder: `the ${rtc.n_controlled} controlled` },
+        { name: "pattern", label: "Pattern", options: Object.entries(PATTERNS), value: "push-pull-modal" },
+        { name: "modes", label: "First N modes", min: 1, max: rtc.n_modes, placeholder: `the ${rtc.n_controlled} controlled` },
         { name: "n_average", label: "Repetitions", min: 1, max: 10_000, placeholder: "the service chooses" },
       ],
       facts: ({ pattern, modes }) => [
         pattern === "sine"
           ? "The loop stays as it is; each mode moves at its own frequency, all at once, for about 10 s."
           : `The loop, now ${rtc.loop}, is opened: the image is lost until the RTC has measured, seconds to minutes, and closes it again.`,
-        `What moves: ${modes ?? (pattern === "sine" ? "up to 40" : rtc.n_controlled)} modes, by some nanometres RMS each.`,
-        "No dither and no new reconstructor meanwhile. What is in use stays; nothing measured is ever sent to the RTC.",
+        `Moving: ${modes ?? (pattern === "sine" ? "up to 40" : rtc.n_controlled)} modes, by some nanometres RMS each.`,
+        "No dither and no new reconstructor meanwhile. The reconstructor in use stays; the measured matrix is never sent to the RTC.",
       ],
       button: "Measure",
       asked: true,
@@ -563,17 +563,17 @@ const ORDERS = {
   },
   record() {
     return {
-      title: "Keep telemetry",
+      title: "Record telemetry",
       fields: [
         { name: "duration_s", label: "Seconds from now on", needed: true, min: 0, max: 3600, step: "any", value: 60 },
         { name: "before_s", label: "Seconds before", needed: true, min: 0, max: 3600, step: "any", value: 60 },
       ],
       facts: ({ duration_s: seconds = 0, before_s: before = 0 }) => [
-        `All that the RTC sends in the next ${number(seconds, 0)} s goes to the archive, byte for byte.`,
-        before > 0 ? `What came in the last ${number(before, 0)} s is in it too, as far as the service still holds it (usually a minute).` : "It begins now.",
-        "It stays until it is removed; it ends early if the disk becomes full.",
+        `Everything that the RTC sends in the next ${number(seconds, 0)} s is archived, byte for byte.`,
+        before > 0 ? `The last ${number(before, 0)} s are included, as far as the service still has them (usually a minute).` : "It starts now.",
+        "The recording stays until it is removed. It ends early if the disk is nearly full.",
       ],
-      button: "Begin",
+      button: "Start",
       asked: true,
       method: "POST",
       path: "v1/recordings",
@@ -586,10 +586,10 @@ const ORDERS = {
       fields: [{ name: "duration_s", label: "Seconds", needed: true, min: 1, max: 3600, step: "any", value: 30 }],
       facts: ({ duration_s: seconds }) => [
         `The loop stays closed: random signs on its ${rtc.n_controlled} modes at once for ${number(seconds, 0)} s of telemetry.`,
-        `What moves: at most ${nanometres(Math.min(5e-9, dither_policy.budget_m))} RMS of all modes together; the service's own dither makes way.`,
-        "Its windows are fitted like any other; it can never become a reconstructor.",
+        `Moving: at most ${nanometres(Math.min(5e-9, dither_policy.budget_m))} RMS of all modes together; the dither of the service is stopped meanwhile.`,
+        "Its windows are fitted like any other. The matrix never becomes a reconstructor.",
       ],
-      button: "Begin",
+      button: "Start",
       method: "POST",
       path: "v1/noisy-matrix",
     };
@@ -607,7 +607,7 @@ const PATTERNS = {
 // A button that can be used, or says why not.
 export function usable(button, why) {
   button.setAttribute("aria-disabled", String(Boolean(why)));
-  button.title = why ? `cannot be used now: ${why}` : "";
+  button.title = why ? `not possible now: ${why}` : "";
 }
 
 export function margin(gate) {

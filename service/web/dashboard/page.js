@@ -57,7 +57,7 @@ async function turnTo() {
     await (await pages[name]).look();
   } catch {
     delete pages[name];
-    orders.say(`the page ${name} cannot be fetched: the service does not answer; try again`);
+    orders.say(`the page ${name} cannot be loaded: the service does not answer; try again`);
   }
 }
 

@@ -154,7 +154,7 @@ export class Registration {
     // nobody knows what it is worth by now: only how old it is
     const worth = fresh ? known?.validity : `✕ connection lost ${span(this.#service.age_s)} ago`;
     const why = fresh && known?.validity_reason ? `: ${known.validity_reason}` : "";
-    const told = known ? `${worth}, from telemetry of ${ago(measured, now)}${why}` : "not known yet";
+    const told = known ? `${worth}, from telemetry of ${ago(measured, now)}${why}` : "not measured yet";
     put(this.root.querySelector(".worth"), state ? told : DASH);
     if (performance.now() - this.#drawn > 1000) this.#draw();
   }

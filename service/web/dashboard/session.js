@@ -29,7 +29,7 @@ export class Session {
   #take({ name, scope }) {
     this.#name = name;
     this.#service.locked = false;
-    this.#service.forbidden = scope === "read" ? `key ${name} may look, not order: log out, and in with one of scope operate` : "";
+    this.#service.forbidden = scope === "read" ? `key ${name} is read-only: log out, and log in with a key of scope operate` : "";
     this.#button.hidden = !name;
     put(this.#button, `${name} (${scope}): log out`);
   }
@@ -53,7 +53,7 @@ export class Session {
       if (!answer.ok) return put(refused, `Refused: ${told.detail}`);
       this.#take(told);
     } catch {
-      return put(refused, "No such key, or the service does not answer.");
+      return put(refused, "Wrong key, or the service does not answer.");
     }
     this.#field.value = "";
     this.#dialog.close();

@@ -82,7 +82,7 @@ export class Service extends EventTarget {
         body: body && JSON.stringify(body),
       });
     } catch {
-      return { refused: true, lost: true, text: "the service does not answer: nothing is known of what became of it" };
+      return { refused: true, lost: true, text: "the service does not answer; it is not known whether the order was carried out" };
     }
     const told = await answer.json().catch(() => ({}));
     return { refused: !answer.ok, stale: answer.status === 412, told, text: told.detail ?? told.text ?? `${answer.status} ${answer.statusText}` };

@@ -11,9 +11,9 @@ const STROKES = ["accent", "tolerance"];
 // Each: what it is, how it is written, its lines of the samples, and what it may not pass.
 const ROWS = [
   { label: "wavefront error", unit: "nm", write: (y) => nanometres(y / 1e9), lines: [
-    { name: "by the model", of: (s) => times(s.wavefront_m, 1e9) }, { name: "seen in the slopes", of: (s) => times(s.residual_m, 1e9) }] },
-  { label: "margin", unit: "pole radius over its bound", write: (y) => number(y, 3), limit: 1, lines: [{ name: "", of: (s) => s.margin }] },
-  { label: "gain of the sensor", unit: "", write: (y) => number(y, 2), lines: [{ name: "", of: (s) => s.optical_gain }] },
+    { name: "model", of: (s) => times(s.wavefront_m, 1e9) }, { name: "from the slopes", of: (s) => times(s.residual_m, 1e9) }] },
+  { label: "stability", unit: "pole radius relative to its limit", write: (y) => number(y, 3), limit: 1, lines: [{ name: "", of: (s) => s.margin }] },
+  { label: "optical gain", unit: "", write: (y) => number(y, 2), lines: [{ name: "", of: (s) => s.optical_gain }] },
   { label: "flux", unit: "", write: (y) => number(y, 1), instead: "magnitude", lines: [{ name: "", of: (s) => s.flux }] },
   { label: "elevation", unit: "deg", write: (y) => number(y, 1, "deg"), lines: [{ name: "", of: (s) => s.elevation_deg }] },
   { label: "azimuth", unit: "deg", write: (y) => number(y, 1, "deg"), lines: [{ name: "", of: (s) => s.azimuth_deg }] },
@@ -70,7 +70,7 @@ export class Trends {
   #choose(row, samples) {
     const key = samples.some((s) => present(s[row.label])) ? row.label : row.instead;
     row.lines[0].of = (s) => s[key];
-    put(row.plot.parentElement.querySelector(".label"), key === row.label ? row.label : `star's ${key}`);
+    put(row.plot.parentElement.querySelector(".label"), key === row.label ? row.label : `star, ${key}`);
   }
 
   #chart(row, k, data) {

@@ -110,14 +110,14 @@ const OPERATIONS = {
 };
 
 export const MODES = {
-  auto: "it makes and sends by itself whatever passes the gate",
-  propose: "it makes matrices, and an operator approves each one",
-  hold: "it only measures: nothing is made or sent without an order",
+  auto: "the service computes matrices and sends those that pass the stability check",
+  propose: "the service computes matrices, and an operator approves each one",
+  hold: "the service only measures; nothing is computed or sent without an order",
 };
 
 // What the gate found, as a line.
 export function verdict(gate) {
-  if (!gate) return "not judged";
+  if (!gate) return "not checked";
   const radius = `${number(gate.worst_pole_radius, 3)} of ${number(gate.bound, 2)}`;
   return gate.accepted ? `stable, ${radius}` : `REFUSED, ${radius}: ${gate.reason}`;
 }

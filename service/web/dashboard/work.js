@@ -18,14 +18,14 @@ export function busy(state, now) {
   }
   const one = measuring ?? noisy_measurement;
   if (one) {
-    const sofar = one.state === "finishing" ? "being fitted and kept" : one.state === "waiting" ? "waiting for the dither to end" : one.state;
+    const sofar = one.state === "finishing" ? "being fitted and stored" : one.state === "waiting" ? "waiting for the dither to end" : one.state;
     const what = `${sofar}${measuring ? `, ${measuring.pattern}, ${measuring.modes.length} modes` : ""}`;
-    return { title: `Measuring ${one.id}`, text: what, ...timed(one.asked_ns_utc, one.duration_s, now), order: "give-up", button: "Give up" };
+    return { title: `Measuring ${one.id}`, text: what, ...timed(one.asked_ns_utc, one.duration_s, now), order: "give-up", button: "Cancel" };
   }
   const ramp = asked?.lasts_s && RAMPING.has(asked.state) && rtc && rtc.loop !== "open" ? asked : null;
   const over = ramp && now - milliseconds(ramp.asked_ns_utc) > 1000 * (ramp.lasts_s + 10);
   if (!ramp || over) return null;
-  return { title: "Gain ramp", text: ramp.text, ...timed(ramp.asked_ns_utc, ramp.lasts_s, now), order: "open-loop", button: "End it" };
+  return { title: "Gain ramp", text: ramp.text, ...timed(ramp.asked_ns_utc, ramp.lasts_s, now), order: "open-loop", button: "End" };
 }
 
 function timed(since, lasts_s, now) {
@@ -36,7 +36,7 @@ function timed(since, lasts_s, now) {
 
 // How far it is, as a line: what is not known is not guessed.
 export function soFar({ text, since, left_s: left }, now) {
-  const until = left === null ? "" : left > 0 ? `, about ${span(left)} left` : ", over any moment";
+  const until = left === null ? "" : left > 0 ? `, about ${span(left)} left` : ", ending";
   return `${text}; for ${span((now - milliseconds(since)) / 1000)}${until}`;
 }
 

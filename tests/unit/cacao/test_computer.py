@@ -90,7 +90,7 @@ def test_a_loop_switched_off_is_open_and_goes_on_in_its_session(loop):
     loop.rows(0.5)
     session = loop.rtc.session
     assert loop.stands("commands") == (
-        "aol1_modevalDM: its counter stands at 81; is the loop on (loopON)?"
+        "aol1_modevalDM: its counter stays at 81; is the loop on (loopON)?"
     )
     assert loop.rtc.status().loop is Loop.OPEN
     loop.rows(0.5)
@@ -114,13 +114,13 @@ def test_a_loop_set_to_zero_is_another_session(loop):
 
 def test_a_counter_that_stands_is_told_with_the_writer_that_has_ended(loop, gone):
     loop.rows(0.5)
-    assert loop.stands("slopes") == "aol1_imWFS2: its counter stands at 81"
+    assert loop.stands("slopes") == "aol1_imWFS2: its counter stays at 81"
     loop.rows(0.5)
     loop.slopes.pid = gone
     loop.frame(0.5)
     loop.rtc.poll()
     ended = f"process {gone}, which wrote it, has ended"
-    assert loop.stands("slopes") == f"aol1_imWFS2: its counter stands at 162; {ended}"
+    assert loop.stands("slopes") == f"aol1_imWFS2: its counter stays at 162; {ended}"
 
 
 def test_a_writer_that_ended_in_the_midst_of_a_frame_is_named(loop, gone):
@@ -135,7 +135,7 @@ def test_a_writer_that_ended_in_the_midst_of_a_frame_is_named(loop, gone):
 @pytest.mark.parametrize(
     ("field", "value", "told"),
     [
-        ("version", b"1.00", "found version '1.00', expected '2.00': make it anew with milk"),
+        ("version", b"1.00", "found version '1.00', expected '2.00': create it again"),
         ("location", 1, "found its data in the memory of GPU 1, expected a stream in the host's"),
     ],
 )

@@ -37,22 +37,25 @@ def told(tracker=STATE, *, ready=True, **changes):
 
 def test_the_first_line_says_whether_it_is_ready_and_the_next_what_is_wrong():
     lines = status_lines(told())
-    assert lines[0] == "flao-lbt: Operational, Tracking; mode propose, up 1 min 0 s: ready"
-    assert lines[1] == "ALARM rtc.silent (warning) for 30 s: no status: look at it"
+    assert lines[0] == "flao-lbt: READY"
+    assert lines[1].startswith("Operational, Tracking; mode propose (")
+    assert lines[1].endswith("up 1 min 0 s")
+    assert lines[2] == "ALARM warning rtc.silent (for 30 s): no status: look at it"
+    assert lines[3].strip().startswith("To do:")
     assert status_lines(told(ready=False))[0].endswith("NOT READY: no RTC is there")
 
 
 def test_the_registration_the_loop_and_the_matrix_are_on_the_screen():
     text = "\n".join(status_lines(told()))
     for part in (
-        "loop closed at 1000 Hz, 400 of 594 modes",
+        "loop closed at 1000 Hz, 400 of 594 modes controlled",
         "shift x       +0.",
         "rotation",
         " deg",
         "magnification 1.",
-        "rtc-0 in use, worst pole radius 0.",
+        "rtc-0; worst pole radius 0.",
         "sparse: ordinary telemetry keeps σ between windows",
-        "windows  4 accepted, 1 refused",
+        "4 accepted, 1 rejected",
     ):
         assert part in text, text
 
@@ -67,21 +70,21 @@ def test_it_says_why_the_last_window_was_refused():
         last_ns_utc=88 * SECOND,
     )
     text = "\n".join(status_lines(told(refusal=last)))
-    assert "refused 12 s ago (3 times within a minute): 38 % of its frames were lost" in text
+    assert "12 s ago (3 times within a minute): 38 % of its frames were lost" in text
     assert "frames were lost" not in "\n".join(status_lines(told()))
 
 
 def test_a_service_that_knows_nothing_says_so():
     text = "\n".join(status_lines(told(tracker_state(system="small", mode=STATE.operator.mode))))
-    assert "none seen yet" in text
-    assert "not known yet" in text
-    assert "unknown in use, not judged" in text
+    assert "not connected" in text
+    assert "not measured yet" in text
+    assert "unknown; stability not checked" in text
 
 
 def test_what_cannot_be_told_is_a_question_mark():
     state = told()
     state["margin"]["worst_pole_radius"] = None
-    assert "worst pole radius ? of at most" in "\n".join(status_lines(state))
+    assert "worst pole radius ?, limit" in "\n".join(status_lines(state))
 
 
 @contextmanager

@@ -9,8 +9,8 @@ from service.control.expected_gain import (
     Sky,
     compute_radial_orders,
     estimate_noise_loss_m,
-    expected_gain,
     extrapolate_variance_m2,
+    predict_gain,
 )
 from service.control.loop import ControlLoop
 from service.control.reconstructor import invert
@@ -44,7 +44,7 @@ def shifted(by):
 def judged(alpha, sky=SKY, timing=TIMING):
     in_use = invert(matrix_at(Misregistration()), N_CONTROLLED).matrix
     fresh = invert(matrix_at(alpha), N_CONTROLLED).matrix
-    return expected_gain(in_use, fresh, matrix_at(alpha), timing, sky)
+    return predict_gain(in_use, fresh, matrix_at(alpha), timing, sky)
 
 
 def test_a_matrix_that_fits_has_nothing_to_gain():
@@ -82,7 +82,7 @@ def test_a_mode_without_gain_is_one_beyond_the_loop():
     matrix, n_fewer = matrix_at(shifted(0.1)), N_CONTROLLED - 1
     in_use, fresh = (invert(m, N_CONTROLLED).matrix for m in (matrix_at(Misregistration()), matrix))
     fewer = replace(TIMING, gains=np.full(n_fewer, 0.4))
-    expected = expected_gain(in_use[:n_fewer], fresh[:n_fewer], matrix, fewer, SKY)
+    expected = predict_gain(in_use[:n_fewer], fresh[:n_fewer], matrix, fewer, SKY)
     found = judged(shifted(0.1), timing=still(n_fewer))
     for name in ("loss_m", "wavefront_m", "pole_radius", "fresh_pole_radius"):
         assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-6)
@@ -145,7 +145,7 @@ def test_modes_that_are_the_eigenvectors_and_mixtures_of_them_are_summed_alike()
         (N_CONTROLLED, N_CONTROLLED)
     )
     mixed = (mixing @ fresh).astype(np.float32)
-    found = expected_gain(mixed, fresh, matrix_at(Misregistration()), TIMING, SKY)
+    found = predict_gain(mixed, fresh, matrix_at(Misregistration()), TIMING, SKY)
     assert found.pole_radius != found.fresh_pole_radius
     assert abs(found.loss_m) < 2e-4 * found.wavefront_m
 

@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from pyrcal.demo.children import GRACE_S, children, interrupt_on_end
+from pyrcal.demo.children import GRACE_S, interrupt_on_end, run_children
 from tests.system.night import session_members, wait_for
 from tests.system.pace import in_time
 
@@ -26,7 +26,7 @@ def started(child):
 def test_whatever_the_children_do_they_and_theirs_are_gone_within_the_grace(tmp_path, how):
     program = DEAF if how == "deaf" else WITH_A_CHILD
     commands = {name: ["-c", program] for name in ("service", "simulator")}
-    with children(tmp_path, commands) as both:
+    with run_children(tmp_path, commands) as both:
         leaders = [started(child) for child in both]
         assert all(len(session_members(leader)) == 2 for leader in leaders)
         if how == "stopped":
@@ -39,13 +39,15 @@ def test_whatever_the_children_do_they_and_theirs_are_gone_within_the_grace(tmp_
 
 
 def test_a_child_that_ended_is_quoted(tmp_path):
-    with children(tmp_path, {"service": ["-c", "print('why'); raise SystemExit(3)"]}) as (child,):
+    with run_children(tmp_path, {"service": ["-c", "print('why'); raise SystemExit(3)"]}) as (
+        child,
+    ):
         wait_for(lambda: child.ended, 20.0, "an end")
         assert child.ended == "the service ended with status 3: why"
 
 
 def test_an_impatient_second_interrupt_leaves_nothing_behind(tmp_path):
-    with children(tmp_path, {"service": ["-c", DEAF]}) as (child,):
+    with run_children(tmp_path, {"service": ["-c", DEAF]}) as (child,):
         leader = started(child)
         signal.setitimer(signal.ITIMER_REAL, 0.5)
         before = signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT))

@@ -14,11 +14,11 @@ from service.estimation.kalman import (
     Joint,
     allow_scatter,
     begin_joint,
-    corrected,
+    correct_state,
     expect_stretches,
     forget,
     innovation,
-    predicted,
+    predict_state,
     widen_after_jump,
     with_stretches,
 )
@@ -58,26 +58,26 @@ class TestWindows:
         """The arithmetic mean, and half the variance; the innovation is 4 x 1/2."""
         noise = np.diag(SIGMA**2)
         begun = begin_joint(np.zeros(4), noise)
-        found = corrected(begun, SIGMA, noise)
+        found = correct_state(begun, SIGMA, noise)
         np.testing.assert_allclose(found.alpha, SIGMA / 2)
         np.testing.assert_allclose(found.alpha_covariance, noise / 2)
         assert innovation(begun, SIGMA, noise) == pytest.approx(2.0)
 
     def test_the_random_walk_widens_with_the_square_root_of_time(self):
         drift = Drift(alpha_rate=np.array([0.01, 0.02, 0.001, 0.0003]))
-        found = predicted(begin_joint(NOWHERE, np.zeros((4, 4))), drift, 9.0)
+        found = predict_state(begin_joint(NOWHERE, np.zeros((4, 4))), drift, 9.0)
         sigma = np.sqrt(np.diag(found.alpha_covariance))
         np.testing.assert_allclose(sigma, 3 * drift.alpha_rate)
 
     def test_time_that_runs_backwards_does_not_shrink_it(self):
         begun = begin_joint(NOWHERE, DITHERED)
-        early = predicted(begun, DRIFT, -3.0)
+        early = predict_state(begun, DRIFT, -3.0)
         np.testing.assert_array_equal(early.covariance, begun.covariance)
 
     def test_what_flexure_adds_is_a_variance_too(self):
         """0.3 and 0.4 make 0.5."""
         begun = begin_joint(NOWHERE, np.diag([0.09, 0.0, 0.0, 0.0]))
-        bent = predicted(begun, STILL, 1.0, np.array([0.4, 0.0, 0.0, 0.0]))
+        bent = predict_state(begun, STILL, 1.0, np.array([0.4, 0.0, 0.0, 0.0]))
         assert np.sqrt(bent.covariance[0, 0]) == pytest.approx(0.5)
 
     @pytest.mark.parametrize(
@@ -89,15 +89,15 @@ class TestWindows:
         noise, walk = np.diag(SIGMA**2), Drift(alpha_rate=SIGMA / 20)
         joint = begin_joint(SIGMA * rng.normal(size=4), noise)
         for _ in range(100):
-            prior = predicted(joint, walk, 1.0)
+            prior = predict_state(joint, walk, 1.0)
             read = SIGMA * rng.normal(size=4)
             assert innovation(prior, read, noise) < JUMP_THRESHOLD
-            joint = corrected(prior, read, noise)
+            joint = correct_state(prior, read, noise)
         assert np.all(np.abs(joint.alpha) < 4 * np.sqrt(np.diag(joint.alpha_covariance)))
         measured = joint.alpha + jump
-        prior = predicted(joint, walk, 1.0)
+        prior = predict_state(joint, walk, 1.0)
         assert innovation(prior, measured, noise) > JUMP_THRESHOLD
-        found = corrected(widen_after_jump(prior, noise), measured, noise)
+        found = correct_state(widen_after_jump(prior, noise), measured, noise)
         assert np.all(np.abs(found.alpha - measured) < 0.02 * np.abs(jump).max())
         assert np.all(np.diag(found.alpha_covariance) > 0.9 * SIGMA**2)
 
@@ -108,7 +108,7 @@ class TestWindows:
 
     def test_the_inputs_are_left_alone(self):
         begun, measured, noise = begin_joint(NOWHERE, DITHERED), away(0.1, 0, 0, 0), SCATTER.copy()
-        corrected(predicted(begun, DRIFT, 5.0), measured, noise)
+        correct_state(predict_state(begun, DRIFT, 5.0), measured, noise)
         np.testing.assert_array_equal(begun.alpha_covariance, DITHERED)
         np.testing.assert_array_equal(noise, SCATTER)
         np.testing.assert_array_equal(measured, away(0.1, 0, 0, 0))
@@ -121,33 +121,33 @@ class TestBias:
         """Prior of α: 1 subaperture. A bias does not average out, of no parameter."""
         joint = begun(NOWHERE, np.diag([1.0, 1.0, 0.01, 0.01]))
         for _ in range(50):
-            joint = corrected(joint, NOWHERE, SCATTER, PASSIVE_BIAS)
+            joint = correct_state(joint, NOWHERE, SCATTER, PASSIVE_BIAS)
         assert np.all(np.sqrt(np.diag(joint.alpha_covariance)) > 0.99 * BIAS_FLOOR)
 
     def test_the_bias_is_the_difference_of_the_two_readings(self):
         """Both many times: to a tenth of a percent of a subaperture."""
         joint = begun(NOWHERE, DITHERED)
         for _ in range(400):
-            joint = corrected(joint, NOWHERE, DITHERED)
-            joint = corrected(joint, away(0.06, -0.03, 3e-4, 0.0), SCATTER, PASSIVE_BIAS)
+            joint = correct_state(joint, NOWHERE, DITHERED)
+            joint = correct_state(joint, away(0.06, -0.03, 3e-4, 0.0), SCATTER, PASSIVE_BIAS)
         np.testing.assert_allclose(joint.bias(PASSIVE_BIAS), [0.06, -0.03, 3e-4, 0.0], atol=1e-3)
         np.testing.assert_allclose(joint.alpha, NOWHERE, atol=1e-3)
 
     def test_once_the_bias_is_learnt_a_passive_reading_moves_the_registration(self):
         joint = begun(NOWHERE, DITHERED)
         for _ in range(100):
-            joint = corrected(joint, NOWHERE, DITHERED)
-            joint = corrected(joint, away(0.06, 0, 0, 0), SCATTER, PASSIVE_BIAS)
-        later = predicted(joint, Drift(alpha_rate=np.full(4, 0.01), bias_memory_s=np.inf), 1.0)
-        found = corrected(later, away(0.08, 0, 0, 0), SCATTER, PASSIVE_BIAS)
+            joint = correct_state(joint, NOWHERE, DITHERED)
+            joint = correct_state(joint, away(0.06, 0, 0, 0), SCATTER, PASSIVE_BIAS)
+        later = predict_state(joint, Drift(alpha_rate=np.full(4, 0.01), bias_memory_s=np.inf), 1.0)
+        found = correct_state(later, away(0.08, 0, 0, 0), SCATTER, PASSIVE_BIAS)
         assert found.alpha[0] == pytest.approx(0.02, abs=0.003)
         assert np.sqrt(found.covariance[0, 0]) < 0.005
 
     def test_a_change_of_wind_is_far_out_and_what_is_forgotten_is_the_bias_alone(self):
         joint = begun(NOWHERE, DITHERED)
         for _ in range(20):
-            joint = corrected(joint, NOWHERE, DITHERED)
-            joint = corrected(joint, NOWHERE, SCATTER, PASSIVE_BIAS)
+            joint = correct_state(joint, NOWHERE, DITHERED)
+            joint = correct_state(joint, NOWHERE, SCATTER, PASSIVE_BIAS)
         assert innovation(joint, away(0.12, 0, 0, 0), SCATTER, PASSIVE_BIAS) > JUMP_THRESHOLD
         gone = forget(joint, PASSIVE_BIAS)
         np.testing.assert_array_equal(gone.alpha, joint.alpha)
@@ -157,16 +157,16 @@ class TestBias:
     def test_a_jump_seen_by_the_dither_keeps_the_bias(self):
         joint = begun(NOWHERE, DITHERED)
         for _ in range(50):
-            joint = corrected(joint, NOWHERE, DITHERED)
-            joint = corrected(joint, away(0.05, 0, 0, 0), SCATTER, PASSIVE_BIAS)
-        moved = corrected(widen_after_jump(joint, DITHERED), away(0.1, 0, 0, 0), DITHERED)
+            joint = correct_state(joint, NOWHERE, DITHERED)
+            joint = correct_state(joint, away(0.05, 0, 0, 0), SCATTER, PASSIVE_BIAS)
+        moved = correct_state(widen_after_jump(joint, DITHERED), away(0.1, 0, 0, 0), DITHERED)
         assert moved.alpha[0] == pytest.approx(0.1, abs=0.005)
         assert moved.bias(PASSIVE_BIAS)[0] == pytest.approx(0.05, abs=0.01)
 
     def test_what_was_learnt_of_the_bias_fades_to_knowing_nothing(self):
         joint = begun(NOWHERE, DITHERED)
         learnt = replace(joint, mean=joint.mean + np.array([0, 0, 0, 0, 0.05, 0, 0, 0]))
-        later = predicted(learnt, DRIFT, 20 * DRIFT.bias_memory_s)
+        later = predict_state(learnt, DRIFT, 20 * DRIFT.bias_memory_s)
         np.testing.assert_allclose(later.bias(PASSIVE_BIAS), 0.0, atol=1e-9)
         np.testing.assert_allclose(np.sqrt(np.diag(later.covariance)[4:]), BIAS_FLOOR)
 
@@ -186,8 +186,8 @@ class TestExcess:
         excess = np.array([0.1, 0.1, 0.0, 0.0]) ** 2
         joint = begun(NOWHERE, DITHERED)
         for _ in range(50):
-            joint = corrected(joint, NOWHERE, DITHERED)
-            joint = corrected(
+            joint = correct_state(joint, NOWHERE, DITHERED)
+            joint = correct_state(
                 allow_scatter(joint, PASSIVE_BIAS, excess),
                 away(0.15, 0, 0, 0),
                 SCATTER,
@@ -202,12 +202,12 @@ class TestExcess:
         """The bias may have changed with the wind: 1 % of a subaperture of drift, a step of 6 %."""
         joint = begun(NOWHERE, DITHERED)
         for _ in range(50):
-            joint = corrected(joint, NOWHERE, DITHERED)
-            joint = corrected(joint, NOWHERE, SCATTER, PASSIVE_BIAS)
-        joint = predicted(joint, Drift(alpha_rate=np.full(4, 0.01), bias_memory_s=np.inf), 1.0)
-        calm = corrected(joint, away(0.06, 0, 0, 0), SCATTER, PASSIVE_BIAS)
+            joint = correct_state(joint, NOWHERE, DITHERED)
+            joint = correct_state(joint, NOWHERE, SCATTER, PASSIVE_BIAS)
+        joint = predict_state(joint, Drift(alpha_rate=np.full(4, 0.01), bias_memory_s=np.inf), 1.0)
+        calm = correct_state(joint, away(0.06, 0, 0, 0), SCATTER, PASSIVE_BIAS)
         windy = allow_scatter(joint, PASSIVE_BIAS, np.array([0.12, 0.12, 0.0, 0.0]) ** 2)
-        stormy = corrected(windy, away(0.06, 0, 0, 0), 16 * SCATTER, PASSIVE_BIAS)
+        stormy = correct_state(windy, away(0.06, 0, 0, 0), 16 * SCATTER, PASSIVE_BIAS)
         assert calm.alpha[0] > 0.04
         assert stormy.alpha[0] < 0.001
         assert stormy.bias(PASSIVE_BIAS)[0] > 0.05
@@ -224,7 +224,7 @@ class TestExcess:
         excess = np.array([0.2, 0.2, 0.0, 0.0]) ** 2
         joint = allow_scatter(begun(NOWHERE, DITHERED), PASSIVE_BIAS, excess)
         for _ in range(3000):
-            joint = allow_scatter(predicted(joint, DRIFT, 60.0), PASSIVE_BIAS, excess)
+            joint = allow_scatter(predict_state(joint, DRIFT, 60.0), PASSIVE_BIAS, excess)
         np.testing.assert_allclose(np.diag(joint.covariance)[4:], BIAS_FLOOR**2 + excess)
 
 
@@ -242,9 +242,9 @@ class TestSeveralBiases:
     def test_each_is_learnt_by_itself(self):
         joint = begun(NOWHERE, DITHERED, PASSIVE_BIAS, OTHER)
         for _ in range(400):
-            joint = corrected(joint, NOWHERE, DITHERED)
-            joint = corrected(joint, away(0.06, 0, 0, 0), SCATTER, PASSIVE_BIAS)
-            joint = corrected(joint, away(-0.04, 0, 0, 0), SCATTER, OTHER)
+            joint = correct_state(joint, NOWHERE, DITHERED)
+            joint = correct_state(joint, away(0.06, 0, 0, 0), SCATTER, PASSIVE_BIAS)
+            joint = correct_state(joint, away(-0.04, 0, 0, 0), SCATTER, OTHER)
         assert joint.bias(PASSIVE_BIAS)[0] == pytest.approx(0.06, abs=1e-3)
         assert joint.bias(OTHER)[0] == pytest.approx(-0.04, abs=1e-3)
         np.testing.assert_allclose(joint.alpha, NOWHERE, atol=1e-3)
@@ -253,17 +253,17 @@ class TestSeveralBiases:
         """Precisions add up: 10 % and 5 % of a subaperture make 4.5 %."""
         joint = begun(NOWHERE, np.diag([1e4] * 4), PASSIVE_BIAS, OTHER)
         for block in (PASSIVE_BIAS, OTHER):
-            joint = corrected(joint, NOWHERE, 1e-12 * np.eye(4), block)
+            joint = correct_state(joint, NOWHERE, 1e-12 * np.eye(4), block)
         expected = (0.10**-2 + 0.05**-2) ** -0.5
         assert np.sqrt(joint.covariance[0, 0]) == pytest.approx(expected, rel=1e-4)
 
     def test_one_that_says_nothing_changes_nothing(self):
         one, two = begun(NOWHERE, DITHERED), begun(NOWHERE, DITHERED, OTHER, PASSIVE_BIAS)
         for _ in range(20):
-            one, two = (predicted(joint, DRIFT, 10.0) for joint in (one, two))
-            one, two = (corrected(joint, NOWHERE, DITHERED) for joint in (one, two))
+            one, two = (predict_state(joint, DRIFT, 10.0) for joint in (one, two))
+            one, two = (correct_state(joint, NOWHERE, DITHERED) for joint in (one, two))
             read = away(0.06, 0, 0, 0)
-            one, two = (corrected(joint, read, SCATTER, PASSIVE_BIAS) for joint in (one, two))
+            one, two = (correct_state(joint, read, SCATTER, PASSIVE_BIAS) for joint in (one, two))
         np.testing.assert_allclose(two.alpha, one.alpha, rtol=1e-12)
         np.testing.assert_allclose(two.alpha_covariance, one.alpha_covariance, rtol=1e-9)
         np.testing.assert_allclose(two.bias(PASSIVE_BIAS), one.bias(PASSIVE_BIAS), atol=1e-15)
@@ -271,7 +271,7 @@ class TestSeveralBiases:
     def test_what_is_forgotten_of_one_leaves_the_other(self):
         joint = begun(NOWHERE, DITHERED, PASSIVE_BIAS, OTHER)
         for block in (PASSIVE_BIAS, OTHER):
-            joint = corrected(joint, away(0.06, 0, 0, 0), SCATTER, block)
+            joint = correct_state(joint, away(0.06, 0, 0, 0), SCATTER, block)
         gone = forget(joint, PASSIVE_BIAS)
         np.testing.assert_array_equal(gone.bias(PASSIVE_BIAS), 0.0)
         np.testing.assert_array_equal(gone.bias(OTHER), joint.bias(OTHER))
@@ -302,12 +302,12 @@ def windy_night(seed: int, scatters: tuple[np.ndarray, np.ndarray]) -> np.ndarra
         bias = bias + np.sqrt(np.maximum(excess - allowed, 0.0)) * rng.normal(size=4)
         allowed = np.maximum(excess, allowed)
         true = true + DRIFT.alpha_rate * np.sqrt(6.0) * rng.normal(size=4)
-        joint = predicted(joint, drift, 6.0)
+        joint = predict_state(joint, drift, 6.0)
         if t in {120, 180}:
             read = true + np.sqrt(np.diag(DITHERED)) * rng.normal(size=4)
-            joint = corrected(joint, read, DITHERED)
+            joint = correct_state(joint, read, DITHERED)
         read = true + bias + scatter * rng.normal(size=4)
-        joint = corrected(
+        joint = correct_state(
             allow_scatter(joint, PASSIVE_BIAS, excess), read, np.diag(scatter**2), PASSIVE_BIAS
         )
         error, covariance = joint.alpha - true, joint.alpha_covariance
@@ -341,14 +341,14 @@ def night(seed: int, dither_every_s: float) -> tuple[np.ndarray, np.ndarray]:
         true = true + DRIFT.alpha_rate * np.sqrt(10.0) * rng.normal(size=4)
         keep = np.exp(-10.0 / DRIFT.bias_memory_s)
         bias = keep * bias + size * np.sqrt(1 - keep**2) * rng.normal(size=4)
-        joint = None if joint is None else predicted(joint, DRIFT, 10.0)
+        joint = None if joint is None else predict_state(joint, DRIFT, 10.0)
         if t % dither_every_s == 0.0:
             read = true + np.sqrt(np.diag(DITHERED)) * rng.normal(size=4)
             fresh = begun(read, DITHERED)
-            joint = fresh if joint is None else corrected(joint, read, DITHERED)
+            joint = fresh if joint is None else correct_state(joint, read, DITHERED)
         assert joint is not None
         read = true + bias + np.sqrt(np.diag(SCATTER)) * rng.normal(size=4)
-        joint = corrected(joint, read, SCATTER, PASSIVE_BIAS)
+        joint = correct_state(joint, read, SCATTER, PASSIVE_BIAS)
         if t > 600.0:
             error = joint.alpha - true
             errors.append(error)
@@ -395,7 +395,7 @@ class TestAnamorphosis:
 
     def test_a_window_that_does_not_tell_it_tells_the_four(self):
         prior = expect_stretches(begin_joint(self.SEEN, self.NOISE), np.zeros(2))
-        found = corrected(prior, self.SEEN[:4], DITHERED)
+        found = correct_state(prior, self.SEEN[:4], DITHERED)
         assert np.all(np.diag(found.covariance) <= np.diag(prior.covariance) + 1e-15)
         assert len(found.mean) == 6
 
@@ -407,5 +407,5 @@ class TestAnamorphosis:
 
     def test_it_walks_far_more_slowly_than_the_mirror(self):
         """1e-4 after a minute, where the magnification drifts by 5e-4."""
-        later = predicted(begin_joint(self.SEEN, 0.0 * self.NOISE), DRIFT, 60.0)
+        later = predict_state(begin_joint(self.SEEN, 0.0 * self.NOISE), DRIFT, 60.0)
         np.testing.assert_allclose(np.sqrt(np.diag(later.covariance)[4:]), 1e-4)

@@ -10,7 +10,7 @@ import pytest
 from service.errors import ModelError
 from service.estimation.demodulation import SIDE_OFFSETS_HZ
 from service.estimation.frames import FrameBlock
-from service.estimation.lockin import LockIn, LockInPlan, Spectra, joined
+from service.estimation.lockin import LockIn, LockInPlan, Spectra, join_windows
 from service.estimation.windows import WindowRefused
 from tests.numerics import DT_NS, FRAME_RATE_HZ, T0_NS, block_of, part, sines
 
@@ -257,7 +257,7 @@ def test_a_dither_weaker_than_half_its_request_is_named_with_both_numbers():
     block = telemetry(1100)
     weak = replace(block, dither_m=block.dither_m * np.float32([1, 0.4, 1, 1, 1]))
     reason = only_refusal(weak).reason
-    assert "mode 1 carries 3.20 nm of dither at 270.0 Hz, 8.00 nm were asked for" in reason
+    assert "mode 1 carries 3.20 nm of dither at 270.0 Hz, 8.00 nm were requested" in reason
     assert "see whether the RTC clips it" in reason
 
 
@@ -278,7 +278,7 @@ def white(n_frames: int, seed: int) -> FrameBlock:
 
 def test_joined_windows_show_the_dither_as_each_of_them_does():
     first, second = run(telemetry(2200))
-    both = joined(first, second)
+    both = join_windows(first, second)
     assert both is not None
     lines = np.arange(2), [3, 1]
     np.testing.assert_allclose(both.dither[lines], first.dither[lines], rtol=1e-4)
@@ -291,7 +291,7 @@ def test_a_line_that_begins_a_window_with_another_phase_is_turned_back():
         without(telemetry(2300), 1100, 1103)[0], without(telemetry(2300), 0, 1103)[1]
     )
     assert second.first_seq - first.first_seq == 1003
-    both = joined(first, second)
+    both = join_windows(first, second)
     lines = np.arange(2), [3, 1]
     np.testing.assert_allclose(both.dither[lines], first.dither[lines], rtol=1e-4)
 
@@ -299,7 +299,7 @@ def test_a_line_that_begins_a_window_with_another_phase_is_turned_back():
 def test_noise_falls_as_in_a_longer_window_at_the_lines_and_beside_them():
     windows = run(white(4200, seed=3))
     one = np.mean([np.abs(w.slopes) ** 2 for w in windows])
-    both = joined(joined(windows[0], windows[1]), joined(windows[2], windows[3]))
+    both = join_windows(join_windows(windows[0], windows[1]), join_windows(windows[2], windows[3]))
     two = np.mean(np.abs(both.slopes) ** 2)
     # 29,600 complex numbers: the ratio of their powers is good to 1 %
     assert both.n_windows == 4
@@ -308,7 +308,7 @@ def test_noise_falls_as_in_a_longer_window_at_the_lines_and_beside_them():
 
 def test_three_windows_count_the_same():
     windows = run(white(3200, seed=4))
-    both = joined(joined(*windows[:2]), windows[2])
+    both = join_windows(join_windows(*windows[:2]), windows[2])
     mean = np.mean([w.slopes[0, 0] for w in windows], axis=0)
     # the lines have whole periods in a window, so there is no phase to turn
     np.testing.assert_allclose(both.slopes[0, 0], mean, atol=1e-3 * np.abs(mean).max())
@@ -325,4 +325,4 @@ def test_three_windows_count_the_same():
 )
 def test_windows_of_other_loops_dithers_or_times_are_not_joined(change):
     first, second = run(telemetry(2200))
-    assert joined(first, replace(second, **change)) is None
+    assert join_windows(first, replace(second, **change)) is None

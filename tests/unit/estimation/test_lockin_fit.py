@@ -15,7 +15,7 @@ from service.estimation.lockin import (
     LockInEstimate,
     LockInPlan,
     Spectra,
-    closed_loop_responses,
+    compute_total_commands,
     fit_window,
 )
 from service.model.interaction import Linearisation
@@ -40,7 +40,7 @@ N_WINDOWS, FIRST = 48, 12
 
 def the_response(dither, matrix, loop, frequency_hz, gain):
     """Return the total command that one line leads to."""
-    found = closed_loop_responses(
+    found = compute_total_commands(
         dither[None], loop.reconstructor @ matrix, loop, (frequency_hz,), np.array([gain])
     )
     return found[0]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.estimation.control_law import KEPT_FRAMES, ControlLawCheck, follow, judged
+from service.estimation.control_law import KEPT_FRAMES, ControlLawCheck, follow, judge_frames
 from tests.unit.estimation.test_loopcheck import GAINS, INVERSE, blocks, closed_loop, terms
 
 
@@ -14,7 +14,7 @@ def found(telemetry, told=None, *, keep=lambda block: True, **how):
     for block in blocks(telemetry, **how):
         if keep(block):
             law = follow(law, block, told)
-    return judged(law, told, 10**9)[1]
+    return judge_frames(law, told, 10**9)[1]
 
 
 @pytest.mark.parametrize("delay", [1, 2, 3])
@@ -121,16 +121,16 @@ def test_frames_of_another_matrix_are_forgotten():
     law = follow(law, replace(block, cm_id="cm-2"), replace(told, cm_id="cm-2"))
     assert len(law.seq) == block.n_frames
     assert len(law.seq) < KEPT_FRAMES
-    assert judged(law, told, 10**9)[1] is None
+    assert judge_frames(law, told, 10**9)[1] is None
 
 
 def test_a_verdict_is_given_on_new_frames_only():
     told, law = terms(), ControlLawCheck()
     for block in blocks(closed_loop()):
         law = follow(law, block, told)
-    law, first = judged(law, told, 2499)
+    law, first = judge_frames(law, told, 2499)
     assert first is not None
-    assert judged(law, told, 2499)[1] is None
+    assert judge_frames(law, told, 2499)[1] is None
 
 
 def test_frames_that_no_verdict_will_look_at_are_left_out_and_it_is_the_same():
@@ -143,4 +143,4 @@ def test_frames_that_no_verdict_will_look_at_are_left_out_and_it_is_the_same():
             some = replace(some, judged_seq=1900)
     assert left_out > 700
     every = replace(every, judged_seq=1900)
-    assert judged(some, told, 10**9)[1] == judged(every, told, 10**9)[1]
+    assert judge_frames(some, told, 10**9)[1] == judge_frames(every, told, 10**9)[1]

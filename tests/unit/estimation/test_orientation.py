@@ -84,7 +84,7 @@ def test_tip_and_tilt_alone_are_refused_with_the_tie_named():
 
 def test_a_mixture_of_the_modes_is_a_basis_like_any_other():
     mixture, _ = np.linalg.qr(np.random.default_rng(5).normal(size=(40, 40)))
-    basis = small_basis().combined(mixture)
+    basis = small_basis().combine_modes(mixture)
     rows = listed(matrix(turned(65.0)) @ mixture, SlopeOrder.XY, Orientation(sign_y=-1))
     found = fit_matrix(UNKNOWN, Reference(matrix=rows), basis=basis)
     assert found.accepted

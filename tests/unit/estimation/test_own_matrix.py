@@ -231,7 +231,7 @@ def test_what_is_left_over_makes_the_measured_response_of_the_models_own():
     own = np.linalg.pinv(measured[:, :N_CONTROLLED]).astype(np.float32)
     found = recognise_modes(own, model(2).linearise, Misregistration())
     near = model(2).linearise(found.alpha)
-    there = left_over(own, found, near.matrix).added_to(near)
+    there = left_over(own, found, near.matrix).add_to(near)
     gain = np.median(found.response)
     np.testing.assert_allclose(
         there.matrix[:, :N_CONTROLLED],
@@ -240,4 +240,4 @@ def test_what_is_left_over_makes_the_measured_response_of_the_models_own():
     )
     np.testing.assert_array_equal(there.matrix[:, N_CONTROLLED:], near.matrix[:, N_CONTROLLED:])
     none = LeftOver(columns=np.arange(0), slopes=np.zeros((len(own[0]), 0), np.float32))
-    np.testing.assert_array_equal(none.added_to(near).matrix, near.matrix)
+    np.testing.assert_array_equal(none.add_to(near).matrix, near.matrix)

@@ -15,7 +15,7 @@ from service.estimation.random_dither import (
     RandomEstimate,
     RandomPlan,
     fit_random,
-    joined,
+    join_random_windows,
     noisy_matrix,
 )
 from service.estimation.windows import RefusalKind, WindowRefused
@@ -166,7 +166,7 @@ def test_two_windows_joined_are_as_good_as_one_of_twice_the_length(modes):
     near, block = near_somewhere(), looped(4001, 6, modes=modes)
     _, halves = RandomDither(plan=plan(modes, 2000)).accumulate(block)
     whole = fit_random(only_window(RandomDither(plan=plan(modes, 4000)), block), near)
-    both = fit_random(joined(*halves), near)
+    both = fit_random(join_random_windows(*halves), near)
     sigma = np.sqrt(np.diag(whole.covariance))
     assert np.all(np.abs(both.alpha.vector - whole.alpha.vector) < 0.2 * sigma)
     np.testing.assert_allclose(np.sqrt(np.diag(both.covariance)), sigma, rtol=0.25)
@@ -176,7 +176,7 @@ def test_windows_of_different_modes_are_never_joined():
     one = only_window(RandomDither(plan=plan()), quiet_block(FREE, 2001))
     other = only_window(RandomDither(plan=plan(FREE[:3])), quiet_block(FREE[:3], 2001))
     with pytest.raises(ModelError, match="windows of 4 modes in session night-1 and 3"):
-        joined(one, other)
+        join_random_windows(one, other)
 
 
 def test_the_noise_of_the_elements_is_what_they_scatter_by():
@@ -189,7 +189,9 @@ def test_the_noise_of_the_elements_is_what_they_scatter_by():
     one, other = (noisy_matrix(half) for half in halves)
     difference = (one.matrix - other.matrix) / np.hypot(one.noise, other.noise)
     assert np.sqrt(np.mean(difference**2)) == pytest.approx(1.0, abs=0.07)
-    assert noisy_matrix(joined(*halves)).snr == pytest.approx(np.sqrt(2) * one.snr, rel=0.1)
+    assert noisy_matrix(join_random_windows(*halves)).snr == pytest.approx(
+        np.sqrt(2) * one.snr, rel=0.1
+    )
 
 
 def test_slopes_that_answer_one_frame_late_are_refused_as_misaligned():
@@ -216,7 +218,7 @@ def test_a_clipped_dither_is_refused_with_the_mode_and_both_amplitudes():
     dither[:, 35] *= 0.2
     refused = only_window(RandomDither(plan=plan()), replace(block, dither_m=dither))
     assert isinstance(refused, WindowRefused)
-    assert "mode 35 carries 1.00 nm of dither, 5.00 nm were asked for" in refused.reason
+    assert "mode 35 carries 1.00 nm of dither, 5.00 nm were requested" in refused.reason
 
 
 def test_another_reconstructor_inside_the_window_ends_it():

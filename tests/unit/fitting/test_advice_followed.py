@@ -13,7 +13,9 @@ import h5py
 import numpy as np
 import pytest
 
+from pyrcal.fitting.advice import Advice
 from pyrcal.fitting.matrix import FitOptions, fit_matrix
+from pyrcal_studies.fft_pyramid import FftPyramid
 from service.errors import MatrixError
 from service.estimation.reference import Reference
 from service.instrument import load_instrument
@@ -352,6 +354,51 @@ def test_a_matrix_of_both_passes_is_right_once_it_is_divided_by_the_number_named
     found = fitted(about, values / float(named))
     check_right(found)
     assert np.median(found.gains) == pytest.approx(1.0, abs=0.01)
+
+
+NARROW = PYRAMID | {
+    "mirror": PYRAMID["mirror"] | {"pitch_m": 0.4, "n_across": 12, "diameter_m": 4.6},
+    "wfs": PYRAMID["wfs"] | {"modulation_lambda_over_d": 1.0},
+}
+
+
+def poked(about, stroke_m, *, pull):
+    """Return the matrix that an FFT pyramid measures with pokes of this stroke."""
+    basis, wfs = modal_basis(about), about.wfs
+    model = RtcInteractionModel(about, basis, pupil_sampling=4, detector_nodes=2)
+    sensor = FftPyramid(
+        amplitude=model.pupil.amplitude,
+        sampling=4,
+        wavelength_m=wfs.wavelength_m,
+        n_subapertures=wfs.n_subapertures,
+        image_separation_subap=wfs.pupil_separation_subap,
+        modulation_lambda_over_d=wfs.modulation_lambda_over_d,
+        n_modulation=16,
+        padded_subap=60,
+    )
+    u = sensor.coordinates
+    points = np.stack(np.meshgrid(u, u), axis=-1).reshape(-1, 2)
+    # on_mirror turns and scales; the shift is taken off before
+    shapes = basis.render(ALPHA.on_mirror(points - ALPHA.vector[:2]))
+    maps = stroke_m * shapes.T.reshape(-1, len(u), len(u))
+    if pull:
+        return sensor.jacobian(maps, model.valid, stroke_m=1.0) / stroke_m
+    flat = sensor.slopes(np.zeros_like(maps[0]), model.valid)
+    return np.stack([sensor.slopes(one, model.valid) - flat for one in maps], axis=1) / stroke_m
+
+
+def test_pokes_beyond_the_linear_range_are_right_once_they_are_smaller(tmp_path):
+    """Averaging does not help: hardly any of the 13 % that is left over is noise."""
+    about = loaded(tmp_path, NARROW)
+    first = fitted(about, poked(about, 300e-9, pull=False))
+    check_right(first)
+    assert first.recommendation.startswith(f"{Advice.MEASURE_MORE}:")
+    assert "smaller stroke" in first.recommendation
+    assert "average more" not in first.recommendation
+    followed = fitted(about, poked(about, 40e-9, pull=True))
+    check_right(followed)
+    assert followed.recommendation.startswith(f"{Advice.USE}:")
+    assert np.all(followed.sigma < 0.5 * first.sigma)
 
 
 def check_right(found, scale=1.0):

@@ -115,7 +115,7 @@ def test_the_move_told_of_the_right_stop_leads_to_the_truth():
 
 
 def test_the_move_told_of_an_image_that_is_not_stretched_is_the_fits():
-    stretched = matrix(ELSEWHERE.stretched(np.array([0.003, -0.002])), noise=0.05)
+    stretched = matrix(ELSEWHERE.with_anamorphosis(np.array([0.003, -0.002])), noise=0.05)
     found = fit(stretched, options=EXPLAIN)
     without = fit(stretched, options=FitOptions(anamorphosis=False))
     moved = without.alpha.vector - found.alpha.vector
@@ -133,12 +133,6 @@ def test_the_move_told_of_half_the_modes_is_that_of_a_fit_of_them(half):
     moved = alone.alpha.vector - found.alpha.vector
     told = named(found, f"the {half} half of the modes")
     assert np.all(np.abs(told.moved - moved) < 0.5 * alone.sigma)
-
-
-def test_a_wavelength_moves_nothing():
-    told = named(clean(), "wavelength_m")
-    assert np.all(np.abs(told.moved) < 0.01 * clean().sigma)
-    assert told.share == pytest.approx(1.0, abs=1e-3)
 
 
 def test_another_modulation_is_worse_and_would_move_it_by_sigmas():

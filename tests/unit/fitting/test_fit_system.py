@@ -183,7 +183,7 @@ def test_pairs_that_disagree_are_refused_and_the_worst_is_named(folder):
 
     def one_wrong(pair, about):
         report = fit(pair, about)
-        moved = report.fit.alpha.stepped(np.array([0.0, 0.0, 0.01, 0.0]) * (pair == wrong))
+        moved = report.fit.alpha.add_step(np.array([0.0, 0.0, 0.01, 0.0]) * (pair == wrong))
         return replace(report, fit=replace(report.fit, alpha=moved))
 
     report = fit_pairs(system, one_wrong)

@@ -151,7 +151,7 @@ def test_a_registration_there_and_back(stretches):
     tel, wfs = SimpleNamespace(D=8.0, resolution=80), SimpleNamespace(nSubap=20)
     alpha = Misregistration(
         shift_x_subap=0.3, shift_y_subap=-0.1, rotation_rad=0.3, magnification=1.02
-    ).stretched(np.array(stretches))
+    ).with_anamorphosis(np.array(stretches))
     moved = SimpleNamespace(**to_oopao(alpha, tel, wfs))
     assert moved.shiftX < 0.0 < moved.shiftY
     found = registration_of(moved, tel, 20)

@@ -58,16 +58,18 @@ def path(light, tmp_path):
 def test_a_flux_map_is_turned_with_its_images(light, instrument):
     rows_from_top = light.reshape(24, 24)[::-1].reshape(2, 12, 2, 12)
     np.testing.assert_array_equal(
-        PyramidLight(instrument=instrument).turned(as_four(rows_from_top)), as_four(light)
+        PyramidLight(instrument=instrument).orient_counts(as_four(rows_from_top)), as_four(light)
     )
     swapped = light.reshape(24, 24).T.reshape(2, 12, 2, 12)
     np.testing.assert_array_equal(
-        PyramidLight(instrument=oriented(Orientation(swap_xy=True))).turned(as_four(swapped)),
+        PyramidLight(instrument=oriented(Orientation(swap_xy=True))).orient_counts(
+            as_four(swapped)
+        ),
         as_four(light),
     )
     signed = oriented(Orientation(sign_x=-1, sign_y=-1))
     np.testing.assert_array_equal(
-        PyramidLight(instrument=signed).turned(as_four(light)), as_four(light)
+        PyramidLight(instrument=signed).orient_counts(as_four(light)), as_four(light)
     )
 
 

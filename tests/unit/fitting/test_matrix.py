@@ -186,7 +186,7 @@ def test_a_large_smooth_gain_moves_nothing_by_its_sigma_when_a_map_is_fitted(sha
 @pytest.mark.parametrize("stretches", [(0.004, 0.0), (-0.003, 0.002), (0.02, -0.02)])
 def test_a_stretched_image_of_the_mirror_is_found_unasked(stretches):
     """2.8 % is more than any telescope's; the largest of GPAO is 1.9 %."""
-    found = fit(matrix(ELSEWHERE.stretched(np.array(stretches))))
+    found = fit(matrix(ELSEWHERE.with_anamorphosis(np.array(stretches))))
     assert found.accepted
     np.testing.assert_allclose(found.anamorphosis, stretches, atol=2e-4)
     assert np.all(np.abs(found.anamorphosis - stretches) < 3.0 * found.anamorphosis_sigma)
@@ -205,7 +205,7 @@ def test_the_fit_of_a_stretched_mirror_begins_where_the_file_says():
 
 def test_noisy_tip_and_tilt_alone_tell_of_no_anamorphosis():
     """They look almost alike however the image is stretched: the fit says that it cannot tell."""
-    stretched = ELSEWHERE.stretched(np.array([0.01, 0.0]))
+    stretched = ELSEWHERE.with_anamorphosis(np.array([0.01, 0.0]))
     found = fit(matrix(stretched, noise=0.5)[:, :2], options=from_here(0.0, 0.0, 0.0, 0.0))
     assert found.anamorphosis is None
     assert np.all(found.anamorphosis_sigma > 0.01)

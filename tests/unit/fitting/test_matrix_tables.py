@@ -37,7 +37,7 @@ def test_a_table_that_ends_at_the_pupil_costs_slopes_and_no_accuracy(half_subap)
 
 def test_single_actuators_are_a_basis_too():
     strokes = small_basis().mode_to_actuator
-    poked = small_basis().combined(np.linalg.pinv(strokes)[:, ::3])
+    poked = small_basis().combine_modes(np.linalg.pinv(strokes)[:, ::3])
     found = fit_matrix(instrument(None), Reference(matrix=matrix(FAR, basis=poked)), basis=poked)
     assert found.accepted
     assert np.all(np.abs(error(found, FAR)[:2]) < 2e-3)

@@ -278,7 +278,7 @@ def test_what_was_asked_beside_the_four_is_told():
 
 
 def stretched(sigma):
-    alpha = ALPHA.stretched(np.array([0.001, -0.002]))
+    alpha = ALPHA.with_anamorphosis(np.array([0.001, -0.002]))
     return {"alpha": alpha, "anamorphosis_sigma": np.full(2, sigma)}
 
 

@@ -45,7 +45,7 @@ def assert_alike(library, **settings):
 
 def test_the_standard_alone_is_enough():
     pytest.importorskip("array_api_strict")
-    assert isinstance(model(NUMPY)._rendered(SOMEWHERE), LocalShapes)
+    assert isinstance(model(NUMPY)._render_modes(SOMEWHERE), LocalShapes)
     assert_alike(STRICT)
 
 

@@ -35,7 +35,7 @@ def relative(found, expected):
 
 
 def moved(alpha: Misregistration, axis: int, step: float) -> Misregistration:
-    return alpha.stepped(step * np.eye(4)[axis])
+    return alpha.add_step(step * np.eye(4)[axis])
 
 
 # --- axes and signs
@@ -60,7 +60,7 @@ def test_pupil_points_are_traced_back_to_the_mirror_point_that_lands_on_them(sto
     np.testing.assert_allclose(landed, model.pupil.points, atol=1e-12)
 
 
-STRETCHED = SOMEWHERE.stretched(np.array([0.03, -0.02]))
+STRETCHED = SOMEWHERE.with_anamorphosis(np.array([0.03, -0.02]))
 
 
 @pytest.mark.parametrize("stop", Stop)
@@ -83,7 +83,7 @@ def test_nobody_having_told_an_anamorphosis_it_is_the_files(stop):
     np.testing.assert_array_equal(
         told.interaction_matrix(SOMEWHERE), told.interaction_matrix(STRETCHED)
     )
-    flat = told.interaction_matrix(SOMEWHERE.stretched(np.zeros(2)))
+    flat = told.interaction_matrix(SOMEWHERE.with_anamorphosis(np.zeros(2)))
     assert relative(flat, told.interaction_matrix(SOMEWHERE)) > 0.01
 
 
@@ -93,7 +93,7 @@ def test_derivatives_by_a_stretch_are_exact(stop, axis):
     model = small_model(stop, double=True)
     step = 1e-4 * np.eye(2)[axis]
     ahead, behind = (
-        model.interaction_matrix(STRETCHED.stretched(STRETCHED.stretches + s))
+        model.interaction_matrix(STRETCHED.with_anamorphosis(STRETCHED.stretches + s))
         for s in (step, -step)
     )
     assert relative(model.stretch_derivatives(STRETCHED)[axis], (ahead - behind) / 2e-4) < 1e-5

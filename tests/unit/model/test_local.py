@@ -63,7 +63,7 @@ def everywhere():
 def local_shapes(sampling=2):
     pupil = instrument_pupil(many_actuators(), sampling)
     model = InteractionModel(many_actuators(), basis(), pupil_sampling=sampling, dtype=np.float64)
-    shapes = model._rendered(SOMEWHERE)
+    shapes = model._render_modes(SOMEWHERE)
     assert isinstance(shapes, LocalShapes)
     return pupil, model, shapes
 
@@ -114,7 +114,7 @@ def test_shapes_beside_one_another_are_seen_as_each_alone():
 def test_few_modes_are_cheaper_as_an_array():
     some = basis().subset(np.arange(20))
     model = InteractionModel(many_actuators(), some, pupil_sampling=2)
-    shapes = model._rendered(SOMEWHERE)
+    shapes = model._render_modes(SOMEWHERE)
     assert isinstance(shapes, np.ndarray)
     expected = some.render(model._mirror_points(SOMEWHERE))
     np.testing.assert_allclose(shapes, expected, atol=2e-6)
@@ -128,7 +128,7 @@ def test_the_matrix_and_its_derivatives_are_those_of_functions_without_end(stop,
     local = InteractionModel(instrument, basis(), pupil_sampling=2, kept_bytes=kept_bytes)
     whole = InteractionModel(instrument, everywhere(), pupil_sampling=2)
     found, expected = local.linearise(SOMEWHERE), whole.linearise(SOMEWHERE)
-    assert isinstance(local._rendered(SOMEWHERE), LocalShapes)
+    assert isinstance(local._render_modes(SOMEWHERE), LocalShapes)
     lit = np.linalg.norm(expected.matrix, axis=0) > 1e-2 * np.linalg.norm(expected.matrix, 2)
     for one, other in zip(
         (found.matrix, *found.derivatives), (expected.matrix, *expected.derivatives), strict=True
@@ -146,7 +146,7 @@ def test_what_is_streamed_is_the_jacobian_times_the_shapes(order, normalisation)
     model = InteractionModel(
         instrument, basis(), pupil_sampling=2, dtype=np.float64, kept_bytes=0.0
     )
-    response, shapes = model.sensor.at((0.21, -0.13)), model._rendered(SOMEWHERE)
+    response, shapes = model.sensor.at((0.21, -0.13)), model._render_modes(SOMEWHERE)
     expected = response.jacobian() @ shapes.array()
     np.testing.assert_allclose(
         response.apply(shapes), expected, atol=1e-10 * np.abs(expected).max()
@@ -157,7 +157,7 @@ def test_a_sparse_jacobian_takes_local_shapes_as_it_takes_an_array():
     plain = many_actuators()
     lenslets = replace(plain, wfs=ShackHartmann(n_subapertures=24, wavelength_m=600e-9))
     model = InteractionModel(lenslets, basis(), dtype=np.float64)
-    shapes = model._rendered(SOMEWHERE)
+    shapes = model._render_modes(SOMEWHERE)
     assert isinstance(shapes, LocalShapes)
     expected = model.seen(SOMEWHERE, shapes.array())
     np.testing.assert_allclose(

@@ -32,4 +32,4 @@ def test_the_inverse_leads_back():
 
 def test_in_another_unit_the_same_points_land_in_the_same_places():
     there = Similarity.of(ALPHA)
-    assert there.scaled(0.2).points(POINTS / 0.2) * 0.2 == pytest.approx(there.points(POINTS))
+    assert there.scale_unit(0.2).points(POINTS / 0.2) * 0.2 == pytest.approx(there.points(POINTS))

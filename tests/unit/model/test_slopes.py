@@ -12,12 +12,12 @@ from service.model.kinds import SignalKind, SlopeOrder
 from service.model.slopes import (
     Orientation,
     SlopeRecipe,
+    orient_mask,
     rtc_mask,
     signals_of_slopes,
     slopes_of,
     to_conventions,
     to_rtc,
-    turned_mask,
 )
 
 SIGNS = (1, -1)
@@ -64,7 +64,7 @@ def test_a_wavefront_seen_in_the_rtcs_axes_comes_out_in_ours(orientation):
     plane = (0.7, -1.1, 0.31, 0.17)
     listed = np.concatenate(seen_by_the_rtc(plane, orientation, MASK))
     found = to_conventions(listed, SlopeRecipe(order=SlopeOrder.XY, orientation=orientation), MASK)
-    expected = np.concatenate(gradients(positions(turned_mask(MASK, orientation)), plane))
+    expected = np.concatenate(gradients(positions(orient_mask(MASK, orientation)), plane))
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
@@ -90,7 +90,7 @@ def test_images_seen_in_the_rtcs_axes_come_out_in_ours(orientation):
     found = to_conventions(
         np.concatenate(listed), SlopeRecipe(order=SlopeOrder.IMAGES, orientation=orientation), MASK
     )
-    ours = positions(turned_mask(MASK, orientation))
+    ours = positions(orient_mask(MASK, orientation))
     expected = [light(ours, x, y, plane) for y, x in product((-1, 1), (-1, 1))]
     np.testing.assert_allclose(found, np.concatenate(expected), rtol=1e-12)
     slopes = slopes_of(found, SignalKind.INTENSITY)
@@ -140,7 +140,7 @@ def test_there_and_back_is_the_same_list_for_vectors_and_matrices(order):
 
 @pytest.mark.parametrize("orientation", ORIENTATIONS, ids=repr)
 def test_a_mask_turned_and_turned_back_is_the_same_mask(orientation):
-    np.testing.assert_array_equal(rtc_mask(turned_mask(MASK, orientation), orientation), MASK)
+    np.testing.assert_array_equal(rtc_mask(orient_mask(MASK, orientation), orientation), MASK)
 
 
 def test_the_orders_are_what_their_names_say():
@@ -167,7 +167,7 @@ def test_by_hand_a_flip_of_x_reverses_a_row_and_negates_sx_only():
 
 
 def test_by_hand_a_swap_exchanges_the_components_and_transposes_the_grid():
-    column = turned_mask(np.ones((1, 3), bool), Orientation(swap_xy=True))
+    column = orient_mask(np.ones((1, 3), bool), Orientation(swap_xy=True))
     assert column.shape == (3, 1)
     listed = np.array([1.0, 2, 3, 4, 5, 6])
     swapped = to_conventions(

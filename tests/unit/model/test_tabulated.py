@@ -12,7 +12,13 @@ from service.model.instrument import TabulatedModes
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
-from service.model.tabulated import MARGIN_SUBAP, TabulatedBasis, filled, known_samples, padded
+from service.model.tabulated import (
+    MARGIN_SUBAP,
+    TabulatedBasis,
+    fill_table,
+    known_samples,
+    pad_mask,
+)
 from tests.numerics import N_MODES, small_basis, small_instrument
 
 SUBAPERTURE_M = 8.0 / 12
@@ -103,7 +109,7 @@ def test_a_subset_of_all_modes_in_order_is_no_copy(basis):
 
 def test_combinations_keep_the_precision_of_the_table():
     single = basis_of(table(dtype=np.float32)[0])
-    combined = single.combined(np.full((single.n_modes, 2), 0.5))
+    combined = single.combine_modes(np.full((single.n_modes, 2), 0.5))
     assert combined.coefficients.dtype == np.float32
 
 
@@ -145,7 +151,7 @@ def test_a_tilt_is_continued_as_a_tilt():
     y, x = np.mgrid[-10:11, -10:11].astype(float)
     plane = (2.0 + 0.3 * x - 0.7 * y)[None]
     known = np.hypot(x, y) < 7.0
-    shapes = filled(np.where(known, plane, np.nan), known, (2, 3))
+    shapes = fill_table(np.where(known, plane, np.nan), known, (2, 3))
     y, x = np.mgrid[-12:13, -13:14].astype(float)
     near = np.hypot(x, y) < 10.0
     found = shapes[:, 0].reshape(25, 27)
@@ -155,9 +161,9 @@ def test_a_tilt_is_continued_as_a_tilt():
 
 def test_a_negative_margin_cuts():
     known = np.ones((9, 11), bool)
-    assert padded(known, (-2, 1)).shape == (5, 13)
+    assert pad_mask(known, (-2, 1)).shape == (5, 13)
     cube = np.arange(99.0).reshape(1, 9, 11)
-    shapes = filled(cube, known, (-2, -1))
+    shapes = fill_table(cube, known, (-2, -1))
     np.testing.assert_array_equal(shapes[:, 0], cube[0, 2:-2, 1:-1].ravel())
 
 

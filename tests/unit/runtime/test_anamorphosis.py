@@ -25,7 +25,7 @@ FILE = Path(__file__).parents[2] / "data" / "lenslets.toml"
 STRETCHES = np.array([0.0185, -0.003])
 """GPAO's largest, and a little beside it."""
 
-TRUE = ALPHA.stretched(STRETCHES)
+TRUE = ALPHA.with_anamorphosis(STRETCHES)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ from service.errors import ConfigurationError
 from service.model.surface import mirror_surface
 from sim_rtc.assembly import build_drive, build_plant
 from sim_rtc.options import parse_options
-from sim_rtc.telescope.detector import binned
+from sim_rtc.telescope.detector import bin_pixels
 from sim_rtc.telescope.diffractive import DiffractivePlant
 from sim_rtc.telescope.mirror import MirrorFaults
 
@@ -92,7 +92,7 @@ def test_actuators_the_mirror_does_not_have_are_refused(small_instrument, small_
 
 
 def test_binning_leaves_the_modes_as_they_are(small_instrument, small_basis):
-    coarse = binned(small_instrument, 2)
+    coarse = bin_pixels(small_instrument, 2)
     surface = mirror_surface(coarse.analytic_mirror, coarse.subaperture_m)
     basis = small_basis.of_surface(surface)
     metres = np.random.default_rng(2).uniform(-3.0, 3.0, (40, 2))

@@ -79,10 +79,10 @@ def test_the_shares_of_a_profile_add_up(name):
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["--scene", "dusk"], "--scene: invalid choice: 'dusk' (choose from "),
+        (["--scene", "dusk"], "--scene: found 'dusk', expected one of "),
         (["--scene", "daytime", "--spiders", "2:0.1"], "--spiders: the fibre by day"),
         (["--spiders", "2.5:0.1"], "--spiders: found '2.5:0.1'; expected N:WIDTH_M"),
-        (["--profile", "single", "--wind", "8,0"], "--profile: found beside --wind"),
+        (["--profile", "single", "--wind", "8,0"], "--profile: found together with --wind"),
         (["--seeing", "-1"], "--seeing: found '-1'; expected a number from 0.05 to 5"),
         (["--seeing-at", "5:-1"], "--seeing-at: found '5:-1'; expected T:ARCSEC"),
         (["--seeing-at", "5:1", "--seeing-at", "5:2"], "--seeing-at: found 5 s twice"),

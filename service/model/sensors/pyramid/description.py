@@ -110,7 +110,7 @@ def modes_of(table: PyramidTable, sensor: Pyramid) -> tuple[tuple[SensorMode, st
     )
 
 
-def binned(sensor: Pyramid, binning: int) -> Pyramid:
+def bin_pyramid(sensor: Pyramid, binning: int) -> Pyramid:
     """Return the pyramid whose subapertures are ``binning`` of the finest along each axis."""
     return replace(
         sensor,
@@ -128,7 +128,7 @@ def _in_mode(sensor: Pyramid, mode: PyramidMode, where: str) -> SensorMode:
     if mode.n_subapertures is None and n % binning:
         raise ModelError(
             f"{where}.binning: found {binning} of {n} subapertures, which it does not divide; "
-            f"expected n_subapertures beside it, the binned grid's: about {n / binning:.1f}"
+            f"expected n_subapertures as well, that of the binned grid: about {n / binning:.1f}"
         )
     across = mode.n_subapertures or n // binning
     diameter = sensor.pupil_diameter / binning
@@ -139,7 +139,7 @@ def _in_mode(sensor: Pyramid, mode: PyramidMode, where: str) -> SensorMode:
         )
     modulation = mode.modulation_lambda_over_d
     wfs = replace(
-        binned(sensor, binning),
+        bin_pyramid(sensor, binning),
         n_subapertures=across,
         modulation_lambda_over_d=(
             sensor.modulation_lambda_over_d if modulation is None else modulation
@@ -159,7 +159,7 @@ def image_offsets(instrument: Instrument) -> NDArray[np.float64] | None:
     told = pyramid_in(instrument).image_offsets_subap
     if told is None:
         return None
-    turned = turned_offsets(np.array(told).reshape(2, 2, 2), instrument.slopes.assumed_orientation)
+    turned = orient_offsets(np.array(told).reshape(2, 2, 2), instrument.slopes.assumed_orientation)
     return np.asarray(turned - turned.mean(axis=(0, 1)))
 
 
@@ -168,7 +168,7 @@ def pupil_offset(instrument: Instrument) -> tuple[float, float] | None:
     told = pyramid_in(instrument).image_offsets_subap
     if told is None:
         return None
-    turned = turned_offsets(np.array(told).reshape(2, 2, 2), instrument.slopes.assumed_orientation)
+    turned = orient_offsets(np.array(told).reshape(2, 2, 2), instrument.slopes.assumed_orientation)
     x, y = turned.mean(axis=(0, 1))
     return float(x), float(y)
 
@@ -194,7 +194,7 @@ def image_floor(instrument: Instrument) -> NDArray[np.float64]:
     return np.array([shift, shift, edge, edge])
 
 
-def displaced(instrument: Instrument, offsets: NDArray[np.float64]) -> Pyramid:
+def displace_pyramid(instrument: Instrument, offsets: NDArray[np.float64]) -> Pyramid:
     """Return the pyramid with its images displaced from their places ``(8,)``.
 
     Subapertures, axes of conventions.md: along x of the images at -x -y, +x -y, -x +y, +x +y, then
@@ -205,7 +205,7 @@ def displaced(instrument: Instrument, offsets: NDArray[np.float64]) -> Pyramid:
 
 
 def offsets_px(instrument: Instrument, offsets: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return displacements ``(8,)`` of ``displaced`` as the file's key has them, ``(4, 2)``."""
+    """Return displacements ``(8,)`` of ``displace_pyramid`` in units of the file, ``(4, 2)``."""
     return _in_rtc_axes(instrument, offsets) * _pixels(instrument)
 
 
@@ -217,7 +217,7 @@ def with_images_at(instrument: Instrument, offsets_px: NDArray[np.float64]) -> P
 
 
 def _in_rtc_axes(instrument: Instrument, offsets: NDArray[np.float64]) -> NDArray[np.float64]:
-    turned = turned_offsets(
+    turned = orient_offsets(
         offsets.reshape(2, 2, 2).transpose(1, 2, 0),
         instrument.slopes.assumed_orientation,
         back=True,
@@ -231,7 +231,7 @@ def _pixels(instrument: Instrument) -> int:
     return frames.pixels_per_subaperture if isinstance(frames, FrameWindows) else 1
 
 
-def turned_offsets(
+def orient_offsets(
     offsets: NDArray[np.float64], orientation: Orientation, *, back: bool = False
 ) -> NDArray[np.float64]:
     """Return displacements ``(2, 2, 2)`` of the RTC's axes in those of conventions.md.
@@ -242,13 +242,13 @@ def turned_offsets(
     flips = np.array([orientation.flip_x, orientation.flip_y])
     signs = np.array([orientation.sign_x, orientation.sign_y]) * (-1) ** flips
 
-    def flipped(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def flip(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return values[:: signs[1], :: signs[0]] * (-1.0) ** flips
 
-    def swapped(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def swap(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return values.swapaxes(0, 1)[..., ::-1] if orientation.swap_xy else values
 
-    return flipped(swapped(offsets)) if back else swapped(flipped(offsets))
+    return flip(swap(offsets)) if back else swap(flip(offsets))
 
 
 def pyramid_in(instrument: Instrument) -> Pyramid:

@@ -203,7 +203,7 @@ def _beside_the_light(instrument: Instrument, windows: FrameWindows, light: Arra
     away = float(np.hypot(*(found - expected).T).max()) / pixels
     if away > _REMARK_DISTANCE_SUBAP:
         yield (
-            f"wfs.pupil_centres_px lie up to {away:.2f} subapertures beside the pupil images of "
+            f"wfs.pupil_centres_px are up to {away:.2f} subapertures from the pupil images of "
             f"the flux frame, which are centred at [{_format_centres(found)}]: correct the key"
         )
 

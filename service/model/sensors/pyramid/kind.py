@@ -65,7 +65,7 @@ class PyramidKind(SensorKind):
         return written
 
     @override
-    def described(self, table: PyramidTable, given: frozenset[str]) -> Pyramid:
+    def read_sensor(self, table: PyramidTable, given: frozenset[str]) -> Pyramid:
         from service.model.sensors.pyramid.description import pyramid_of
 
         return pyramid_of(table, given)
@@ -87,7 +87,9 @@ class PyramidKind(SensorKind):
         return frames_of(table, given)
 
     @override
-    def assumed(self, table: PyramidTable, given: frozenset[str]) -> Iterator[tuple[str, str]]:
+    def list_assumptions(
+        self, table: PyramidTable, given: frozenset[str]
+    ) -> Iterator[tuple[str, str]]:
         told = table.input == "frames" and table.pupil_centres_px is not None
         if "pupil_separation_subap" not in given and not told:
             yield (
@@ -126,10 +128,10 @@ class PyramidKind(SensorKind):
         return (sensor.wavelength_m, sensor.modulation_lambda_over_d, separation)
 
     @override
-    def binned(self, sensor: Pyramid, binning: int) -> Pyramid:
-        from service.model.sensors.pyramid.description import binned
+    def bin_sensor(self, sensor: Pyramid, binning: int) -> Pyramid:
+        from service.model.sensors.pyramid.description import bin_pyramid
 
-        return binned(sensor, binning)
+        return bin_pyramid(sensor, binning)
 
     @override
     def noise_terms(self, instrument: Instrument) -> tuple[Term, Term]:
@@ -180,7 +182,7 @@ class PyramidKind(SensorKind):
         return sensor.modulation_lambda_over_d <= _WEAK_LAMBDA_OVER_D
 
     @override
-    def fitted_key(self, sensor: Pyramid) -> str | None:
+    def find_fitted_key(self, sensor: Pyramid) -> str | None:
         return "modulation_lambda_over_d" if sensor.modulation_lambda_over_d > 0.0 else None
 
     @override
@@ -208,10 +210,10 @@ class PyramidKind(SensorKind):
         return image_floor(instrument)
 
     @override
-    def displaced(self, instrument: Instrument, offsets: NDArray[np.float64]) -> Pyramid:
-        from service.model.sensors.pyramid.description import displaced
+    def displace_images(self, instrument: Instrument, offsets: NDArray[np.float64]) -> Pyramid:
+        from service.model.sensors.pyramid.description import displace_pyramid
 
-        return displaced(instrument, offsets)
+        return displace_pyramid(instrument, offsets)
 
     @override
     def image_offsets(self, instrument: Instrument) -> NDArray[np.float64] | None:

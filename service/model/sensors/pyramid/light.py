@@ -29,7 +29,7 @@ from service.model.pupil import Illumination, instrument_pupil
 from service.model.sensors.pyramid.description import image_offsets, pyramid_in
 from service.model.sensors.pyramid.optics import PyramidOptics, enough_modulation_points
 from service.model.sensors.sensor import CannotTell, ImageOffsets, PupilPosition
-from service.model.slopes import turned_mask
+from service.model.slopes import orient_mask
 
 Array = NDArray[np.float64]
 
@@ -105,14 +105,14 @@ class PyramidLight:
         """Return images ``(2, n, 2, n)`` in row-major order of their place on the detector."""
         return light.transpose(0, 2, 1, 3).reshape(self.shape)
 
-    def turned(self, counts: NDArray[Any]) -> NDArray[Any]:
+    def orient_counts(self, counts: NDArray[Any]) -> NDArray[Any]:
         """Return counts in the RTC's axes, in those of conventions.md.
 
         A flip or a swap moves the images among one another, too.
         """
         n = counts.shape[-1]
         detector = counts.reshape(2, 2, n, n).transpose(0, 2, 1, 3).reshape(2 * n, 2 * n)
-        turned = turned_mask(detector, self.instrument.slopes.assumed_orientation)
+        turned = orient_mask(detector, self.instrument.slopes.assumed_orientation)
         sides = turned.reshape(2, n, 2, n).transpose(0, 2, 1, 3)
         return np.ascontiguousarray(sides).reshape(4, n, n)
 
@@ -151,9 +151,9 @@ def find_pupil(counts: NDArray[Any], instrument: Instrument) -> PupilPosition | 
     if not light > 0.0:
         return CannotTell(reason=f"no light: the mean count is {light:g}; open the shutter")
     images = images / light
-    optics = even_optics(instrument)
+    optics = build_even_optics(instrument)
     try:
-        start = _first_guess(images, even_optics(instrument, 1))
+        start = _first_guess(images, build_even_optics(instrument, 1))
         position, steps, formal, residual = _settle_position(images, optics, start)
     except np.linalg.LinAlgError:
         return CannotTell(reason="the light has no edge the position could be read from")
@@ -226,7 +226,7 @@ def _locate_images(
     light = float(images.mean())
     if not light > 0.0:
         return CannotTell(reason=f"no light: the mean count is {light:g}; open the shutter")
-    optics, places = even_optics(instrument, sampling), start
+    optics, places = build_even_optics(instrument, sampling), start
     try:
         for _ in range(_PLACES_STEPS):
             there = replace(optics, offsets=places.reshape(2, 2, 2))
@@ -245,7 +245,7 @@ def _other_light(residual: float) -> CannotTell:
     return CannotTell(reason=f"the light is not that of the pupil: {residual:.0%} remain")
 
 
-def even_optics(instrument: Instrument, sampling: int = 2) -> PyramidOptics:
+def build_even_optics(instrument: Instrument, sampling: int = 2) -> PyramidOptics:
     """Return the sensor with an evenly lit pupil, as finely as light needs it."""
     return PyramidOptics(
         wfs=pyramid_in(instrument),
@@ -256,7 +256,7 @@ def even_optics(instrument: Instrument, sampling: int = 2) -> PyramidOptics:
     )
 
 
-def even_images(optics: PyramidOptics, shift: tuple[float, float]) -> Array:
+def compute_even_images(optics: PyramidOptics, shift: tuple[float, float]) -> Array:
     """Return what an even beam shows ``(4, n, n)``, in the order of the counts."""
     n = optics.wfs.n_subapertures
     return optics.images(shift).transpose(0, 2, 1, 3).reshape(4, n, n)
@@ -310,7 +310,7 @@ def _first_guess(images: Array, optics: PyramidOptics) -> Array:
     surface = _polynomials(images.shape[1], 1)
 
     def left(x: float, y: float) -> float:
-        even = even_images(optics, (x, y)).sum(axis=0).reshape(-1, 1)
+        even = compute_even_images(optics, (x, y)).sum(axis=0).reshape(-1, 1)
         columns = np.hstack([surface * even, np.ones_like(even)])
         return float(np.linalg.norm(total - columns @ np.linalg.lstsq(columns, total)[0]))
 
@@ -325,11 +325,11 @@ def _departures(
 
     Displacements and σ are ``(4, 2)`` each.
     """
-    even = even_images(optics, _pair(position))
+    even = compute_even_images(optics, _pair(position))
     rates = [
         (
-            even_images(optics, _pair(position + probe))
-            - even_images(optics, _pair(position - probe))
+            compute_even_images(optics, _pair(position + probe))
+            - compute_even_images(optics, _pair(position - probe))
         )
         / (2 * _PROBE_SUBAP)
         for probe in _PROBE_SUBAP * np.eye(2)
@@ -411,7 +411,7 @@ def measure_illumination(
     images, _ = repair_pixels(counts, instrument)
     if not images.mean() > 0.0:
         raise ModelError("illumination: found no light; expected the mean counts of the images")
-    shown = even_images(even_optics(instrument), position.at)
+    shown = compute_even_images(build_even_optics(instrument), position.at)
     lit = shown.sum(axis=0) > _LIT_SHARE * np.percentile(shown.sum(axis=0), 75.0)
     return _beam(_fill_outside(_excess(images, shown, lit), lit), position)
 
@@ -430,7 +430,7 @@ def relative_light(
         If the counts are not four images of the instrument's size.
     """
     images, _ = repair_pixels(counts, instrument)
-    even = even_images(even_optics(instrument), position.at).sum(axis=0)
+    even = compute_even_images(build_even_optics(instrument), position.at).sum(axis=0)
     lit = even > _LIT_SHARE * np.percentile(even, 75.0)
     share = images.sum(axis=0) / np.where(lit, even, 1.0)
     return np.where(lit, share / share[lit].mean(), 1.0), lit

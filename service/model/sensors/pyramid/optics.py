@@ -183,15 +183,15 @@ class PyramidOptics:
         for grid in self._grids:
             roof_y = self._roof(of_row.shift[1] + grid.y, of_row.nodes_y, grid.sides_y)
             roof_x = self._roof(of_row.shift[0] + grid.x, of_row.nodes_x, grid.sides_x)
-            modulated_y, modulated_x = self._modulated(roof_y, roof_x)
+            modulated_y, modulated_x = self._modulate_roof(roof_y, roof_x)
             fields_at_rest = self._fields(modulated_y, modulated_x)
             images[grid.sides_y, :, grid.sides_x] = self._images(fields_at_rest, roof_y, roof_x)
             parts.append(
                 PreparedGrid(
                     grid=grid,
                     fields=fields_at_rest,
-                    factors_y=_weighted_parts(modulated_y, roof_y, axis=1),
-                    factors_x=self.arrays.there(_weighted_parts(modulated_x, roof_x, axis=-2)),
+                    factors_y=_weight_parts(modulated_y, roof_y, axis=1),
+                    factors_x=self.arrays.there(_weight_parts(modulated_x, roof_x, axis=-2)),
                     signs=self._signs(len(roof_y.weights), len(roof_x.weights), grid),
                 )
             )
@@ -221,7 +221,7 @@ class PyramidOptics:
         for grid in self._grids:
             roof_y = self._roof(shift[1] + grid.y, nodes, grid.sides_y)
             roof_x = self._roof(shift[0] + grid.x, nodes, grid.sides_x)
-            fields_at_rest = self._fields(*self._modulated(roof_y, roof_x))
+            fields_at_rest = self._fields(*self._modulate_roof(roof_y, roof_x))
             images[grid.sides_y, :, grid.sides_x] = self._images(fields_at_rest, roof_y, roof_x)
         return images
 
@@ -294,7 +294,7 @@ class PyramidOptics:
         x = (radii * np.sin(angles))[:, None, None] * _SIDES[:, None]
         return along_y.astype(self._complex), np.exp(1j * x * u).astype(self._complex)
 
-    def _modulated(self, roof_y: _Roof, roof_x: _Roof) -> tuple[Array, Array]:
+    def _modulate_roof(self, roof_y: _Roof, roof_x: _Roof) -> tuple[Array, Array]:
         """Return the roof operators times the source's phasors.
 
         Along y ``(M/2, n, 2, n_nodes, N)``: source, subaperture, image side, node; along x
@@ -396,7 +396,7 @@ class PyramidOptics:
         there = self.arrays.there
         lit, scale = there(np.flatnonzero(self.pupil.lit)), there(self._scale[self.pupil.lit])
         if shapes is not None and self.are_few(shapes.shape[1]):
-            return partial(self._fold_few, weighted=self._weighted(shapes))
+            return partial(self._fold_few, weighted=self._weight_shapes(shapes))
         known = None if shapes is None else there(shapes)
         return partial(self._fold, lit=lit, scale=scale, shapes=known)
 
@@ -406,7 +406,7 @@ class PyramidOptics:
         n_points = len(self.pupil.coordinates)
         return n_shapes * (n_points + n_lines) < n_points * n_lines
 
-    def _weighted(self, shapes: Array) -> Foreign:
+    def _weight_shapes(self, shapes: Array) -> Foreign:
         """Return shapes ``(n_lit, n_shapes)`` times the amplitude on the grid ``(N, N n_shapes)``.
 
         0 at points that are not lit.
@@ -559,7 +559,7 @@ class _Roof:
     """``(n_nodes,)``."""
 
 
-def _weighted_parts(modulated: Array, roof: _Roof, axis: int) -> Array:
+def _weight_parts(modulated: Array, roof: _Roof, axis: int) -> Array:
     """Return roof operators times phasors and weights of the nodes, Re | Im along an axis."""
     weighted = modulated * roof.weights[:, None].astype(modulated.real.dtype)
     return np.stack([weighted.real, weighted.imag], axis=axis)

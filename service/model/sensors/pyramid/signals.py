@@ -145,21 +145,21 @@ class PyramidResponse:
 
     def jacobian(self) -> Array:
         """Return K whole, ``(n_signals, n_points)`` per metre."""
-        return self._per_metre(normalised_jacobian(self._gradient, self.sensor.valid))
+        return self._per_metre(differentiate_signals(self._gradient, self.sensor.valid))
 
     def apply(self, shapes: Shapes) -> Array:
         """Return the signals ``(n_signals, n_shapes)`` of wavefronts, metres."""
         light = self._to(shapes)
-        return self._per_metre(normalised_jacobian(light, self.sensor.valid, out=light.gradient))
+        return self._per_metre(differentiate_signals(light, self.sensor.valid, out=light.gradient))
 
     def with_shift_rates(self, shapes: Shapes) -> tuple[Array, Array, Array]:
         """Return the signals, and their change when the images move along x, and along y."""
         at_rest, valid = self._to(shapes), self.sensor.valid
         along_x, along_y = (
-            self._per_metre(normalised_derivative(at_rest, self._to(shapes, **edges), valid))
+            self._per_metre(differentiate_jacobian(at_rest, self._to(shapes, **edges), valid))
             for edges in ({"nodes_x": Nodes.edges()}, {"nodes_y": Nodes.edges()})
         )
-        signals = normalised_jacobian(at_rest, valid, out=at_rest.gradient)
+        signals = differentiate_signals(at_rest, valid, out=at_rest.gradient)
         return self._per_metre(signals), along_x, along_y
 
     def image_rates(self, shapes: Shapes) -> Array:
@@ -178,7 +178,7 @@ class PyramidResponse:
                 light = np.zeros_like(moving.images)
                 light[side_y, :, side_x] = moving.images[side_y, :, side_x]
                 one = _of_image(by_image[side_y, side_x], (side_y, side_x), recipe)
-                rate = normalised_derivative(at_rest, replace(one, images=light), valid)
+                rate = differentiate_jacobian(at_rest, replace(one, images=light), valid)
                 rates.append(self._per_metre(rate))
         return np.array(rates)
 
@@ -281,7 +281,7 @@ def signals_of(images: Array, valid: NDArray[np.bool_], recipe: SlopeRecipe) -> 
     return signals, flux.mean(axis=-1, keepdims=True)
 
 
-def normalised_jacobian(
+def differentiate_signals(
     response: LightGradient, valid: NDArray[np.bool_], *, out: Array | None = None
 ) -> Array:
     """Return the gradient of the normalised signals, ``(n_slopes, n_points)`` per radian.
@@ -304,17 +304,17 @@ def normalised_jacobian(
     return jacobian
 
 
-def normalised_derivative(
+def differentiate_jacobian(
     at_rest: LightGradient, moving: LightGradient, valid: NDArray[np.bool_]
 ) -> Array:
-    """Return the rate of ``normalised_jacobian`` when the images move, by the product rule."""
+    """Return the rate of ``differentiate_signals`` when the images move, by the product rule."""
     signals, flux = signals_of(at_rest.images, valid, at_rest.recipe)
     signal_rate, flux_rate = signals_of(moving.images, valid, moving.recipe)
     slopes = signals / flux
     slope_rate = (signal_rate - slopes * flux_rate) / flux
     rate = moving.gradient - _times(slopes, moving.flux_gradient)
     rate -= _times(slope_rate, at_rest.flux_gradient)
-    rate -= normalised_jacobian(at_rest, valid) * flux_rate[:, None].astype(rate.dtype)
+    rate -= differentiate_signals(at_rest, valid) * flux_rate[:, None].astype(rate.dtype)
     rate /= flux[:, None].astype(rate.dtype)
     return np.asarray(rate)
 

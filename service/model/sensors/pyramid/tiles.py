@@ -66,7 +66,9 @@ class _Strip:
 
     sum: _Sum
 
-    def seen(self, along_y: Foreign, along_x: Sequence[Foreign], arrays: Arrays) -> Foreign:
+    def measure_functions(
+        self, along_y: Foreign, along_x: Sequence[Foreign], arrays: Arrays
+    ) -> Foreign:
         """Return ``(n_functions, n_lines)`` what lines see of the strip's functions."""
         xp = arrays.xp
         products = [xp.matmul(along_y[self.lines, :], part) for part in along_x]
@@ -99,7 +101,7 @@ class TiledResponse:
     def __call__(self, along_y: Foreign, along_x: Sequence[Foreign]) -> Foreign:
         """Return ``(n_lines, n_shapes)`` of ``(N, n_terms)`` and ``(n_lines, n_terms, N)``."""
         xp, arrays = self._arrays.xp, self._arrays
-        strips = [strip.seen(along_y, along_x, arrays) for strip in self._strips]
+        strips = [strip.measure_functions(along_y, along_x, arrays) for strip in self._strips]
         by_function = self._sum(xp.concat(strips, axis=0), arrays)
         by_function = xp.concat([by_function, xp.zeros_like(by_function[:1, :])], axis=0)
         layers = [xp.take(by_function, places, axis=0).T for places in self._layers]

@@ -57,23 +57,23 @@ def shack_hartmann_of(table: ShackHartmannTable) -> ShackHartmann:
     thresholded = table.centroid is Centroid.THRESHOLD
     if thresholded and table.threshold is None:
         raise ModelError(
-            'threshold: found none, expected a share of the brightest pixel beside centroid = "'
+            'threshold: found none, expected a share of the brightest pixel with centroid = "'
             f'{table.centroid}"'
         )
     if not thresholded and table.threshold is not None:
         raise ModelError(
-            f'threshold: found {table.threshold:g} beside centroid = "{table.centroid}", expected '
+            f'threshold: found {table.threshold:g} with centroid = "{table.centroid}", expected '
             'centroid = "threshold" or no threshold'
         )
     if table.centroid is Centroid.GRADIENT and table.laser is not None:
         raise ModelError(
-            'centroid: found "gradient" beside a laser star, expected "cog", "weighted" or '
-            '"threshold": a mean gradient knows no elongated spots'
+            'centroid: found "gradient" with a laser star, expected "cog", "weighted" or '
+            '"threshold": a mean gradient does not model elongated spots'
         )
     if thresholded and table.partly_lit is PartlyLit.USE:
         raise ModelError(
-            f'partly_lit: found "use" beside a threshold of {table.threshold:g}, expected "leave '
-            'out": of a spot that the edge of the pupil widens a threshold cuts more'
+            f'partly_lit: found "use" with a threshold of {table.threshold:g}, expected "leave '
+            'out": a threshold removes more of a spot that the pupil edge widens'
         )
     return ShackHartmann(
         **{field.name: getattr(table, field.name) for field in fields(ShackHartmannNumbers)}

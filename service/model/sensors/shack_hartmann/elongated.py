@@ -117,9 +117,13 @@ class ElongatedSpots(Spots):
     def _counts(self) -> tuple[Array, Array, Array]:
         counts = self.weights_of(self.images(np.ones((1, *[len(self.nodes[0])] * 2))))
         x = self.pixel * self._places
-        return self._blurred(counts), self._blurred(counts * x), self._blurred(counts * x[:, None])
+        return (
+            self._integrate_pixels(counts),
+            self._integrate_pixels(counts * x),
+            self._integrate_pixels(counts * x[:, None]),
+        )
 
-    def _blurred(self, on_pixels: Array) -> Array:
+    def _integrate_pixels(self, on_pixels: Array) -> Array:
         """Return what pixels ``(n, n_pixels, n_pixels)`` make count of a point's light at angles.
 
         The transpose of ``images``, light to pixels.
@@ -135,7 +139,7 @@ class ElongatedSpots(Spots):
 
     @override
     def images(self, amplitude: Array) -> Array:
-        light = np.abs(self._seen(amplitude)) ** 2
+        light = np.abs(self._transform_amplitude(amplitude)) ** 2
         spectrum = self._star * (self._spectrum @ light @ self._spectrum.T)
         return np.asarray((self._to_pixels @ spectrum @ self._to_pixels.T).real)
 

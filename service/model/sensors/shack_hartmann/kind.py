@@ -47,11 +47,13 @@ class ShackHartmannKind(SensorKind):
                 "[wfs.laser] with height_m, thickness_m, spot_arcsec and launcher_m"
             )
         if "guide_star_height_m" in written and "laser" in written:
-            raise ModelError("guide_star_height_m: has no meaning beside the table [wfs.laser]")
+            raise ModelError(
+                "guide_star_height_m: has no effect together with the table [wfs.laser]; remove it"
+            )
         return written
 
     @override
-    def described(self, table: ShackHartmannTable, given: frozenset[str]) -> ShackHartmann:
+    def read_sensor(self, table: ShackHartmannTable, given: frozenset[str]) -> ShackHartmann:
         from service.model.sensors.shack_hartmann.description import shack_hartmann_of
 
         return shack_hartmann_of(table)
@@ -75,7 +77,7 @@ class ShackHartmannKind(SensorKind):
         return LeftOut(cut, "cut by the edge of the pupil, left out by wfs.partly_lit")
 
     @override
-    def assumed(
+    def list_assumptions(
         self, table: ShackHartmannTable, given: frozenset[str]
     ) -> Iterator[tuple[str, str]]:
         if "pixel_scale_arcsec" not in given:
@@ -83,7 +85,7 @@ class ShackHartmannKind(SensorKind):
         if table.centroid is Centroid.THRESHOLD and "partly_lit" not in given:
             yield (
                 "partly_lit",
-                'not given, taken as "leave out": beside a threshold, fits leave out subapertures '
+                'not given, taken as "leave out": with a threshold, fits leave out subapertures '
                 "that the edge of the pupil cuts",
             )
 

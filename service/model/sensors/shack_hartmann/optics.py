@@ -99,7 +99,7 @@ class ShackHartmannSensor:
         return fine.lit_by(Illumination(coordinates=drawn.coordinates, intensity=intensity))
 
     @cached_property
-    def continued(self) -> Any:  # noqa: ANN401 - scipy has no types
+    def extend_wavefronts(self) -> Any:  # noqa: ANN401 - scipy has no types
         """``(n_grid, n_points)``: from wavefronts where it is lit to that grid; sparse."""
         lit = np.pad(self.pupil.lit, _MARGIN_POINTS)
         near = scipy.ndimage.binary_dilation(lit, np.ones((2 * _MARGIN_POINTS + 1,) * 2)) & ~lit
@@ -281,11 +281,11 @@ class ShackHartmannResponse:
         sensor, n = self.sensor, len(self.sensor.valid)
         (on_x, rate_x), (on_y, rate_y) = (light_at_nodes(sensor, shift) for shift in self.shift)
 
-        def seen(of_y: Any, of_x: Any) -> Array:  # noqa: ANN401 - scipy has no types
+        def sample(of_y: Any, of_x: Any) -> Array:  # noqa: ANN401 - scipy has no types
             along = of_y @ sensor.light_grid.amplitude @ of_x.T
             return np.asarray(along).reshape(n, len(along) // n, n, -1).swapaxes(1, 2)
 
-        return seen(on_y, on_x), seen(on_y, rate_x), seen(rate_y, on_x)
+        return sample(on_y, on_x), sample(on_y, rate_x), sample(rate_y, on_x)
 
     def _window(self, y: Array, x: Array) -> tuple[Array, Array, Array]:
         """Return rows and columns of the grid that lenslets read, and which exist."""
@@ -313,4 +313,4 @@ class ShackHartmannResponse:
             ),
             shape=(len(values), sensor.side**2),
         )
-        return (matrix @ sensor.continued).astype(sensor.dtype)
+        return (matrix @ sensor.extend_wavefronts).astype(sensor.dtype)

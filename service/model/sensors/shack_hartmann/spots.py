@@ -104,12 +104,12 @@ class Spots:
         n_inside = self._angles[0].shape[1]
         return np.asarray(np.kron(on_pixels, np.ones((n_inside, n_inside))) * self._area)
 
-    def _seen(self, amplitude: Array) -> Array:
+    def _transform_amplitude(self, amplitude: Array) -> Array:
         return np.asarray(self._transform @ amplitude @ self._transform.T)
 
     def images(self, amplitude: Array) -> Array:
         """Return the light on the pixels ``(n_lenslets, n_pixels, n_pixels)`` [y, x]."""
-        light = np.abs(self._seen(amplitude)) ** 2 * self._area
+        light = np.abs(self._transform_amplitude(amplitude)) ** 2 * self._area
         n, inside = self.n_pixels, self._angles[0].shape[1]
         return np.asarray(light.reshape(-1, n, inside, n, inside).sum(axis=(2, 4)))
 
@@ -123,7 +123,7 @@ class Spots:
 
         Amplitudes are ``(n_lenslets, n_nodes, n_nodes)`` [y, x] at the nodes.
         """
-        product = self._seen(first).conj() * self._seen(second)
+        product = self._transform_amplitude(first).conj() * self._transform_amplitude(second)
         return np.asarray(np.sum(product.real * self._counts[0], axis=(1, 2)))
 
     def pull(self, outer: Array, inner: Array) -> tuple[Array, Array]:
@@ -133,7 +133,7 @@ class Spots:
         phase is, and with which light it interferes. Quadrature weights are in it.
         """
         _, weights = self.nodes
-        seen = self._seen(inner).conj()
+        seen = self._transform_amplitude(inner).conj()
         back = self._transform / weights
         lit = -2.0 * outer * np.outer(weights, weights)
         along_x, along_y = (

@@ -13,7 +13,11 @@ from service.errors import ModelError
 from service.model.interaction import InteractionModel
 from service.model.kinds import Normalisation, SlopeOrder, Stop
 from service.model.misregistration import Misregistration
-from service.model.sensors.pyramid.description import displaced, image_offsets, turned_offsets
+from service.model.sensors.pyramid.description import (
+    displace_pyramid,
+    image_offsets,
+    orient_offsets,
+)
 from service.model.sensors.registry import kind_of
 from service.model.slopes import Orientation
 from tests.numerics import small_basis, small_instrument
@@ -68,14 +72,14 @@ def test_axes_of_the_rtc_are_turned_there_and_back(axes, sign):
     swap, flip_x, flip_y = axes
     orientation = Orientation(swap_xy=swap, flip_x=flip_x, flip_y=flip_y, sign_x=sign, sign_y=-sign)
     offsets = np.random.default_rng(1).normal(size=(2, 2, 2))
-    there = turned_offsets(offsets, orientation)
-    assert np.allclose(turned_offsets(there, orientation, back=True), offsets)
+    there = orient_offsets(offsets, orientation)
+    assert np.allclose(orient_offsets(there, orientation, back=True), offsets)
 
 
 def test_a_flip_moves_an_image_to_the_other_side_and_turns_its_displacement():
     offsets = np.zeros((2, 2, 2))
     offsets[0, 1] = [0.1, 0.2]  # the image at +x -y
-    turned = turned_offsets(offsets, Orientation(flip_x=True))
+    turned = orient_offsets(offsets, Orientation(flip_x=True))
     assert turned[0, 0] == pytest.approx([-0.1, 0.2])
     assert not turned[0, 1].any()
 
@@ -84,7 +88,7 @@ def test_with_the_mirror_as_stop_the_mean_is_the_shift_itself():
     about = small_instrument()
     for stop, mean in ((Stop.MIRROR, 0.0), (Stop.TELESCOPE, 0.2)):
         there = replace(about, stop=stop)
-        wfs = displaced(there, np.full(8, 0.2))
+        wfs = displace_pyramid(there, np.full(8, 0.2))
         told = replace(there, wfs=wfs)
         assert np.allclose(image_offsets(told), 0.0)
         shift = InteractionModel(told, small_basis(), pupil_sampling=1, detector_nodes=1)
@@ -104,7 +108,7 @@ def test_unknown_places_widen_the_floor_and_known_ones_do_not():
     assert not kind.image_floor(about).any()
     unknown = replace(about, unknown=("wfs.image_offsets_px",))
     assert kind.image_floor(unknown)[0] == pytest.approx(0.25 * 0.15)
-    told = replace(about, wfs=displaced(about, np.zeros(8)))
+    told = replace(about, wfs=displace_pyramid(about, np.zeros(8)))
     assert kind.image_sigma_subap(told) is None
 
 
@@ -112,4 +116,4 @@ def test_a_sensor_of_one_image_has_none_to_be_moved():
     from service.model.sensors.shack_hartmann.kind import ShackHartmannKind
 
     with pytest.raises(ModelError):
-        ShackHartmannKind().displaced(small_instrument(), np.zeros(8))
+        ShackHartmannKind().displace_images(small_instrument(), np.zeros(8))

@@ -110,7 +110,7 @@ def test_what_may_be_unknown_of_it_is(write):
         (
             WFS,
             '[slopes]\nnormalisation = "local"\n',
-            'normalisation: has no meaning beside wfs.kind = "curvature"',
+            'normalisation: has no effect with kind = "curvature"',
         ),
     ],
 )

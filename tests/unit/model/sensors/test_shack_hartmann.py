@@ -148,18 +148,18 @@ def test_its_light_tells_nothing_of_the_pupil(lenslets):
     ("old", "new", "said"),
     [
         ("wavelength_m", 'centroid = "threshold"\nwavelength_m', "threshold: found none"),
-        ("wavelength_m", "threshold = 0.1\nwavelength_m", 'beside centroid = "cog"'),
+        ("wavelength_m", "threshold = 0.1\nwavelength_m", 'found 0.1 with centroid = "cog"'),
         (
             "wavelength_m",
             'centroid = "threshold"\nthreshold = 0.1\npartly_lit = "use"\nwavelength_m',
-            'partly_lit: found "use" beside a threshold of 0.1, expected "leave out"',
+            'partly_lit: found "use" with a threshold of 0.1, expected "leave out"',
         ),
         ("wavelength_m", "pixel_scale_arcsec = 0.001\nwavelength_m", "expected 1.5 to 60"),
         ("wavelength_m", "guide_star_height_m = 9e4\nwavelength_m", "a table [wfs.laser]"),
         (
             "[mirror]",
             f'guide_star_height_m = "infinity"\n[wfs.laser]\n{STAR}[mirror]',
-            "has no meaning beside the table [wfs.laser]",
+            "guide_star_height_m: has no effect",
         ),
         ("[mirror]", f"[wfs.laser]\n{STAR}[mirror]".replace("launcher_m", "#"), "laser.launcher_m"),
         ("[mirror]", f"[wfs.laser]\n{STAR}[mirror]".replace("9e4", "90"), "laser.height_m"),
@@ -196,7 +196,11 @@ def test_its_light_tells_nothing_of_the_pupil(lenslets):
             "wfs: found 2 tables [[wfs]], expected one table [wfs]: a service has one sensor",
         ),
         ("[modes]", '[slopes]\nkind = "intensity"\n[modes]', "intensity of a shack-hartmann"),
-        ("[modes]", '[slopes]\nnormalisation = "local"\n[modes]', "no meaning beside wfs.kind"),
+        (
+            "[modes]",
+            '[slopes]\nnormalisation = "local"\n[modes]',
+            "slopes.normalisation: has no effect",
+        ),
     ],
 )
 def test_what_is_no_lenslets_is_refused_in_one_line(tmp_path, old, new, said):

@@ -7,7 +7,7 @@ import pytest
 from service.model.kinds import KarhunenLoeve
 from service.model.misregistration import Misregistration
 from sim_rtc.computer.feed import BATCH_FRAMES, Ahead, OpenLoopFeed, OpenModes, message_frames
-from sim_rtc.telescope.atmosphere import Layer, frozen_layers
+from sim_rtc.telescope.atmosphere import Layer, build_layers
 from sim_rtc.telescope.detector import Detector
 from sim_rtc.telescope.imperfections import SETS, Imperfections
 from sim_rtc.telescope.linear import LinearPlant
@@ -60,7 +60,7 @@ def make_feed(
         magnitude=-30.0,
         frame_rate_hz=500.0,
     )
-    layers = frozen_layers(
+    layers = build_layers(
         tuple(Layer(fraction=1.0, speed_m_s=v, direction_deg=angle) for v, angle in winds),
         points_m=plant.points_m,
         pitch_m=plant.pitch_m,

@@ -6,7 +6,7 @@ import pytest
 from pyrcal.rtc.identity import Identity
 from pyrcal.rtc.staging import Staging, Terms
 from service.wire import AckState, Manifest, layout_of, split
-from sim_rtc.computer.reconstructors import truncated_inverse
+from sim_rtc.computer.reconstructors import compute_truncated_inverse
 
 TERMS = Terms(
     session="s1",
@@ -154,6 +154,6 @@ def test_the_inverse_leaves_directions_the_sensor_hardly_sees():
     left, _ = np.linalg.qr(rng.standard_normal((20, 5)))
     right, _ = np.linalg.qr(rng.standard_normal((5, 5)))
     values = np.array([4.0, 3.0, 2.0, 1.0, 1e-4])
-    inverse = truncated_inverse((left * values @ right.T).astype(np.float32))
+    inverse = compute_truncated_inverse((left * values @ right.T).astype(np.float32))
     identity = inverse @ (left * values @ right.T)
     np.testing.assert_allclose(identity, right[:, :4] @ right[:, :4].T, atol=1e-3)

@@ -3,7 +3,7 @@ import pytest
 
 from service.model.kinds import KarhunenLoeve
 from service.model.turbulence import von_karman_covariance
-from sim_rtc.telescope.atmosphere import ExtrudedScreen, fried_parameter_m
+from sim_rtc.telescope.atmosphere import ExtrudedScreen, compute_fried_parameter_m
 
 TURBULENCE = KarhunenLoeve(r0_m=0.1, outer_scale_m=10.0)
 PITCH_M = 0.1
@@ -64,5 +64,5 @@ def test_the_same_seed_gives_the_same_screen():
 
 
 def test_one_arcsecond_is_a_fried_parameter_of_ten_centimetres():
-    assert fried_parameter_m(1.0) == pytest.approx(0.101, abs=0.001)
-    assert fried_parameter_m(0.5) == pytest.approx(2 * fried_parameter_m(1.0))
+    assert compute_fried_parameter_m(1.0) == pytest.approx(0.101, abs=0.001)
+    assert compute_fried_parameter_m(0.5) == pytest.approx(2 * compute_fried_parameter_m(1.0))

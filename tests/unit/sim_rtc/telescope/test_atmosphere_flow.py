@@ -7,8 +7,8 @@ from sim_rtc.telescope.atmosphere import (
     FrozenLayer,
     Layer,
     PhaseResponse,
+    build_layers,
     cubic_weights,
-    frozen_layers,
 )
 
 TURBULENCE = KarhunenLoeve(r0_m=0.1, outer_scale_m=10.0)
@@ -104,7 +104,7 @@ def test_shares_of_the_layers_are_normalised():
     )
 
     def phases(chosen):
-        layers = frozen_layers(
+        layers = build_layers(
             chosen,
             points_m=points,
             pitch_m=PITCH_M,
@@ -128,7 +128,7 @@ def test_shares_of_the_layers_are_normalised():
 )
 def test_impossible_layers_are_refused(layers):
     with pytest.raises(ModelError, match="expected shares > 0 and speeds > 0"):
-        frozen_layers(
+        build_layers(
             layers,
             points_m=np.zeros((1, 2)),
             pitch_m=PITCH_M,

@@ -6,7 +6,7 @@ import pytest
 
 from service.errors import ConfigurationError
 from service.model.pupil import valid_subapertures
-from sim_rtc.telescope.detector import FLAO_PRESETS, Camera, PixelDetector, binned, preset_for
+from sim_rtc.telescope.detector import FLAO_PRESETS, Camera, PixelDetector, bin_pixels, preset_for
 
 N_DRAWS = 40_000
 
@@ -62,22 +62,22 @@ def test_the_preset_is_the_first_that_reaches_the_star():
 
 
 def test_binning_keeps_the_beam_and_halves_the_subapertures(small_instrument):
-    coarse = binned(small_instrument, 2)
+    coarse = bin_pixels(small_instrument, 2)
     assert coarse.wfs.n_subapertures == 5
     assert coarse.subaperture_m == pytest.approx(2 * small_instrument.subaperture_m)
     assert coarse.wfs.pupil_separation_subap * coarse.subaperture_m == pytest.approx(
         small_instrument.wfs.pupil_separation_subap * small_instrument.subaperture_m
     )
-    assert binned(small_instrument, 1) is small_instrument
+    assert bin_pixels(small_instrument, 1) is small_instrument
 
 
 def test_a_binning_that_does_not_divide_is_refused(small_instrument):
     with pytest.raises(ConfigurationError, match="found 3; 10 subapertures must divide by it"):
-        binned(small_instrument, 3)
+        bin_pixels(small_instrument, 3)
 
 
 def test_binning_a_mask_of_valid_subapertures_is_refused(small_instrument):
     mask = valid_subapertures(small_instrument)
     wfs = replace(small_instrument.wfs, valid_subapertures=mask)
     with pytest.raises(ConfigurationError, match="their mask must be found by flux"):
-        binned(replace(small_instrument, wfs=wfs), 2)
+        bin_pixels(replace(small_instrument, wfs=wfs), 2)

@@ -11,16 +11,16 @@ from service.model.kinds import KarhunenLoeve, Stop
 from service.model.misregistration import Misregistration
 from service.model.pupil import valid_subapertures
 from service.model.sensors.pyramid.optics import PyramidOptics
-from service.model.sensors.pyramid.signals import normalised_jacobian, reference_slopes
+from service.model.sensors.pyramid.signals import differentiate_signals, reference_slopes
 from sim_rtc.computer.feed import BATCH_FRAMES, PhaseFeed
 from sim_rtc.computer.loop import LoopTerms, ModalLoop
-from sim_rtc.telescope.atmosphere import Layer, frozen_layers
-from sim_rtc.telescope.detector import PixelDetector, binned
+from sim_rtc.telescope.atmosphere import Layer, build_layers
+from sim_rtc.telescope.detector import PixelDetector, bin_pixels
 from sim_rtc.telescope.diffractive import (
     DiffractivePlant,
     DiffractivePyramid,
     Quadrature,
-    centred_pupil,
+    build_centred_pupil,
 )
 from sim_rtc.telescope.imperfections import Imperfections
 from sim_rtc.telescope.mirror import MirrorFaults
@@ -46,7 +46,7 @@ PERFECT = Imperfections(unevenness=0.0, position_error=0.0)
 
 @pytest.fixture(scope="module")
 def pupil(small_instrument):
-    return centred_pupil(small_instrument, 3)
+    return build_centred_pupil(small_instrument, 3)
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +92,7 @@ def test_small_phases_give_the_slopes_of_the_linear_jacobian(small_instrument, p
     wfs, shift = small_instrument.wfs, (0.1, 0.2)
     linear = PyramidOptics(wfs=wfs, pupil=pupil, n_nodes=2, n_modulation=28)
     valid = valid_subapertures(small_instrument)
-    jacobian = normalised_jacobian(linear.response(valid, shift), valid)
+    jacobian = differentiate_signals(linear.response(valid, shift), valid)
     sensor = DiffractivePyramid(wfs, pupil, shift, Quadrature(n_modulation=28, dtype=precision))
     for opd_m in phases(pupil, 1e-9, n=5):
         push, pull = (reference_slopes(sensor.images(s * opd_m), valid)[0] for s in (1, -1))
@@ -240,7 +240,7 @@ def test_a_drift_moves_the_images_exactly(plant):
 
 
 def test_a_binned_sensor_keeps_its_pupil_points(small_instrument, small_basis):
-    coarse = binned(small_instrument, 2)
+    coarse = bin_pixels(small_instrument, 2)
     plant = DiffractivePlant(
         coarse, small_basis, rng=np.random.default_rng(1), binning=2, imperfections=PERFECT
     )
@@ -251,7 +251,7 @@ def test_a_binned_sensor_keeps_its_pupil_points(small_instrument, small_basis):
 
 def feed(plant, schedule):
     optics = MovingOptics(plant, schedule, Immediate())
-    layers = frozen_layers(
+    layers = build_layers(
         (Layer(fraction=1.0, speed_m_s=15.0, direction_deg=20.0),),
         points_m=plant.points_m,
         pitch_m=plant.pitch_m,
@@ -398,7 +398,7 @@ def test_displacements_of_the_images_reach_the_light(small_instrument, small_bas
     np.testing.assert_allclose(made.image_offsets_px, np.reshape(given, (4, 2)))
     assert ideal.image_offsets_px is None
     images, places = made.optics(TURNED).images, ideal.optics(TURNED).images
-    wider = binned(small_instrument, 2)
+    wider = bin_pixels(small_instrument, 2)
     coarse = DiffractivePlant(
         wider, small_basis, binning=2, rng=np.random.default_rng(1), imperfections=changes
     )

@@ -17,7 +17,7 @@ from sim_rtc.telescope.imperfections import (
     SETS,
     Imperfections,
     SlopeErrors,
-    distorted,
+    distort_points,
     image_offsets,
     non_common_path,
 )
@@ -61,7 +61,7 @@ def test_the_realistic_mix_has_every_imperfection_but_these():
 def test_turned_axes_turn_the_slopes_and_keep_their_length():
     errors = SlopeErrors(PIXELS, replace(IDEAL, slope_rotation_deg=90.0), np.random.default_rng(1))
     slopes = np.arange(50, dtype=np.float32)
-    read = errors.applied(slopes)
+    read = errors.add_errors(slopes)
     np.testing.assert_allclose(read[25:], slopes[:25], atol=1e-5)
     np.testing.assert_allclose(read[:25], -slopes[25:], atol=1e-5)
 
@@ -72,14 +72,14 @@ def test_what_is_worked_through_in_parts_is_the_same(kind, monkeypatch):
     wrong = replace(IDEAL, bad_pixels=3, slope_rotation_deg=2.0)
     errors = SlopeErrors(PIXELS, wrong, rng, SlopeRecipe(order=kind.orders[0]))
     slopes = rng.normal(size=(kind.n_planes * 25, 2500)).astype(np.float32)
-    whole = errors.applied(slopes)
+    whole = errors.add_errors(slopes)
     monkeypatch.setattr(imperfections, "_WHOLE_BYTES", 0)
-    np.testing.assert_array_equal(errors.applied(slopes), whole)
+    np.testing.assert_array_equal(errors.add_errors(slopes), whole)
 
 
 def test_a_dead_pixel_silences_both_slopes_of_its_subaperture():
     errors = SlopeErrors(PIXELS, replace(IDEAL, bad_pixels=3), np.random.default_rng(1))
-    read = errors.applied(np.ones((50, 4), dtype=np.float32))
+    read = errors.add_errors(np.ones((50, 4), dtype=np.float32))
     silent = np.flatnonzero(errors.silent)
     assert 1 <= len(silent) <= 3
     assert set(np.flatnonzero((read == 0.0).all(axis=1))) == {*silent, *(silent + 25)}
@@ -150,12 +150,12 @@ def test_perfect_slopes_are_left_alone():
     slopes = np.ones((50, 4), dtype=np.float32)
     errors = SlopeErrors(PIXELS, IDEAL, np.random.default_rng(1))
     assert errors.absent
-    assert errors.applied(slopes) is slopes
+    assert errors.add_errors(slopes) is slopes
 
 
 def test_a_distortion_holds_no_registration(pupil):
     points, weights = pupil.points, pupil.weights
-    moved = distorted(points, weights, replace(IDEAL, distortion_subap=0.2, anamorphosis=0.01))
+    moved = distort_points(points, weights, replace(IDEAL, distortion_subap=0.2, anamorphosis=0.01))
     error = moved - points
     x, y = points.T
     assert np.abs(weights @ error).max() < 1e-12
@@ -165,7 +165,7 @@ def test_a_distortion_holds_no_registration(pupil):
     # (2/3 of a cubic over a disc).
     on_x = np.abs(y) < 0.2
     edge = on_x & (np.abs(x) > 4.7)
-    without = distorted(points, weights, replace(IDEAL, distortion_subap=0.2)) - points
+    without = distort_points(points, weights, replace(IDEAL, distortion_subap=0.2)) - points
     outwards = (without * points).sum(axis=1) / np.hypot(x, y)
     assert outwards[edge].mean() == pytest.approx(0.2 / 3, rel=0.3)
     assert outwards[np.hypot(x, y) < 2].max() < 0.0

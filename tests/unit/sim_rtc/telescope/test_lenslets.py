@@ -17,7 +17,7 @@ from service.model.slopes import PLAIN
 from sim_rtc.assembly import departures_of
 from sim_rtc.options import parse_options
 from sim_rtc.telescope.detector import Camera, Detector, PixelDetector
-from sim_rtc.telescope.diffractive import DiffractivePlant, centred_pupil
+from sim_rtc.telescope.diffractive import DiffractivePlant, build_centred_pupil
 from sim_rtc.telescope.imperfections import SETS
 from sim_rtc.telescope.lenslets import LENSLET_SAMPLING, DiffractiveLenslets
 from tests.physics.fft_spots import pushed
@@ -33,7 +33,7 @@ def lenslets():
 
 
 def sensor_of(instrument, shift=SHIFT):
-    pupil = centred_pupil(instrument, LENSLET_SAMPLING)
+    pupil = build_centred_pupil(instrument, LENSLET_SAMPLING)
     return DiffractiveLenslets(instrument.wfs, pupil, instrument.subaperture_m, shift), pupil
 
 

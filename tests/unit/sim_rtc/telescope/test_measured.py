@@ -99,7 +99,7 @@ def test_turbulence_beyond_the_modes_is_seen_as_the_model_says(
         modes * np.sqrt(weights)[:, None], phase * np.sqrt(weights)[:, None], rcond=None
     )[0]
     beyond = phase - modes @ content
-    of_model = plant.listed(
+    of_model = plant.sort_rows(
         kind_of(bench).sensor(bench, plant._pupil, Fineness()).at((0.1, 0.0)).jacobian()
     )
     expected = of_model @ beyond

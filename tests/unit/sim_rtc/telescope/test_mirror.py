@@ -5,7 +5,7 @@ import pytest
 
 from service.errors import ConfigurationError
 from service.model.surface import ThinPlate
-from sim_rtc.telescope.mirror import MirrorFaults, TensionedPlate, disobedient, misplaced
+from sim_rtc.telescope.mirror import MirrorFaults, TensionedPlate, disobedient, misplace_actuators
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +94,7 @@ def test_faults_the_mirror_cannot_have_are_refused(plate, small_basis, faults, t
 
 def test_position_errors_contain_no_registration(small_instrument):
     mirror = small_instrument.mirror
-    moved = misplaced(mirror, 0.02, np.random.default_rng(2)).positions_m
+    moved = misplace_actuators(mirror, 0.02, np.random.default_rng(2)).positions_m
     error = moved - mirror.positions_m
     x, y = mirror.positions_m.T
     assert np.abs(error.mean(axis=0)).max() < 1e-12

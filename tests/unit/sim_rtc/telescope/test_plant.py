@@ -10,8 +10,8 @@ from service.model.pupil import instrument_pupil
 from service.model.surface import ThinPlate
 from sim_rtc.telescope.imperfections import Imperfections
 from sim_rtc.telescope.linear import LinearPlant, optical_gain
-from sim_rtc.telescope.mirror import MirrorFaults, misplaced
-from sim_rtc.telescope.plant import uneven
+from sim_rtc.telescope.mirror import MirrorFaults, misplace_actuators
+from sim_rtc.telescope.plant import light_unevenly
 
 ALIGNED = Misregistration()
 TURNED = Misregistration(
@@ -88,7 +88,7 @@ def test_the_telescope_as_stop_moves_the_mirror_instead_of_the_images(
 
 def test_position_errors_contain_no_registration(small_instrument):
     mirror = small_instrument.mirror
-    moved = misplaced(mirror, 0.02, np.random.default_rng(2)).positions_m
+    moved = misplace_actuators(mirror, 0.02, np.random.default_rng(2)).positions_m
     error = moved - mirror.positions_m
     x, y = mirror.positions_m.T
     assert np.abs(error.mean(axis=0)).max() < 1e-12
@@ -100,7 +100,7 @@ def test_position_errors_contain_no_registration(small_instrument):
 
 def test_the_illumination_is_uneven_by_ten_per_cent(small_instrument):
     pupil = instrument_pupil(small_instrument, 4)
-    lit = uneven(pupil, 0.10, np.random.default_rng(3))
+    lit = light_unevenly(pupil, 0.10, np.random.default_rng(3))
     flux = (lit.amplitude[pupil.lit] / pupil.amplitude[pupil.lit]) ** 2
     assert np.abs(flux - 1).max() == pytest.approx(0.10)
     assert flux @ pupil.weights == pytest.approx(1.0)

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 import pyrcal
 from pyrcal.__main__ import main as run_pyrcal
-from pyrcal.offline import figures as fit_figures
-from pyrcal.offline.fitted import Fit
+from pyrcal.fitting import figures as fit_figures
+from pyrcal.fitting.fitted import Fit
 from service.control.loop import pole_radius
 from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration

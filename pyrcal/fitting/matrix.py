@@ -219,6 +219,12 @@ def _fit_usable(
     else:
         start = pose if pose is not None else instrument.start
     found = _run_method(models, target, instrument.with_anamorphosis(start), options, report_stage)
+    n_lost = np.count_nonzero(found.settled.solution.projection.gains == 0.0)
+    if 2 * n_lost > used.n_modes:
+        raise ModelError(
+            f"{instrument.name}: the fit ended where {n_lost} of {used.n_modes} modes change no "
+            "slope; start closer to the true registration (--start), or leave the start out"
+        )
     noisy = find_noise_columns(
         found.settled.solution, found.settled.target, instrument.slopes.kind.n_planes
     )
@@ -536,7 +542,9 @@ def _make_fit(
         error = by_smear * found.smear.sigma / found.smear.share
         sure = sure.with_moves(error[np.newaxis], np.ones(1))
     misplaced = _misplacement_sigma(models.instrument, structured)
-    sure = sure.with_moves(misplaced[np.newaxis], np.ones(1))
+    images = nuisances.images.T @ solution.nuisances[nuisances.image_places]
+    turned = kind_of(models.instrument).turned_edge_sigma(models.instrument, images.reshape(2, 4).T)
+    sure = sure.with_moves(np.array([misplaced, turned]), np.ones(2))
     noise_share = bound_noise_share(seen.residual, solution.matrix[target.rows] * seen.gains)
     # large pokes look like a wider modulation, which the fit may have taken for the true one
     weakly_modulated = any(

@@ -13,7 +13,15 @@ from pyrcal_studies.campaign.small import N_TARGET, SETTINGS, SMALL, bench_of, l
 from pyrcal_studies.campaign.system_measures import row_of
 from service.config import load_settings
 from service.errors import CommandError
-from service.estimation.health import DIVERGING_RATIO, LoopHealth, observe
+from service.estimation.description import actuator_watch
+from service.estimation.health import (
+    DIVERGING_RATIO,
+    UNPLAYED_RATIO,
+    LoopHealth,
+    PlayedCommands,
+    observe,
+    observe_played,
+)
 from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
 from service.tracking import alarms
@@ -271,35 +279,63 @@ def test_a_loop_lost_to_a_jump_is_opened_within_a_second_and_back_on_all_modes_w
     assert errors[1] < 1.1 * errors[0]
 
 
-def watched(*words, seconds) -> list[tuple[float, LoopHealth]]:
-    """Return the watch of the loop on the diffractive telescope, block by block."""
-    dome = Dome([f"--instrument={SMALL}", "--plant=diffractive", "--rate=500", *words])
-    modes = np.array(dome.computer.status().in_loop)
-    variance = bench_of(SMALL).describe().mode_variance_m2
-    loop, seen = LoopHealth(), []
+Seen = list[tuple[float, LoopHealth, PlayedCommands]]
+
+
+def watched(*words, seconds, plant="diffractive") -> Seen:
+    """Return the watch of the loop on a simulated telescope, block by block."""
+    usual = ("--mag=8", "--n-controlled=60", "--rate=500", "--gain=0.4")
+    dome = Dome([f"--instrument={SMALL}", f"--plant={plant}", *usual, *words])
+    about, matrix = bench_of(SMALL).describe(), dome.computer.reconstructor.matrix
+    modes, variance = np.array(dome.computer.status().in_loop), about.mode_variance_m2
+    actuators = actuator_watch(about.actuators, variance, modes)
+    loop, played, seen = LoopHealth(), PlayedCommands(), []
     while dome.time_s < seconds:
         for block in dome.play():
             loop = observe(loop, block, variance, modes)
-            seen.append((dome.time_s, loop))
+            if dome.time_s > 0.5:  # the loop has closed
+                played = observe_played(played, block, actuators, matrix)
+            seen.append((dome.time_s, loop, played))
     return seen
 
 
 def test_a_jump_that_saturates_the_pyramid_is_called_diverging_within_half_a_second():
     """A subaperture: 0.1 to 2 um of wavefront error, and slopes only twice as large as before."""
-    words = ("--seed=4", "--mag=8", "--seeing=0.6", "--n-controlled=60", "--jump=2.5:1,0,0,0")
-    seen = watched(*words, seconds=3.2)
-    assert not any(loop.diverging for time_s, loop in seen if time_s <= 2.5)
-    assert all(loop.diverging for time_s, loop in seen if time_s > 3.0)
+    seen = watched("--seed=4", "--seeing=0.6", "--jump=2.5:1,0,0,0", seconds=3.2)
+    assert not any(loop.diverging for time_s, loop, _ in seen if time_s <= 2.5)
+    assert all(loop.diverging for time_s, loop, _ in seen if time_s > 3.0)
     # that of the expected turbulence alone does not see it
-    assert max(loop.ratio for _, loop in seen) < DIVERGING_RATIO
+    assert max(loop.ratio for _, loop, _ in seen) < DIVERGING_RATIO
 
 
-def test_seeing_that_doubles_and_a_gust_are_no_jump():
+def test_a_gust_is_no_jump_and_no_clipped_command():
     gust = (
         "--seeing-at=1.9:0.6",
         "--seeing-at=2:1.05",
         "--seeing-at=3:1.05",
         "--seeing-at=3.1:0.6",
     )
-    words = ("--seed=4", "--mag=8", "--seeing=0.6", "--n-controlled=60")
-    assert not any(loop.diverging for _, loop in watched(*words, *gust, seconds=4.0))
+    seen = watched("--seed=4", "--seeing=0.6", *gust, seconds=4.0)
+    assert not any(loop.diverging or played.unplayed for _, loop, played in seen)
+
+
+CLIPPED = ("--seed=3", "--seeing=0.8", "--actuator-stroke=1.2", "--actuator-bend=100")
+
+
+@pytest.mark.parametrize("plant", ["linear", "diffractive"])
+def test_commands_as_asked_while_the_mirror_clips_them_are_named_within_seconds(plant):
+    seen = watched(*CLIPPED, "--report-asked", seconds=4.0, plant=plant)
+    assert seen[-1][2].unplayed
+    assert max(ratio for ratio, _ in seen[-1][2].beyond) > UNPLAYED_RATIO
+
+
+def test_clipped_commands_as_played_are_what_the_slopes_show():
+    seen = watched(*CLIPPED, seconds=4.0, plant="linear")
+    assert not any(played.unplayed for _, _, played in seen)
+
+
+def test_a_loop_that_diverges_at_its_own_frequency_clips_nothing():
+    """The implied turbulence is 10 times the usual one, and swings within a few frames."""
+    seen = watched("--seed=2", "--seeing=0.8", "--jump=1.5:0.5,0,4,0", seconds=3.5, plant="linear")
+    assert seen[-1][1].diverging
+    assert not any(played.unplayed for _, _, played in seen)

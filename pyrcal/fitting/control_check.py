@@ -24,7 +24,6 @@ from service.control.loop import pole_radius
 from service.control.reconstructor import MAX_CONDITION
 
 Array = NDArray[np.float64]
-Complex = NDArray[np.complexfloating[Any, Any]]
 
 GAIN = 0.5
 """Default integrator gain of the loop."""
@@ -161,7 +160,7 @@ class _Loops:
     def __init__(self, model: Array, plant: Array, gain: float) -> None:
         self._normal, self._cross, self._gain = model.T @ model, model.T @ plant, gain
         self._radii: dict[int, float] = {}
-        self._eigenmodes: dict[int, tuple[Complex, Complex, int]] = {}
+        self._eigenmodes: dict[int, tuple[NDArray[Any], NDArray[Any], int]] = {}
 
     def coupling(self, n: int) -> tuple[Array, int]:
         """Return R M ``(n, n)`` of the first ``n`` modes, and the singular values left out."""
@@ -173,6 +172,7 @@ class _Loops:
     def radius(self, n: int) -> float:
         """Return the largest pole radius with ``n`` modes; combinations left out do not move."""
         if n not in self._radii:
+            eigenvalues: NDArray[Any]
             if n == len(self._normal):
                 # with all modes the eigenvectors are needed as well, for the loss
                 eigenvalues, _, n_left_out = self.eigenmodes(n)
@@ -184,7 +184,7 @@ class _Loops:
             self._radii[n] = float(radii.max())
         return self._radii[n]
 
-    def eigenmodes(self, n: int) -> tuple[Complex, Complex, int]:
+    def eigenmodes(self, n: int) -> tuple[NDArray[Any], NDArray[Any], int]:
         """Return eigenvalues and eigenvectors of R M, and the singular values left out."""
         if n not in self._eigenmodes:
             coupling, n_left_out = self.coupling(n)

@@ -242,6 +242,7 @@ class FitSubset:
             known, seen = self._last
             if len(known) == len(asked) and all(map(operator.is_, known, asked)):
                 return seen
+        self._last = None  # its memory is needed for the next one
         seen = self.target.project(matrix, self._with(more))
         self._last = asked, seen
         return seen

@@ -123,7 +123,7 @@ class ChangedReconstructor:
         alpha, instrument = fitted_alpha(store.read(self.fit)), telescope.instrument()
         if self.change.displaced_images:
             offsets = image_offsets(self.change.displaced_images, rng)
-            displaced = kind_of(instrument).displaced(instrument, offsets)
+            displaced = kind_of(instrument).displace_images(instrument, offsets)
             instrument = replace(instrument, wfs=displaced)
         matrix = synthetic_matrix(alpha, instrument)[:, : self.n_modes]
         kept = 1.0 - self.change.depth * missing(self.change.feature)

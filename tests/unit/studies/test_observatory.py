@@ -12,7 +12,6 @@ from pyrcal_studies.campaign.observatory_dome import START_NS, Dome, replayed
 from pyrcal_studies.campaign.small import N_TARGET, SETTINGS, SMALL, bench_of, latencies_of
 from pyrcal_studies.campaign.system_measures import recovery_of, row_of
 from service.config import load_settings
-from service.config.policy import policy_of
 from service.errors import CommandError
 from service.estimation.description import actuator_watch
 from service.estimation.health import (
@@ -23,6 +22,7 @@ from service.estimation.health import (
     observe,
     observe_played,
 )
+from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
 from service.tracking import commands as cmd
 from service.tracking import events as ev

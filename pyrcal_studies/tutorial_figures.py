@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 import pyrcal
 from pyrcal.__main__ import main as run_pyrcal
-from pyrcal.offline import figures as fit_figures
-from pyrcal.offline.fitted import Fit
+from pyrcal.fitting import figures as fit_figures
+from pyrcal.fitting.fitted import Fit
 from service.control.loop import pole_radius
 from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
@@ -96,11 +96,6 @@ def synim_fit() -> Figure:
 def cacao_fit() -> Figure:
     """Draw the fit of the files like cacao's."""
     return _fit_sheet(*_made("cacao", "--diameter-m", "2"))
-
-
-def papyrus_fit() -> Figure:
-    """Draw the fit of the files like PAPYRUS's."""
-    return _fit_sheet(*_made("papyrus", "--instrument", "papyrus"))
 
 
 def residual_maps(fit: Fit) -> Figure:
@@ -315,7 +310,6 @@ FIGURES: dict[str, Callable[[], Figure]] = {
         cacao_response,
         cacao_fit,
         papyrus_frames,
-        papyrus_fit,
         lenslets,
         petals,
         elt_poles,

@@ -99,5 +99,5 @@ def test_the_service_refuses_nothing_that_a_page_needs(manual, browser):
             line for line in browser.get_log("browser") if "Content Security" in line["message"]
         ]
         assert refused == []
-        icon = "document.querySelector('svg.svg-inline--fa').getBoundingClientRect().height"
-        assert 5 < reader.js(icon) < 40
+        icons = "f => f.family.includes('Font Awesome') && f.status === 'loaded'"
+        reader.until(f"[...document.fonts].some({icons})")

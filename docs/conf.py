@@ -77,7 +77,7 @@ def _inline_math(writer: HTML5Translator, node: nodes.math) -> None:
 
 def _block_math(writer: HTML5Translator, node: nodes.math_block) -> None:
     """Write a displayed formula as MathML."""
-    writer.body.append(f'<div class="math">{convert(node.astext(), display="block")}</div>')
+    writer.body.append(f'<div class="formula">{convert(node.astext(), display="block")}</div>')
     raise nodes.SkipNode
 
 

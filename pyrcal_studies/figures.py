@@ -382,31 +382,31 @@ def gate() -> Figure:
 
 
 def probation() -> Figure:
-    """Draw the residual of a loop whose new matrix is worse, and where probation ends it."""
+    """Draw the residual of a loop after a right matrix, and after one that diverges."""
     figure = Figure(figsize=(7.2, 3.6), layout="constrained")
     axes = figure.subplots()
-    swap_s, back_s = 6.0, 4.0
-    for held, label, colour in (
-        (alpha_of(x=0.02), "right matrix: stays", "tab:blue"),
-        (alpha_of(x=0.62), "matrix for a wrong α: taken back", "tab:orange"),
-    ):
-        worse = held.shift_x_subap > 0.1
-        swaps = {int(swap_s * 1000): held}
-        if worse:
-            swaps[int((swap_s + back_s) * 1000)] = alpha_of()
+    swap_s, back_s, step = 6.0, 0.1, 50
+    n_modes = 75
+    cases = {
+        "right matrix: stays": {6000: alpha_of(x=0.02)},
+        "matrix that diverges: taken back after 0.1 s": {6000: alpha_of(x=0.62), 6100: alpha_of()},
+    }
+    for (label, swaps), colour in zip(cases.items(), ("tab:blue", "tab:orange"), strict=True):
         loop = small_loop.run(
             small_loop.Case(
-                alpha=alpha_of(), matrix=alpha_of(), n_modes=75, n_frames=15000, swaps=swaps
+                alpha=alpha_of(), matrix=alpha_of(), n_modes=n_modes, n_frames=12000, swaps=swaps
             )
         )
-        rms = np.sqrt((loop.residual_m[:, :75] ** 2).sum(axis=1).reshape(-1, 250).mean(axis=1))
-        axes.plot(0.25 * np.arange(len(rms)) + 0.125, rms * 1e9, color=colour, label=label)
+        power = (loop.residual_m[:, :n_modes] ** 2).sum(axis=1).reshape(-1, step).mean(axis=1)
+        times = (np.arange(len(power)) + 0.5) * step / 1000.0
+        axes.semilogy(times, 1e9 * np.sqrt(power), color=colour, lw=1.0, label=label)
+    axes.axvspan(swap_s, swap_s + 4.0, color="0.92", zorder=0)
     axes.axvline(swap_s, color="0.5", lw=1.0)
-    axes.axvspan(swap_s, swap_s + back_s, color="0.9", zorder=0)
-    axes.set(xlabel="time (s)", ylabel="residual of 75 modes (nm RMS)", ylim=(0, None))
-    axes.text(swap_s + 0.1, 0.03, "probation, 4 s", transform=axes.get_xaxis_transform())
+    axes.axvline(swap_s + back_s, color="tab:orange", lw=1.0, ls=":")
+    axes.text(swap_s + 0.3, 0.03, "probation, 4 s", transform=axes.get_xaxis_transform())
+    axes.set(xlabel="time (s)", ylabel=f"residual of {n_modes} modes (nm RMS)", xlim=(3.0, 12.0))
     axes.legend(loc="upper right", fontsize="small")
-    axes.grid(alpha=0.3)
+    axes.grid(alpha=0.3, which="both")
     return figure
 
 

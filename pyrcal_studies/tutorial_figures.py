@@ -98,11 +98,6 @@ def cacao_fit() -> Figure:
     return _fit_sheet(*_made("cacao", "--diameter-m", "2"))
 
 
-def papyrus_fit() -> Figure:
-    """Draw the fit of the files like PAPYRUS's."""
-    return _fit_sheet(*_made("papyrus", "--instrument", "papyrus"))
-
-
 def residual_maps(fit: Fit) -> Figure:
     """Draw slope maps of single modes: model, measurement, difference."""
     figure = Figure(figsize=(9.4, 3.0), layout="constrained")
@@ -315,7 +310,6 @@ FIGURES: dict[str, Callable[[], Figure]] = {
         cacao_response,
         cacao_fit,
         papyrus_frames,
-        papyrus_fit,
         lenslets,
         petals,
         elt_poles,

@@ -1,1 +1,1 @@
-"""What pyrcal costs, measured here and beside its peers: ``python -m benchmarks.model --help``."""
+"""What pyrcal costs, measured here and beside its peers: ``python -m benchmarks.bench --help``."""

@@ -287,10 +287,10 @@ def _written(case: Case, found: Measured, cube: Array | None, folder: Path) -> t
 def matrix_rows(rounds: Rounds, seen: dict[str, Measured], folder: Path) -> list[Row]:
     """Return the rows about interaction matrices."""
     jobs = {
-        "first594": ("D of 594 modes, nothing kept from before", N_ALL),
+        "first594": ("D of 594 modes, nothing cached", N_ALL),
         "shift400": ("D of 400 modes at a new shift", N_MODES),
         "shift594": ("D of 594 modes at a new shift", N_ALL),
-        "turn594": ("D of 594 modes, turned and magnified anew", N_ALL),
+        "turn594": ("D of 594 modes at a new rotation and magnification", N_ALL),
         "slopes594": ("D of 594 modes and its four derivatives", 9 * N_ALL),
     }
     names = {"oopao": "OOPAO", "hcipy": "HCIPy", "specula": "SPECULA"}

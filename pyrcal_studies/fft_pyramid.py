@@ -20,6 +20,14 @@ Paths = list[tuple[NDArray[np.complex128], NDArray[np.complex128]]]
 """Of y and of x, ``(n_detector, n)``."""
 
 
+def slopes_of(images: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return ``[all Sx; all Sy]`` of four pupil images ``(2, n, 2, n)``, over their mean flux."""
+    flux = images.sum(axis=(0, 2))[valid].mean()
+    across_x = (images[:, :, 0] - images[:, :, 1]).sum(axis=0)
+    across_y = (images[0] - images[1]).sum(axis=1)
+    return np.asarray(np.concatenate([across_x[valid], across_y[valid]]) / flux)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FftPyramid:
     """A pyramid sensor behind a pupil of given illumination."""
@@ -81,11 +89,7 @@ class FftPyramid:
     def _slopes(
         self, opd_m: NDArray[np.float64], valid: NDArray[np.bool_], paths: Paths
     ) -> NDArray[np.float64]:
-        images = self._images(opd_m, paths)
-        flux = images.sum(axis=(0, 2))[valid].mean()
-        across_x = (images[:, :, 0] - images[:, :, 1]).sum(axis=0)
-        across_y = (images[0] - images[1]).sum(axis=1)
-        return np.asarray(np.concatenate([across_x[valid], across_y[valid]]) / flux)
+        return slopes_of(self._images(opd_m, paths), valid)
 
     def jacobian(
         self,

@@ -18,6 +18,7 @@ import scipy
 from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import FancyBboxPatch, Rectangle
 from numpy.typing import NDArray
 from PIL import Image
@@ -113,8 +114,8 @@ def slope_maps(column: NDArray[np.floating], valid: NDArray[np.bool_]) -> Array:
 
 def _slope_panels(columns: dict[str, Array], unit: str) -> Figure:
     """Draw Sx above Sy for each named pair of maps, all with one colour scale."""
-    figure = Figure(figsize=(2.6 * len(columns) + 1.0, 5.0), layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.15)
+    engine = ConstrainedLayoutEngine(w_pad=0.15)
+    figure = Figure(figsize=(2.6 * len(columns) + 1.0, 5.0), layout=engine)
     grid = figure.subplots(2, len(columns), squeeze=False)
     limit = max(float(np.nanmax(np.abs(maps))) for maps in columns.values())
     for k, (name, maps) in enumerate(columns.items()):
@@ -181,10 +182,10 @@ def poles() -> Figure:
     """Draw the pole radius of FLAO's loop against each parameter of the registration."""
     _, model = _flao()
     nominal = model.interaction_matrix(alpha_of())
-    ranges = {
-        "shift x (subapertures)": (np.linspace(0.0, 0.5, 9), lambda v: alpha_of(x=v)),
-        "rotation (deg)": (np.linspace(0.0, 1.6, 9), lambda v: alpha_of(deg=v)),
-        "magnification - 1 (%)": (np.linspace(0.0, 5.0, 9), lambda v: alpha_of(mag=1 + v / 100)),
+    ranges: dict[str, tuple[Array, Callable[[float], Misregistration]]] = {
+        "shift x (subapertures)": (np.linspace(0.0, 0.5, 6), lambda v: alpha_of(x=v)),
+        "rotation (deg)": (np.linspace(0.0, 1.6, 5), lambda v: alpha_of(deg=v)),
+        "magnification - 1 (%)": (np.linspace(0.0, 5.0, 6), lambda v: alpha_of(mag=1 + v / 100)),
     }
     inverses = {
         n: pyrcal.reconstruct(nominal, pyrcal.InversionOptions(n_modes=n)).matrix
@@ -220,7 +221,8 @@ def wavefront_against_shift() -> Figure:
     figure = Figure(figsize=(6.4, 3.8), layout="constrained")
     axes = figure.subplots()
     for n_modes, mark in ((40, "s"), (80, "o")):
-        old, right = [], []
+        old: list[float] = []
+        right: list[float] = []
         for shift in shifts:
             alpha = alpha_of(x=float(shift))
             for found, held in ((old, alpha_of()), (right, alpha)):
@@ -330,12 +332,12 @@ def dither_lines() -> Figure:
 def gate() -> Figure:
     """Draw the pole radius over shift and rotation, and two estimates with their 3 σ."""
     _, model = _flao()
-    n = 400
+    n = 300
     inverse = pyrcal.reconstruct(
         model.interaction_matrix(alpha_of()), pyrcal.InversionOptions(n_modes=n)
     ).matrix
     near = model.linearise(alpha_of())
-    shifts, turns = np.linspace(-0.35, 0.35, 15), np.linspace(-1.0, 1.0, 15)
+    shifts, turns = np.linspace(-0.36, 0.36, 9), np.linspace(-1.0, 1.0, 9)
     coupling = GAIN * inverse @ near.matrix[:, :n]
     by_x = GAIN * inverse @ near.derivatives[0][:, :n]
     by_turn = GAIN * inverse @ near.derivatives[2][:, :n]
@@ -360,7 +362,7 @@ def gate() -> Figure:
     figure.colorbar(filled, label="largest pole radius")
     angle = np.linspace(0.0, 2.0 * np.pi, 100)
     loop = ControlLoop(gains=np.full(n, GAIN), leak=LEAK, delay_frames=DELAY, frame_rate_hz=1000.0)
-    for sigma_x, sigma_deg, colour in ((0.02, 0.05, "tab:green"), (0.09, 0.25, "tab:purple")):
+    for sigma_x, sigma_deg, colour in ((0.02, 0.05, "tab:green"), (0.1, 0.3, "tab:purple")):
         sigma = np.array([sigma_x, sigma_x, np.deg2rad(sigma_deg), 1e-3])
         verdict = judge(inverse, near, alpha_of(), np.diag(sigma**2), loop, bound=GATE_BOUND)
         word = "accepted" if verdict.accepted else "refused"
@@ -494,7 +496,6 @@ def noise_of_a_matrix() -> Figure:
         axes.axhline(found[0], color=colour, ls=":", label=f"without noise, {n_modes} modes")
     axes.set(
         xlabel="noise of the matrix (% of each mode's signal)",
-        yscale="log",
         ylabel="wavefront error (nm RMS)",
     )
     axes.legend(fontsize="small")
@@ -511,7 +512,7 @@ def sigma_of_a_dither() -> Figure:
     scales = (100.0, np.rad2deg(1e3), 100.0)
     figure = Figure(figsize=(9.2, 3.2), layout="constrained")
     grid = figure.subplots(1, 3)
-    for noise, label in ((0.02, "slope noise 0.02"), (0.1, "slope noise 0.1")):
+    for noise, label in ((0.1, "slope noise 0.1"), (0.5, "slope noise 0.5")):
         sigma = np.array(
             [
                 pyrcal.dither_sigma(

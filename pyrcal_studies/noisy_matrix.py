@@ -4,6 +4,9 @@ Random signs on all controlled modes, 5 nm RMS on the mirror altogether: what on
 matrix is worth after half a minute, and what the registration fitted to it is worth. Run:
 ``python -m pyrcal_studies.noisy_matrix --magnitude 7 --out noisy-7.json --archive noisy``. Beside
 what the windows say it archives the matrix as the service does, and draws it.
+
+``--instrument tests/system/small.toml --image-offset-rms 0.1 --images unknown`` displaces the pupil
+images; their places are in the service's instrument file, unknown, or on the grid.
 """
 
 from __future__ import annotations
@@ -12,15 +15,18 @@ import argparse
 import json
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pyrcal_studies.campaign.telemetry import blocks_of
 from pyrcal_studies.noisy_figure import draw
 from service.archive import Archive
+from service.config.settings import Settings
 from service.estimation.random_dither import (
     Correlated,
     RandomDither,
@@ -31,8 +37,11 @@ from service.estimation.random_dither import (
 )
 from service.estimation.windows import WindowRefused
 from service.instrument import load_instrument
+from service.model.instrument import Instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.model.sensors.registry import kind_of
 from service.runtime.estimates import work_out
+from service.runtime.policy import floor_of
 from service.runtime.worker import Compute, OpticsWorker
 from service.tracking.operation_records import MeasurementRecord, MeasureState
 from service.wire import DitherKind, DitherRequest
@@ -42,6 +51,11 @@ from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.options import parse_options
 from sim_rtc.truth import WavefrontError
 
+Array = NDArray[np.float64]
+
+IMAGES = ("on the grid", "told", "unknown")
+"""What the service's instrument file says of the pupil images' places."""
+
 SETTLING_S = 0.5
 N_BATCHES = 20
 """Of the simulator, in one block of telemetry."""
@@ -50,13 +64,15 @@ N_BATCHES = 20
 def main() -> None:
     """Play, print a line per window, write what was found."""
     given = _arguments()
-    instrument = load_instrument("flao-lbt")
+    instrument = load_instrument(given.instrument)
     options = parse_options(_simulated(given))
     rows: list[dict[str, Any]] = []
     with threadpool_limits(1):
         telescope = build_telescope(options, instrument)
         true = telescope.optics.start().alpha
-        bench = OpticsWorker(instrument, Compute(threads=1))
+        about = _with_images(instrument, given.images, telescope.plant.image_offsets_px)
+        bench = OpticsWorker(about, Compute(threads=1))
+        floor = floor_of(Settings(), about)
         total: Correlated | None = None
         start = Misregistration()
         for window, wavefront_nm in _windows(given, telescope, options.frame_rate_hz):
@@ -66,7 +82,7 @@ def main() -> None:
             else:
                 total = window if total is None else join_random_windows(total, window)
                 outcome = bench.fit_random(window, start)
-            rows.append(_row(outcome, true) | {"wavefront_nm": wavefront_nm})
+            rows.append(_row(outcome, true, floor) | {"wavefront_nm": wavefront_nm})
             if isinstance(outcome, RandomEstimate):
                 start = outcome.alpha
             sys.stdout.write(json.dumps(rows[-1]) + "\n")
@@ -79,13 +95,16 @@ def main() -> None:
     found = {
         "arguments": {k: str(v) for k, v in vars(given).items()},
         "windows": rows,
-        "whole": _row(whole, true) | _signal(total),
+        "whole": _row(whole, true, floor) | _signal(total),
     }
     given.out.write_text(json.dumps(found, indent=1) + "\n")
 
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m pyrcal_studies.noisy_matrix")
+    parser.add_argument("--instrument", default="flao-lbt")
+    parser.add_argument("--image-offset-rms", type=float, default=0.0, help="pixels")
+    parser.add_argument("--images", default="on the grid", choices=IMAGES)
     parser.add_argument("--plant", default="diffractive", choices=["diffractive", "linear"])
     parser.add_argument("--truth", default="ideal", choices=["ideal", "realistic"])
     parser.add_argument("--magnitude", type=float, default=7.0)
@@ -111,6 +130,7 @@ def _simulated(given: argparse.Namespace) -> list[str]:
         f"--gain={given.gain}",
         f"--wind={given.wind}",
         f"--n-controlled={given.n_controlled}",
+        f"--image-offset-rms={given.image_offset_rms}",
     ]
 
 
@@ -161,7 +181,18 @@ def _started(given: argparse.Namespace, computer: RealTimeComputer, rate_hz: flo
     )
 
 
-def _row(outcome: RandomEstimate | WindowRefused, true: Misregistration) -> dict[str, Any]:
+def _with_images(instrument: Instrument, images: str, offsets_px: Array | None) -> Instrument:
+    """Return the instrument with the places of its pupil images told, or unknown."""
+    if images == "unknown":
+        return replace(instrument, unknown=(*instrument.unknown, "wfs.image_offsets_px"))
+    if images == "told" and offsets_px is not None:
+        return replace(instrument, wfs=kind_of(instrument).with_images_at(instrument, offsets_px))
+    return instrument
+
+
+def _row(
+    outcome: RandomEstimate | WindowRefused, true: Misregistration, floor: Array
+) -> dict[str, Any]:
     if isinstance(outcome, WindowRefused):
         return {"refused": outcome.reason}
     error = (outcome.alpha.vector - true.vector) * BOUNDARY_SCALE
@@ -169,6 +200,7 @@ def _row(outcome: RandomEstimate | WindowRefused, true: Misregistration) -> dict
     return {
         "error": error.tolist(),
         "sigma": sigma.tolist(),
+        "sigma_with_floor": np.hypot(sigma, floor).tolist(),
         "misfit": outcome.misfit,
         "optical_gain": float(np.average(outcome.optical_gain, weights=outcome.gain_sigma**-2.0)),
         "lag_frames": float(outcome.lag_frames[0]),
@@ -189,7 +221,7 @@ def _archive(
     given: argparse.Namespace, total: Correlated, bench: OpticsWorker, start: Misregistration
 ) -> None:
     """Archive the matrix as the service does, and draw it."""
-    instrument = load_instrument("flao-lbt")
+    instrument = load_instrument(given.instrument)
     record = MeasurementRecord(
         id=f"noisy-mag{given.magnitude:g}",
         state=MeasureState.FINISHING,

@@ -20,10 +20,16 @@ from pyrcal_studies.peers_pushpull import (
     job_and_product,
     push_pull,
     read_job,
+    roof,
     write_product,
 )
 
 _LIGHT_RATIO = 0.5
+_REFRACTIVE_INDEX = 1.5
+"""Of its pyramid, as it has it by default."""
+
+_LIGHTS = -1
+"""Its faces light the quadrants opposite."""
 
 
 class Hcipy:
@@ -74,6 +80,21 @@ class Hcipy:
             num_steps=bench.n_modulation,
             fast_modulation_method=True,
         )
+
+    def tilt_faces(self, offsets_px: Array) -> None:
+        """Give the pyramid another face for each image, at every position of the modulation."""
+        bench, optics = self._bench, self._optics
+        pixel_m = bench.diameter_m / bench.n_subapertures
+
+        def surface(grid: hcipy.Grid) -> hcipy.Field:
+            high = roof(grid.x, grid.y, bench.pupil_separation_subap, offsets_px, _LIGHTS)
+            return hcipy.Field(-high * pixel_m / (_REFRACTIVE_INDEX - 1.0), grid)
+
+        apodizers = optics._pyramid_apodizers  # noqa: SLF001 - it has no other access to its faces
+        for place, apodizer in zip(optics.modulation_positions, apodizers, strict=True):
+            grid = optics.focal_grid.shifted(2 * place)
+            sag = hcipy.evaluate_supersampled(surface, grid, 4)
+            apodizer.surface_sag = hcipy.Field(sag, optics.focal_grid)
 
     def frame(self, opd_m: Array) -> Array:
         """Return the frame of its detector."""

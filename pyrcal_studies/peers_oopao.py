@@ -29,12 +29,16 @@ from pyrcal_studies.peers_pushpull import (
 COUPLING = 0.35
 """Of OOPAO's Gaussian influence functions."""
 
+_FACES = ([1, 1, 0, 0], [1, 0, 0, 1])
+"""Row and column of the quadrant that each of its faces lights."""
+
 
 class Oopao:
     """Its telescope, its pyramid, its own choice of valid pixels."""
 
     def __init__(self, bench: Bench) -> None:
         self.version = version("OOPAO")
+        self._moved_px = np.zeros(2)
         self.telescope = _telescope(bench)
         star = Source(optBand="I", magnitude=0)
         star * self.telescope
@@ -63,7 +67,13 @@ class Oopao:
 
     def move_images(self, columns_px: float, rows_px: float) -> None:
         """Tilt the faces of the pyramid together."""
-        self.sensor.apply_shift_wfs(sx=columns_px, sy=-rows_px)
+        self._moved_px = np.array([columns_px, rows_px])
+        self.tilt_faces(np.zeros((2, 2, 2)))
+
+    def tilt_faces(self, offsets_px: Array) -> None:
+        """Tilt each face of the pyramid by itself."""
+        columns, rows = (offsets_px + self._moved_px)[_FACES].T
+        self.sensor.apply_shift_wfs(sx=list(columns), sy=list(-rows))
 
 
 def _telescope(bench: Bench) -> Telescope:

@@ -12,6 +12,7 @@ import json
 import sys
 import time
 from dataclasses import asdict, dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -19,6 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
+
+JOB = "-job.npz"
+"""End of the name of a job's file."""
 
 _POKE_SUBAP = 7.0
 _POKE_WIDTH_SUBAP = 1.5
@@ -68,6 +72,10 @@ class Bench:
     misregistration: tuple[float, float, float, float] | None = None
     """Shift x, y (subapertures), rotation (degrees) and magnification for the peer's own mirror."""
 
+    image_offsets_px: tuple[tuple[float, float], ...] = ()
+    """Displacement (columns, rows) of each pupil image, pixels, in the order of the detector's
+    quadrants, row by row. Empty if the images lie on the pixel grid."""
+
     @property
     def n_pupil(self) -> int:
         """Pupil points across."""
@@ -108,6 +116,9 @@ class Peer(Protocol):
     def move_images(self, columns_px: float, rows_px: float) -> None:
         """Move the four pupil images together on the detector."""
 
+    def tilt_faces(self, offsets_px: Array) -> None:
+        """Displace each pupil image ``(2, 2, 2)``: quadrant's row, column; (columns, rows)."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Measured:
@@ -143,6 +154,8 @@ def push_pull(peer: Peer, shapes_m: Array, bench: Bench) -> Measured:
     looks = detector_from_pupil(peer, bench)
     if any(bench.image_shift_subap):
         _move(peer, looks @ np.array(bench.image_shift_subap), bench)
+    if bench.image_offsets_px:
+        _move_each(peer, np.reshape(bench.image_offsets_px, (2, 2, 2)), bench)
     start = time.perf_counter()
     columns = []
     for shape in shapes_m:
@@ -202,6 +215,44 @@ def _move(peer: Peer, pixels: Array, bench: Bench) -> None:
         raise ValueError(f"the images were to move by {pixels} pixels; they moved by {moved}")
 
 
+def roof(x: Array, y: Array, separation: float, offsets: Array, lights: int) -> Array:
+    """Return the height of a pyramid's four planes, which meet where the higher one begins.
+
+    Parameters
+    ----------
+    x, y
+        Coordinates in the focal plane, of the same shape.
+    separation
+        Distance between the centres of neighbouring images.
+    offsets
+        ``(2, 2, 2)`` displacement of each image: quadrant's row, column; (columns, rows).
+    lights
+        1 if a face lights the quadrant at its own side, -1 if that opposite.
+    """
+    planes = []
+    for row, column in np.ndindex(2, 2):
+        columns, rows = separation * (np.array([column, row]) - 0.5) + offsets[row, column]
+        planes.append(lights * (columns * x + rows * y))
+    return np.asarray(np.max(planes, axis=0))
+
+
+def _move_each(peer: Peer, offsets_px: Array, bench: Bench) -> None:
+    flat = np.zeros((bench.n_pupil, bench.n_pupil))
+    before = _image_centres(peer.frame(flat), bench)
+    peer.tilt_faces(offsets_px)
+    moved = _image_centres(peer.frame(flat), bench) - before
+    # light that an edge diffracts moves the centroids as well
+    if np.linalg.norm(moved - offsets_px) > 0.05 + 0.5 * np.linalg.norm(offsets_px):
+        raise ValueError(f"the images were to move by {offsets_px} pixels; they moved by {moved}")
+
+
+def _image_centres(frame: Array, bench: Bench) -> Array:
+    """Return the centroid (columns, rows) of each image ``(2, 2, 2)`` in its quadrant, pixels."""
+    half = bench.n_detector // 2
+    quadrants = frame.reshape(2, half, 2, half).transpose(0, 2, 1, 3)
+    return np.array([[_centroid(one) for one in row] for row in quadrants])
+
+
 def write_job(path: Path, bench: Bench, **arrays: Array) -> None:
     """Write what a peer's process shall measure."""
     np.savez(path, bench=json.dumps(asdict(bench)), **arrays)  # type: ignore[arg-type]
@@ -213,6 +264,7 @@ def read_job(path: Path) -> tuple[Bench, dict[str, Array]]:
         bench = json.loads(str(job["bench"]))
         arrays = {name: job[name] for name in job.files if name != "bench"}
     bench["image_shift_subap"] = tuple(bench["image_shift_subap"])
+    bench["image_offsets_px"] = tuple(map(tuple, bench["image_offsets_px"]))
     if bench["misregistration"] is not None:
         bench["misregistration"] = tuple(bench["misregistration"])
     return Bench(**bench), arrays
@@ -248,3 +300,18 @@ def read_product(path: Path) -> tuple[Measured, dict[str, Array]]:
         detector_from_pupil=arrays.pop("detector_from_pupil"),
     )
     return measured, arrays
+
+
+def main() -> None:
+    """Measure every job of a folder in one process, and remove each job when it is done."""
+    name, folder = sys.argv[1], Path(sys.argv[2])
+    peer = getattr(import_module(f"pyrcal_studies.peers_{name}"), name.capitalize())
+    for job in sorted(folder.glob(f"*{JOB}")):
+        bench, arrays = read_job(job)
+        product = job.with_name(job.name.removesuffix(JOB) + ".npz")
+        write_product(product, push_pull(peer(bench), arrays["shapes_m"], bench))
+        job.unlink()
+
+
+if __name__ == "__main__":
+    main()

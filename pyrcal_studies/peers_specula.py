@@ -32,6 +32,7 @@ from pyrcal_studies.peers_pushpull import (  # noqa: E402
     job_and_product,
     push_pull,
     read_job,
+    roof,
     write_product,
 )
 
@@ -41,6 +42,9 @@ _MARGIN_SUBAP = 1
 
 _FFT_RESOLUTION = 2.5
 """Padding of the focal plane: makes whole pixels and an easy FFT for 30 subapertures."""
+
+_LIGHTS = -1
+"""Its faces light the quadrants opposite."""
 
 _LIGHT_RATIO = 0.45
 """Of the brightest pixel: its own default takes the light diffracted between images for pupil."""
@@ -86,6 +90,15 @@ class Specula:
                 f"at most {self._margin}"
             )
         self._moved = (int(whole[0]), int(whole[1]))
+
+    def tilt_faces(self, offsets_px: Array) -> None:
+        """Give the pyramid another face for each image: its own coefficients part the faces."""
+        pyramid, separation = self._pyramid, self._bench.pupil_separation_subap
+        n = len(pyramid.pyr_tlt)
+        along = (np.arange(n) - (n - 1) / 2) / (pyramid.tilt_scale * separation / 2)
+        high = roof(along, along[:, None], separation, offsets_px, _LIGHTS)
+        faces = np.exp(2j * np.pi * (high - high.max()))
+        pyramid.shifted_masked_exp = np.fft.fftshift(faces * pyramid.fp_mask)
 
     def frame(self, opd_m: Array) -> Array:
         """Return the intensity on its detector."""

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pyrcal.fitting.control_check import DELAY_FRAMES, GAIN, ReconstructorVerdict, check_control
-from pyrcal_studies.registered import noise_free
 from service.control.reconstructor import MAX_CONDITION
 from service.instrument import load_instrument
 from service.model.instrument import Instrument
@@ -35,6 +34,7 @@ from sim_rtc.assembly import STROKE_M, Telescope, build_telescope
 from sim_rtc.computer.feed import BATCH_FRAMES
 from sim_rtc.computer.loop import LoopTerms, ModalLoop
 from sim_rtc.options import parse_options
+from sim_rtc.telescope.diffractive import DiffractiveOptics
 
 Array = NDArray[np.float64]
 
@@ -53,6 +53,20 @@ unstable. A pyramid bounds what diverges: an unstable mode ends in a limit cycle
 aligned commands with a pole radius of 1.01; with one of .996 it was 1.13 times."""
 
 MARGIN = 0.15
+
+
+def noise_free_matrix(telescope: Telescope) -> Array:
+    """Return the matrix by push-pull of ``POKE_M`` without noise, ``(n_slopes, N_MODES)``."""
+    optics = telescope.optics.at(0.0)
+    if not isinstance(optics, DiffractiveOptics):
+        raise TypeError(f"study: found {type(optics).__name__}; expected --plant diffractive")
+    rng = np.random.default_rng(0)
+    columns = []
+    for mode in range(N_MODES):
+        stroke = POKE_M * optics.opd_per_command[:, mode]
+        push, pull = (optics.slopes(sign * stroke, None, rng) for sign in (1.0, -1.0))
+        columns.append((push - pull).astype(np.float64) / (2 * POKE_M))
+    return np.column_stack(columns)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -170,7 +184,7 @@ def answers(case: Case) -> dict[str, Any]:
 
     first = telescope()
     true = first.optics.start().alpha
-    measured = noise_free(first, N_MODES, POKE_M, passes=1)
+    measured = noise_free_matrix(first)
     model = model_matrix(case, instrument, true)
     gains = np.sum(model * measured, axis=0) / np.sum(model**2, axis=0)
     rows = np.ones(len(model), dtype=bool)

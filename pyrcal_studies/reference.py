@@ -285,21 +285,33 @@ def rest(described: Schema) -> str:
 # --- alarms
 
 
+def _sentence(text: str) -> str:
+    """Return a text that begins with a capital and ends with a full stop."""
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
+
+
 def runbook(acts: Mapping[str, str]) -> str:
     """Return docs/operate/runbook.md: what to do about each alarm; ``acts``: what it may forbid."""
     parts = [
-        "An alarm is active as long as its cause. It is shown on the page, in `GET /v1/state`, on "
-        "the link (`ao/v1/{system}/alarm`), and in [the metrics](monitoring.md). Its text has the "
-        "numbers. This page lists for each alarm what has happened, why it matters and what to "
-        "do; in brackets is the file of the service that detects it.",
+        "An alarm lasts as long as its cause. The page, `pyrcal alarms list` and "
+        "[the metrics](monitoring.md) show it; its text has the numbers. *Critical*: the loop is "
+        "in danger, or its telemetry cannot be used. *Serious*: the service does less than it "
+        "should. *Warning*: it does its work.",
         "## What an alarm may forbid",
+        "Each alarm names what it `blocks`, as a rule of your own does.",
         listed((f"`{act}`", text) for act, text in acts.items()),
     ]
     for name, kind in ALARMS.items():
-        forbids = ", ".join(f"`{act}`" for act in acts if act in kind.blocks)
-        head = [f"*{kind.severity.value}* (`service/{kind.origin}`)"]
-        head.append(f"forbids {forbids}" if forbids else "")
-        head.append(f"the {kind.responsible} can end it" if kind.responsible else "")
-        do = f"**Do**: {kind.do}"
-        parts += [f"## {name}", "; ".join(part for part in head if part), kind.means, do]
+        blocks = [f"`{act}`" for act in acts if act in kind.blocks]
+        head = kind.severity.value.capitalize()
+        if kind.responsible:
+            who = kind.responsible.value
+            head += f"; the {'RTC' if who == 'rtc' else who} can end it"
+        if blocks:
+            head += f"; blocks {', '.join(blocks)}"
+        parts += [
+            f"## {name}",
+            f"*{head}.* {_sentence(kind.means)}",
+            f"**Do**: {_sentence(kind.do)}",
+        ]
     return page("Runbook: what to do about an alarm", *parts)

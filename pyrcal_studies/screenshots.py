@@ -1,8 +1,11 @@
-"""Walks through docs/start/demo.md with a demo and a headless browser, and takes its pictures anew.
+"""Takes the pictures of docs/start and of the operating pages with a demo and a headless browser.
 
 Run: ``python -m pyrcal_studies.screenshots``, then look at ``docs/start/*.png``: three minutes.
-It needs Debian's chromium and chromium-driver, selenium and Pillow. A slow machine wants the jump
-later than after 90 s: ``python -m pyrcal_studies.screenshots 200``.
+A slow machine needs the jump later than after 90 s: ``python -m pyrcal_studies.screenshots 200``.
+``python -m pyrcal_studies.screenshots operate`` takes ``docs/operate/pictures/*.png``: the page in
+tracking, a fit, a night, and a critical alarm: two minutes; ``... report REPORT.html`` a report of
+``pyrcal commission``, such as the one of tests/system/test_commission.py.
+It needs Debian's chromium and chromium-driver, selenium and Pillow.
 """
 
 from __future__ import annotations
@@ -22,7 +25,14 @@ import httpx
 from PIL import Image
 from selenium import webdriver
 
-PICTURES = Path(__file__).parents[1] / "docs" / "start"
+ROOT = Path(__file__).parents[1]
+PICTURES = ROOT / "docs" / "start"
+OPERATE = ROOT / "docs" / "operate" / "pictures"
+TINY = ROOT / "tests" / "data" / "tiny"
+SMALL = ROOT / "tests" / "system" / "small.toml"
+ALARM_AT_S = 90
+"""Loop time at which the slopes of the demo for the operating pages stop changing."""
+
 SIZE = (1280, 860)
 N_COLOURS = 48
 """A page of few colours: a picture stays below 100 kB."""
@@ -35,19 +45,83 @@ PATIENCE_S = 400.0
 
 def main() -> int:
     """Take the pictures; return the exit status."""
-    PICTURES.mkdir(exist_ok=True)
+    if sys.argv[1:2] == ["report"]:
+        show_report(Path(sys.argv[2]))
+        return 0
+    operates = sys.argv[1:2] == ["operate"]
+    (OPERATE if operates else PICTURES).mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         port, zenoh_port = free_port(), free_port()
         words = ["--port", str(port), "--zenoh-port", str(zenoh_port), "--dir", f"{folder}/demo"]
         at_s = sys.argv[1] if len(sys.argv) > 1 else "90"
-        command = [sys.executable, "-m", "pyrcal.demo", "--jump", f"{at_s}:{JUMP}", *words]
-        demo = subprocess.Popen(command)
+        words += (
+            ["--instrument", str(SMALL), "--near", "--fault", f"frozen@{ALARM_AT_S}:60"]
+            if operates
+            else ["--jump", f"{at_s}:{JUMP}"]
+        )
+        demo = subprocess.Popen([sys.executable, "-m", "pyrcal.demo", *words])
         try:
-            walk(f"http://127.0.0.1:{port}")
+            (walk_operating if operates else walk)(f"http://127.0.0.1:{port}")
         finally:
             demo.terminate()
             demo.wait(20.0)
     return 0
+
+
+def walk_operating(url: str) -> None:
+    """Take the pictures of the operating pages."""
+    client = httpx.Client(base_url=url, timeout=20.0)
+    wait(lambda: state(client).get("registration"), "the first estimate")
+    driver = browser()
+    try:
+        driver.get(url)
+        wait(lambda: own_matrix(client), "a matrix of the service in use")
+        time.sleep(20.0)  # a chart of a few windows
+        picture(driver, "operate", OPERATE)
+        press(driver, "m")
+        wait(lambda: finds(driver, "#fits tbody tr"), "the list of fits")
+        for name, file in (("matrix", "tiny.h5"), ("instrument", "tiny.toml")):
+            driver.find_element("css selector", f"[name={name}]").send_keys(str(TINY / file))
+        driver.find_element("css selector", "#fit [type=submit]").click()
+        wait(lambda: finds(driver, "#found .maps canvas"), "the figures of the fit")
+        driver.execute_script("document.querySelector('#found').scrollIntoView()")
+        time.sleep(1.0)
+        picture(driver, "fit", OPERATE)
+        press(driver, "y")
+        wait(lambda: finds(driver, "#past .plot canvas"), "the night")
+        time.sleep(3.0)
+        picture(driver, "history", OPERATE)
+        press(driver, "o")
+        wait(lambda: "slopes-stand" in alarms(client), "the alarm")
+        time.sleep(2.0)
+        picture(driver, "alarm", OPERATE, height_px=460)
+    finally:
+        driver.quit()
+
+
+def show_report(report: Path) -> None:
+    """Take the picture of a report of ``pyrcal commission``."""
+    driver = browser()
+    try:
+        driver.get(report.absolute().as_uri())
+        picture(driver, "commissioning", OPERATE)
+    finally:
+        driver.quit()
+
+
+def press(driver: webdriver.Chrome, key: str) -> None:
+    """Press a key on the page."""
+    driver.find_element("css selector", "body").send_keys(key)
+
+
+def finds(driver: webdriver.Chrome, selector: str) -> bool:
+    """Return whether the page has such an element."""
+    return bool(driver.find_elements("css selector", selector))
+
+
+def alarms(client: httpx.Client) -> set[str]:
+    """Return the names of the alarms that last."""
+    return {one["name"] for one in state(client).get("alarms", ())}
 
 
 def walk(url: str) -> None:
@@ -92,10 +166,13 @@ def browser() -> webdriver.Chrome:
     return driver
 
 
-def picture(driver: webdriver.Chrome, name: str) -> None:
+def picture(
+    driver: webdriver.Chrome, name: str, folder: Path = PICTURES, height_px: int = SIZE[1]
+) -> None:
     """Keep what is seen, in few colours."""
     seen = Image.open(io.BytesIO(driver.get_screenshot_as_png())).convert("RGB")
-    path = PICTURES / f"{name}.png"
+    seen = seen.crop((0, 0, SIZE[0], height_px))
+    path = folder / f"{name}.png"
     seen.quantize(N_COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
     sys.stdout.write(f"{path.name}: {path.stat().st_size / 1000:.0f} kB\n")
 
@@ -115,11 +192,11 @@ def state(client: httpx.Client) -> dict[str, Any]:
     return found
 
 
-def own_matrix(client: httpx.Client, n_modes: int) -> bool:
+def own_matrix(client: httpx.Client, n_modes: int | None = None) -> bool:
     """Return whether a matrix of this service, of so many modes, is in use."""
     answer = client.get("/v1/reconstructors/in-use")
     found = answer.json() if answer.is_success else {}
-    return bool(found.get("parent") and found.get("n_modes") == n_modes)
+    return bool(found.get("parent") and n_modes in {None, found.get("n_modes")})
 
 
 def moved(client: httpx.Client, before: float) -> bool:

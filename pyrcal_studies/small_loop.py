@@ -123,7 +123,7 @@ def run(case: Case) -> Loop:
     for k in range(n):
         if k in case.swaps:
             reconstructor = _inverse(case.swaps[k], case, rng)
-        if case.moving is not None and k % 100 == 0:
+        if case.moving is not None and k % 1000 == 0:
             response = np.asarray(model.interaction_matrix(case.moving(time[k])), dtype=float)
         kick = np.sqrt(1.0 - CORRELATION**2) * share * rng.normal(size=N_MODES)
         sky = CORRELATION * sky + kick
@@ -163,8 +163,8 @@ def write_telemetry(path: Path, case: Case, loop: Loop) -> None:
 
 
 def moving_mirror(time_s: float) -> Misregistration:
-    """Return a registration that drifts, and jumps after 30 s."""
-    jump = 1.0 if time_s >= 30.0 else 0.0
+    """Return a registration that drifts, and jumps after 25 s."""
+    jump = 1.0 if time_s >= 25.0 else 0.0
     return Misregistration(
         shift_x_subap=0.02 + 0.001 * time_s + 0.12 * jump,
         shift_y_subap=-0.03 - 0.05 * jump,
@@ -173,7 +173,7 @@ def moving_mirror(time_s: float) -> Misregistration:
     )
 
 
-def tracked_night(seconds: float = 60.0) -> tuple[Array, pyrcal.Track]:
+def tracked_night(seconds: float = 45.0) -> tuple[Array, pyrcal.Track]:
     """Return the truth ``(n, 5)``, time and α in degrees, and what ``pyrcal.track`` finds."""
     case = Case(
         alpha=moving_mirror(0.0),

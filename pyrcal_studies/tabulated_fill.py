@@ -20,8 +20,8 @@ from threadpoolctl import threadpool_limits
 
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.matrix import fit_matrix
-from pyrcal_studies.registered import against, step_of
 from service.estimation.reference import Reference
+from service.estimation.solver import Columns
 from service.instrument.reader import load_instrument
 from service.model.instrument import Instrument, TabulatedModes
 from service.model.interaction import InteractionModel
@@ -96,10 +96,14 @@ def registered(
 
     Slopes near surface that ``knowing`` does not know at the present α are left out.
     """
-    alpha = Misregistration()
+    alpha, matrix = Misregistration(), measured.astype(np.float64)
     for _ in range(N_STEPS):
-        read = None if knowing is None else ~knowing.unknown_rows(alpha)
-        step = step_of(against(model.linearise(alpha), measured, read=read))
+        known = np.ones(len(matrix), np.bool_) if knowing is None else ~knowing.unknown_rows(alpha)
+        weights = 1.0 / np.sum(matrix[known] ** 2, axis=0)
+        linear = model.linearise(alpha)
+        columns = Columns(matrix=matrix, weights=weights, rows=known)
+        projected = columns.project(linear.matrix, linear.derivatives)
+        step = np.linalg.solve(projected.normal, projected.scores.sum(axis=1))
         alpha = Misregistration.from_vector(alpha.vector + step)
     return alpha
 

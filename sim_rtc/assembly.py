@@ -77,6 +77,9 @@ class Telescope:
     drive: MirrorDrive | None
     """Limits and lag of the mirror; None: it obeys at once."""
 
+    reports_asked: bool
+    """True if the telemetry has the commands before the mirror's limits."""
+
     move: Callable[[NDArray[np.float64]], float] | None
     """Moves the mirror's image by ``(4,)``, numeric units, and returns the time of arrival; None if
     the telescope has no such stage."""
@@ -92,6 +95,7 @@ class Telescope:
             stroke_m=STROKE_M,
             mode_to_actuator=self.mode_to_actuator,
             drive=self.drive,
+            reports_asked=self.reports_asked,
             move=self.move,
         )
 
@@ -254,6 +258,7 @@ def build_telescope(
         weights=plant.weights,
         mode_to_actuator=basis.mode_to_actuator if isinstance(basis, ModalBasis) else None,
         drive=build_drive(options, instrument, basis),
+        reports_asked=options.reports_asked,
         move=build_stage(options, optics),
     )
 

@@ -340,6 +340,11 @@ class Options:
         within(0.1, 1000.0),
         default=MirrorLimits().bend_m / 1e-6,
     )
+    reports_asked: bool = option(
+        "--report-asked",
+        "the telemetry has the commands before the mirror's limits, not those that it plays",
+        action="store_true",
+    )
     dead_actuators: tuple[int, ...] = option(
         "--dead-actuators N,N...",
         "actuators that are switched off and follow their neighbours",

@@ -26,6 +26,10 @@ ENOUGH_SUBAP = 0.03
 """Sufficient 1 σ of the mirror's position at the pupil's edge: 3 σ are then a tenth of a
 subaperture, the accuracy that Heritier et al. 2018, section 3.2, require of a shift."""
 
+MIN_NOISE_SHARE = 0.5
+"""Share of the residual's power that must be noise for averaging to be advised. With pokes of
+0.2 µm the elements with a weak response have 6 % of the residual's mean power, with noise 100 %."""
+
 FEWEST_SETS = 2
 """Sets of modes that can check each other."""
 
@@ -51,6 +55,13 @@ class Grounds:
 
     gains: tuple[str, ...] = ()
     """Causes of gains that are far from 1."""
+
+    noise_share: float = 1.0
+    """Largest share of the residual's power that is noise, 0 to 1."""
+
+    large_pokes: bool = False
+    """True if another modulation than the file's explains part of what is left over, as of pokes
+    beyond the linear range of a weakly modulated pyramid."""
 
 
 class Advice(StrEnum):
@@ -96,7 +107,7 @@ def recommend_action(fit: Fit, grounds: Grounds) -> str:
         return f"{Advice.MEASURE_MORE}: the reconstructor is not stable: {control.reason}"
     # a reconstructor that is stable with all modes is good enough, however large sigma is
     if edge > ENOUGH_SUBAP and not (control is not None and control.holds):
-        return f"{Advice.MEASURE_MORE}: {_explain_uncertainty(fit, edge, radius)}"
+        return f"{Advice.MEASURE_MORE}: {_explain_uncertainty(fit, grounds, edge, radius)}"
     if grounds.n_sets < FEWEST_SETS:
         return (
             f"{Advice.MEASURE_MORE}: too few modes ({len(fit.modes)}) to check each other; push "
@@ -113,7 +124,7 @@ def recommend_action(fit: Fit, grounds: Grounds) -> str:
     return f"{Advice.USE}: {known}"
 
 
-def _explain_uncertainty(fit: Fit, edge: float, radius: float) -> str:
+def _explain_uncertainty(fit: Fit, grounds: Grounds, edge: float, radius: float) -> str:
     """Return the uncertainty of the registration and how to reduce it."""
     known = (
         f"at the pupil's edge the mirror is known to {edge:.3f} subapertures (1 sigma), "
@@ -121,7 +132,18 @@ def _explain_uncertainty(fit: Fit, edge: float, radius: float) -> str:
     )
     found = fit.registration
     if found is None or _at_edge(found.sigma_statistical, radius) > 0.7 * edge:
-        return f"{known}; average more, or push more modes"
+        if grounds.noise_share >= MIN_NOISE_SHARE:
+            return f"{known}; average more, or push more modes"
+        left = (
+            f"{known}; {fit.residual_fraction:.1%} of the signal is left over and hardly any of it "
+            "is noise, so that averaging does not help"
+        )
+        if grounds.large_pokes:
+            return (
+                f"{left}: the sensor may be beyond its linear range; poke with a smaller stroke, "
+                "and push and pull"
+            )
+        return f"{left}: the model differs from the bench, and only more modes average that out"
     terms = systematic_terms(fit.alternatives, fit.residual_fraction, fit.sigma)
     most = max(terms, key=lambda term: _at_edge(term.sigma, radius), default=None)
     if most is None or _at_edge(most.sigma, radius) < 0.5 * edge:

@@ -50,6 +50,9 @@ EXCLUSION_SIGMA = 3.0
 NOTABLE_GAIN_RATIO = 0.02
 """Smallest reported ratio of the gains of Sx and Sy, less 1."""
 
+CENTRED_KEY = "pupil, or valid_subapertures, centred"
+"""What to put right in the instrument file if the pupil is not centred."""
+
 ARM_SUBAP = 0.5
 """Width of the arms in the trial model, subapertures; the best width is extrapolated from it."""
 
@@ -181,7 +184,6 @@ def find_alternatives(
         *_yield_determined(_try_file_optics(settled, optics, without)),
         *_yield_determined(_try_fixed_nuisances(settled)),
         *_yield_determined(_try_images_in_place(settled)),
-        *_yield_determined(_try_wavelength(few)),
         *_yield_determined(_try_equal_weights(settled)),
         *_yield_determined(_try_mode_subsets(settled)),
         *_yield_determined(_try_without_border(few)),
@@ -224,7 +226,7 @@ def add_alternatives(
 
 
 def find_decentred_pupil(
-    few: FitSubset, others: tuple[AlternativeInstrument, ...]
+    tried: Sequence[Alternative], others: tuple[AlternativeInstrument, ...]
 ) -> Alternative | None:
     """Return the preferred alternative with a decentred pupil, or None.
 
@@ -232,7 +234,7 @@ def find_decentred_pupil(
     """
     if not any(one.preferred and "stop" in one.change.words for one in others):
         return None
-    return next((one for one in _yield_determined(_try_off_centre(few)) if one.preferred), None)
+    return next((one for one in tried if one.preferred and one.key == CENTRED_KEY), None)
 
 
 def _yield_determined(rivals: Iterator[Alternative]) -> Iterator[Alternative]:
@@ -331,7 +333,7 @@ def _try_off_centre(few: FitSubset) -> Iterator[Alternative]:
             and explained > MIN_OFFSET_EXPLAINED
         ),
         undecided=is_open(lead),
-        key="pupil, or valid_subapertures, centred",
+        key=CENTRED_KEY,
         counts=True,
         is_number=True,
     )
@@ -400,22 +402,6 @@ def _try_spiders(few: FitSubset, arms_deg: tuple[float, ...]) -> Iterator[Altern
         key=words,
         counts=True,
         is_number=True,
-    )
-
-
-def _try_wavelength(few: FitSubset) -> Iterator[Alternative]:
-    """Yield the alternative with a 10 % longer wavelength and the same modulation in λ/D."""
-    about = few.models.instrument
-    wfs = replace(about.wfs, wavelength_m=1.1 * about.wfs.wavelength_m)
-    matrix = few.matrix(few.of(replace(about, wfs=wfs)))
-    # the free gains absorb the common scale
-    matrix *= np.linalg.norm(few.own) / np.linalg.norm(matrix)
-    seen = few.seen(matrix)
-    yield Alternative(
-        words=f"wavelength_m = {wfs.wavelength_m:.3g}",
-        share=_ratio(seen.chi_at_best, few.left(few.own)),
-        moved=seen.best_step[:4] - few.step(few.own)[:4],
-        undecided=True,
     )
 
 

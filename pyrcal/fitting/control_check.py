@@ -14,6 +14,7 @@ cannot show more, and the result is a lower bound.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -159,6 +160,7 @@ class _Loops:
     def __init__(self, model: Array, plant: Array, gain: float) -> None:
         self._normal, self._cross, self._gain = model.T @ model, model.T @ plant, gain
         self._radii: dict[int, float] = {}
+        self._eigenmodes: dict[int, tuple[NDArray[Any], NDArray[Any], int]] = {}
 
     def coupling(self, n: int) -> tuple[Array, int]:
         """Return R M ``(n, n)`` of the first ``n`` modes, and the singular values left out."""
@@ -170,17 +172,28 @@ class _Loops:
     def radius(self, n: int) -> float:
         """Return the largest pole radius with ``n`` modes; combinations left out do not move."""
         if n not in self._radii:
-            coupling, n_left_out = self.coupling(n)
-            eigenvalues = np.linalg.eigvals(coupling)
+            eigenvalues: NDArray[Any]
+            if n == len(self._normal):
+                # with all modes the eigenvectors are needed as well, for the loss
+                eigenvalues, _, n_left_out = self.eigenmodes(n)
+            else:
+                coupling, n_left_out = self.coupling(n)
+                eigenvalues = np.linalg.eigvals(coupling)
             moving = np.argsort(np.abs(eigenvalues))[n_left_out:]
             radii = pole_radius(self._gain * eigenvalues[moving], delay_frames=DELAY_FRAMES)
             self._radii[n] = float(radii.max())
         return self._radii[n]
 
+    def eigenmodes(self, n: int) -> tuple[NDArray[Any], NDArray[Any], int]:
+        """Return eigenvalues and eigenvectors of R M, and the singular values left out."""
+        if n not in self._eigenmodes:
+            coupling, n_left_out = self.coupling(n)
+            self._eigenmodes[n] = (*np.linalg.eig(coupling), n_left_out)
+        return self._eigenmodes[n]
+
     def worst_modes(self, n: int) -> tuple[int, ...]:
         """Return which modes take part most in the eigenvector of the largest pole."""
-        coupling, n_left_out = self.coupling(n)
-        eigenvalues, vectors = np.linalg.eig(coupling)
+        eigenvalues, vectors, n_left_out = self.eigenmodes(n)
         radii = pole_radius(self._gain * eigenvalues, delay_frames=DELAY_FRAMES)
         radii[np.argsort(np.abs(eigenvalues))[:n_left_out]] = 0.0
         share = np.abs(vectors[:, int(np.argmax(radii))]) ** 2
@@ -197,8 +210,7 @@ class _Loops:
         spectrum = frequency / (1.0 + (frequency * CORNER_FRAMES) ** (17.0 / 3.0))
         z = np.exp(-2j * np.pi * frequency)
         integrator = self._gain * z**DELAY_FRAMES / (1.0 - z)
-        coupling, n_left_out = self.coupling(n)
-        eigenvalues, vectors = np.linalg.eig(coupling)
+        eigenvalues, vectors, n_left_out = self.eigenmodes(n)
         back = np.linalg.inv(vectors)
         # |V diag(h) V^-1|^2 is a quadratic form in h
         form = (vectors.conj().T @ vectors) * (back @ back.conj().T).T
@@ -238,9 +250,10 @@ def _reason(found: ReconstructorVerdict) -> str:
         bound = "noise of the measured matrix bounds the answer: average more to know of more modes"
     else:
         named = ", ".join(str(mode) for mode in found.weakest_modes)
+        of_modes = f" (modes {named})" if named else ""
         bound = (
-            f"beyond it the model differs too much from the measured matrix (modes {named}): "
-            "control fewer modes, lower the gain, or use the measured matrix"
+            f"beyond it the model differs too much from the measured matrix{of_modes}: control "
+            "fewer modes, lower the gain, or use the measured matrix"
         )
     modes = f"{found.stable_modes} of {found.n_modes} modes"
     return f"stable up to {modes} at gain {found.gain:g}; {bound}"

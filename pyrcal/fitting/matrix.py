@@ -43,7 +43,7 @@ from pyrcal.fitting.methods import (
     settle_at,
 )
 from pyrcal.fitting.models import FitModels
-from pyrcal.fitting.noise import measure_structure
+from pyrcal.fitting.noise import bound_noise_share, measure_structure
 from pyrcal.fitting.origins import Origin, list_origins, list_undetermined_keys
 from pyrcal.fitting.pupil_checks import FitSubset, fit_smooth_gain, try_pupils
 from pyrcal.fitting.pupil_width import SeenPupil, compute_responses, measure_pupil
@@ -55,6 +55,7 @@ from pyrcal.fitting.uncertainty import (
     MAGNIFICATION_FLOOR,
     WEAK_MODULATION_FLOOR,
     misplacement_sigma,
+    nonlinearity_sigma,
     pupil_places,
     pupil_regions,
     uncertainty,
@@ -218,6 +219,12 @@ def _fit_usable(
     else:
         start = pose if pose is not None else instrument.start
     found = _run_method(models, target, instrument.with_anamorphosis(start), options, report_stage)
+    n_lost = np.count_nonzero(found.settled.solution.projection.gains == 0.0)
+    if 2 * n_lost > used.n_modes:
+        raise ModelError(
+            f"{instrument.name}: the fit ended where {n_lost} of {used.n_modes} modes change no "
+            "slope; start closer to the true registration (--start), or leave the start out"
+        )
     noisy = find_noise_columns(
         found.settled.solution, found.settled.target, instrument.slopes.kind.n_planes
     )
@@ -535,7 +542,18 @@ def _make_fit(
         error = by_smear * found.smear.sigma / found.smear.share
         sure = sure.with_moves(error[np.newaxis], np.ones(1))
     misplaced = _misplacement_sigma(models.instrument, structured)
-    sure = sure.with_moves(misplaced[np.newaxis], np.ones(1))
+    images = nuisances.images.T @ solution.nuisances[nuisances.image_places]
+    turned = kind_of(models.instrument).turned_edge_sigma(models.instrument, images.reshape(2, 4).T)
+    sure = sure.with_moves(np.array([misplaced, turned]), np.ones(2))
+    noise_share = bound_noise_share(seen.residual, solution.matrix[target.rows] * seen.gains)
+    # large pokes look like a wider modulation, which the fit may have taken for the true one
+    weakly_modulated = any(
+        kind_of(about).is_weakly_modulated(about.wfs)
+        for about in (models.instrument, as_in_file.instrument)
+    )
+    if weakly_modulated:
+        beyond = nonlinearity_sigma(residual_fraction, noise_share)
+        sure = sure.with_moves(beyond[np.newaxis], np.ones(1))
     stretch_sigma = nuisances.stretch_sigma(sure.nuisance_sigma)
     findings = FitFindings(
         solution=solution,
@@ -547,7 +565,7 @@ def _make_fit(
         alternatives=tried,
         landing=found.landing,
         rivals=others,
-        off_centre=find_decentred_pupil(few, others),
+        off_centre=find_decentred_pupil(tried, others),
         optics=optics,
         narrow=_find_narrow_pupil(settled),
         with_file_values=without,
@@ -627,6 +645,8 @@ def _make_fit(
         n_sets=len(sure.subset_steps),
         columns=columns,
         numbers_share=1.0 if without is None else without.share,
+        noise_share=noise_share,
+        large_pokes=weakly_modulated and without is not None and without.is_undecided,
     )
     if not options.explain:
         return replace(fit, recommendation=recommend_action(fit, grounds))

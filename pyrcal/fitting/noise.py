@@ -19,6 +19,10 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+WEAK_SHARE = 0.25
+"""Share of the elements of each column, those with the weakest modelled response, that bound the
+noise."""
+
 _N_POINTS = 4001
 """Number of points of the distribution whose median is computed."""
 
@@ -50,6 +54,25 @@ def measure_structure(residual: Array, power: Array, noise: Array | None) -> flo
     known = np.zeros(1) if noise is None else n_rows * noise**2 / power
     most = max(np.mean(alike_in_slopes), alike_in_shares, np.mean(known))
     return float(np.sqrt(max(np.mean(left) - most, 0.0)))
+
+
+def bound_noise_share(residual: Array, model: Array) -> float:
+    """Return the largest share of the residual's power that can be noise, 0 to 1.
+
+    Noise does not depend on the response, so that it is as strong in elements where the model
+    expects hardly any. What is left over only where the response is strong is an error of the
+    model, or a sensor beyond its linear range. :func:`measure_structure` cannot show that for
+    actuators: what each leaves over at its own place is spread evenly over all directions.
+
+    Parameters
+    ----------
+    residual, model
+        ``(n_rows, n_modes)`` residual of the fit, and the modelled response.
+    """
+    response = np.abs(model)
+    weak = response <= np.quantile(response, WEAK_SHARE, axis=0)
+    total = float(np.mean(residual**2))
+    return min(float(np.mean(residual[weak] ** 2)) / total, 1.0) if total > 0.0 else 0.0
 
 
 def noise_sigma(matrix: Array) -> float:

@@ -7,6 +7,7 @@ instead.
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -156,6 +157,8 @@ class FitSubset:
         self.derivatives = np.asarray(known[:, :, self.modes], dtype=np.float64)
         """Derivatives of the unchanged instrument; they hardly depend on the alternative."""
 
+        self._last: tuple[tuple[Array, ...], Projection] | None = None
+
     @cached_property
     def model(self) -> InteractionModel:
         """Model of the unchanged instrument with these modes only."""
@@ -227,10 +230,22 @@ class FitSubset:
         return self.seen(matrix, *more).best_step
 
     def seen(self, matrix: Array, *more: Array) -> Projection:
-        """Return the projection of the measurement on a matrix; the unchanged one is cached."""
+        """Return the projection of the measurement on a matrix and further derivatives.
+
+        That of the unchanged instrument and the last one are cached, because both the step and the
+        misfit of an alternative are taken from it.
+        """
         if matrix is self.own and not more:
             return self._own_seen
-        return self.target.project(matrix, self._with(more))
+        asked = (matrix, *more)
+        if self._last is not None:
+            known, seen = self._last
+            if len(known) == len(asked) and all(map(operator.is_, known, asked)):
+                return seen
+        self._last = None  # its memory is needed for the next one
+        seen = self.target.project(matrix, self._with(more))
+        self._last = asked, seen
+        return seen
 
     @cached_property
     def _own_seen(self) -> Projection:

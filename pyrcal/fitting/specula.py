@@ -55,16 +55,38 @@ def read_subapertures(container: Container) -> Subapertures:
     if "np_sub" in container.facts:  # stored as (pixels, subapertures); its map says which lenslet
         shown = container.find("2")
         listed = indices.T if shown is None else shown.numbers().astype(np.intp)
-        n = int(container.facts["nx"])
+        n = _image_width(container, "nx")
         lenslet = np.asarray(listed).reshape(-1)
         return Subapertures(lenslet // n, lenslet % n)
     image = indices[:, 0] if indices.shape[1] == 4 else indices[0]
     image = image[image >= 0]
-    n_columns = int(container.facts["fsizey"])
+    n_columns, n_rows = (_image_width(container, key) for key in ("fsizey", "fsizex"))
+    if len(image) and image.max() >= n_columns * n_rows:
+        raise MatrixError(
+            f"{first.where}: found pixel {image.max()}, expected less than the {n_columns} x "
+            f"{n_rows} pixels of fsizey and fsizex"
+        )
     return Subapertures(image // n_columns, image % n_columns)
 
 
+def _image_width(container: Container, key: str) -> int:
+    """Return a number of pixels that indices are counted with."""
+    value = container.facts.get(key)
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | float | np.number)
+        or not 1 <= value <= MAX_WIDTH_PX
+    ):
+        raise MatrixError(
+            f"{container.path}: found {key} = {value!r}, expected 1 to {MAX_WIDTH_PX} pixels; "
+            "indices cannot be read without it"
+        )
+    return int(value)
+
+
 NANOMETRE_M = 1e-9
+
+MAX_WIDTH_PX = 100_000
 
 
 def write_specula(

@@ -49,6 +49,15 @@ WEAK_MODULATION_FLOOR = 1e-3
 circle of 1 λ/D by 8 points: its matrices were fitted with errors of 0.1 to 0.3 %, and with an FFT
 pyramid of 12 subapertures those 8 points alone change the magnification by 2.7e-4."""
 
+NONLINEAR_SHIFT_SUBAP = 0.08
+"""Error of a shift over the share of the signal that pokes beyond the linear range leave, for a
+pyramid modulated by 1 λ/D: 0.03 to 0.09 subapertures for strokes of 0.15 to 0.4 µm, push-only and
+push-pull, on two mirrors with an FFT pyramid, and 0.05 on one of OOPAO. All actuators err alike, so
+that no sets of them show it."""
+
+LINEAR_RESIDUAL = 0.035
+"""RMS share of the signal that such a pyramid leaves with small pokes, at most."""
+
 FAR_SHARE = np.array([1.5e-3, 1.5e-3, np.deg2rad(2.5e-3), 2.5e-4])
 """1 σ of each parameter over the length of the shift in subapertures: with a large shift, a mirror
 of another kind differs from the model at the border. Of 24 telescopes at 0.66 to 1.0 subapertures,
@@ -299,6 +308,21 @@ def misplacement_sigma(
     turn = each_m / float(np.sqrt(np.mean(seen**2)))
     shift = each_m / subaperture_m
     return np.array([shift, shift, turn, turn])
+
+
+def nonlinearity_sigma(residual: float, noise_share: float) -> Array:
+    """Return 1 σ of the registration from pokes beyond a pyramid's linear range, ``(4,)``.
+
+    Parameters
+    ----------
+    residual
+        RMS share of the signal that is left over.
+    noise_share
+        Largest share of its power that is noise, 0 to 1.
+    """
+    left = float(np.sqrt(max(residual**2 * (1.0 - noise_share) - LINEAR_RESIDUAL**2, 0.0)))
+    shift = NONLINEAR_SHIFT_SUBAP * left
+    return np.array([shift, shift, 0.0, 0.0])
 
 
 def pupil_places(valid: NDArray[np.bool_], n_planes: int, radius_subap: float) -> Array:

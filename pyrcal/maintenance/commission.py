@@ -22,6 +22,7 @@ from service.archive.nights import FOREVER_NS, MAX_DOWNSAMPLED
 from service.config import load_settings
 from service.errors import ConfigurationError, UnknownIdError, say
 from service.files.documents import json_text
+from service.files.whole import open_hdf5
 from service.instrument import load_instrument
 from service.model.misregistration import PARAMETERS
 from service.tracking.products import MatrixState
@@ -63,6 +64,7 @@ def read_commissioning(options: argparse.Namespace) -> Commissioning:
     folder = Path(settings.service.data_dir)
     with Archive(folder, settings.archive.noon_utc_h) as archive:
         archive.look()
+        _check_instrument(archive, instrument.name)
         first_ns, last_ns = _choose_time(archive, options)
         estimates = archive.nights.estimates(first_ns, last_ns, MAX_DOWNSAMPLED)
         samples = archive.nights.samples(first_ns, last_ns, MAX_SAMPLES)
@@ -99,6 +101,21 @@ def read_commissioning(options: argparse.Namespace) -> Commissioning:
                 "fit": str(options.fit or "not given"),
             },
         )
+
+
+def _check_instrument(archive: Archive, name: str) -> None:
+    """Raise if the matrices of the archive were made for another instrument.
+
+    The limits follow from the instrument, so a report with another one would mislead.
+    """
+    for product_id in archive.reconstructors.stored():
+        with open_hdf5(archive.reconstructors.path_of(product_id)) as file:
+            made_for = str(file["provenance"].attrs.get("instrument", name))
+        if made_for != name:
+            raise ConfigurationError(
+                f"--instrument: found {name}, but {product_id} in {archive.directory} is for "
+                f"{made_for}; expected the instrument of the archive"
+            )
 
 
 def _choose_time(archive: Archive, options: argparse.Namespace) -> tuple[int, int]:

@@ -11,7 +11,8 @@ changes by a factor of two in 10 s, the wind is 5 to 30 m/s, the frame rate 200 
 gust raises the residual 1.6 times for one second at a random moment around the swap. A worse
 matrix raises the residual of the same stretch of turbulence by 1.5; a diverging one makes the loop
 unstable. Telemetry goes to the service's own comparison, in blocks of 50 ms, and to its watch of
-the loop, which must raise no alarm while a healthy matrix is in use.
+the loop and (of the simulator's telescope) of commands that are not played, which must raise no
+alarm while a healthy matrix is in use.
 """
 
 from __future__ import annotations
@@ -36,10 +37,12 @@ from pyrcal_studies.campaign.small import SMALL, bench_of
 from service.control.reconstructor import Recipe, reconstruct
 from service.estimation import health
 from service.estimation.comparison import REFERENCE_PERIOD_S
+from service.estimation.description import actuator_watch
 from service.estimation.frames import FrameBlock
-from service.estimation.health import LoopHealth
+from service.estimation.health import LoopHealth, PlayedCommands, observe_played
 from service.estimation.probation import Comparison, observe
 from service.model.misregistration import Misregistration
+from service.tracking import alarms
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -457,8 +460,8 @@ def _flipped(matrix: Array, mode: int) -> Array:
     return flipped
 
 
-Watched = tuple[Comparison, bool]
-"""A comparison that has ended, and whether the loop was called diverging meanwhile."""
+Watched = tuple[Comparison, frozenset[str]]
+"""A comparison that has ended, and the alarms that the watch of the loop raised meanwhile."""
 
 
 def judge(trial: Trial, played: Played, n_before: int, before: Array, after: Array) -> Watched:
@@ -466,20 +469,20 @@ def judge(trial: Trial, played: Played, n_before: int, before: Array, after: Arr
     state, loop, modes = Comparison(), LoopHealth(), np.arange(N_CONTROLLED)
     variance = np.mean(np.square(played.commands_m[:n_before], dtype=float), axis=0)
     matrices = {"before": np.asarray(before, np.float32), "after": np.asarray(after, np.float32)}
-    diverges = False
+    raised: frozenset[str] = frozenset()
     for block in blocks_of(trial, played, n_before):
         state = observe(state, block, modes, matrix=matrices[str(block.cm_id)])
         loop = health.observe(loop, block, variance, modes)
-        diverges = diverges or loop.diverging
+        raised |= {alarms.DIVERGING} if loop.diverging else set()
         if state.found is not None and trial.kind != "healthy":
             break
-    return state, diverges
+    return state, raised
 
 
 def _row(trial: Trial, watched: Watched, **more: object) -> dict[str, object]:
-    state, diverges = watched
+    state, raised = watched
     found = state.found
-    row = asdict(trial) | more | {"loop_diverging": diverges}
+    row = asdict(trial) | more | {"alarms": sorted(raised)}
     if found is None:
         return row | {"verdict": "none"}
     return row | {
@@ -518,8 +521,15 @@ class SimulatedNight:
             words.append("--imperfections=realistic")
         self.dome, self._n_swaps = Dome(words), 0
         self._matrices: dict[str | None, Array32] = {}
-        self._variance = bench_of(SMALL).describe().mode_variance_m2
-        self.loop, self.diverges = LoopHealth(), False
+        about = bench_of(SMALL).describe()
+        self._variance = about.mode_variance_m2
+        self._watch = (
+            actuator_watch(about.actuators, self._variance, np.arange(N_SMALL))
+            if about.actuators is not None
+            else None
+        )
+        self.loop, self.played = LoopHealth(), PlayedCommands()
+        self.alarms: frozenset[str] = frozenset()
         self.state = Comparison()
         self._swap(self._matrix(0.1))
         self._pass(CLOSING_S)
@@ -534,7 +544,7 @@ class SimulatedNight:
             found_before = self.state.found
             self._pass(SWAP_EVERY_S)
             found = self.state if self.state.found is not found_before else Comparison()
-            yield _row(self._trial, (found, self.diverges), swap_s=begun_s, swap=k)
+            yield _row(self._trial, (found, self.alarms), swap_s=begun_s, swap=k)
 
     def worse(self, share: float, healthy_nm: float | None = None) -> dict[str, object]:
         """Swap a matrix of so much of the loop gain in.
@@ -547,7 +557,7 @@ class SimulatedNight:
         self._swap(np.asarray(share * right, np.float32))
         self._pass(4.5)
         ratio = self._wavefront_nm(4.0) / (before_nm if healthy_nm is None else healthy_nm)
-        return _row(self._trial, (self.state, self.diverges), way="slow", ratio=ratio)
+        return _row(self._trial, (self.state, self.alarms), way="slow", ratio=ratio)
 
     def healthy_nm(self) -> float:
         """Return the wavefront error of the 4 s after a swap to the same matrix."""
@@ -586,13 +596,16 @@ class SimulatedNight:
 
     def _pass(self, seconds: float) -> None:
         end_s, modes = self.dome.time_s + seconds - 1e-6, np.arange(N_SMALL)
-        self.diverges = False
+        self.alarms = frozenset()
         while self.dome.time_s < end_s:
             for block in self.dome.play():
                 matrix = self._matrices.get(block.cm_id)
                 self.state = observe(self.state, block, modes, matrix=matrix)
                 self.loop = health.observe(self.loop, block, self._variance, modes)
-                self.diverges = self.diverges or self.loop.diverging
+                if matrix is not None and self._watch is not None:
+                    self.played = observe_played(self.played, block, self._watch, matrix)
+                self.alarms |= {alarms.DIVERGING} if self.loop.diverging else set()
+                self.alarms |= {alarms.NOT_PLAYED} if self.played.unplayed else set()
 
     def _wavefront_nm(self, seconds: float) -> float:
         since_s = self.dome.time_s - seconds
@@ -600,12 +613,14 @@ class SimulatedNight:
         return float(np.sqrt(np.mean(np.square(last))))
 
 
-def simulated_rows(plant: str, kind: str, n: int, seed: int) -> Iterator[dict[str, object]]:
+def simulated_rows(
+    plant: str, kind: str, n: int, seed: int, rate_hz: float | None = None
+) -> Iterator[dict[str, object]]:
     """Yield what comes of swaps on the simulator's telescope, a few in each night."""
     done = night_number = 0
     while done < n:
-        rate_hz = RATES_HZ[night_number % len(RATES_HZ)]
-        trial = replace(drawn(plant, kind, seed + night_number), rate_hz=rate_hz)
+        usual_hz = RATES_HZ[night_number % len(RATES_HZ)]
+        trial = replace(drawn(plant, kind, seed + night_number), rate_hz=rate_hz or usual_hz)
         if plant == "diffractive" and kind != "healthy":
             trial = _calm(trial, night_number)
         n_swaps = min(SWAPS_A_NIGHT if kind == "healthy" else 1, n - done)
@@ -630,11 +645,17 @@ def _calm(trial: Trial, night_number: int) -> Trial:
     )
 
 
-def rows_of(plant: str, kind: str, n: int, seed: int) -> Iterator[dict[str, object]]:
-    """Yield a row for each swap."""
-    if plant == "outside":
-        return (outside_trial(drawn(plant, kind, seed + k)) for k in range(n))
-    return simulated_rows(plant, kind, n, seed)
+def rows_of(
+    plant: str, kind: str, n: int, seed: int, rate_hz: float | None
+) -> Iterator[dict[str, object]]:
+    """Yield a row for each swap; ``rate_hz`` None: the rates in turns or at random."""
+    if plant != "outside":
+        return simulated_rows(plant, kind, n, seed, rate_hz)
+    trials = (drawn(plant, kind, seed + k) for k in range(n))
+    return (
+        outside_trial(trial if rate_hz is None else replace(trial, rate_hz=rate_hz))
+        for trial in trials
+    )
 
 
 def main() -> int:
@@ -645,13 +666,15 @@ def main() -> int:
     parser.add_argument("--worse", type=int, default=0, metavar="N")
     parser.add_argument("--diverging", type=int, default=0, metavar="N")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--rate", type=float, metavar="HZ", help="all swaps at this frame rate")
     parser.add_argument("--output", type=Path, default=Path("var/healthy_swaps.jsonl"))
     given = parser.parse_args()
     given.output.parent.mkdir(parents=True, exist_ok=True)
     begun = time.process_time()
     with threadpool_limits(1), given.output.open("a", encoding="utf-8") as file:
         for kind in ("healthy", "worse", "diverging"):
-            for row in rows_of(given.plant, kind, getattr(given, kind), given.seed):
+            n = getattr(given, kind)
+            for row in rows_of(given.plant, kind, n, given.seed, given.rate):
                 file.write(json.dumps(row) + "\n")
                 file.flush()
     sys.stdout.write(f"{time.process_time() - begun:.0f} s of processor time\n")

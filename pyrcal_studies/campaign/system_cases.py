@@ -38,6 +38,9 @@ class Case(StrEnum):
     GAIN = "gain"
     """Seeing that swings by 15 % every two seconds, and the optical gain with it."""
 
+    LOST = "lost"
+    """A jump of 0.3 subapertures and 1 deg, which no loop of many modes survives."""
+
     RESTART = "restart"
     """The RTC begins again with the matrix of the start, in the middle of a drift."""
 
@@ -66,6 +69,8 @@ class Plan:
     @property
     def jump_times_s(self) -> tuple[float, ...]:
         """When the mirror jumps."""
+        if self.case is Case.LOST:
+            return (self.period_s,)
         if self.case not in {Case.JUMP, Case.JUMP_ROTATION, Case.BUSY}:
             return ()
         due_s = np.arange(self.period_s, self.seconds - LATER_S - self.period_s / 2, self.period_s)
@@ -106,6 +111,8 @@ class Plan:
                 return [drift]
             case Case.JUMP | Case.JUMP_ROTATION:
                 return jumps
+            case Case.LOST:
+                return [f"--jump={self.period_s}:0.3,0,1,0"]
             case Case.BUSY:
                 return [drift, *jumps]
             case Case.SEEING:

@@ -10,6 +10,7 @@ from pyrcal_studies.campaign.observatory_checks import Outcome, Publication
 from pyrcal_studies.campaign.observatory_dome import START_NS, Moment
 from pyrcal_studies.campaign.rows import Row
 from service.model.misregistration import BOUNDARY_SCALE
+from service.tracking import alarms
 from service.tracking.products import MatrixState
 
 GOOD = np.array([0.02, 0.02, 0.02, 0.001])
@@ -60,6 +61,32 @@ def row_of(night: Observatory, jump_times_s: tuple[float, ...]) -> Row:
             for e in night.state.log
         ],
     }
+
+
+def recovery_of(night: Observatory, jump_s: float) -> Row:
+    """Return when a loop that a jump lost was opened and back on all modes, after the jump."""
+    moments = night.dome.moments
+    before = [m for m in moments if jump_s - 3.0 < m.time_s < jump_s]
+    opened_s = next((m.time_s for m in moments if m.time_s > jump_s and not m.closed), None)
+    back_s = None
+    if opened_s is not None and before:
+        n_modes = before[-1].n_controlled
+        later = (m for m in moments if m.time_s > opened_s)
+        back_s = next((m.time_s for m in later if m.closed and m.n_controlled >= n_modes), None)
+    lost_s = (g.time_s for g in night.glances if g.time_s > jump_s and alarms.LOST in g.alarms)
+    return {
+        "lost_after_s": _after(next(lost_s, None), jump_s),
+        "opened_after_s": _after(opened_s, jump_s),
+        "all_modes_after_s": _after(back_s, jump_s),
+        "before_nm": wavefront_rms_nm(before),
+        "after_nm": None
+        if back_s is None
+        else wavefront_rms_nm([m for m in moments if m.time_s > back_s + 1.0]),
+    }
+
+
+def _after(time_s: float | None, jump_s: float) -> float | None:
+    return None if time_s is None else round(time_s - jump_s, 2)
 
 
 def first_good_s(night: Observatory) -> float | None:

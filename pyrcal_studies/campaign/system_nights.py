@@ -30,7 +30,7 @@ from pyrcal_studies.campaign.rows import (
     words,
 )
 from pyrcal_studies.campaign.system_cases import Case, Plan
-from pyrcal_studies.campaign.system_measures import row_of, wavefront_rms_nm
+from pyrcal_studies.campaign.system_measures import recovery_of, row_of, wavefront_rms_nm
 from pyrcal_studies.campaign.system_table import table
 from service.config import load_settings
 from service.instrument import load_instrument
@@ -79,6 +79,8 @@ def play(plan: Plan) -> Row:
             night.restart_rtc()
         night.advance(plan.seconds - night.time_s)
         row = row_of(night, plan.jump_times_s)
+        if plan.case is Case.LOST:
+            row |= recovery_of(night, plan.period_s)
         if plan.case is Case.BUDGET:
             row["twin_nm"] = _without_dither_nm(night, plan, row["steady_from_s"])
     return asdict(plan) | row | {"took_s": time.monotonic() - begun}

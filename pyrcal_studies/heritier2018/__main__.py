@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 
 from pyrcal_studies.heritier2018 import figures, page
-from pyrcal_studies.heritier2018.crew import carry_out
+from pyrcal_studies.heritier2018.crew import carry_out, processor_minutes
 from pyrcal_studies.heritier2018.plan import FULL, QUICK, every_task
-from pyrcal_studies.heritier2018.store import Store, in_order
+from pyrcal_studies.heritier2018.store import Store
 
 PAGES = Path(__file__).parents[2] / "docs" / "results"
 
@@ -46,7 +46,7 @@ def main() -> int:
     folder = given.output if given.quick else PAGES
     figures.write_all(budget, store, folder / page.PICTURES)
     path = folder / "heritier2018.md"
-    minutes = sum(task.cost_s for task in in_order(tasks)) / 60.0
+    minutes = processor_minutes(tasks, store)
     path.write_text(page.write(budget, store, minutes), encoding="utf-8")
     sys.stdout.write(f"{path}\n")
     return 0

@@ -11,12 +11,16 @@ import time
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from pathlib import Path
 
+import numpy as np
 import structlog
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from threadpoolctl import threadpool_limits
 
 from pyrcal_studies.heritier2018.store import Store, Task, in_order
+
+PROCESSOR_S = "processor_s"
+"""Name of the array that says what a step took of a processor, seconds."""
 
 _NICENESS = 5
 _PLAIN_EVERY_S = 30.0
@@ -64,6 +68,11 @@ def carry_out(
     return time.monotonic() - started
 
 
+def processor_minutes(tasks: tuple[Task, ...], store: Store) -> float:
+    """Return what all steps took of a processor, minutes."""
+    return sum(float(store.read(task)[PROCESSOR_S]) for task in in_order(tasks)) / 60.0
+
+
 def _progress() -> Progress:
     """Return a line: share of the work, time left by its cost, steps, what ended last."""
     return Progress(
@@ -93,4 +102,6 @@ def _work(task: Task, folder: Path) -> None:
     store = Store(folder)
     # One BLAS thread to a worker: nested threads would slow the frame loop down several times.
     with threadpool_limits(1):
-        store.write(task, task.compute(store))
+        started = time.process_time()
+        record = task.compute(store)
+        store.write(task, {**record, PROCESSOR_S: np.array(time.process_time() - started)})

@@ -340,7 +340,7 @@ def around(budget: Budget, store: Store) -> Figure:
 def telescope_spectra(budget: Budget, store: Store) -> Figure:
     """Draw figure 13: modal spectra by day from the mirror's positions."""
     synthetic, measured = (
-        store.read(plan.closed_run(budget, budget.seeds[0], variant))
+        store.read(plan.variant_run(budget, budget.seeds[0], variant))
         for variant in (Variant.SYNTHETIC, Variant.MEASURED)
     )
     figure = canvas(6.4, 3.8)
@@ -365,7 +365,7 @@ def images(budget: Budget, store: Store) -> Figure:
     half = FIELD / OVERSAMPLING / 2
     order = (Variant.SYNTHETIC, Variant.MEASURED, Variant.MORE)
     for axes, variant in zip(panels, order, strict=True):
-        record = store.read(plan.closed_run(budget, budget.seeds[0], variant))
+        record = store.read(plan.variant_run(budget, budget.seeds[0], variant))
         image = axes.imshow(
             np.log10(np.maximum(record["image"], 1e-7)),
             origin="lower",

@@ -1,4 +1,4 @@
-"""Reconstructors of a synthetic matrix in which signal is missing, or which is noisy.
+"""Reconstructors of a synthetic matrix with less signal, noise or displaced pupil images.
 
 The paper sees parts of the pupil that gather less signal (figure 10): the bottom left part, the
 central obscuration and what is behind the spiders of the retro-reflector. Here the slopes of those
@@ -8,7 +8,7 @@ the simulated loop of section 4.4 is known feature by feature.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -24,6 +24,7 @@ from pyrcal_studies.heritier2018.registration import FitRun, fitted_alpha
 from pyrcal_studies.heritier2018.store import Record, Store, Task
 from service.control.reconstructor import invert
 from service.model.pupil import valid_subapertures
+from service.model.sensors.registry import kind_of
 
 Array = NDArray[np.float64]
 
@@ -59,6 +60,9 @@ class Change:
     noise: float = 0.0
     """RMS of the noise over that of each column."""
 
+    displaced_images: float = 0.0
+    """RMS displacement of the four pupil images from their common place, subapertures."""
+
 
 def missing(feature: Feature) -> Array:
     """Return ``(n_valid,)``, 1 where all of the signal may be missing and 0 where none is."""
@@ -73,6 +77,16 @@ def missing(feature: Feature) -> Array:
     if feature is Feature.ALL:
         return np.asarray(np.max(list(maps.values()), axis=0))
     return np.asarray(maps.get(feature, np.zeros_like(blob)))
+
+
+def image_offsets(rms_subap: float, rng: np.random.Generator) -> Array:
+    """Return random displacements ``(8,)`` of four pupil images, along x then along y.
+
+    Their mean is zero in both directions: a common displacement is a shift of the registration.
+    """
+    offsets = rng.standard_normal((2, 4))
+    offsets -= offsets.mean(axis=1, keepdims=True)
+    return np.asarray((offsets * rms_subap / np.sqrt(np.mean(offsets**2))).ravel())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,10 +119,15 @@ class ChangedReconstructor:
 
     def compute(self, store: Store) -> Record:
         """Return ``matrix`` ``(n_modes, n_slopes)`` and its condition number."""
-        matrix = synthetic_matrix(fitted_alpha(store.read(self.fit)))[:, : self.n_modes]
+        rng = np.random.default_rng(_NOISE_SEED)
+        alpha, instrument = fitted_alpha(store.read(self.fit)), telescope.instrument()
+        if self.change.displaced_images:
+            offsets = image_offsets(self.change.displaced_images, rng)
+            displaced = kind_of(instrument).displace_images(instrument, offsets)
+            instrument = replace(instrument, wfs=displaced)
+        matrix = synthetic_matrix(alpha, instrument)[:, : self.n_modes]
         kept = 1.0 - self.change.depth * missing(self.change.feature)
         matrix = matrix * np.tile(kept, 2)[:, None]
-        rng = np.random.default_rng(_NOISE_SEED)
         scatter = self.change.noise * np.sqrt(np.mean(matrix**2, axis=0))
         matrix = matrix + scatter * rng.standard_normal(matrix.shape)
         return inverse_record(invert(matrix, self.n_modes))

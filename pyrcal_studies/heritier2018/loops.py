@@ -25,8 +25,6 @@ from sim_rtc.telescope.diffractive import DiffractiveOptics
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 
-SETTLING_FRAMES = 200
-
 N_PARTS = 3
 """Parts of a loop, one after the other, whose difference is chance."""
 
@@ -60,6 +58,9 @@ class LoopRun:
     n_frames: int
     """After it has settled."""
 
+    settling_frames: int = 200
+    """From rest until it has settled."""
+
     played_modes: int | None = None
     """By day: modes of the played turbulence; None: all the mirror can make."""
 
@@ -89,7 +90,7 @@ class LoopRun:
     @property
     def n_frames_run(self) -> int:
         """Frames computed, those of settling in among them."""
-        return SETTLING_FRAMES + self.n_frames
+        return self.settling_frames + self.n_frames
 
     def compute(self, store: Store) -> Record:
         """Return the residual's error in time and by mode, nm, and its H-band image.
@@ -116,13 +117,12 @@ class LoopRun:
         for row in range(0, self.n_frames_run, BATCH_FRAMES):
             result = closed.batch(row, gains)
             n_clipped += result.n_clipped
-            if row >= SETTLING_FRAMES:
+            if row >= self.settling_frames:
                 residual.append(closed.residual_m(row, result))
                 positions.append(result.commands_m)
         plant = telescope.plant(self.occasion)
-        found = statistics(
-            closed.optics, plant.weights, np.array(residual), closed.incoming_m(SETTLING_FRAMES)
-        )
+        coming = closed.incoming_m(self.settling_frames)
+        found = statistics(closed.optics, plant.weights, np.array(residual), coming)
         power = np.mean(np.concatenate(positions).astype(np.float64) ** 2, axis=0)
         return {
             **found,

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pyrcal_studies.heritier2018 import telescope
 from pyrcal_studies.heritier2018.calibration import FRAME_COST_S, STROKE_M, Answer
 from pyrcal_studies.heritier2018.reconstructors import synthetic_matrix
+from pyrcal_studies.heritier2018.registration import DERIVATIVE_STEPS
 from pyrcal_studies.heritier2018.store import Record, Store, Task
 from pyrcal_studies.heritier2018.telescope import Occasion
 from service.control.reconstructor import invert
@@ -41,15 +42,14 @@ POKE_PEAK_M = 100e-9
 """Largest displacement of a single actuator, metres OPD. A poke of 20 nm RMS over the pupil would
 reach half a micrometre and leave the pyramid's linear range."""
 
-TONES_FRAMES = 600
+TONES_FRAMES_PER_MODE = 6
+"""As many as two pushes and two pulls take."""
+
 FREQUENCIES = (0.05, 0.45)
 """Range of the sines, cycles per frame."""
 
 N_SETS = 8
 """Disjoint sets of modes whose scatter gives the registration's σ."""
-
-_STEPS = np.array([1e-2, 1e-2, 1e-3, 1e-3])
-"""Steps of the derivatives, numeric units."""
 
 
 class Pattern(StrEnum):
@@ -83,7 +83,7 @@ class PatternRun:
     @property
     def cost_s(self) -> float:
         """Rough time on one idle core, seconds."""
-        return TONES_FRAMES * FRAME_COST_S + 6.0
+        return TONES_FRAMES_PER_MODE * self.n_modes * FRAME_COST_S + 6.0
 
     @property
     def needs(self) -> tuple[Task, ...]:
@@ -131,14 +131,15 @@ class PatternRun:
         n_basis = telescope.basis().n_modes
         modes = tuple(range(self.n_modes))
         if self.pattern is Pattern.SINES:
+            n_frames = TONES_FRAMES_PER_MODE * self.n_modes
             tones = Tones(
                 modes=np.arange(self.n_modes),
                 amplitude_m=np.full(self.n_modes, STROKE_M / np.sqrt(self.n_modes)),
                 cycles_per_frame=np.linspace(*FREQUENCIES, self.n_modes),
                 n_modes=n_basis,
-                n_frames=TONES_FRAMES,
+                n_frames=n_frames,
             )
-            return tones.commands, Demodulation(tones, n_slopes=n_slopes), TONES_FRAMES
+            return tones.commands, Demodulation(tones, n_slopes=n_slopes), n_frames
         if self.pattern is Pattern.ZONAL:
             to_actuators = telescope.basis().mode_to_actuator
             shapes = pokes(np.asarray(to_actuators, dtype=np.float64), 1.0)
@@ -193,7 +194,7 @@ def registration_by_set(error: Array, exact: Array, alpha: Misregistration, n_se
 def sensitivities(alpha: Misregistration, n_modes: int) -> Array:
     """Return the derivatives of the synthetic matrix for two passes ``(4, n_slopes, n_modes)``."""
     found = []
-    for index, step in enumerate(_STEPS):
+    for index, step in enumerate(DERIVATIVE_STEPS):
         away = step * (np.arange(4) == index)
         plus, minus = (
             synthetic_matrix(Misregistration.from_vector(alpha.vector + sign * away))[:, :n_modes]

@@ -19,7 +19,7 @@ from pyrcal_studies.heritier2018.reconstructors import (
     MeasuredReconstructor,
     ModelReconstructor,
 )
-from pyrcal_studies.heritier2018.registration import FitRun, Found, Repeat, random_starts
+from pyrcal_studies.heritier2018.registration import CriterionMinimum, FitRun, Found, random_starts
 from pyrcal_studies.heritier2018.store import Task
 from pyrcal_studies.heritier2018.telescope import DRAWN, Occasion, ShakenOccasion
 from service.model.kinds import Method
@@ -62,6 +62,9 @@ class Budget:
     """How much is run."""
 
     name: str
+    settling_frames: int
+    """Frames of each loop before it has settled."""
+
     influence_frames: int
     """Frames of each loop by night, after settling."""
 
@@ -80,7 +83,6 @@ class Budget:
     start_distances: tuple[float, ...]
     """Distances of starts from the truth, in units of the paper's rough estimate."""
 
-    starts_per_distance: int
     every: int
     """Only each such point of a sweep is run; the first and the marked ones always."""
 
@@ -90,36 +92,36 @@ class Budget:
 
 FULL = Budget(
     name="full",
-    influence_frames=200,
-    closed_frames=1000,
-    n_average=4,
+    settling_frames=100,
+    influence_frames=100,
+    closed_frames=300,
+    n_average=10,
     seeds=(1, 2, 3),
-    ramp_frames=160,
-    start_distances=(1.0,),
-    starts_per_distance=1,
+    ramp_frames=80,
+    start_distances=(3.0,),
     every=1,
     modes_every=1,
 )
 QUICK = Budget(
     name="quick",
+    settling_frames=50,
     influence_frames=60,
     closed_frames=100,
     n_average=1,
     seeds=(1,),
     ramp_frames=40,
     start_distances=(1.0,),
-    starts_per_distance=1,
     every=8,
     modes_every=8,
 )
 
-CAPTURE_MODES_EVERY = 8
-"""Modes of the fits that measure the capture range: each eighth of the 400."""
+CAPTURE_MODES_EVERY = 16
+"""Modes of the fits that measure the capture range: each sixteenth of the 400."""
 
 
-def hasty(budget: Budget) -> Budget:
-    """Return the same with every mode pushed and pulled only once, on the first telescope."""
-    return replace(budget, n_average=1, seeds=budget.seeds[:1])
+def measured_once(budget: Budget) -> Measurement:
+    """Return the first telescope's matrix with every mode pushed and pulled only once."""
+    return measurement(replace(budget, n_average=1), budget.seeds[0])
 
 
 # --- registration: section 4, equations 6 to 10, table 1, figures 7 and 8
@@ -167,58 +169,51 @@ def paper_fit(budget: Budget, seed: int) -> FitRun:
     return fit_of(budget, measurement(budget, seed))
 
 
-def joint_fit(budget: Budget, seed: int) -> FitRun:
-    """Return the joint fit to the same matrix from the same start."""
-    return fit_of(budget, measurement(budget, seed), Method.JOINT)
-
-
 def near_zero_sources(budget: Budget) -> dict[str, Answer]:
     """Return noise-free matrices of telescopes close to the nominal registration."""
     return {f"clean, telescope {s}": answer(s, NEAR_ZERO) for s in budget.seeds[:1]}
 
 
-def registration_sources(budget: Budget) -> dict[str, Measurement | Answer]:
-    """Return the matrices at the paper's registration, noise-free and measured."""
-    first = budget.seeds[0]
+def telescope_sources(budget: Budget) -> dict[str, Measurement | Answer]:
+    """Return the matrices of all telescopes, noise-free and measured."""
     return {
-        "clean, the model's mirror": answer(first, TRUTH, DRAWN),
-        f"clean, telescope {first}": answer(first),
+        **{f"clean, telescope {s}": answer(s) for s in budget.seeds},
         **{f"noisy, telescope {s}": measurement(budget, s) for s in budget.seeds},
     }
 
 
-def starts(budget: Budget) -> dict[float, tuple[Misregistration, ...]]:
-    """Return starts by distance from the truth, in units of the paper's rough estimate."""
+def registration_sources(budget: Budget) -> dict[str, Measurement | Answer]:
+    """Return the matrices at the paper's registration, noise-free and measured."""
+    drawn = answer(budget.seeds[0], TRUTH, DRAWN)
+    return {"clean, the model's mirror": drawn, **telescope_sources(budget)}
+
+
+def capture_fits(budget: Budget, method: Method) -> dict[float, dict[str, FitRun]]:
+    """Return fits by the distance of their start from the truth, and by matrix.
+
+    Distances are in units of the paper's rough estimate. Both methods have the same starts.
+    """
     rng = np.random.default_rng(_STARTS_SEED)
+    sources = telescope_sources(budget)
     return {
-        distance: random_starts(TRUTH, distance, budget.starts_per_distance, rng)
+        distance: {
+            name: FitRun(source=source, method=method, start=start, modes_every=CAPTURE_MODES_EVERY)
+            for (name, source), start in zip(
+                sources.items(), random_starts(TRUTH, distance, len(sources), rng), strict=True
+            )
+        }
         for distance in budget.start_distances
-    }
-
-
-def capture_fits(budget: Budget, method: Method) -> dict[float, tuple[FitRun, ...]]:
-    """Return fits of the first telescope's matrix from those starts."""
-    source = measurement(budget, budget.seeds[0])
-    return {
-        distance: tuple(
-            FitRun(source=source, method=method, start=start, modes_every=CAPTURE_MODES_EVERY)
-            for start in some
-        )
-        for distance, some in starts(budget).items()
     }
 
 
 def registration_tasks(budget: Budget) -> list[Task]:
     """Return all fits."""
-    tasks: list[Task] = [Repeat(fit=paper_fit(budget, budget.seeds[0]))]
-    for seed in budget.seeds:
-        tasks += [paper_fit(budget, seed), joint_fit(budget, seed)]
-    tasks += [fit_of(budget, source) for source in registration_sources(budget).values()]
+    sources = registration_sources(budget).values()
+    tasks: list[Task] = [fit_of(budget, source) for source in sources]
+    tasks += [CriterionMinimum(source=source) for source in sources]
+    tasks += [fit_of(budget, source, Method.JOINT) for source in telescope_sources(budget).values()]
     near = near_zero_sources(budget).values()
     tasks += [fit_of(budget, source, Method.PAPER, Misregistration()) for source in near]
-    for method in (Method.PAPER, Method.JOINT):
-        for fits in capture_fits(budget, method).values():
-            tasks += fits
     return tasks
 
 
@@ -311,6 +306,7 @@ def influence_run(budget: Budget, alpha: Misregistration, n_modes: int) -> LoopR
         reconstructor=ModelReconstructor(occasion=night, alpha=Misregistration(), n_modes=n_modes),
         gain=NIGHT_GAIN,
         n_frames=budget.influence_frames,
+        settling_frames=budget.settling_frames,
     )
 
 
@@ -381,22 +377,23 @@ def gain_tuning(budget: Budget, seed: int) -> GainTuning:
 def closed_run(
     budget: Budget,
     seed: int,
-    variant: Variant,
-    *,
+    inverse: MeasuredReconstructor | FittedReconstructor,
     occasion: Occasion | None = None,
-    gain: float | None = None,
 ) -> LoopRun:
-    """Return a loop by day in a shaking dome.
-
-    The gains of every variant are those tuned on the measured matrix (section 5), or one ``gain``.
-    """
+    """Return a loop by day in a shaking dome, with the gains tuned on the measured matrix."""
     return LoopRun(
         occasion=occasion or Occasion(daytime=True, seed=seed, vibrations=True),
         alpha=TRUTH,
-        reconstructor=reconstructor(budget, seed, variant),
-        gain=gain_tuning(budget, seed) if gain is None else gain,
+        reconstructor=inverse,
+        gain=gain_tuning(budget, seed),
         n_frames=budget.closed_frames,
+        settling_frames=budget.settling_frames,
     )
+
+
+def variant_run(budget: Budget, seed: int, variant: Variant) -> LoopRun:
+    """Return the loop of a variant of Table 2."""
+    return closed_run(budget, seed, reconstructor(budget, seed, variant))
 
 
 SHAKING = 2.64
@@ -404,29 +401,30 @@ SHAKING = 2.64
 190 nm of the paper's Table 2, instead of the 72 nm of the simulated dome."""
 
 
-def trials(budget: Budget) -> dict[str, LoopRun]:
-    """Return loops of the first telescope that show what a column of Table 2 depends on."""
+def shaken_run(budget: Budget) -> LoopRun:
+    """Return the first telescope's loop with the synthetic matrix and stronger vibrations."""
     seed = budget.seeds[0]
-    still = Occasion(daytime=True, seed=seed)
     shaken = ShakenOccasion(daytime=True, seed=seed, vibrations=True, times=SHAKING)
-    found = {
-        f"synthetic, vibrations x {SHAKING:g}": closed_run(
-            budget, seed, Variant.SYNTHETIC, occasion=shaken
-        ),
-        "synthetic, no vibrations": closed_run(budget, seed, Variant.SYNTHETIC, occasion=still),
-    }
-    for variant, name in ((Variant.SYNTHETIC, "synthetic"), (Variant.MEASURED, "measured")):
-        found[f"{name}, matrix measured once"] = closed_run(hasty(budget), seed, variant)
-    return found
+    return closed_run(budget, seed, reconstructor(budget, seed, Variant.SYNTHETIC), shaken)
+
+
+def once_run(budget: Budget) -> LoopRun:
+    """Return the first telescope's loop with the matrix that was measured once."""
+    inverse = MeasuredReconstructor(measurement=measured_once(budget))
+    return closed_run(budget, budget.seeds[0], inverse)
 
 
 def closed_tasks(budget: Budget) -> list[Task]:
-    """Return the loops of Table 2 and of its trials."""
-    tasks: list[Task] = [closed_run(budget, s, v) for s in budget.seeds for v in Variant]
-    return [*tasks, *trials(budget).values()]
+    """Return the loops of Table 2, and two that show what its columns depend on."""
+    tasks: list[Task] = [variant_run(budget, s, v) for s in budget.seeds for v in Variant]
+    return [*tasks, shaken_run(budget), once_run(budget)]
 
 
 # --- the simulator: section 4.4, figures 11 and 12
+
+
+SIMULATOR = Occasion(daytime=False, seed=1, imperfections=DRAWN)
+"""The paper's simulator: it has the model's own mirror and sees all of the turbulence by night."""
 
 
 def in_simulator(
@@ -441,11 +439,12 @@ def in_simulator(
     or a step away from there, and sees all of the turbulence.
     """
     return LoopRun(
-        occasion=Occasion(daytime=False, seed=1, imperfections=DRAWN),
+        occasion=SIMULATOR,
         alpha=Found(fit=fit, step=step),
         reconstructor=inverse,
         gain=NIGHT_GAIN,
         n_frames=budget.influence_frames,
+        settling_frames=budget.settling_frames,
     )
 
 
@@ -479,18 +478,49 @@ def around_run(budget: Budget, sweep: Sweep, value: float) -> LoopRun:
     return in_simulator(budget, measured, paper_fit(budget, seed), sweep.step(value))
 
 
-def changes(budget: Budget) -> dict[str, Change]:
-    """Return what is done to the synthetic matrix before it is inverted."""
+REGISTERED = (-20.0, 0.0, 20.0)
+"""Shifts along x, %, at which the simulator runs with the reconstructor of that place."""
+
+
+def registered_run(budget: Budget, value: float) -> LoopRun:
+    """Return the simulator at so much shift along x, with the reconstructor of that place.
+
+    Nothing is misregistered: only the place of the light on the sensor's mask changes.
+    """
+    fit, step = paper_fit(budget, budget.seeds[0]), AROUND[1].step(value)
+    registered = ModelReconstructor(
+        occasion=SIMULATOR, alpha=Found(fit=fit, step=step), n_modes=N_MEASURED
+    )
+    return in_simulator(budget, registered, fit, step)
+
+
+def single_changes(budget: Budget) -> dict[str, Change]:
+    """Return the features of figure 10 one by one, and pupil images off their places."""
     every = {
-        "all three features, 50 % of the signal missing": Change(feature=Feature.ALL, depth=0.5),
-        "all three features, 75 %": Change(feature=Feature.ALL, depth=0.75),
-        "bottom left, 75 %": Change(feature=Feature.BOTTOM_LEFT, depth=0.75),
-        "about the obscuration, 75 %": Change(feature=Feature.OBSCURATION, depth=0.75),
-        "behind four spiders, 75 %": Change(feature=Feature.SPIDERS, depth=0.75),
-        "noise, 25 % of a column": Change(noise=0.25),
-        "noise, 50 %": Change(noise=0.50),
+        "75 % of the signal missing bottom left": Change(feature=Feature.BOTTOM_LEFT, depth=0.75),
+        "about the obscuration": Change(feature=Feature.OBSCURATION, depth=0.75),
+        "behind four spiders": Change(feature=Feature.SPIDERS, depth=0.75),
+        "pupil images displaced by 25 % of a subaperture": Change(displaced_images=0.25),
+        "images 25 %, 50 % missing in all features, noise 25 %": Change(
+            feature=Feature.ALL, depth=0.5, noise=0.25, displaced_images=0.25
+        ),
     }
-    return dict(list(every.items())[:: 1 if budget.name == "full" else 5])
+    return every if budget.name == "full" else {}
+
+
+def combinations(budget: Budget) -> dict[tuple[float, float], Change]:
+    """Return all features together with noise, by missing share of the signal and by noise."""
+    full = budget.name == "full"
+    depths = (0.0, 0.5, 0.75) if full else (0.0, 0.75)
+    noises = (0.0, 0.25, 0.5) if full else (0.0, 0.5)
+    return {
+        (depth, noise): Change(
+            feature=Feature.ALL if depth else Feature.NONE, depth=depth, noise=noise
+        )
+        for depth in depths
+        for noise in noises
+        if depth or noise
+    }
 
 
 def change_run(budget: Budget, change: Change) -> LoopRun:
@@ -501,20 +531,23 @@ def change_run(budget: Budget, change: Change) -> LoopRun:
     )
 
 
-UNEVEN = (0.6,)
-"""Largest departure of the light from its mean, of telescopes measured without noise."""
+UNEVENNESS = 0.6
+"""Largest departure of the light from its mean, of a telescope measured without noise."""
 
 
-def uneven_source(budget: Budget, unevenness: float) -> Answer:
-    """Return the noise-free matrix of a telescope in uneven light."""
-    return answer(budget.seeds[0], TRUTH, f"{DRAWN}-uneven-{unevenness:g}")
-
-
-def uneven_run(budget: Budget, unevenness: float) -> LoopRun:
-    """Return the simulator's loop with the matrix of a telescope in uneven light."""
-    source = uneven_source(budget, unevenness)
-    fit = fit_of(budget, source)
-    return in_simulator(budget, MeasuredReconstructor(measurement=source), fit)
+def measured_runs(budget: Budget) -> dict[str, LoopRun]:
+    """Return the simulator's loops with other measured matrices of the first telescope."""
+    sources: dict[str, Measurement | Answer] = {
+        "telescope 1, each mode pushed and pulled once": measured_once(budget)
+    }
+    if budget.name == "full":
+        uneven = answer(budget.seeds[0], TRUTH, f"{DRAWN}-uneven-{UNEVENNESS:g}")
+        sources[f"noise-free matrix in light uneven by {UNEVENNESS:.0%}"] = uneven
+    fit = paper_fit(budget, budget.seeds[0])
+    return {
+        name: in_simulator(budget, MeasuredReconstructor(measurement=source), fit)
+        for name, source in sources.items()
+    }
 
 
 def simulator_tasks(budget: Budget) -> list[Task]:
@@ -522,12 +555,12 @@ def simulator_tasks(budget: Budget) -> list[Task]:
     tasks: list[Task] = []
     for seed in budget.seeds:
         tasks += simulator_pair(budget, seed)
-    tasks += simulator_pair(hasty(budget), budget.seeds[0])
-    tasks += [change_run(budget, change) for change in changes(budget).values()]
-    if budget.name == "full":
-        tasks += [uneven_run(budget, unevenness) for unevenness in UNEVEN]
+    tasks += measured_runs(budget).values()
+    changes = [*single_changes(budget).values(), *combinations(budget).values()]
+    tasks += [change_run(budget, change) for change in changes]
     for sweep in AROUND:
         tasks += [around_run(budget, sweep, value) for value in sweep.at(budget)]
+    tasks += [registered_run(budget, value) for value in REGISTERED]
     return tasks
 
 
@@ -560,15 +593,19 @@ def pattern_tasks(budget: Budget) -> list[Task]:
     return [pattern_run(budget, pattern) for pattern in patterns(budget)]
 
 
+def capture_tasks(budget: Budget) -> list[Task]:
+    """Return the fits that measure the capture range."""
+    tasks: list[Task] = []
+    for method in (Method.PAPER, Method.JOINT):
+        for fits in capture_fits(budget, method).values():
+            tasks += fits.values()
+    return tasks
+
+
 def every_task(budget: Budget) -> tuple[Task, ...]:
     """Return all that the page needs, the longest chains first."""
-    tasks = [
-        *registration_tasks(budget),
-        *closed_tasks(budget),
-        *simulator_tasks(budget),
-        *pattern_tasks(budget),
-        *influence_tasks(budget),
-    ]
+    tasks = [*registration_tasks(budget), *closed_tasks(budget), *simulator_tasks(budget)]
     for alpha in (TRUTH, WITHOUT_BORDER):
         tasks += answers(budget, alpha).values()
+    tasks += [*influence_tasks(budget), *pattern_tasks(budget), *capture_tasks(budget)]
     return tuple(tasks)

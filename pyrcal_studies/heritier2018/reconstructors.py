@@ -15,6 +15,7 @@ from pyrcal_studies.heritier2018.store import Record, Store, Task
 from pyrcal_studies.heritier2018.telescope import Occasion
 from service.control.gains import CalibrationGains
 from service.control.reconstructor import Inversion, invert
+from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 
@@ -148,9 +149,14 @@ def calibration_gains(fit: Record, n_basis: int) -> CalibrationGains:
     return CalibrationGains.of_modes(fit["gains"], fit["modes"], n_basis)
 
 
-def synthetic_matrix(alpha: Misregistration) -> NDArray[np.float64]:
-    """Return the model's matrix ``(n_slopes, n_modes)`` for light that meets the mirror once."""
-    model = InteractionModel(telescope.instrument(), telescope.basis())
+def synthetic_matrix(
+    alpha: Misregistration, instrument: Instrument | None = None
+) -> NDArray[np.float64]:
+    """Return the model's matrix ``(n_slopes, n_modes)`` for light that meets the mirror once.
+
+    ``instrument`` is None for the study's own.
+    """
+    model = InteractionModel(instrument or telescope.instrument(), telescope.basis())
     return np.asarray(model.interaction_matrix(alpha), dtype=np.float64)
 
 

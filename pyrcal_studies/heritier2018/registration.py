@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.matrix import FitOptions, fit_matrix
-from pyrcal.fitting.methods import TABLE_1, scan
 from pyrcal.fitting.models import FitModels
 from pyrcal_studies.heritier2018 import telescope
 from pyrcal_studies.heritier2018.calibration import Answer, Measurement
@@ -24,6 +23,9 @@ from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.slopes import Orientation
 
 Array = NDArray[np.float64]
+
+DERIVATIVE_STEPS = np.array([1e-2, 1e-2, 1e-3, 1e-3])
+"""Steps of the derivatives of a matrix by the registration, numeric units."""
 
 _COST_S = {Method.JOINT: 12.0, Method.PAPER: 35.0, Method.SENSITIVITY: 12.0}
 
@@ -120,42 +122,60 @@ def fitted_alpha(record: Mapping[str, NDArray[Any]]) -> Misregistration:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Repeat:
-    """Another estimation after Table 1's procedure: its last four steps again."""
+class CriterionMinimum:
+    """The minimum of the paper's criterion in all four parameters together.
 
-    fit: FitRun
+    It is what Table 1's procedure would converge to. It is found by a Gauss-Newton step from the
+    true registration, which only a study can do.
+    """
+
+    source: Measurement | Answer
 
     @property
     def label(self) -> str:
         """What the progress bar shows."""
-        return "steps 7 to 10 of Table 1 again"
+        return "minimum of the criterion"
 
     @property
     def cost_s(self) -> float:
         """Rough time on one idle core, seconds."""
-        return float(30.0 / self.fit.modes_every**0.5)
+        return 8.0
 
     @property
     def needs(self) -> tuple[Task, ...]:
-        """The procedure."""
-        return (self.fit,)
+        """The measurement."""
+        return self.source.parts
 
     def compute(self, store: Store) -> Record:
-        """Return ``alpha`` and, with the columns divided by their gains, ``alpha_tuned``.
-
-        Both are in boundary units. The second shows what the missing free gains cost.
-        """
+        """Return ``alpha``, and ``alpha_gains`` with a free gain per mode, boundary units."""
         plain = replace(telescope.instrument().slopes, orientation=Orientation())
         instrument = replace(telescope.instrument(), slopes=plain)
-        models = FitModels(instrument=instrument, basis=telescope.basis().subset(self.fit.modes))
-        target = target_of(self.fit.source.reference(store), instrument)
-        target = target.column_subset(self.fit.modes)
-        fit = store.read(self.fit)
-        start, found = fitted_alpha(fit), {}
-        tuned = replace(target, matrix=target.matrix / fit["gains"])
-        for name, reference in (("alpha", target), ("alpha_tuned", tuned)):
-            alpha, _ = scan(models, reference, start, TABLE_1[6:])
-            found[name] = alpha.vector * BOUNDARY_SCALE
+        basis = telescope.basis().subset(np.arange(self.source.n_modes))
+        model = FitModels(instrument=instrument, basis=basis).fine
+        target = target_of(self.source.reference(store), instrument)
+        truth = self.source.alpha.vector
+
+        def matrix_at(vector: Array) -> Array:
+            found = model.interaction_matrix(Misregistration.from_vector(vector))
+            return np.asarray(found, dtype=np.float64)[target.rows]
+
+        nominal = matrix_at(truth)
+        units = nominal / np.linalg.norm(nominal, axis=0)
+        residual = np.asarray(target.matrix[target.rows], dtype=np.float64) - nominal
+        steps = np.diag(DERIVATIVE_STEPS)
+        derivatives = [
+            (matrix_at(truth + step) - matrix_at(truth - step)) / (2.0 * step.sum())
+            for step in steps
+        ]
+
+        def without_gains(values: Array) -> Array:
+            return np.asarray(values - units * np.sum(units * values, axis=0))
+
+        found = {}
+        for name, prepare in (("alpha", np.asarray), ("alpha_gains", without_gains)):
+            rows = np.array([prepare(one).ravel() for one in derivatives]).T
+            step = np.linalg.lstsq(rows, prepare(residual).ravel(), rcond=None)[0]
+            found[name] = (truth + step) * BOUNDARY_SCALE
         return found
 
 

@@ -15,7 +15,13 @@ from pyrcal_studies.heritier2018.plan import Budget, Sweep, Variant
 from pyrcal_studies.heritier2018.poles import limit_of_stability
 from pyrcal_studies.heritier2018.psf import strehl
 from pyrcal_studies.heritier2018.reconstructors import synthetic_matrix
-from pyrcal_studies.heritier2018.registration import FitRun, Repeat, errors, fitted_alpha, is_right
+from pyrcal_studies.heritier2018.registration import (
+    CriterionMinimum,
+    FitRun,
+    errors,
+    fitted_alpha,
+    is_right,
+)
 from pyrcal_studies.heritier2018.store import Record, Store
 from pyrcal_studies.heritier2018.telescope import DRAWN
 from service.model.kinds import Method
@@ -82,10 +88,10 @@ def fit_errors(budget: Budget, store: Store, *, near: bool = False) -> dict[str,
 
 
 def joint_errors(budget: Budget, store: Store) -> dict[str, Array]:
-    """Return the errors of the joint fit to the measured matrices."""
+    """Return the errors of the joint fit by matrix, the paper's units."""
     return {
-        f"noisy, telescope {seed}": errors(store.read(plan.joint_fit(budget, seed)), plan.TRUTH)
-        for seed in budget.seeds
+        name: errors(store.read(plan.fit_of(budget, source, Method.JOINT)), plan.TRUTH)
+        for name, source in plan.telescope_sources(budget).items()
     }
 
 
@@ -108,18 +114,63 @@ def third_estimation(budget: Budget, store: Store) -> Array:
     return np.asarray(np.max(changes, axis=0))
 
 
-def repeated(budget: Budget, store: Store) -> tuple[Array, Array]:
-    """Return by how much steps 7 to 10 once more change α, and the errors after them."""
-    fit, record = fit_record(budget, store, budget.seeds[0])
-    again = store.read(Repeat(fit=fit))["alpha"]
-    change = np.abs(again - record["alpha"]) * SHOWN
-    return np.asarray(change), errors({"alpha": again}, plan.TRUTH)
+def minimum_errors(budget: Budget, store: Store, name: str = "alpha") -> dict[str, Array]:
+    """Return the errors of the criterion's minimum by matrix, the paper's units.
+
+    ``name`` is ``alpha``, or ``alpha_gains`` for a free gain per mode.
+    """
+    found = {}
+    for matrix, source in plan.registration_sources(budget).items():
+        record = store.read(CriterionMinimum(source=source))
+        found[matrix] = errors({"alpha": record[name]}, plan.TRUTH)
+    return found
 
 
-def captured(budget: Budget, store: Store, method: Method) -> dict[float, tuple[int, int]]:
-    """Return by distance of the starts how many fits were right, and how many there were."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Causes:
+    """Parts of the error of Table 1's procedure on a measured matrix; their sum is the error."""
+
+    order: Array
+    """One parameter after the other, the magnification last."""
+
+    grid: Array
+    """The model's optics: the same mirror, no noise."""
+
+    imperfections: Array
+    """Uneven light, displaced actuators and another mirror."""
+
+    noise: Array
+    """Noise, vibrations, and pokes of 20 nm instead of 1 nm."""
+
+    @property
+    def largest(self) -> str:
+        """Name of the part with the largest shift error."""
+        names = ("order", "grid", "imperfections", "noise")
+        return max(names, key=lambda name: float(np.abs(getattr(self, name)[:2]).max()))
+
+
+def causes(budget: Budget, store: Store) -> dict[int, Causes]:
+    """Return the parts of the error by telescope."""
+    at_minimum, scanned = minimum_errors(budget, store), fit_errors(budget, store)
+    drawn = at_minimum["clean, the model's mirror"]
+    found = {}
+    for seed in budget.seeds:
+        clean, noisy = (at_minimum[f"{word}, telescope {seed}"] for word in ("clean", "noisy"))
+        found[seed] = Causes(
+            order=scanned[f"noisy, telescope {seed}"] - noisy,
+            grid=drawn,
+            imperfections=clean - drawn,
+            noise=noisy - clean,
+        )
+    return found
+
+
+def captured(budget: Budget, store: Store, method: Method, word: str) -> dict[float, int]:
+    """Return by distance of the starts how many fits are right, of matrices named with ``word``."""
     return {
-        distance: (sum(is_right(store.read(fit), plan.TRUTH) for fit in fits), len(fits))
+        distance: sum(
+            is_right(store.read(fit), plan.TRUTH) for name, fit in fits.items() if word in name
+        )
         for distance, fits in plan.capture_fits(budget, method).items()
     }
 
@@ -127,8 +178,13 @@ def captured(budget: Budget, store: Store, method: Method) -> dict[float, tuple[
 def evaluations(budget: Budget, store: Store) -> tuple[float, float]:
     """Return the mean number of model matrices of Table 1's procedure and of the joint fit."""
     scans, joint = (
-        np.mean([int(store.read(fit(budget, seed))["n_evaluations"]) for seed in budget.seeds])
-        for fit in (plan.paper_fit, plan.joint_fit)
+        np.mean(
+            [
+                int(store.read(plan.fit_of(budget, source, method))["n_evaluations"])
+                for source in plan.telescope_sources(budget).values()
+            ]
+        )
+        for method in (Method.PAPER, Method.JOINT)
     )
     return float(scans), float(joint)
 
@@ -215,16 +271,6 @@ def amplified(budget: Budget, store: Store, sweep: Sweep, value: float) -> tuple
     left, came = (np.convolve(record[k], mean, "valid") for k in ("modal_nm2", "incoming_nm2"))
     ratio = left / came
     return float(ratio.max()), int(np.argmax(ratio)) + 5
-
-
-def share_of_last_third(budget: Budget, store: Store, sweep: Sweep, value: float) -> float:
-    """Return the share of the added variance that the last third of 594 modes has."""
-    rest, off = (
-        store.read(plan.influence_run(budget, alpha, plan.N_BASIS))["modal_nm2"]
-        for alpha in (Misregistration(), sweep.alpha(value))
-    )
-    extra = off - rest
-    return float(extra[2 * len(extra) // 3 :].sum() / extra.sum())
 
 
 # --- matrices
@@ -339,6 +385,15 @@ def optimum(errors_nm: Mapping[float, float]) -> float | None:
     return None if bend <= 0.0 else float(-slope / (2.0 * bend))
 
 
+def smallest_at_zero(budget: Budget, store: Store) -> int:
+    """Return for how many parameters the registration found has the smallest error."""
+    count = 0
+    for sweep in plan.AROUND:
+        found = around_nm(budget, store, sweep)
+        count += min(found, key=lambda value: found[value]) == 0.0
+    return count
+
+
 def columns_nm(record: Record, over: Over) -> Array:
     """Return the three columns of Table 2, nm."""
     return np.array([wavefront_error_nm(record, without_first=n, over=over) for n in LEFT_OUT])
@@ -346,18 +401,13 @@ def columns_nm(record: Record, over: Over) -> Array:
 
 def table_2_nm(budget: Budget, store: Store, variant: Variant, over: Over) -> Array:
     """Return the columns of a variant ``(n_telescopes, 3)``, nm."""
-    runs = (plan.closed_run(budget, seed, variant) for seed in budget.seeds)
+    runs = (plan.variant_run(budget, seed, variant) for seed in budget.seeds)
     return np.array([columns_nm(store.read(run), over) for run in runs])
-
-
-def trial_nm(budget: Budget, store: Store, name: str, over: Over) -> Array:
-    """Return the columns of one of the trials, nm."""
-    return columns_nm(store.read(plan.trials(budget)[name]), over)
 
 
 def strehls(budget: Budget, store: Store, variant: Variant) -> Array:
     """Return the Strehl ratios in H, from the images, by telescope."""
-    runs = (plan.closed_run(budget, seed, variant) for seed in budget.seeds)
+    runs = (plan.variant_run(budget, seed, variant) for seed in budget.seeds)
     return np.array([strehl(store.read(run)["image"]) for run in runs])
 
 
@@ -366,12 +416,6 @@ def gains(budget: Budget, store: Store) -> list[list[float]]:
     return [
         store.read(plan.gain_tuning(budget, seed))["by_group"].tolist() for seed in budget.seeds
     ]
-
-
-def tuned_errors(budget: Budget, store: Store) -> Array:
-    """Return errors after steps 7 to 10 with the measured columns divided by their gains."""
-    fit, _ = fit_record(budget, store, budget.seeds[0])
-    return errors({"alpha": store.read(Repeat(fit=fit))["alpha_tuned"]}, plan.TRUTH)
 
 
 def is_stable(record: Record) -> bool:
@@ -406,26 +450,25 @@ def captured_errors(budget: Budget, store: Store) -> float:
 
     Only fits that are right count.
     """
-    fits = [fit for some in plan.capture_fits(budget, Method.JOINT).values() for fit in some]
-    records = [store.read(fit) for fit in fits]
+    every = plan.capture_fits(budget, Method.JOINT).values()
+    records = [store.read(fit) for fits in every for fit in fits.values()]
     found = [errors(record, plan.TRUTH) for record in records if is_right(record, plan.TRUTH)]
     return float(np.max(np.abs(found)[:, :2])) if found else float("nan")
 
 
-def uneven_errors(budget: Budget, store: Store) -> str:
-    """Return what uneven light alone does to Table 1's procedure, in words."""
-    if budget.name != "full":
-        return ""
-    texts = []
-    for unevenness in plan.UNEVEN:
-        fit = plan.fit_of(budget, plan.uneven_source(budget, unevenness))
-        off = np.abs(errors(store.read(fit), plan.TRUTH))
-        texts.append(f"{max(off[:2]):.2f} % for {unevenness:.0%}")
-    return (
-        "Table 1's procedure, whose model is lit evenly, is off in uneven light without noise by "
-        + " and ".join(texts)
-        + "."
-    )
+def combined_nm(budget: Budget, store: Store) -> dict[tuple[float, float], float]:
+    """Return the simulator's error by missing share of the signal and by noise, nm."""
+    found = {(0.0, 0.0): simulator_nm(store, budget, budget.seeds[0])[0]}
+    for strength, change in plan.combinations(budget).items():
+        found[strength] = wavefront_error_nm(store.read(plan.change_run(budget, change)))
+    return found
+
+
+def noise_share(budget: Budget, store: Store, measurement: Measurement) -> float:
+    """Return the noise of a measured matrix of the first telescope over its signal, RMS."""
+    exact = plan.answer(budget.seeds[0]).matrix(store).astype(np.float64)
+    error = measurement.matrix(store) - exact
+    return float(np.linalg.norm(error) / np.linalg.norm(exact))
 
 
 def sensitivity_ratios(budget: Budget, store: Store) -> dict[str, tuple[float, float]]:

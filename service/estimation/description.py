@@ -18,6 +18,14 @@ EDGE_MEMORY_S, EDGE_MEMORY_OF_M = 0.25, 8.22
 """Turbulence of higher modes has forgotten itself after this on a pupil so wide, a slip has not; on
 a wider one the wind takes as much longer to cross a mode."""
 
+MIN_LEFT_OUT_MODES = 5
+LEFT_OUT_SHARE = 0.1
+"""Lowest modes of the loop that are left out where every actuator is watched: tip, tilt and their
+like, at least so many, and so many of those in the loop."""
+
+MIN_ACTUATOR_MODES = 20
+"""Modes that must be left; fewer do not tell one actuator from its neighbours."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Actuators:
@@ -93,11 +101,9 @@ def edge_watch(
     The same when nothing is known of the turbulence in the modes.
     """
     high, outer = in_loop[in_loop >= LOW_MODES], actuators.outer
-    strokes = actuators.strokes[:, high]
-    expected = np.sqrt(strokes**2 @ mode_variance_m2[high])
-    if len(high) <= LOW_MODES or expected.min() <= 0.0:
+    shapes = _shapes_in_sigma(actuators, mode_variance_m2, high)
+    if shapes is None or len(high) <= LOW_MODES:
         return None
-    shapes = strokes / expected[:, None]
     inner = shapes[~outer].T @ shapes[~outer] / np.count_nonzero(~outer)
     return EdgeWatch(
         modes=high,
@@ -105,3 +111,40 @@ def edge_watch(
         inner=inner.astype(np.float32),
         memory_s=EDGE_MEMORY_S * max(diameter_m / EDGE_MEMORY_OF_M, 1.0),
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ActuatorWatch:
+    """Positions of all actuators for a modal command, in σ of turbulence."""
+
+    modes: NDArray[np.intp]
+    """``(n_watched,)`` those of the loop that are not left out."""
+
+    shapes: NDArray[np.float32]
+    """``(n_actuators, n_watched)``."""
+
+
+def actuator_watch(
+    actuators: Actuators, mode_variance_m2: NDArray[np.float64], in_loop: NDArray[np.intp]
+) -> ActuatorWatch | None:
+    """Return the watch of the actuators in a loop of these modes; None if they are too few.
+
+    The lowest modes are left out: offsets and vibrations move them by more than turbulence does,
+    and all actuators with them.
+    """
+    high = in_loop[max(MIN_LEFT_OUT_MODES, round(LEFT_OUT_SHARE * len(in_loop))) :]
+    shapes = _shapes_in_sigma(actuators, mode_variance_m2, high)
+    if shapes is None or len(high) < MIN_ACTUATOR_MODES:
+        return None
+    return ActuatorWatch(modes=high, shapes=shapes.astype(np.float32))
+
+
+def _shapes_in_sigma(
+    actuators: Actuators, mode_variance_m2: NDArray[np.float64], modes: NDArray[np.intp]
+) -> NDArray[np.float64] | None:
+    """Return ``(n_actuators, n_modes)`` in σ of turbulence; None if it moves one not at all."""
+    strokes = actuators.strokes[:, modes]
+    expected = np.sqrt(strokes**2 @ mode_variance_m2[modes])
+    if not len(modes) or expected.min() <= 0.0:
+        return None
+    return np.asarray(strokes / expected[:, None])

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.description import Description, EdgeWatch
+from service.estimation.description import ActuatorWatch, Description, EdgeWatch
 from service.estimation.frames import FrameBlock
 from service.estimation.loop import build_loop
 from service.estimation.windows import ClosedLoop, ExpectedDither, Telemetry
@@ -83,6 +83,9 @@ class LoopContext:
 
     edge: EdgeWatch | None = None
     """Parameters for watching the outer ring; None if too few modes are controlled."""
+
+    actuators: ActuatorWatch | None = None
+    """Parameters for watching all actuators; None if too few modes are controlled."""
 
     matrices: tuple[tuple[str, NDArray[np.float32]], ...] = ()
     """Reconstructors by id, oldest first, bounded."""

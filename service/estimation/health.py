@@ -1,4 +1,4 @@
-"""Watch the loop, the mirror's edge, vibrations, and frozen slopes.
+"""Watch the loop, the mirror's edge, clipped commands, vibrations, and frozen slopes.
 
 **The loop** is watched on the commands of the highest controlled modes: a misregistered loop
 becomes unstable there first, while slopes and wavefront error look healthy almost to the end. Their
@@ -11,6 +11,13 @@ look healthy, and only the command shows the step. On the diffractive telescope 
 position of the outermost actuators stays below 2.2 times the RMS that turbulence requires in every
 stable loop. A slip takes it to 7 to 18, or leaves it at 3 for seconds while the wavefront is lost
 already (docs/results/reliability.md).
+
+**Commands that are not played** are found in telemetry that reports them as asked while the mirror
+clips them. While the mirror plays what is asked, the residual less the command is the turbulence.
+Where it does not, the integrator winds up: the commands of some actuators go far beyond all
+turbulence, for tenths of a second, and the slopes do not show it. Averaged over 0.1 s the implied
+turbulence of healthy loops stays below 4.6 times the usual one at every actuator, that of clipped
+ones reaches 9 to 27 (docs/results/faults.md).
 
 **Vibrations** are lines in the slopes; the dither avoids them.
 
@@ -28,7 +35,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.estimation.comparison import REFERENCE_PERIOD_S
-from service.estimation.description import EdgeWatch
+from service.estimation.description import ActuatorWatch, EdgeWatch
 from service.estimation.estimator import UNMARKED, Change, Detector, FrameContext, LoopContext, Mark
 from service.estimation.frames import FrameBlock
 from service.estimation.probation import MIN_HISTORY_S, MIN_PART_FRAMES, PART_S
@@ -376,6 +383,137 @@ def _update_health(
         suspect_s=suspect_s,
         slipped=slipped or (health.slipped and suspect_s > 0.0),
     )
+
+
+UNPLAYED_RATIO = 6.0
+"""Turbulence at an actuator as commands and slopes imply it, a part's mean over the usual."""
+
+STEADY_SHARE = 0.8
+"""Share of an actuator's RMS command in a part that its mean has: in a loop that diverges the
+commands swing, and their mean is small."""
+
+N_UNPLAYED_PARTS = 2
+"""Parts of the last ``UNPLAYED_MEMORY_S`` in which an actuator must be beyond."""
+
+UNPLAYED_MEMORY_S = 5.0
+
+_USUAL_S = 10.0
+"""Telemetry from which the usual turbulence is measured."""
+
+_PLAYED_STRIDE_FRAMES = 4
+"""One of so many frames is averaged."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PlayedCommands(Detector):
+    """Turbulence at every actuator, as commands and slopes imply it."""
+
+    resets = Change.GONE | Change.SESSION | Change.LOOP | Change.OPEN
+    unless = Mark.STANDS | Mark.ABSURD
+    only_closed = True
+
+    cm_id: str | None = None
+    """Matrix of the part under way."""
+
+    slopes: Array | None = None
+    """``(n_slopes,)`` sum over the sampled frames of that part; None: it has none."""
+
+    commands_m: tuple[Array, ...] = ()
+    """``(n, n_watched)`` each: the commands of these frames."""
+
+    n_frames: int = 0
+    """All frames of that part."""
+
+    turbulence: Array | None = None
+    """``(n_parts, n_actuators)`` in σ of the expected turbulence, oldest first, bounded."""
+
+    beyond: tuple[tuple[float, frozenset[int]], ...] = ()
+    """Largest ratio, and the actuators beyond the limit, of each of the last parts."""
+
+    unplayed: bool = False
+
+    @override
+    def update(self, frames: FrameContext) -> PlayedCommands:
+        """Return it after one more block."""
+        watch, terms = frames.loop.actuators, frames.terms
+        if watch is None or terms is None:
+            return self
+        return observe_played(self, frames.block, watch, terms.reconstructor)
+
+    @property
+    @override
+    def conditions(self) -> tuple[str | None, ...]:
+        """Text of the alarm for commands that the slopes do not answer."""
+        if not self.unplayed:
+            return (None,)
+        ratio, _ = max(self.beyond, key=lambda part: part[0])
+        actuators = sorted(set().union(*(part[1] for part in self.beyond)))
+        some = ", ".join(map(str, actuators[:4])) + (", ..." if len(actuators) > 4 else "")
+        return (
+            f"commands and slopes part: {len(actuators)} actuators ({some}) are commanded up to "
+            f"{ratio:.0f} times what turbulence needs, and the slopes do not show it. The mirror "
+            "clips commands that the telemetry reports as asked, or the sensor saturates: report "
+            "the commands that the mirror plays, offload, lower the gain or control fewer modes",
+        )
+
+
+def observe_played(
+    state: PlayedCommands,
+    block: FrameBlock,
+    watch: ActuatorWatch,
+    reconstructor: NDArray[np.float32],
+) -> PlayedCommands:
+    """Return the state after one more block of a loop closed by ``(n_modes, n_slopes)``."""
+    if block.cm_id != state.cm_id:
+        state = replace(state, cm_id=block.cm_id, slopes=None, commands_m=(), n_frames=0)
+    start, n_part = 0, max(round(PART_S * 1e9 / block.dt_ns), MIN_PART_FRAMES)
+    while start < block.n_frames:
+        stop = min(start + n_part - state.n_frames, block.n_frames)
+        rows = slice(start, stop, _PLAYED_STRIDE_FRAMES)
+        total = block.slopes[rows].sum(axis=0)
+        state = replace(
+            state,
+            slopes=total if state.slopes is None else state.slopes + total,
+            commands_m=(*state.commands_m, block.commands_m[rows, watch.modes]),
+            n_frames=state.n_frames + stop - start,
+        )
+        start = stop
+        if state.n_frames >= n_part:
+            state = _close_played(state, watch, reconstructor, n_part * block.dt_ns * 1e-9)
+    return state
+
+
+def _close_played(
+    state: PlayedCommands, watch: ActuatorWatch, reconstructor: NDArray[np.float32], part_s: float
+) -> PlayedCommands:
+    """Return the state after a complete part."""
+    commands = np.concatenate(state.commands_m)
+    mean = commands.mean(axis=0)
+    slopes = np.asarray(state.slopes) / np.float32(len(commands))
+    residual = (reconstructor @ slopes)[watch.modes]
+    implied = watch.shapes @ (residual - mean)
+    known = implied[None] if state.turbulence is None else np.vstack([state.turbulence, implied])
+    known = known[-max(round(_USUAL_S / part_s), 1) :]
+    state = replace(state, turbulence=known, slopes=None, commands_m=(), n_frames=0)
+    if len(known) * part_s < MIN_HISTORY_S:
+        return state
+    # a gust moves all actuators of a part, a clipped command moves few of them far
+    usual = max(_sigma(known), _sigma(implied))
+    ratio = np.abs(implied) / max(usual, 1e-12)
+    far = np.flatnonzero(ratio > UNPLAYED_RATIO)
+    moved = watch.shapes[far] @ commands.T
+    steady = np.abs(moved.mean(axis=1)) > STEADY_SHARE * np.sqrt(np.mean(moved**2, axis=1))
+    far = far[steady]
+    part = (float(ratio[far].max()) if len(far) else 0.0, frozenset(far.tolist()))
+    beyond = (*state.beyond, part)[-max(round(UNPLAYED_MEMORY_S / part_s), 1) :]
+    n_beyond = sum(bool(actuators) for _, actuators in beyond)
+    unplayed = n_beyond >= (1 if state.unplayed else N_UNPLAYED_PARTS)
+    return replace(state, beyond=beyond, unplayed=unplayed)
+
+
+def _sigma(values: Array) -> float:
+    """Return 1 σ of values around zero by their median, which a few far ones do not change."""
+    return float(np.median(np.abs(values))) / 0.6745
 
 
 SEGMENT_FRAMES = 1024

@@ -72,7 +72,8 @@ class Columns:
         """
         matrix = np.asarray(model[self.rows], dtype=np.float64)
         measured = self.matrix[self.rows]
-        power = np.sum(matrix**2, axis=0)
+        # a mode that a far registration moves off the pupil changes no slope: its gain is 0
+        power = np.maximum(np.sum(matrix**2, axis=0), np.finfo(float).tiny)
         gains = np.sum(matrix * measured, axis=0) / power
         if not self.signed:
             gains = np.maximum(gains, 0.0)

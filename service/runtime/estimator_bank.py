@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.estimation import estimator
-from service.estimation.description import Description, edge_watch
+from service.estimation.description import Description, actuator_watch, edge_watch
 from service.estimation.dither_windows import Window
 from service.estimation.estimator import Change, FrameContext, LoopContext, Mark, Streaming
 from service.estimation.frames import FrameBlock
@@ -74,7 +74,7 @@ def with_rtc(bank: EstimatorBank, rtc: Status | None) -> EstimatorBank:
     if rtc is None:
         if before is None:
             return bank
-        loop = replace(bank.loop, rtc=None, dither=None, edge=None, cm_id=None)
+        loop = replace(bank.loop, rtc=None, dither=None, edge=None, actuators=None, cm_id=None)
         return replace(_reset_members(bank, loop, Change.GONE), begun_with=None, dither=None)
     changes = estimator.NOTHING if rtc is before else _changes(bank, before, rtc)
     loop = replace(bank.loop, rtc=rtc)
@@ -113,13 +113,14 @@ def _of_modes(loop: LoopContext, rtc: Status) -> LoopContext:
     in_loop = np.array(rtc.in_loop, dtype=np.intp)
     # an RTC of another instrument may have more
     in_loop = in_loop[in_loop < known.n_modes]
-    edge = None
+    edge = watch = None
     if rtc.in_loop and known.actuators is not None:
         edge = edge_watch(known.actuators, known.mode_variance_m2, in_loop, known.diameter_m)
+        watch = actuator_watch(known.actuators, known.mode_variance_m2, in_loop)
     if dither is not None:
         dither = replace(dither, own=tuple(mode not in rtc.in_loop for mode in dither.modes))
     still = np.setdiff1d(np.arange(rtc.n_controlled), in_loop)
-    return replace(loop, in_loop=in_loop, still=still, edge=edge, dither=dither)
+    return replace(loop, in_loop=in_loop, still=still, edge=edge, actuators=watch, dither=dither)
 
 
 def _reset_members(bank: EstimatorBank, loop: LoopContext, changes: Change) -> EstimatorBank:

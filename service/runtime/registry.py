@@ -13,7 +13,13 @@ from service.estimation.control_law import ControlLawCheck
 from service.estimation.dither_monitor import MAX_AMPLITUDE_RATIO, DitherMeasurement, DitherWatch
 from service.estimation.dither_windows import DitherWindows
 from service.estimation.estimator import Detector, LoopContext, Streaming
-from service.estimation.health import EdgeHealth, LoopHealth, Standstill, VibrationMonitor
+from service.estimation.health import (
+    EdgeHealth,
+    LoopHealth,
+    PlayedCommands,
+    Standstill,
+    VibrationMonitor,
+)
 from service.estimation.loopcheck import LoopCheck
 from service.estimation.passive import Passive
 from service.estimation.probation import Comparison
@@ -136,6 +142,7 @@ REGISTRY: Final = (
     ),
     Entry(ControlLawCheck, {alarms.WRONG_LOOP: "the loop follows its status again"}),
     Entry(EdgeHealth, {alarms.EDGE_SLIP: "the outer ring is back"}),
+    Entry(PlayedCommands, {alarms.NOT_PLAYED: "the slopes answer the commands again"}),
     Entry(LoopCheck, {alarms.OFF_LOOP: "commands obey the loop equation again"}),
     Entry(Rejection, events=_held),
     Entry(Comparison, events=_report_comparison),

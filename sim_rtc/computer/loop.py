@@ -77,6 +77,15 @@ class LoopBlock:
     n_clipped: int = 0
     """Commands that met a limit of the mirror."""
 
+    asked_m: Array32 | None = None
+    """``(n_frames, n_modes)`` commands before any limit; None if those played are reported."""
+
+    def reported(self) -> LoopBlock:
+        """Return the block with the commands that the telemetry holds."""
+        if self.asked_m is not None:
+            self.commands_m, self.asked_m = self.asked_m, None
+        return self
+
     @classmethod
     def of(
         cls, slopes: Array32, dither_m: Array32 | None, played_m: Array32 | None, n_modes: int
@@ -100,11 +109,18 @@ class ModalLoop:
         delay_frames: int,
         stroke_m: float,
         drive: MirrorDrive | None = None,
+        reports_asked: bool = False,
     ) -> None:
-        """Take a drive for a mirror with limits or a lag; without one it obeys at once."""
+        """Take a drive for a mirror with limits or a lag; without one it obeys at once.
+
+        ``reports_asked`` reports commands as they are before any limit, which the slopes do not
+        show.
+        """
+        self._reports_asked = reports_asked
         self._stroke_m = np.float32(stroke_m)
         self._drive = drive
         self._decided = np.zeros((delay_frames, n_modes), dtype=np.float32)
+        self._asked = np.zeros_like(self._decided)
         self._integrator = np.empty((0, n_modes), dtype=np.float32)
         """Commands of the block under way, kept from block to block for its memory."""
 
@@ -114,11 +130,11 @@ class ModalLoop:
 
     def reset(self) -> None:
         """Forget everything: the integrator starts from zero."""
-        self._decided[:] = 0.0
+        self._decided[:] = self._asked[:] = 0.0
 
     def release(self, n_controlled: int) -> None:
         """Zero the modes from ``n_controlled`` on: nothing would correct them any more."""
-        self._decided[:, n_controlled:] = 0.0
+        self._decided[:, n_controlled:] = self._asked[:, n_controlled:] = 0.0
 
     def run(
         self,
@@ -153,7 +169,7 @@ class ModalLoop:
         self._integrate(estimate, terms, block)
         block.slopes = block.commands_m[:, :moved] @ matrix[:, :moved].T
         block.slopes += open_slopes
-        return block
+        return block.reported()
 
     def _count_movable_modes(self, added_m: Array32 | None, n_controlled: int) -> int:
         """Return how many of the first modes may move: nothing corrects those beyond the loop."""
@@ -182,7 +198,7 @@ class ModalLoop:
 
         block = LoopBlock.of(slopes, dither_m, played_m, self._decided.shape[1])
         self._integrate(estimate, terms, block)
-        return block
+        return block.reported()
 
     def _integrate(
         self,
@@ -205,7 +221,7 @@ class ModalLoop:
         leak, stroke = np.array(terms.leak, dtype=np.float32), np.array(self._stroke_m)
         least = -stroke
         n_controlled = len(terms.gains)
-        n_limited = 0
+        n_limited, asked = 0, self._begin_asked(block)
         for first in range(0, n_frames, delay):
             commands = applied[first : first + delay]
             commands += integrator[first : first + len(commands)]
@@ -222,10 +238,29 @@ class ModalLoop:
                 decided = integrator[k]
                 np.multiply(integrator[k - 1], leak, out=decided)
                 decided[:n_controlled] -= correction
+                asked[k : k + 1] = decided
                 np.minimum(decided, stroke, out=decided)
                 np.maximum(decided, least, out=decided)
         self._decided[:] = integrator[n_frames:]
+        self._end_asked(block, asked)
         block.n_clipped = n_limited + int(np.count_nonzero(np.abs(applied) >= stroke))
+
+    def _begin_asked(self, block: LoopBlock) -> Array32:
+        """Return ``(n_frames + delay, n_modes)`` for the integrator before its limit."""
+        n_frames, n_modes = block.commands_m.shape
+        if not self._reports_asked:
+            return np.empty((0, n_modes), dtype=np.float32)
+        block.asked_m = block.commands_m.copy()
+        asked = np.empty((n_frames + len(self._asked), n_modes), dtype=np.float32)
+        asked[: len(self._asked)] = self._asked
+        return asked
+
+    def _end_asked(self, block: LoopBlock, asked: Array32) -> None:
+        """Add the integrator before its limit to what is reported, and keep what is to come."""
+        if block.asked_m is not None:
+            n_frames = len(block.asked_m)
+            block.asked_m += asked[:n_frames]
+            self._asked[:] = asked[n_frames:]
 
     def _follow(self, drive: MirrorDrive, first: int, block: LoopBlock) -> int:
         """Let the drive make what it can of the next commands; count its limits."""

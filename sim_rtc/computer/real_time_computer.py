@@ -70,6 +70,7 @@ class RealTimeComputer:
         optics: Optics,
         stroke_m: float,
         drive: MirrorDrive | None = None,
+        reports_asked: bool = False,
         mode_to_actuator: NDArray[np.float64] | None = None,
         move: Callable[[NDArray[np.float64]], float] | None = None,
     ) -> None:
@@ -83,6 +84,7 @@ class RealTimeComputer:
             delay_frames=settings.delay_frames,
             stroke_m=stroke_m,
             drive=drive,
+            reports_asked=reports_asked,
         )
         self._lock = threading.Lock()
         self._session = new_session()

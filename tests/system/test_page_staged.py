@@ -110,6 +110,20 @@ def test_it_is_under_the_header_on_every_view_and_nobody_is_kept_out(page, view)
     assert page.faults_of_access() == []
 
 
+def test_below_a_critical_alarm_no_card_grows_with_its_own_chart(page):
+    page.service.calm()
+    page.resize(LAPTOP)
+    page.turn("history")
+    page.service.alarm("slopes-stand", "found")
+    page.says("#critical h2", "slopes-stand")
+    page.turn("operate")
+    heights = []
+    for _ in range(8):
+        heights.append(page.js("document.querySelector('#registration').offsetHeight"))
+        time.sleep(1.0)
+    assert len(set(heights[2:])) == 1, heights
+
+
 def test_once_somebody_knows_it_gives_way_but_stays(page):
     page.service.alarm("loop-diverging", "found")
     page.until("document.querySelector('#critical').checkVisibility()")

@@ -16,6 +16,7 @@ from service.archive.nights import TrendSample
 from service.model.misregistration import Misregistration
 from service.tracking.registration import HistoryEntry
 from tests.system.night import INSTRUMENT
+from tests.unit.test_archive import MATRIX, record_of
 
 SECOND = 1_000_000_000
 EVENING = 1_800_000_000 * SECOND
@@ -208,6 +209,13 @@ def test_a_disturbance_can_be_cut_off(commissioned):
 def test_what_cannot_be_judged_is_refused(commissioned, words):
     status, criteria, page = commissioned(*words)
     assert (status, criteria, page) == (2, [], "")
+
+
+def test_an_archive_of_another_instrument_is_refused(commissioned, tmp_path):
+    with Archive(tmp_path / "data") as archive:
+        archive.open()
+        archive.reconstructors.store(record_of(), MATRIX, None, {"instrument": "another"})
+    assert commissioned() == (2, [], "")
 
 
 def test_the_required_checks_are_the_checkers_own():

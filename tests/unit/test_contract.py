@@ -33,7 +33,11 @@ TESTS = {
         f"{COMPUTER}/test_reconstructors.py",
         "test_a_new_session_voids_what_is_not_applied",
     ),
-    34: (SIMULATED, "test_a_sine_dither_appears_as_announced_and_stays_out_of_the_integrator"),
+    34: (f"{COMPUTER}/test_loop.py", "test_the_dither_is_applied_but_never_integrated"),
+    44: (
+        f"{COMPUTER}/test_real_time_computer.py",
+        "test_a_command_is_carried_out_once_for_ten_minutes",
+    ),
     46: (
         "unit/rtc/test_basic_computer.py",
         "test_a_dither_is_played_from_its_first_frame_whatever_the_batch",
@@ -44,6 +48,19 @@ TESTS = {
     ),
     48: (SIMULATED, "test_a_second_dither_is_refused_until_the_first_is_stopped"),
     53: (SIMULATED, "test_more_modes_take_effect_with_the_next_matrix_of_that_shape"),
+    55: (
+        f"{COMPUTER}/test_gains_loop.py",
+        "test_while_one_runs_another_is_refused_and_so_is_what_would_spoil_it",
+    ),
+    60: (
+        f"{COMPUTER}/test_gains_loop.py",
+        "test_opening_the_loop_ends_it_with_what_is_chosen_and_what_was_there",
+    ),
+    64: (
+        f"{COMPUTER}/test_real_time_computer.py",
+        "test_the_image_is_moved_by_who_can_and_refused_by_who_cannot",
+    ),
+    73: (f"{COMPUTER}/test_real_time_computer.py", "test_modes_that_are_given_up_go_to_zero"),
     77: ("unit/test_wire.py", "test_a_measured_manifest_names_its_columns_or_why_there_are_none"),
     78: ("unit/test_signing.py", "test_each_side_takes_what_the_other_signs"),
     80: ("unit/test_signing.py", "test_an_order_of_before_the_rtcs_restart_is_refused"),

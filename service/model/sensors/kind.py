@@ -333,6 +333,18 @@ class SensorKind(ABC):
         """
         return None
 
+    def turned_edge_sigma(
+        self, instrument: Instrument, displaced_subap: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return 1 σ of α ``(4,)`` from the turned edges of what displaces the pupil images.
+
+        ``displaced_subap`` ``(4, 2)`` is added to what the instrument file states. Numeric units; 0
+        for a sensor with one image.
+        """
+        import numpy as np
+
+        return np.zeros(4)
+
     def offsets_px(
         self, instrument: Instrument, offsets: NDArray[np.float64]
     ) -> NDArray[np.float64]:

@@ -135,12 +135,6 @@ def test_the_move_told_of_half_the_modes_is_that_of_a_fit_of_them(half):
     assert np.all(np.abs(told.moved - moved) < 0.5 * alone.sigma)
 
 
-def test_a_wavelength_moves_nothing():
-    told = named(clean(), "wavelength_m")
-    assert np.all(np.abs(told.moved) < 0.01 * clean().sigma)
-    assert told.share == pytest.approx(1.0, abs=1e-3)
-
-
 def test_another_modulation_is_worse_and_would_move_it_by_sigmas():
     told = named(clean(), "modulation_lambda_over_d = 3.3")
     assert told.share > 2.0

@@ -1,9 +1,14 @@
 """Displacements of pupil images that no pyramid has leave the registration uncertain."""
 
+import os
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 import pyrcal.fitting.alternatives as alternatives
+from pyrcal_studies.benches import coarse_bench, fit_bench, some_columns
 from tests.unit.estimation.bench import ELSEWHERE, fit, matrix
 
 
@@ -25,3 +30,23 @@ def test_images_displaced_beyond_belief_are_tried_in_their_places(monkeypatch):
     # the true images are in their places: nothing is lost and hardly anything moves
     assert one.share == pytest.approx(1.0, abs=0.05)
     assert np.all(np.abs(one.moved) < 0.01)
+
+
+BENCHES = Path(os.environ.get("PYRCAL_BENCH_DATA", "../shared/data"))
+
+
+@pytest.mark.long
+@pytest.mark.timeout(900)
+@pytest.mark.skipif(not (BENCHES / "ao188").is_dir(), reason="no measured matrices here")
+def test_images_of_a_real_bench_stay_where_their_light_is_with_a_wrong_obscuration():
+    """A third of the signal is left over: images once moved by 2 pixels, and α by 12.9 sigma."""
+    pytest.importorskip("astropy")
+    bench = coarse_bench("ao188")
+    stated = "obscuration_ratio = 0.30"
+    assert stated in bench.instrument
+    wrong = replace(bench, instrument=bench.instrument.replace(stated, "obscuration_ratio = 0.40"))
+    columns = some_columns("ao188")
+    right, other = (fit_bench(one, BENCHES, columns) for one in (bench, wrong))
+    assert right.accepted
+    assert np.abs(other.image_offsets_px).max() < 0.3  # what real pyramids have at most
+    assert np.all(np.abs(other.alpha.vector - right.alpha.vector) < 3.0 * other.sigma)

@@ -6,6 +6,7 @@ it has moved by 0.25 of one, 20 Zernike modes, and what pyRTC 2.1 saved of rando
 
 import contextlib
 import re
+import shutil
 import warnings
 from dataclasses import replace
 
@@ -502,6 +503,20 @@ def test_one_of_four_loops_is_chosen_and_a_mirror_without_places_given_some(
     assert main([*words, "--loop", "3", "--output", str(tmp_path / "other")]) == 2
     assert "--positions FILE" in capsys.readouterr().err
     assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.parametrize("width", [None, "x", 0, -1, True, 1e30, 1])
+def test_speculas_pixels_are_counted_with_the_width_of_its_image(width, tmp_path):
+    """One pixel of width would make hundreds of rows of subapertures."""
+    pup = tmp_path / "pup.fits"
+    shutil.copy(SPECULA[1], pup)
+    with fits.open(pup, mode="update") as units:
+        if width is None:
+            units[0].header.remove("FSIZEY")
+        else:
+            units[0].header["FSIZEY"] = width
+    with pytest.raises(MatrixError, match="fsizey"):
+        from_specula([SPECULA[0], pup, SPECULA[2]], REPORTED)
 
 
 def test_a_matrix_goes_back_into_speculas_own_files(tmp_path):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pyrcal.fitting.noise import measure_structure, noise_sigma
+from pyrcal.fitting.noise import bound_noise_share, measure_structure, noise_sigma
 
 RNG = np.random.default_rng(4)
 
@@ -39,3 +39,17 @@ def test_noise_that_was_measured_does_not_count_either():
     wrong = 0.2 * low_rank((600, 200), 10)
     assert measure_structure(wrong, power, None) == pytest.approx(0.2, abs=0.02)
     assert measure_structure(wrong, power, noise) < 0.06
+
+
+def test_what_is_left_over_where_a_response_is_expected_is_no_noise():
+    """Each of 100 actuators answers in its own tenth of the slopes: an error of full rank."""
+    place = np.arange(200)[:, None] / 2.0 - np.arange(100)
+    response = np.exp(-0.5 * (place / 5.0) ** 2)
+    wrong = 0.1 * response * RNG.normal(size=response.shape)
+    assert bound_noise_share(wrong, response) < 0.01
+    noise = 0.1 * RNG.normal(size=response.shape)
+    assert bound_noise_share(noise, response) == pytest.approx(1.0, abs=0.05)
+    # half of the power is noise
+    noise *= np.linalg.norm(wrong) / np.linalg.norm(noise)
+    assert bound_noise_share(wrong + noise, response) == pytest.approx(0.5, abs=0.05)
+    assert bound_noise_share(np.zeros_like(response), response) == 0.0

@@ -8,6 +8,7 @@ import pytest
 
 import pyrcal
 from pyrcal.__main__ import main
+from pyrcal_studies.campaign.observatory_dome import Dome
 from pyrcal_studies.campaign.small import SMALL
 from pyrcal_studies.campaign.telemetry import LINE_FRACTIONS
 from service.instrument import load_instrument
@@ -131,6 +132,30 @@ def test_hdf5_says_the_same_as_npz(telemetry, tmp_path, capsys):
     _, other, _ = tracked(capsys, saved(tmp_path, telemetry))
     assert one["entries"] == other["entries"]
     assert one["entries"]
+
+
+def test_commands_as_asked_that_the_mirror_clipped_are_named(tmp_path, capsys):
+    words = [f"--instrument={SMALL}", f"--n-controlled={N_CONTROLLED}", "--seed=3", "--mag=8"]
+    limits = ("--rate=500", "--actuator-stroke=1.2", "--actuator-bend=100", "--report-asked")
+    dome = Dome([*words, "--seeing=0.8", *limits])
+    blocks = [block for _ in range(40) for block in dome.play()]
+    settings = dome.telescope.settings
+    path = saved(
+        tmp_path,
+        {
+            "slopes": np.concatenate([block.slopes for block in blocks]),
+            "commands_m": np.concatenate([block.commands_m for block in blocks]),
+            "reconstructor": dome.telescope.reconstructor.matrix,
+            "gains": np.array(settings.gains),
+            "frame_rate_hz": np.array(500.0),
+            "delay_frames": np.array(settings.delay_frames),
+            "leak": np.array(settings.leak),
+        },
+    )
+    _, found, _ = tracked(capsys, path)
+    assert "commands-not-played" in {alarm["name"] for alarm in found["alarms"]}
+    # the integrator obeys its law, so that the check of the law finds nothing
+    assert "commands-off-loop" not in {alarm["name"] for alarm in found["alarms"]}
 
 
 def test_without_a_dither_it_says_what_ordinary_telemetry_says(telemetry, tmp_path, capsys):

@@ -4,6 +4,7 @@ import re
 
 import pytest
 
+from pyrcal_studies.result_figures import read_table, write_figures
 from pyrcal_studies.sections import RESULTS, write_section
 
 
@@ -31,3 +32,12 @@ def test_the_pages_have_the_sections_of_the_benchmarks():
     found = {page.name: marks.findall(page.read_text("utf-8")) for page in RESULTS.glob("*.md")}
     assert found["speed.md"] == ["bench"]
     assert found["link.md"] == ["soak", "load"]
+
+
+def test_figures_are_drawn_from_the_tables_of_the_pages(tmp_path):
+    write_figures(tmp_path)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"faults.png", "elt.png", "shack_hartmann.png"}
+    assert all((RESULTS / name).is_file() for name in names)
+    with pytest.raises(ValueError, match="no table"):
+        read_table("speed.md", "No such section")

@@ -210,6 +210,14 @@ class PyramidKind(SensorKind):
         return image_floor(instrument)
 
     @override
+    def turned_edge_sigma(
+        self, instrument: Instrument, displaced_subap: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        from service.model.sensors.pyramid.description import turned_edge_sigma
+
+        return turned_edge_sigma(instrument, displaced_subap)
+
+    @override
     def displace_images(self, instrument: Instrument, offsets: NDArray[np.float64]) -> Pyramid:
         from service.model.sensors.pyramid.description import displace_pyramid
 

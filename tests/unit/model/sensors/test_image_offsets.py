@@ -14,6 +14,8 @@ from service.model.interaction import InteractionModel
 from service.model.kinds import Normalisation, SlopeOrder, Stop
 from service.model.misregistration import Misregistration
 from service.model.sensors.pyramid.description import (
+    EDGE_SHIFT,
+    EDGE_TURN,
     displace_pyramid,
     image_offsets,
     orient_offsets,
@@ -112,8 +114,23 @@ def test_unknown_places_widen_the_floor_and_known_ones_do_not():
     assert kind.image_sigma_subap(told) is None
 
 
+def test_turned_edges_widen_shift_and_rotation_by_the_square_of_the_displacement():
+    about = small_instrument()
+    kind, separation = kind_of(about), about.wfs.image_separation_subap
+    sheared = np.array([[0.1, 0.2], [0.1, -0.2], [-0.1, -0.2], [-0.1, 0.2]])
+    found = kind.turned_edge_sigma(about, sheared + np.array([0.3, 0.4]))
+    shift = EDGE_SHIFT * 0.025 / separation
+    turn = EDGE_TURN * shift / (about.wfs.pupil_diameter / 2.0)
+    np.testing.assert_allclose(found, [shift, shift, turn, 0.0])
+    stated = replace(about, wfs=displace_pyramid(about, sheared.T.ravel()))
+    np.testing.assert_allclose(kind.turned_edge_sigma(stated, np.zeros((4, 2))), found)
+    np.testing.assert_allclose(kind.turned_edge_sigma(stated, sheared), 4.0 * found)
+
+
 def test_a_sensor_of_one_image_has_none_to_be_moved():
     from service.model.sensors.shack_hartmann.kind import ShackHartmannKind
 
     with pytest.raises(ModelError):
         ShackHartmannKind().displace_images(small_instrument(), np.zeros(8))
+    edges = ShackHartmannKind().turned_edge_sigma(small_instrument(), np.ones((4, 2)))
+    assert not edges.any()

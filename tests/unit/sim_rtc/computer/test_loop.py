@@ -77,6 +77,22 @@ def test_a_clipped_loop_recovers():
     assert abs(commands[399, 0]) < 1e-9
 
 
+def test_commands_as_asked_go_beyond_the_stroke_and_the_slopes_do_not():
+    """The loop is the same; only what is reported differs."""
+    chosen, wavefront = terms(0.4), np.zeros((300, N_MODES))
+    wavefront[:, 0] = 50e-6
+    loops = [
+        ModalLoop(n_modes=N_MODES, delay_frames=2, stroke_m=STROKE_M, reports_asked=asked)
+        for asked in (False, True)
+    ]
+    (slopes, played, _), (same, asked, _) = (run(loop, wavefront, chosen) for loop in loops)
+    np.testing.assert_array_equal(slopes, same)
+    # what it holds, less what the integrator adds in each frame: 0.4 of the 40 um that are left
+    assert asked[-1, 0] == pytest.approx(-STROKE_M - 0.4 * 40e-6, rel=1e-4)
+    assert played[-1, 0] == pytest.approx(-STROKE_M)
+    np.testing.assert_array_equal(np.clip(asked, -STROKE_M, STROKE_M), played)
+
+
 def test_the_result_does_not_depend_on_the_block_length():
     wavefront = 1e-7 * np.random.default_rng(2).standard_normal((120, N_MODES))
     results = [

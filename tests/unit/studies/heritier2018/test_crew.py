@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pyrcal_studies.heritier2018.crew import carry_out
+from pyrcal_studies.heritier2018.crew import carry_out, processor_minutes
 from pyrcal_studies.heritier2018.store import Record, Store, Task
 
 DONE: list[str] = []
@@ -52,6 +53,20 @@ def test_every_step_is_done_once_and_after_those_it_needs(tmp_path: Path) -> Non
     run(tops, tmp_path)
     assert DONE[0] == "base"
     assert sorted(DONE) == sorted(["base", *(top.name for top in tops)])
+
+
+def test_the_processor_time_of_every_step_is_kept(tmp_path: Path) -> None:
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Busy(Step):
+        def compute(self, store: Store) -> Record:
+            end = time.process_time() + 0.05
+            while time.process_time() < end:
+                pass
+            return {"x": np.zeros(1)}
+
+    steps = (Busy(name="one"), Busy(name="two"))
+    run(steps, tmp_path)
+    assert 0.09 / 60.0 < processor_minutes(steps, Store(tmp_path)) < 5.0 / 60.0
 
 
 def test_a_second_run_does_only_what_the_first_did_not_get_to(tmp_path: Path) -> None:

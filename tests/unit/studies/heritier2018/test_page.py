@@ -11,26 +11,51 @@ from pyrcal_studies.heritier2018.markdown import listed, table
 from tests.unit.studies.heritier2018.test_paper import PAGE, ROOT
 
 
-def main_table() -> list[list[str]]:
-    """Return the cells of the table of equations, tables, figures and claims."""
+def main_rows() -> list[list[str]]:
+    """Return the cells of the rows of figures, equations, tables and claims."""
     text = PAGE.read_text(encoding="utf-8")
     rows = [
-        line for line in text.splitlines() if re.match(r"\| (Equation|Table|Figure|Sect)", line)
+        line for line in text.splitlines() if re.match(r"\| (Equation|Table|\[Figure|Sect)", line)
     ]
     return [[cell.strip() for cell in row.strip("| ").split(" | ")] for row in rows]
 
 
 def test_every_equation_table_and_figure_has_a_row():
-    first = {cells[0] for cells in main_table()}
+    first = {re.sub(r"\[(Figure \d+)\].*", r"\1", cells[0]) for cells in main_rows()}
     for kind, numbers in (("Equation", range(1, 11)), ("Figure", range(1, 15))):
         assert {f"{kind} {number}" for number in numbers} <= first
     assert {"Table 1", "Table 2, PSIM 400 Modes", "Table 2, LBT 400 Modes"} <= first
 
 
-def test_every_file_that_the_table_names_exists():
-    named = [name for cells in main_table() for name in re.findall(r"`([\w/.-]+\.\w+)`", cells[2])]
-    assert len(named) >= 30
+def test_every_row_of_an_equation_table_or_claim_names_a_file():
+    rows = [cells for cells in main_rows() if not cells[0].startswith("[")]
+    assert len(rows) >= 25
+    for cells in rows:
+        assert re.fullmatch(r"`[\w/.-]+\.\w+`", cells[2]), cells
+
+
+def test_every_file_that_the_page_names_exists():
+    text = PAGE.read_text(encoding="utf-8")
+    named = re.findall(r"`([\w-]+/[\w/.-]+\.\w+)`", text)
+    linked = [name for name, _ in re.findall(r"\]\(([\w/.-]+\.\w+)(#[\w-]+)?\)", text)]
+    assert len(named) >= 25
+    assert len(linked) >= 15
     assert [name for name in named if not (ROOT / name).is_file()] == []
+    assert [name for name in linked if not (PAGE.parent / name).is_file()] == []
+
+
+def test_every_link_within_the_page_leads_to_a_heading():
+    text = PAGE.read_text(encoding="utf-8")
+    headings = {
+        captions.heading_anchor(title) for title in re.findall(r"^##+ (.*)$", text, re.MULTILINE)
+    }
+    links = re.findall(r"\]\(#([\w-]+)\)", text)
+    assert len(links) >= 15
+    assert [link for link in links if link not in headings] == []
+
+
+def test_the_page_is_short():
+    assert len(PAGE.read_text(encoding="utf-8").split()) <= 3500
 
 
 def test_twelve_figures_are_on_the_page_and_small_enough():

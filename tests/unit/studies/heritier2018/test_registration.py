@@ -1,10 +1,22 @@
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from pyrcal_studies.heritier2018.plan import FULL, TRUTH, capture_fits, joint_fit
-from pyrcal_studies.heritier2018.registration import errors, fitted_alpha, is_right, random_starts
+from pyrcal_studies.heritier2018.plan import FULL, TRUTH, capture_fits, telescope_sources
+from pyrcal_studies.heritier2018.reconstructors import synthetic_matrix
+from pyrcal_studies.heritier2018.registration import (
+    CriterionMinimum,
+    errors,
+    fitted_alpha,
+    is_right,
+    random_starts,
+)
+from pyrcal_studies.heritier2018.store import Store
+from service.estimation.reference import Reference
 from service.model.kinds import Method
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 
@@ -40,8 +52,45 @@ def test_starts_are_corners_of_the_papers_rough_estimate() -> None:
     assert len(np.unique(np.sign(off), axis=0)) == 16
 
 
-def test_both_methods_begin_at_the_same_starts_and_with_the_same_matrix() -> None:
+def test_both_methods_begin_at_the_same_starts_and_with_the_same_matrices() -> None:
     joint, scans = (capture_fits(FULL, method) for method in (Method.JOINT, Method.PAPER))
+    assert len(telescope_sources(FULL)) == 6
     for distance, fits in joint.items():
-        assert [fit.start for fit in fits] == [fit.start for fit in scans[distance]]
-        assert {fit.source for fit in (*fits, *scans[distance])} == {joint_fit(FULL, 1).source}
+        for name, fit in fits.items():
+            assert fit.start == scans[distance][name].start
+            assert fit.source == scans[distance][name].source == telescope_sources(FULL)[name]
+
+
+SAID = Misregistration(shift_x_subap=0.1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelMatrix:
+    """A matrix of the model at a registration a small step away from the one it is said to have."""
+
+    step: tuple[float, float, float, float]
+    gain: float
+    n_modes: int = 24
+    alpha: Misregistration = SAID
+    parts: tuple[()] = ()
+
+    def reference(self, store: Store) -> Reference:
+        moved = Misregistration.from_vector(self.alpha.vector + np.array(self.step))
+        gains = np.linspace(1.0, self.gain, self.n_modes)
+        return Reference(matrix=synthetic_matrix(moved)[:, : self.n_modes] * gains)
+
+
+@pytest.mark.usefixtures("small_telescope")
+@pytest.mark.parametrize(("gain", "name"), [(1.0, "alpha"), (0.95, "alpha_gains")])
+def test_the_minimum_of_the_criterion_moves_with_the_registration(
+    tmp_path: Path, gain: float, name: str
+) -> None:
+    step = np.array([2e-3, -1e-3, 2e-4, 1e-4])
+    found = []
+    for sign in (1.0, -1.0):
+        source = ModelMatrix(step=tuple(sign * step), gain=gain)
+        record = CriterionMinimum(source=source).compute(Store(tmp_path))  # type: ignore[arg-type]
+        found.append(fitted_alpha({"alpha": record[name]}).vector)
+    # the difference is free of what the two samplings of the pupil differ by
+    # and the step of a column with a gain is counted with that gain
+    assert (found[0] - found[1]) / 2.0 == pytest.approx(step, rel=0.01 + (1.0 - gain))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pyrcal_studies.heritier2018 import plan, results
-from pyrcal_studies.heritier2018.illumination import Change, Feature, missing
+from pyrcal_studies.heritier2018.illumination import Change, Feature, image_offsets, missing
 from pyrcal_studies.heritier2018.patterns import registration_by_set, sensitivities
 from pyrcal_studies.heritier2018.poles import largest_pole, limit_of_stability
 from pyrcal_studies.heritier2018.registration import ROUGH_ESTIMATE
@@ -83,6 +83,12 @@ def test_signal_is_missing_where_figure_10_shows_it_missing():
         assert 0.0 <= places[feature].min() < places[feature].max() <= 1.0
         assert np.all(places[Feature.ALL] >= places[feature])
     assert Change().feature is Feature.NONE
+
+
+def test_displaced_pupil_images_have_no_common_displacement():
+    offsets = image_offsets(0.25, np.random.default_rng(1)).reshape(2, 4)
+    assert offsets.mean(axis=1) == pytest.approx([0.0, 0.0])
+    assert np.sqrt(np.mean(offsets**2)) == pytest.approx(0.25)
 
 
 @pytest.mark.usefixtures("small_telescope")

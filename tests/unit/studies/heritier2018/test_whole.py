@@ -38,4 +38,4 @@ def test_a_run_ends_in_a_page_and_twelve_pictures(
     assert text.count("![Figure") == 12
     assert "rehearsal" in text
     assert len(re.findall(r"^\| Equation \d+ ", text, re.MULTILINE)) == 10
-    assert len(re.findall(r"^\| Figure \d+ ", text, re.MULTILINE)) == 14
+    assert len(re.findall(r"^\| \[Figure \d+\]", text, re.MULTILINE)) == 14

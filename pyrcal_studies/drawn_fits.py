@@ -1,0 +1,469 @@
+"""Fits of matrices drawn at random, by four codes and the simulator, against their truth.
+
+Each seed is another registration of a bench of 12 subapertures and 13 x 13 Gaussian actuators, of
+which every second of 40 KL modes is pushed and pulled: by an FFT pyramid that shares no code with
+the model (``fft``), or by OOPAO, HCIPy or SPECULA with their own optics, masks, slopes and axes. A
+condition displaces the pupil images or the actuators, or adds noise. ``diffractive`` is the
+simulated telescope of ``tests/data/tiny`` with its usual imperfections. Both kinds of stop in turn.
+
+``python -m pyrcal_studies.drawn_fits images --codes fft oopao --rms 0.05 --draws 40`` appends a
+line of JSON for each fit to ``var/drawn``; fits that are there already are not made again. With
+``--table`` it prints the tables of all that is there. Campaigns: images, actuators,
+noise, modulations, mistold (instrument files with one thing wrong), small (the telescope).
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from pyrcal.fitting.fit_file import fit
+from pyrcal.fitting.fitted import Fit
+from pyrcal.fitting.matrix import FitOptions, fit_matrix
+from pyrcal_studies.fft_pyramid import slopes_of
+from pyrcal_studies.image_offsets import (
+    TRUTH,
+    N,
+    as_told,
+    basis,
+    bench,
+    camera,
+    displacements,
+    filmed,
+    model_of,
+)
+from pyrcal_studies.mistold_fits import AS_IT_IS, MISTELLINGS, PUPILS, error
+from pyrcal_studies.peers import ROOT, environment, variables
+from pyrcal_studies.peers_cases import mirror_points
+from pyrcal_studies.peers_files import LISTINGS
+from pyrcal_studies.peers_pushpull import JOB, Bench, Measured, read_product, write_job
+from service.estimation.reference import Reference
+from service.instrument import load_instrument
+from service.model.instrument import Instrument
+from service.model.kinds import Normalisation, SlopeOrder, Stop
+from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.model.pupil import valid_subapertures
+from service.model.sensors.pyramid.description import FrameWindows
+from service.model.slopes import Orientation, SlopeRecipe
+from sim_rtc.telescope.mirror import misplace_actuators
+from tests.data.tiny.make import push_pull
+
+Array = NDArray[Any]
+
+FOLDER = ROOT / "var" / "drawn"
+CODES = ("fft", "oopao", "hcipy", "specula")
+TINY = ROOT / "tests" / "data" / "tiny" / "tiny.toml"
+
+EVERY = 2
+"""Every second mode of the bench is pushed."""
+
+MAX_SIGMA = 3.0
+SEPARATION = 18
+"""Between the centres of neighbouring images of a peer, subapertures; the FFT pyramid has 17."""
+
+TINY_MODES, TINY_NOISE = 40, 5e-5
+"""Modes of the simulated telescope, and RMS of a slope averaged over all pushes of one."""
+
+
+TOLD = {one.words: one for one in (AS_IT_IS, *MISTELLINGS, *PUPILS[:2])}
+"""Instrument files with one thing wrong."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Condition:
+    """What differs from a perfect bench, and what the instrument file says of it."""
+
+    images_px: float = 0.0
+    """RMS displacement of the pupil images along either axis, pixels."""
+
+    images: str = "unknown"
+    """``unknown`` without the key, ``told``, or ``frames``: located in the mean frame."""
+
+    position_error: float = 0.0
+    """RMS error of an actuator's position along either axis, pitches."""
+
+    noise: float = 0.0
+    """RMS of the noise over the RMS of the signal, of the whole matrix."""
+
+    stroke_m: float = 1e-9
+    """RMS stroke of each push and pull."""
+
+    modulation_lambda_over_d: float = 3.0
+    """Radius of the modulation circle."""
+
+    told: str = AS_IT_IS.words
+    """What the instrument file says that is not so."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Draw:
+    """One matrix of one code."""
+
+    code: str
+    """``fft``, the package of a peer, or ``diffractive``."""
+
+    condition: Condition
+    """What differs from a perfect bench."""
+
+    seed: int
+    """Of all that is drawn."""
+
+    @property
+    def stop(self) -> Stop:
+        """Telescope and mirror in turn."""
+        return list(Stop)[self.seed % 2]
+
+    @property
+    def alpha(self) -> Misregistration:
+        """Truth, within 0.6 subapertures, 3 deg and 2 %."""
+        if self.condition.images == "frames":
+            return TRUTH
+        x, y, turned, size = np.random.default_rng([36, self.seed]).uniform(-1.0, 1.0, size=4)
+        shift = np.array([0.6 * x, 0.6 * y])
+        if self.code in LISTINGS:
+            shift = np.rint(4.0 * shift) / 4.0  # SPECULA's images move by whole samples
+        return Misregistration.from_vector(
+            np.array([*shift, np.deg2rad(3.0 * turned), 1.0 + 0.02 * size])
+        )
+
+    @property
+    def offsets(self) -> Array:
+        """Displacement of each image ``(2, 2, 2)``: row, column; (columns, rows), pixels."""
+        rms = self.condition.images_px
+        return displacements(self.seed, rms) if rms else np.zeros((2, 2, 2))
+
+    @property
+    def bench(self) -> Bench:
+        """What a peer is told of the optics."""
+        alpha, offsets = self.alpha, self.offsets.reshape(4, 2)
+        moved = self.stop is Stop.MIRROR
+        return Bench(
+            diameter_m=4.0,
+            obscuration_ratio=0.2,
+            n_subapertures=N,
+            pupil_separation_subap=SEPARATION,
+            wavelength_m=750e-9,
+            modulation_lambda_over_d=self.condition.modulation_lambda_over_d,
+            n_modulation=24,
+            sampling=4,
+            stroke_m=self.condition.stroke_m,
+            image_shift_subap=(alpha.shift_x_subap, alpha.shift_y_subap) if moved else (0.0, 0.0),
+            image_offsets_px=tuple(map(tuple, offsets.tolist())) if offsets.any() else (),
+        )
+
+    @property
+    def product(self) -> Path:
+        """File with the matrix of a peer, its name made of all that the matrix depends on."""
+        asked = json.dumps([asdict(self.bench), self.condition.position_error])
+        digest = hashlib.sha256(asked.encode()).hexdigest()[:10]
+        return FOLDER / self.code / f"{self.seed:04d}-{digest}.npz"
+
+    @property
+    def shapes_m(self) -> Array:
+        """Modes on the pupil ``(n_modes, n, n)``, metres per metre, drawn where the mirror is."""
+        mirror = bench(self.stop).analytic_mirror
+        rng = np.random.default_rng([37, self.seed])
+        moved = misplace_actuators(mirror, self.condition.position_error, rng)
+        told = self.bench
+        points = mirror_points(told, self.alpha, self.stop) * (told.diameter_m / N)
+        apart = np.linalg.norm(points[:, None] - moved.positions_m, axis=2)
+        heights = mirror.shape.coupling ** ((apart / mirror.pitch_m) ** 2)
+        shapes = heights @ basis().mode_to_actuator[:, ::EVERY]
+        return np.asarray(shapes.T.reshape(-1, told.n_pupil, told.n_pupil))
+
+
+def measured(draws: list[Draw]) -> Iterator[tuple[Draw, Measured]]:
+    """Yield the matrix of every draw of one code.
+
+    Matrices of peers are kept. A peer measures all that are missing in one process.
+    """
+    code = draws[0].code
+    if code not in LISTINGS:
+        for draw in draws:
+            yield draw, _tiny_matrix(draw) if code == "diffractive" else _fft_matrix(draw)
+        return
+    missing = [draw for draw in draws if not draw.product.exists()]
+    if missing:
+        _run_peer(code, missing)
+    for draw in draws:
+        yield draw, _with_noise(draw, read_product(draw.product)[0])
+
+
+def _run_peer(code: str, draws: list[Draw]) -> None:
+    interpreter, folder = environment(code), FOLDER / code
+    folder.mkdir(parents=True, exist_ok=True)
+    for draw in draws:
+        write_job(folder / f"{draw.product.stem}{JOB}", draw.bench, shapes_m=draw.shapes_m)
+    subprocess.run(
+        [str(interpreter), "-m", "pyrcal_studies.peers_pushpull", code, str(folder)],
+        cwd=ROOT,
+        env=variables(),
+        stdout=subprocess.DEVNULL,
+        check=True,
+    )
+
+
+def _with_noise(draw: Draw, found: Measured) -> Measured:
+    """Return the matrix of a peer with noise that is equal in all slopes."""
+    rng = np.random.default_rng([38, draw.seed])
+    noise = draw.condition.noise * np.sqrt(np.mean(found.matrix**2))
+    return replace(found, matrix=found.matrix + noise * rng.standard_normal(found.matrix.shape))
+
+
+def _fft_matrix(draw: Draw) -> Measured:
+    """Return the matrix of the FFT pyramid, with the noise of photons."""
+    told, stroke_m = draw.bench, draw.condition.stroke_m
+    model = model_of(bench(draw.stop))
+    pyramid = camera(model, draw.offsets, N, told.modulation_lambda_over_d)
+    pushes = [
+        [pyramid.images(sign * stroke_m * shape, told.image_shift_subap) for sign in (1.0, -1.0)]
+        for shape in draw.shapes_m
+    ]
+    matrix = _from_images(pushes, model.valid, stroke_m)
+    if draw.condition.noise:
+        # of N photons in a subaperture a slope has a variance of 1 / N, a difference of two twice
+        # as much
+        share = draw.condition.noise * np.sqrt(np.mean(matrix**2)) * 2.0 * stroke_m
+        flux = pushes[0][0].sum(axis=(0, 2))[model.valid].mean()
+        photons = 2.0 / (share**2 * flux)
+        rng = np.random.default_rng([38, draw.seed])
+        pushes = [[rng.poisson(photons * one) / photons for one in pair] for pair in pushes]
+        matrix = _from_images(pushes, model.valid, stroke_m)
+    return _measured(matrix, model.valid, told.wavelength_m)
+
+
+def _from_images(pushes: list[list[Array]], valid: NDArray[np.bool_], stroke_m: float) -> Array:
+    columns = [slopes_of(push, valid) - slopes_of(pull, valid) for push, pull in pushes]
+    return np.stack(columns, axis=1) / (2.0 * stroke_m)
+
+
+def _tiny_matrix(draw: Draw) -> Measured:
+    about = _tiny(draw)
+    matrix = push_pull(about, draw.alpha, TINY_MODES, TINY_NOISE, draw.seed)
+    return _measured(matrix, valid_subapertures(about), about.wfs.wavelength_m)
+
+
+def _measured(matrix: Array, valid: NDArray[np.bool_], wavelength_m: float) -> Measured:
+    return Measured(
+        matrix=matrix,
+        valid=valid,
+        wavelength_m=wavelength_m,
+        version="",
+        seconds=0.0,
+        detector_from_pupil=np.eye(2),
+    )
+
+
+def _tiny(draw: Draw) -> Instrument:
+    about = load_instrument(TINY)
+    wfs = replace(about.wfs, modulation_lambda_over_d=draw.condition.modulation_lambda_over_d)
+    return replace(about, wfs=wfs, slopes=SlopeRecipe(orientation=Orientation()))
+
+
+def instrument_of(draw: Draw, found: Measured) -> Instrument:
+    """Return what a user of the code knows; a peer's axes are searched for."""
+    if draw.code == "diffractive":
+        return _tiny(draw)
+    about = bench(draw.stop)
+    wfs = replace(
+        about.wfs,
+        wavelength_m=found.wavelength_m,
+        modulation_lambda_over_d=draw.condition.modulation_lambda_over_d,
+        valid_subapertures=found.valid,
+    )
+    # strokes, so that a wrong mirror changes the influence functions alone
+    strokes = basis().mode_to_actuator[:, ::EVERY]
+    about = replace(about, wfs=wfs, mirror=replace(about.analytic_mirror, mode_to_actuator=strokes))
+    listing = LISTINGS.get(draw.code)
+    if listing is not None:
+        about = replace(
+            about,
+            wfs=replace(about.wfs, pupil_separation_subap=float(SEPARATION)),
+            mirror=replace(about.analytic_mirror, nominal_rotation_rad=None, parity=None),
+            slopes=SlopeRecipe(
+                order=SlopeOrder(listing.order), normalisation=Normalisation(listing.normalisation)
+            ),
+        )
+    if draw.condition.images == "told":
+        about = as_told(about, draw.offsets)
+    return TOLD[draw.condition.told].tell(about)
+
+
+def fitted(draw: Draw, found: Measured) -> Fit:
+    """Return the fit of a measured matrix."""
+    about = instrument_of(draw, found)
+    return fit_matrix(about, Reference(matrix=found.matrix), FitOptions(explain=True))
+
+
+def fitted_frames(draw: Draw) -> Fit:
+    """Return the fit of detector frames, the images located in the mean frame."""
+    instrument = replace(bench(Stop.TELESCOPE), frames=FrameWindows())
+    frames, rest = filmed(instrument, draw.offsets, EVERY)
+    modes = np.arange(0, basis().n_modes, EVERY)
+    return fit(instrument, frames, modes=modes, flux_frame=rest, threads=1)
+
+
+def row(draw: Draw, found: Fit, cpu_s: float) -> dict[str, Any]:
+    """Return what is kept of a fit."""
+    parts = found.registration
+    return {
+        "code": draw.code,
+        "condition": asdict(draw.condition),
+        "seed": draw.seed,
+        "accepted": found.accepted,
+        "error": (
+            error(found.alpha, draw.alpha, TOLD[draw.condition.told]) * BOUNDARY_SCALE
+        ).tolist(),
+        "sigma": (found.sigma * BOUNDARY_SCALE).tolist(),
+        "sigma_statistical": (parts.sigma_statistical * BOUNDARY_SCALE).tolist(),
+        "residual": found.residual_fraction,
+        "said": found.recommendation,
+        "cpu_s": round(cpu_s, 1),
+    }
+
+
+def _images(given: argparse.Namespace) -> Iterator[Condition]:
+    for rms, images in product(given.rms, given.images):
+        yield Condition(images_px=rms, images=images)
+
+
+def _actuators(given: argparse.Namespace) -> Iterator[Condition]:
+    for position_error in given.position_errors:
+        yield Condition(position_error=position_error)
+
+
+def _noise(given: argparse.Namespace) -> Iterator[Condition]:
+    for noise, stroke_nm in product(given.noise, given.strokes_nm):
+        yield Condition(noise=noise, stroke_m=stroke_nm * 1e-9)
+
+
+def _modulations(given: argparse.Namespace) -> Iterator[Condition]:
+    for radius in given.modulations:
+        yield Condition(modulation_lambda_over_d=radius)
+
+
+def _mistold(given: argparse.Namespace) -> Iterator[Condition]:
+    yield from (Condition(told=words) for words in TOLD)
+
+
+CAMPAIGNS: dict[str, Callable[[argparse.Namespace], Iterator[Condition]]] = {
+    "images": _images,
+    "actuators": _actuators,
+    "noise": _noise,
+    "modulations": _modulations,
+    "small": _modulations,
+    "mistold": _mistold,
+}
+
+
+def run(name: str, given: argparse.Namespace) -> None:
+    """Measure and fit what is not there yet, and append a line for each fit."""
+    path = FOLDER / f"{name}.jsonl"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    known = {_key(one) for one in _read(name)}
+    codes = ["diffractive"] if name == "small" else given.codes
+    for condition, code in product(CAMPAIGNS[name](given), codes):
+        seeds = range(given.first_seed, given.first_seed + given.draws)
+        draws = [Draw(code=code, condition=condition, seed=seed) for seed in seeds]
+        draws = [one for one in draws if (code, str(asdict(condition)), one.seed) not in known]
+        for draw, found, cpu_s in _fits(draws):
+            with path.open("a") as file:
+                print(json.dumps(row(draw, found, cpu_s)), file=file)
+
+
+def _fits(draws: list[Draw]) -> Iterator[tuple[Draw, Fit, float]]:
+    if not draws:
+        return
+    if draws[0].condition.images == "frames":
+        for draw in draws:
+            yield draw, fitted_frames(draw), 0.0
+        return
+    for draw, found in measured(draws):
+        begun = time.process_time()
+        done = fitted(draw, found)
+        yield draw, done, time.process_time() - begun
+
+
+def _read(name: str) -> list[dict[str, Any]]:
+    path = FOLDER / f"{name}.jsonl"
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def _key(one: dict[str, Any]) -> tuple[str, str, int]:
+    return one["code"], str(one["condition"]), one["seed"]
+
+
+def table(found: list[dict[str, Any]]) -> Iterator[str]:
+    """Yield a table in Markdown, a row for each condition and code."""
+    plain = asdict(Condition())
+    yield (
+        "| condition | code | accepted | within 3 σ | accepted beyond 3 σ | largest over σ | RMS "
+        "over σ: x, y, rotation, magnification | largest error: shift (subap), rotation (deg), "
+        "magnification | largest σ of a shift |"
+    )
+    yield "|" + " --- |" * 9
+    for words, code in dict.fromkeys((str(one["condition"]), one["code"]) for one in found):
+        these = [one for one in found if (str(one["condition"]), one["code"]) == (words, code)]
+        condition = these[0]["condition"]
+        named = ", ".join(
+            f"{key} {value}" for key, value in condition.items() if value != plain[key]
+        )
+        yield f"| {named or 'nothing'} | {code} | {_cells(these)} |"
+
+
+def _cells(these: list[dict[str, Any]]) -> str:
+    errors = np.abs([one["error"] for one in these])
+    sigma = np.array([one["sigma"] for one in these])
+    worst = (errors / sigma).max(axis=1)
+    accepted = np.array([one["accepted"] for one in these])
+    rms = np.sqrt(np.mean((errors / sigma) ** 2, axis=0))
+    return " | ".join(
+        [
+            f"{accepted.sum()} of {len(these)}",
+            str(np.sum(worst < MAX_SIGMA)),
+            str(np.sum(accepted & (worst >= MAX_SIGMA))),
+            f"{worst.max():.1f}",
+            ", ".join(f"{value:.2f}" for value in rms),
+            f"{errors[:, :2].max():.4f}, {errors[:, 2].max():.4f}, {errors[:, 3].max():.5f}",
+            f"{sigma[:, :2].max():.4f}",
+        ]
+    )
+
+
+def main() -> int:
+    """Measure and fit, or print the table of all that is there."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("campaign", choices=CAMPAIGNS)
+    parser.add_argument("--codes", nargs="+", choices=CODES, default=CODES)
+    parser.add_argument("--draws", type=int, default=40, help="of each code and condition")
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--rms", nargs="+", type=float, default=[0.0, 0.05, 0.1, 0.2, 0.3])
+    parser.add_argument("--images", nargs="+", default=["told", "unknown"])
+    parser.add_argument("--position-errors", nargs="+", type=float, default=[0.0, 0.02])
+    parser.add_argument("--noise", nargs="+", type=float, default=[0.05, 0.3, 1.0])
+    parser.add_argument("--strokes-nm", nargs="+", type=float, default=[1.0, 100.0])
+    parser.add_argument("--modulations", nargs="+", type=float, default=[3.0, 0.0])
+    parser.add_argument("--table", action="store_true", help="print the table, measure nothing")
+    given = parser.parse_args()
+    if not given.table:
+        with threadpool_limits(1):
+            run(given.campaign, given)
+    print("\n".join(table(_read(given.campaign))))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,55 @@
+"""Matrices of OOPAO that a fit once refused, or accepted with a wrong registration.
+
+They lie beside the repository, because their licence is not ours; each contains its truth.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from pyrcal.fitting.fit_file import fit_file
+from pyrcal.fitting.matrix import FitOptions
+from service.instrument import load_instrument
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
+
+FAILING = Path(os.environ.get("PYRCAL_BENCH_DATA", "../shared/data")) / "failing"
+
+ERRORS = {
+    "U1_rms05": (0.002, 0.01, 0.001),
+    "S01_diff8": (0.001, 0.01, 0.001),
+    "P09_nl_push200nm": (0.01, 0.03, 0.01),
+    "P16_wfsshift": (0.001, 0.01, 0.001),
+    "P19_far": (0.002, 0.01, 0.001),
+}
+"""Largest error of a shift (subapertures), the rotation (degrees) and the magnification."""
+
+
+def unpacked(case, folder):
+    """Write the instrument file and the matrix into a folder, and return the true registration."""
+    arrays = np.load(FAILING / f"{case}.npz")
+    with h5py.File(folder / "matrix.h5", "w") as file:
+        for name in set(arrays.files) - {"instrument_toml", "truth"}:
+            values = arrays[name]
+            file[name] = values.astype(np.float32) if values.dtype == np.float16 else values
+    (folder / "instrument.toml").write_text(str(arrays["instrument_toml"]))
+    truth = json.loads(str(arrays["truth"]))
+    return np.array([truth[name] for name in PARAMETERS])
+
+
+@pytest.mark.skipif(not FAILING.is_dir(), reason="the matrices are not here")
+@pytest.mark.parametrize("case", ERRORS)
+def test_a_matrix_that_once_failed_is_accepted_within_three_sigma(case, tmp_path):
+    truth = unpacked(case, tmp_path)
+    instrument = load_instrument(tmp_path / "instrument.toml")
+    fit = fit_file(instrument, tmp_path / "matrix.h5", FitOptions(explain=True), threads=1).fit
+    error = np.abs(fit.alpha.vector * BOUNDARY_SCALE - truth)
+    assert fit.accepted
+    assert np.all(error < 3.0 * fit.sigma * BOUNDARY_SCALE)
+    shift, rotation, magnification = ERRORS[case]
+    assert np.all(error < [shift, shift, rotation, magnification])

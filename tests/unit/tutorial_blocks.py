@@ -1,0 +1,50 @@
+"""The blocks of a tutorial in their order, and the comparison of outputs with those printed."""
+
+import re
+from itertools import zip_longest
+
+BLOCK = re.compile(
+    r"(?P<mark><!-- not run: [^\n]+ -->\n)?^```(?P<kind>\w+)\n(?P<text>.*?)^```", re.M | re.S
+)
+NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?(?![\w])")
+
+
+def steps(page):
+    """Each block that runs: (kind, text, output printed after it or None)."""
+    found = list(BLOCK.finditer(page.read_text("utf-8")))
+    for block, after in zip_longest(found, found[1:]):
+        if block["kind"] in {"sh", "python"} and not block["mark"]:
+            printed = after["text"] if after is not None and after["kind"] == "text" else None
+            yield block["kind"], block["text"], printed
+
+
+def parts(line):
+    """A line without its numbers, and the numbers as written."""
+    return " ".join(NUMBER.sub("#", line).split()), NUMBER.findall(line)
+
+
+def close(written, found):
+    """Whether two numbers agree within 5 %, or three units of the last digit that is written."""
+    one, other = float(written), float(found)
+    digits = len(re.sub(r"e.*", "", written).partition(".")[2])
+    return abs(one - other) <= max(0.05 * abs(one), 3.0 * 10.0**-digits)
+
+
+def missing_lines(printed, output):
+    """The lines of ``printed`` that ``output`` does not have, in their order; "..." skips some."""
+    lines = iter(output.splitlines())
+    missing = []
+    for line in printed.splitlines():
+        if line.strip() in {"", "..."}:
+            continue
+        shape, numbers = parts(line)
+        rest = list(lines)
+        for k, candidate in enumerate(rest):
+            other, values = parts(candidate)
+            if other == shape and all(map(close, numbers, values)):
+                lines = iter(rest[k + 1 :])
+                break
+        else:
+            missing.append(line)
+            lines = iter(rest)
+    return missing

@@ -180,14 +180,14 @@ REQUESTS = (
         "hide an alarm for a time; what it forbids stays forbidden",
         *(_ALARM, words("for_s SECONDS", "up to 43200 (twelve hours)", type=float)),
         operation="mute",
-        example="disk-low 3600 --why 'disk is being replaced'",
+        example="margin 3600 --why 'seen, lowering the gain'",
     ),
     _orders(
         "alarms unmute",
         "show a muted alarm again",
         _ALARM,
         operation="unmute",
-        example="disk-low",
+        example="margin",
     ),
     _reads(
         "audit",

@@ -17,8 +17,8 @@ ROOT = Path(service.__file__).parent.parent
 HELD = ("service", "pyrcal", "check_rtc")
 
 CALLED_FROM_ELSEWHERE = {
-    "sigma_to_boundary",  # the library's users
     "__getattr__",  # Python
+    "_check_value",  # argparse
     "capture_signals",  # uvicorn
     "collect",  # prometheus_client
 }

@@ -31,9 +31,9 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pyrcal.offline.fit_file import fit
-from pyrcal.offline.fitted import Fit
-from pyrcal.offline.matrix import FitOptions, fit_matrix
+from pyrcal.fitting.fit_file import fit
+from pyrcal.fitting.fitted import Fit
+from pyrcal.fitting.matrix import FitOptions, fit_matrix
 from pyrcal_studies.fft_pyramid import slopes_of
 from pyrcal_studies.image_offsets import (
     TRUTH,
@@ -51,8 +51,8 @@ from pyrcal_studies.peers import ROOT, environment, variables
 from pyrcal_studies.peers_cases import mirror_points
 from pyrcal_studies.peers_files import LISTINGS
 from pyrcal_studies.peers_pushpull import JOB, Bench, Measured, read_product, write_job
-from service.config import load_instrument
 from service.estimation.reference import Reference
+from service.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.kinds import Normalisation, SlopeOrder, Stop
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration

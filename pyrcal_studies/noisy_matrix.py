@@ -26,8 +26,6 @@ from threadpoolctl import threadpool_limits
 from pyrcal_studies.campaign.telemetry import blocks_of
 from pyrcal_studies.noisy_figure import draw
 from service.archive import Archive
-from service.config import load_instrument
-from service.config.policy import floor_of
 from service.config.settings import Settings
 from service.estimation.random_dither import (
     Correlated,
@@ -38,10 +36,12 @@ from service.estimation.random_dither import (
     noisy_matrix,
 )
 from service.estimation.windows import WindowRefused
+from service.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.sensors.registry import kind_of
 from service.runtime.estimates import work_out
+from service.runtime.policy import floor_of
 from service.runtime.worker import Compute, OpticsWorker
 from service.tracking.operation_records import MeasurementRecord, MeasureState
 from service.wire import DitherKind, DitherRequest

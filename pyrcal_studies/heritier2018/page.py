@@ -67,7 +67,7 @@ def _opening(budget: Budget, store: Store, minutes: float) -> str:
         f"{datetime.now(UTC).date().isoformat()}; all steps together take about {minutes:.0f} "
         "minutes of one idle core.\n"
         "- **Telescope**: a diffractive simulation of FLAO at the LBT "
-        "(`service/instruments/flao-lbt.toml`) with another pupil grid and other influence "
+        "(`service/instrument/packaged/flao-lbt.toml`) with another pupil grid and other influence "
         "functions than the model, uneven light (10 %) and displaced actuators. Its registration "
         f"is that of equation 10. {len(budget.seeds)} telescopes differ in their imperfections, "
         "noise and turbulence.\n"

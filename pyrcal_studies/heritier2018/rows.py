@@ -89,7 +89,7 @@ def _equations(budget: Budget, store: Store) -> Iterator[Row]:
     yield (
         "Equation 7",
         "σ_j, RMSE of mode j",
-        "`pyrcal/offline/methods.py`",
+        "`pyrcal/fitting/methods.py`",
         "`chi_n`",
         "-",
         "same",
@@ -97,7 +97,7 @@ def _equations(budget: Budget, store: Store) -> Iterator[Row]:
     yield (
         "Equation 8",
         "χ_N, squared norm of σ_N",
-        "`pyrcal/offline/methods.py`",
+        "`pyrcal/fitting/methods.py`",
         f"N = {len(record['gains'])}, no free gain",
         "N = 400",
         "same",
@@ -126,7 +126,7 @@ def _tables(budget: Budget, store: Store) -> Iterator[Row]:
     yield (
         "Table 1",
         "ten steps",
-        "`pyrcal/offline/methods.py`",
+        "`pyrcal/fitting/methods.py`",
         ", ".join(f"{line.symbol} {line.value:.2f} {line.unit}" for line in last.values()),
         "65.08°, -92 %, 35 %, 98 %",
         "[step by step](#table-1-the-procedure-step-by-step)",
@@ -293,7 +293,7 @@ def _claims(budget: Budget, store: Store) -> Iterator[Row]:
         for seed in budget.seeds
     )
     gains = results.gains(budget, store)[0]
-    file = "`service/instruments/flao-lbt.toml`"
+    file = "`service/instrument/packaged/flao-lbt.toml`"
     yield (
         "Section 3.1",
         f"“{paper.QUOTES['actuators'].text}”",
@@ -345,7 +345,7 @@ def _claims(budget: Budget, store: Store) -> Iterator[Row]:
     yield (
         "Section 3.2",
         f"“{paper.QUOTES['rule'].text}”",
-        "`service/config/policy.py`",
+        "`service/runtime/policy.py`",
         "; ".join(f"{s}, {n} modes: {cost:+.1f} nm" for (s, n), cost in costs.items()),
         "no cost printed",
         f"the rule costs at most {max(costs.values()):.1f} nm",
@@ -353,7 +353,7 @@ def _claims(budget: Budget, store: Store) -> Iterator[Row]:
     yield (
         "Section 4.3",
         f"“{paper.QUOTES['third'].text}”",
-        "`pyrcal/offline/methods.py`",
+        "`pyrcal/fitting/methods.py`",
         f"{max(third[:2]):.2f} %, {third[2]:.4f}°",
         "no change",
         "agrees" if max(third[:2]) < 0.5 else "differs",

@@ -13,9 +13,9 @@ import h5py
 import numpy as np
 import pytest
 
-from pyrcal.offline.fit_file import fit_file
-from pyrcal.offline.matrix import FitOptions
-from service.config import load_instrument
+from pyrcal.fitting.fit_file import fit_file
+from pyrcal.fitting.matrix import FitOptions
+from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 
 FAILING = Path(os.environ.get("PYRCAL_BENCH_DATA", "../shared/data")) / "failing"

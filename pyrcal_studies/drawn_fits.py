@@ -22,6 +22,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,7 @@ from service.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.kinds import Normalisation, SlopeOrder, Stop
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.model.modes import karhunen_loeve_basis
 from service.model.pupil import valid_subapertures
 from service.model.sensors.pyramid.description import FrameWindows
 from service.model.slopes import Orientation, SlopeRecipe
@@ -76,6 +78,12 @@ SEPARATION = 18
 
 TINY_MODES, TINY_NOISE = 40, 5e-5
 """Modes of the simulated telescope, and RMS of a slope averaged over all pushes of one."""
+
+
+@cache
+def strokes() -> Array:
+    """Return the modes that are pushed as strokes of the actuators ``(n_actuators, n_modes)``."""
+    return karhunen_loeve_basis(bench(Stop.MIRROR)).mode_to_actuator[:, ::EVERY]
 
 
 TOLD = {one.words: one for one in (AS_IT_IS, *MISTELLINGS, *PUPILS[:2])}
@@ -181,7 +189,7 @@ class Draw:
         points = mirror_points(told, self.alpha, self.stop) * (told.diameter_m / N)
         apart = np.linalg.norm(points[:, None] - moved.positions_m, axis=2)
         heights = mirror.shape.coupling ** ((apart / mirror.pitch_m) ** 2)
-        shapes = heights @ basis().mode_to_actuator[:, ::EVERY]
+        shapes = heights @ strokes()
         return np.asarray(shapes.T.reshape(-1, told.n_pupil, told.n_pupil))
 
 
@@ -285,8 +293,9 @@ def instrument_of(draw: Draw, found: Measured) -> Instrument:
         valid_subapertures=found.valid,
     )
     # strokes, so that a wrong mirror changes the influence functions alone
-    strokes = basis().mode_to_actuator[:, ::EVERY]
-    about = replace(about, wfs=wfs, mirror=replace(about.analytic_mirror, mode_to_actuator=strokes))
+    about = replace(
+        about, wfs=wfs, mirror=replace(about.analytic_mirror, mode_to_actuator=strokes())
+    )
     listing = LISTINGS.get(draw.code)
     if listing is not None:
         about = replace(
@@ -318,7 +327,6 @@ def fitted_frames(draw: Draw) -> Fit:
 
 def row(draw: Draw, found: Fit, cpu_s: float) -> dict[str, Any]:
     """Return what is kept of a fit."""
-    parts = found.registration
     return {
         "code": draw.code,
         "condition": asdict(draw.condition),
@@ -328,7 +336,6 @@ def row(draw: Draw, found: Fit, cpu_s: float) -> dict[str, Any]:
             error(found.alpha, draw.alpha, TOLD[draw.condition.told]) * BOUNDARY_SCALE
         ).tolist(),
         "sigma": (found.sigma * BOUNDARY_SCALE).tolist(),
-        "sigma_statistical": (parts.sigma_statistical * BOUNDARY_SCALE).tolist(),
         "residual": found.residual_fraction,
         "said": found.recommendation,
         "cpu_s": round(cpu_s, 1),

@@ -30,11 +30,11 @@ from benchmarks import plant
 from benchmarks.bench_alone import alone_rows, elt_section, peak_mb
 from benchmarks.bench_page import Row, page, plot
 from benchmarks.peer_rounds import cpu_s
-from pyrcal.offline.fit_file import fit_file, make_reference
-from pyrcal.offline.fitted import Fit
-from pyrcal.offline.matrix import FitOptions, fit_matrix
-from pyrcal.offline.recorded import read_recorded
-from pyrcal.offline.report import FitReport
+from pyrcal.fitting.fit_file import fit_file, make_reference
+from pyrcal.fitting.fitted import Fit
+from pyrcal.fitting.matrix import FitOptions, fit_matrix
+from pyrcal.fitting.recorded import read_recorded
+from pyrcal.fitting.report import FitReport
 from pyrcal_studies.peers import ROOT, environment, measured, variables
 from pyrcal_studies.peers_cases import (
     N_MODES,
@@ -48,7 +48,7 @@ from pyrcal_studies.peers_cases import (
 from pyrcal_studies.peers_files import LISTINGS, write_instrument, write_reference
 from pyrcal_studies.peers_fits import error
 from pyrcal_studies.peers_pushpull import Array, Measured, read_product, write_job
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.kinds import Stop

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.bench_page import Alone
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration

@@ -17,8 +17,8 @@ from typing import Any
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from service.config import load_instrument
 from service.files.disk_cache import DiskCache
+from service.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.runtime.cluster import Cluster

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.local import LocalShapes
 from service.model.misregistration import Misregistration

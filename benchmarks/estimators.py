@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from service.config import load_instrument
 from service.estimation import demodulation, loopcheck, passive
 from service.estimation.description import Actuators, Description, EdgeWatch, edge_watch
 from service.estimation.frames import FrameBlock
@@ -35,6 +34,7 @@ from service.estimation.loopcheck import LoopCheck
 from service.estimation.passive import Passive
 from service.estimation.random_dither import RandomDither, RandomPlan
 from service.estimation.windows import ClosedLoop
+from service.instrument import load_instrument
 from service.model.instrument import Mirror
 from service.model.modes import karhunen_loeve_basis
 from service.runtime.estimator_bank import (

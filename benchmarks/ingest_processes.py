@@ -15,8 +15,8 @@ import zenoh
 import zenoh.ext
 from threadpoolctl import threadpool_limits
 
-from service.config import load_instrument
 from service.config.link_tables import Router
+from service.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis

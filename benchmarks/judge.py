@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from benchmarks.peers import hcipy_slopes
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.modes import karhunen_loeve_basis
 from service.model.sensors.pyramid.description import pyramid_in

@@ -25,7 +25,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from benchmarks.peers import MODES, PEERS
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis

@@ -24,7 +24,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from pyrcal_studies.peers import variables
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.wire import encode_frames
 from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.computer.feed import BATCH_FRAMES, message_frames

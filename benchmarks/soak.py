@@ -30,7 +30,7 @@ import httpx
 from benchmarks import soak_page
 from benchmarks.rest import PAGES
 from benchmarks.standing import Sample, Standing, standing
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis

@@ -15,8 +15,8 @@ import numpy as np
 from pyrcal_studies.campaign.golden import FOLDER, INSTRUMENT, nights_in, read, with_instrument
 from pyrcal_studies.campaign.golden_codec import decoded
 from service.config import load_settings
-from service.config.policy import policy_of
 from service.errors import PyrcalError
+from service.runtime.policy import policy_of
 from service.tracker import step
 from service.tracking.events import Event
 from service.tracking.state import Mode, OperatorState, TrackerState

@@ -21,17 +21,18 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pyrcal_studies.campaign.observatory import Observatory
-from service.config import load_instrument, load_settings
-from service.config.policy import policy_of
+from service.config import load_settings
 from service.control.loop import ControlLoop
 from service.control.reconstructor import Recipe, reconstruct
 from service.estimation.demodulation import SIDE_OFFSETS_HZ
 from service.estimation.lockin import LockInPlan, Spectra, fit_window
 from service.estimation.windows import ClosedLoop
 from service.files.disk_cache import usual_folder
+from service.instrument import load_instrument
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
+from service.runtime.policy import policy_of
 from service.runtime.worker import Compute, Conditions, OpticsWorker
 from service.tracking.state import Mode
 from service.tracking.updates import JUDGE_INTERVAL_S

@@ -22,8 +22,8 @@ from cacao_bridge.settings import Settings, load
 from pyrcal.rtc.background import Background
 from pyrcal.rtc.link import STATUS_PERIOD_S, RtcConnection, RtcLink
 from pyrcal.terminal import print_lines
-from service.cli.program import leave, log_to_terminal, status_of, stop_signal
 from service.config.link_tables import Router, client_security, secret_of
+from service.program import leave, log_to_terminal, status_of, stop_signal
 from service.wire import FrameHeader
 
 _REPORT_PERIOD_S: Final = 10.0

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from service.config.link_tables import CredentialsTable
-from service.config.sources import Id, Table, in_file, read_toml, refuse, validated
+from service.files.toml import Id, Table, in_file, read_toml, refuse, validated
 
 Positive = Annotated[float, Field(gt=0.0)]
 Counted = Annotated[int, Field(ge=1, le=1_000_000)]

@@ -11,9 +11,9 @@ import signal
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from pyrcal.offline.arguments import seconds
+from pyrcal.fitting.arguments import seconds
 from pyrcal.options import add, words
-from service.cli.program import OneLineParser, imported_and_run, leave
+from service.program import OneLineParser, imported_and_run, leave
 
 _EPILOG = """
 Prints one line for each requirement of docs/rtc.md: the finding, the requirement, its section.

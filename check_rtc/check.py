@@ -22,13 +22,13 @@ from check_rtc.offload import RegistrationFit
 from check_rtc.requirements import REQUIREMENTS, CheckResult, Outcome
 from check_rtc.telemetry_checks import ImageOffsets
 from check_rtc.watch import TelemetryObserver
-from service.config import load_instrument, packaged_instrument
 from service.config.link_tables import ZenohTable, link_security, read_link_tables
 from service.errors import ConfigurationError, LinkError, ModelError, say, shown
 from service.estimation.lockin import LockInEstimate, Spectra
 from service.estimation.slope_convention import SlopeConvention, identify_from_reconstructor
 from service.estimation.windows import ClosedLoop, WindowRefused
 from service.files.disk_cache import DiskCache, usual_folder
+from service.instrument import load_instrument, packaged_instrument
 from service.link.session import Endpoint
 from service.model.instrument import Instrument
 from service.model.interaction import RtcInteractionModel

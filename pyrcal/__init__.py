@@ -17,15 +17,14 @@ from service.errors import (
 
 if TYPE_CHECKING:
     from pyrcal.client.rest import Service
-    from pyrcal.offline.design import dither_sigma, interaction_matrix
-    from pyrcal.offline.fit_file import fit, fit_file
-    from pyrcal.offline.fitted import Fit
-    from pyrcal.offline.importers.oopao import from_oopao, to_oopao
-    from pyrcal.offline.matrix import FitOptions
-    from pyrcal.offline.report import FitReport, KnownFit, read_fit
+    from pyrcal.fitting.design import dither_sigma, interaction_matrix
+    from pyrcal.fitting.fit_file import fit, fit_file
+    from pyrcal.fitting.fitted import Fit
+    from pyrcal.fitting.matrix import FitOptions
+    from pyrcal.fitting.report import FitReport, KnownFit, read_fit
+    from pyrcal.importers.oopao import from_oopao, to_oopao
     from pyrcal.playback.player import Track
     from pyrcal.playback.track import track
-    from service.config.instrument import load_instrument
     from service.config.settings import Settings
     from service.control.reconstructor import (
         Inversion,
@@ -36,6 +35,7 @@ if TYPE_CHECKING:
     )
     from service.control.reconstructor import Recipe as InversionOptions
     from service.files.bundle import Bundle, read_bundle, write_bundle
+    from service.instrument.reader import load_instrument
     from service.model.arrays import arrays_of
     from service.model.arrays import arrays_of as array_backend
     from service.model.instrument import Instrument
@@ -87,14 +87,14 @@ __all__ = [
 
 _HOMES = {
     "Bundle": "service.files.bundle",
-    "Fit": "pyrcal.offline.fitted",
-    "FitOptions": "pyrcal.offline.matrix",
-    "FitReport": "pyrcal.offline.report",
+    "Fit": "pyrcal.fitting.fitted",
+    "FitOptions": "pyrcal.fitting.matrix",
+    "FitReport": "pyrcal.fitting.report",
     "Instrument": "service.model.instrument",
     "Inversion": "service.control.reconstructor",
     "InversionMethod": "service.control.reconstructor",
     "InversionOptions": "service.control.reconstructor",
-    "KnownFit": "pyrcal.offline.report",
+    "KnownFit": "pyrcal.fitting.report",
     "Misregistration": "service.model.misregistration",
     "Orientation": "service.model.slopes",
     "Prior": "service.control.reconstructor",
@@ -105,17 +105,17 @@ _HOMES = {
     "Track": "pyrcal.playback.player",
     "array_backend": "service.model.arrays",
     "arrays_of": "service.model.arrays",
-    "dither_sigma": "pyrcal.offline.design",
-    "fit": "pyrcal.offline.fit_file",
-    "fit_file": "pyrcal.offline.fit_file",
-    "from_oopao": "pyrcal.offline.importers.oopao",
-    "interaction_matrix": "pyrcal.offline.design",
-    "load_instrument": "service.config.instrument",
+    "dither_sigma": "pyrcal.fitting.design",
+    "fit": "pyrcal.fitting.fit_file",
+    "fit_file": "pyrcal.fitting.fit_file",
+    "from_oopao": "pyrcal.importers.oopao",
+    "interaction_matrix": "pyrcal.fitting.design",
+    "load_instrument": "service.instrument.reader",
     "modal_basis": "service.model.modes",
     "read_bundle": "service.files.bundle",
-    "read_fit": "pyrcal.offline.report",
+    "read_fit": "pyrcal.fitting.report",
     "reconstruct": "service.control.reconstructor",
-    "to_oopao": "pyrcal.offline.importers.oopao",
+    "to_oopao": "pyrcal.importers.oopao",
     "track": "pyrcal.playback.track",
     "write_bundle": "service.files.bundle",
 }

@@ -7,8 +7,8 @@ import sys
 from collections.abc import Sequence
 
 from pyrcal.arguments import OTHER_PROGRAMS, command_line, with_negative_numbers
-from pyrcal.offline.arguments import check_files
-from service.cli.program import run_command
+from pyrcal.fitting.arguments import check_files
+from service.program import run_command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

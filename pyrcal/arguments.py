@@ -10,11 +10,10 @@ from typing import NoReturn
 from typing_extensions import override
 
 from pyrcal.client import remote
-from pyrcal.offline import arguments as offline_arguments
+from pyrcal.fitting import arguments as offline_arguments
 from pyrcal.playback import arguments as playback_arguments
-from service import __version__
-from service.cli import program
-from service.cli.program import OneLineParser
+from service import __version__, program
+from service.program import OneLineParser
 
 OTHER_PROGRAMS = {
     "demo": ("pyrcal.demo", "service and simulated telescope, end to end"),

@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pyrcal.offline.fitted import Fit
-from pyrcal.offline.matrix import fit_matrix
-from pyrcal.offline.recorded import read_recorded
+from pyrcal.fitting.fitted import Fit
+from pyrcal.fitting.matrix import fit_matrix
+from pyrcal.fitting.recorded import read_recorded
 from pyrcal.terminal import print_lines
-from service.config import load_instrument
 from service.errors import MatrixError, ModelError
 from service.estimation.reference import Reference
 from service.files.disk_cache import cached_basis
+from service.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.misregistration import wrapped
 from service.model.pupil import instrument_pupil, rtc_valid_subapertures

@@ -22,14 +22,14 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.alternatives import format_move, systematic_terms
-from pyrcal.offline.disjoint_sets import DisjointSets
-from pyrcal.offline.figures import shown_modes
-from pyrcal.offline.fit_file import fit_file
-from pyrcal.offline.fitted import Fit, Registration
-from pyrcal.offline.matrix import FitOptions
+from pyrcal.fitting.alternatives import format_move, systematic_terms
+from pyrcal.fitting.disjoint_sets import DisjointSets
+from pyrcal.fitting.figures import shown_modes
+from pyrcal.fitting.fit_file import fit_file
+from pyrcal.fitting.fitted import Fit, Registration
+from pyrcal.fitting.matrix import FitOptions
 from pyrcal_studies.peers import ROOT
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.model.slopes import as_maps, side_by_side
 

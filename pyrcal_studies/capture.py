@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pyrcal.offline.fitted import Fit
-from pyrcal.offline.matrix import FitOptions, fit_matrix
-from pyrcal.offline.methods import SAME_MINIMUM, search_minimum
-from pyrcal.offline.models import FitModels
+from pyrcal.fitting.fitted import Fit
+from pyrcal.fitting.matrix import FitOptions, fit_matrix
+from pyrcal.fitting.methods import SAME_MINIMUM, search_minimum
+from pyrcal.fitting.models import FitModels
 from pyrcal_studies.fit_coverage import FIRST_SEED, N_MODES, measured
-from service.config import load_instrument
 from service.estimation.reference import Reference, Target, target_of
+from service.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis

@@ -25,11 +25,11 @@ from pyrcal_studies.registered import (
     registered,
     telescope_of,
 )
-from service.config import load_instrument
 from service.control.gains import CalibrationGains
 from service.control.gate import GateVerdict, judge
 from service.control.loop import ControlLoop
 from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
+from service.instrument import load_instrument
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis

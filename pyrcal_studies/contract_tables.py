@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from msgspec import inspect as types
 
-from service.config.schema_texts import described
+from service.instrument.schema_texts import described
 from service.wire import (
     ATTACHMENT_LIMIT,
     BATCH_LIMIT,

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from service.config import load_instrument
 from service.control.gate import compute_edge_motion_m
 from service.control.loop import ControlLoop, pole_radius
 from service.control.reconstructor import invert
@@ -26,6 +25,7 @@ from service.estimation.description import Actuators, edge_watch
 from service.estimation.frames import FrameBlock
 from service.estimation.health import EdgeHealth, observe_edge
 from service.files import parse_alpha
+from service.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration

@@ -25,7 +25,6 @@ import scipy
 from threadpoolctl import threadpool_limits
 
 from benchmarks import estimators
-from service.config.mirrors import grid
 from service.control.gate import judge
 from service.control.loop import ControlLoop
 from service.control.reconstructor import invert
@@ -36,6 +35,7 @@ from service.estimation.loopcheck import LoopCheck
 from service.estimation.passive import PASSIVE_MEMORY_S, Passive, accumulate
 from service.estimation.windows import ClosedLoop
 from service.files.disk_cache import DiskCache
+from service.instrument.mirrors import grid
 from service.model.instrument import Instrument, Mirror
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.kinds import Influence, InfluenceShape, KarhunenLoeve, Stop

@@ -23,9 +23,9 @@ import scipy
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pyrcal.offline.matrix import FitOptions, fit_matrix
-from service.config import load_instrument
+from pyrcal.fitting.matrix import FitOptions, fit_matrix
 from service.estimation.reference import Reference
+from service.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import Basis, ModalBasis, karhunen_loeve_basis

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pyrcal.offline.matrix import fit_matrix
-from service.config.mirrors import grid
+from pyrcal.fitting.matrix import fit_matrix
 from service.estimation.reference import Reference
+from service.instrument.mirrors import grid
 from service.model.instrument import Instrument, Mirror
 from service.model.kinds import KarhunenLoeve, Normalisation, Stop
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration, rotation

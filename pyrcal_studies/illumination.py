@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pyrcal_studies.registered import PASSES, STROKE_M, Array, measured_by_day, registered
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import karhunen_loeve_basis

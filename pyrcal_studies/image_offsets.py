@@ -17,9 +17,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.fit_file import fit
-from pyrcal.offline.fitted import Fit
-from pyrcal.offline.matrix import FitOptions, fit_matrix
+from pyrcal.fitting.fit_file import fit
+from pyrcal.fitting.fitted import Fit
+from pyrcal.fitting.matrix import FitOptions, fit_matrix
 from pyrcal_studies.fft_pyramid import DisplacedPyramid
 from service.estimation.reference import Reference
 from service.model.instrument import Instrument, Mirror

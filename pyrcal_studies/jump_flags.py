@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal_studies.campaign.rows import floats
-from service.config.policy import policy_of
 from service.config.settings import Settings
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.runtime.policy import policy_of
 from service.tracking.filtering import WindowEstimate
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Source

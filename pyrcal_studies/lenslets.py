@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.fitted import Fit
-from pyrcal.offline.matrix import fit_matrix
+from pyrcal.fitting.fitted import Fit
+from pyrcal.fitting.matrix import fit_matrix
 from pyrcal_studies.peers import KEPT, ROOT, environment
-from service.config import load_instrument
 from service.estimation.reference import Reference
+from service.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration, rotation
 from service.model.modes import ModalBasis, modal_basis

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pyrcal.offline.matrix import fit_matrix
+from pyrcal.fitting.matrix import fit_matrix
 from pyrcal_studies.mistold_matrices import (
     COUPLING,
     OBSCURATION,

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pyrcal_studies.peers import KEPT, REQUIREMENTS, ROOT, environment
 from pyrcal_studies.peers_cases import in_degrees, mirror_points
 from pyrcal_studies.peers_pushpull import Bench, Measured, read_product, write_job
-from service.config.mirrors import grid
+from service.instrument.mirrors import grid
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 

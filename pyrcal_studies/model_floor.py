@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pyrcal_studies.registered import against, step_of
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.model.modes import karhunen_loeve_basis

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.figures import PAPER_MODES, check_plots
+from pyrcal.fitting.figures import PAPER_MODES, check_plots
 from service.errors import MatrixError
 from service.files.whole import open_hdf5
 from service.model.instrument import Instrument

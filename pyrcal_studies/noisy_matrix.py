@@ -21,7 +21,6 @@ from threadpoolctl import threadpool_limits
 from pyrcal_studies.campaign.telemetry import blocks_of
 from pyrcal_studies.noisy_figure import draw
 from service.archive import Archive
-from service.config import load_instrument
 from service.estimation.random_dither import (
     Correlated,
     RandomDither,
@@ -31,6 +30,7 @@ from service.estimation.random_dither import (
     noisy_matrix,
 )
 from service.estimation.windows import WindowRefused
+from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.runtime.estimates import work_out
 from service.runtime.worker import Compute, OpticsWorker

@@ -275,7 +275,7 @@ def _for_readers(text: str) -> str:
     return re.sub(r"``\(4,\)`` |,? ?numeric units( \([^)]*\))?", "", text)
 
 
-# --- what a fit of a file answers: it is pyrcal/offline's, and the service hands it on
+# --- what a fit of a file answers: it is pyrcal/fitting's, and the service hands it on
 
 
 class FitDocument(BaseModel):

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from service.config import load_instrument
+from service.instrument import load_instrument
 from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.computer.feed import BATCH_FRAMES
 from sim_rtc.computer.loop import LoopTerms, ModalLoop

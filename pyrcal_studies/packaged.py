@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pyrcal_studies.reference import page
 
-FOLDER = Path(__file__).parents[1] / "service" / "instruments"
+FOLDER = Path(__file__).parents[1] / "service" / "instrument" / "packaged"
 
 _KEY = re.compile(r"(?P<key>[a-z0-9_]+) *= *(?P<value>\"[^\"]*\"|[^#]*?) *(?:# *(?P<source>.*))?")
 
@@ -22,7 +22,7 @@ NO_SOURCE = {"name": "the name of this file"}
 def packaged() -> str:
     """Return docs/reference/instruments.md: every packaged instrument, key by key."""
     intro = (
-        "Each is a file in `service/instruments`, used by its name: `pyrcal demo --instrument "
+        "Each is a file in `service/instrument/packaged`, used by its name: `pyrcal demo --instrument "
         "papyrus`, `pyrcal instrument show papyrus papyrus.png`. A value is public, and then its "
         f"source is named, or it is {ASSUMED}: chosen by the authors of pyrcal because no public "
         "source was found. Check assumed values before you use a file on the real telescope."

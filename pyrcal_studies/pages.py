@@ -16,7 +16,7 @@ from pyrcal_studies import dispatch, reference
 from pyrcal_studies.contract_tables import with_tables
 from pyrcal_studies.openapi import document
 from pyrcal_studies.packaged import packaged
-from service.config.schema_texts import described
+from service.instrument.schema_texts import described
 from service.tracking.alarms import AlarmState, Interlock, Severity
 from service.tracking.commands import Command
 from service.tracking.interlocks import ALLOWS

@@ -31,10 +31,11 @@ from pyrcal.playback.player import Player
 from pyrcal_studies.peers_cases import mirror_points
 from pyrcal_studies.peers_oopao import Oopao
 from pyrcal_studies.peers_pushpull import Bench
-from service.config import load_instrument, load_settings
+from service.config import load_settings
 from service.estimation import passive
 from service.estimation.estimate import PassiveEstimate
 from service.estimation.frames import FrameBlock
+from service.instrument import load_instrument
 from service.model.interaction import Linearisation, RtcInteractionModel
 from service.model.kinds import Stop
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration

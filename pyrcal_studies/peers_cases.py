@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal_studies.peers_pushpull import Bench
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.instrument import Instrument, Mirror
 from service.model.kinds import Influence, InfluenceShape, Stop
 from service.model.misregistration import Misregistration, rotation

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pyrcal.offline.matrix import FitOptions, fit_matrix
+from pyrcal.fitting.matrix import FitOptions, fit_matrix
 from pyrcal_studies.mistold_fits import AS_IT_IS, bench, error
 from pyrcal_studies.mistold_matrices import COUPLING, FRESH, PITCH_M, ZonalCase, actuators_m
 from pyrcal_studies.peers import KEPT, ROOT, environment, variables

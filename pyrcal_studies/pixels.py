@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pyrcal.offline.fitted import Fit
-from pyrcal.offline.matrix import fit_matrix
-from service.config import load_instrument
+from pyrcal.fitting.fitted import Fit
+from pyrcal.fitting.matrix import fit_matrix
 from service.estimation.reference import Reference
+from service.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.kinds import SignalKind

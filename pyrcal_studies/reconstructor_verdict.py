@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pyrcal.offline.control_check import DELAY_FRAMES, GAIN, ReconstructorVerdict, check_control
+from pyrcal.fitting.control_check import DELAY_FRAMES, GAIN, ReconstructorVerdict, check_control
 from pyrcal_studies.registered import noise_free
-from service.config import load_instrument
 from service.control.reconstructor import MAX_CONDITION
+from service.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.kinds import Influence, InfluenceShape

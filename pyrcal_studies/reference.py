@@ -11,11 +11,11 @@ from typing import Any
 
 from check_rtc.__main__ import check_parser
 from pyrcal.arguments import OTHER_PROGRAMS, command_line
-from pyrcal.offline.system_file import SystemFile
-from service.config.instrument_schema import whole_of
-from service.config.schema_texts import KeyText, tables_of
+from pyrcal.fitting.system_file import SystemFile
 from service.config.settings import Settings
-from service.config.sources import Table
+from service.files.toml import Table
+from service.instrument.schema import whole_of
+from service.instrument.schema_texts import KeyText, tables_of
 from service.model.sensors.kind import SensorKind
 from service.model.sensors.registry import KINDS
 from service.tracking.alarms import ALARMS

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.rtc.identity import Identity
-from service.config import load_instrument
 from service.estimation.solver import Columns, Projection
+from service.instrument import load_instrument
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
 from service.wire import MeasureRequest, Pattern

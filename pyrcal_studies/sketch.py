@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from service.config import packaged_instrument
+from service.instrument import packaged_instrument
 from service.model.instrument import Instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 

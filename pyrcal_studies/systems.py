@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.fit_system import fit_pairs
-from pyrcal.offline.matrix import FitOptions, fit_matrix
-from pyrcal.offline.report import FitReport
-from pyrcal.offline.system import ARCSEC_RAD, SHIFTS, Pair, System
-from pyrcal.offline.system_file import load_system
-from pyrcal.offline.system_fit import fit_system
-from pyrcal.offline.system_report import SystemReport
+from pyrcal.fitting.fit_system import fit_pairs
+from pyrcal.fitting.matrix import FitOptions, fit_matrix
+from pyrcal.fitting.report import FitReport
+from pyrcal.fitting.system import ARCSEC_RAD, SHIFTS, Pair, System
+from pyrcal.fitting.system_file import load_system
+from pyrcal.fitting.system_fit import fit_system
+from pyrcal.fitting.system_report import SystemReport
 from pyrcal_studies.peers import environment, variables
 from service.estimation.reference import Reference
 from service.model.instrument import Instrument

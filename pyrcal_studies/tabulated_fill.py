@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from threadpoolctl import threadpool_limits
 
-from pyrcal.offline.fitted import Fit
-from pyrcal.offline.matrix import fit_matrix
+from pyrcal.fitting.fitted import Fit
+from pyrcal.fitting.matrix import fit_matrix
 from pyrcal_studies.registered import against, step_of
-from service.config.instrument import load_instrument
 from service.estimation.reference import Reference
+from service.instrument.reader import load_instrument
 from service.model.instrument import Instrument, TabulatedModes
 from service.model.interaction import InteractionModel
 from service.model.kinds import Stop

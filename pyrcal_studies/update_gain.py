@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from service.config import load_instrument
 from service.control.expected_gain import (
     ExpectedGain,
     Sky,
@@ -28,6 +27,7 @@ from service.control.expected_gain import (
 from service.control.loop import ControlLoop
 from service.control.reconstructor import invert
 from service.files import parse_alpha
+from service.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis

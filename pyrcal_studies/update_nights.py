@@ -17,9 +17,10 @@ from threadpoolctl import threadpool_limits
 
 from pyrcal_studies.campaign.observatory import Observatory
 from pyrcal_studies.campaign.system_measures import wavefront_rms_nm
-from service.config import load_instrument, load_settings
-from service.config.policy import policy_of
+from service.config import load_settings
 from service.control.gate import MAX_SLIP_SAFE_LEAK
+from service.instrument import load_instrument
+from service.runtime.policy import policy_of
 from service.runtime.worker import Compute, OpticsWorker
 from service.tracking import commands as cmd
 from service.tracking import events as ev

@@ -19,15 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-import pyrcal.offline.alternatives as other_explanations
-import pyrcal.offline.instrument_checks as checks
-import pyrcal.offline.matrix as fits
-import pyrcal.offline.verdict as verdicts
-from pyrcal.offline.pupil_checks import FitSubset
+import pyrcal.fitting.alternatives as other_explanations
+import pyrcal.fitting.instrument_checks as checks
+import pyrcal.fitting.matrix as fits
+import pyrcal.fitting.verdict as verdicts
+from pyrcal.fitting.pupil_checks import FitSubset
 from service.estimation.reference import Reference
 from service.model.instrument import Instrument
 from service.model.kinds import Influence, InfluenceShape, Stop
-from tests.unit.offline.test_mistold import MODES, TRUTH, bench, masked, zonal
+from tests.unit.fitting.test_mistold import MODES, TRUTH, bench, masked, zonal
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from pyrcal_studies.optical_gain import PROBE_M, closed_loop, telescope_of
 from pyrcal_studies.registered import against, step_of
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.model.modes import karhunen_loeve_basis

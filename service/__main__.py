@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from service.cli.program import OneLineParser, check_settings, declare, run_command
+from service.program import OneLineParser, check_settings, declare, run_command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -11,10 +11,10 @@ from pathlib import Path
 import structlog
 from threadpoolctl import threadpool_limits
 
-from service.cli.program import leave, log_to_terminal, status_of, stop_signal
-from service.config import load_instrument
 from service.errors import ConfigurationError
 from service.files.recording import Recording, RecordingWriter
+from service.instrument import load_instrument
+from service.program import leave, log_to_terminal, status_of, stop_signal
 from sim_rtc.assembly import Telescope, at_held_rate, build_telescope
 from sim_rtc.computer.feed import Ahead, message_frames
 from sim_rtc.computer.real_time_computer import RealTimeComputer

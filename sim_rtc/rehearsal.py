@@ -13,9 +13,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeGuard
 
-from service.config import instrument_path, load_instrument
-from service.config.sources import read_toml
 from service.errors import ConfigurationError
+from service.files.toml import read_toml
+from service.instrument import instrument_path, load_instrument
 from service.model.instrument import Instrument, Mirror, TabulatedModes
 from service.model.kinds import BasisKind
 

@@ -31,11 +31,11 @@ import h5py
 import numpy as np
 import structlog
 
-from pyrcal.offline.recorded import check_sealed
-from service.config import load_instrument
-from service.config.sources import read_toml
+from pyrcal.fitting.recorded import check_sealed
 from service.errors import PyrcalError
 from service.files.container import opened
+from service.files.toml import read_toml
+from service.instrument import load_instrument
 from service.wire import (
     Acknowledgement,
     CommandKind,

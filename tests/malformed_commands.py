@@ -117,7 +117,7 @@ def as_fits(*images):
 @cache
 def bench():
     """Instrument, mask and matrix of a bench that is fitted in a second."""
-    from service.config import load_instrument
+    from service.instrument import load_instrument
     from service.model.interaction import RtcInteractionModel
     from service.model.misregistration import Misregistration
     from service.model.modes import modal_basis
@@ -166,13 +166,13 @@ def cubes():
 
 def frames():
     """Camera frames of a pyramid, the light, and positions of actuators."""
-    from tests.unit.offline.test_import_cacao import CUBE, LIGHT, PLACES
+    from tests.unit.fitting.test_import_cacao import CUBE, LIGHT, PLACES
 
     return {"matrix": CUBE, "light": LIGHT, "positions": PLACES[:, 1:]}
 
 
 def cacao_files():
-    from tests.unit.offline import test_import_cacao as made
+    from tests.unit.fitting import test_import_cacao as made
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -182,7 +182,7 @@ def cacao_files():
 
 
 def cacao_maps():
-    from tests.unit.offline import test_import_cacao as made
+    from tests.unit.fitting import test_import_cacao as made
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -209,7 +209,7 @@ TRACKED = str(ROOT / "tests" / "unit" / "runtime" / "small.toml")
 @cache
 def telemetry():
     """A second of random telemetry of the small instrument."""
-    from service.config import load_instrument
+    from service.instrument import load_instrument
     from service.model.pupil import rtc_valid_subapertures
 
     about = load_instrument(TRACKED)
@@ -236,7 +236,7 @@ def telemetry():
 def recording():
     from service.files.recording import RecordedKind, RecordingWriter
     from service.wire import encode, encode_frames
-    from tests.unit.offline import test_aot as made
+    from tests.unit.fitting import test_aot as made
 
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "night.h5"
@@ -250,7 +250,7 @@ def recording():
 
 
 def aot_matrix():
-    from tests.unit.offline import test_import_files as made
+    from tests.unit.fitting import test_import_files as made
 
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "it.fits"
@@ -260,7 +260,7 @@ def aot_matrix():
 
 @cache
 def aot_telemetry():
-    from service.config import load_instrument
+    from service.instrument import load_instrument
     from tests.unit.playback import test_aot as made
 
     with tempfile.TemporaryDirectory() as name:
@@ -288,7 +288,7 @@ def session():
 
 @cache
 def system_files():
-    from tests.unit.offline import systems
+    from tests.unit.fitting import systems
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -304,9 +304,9 @@ def system_files():
 
 @cache
 def fit_outputs():
-    from pyrcal.offline.report import document, fill_fit
+    from pyrcal.fitting.report import document, fill_fit
     from service.files.documents import json_text
-    from tests.unit.offline.made import a_fit, a_report
+    from tests.unit.fitting.made import a_fit, a_report
 
     n = bench()[0].shape[1]
     maps = np.full((2, 5, 5), 0.02)

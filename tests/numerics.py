@@ -11,13 +11,13 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from service.config.instrument import load_instrument
-from service.config.mirrors import rings
 from service.control.reconstructor import invert
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import LockInPlan
 from service.estimation.windows import ClosedLoop
 from service.files.disk_cache import DiskCache, usual_folder
+from service.instrument.mirrors import rings
+from service.instrument.reader import load_instrument
 from service.model.instrument import Instrument, Mirror
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.kinds import Influence, InfluenceShape, KarhunenLoeve, Stop

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 from pyrcal.arguments import with_negative_numbers
 from pyrcal.demo.arguments import demo_parser
-from service.cli.program import imported_and_run
+from service.program import imported_and_run
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

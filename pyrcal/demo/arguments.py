@@ -6,7 +6,7 @@ import argparse
 import math
 from pathlib import Path
 
-from service.cli.program import OneLineParser
+from service.program import OneLineParser
 
 FORWARDED = {
     "alpha": ("X,Y,ROT_DEG,MAG", "true registration; default far away, see --near"),

@@ -19,13 +19,13 @@ from pyrcal.demo.children import children, interrupt_on_end
 from pyrcal.demo.report import table
 from pyrcal.demo.truth import TruthFile
 from pyrcal.demo.watch import REQUEST_TIMEOUT_S, USUAL_RATE_HZ, Promise, TelemetryObserver
-from service.config.instrument_schema import (
+from service.errors import ConfigurationError, shown
+from service.instrument.schema import (
     AboutTable,
     InstrumentFile,
     SlopesTable,
     read_instrument_file,
 )
-from service.errors import ConfigurationError, shown
 from service.model.kinds import KarhunenLoeve, LoopFacts
 from sim_rtc.rehearsal import write_live_instrument
 

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.aot import is_own
-from pyrcal.offline.importers.aot import places_of, read_system, registrations_between
-from pyrcal.offline.importers.registration import SECOND_NS, Dated
+from pyrcal.fitting.aot import is_own
+from pyrcal.importers.aot import places_of, read_system, registrations_between
+from pyrcal.importers.registration import SECOND_NS, Dated
 from service.errors import MatrixError
 from service.model.instrument import Instrument, Mirror
 from service.model.pupil import rtc_valid_subapertures, valid_subapertures

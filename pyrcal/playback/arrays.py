@@ -34,7 +34,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.importers.saved import read_npz
+from pyrcal.importers.saved import read_npz
 from pyrcal.playback.alignment import MAX_FRAMES, measure_delay
 from service.errors import ConfigurationError, say
 from service.files import FileKind, kind_of

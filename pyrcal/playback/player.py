@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Concatenate, Final, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.importers.registration import Dated
-from service.config.policy import compute_of, policy_of
+from pyrcal.importers.registration import Dated
 from service.config.settings import Settings
 from service.errors import ModelError, UnknownIdError, WireError
 from service.estimation.dither_windows import EndedWindow
@@ -32,6 +31,7 @@ from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.model.slopes import SlopeRecipe
 from service.runtime.engine import Engine
 from service.runtime.estimates import fit_passive, fitted, read_own_matrix
+from service.runtime.policy import compute_of, policy_of
 from service.runtime.worker import Done, OpticsWorker
 from service.tracking import events as ev
 from service.tracking.events import Effect, Event

@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.importers.saved import read_npz
+from pyrcal.importers.saved import read_npz
 from service.errors import ConfigurationError
 from service.files.container import NUMPY_DAMAGE
 from service.model.instrument import Instrument

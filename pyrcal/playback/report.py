@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.figures import check_plots
+from pyrcal.fitting.figures import check_plots
 from pyrcal.playback.player import Track
 from pyrcal.terminal import table as aligned
 from service.errors import ConfigurationError

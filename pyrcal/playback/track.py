@@ -14,19 +14,20 @@ from pathlib import Path
 import structlog
 from threadpoolctl import threadpool_limits
 
-from pyrcal.offline.figures import check_plots
+from pyrcal.fitting.figures import check_plots
 from pyrcal.playback.aot import read_telemetry
 from pyrcal.playback.arrays import Arrays, open_arrays
 from pyrcal.playback.player import Player, Track
 from pyrcal.playback.pyrtc import is_session, read_session
 from pyrcal.playback.report import document, fill, plot, table
 from pyrcal.terminal import show_progress
-from service.config import load_instrument, load_settings
+from service.config import load_settings
 from service.config.settings import Settings
 from service.errors import ConfigurationError, say
 from service.files.documents import json_text
 from service.files.recording import FORMAT, Message, Recording
 from service.files.whole import open_hdf5, write_whole
+from service.instrument import load_instrument
 from service.model.instrument import Instrument
 
 FOUND, NOTHING_FOUND = 0, 1

@@ -22,9 +22,10 @@ from pyrcal_studies.campaign.plots import plot
 from pyrcal_studies.campaign.rows import RowFile, add_workers, floats, played, range_of, tell, words
 from pyrcal_studies.campaign.summary import table
 from pyrcal_studies.campaign.trouble import Trouble
-from service.cli.program import status_of
-from service.config import load_instrument, load_settings
-from service.config.policy import floor_of
+from service.config import load_settings
+from service.instrument import load_instrument
+from service.program import status_of
+from service.runtime.policy import floor_of
 
 
 def main() -> int:

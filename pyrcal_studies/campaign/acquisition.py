@@ -25,9 +25,9 @@ from pyrcal_studies.campaign.rows import Row, RowFile, range_of, tell
 from pyrcal_studies.campaign.small import bench_of
 from pyrcal_studies.campaign.system_nights import GAINS
 from service.config import load_settings
-from service.config.policy import policy_of
 from service.estimation.openloop import WideCaptureEstimate
 from service.model.misregistration import BOUNDARY_SCALE
+from service.runtime.policy import policy_of
 from service.tracking.events import WideCaptureFitted
 from service.tracking.operation_records import AcquisitionStage
 from service.tracking.state import Mode

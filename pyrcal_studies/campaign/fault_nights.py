@@ -32,10 +32,10 @@ from pyrcal_studies.campaign.rows import Row, RowFile, heading, line, range_of, 
 from pyrcal_studies.campaign.small import SETTINGS, SMALL, bench_of, latencies_of
 from pyrcal_studies.campaign.trouble import Trouble, troubled
 from service.config import load_settings
-from service.config.policy import policy_of
 from service.errors import LinkError, PyrcalError
 from service.estimation.frames import FrameBlock
 from service.runtime.losses import silence
+from service.runtime.policy import policy_of
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither_request import DitherPhase

@@ -20,9 +20,9 @@ import numpy as np
 
 from pyrcal_studies.campaign.golden_codec import Json, decoded, encoded
 from service.config import load_settings
-from service.config.policy import policy_of
 from service.errors import PyrcalError
 from service.model.misregistration import Misregistration
+from service.runtime.policy import policy_of
 from service.tracker import step
 from service.tracking.events import Effect, Event
 from service.tracking.operations.running import running_operations

@@ -17,9 +17,9 @@ from pyrcal_studies.campaign.small import SETTINGS as SMALL_SETTINGS
 from pyrcal_studies.campaign.small import SMALL, latencies_of
 from pyrcal_studies.campaign.strange_rtc import Mischief, StrangeDome, StrangeLink
 from service.config import load_settings
-from service.config.policy import policy_of
 from service.control.reconstructor import Recipe, reconstruct
 from service.errors import LinkError, PyrcalError
+from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
 from service.tracking import events as ev
 from service.tracking.commands import Command

@@ -20,7 +20,7 @@ from pyrcal_studies.campaign.golden_night import GoldenNight
 from pyrcal_studies.campaign.golden_orders import COMMANDED, MEASURING
 from pyrcal_studies.campaign.golden_skies import ACQUIRING, FAULTS, TRACKING
 from pyrcal_studies.campaign.small import SMALL
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.runtime.worker import Compute, OpticsWorker
 
 NIGHTS = (*TRACKING, *ACQUIRING, *COMMANDED, *MEASURING, *FAULTS)

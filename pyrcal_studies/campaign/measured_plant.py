@@ -30,15 +30,16 @@ from pyrcal.rtc.identity import Identity, Reconstructor
 from pyrcal_studies.campaign.observatory import Latencies, Observatory
 from pyrcal_studies.campaign.observatory_dome import START_NS, Dome, Moment
 from pyrcal_studies.campaign.rows import Row, RowFile, heading, line, tell
-from service.config import load_instrument, load_settings
-from service.config.policy import policy_of
+from service.config import load_settings
 from service.control.loop import pole_radius
 from service.estimation.own_matrix import recognise_modes
+from service.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel, RtcInteractionModel
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import analytic_basis
 from service.model.surface import mirror_surface
+from service.runtime.policy import policy_of
 from service.runtime.worker import Compute, OpticsWorker
 from service.tracking import commands as cmd
 from service.tracking.products import MatrixState

@@ -21,11 +21,12 @@ from typing_extensions import override
 from pyrcal_studies.campaign.observatory import Observatory
 from pyrcal_studies.campaign.rows import Row, RowFile
 from pyrcal_studies.campaign.strange_rtc import Dialect, StrangeDome, StrangeLink
-from service.config import load_instrument, load_settings
-from service.config.policy import policy_of
+from service.config import load_settings
+from service.instrument import load_instrument
 from service.model.kinds import SlopeOrder
 from service.model.pupil import rtc_valid_subapertures
 from service.model.slopes import Orientation, SlopeRecipe, to_rtc
+from service.runtime.policy import policy_of
 from service.runtime.worker import Compute, OpticsWorker, Sampling
 from service.tracking.state import Mode
 from service.wire import LoopRequest, Status

@@ -18,10 +18,10 @@ from threadpoolctl import threadpool_limits
 from pyrcal_studies.campaign.plan import Night
 from pyrcal_studies.campaign.telemetry import LINE_FRACTIONS, Arriving, Window, start_dither
 from pyrcal_studies.campaign.trouble import options_for, prepare
-from service.config import load_instrument
 from service.estimation.lockin import LockInEstimate, Spectra
 from service.estimation.random_dither import Correlated, RandomEstimate
 from service.estimation.windows import ClosedLoop, WindowRefused
+from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.runtime.worker import Compute, OpticsWorker, Sampling
 from sim_rtc.assembly import Telescope, build_telescope

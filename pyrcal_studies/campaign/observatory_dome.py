@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from pyrcal.rtc.identity import Reconstructor
-from service.config import load_instrument
 from service.estimation.frames import FrameBlock
+from service.instrument import load_instrument
 from service.model.misregistration import Misregistration
 from service.wire import Command, Reply, Status, decode, encode
 from sim_rtc.assembly import Telescope, build_telescope

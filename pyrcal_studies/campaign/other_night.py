@@ -10,9 +10,10 @@ import numpy as np
 from pyrcal_studies.campaign.kept_night import KeptNight
 from pyrcal_studies.campaign.observatory import Latencies
 from pyrcal_studies.campaign.other_truth import OtherDome, OtherLink, Truth
-from service.config import load_instrument, load_settings
-from service.config.policy import policy_of
+from service.config import load_settings
+from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.runtime.policy import policy_of
 from service.runtime.worker import Compute, OpticsWorker, Sampling
 from service.tracking.state import Mode
 

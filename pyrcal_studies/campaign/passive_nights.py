@@ -23,8 +23,8 @@ from threadpoolctl import threadpool_limits
 from pyrcal_studies.campaign.passive_table import table
 from pyrcal_studies.campaign.passive_watch import PassiveNight, Watch
 from pyrcal_studies.campaign.rows import Row, RowFile, floats, range_of, words
-from service.config import load_instrument
 from service.control.reconstructor import invert
+from service.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import analytic_basis

@@ -13,7 +13,6 @@ from pyrcal_studies.campaign.plan import Observed
 from pyrcal_studies.campaign.small import bench_of
 from pyrcal_studies.campaign.telemetry import LINE_FRACTIONS, SETTLING_S, blocks_of
 from service.config import load_settings
-from service.config.policy import policy_of
 from service.estimation.kalman import (
     Drift,
     Joint,
@@ -27,6 +26,7 @@ from service.estimation.lockin import LockIn, LockInPlan, Spectra
 from service.estimation.passive import PASSIVE_MEMORY_S, Passive, accumulate
 from service.estimation.windows import WindowRefused
 from service.model.misregistration import Misregistration
+from service.runtime.policy import policy_of
 from service.wire import DitherKind, DitherRequest
 from sim_rtc.assembly import Telescope
 from sim_rtc.computer.real_time_computer import RealTimeComputer

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from functools import cache
 
 from pyrcal_studies.campaign.observatory import Latencies
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.runtime.worker import Compute, OpticsWorker, Sampling
 
 SMALL = "tests/system/small.toml"

@@ -23,7 +23,7 @@ from pyrcal_studies.campaign.observatory import Observatory
 from pyrcal_studies.campaign.rows import Row, RowFile, heading, line
 from pyrcal_studies.campaign.small import SETTINGS, SMALL, bench_of, latencies_of
 from service.config import load_settings
-from service.config.policy import policy_of
+from service.runtime.policy import policy_of
 from service.tracking.events import Event
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import new_lines

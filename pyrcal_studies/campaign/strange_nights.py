@@ -27,8 +27,8 @@ from pyrcal_studies.campaign.rows import Row, RowFile, heading, line, range_of, 
 from pyrcal_studies.campaign.small import SETTINGS, SMALL, bench_of, latencies_of
 from pyrcal_studies.campaign.strange_rtc import DIALECTS, Mischief, StrangeDome, StrangeLink
 from service.config import load_settings
-from service.config.policy import policy_of
 from service.errors import PyrcalError
+from service.runtime.policy import policy_of
 from service.tracking import commands as cmd
 from service.tracking.events import Event
 from service.tracking.products import MatrixState

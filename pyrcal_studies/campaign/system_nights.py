@@ -32,9 +32,10 @@ from pyrcal_studies.campaign.rows import (
 from pyrcal_studies.campaign.system_cases import Case, Plan
 from pyrcal_studies.campaign.system_measures import row_of, wavefront_rms_nm
 from pyrcal_studies.campaign.system_table import table
-from service.cli.program import status_of
-from service.config import load_instrument, load_settings
-from service.config.policy import policy_of
+from service.config import load_settings
+from service.instrument import load_instrument
+from service.program import status_of
+from service.runtime.policy import policy_of
 from service.runtime.worker import Compute, OpticsWorker, Sampling
 from service.tracking.state import Mode
 from service.wire import DitherRequest

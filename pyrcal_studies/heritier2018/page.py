@@ -68,7 +68,7 @@ def _conditions(budget: Budget, minutes: float) -> str:
         f"writes this page from it. Written on {datetime.now(UTC).date().isoformat()}; all steps "
         f"took {minutes:.0f} minutes of processor time on two shared cores.\n"
         "- **Telescope**: a diffractive simulation of FLAO at the LBT "
-        "(`service/instruments/flao-lbt.toml`) with another pupil grid and mirror than the model, "
+        "(`service/instrument/packaged/flao-lbt.toml`) with another pupil grid and mirror than the model, "
         "light uneven by 10 % and displaced actuators, at the registration of equation 10. "
         f"{len(budget.seeds)} telescopes differ in imperfections, noise and turbulence; single "
         f"numbers are of telescope {budget.seeds[0]}.\n"

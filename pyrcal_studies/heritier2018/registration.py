@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.fitted import Fit
-from pyrcal.offline.matrix import FitOptions, fit_matrix
-from pyrcal.offline.models import FitModels
+from pyrcal.fitting.fitted import Fit
+from pyrcal.fitting.matrix import FitOptions, fit_matrix
+from pyrcal.fitting.models import FitModels
 from pyrcal_studies.heritier2018 import telescope
 from pyrcal_studies.heritier2018.calibration import Answer, Measurement
 from pyrcal_studies.heritier2018.store import Record, Store, Task

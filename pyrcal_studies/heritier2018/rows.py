@@ -175,11 +175,11 @@ def _equations(budget: Budget, store: Store) -> Iterator[tuple[str, ...]]:
         "the same; anamorphosis optional",
         "same",
     )
-    yield ("Equation 7", "σ_j, RMSE of mode j", "`pyrcal/offline/methods.py`", "`chi_n`", "same")
+    yield ("Equation 7", "σ_j, RMSE of mode j", "`pyrcal/fitting/methods.py`", "`chi_n`", "same")
     yield (
         "Equation 8",
         "χ_N, squared norm; N = 400",
-        "`pyrcal/offline/methods.py`",
+        "`pyrcal/fitting/methods.py`",
         f"N = {len(record['gains'])}, no free gain",
         "same",
     )
@@ -204,7 +204,7 @@ def _tables(budget: Budget, store: Store) -> Iterator[tuple[str, ...]]:
     yield (
         "Table 1",
         "ten steps",
-        "`pyrcal/offline/methods.py`",
+        "`pyrcal/fitting/methods.py`",
         "the same ten",
         "[step by step](#table-1-step-by-step)",
     )
@@ -234,7 +234,7 @@ def _claims(budget: Budget, store: Store) -> Iterator[tuple[str, ...]]:
         for seed in budget.seeds
     )
     gains = results.gains(budget, store)[0]
-    file = "`service/instruments/flao-lbt.toml`"
+    file = "`service/instrument/packaged/flao-lbt.toml`"
     yield (
         "Section 3.1",
         f"“{paper.QUOTES['actuators'].text}”",
@@ -280,14 +280,14 @@ def _claims(budget: Budget, store: Store) -> Iterator[tuple[str, ...]]:
     yield (
         "Section 3.2",
         "“less than 10% of a subaperture for the shifts and less than 0.1° for the rotation”",
-        "`service/config/policy.py`",
+        "`service/runtime/policy.py`",
         f"this costs at most {max(costs.values()):+.1f} nm",
         "no cost printed",
     )
     yield (
         "Section 4.3",
         f"“{paper.QUOTES['third'].text}”",
-        "`pyrcal/offline/methods.py`",
+        "`pyrcal/fitting/methods.py`",
         f"{max(third[:2]):.2f} %, {third[2]:.4f}°",
         "agrees" if max(third[:2]) < 0.5 else "differs",
     )

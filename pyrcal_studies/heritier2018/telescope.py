@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.instrument import Instrument, Mirror
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis

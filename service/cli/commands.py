@@ -15,8 +15,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from service.cli.program import data_dir_of_the_one
 from service.errors import ArchiveError, ConfigurationError, say
+from service.program import data_dir_of_the_one
 from service.web.keys import KeyFile, KeyScope, is_loopback
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def _run(options: argparse.Namespace) -> int:
         if key in given:
             given[key] = [given[key]]
     settings = load_settings(options.config, os.environ, given)
-    from service.config.instrument_schema import read_instrument_file
+    from service.instrument.schema import read_instrument_file
 
     read_instrument_file(settings.service.instrument)
     _check_that_a_key_can_operate(settings)
@@ -74,8 +74,8 @@ def _run(options: argparse.Namespace) -> int:
     from service.runtime.processes import Worker
 
     early = Worker().begin() if options.own_process else Worker()
-    from service.config import load_instrument
-    from service.config.policy import compute_of
+    from service.instrument import load_instrument
+    from service.runtime.policy import compute_of
     from service.runtime.worker import start_worker
 
     instrument, compute = load_instrument(settings.service.instrument), compute_of(settings)

@@ -23,19 +23,19 @@ from typing_extensions import override
 
 from service.archive import Archive
 from service.cli.notify import keep_informed, notify
-from service.cli.program import announced, leave
 from service.config import Settings
 from service.config.link_tables import link_security
-from service.config.policy import keeping_of, policy_of
 from service.config.settings import ApiTable
 from service.errors import ConfigurationError, PyrcalError, shown
 from service.files.fit_folder import FitRequest
 from service.files.last_telemetry import LastTelemetry
 from service.model.instrument import Instrument, instrument_sha256
+from service.program import announced, leave
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.actions import Actions, Publishing
 from service.runtime.archiving import restore_tracking
 from service.runtime.clock import ServiceClock
+from service.runtime.policy import keeping_of, policy_of
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitLimits, FitQueue
 from service.runtime.workers import WorkerPool
@@ -264,7 +264,7 @@ def _supervisor(
     )
 
 
-FIT_PROGRAM = (sys.executable, "-m", "pyrcal.offline.uploaded")
+FIT_PROGRAM = (sys.executable, "-m", "pyrcal.fitting.uploaded")
 """Command of ``pyrcal fit`` for an upload; that process imports only the parts of the service that
 the library uses."""
 

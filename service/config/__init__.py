@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 from service.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from service.config.instrument import load_instrument, packaged_instrument
     from service.config.settings import Settings, load_settings
+    from service.instrument.reader import load_instrument, packaged_instrument
 
 __all__ = ["Settings", "load_instrument", "load_settings", "packaged_instrument"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from service.config.sources import refuse
+from service.files.toml import refuse
 from service.link.guard import Certificate
 
 

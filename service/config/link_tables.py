@@ -11,7 +11,7 @@ from typing import Annotated, Final
 from pydantic import Field, model_validator
 
 from service.config.certificates import read_certificate
-from service.config.sources import Table, in_file, read_toml, refuse, validated
+from service.files.toml import Table, in_file, read_toml, refuse, validated
 from service.link.guard import DAY_S, Certificate, LinkSecurity
 from service.web.keys import is_loopback
 from service.wire.access import LinkRole, access_control

@@ -11,8 +11,8 @@ from typing import Annotated, Literal, get_args, get_origin
 from pydantic import Field, model_validator
 
 from service.config.link_tables import ZenohTable
-from service.config.sources import Id, Network, Table, in_file, nearest, read_toml, validated
 from service.errors import ConfigurationError
+from service.files.toml import Id, Network, Table, in_file, nearest, read_toml, validated
 from service.model.kinds import ArrayLibrary
 
 PREFIX = "PYRCAL_"

@@ -1,6 +1,6 @@
 """Measured matrices and telemetry in files.
 
-The fit is in ``pyrcal.offline``; this module decides nothing about it. It checks a request, in the
+The fit is in ``pyrcal.fitting``; this module decides nothing about it. It checks a request, in the
 words of the command line and of REST, and the type of a file, before anything large is imported, so
 that a mistake is reported at once.
 """

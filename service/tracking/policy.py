@@ -76,7 +76,7 @@ class SensorModePolicy:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Policy:
-    """The settings of the tracker; :func:`service.config.policy.policy_of` makes it of the user's.
+    """The settings of the tracker; :func:`service.runtime.policy.policy_of` makes it of the user's.
 
     What users decide has its default there, and no other here.
     """

@@ -15,8 +15,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from service.config.sources import read_dataset
 from service.errors import ConfigurationError
+from service.files.toml import read_dataset
 from service.files.whole import open_hdf5
 from service.model.instrument import Instrument
 

@@ -27,8 +27,8 @@ import scipy
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from pyrcal.offline.fit_file import make_reference
-from pyrcal.offline.recorded import read_recorded
+from pyrcal.fitting.fit_file import make_reference
+from pyrcal.fitting.recorded import read_recorded
 from service.errors import ConfigurationError, MatrixError, ModelError
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pyrcal_studies.fft_pyramid import FftPyramid
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.pupil import valid_subapertures
 from service.model.sensors.pyramid.optics import PyramidOptics
 from service.model.sensors.pyramid.signals import normalised_jacobian, reference_slopes

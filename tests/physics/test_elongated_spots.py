@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy
 
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.interaction import InteractionModel, RtcInteractionModel
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration

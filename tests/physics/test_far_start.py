@@ -4,8 +4,8 @@ import os
 
 import numpy as np
 
-from service.config import packaged_instrument
 from service.files.disk_cache import DiskCache, usual_folder
+from service.instrument import packaged_instrument
 from service.model.interaction import InteractionModel
 from sim_rtc.computer.reconstructors import truncated_inverse
 from sim_rtc.options import FAR_MODES, USUAL_MODES, parse_options

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pyrcal.offline.importers.files import Reported, from_arrays
-from pyrcal.offline.matrix import FitOptions, fit_matrix
+from pyrcal.fitting.matrix import FitOptions, fit_matrix
+from pyrcal.importers.files import Reported, from_arrays
 from pyrcal_studies.fft_pyramid import DisplacedPyramid
 from pyrcal_studies.image_offsets import (
     SEPARATION,
@@ -26,8 +26,8 @@ from pyrcal_studies.image_offsets import (
     measured,
     model_of,
 )
-from service.config import load_instrument
 from service.estimation.reference import Reference
+from service.instrument import load_instrument
 from service.model.kinds import Stop
 from service.model.pupil import valid_subapertures
 from service.model.sensors.pyramid.description import FrameWindows

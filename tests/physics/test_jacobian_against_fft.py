@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pyrcal_studies.fft_pyramid import FftPyramid
-from service.config.instrument import load_instrument
+from service.instrument.reader import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pyrcal.offline.matrix import FitOptions, fit_matrix
-from service.config import load_instrument
+from pyrcal.fitting.matrix import FitOptions, fit_matrix
 from service.estimation.reference import Reference
+from service.instrument import load_instrument
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration, rotation
 from service.model.modes import modal_basis

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pyrcal.offline.matrix import FitOptions, fit_matrix
+from pyrcal.fitting.matrix import FitOptions, fit_matrix
 from pyrcal_studies import image_offsets
 from pyrcal_studies.fft_pyramid import FftPyramid
 from service.estimation.reference import Reference

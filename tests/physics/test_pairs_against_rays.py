@@ -10,12 +10,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pyrcal.offline.system import Pair
+from pyrcal.fitting.system import Pair
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from tests.physics.fft_spots import pushed
-from tests.unit.offline import systems
+from tests.unit.fitting import systems
 
 ACTUATORS = np.array([29, 41])
 """Near the middle of either mirror."""

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration, rotation

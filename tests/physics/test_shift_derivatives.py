@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.config.instrument import load_instrument
+from service.instrument.reader import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from tests.numerics import SOMEWHERE, flao_basis

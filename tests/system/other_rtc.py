@@ -18,7 +18,7 @@ STROKE_M = 10e-6
 @functools.cache
 def true_response(shift_x=0.0, shift_y=0.0, rotation_deg=0.0, magnification=1.0):
     """Return what the simulator's sensor makes of its mirror ``(n_slopes, n_modes)``."""
-    from service.config import load_instrument
+    from service.instrument import load_instrument
     from sim_rtc.assembly import build_telescope
     from sim_rtc.options import parse_options
 

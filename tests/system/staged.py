@@ -11,7 +11,7 @@ import uvicorn
 
 from service.api import create_app
 from service.archive import Archive
-from service.config import packaged_instrument
+from service.instrument import packaged_instrument
 from service.model.misregistration import Misregistration
 from service.runtime.snapshot import Snapshot
 from service.tracking.alarm_records import record_of

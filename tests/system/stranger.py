@@ -52,7 +52,7 @@ def small_telescope(shift_x_subap=0.0, shift_y_subap=0.0, rotation_deg=0.0, magn
     Numbers only, from the service's own optics: this is for what goes wrong on the wire, and no
     accuracy is claimed on it.
     """
-    from service.config import load_instrument
+    from service.instrument import load_instrument
     from service.model.interaction import RtcInteractionModel
     from service.model.misregistration import Misregistration
     from service.model.modes import modal_basis

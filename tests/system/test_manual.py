@@ -13,7 +13,7 @@ import sys
 import h5py
 import pytest
 
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.misregistration import PARAMETERS, Misregistration
 from tests.data.tiny.make import push_pull
 from tests.system.night import ROOT, a_night, wait_for

@@ -8,7 +8,7 @@ import httpx
 import numpy as np
 import pytest
 
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis

@@ -7,7 +7,7 @@ import h5py
 import pytest
 
 from pyrcal.demo.truth import TruthFile
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.slopes import rtc_mask, to_rtc
 from sim_rtc.assembly import build_telescope
 from sim_rtc.options import parse_options

@@ -56,7 +56,7 @@ def test_a_wheel_has_the_manual_inside(wheel):
 
 def test_a_wheel_has_what_the_program_reads_besides_its_code(wheel):
     expected = [
-        *(ROOT / "service" / "instruments").glob("*.toml"),
+        *(ROOT / "service" / "instrument" / "packaged").glob("*.toml"),
         *(ROOT / "service" / "web" / "dashboard").iterdir(),
         ROOT / "service" / "commands.toml",
         ROOT / "service" / "tracking" / "alarms.toml",

@@ -7,12 +7,12 @@ from types import SimpleNamespace
 import httpx
 import pytest
 
-from pyrcal.offline.figures import numbers
-from pyrcal.offline.report import document
+from pyrcal.fitting.figures import numbers
+from pyrcal.fitting.report import document
 from service.api import create_app
 from service.errors import BusyError, MatrixError, TooLargeError, UnknownIdError
 from service.runtime.uploads import FitJob, FitState
-from tests.unit.offline.made import a_fit, a_report
+from tests.unit.fitting.made import a_fit, a_report
 from tests.unit.test_api import assert_problem
 
 JOB = FitJob(id="fit-1", state=FitState.WAITING, asked_ns_utc=7, n_bytes=4, sha256="ab")

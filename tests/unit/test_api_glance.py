@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from service.config import packaged_instrument
 from service.control.reconstructor import invert
 from service.errors import UnknownIdError
 from service.estimation.frames import FrameBlock
+from service.instrument import packaged_instrument
 from service.model.pupil import rtc_valid_subapertures
 from service.web import matrices, page
 from tests.unit.test_api_fits import assert_problem

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.config import packaged_instrument
+from service.instrument import packaged_instrument
 from service.model.instrument import TabulatedModes
 from service.model.misregistration import PARAMETERS
 from service.web.page import FILES

@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from pyrcal.offline.recorded import read_recorded
+from pyrcal.fitting.recorded import read_recorded
 from service.archive import Archive
 from service.archive.products import NoisyNumbers
 from service.archive.serialisation import from_json, to_json

@@ -10,7 +10,7 @@ import pytest
 
 from pyrcal.__main__ import main
 from pyrcal.arguments import HEADINGS, command_line
-from pyrcal.offline.matrix import FitOptions
+from pyrcal.fitting.matrix import FitOptions
 from service import __version__
 from service.config import Settings, load_settings
 from service.control.reconstructor import MAX_CONDITION, Recipe

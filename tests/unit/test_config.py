@@ -10,10 +10,11 @@ import h5py
 import numpy as np
 import pytest
 
-from service.config import Settings, load_instrument, load_settings, packaged_file
-from service.config.mirrors import coincident, grid, hexagonal, rings, typical_pitch
-from service.config.sources import read_toml
+from service.config import Settings, load_settings
 from service.errors import ConfigurationError, ModelError
+from service.files.toml import read_toml
+from service.instrument import load_instrument, packaged_file
+from service.instrument.mirrors import coincident, grid, hexagonal, rings, typical_pitch
 from service.model.instrument import instrument_sha256
 from service.model.kinds import Influence, LoopFacts, Normalisation, SignalKind, SlopeOrder, Stop
 from service.model.misregistration import Misregistration

@@ -4,7 +4,8 @@ import h5py
 import numpy as np
 import pytest
 
-from service.config import crops, load_instrument
+from service.config import crops
+from service.instrument import load_instrument
 from service.model import interaction
 from service.model.instrument import instrument_sha256
 from service.model.interaction import InteractionModel

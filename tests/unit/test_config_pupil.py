@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from service.config import load_instrument
 from service.errors import ConfigurationError
+from service.instrument import load_instrument
 from service.model.instrument import instrument_sha256
 from service.model.pupil import instrument_pupil, lit_subapertures
 from sim_rtc.telescope.diffractive import centred_pupil

@@ -5,8 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from service.config import load_instrument, packaged_file
-from service.config.mirrors import grid
+from service.instrument import load_instrument, packaged_file
+from service.instrument.mirrors import grid
 from service.model.pupil import valid_subapertures
 from tests.unit.test_config import ABOUT, MIRROR, WFS, refusal, write
 

@@ -19,9 +19,10 @@ from cacao_bridge.settings import load as load_bridge
 from check_rtc.__main__ import check_parser
 from pyrcal.arguments import command_line, with_negative_numbers
 from pyrcal.demo.arguments import demo_parser
-from pyrcal.offline.system_file import load_system
+from pyrcal.fitting.system_file import load_system
 from service.api import create_app
-from service.config import load_instrument, load_settings
+from service.config import load_settings
+from service.instrument import load_instrument
 from service.tracking.alarms import ALARMS
 from service.web import page
 from sim_rtc.options import parse_options

@@ -13,9 +13,9 @@ from pyrcal.__main__ import main
 from pyrcal.terminal import login
 from service.archive import Archive
 from service.cli.commands import DATA_DIR
-from service.cli.program import announced, running_services
 from service.config import Settings
 from service.errors import ConfigurationError, UnknownIdError
+from service.program import announced, running_services
 from service.web.keys import KeyFile, KeyScope, is_loopback
 
 

@@ -31,7 +31,7 @@ def test_nothing_else_is_offered():
         _ = pyrcal.nonsense
 
 
-@pytest.mark.parametrize("module", ["pyrcal", "pyrcal.client.rest", "pyrcal.offline"])
+@pytest.mark.parametrize("module", ["pyrcal", "pyrcal.client.rest", "pyrcal.fitting"])
 def test_what_is_imported_brings_no_mathematics(module):
     code = f"import sys, {module}; sys.exit('numpy' in sys.modules or 'pydantic' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.config import load_instrument, load_settings
-from service.config.policy import AT_WORK, FLAT, floor_of, policy_of
+from service.config import load_settings
 from service.errors import ConfigurationError
+from service.instrument import load_instrument
+from service.runtime.policy import AT_WORK, FLAT, floor_of, policy_of
 
 LENSLETS = Path(__file__).parents[1] / "data" / "lenslets.toml"
 

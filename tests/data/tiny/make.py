@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration

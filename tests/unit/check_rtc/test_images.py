@@ -10,7 +10,7 @@ from check_rtc.check import measure_image_offsets
 from check_rtc.examine import Examination, examine
 from check_rtc.requirements import Outcome
 from check_rtc.telemetry_checks import ImageOffsets
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.kinds import KarhunenLoeve
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis

@@ -6,13 +6,13 @@ import sys
 
 import pytest
 
-from service.cli.program import leave, status_of
+from service.program import leave, status_of
 
 AT_ITS_END = "import atexit, sys; atexit.register(print, 'taken down'); "
 
 WITH_A_CHILD = """
 import multiprocessing, time
-from service.cli.program import leave
+from service.program import leave
 
 if __name__ == "__main__":
     context = multiprocessing.get_context("fork")

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from pyrcal.offline.report import KnownFit, Provenance
+from pyrcal.fitting.report import KnownFit, Provenance
 from service.control.gains import CalibrationGains
 from service.control.reconstructor import (
     Prior,

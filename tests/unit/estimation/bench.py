@@ -7,8 +7,8 @@ from functools import cache
 
 import numpy as np
 
-from pyrcal.offline.fitted import Fit
-from pyrcal.offline.matrix import FitOptions, fit_matrix
+from pyrcal.fitting.fitted import Fit
+from pyrcal.fitting.matrix import FitOptions, fit_matrix
 from service.estimation.reference import Reference
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel

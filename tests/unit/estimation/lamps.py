@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from service.config.instrument import load_instrument
+from service.instrument.reader import load_instrument
 from service.model.instrument import Instrument
 from service.model.kinds import Stop
 from service.model.pupil import Illumination, instrument_pupil

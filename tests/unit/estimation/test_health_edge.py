@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import scipy
 
-from service.config.mirrors import rings
 from service.estimation.description import Actuators, EdgeWatch, edge_watch
 from service.estimation.health import SLIPPED_RATIO, SUSPECT_RATIO, EdgeHealth, observe_edge
+from service.instrument.mirrors import rings
 from service.model.kinds import KarhunenLoeve
 from service.model.modes import ModalBasis, karhunen_loeve_basis
 from tests.numerics import block_of, small_instrument

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pyrcal.offline.matrix import fit_matrix
+from pyrcal.fitting.matrix import fit_matrix
 from service.estimation.reference import Reference
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration

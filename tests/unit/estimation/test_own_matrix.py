@@ -5,13 +5,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from service.config import load_instrument
 from service.estimation.own_matrix import (
     LeftOver,
     left_over,
     recognise_modes,
     weights_of_modes,
 )
+from service.instrument import load_instrument
 from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis

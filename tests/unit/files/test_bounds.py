@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
-from pyrcal.offline.recorded import check_sealed
+from pyrcal.fitting.recorded import check_sealed
 from service.errors import MatrixError
 from service.files import bounds
 from service.files.container import opened

@@ -5,7 +5,7 @@ import h5py
 import numpy as np
 import pytest
 
-from pyrcal.offline.recorded import check_sealed
+from pyrcal.fitting.recorded import check_sealed
 from service.errors import MatrixError
 from service.files import container
 from service.files.container import opened

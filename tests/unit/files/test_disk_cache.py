@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pyrcal.offline.design import interaction_matrix
+from pyrcal.fitting.design import interaction_matrix
 from service.files import disk_cache
 from service.files.disk_cache import DiskCache, usual_folder
 from service.model.modes import modal_basis
@@ -135,7 +135,7 @@ WRITER = """
 import sys
 from pathlib import Path
 import numpy as np
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.files.disk_cache import DiskCache
 instrument, kept = load_instrument(sys.argv[2]), DiskCache(Path(sys.argv[1]))
 for k in range(60):

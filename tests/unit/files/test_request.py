@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from pyrcal.offline.arguments import parse_arms
+from pyrcal.fitting.arguments import parse_arms
 from service.files import parse_alpha, parse_modes
 
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from pyrcal.__main__ import main
-from pyrcal.offline.advice import Advice
-from pyrcal.offline.matrix import FitOptions, fit_matrix
-from service.config import load_instrument
+from pyrcal.fitting.advice import Advice
+from pyrcal.fitting.matrix import FitOptions, fit_matrix
 from service.estimation.reference import Reference
+from service.instrument import load_instrument
 from service.model.aperture import check_mask, measure_aperture
 from service.model.interaction import RtcInteractionModel
 from service.model.kinds import Stop

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.config.mirrors import grid
+from service.instrument.mirrors import grid
 from service.model import karhunen_loeve
 from service.model.kinds import Influence
 from service.model.modes import analytic_basis

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from service.config.mirrors import grid
+from service.instrument.mirrors import grid
 from service.model.interaction import InteractionModel
 from service.model.kinds import Influence, Stop
 from service.model.memory import PROGRAM_BYTES, work_of

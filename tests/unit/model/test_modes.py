@@ -7,9 +7,9 @@ import pickle
 import numpy as np
 import pytest
 
-from service.config.instrument import load_instrument
-from service.config.mirrors import grid, rings
 from service.errors import ModelError
+from service.instrument.mirrors import grid, rings
+from service.instrument.reader import load_instrument
 from service.model import karhunen_loeve
 from service.model.kinds import Influence
 from service.model.modes import ModalBasis, karhunen_loeve_basis

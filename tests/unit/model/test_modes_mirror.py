@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.config.mirrors import rings
+from service.instrument.mirrors import rings
 from service.model.instrument import Mirror
 from service.model.kinds import Influence, InfluenceShape
 from service.model.surface import Gaussian, ThinPlate, mirror_surface

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.config.mirrors import hexagonal
+from service.instrument.mirrors import hexagonal
 from service.model import karhunen_loeve
 from service.model.instrument import Mirror, instrument_sha256
 from service.model.kinds import Influence, InfluenceShape

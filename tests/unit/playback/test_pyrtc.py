@@ -7,8 +7,8 @@ import pytest
 
 from pyrcal.playback.arrays import Arrays
 from pyrcal.playback.pyrtc import is_session, read_session
-from service.config import load_instrument
 from service.errors import ConfigurationError, MatrixError
+from service.instrument import load_instrument
 from tests.system.night import INSTRUMENT
 
 N_SLOPES, N_MODES = 224, 6

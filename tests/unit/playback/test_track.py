@@ -10,7 +10,7 @@ import pyrcal
 from pyrcal.__main__ import main
 from pyrcal_studies.campaign.small import SMALL
 from pyrcal_studies.campaign.telemetry import LINE_FRACTIONS
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE
 from sim_rtc.assembly import build_telescope
 from sim_rtc.options import parse_options
@@ -289,8 +289,8 @@ def test_other_files_are_refused_in_one_line(tmp_path, capsys, fill):
 
 def test_an_aot_file_is_played_and_its_own_alpha_is_compared(telemetry, tmp_path, capsys):
     pytest.importorskip("aotpy")
-    from pyrcal.offline.aot import Excerpt, write_aot
-    from pyrcal.offline.importers.registration import Dated
+    from pyrcal.fitting.aot import Excerpt, write_aot
+    from pyrcal.importers.registration import Dated
     from pyrcal.playback.aot import read_telemetry
     from service.model.misregistration import Misregistration
     from service.wire import FrameBatch, FrameHeader

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from service.config import load_instrument
 from service.control.loop import ControlLoop
 from service.files.disk_cache import usual_folder
+from service.instrument import load_instrument
 from service.runtime.worker import Compute, Conditions
 
 INSTRUMENT = Path(__file__).with_name("small.toml")

@@ -10,8 +10,9 @@ from pyrcal_studies.campaign.golden_night import SETTINGS
 from pyrcal_studies.campaign.observatory import Observatory
 from pyrcal_studies.campaign.small import latencies_of
 from service.archive.serialisation import TrackingFile
-from service.config import load_instrument, load_settings
-from service.config.policy import policy_of
+from service.config import load_settings
+from service.instrument import load_instrument
+from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
 from service.runtime.worker.records import Compute
 from service.tracking.products import MatrixState

@@ -8,9 +8,10 @@ from threadpoolctl import threadpool_limits
 
 from pyrcal_studies.campaign.observatory import Observatory
 from pyrcal_studies.campaign.observatory_dome import Dome
-from service.config import load_instrument, load_settings
-from service.config.policy import policy_of
+from service.config import load_settings
 from service.errors import ConfigurationError
+from service.instrument import load_instrument
+from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
 from service.tracking.state import Mode
 from sim_rtc.assembly import build_telescope

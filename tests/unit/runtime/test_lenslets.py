@@ -6,15 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pyrcal.offline.matrix import fit_matrix
+from pyrcal.fitting.matrix import fit_matrix
 from pyrcal_studies.campaign.golden_night import SETTINGS, WORDS
 from pyrcal_studies.campaign.observatory import Observatory
 from pyrcal_studies.campaign.small import latencies_of
-from service.config import load_instrument, load_settings
-from service.config.policy import policy_of
+from service.config import load_settings
 from service.estimation.reference import Reference
+from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import modal_basis
+from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
 from service.runtime.worker.records import Compute
 from service.tracking.products import MatrixState

@@ -6,11 +6,12 @@ from threadpoolctl import threadpool_limits
 
 from pyrcal_studies.campaign.observatory import Observatory
 from service.archive import Archive
-from service.config import load_instrument, load_settings
-from service.config.policy import policy_of
+from service.config import load_settings
+from service.instrument import load_instrument
 from service.model.misregistration import Misregistration
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.actions import Actions, Publishing
+from service.runtime.policy import policy_of
 from service.runtime.supervisor import Supervisor
 from service.runtime.worker import OpticsWorker, start_worker
 from service.runtime.workers import WorkerPool

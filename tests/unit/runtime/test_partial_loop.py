@@ -8,11 +8,11 @@ from threadpoolctl import threadpool_limits
 
 from pyrcal_studies.campaign.observatory import Observatory
 from service.config import load_settings
-from service.config.policy import policy_of
 from service.estimation.description import LOW_MODES
 from service.estimation.health import LoopHealth
 from service.runtime.engine import shape_mismatch
 from service.runtime.estimator_bank import EstimatorBank, process_block, with_rtc
+from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
 from service.tracking import commands as cmd
 from service.tracking.registration import Source

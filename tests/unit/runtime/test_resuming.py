@@ -8,11 +8,12 @@ from threadpoolctl import threadpool_limits
 from pyrcal_studies.campaign.acquisition import Start
 from pyrcal_studies.campaign.observatory import Observatory
 from service.archive import Archive
-from service.config import load_instrument, load_settings
-from service.config.policy import policy_of
+from service.config import load_settings
+from service.instrument import load_instrument
 from service.runtime.archiving import is_unsaved, is_urgent, leave, restore_tracking
 from service.runtime.engine import Engine
 from service.runtime.estimates import PendingWindow
+from service.runtime.policy import policy_of
 from service.runtime.worker import Compute, OpticsWorker
 from service.tracking import commands as cmd
 from service.tracking import events as ev

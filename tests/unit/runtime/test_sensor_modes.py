@@ -10,14 +10,15 @@ from threadpoolctl import threadpool_limits
 from pyrcal_studies.campaign.observatory import Observatory
 from pyrcal_studies.campaign.observatory_dome import Dome
 from pyrcal_studies.campaign.observatory_link import OwnHands
-from service.config import load_instrument, load_settings
-from service.config.policy import policy_of
+from service.config import load_settings
 from service.errors import ModelError
 from service.estimation.windows import RefusalKind
+from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE
 from service.model.slopes import Orientation, SlopeRecipe
 from service.runtime.actions import Actions
 from service.runtime.estimates import fitted, read_own_matrix
+from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
 from service.tracking.products import MatrixState
 from service.tracking.resume import resumed, saved_of

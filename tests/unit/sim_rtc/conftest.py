@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.instrument import Mirror
 from service.model.kinds import KarhunenLoeve
 from service.model.modes import karhunen_loeve_basis

@@ -2,7 +2,7 @@
 
 import pytest
 
-from service.config import load_instrument
+from service.instrument import load_instrument
 from sim_rtc.assembly import at_held_rate
 from sim_rtc.held_rate import RATES_HZ, SHARE, frame_s, held_rate_hz
 from sim_rtc.options import parse_options

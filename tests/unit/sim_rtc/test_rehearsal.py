@@ -4,9 +4,9 @@ import h5py
 import numpy as np
 import pytest
 
-from service.config import load_instrument
-from service.config.sources import read_toml
 from service.errors import ConfigurationError
+from service.files.toml import read_toml
+from service.instrument import load_instrument
 from service.model.instrument import instrument_sha256
 from service.model.kinds import BasisKind
 from sim_rtc.rehearsal import with_modes, write_live_instrument

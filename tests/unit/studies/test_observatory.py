@@ -12,8 +12,8 @@ from pyrcal_studies.campaign.observatory_dome import START_NS, Dome, replayed
 from pyrcal_studies.campaign.small import N_TARGET, SETTINGS, SMALL, bench_of, latencies_of
 from pyrcal_studies.campaign.system_measures import row_of
 from service.config import load_settings
-from service.config.policy import policy_of
 from service.errors import CommandError
+from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
 from service.tracking import alarms
 from service.tracking import commands as cmd

@@ -7,9 +7,10 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from pyrcal_studies.campaign.observatory import Latencies, Observatory
-from service.config import load_instrument, load_settings
-from service.config.policy import policy_of
+from service.config import load_settings
+from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE
+from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
 from service.tracking.state import Mode
 from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED

@@ -3,7 +3,7 @@
 import pytest
 
 from pyrcal_studies.packaged import FOLDER, packaged
-from service.config.sources import read_toml
+from service.files.toml import read_toml
 
 PAGE = packaged()
 NAMES = sorted(path.stem for path in FOLDER.glob("*.toml"))

@@ -21,7 +21,7 @@ from pyrcal_studies.peers_pushpull import (
     write_job,
     write_product,
 )
-from service.config import load_instrument
+from service.instrument import load_instrument
 from service.model.kinds import Stop
 
 BENCH = Bench(

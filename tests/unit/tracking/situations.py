@@ -6,12 +6,12 @@ import numpy as np
 
 from pyrcal.client.remote import REQUESTS
 from service.config import load_settings
-from service.config.policy import policy_of
 from service.control.gate import GateVerdict
 from service.errors import CommandError
 from service.estimation.lockin import LockInEstimate
 from service.estimation.loop import select_gains
 from service.model.misregistration import Misregistration
+from service.runtime.policy import policy_of
 from service.tracker import step
 from service.tracking import events as ev
 from service.tracking.dither_request import Dither

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 
 from service.config import load_settings
-from service.config.policy import policy_of
 from service.config.settings import STATE_FIELDS
 from service.errors import CommandError, ConfigurationError, UnknownIdError
+from service.runtime.policy import policy_of
 from service.tracker import step
 from service.tracking import commands as cmd
 from service.tracking import events as ev

@@ -19,7 +19,7 @@ from service.model.sensors.pyramid.detector_windows import (
 )
 from service.model.slopes import SlopeRecipe
 from tests.numerics import small_instrument
-from tests.unit.offline.discs import four_discs
+from tests.unit.fitting.discs import four_discs
 
 RECTANGLE = np.array([[14.0, 15.0], [14.0, 45.0], [44.0, 15.0], [44.0, 45.0]])
 

@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from pyrcal.offline.solver import image_patterns, is_blurring
+from pyrcal.fitting.solver import image_patterns, is_blurring
 from service.errors import ModelError
 from service.model.interaction import InteractionModel
 from service.model.kinds import Normalisation, SlopeOrder, Stop

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pyrcal.offline.matrix import fit_matrix
-from service.config import load_instrument
+from pyrcal.fitting.matrix import fit_matrix
 from service.errors import ConfigurationError
 from service.estimation.reference import Reference
+from service.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis

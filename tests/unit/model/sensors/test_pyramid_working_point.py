@@ -4,8 +4,8 @@ import functools
 import numpy as np
 import pytest
 
-from service.config import load_instrument
 from service.errors import ModelError
+from service.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.sensors.pyramid.working_point import Halo, working_point

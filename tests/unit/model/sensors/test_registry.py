@@ -6,10 +6,10 @@ from typing import ClassVar, Literal
 import numpy as np
 import pytest
 
-from pyrcal.offline.models import FitModels, Optic
-from service.config import load_instrument
+from pyrcal.fitting.models import FitModels, Optic
 from service.errors import ConfigurationError
 from service.estimation.openloop import far_starts
+from service.instrument import load_instrument
 from service.model.instrument import instrument_sha256
 from service.model.kinds import SignalKind
 from service.model.sensors import registry

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import scipy
 
-from pyrcal.offline.matrix import fit_matrix
-from service.config import load_instrument
+from pyrcal.fitting.matrix import fit_matrix
 from service.errors import ConfigurationError
 from service.estimation.reference import Reference, target_of
+from service.instrument import load_instrument
 from service.model.instrument import instrument_sha256
 from service.model.interaction import InteractionModel
 from service.model.kinds import Stop

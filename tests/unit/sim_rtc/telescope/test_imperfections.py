@@ -3,8 +3,8 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from service.config import load_instrument
 from service.errors import ConfigurationError
+from service.instrument import load_instrument
 from service.model.kinds import KarhunenLoeve, SignalKind, Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.config import load_instrument
 from service.errors import ConfigurationError
+from service.instrument import load_instrument
 from service.model.modes import modal_basis
 from service.model.pupil import fully_lit_subapertures, instrument_pupil, valid_subapertures
 from service.model.sensors.registry import kind_of

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from pyrcal.__main__ import main
-from service.config import load_instrument
 from service.errors import ConfigurationError
+from service.instrument import load_instrument
 from service.model.interaction import RtcInteractionModel
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration

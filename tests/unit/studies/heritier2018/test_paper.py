@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pyrcal.offline.methods import TABLE_1 as SCANNED
+from pyrcal.fitting.methods import TABLE_1 as SCANNED
 from pyrcal_studies.heritier2018 import paper, plan, results
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 

@@ -1,0 +1,213 @@
+"""Recommend an action for a fit, in one sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.fitting.alternatives import (
+    Alternative,
+    describe_preference,
+    format_move,
+    systematic_terms,
+)
+from pyrcal.fitting.fitted import Fit
+from pyrcal.fitting.left_over import locate_residual
+from pyrcal.fitting.origins import Origin
+from pyrcal.fitting.verdict import UNDECIDED_WORDS, Refusal
+
+Array = NDArray[np.float64]
+
+ENOUGH_SUBAP = 0.03
+"""Sufficient 1 σ of the mirror's position at the pupil's edge: 3 σ are then a tenth of a
+subaperture, the accuracy that Heritier et al. 2018, section 3.2, require of a shift."""
+
+FEWEST_SETS = 2
+"""Sets of modes that can check each other."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Grounds:
+    """Inputs of a recommendation, besides the fit's own numbers."""
+
+    refusal: Refusal | None
+    """Reason of the refusal; None if the fit was accepted."""
+
+    structure: float
+    """RMS share of the signal that is left over and is not noise."""
+
+    n_sets: int
+    """Number of disjoint sets of modes that were fitted separately."""
+
+    columns: tuple[str, ...] = ()
+    """Sentences on columns with wrong signs or in wrong places."""
+
+    numbers_share: float = 1.0
+    """χ² left with coupling and modulation as fitted, over that with those of the file."""
+
+    gains: tuple[str, ...] = ()
+    """Causes of gains that are far from 1."""
+
+
+class Advice(StrEnum):
+    """Recommended action for a fit."""
+
+    USE = "use it"
+    MEASURE_MORE = "measure more"
+    DO_NOT_USE = "do not use it"
+
+
+def add_explanations(fit: Fit, tried: tuple[Alternative, ...], grounds: Grounds) -> Fit:
+    """Return the fit with alternatives, residual analysis and recommendation filled in."""
+    preferred = (
+        describe_preference(one, fit.sigma)
+        for one in tried
+        if one.preferred and one.words not in fit.verdict
+    )
+    sentences = (*fit.remarks, *grounds.gains, *preferred)
+    size = np.linalg.norm(np.asarray(fit.measured, dtype=np.float64), axis=0)
+    left = locate_residual(
+        fit.residual_map, fit.residual_by_mode, valid=fit.valid, modes=fit.modes, size=size
+    )
+    fit = replace(fit, alternatives=tried, remarks=sentences, left_over=left)
+    return replace(fit, recommendation=recommend_action(fit, grounds))
+
+
+def add_displaced(fit: Fit, columns: tuple[str, ...]) -> Fit:
+    """Return a refused fit whose cause is that all columns are displaced."""
+    if not columns:
+        return fit
+    advised = f"{Advice.DO_NOT_USE}: {columns[0]}"
+    return replace(fit, remarks=(*fit.remarks, *columns), recommendation=advised)
+
+
+def recommend_action(fit: Fit, grounds: Grounds) -> str:
+    """Return the recommended action for a fit and its reason, in one sentence."""
+    if grounds.refusal is not None:
+        return _advise_refused(fit, grounds)
+    radius = _radius(fit)
+    edge = float(_at_edge(fit.sigma, radius))
+    control = fit.reconstructor
+    if control is not None and not control.usable:
+        return f"{Advice.MEASURE_MORE}: the reconstructor is not stable: {control.reason}"
+    # a reconstructor that is stable with all modes is good enough, however large sigma is
+    if edge > ENOUGH_SUBAP and not (control is not None and control.holds):
+        return f"{Advice.MEASURE_MORE}: {_explain_uncertainty(fit, edge, radius)}"
+    if grounds.n_sets < FEWEST_SETS:
+        return (
+            f"{Advice.MEASURE_MORE}: too few modes ({len(fit.modes)}) to check each other; push "
+            "six or more"
+        )
+    if grounds.columns:
+        return f"{Advice.USE} for the registration alone: {'; '.join(grounds.columns)}"
+    known = f"the mirror is known to {edge:.2g} subapertures at the pupil's edge (1 sigma)"
+    if control is not None and not control.holds:
+        known = f"{known}; the reconstructor is {control.reason}"
+    corrections = ", ".join(_list_corrections(fit))
+    if corrections:
+        return f"{Advice.USE}, and correct the instrument file ({corrections}): {known}"
+    return f"{Advice.USE}: {known}"
+
+
+def _explain_uncertainty(fit: Fit, edge: float, radius: float) -> str:
+    """Return the uncertainty of the registration and how to reduce it."""
+    known = (
+        f"at the pupil's edge the mirror is known to {edge:.3f} subapertures (1 sigma), "
+        f"{ENOUGH_SUBAP:g} is enough"
+    )
+    found = fit.registration
+    if found is None or _at_edge(found.sigma_statistical, radius) > 0.7 * edge:
+        return f"{known}; average more, or push more modes"
+    terms = systematic_terms(fit.alternatives, fit.residual_fraction, fit.sigma)
+    most = max(terms, key=lambda term: _at_edge(term.sigma, radius), default=None)
+    if most is None or _at_edge(most.sigma, radius) < 0.5 * edge:
+        return f"{known}; the model differs from the bench, and more averaging does not help"
+    other = most.alternative
+    return (
+        f"{known}; the matrix does not exclude {other.words}, which would move the registration "
+        f"by {format_move(other.moved)}"
+    )
+
+
+def _advise_refused(fit: Fit, grounds: Grounds) -> str:
+    match grounds.refusal:
+        case Refusal.UNDETERMINED:
+            return f"{Advice.MEASURE_MORE}: the modes do not determine the registration"
+        case Refusal.ANOTHER_MINIMUM:
+            return (
+                f"{Advice.MEASURE_MORE}: two registrations explain the matrix nearly as well; push "
+                "more modes, or give a start near the true registration (--start)"
+            )
+        case Refusal.UNEXPLAINED if grounds.structure < 0.5 * fit.residual_fraction:
+            return (
+                f"{Advice.MEASURE_MORE}: {fit.residual_fraction:.0%} of the signal is noise; "
+                "average more, or push further"
+            )
+    return f"{Advice.DO_NOT_USE}: {_find_cause(fit, grounds)}"
+
+
+def _find_cause(fit: Fit, grounds: Grounds) -> str:
+    """Return the most likely cause of a refusal; a definite cause precedes the verdict."""
+    if grounds.refusal in {Refusal.ANOTHER_BASIS, Refusal.ANOTHER_UNIT} and grounds.gains:
+        return grounds.gains[0]
+    if grounds.columns and grounds.refusal is not Refusal.AXES:
+        return "; ".join(grounds.columns)
+    best = _choose_correction(fit)
+    if best is not None and grounds.refusal is Refusal.ANOTHER_INSTRUMENT:
+        number = next(_list_wrong_numbers(fit), None)
+        if number is not None and grounds.numbers_share < (best.share or 0.0):
+            return f"{number.words}; correct that and fit again"
+        if UNDECIDED_WORDS in fit.verdict:
+            return fit.verdict.rpartition("better: ")[2]
+        return (
+            f"with {best.words} the misfit is {best.share:.0%} of what it is; correct that and fit "
+            "again"
+        )
+    left = fit.left_over
+    if grounds.refusal is Refusal.DIVIDED and left is not None and left.modes:
+        return f"{left.words}; measure these again, or leave them out (--modes)"
+    return fit.verdict.removeprefix("refused: ")
+
+
+def _list_corrections(fit: Fit) -> Iterator[str]:
+    """Yield corrections of the instrument file, in its own notation."""
+    for one in fit.origins:
+        if one.correct:
+            yield f"{one.key} = {one.found}"
+    best = _choose_correction(fit)
+    if best is not None:
+        yield best.key
+
+
+def _list_wrong_numbers(fit: Fit) -> Iterator[Origin]:
+    """Yield numbers of the file that the matrix contradicts.
+
+    With a wrong modulation another stop explains part of the misfit that the fitted number leaves.
+    What reduces the misfit by the larger factor is corrected first.
+    """
+    notable = {one.key for one in fit.optics if one.notable}
+    return (one for one in fit.origins if one.correct and one.key in notable)
+
+
+def _choose_correction(fit: Fit) -> Alternative | None:
+    """Return the preferred alternative with a key that leaves the smallest misfit, or None."""
+    found = [
+        one
+        for one in fit.alternatives
+        if one.preferred and one.key and one.share is not None and one.share < 1.0
+    ]
+    return min(found, key=lambda one: one.share or 0.0, default=None)
+
+
+def _radius(fit: Fit) -> float:
+    """Return the radius of the pupil, in subapertures."""
+    return float(np.sqrt(fit.valid.sum() / np.pi))
+
+
+def _at_edge(step: Array, radius: float) -> float:
+    """Return the displacement at the pupil's edge for a change of α, subapertures."""
+    return float(np.sqrt(np.max(step[:2] ** 2) + radius**2 * np.sum(step[2:] ** 2)))

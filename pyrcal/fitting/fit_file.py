@@ -1,0 +1,252 @@
+"""Fit a matrix in memory or in a file, for the library, the command line and REST."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from threadpoolctl import threadpool_limits
+
+from pyrcal.fitting.fitted import Fit
+from pyrcal.fitting.matrix import FitOptions, fit_matrix
+from pyrcal.fitting.memory import check_fit
+from pyrcal.fitting.recorded import FLUX_FRAME, Recorded, read_recorded
+from pyrcal.fitting.report import FitReport
+from service.errors import MatrixError
+from service.estimation.reference import Reference
+from service.files.disk_cache import cached_basis
+from service.instrument import load_instrument
+from service.model.instrument import Instrument, instrument_sha256
+from service.model.modes import Basis
+from service.model.sensors.registry import kind_of
+from service.model.sensors.sensor import Mapper
+
+Progress = Callable[[str], None]
+
+
+def fit(
+    instrument: Instrument | str | Path,
+    matrix: ArrayLike,
+    *,
+    modes: ArrayLike | None = None,
+    noise: ArrayLike | None = None,
+    flux_frame: ArrayLike | None = None,
+    double_pass: bool | None = None,
+    options: FitOptions | None = None,
+    threads: int = 2,
+) -> Fit:
+    """Return the registration of a measured interaction matrix.
+
+    Parameters
+    ----------
+    instrument
+        As ``load_instrument`` returns it, or what that takes: a packaged name, or a TOML file.
+    matrix
+        ``(n_slopes, n_modes)`` slope per unit command, slopes in the RTC's order; or detector
+        frames ``(n_modes, ny, nx)`` where the instrument has ``wfs.input = "frames"``.
+    modes
+        ``(n_modes,)`` basis index of each column; None if column k is mode k.
+    noise
+        ``(n_modes,)`` 1 σ of one slope in each column; None if it is unknown.
+    flux_frame
+        ``(ny, nx)`` mean detector frame in the counts of the frames; needed for frames.
+    double_pass
+        Whether light met the mirror twice; None if it is as the instrument says.
+    options
+        Options of the fit; None for the usual ones. Alternatives are always tried.
+    threads
+        Threads that share the work.
+
+    Raises
+    ------
+    MatrixError
+        If the matrix cannot be used.
+    ModelError
+        If the optical model cannot work with the instrument or the options.
+
+    Examples
+    --------
+    >>> found = pyrcal.fit("flao-lbt", matrix)  # doctest: +SKIP
+    >>> found.alpha.rotation_deg, found.accepted  # doctest: +SKIP
+    """
+    if not isinstance(instrument, Instrument):
+        instrument = load_instrument(instrument)
+    values = _numbers(matrix, "matrix", (2, 3))
+    n_modes = values.shape[1 if values.ndim == 2 else 0]
+    indices = None if modes is None else _numbers(modes, "modes", (1,))
+    if indices is not None and (
+        len(indices) != n_modes or np.any(indices < 0) or np.any(indices != np.round(indices))
+    ):
+        raise MatrixError(
+            f"modes: found {len(indices)} numbers, expected the basis index of each of {n_modes} "
+            "columns"
+        )
+    recorded = Recorded(
+        values=values,
+        modes=None if indices is None else indices.astype(np.intp),
+        noise=None if noise is None else _numbers(noise, "noise", (1,)),
+        double_pass=double_pass,
+        flux_frame=None if flux_frame is None else _numbers(flux_frame, "flux_frame", (2,)),
+        where="matrix",
+        sha256="",
+    )
+    reference, notes = make_reference(recorded, instrument)
+    if reference.noise is not None and len(reference.noise) != n_modes:
+        raise MatrixError(
+            f"noise: found {len(reference.noise)} numbers, expected one for each of {n_modes} modes"
+        )
+    found = _fit_recorded(instrument, recorded, reference, options or FitOptions(), threads=threads)
+    return replace(found, remarks=(*notes, *found.remarks))
+
+
+def _numbers(given: ArrayLike, name: str, n_axes: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return an argument as numbers.
+
+    Raises
+    ------
+    MatrixError
+        If it holds none, or has other axes.
+    """
+    values = np.asarray(given)
+    if values.dtype.kind not in "iuf" or values.ndim not in n_axes or not values.size:
+        raise MatrixError(
+            f"{name}: found {values.dtype} of shape {values.shape}, expected real numbers with "
+            f"{' or '.join(map(str, n_axes))} axes"
+        )
+    return values.astype(np.float64)
+
+
+def fit_file(
+    instrument: Instrument,
+    path: str | Path,
+    options: FitOptions,
+    *,
+    dataset: str | None = None,
+    threads: int = 2,
+    memory_gb: float | None = None,
+    basis: Basis | None = None,
+    progress: Progress | None = None,
+) -> FitReport:
+    """Return the fit of the measured matrix in a file.
+
+    ``basis`` are the instrument's modes; None to use the disk cache or to compute them. A fit that
+    would take more than ``memory_gb`` is rejected before it starts; None for no limit.
+
+    Raises
+    ------
+    MatrixError
+        If the file or the matrix cannot be used.
+    ModelError
+        If the optical model cannot work with the instrument or the options.
+    """
+    recorded = read_recorded(Path(path), dataset)
+    reference, notes = make_reference(recorded, instrument)
+    if memory_gb is not None:
+        n_modes = len(reference.columns if options.modes is None else options.modes)
+        check_fit(instrument, n_modes, memory_gb, gain_map=options.gain_map)
+    begun = time.perf_counter()
+    found = _fit_recorded(
+        instrument, recorded, reference, options, threads=threads, basis=basis, progress=progress
+    )
+    return FitReport(
+        fit=found,
+        method=options.method,
+        instrument=instrument.name,
+        instrument_sha256=instrument_sha256(instrument),
+        reference=recorded.where,
+        reference_sha256=recorded.sha256,
+        double_pass=reference.double_pass,
+        seconds=time.perf_counter() - begun,
+        notes=(*notes, *found.remarks),
+    )
+
+
+def _fit_recorded(
+    instrument: Instrument,
+    recorded: Recorded,
+    reference: Reference,
+    options: FitOptions,
+    *,
+    threads: int,
+    basis: Basis | None = None,
+    progress: Progress | None = None,
+) -> Fit:
+    """Return the fit with its alternatives, with the work distributed over threads."""
+    report_stage = progress or (lambda _: None)
+    options = replace(options, explain=True)
+    # BLAS keeps to one thread: nested threading made a fit seven times slower
+    with threadpool_limits(1), ThreadPoolExecutor(threads) as pool:
+        mapper: Mapper = pool.map if threads > 1 else map
+        try:
+            if basis is None:
+                report_stage("modes")
+                basis = cached_basis(instrument)
+            return fit_matrix(
+                instrument, reference, options, basis=basis, mapper=mapper, progress=report_stage
+            )
+        except MatrixError as error:
+            text = str(error).removeprefix("reference: ")
+            raise MatrixError(f"{recorded.where}: {text}") from error
+
+
+def make_reference(recorded: Recorded, instrument: Instrument) -> tuple[Reference, tuple[str, ...]]:
+    """Return the matrix to be fitted, and the decisions made on the way.
+
+    Raises
+    ------
+    MatrixError
+        If the file holds frames and the instrument slopes, or the other way round.
+    """
+    notes = list(instrument.remarks)
+    double_pass = instrument.double_pass
+    if recorded.double_pass is not None and recorded.double_pass is not double_pass:
+        double_pass = recorded.double_pass
+        notes.append(
+            f"double pass: {'yes' if double_pass else 'no'}, as the measured file says; the "
+            "instrument file says otherwise"
+        )
+    if recorded.modes is not None:
+        notes.append(f"columns belong to the {len(recorded.modes)} modes the measured file names")
+    frames = recorded.values.ndim == 3
+    if frames and recorded.noise is not None:
+        notes.append("the noise in the measured file is of frames, not of slopes: not used")
+    matrix, found = _slopes(recorded, instrument)
+    notes += found
+    reference = Reference(
+        matrix=matrix,
+        modes=recorded.modes,
+        noise=None if frames else recorded.noise,
+        double_pass=double_pass,
+    )
+    return reference, tuple(notes)
+
+
+def _slopes(
+    recorded: Recorded, instrument: Instrument
+) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+    """Return the measured slopes, extracted from detector frames if necessary, and notes."""
+    found = f"{recorded.where}: found shape {recorded.values.shape}"
+    if instrument.frames is None:
+        if recorded.values.ndim == 3:
+            raise MatrixError(
+                f"{found}, expected (n_slopes, n_modes): detector frames need "
+                'wfs.input = "frames" in the instrument file'
+            )
+        return recorded.values, ()
+    if recorded.values.ndim != 3:
+        raise MatrixError(
+            f'{found}, expected detector frames (n_modes, ny, nx): wfs.input is "frames"'
+        )
+    if recorded.flux_frame is None:
+        raise MatrixError(
+            f"{recorded.where}: found no {FLUX_FRAME} next to it, expected a mean detector frame "
+            "(ny, nx) in the same counts"
+        )
+    kind, flux_frame = kind_of(instrument), recorded.flux_frame
+    located, remarks = kind.locate_images(instrument, flux_frame)
+    return kind.signals_of_frames(located, recorded.values, flux_frame), remarks

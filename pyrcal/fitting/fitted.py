@@ -1,0 +1,186 @@
+"""The record of a fit: the registration, its uncertainty and evidence, and other findings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.fitting.alternatives import Alternative
+from pyrcal.fitting.control_check import ReconstructorVerdict
+from pyrcal.fitting.disjoint_sets import DisjointSets, Distortion
+from pyrcal.fitting.instrument_checks import FoundOptic
+from pyrcal.fitting.left_over import LeftOver
+from pyrcal.fitting.methods import ScanStep
+from pyrcal.fitting.origins import Origin
+from pyrcal.fitting.solver import ANAMORPHOSIS_SIGMA
+from service.model.kinds import SlopeOrder
+from service.model.misregistration import Determination
+from service.model.slopes import Orientation
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from service.model.instrument import Instrument
+
+MAX_STRETCH_SIGMA_RATIO = 0.5
+"""Largest 1 σ of an anamorphosis, over its prior σ, at which the anamorphosis is reported."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Registration:
+    """Verdict on the registration, and the two parts of its σ."""
+
+    determined: bool
+    """True if the data determine the registration; the same as ``Fit.accepted``."""
+
+    reason: str
+    """Reason of the verdict, in one sentence."""
+
+    sigma_statistical: NDArray[np.float64]
+    """``(4,)`` 1 σ from noise and from the scatter of disjoint sets, numeric units."""
+
+    sigma_systematic: NDArray[np.float64]
+    """``(4,)`` 1 σ from model errors and from alternatives that the data do not exclude, numeric
+    units."""
+
+    sets: tuple[DisjointSets, ...] = ()
+    """Disjoint sets of modes, actuators and subapertures, each fitted separately."""
+
+    distortion: Distortion | None = None
+    """Smooth distortion of the mirror that explains the most; None for a fit constructed by hand.
+    """
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Fit(Determination):
+    """A fitted registration with its σ and verdict.
+
+    The covariance includes noise, the scatter of disjoint sets and the floor of model errors.
+    """
+
+    gains: NDArray[np.float64]
+    """``(n_used,)`` amplitude of each measured column over the model's, number of passes included.
+    """
+
+    residual_fraction: float
+    """RMS of the residual over RMS of the measurement, with all modes weighted equally."""
+
+    residual_map: NDArray[np.float64]
+    """``(n_planes, n, n)`` [x or y, or image; row, column] RMS of the residual over modes, in units
+    of the measurement's own RMS; NaN outside the valid subapertures."""
+
+    residual_by_mode: NDArray[np.float64]
+    """``(n_used,)`` RMS of the residual over RMS of the measurement, for each mode."""
+
+    condition_number: float
+    """Condition number of the synthetic matrix at ``alpha``, with the modes used."""
+
+    modes: NDArray[np.intp]
+    """``(n_used,)`` basis indices."""
+
+    orientation: Orientation
+    """Orientation of the slopes, given or found."""
+
+    order: SlopeOrder
+    """Order of the components, given or found."""
+
+    subset_scatter: NDArray[np.float64]
+    """``(4,)`` 1 σ scatter of disjoint sets of modes, units of ``alpha.vector``."""
+
+    accepted: bool
+    """True if the data determine the registration."""
+
+    converged: bool
+    """True if the steps converged."""
+
+    verdict: str
+    """Verdict in one line: accepted with its quality, or refused with the reason and the remedy."""
+
+    left_out: tuple[str, ...]
+    """Unused columns and slopes, one sentence for each kind."""
+
+    remarks: tuple[str, ...]
+    """Further notes on the fit, one sentence each."""
+
+    n_evaluations: int
+    """Number of interaction matrices computed, those for derivatives included."""
+
+    synthetic: NDArray[Any]
+    """``(n_slopes, n_used)`` model matrix at ``alpha`` without gains, in the axes of
+    conventions.md."""
+
+    measured: NDArray[Any]
+    """``(n_slopes, n_used)`` measured matrix in the same axes and unit, divided by the number of
+    passes."""
+
+    valid: NDArray[np.bool_]
+    """``(n, n)`` [y, x] mask of the subapertures in both, in the axes of conventions.md."""
+
+    gain_map: NDArray[np.float64] | None = None
+    """``(n, n)`` gain over the pupil common to all modes, mean 1; None if it was not fitted."""
+
+    anamorphosis_sigma: NDArray[np.float64] | None = None
+    """``(2,)`` 1 σ of the anamorphosis of ``alpha``; None if it was not fitted."""
+
+    image_offsets_px: NDArray[np.float64] | None = None
+    """``(4, 2)`` [x, y] offsets of the pupil images from their nominal positions on the pixel grid,
+    as in the instrument file's key. A matrix does not determine which of two opposite images is
+    displaced, and α does not depend on it. None if the file gives the offsets, or the sensor has
+    one image."""
+
+    optics: tuple[FoundOptic, ...] = ()
+    """Optical quantities that were fitted: coupling or width, modulation."""
+
+    alternatives: tuple[Alternative, ...] = ()
+    """Alternative explanations of the matrix, with the change of α that each would cause."""
+
+    registration: Registration | None = None
+    """Verdict on the registration; None for a fit constructed by hand."""
+
+    reconstructor: ReconstructorVerdict | None = None
+    """Result of the closed-loop check with the model's reconstructor; None for a fit constructed by
+    hand."""
+
+    origins: tuple[Origin, ...] = ()
+    """Instrument quantities that the fit determined."""
+
+    unknown_not_found: tuple[str, ...] = ()
+    """Keys marked as unknown in the file that the matrix does not determine."""
+
+    left_over: LeftOver | None = None
+    """Location of the residual in pupil and modes; None if it was not computed."""
+
+    recommendation: str = ""
+    """Recommended action, in one sentence."""
+
+    paper_table: tuple[ScanStep, ...] | None = None
+    """Scans of the paper's method, in order; None for the other methods."""
+
+    @property
+    def anamorphosis(self) -> NDArray[np.float64] | None:
+        """``(2,)`` stretches of α; None if the modes do not determine them."""
+        sigma = self.anamorphosis_sigma
+        is_observable = sigma is not None and bool(
+            np.all(sigma < MAX_STRETCH_SIGMA_RATIO * ANAMORPHOSIS_SIGMA)
+        )
+        return self.alpha.stretches if is_observable else None
+
+    def plot(self, instrument: Instrument | None = None) -> Figure:
+        """Return the figures of this fit, as ``pyrcal fit --plot`` draws them.
+
+        With the ``instrument``, its mirror is drawn over the subapertures as well. Save them with
+        ``fit.plot().savefig("fit.png")``.
+
+        Raises
+        ------
+        ConfigurationError
+            If matplotlib, the extra ``plots``, is not installed.
+        """
+        figures = import_module("pyrcal.fitting.figures")  # imported late: it imports this module
+        heading = "" if instrument is None else instrument.name
+        figure: Figure = figures.draw_sheet(self, heading, instrument)
+        return figure

@@ -1,0 +1,723 @@
+"""Fit the registration of a measured interaction matrix."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.fitting.advice import Advice, Grounds, add_displaced, add_explanations, recommend_action
+from pyrcal.fitting.alternatives import add_alternatives, find_alternatives, find_decentred_pupil
+from pyrcal.fitting.columns import (
+    MAX_SMEAR,
+    Smear,
+    find_displaced_columns,
+    find_noise_columns,
+    find_strange_columns,
+    measure_smear,
+    remove_smear,
+)
+from pyrcal.fitting.control_check import GAIN, check_control
+from pyrcal.fitting.disjoint_sets import mode_partitions, pupil_partitions
+from pyrcal.fitting.fitted import Fit, Registration
+from pyrcal.fitting.gain_causes import find_gain_causes
+from pyrcal.fitting.instrument_checks import (
+    compare_instruments,
+    estimate_width_effect,
+    fit_file_values,
+    list_optics,
+)
+from pyrcal.fitting.left_over import find_arms
+from pyrcal.fitting.methods import (
+    Landing,
+    ScanStep,
+    Settled,
+    project_on_sensitivities,
+    scan,
+    search_minimum,
+    settle,
+    settle_at,
+)
+from pyrcal.fitting.models import FitModels
+from pyrcal.fitting.noise import measure_structure
+from pyrcal.fitting.origins import Origin, list_origins, list_undetermined_keys
+from pyrcal.fitting.pupil_checks import FitSubset, fit_smooth_gain, try_pupils
+from pyrcal.fitting.pupil_width import SeenPupil, compute_responses, measure_pupil
+from pyrcal.fitting.reference import check_reference
+from pyrcal.fitting.remarks import collect_remarks
+from pyrcal.fitting.solver import Nuisances, Solution, image_patterns, nuisances_of
+from pyrcal.fitting.uncertainty import (
+    LOCAL_MAGNIFICATION_FLOOR,
+    MAGNIFICATION_FLOOR,
+    WEAK_MODULATION_FLOOR,
+    misplacement_sigma,
+    pupil_places,
+    pupil_regions,
+    uncertainty,
+)
+from pyrcal.fitting.verdict import FitFindings, judge_fit
+from service.errors import ModelError
+from service.estimation.orientation import (
+    DOUBTFUL_CORRELATION,
+    MIN_CORRELATION,
+    MIN_CORRELATION_LEAD,
+    Search,
+    check_stated_orientation,
+    find_orientation,
+)
+from service.estimation.reference import Reference, Target, is_by_actuator, target_of
+from service.model.aperture import check_mask
+from service.model.instrument import Instrument, Mirror
+from service.model.kinds import Method, Normalisation, Stop
+from service.model.misregistration import Misregistration
+from service.model.modes import Basis, modal_basis
+from service.model.pupil import Illumination, rtc_valid_subapertures
+from service.model.sensors.registry import kind_of
+from service.model.sensors.sensor import Mapper
+from service.model.slopes import Orientation, SlopeRecipe
+
+MIN_COLUMNS = 3
+"""Smallest number of columns that must remain when columns with noise only are left out."""
+
+_MAX_LISTED = 12
+
+_SMEAR_STEPS = 8
+_LONGEST_SMEAR_STEP = 0.15
+"""Longest secant step. The registration follows most of a smear of 0.3, so longer secants miss it.
+"""
+_SMEAR_SETTLED = 1e-3
+"""Remaining share of the previous column at which the iteration ends."""
+
+_LEAST_RATE = 0.1
+"""Smallest slope of the measured share over the removed share used in the uncertainty."""
+
+_SMEAR_EXPLAINS = 0.9
+"""Residual without the smear over that with it, above which the smear is rejected."""
+
+Array = NDArray[np.float64]
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FitOptions:
+    """Options of a fit."""
+
+    method: Method = Method.JOINT
+    """Fit method."""
+
+    modes: NDArray[np.intp] | None = None
+    """Basis indices to use; None for all that the reference contains."""
+
+    start: Misregistration | None = None
+    """Start of the fit. None for a coarse rotation from the lowest orders and nominal other values.
+    """
+
+    orientation: Orientation | None = None
+    """Orientation of the slopes. None for that of the instrument file, or a search if it has none.
+    """
+
+    gain_map: bool = False
+    """True to fit a smooth gain over the pupil, common to all modes."""
+
+    anamorphosis: bool = True
+    """True to fit the anamorphosis of the mirror's image."""
+
+    illumination: Illumination | None = None
+    """Measured illumination of the pupil, in the axes of conventions.md; None if it is uniform."""
+
+    explain: bool = False
+    """True to search for causes of gains far from 1 and of displaced columns."""
+
+    gain: float = GAIN
+    """Integrator gain of the loop in which the reconstructor is checked."""
+
+
+def fit_matrix(
+    instrument: Instrument,
+    reference: Reference,
+    options: FitOptions | None = None,
+    *,
+    basis: Basis | None = None,
+    mapper: Mapper = map,
+    progress: Progress | None = None,
+) -> Fit:
+    """Return the registration of a measured matrix, with its uncertainty and verdict.
+
+    Parameters
+    ----------
+    instrument
+        Instrument whose matrix was measured.
+    reference
+        Measured matrix.
+    options
+        Options of the fit.
+    basis
+        Modes of the instrument; None to compute them, which takes seconds.
+    mapper
+        Function like ``map``; an executor's ``map`` distributes the work over threads.
+    progress
+        Callback for a short text at the beginning of each stage.
+
+    Raises
+    ------
+    MatrixError
+        If the matrix belongs to another instrument, is transposed, in another unit or empty.
+    ModelError
+        If a requested mode was not measured, or the instrument cannot be modelled.
+    """
+    options = options or FitOptions()
+    report_stage = progress or (lambda _: None)
+    try:
+        return _fit_usable(instrument, reference, options, basis, mapper, report_stage)
+    except np.linalg.LinAlgError as error:
+        raise ModelError(
+            f"{instrument.name}: found modes that do not depend on the registration ({error}); "
+            "expected actuators or tables in metres over the pupil that the sensor sees"
+        ) from error
+
+
+def _fit_usable(
+    instrument: Instrument,
+    reference: Reference,
+    options: FitOptions,
+    basis: Basis | None,
+    mapper: Mapper,
+    report_stage: Progress,
+) -> Fit:
+    if basis is None:
+        report_stage("modes")
+        basis = modal_basis(instrument)
+    usable = check_reference(
+        _remove_shapeless(_select_modes(reference, options.modes), instrument),
+        n_slopes=instrument.slopes.kind.n_planes * int(rtc_valid_subapertures(instrument).sum()),
+        n_modes=basis.n_modes,
+        wavelength_m=instrument.wfs.wavelength_m,
+        stroke_known=_stroke_known(instrument),
+    )
+    used = basis.subset(usable.columns)
+    report_stage("orientation")
+    # remembered here, because ``_fix_mask`` gives every instrument a mask
+    own_mask = instrument.wfs.valid_subapertures is not None
+    instrument = _fix_mask(instrument)
+    reported = replace(
+        instrument.slopes, orientation=options.orientation or instrument.slopes.orientation
+    )
+    slopes, pose, axes_doubt = _find_axes(instrument, usable, used, options, mapper)
+    instrument = replace(instrument, slopes=slopes)
+    target = target_of(usable, instrument)
+    models = FitModels(
+        instrument=instrument, basis=used, illumination=options.illumination, mapper=mapper
+    )
+    report_stage("fit")
+    if options.start is not None:
+        start = options.start
+    else:
+        start = pose if pose is not None else instrument.start
+    found = _run_method(models, target, instrument.with_anamorphosis(start), options, report_stage)
+    noisy = find_noise_columns(
+        found.settled.solution, found.settled.target, instrument.slopes.kind.n_planes
+    )
+    if noisy.any() and np.sum(~noisy) >= MIN_COLUMNS:
+        report_stage("fit")
+        usable = _remove_noise(usable, noisy)
+        used = basis.subset(usable.columns)
+        target, models = target_of(usable, instrument), replace(models, basis=used)
+        begin = instrument.with_anamorphosis(found.settled.solution.alpha)
+        found = _run_method(models, target, begin, options, report_stage)
+    smear = measure_smear(found.settled.solution, found.settled.target)
+    if smear.is_found:
+        report_stage("fit")
+        found, usable = _remove_smear(
+            models, instrument, found, usable, smear, options, report_stage
+        )
+    report_stage("verdict")
+    fit = _make_fit(models, found, usable, axes_doubt, reported, options)
+    if options.explain and not fit.accepted:
+        columns = find_displaced_columns(
+            replace(instrument, slopes=reported), usable, used, mapper=mapper
+        )
+        fit = add_displaced(fit, tuple(columns))
+    return _note_mask(fit, instrument) if own_mask else fit
+
+
+def _note_mask(fit: Fit, instrument: Instrument) -> Fit:
+    """Return the fit with any mismatch between mask and pupil added to remarks and advice."""
+    x, y = fit.alpha.vector[:2].tolist()
+    difference = check_mask(instrument, (x, y))
+    if difference is None:
+        return fit
+    remarks = fit.remarks
+    if difference not in instrument.remarks:
+        remarks = (*remarks, difference)
+    advised = fit.recommendation
+    # where the mirror is the stop, its shift moves the pupil: another stop may be the cause
+    of_stop = (
+        instrument.stop is Stop.MIRROR
+        and check_mask(replace(instrument, stop=Stop.TELESCOPE), (x, y)) is None
+    )
+    if not fit.accepted and not of_stop:
+        advised = f"{Advice.DO_NOT_USE}: {difference}"
+    return replace(fit, remarks=remarks, recommendation=advised)
+
+
+def _remove_smear(
+    models: FitModels,
+    instrument: Instrument,
+    found: _Found,
+    usable: Reference,
+    first: Smear,
+    options: FitOptions,
+    report_stage: Progress,
+) -> tuple[_Found, Reference]:
+    """Return the fit with the remainder of each previous poke removed from the columns.
+
+    The registration itself follows part of the smear, so the first measurement is too small. Secant
+    steps find the share at which none remains. If that does not explain the matrix clearly better,
+    the original fit is returned.
+    """
+    begin = instrument.with_anamorphosis(found.settled.solution.alpha)
+    before, left_before, share = 0.0, first.share, first.share
+    again, sigma = found, first.sigma
+    for _ in range(_SMEAR_STEPS):
+        if not 0.0 < share <= MAX_SMEAR:
+            return found, usable  # the secants diverged: the residual has another cause
+        cleaned = remove_smear(usable, share)
+        again = _run_method(models, target_of(cleaned, instrument), begin, options, report_stage)
+        left = measure_smear(again.settled.solution, again.settled.target)
+        rate = (left.share - left_before) / (share - before)
+        sigma = left.sigma / max(abs(rate), _LEAST_RATE)
+        # removing more must leave less; a rate of the other sign is noise
+        if abs(left.share) < max(left.sigma, _SMEAR_SETTLED) or rate >= 0.0:
+            break
+        step = float(np.clip(-left.share / rate, -_LONGEST_SMEAR_STEP, _LONGEST_SMEAR_STEP))
+        before, left_before, share = share, left.share, min(share + step, MAX_SMEAR)
+    if again.settled.share > _SMEAR_EXPLAINS * found.settled.share:
+        return found, usable
+    again = replace(again, smear=Smear(share=share, sigma=sigma), before=found.settled.solution)
+    return again, remove_smear(usable, share)
+
+
+def _remove_noise(usable: Reference, noisy: NDArray[np.bool_]) -> Reference:
+    """Return the reference without the columns that hold noise only; these are listed."""
+    named = ", ".join(str(mode) for mode in usable.columns[noisy][:_MAX_LISTED])
+    more = f" and {int(noisy.sum()) - _MAX_LISTED} more" if noisy.sum() > _MAX_LISTED else ""
+    left_out = f"{int(noisy.sum())} of {len(noisy)} columns hold noise only: modes {named}{more}"
+    return replace(
+        usable,
+        matrix=usable.matrix[:, ~noisy],
+        modes=usable.columns[~noisy],
+        noise=None if usable.noise is None else usable.noise[~noisy],
+        left_out=(*usable.left_out, left_out),
+    )
+
+
+def _stroke_known(instrument: Instrument) -> bool:
+    """Return True if the amplitude of a column is known: stroke and wavelength both scale it."""
+    return instrument.mirror.stroke_known and "wfs.wavelength_m" not in instrument.unknown
+
+
+def _fix_mask(instrument: Instrument) -> Instrument:
+    """Return the instrument with its mask computed once, because every model of the fit uses it."""
+    mask = rtc_valid_subapertures(instrument)
+    return replace(instrument, wfs=replace(instrument.wfs, valid_subapertures=mask))
+
+
+def _select_modes(reference: Reference, modes: NDArray[np.intp] | None) -> Reference:
+    """Return only the columns of these modes.
+
+    Raises
+    ------
+    ModelError
+        If one of them was not measured.
+    """
+    if modes is None:
+        return reference
+    place = {int(mode): column for column, mode in enumerate(reference.columns)}
+    missing = [int(mode) for mode in modes if int(mode) not in place]
+    if missing:
+        raise ModelError(
+            f"modes: {missing[0]} is requested and was not measured; expected some of the "
+            f"{len(place)} that were ({min(place)} to {max(place)})"
+        )
+    columns = np.array([place[int(mode)] for mode in modes], dtype=np.intp)
+    return replace(
+        reference,
+        matrix=reference.matrix[:, columns],
+        modes=reference.columns[columns],
+        noise=None if reference.noise is None else reference.noise[columns],
+    )
+
+
+def _remove_shapeless(reference: Reference, instrument: Instrument) -> Reference:
+    """Return only the columns of modes that have a usable shape in the instrument file."""
+    flat = np.isin(reference.columns, instrument.mirror.flat_modes)
+    if not flat.any() or flat.all() or reference.matrix.shape[1:] != flat.shape:
+        return reference
+    named = ", ".join(str(mode) for mode in reference.columns[flat][:_MAX_LISTED])
+    more = f" and {int(flat.sum()) - _MAX_LISTED} more" if flat.sum() > _MAX_LISTED else ""
+    noise = reference.noise
+    return replace(
+        reference,
+        matrix=reference.matrix[:, ~flat],
+        modes=reference.columns[~flat],
+        noise=noise[~flat] if noise is not None and noise.shape == flat.shape else noise,
+        left_out=(
+            *reference.left_out,
+            f"without a usable shape in the instrument file: modes {named}{more}",
+        ),
+    )
+
+
+FAR_SUBAP = 2.0
+"""Shift at which the orientation search is repeated if none explains the lowest orders,
+subapertures."""
+
+
+EQUAL_CORRELATION = 0.02
+"""Largest difference of two correlations that rounding of the angles causes."""
+
+
+def _find_axes(
+    instrument: Instrument, usable: Reference, basis: Basis, options: FitOptions, mapper: Mapper
+) -> tuple[SlopeRecipe, Misregistration | None, str]:
+    """Return the slope recipe, the start pose, and the reason if the axes are uncertain.
+
+    The search also determines the rotation, so it is skipped only if both orientation and start are
+    given. It is made around the start, because a mirror displaced by subapertures has different
+    lowest orders.
+    """
+    stated = options.orientation or instrument.slopes.orientation
+    slopes = replace(instrument.slopes, orientation=stated)
+    if stated is not None and options.start is not None:
+        return slopes, None, ""
+    about = options.start or instrument.start
+
+    def search_about(place: Misregistration, setting: Orientation | None) -> Search:
+        seen = replace(instrument, slopes=replace(slopes, orientation=setting))
+        return find_orientation(seen, usable, basis, mapper=mapper, about=place)
+
+    search = search_about(about, stated)
+    if options.start is None and search.best.correlation < DOUBTFUL_CORRELATION:
+        corners = [
+            about.moved_to(about.vector + FAR_SUBAP * np.array([x, y, 0.0, 0.0]))
+            for x, y in product((-1.0, 0.0, 1.0), repeat=2)
+            if x or y
+        ]
+        far = {place: search_about(place, stated) for place in corners}
+        most = max(one.best.correlation for one in far.values())
+        # rotated by 180 deg together with the axes, the same mirror is at the opposite shift
+        alike = [one for one in far if far[one].best.correlation > most - EQUAL_CORRELATION]
+        place = min(alike, key=lambda one: far[one].best.effort)
+        if far[place].best.correlation > search.best.correlation + 2.0 * MIN_CORRELATION_LEAD:
+            about, search = place, far[place]
+    best = search.best
+    sure = best.correlation >= MIN_CORRELATION
+    pose = replace(about, rotation_rad=best.rotation_rad) if sure else None
+    if stated is None:
+        return best.slopes, pose, search.refusal
+    if best.correlation >= DOUBTFUL_CORRELATION:
+        return best.slopes, pose, ""
+    return best.slopes, pose, check_stated_orientation(best, search_about(about, None).best)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Found:
+    """Result of one of the methods."""
+
+    settled: Settled
+    landing: Landing | None = None
+    table: tuple[ScanStep, ...] | None = None
+    smear: Smear | None = None
+    """Share of the previous column that was removed from each column."""
+
+    before: Solution | None = None
+    """Solution with the original columns, if a smear was removed."""
+
+
+def _run_method(
+    models: FitModels,
+    target: Target,
+    start: Misregistration,
+    options: FitOptions,
+    report_stage: Progress,
+) -> _Found:
+    nuisances = nuisances_of(
+        target.valid,
+        models.instrument.slopes.kind,
+        gain_map=options.gain_map,
+        anamorphosis=options.anamorphosis,
+        nominal=models.instrument.with_anamorphosis(models.instrument.start),
+        optics=models.optics,
+        unknown=models.unknown,
+        **_unknown_images(models),
+    )
+    match options.method:
+        case Method.JOINT:
+            landing = search_minimum(models, target, start)
+            settled = settle(models, target, landing.best.alpha, nuisances)
+            return _Found(settled=settled, landing=landing)
+        case Method.SENSITIVITY:
+            return _Found(settled=project_on_sensitivities(models, target, start, nuisances))
+        case Method.PAPER:
+            if not _stroke_known(models.instrument):
+                raise ModelError(
+                    "--method paper: found a matrix whose strokes are unknown; expected slopes per "
+                    "metre, because the paper's criterion leaves no gain free. Use --method joint"
+                )
+            alpha, table = scan(models, target, start, progress=report_stage)
+            return _Found(settled=settle_at(models, target, alpha, nuisances), table=table)
+
+
+def _unknown_images(models: FitModels) -> dict[str, Any]:
+    """Return the displacement patterns of the pupil images and their σ, if they are unknown."""
+    sigma = kind_of(models.instrument).image_sigma_subap(models.instrument)
+    if sigma is None:
+        return {}
+    return {"images": image_patterns(models.instrument.stop), "image_sigma": sigma}
+
+
+def _make_fit(
+    as_in_file: FitModels,
+    found: _Found,
+    usable: Reference,
+    axes_doubt: str,
+    reported: SlopeRecipe,
+    options: FitOptions,
+) -> Fit:
+    settled = found.settled
+    solution, target, models = settled.solution, settled.target, settled.models
+    nuisances, slopes = settled.nuisances, models.instrument.slopes
+    seen = solution.projection
+    values = np.concatenate([np.zeros(4), nuisances.from_prior(solution.nuisances)])
+    regions = pupil_regions(target.valid, slopes.kind.n_planes)[target.rows]
+    residual_fraction = settled.share
+    few = FitSubset(settled)
+    pupils = try_pupils(few)
+    others = compare_instruments(settled, few, pupils)
+    power = np.sum(target.matrix[target.rows] ** 2, axis=0)
+    noise = None if usable.noise is None else usable.noise / usable.passes
+    structured = measure_structure(seen.residual, power, noise)
+    by_light = residual_fraction**2 * (1.0 - fit_smooth_gain(few))
+    n_planes = slopes.kind.n_planes
+    floor_of_size, floor_words = _magnification_floor(models.instrument)
+    before = uncertainty(
+        seen,
+        values,
+        settled.prior,
+        regions,
+        pupil_places(target.valid, n_planes, models.instrument.wfs.pupil_diameter / 2.0)[
+            target.rows
+        ],
+        dispersed=solution.dispersion,
+        shift_subap=float(np.hypot(*solution.vector[:2])),
+        radius_subap=models.instrument.wfs.pupil_diameter / 2.0,
+        magnification_floor=floor_of_size,
+        residual_fraction=residual_fraction,
+        noise_share=_noise_share(residual_fraction, structured),
+        mode_sets=mode_partitions(target, n_planes, by_actuator=is_by_actuator(models.instrument)),
+        pupil_sets=pupil_partitions(target.valid, n_planes, target.rows),
+    )
+    optics = list_optics(as_in_file, settled, before)
+    stroke_known = _stroke_known(models.instrument)
+    without = fit_file_values(as_in_file, settled) if any(one.notable for one in optics) else None
+    left_map = _residual_map(found)
+    arms_deg = tuple(arm.angle_deg for arm in find_arms(left_map))
+    tried = find_alternatives(settled, few, others, pupils, optics, without, arms_deg)
+    sure = add_alternatives(
+        before, tried, residual_fraction, width=estimate_width_effect(settled, few), without=without
+    )
+    if found.smear is not None and found.before is not None:
+        by_smear = solution.vector - found.before.vector
+        error = by_smear * found.smear.sigma / found.smear.share
+        sure = sure.with_moves(error[np.newaxis], np.ones(1))
+    misplaced = _misplacement_sigma(models.instrument, structured)
+    sure = sure.with_moves(misplaced[np.newaxis], np.ones(1))
+    stretch_sigma = nuisances.stretch_sigma(sure.nuisance_sigma)
+    findings = FitFindings(
+        solution=solution,
+        residual_fraction=residual_fraction,
+        structure=structured,
+        after_light=float(np.sqrt(max(structured**2 - by_light, 0.0))),
+        uncertainty=sure,
+        before=before,
+        alternatives=tried,
+        landing=found.landing,
+        rivals=others,
+        off_centre=find_decentred_pupil(few, others),
+        optics=optics,
+        narrow=_find_narrow_pupil(settled),
+        with_file_values=without,
+        axes=axes_doubt,
+        passes=usable.passes,
+        stroke_known=stroke_known,
+    )
+    refusal, verdict = judge_fit(findings)
+    smeared = () if found.smear is None else (found.smear.words,)
+    columns = tuple(find_strange_columns(solution, target))
+    found_origins: tuple[Origin, ...] = ()
+    if findings.explained:
+        found_origins = list_origins(
+            as_in_file.instrument, reported, slopes, optics, without, structured, seen.gains
+        )
+    fit = Fit(
+        alpha=solution.alpha,
+        covariance=sure.covariance,
+        gains=seen.gains,
+        residual_fraction=residual_fraction,
+        residual_map=left_map,
+        residual_by_mode=settled.by_mode,
+        condition_number=_condition_number(solution.matrix),
+        modes=target.modes,
+        orientation=slopes.assumed_orientation,
+        order=slopes.order,
+        subset_scatter=sure.subset_scatter,
+        accepted=refusal is None,
+        converged=solution.converged,
+        verdict=verdict,
+        remarks=(
+            *collect_remarks(findings, reported=reported, found=slopes, about=models.instrument),
+            *columns,
+            *smeared,
+            *(
+                (floor_words,)
+                if floor_words and floor_of_size**2 > sure.covariance[3, 3] / 2.0
+                else ()
+            ),
+        ),
+        left_out=(*usable.left_out, *_rows_left_out(target, models.instrument)),
+        n_evaluations=models.counter.n,
+        synthetic=solution.matrix,
+        measured=target.matrix,
+        valid=target.valid,
+        gain_map=nuisances.gain_map(solution.nuisances, target.valid),
+        # misplaced actuators stretch the image as much as they turn it
+        anamorphosis_sigma=None if stretch_sigma is None else np.hypot(stretch_sigma, misplaced[2]),
+        image_offsets_px=_image_offsets(models.instrument, nuisances, solution),
+        # values fitted to noise are not reported
+        optics=optics if findings.explained else (),
+        origins=found_origins,
+        unknown_not_found=list_undetermined_keys(as_in_file.instrument, found_origins),
+        alternatives=tried,
+        registration=Registration(
+            determined=refusal is None,
+            reason=verdict.partition(": ")[2],
+            sigma_statistical=sure.sigma_statistical,
+            sigma_systematic=sure.sigma_systematic,
+            sets=sure.sets,
+            distortion=sure.distortion,
+        ),
+        reconstructor=check_control(
+            target.matrix,
+            solution.matrix,
+            seen.gains,
+            target.modes,
+            target.rows,
+            gain=options.gain,
+            noise=noise,
+        ),
+        paper_table=found.table,
+    )
+    grounds = Grounds(
+        refusal=refusal,
+        structure=structured,
+        n_sets=len(sure.subset_steps),
+        columns=columns,
+        numbers_share=1.0 if without is None else without.share,
+    )
+    if not options.explain:
+        return replace(fit, recommendation=recommend_action(fit, grounds))
+    causes = find_gain_causes(settled, passes=usable.passes, stroke_known=stroke_known)
+    return add_explanations(fit, tried, replace(grounds, gains=tuple(causes)))
+
+
+def _magnification_floor(instrument: Instrument) -> tuple[float, str]:
+    """Return the smallest 1 σ of a magnification, and the reason if it is larger than usual."""
+    if instrument.slopes.normalisation is Normalisation.LOCAL:
+        floor = LOCAL_MAGNIFICATION_FLOOR
+        cause = "each subaperture is divided by its own light, which lets its border weigh as much"
+    elif kind_of(instrument).is_weakly_modulated(instrument.wfs):
+        floor = WEAK_MODULATION_FLOOR
+        cause = "the modulation is at most 1.5 λ/D, where models sample the focus differently"
+    else:
+        return MAGNIFICATION_FLOOR, ""
+    return floor, (
+        f"sigma of the magnification is mostly a floor of {floor:.1%}: {cause}, and matrices of "
+        "such sensors differ by 0.1 to 0.3 % from their model"
+    )
+
+
+def _misplacement_sigma(instrument: Instrument, structured: float) -> Array:
+    """Return 1 σ from misplaced actuators; 0 where sets of actuators show it or none are drawn."""
+    mirror = instrument.mirror
+    if not isinstance(mirror, Mirror) or is_by_actuator(instrument):
+        return np.zeros(4)
+    radius_m = instrument.wfs.pupil_diameter / 2.0 * instrument.subaperture_m
+    return misplacement_sigma(mirror, radius_m, instrument.subaperture_m, structured)
+
+
+def _noise_share(residual: float, structured: float) -> float:
+    """Return the share of the residual's power that is noise."""
+    return max(1.0 - (structured / residual) ** 2, 0.0) if residual > 0.0 else 0.0
+
+
+def _image_offsets(
+    instrument: Instrument, nuisances: Nuisances, solution: Solution
+) -> Array | None:
+    """Return the fitted pupil image offsets, as the instrument file's key gives them.
+
+    None if they were not fitted.
+    """
+    if not len(nuisances.images):
+        return None
+    found = nuisances.image_offsets(solution.nuisances)
+    return kind_of(instrument).offsets_px(instrument, found)
+
+
+def _find_narrow_pupil(settled: Settled) -> SeenPupil | None:
+    """Return the pupil image if it is narrower than in the instrument file, else None."""
+    target, solution = settled.target, settled.solution
+    squares = solution.projection.gains**2
+    measured = np.einsum("ij,ij->i", target.matrix, target.matrix)
+    counted = np.where(target.rows | (measured == 0.0), 1.0, np.nan)
+    expected = np.einsum("ij,ij,j->i", solution.matrix, solution.matrix, squares)
+    answers = compute_responses(measured * counted, expected * counted, target.valid)
+    return measure_pupil(answers, settled.models.instrument.wfs.pupil_diameter)
+
+
+def _rows_left_out(target: Target, instrument: Instrument) -> Iterator[str]:
+    """Yield the number of unused slopes and the reason."""
+    n_all, n_left_out = len(target.rows), int(np.sum(~target.rows))
+    of_sensor = kind_of(instrument).left_out(instrument)
+    if of_sensor is not None:
+        n = int(of_sensor.subapertures.sum()) * instrument.slopes.kind.n_planes
+        yield f"{n} of {n_all} slopes: {of_sensor.reason}"
+        n_left_out -= n
+    if n_left_out > 0:
+        yield f"{n_left_out} of {n_all} slopes: silent, or seen against unknown surface"
+
+
+def _residual_map(found: _Found) -> Array:
+    """Return the RMS residual of every slope over the RMS of all, modes counted alike."""
+    target, seen = found.settled.target, found.settled.solution.projection
+    scale = np.sqrt(target.weights)
+    typical = np.sqrt(np.mean((target.matrix[target.rows] * scale) ** 2))
+    by_slope = np.full(len(target.rows), np.nan)
+    by_slope[target.rows] = np.sqrt(np.mean((seen.residual * scale) ** 2, axis=1)) / typical
+    planes = by_slope.reshape(-1, int(target.valid.sum()))
+    maps = np.full((len(planes), *target.valid.shape), np.nan)
+    maps[:, target.valid] = planes
+    return maps
+
+
+def _condition_number(matrix: NDArray[np.float32]) -> float:
+    """Return the ratio of the extreme singular values.
+
+    The Gram matrix is precise enough below 1e6.
+    """
+    columns = matrix.astype(np.float64)
+    power = np.linalg.eigvalsh(columns.T @ columns)
+    return float(np.sqrt(power[-1] / power[0])) if power[0] > 0.0 else float("inf")

@@ -1,0 +1,570 @@
+"""Three methods to fit the registration of a matrix from a start.
+
+**joint**: all four parameters together (:mod:`service.estimation.solver`), from one start or from
+many.
+
+**sensitivity**: as at the Adaptive Optics Facility, the measured matrix less the synthetic one is
+projected on the derivatives of the synthetic one. The method is first order, so it is repeated at
+each result.
+
+**paper**: the ten steps of Table 1 of Heritier et al. 2018. One parameter is scanned at a time with
+the others fixed, in the order and with the step sizes of :data:`TABLE_1`. The criterion is χ_N of
+section 4.2, :func:`chi_n`: all modes, no free gain. The value of a step is the minimum of a second
+order polynomial through the samples near the lowest one. The modal gains are fitted afterwards, at
+the registration found (section 4.3).
+
+References
+----------
+Heritier et al. 2018, MNRAS 481, 2829, section 4, equations 7 and 8, Table 1; Kolb et al. 2012,
+Proc. SPIE 8447 (identification by sensitivity matrices at the VLT's AOF).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.fitting.models import COARSE_SAMPLING, FitModels, Optic
+from pyrcal.fitting.solver import (
+    LONGEST_OPTIC_STEP,
+    Nuisances,
+    Solution,
+    is_blurring,
+    refine,
+)
+from service.estimation.reference import Target
+from service.estimation.solver import (
+    SETTLED_STEP,
+    Approach,
+    Columns,
+    approach,
+    vertex,
+    within_limits,
+)
+from service.model.interaction import InteractionModel
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
+
+Array = NDArray[np.float64]
+
+GOOD_MISFIT = 0.10
+"""Largest share of χ² left to the smooth shapes at the true minimum, even with uneven light and
+another mirror; a false minimum leaves several times as much."""
+
+SAME_MINIMUM = np.array([0.15, 0.15, np.deg2rad(0.5), 0.01])
+"""Distance below which two minima are the same (numeric units)."""
+
+SAME_SENSOR = 0.1
+"""Largest logarithmic change of the sensor number for which other derivatives are reused."""
+
+ALTERNATIVE_MISFIT_RATIO = 1.3
+"""Misfit of another minimum over the smallest one, below which it is an alternative."""
+
+MAX_REPEATS = 6
+LINEAR_CHANGE = 0.01
+"""Logarithmic change of an optical quantity below which the model is linear."""
+
+LINEAR_DISPLACEMENT = 0.02
+"""Displacement of a pupil image below which the model is linear, subapertures."""
+
+LINEAR_DISPLACEMENT_RATIO = 0.08
+"""The same limit over the root of the residual share of the signal: the second order of a
+displacement d, at most (π d)² / 2 of the signal, is then a thirtieth of that share."""
+
+BLUR_STEPS = (-0.5, -0.25, 0.25, 0.5)
+"""Trial amplitudes of a blurring pattern, subapertures: half of each in every image."""
+
+LONGEST_MOVE = 0.3
+"""Longest change of one displacement pattern, subapertures; the derivatives hold no further."""
+
+IMAGES_GAIN = 0.9
+"""Ratio of χ² below which a fit with displaced images is repeated: four of the displacements hardly
+change a matrix, and would drift without end."""
+
+REUSE_DISTANCE = 20.0
+"""Number of settling lengths within which derivatives are reused."""
+
+TABLE_1 = (
+    ("rotation_deg", 0.125),
+    ("shift_x_subap", 0.25),
+    ("shift_y_subap", 0.25),
+    ("rotation_deg", 0.1),
+    ("shift_x_subap", 0.02),
+    ("shift_y_subap", 0.02),
+    ("rotation_deg", 0.025),
+    ("shift_x_subap", 0.02),
+    ("shift_y_subap", 0.02),
+    ("magnification", 0.0045),
+)
+"""Parameter and distance of two samples of each step of the paper's Table 1, boundary units."""
+
+ROUGH_RANGE = {"rotation_deg": 2.0, "shift_x_subap": 1.0, "shift_y_subap": 1.0}
+"""Error of the rough first estimate that the paper assumes (section 4), boundary units. The first
+scan of each parameter covers it."""
+
+HALF_WIDTH = 5
+"""Samples on either side of the start of the later scans. The paper does not print a number."""
+
+MAX_EXTENSION = 60
+"""Largest number of samples added to a scan whose lowest sample is its last."""
+
+FITTED_HALF_WIDTH = 2
+"""Samples on either side of the lowest one that the polynomial is fitted to."""
+
+MAX_MODES = 60
+"""Largest number of modes used for comparisons that do not need all modes."""
+
+SENSOR_CHANGES = np.arange(-4, 5) * 0.3
+"""Logarithms of the factors of the sensor number that are tried, from a third to three."""
+
+NO_SENSOR_NUMBER = 0.02
+"""Modulation, λ/D, that represents none, because a logarithm has no value for 0."""
+
+SEARCH_RESIDUAL = 0.05
+"""RMS residual share of the signal above which the sensor number is searched over a wide range."""
+
+SEARCH_STEP = 0.03
+"""Logarithmic step of the sensor number above which it is searched over a wide range."""
+
+_SHIFTS = (-1.3, 1.3)
+_TURNS_RAD = np.deg2rad([-6.0, 6.0])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScanStep:
+    """One line of the paper's Table 1: a scan of one parameter with the others fixed."""
+
+    parameter: str
+    """Name at the boundary, as in ``PARAMETERS``."""
+
+    step: float
+    """Distance of two samples, in boundary units (subaperture, degree, ratio)."""
+
+    samples: NDArray[np.float64]
+    """``(n_samples,)`` values tried, ascending, in boundary units."""
+
+    chi: NDArray[np.float64]
+    """``(n_samples,)`` criterion χ_N at each, (slope per metre)²."""
+
+    minimum: float
+    """Minimum of the polynomial, in boundary units: the parameter's value after this step."""
+
+    coefficients: NDArray[np.float64]
+    """``(3,)`` polynomial coefficients, highest order first, in ``(value - minimum) / step``."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Landing:
+    """Result of the coarse steps from one or many starts."""
+
+    best: Approach
+    rivals: tuple[Approach, ...]
+    """Other minima that are nearly as good."""
+
+
+def search_minimum(models: FitModels, target: Target, start: Misregistration) -> Landing:
+    """Return the result from a start; if it explains little, the best of many starts."""
+    matrix = models.low_order.measured(target.matrix)
+    low = Columns(
+        matrix=matrix, weights=1.0 / np.sum(matrix[target.rows] ** 2, axis=0), rows=target.rows
+    )
+    # the smooth combinations of the modes have the widest capture range
+    found: list[Approach] = []
+    for tried in (start, *map(start.moved_to, _other_starts(start.vector))):
+        found.append(approach(models.far, low, tried))
+        models.counter.n += found[-1].n_matrices
+        if found[-1].converged and found[-1].misfit < GOOD_MISFIT:
+            break
+    # an end that has not converged is used only if no other has
+    best = min(found, key=lambda one: (not one.converged, one.misfit))
+    rivals = [
+        one
+        for one in found
+        if one.converged
+        and one.misfit < ALTERNATIVE_MISFIT_RATIO * best.misfit
+        and np.any(np.abs(one.alpha.vector - best.alpha.vector) > SAME_MINIMUM)
+    ]
+    return Landing(best=best, rivals=tuple(rivals))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Settled:
+    """Minimum on the fine grid, and the models used."""
+
+    solution: Solution
+    target: Target
+    """Measured columns without the slopes of unknown surface."""
+
+    models: FitModels
+    """Models of the fitted instrument; their basis may have another coupling."""
+
+    nuisances: Nuisances
+    """Nuisances relative to these models."""
+
+    on_fine_grid: bool = True
+    """True if the fine model determined the solution."""
+
+    @property
+    def prior(self) -> Array:
+        """``(4 + n_nuisances,)`` effective weight of the prior of each unknown, 1 / σ²."""
+        return self.nuisances.prior * self.solution.dispersion
+
+    @property
+    def by_mode(self) -> Array:
+        """``(n_modes,)`` RMS of the residual over the RMS of the measurement."""
+        left = np.sum(self.solution.projection.residual**2, axis=0)
+        power = np.sum(self.target.matrix[self.target.rows] ** 2, axis=0)
+        return np.asarray(np.sqrt(left / power))
+
+    @property
+    def share(self) -> float:
+        """RMS of the residual, with all modes weighted equally."""
+        return float(np.sqrt(np.mean(self.by_mode**2)))
+
+
+def settle(
+    models: FitModels, target: Target, start: Misregistration, nuisances: Nuisances
+) -> Settled:
+    """Return the minimum on the fine grid.
+
+    The effect of optical quantities is linear only nearby, so the fit is repeated with updated
+    models: on the coarse grid until it converges, then on the fine one. A table of modes has an
+    edge, whose position depends on the registration. The slopes near the edge are left out, and the
+    fit is repeated if their set has changed.
+    """
+    seen = _remove_unknown_rows(models, target, start)
+    solution = refine(models, seen, start, nuisances, decides=models.cheap)
+    settled = Settled(
+        solution=solution, target=seen, models=models, nuisances=nuisances, on_fine_grid=False
+    )
+    if settled.share < SEARCH_RESIDUAL:
+        # so little is left over that the cheap grid's own error would displace pupil images
+        solution = refine(models, seen, solution.alpha, nuisances, near=solution.near)
+        settled = replace(settled, solution=solution, on_fine_grid=True)
+    settled = _with_nearest_instrument(settled)
+    models, nuisances = settled.models, settled.nuisances
+    # ``approaching``: iterate on the coarse grid, which is cheaper, until that has converged
+    before, approaching, taken = np.inf, True, settled
+    for _ in range(MAX_REPEATS):
+        left = settled.solution.projection.chi
+        if models is settled.models:
+            models, nuisances = _update_models(settled, move_images=left < IMAGES_GAIN * before)
+        before = left
+        there, near = _remove_unknown_rows(models, target, settled.solution.alpha), None
+        if models is settled.models and np.array_equal(there.rows, settled.target.rows):
+            if settled.on_fine_grid:
+                break
+            approaching, near = False, settled.solution.near
+        decides = models.cheap if approaching else models.fine
+        start, images = settled.solution.alpha, _images_of(taken, start, nuisances)
+        solution = refine(
+            models, there, start, nuisances, near=near, of_images=images, decides=decides
+        )
+        settled = Settled(
+            solution=solution,
+            target=there,
+            models=models,
+            nuisances=nuisances,
+            on_fine_grid=not approaching,
+        )
+        taken = settled if images is None and near is None else taken
+    if settled.on_fine_grid:
+        return settled
+    solution = refine(models, settled.target, settled.solution.alpha, nuisances)
+    return replace(settled, solution=solution, on_fine_grid=True)
+
+
+def _images_of(settled: Settled, alpha: Misregistration, nuisances: Nuisances) -> Array | None:
+    """Return the derivatives by image displacements of an earlier fit, if they still hold.
+
+    They take as long as all others together. None if α, the images or the sensor differ too much.
+    """
+    before = settled.nuisances
+    sensors = [dict(one.optics).get(Optic.SENSOR, 0.0) for one in (before, nuisances)]
+    apart = np.abs(alpha.vector - settled.solution.alpha.vector)
+    if (
+        abs(sensors[1] - sensors[0]) > SAME_SENSOR
+        or np.any(apart > SAME_MINIMUM)
+        or not np.array_equal(before.displaced, nuisances.displaced)
+    ):
+        return None
+    first = 4 + before.image_places.start
+    return settled.solution.near[first : first + len(before.images)]
+
+
+def _with_nearest_instrument(settled: Settled) -> Settled:
+    """Return the fit with the best images and sensor number, if they may be far off.
+
+    Displaced images look like another modulation, so they are searched first if the modulation is
+    known.
+    """
+    # the order matters: the first search absorbs part of the other's effect
+    searches = [_with_nearest_images, _with_nearest_sensor]
+    if Optic.SENSOR in settled.nuisances.unknown:
+        searches.reverse()
+    for search in searches:
+        models, nuisances = search(settled)
+        if models is not settled.models:
+            start = settled.solution.alpha
+            solution = refine(models, settled.target, start, nuisances, decides=models.cheap)
+            settled = replace(
+                settled, solution=solution, models=models, nuisances=nuisances, on_fine_grid=False
+            )
+    return settled
+
+
+def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
+    """Return the models with the best sensor number, if it may be far off.
+
+    Steps converge slowly there, because gains hide much of a modulation's effect. So a few modes
+    are compared on the coarse grid, each with its own registration to first order.
+    """
+    models, nuisances, solution = settled.models, settled.nuisances, settled.solution
+    places = [k for k, (o, _) in enumerate(nuisances.optics) if o is Optic.SENSOR]
+    if not places:
+        return models, nuisances
+    step = solution.nuisances[nuisances.first_optic + places[0]]
+    unknown = Optic.SENSOR in nuisances.unknown
+    if settled.share < SEARCH_RESIDUAL and abs(step) < SEARCH_STEP and not unknown:
+        return models, nuisances
+    modes = spread(settled.target.n_modes)
+    few = settled.target.column_subset(modes)
+    subset = replace(models, basis=models.basis.subset(modes))
+    every = np.concatenate([solution.derivatives, solution.nuisance_derivatives])[:, :, modes]
+
+    def left(change: float) -> float:
+        models.counter.n += 1
+        changed = subset.with_optic(Optic.SENSOR, change) if change else subset
+        matrix = changed.model(COARSE_SAMPLING, once=True).interaction_matrix(solution.alpha)
+        return few.project(matrix, every).chi_at_best
+
+    found = _scan_outwards(left)
+    best = int(np.argmin(found))
+    change = SENSOR_CHANGES[best]
+    nothing = float(np.log(NO_SENSOR_NUMBER / models.sensor_number))
+    if best == 0 and left(nothing) < found[0]:
+        change = nothing
+    elif 0 < best < len(found) - 1:
+        change += vertex(*found[best - 1 : best + 2]) * (SENSOR_CHANGES[1] - SENSOR_CHANGES[0])
+    if abs(change) < LINEAR_CHANGE:
+        return models, nuisances
+    optics = [
+        (optic, offset + change * (optic is Optic.SENSOR)) for optic, offset in nuisances.optics
+    ]
+    moved = models.with_optic(Optic.SENSOR, float(change))
+    return moved, replace(nuisances, optics=tuple(optics))
+
+
+def _scan_outwards(left: Callable[[float], float]) -> Array:
+    """Return χ² at ``SENSOR_CHANGES``, outwards from no change until it grows; infinite beyond.
+
+    The widest modulations take longest, so they are not computed without need.
+    """
+    found = np.full(len(SENSOR_CHANGES), np.inf)
+    middle = len(SENSOR_CHANGES) // 2
+    found[middle] = left(0.0)
+    for side in (-1, 1):
+        k = middle + side
+        while 0 <= k < len(found):
+            found[k] = left(SENSOR_CHANGES[k])
+            if found[k] > found[k - side]:
+                break
+            k += side
+    return found
+
+
+def _with_nearest_images(settled: Settled) -> tuple[FitModels, Nuisances]:
+    """Return the models with the pupil images that best explain a few modes.
+
+    This is done only if the first steps displace the images, and within plausible displacements.
+    Quadrupoles and common displacements change a matrix to first order. The others blur it, and the
+    sign of a blur is hardly measurable: so each of them is searched in turn on the coarse grid,
+    with all other unknowns free to first order.
+    """
+    models, nuisances, solution = settled.models, settled.nuisances, settled.solution
+    values = solution.nuisances[nuisances.image_places]
+    if not np.any(np.abs(values @ nuisances.images) > _linear_images(settled)):
+        return models, nuisances
+    modes = spread(settled.target.n_modes)
+    few = settled.target.column_subset(modes)
+    subset = replace(models, basis=models.basis.subset(modes))
+    blurring = np.array([is_blurring(pattern) for pattern in nuisances.images])
+    # derivatives by a blur, evaluated without blur, would fit any residual
+    free = np.ones(len(solution.nuisance_derivatives), dtype=bool)
+    free[nuisances.image_places] = ~blurring
+    every = np.concatenate([solution.derivatives, solution.nuisance_derivatives[free]])
+    every = every[:, :, modes]
+    seen = solution.projection
+    noise = seen.chi / max(seen.residual.size - len(seen.gains), 1)
+    unlikely = solution.dispersion * noise / nuisances.image_sigma**2
+
+    def left(displaced: Array) -> float:
+        improbable = unlikely * float(np.sum((nuisances.images @ displaced) ** 2))
+        if improbable > seen.chi:
+            return np.inf
+        models.counter.n += 1
+        matrix = subset.with_displaced_images(displaced).cheap.interaction_matrix(solution.alpha)
+        return few.project(matrix, every).chi_at_best + improbable
+
+    displaced = nuisances.displaced + np.where(blurring, 0.0, values) @ nuisances.images
+    least = left(displaced)
+    for pattern in nuisances.images[blurring]:
+        tried = [displaced + size * pattern for size in BLUR_STEPS]
+        found = [left(one) for one in tried]
+        best = int(np.argmin(found))
+        if found[best] < least:
+            displaced, least = tried[best], found[best]
+    return models.with_displaced_images(displaced), replace(nuisances, displaced=displaced)
+
+
+def spread(n_modes: int) -> NDArray[np.intp]:
+    """Return indices of a few columns, evenly spread over all."""
+    return np.unique(np.linspace(0, n_modes - 1, min(MAX_MODES, n_modes)).astype(np.intp))
+
+
+def _linear_images(settled: Settled) -> float:
+    """Return the displacement of a pupil image below which the model is linear, subapertures."""
+    return max(LINEAR_DISPLACEMENT, LINEAR_DISPLACEMENT_RATIO * float(np.sqrt(settled.share)))
+
+
+def _update_models(settled: Settled, *, move_images: bool) -> tuple[FitModels, Nuisances]:
+    """Return models updated with the fitted optical quantities, and nuisances relative to them."""
+    models, nuisances = settled.models, settled.nuisances
+    optics = []
+    for k, (optic, offset) in enumerate(nuisances.optics, nuisances.first_optic):
+        change = float(settled.solution.nuisances[k])
+        if abs(change) > LINEAR_CHANGE and models.exact(optic):
+            change = float(np.clip(change, -LONGEST_OPTIC_STEP, LONGEST_OPTIC_STEP))
+            models, offset = models.with_optic(optic, change), offset + change
+        optics.append((optic, offset))
+    nuisances = replace(nuisances, optics=tuple(optics))
+    step = settled.solution.nuisances[nuisances.image_places]
+    step = np.clip(step, -LONGEST_MOVE, LONGEST_MOVE) @ nuisances.images
+    displaced = nuisances.displaced + step
+    far = np.any(np.abs(displaced - nuisances.displaced) > _linear_images(settled))
+    if move_images and far:
+        return models.with_displaced_images(displaced), replace(nuisances, displaced=displaced)
+    return models, nuisances
+
+
+def settle_at(
+    models: FitModels, target: Target, alpha: Misregistration, nuisances: Nuisances
+) -> Settled:
+    """Return the model evaluated at a registration from another method."""
+    seen = _remove_unknown_rows(models, target, alpha)
+    there = refine(models, seen, alpha, nuisances, max_steps=0)
+    solution = replace(there, converged=within_limits(alpha.vector))
+    return Settled(solution=solution, target=seen, models=models, nuisances=nuisances)
+
+
+def project_on_sensitivities(
+    models: FitModels, target: Target, start: Misregistration, nuisances: Nuisances
+) -> Settled:
+    """Return the result of repeated projections on sensitivities from one start."""
+    for _ in range(MAX_REPEATS):
+        settled = settle(models, target, start, nuisances)
+        step = settled.solution.vector - start.vector
+        if not settled.solution.converged or np.all(np.abs(step) < REUSE_DISTANCE * SETTLED_STEP):
+            break
+        start = settled.solution.alpha
+    return settled
+
+
+def scan(
+    models: FitModels,
+    target: Target,
+    start: Misregistration,
+    steps: Sequence[tuple[str, float]] = TABLE_1,
+    progress: Callable[[str], None] = lambda _: None,
+) -> tuple[Misregistration, tuple[ScanStep, ...]]:
+    """Scan the parameters one by one and return the last values and every scan.
+
+    ``steps`` are the parameter and the step size of each scan, in boundary units. ``progress`` is a
+    callback that receives a line after each scan.
+    """
+    values = start.vector * BOUNDARY_SCALE
+    table: list[ScanStep] = []
+    for number, (parameter, step) in enumerate(steps):
+        # only the last scan of a parameter sets its value, so earlier ones use the coarse model
+        last = all(later != parameter for later, _ in steps[number + 1 :])
+        model = models.fine if last else models.cheap
+        index, known = PARAMETERS.index(parameter), values.copy()
+
+        chi = partial(_compute_chi, models, model, target, start, known, index)
+        first = all(done.parameter != parameter for done in table)
+        reach = ROUGH_RANGE.get(parameter, 0.0) if first else 0.0
+        half_width = max(HALF_WIDTH, round(reach / step))
+        table.append(_scan_parameter(chi, parameter, float(values[index]), step, half_width))
+        values[index] = table[-1].minimum
+        progress(f"step {len(table)}: {parameter} by {step:g}: {table[-1].minimum:.4f}")
+    return start.moved_to(values / BOUNDARY_SCALE), tuple(table)
+
+
+def _compute_chi(
+    models: FitModels,
+    model: InteractionModel,
+    target: Target,
+    start: Misregistration,
+    known: Array,
+    index: int,
+    tried: float,
+) -> float:
+    """Return χ_N with one parameter at a tried value, boundary units."""
+    there = np.where(np.arange(4) == index, tried, known)
+    return chi_n(target, models.matrix(model, start.moved_to(there / BOUNDARY_SCALE)))
+
+
+def chi_n(target: Target, matrix: NDArray[Any]) -> float:
+    """Return the paper's criterion χ_N of a synthetic matrix, (slope per metre)².
+
+    It is the squared norm over the modes (equation 8) of the RMS difference between measured and
+    synthetic slopes of each mode (equation 7). There is no free gain.
+    """
+    difference = target.matrix[target.rows] - matrix[target.rows]
+    return float(np.sum(np.mean(difference**2, axis=0, dtype=np.float64)))
+
+
+def _remove_unknown_rows(models: FitModels, target: Target, alpha: Misregistration) -> Target:
+    """Return the target without slopes from surface outside a table of modes."""
+    return target.without(models.fine.unknown_rows(alpha))
+
+
+def _other_starts(start: Array) -> list[Array]:
+    """Return further starts: corners of the range, and rotations."""
+    corners = [np.array([x, y, 0.0, 0.0]) for x, y in product(_SHIFTS, _SHIFTS)]
+    turns = [np.array([0.0, 0.0, turn, 0.0]) for turn in _TURNS_RAD]
+    nominal = np.array([0.0, 0.0, start[2], 1.0])
+    return [nominal, *(nominal + step for step in [*turns, *corners])]
+
+
+def _scan_parameter(
+    chi: Callable[[float], float], parameter: str, start: float, step: float, half_width: int
+) -> ScanStep:
+    """Scan one parameter around a start, and continue while the lowest sample is the last one."""
+    found = {k: chi(start + k * step) for k in range(-half_width, half_width + 1)}
+    for _ in range(MAX_EXTENSION):
+        best = min(found, key=lambda k: found[k])
+        beyond = best - 1 if best == min(found) else best + 1
+        if beyond in found:
+            break
+        found[beyond] = chi(start + beyond * step)
+    places = np.array(sorted(found))
+    values = np.array([found[k] for k in places])
+    near = np.abs(places - best) <= FITTED_HALF_WIDTH
+    bend, slope, least = np.polyfit(places[near] - best, values[near], 2)
+    # without a minimum near the lowest sample, the polynomial is no better than the sample
+    turn = -slope / (2.0 * bend) if bend > 0.0 and abs(slope) <= 2.0 * bend else 0.0
+    level = least + turn * (slope + bend * turn)
+    return ScanStep(
+        parameter=parameter,
+        step=step,
+        samples=start + step * places,
+        chi=values,
+        minimum=float(start + step * (best + turn)),
+        coefficients=np.array([bend, slope + 2.0 * bend * turn, level]),
+    )

@@ -1,0 +1,173 @@
+"""Quantities that the fit determined: key, value in the file, fitted value, and method."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.fitting.instrument_checks import FileValuesFit, FoundOptic
+from service.model.instrument import Instrument
+from service.model.slopes import FLIPS, Orientation, SlopeRecipe
+
+MAX_STRUCTURE = 0.09
+"""Largest RMS share of the signal, left over and not noise, at which a fitted number that the file
+does not have is accepted. Beyond it the number may compensate errors of the model: on PAPYRUS, with
+14 % left over, every disjoint set finds a modulation of 10.6 λ/D, although the bench is set to 5.
+"""
+
+MAX_LOG_SIGMA = 0.5
+"""Largest 1 σ of a number's logarithm at which it is accepted: half the prior of an unknown number.
+"""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Origin:
+    """A number or choice determined from the matrix."""
+
+    key: str
+    """Key in the instrument file."""
+
+    found: str
+    """Fitted value, in the notation of the file."""
+
+    reported: str
+    """Value in the file."""
+
+    how: str
+    """Method by which it was determined."""
+
+    correct: bool
+    """True if the file should be corrected or completed."""
+
+    @property
+    def words(self) -> str:
+        """Summary of key, values and method."""
+        return f"{self.key} = {self.found} ({self.how}; the file says {self.reported})"
+
+
+def list_origins(
+    about: Instrument,
+    reported: SlopeRecipe,
+    found: SlopeRecipe,
+    optics: tuple[FoundOptic, ...],
+    with_file_values: FileValuesFit | None,
+    structure: float,
+    gains: NDArray[np.float64],
+) -> tuple[Origin, ...]:
+    """Return the quantities of instrument and slopes that the fit determined.
+
+    Parameters
+    ----------
+    about
+        Instrument as the file describes it.
+    reported, found
+        Slope recipes: requested and fitted.
+    optics
+        Optical quantities that were fitted together with the registration.
+    with_file_values
+        Fit with the file's values of these; None if none differs significantly.
+    structure
+        RMS share of the signal that is left over and is not noise.
+    gains
+        ``(n_used,)`` gains of the modes.
+    """
+    return (
+        *_find_slopes(reported, found),
+        *(
+            _describe_optic(one, determined=is_determined(one, with_file_values, structure))
+            for one in optics
+            if one.found is not None and one.sigma < MAX_LOG_SIGMA
+        ),
+        *_find_wavelength(about, gains),
+        *_find_strokes(about),
+    )
+
+
+def _find_slopes(reported: SlopeRecipe, found: SlopeRecipe) -> Iterator[Origin]:
+    if reported.order is not found.order:
+        yield Origin(
+            key="order",
+            found=f'"{found.order}"',
+            reported=f'"{reported.order}"',
+            how="scanned: the lowest modes",
+            correct=True,
+        )
+    if reported.orientation is None:
+        yield Origin(
+            key="orientation",
+            found=format_orientation(found.assumed_orientation),
+            reported='"auto"',
+            how="scanned: the lowest modes",
+            correct=False,
+        )
+
+
+def format_orientation(orientation: Orientation) -> str:
+    """Return an orientation as the instrument file writes it."""
+    flips = ", ".join(f"{name} = {str(getattr(orientation, name)).lower()}" for name in FLIPS)
+    both = [orientation.sign_x, orientation.sign_y]
+    return f"{{ {flips}, sign = {both[0] if both[0] == both[1] else both} }}"
+
+
+def is_determined(
+    one: FoundOptic, with_file_values: FileValuesFit | None, structure: float
+) -> bool:
+    """Return True if a fitted number is reliable, rather than compensating model errors.
+
+    A number of the file is corrected if the file's value leaves several times the residual. A
+    number that the file does not have is accepted if hardly more than noise is left over. Agreement
+    of disjoint sets proves nothing: they share the errors of the model.
+    """
+    if one.sigma > MAX_LOG_SIGMA:
+        return False
+    if one.reported is None or with_file_values is None:
+        return structure < MAX_STRUCTURE
+    return not with_file_values.is_undecided
+
+
+def list_undetermined_keys(about: Instrument, found: tuple[Origin, ...]) -> tuple[str, ...]:
+    """Return the keys marked as unknown in the file that the matrix does not determine.
+
+    The positions of the pupil images are excluded: they are fitted whenever the file has none.
+    """
+    keys = {one.key for one in found} | {"image_offsets_px"}
+    return tuple(key for key in about.unknown if key.rpartition(".")[2] not in keys)
+
+
+def _describe_optic(one: FoundOptic, *, determined: bool) -> Origin:
+    unknown = one.reported is None
+    doubt = "" if determined else ", may compensate errors of the model"
+    return Origin(
+        key=one.key,
+        found=f"{one.found:.3g}",
+        reported='"unknown"' if unknown else f"{one.reported:.3g}",
+        how=f"fitted, 1 sigma {one.found_sigma:.1g}{doubt if unknown or one.notable else ''}",
+        correct=determined and (unknown or one.notable),
+    )
+
+
+def _find_wavelength(about: Instrument, gains: NDArray[np.float64]) -> Iterator[Origin]:
+    middle = float(np.median(gains))
+    if "wfs.wavelength_m" in about.unknown and about.mirror.stroke_known and middle > 0.0:
+        scatter = float(np.std(gains)) / middle
+        yield Origin(
+            key="wavelength_m",
+            found=f"{about.wfs.wavelength_m / middle:.3g}",
+            reported='"unknown"',
+            how=f"from the gains, which scatter by {scatter:.1%}",
+            correct=True,
+        )
+
+
+def _find_strokes(about: Instrument) -> Iterator[Origin]:
+    if not about.mirror.stroke_known:
+        yield Origin(
+            key="stroke",
+            found="one gain for each mode",
+            reported='"unknown"',
+            how="fitted: the shapes alone determine the registration",
+            correct=False,
+        )

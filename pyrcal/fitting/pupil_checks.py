@@ -1,0 +1,298 @@
+"""Try another obscuration and pupil size.
+
+Neither is fitted together with the registration: a wrong pupil has an effect at its edges only, and
+uneven light has a similar one. A value that would explain the matrix far better is reported
+instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.fitting.methods import Settled, spread
+from pyrcal.fitting.models import COARSE_SAMPLING, PREFERRED_SHARE, FitModels
+from pyrcal.fitting.solver import nuisances_of
+from pyrcal.fitting.uncertainty import pupil_regions
+from service.estimation.solver import Projection
+from service.model.instrument import Instrument
+from service.model.interaction import InteractionModel
+
+Array = NDArray[np.float64]
+
+MIN_PUPIL_EXPLAINED = 0.03
+"""RMS share of the signal that a pupil must explain; less may be the model's own error."""
+
+_N_STEPS = 2
+"""Number of steps towards the value that explains the most."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PupilNumber:
+    """A number of the instrument file that describes the pupil."""
+
+    key: str
+    """Key in the instrument file."""
+
+    reported: float
+    """Value in the instrument file."""
+
+    power: int
+    """Power of the value to which the illuminated area is proportional; steps are linear in it."""
+
+    step: float
+    """Step of that power for the finite difference."""
+
+    range: tuple[float, float]
+    """Range within which a file's value is assumed to be wrong at most."""
+
+    notable: float
+    """Smallest reported difference: simulators round their pupils to whole points."""
+
+    def with_value(self, about: Instrument, light: float) -> Instrument:
+        """Return the instrument with another value, given as its power."""
+        value = light ** (1.0 / self.power)
+        if self.key == "obscuration_ratio":
+            return replace(about, obscuration_ratio=value)
+        return replace(about, wfs=replace(about.wfs, pupil_diameter_subap=value))
+
+    def rate(self, few: FitSubset) -> Array:
+        """Return the derivative of D by the value's power ``(n_slopes, n_few)``."""
+        stepped = self.reported**self.power + self.step
+        there = few.matrix(few.of(self.with_value(few.models.instrument, stepped)))
+        return np.asarray((there - few.own) / self.step)
+
+    def near(self, few: FitSubset) -> tuple[float, Lead, Array]:
+        """Return the best value, its improvement and the change of α, to first order."""
+        light, rate = self.reported**self.power, self.rate(few)
+        if not few.tells(few.own, rate):
+            return self.reported, Lead(share=1.0, sigma=0.0), np.zeros(4)
+        step = few.step(few.own, rate)
+        low, high = (limit**self.power for limit in self.range)
+        value = float(np.clip(light + step[-1], low, high)) ** (1.0 / self.power)
+        return value, few.lead(few.own, rate), step[:4] - few.step(few.own)[:4]
+
+    def far(self, few: FitSubset) -> tuple[float, Lead, Array]:
+        """Return the best value, its improvement and the change of α, with D of that value."""
+        value, matrix = self.found(few)
+        return value, few.lead(matrix), few.step(matrix)[:4] - few.step(few.own)[:4]
+
+    def found(self, few: FitSubset) -> tuple[float, Array]:
+        """Return the value that explains the most, and its D ``(n_slopes, n_few)``.
+
+        A second step takes its derivative from the first, unless that was too short.
+        """
+        light, matrix, rate = self.reported**self.power, few.own, self.rate(few)
+        low, high = (limit**self.power for limit in self.range)
+        for _ in range(_N_STEPS):
+            if not few.tells(matrix, rate):
+                break
+            before, left = light, matrix
+            light += float(few.step(matrix, rate)[-1])
+            light = float(np.clip(light, low, high))
+            if light == before:
+                break
+            matrix = few.matrix(few.of(self.with_value(few.models.instrument, light)))
+            if abs(light - before) > self.step:
+                rate = (matrix - left) / (light - before)
+        return light ** (1.0 / self.power), matrix
+
+
+def _numbers(about: Instrument) -> tuple[PupilNumber, ...]:
+    size, hole = about.wfs.pupil_diameter, about.obscuration_ratio
+    width = PupilNumber(
+        key="pupil_diameter_subap",
+        reported=size,
+        power=1,
+        step=0.01 * size,
+        range=(0.94 * size, 1.06 * size),
+        notable=0.01 * size,
+    )
+    if about.pupil is not None:
+        return (width,)  # the pupil map contains the obscuration
+    inner = PupilNumber(
+        key="obscuration_ratio",
+        reported=hole,
+        power=2,
+        step=0.01,
+        range=(0.0, max(0.6, hole)),
+        notable=0.03,
+    )
+    return inner, width
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lead:
+    """Improvement or degradation of the misfit by another explanation."""
+
+    share: float
+    """χ² that it leaves over that of the fit."""
+
+    sigma: float
+    """1 σ of that share, from its scatter between modes and between regions of the pupil."""
+
+    @property
+    def significance(self) -> float:
+        """Number of σ by which the other explanation is better; negative if it is worse."""
+        gained = 1.0 - self.share
+        if self.sigma > 0.0:
+            return gained / self.sigma
+        return float(np.copysign(np.inf, gained)) if gained else 0.0
+
+
+class FitSubset:
+    """A subset of a fit's modes at its solution, on the coarse grid."""
+
+    def __init__(self, settled: Settled) -> None:
+        solution, self.models = settled.solution, settled.models
+        self.residual_fraction = settled.share
+        self.modes = spread(settled.target.n_modes)
+        self.target = settled.target.column_subset(self.modes)
+        self.here = solution.alpha
+        known = np.concatenate([solution.derivatives, solution.nuisance_derivatives])
+        self.derivatives = np.asarray(known[:, :, self.modes], dtype=np.float64)
+        """Derivatives of the unchanged instrument; they hardly depend on the alternative."""
+
+    @cached_property
+    def model(self) -> InteractionModel:
+        """Model of the unchanged instrument with these modes only."""
+        return self.models.cheap.of_modes(self.models.basis.subset(self.modes))
+
+    @cached_property
+    def own(self) -> Array:
+        """D of the unchanged instrument, ``(n_slopes, n_few)``."""
+        return self._at_solution(self.model)
+
+    def of(self, about: Instrument) -> FitModels:
+        """Return the models of another instrument with the same modes."""
+        return replace(self.models, instrument=about)
+
+    def matrix(self, tried: FitModels) -> Array:
+        """Return D of an instrument, ``(n_slopes, n_few)``."""
+        own = tried.basis is self.models.basis
+        basis = self.model.basis if own else tried.basis.subset(self.modes)
+        return self._at_solution(tried.model(COARSE_SAMPLING, basis, once=True))
+
+    def left(self, matrix: Array, *more: Array) -> float:
+        """Return χ² at the best unknowns, including those of further derivatives."""
+        return float(self.seen(matrix, *more).chi_at_best)
+
+    def lead(self, matrix: Array, *more: Array) -> Lead:
+        """Return the improvement of another matrix over the unchanged instrument.
+
+        Squares of both residuals are compared mode by mode and region by region: common noise and
+        errors cancel, and the rest scatters between modes and between regions.
+        """
+        own, other = self._own_left, self._left_at_best(self.seen(matrix, *more))
+        gained = own - other
+        by_mode = gained.sum(axis=0)
+        by_region = np.bincount(self._regions, gained.sum(axis=1))
+        return Lead(
+            share=float(other.sum() / own.sum()) if own.any() else 1.0,
+            sigma=float(
+                max(
+                    np.std(parts, ddof=1) * np.sqrt(len(parts)) if len(parts) > 1 else 0.0
+                    for parts in (by_mode, by_region)
+                )
+                / own.sum()
+            )
+            if own.any()
+            else 0.0,
+        )
+
+    @cached_property
+    def _own_left(self) -> Array:
+        return self._left_at_best(self.seen(self.own))
+
+    @cached_property
+    def _regions(self) -> NDArray[np.intp]:
+        n_planes = self.models.instrument.slopes.kind.n_planes
+        return pupil_regions(self.target.valid, n_planes)[self.target.rows]
+
+    @staticmethod
+    def _left_at_best(seen: Projection) -> Array:
+        """Return the weighted squares of the residual after the best step ``(n_rows, n_few)``."""
+        left = seen.residual - np.tensordot(seen.best_step, seen.jacobian, axes=1)
+        return np.asarray(left**2 * seen.weights)
+
+    def tells(self, matrix: Array, rate: Array) -> bool:
+        """Return True if the measurement depends on a quantity; it may cut no subaperture."""
+        return bool(self.target.project(matrix, rate[None]).normal[0, 0] > 0.0)
+
+    def step(self, matrix: Array, *more: Array) -> Array:
+        """Return the best step of all unknowns."""
+        return self.seen(matrix, *more).best_step
+
+    def seen(self, matrix: Array, *more: Array) -> Projection:
+        """Return the projection of the measurement on a matrix; the unchanged one is cached."""
+        if matrix is self.own and not more:
+            return self._own_seen
+        return self.target.project(matrix, self._with(more))
+
+    @cached_property
+    def _own_seen(self) -> Projection:
+        return self.target.project(self.own, self.derivatives)
+
+    def _at_solution(self, model: InteractionModel) -> Array:
+        self.models.counter.n += 1
+        return np.asarray(model.interaction_matrix(self.here), dtype=np.float64)
+
+    def _with(self, more: tuple[Array, ...]) -> Array:
+        return np.concatenate([self.derivatives, np.array(more)]) if more else self.derivatives
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TriedPupil:
+    """Another obscuration or diameter, at the value that explains the most."""
+
+    words: str
+    """Entry for the instrument file."""
+
+    lead: Lead
+    """Improvement over the file's pupil."""
+
+    moved: Array
+    """``(4,)`` change of α, numeric units."""
+
+    explains: bool
+    """True if it explains enough of the signal to be reported."""
+
+
+def try_pupils(few: FitSubset) -> tuple[TriedPupil, ...]:
+    """Return other pupils, each at the value that explains the most.
+
+    They are computed to first order only, if the residual is smaller than a pupil would have to
+    explain.
+    """
+    found = []
+    little = few.residual_fraction < MIN_PUPIL_EXPLAINED
+    for number in _numbers(few.models.instrument):
+        value, lead, moved = number.near(few) if little else number.far(few)
+        explained = few.residual_fraction * np.sqrt(max(1.0 - lead.share, 0.0))
+        notable = (
+            abs(value - number.reported) >= number.notable and explained >= MIN_PUPIL_EXPLAINED
+        )
+        found.append(
+            TriedPupil(
+                words=f"{number.key} = {value:.3g}",
+                lead=lead,
+                moved=moved,
+                explains=notable and lead.share < PREFERRED_SHARE,
+            )
+        )
+    return tuple(found)
+
+
+def fit_smooth_gain(few: FitSubset) -> float:
+    """Return χ² with a smooth gain over the pupil, common to all modes, over that without."""
+    own = few.own
+    return few.left(own, *(pattern[:, None] * own for pattern in gain_maps(few))) / few.left(own)
+
+
+def gain_maps(few: FitSubset) -> Array:
+    """Return the shapes of a smooth gain over the pupil, ``(n_maps, n_slopes)``."""
+    kind = few.models.instrument.slopes.kind
+    return nuisances_of(few.target.valid, kind, gain_map=True).maps

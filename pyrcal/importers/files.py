@@ -1,0 +1,472 @@
+"""Build an instrument and its matrix from arrays in files, recognised and checked by shape.
+
+Each array has a role: the matrix, the valid subapertures, the modes. Parameters missing from the
+files can be given as options. Otherwise they are read from the mask or marked unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.fitting.pupil_width import compute_responses, measure_pupil
+from pyrcal.importers.actuators import Mirror, read_mirror
+from pyrcal.importers.apertures import centre_grid, find_lit
+from pyrcal.importers.frames import Frames, describe_frames, frames_of
+from pyrcal.importers.imported import (
+    UNKNOWN,
+    Array,
+    Dataset,
+    Imported,
+    matrix_of,
+)
+from pyrcal.importers.layouts import ROLES, maps_of, mask_of
+from service.errors import ConfigurationError, MatrixError
+from service.model.aperture import measure_aperture
+from service.model.defects import explain_defects, find_defects
+
+UNITS_M = {"m": 1.0, "um": 1e-6, "nm": 1e-9}
+"""Metres of OPD in a unit of the commands."""
+
+MIN_WIDTH_DIFFERENCE_SUBAP = 0.75
+"""Difference of the widths of grid and pupil above which the pupil's width is recorded."""
+
+MIN_OBSCURATION = 0.05
+"""Smallest obscuration ratio that is read from a mask."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reported:
+    """Parameters that no array contains."""
+
+    diameter_m: float
+    """Diameter of the pupil, metres; cubes of modes have the same width, edge to edge."""
+
+    sensor: str | None = None
+    """``pyramid`` or ``shack-hartmann``; None for that of the files, or a pyramid."""
+
+    stop: str
+    """Aperture stop: ``telescope`` or ``mirror``."""
+
+    obscuration_ratio: float | None = None
+    """Linear obscuration of the pupil; None to read it from the mask."""
+
+    wavelength_m: float | None = None
+    """Sensing wavelength, metres; None if unknown."""
+
+    modulation_lambda_over_d: float | None = None
+    """Modulation of a pyramid, λ/D; None if unknown."""
+
+    pupil_diameter_subap: float | None = None
+    """Diameter of the pupil image, subapertures; None for the width of the mask."""
+
+    pixels_per_subaperture: int | None = None
+    """Binning of camera frames; None for the largest that keeps two subapertures per actuator."""
+
+    centroid: str | None = None
+    """Centroid algorithm of a Shack-Hartmann; None for the default of the instrument file."""
+
+    order: str = "xy"
+    """Order of the slope components as assumed by the user; the fit may find another."""
+
+    unit: str | None = None
+    """Unit of the commands, OPD; None if unknown, so that only shapes are compared."""
+
+    columns: Array | None = None
+    """``(n_columns,)`` basis index of each column; None for the first ones."""
+
+    basis: str | None = None
+    """Meaning of columns if positions come without ``mode_to_actuator``: ``zonal`` for single
+    actuators, ``KL`` for modes that pyrcal computes. None for zonal if the numbers agree."""
+
+    @property
+    def kind(self) -> str:
+        """Kind of the sensor."""
+        return self.sensor or "pyramid"
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class Signals:
+    """The sensor's part of an import."""
+
+    table: dict[str, Any]
+    """Keys of ``[wfs]`` except the optical parameters."""
+
+    arrays: dict[str, Array]
+    """The matrix and the mask."""
+
+    obscuration_ratio: float
+    """Obscuration ratio measured on the mask or the light."""
+
+    columns: int
+    """Axis of the matrix that enumerates the modes."""
+
+    @property
+    def n_columns(self) -> int:
+        """Number of columns of the matrix."""
+        return int(self.arrays["interaction_matrix"].shape[self.columns])
+
+    @property
+    def by_column(self) -> Array:
+        """Matrix with the modes along the first axis."""
+        return np.moveaxis(self.arrays["interaction_matrix"], self.columns, 0)
+
+    def keep(self, columns: Array) -> None:
+        """Remove all but these columns."""
+        kept = np.moveaxis(self.by_column[columns], 0, self.columns)
+        self.arrays["interaction_matrix"] = kept
+
+
+def from_arrays(
+    source: str,
+    arrays: Mapping[str, Array],
+    reported: Reported,
+    column_numbers: Array | None = None,
+) -> Imported:
+    """Return an instrument and its matrix from arrays by role.
+
+    ``column_numbers`` are the numbers of the columns in their file, for messages and for the record
+    of what was kept; None if all columns are present.
+
+    Raises
+    ------
+    MatrixError
+        If a role is missing, or a shape fits no layout, or several.
+    """
+    notes: list[str] = []
+    if "matrix" not in arrays:
+        raise MatrixError(
+            f"{source}: found no matrix; expected an array named {' or '.join(ROLES['matrix'])}, "
+            "or a file of its own"
+        )
+    mirror = read_mirror(source, arrays, reported.diameter_m, notes)
+    frames = read_frames(source, arrays, reported.kind)
+    if frames is None:
+        signals = read_slopes(source, arrays, mirror.n_modes, notes)
+    else:
+        table, kept, ratio = describe_frames(
+            frames, mirror.n_actuators, reported.pixels_per_subaperture, source, notes
+        )
+        signals = Signals(table=table, arrays=kept, obscuration_ratio=ratio, columns=0)
+    turbulence = _make_own_modes(source, signals, mirror, reported)
+    modes = usable_modes(signals, mirror, reported.columns, notes, column_numbers)
+    if reported.unit is None:
+        mirror.table["stroke"] = UNKNOWN
+        notes.append("the unit of the commands is unknown: only shapes are compared")
+    else:
+        signals.arrays["interaction_matrix"] = (
+            signals.arrays["interaction_matrix"] / UNITS_M[reported.unit]
+        )
+    sensor = _sensor(reported, signals, notes)
+    obscuration = reported.obscuration_ratio
+    if obscuration is None:
+        seen = signals.obscuration_ratio
+        obscuration = round(seen, 3) if seen > MIN_OBSCURATION else 0.0
+        if obscuration:
+            notes.append(f"obscuration_ratio = {obscuration}: read from the hole in the mask")
+    return Imported(
+        source=source,
+        tables={
+            "instrument": {
+                "name": "bench",
+                "diameter_m": reported.diameter_m,
+                "obscuration_ratio": obscuration,
+                "stop": reported.stop,
+            },
+            "wfs": sensor,
+            "mirror": mirror.table,
+            **turbulence,
+            "slopes": {
+                # slopes that pyrcal computes from frames have its own order
+                **({} if frames else {"order": reported.order}),
+                "orientation": "auto",
+            },
+        },
+        arrays={**signals.arrays, **modes, **mirror.arrays},
+        centres_found=frames is not None,
+        notes=(*notes, *(f"{key} is unknown" for key, v in sensor.items() if v == UNKNOWN)),
+    )
+
+
+def _make_own_modes(
+    source: str, signals: Signals, mirror: Mirror, reported: Reported
+) -> dict[str, dict[str, int]]:
+    """Return ``[modes]`` if the columns are pyrcal's Karhunen-Loeve modes, else nothing.
+
+    Raises
+    ------
+    MatrixError
+        If there are fewer columns than actuators and nothing says what they are.
+    """
+    n_columns, columns = signals.n_columns, reported.columns
+    if not mirror.is_zonal:
+        if reported.basis is not None:
+            raise MatrixError(
+                f"{source}: --basis: found it with modes of the mirror, expected it only with "
+                "positions of actuators"
+            )
+        return {}
+    if reported.basis == "KL":
+        n_modes = n_columns if columns is None else int(max(columns)) + 1
+        mirror.become_modal(n_modes)
+        return {"modes": {"n_modes": n_modes}}
+    if reported.basis is None and columns is None and n_columns < mirror.n_actuators:
+        raise MatrixError(
+            f"{source}: matrix: found {n_columns} columns of {mirror.n_actuators} actuators, "
+            "expected one for each; give mode_to_actuator=FILE for modes of your own, --basis KL "
+            "for pyrcal's Karhunen-Loeve modes, or --basis zonal --modes LIST for some actuators"
+        )
+    return {}
+
+
+def read_frames(source: str, arrays: Mapping[str, Array], kind: str) -> Frames | None:
+    """Return the response as camera frames; None if it consists of slopes."""
+    matrix = np.asarray(arrays["matrix"])
+    light, valid = arrays.get("light"), arrays.get("valid")
+    if matrix.ndim == 3:
+        try:
+            maps_of(matrix, None if valid is None else min(np.shape(valid)), [])
+        except MatrixError:
+            pass
+        else:
+            return None
+    frames = frames_of(
+        matrix,
+        None if light is None else _plane(light),
+        None if valid is None else _plane(valid),
+    )
+    if frames is not None and kind != "pyramid":
+        raise MatrixError(
+            f"{source}: matrix: found shape {matrix.shape}, camera frames; of a {kind} "
+            "only slopes are read"
+        )
+    return frames
+
+
+def _plane(values: Array) -> Array:
+    """Return an image, also if a FITS file has it as a cube with a single plane."""
+    found = np.asarray(values)
+    return found[0] if found.ndim == 3 and len(found) == 1 else found
+
+
+def read_slopes(
+    source: str, arrays: Mapping[str, Array], n_modes: int, notes: list[str]
+) -> Signals:
+    """Return a matrix of slopes and its mask.
+
+    Raises
+    ------
+    MatrixError
+        If there is no mask and the matrix is no cube of maps, or a shape fits no layout.
+    """
+    given, found = arrays.get("valid"), np.asarray(arrays["matrix"])
+    if given is None and found.ndim == 2:
+        side = round(found.shape[0] ** 0.5)
+        frames = (
+            f"; {found.shape[0]} = {side} x {side} values look like camera frames: give the mean "
+            "frame (light=FILE) or the mask of lit pixels (valid=FILE)"
+            if side**2 == found.shape[0]
+            else ""
+        )
+        raise MatrixError(
+            f"{source}: found no valid; expected an array named {' or '.join(ROLES['valid'])}, or "
+            f"a file of its own{frames}"
+        )
+    valid = None if given is None else mask_of(given, notes)
+    if found.ndim > 2:
+        maps = maps_of(found, None if valid is None else len(valid), notes)
+        if valid is None:
+            valid = find_lit(maps, notes)
+        found = maps[:, valid].reshape(-1, maps.shape[-1])
+    if valid is None:
+        raise MatrixError(f"{source}: found no valid subapertures, expected a mask (n, n)")
+    n_rows = 2 * int(valid.sum())
+    found, valid = _remove_dead_rows(found, valid, n_rows, notes)
+    matrix, turned = _orient_matrix(found, 2 * int(valid.sum()), _columns(found, valid, n_modes))
+    notes += turned
+    grid = centre_grid(valid)
+    if grid.shape != valid.shape or np.any(grid != valid):
+        notes.append(
+            f"valid: the lit subapertures are put into the middle of a grid of {len(grid)} x "
+            f"{len(grid)} instead of {len(valid)} x {len(valid)}: their order is the same"
+        )
+    aperture = measure_aperture(grid)
+    notes.append(f"valid: {int(grid.sum())} subapertures, {aperture.words}")
+    width: dict[str, Any] = {}
+    if len(grid) - aperture.diameter_subap > MIN_WIDTH_DIFFERENCE_SUBAP:
+        width = {"pupil_diameter_subap": round(aperture.diameter_subap, 2)}
+    return Signals(
+        table={
+            "n_subapertures": len(grid),
+            "valid_subapertures": Dataset("valid_subapertures"),
+            **width,
+        },
+        arrays={"interaction_matrix": matrix, "valid_subapertures": grid.astype(np.uint8)},
+        obscuration_ratio=aperture.obscuration_ratio,
+        columns=1,
+    )
+
+
+def _orient_matrix(found: Array, n_rows: int, n_columns: int) -> tuple[Array, tuple[str, ...]]:
+    """Return a matrix ``(n_slopes, n_modes)``; NaN in columns are kept."""
+    if found.dtype.kind != "f" or found.ndim != 2:
+        return matrix_of(found, n_rows, n_columns)
+    unknown = ~np.isfinite(found)
+    matrix, turned = matrix_of(np.where(unknown, 0.0, found), n_rows, n_columns)
+    if unknown.any():
+        matrix = np.array(matrix)
+        matrix[
+            unknown if matrix.shape == unknown.shape and found.shape[0] == n_rows else unknown.T
+        ] = np.nan
+    return matrix, turned
+
+
+def _remove_dead_rows(
+    found: Array, valid: NDArray[np.bool_], n_rows: int, notes: list[str]
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return matrix and mask without subapertures that are NaN or 0 for all modes."""
+    if found.ndim != 2 or found.dtype.kind not in "iuf" or n_rows not in found.shape:
+        return found, valid
+    turned = found.shape[0] != n_rows
+    slopes = found.T if turned else found
+    planes = slopes.reshape(2, -1, slopes.shape[1])
+    with np.errstate(invalid="ignore"):
+        silent = ~np.isfinite(planes) | (planes == 0.0)
+    dead = silent.all(axis=2).any(axis=0)
+    usable = np.isfinite(planes).any(axis=2).any(axis=0)
+    dead |= ~usable
+    if not dead.any() or dead.all():
+        return found, valid
+    places = np.argwhere(valid)[dead]
+    listed = ", ".join(f"({row}, {column})" for row, column in places[:12])
+    more = f" and {len(places) - 12} more" if len(places) > 12 else ""
+    notes.append(
+        f"valid: the subapertures at (row, column) {listed}{more} give NaN or 0 in all columns: "
+        "left out"
+    )
+    kept = valid.copy()
+    kept[tuple(places.T)] = False
+    remaining = planes[:, ~dead].reshape(-1, slopes.shape[1])
+    return (remaining.T if turned else remaining), kept
+
+
+def _columns(matrix: Array, valid: NDArray[np.bool_], n_modes: int) -> int:
+    """Return the expected number of columns: all modes, or fewer if the matrix has fewer."""
+    others = [n for n in matrix.shape if n != 2 * int(valid.sum())]
+    return others[0] if len(others) == 1 and others[0] < n_modes else n_modes
+
+
+def usable_modes(
+    signals: Signals,
+    mirror: Mirror,
+    columns: Array | None,
+    notes: list[str],
+    numbers: Array | None = None,
+) -> dict[str, Array]:
+    """Remove unusable columns and modes; return the basis index of each remaining column.
+
+    Parameters
+    ----------
+    signals, mirror
+        Changed in place.
+    columns
+        ``(n_columns,)`` basis index of each column; None for the first ones.
+    notes
+        List to which notes on removed columns are appended.
+    numbers
+        Numbers of the columns in their file; None to count from 0.
+
+    Raises
+    ------
+    ConfigurationError
+        If ``columns`` are not of the matrix and the basis.
+    MatrixError
+        If no column is left.
+    """
+    n_columns, n_modes = signals.n_columns, mirror.n_modes
+    if not n_columns:
+        raise MatrixError("matrix: found no column, expected the response to each mode")
+    indices = _indices(columns, n_columns, n_modes, notes)
+    dead, shapes = find_defects(signals.by_column), mirror.defects
+    notes += explain_defects(dead, "column", numbers)
+    notes += explain_defects(shapes, "actuator" if mirror.is_zonal else "mode")
+    unusable = set(shapes)
+    if mirror.is_zonal and mirror.per_mode:
+        unusable |= {int(indices[k]) for k in dead}
+    kept = np.array([n for n in range(n_modes) if n not in unusable], dtype=np.intp)
+    measured = np.array(
+        [k for k in range(n_columns) if k not in dead and int(indices[k]) not in shapes],
+        dtype=np.intp,
+    )
+    if not len(measured):
+        raise MatrixError("matrix: found no column that can be used, expected some")
+    if len(measured) < n_columns:
+        signals.keep(measured)
+    arrays: dict[str, Array] = {}
+    if len(kept) < n_modes or numbers is not None:
+        name = "kept_actuators" if mirror.is_zonal else "kept_modes"
+        arrays[name] = kept if numbers is None else np.asarray(numbers)[kept]
+        mirror.keep(kept)
+    position = {int(n): k for k, n in enumerate(kept)}
+    left = np.array([position[int(indices[k])] for k in measured])
+    if not np.array_equal(left, np.arange(len(kept))):
+        arrays["modes"] = left
+    return arrays
+
+
+def _indices(columns: Array | None, n_columns: int, n_modes: int, notes: list[str]) -> Array:
+    """Return the basis index of each column."""
+    if columns is None:
+        if n_columns > n_modes:
+            raise MatrixError(f"matrix: found {n_columns} columns, expected at most {n_modes}")
+        if n_modes > n_columns:
+            notes.append(
+                f"the matrix is of the first {n_columns} of {n_modes} modes; --modes if of others"
+            )
+        return np.arange(n_columns)
+    if len(columns) != n_columns:
+        raise ConfigurationError(
+            f"--modes: found {len(columns)} numbers, expected one for each of the {n_columns} "
+            "columns of the matrix"
+        )
+    if max(columns) >= n_modes:
+        raise ConfigurationError(
+            f"--modes: found {max(columns)}, expected numbers below {n_modes}, the number of modes"
+        )
+    return columns
+
+
+def _sensor(reported: Reported, signals: Signals, notes: list[str]) -> dict[str, Any]:
+    """Return the keys of ``[wfs]``."""
+    table: dict[str, Any] = {
+        "kind": reported.kind,
+        **signals.table,
+        "wavelength_m": reported.wavelength_m or UNKNOWN,
+    }
+    if reported.kind == "pyramid":
+        modulation = reported.modulation_lambda_over_d
+        table["modulation_lambda_over_d"] = UNKNOWN if modulation is None else modulation
+    elif reported.centroid is not None:
+        table["centroid"] = reported.centroid
+    if reported.pupil_diameter_subap is not None:
+        return {**table, "pupil_diameter_subap": reported.pupil_diameter_subap}
+    if table.get("input") != "frames":
+        valid = signals.arrays["valid_subapertures"].astype(bool)
+        notes += _check_width(signals.arrays["interaction_matrix"], valid)
+    return table
+
+
+def _check_width(matrix: Array, valid: NDArray[np.bool_]) -> list[str]:
+    """Return a note if the mask seems wider than the pupil image."""
+    power = np.einsum("ij,ij->i", matrix, matrix)
+    seen = measure_pupil(compute_responses(power, np.ones(len(power)), valid), len(valid))
+    if seen is None:
+        return []
+    return [
+        f"{seen.words}, the mask has {len(valid)}: say --pupil-subap, unless the mirror does not "
+        "reach these"
+    ]

@@ -1,0 +1,170 @@
+"""Recognise the layout of arrays by shape: masks, maps of slopes, cubes of modes.
+
+An array that fits no layout, or several, is rejected.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.importers.imported import Array
+from service.errors import MatrixError
+
+_NUMBERED = re.compile(r"(?:_\d{1,6})+$")
+
+ROLES = {
+    "matrix": ("interaction_matrix", "im", "imat", "intmat", "int_mat", "D", "matrix"),
+    "valid": (
+        *("valid_subapertures", "valid", "mask", "valid_sub_aps", "subap_mask"),
+        *("valid_pixel", "valid_pixels", "validI4Q"),
+    ),
+    "light": ("flux_frame", "light", "wfsref", "reference_frame", "referenceIntensity"),
+    "modes": ("modes", "influence_functions", "cube", "ifunc", "mode_shapes"),
+    "mode_to_actuator": ("mode_to_actuator", "M2C", "m2c"),
+    "positions": ("positions", "xy_m", "coordinates"),
+}
+"""Names of arrays by role, in a file with several arrays."""
+
+
+def mask_of(values: Array, notes: list[str]) -> NDArray[np.bool_]:
+    """Return a mask ``(n, n)`` of subapertures.
+
+    Raises
+    ------
+    MatrixError
+        If it is none: of another shape, with other values than 0 and 1, or empty. One that lists
+        the same mask for x and for y, ``(2n, n)`` or ``(n, 2n)``, is taken once.
+    """
+    mask = np.asarray(values)
+    if is_listed_twice(mask):
+        notes.append("valid: listed twice, for x and y: taken once")
+        mask = np.split(mask, 2, axis=int(np.argmax(mask.shape)))[0]
+    if mask.ndim != 2 or mask.shape[0] != mask.shape[1]:
+        raise MatrixError(
+            f"valid: found shape {mask.shape} of {mask.dtype}, expected a mask (n, n) of 0 and 1"
+        )
+    check_binary(mask, "valid")
+    if not mask.any():
+        raise MatrixError("valid: found no valid subaperture, expected some")
+    return mask.astype(bool)
+
+
+def is_listed_twice(mask: Array) -> bool:
+    """Return True if a mask contains the same subapertures twice, for x and for y."""
+    if mask.ndim != 2 or max(mask.shape) != 2 * min(mask.shape):
+        return False
+    of_x, of_y = np.split(mask, 2, axis=int(np.argmax(mask.shape)))
+    return bool(np.array_equal(of_x, of_y))
+
+
+def check_binary(mask: Array, what: str) -> None:
+    """Raise if a mask has values other than 0 and 1, and quote two of them.
+
+    Raises
+    ------
+    MatrixError
+        If it has such values.
+    """
+    other = np.unique(mask[~np.isin(mask, (0, 1))])
+    if other.size:
+        quoted = " and ".join(f"{value:g}" for value in other[:2])
+        hint = ": was BZERO applied?" if np.any(other == -128) else ""
+        raise MatrixError(f"{what}: found values {quoted}, expected a mask of 0 and 1{hint}")
+
+
+def maps_of(values: Array, n: int | None, notes: list[str]) -> Array:
+    """Return slopes listed as maps as ``(2, n, n, n_modes)``, Sx then Sy.
+
+    Accepted are ``(2, n, n)`` maps, or one map of both, next to each other ``(n, 2n)`` or one above
+    the other ``(2n, n)``; modes first or last.
+
+    Raises
+    ------
+    MatrixError
+        If they fit no layout, or several.
+    """
+    ways: dict[str, Array] = {}
+    for first in (True, False):
+        modes_last = np.moveaxis(values, 0, -1) if first else values
+        shape, where = modes_last.shape[:-1], "first" if first else "last"
+        if len(shape) == 3 and shape[0] == 2 and shape[1] == shape[2]:
+            ways[f"(2, n, n), modes {where}"] = modes_last
+        elif len(shape) == 2 and shape[1] == 2 * shape[0]:
+            ways[f"(n, 2n), modes {where}"] = np.stack(np.split(modes_last, 2, axis=1))
+        elif len(shape) == 2 and shape[0] == 2 * shape[1]:
+            ways[f"(2n, n), modes {where}"] = np.stack(np.split(modes_last, 2, axis=0))
+    ways = {way: maps for way, maps in ways.items() if n in {None, maps.shape[1]}}
+    if len(ways) != 1:
+        raise MatrixError(
+            f"matrix: found shape {values.shape}, expected maps of slopes: (2, n, n), (n, 2n) or "
+            f"(2n, n), modes first or last; it fits {' and '.join(ways) or 'none of them'}"
+        )
+    ((way, maps),) = ways.items()
+    notes.append(f"matrix: maps of slopes, {way}: the first half taken as Sx")
+    return maps
+
+
+def cube_of(values: Array, notes: list[str]) -> NDArray[np.float32]:
+    """Return shapes as ``(n_modes, ny, nx)``: the map has the two axes of equal length.
+
+    Raises
+    ------
+    MatrixError
+        If it is unclear which two axes are the map's.
+    """
+    cube = np.asarray(values)
+    if cube.ndim != 3 or cube.dtype.kind not in "iuf":
+        raise MatrixError(
+            f"modes: found shape {cube.shape} of {cube.dtype}, expected numbers (n_modes, n, n)"
+        )
+    first, _, last = cube.shape
+    if first == last or (first != cube.shape[1] and cube.shape[1] != last):
+        raise MatrixError(
+            f"modes: found shape {cube.shape}, expected (n_modes, n, n) or (n, n, n_modes) with "
+            "n_modes other than n"
+        )
+    if first == cube.shape[1]:
+        notes.append("modes: listed last, (n, n, n_modes): turned to (n_modes, n, n)")
+        cube = np.moveaxis(cube, -1, 0)
+    return np.ascontiguousarray(cube, dtype=np.float32)
+
+
+def by_role(arrays: Mapping[str, Array], where: str) -> dict[str, Array]:
+    """Return the arrays of a file by role, recognised by name in any letter case.
+
+    FITS has capitals only.
+
+    Raises
+    ------
+    MatrixError
+        If two have names of the same role.
+    """
+    found: dict[str, Array] = {}
+    for role, names in ROLES.items():
+        there = [one for name in names for one in arrays if one.lower() == name.lower()]
+        there = list(dict.fromkeys(there))  # two of the names differ in letter case only
+        if len(there) > 1:
+            raise MatrixError(f"{where}: found {' and '.join(there)}, expected one {role}")
+        if there:
+            found[role] = arrays[there[0]]
+    return found
+
+
+def role_of_name(name: str) -> str | None:
+    """Return the role for an array or file name; None if the name is unknown.
+
+    Numbers may follow the name, as in ``int_mat_1_5_10``.
+    """
+    plain = _NUMBERED.sub("", name).lower()
+    known = (role for role, names in ROLES.items() if plain in {n.lower() for n in names})
+    return next(known, None)
+
+
+def numbers_of_name(name: str) -> list[int]:
+    """Return the numbers at the end of a name like ``int_mat_1_5_10``."""
+    match = _NUMBERED.search(name)
+    return [] if match is None else [int(number) for number in match[0].split("_")[1:]]

@@ -1,0 +1,281 @@
+"""From the instrument file to ``service.model.instrument.Instrument``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import ConfigurationError, ModelError
+from service.files.toml import read_dataset, refuse, refuse_all
+from service.instrument import and_sensor_mode, packaged_file
+from service.instrument import schema as schema
+from service.instrument.laws import LawTable, law_of
+from service.instrument.mirrors import Pupil, own_modes, read_mirror
+from service.instrument.pupils import read_pupil
+from service.model.aperture import check_mask
+from service.model.instrument import (
+    Instrument,
+    Mirror,
+    SensorDescription,
+    SensorMode,
+    TabulatedModes,
+)
+from service.model.kinds import KarhunenLoeve, LoopFacts
+from service.model.sensors.kind import SensorKind, SensorTable
+from service.model.slopes import Orientation, SlopeRecipe
+
+
+def load_instrument(name_or_path: str | Path) -> Instrument:
+    """Return the instrument that a packaged name (``flao-lbt``) or a TOML file describes.
+
+    Anything that has a folder or ends in ``.toml`` is a path; references to datasets in it
+    (``mask.h5:/valid_subapertures``) are relative to the file. ``soul-lbt@soul-bin2`` is in that
+    mode of its sensor, without one in the first.
+
+    Raises
+    ------
+    ConfigurationError
+        One line with the file and the key: unknown, missing, of the wrong type, out of range, or
+        in contradiction to another.
+    """
+    said = schema.read_instrument_file(name_or_path)
+    section, kind = said.section, said.kind
+    about, wfs = section(schema.AboutTable).said, section(kind.table)
+    told = asdict(about)
+    del told["pupil"], told["pupil_pitch_m"]
+    instrument = Instrument(
+        **told,
+        **_made(_parts(said)),
+        unknown=tuple(one for one in schema.unknown_values(kind) if one in said.unknown),
+    )
+    difference = check_mask(instrument)
+    if difference is not None:
+        instrument = replace(instrument, remarks=(*instrument.remarks, difference))
+    whole = _in_first_mode(instrument, wfs, kind)
+    _, mode = and_sensor_mode(name_or_path)
+    try:
+        return whole if mode is None else whole.in_mode(mode)
+    except ModelError as error:
+        raise ConfigurationError(f"{wfs.path}: {error}") from error
+
+
+def _parts(said: schema.InstrumentFile) -> Mapping[str, Callable[[], Any]]:
+    """Return how each part of an instrument is made; what one needs of another is made once."""
+    section, kind = said.section, said.kind
+    about, wfs = section(schema.AboutTable), section(kind.table)
+    pupil = Pupil(about.said.diameter_m, about.said.diameter_m / wfs.said.pupil_diameter)
+    sensor = cache(lambda: _sensor(wfs, kind, pupil))
+    mirror = cache(lambda: read_mirror(section(schema.MirrorTable), pupil))
+    modes = cache(lambda: _modes(section(KarhunenLoeve), mirror()[0]))
+
+    @cache
+    def frames() -> object | None:
+        with schema.refused_at(wfs.path, wfs.name):
+            return kind.frames(wfs.said, wfs.given)
+
+    return {
+        "wfs": sensor,
+        "mirror": lambda: mirror()[0],
+        "modes": modes,
+        "frames": frames,
+        "law": lambda: law_of(section(LawTable).said),
+        "pupil": lambda: read_pupil(about, pupil.subaperture_m),
+        "slopes": lambda: _slopes(
+            section(schema.SlopesTable), kind, has_frames=frames() is not None
+        ),
+        "loop": lambda: _loop(section(LoopFacts), modes().n_modes),
+        "remarks": lambda: (*mirror()[1], *_assumed(said, sensor(), mirror()[0])),
+    }
+
+
+def _made(parts: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
+    """Return the parts made, or refuse with everything that is wrong.
+
+    Raises
+    ------
+    ConfigurationError
+        Of the first part that cannot be made; it has the others.
+    """
+    made: dict[str, Any] = {}
+    refused: dict[str, ConfigurationError] = {}
+    for name, make in parts.items():
+        try:
+            made[name] = make()
+        except ConfigurationError as error:
+            refused.setdefault(str(error), error)  # once, though another part needed this one
+    if refused:
+        refuse_all(list(refused), next(iter(refused.values())))
+    return made
+
+
+def _in_first_mode(
+    instrument: Instrument, file: schema.Section[SensorTable], kind: SensorKind
+) -> Instrument:
+    """Return the instrument with the modes of its sensor, in the first of them."""
+    with schema.refused_at(file.path, file.name):
+        modes = kind.in_modes(file.said, instrument.wfs)
+    if not modes:
+        return instrument
+    if instrument.config_id is not None:
+        raise ConfigurationError(
+            f"{file.path}: instrument.config_id: has no meaning beside [[wfs.mode]], each of which "
+            "has its own: remove one of the two"
+        )
+    whole = replace(
+        instrument,
+        sensor_modes=tuple(
+            _completed(mode, mask, f"{file.where('mode')}[{k}]", file.path.parent, instrument)
+            for k, (mode, mask) in enumerate(modes)
+        ),
+    )
+    return whole.sensor_modes[0].of(whole)
+
+
+def _completed(
+    mode: SensorMode, reference: str, where: str, folder: Path, instrument: Instrument
+) -> SensorMode:
+    """Return a mode with its own mask, and what it does not say of the loop as ``[loop]`` has it.
+
+    Raises
+    ------
+    ConfigurationError
+        If it controls more modes than there are, or its mask is missing or not its own.
+    """
+    loop = instrument.loop or LoopFacts()
+    n_controlled = mode.loop.n_controlled or loop.n_controlled
+    rate_hz = mode.loop.frame_rate_hz or loop.frame_rate_hz
+    if (n_controlled or 0) > instrument.modes.n_modes:
+        expected = f"at most the {instrument.modes.n_modes} modes of the basis"
+        refuse(f"{where}.n_controlled", str(n_controlled), expected)
+    wfs, at = mode.wfs, f"{where}.valid_subapertures"
+    if reference != "auto":
+        mask = _mask(read_dataset(reference, folder, at), at, wfs.n_subapertures)
+        wfs = replace(wfs, valid_subapertures=mask)
+    elif mode.binning > 1 and wfs.valid_subapertures is not None:
+        raise ConfigurationError(
+            f"{at}: missing; a mask of the finest subapertures (wfs.valid_subapertures) says "
+            "nothing of binned ones"
+        )
+    told = replace(loop, frame_rate_hz=rate_hz, n_controlled=n_controlled)
+    return replace(mode, wfs=wfs, loop=told)
+
+
+def _assumed(
+    said: schema.InstrumentFile, sensor: SensorDescription, mirror: Mirror | TabulatedModes
+) -> Iterator[str]:
+    """Yield what the file does not say, and what is taken instead."""
+    wfs = said.section(said.kind.table)
+    for key, text in said.kind.assumed(wfs.said, wfs.given):
+        yield f"{wfs.where(key)}: {text}"
+    values = {f"wfs.{key}": getattr(sensor, key, None) for key in said.kind.unknown}
+    values["mirror.coupling"] = mirror.shape.coupling if isinstance(mirror, Mirror) else None
+    for key in sorted(said.unknown):
+        taken = values.get(key)
+        words = "allows for it in its uncertainty" if taken is None else f"takes {taken:g}"
+        yield (
+            f"{wfs.path}: {key}: unknown; a fit of a measured matrix finds it, everything else "
+            f"{words}"
+        )
+
+
+def packaged_instrument(name: str) -> Instrument:
+    """Return the instrument of a packaged name, which is never that of a file of this machine.
+
+    Raises
+    ------
+    ConfigurationError
+        If none has this name.
+    """
+    return load_instrument(packaged_file(name))
+
+
+def _modes(file: schema.Section[KarhunenLoeve], mirror: Mirror | TabulatedModes) -> KarhunenLoeve:
+    """Return the turbulence, and as many modes as the user's basis or ``[modes]`` has."""
+    where, own, table = file.where("n_modes"), own_modes(mirror), file.said
+    if own is not None:
+        if "n_modes" in file.given:
+            refuse(where, f"it beside a basis of its own {own} modes", "it for KL modes only")
+        return replace(table, n_modes=own)
+    n_max = len(mirror.positions_m) - 1 if isinstance(mirror, Mirror) else 0
+    if "n_modes" not in file.given:
+        # of the last modes the actuators make the sensor sees little, and the model says less
+        return replace(table, n_modes=min(table.n_modes, 9 * n_max // 10))
+    if table.n_modes > n_max:
+        refuse(
+            where,
+            str(table.n_modes),
+            f"at most {n_max}: {n_max + 1} actuators make {n_max} modes without piston",
+        )
+    return table
+
+
+def _slopes(
+    file: schema.Section[schema.SlopesTable], sensor: SensorKind, *, has_frames: bool
+) -> SlopeRecipe:
+    table = file.said
+    if table.kind not in sensor.signals:
+        refuse(file.where("kind"), f"{table.kind} of a {sensor.name}", " or ".join(sensor.signals))
+    if not sensor.normalised and "normalisation" in file.given:
+        raise ConfigurationError(
+            f'{file.where("normalisation")}: has no meaning beside wfs.kind = "{sensor.name}"'
+        )
+    if has_frames and "order" in file.given:
+        raise ConfigurationError(
+            f'{file.where("order")}: has no meaning beside wfs.input = "frames", '
+            "whose slopes are made here"
+        )
+    orientation = None
+    if table.orientation is not None:
+        flips = table.orientation.model_dump(exclude={"sign"})
+        sign_x, sign_y = table.orientation.sign
+        orientation = Orientation(**flips, sign_x=sign_x, sign_y=sign_y)
+    orders = table.kind.orders
+    order = table.order or orders[0]
+    if order not in orders:
+        refuse(file.where("order"), f'{order} beside kind = "{table.kind}"', " or ".join(orders))
+    return SlopeRecipe(order=order, orientation=orientation, normalisation=table.normalisation)
+
+
+def _loop(file: schema.Section[LoopFacts], n_modes: int) -> LoopFacts | None:
+    if not file.given:
+        return None
+    table = file.said
+    if table.n_controlled is not None and table.n_controlled > n_modes:
+        refuse(
+            file.where("n_controlled"),
+            str(table.n_controlled),
+            f"at most the {n_modes} modes of the basis",
+        )
+    return table
+
+
+def _sensor(file: schema.Section[SensorTable], kind: SensorKind, pupil: Pupil) -> SensorDescription:
+    with schema.refused_at(file.path, file.name):
+        sensor = kind.described(file.said, file.given)
+        kind.check(sensor, pupil.subaperture_m)
+    if file.said.valid_subapertures == "auto":
+        return sensor
+    if "flux_threshold" in file.given:
+        raise ConfigurationError(
+            f"{file.where('flux_threshold')}: has no meaning beside a mask file "
+            "(wfs.valid_subapertures): remove one of the two"
+        )
+    where = file.where("valid_subapertures")
+    mask = _mask(file.array("valid_subapertures"), where, file.said.n_subapertures)
+    return replace(sensor, valid_subapertures=mask)
+
+
+def _mask(values: NDArray[Any], where: str, n: int) -> NDArray[np.bool_]:
+    if values.shape != (n, n):
+        refuse(where, f"shape {values.shape}", f"(n_subapertures, n_subapertures) = ({n}, {n})")
+    if not np.isin(values, (0, 1)).all():
+        refuse(where, "values other than 0 and 1", "a mask, 1 where a subaperture is valid")
+    if not values.any():
+        refuse(where, "no valid subaperture", "at least one")
+    return values.astype(bool)

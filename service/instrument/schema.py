@@ -1,0 +1,312 @@
+"""Every key of an instrument file: type, range, default."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
+
+from pydantic import BeforeValidator, Field, create_model
+
+from service.errors import ConfigurationError, ModelError
+from service.files.toml import Id, Table, in_file, read_dataset, read_toml, refuse, validated
+from service.instrument import instrument_path
+from service.instrument.laws import LawTable
+from service.model import kinds
+from service.model.sensors.kind import SensorKind
+from service.model.sensors.registry import KINDS
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+Sign = Literal[-1, 1]
+
+Stretch = Annotated[float, Field(ge=-0.2, le=0.2)]
+"""Beyond a fifth the image is another one, and no fit leads there."""
+
+
+def _auto_is_none(value: object) -> object:
+    return None if value == "auto" else value
+
+
+def _signs(value: object) -> object:
+    pair = value if isinstance(value, list) else [value, value]
+    if len(pair) != 2 or not all(type(sign) is int and abs(sign) == 1 for sign in pair):
+        raise ValueError(f"found {value!r}, expected 1, -1 or two of them: [sign_x, sign_y]")
+    return tuple(pair)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AboutTable(kinds.Telescope):
+    """``[instrument]``: the telescope as a whole."""
+
+    name: Id
+    basis_id: Id | None = None
+    """Pins the RTC's basis; None: the first seen is adopted."""
+
+    config_id: Id | None = None
+    """Pins the RTC's sensor configuration; None: the first seen is adopted."""
+
+    pupil: str | None = None
+    """Map of the pupil, ``path:/dataset``, ``path.fits`` or ``path.npy`` of ``(ny, nx)``: the share
+    of each point that is lit, [y, x] in the mirror's plane, centred; None: a ring."""
+
+    pupil_pitch_m: kinds.Positive | None = None
+    """Step of that map; None: ``diameter_m`` over its points."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MirrorTable(kinds.InfluenceShape):
+    """``[mirror]``: analytic (``layout``) or measured (``modes``, ``influence_functions``)."""
+
+    layout: Literal["rings", "grid", "hexagonal", "positions"] | None = None
+    """Placement of an analytic mirror's actuators."""
+
+    pitch_m: kinds.Positive | None = None
+    """Distance between neighbours, metres; None: 0.30 for rings, measured for positions. Hexagonal:
+    rows along +x, one actuator in the middle."""
+
+    first_ring: kinds.Count = 2
+    """Rings only."""
+
+    last_ring: Annotated[int, Field(ge=1, le=500)] = 14
+    """Rings only."""
+
+    ring_actuators: tuple[kinds.Count, ...] | None = None
+    """Rings only: number of actuators on each ring, from the inside, the first of each on +x;
+    instead of ``first_ring`` and ``last_ring``."""
+
+    ring_radii_m: tuple[kinds.Positive, ...] | None = None
+    """Radius of each ring, metres; together with ``ring_actuators``."""
+
+    n_across: Annotated[int, Field(ge=2, le=1000)] | None = None
+    """Grid only: actuators along a diameter."""
+
+    diameter_m: kinds.Positive | None = None
+    """Grid and hexagonal: actuators beyond this circle do not exist."""
+
+    hole_m: kinds.Positive | None = None
+    """Hexagonal only: diameter of a hole in the middle, where there are no actuators."""
+
+    position_error_pitch: Annotated[float, Field(ge=0.0, le=0.2)] | None = None
+    """RMS error of an actuator's position along each axis, in pitches, which sigma of a fit covers;
+    None: 0.02."""
+
+    segments_deg: tuple[float, ...] = ()
+    """Direction of each gap between segments from the centre outwards, degrees from +x towards +y;
+    Gaussian influence only. No function crosses a gap, no actuator of a grid is on one, and KL
+    modes exclude the differential pistons of the segments."""
+
+    positions: str | None = None
+    """Positions only: ``path:/dataset`` of ``(n_actuators, 2)``, x and y in metres."""
+
+    mode_to_actuator: str | None = None
+    """``path:/dataset`` of the user's modes, ``(n_actuators, n_modes)``."""
+
+    basis: kinds.BasisKind = kinds.BasisKind.KARHUNEN_LOEVE
+    """Modes of an analytic mirror without ``mode_to_actuator``."""
+
+    nominal_rotation_deg: float | None = None
+    """Rotation at which a fit starts; None to find it from tip and tilt."""
+
+    nominal_anamorphosis: tuple[Stretch, Stretch] | None = None
+    """Stretch of the mirror's turned image along the sensor's x over the mean of both axes, ratio
+    less 1, and along 45 deg: where a fit starts; None: 0."""
+
+    parity: Sign | None = None
+    """-1: the mirror is seen from behind; None: found from tip and tilt."""
+
+    stroke: Literal["known", "unknown"] = "known"
+    """"unknown": only shapes are compared."""
+
+    modes: str | None = None
+    """``path:/dataset`` of measured modes, ``(n_modes, ny, nx)``."""
+
+    modes_pitch_m: kinds.Positive | None = None
+    """Grid step of the measured modes."""
+
+    modes_kind: Literal["opd", "surface"] = "opd"
+    """Meaning of the user's modes: OPD, or surface."""
+
+    influence_functions: str | None = None
+    """``path:/dataset`` of measured influence functions, ``(n_actuators, ny, nx)``, or cropped.
+    From 200 on, those that end are kept as far as they are higher than a millionth of their height:
+    on an ELT, crop them."""
+
+    influence_origin: str | None = None
+    """Cropped functions only: ``path:/dataset`` of ``(n_actuators, 2)``, row and column where each
+    begins in the whole table; beyond its crop a function is 0."""
+
+    influence_table: tuple[kinds.Count, kinds.Count] | None = None
+    """Cropped functions only: rows and columns of the whole table, centred on the pupil."""
+
+
+class OrientationTable(Table):
+    """``orientation``: how the RTC's slopes map to the conventions' axes."""
+
+    swap_xy: bool = False
+    flip_x: bool = False
+    flip_y: bool = False
+    sign: Annotated[tuple[int, int], BeforeValidator(_signs)] = (1, 1)
+    """Sign of both components on the RTC's own grid, or of Sx and Sy each."""
+
+
+class SlopesTable(Table):
+    """``[slopes]``: the RTC's own signals: kind, order, sign and recipe."""
+
+    kind: kinds.SignalKind = kinds.SignalKind.XY
+    """Two slopes for each subaperture, or its four normalised pixels."""
+
+    order: kinds.SlopeOrder | None = None
+    """`xy`, `yx`, `interleaved` of slopes, the others of pixels; None: `xy`, or `images`."""
+
+    orientation: Annotated[OrientationTable | None, BeforeValidator(_auto_is_none)] = None
+    normalisation: kinds.Normalisation = kinds.Normalisation.GLOBAL
+    """Normalisation by the mean flux of all subapertures, or by each one's own: of its four pixels
+    together."""
+
+
+@cache
+def whole_of(kind: SensorKind) -> type[Table]:
+    """Return what a file with this kind of sensor is read into, table by table."""
+    tables: dict[str, Any] = {
+        "instrument": AboutTable,
+        "wfs": kind.table,
+        "mirror": MirrorTable,
+        "law": (LawTable, Field(default_factory=LawTable)),
+        "modes": (kinds.KarhunenLoeve, Field(default_factory=kinds.KarhunenLoeve)),
+        "slopes": (SlopesTable, Field(default_factory=SlopesTable)),
+        "loop": (kinds.LoopFacts, Field(default_factory=kinds.LoopFacts)),
+    }
+    return create_model("InstrumentFile", __base__=Table, **tables)
+
+
+def unknown_values(kind: SensorKind) -> dict[str, float | None]:
+    """Return keys that may be "unknown", each with the value assumed until it is determined."""
+    of_sensor = {f"wfs.{key}": value for key, value in kind.unknown.items()}
+    return {**of_sensor, "mirror.coupling": 0.35}
+
+
+Said = TypeVar("Said")
+
+
+@dataclass(frozen=True, slots=True)
+class Section(Generic[Said]):
+    """A table of a file, as it is read and as it is written."""
+
+    said: Said
+    given: frozenset[str]
+    """Keys that are written."""
+
+    path: Path
+    """Path of the file; references are relative to its folder."""
+
+    name: str
+
+    def where(self, key: str) -> str:
+        """Return the file and key, for messages."""
+        return f"{self.path}: {self.name}.{key}"
+
+    def array(self, key: str) -> NDArray[Any]:
+        """Return the array that a key refers to."""
+        return read_dataset(getattr(self.said, key), self.path.parent, self.where(key))
+
+
+@dataclass(frozen=True, slots=True)
+class InstrumentFile:
+    """An instrument file by its tables."""
+
+    sections: tuple[Section[Any], ...]
+    kind: SensorKind
+    """Kind of its sensor."""
+
+    unknown: frozenset[str] = frozenset()
+    """Keys, with their tables, that are said to be unknown."""
+
+    def section(self, kind: type[Said]) -> Section[Said]:
+        """Return the table that is read into this."""
+        return next(section for section in self.sections if isinstance(section.said, kind))
+
+
+def read_instrument_file(name_or_path: str | Path) -> InstrumentFile:
+    """Return what the file of a packaged instrument or of a user's own says.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no such file, or one line with the key that cannot be used.
+    """
+    path = instrument_path(name_or_path)
+    written = read_toml(path)
+    kind = _kind(written, path)
+    _check_one_sensor(written, kind, path)
+    taken = unknown_values(kind)
+    unknown = frozenset(key for key in taken if _value(written, key) == "unknown")
+    tables = dict(written)
+    for key in unknown:
+        table, name = key.split(".")
+        tables[table] = {**tables[table], name: taken[key]}
+    if isinstance(tables.get("wfs"), dict):
+        with refused_at(path, "wfs"):
+            tables["wfs"] = kind.as_read(tables["wfs"])
+    whole = whole_of(kind)
+    said = validated(whole, tables, in_file(path))
+    return InstrumentFile(
+        tuple(
+            Section(getattr(said, name), frozenset(written.get(name, ())), path, name)
+            for name in whole.model_fields
+        ),
+        kind,
+        unknown,
+    )
+
+
+def _kind(written: Mapping[str, Any], path: Path) -> SensorKind:
+    """Return the kind of sensor a file is about; the first one where it does not say."""
+    name = _value(written, "wfs.kind")
+    if name is None:
+        return next(iter(KINDS.values()))
+    if not isinstance(name, str) or name not in KINDS:
+        refuse(f"{path}: wfs.kind", repr(name), " or ".join(repr(known) for known in KINDS))
+    return KINDS[name]
+
+
+def _check_one_sensor(written: Mapping[str, Any], kind: SensorKind, path: Path) -> None:
+    """Refuse a file of several sensors, or with keys of two kinds of them."""
+    wfs = written.get("wfs", {})
+    if isinstance(wfs, list):
+        refuse(
+            f"{path}: wfs",
+            f"{len(wfs)} tables [[wfs]]",
+            "one table [wfs]: a service has one sensor, the next one a file and service of its own",
+        )
+    if not isinstance(wfs, dict):
+        return  # refused with the other tables
+    known = {name: {field.name for field in fields(one.table)} for name, one in KINDS.items()}
+    for key in sorted(set(wfs) - known[kind.name]):
+        others = [f'"{name}"' for name, keys in known.items() if key in keys]
+        if others:
+            found = f'kind = "{kind.name}"' if "kind" in wfs else "no kind"
+            raise ConfigurationError(
+                f"{path}: wfs.{key}: belongs to kind = {' or '.join(others)}, found {found}: leave "
+                "it out, or give the other sensor a file of its own"
+            )
+
+
+@contextmanager
+def refused_at(path: Path, table: str) -> Iterator[None]:
+    """Add the place in a file to what a kind of sensor rejects."""
+    try:
+        yield
+    except ModelError as error:
+        raise ConfigurationError(f"{path}: {table}.{error}") from error
+
+
+def _value(written: Mapping[str, Any], key: str) -> object:
+    """Return what is written under a key of a table; None: nothing."""
+    table, name = key.split(".")
+    found = written.get(table)
+    return found.get(name) if isinstance(found, dict) else None

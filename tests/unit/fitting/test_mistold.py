@@ -1,0 +1,260 @@
+"""Matrices of a bench with Gaussian influence functions, fitted with one thing told wrong.
+
+They are made by the FFT pyramid of tests/physics and by Gaussians written out here: nothing of the
+model is in them.
+"""
+
+import re
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from pyrcal.fitting.matrix import FitOptions, fit_matrix
+from pyrcal.fitting.models import Optic
+from pyrcal_studies.fft_pyramid import FftPyramid
+from service.errors import ModelError
+from service.estimation.reference import Reference
+from service.instrument.mirrors import grid
+from service.model.instrument import Instrument, Mirror
+from service.model.kinds import BasisKind, Influence, InfluenceShape, Normalisation, Stop
+from service.model.misregistration import Misregistration
+from service.model.pupil import lit_subapertures
+from service.model.sensors.pyramid.description import Pyramid
+from service.model.slopes import Orientation, SlopeRecipe
+
+TRUTH = Misregistration(
+    shift_x_subap=0.31, shift_y_subap=-0.22, rotation_rad=np.deg2rad(1.1), magnification=1.006
+)
+COUPLING = 0.35
+N, SAMPLING, DIAMETER_M, OBSCURATION, PITCH_M = 12, 4, 3.0, 0.1, 0.25
+ACTUATORS_M = grid(13, PITCH_M, 3.3)
+MODES = np.linalg.qr(np.random.default_rng(5).normal(size=(len(ACTUATORS_M), 60)))[0]
+"""A user's own combinations of actuators."""
+
+
+def bench(**mirror) -> Instrument:
+    shape = InfluenceShape(influence=Influence.GAUSSIAN, coupling=mirror.pop("coupling", COUPLING))
+    return Instrument(
+        name="bench",
+        diameter_m=DIAMETER_M,
+        obscuration_ratio=OBSCURATION,
+        stop=Stop.TELESCOPE,
+        wfs=Pyramid(
+            n_subapertures=N,
+            wavelength_m=750e-9,
+            modulation_lambda_over_d=3.0,
+            pupil_separation_subap=16.0,
+        ),
+        mirror=Mirror(
+            **{"positions_m": ACTUATORS_M, "pitch_m": PITCH_M, "basis": BasisKind.ZONAL} | mirror,
+            shape=shape,
+        ),
+        slopes=SlopeRecipe(orientation=Orientation()),
+    )
+
+
+def modulated(radius: float) -> Instrument:
+    return replace(bench(), wfs=replace(bench().wfs, modulation_lambda_over_d=radius))
+
+
+@cache
+def zonal(
+    truth: Misregistration = TRUTH, pupil_subap: tuple[float, float] = (0.0, 0.0)
+) -> np.ndarray:
+    """Every actuator pushed where the truth puts it, ``(n_slopes, n_actuators)``."""
+    n = N * SAMPLING
+    fine = (np.arange(8 * n) - (8 * n - 1) / 2) / (4 * n)
+    off_x, off_y = np.array(pupil_subap) * 2.0 / N
+    radius = np.hypot(fine - off_x, (fine - off_y)[:, None])
+    lit = (radius <= 1.0) & (radius >= OBSCURATION)
+    pyramid = FftPyramid(
+        amplitude=lit.reshape(n, 8, n, 8).mean(axis=(1, 3)),
+        sampling=SAMPLING,
+        wavelength_m=750e-9,
+        n_subapertures=N,
+        image_separation_subap=16.0,
+        padded_subap=80,
+    )
+    x, y = np.meshgrid(pyramid.coordinates, pyramid.coordinates)
+    x, y = x - truth.shift_x_subap, y - truth.shift_y_subap
+    c, s = np.cos(truth.rotation_rad), np.sin(truth.rotation_rad)
+    on_mirror = np.stack([c * x + s * y, -s * x + c * y]) / truth.magnification * DIAMETER_M / N
+    apart = np.hypot(*(on_mirror[:, None] - ACTUATORS_M.T[:, :, None, None]))
+    return pyramid.jacobian(COUPLING ** ((apart / PITCH_M) ** 2), lit_subapertures(bench()))
+
+
+def fitted(about: Instrument, matrix: np.ndarray | None = None, **options):
+    return fit_matrix(
+        about, Reference(matrix=zonal() if matrix is None else matrix), FitOptions(**options)
+    )
+
+
+def sigmas_off(found) -> np.ndarray:
+    return np.abs(found.alpha.vector - TRUTH.vector) / found.sigma
+
+
+@pytest.mark.parametrize("modal", [False, True])
+@pytest.mark.parametrize("told", [0.2, 0.3, 0.35, 0.5])
+def test_whatever_coupling_is_told_the_registration_is_right_and_the_coupling_found(told, modal):
+    about = bench(coupling=told, mode_to_actuator=MODES if modal else None)
+    found = fitted(about, zonal() @ MODES if modal else zonal())
+    assert found.accepted
+    assert np.all(sigmas_off(found) < 3.0)
+    assert np.all(found.sigma < [2e-3, 2e-3, np.deg2rad(0.01), 1e-3])
+    width = {one.optic: one for one in found.optics}[Optic.WIDTH]
+    assert width.found == pytest.approx(COUPLING, abs=0.01)
+    named = any(f"coupling = {width.found:.3g}" in remark for remark in found.remarks)
+    assert named == (told != COUPLING)
+    assert not any("modulation" in remark for remark in found.remarks)
+
+
+@pytest.mark.parametrize("told", [1.5, 4.0, 6.0])
+def test_whatever_modulation_is_told_the_registration_is_right_and_the_modulation_named(told):
+    found = fitted(modulated(told))
+    assert found.accepted
+    assert np.all(sigmas_off(found) < 3.0)
+    assert any("modulation_lambda_over_d = 3" in remark for remark in found.remarks)
+    assert not any("coupling" in remark for remark in found.remarks)
+
+
+def test_four_modes_and_nine_say_the_same_of_a_modulation():
+    """A rule that asks how sure the registration is would say another thing of few modes."""
+    x, y = ACTUATORS_M.T
+    lowest = np.stack([x, y, x * y, x**2 - y**2, x**2 + y**2, x**3, y**3, x**2 * y, x * y**2])
+    for n_modes in (4, 9):
+        strokes = lowest[:n_modes].T
+        about = modulated(4.5)
+        about = replace(about, mirror=replace(about.mirror, mode_to_actuator=strokes))
+        found = fitted(about, zonal() @ strokes)
+        assert found.accepted, found.verdict
+        assert np.all(sigmas_off(found) < 3.0)
+
+
+def test_a_kind_of_influence_functions_that_is_not_the_mirrors_is_named():
+    about = bench()
+    plate = replace(about.mirror, shape=InfluenceShape(influence=Influence.THIN_PLATE))
+    found = fitted(replace(about, mirror=plate))
+    assert not found.accepted
+    assert 'influence = "gaussian"' in found.verdict
+
+
+def test_a_normalisation_that_is_not_the_rtcs_is_named():
+    local = replace(bench().slopes, normalisation=Normalisation.LOCAL)
+    found = fitted(replace(bench(), slopes=local))
+    assert not found.accepted or np.all(sigmas_off(found) < 3.0)
+    assert 'normalisation = "global"' in found.verdict + found.recommendation
+
+
+def test_a_wavelength_told_wrong_is_named_and_moves_nothing():
+    found = fitted(replace(bench(), wfs=replace(bench().wfs, wavelength_m=900e-9)))
+    assert found.accepted
+    assert np.all(sigmas_off(found) < 3.0)
+    assert any("a wavelength of 7.5" in remark for remark in found.remarks)
+
+
+def test_a_pitch_told_wrong_is_a_magnification_and_is_told_to_be_one_or_the_other():
+    about = bench(positions_m=ACTUATORS_M * 1.05, pitch_m=PITCH_M * 1.05)
+    found = fitted(about)
+    as_drawn = found.alpha.vector * [1.0, 1.0, 1.0, 1.05]
+    assert np.all(np.abs(as_drawn - TRUTH.vector) < 3.0 * found.sigma)
+    assert any("pitch_m" in remark for remark in found.remarks)
+
+
+@pytest.mark.parametrize("image", [[-1.0, 1.0], [1.0, -1.0]])
+def test_mirrored_actuators_are_noted_with_any_orientation_and_refused_with_one_that_is_told(image):
+    about = bench(positions_m=ACTUATORS_M * image)
+    told = fitted(about)
+    assert not told.accepted
+    assert "mirrored" in told.verdict
+    found = fitted(replace(about, slopes=SlopeRecipe()))
+    assert any("mirrored or exchanged" in remark for remark in found.remarks)
+
+
+def test_exchanged_coordinates_are_noted():
+    found = fitted(replace(bench(positions_m=ACTUATORS_M[:, ::-1]), slopes=SlopeRecipe()))
+    assert any("mirrored or exchanged" in remark for remark in found.remarks)
+
+
+def test_what_is_unknown_is_found_and_told():
+    keys = ("wfs.wavelength_m", "wfs.modulation_lambda_over_d", "mirror.coupling")
+    about = replace(modulated(5.0), unknown=keys)
+    found = fitted(replace(about, wfs=replace(about.wfs, wavelength_m=500e-9)))
+    assert found.accepted
+    assert np.all(sigmas_off(found) < 3.0)
+    for words in (
+        "modulation_lambda_over_d = 3 was found",
+        "coupling = 0.35",
+        "wavelength_m = 7.5",
+    ):
+        assert any(words in remark for remark in found.remarks), words
+    assert not any("the instrument file says" in remark for remark in found.remarks)
+
+
+def test_actuators_in_millimetres_are_an_error_that_says_what_was_expected():
+    with pytest.raises(
+        ModelError, match=r"bench: found \d+ of 13.* modes that move nothing.* metres"
+    ):
+        fitted(bench(positions_m=ACTUATORS_M * 1e3))
+
+
+def masked(about: Instrument) -> Instrument:
+    """The same with the RTC's own mask, as users give it."""
+    mask = lit_subapertures(bench())
+    return replace(about, wfs=replace(about.wfs, valid_subapertures=mask))
+
+
+def noisy(share: float) -> np.ndarray:
+    """Every element with as much noise, whatever the actuator's own size."""
+    scatter = np.random.default_rng(8).normal(size=zonal().shape)
+    return zonal() + share * zonal().std() * scatter
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.15])
+@pytest.mark.parametrize("told", [0.25, 0.3])
+def test_an_obscuration_told_wrong_is_in_sigma_and_the_right_one_advised(told, noise):
+    about = masked(replace(bench(), obscuration_ratio=told))
+    found = fitted(about, noisy(noise), explain=True)
+    assert not found.accepted or np.all(sigmas_off(found) < 3.0)
+    said = found.recommendation + found.verdict
+    named = re.search(r"obscuration_ratio = (0\.\d+)", said)
+    assert named is not None, said
+    assert float(named[1]) == pytest.approx(OBSCURATION, abs=0.04)
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.2, 0.3])
+def test_noise_that_nobody_has_told_of_is_no_cause_to_refuse(noise):
+    found = fitted(bench(), noisy(noise))
+    assert found.residual_fraction > noise
+    assert found.accepted, found.verdict
+    assert np.all(sigmas_off(found) < 3.0)
+
+
+def test_a_shade_that_nothing_explains_moves_the_registration_by_less_than_sigma_allows():
+    """An arm across the pupil that is not smooth: 10 % of the signal are left over."""
+    rows, columns = np.nonzero(lit_subapertures(bench()))
+    shaded = np.where(np.abs(rows - columns) < 2, 0.6, 1.0)
+    shaded *= np.where((rows + columns) % 5 == 0, 1.3, 1.0)
+    found = fitted(bench(), zonal() * np.tile(shaded, 2)[:, None])
+    assert found.residual_fraction > 0.1
+    assert found.accepted
+    assert np.all(sigmas_off(found) < 3.0)
+
+
+@pytest.mark.parametrize("factor", [0.98, 1.02])
+def test_a_diameter_told_wrong_is_a_magnification_and_is_told_to_be_one_or_the_other(factor):
+    found = fitted(replace(bench(), diameter_m=DIAMETER_M * factor))
+    as_told = TRUTH.vector * [1.0, 1.0, 1.0, factor]
+    assert np.all(np.abs(found.alpha.vector - as_told) < 3.0 * found.sigma)
+    assert any("diameter_m" in remark for remark in found.remarks)
+
+
+def test_a_pupil_told_two_percent_small_is_a_magnification_and_the_right_one_advised():
+    wfs = replace(bench().wfs, pupil_diameter_subap=N * 0.98)
+    found = fitted(masked(replace(bench(), wfs=wfs)), explain=True)
+    as_told = TRUTH.vector * [1.0, 1.0, 1.0, 1.0 / 0.98]
+    off = np.abs(found.alpha.vector - as_told) / found.sigma
+    assert not found.accepted or np.all(off < 3.0)
+    said = found.recommendation + found.verdict
+    assert re.search(r"pupil_diameter_subap = 12(\.1)?\b", said), said

@@ -1,0 +1,78 @@
+"""Numbers found by a fit: which are findings, which may stand for model errors, which are not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pyrcal.fitting.fit_table import table
+from pyrcal.fitting.instrument_checks import FileValuesFit, FoundOptic
+from pyrcal.fitting.models import Optic
+from pyrcal.fitting.origins import is_determined, list_origins, list_undetermined_keys
+from pyrcal.fitting.report import document
+from service.model.slopes import Orientation, SlopeRecipe
+from tests.unit.fitting.made import a_fit, a_report
+from tests.unit.fitting.test_mistold import bench
+
+TEN = FoundOptic(
+    optic=Optic.SENSOR,
+    key="modulation_lambda_over_d",
+    change=0.75,
+    sigma=0.014,
+    found=10.6,
+    reported=5.0,
+)
+UNKNOWN = replace(TEN, reported=None)
+
+
+def file_values(share):
+    return FileValuesFit(share=share, moved=np.zeros(4))
+
+
+def test_a_number_that_explains_little_of_the_misfit_does_not_correct_the_file():
+    """PAPYRUS: 80 % of the misfit is left, every disjoint set agrees, and the file is right."""
+    assert not is_determined(TEN, file_values(0.8), 0.14)
+    assert not is_determined(TEN, file_values(0.8), 0.01)
+
+
+def test_a_number_that_explains_nearly_all_of_the_misfit_corrects_the_file():
+    assert is_determined(TEN, file_values(0.03), 0.14)
+
+
+@pytest.mark.parametrize(("structure", "found"), [(0.02, True), (0.14, False), (0.3, False)])
+def test_a_number_that_the_file_lacks_is_a_finding_where_little_but_noise_is_left(structure, found):
+    assert is_determined(UNKNOWN, None, structure) is found
+
+
+def listed(optic, structure, share=None):
+    slopes = SlopeRecipe(orientation=Orientation())
+    there = None if share is None else file_values(share)
+    return list_origins(bench(), slopes, slopes, (optic,), there, structure, np.ones(9))
+
+
+def test_only_a_finding_is_to_be_written_into_the_file():
+    (sure,), (open_,) = listed(UNKNOWN, 0.02), listed(UNKNOWN, 0.3)
+    assert sure.correct
+    assert not open_.correct
+    assert "model" in open_.how
+    assert "model" not in sure.how
+
+
+def test_unknown_numbers_that_no_matrix_determines_are_listed():
+    about = replace(bench(), unknown=("wfs.wavelength_m", "mirror.coupling"))
+    loose = replace(UNKNOWN, optic=Optic.WIDTH, key="coupling", sigma=0.9)
+    assert listed(loose, 0.02) == ()
+    assert list_undetermined_keys(about, listed(loose, 0.02)) == (
+        "wfs.wavelength_m",
+        "mirror.coupling",
+    )
+    tight = replace(loose, sigma=0.01)
+    assert list_undetermined_keys(about, listed(tight, 0.02)) == ("wfs.wavelength_m",)
+
+
+def test_unknown_numbers_that_were_not_found_are_in_table_and_document():
+    fit = a_fit(unknown_not_found=("wfs.wavelength_m",))
+    (line,) = [row for row in table(a_report(fit)).splitlines() if row.startswith("unknown, not")]
+    assert "wfs.wavelength_m" in line
+    assert document(a_report(fit))["unknown_not_found"] == ["wfs.wavelength_m"]
+    assert "unknown, not" not in table(a_report(a_fit()))

@@ -1,0 +1,206 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pyrcal.fitting.matrix import FitOptions
+from service.model.kinds import SlopeOrder, Stop
+from service.model.misregistration import Misregistration
+from service.model.pupil import Illumination
+from tests.numerics import small_instrument
+from tests.unit.estimation.bench import (
+    ELSEWHERE,
+    GRID,
+    PLAIN,
+    error,
+    fit,
+    instrument,
+    listed,
+    matrix,
+)
+
+STRAIGHT = replace(ELSEWHERE, magnification=1.006)
+"""So near to 1 that neither pitch nor diameter is doubted."""
+
+EXPLAIN = FitOptions(explain=True)
+RNG = np.random.default_rng(3)
+
+
+def changed(**wfs):
+    return replace(instrument(), wfs=replace(instrument().wfs, **wfs))
+
+
+@pytest.mark.parametrize(("true", "assumed"), [tuple(Stop), tuple(Stop)[::-1]])
+def test_a_wrong_stop_is_recognised_and_the_right_one_named(true, assumed):
+    about = replace(instrument(), stop=assumed)
+    found = fit(matrix(about=replace(instrument(), stop=true)), about, options=EXPLAIN)
+    assert not found.accepted or np.all(np.abs(error(found)) < 3.0 * found.sigma)
+    if assumed is Stop.TELESCOPE:  # its pupil may lie anywhere: it is found where α moves it
+        places = found.image_offsets_px.mean(axis=0)
+        np.testing.assert_allclose(places, found.alpha.vector[:2], atol=0.01)
+    else:
+        assert f'stop = "{true}"' in found.verdict + found.recommendation
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_wrong_modulation_is_found_and_named_and_moves_nothing(factor):
+    found = fit(matrix(about=changed(modulation_lambda_over_d=3.0 * factor)))
+    assert found.accepted
+    assert np.all(np.abs(error(found)) < 2.0 * GRID)
+    (modulation,) = [one.found for one in found.optics if "modulation" in one.key]
+    # displaced images blur the slopes as modulation does, so it is known to a percent only
+    assert modulation == pytest.approx(3.0 * factor, rel=0.01)
+    assert any("modulation_lambda_over_d = " in remark for remark in found.remarks)
+
+
+def test_a_modulation_is_found_beside_uneven_light():
+    """A lamp to one side leaves a third of the signal, and a wrong modulation hides in that."""
+    coordinates = np.linspace(-7.0, 7.0, 57)
+    x, y = np.meshgrid(coordinates, coordinates)
+    lamp = Illumination(
+        coordinates=coordinates, intensity=1.0 + 0.6 * x / 7.0 + 0.3 * np.sin(1.9 * y)
+    )
+    bench = matrix(about=changed(modulation_lambda_over_d=6.0), illumination=lamp, noise=0.1)
+    found = fit(bench)
+    assert found.accepted
+    assert any(r.startswith("with modulation_lambda_over_d = ") for r in found.remarks)
+    corrected = fit(bench, changed(modulation_lambda_over_d=6.0))
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert np.all(np.abs(corrected.alpha.vector - found.alpha.vector) < sigma)
+
+
+def test_light_that_explains_what_is_left_over_is_named():
+    coordinates = np.linspace(-7.0, 7.0, 57)
+    x, _ = np.meshgrid(coordinates, coordinates)
+    lamp = Illumination(coordinates=coordinates, intensity=1.0 + 0.6 * x / 7.0)
+    found = fit(matrix(illumination=lamp))
+    assert found.accepted, found.verdict
+    assert any("uneven light" in remark for remark in found.remarks)
+    assert not any("uneven light" in remark for remark in fit(matrix()).remarks)
+
+
+def test_a_modulation_off_by_a_tenth_is_lived_with():
+    assert fit(matrix(about=changed(modulation_lambda_over_d=3.3))).accepted
+
+
+@pytest.mark.parametrize(
+    ("factor", "passes", "words"), [(2.0, False, "twice the model"), (0.5, False, "")]
+)
+def test_a_forgotten_double_pass_is_named_and_a_low_optical_gain_is_not(factor, passes, words):
+    found = fit(factor * matrix(), double_pass=passes)
+    assert found.accepted == (not words)
+    assert words in found.verdict
+
+
+def test_a_double_pass_that_was_none_is_named():
+    found = fit(matrix(), double_pass=True)
+    assert "set double_pass = false" in found.verdict
+
+
+def test_twice_what_two_passes_give_is_per_metre_of_surface():
+    found = fit(4.0 * matrix(), double_pass=True)
+    assert not found.accepted
+    assert "per metre of the mirror's surface" in found.verdict
+    assert 'modes_kind = "surface"' in found.verdict
+
+
+@pytest.mark.parametrize(
+    ("factor", "passes", "words"),
+    [
+        (2.0, False, "double_pass = true if the light meets the mirror twice"),
+        (4.0, True, "per metre of surface?"),
+        (1.0, True, "double_pass = false if the light meets the mirror once"),
+        (0.5, False, None),
+    ],
+)
+def test_a_factor_of_two_among_scattered_gains_is_told(factor, passes, words):
+    scattered = np.exp(0.2 * np.sin(np.arange(40) * 1.7))
+    found = fit(factor * scattered * matrix(STRAIGHT), double_pass=passes)
+    assert found.accepted
+    assert [words in remark for remark in found.remarks] == ([True] if words else [])
+
+
+def test_an_order_that_the_data_overrule_is_told():
+    auto = instrument(orientation=None)
+    found = fit(listed(matrix(), SlopeOrder.YX, PLAIN), auto)
+    assert found.order is SlopeOrder.YX
+    assert any('write order = "yx" into [slopes]' in remark for remark in found.remarks)
+    assert fit(matrix(STRAIGHT), auto).remarks == ()
+
+
+def test_columns_of_the_wrong_sign_or_in_anothers_place_are_named():
+    columns = np.arange(40)
+    columns[[11, 25]] = 25, 11
+    signs = np.ones(40)
+    signs[[7, 30]] = -1.0
+    found = fit((matrix() * signs)[:, columns])
+    assert "columns of the wrong sign: 7, 30" in found.remarks
+    assert "columns that have changed places: 11 and 25" in found.remarks
+
+
+def test_a_column_that_is_another_modes_is_named():
+    """Measured twice: an exact copy of a column is left out before the fit, and named there."""
+    twice = matrix()
+    twice[:, 12] = 1.01 * twice[:, 20]
+    assert "columns that are another mode's: 12 is mode 20's" in fit(twice).remarks
+
+
+def test_a_matrix_that_is_right_needs_no_remarks():
+    assert fit(matrix(STRAIGHT, noise=0.1)).remarks == ()
+
+
+def test_optical_gains_of_a_sky_are_accepted():
+    assert fit(matrix() * np.linspace(0.45, 0.75, 40)).accepted
+
+
+def test_another_basis_is_refused():
+    found = fit(matrix()[:, RNG.permutation(40)])
+    assert not found.accepted
+
+
+def test_signs_of_single_modes_are_refused():
+    found = fit(matrix() * np.where(np.arange(40) % 3 == 0, -1.0, 1.0))
+    assert not found.accepted
+    assert "14 of 40 modes answer with the wrong sign" in found.verdict
+
+
+def test_scattered_gains_are_refused_unless_the_stroke_is_unknown():
+    scattered = matrix() * np.exp(0.8 * RNG.normal(size=40))
+    assert "gains of the modes scatter" in fit(scattered).verdict
+    mirror = replace(small_instrument().mirror, stroke_known=False)
+    assert fit(scattered, replace(instrument(), mirror=mirror)).accepted
+
+
+def test_noise_alone_is_refused():
+    found = fit(RNG.normal(size=matrix().shape) * 1e6)
+    assert not found.accepted
+
+
+def test_as_much_noise_as_signal_determines_the_registration_as_far_as_sigma_says():
+    found = fit(matrix(noise=1.0))
+    assert found.accepted, found.verdict
+    assert np.all(np.abs(error(found)) < 3.0 * found.sigma)
+
+
+def test_columns_of_noise_alone_are_named_and_left_out():
+    dead = matrix()
+    dead[:, [3, 20, 30]] = 0.3 * dead.std() * RNG.normal(size=(len(dead), 3))
+    found = fit(dead)
+    assert found.accepted, found.verdict
+    assert any("3 of 40 columns hold noise only: modes 3, 20, 30" in one for one in found.left_out)
+    assert np.all(np.abs(error(found)) < 3.0 * found.sigma)
+
+
+def test_sets_of_modes_that_were_measured_at_two_registrations_disagree():
+    moved = matrix()
+    later = matrix(Misregistration(shift_x_subap=0.45, rotation_rad=0.03, magnification=1.012))
+    moved[:, ::2] = later[:, ::2]
+    found = fit(moved)
+    assert not found.accepted
+    assert "sets of modes disagree" in found.verdict
+    assert found.subset_scatter[0] > 0.02
+
+
+def test_noise_that_hides_the_registration_leaves_it_undetermined_or_unexplained():
+    found = fit(matrix(noise=3.0)[:, :6])
+    assert not found.accepted

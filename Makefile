@@ -57,7 +57,7 @@ check: $(STAMP) ## lint, formatting, types and import contracts
 	@$(PY) -m mypy
 	@.venv/bin/lint-imports --no-logo
 
-paper: $(STAMP) ## the seed paper beside pyrcal: docs/results/heritier2018.md and its figures; 20 minutes, ARGS=--quick three
+paper: $(STAMP) ## the seed paper beside pyrcal: docs/results/heritier2018.md and its figures; ten minutes on two cores, ARGS=--quick three
 	@$(PY) -m pyrcal_studies.heritier2018 $(ARGS)
 
 bench: $(STAMP) ## pyrcal beside OOPAO, HCIPy and SPECULA, each from its package: docs/results/speed.md; a quarter of an hour

@@ -86,12 +86,12 @@ def _slopes_rms(budget: Budget, store: Store) -> str:
 def _sensitivity(budget: Budget, store: Store) -> str:
     texts = []
     for sweep in plan.SWEEPS:
-        few, many = (
+        many, few = (
             results.curve(budget, store, sweep, n).drop() for n in reversed(plan.INFLUENCE_MODES)
         )
         words = [
             "none" if drop is None else f"{drop:.2f} {sweep.unit}".replace(" deg", "°")
-            for drop in (few, many)
+            for drop in (many, few)
         ]
         texts.append(f"{sweep.symbol} {words[0]} ({plan.INFLUENCE_MODES[0]} modes: {words[1]})")
     curves = [results.curve(budget, store, plan.MAGNIFICATION, n) for n in plan.INFLUENCE_MODES]
@@ -219,12 +219,10 @@ def _around(budget: Budget, store: Store) -> str:
     texts = []
     for sweep in plan.AROUND:
         found = results.around_nm(budget, store, sweep)
-        smallest = list(found)[int(np.argmin(list(found.values())))]
         unit = "°" if sweep.unit == "deg" else " %"
-        texts.append(
-            f"{sweep.symbol} best at {smallest:g}{unit}, {max(found.values()) - found[0.0]:+.0f} "
-            "nm at the worst end"
-        )
+        steps = ", ".join(f"{value:+g}" if value else "0" for value in found)
+        texts.append(f"{sweep.symbol} at {steps}{unit}: {listed(found.values(), '.0f')}")
+    best = results.best_at_zero(budget, store)
     place = {
         value: wavefront_error_nm(store.read(plan.registered_run(budget, value)))
         for value in plan.REGISTERED
@@ -232,12 +230,13 @@ def _around(budget: Budget, store: Store) -> str:
     ratios = results.sensitivity_ratios(budget, store)
     alike = "; ".join(f"{name} {a:.0f} and {b:.0f}" for name, (a, b) in ratios.items())
     return (
-        f"**Paper**: “{paper.QUOTES['best'].text}”; “{paper.QUOTES['same'].text}”. **Ours** "
-        f"(measured reconstructor, judged by wavefront error): {'; '.join(texts)}. Nanometres "
-        f"added in quadrature in figures 5 and 12: {alike or 'not compared'}. **Cause** of α_x: "
+        f"**Paper**: “{paper.QUOTES['best'].text}”. **Ours**, "
+        f"wavefront error [nm] with the measured reconstructor: {'; '.join(texts)}. The value "
+        f"found is the best within {results.FLAT_NM:g} nm for {', '.join(best)}. Added in "
+        f"quadrature in figures 5 and 12 [nm]: {alike or 'not compared'}. **Cause** of α_x: "
         "the light moves over the sensor's fixed mask. With the reconstructor of each place, so "
         "without any misregistration, the error at "
-        + ", ".join(f"{value:+g}" for value in place)
+        + ", ".join(f"{value:+g}" if value else "0" for value in place)
         + f" % is {listed(place.values())} nm."
     )
 

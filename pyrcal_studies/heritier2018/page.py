@@ -26,8 +26,8 @@ def write(budget: Budget, store: Store, minutes: float) -> str:
         "## Conditions",
         _conditions(budget, minutes),
         "## Equations, tables and claims",
-        "Equations have the published numbers: LaTeX counts ten. “Quotations” are the paper's "
-        "words.",
+        "Equations have the published numbers: LaTeX counts ten. Quotation marks hold the "
+        "paper's words.",
         rows.markdown(budget, store),
         "## Table 1: step by step",
         tables.table_1(budget, store),

@@ -188,20 +188,19 @@ def registration_sources(budget: Budget) -> dict[str, Measurement | Answer]:
     return {"clean, the model's mirror": drawn, **telescope_sources(budget)}
 
 
-def capture_fits(budget: Budget, method: Method) -> dict[float, dict[str, FitRun]]:
-    """Return fits by the distance of their start from the truth, and by matrix.
+def capture_fits(budget: Budget, method: Method) -> dict[float, tuple[FitRun, ...]]:
+    """Return fits of every telescope's noise-free matrix by the distance of their start.
 
     Distances are in units of the paper's rough estimate. Both methods have the same starts.
     """
     rng = np.random.default_rng(_STARTS_SEED)
-    sources = telescope_sources(budget)
     return {
-        distance: {
-            name: FitRun(source=source, method=method, start=start, modes_every=CAPTURE_MODES_EVERY)
-            for (name, source), start in zip(
-                sources.items(), random_starts(TRUTH, distance, len(sources), rng), strict=True
+        distance: tuple(
+            FitRun(source=answer(seed), method=method, start=start, modes_every=CAPTURE_MODES_EVERY)
+            for seed, start in zip(
+                budget.seeds, random_starts(TRUTH, distance, len(budget.seeds), rng), strict=True
             )
-        }
+        )
         for distance in budget.start_distances
     }
 
@@ -512,7 +511,7 @@ def combinations(budget: Budget) -> dict[tuple[float, float], Change]:
     """Return all features together with noise, by missing share of the signal and by noise."""
     full = budget.name == "full"
     depths = (0.0, 0.5, 0.75) if full else (0.0, 0.75)
-    noises = (0.0, 0.25, 0.5) if full else (0.0, 0.5)
+    noises = (0.0, 0.25, 0.5, 0.75) if full else (0.0, 0.5)
     return {
         (depth, noise): Change(
             feature=Feature.ALL if depth else Feature.NONE, depth=depth, noise=noise
@@ -598,7 +597,7 @@ def capture_tasks(budget: Budget) -> list[Task]:
     tasks: list[Task] = []
     for method in (Method.PAPER, Method.JOINT):
         for fits in capture_fits(budget, method).values():
-            tasks += fits.values()
+            tasks += fits
     return tasks
 
 

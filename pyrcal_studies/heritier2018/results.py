@@ -165,14 +165,19 @@ def causes(budget: Budget, store: Store) -> dict[int, Causes]:
     return found
 
 
-def captured(budget: Budget, store: Store, method: Method, word: str) -> dict[float, int]:
-    """Return by distance of the starts how many fits are right, of matrices named with ``word``."""
+def captured(budget: Budget, store: Store, method: Method) -> dict[float, int]:
+    """Return by distance of the starts how many fits are right."""
     return {
-        distance: sum(
-            is_right(store.read(fit), plan.TRUTH) for name, fit in fits.items() if word in name
-        )
+        distance: sum(is_right(store.read(fit), plan.TRUTH) for fit in fits)
         for distance, fits in plan.capture_fits(budget, method).items()
     }
+
+
+def right_from_rough(budget: Budget, store: Store, method: Method) -> int:
+    """Return how many fits of all matrices are right from the start of equation 9."""
+    sources = plan.telescope_sources(budget).values()
+    records = [store.read(plan.fit_of(budget, source, method)) for source in sources]
+    return sum(is_right(record, plan.TRUTH) for record in records)
 
 
 def evaluations(budget: Budget, store: Store) -> tuple[float, float]:
@@ -385,13 +390,14 @@ def optimum(errors_nm: Mapping[float, float]) -> float | None:
     return None if bend <= 0.0 else float(-slope / (2.0 * bend))
 
 
-def smallest_at_zero(budget: Budget, store: Store) -> int:
-    """Return for how many parameters the registration found has the smallest error."""
-    count = 0
-    for sweep in plan.AROUND:
-        found = around_nm(budget, store, sweep)
-        count += min(found, key=lambda value: found[value]) == 0.0
-    return count
+FLAT_NM = 1.5
+"""Difference of two errors below which a sweep about the optimum is called flat."""
+
+
+def best_at_zero(budget: Budget, store: Store) -> list[str]:
+    """Return the parameters whose error at the registration found is the smallest or flat."""
+    found = {sweep.symbol: around_nm(budget, store, sweep) for sweep in plan.AROUND}
+    return [symbol for symbol, one in found.items() if one[0.0] - min(one.values()) <= FLAT_NM]
 
 
 def columns_nm(record: Record, over: Over) -> Array:
@@ -451,7 +457,7 @@ def captured_errors(budget: Budget, store: Store) -> float:
     Only fits that are right count.
     """
     every = plan.capture_fits(budget, Method.JOINT).values()
-    records = [store.read(fit) for fits in every for fit in fits.values()]
+    records = [store.read(fit) for fits in every for fit in fits]
     found = [errors(record, plan.TRUTH) for record in records if is_right(record, plan.TRUTH)]
     return float(np.max(np.abs(found)[:, :2])) if found else float("nan")
 

@@ -32,9 +32,9 @@ def markdown(budget: Budget, store: Store) -> str:
 def figures_index(budget: Budget, store: Store) -> str:
     """Return the table of the paper's figures with a link to each of ours."""
     rows = [
-        ("[Figure 1](../understand/method.md): the method", "a page", "diagram", "same method"),
+        ("[Figure 1](../explanation/method.md): the method", "a page", "diagram", "same method"),
         (
-            "[Figure 2](../understand/architecture.md): the model",
+            "[Figure 2](../developer/architecture.md): the model",
             "a page",
             "diagram",
             "same inputs",
@@ -59,7 +59,7 @@ def _figure_values(budget: Budget, store: Store) -> dict[int, tuple[str, str, st
         results.amplified(budget, store, s, list(results.shown_values(budget, store, s))[-1])[0]
         for s in plan.SWEEPS[:2]
     ]
-    at_zero = results.smallest_at_zero(budget, store)
+    at_zero = len(results.best_at_zero(budget, store))
     strehl = [results.strehls(budget, store, v).mean() for v in Variant]
     mirror = [
         results.table_2_nm(budget, store, v, Over.MIRROR).mean(axis=0)[2]

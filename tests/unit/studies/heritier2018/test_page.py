@@ -14,9 +14,8 @@ from tests.unit.studies.heritier2018.test_paper import PAGE, ROOT
 def main_rows() -> list[list[str]]:
     """Return the cells of the rows of figures, equations, tables and claims."""
     text = PAGE.read_text(encoding="utf-8")
-    rows = [
-        line for line in text.splitlines() if re.match(r"\| (Equation|Table|\[Figure|Sect)", line)
-    ]
+    kinds = r"\| (Equation \d+|Table \d(, [\w ]+)?|\[Figure [^|]+|Section [\d.]+) \|"
+    rows = [line for line in text.splitlines() if re.match(kinds, line)]
     return [[cell.strip() for cell in row.strip("| ").split(" | ")] for row in rows]
 
 
@@ -55,7 +54,7 @@ def test_every_link_within_the_page_leads_to_a_heading():
 
 
 def test_the_page_is_short():
-    assert len(PAGE.read_text(encoding="utf-8").split()) <= 3500
+    assert len(PAGE.read_text(encoding="utf-8").split()) <= 4500
 
 
 def test_twelve_figures_are_on_the_page_and_small_enough():

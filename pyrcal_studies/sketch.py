@@ -1,4 +1,4 @@
-"""What mis-registration is, in a picture: actuators where the matrix has them, and where they are.
+"""Picture of a misregistration: nominal and actual positions of the actuators on the sensor.
 
 Run: ``python -m pyrcal_studies.sketch``, which writes ``docs/pictures/misregistration.png``; the
 registration drawn is that of ``OFF``, on the packaged instrument.
@@ -20,7 +20,7 @@ from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "misregistration.png"
 OFF = (0.4, -0.1, 2.5, 1.01)
-"""Subapertures, degrees, ratio: turned more than a night turns it, so that one sees it."""
+"""Subapertures, degrees, ratio: rotated more than in a night, so that it is visible."""
 
 EXPECTED, TRUE = "#9aa4ad", "#1f6fb2"
 Points = NDArray[np.float64]
@@ -48,12 +48,12 @@ def main() -> None:
         style = {"arrowstyle": "->", "color": "#c0392b", "lw": 1.2}
         part.annotate("", xy=tuple(end), xytext=tuple(begin), arrowprops=style)
     whole.set_title("663 actuators on the sensor's subapertures", fontsize=8)
-    part.set_title("grey: where the matrix has them; blue: where they are", fontsize=8)
+    part.set_title("grey: nominal, blue: actual (a part)", fontsize=8)
     figure.savefig(PICTURE, dpi=100)
 
 
 def on_sensor(points: Points, alpha: Misregistration) -> Points:
-    """Return where points of the mirror lie on the sensor, in subapertures."""
+    """Return the positions on the sensor of points of the mirror, in subapertures."""
     cosine, sine = np.cos(alpha.rotation_rad), np.sin(alpha.rotation_rad)
     turned = points @ np.array([[cosine, sine], [-sine, cosine]])
     moved = alpha.magnification * turned + (alpha.shift_x_subap, alpha.shift_y_subap)

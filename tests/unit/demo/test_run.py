@@ -159,7 +159,7 @@ def test_the_demo_refuses_an_argument_in_one_line_before_it_starts_anything(
 ):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("pyrcal.demo.run.children", None)  # whoever starts something fails
+    monkeypatch.setattr("pyrcal.demo.run.run_children", None)  # whoever starts something fails
     words = ["--dir", str(tmp_path / "demo"), option, value]
     try:
         status = main(words)

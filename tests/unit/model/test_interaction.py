@@ -114,7 +114,7 @@ def test_the_other_derivatives_are_of_the_stretched_image(stop, axis):
 def test_a_wavefront_rising_along_an_axis_gives_positive_mean_slopes_on_that_axis_only(stop, axis):
     """1e-4 of cross-talk: float32 sums over a symmetric pupil."""
     model = small_model(stop)
-    slopes = model.seen(ALIGNED, model.pupil.points[:, [axis]])
+    slopes = model.measure_signals(ALIGNED, model.pupil.points[:, [axis]])
     mean = slopes.reshape(2, -1).mean(axis=1)
     assert mean[axis] > 0
     assert abs(mean[1 - axis]) < 1e-4 * mean[axis]
@@ -211,8 +211,8 @@ def test_far_plates_summed_as_polynomials_move_the_matrix_by_rounding_only():
     points = flao_model().pupil.points @ rotation(0.02)
     direct = basis.surface.basis(points) @ basis.coefficients
     model = flao_model().of_modes(basis)
-    seen = model.seen(ALIGNED, basis.render(points).astype(np.float32))
-    assert relative(seen, model.seen(ALIGNED, direct.astype(np.float32))) < 6e-8
+    seen = model.measure_signals(ALIGNED, basis.render(points).astype(np.float32))
+    assert relative(seen, model.measure_signals(ALIGNED, direct.astype(np.float32))) < 6e-8
 
 
 @pytest.mark.parametrize("stop", Stop)
@@ -258,15 +258,15 @@ def test_a_pupil_that_lies_elsewhere_is_seen_as_one_that_the_mirror_carries_ther
 def test_with_the_telescope_as_stop_the_sensor_does_not_know_of_the_shift():
     model = small_model(Stop.TELESCOPE)
     shapes = small_basis().render(model.pupil.points)
-    at_rest = model.seen(ALIGNED, shapes)
-    np.testing.assert_array_equal(model.seen(SOMEWHERE, shapes), at_rest)
+    at_rest = model.measure_signals(ALIGNED, shapes)
+    np.testing.assert_array_equal(model.measure_signals(SOMEWHERE, shapes), at_rest)
 
 
 def test_with_the_mirror_as_stop_the_sensor_sees_the_images_move():
     model = small_model()
     shapes = small_basis().render(model.pupil.points)
-    at_rest = model.seen(ALIGNED, shapes)
-    assert relative(model.seen(SOMEWHERE, shapes), at_rest) > 0.1
+    at_rest = model.measure_signals(ALIGNED, shapes)
+    assert relative(model.measure_signals(SOMEWHERE, shapes), at_rest) > 0.1
 
 
 def test_the_two_stops_agree_when_nothing_is_shifted():

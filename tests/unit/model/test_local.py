@@ -100,7 +100,7 @@ def test_all_forms_of_local_shapes_are_the_modes():
 
 def test_shapes_beside_one_another_are_seen_as_each_alone():
     pupil, model, shapes = local_shapes()
-    turned = model._moved(SOMEWHERE, lambda at: at[:, ::-1] * [1.0, -1.0])
+    turned = model._move_modes(SOMEWHERE, lambda at: at[:, ::-1] * [1.0, -1.0])
     rows = np.random.default_rng(2).normal(size=(5, len(pupil.points)))
     both = beside([shapes, turned])
     apart = np.hstack([rows @ shapes, rows @ turned])
@@ -159,9 +159,9 @@ def test_a_sparse_jacobian_takes_local_shapes_as_it_takes_an_array():
     model = InteractionModel(lenslets, basis(), dtype=np.float64)
     shapes = model._render_modes(SOMEWHERE)
     assert isinstance(shapes, LocalShapes)
-    expected = model.seen(SOMEWHERE, shapes.array())
+    expected = model.measure_signals(SOMEWHERE, shapes.array())
     np.testing.assert_allclose(
-        model.seen(SOMEWHERE, shapes), expected, atol=1e-10 * np.abs(expected).max()
+        model.measure_signals(SOMEWHERE, shapes), expected, atol=1e-10 * np.abs(expected).max()
     )
 
 

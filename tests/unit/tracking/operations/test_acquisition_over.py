@@ -127,7 +127,7 @@ def test_what_an_operator_ended_does_not_begin_again_while_its_alarm_lasts(troub
     assert story.began == 1
     assert [asked.loop for asked in story.asked(LoopRequest)] == [Loop.OPEN]
     assert "ended by the operator" in story.text
-    assert "none begins by itself until" in story.text
+    assert "none starts by itself until" in story.text
 
 
 def test_nor_when_the_alarm_goes_and_comes():

@@ -271,8 +271,8 @@ class TestGap:
         assert opened.stage is AcquisitionStage.INTERRUPTED
         assert {"acquisition", "rtc-vanished"} <= opened.alarms
         assert "the RTC vanished during an acquisition (coarse" in opened.text
-        assert "no RTC is there" in opened.text
-        assert "not begin anew by itself" not in opened.text
+        assert "no RTC is present" in opened.text
+        assert "not restart by itself" not in opened.text
         opened.still_open()
         opened.still_open()
         assert opened.stage is AcquisitionStage.COARSE

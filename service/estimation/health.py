@@ -17,7 +17,7 @@ clips them. While the mirror plays what is asked, the residual less the command 
 Where it does not, the integrator winds up: the commands of some actuators go far beyond all
 turbulence, for tenths of a second, and the slopes do not show it. Averaged over 0.1 s the implied
 turbulence of healthy loops stays below 4.6 times the usual one at every actuator, that of clipped
-ones reaches 9 to 27 (docs/results/faults.md).
+ones reaches 9 to 27 (docs/results/reliability.md).
 
 **Vibrations** are lines in the slopes; the dither avoids them.
 

@@ -19,7 +19,7 @@ _ROWS = (
     ("shift x", "subapertures", 4),
     ("shift y", "subapertures", 4),
     ("rotation", "deg", 4),
-    ("magnification", "ratio, of the mirror as drawn over the pupil as described", 5),
+    ("magnification", "ratio, image of the mirror over its nominal size", 5),
 )
 """Name, unit and decimals of each parameter."""
 

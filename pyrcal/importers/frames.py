@@ -109,7 +109,7 @@ def describe_frames(
         If the light does not show four pupil images.
     """
     images = find_pupil_images(frames.light, f"{where}: {frames.light_name}")
-    pixels = pixels_per_subaperture or _binning(images, n_actuators)
+    pixels = pixels_per_subaperture or _choose_binning(images, n_actuators)
     n = _grid(images, pixels, frames.light.shape)
     notes.append(describe_images(frames, images))
     notes.append(f"{pixels} x {pixels} pixels are one subaperture; --pixels-per-subap changes that")
@@ -145,7 +145,7 @@ def round_centres(images: PupilImages) -> list[list[float]]:
     return [[round(float(value), 3) for value in at] for at in images.centres_px]
 
 
-def _binning(images: PupilImages, n_actuators: int) -> int:
+def _choose_binning(images: PupilImages, n_actuators: int) -> int:
     across = math.sqrt(4.0 * n_actuators / math.pi)
     return max(1, int(images.diameter_px / (SUBAPERTURES_PER_ACTUATOR * across)))
 

@@ -105,7 +105,7 @@ class Staging:
         """Add the manifest, which is the order to stage the matrix and swap it in."""
         known = self._answers.get(manifest.id)
         if known is not None:
-            return self._repeated(manifest, known)
+            return self._repeat_answer(manifest, known)
         collection = self._collection(manifest.id)
         if collection.manifest is not None:
             return Outcome()
@@ -179,7 +179,7 @@ class Staging:
             acknowledgements=[self._remember(self.answer(manifest, AckState.REJECTED, reason))]
         )
 
-    def _repeated(self, manifest: Manifest, known: Acknowledgement) -> Outcome:
+    def _repeat_answer(self, manifest: Manifest, known: Acknowledgement) -> Outcome:
         """Repeat the answer to a repeated commit; reject an id that belongs to another matrix."""
         if manifest.layout.sha256 == known.sha256:
             return Outcome(acknowledgements=[replace(known, session=self._terms().session)])

@@ -147,7 +147,7 @@ class Store(Folder, Generic[Record]):
                     became = self._became(record, anew=anew)
                     self._index.add(self._table, became, checksum(matrix))
         _, wrong = self._index.records(self._table, self.kind)
-        self._unsound = self._damaged(sorted(known.keys() - wrong.keys()))
+        self._unsound = self._find_damage(sorted(known.keys() - wrong.keys()))
         self._stand_ins.clear()
         for name in wrong:
             with contextlib.suppress(ArchiveError):
@@ -282,7 +282,7 @@ class Store(Folder, Generic[Record]):
             return False
         return True
 
-    def _damaged(self, product_ids: Iterable[str]) -> dict[str, str]:
+    def _find_damage(self, product_ids: Iterable[str]) -> dict[str, str]:
         """Return, by id, what is wrong with files that are missing or cut; none of it is read."""
         wrong = {}
         for name in product_ids:

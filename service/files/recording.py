@@ -221,8 +221,8 @@ class RecordingWriter:
         self._file.attrs.update(
             format=FORMAT, version=VERSION, system=self._system, created_ns=time.time_ns()
         )
-        self._bytes = _growing(self._file, "bytes", np.dtype("u1"), 1 << 20)
-        self._rows = _growing(self._file, "messages", _ROW, 4096)
+        self._bytes = _create_growing(self._file, "bytes", np.dtype("u1"), 1 << 20)
+        self._rows = _create_growing(self._file, "messages", _ROW, 4096)
         self._dropped = self._file.create_dataset("dropped", data=np.zeros(1, np.int64))
         self._file.swmr_mode = True
         self._thread.start()
@@ -320,6 +320,6 @@ class RecordingWriter:
         return len(data)
 
 
-def _growing(file: Any, name: str, kind: np.dtype[Any], chunk: int) -> Any:  # noqa: ANN401 - h5py
+def _create_growing(file: Any, name: str, kind: np.dtype[Any], chunk: int) -> Any:  # noqa: ANN401 - h5py
     """Return a new dataset without rows that may grow for ever."""
     return file.create_dataset(name, shape=(0,), maxshape=(None,), chunks=(chunk,), dtype=kind)

@@ -292,7 +292,7 @@ class Supervisor:
                 if isinstance(event, matrices.MeasuredMatrix):
                     self._start("a measured matrix", self._keep_measured(event))
                     continue
-                with self._surviving("an event of the link"):
+                with self._survive_errors("an event of the link"):
                     self._engine.receive(event)
 
     async def _feed(self) -> None:
@@ -304,7 +304,7 @@ class Supervisor:
                 return
             blocks: list[frames.FrameBlock] = []
             found: Fed = bank, []
-            with self._surviving("telemetry"):
+            with self._survive_errors("telemetry"):
                 try:
                     blocks, found = await loop.run_in_executor(
                         self._telemetry_executor, self._take_in, bank
@@ -320,7 +320,7 @@ class Supervisor:
         return blocks, process_blocks(bank, blocks)
 
     @contextlib.contextmanager
-    def _surviving(self, what: str) -> Iterator[None]:
+    def _survive_errors(self, what: str) -> Iterator[None]:
         """Continue after an unforeseen error: log it and reset the estimators.
 
         The estimators are reset before anything is posted, because each event advances them.
@@ -356,7 +356,7 @@ class Supervisor:
             if revival.due(link, time.monotonic()):
                 await self._reopen_link()
                 link = self._bridge.statistics()
-            with self._surviving("a tick"):
+            with self._survive_errors("a tick"):
                 self._post(ev.Tick())
             self._worker_load.look()
             for trouble in self._worker_load.detect_changes(self._engine.state):
@@ -454,7 +454,7 @@ class Supervisor:
         """Begin a task; a bug in it costs what it was about, not the service."""
 
         async def survived() -> None:
-            with self._surviving(what):
+            with self._survive_errors(what):
                 await action
 
         task = asyncio.get_running_loop().create_task(survived())

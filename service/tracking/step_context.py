@@ -299,7 +299,7 @@ def logged(
         # the very last line may be any; what lies between makes a story of two equal ones
         if (back == 1 or name in REPEATING) and _same(before, entry):
             log = list(state.log)
-            ranges = _widened(before.ranges or _ranges(before.text), _ranges(text))
+            ranges = _widen_ranges(before.ranges or _ranges(before.text), _ranges(text))
             times = before.times + 1
             log[-back] = replace(before, times=times, last_ns_utc=now_ns, ranges=ranges)
             return replace(state, log=tuple(log))
@@ -324,7 +324,7 @@ def _ranges(text: str) -> tuple[tuple[str, str], ...]:
     return tuple((found, found) for found in _VALUE.findall(text))
 
 
-def _widened(
+def _widen_ranges(
     before: tuple[tuple[str, str], ...], new: tuple[tuple[str, str], ...]
 ) -> tuple[tuple[str, str], ...]:
     """Return the ranges of both lines; for a line of another form the first ranges are kept."""

@@ -229,9 +229,9 @@ def test_the_four_parameters_are_there_with_unit_and_uncertainty():
         "subapertures",
     ]
     assert line(text, "rotation").split() == ["rotation", "65.0800", "0.0100", "0.0040", "deg"]
-    numbers, words = line(text, "magnification").split()[1:4], "the mirror as drawn over the pupil"
+    numbers = line(text, "magnification").split()[1:4]
     assert numbers == ["0.98000", "0.00100", "0.00010"]
-    assert f"ratio, of {words} as described" in line(text, "magnification")
+    assert "ratio, image of the mirror" in line(text, "magnification")
 
 
 def test_the_slopes_are_printed_as_the_instrument_file_takes_them():

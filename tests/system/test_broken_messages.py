@@ -174,7 +174,7 @@ def test_an_rtc_that_pauses_is_waited_for(night, rtc):
     rtc.on_frames = lambda *_: None
     named(night, waits, "frames", "no frames", 3.0 + SLACK_S)
     rtc.on_status = lambda _: None
-    named(night, waits, "telemetry", "nothing comes", 4.0 + SLACK_S)
+    named(night, waits, "telemetry", "no message arrives", 4.0 + SLACK_S)
     rtc.on_frames = rtc.on_status = None
     wait_for(lambda: not {"frames", "telemetry"} & set(waits(night)), 5.0, "all well")
 

@@ -133,7 +133,7 @@ def without_pyrcal(folder):
     return folder / "without"
 
 
-NO_PYRCAL = r"found no pyrcal that can be asked for its version \(ModuleNotFoundError"
+NO_PYRCAL = r"found no pyrcal that reports its version \(ModuleNotFoundError"
 
 
 def test_a_worker_without_pyrcal_is_named_whenever_it_comes(tmp_path):

@@ -293,7 +293,7 @@ def test_once_there_are_keys_the_page_asks_for_one_and_says_why_it_may_not_order
     page.says("#who", "looks (read)")
     page.press("h")
     page.says("#answer", "Hold is not possible now: key looks is read-only")
-    assert "key looks may look" in page.js("document.querySelector('#stop').title")
+    assert "key looks is read-only" in page.js("document.querySelector('#stop').title")
     keys.revoke("looks")
     log_in(order)
     page.until("document.querySelector('#lost').hidden")
@@ -322,7 +322,7 @@ def test_two_rtcs_at_once_are_a_banner_that_says_what_to_do_until_one_is_gone(pa
     other = page.night.rtc(seed=4)
     page.until("document.querySelector('#critical').checkVisibility()", 20.0)
     page.says("#critical", "second-rtc")
-    page.says("#critical .remedy", "stop one of them")
+    page.says("#critical .remedy", "Stop one of them")
     assert page.js("parseFloat(getComputedStyle(document.querySelector('.cause')).fontSize)") > 36
     page.says("#operation", "■ ERROR")
     other.kill()

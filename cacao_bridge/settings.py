@@ -119,8 +119,7 @@ class CalibrationTable(Table):
     """NumPy file ``(n_slopes,)``: places of the slopes in a frame; empty: all of it is slopes."""
 
     interlock: Literal["operator", "restart"] = "operator"
-    """When the streams are written: after an operator's order, or as soon as a matrix has arrived.
-    """
+    """Condition for writing the streams: an operator's order, or the arrival of a matrix."""
 
 
 class Settings(Table):

@@ -94,11 +94,11 @@ _LOOKS: Final = 4
 """Consistent readings of a ring that are required before its first use."""
 
 _LOOK_S: Final = 3e-4
-"""Between two of them."""
+"""Interval between two looks at a stream, seconds."""
 
 _MAKE_ANEW: Final = "create it again with milk and cacao of that format"
 _ADRIFT_S: Final = 0.5
-"""For which a writer may be put aside in the midst of a frame: less than a ring should hold."""
+"""Longest suspension of a writer within a frame, seconds; a ring should hold more frames."""
 
 _TWO_WRITERS_S: Final = 10.0
 """Within which a process that was taken over from may not come back."""
@@ -204,7 +204,7 @@ class Stream:
         sizes = [int(n) for n in self._about["size"][: int(self._about["naxis"])]]
         n_slices = sizes[2] if self._is_cube else 1
         self.shape = tuple(reversed(sizes[:2] if self._is_cube else sizes))
-        """Of a frame, slowest axis first: cacao's ``size`` backwards."""
+        """Shape of a frame, slowest axis first: cacao's ``size`` reversed."""
         self.n_values = math.prod(self.shape)
         self.inode = os.fstat(self._fd).st_ino
         data = np.frombuffer(self._map, kind, self.n_values * n_slices, _METADATA.itemsize)
@@ -221,7 +221,7 @@ class Stream:
         self._shift: int | None = 0 if self._is_cube else None
         """Slot of the newest frame less the one that the writer's index names; None: not known."""
         self._adrift_s = math.inf
-        """Since when ring and counter have not been seen together."""
+        """Time since which ring and counter have disagreed, on a monotonic clock, seconds."""
         self._writers: list[tuple[int, float]] = []
 
     def __del__(self) -> None:

@@ -69,7 +69,7 @@ class ReceivedMessage:
     """True if its publisher has a cache from which lost messages can be recovered."""
 
     alive: bool = False
-    """For a liveliness token: True if it appeared, False if it disappeared."""
+    """True if a liveliness token appeared, False if it disappeared; used for tokens only."""
 
     refused: str = ""
     """Reason for which its signature is not accepted; empty if it is, or none is required."""

@@ -52,7 +52,7 @@ class Moves(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Requirement:
-    """What one check verifies: requirements of a section of the contract."""
+    """Requirements of one section of the contract that one check verifies."""
 
     numbers: tuple[int, ...]
     """Numbers of the requirements in docs/rtc.md: 4 is R-4."""

@@ -51,7 +51,7 @@ NOTABLE_GAIN_RATIO = 0.02
 """Smallest reported ratio of the gains of Sx and Sy, less 1."""
 
 CENTRED_KEY = "pupil, or valid_subapertures, centred"
-"""What to put right in the instrument file if the pupil is not centred."""
+"""Keys of the instrument file to correct if the pupil is not centred."""
 
 ARM_SUBAP = 0.5
 """Width of the arms in the trial model, subapertures; the best width is extrapolated from it."""

@@ -85,7 +85,7 @@ class Criterion:
     """Limit with its unit."""
 
     remedy: str
-    """What to do if it is not passed."""
+    """Advice if the criterion is not passed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

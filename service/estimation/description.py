@@ -15,16 +15,17 @@ LOW_MODES = 30
 
 
 EDGE_MEMORY_S, EDGE_MEMORY_OF_M = 0.25, 8.22
-"""Turbulence of higher modes has forgotten itself after this on a pupil so wide, a slip has not; on
-a wider one the wind takes as much longer to cross a mode."""
+"""Averaging time in seconds on a pupil of this diameter in metres, longer than the correlation time
+of turbulence in the higher modes and shorter than a slip. It grows with the diameter, as the time
+in which the wind crosses a mode."""
 
 MIN_LEFT_OUT_MODES = 5
 LEFT_OUT_SHARE = 0.1
-"""Lowest modes of the loop that are left out where every actuator is watched: tip, tilt and their
-like, at least so many, and so many of those in the loop."""
+"""Number and share of the lowest modes of the loop that are left out where every actuator is
+watched (tip, tilt and others that wander far); the larger of both applies."""
 
 MIN_ACTUATOR_MODES = 20
-"""Modes that must be left; fewer do not tell one actuator from its neighbours."""
+"""Smallest number of modes that remain; fewer do not separate an actuator from its neighbours."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -148,7 +148,7 @@ class LoopHealth(Detector):
     """RMS of the command in the upper half of the controlled modes over its expectation."""
 
     power: UpperPower = field(default_factory=UpperPower)
-    """The same power beside that of the seconds before."""
+    """Power of the commands in the upper half, compared with that of the seconds before."""
 
     diverging: bool = False
     absurd: bool = False
@@ -386,22 +386,22 @@ def _update_health(
 
 
 UNPLAYED_RATIO = 6.0
-"""Turbulence at an actuator as commands and slopes imply it, a part's mean over the usual."""
+"""Limit of the implied turbulence at an actuator, averaged over a part, relative to the usual."""
 
 STEADY_SHARE = 0.8
-"""Share of an actuator's RMS command in a part that its mean has: in a loop that diverges the
-commands swing, and their mean is small."""
+"""Smallest ratio of mean to RMS of an actuator's command in a part. In a diverging loop commands
+oscillate, and their mean is small."""
 
 N_UNPLAYED_PARTS = 2
-"""Parts of the last ``UNPLAYED_MEMORY_S`` in which an actuator must be beyond."""
+"""Number of parts in the last ``UNPLAYED_MEMORY_S`` with an actuator beyond the limit."""
 
 UNPLAYED_MEMORY_S = 5.0
 
 _USUAL_S = 10.0
-"""Telemetry from which the usual turbulence is measured."""
+"""Duration of the telemetry from which the usual turbulence is measured."""
 
 _PLAYED_STRIDE_FRAMES = 4
-"""One of so many frames is averaged."""
+"""Stride of the frames that are averaged."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

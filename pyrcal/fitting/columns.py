@@ -60,8 +60,9 @@ def find_noise_columns(solution: Solution, target: Target, n_planes: int) -> NDA
     Such a column has nothing in common with its model, and its neighbouring subapertures are
     uncorrelated. A column of another mode, or of another basis, is smooth.
     """
-    measured = np.where(target.rows[:, None], target.matrix, 0.0)
-    alike = np.sum(_unit(measured) * _unit(np.asarray(solution.matrix, np.float64)), axis=0)
+    # unit columns: squares of a value such as 1e200, read from a damaged file, would overflow
+    measured = _unit(np.where(target.rows[:, None], target.matrix, 0.0))
+    alike = np.sum(measured * _unit(np.asarray(solution.matrix, np.float64)), axis=0)
     unlike = np.abs(alike) < CHANCE_SIGMA / np.sqrt(target.rows.sum())
     found = np.zeros(len(unlike), dtype=np.bool_)
     for column in np.flatnonzero(unlike):

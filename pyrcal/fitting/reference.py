@@ -24,6 +24,10 @@ DEAD_ROW_SHARE = 0.5
 """Share of columns with a value that is not finite above which a slope belongs to a dead
 subaperture; below it the columns are at fault."""
 
+LARGEST_VALUE = 1e60
+"""Value above which an entry counts as not finite: its fourth power would overflow, and a file that
+is not damaged holds slopes per metre of 1e7."""
+
 PLAUSIBLE_UNIT_RATIO = 1e-4
 """Smallest plausible RMS slope per metre of OPD times the wavelength, and the reciprocal of the
 largest; nanometres and micrometres give 1e-9 and 1e-6."""
@@ -64,6 +68,16 @@ def check_reference(
         unit is not the metre.
     """
     _check_shape(reference, n_slopes, n_modes)
+    damaged = np.abs(reference.matrix) > LARGEST_VALUE
+    if damaged.any():
+        reference = replace(
+            reference,
+            matrix=np.where(damaged, np.nan, reference.matrix),
+            left_out=(
+                *reference.left_out,
+                f"{damaged.sum()} values above {LARGEST_VALUE:.0e} are taken as not finite",
+            ),
+        )
     reference, silenced = _remove_dead_rows(reference)
     kept, left_out = _find_usable(reference)
     left_out = (*reference.left_out, *silenced, *left_out)

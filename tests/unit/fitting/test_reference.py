@@ -33,6 +33,14 @@ def test_dead_and_nan_columns_are_named_and_left_out():
     assert found.left_out == ("not finite: mode 7", "dead (no response): mode 9")
 
 
+def test_a_column_with_a_value_whose_squares_overflow_is_left_out():
+    given = matrix()
+    given[3, 2] = 1e300
+    found = check(Reference(matrix=given))
+    assert list(found.columns) == [0, 1, 3, 4, 5]
+    assert "not finite: mode 2" in found.left_out
+
+
 def test_a_transposed_matrix_is_called_transposed():
     with pytest.raises(MatrixError, match="transposed"):
         check(Reference(matrix=matrix().T))

@@ -345,20 +345,14 @@ def rest(described: Schema) -> str:
 # --- alarms
 
 
-def _sentence(text: str) -> str:
-    """Return a text that begins with a capital and ends with a full stop."""
-    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
-
-
 def runbook(acts: Mapping[str, str]) -> str:
     """Return docs/operate/runbook.md: what to do about each alarm; ``acts``: what it may forbid."""
     parts = [
-        "An alarm lasts as long as its cause. The page, `pyrcal alarms list` and "
-        "[the metrics](monitoring.md) show it; its text has the numbers. *Critical*: the loop is "
-        "in danger, or its telemetry cannot be used. *Serious*: the service does less than it "
-        "should. *Warning*: it does its work.",
+        "An alarm lasts as long as its cause; its text on the page and in `pyrcal alarms list` has "
+        "the numbers. *Critical*: the loop is in danger, or its telemetry cannot be used. "
+        "*Serious*: the service does less than it should. *Warning*: it does its work.",
         "## What an alarm may forbid",
-        "Each alarm names what it `blocks`, as a rule of your own does.",
+        "Each alarm names what it `blocks`, as a rule of your own does:",
         listed((f"`{act}`", text) for act, text in acts.items()),
     ]
     for name, kind in ALARMS.items():
@@ -366,12 +360,8 @@ def runbook(acts: Mapping[str, str]) -> str:
         head = kind.severity.value.capitalize()
         if kind.responsible:
             who = kind.responsible.value
-            head += f"; the {'RTC' if who == 'rtc' else who} can end it"
+            head += f"; ended by the {'RTC' if who == 'rtc' else who}"
         if blocks:
             head += f"; blocks {', '.join(blocks)}"
-        parts += [
-            f"## {name}",
-            f"*{head}.* {_sentence(kind.means)}",
-            f"**Do**: {_sentence(kind.do)}",
-        ]
+        parts += [f"## {name}", f"*{head}.* {kind.means}", f"**Do**: {kind.do}"]
     return page("Runbook: what to do about an alarm", *parts)

@@ -141,8 +141,7 @@ def access() -> str:
     ]
     intro = (
         "What each role of [a secured link](../operate/link.md) may do; all else is refused. "
-        "`@adv` is what zenoh's advanced publishers and subscribers say to each other: losses "
-        "asked for again, the last message for those who come late."
+        "`@adv` keys carry what zenoh's advanced publishers send again."
     )
     return page("Access to the link", intro, "\n".join(rows))
 

@@ -194,13 +194,13 @@ class AlarmState(StrEnum):
     """State of an alarm with operators."""
 
     ACTIVE = "active"
-    """It lasts and is not acknowledged."""
+    """Active and not acknowledged."""
 
     ACKNOWLEDGED = "acknowledged"
-    """It lasts and is acknowledged; it goes when it is over."""
+    """Active and acknowledged; it disappears when it ends."""
 
     STALE = "stale"
-    """It ended unseen; it stays until acknowledged."""
+    """Ended unseen; it stays until acknowledged."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -53,8 +53,8 @@ def packaged() -> str:
         "Each is a file in `service/instrument/packaged`, used by its name, which is `name` in "
         "`[instrument]`: `pyrcal demo --instrument papyrus`. A value is public, with its source, "
         f"or {ASSUMED}: chosen by the authors of pyrcal because no public source was found. Check "
-        "assumed values before you use a file on the real telescope. An `r0_m` of 0.126 is a seeing "
-        "of 0.8 arcseconds at 500 nm. Equal in all, and assumed where no source is named: "
+        "assumed values before you use a file on the real telescope. An `r0_m` of 0.126 is a "
+        "seeing of 0.8 arcseconds at 500 nm. Equal in all, and assumed where no source is named: "
         f"{', '.join(f'`{one.key}` {one.value} in `[{one.table}]`' for one in everywhere)}."
     )
     parts = [

@@ -357,10 +357,10 @@ def runbook(acts: Mapping[str, str]) -> str:
     for name, kind in ALARMS.items():
         blocks = [f"`{act}`" for act in acts if act in kind.blocks]
         head = kind.severity.value.capitalize()
-        notes = [f"*Blocks {', '.join(blocks)}.*"] if blocks else []
+        notes = [f"Blocks {', '.join(blocks)}."] if blocks else []
         if kind.responsible:
             who = kind.responsible.value
-            notes += [f"*The {'RTC' if who == 'rtc' else who} can end it.*"]
+            notes += [f"The {'RTC' if who == 'rtc' else who} can end it."]
         parts += [f"## {name}", " ".join([f"*{head}.* {kind.means}", *notes])]
         parts += [f"**Do**: {kind.do}"]
     return page("Runbook: what to do about an alarm", *parts)

@@ -48,7 +48,8 @@ def page(title: str, *parts: str) -> str:
 # --- settings and instrument files
 
 _BRACKETS = (
-    "In brackets: the default, or else the type; then limits. The end of a key is its unit: `_m` "
+    "In brackets: the default and its alternatives, or else the type; then limits. The end of a "
+    "key is its unit: `_m` "
     "metres, `_nm` nanometres, `_s` seconds, `_hz` hertz, `_deg` degrees, `_arcsec` arcseconds, "
     "`_px` pixels, `_subap` or `_subapertures` subapertures, `_gb`, `_mb` gigabytes, megabytes."
 )
@@ -252,7 +253,9 @@ def _describe(
     usages = [list(leaf.usage_parts(shared, short=alone)) for leaf in leaves]
     hidden = {_row(action) for group in shared.values() for action in group} | {_INSTRUMENT}
     rows = [_row(action) for leaf in leaves for action in leaf.shown_actions()]
-    own = [row for row in dict.fromkeys(rows) if row not in hidden and row not in repeated]
+    own = [
+        row for row in dict.fromkeys(rows) if row[1] and row not in hidden and row not in repeated
+    ]
     others = [word.split()[0] for word, text in rows if alone and (word, text) in repeated]
     if others:
         own.append(("and", ", ".join(others)))

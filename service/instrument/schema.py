@@ -86,10 +86,10 @@ class MirrorTable(kinds.InfluenceShape):
     """Grid only: actuators along a diameter."""
 
     diameter_m: kinds.Positive | None = None
-    """Grid and hexagonal: circle that contains all actuators."""
+    """Grid and hexagonal: diameter of the circle that contains all actuators."""
 
     hole_m: kinds.Positive | None = None
-    """Hexagonal only: circle without actuators."""
+    """Hexagonal only: diameter of the middle without actuators."""
 
     position_error_pitch: Annotated[float, Field(ge=0.0, le=0.2)] | None = None
     """RMS error of actuator positions along each axis, in pitches, that is part of σ of a fit;

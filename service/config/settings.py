@@ -130,19 +130,19 @@ class TrackingTable(Table):
     """Random walk of each shift, 1 σ after a minute."""
 
     drift_deg_per_minute: Positive = 0.05
-    """Of the rotation."""
+    """Drift of the rotation."""
 
     drift_magnification_per_minute: Positive = 0.0005
-    """Of the magnification."""
+    """Drift of the magnification."""
 
     floor_shift_subap: float | None = Field(default=None, ge=0.0)
     """Model error of each shift, 1 σ; None: as measured, larger for a coarse mirror."""
 
     floor_rotation_deg: float | None = Field(default=None, ge=0.0)
-    """Of the rotation."""
+    """Model error of the rotation."""
 
     floor_magnification: float | None = Field(default=None, ge=0.0)
-    """Of the magnification."""
+    """Model error of the magnification."""
 
     anamorphosis: bool = False
     """Track the anamorphosis, too; otherwise it is that of the instrument file."""
@@ -154,10 +154,10 @@ class TrackingTable(Table):
     """Shift per degree of elevation, 1 σ."""
 
     flexure_deg_per_degree: float = Field(default=0.01, ge=0.0)
-    """Of the rotation."""
+    """Flexure of the rotation."""
 
     flexure_magnification_per_degree: float = Field(default=1e-4, ge=0.0)
-    """Of the magnification."""
+    """Flexure of the magnification."""
 
     slew_limit_deg: Positive = 5.0
     """Motion of the telescope after which α is invalid until the next window."""
@@ -167,10 +167,10 @@ class TrackingTable(Table):
     30 subapertures, more for fewer modes."""
 
     stale_rotation_deg: Positive | None = None
-    """Of the rotation; None: 0.1 for 500 modes."""
+    """1 σ of the rotation; None: 0.1 for 500 modes."""
 
     stale_magnification: Positive | None = None
-    """Of the magnification; None: 0.003 for 500 modes."""
+    """1 σ of the magnification; None: 0.003 for 500 modes."""
 
 
 class AcquisitionTable(Table):
@@ -212,10 +212,10 @@ class ControlTable(Table):
     for fewer modes."""
 
     update_rotation_deg: Positive | None = None
-    """Of the rotation; None: 0.08 for 500 modes."""
+    """Change of the rotation; None: 0.08 for 500 modes."""
 
     update_magnification: Positive | None = None
-    """Of the magnification; None: 0.005 for 500 modes."""
+    """Change of the magnification; None: 0.005 for 500 modes."""
 
     wind_m_s: Positive = 15.0
     """Wind for the expected wavefront error."""
@@ -350,7 +350,7 @@ class RuleTable(Table):
     """Text: what is wrong and what to do."""
 
     unknown: Literal["holds", "does-not-hold"] = "holds"
-    """Whether the rule holds while the value is unknown."""
+    """Result of the rule while the value is unknown."""
 
     @model_validator(mode="after")
     def _compared_with_sense(self) -> RuleTable:

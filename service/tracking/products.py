@@ -39,7 +39,7 @@ class MatrixState(StrEnum):
     """Checked by the RTC, ready to swap."""
 
     APPLIED = "applied"
-    """In use."""
+    """The RTC uses it."""
 
     SUPERSEDED = "superseded"
     """Replaced by another one."""

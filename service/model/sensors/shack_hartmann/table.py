@@ -104,4 +104,4 @@ class ShackHartmannTable(ShackHartmannNumbers):
     """"auto": by ``flux_threshold``; or a mask ``path:/dataset``."""
 
     guide_star_height_m: Literal["infinity"] = "infinity"
-    """Of a natural star; a laser star has `[wfs.laser]`."""
+    """Natural star only; a laser star has `[wfs.laser]`."""

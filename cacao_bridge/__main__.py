@@ -53,18 +53,18 @@ def arguments_parser() -> OneLineParser:
         nargs="?",
         const="waiting",
         metavar="ID",
-        help="allow a running bridge to write the waiting matrix into cacao, and end",
+        help="have a running bridge write the waiting matrix",
     )
     parser.add_argument(
         "--bundle",
         type=Path,
         metavar="FILE",
-        help="have a running bridge write all of a bundle into cacao, and end",
+        help="have a running bridge write a bundle",
     )
     parser.add_argument(
         "--rollback",
         action="store_true",
-        help="have a running bridge restore the previous bundle or matrix, and end",
+        help="have a running bridge restore what was there before",
     )
     parser.add_argument("--seconds", type=float, metavar="S", help="end after this time")
     return parser

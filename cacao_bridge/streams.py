@@ -94,7 +94,7 @@ _LOOKS: Final = 4
 """Consistent readings of a ring that are required before its first use."""
 
 _LOOK_S: Final = 3e-4
-"""Interval between two looks at a stream, seconds."""
+"""Polling interval of a stream, seconds."""
 
 _MAKE_ANEW: Final = "create it again with milk and cacao of that format"
 _ADRIFT_S: Final = 0.5

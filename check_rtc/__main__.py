@@ -68,7 +68,7 @@ def check_parser() -> OneLineParser:
         words("--open-loop", "also run checks that open the loop: loop, measure"),
         words("--move-image", "also run the check that moves the mirror's image: offload"),
         words("--yes", "consent to all movements beforehand"),
-        words("--json", "print one JSON object at the end"),
+        words("--json", "print JSON"),
     )
     return check
 

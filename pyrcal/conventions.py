@@ -110,7 +110,7 @@ class Stream:
 
     frame_rate_hz: float
     delay_frames: int = 1
-    """Frames from an exposure to the first one that sees its correction."""
+    """Frames from an exposure to its correction."""
 
 
 def main(options: argparse.Namespace) -> int:

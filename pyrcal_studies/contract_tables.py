@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Final
 
 from msgspec import inspect as types
@@ -36,13 +36,14 @@ from service.wire import (
     StateMessage,
     Status,
 )
-from service.wire.codec import RegistrationNumbers, field_names, optional_keys
+from service.wire.codec import SHA256_EXPECTED, RegistrationNumbers, field_names, optional_keys
+from service.wire.keys import ID_EXPECTED
 from service.wire.matrices import MATRIX_LIMIT
 
-Row = tuple[str, str, str, str, str, str]
-"""Key, type, unit, range, whether it may be nil, meaning."""
+Row = tuple[str, str, str, str, str]
+"""Key, type, range, whether it may be nil, meaning."""
 
-HEAD: Final = ("key", "type", "unit", "range", "nil", "meaning")
+HEAD: Final = ("key", "type and range", "meaning")
 
 MESSAGES: Final[dict[str, type]] = {
     "frames": FrameHeader,
@@ -69,28 +70,16 @@ PARTS: Final[dict[str, type]] = {
 }
 """Maps inside of messages."""
 
-_VERSION: Final = ("`v`", "int", "", "1", "no", "Version of the contract.")
+_VERSION: Final = ("`v`", "int", "1", "no", "Version of the contract.")
 _ACTION: Final[dict[str, Row]] = {
-    name: ("`action`", "str", "", f"`{word}`", "no", f"Says that this is a {what}.")
+    name: ("`action`", "str", f"`{word}`", "no", f"{what}.")
     for name, word, what in (
-        ("dither", "start", "start"),
-        ("status-dither", "start", "dither"),
-        ("stop", "stop", "stop"),
+        ("dither", "start", "Start of a dither"),
+        ("status-dither", "start", "Start of a dither"),
+        ("stop", "stop", "End of the dither"),
     )
 }
-_DTYPE: Final = ("`dtype`", "str", "", "`<f4`", "no", "Little-endian float32; there is no other.")
-
-_UNITS: Final = {
-    "_m": "m OPD",
-    "_ns": "ns",
-    "_hz": "Hz",
-    "_s": "s",
-    "_subap": "subapertures",
-    "_deg": "degrees",
-    "_frames": "frames",
-    "_bytes": "bytes",
-    "magnification": "ratio",
-}
+_DTYPE: Final = ("`dtype`", "str", "`<f4`", "no", "Little-endian float32.")
 
 _WORDS: Final[dict[type[types.Type], str]] = {
     types.IntType: "int",
@@ -143,7 +132,6 @@ def _rows(name: str, record: type) -> Iterator[Row]:
         yield (
             f"`{key}`",
             _type(kind),
-            next((unit for end, unit in _UNITS.items() if key.endswith(end)), ""),
             _range(kind),
             nil,
             texts[key].replace("None", "nil").replace("``", "`"),
@@ -168,9 +156,9 @@ def _core(kind: types.Type) -> types.Type:
 def _type(kind: types.Type) -> str:
     core = _core(kind)
     if isinstance(core, types.VarTupleType):
-        return f"array of {_type(core.item_type)}"
+        return f"[{_type(core.item_type)}]"
     if isinstance(core, types.TupleType):
-        return f"array of {len(core.item_types)} {_type(core.item_types[0])}"
+        return f"[{', '.join(map(_type, core.item_types))}]"
     return _WORDS[type(core)]
 
 
@@ -183,8 +171,76 @@ def _range(kind: types.Type) -> str:
     if isinstance(kind, types.EnumType):
         return ", ".join(f"`{each}`" for each in kind.cls)
     if isinstance(kind, types.VarTupleType):
-        return f"each {_range(kind.item_type)}"
-    return "`true`, `false`" if isinstance(kind, types.BoolType) else ""
+        return _range(kind.item_type)
+    return ""
+
+
+_NAMED_RANGES: Final = {
+    "an integer from 0 to 2^63 - 1": ("int", "int"),
+    "a finite number": ("float", "float"),
+    f"a text of 0 to {TEXT_LIMIT} characters": ("str", "text"),
+    "1 to 128 printable characters": ("str", "name"),
+    ID_EXPECTED: ("str", "id"),
+    SHA256_EXPECTED: ("str", "checksum"),
+    "pairs of integers": ("int", "int"),
+}
+"""Ranges that the section *Types* of the page explains, with the name that stands for each."""
+
+
+def _values(row: Row) -> str:
+    """Return type and range of a key in one phrase, and whether it may be nil or absent."""
+    _, kind, limits, nil, _ = row
+    if limits in _NAMED_RANGES:
+        text = kind.replace(*_NAMED_RANGES[limits])
+    elif limits.startswith("`"):
+        text = limits
+    else:
+        short = limits.removeprefix("an integer from ").removeprefix("a finite number ")
+        short = re.sub(r"^from (\S+)$", r"≥ \1", short).removeprefix("from ")
+        text = f"{kind} {short}".strip().replace("1 to 2^63 - 1", "≥ 1").replace("<=", "≤")
+    text += " or nil" if nil.startswith("yes") else ""
+    return text + (", may be absent" if nil.endswith("absent") else "")
+
+
+def _message(name: str) -> str:
+    """Return the table of a message, without the keys that it shares with others."""
+    rows = rows_of(name)
+    lines = []
+    for title, group in _GROUPS.items():
+        common = [row[:-1] for row in group(name)]
+        shared = [row[0] for row in rows if name in MESSAGES and row[:-1] in common]
+        rows = [row for row in rows if row[0] not in shared]
+        anchor = title.lower().replace(" ", "-")
+        lines += [f"[{title}](#{anchor}): {', '.join(shared)}."] if shared else []
+    if name in _SAME_AS:
+        rows = [row for row in rows if row not in rows_of(_SAME_AS[name])]
+    return "\n\n".join([*lines, _keys(rows)])
+
+
+def _keys(rows: Iterable[Row]) -> str:
+    return table(HEAD, [(row[0], _values(row), row[-1]) for row in rows])
+
+
+def _shared(_name: str = "") -> list[Row]:
+    """Return the keys that mean the same in every message that has them."""
+    keys = {"session", "basis_id", "config_id"}
+    found = [row for row in rows_of("frames") if row[0].strip("`") in keys]
+    system = [row for row in rows_of("alarm") if row[0] == "`system`"]
+    return [_VERSION, *found, *system]
+
+
+def _layout(name: str = "commit") -> list[Row]:
+    """Return the keys of a manifest that describe the bytes of its matrix."""
+    return [*_rows("layout", MatrixLayout), _DTYPE] if name in {"commit", "im-commit"} else []
+
+
+_GROUPS: Final[dict[str, Callable[[str], list[Row]]]] = {
+    "Shared keys": _shared,
+    "Layout": _layout,
+}
+
+_SAME_AS: Final = {"status-dither": "dither", "offload": "alpha"}
+"""Messages and parts that repeat the keys of another, as their sections say."""
 
 
 def table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
@@ -219,9 +275,11 @@ def _verification() -> str:
 
 _TABLES: Final[dict[str, Callable[[], str]]] = {
     **{
-        name: (lambda name=name: table(HEAD, rows_of(name)))  # type: ignore[misc]
+        name: (lambda name=name: _message(name))  # type: ignore[misc]
         for name in (*MESSAGES, *PARTS)
     },
+    "shared": lambda: _keys(_shared()),
+    "layout": lambda: _keys(_layout()),
     "limits": _limits,
     "verification": _verification,
 }

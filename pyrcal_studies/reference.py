@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import re
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -45,15 +47,21 @@ def page(title: str, *parts: str) -> str:
 
 # --- settings and instrument files
 
+_BRACKETS = (
+    "In brackets: the default and its alternatives, or else the type; then limits. The end of a "
+    "key is its unit: `_m` "
+    "metres, `_nm` nanometres, `_s` seconds, `_hz` hertz, `_deg` degrees, `_arcsec` arcseconds, "
+    "`_px` pixels, `_subap` or `_subapertures` subapertures, `_gb`, `_mb` gigabytes, megabytes."
+)
+
 
 def settings() -> str:
     """Return docs/reference/settings.md: every key of the service's settings."""
     intro = (
-        "Command line > environment > TOML file > defaults. A key `port` in the section `[api]` is "
-        "`PYRCAL_API__PORT` in the environment; values other than text are written as in TOML "
-        '(`PYRCAL_DITHER__MODES="[501, 450]"`). An unknown key, a wrong type or a number out of '
-        "range is refused with one line that names the file and the key. In brackets: type and "
-        "default."
+        "Command line > environment > TOML file > defaults. `port` of `[api]` is "
+        "`PYRCAL_API__PORT` in the environment, with a value as in TOML "
+        '(`PYRCAL_DITHER__MODES="[501, 450]"`). An unknown key or a wrong value is refused with '
+        f"one line that names it. {_BRACKETS}"
     )
     return page("Settings", intro, *_tables(Settings))
 
@@ -63,8 +71,8 @@ def instrument() -> str:
     intro = (
         "A TOML file that describes the telescope, the sensor, the mirror and how the RTC lists "
         "slopes. [Fitting a measured matrix](../howto/fitting.md) has the smallest one, and "
-        "explains orientation. A reference to data is `path:/dataset`, relative to the file. In "
-        "brackets: type and default."
+        "explains orientation. A reference to data is `path:/dataset`, relative to the file. "
+        f"{_BRACKETS}"
     )
     first, *others = KINDS.values()
     own = [part for kind in others for part in _sensor_table(kind)]
@@ -75,27 +83,46 @@ def system() -> str:
     """Return docs/reference/system.md: every key of a system's file."""
     intro = (
         "A TOML file of several sensors and mirrors, for `pyrcal fit-system`: "
-        "[how it is used](../howto/systems.md). In brackets: type and default."
+        f"[how it is used](../howto/systems.md). {_BRACKETS}"
     )
-    return page("The file of a system", intro, *_tables(SystemFile))
+    sensors, mirrors = list(tables_of(SystemFile))[1:3]
+    common = [key for key in sensors.keys if key in mirrors.keys]
+    return page(
+        "The file of a system",
+        intro,
+        *_tables(SystemFile, common, "below"),
+        "## Keys of sensors and mirrors",
+        listed((f"`{key.name}`{_brackets(key, below=False)}", key.meaning) for key in common),
+    )
 
 
 def _sensor_table(kind: SensorKind) -> list[str]:
     """Return ``[wfs]`` of one kind of sensor: the other tables are alike."""
-    parts = list(_tables(whole_of(kind)))
+    first = next(iter(KINDS.values()))
+    (same,) = (table.keys for table in tables_of(whole_of(first)) if table.header == "[wfs]")
+    parts = list(_tables(whole_of(kind), same, "as for the pyramid"))
     start = parts.index("## [wfs]") + 1
     after = next(k for k, part in enumerate(parts) if k > start and part == "## [mirror]")
     return [f'## [wfs] with kind = "{kind.name}"', *parts[start:after]]
 
 
-def _tables(whole: type[Table]) -> Iterator[str]:
-    """Yield the sections of a file, each with its keys."""
-    for table in tables_of(whole):
+def _tables(
+    whole: type[Table], explained: Collection[KeyText] = (), where: str = ""
+) -> Iterator[str]:
+    """Yield the sections of a file with their keys; those ``explained`` elsewhere by name only."""
+    tables = list(tables_of(whole))
+    headers = {table.header.strip("[]") for table in tables}
+    for table in tables:
         yield f"## {table.header}"
         yield table.about
-        yield listed(
-            (f"`{key.name}` ({key.type}{_default(key)})", key.meaning) for key in table.keys
-        )
+        section = table.header.strip("[]")
+        rows = [
+            (f"`{key.name}`{_brackets(key, below=f'{section}.{key.name}' in headers)}", key.meaning)
+            for key in table.keys
+            if key not in explained
+        ]
+        others = [f"`{key.name}`" for key in table.keys if key in explained]
+        yield listed([*rows, (", ".join(others), where)] if others else rows)
 
 
 def access() -> str:
@@ -115,8 +142,7 @@ def access() -> str:
     ]
     intro = (
         "What each role of [a secured link](../operate/link.md) may do; all else is refused. "
-        "`@adv` is what zenoh's advanced publishers and subscribers say to each other: losses "
-        "asked for again, the last message for those who come late."
+        "`@adv` keys carry what zenoh's advanced publishers send again."
     )
     return page("Access to the link", intro, "\n".join(rows))
 
@@ -125,16 +151,22 @@ def _keys_below(keys: Keys, expressions: Iterable[str]) -> str:
     return ", ".join(f"`{each.removeprefix(keys.root + '/')}`" for each in expressions)
 
 
-def _default(key: KeyText) -> str:
-    match key.default:
-        case _ if key.needed:
-            return "; needed"
-        case None | []:
-            return ""
-        case bool():
-            return f"; `{str(key.default).lower()}`"
-        case _:
-            return f"; `{key.default}`"
+def _brackets(key: KeyText, *, below: bool) -> str:
+    """Return default, type and limits of a key; ``below``: it is a table with its own section."""
+    if below:
+        return " (table, below)"
+    if key.needed:
+        return f" ({key.type}; required)"
+    if key.default is None or key.default == []:
+        return f" ({key.type})"
+    if isinstance(key.default, bool):
+        return f" (`{str(key.default).lower()}`)"
+    default = f"`{key.default}`"
+    if key.type.startswith("`"):
+        others = [value for value in key.type.split(", ") if value != default]
+        return f" ({' or '.join([default, *others])})"
+    limits = re.sub(r"^(number|integer|string)\b *", "", key.type)
+    return f" ({'; '.join(filter(None, (default, limits)))})"
 
 
 # --- the command line
@@ -153,22 +185,44 @@ def commands() -> str:
     parsers = dict(_below(action)) | others
     leaves = {name: list(_leaves(parser)) for name, parser in parsers.items()}
     shared = _shared_groups([leaf for each in leaves.values() for leaf in each])
+    repeated = _repeated_rows(leaves.values(), shared)
     parts = [
-        "`--help` gives more detail and examples. What a usage shows without "
-        "brackets is required. Exit status: 0 done; 2 wrong command line or unusable input; 130 "
-        f"interrupted; others at each command. INSTRUMENT is an {offline_arguments.INSTRUMENT}.",
-        "Earlier names work until version 1.0, with a hint that names the new one: "
-        f"{', '.join(OLD_WORDS)}.",
+        "`--help` of each command has examples. What a usage shows without brackets is required. "
+        "Exit status: 0 done; 2 wrong command line or unusable input; 130 interrupted; others at "
+        f"each command. INSTRUMENT is an {offline_arguments.INSTRUMENT}.",
+        f"Names that work until version 1.0, with a hint at the new one: {', '.join(OLD_WORDS)}.",
+        "## Options of several commands",
     ]
     for title, group in shared.items():
         parts += [f"**{title[:1].upper()}{title[1:]}** {_TAKEN_BY[title]}:"]
         parts += [_block([], dict(map(_row, group)).items())]
+    parts += ["**Other options** of the commands whose usage names them:", _block([], repeated)]
     for name, parser in parsers.items():
         parts += (
             [f"## {HEADINGS[name][:1].upper()}{HEADINGS[name][1:]}"] if name in HEADINGS else []
         )
-        parts += [f"### pyrcal {name}", *_describe(parser, leaves[name], shared)]
+        parts += [f"### pyrcal {name}", *_describe(parser, leaves[name], shared, repeated)]
     return page("The command line", *parts)
+
+
+def _repeated_rows(
+    commands: Iterable[Iterable[OneLineParser]], shared: Mapping[str, Group]
+) -> list[Row]:
+    """Return the options that two commands or more explain in the same words."""
+    hidden = {_row(action) for group in shared.values() for action in group}
+    count = Counter(
+        row
+        for leaves in commands
+        for row in {
+            _row(action)
+            for leaf in leaves
+            if leaf.prog not in _WITH_A_MANUAL
+            for action in leaf.shown_actions()
+            if action.option_strings and not action.required
+        }
+        if row not in hidden
+    )
+    return sorted(row for row, n in count.items() if n > 1)
 
 
 Group = list[argparse.Action]
@@ -184,7 +238,10 @@ _TAKEN_BY = {
 
 
 def _describe(
-    parser: OneLineParser, leaves: list[OneLineParser], shared: Mapping[str, Group]
+    parser: OneLineParser,
+    leaves: list[OneLineParser],
+    shared: Mapping[str, Group],
+    repeated: Collection[Row],
 ) -> Iterator[str]:
     """Yield purpose, usage and options of a command, or of all commands of a group."""
     alone = leaves == [parser]
@@ -195,8 +252,13 @@ def _describe(
         return
     usages = [list(leaf.usage_parts(shared, short=alone)) for leaf in leaves]
     hidden = {_row(action) for group in shared.values() for action in group} | {_INSTRUMENT}
-    rows = (_row(action) for leaf in leaves for action in leaf.shown_actions())
-    own = dict.fromkeys(row for row in rows if row not in hidden)
+    rows = [_row(action) for leaf in leaves for action in leaf.shown_actions()]
+    own = [
+        row for row in dict.fromkeys(rows) if row[1] and row not in hidden and row not in repeated
+    ]
+    others = [word.split()[0] for word, text in rows if alone and (word, text) in repeated]
+    if others:
+        own.append(("and", ", ".join(others)))
     if own or usages != [[parser.prog]]:
         yield _block(usages, own)
     status = " ".join((parser.epilog or "").split()).partition("Exit status: ")[2].partition(".")[0]
@@ -285,33 +347,23 @@ def rest(described: Schema) -> str:
 # --- alarms
 
 
-def _sentence(text: str) -> str:
-    """Return a text that begins with a capital and ends with a full stop."""
-    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
-
-
 def runbook(acts: Mapping[str, str]) -> str:
     """Return docs/operate/runbook.md: what to do about each alarm; ``acts``: what it may forbid."""
     parts = [
-        "An alarm lasts as long as its cause. The page, `pyrcal alarms list` and "
-        "[the metrics](monitoring.md) show it; its text has the numbers. *Critical*: the loop is "
-        "in danger, or its telemetry cannot be used. *Serious*: the service does less than it "
-        "should. *Warning*: it does its work.",
+        "An alarm lasts as long as its cause; its text on the page and in `pyrcal alarms list` has "
+        "the numbers. *Critical*: the loop is in danger, or its telemetry cannot be used. "
+        "*Serious*: the service does less than it should. *Warning*: it does its work.",
         "## What an alarm may forbid",
-        "Each alarm names what it `blocks`, as a rule of your own does.",
+        "Each alarm names what it `blocks`, as a rule of your own does:",
         listed((f"`{act}`", text) for act, text in acts.items()),
     ]
     for name, kind in ALARMS.items():
         blocks = [f"`{act}`" for act in acts if act in kind.blocks]
         head = kind.severity.value.capitalize()
+        notes = [f"Blocks {', '.join(blocks)}."] if blocks else []
         if kind.responsible:
             who = kind.responsible.value
-            head += f"; the {'RTC' if who == 'rtc' else who} can end it"
-        if blocks:
-            head += f"; blocks {', '.join(blocks)}"
-        parts += [
-            f"## {name}",
-            f"*{head}.* {_sentence(kind.means)}",
-            f"**Do**: {_sentence(kind.do)}",
-        ]
+            notes += [f"The {'RTC' if who == 'rtc' else who} can end it."]
+        parts += [f"## {name}", " ".join([f"*{head}.* {kind.means}", *notes])]
+        parts += [f"**Do**: {kind.do}"]
     return page("Runbook: what to do about an alarm", *parts)

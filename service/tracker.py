@@ -127,7 +127,7 @@ def _advance(context: StepContext, event: Event) -> None:
 
 
 def _on_tick(context: StepContext, _: ev.Tick) -> None:
-    """Update what depends on time alone: silence of the RTC, age of α, alarms."""
+    """Update what depends on time: silence of the RTC, age of α, alarms."""
     rtc.on_tick(context)
     validity.age_registration(context)
     operator.close_again(context)
@@ -139,7 +139,7 @@ def _on_log_event(context: StepContext, event: ev.LogEvent) -> None:
 
 
 def _on_condition(context: StepContext, event: ev.ConditionChanged) -> None:
-    """Raise or end the alarm of a condition; stop a dither that the mirror does not follow."""
+    """Raise or end an alarm; stop a dither that the mirror does not follow."""
     if event.over:
         validity.end_alarm(context, event.name, event.t_ns_utc)
     elif event.name == alarms.MIRROR_SILENT:
@@ -149,7 +149,7 @@ def _on_condition(context: StepContext, event: ev.ConditionChanged) -> None:
 
 
 def _on_window(context: StepContext, event: ev.WindowFitted) -> None:
-    """Update α, the verified modes and the precision of the dither from a window."""
+    """Update α, verified modes and dither precision from a window."""
     if context.state.measuring is not None:
         window_processing.reject_window(context, measurement.MEASURING)
         return
@@ -159,7 +159,7 @@ def _on_window(context: StepContext, event: ev.WindowFitted) -> None:
 
 
 def _on_made(context: StepContext, made: ev.MatrixMade) -> None:
-    """Propose a new reconstructor, or send it if it was made for a rollback."""
+    """Propose a new reconstructor, or send it for a rollback."""
     if context.acquisition.under_way:
         reconstructors.propose(context, made.record)
     elif probation.is_way_back(context.state, made):
@@ -169,7 +169,7 @@ def _on_made(context: StepContext, made: ev.MatrixMade) -> None:
 
 
 def _on_dither_measured(context: StepContext, event: ev.DitherMeasured) -> None:
-    """Stop a dither that is measured to be stronger than requested."""
+    """Stop a dither measured stronger than requested."""
     reason = dither.check_measured_dither(context, event)
     if reason is not None:
         noisy_measurement.fail_noisy_measurement(
@@ -184,7 +184,7 @@ def _on_unusable(context: StepContext, event: ev.DitherUnusable) -> None:
 
 
 def _on_answer(context: StepContext, answered: ev.Answered) -> None:
-    """Pass the RTC's reply to the part of the tracker that sent the request."""
+    """Pass the RTC's reply to the requester."""
     reply = answered.reply
     match answered.request:
         case DitherRequest() as request:
@@ -201,7 +201,7 @@ def _on_answer(context: StepContext, answered: ev.Answered) -> None:
 
 
 def _on_failure(context: StepContext, failed: ev.JobFailed) -> None:
-    """Pass the failure of an effect to the part of the tracker that requested it."""
+    """Pass the failure of an effect to its requester."""
     match failed.effect:
         case ev.Ask(request=MeasureRequest(id=name)):
             measurement.fail_measurement(context, context.state.measurement(name), failed.text)

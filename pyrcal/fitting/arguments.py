@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pyrcal.fitting.light_rotation import Arms
 
 _memory_gb = such(float, lambda gb: gb > 0.0, "GB above 0")
-_MEMORY = "refuse at once what needs more memory; default %(default)g"
+_MEMORY = "limit of memory, default %(default)g"
 
 _ARRAY = "library for the matrix; torch and cupy use a GPU; default %(default)s"
 
@@ -124,7 +124,7 @@ def _describe_commission(commission: OneLineParser) -> None:
         words("--check-rtc FILE.json", "output of pyrcal check-rtc --json", type=Path),
         words("--fit FILE.json", "output of pyrcal fit --json", type=Path),
         words("--night DATE", "date of the evening, UTC; default the newest with measurements"),
-        words("--since TIME", "from this time on, RFC 3339"),
+        words("--since TIME", "from this time on, RFC 3339, like 2026-03-01T20:00:00Z"),
         words("--until TIME", "up to this time"),
         words(
             "--output FILE.html",
@@ -132,7 +132,7 @@ def _describe_commission(commission: OneLineParser) -> None:
             type=Path,
             default=Path("commissioning.html"),
         ),
-        words("--json", "print the criteria as JSON"),
+        words("--json", "print JSON"),
     )
     add(commission.add_argument_group(ARCHIVE), *_OF_A_FOLDER)
 
@@ -178,12 +178,12 @@ def _describe_certificates(certificates: OneLineParser) -> None:
     certificates.set_defaults(module="pyrcal.maintenance.certificates")
     certificates.description = (
         "Make an authority, a certificate for each role on the link (service, rtc, viewer), and "
-        "settings that use them. In a folder that has an authority, that authority signs new "
-        "certificates. docs/operate/link.md says where each file belongs."
+        "settings that use them. An authority in the folder is used again. docs/operate/link.md "
+        "says where each file belongs."
     )
     certificates.epilog = "Exit status: 0 done; 2 it cannot be done."
     actions = certificates.add_subparsers(dest="action", required=True, metavar="COMMAND")
-    hosts = "names or addresses of the service, separated by commas; default %(default)s"
+    hosts = "names or addresses of the service; default %(default)s"
     for action, purpose, more in (
         (
             "new",
@@ -227,7 +227,7 @@ INSTRUMENT = "instrument file (TOML) or a packaged name"
 _INSTRUMENT = words("instrument INSTRUMENT", INSTRUMENT)
 
 _OF_AN_ANSWER = (
-    words("--json", "print one JSON object, not a table"),
+    words("--json", "print JSON"),
     words("--plot FILE.png", "write the figures", type=Path),
     words("--output FILE.h5", "write all results", type=Path),
     words("--threads N", "default: one for each core", type=_count, default=os.cpu_count() or 1),
@@ -248,9 +248,9 @@ def _describe_fit(fit: OneLineParser) -> None:
     )
     modes = "basis indices to use, like 0:400 (end excluded) or 3,5,9; default all"
     start = "start of the fit: subapertures, degrees, ratio"
-    flux = "illumination: counts of the four pupil images, array flux (4, n, n)"
-    reference = "earlier flux map: report the rotation of the illumination since then"
-    arms = "spider arms: report the rotation of their shadows in the flux map"
+    flux = "counts of the four pupil images, array flux (4, n, n)"
+    reference = "earlier flux map; reports the rotation of the illumination"
+    arms = "spider arms; reports the rotation of their shadows"
     add(
         fit,
         _INSTRUMENT,
@@ -271,7 +271,7 @@ def _describe_fit(fit: OneLineParser) -> None:
         words("--gain-map", "also fit a smooth gain over the pupil"),
         words(
             "--gain G",
-            "integrator gain for the stability check of the reconstructor, default %(default)g",
+            "integrator gain for the stability check, default %(default)g",
             type=float,
             default=0.5,
         ),
@@ -284,8 +284,8 @@ def _describe_fit(fit: OneLineParser) -> None:
 
 _FIT_SYSTEM = """
 Estimate the position of each sensor, mirror and star of a system from the measured interaction
-matrix of each sensor with each mirror. Each pair is fitted as by pyrcal fit; the positions follow
-by weighted least squares. Directions that no pair observes are listed.
+matrix of each sensor with each mirror. Each pair is fitted as by pyrcal fit. Directions that no
+pair observes are listed.
 """
 
 _FIT_SYSTEM_EPILOG = """
@@ -298,10 +298,7 @@ def _describe_fit_system(fit: OneLineParser) -> None:
     fit.set_defaults(module="pyrcal.fitting.fit_system")
     fit.description, fit.epilog = _FIT_SYSTEM, _FIT_SYSTEM_EPILOG
     fit.examples = ("pyrcal fit-system system.toml matrices.h5 --json",)
-    reference = (
-        "the matrices: one HDF5 file, or one file for each pair, with {sensor} and {mirror} in "
-        "place of their names"
-    )
+    reference = "one HDF5 file, or one for each pair, with {sensor} and {mirror} in its name"
     dataset = "dataset of each matrix; default {sensor}/{mirror}/interaction_matrix in one file"
     add(
         fit,
@@ -329,7 +326,7 @@ def _describe_reconstruct(make: OneLineParser) -> None:
         "turbulence as priors"
     )
     noise = "of map: 1 sigma of one slope in one frame, default %(default)g"
-    gains = "use the columns of the model; by default they are multiplied by the fitted gains"
+    gains = "do not multiply the columns by the fitted gains"
     condition = words(
         "--max-condition C",
         "of svd: largest condition number, default %(default)g",
@@ -352,7 +349,7 @@ def _describe_reconstruct(make: OneLineParser) -> None:
         words("--reference FILE", "measured matrix, whose checksum is recorded", type=Path),
         words(
             "--specula PUPDATA.fits",
-            "also write Intmat and Recmat of SPECULA, in the order of its PupData or SubapData",
+            "also write Intmat and Recmat of SPECULA, in the order of this file",
             type=Path,
         ),
     )
@@ -411,8 +408,7 @@ def _describe_import(bring: OneLineParser) -> None:
     bring.set_defaults(module="pyrcal.importers.program")
     bring.description = (
         "Write an instrument file and a measured matrix for pyrcal fit from files of another code. "
-        "Parameters that neither files nor options contain are marked unknown. docs/integrate "
-        "explains each code."
+        "Missing parameters are marked unknown. docs/howto/importing.md explains each code."
     )
     bring.epilog = "Exit status: 0 written; 2 input that cannot be used."
     folder = words("--output DIR", "new folder for both files", type=Path, required=True)
@@ -426,7 +422,7 @@ def _describe_import(bring: OneLineParser) -> None:
     named = words("files [ROLE=]FILE", roles, type=_role_and_path, nargs="+")
     described = words(
         "--instrument NAME|FILE",
-        "packaged instrument or instrument file that describes telescope, sensor and mirror",
+        "description of telescope, sensor and mirror",
     )
     basis = words(
         "--basis BASIS",

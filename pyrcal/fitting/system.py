@@ -64,7 +64,7 @@ class PlacedMirror:
     """Instrument file with the actuators and modes."""
 
     altitude_m: float
-    """Conjugate altitude above the pupil along the line of sight, metres."""
+    """Conjugate altitude along the line of sight."""
 
     place: Similarity
     """Transform from the nominal mirror geometry to the plane at its altitude, lengths in metres.

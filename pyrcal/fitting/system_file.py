@@ -33,43 +33,42 @@ class PlaceTable(Table):
     """Keys common to sensors and mirrors: a name, an instrument file, a nominal position."""
 
     name: Id
-    """Name of the sensor or mirror, in results and in the names of matrices."""
+    """Name in results and in the names of matrices."""
 
     instrument: str | None = None
-    """Its instrument file, relative to this one, or a packaged name; None for that of [system]."""
+    """Instrument file, relative to this one, or packaged name; None: that of ``[system]``."""
 
     rotation_deg: float | None = None
-    """Nominal rotation from +x towards +y, degrees; None for 0, or for a mirror the value of its
-    instrument file."""
+    """Nominal rotation; None: 0, or that of a mirror's instrument file."""
 
     magnification: Positive = 1.0
     """Nominal magnification."""
 
     fixed: bool = False
-    """True if the nominal position is exact: a reference for the others."""
+    """True if the nominal position is exact, as a reference for others."""
 
 
 class SensorTable(PlaceTable):
     """``[[sensors]]``: one sensor and its star."""
 
     star_arcsec: tuple[float, float] = (0.0, 0.0)
-    """Direction of its guide star, x and y in the pupil's axes, arcseconds off the axis."""
+    """Direction of its guide star, x and y in the pupil's axes."""
 
     star_height_m: Positive | Literal["infinity"] = "infinity"
-    """Height of a laser star above the pupil, along the line of sight."""
+    """Height of a laser star, along the line of sight."""
 
     shift_subap: tuple[float, float] = (0.0, 0.0)
-    """Nominal position of the pupil's centre on the sensor's grid, subapertures."""
+    """Nominal position of the pupil's centre on the sensor's grid."""
 
 
 class MirrorTable(PlaceTable):
     """``[[mirrors]]``: one mirror."""
 
     altitude_m: float = 0.0
-    """Conjugate altitude above the pupil along the line of sight, metres."""
+    """Conjugate altitude along the line of sight."""
 
     shift_m: tuple[float, float] = (0.0, 0.0)
-    """Nominal position of the mirror's centre, metres at its altitude."""
+    """Nominal position of the mirror's centre at its altitude."""
 
 
 class AboutTable(Table):
@@ -80,7 +79,7 @@ class AboutTable(Table):
     """Instrument file of sensors and mirrors that name none."""
 
     stars: Literal["known", "direction", "direction and height"] = "known"
-    """Unknown properties of the stars that are fitted together with sensors and mirrors."""
+    """Properties of the stars that are fitted, too."""
 
 
 class SystemFile(Table):

@@ -37,7 +37,7 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
         words("instrument INSTRUMENT", INSTRUMENT),
         words("telemetry TELEMETRY", "recording, AOT, pyRTC session, HDF5 or .npz", type=Path),
         words("--config FILE", "settings of the service, TOML", type=Path),
-        words("--json", "print one JSON object, not a table"),
+        words("--json", "print JSON"),
         words("--plot FILE.png", "draw alpha over time", type=Path),
         words("--output FILE.h5", "write all results", type=Path),
     )

@@ -39,32 +39,32 @@ class TlsTable(Table):
     """``[zenoh.tls]``: certificates that every program must have to connect."""
 
     ca: Path
-    """Certificate of the authority that has signed all others, PEM."""
+    """Certificate of the authority, PEM."""
 
     certificate: Path
-    """This program's own, PEM."""
+    """Certificate of the service, PEM."""
 
     key: Path
-    """Its private key, PEM; no other user may read the file."""
+    """Private key, PEM; no other user may read the file."""
 
     watched: tuple[Path, ...] = ()
-    """Certificates of other programs, like the RTC's, whose end is to be foreseen, too."""
+    """Certificates of other programs, such as the RTC, to warn of, too."""
 
     warn_days: float = Field(default=30.0, ge=0.0, le=1000.0)
-    """So many days before a certificate ends there is an alarm."""
+    """Days before the end of a certificate at which an alarm begins."""
 
 
 class UsersTable(Table):
     """``[zenoh.users]``: names and passwords; on loopback they may replace certificates."""
 
     name: str = Field(min_length=1, pattern="^[^:]+$")
-    """This program's own name."""
+    """Name of the service."""
 
     password_file: Path
-    """File whose first line is its password; no other user may read it."""
+    """File with its password; no other user may read it."""
 
     file: Path | None = None
-    """Lines ``NAME:PASSWORD`` of all who may connect, for a service with its own router."""
+    """File of lines ``NAME:PASSWORD`` of all that may connect, for the embedded router."""
 
 
 class AccessTable(Table):
@@ -77,10 +77,10 @@ class AccessTable(Table):
     """Send telemetry and acknowledgements, answer commands."""
 
     service: Names = ("service",)
-    """Command, send matrices: other services, ``pyrcal check-rtc``."""
+    """Command and send matrices, as other services and ``pyrcal check-rtc`` do."""
 
     viewer: Names = ("viewer",)
-    """Read state, alarms, statuses and published matrices, and do nothing else."""
+    """Read state, alarms, statuses and published matrices only."""
 
     @model_validator(mode="after")
     def _one_role_for_each_name(self) -> AccessTable:
@@ -92,43 +92,43 @@ class AccessTable(Table):
 
 
 class SigningTable(Table):
-    """``[zenoh.signing]``: signatures of service and RTC, in case the router is not trusted."""
+    """``[zenoh.signing]``: signatures of service and RTC, if the router is not trusted."""
 
     key_file: Path
-    """File whose first line is the shared secret; no other user may read it."""
+    """File with the shared secret; no other user may read it."""
 
 
 class CredentialsTable(Table):
     """``[zenoh]`` of a program that only connects: who it is, and whom it trusts."""
 
     tls: TlsTable | None = None
-    """Certificates. Without them anybody who reaches the port may put a matrix on the mirror."""
+    """Certificates; None: anybody who reaches the port can put a matrix on the mirror."""
 
     users: UsersTable | None = None
-    """Names and passwords; without them none are required."""
+    """Names and passwords; None: not required."""
 
     signing: SigningTable | None = None
-    """Shared secret; without it nothing is signed, and no signature is required."""
+    """Shared secret; None: messages are not signed."""
 
 
 class ZenohTable(CredentialsTable):
-    """``[zenoh]``: the way to the RTC."""
+    """``[zenoh]``: link to the RTC."""
 
     listen: tuple[str, ...] = (DEFAULT_ENDPOINT,)
-    """Endpoints the embedded router listens on."""
+    """Endpoints on which the embedded router listens."""
 
     connect: tuple[str, ...] = ()
-    """Endpoints of an observatory's own routers; not empty: no router is embedded."""
+    """Endpoints of an observatory's routers, instead of the embedded one."""
 
     chunk_bytes: int = Field(default=4_000_000, ge=1024, le=4_000_000)
-    """Size of a reconstructor's chunks; a default build of zenoh-pico drops more than 4 KB."""
+    """Size of a reconstructor's chunks; zenoh-pico drops more than 4 KB by default."""
 
     access: AccessTable = Field(default_factory=AccessTable)
     """Roles of the names in certificates or users."""
 
     anyone_may_command_the_mirror: bool = False
-    """Accept that anybody who reaches ``listen`` can put a matrix on the mirror. Without
-    ``[zenoh.tls]`` any address but loopback is otherwise refused."""
+    """Accept addresses other than loopback without ``[zenoh.tls]``: anybody who reaches them can
+    put a matrix on the mirror."""
 
     @model_validator(mode="after")
     def _with_certificates_no_way_around_them(self) -> ZenohTable:

@@ -25,30 +25,29 @@ Positive = Annotated[float, Field(gt=0.0)]
 
 
 class ServiceTable(Table):
-    """``[service]``: the service as a whole."""
+    """``[service]``: general."""
 
     instrument: str = Field(default="flao-lbt", min_length=1)
-    """Packaged name, or path of the instrument file."""
+    """Packaged name, or path of an instrument file."""
 
     system: Id | None = None
-    """The ``{system}`` of the wire; None: the instrument's name."""
+    """``{system}`` of the contract's keys; None: the instrument's name."""
 
     mode: Literal["auto", "propose", "hold"] = "propose"
     """Mode at the start."""
 
     data_dir: Path = Path("var")
-    """Folder of products, index and audit trail."""
+    """Folder of matrices, index and audit trail."""
 
     cache_dir: Path | None = None
-    """Folder of cached computations; may be deleted at any time. None: ``pyrcal`` in the user's
-    cache folder."""
+    """Folder of cached computations, which may be deleted; None: ``pyrcal`` in the user's cache."""
 
     log_format: Literal["auto", "text", "json"] = "auto"
-    """Format of the log; "auto": text on a terminal, else JSON."""
+    """Format of the log; auto: text on a terminal, else JSON."""
 
 
 class ApiTable(Table):
-    """``[api]``: REST and dashboard."""
+    """``[api]``: REST and the page."""
 
     host: str = Field(default="127.0.0.1", min_length=1)
     """Address to listen on."""
@@ -57,52 +56,50 @@ class ApiTable(Table):
     """TCP port; 0: any free one."""
 
     allowed_hosts: tuple[str, ...] = ()
-    """Names under which it may be asked besides loopback and ``host``, without a port: the
-    machine's, or a proxy's."""
+    """Names that requests may use besides loopback and ``host``, without a port."""
 
     trusted_proxies: tuple[Network, ...] = ()
-    """Addresses and networks of proxies whose ``X-Forwarded-For`` and ``X-Forwarded-Proto`` are
-    used; those of others are ignored."""
+    """Addresses and networks of proxies whose ``X-Forwarded-For`` and ``-Proto`` are used."""
 
 
 class DitherTable(Table):
-    """``[dither]``: the small signal that measures α."""
+    """``[dither]``: the small modulation that measures α."""
 
     enabled: bool = True
-    """Dither without being asked."""
+    """Dither without an order."""
 
     budget_m: float = Field(default=8e-9, gt=0.0, le=2e-7)
-    """Largest RMS of all modes together on the mirror, metres OPD."""
+    """Largest RMS of all modes together, OPD."""
 
     sigma_shift_subap: Positive = 0.01
-    """1 σ of each shift to keep, subapertures."""
+    """1 σ of each shift to keep."""
 
     sigma_rotation_deg: Positive = 0.02
-    """1 σ of the rotation, degrees."""
+    """1 σ of the rotation."""
 
     sigma_magnification: Positive = 0.001
     """1 σ of the magnification."""
 
     longest_pause_s: float = Field(default=0.0, ge=0.0, le=3600.0)
-    """Longest pause between two windows, seconds; a jump may go unseen as long."""
+    """Longest pause between two windows, during which a jump is not seen."""
 
     amplitude_m: float | None = Field(default=None, gt=0.0, le=1e-7)
-    """RMS of each mode, metres OPD; None: the service chooses, within the budget."""
+    """RMS of each mode, OPD; None: as the precision requires, within the budget."""
 
     modes: tuple[Annotated[int, Field(ge=0)], ...] | None = None
-    """0-based basis indices; None: four the loop does not control."""
+    """0-based basis indices; None: four that the loop does not control."""
 
     frequencies_hz: tuple[Positive, ...] | None = None
-    """One for each mode; None: spread over 0.2-0.35 of the frame rate."""
+    """One for each mode; None: 0.2 to 0.35 of the frame rate."""
 
     avoid_hz: tuple[Positive, ...] = ()
     """Vibrations to avoid, besides those found in the slopes."""
 
     window_s: float = Field(default=2.0, ge=0.1, le=60.0)
-    """Shortest window, seconds."""
+    """Shortest window."""
 
     longest_window_s: float = Field(default=20.0, ge=0.1, le=300.0)
-    """Longest window, seconds; faint stars and small budgets need long ones."""
+    """Longest window, for faint stars and small budgets."""
 
     @model_validator(mode="after")
     def _one_frequency_for_each_mode(self) -> DitherTable:
@@ -127,111 +124,108 @@ class DitherTable(Table):
 
 
 class TrackingTable(Table):
-    """``[tracking]``: drift of α, and errors of the model."""
+    """``[tracking]``: drift of α and errors of the model."""
 
     drift_subap_per_minute: Positive = 0.05
-    """Random walk of each shift, 1 σ after a minute, subapertures."""
+    """Random walk of each shift, 1 σ after a minute."""
 
     drift_deg_per_minute: Positive = 0.05
-    """Drift of the rotation, degrees."""
+    """Drift of the rotation."""
 
     drift_magnification_per_minute: Positive = 0.0005
     """Drift of the magnification."""
 
     floor_shift_subap: float | None = Field(default=None, ge=0.0)
-    """1 σ model error of each shift, subapertures. None: as measured."""
+    """Model error of each shift, 1 σ; None: as measured, larger for a coarse mirror."""
 
     floor_rotation_deg: float | None = Field(default=None, ge=0.0)
-    """Model error of the rotation, degrees. None for the measured value, larger for a coarse
-    mirror."""
+    """Model error of the rotation."""
 
     floor_magnification: float | None = Field(default=None, ge=0.0)
-    """Model error of the magnification. None for the measured value, larger for a coarse mirror."""
+    """Model error of the magnification."""
 
     anamorphosis: bool = False
-    """Track the anamorphosis of the mirror's image as well; otherwise it is that of the instrument
-    file. The four parameters are slightly less certain until some windows have measured it."""
+    """Track the anamorphosis, too; otherwise it is that of the instrument file."""
 
     bias_memory_s: Positive = 3600.0
-    """Time in which the learnt bias of the passive estimate decays to 1/e, seconds."""
+    """Time in which the learnt bias of the passive estimate decays to 1/e."""
 
     flexure_subap_per_degree: float = Field(default=0.02, ge=0.0)
-    """Shift per degree of elevation, 1 σ, subapertures."""
+    """Shift per degree of elevation, 1 σ."""
 
     flexure_deg_per_degree: float = Field(default=0.01, ge=0.0)
-    """Rotation per degree of elevation, 1 σ, degrees."""
+    """Flexure of the rotation."""
 
     flexure_magnification_per_degree: float = Field(default=1e-4, ge=0.0)
-    """Magnification per degree of elevation, 1 σ."""
+    """Flexure of the magnification."""
 
     slew_limit_deg: Positive = 5.0
-    """α is invalid when the telescope has moved further since the last window, degrees."""
+    """Motion of the telescope after which α is invalid until the next window."""
 
     stale_shift_subap: Positive | None = None
-    """α is stale from this 1 σ of a shift on, subapertures, beyond the model error. None: 0.05 for
-    500 modes on 30 subapertures, more for fewer modes."""
+    """1 σ of a shift, beyond the model error, from which α is stale; None: 0.05 for 500 modes on
+    30 subapertures, more for fewer modes."""
 
     stale_rotation_deg: Positive | None = None
-    """1 σ of the rotation, degrees. None for 0.1 with 500 modes, more with fewer."""
+    """1 σ of the rotation; None: 0.1 for 500 modes."""
 
     stale_magnification: Positive | None = None
-    """1 σ of the magnification. None for 0.003 with 500 modes, more with fewer."""
+    """1 σ of the magnification; None: 0.003 for 500 modes."""
 
 
 class AcquisitionTable(Table):
-    """``[acquisition]``: finding α from nothing."""
+    """``[acquisition]``: estimation of an unknown α."""
 
     auto: bool = True
-    """Begin by itself, in mode auto, when the loop diverges or α is out of range."""
+    """Begin without an order, in mode auto, when the loop diverges or α is out of range."""
 
     amplitude_m: float = Field(default=50e-9, gt=0.0, le=2e-7)
-    """RMS of each of up to eight modes dithered meanwhile, metres OPD, as far as the RTC allows;
-    the budget is that of a closed loop."""
+    """RMS of each of up to eight modes, OPD, if the RTC allows it; not limited by the budget."""
 
 
 class ControlTable(Table):
-    """``[control]``: making reconstructors."""
+    """``[control]``: reconstructors."""
 
     n_modes_target: int = Field(default=500, ge=1)
     """Modes to control."""
 
     pole_radius_bound: float = Field(default=0.95, gt=0.0, lt=1.0)
-    """Largest closed-loop pole radius, anywhere in α ± 3σ."""
+    """Largest pole radius of the closed loop within α ± 3σ."""
 
     method: Literal["svd", "map"] = "svd"
-    """Inversion: "svd", or "map", which weighs noise and turbulence."""
+    """Inversion; map weighs noise and turbulence."""
 
     max_condition: float = Field(default=100.0, gt=1.0)
-    """svd: singular values below the largest over this are left out."""
+    """svd: largest over smallest singular value used."""
 
     slope_noise: Positive = 0.05
-    """map: 1 sigma of one slope in one frame; the turbulence is the instrument's ``[modes]``."""
+    """map: 1 σ of one slope in one frame; the turbulence is that of ``[modes]``."""
 
     update_gain_nm: Positive = 0.5
-    """Gain in wavefront error that makes a new reconstructor worthwhile, nanometres."""
+    """Gain in wavefront error that justifies a new reconstructor."""
 
     update_margin: float = Field(default=0.08, gt=0.0, lt=1.0)
-    """Gain in stability margin that does, as a share of the new one's."""
+    """Gain in stability margin that does, as a share of the new margin."""
 
     update_shift_subap: Positive | None = None
-    """A new reconstructor at this change of a shift, whatever it wins, subapertures. None: 0.08 for
-    500 modes on 30 subapertures, more for fewer modes."""
+    """Change of a shift that does in any case; None: 0.08 for 500 modes on 30 subapertures, more
+    for fewer modes."""
 
     update_rotation_deg: Positive | None = None
-    """Change of the rotation, degrees. None for 0.08 with 500 modes, more with fewer."""
+    """Change of the rotation; None: 0.08 for 500 modes."""
 
     update_magnification: Positive | None = None
-    """Change of the magnification. None for 0.005 with 500 modes, more with fewer."""
+    """Change of the magnification; None: 0.005 for 500 modes."""
 
     wind_m_s: Positive = 15.0
-    """Wind for the expected loss, metres per second."""
+    """Wind for the expected wavefront error."""
 
     minimum_interval_s: float = Field(default=5.0, ge=0.0)
-    """Shortest time between two reconstructors, seconds."""
+    """Shortest time between two reconstructors."""
 
     open_lost_loop: bool | None = None
-    """Ask the RTC to open a loop that is lost with a matrix just applied, where going
-    back to the one before does not help; left out: if the mode was auto when it was applied."""
+    """Have a loop opened that a new matrix has lost and the previous one does not restore; None:
+    only in mode auto."""
 
 
 Size = Annotated[float, Field(ge=0.0)]
@@ -242,26 +236,26 @@ FourAxes = tuple[Size, Size, Size, Size]
 class OffloadTable(Table):
     """``[offload]``: correction by moving the mirror's image, with a lens or a stage, in mode auto.
 
-    Four values are shift x, shift y (subapertures), rotation (degrees), magnification.
+    The four values: shift x and y (subapertures), rotation (degrees), magnification.
     """
 
     enabled: bool = False
-    """Ask for moves."""
+    """Request moves."""
 
     gain: float = Field(default=0.8, gt=0.0, le=1.0)
-    """Fraction of the distance to the nominal registration that is requested at once."""
+    """Share of the distance to the nominal registration requested at once."""
 
     dead_band: FourAxes = (0.015, 0.015, 0.015, 0.002)
-    """Distance below which nothing is requested."""
+    """Largest distance without a request."""
 
     most_step: FourAxes = (0.1, 0.1, 0.2, 0.005)
     """Largest single move."""
 
     reach: FourAxes = (1.0, 1.0, 1.0, 0.02)
-    """Largest sum of all moves, either way, across restarts; 0: cannot be moved."""
+    """Largest sum of all moves, across restarts; 0: cannot be moved."""
 
     settle_s: float = Field(default=3.0, ge=0.0, le=50.0)
-    """Time from the reply until the image is at rest, unless the reply states it, seconds."""
+    """Time from the reply until the image is at rest, unless the reply states it."""
 
 
 class ComputeTable(Table):
@@ -271,94 +265,92 @@ class ComputeTable(Table):
     """Threads of the worker process."""
 
     cluster: str | None = Field(default=None, pattern=r"^(tcp|tls)://\S+:\d+$")
-    """Dask scheduler, ``tcp://HOST:PORT``, whose workers help with D of telescopes of 70
-    subapertures and more (extra ``cluster``). None: the worker computes alone."""
+    """Dask scheduler, ``tcp://HOST:PORT``, whose workers help with D from 70 subapertures on
+    (extra ``cluster``)."""
 
     array: ArrayLibrary = ArrayLibrary.NUMPY
-    """Library that computes a pyramid's rows of D: ``"torch"`` and ``"cupy"`` use a GPU where there
-    is one (extra ``array``, and the library itself)."""
+    """Library that computes a pyramid's rows of D; torch and cupy use a GPU (extra ``array``)."""
 
     nice: int = Field(default=10, ge=0, le=19)
     """Niceness of the worker."""
 
     pupil_sampling: int = Field(default=3, ge=1, le=16)
-    """Pupil points per subaperture (q of the model)."""
+    """Pupil points per subaperture."""
 
     detector_nodes: int = Field(default=3, ge=1, le=16)
-    """Quadrature nodes per detector pixel and axis (nd of the model)."""
+    """Quadrature nodes per detector pixel and axis."""
 
     memory_gb: Positive = 6.0
-    """Memory that modes, D and its derivatives may take, GB: an instrument that needs more is
-    refused before it is begun. A sensor keeps its own gradient within a quarter of it."""
+    """Memory for modes, D and its derivatives; an instrument that needs more is refused."""
 
     working_point_modes: int | None = Field(default=None, ge=1)
-    """Use the response around the residual of a loop of this many modes at the instrument's r0:
-    less biased on sky, and slower. None: around a flat wavefront."""
+    """Modes of the loop around whose residual the response is computed, which is slower and less
+    biased on sky; None: around a flat wavefront."""
 
 
 class FitsTable(Table):
-    """``[fits]``: fits of uploaded matrices (``POST /v1/fits``)."""
+    """``[fits]``: fits of uploaded matrices."""
 
     upload_limit_mb: int = Field(default=512, ge=1, le=100_000)
-    """Largest upload, megabytes; a zip archive must stay below it unpacked, too."""
+    """Largest upload, also unpacked."""
 
     waiting: int = Field(default=4, ge=1, le=100)
     """Largest number of unfinished fits."""
 
     time_limit_s: Positive = 600.0
-    """A fit that takes longer is stopped."""
+    """Longest fit."""
 
     memory_limit_mb: int = Field(default=4000, ge=500, le=1_000_000)
-    """A fit whose process needs more is stopped, megabytes."""
+    """Largest memory of a fit."""
 
 
 class ArchiveTable(Table):
-    """``[archive]``: how long things are kept."""
+    """``[archive]``: retention."""
 
     keep_days: float = Field(default=0.0, ge=0.0)
-    """Matrices older than this are removed, but for those in use, referenced, pinned or newest. 0:
+    """Age at which matrices are removed, except those in use, referenced, pinned or newest; 0:
     never."""
 
     keep_gb: float = Field(default=100.0, ge=0.0)
-    """Largest size of all matrices, gigabytes, the oldest go first; 0: no limit."""
+    """Largest size of all matrices, of which the oldest go first; 0: no limit."""
 
     reserve_gb: float = Field(default=2.0, ge=0.0)
-    """Less free space than this raises an alarm, gigabytes."""
+    """Free space below which there is an alarm."""
 
     noon_utc_h: int = Field(default=12, ge=0, le=23)
-    """UTC hour of local noon, where one night ends and the next begins."""
+    """UTC hour of local noon, at which a night begins."""
 
     last_telemetry_s: float = Field(default=60.0, ge=0.0, le=3600.0)
-    """Telemetry held in memory for recordings that begin before now, seconds."""
+    """Telemetry kept in memory for recordings that begin in the past."""
 
     last_telemetry_mb: int = Field(default=96, ge=0, le=1_000_000)
-    """Memory for it, megabytes; 0: none is held. FLAO at 1 kHz fills 10 MB a second."""
+    """Memory for it; 0: none. FLAO at 1 kHz needs 10 MB a second."""
 
 
 Scalar = bool | float | str
 
 
 class RuleTable(Table):
-    """``[[rules]]``: operators' own alarms."""
+    """``[[rules]]``: alarms of your own."""
 
     name: Id
     """Its alarm is ``rule.NAME``."""
 
     when: tuple[str, Literal["==", "!=", "<", "<=", ">", ">="], Scalar] = Field(strict=False)
-    """Name of a value reported with ``PUT /v1/values/{name}``, or of a field such as
-    ``state.elevation_deg``; the comparison; the other value."""
+    """Name of a value (``PUT /v1/values/{name}``) or field (``state.elevation_deg``), comparison,
+    other value."""
 
     blocks: tuple[Literal["measure", "decide", "send_new", "send_known", "ask"], ...] = ()
-    """Actions that it forbids, as docs/operate/runbook.md explains."""
+    """Actions that it forbids, explained in docs/operate/runbook.md."""
 
     severity: Literal["warning", "serious", "critical"] = "serious"
     """Severity of the alarm."""
 
     text: str = Field(min_length=1, max_length=300)
-    """Text of the alarm: what is wrong and what to do, in a sentence."""
+    """Text: what is wrong and what to do."""
 
     unknown: Literal["holds", "does-not-hold"] = "holds"
-    """Result of the comparison while the value is unknown."""
+    """Result of the rule while the value is unknown."""
 
     @model_validator(mode="after")
     def _compared_with_sense(self) -> RuleTable:

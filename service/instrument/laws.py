@@ -95,26 +95,25 @@ _Magnification = Annotated[
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LawTable(Read):
-    """``[law]``: the registration as a function of the pointing, each parameter a law of its own.
+    """``[law]``: the nominal registration as a function of the pointing.
 
-    A number, an expression of `azimuth`, `elevation` (degrees, as the RTC's status or the
-    observatory reports them) and of names of the observatory's values, or a table `{ of =
-    "elevation", at = [20, 80], values = [0.1, -0.1] }` with linear interpolation. α is tracked as
-    the deviation from this. After a whole turn of azimuth each term must be the same, except for
-    whole turns of the rotation.
+    α is tracked as the deviation from it. Each parameter is a number, an expression of `azimuth`
+    and `elevation` (degrees) and of names of the observatory's values, or a table `{ of =
+    "elevation", at = [20, 80], values = [0.1, -0.1] }` with linear interpolation. A whole turn of
+    azimuth must not change it, except by whole turns of the rotation.
     """
 
     shift_x_subap: _Shift = None
-    """Subapertures; None: 0."""
+    """None: 0."""
 
     shift_y_subap: _Shift = None
-    """Subapertures; None: 0."""
+    """None: 0."""
 
     rotation_deg: _Rotation = None
-    """Degrees, as `azimuth - 12.98`; None: 0."""
+    """Such as `azimuth - 12.98`; None: 0."""
 
     magnification: _Magnification = None
-    """Ratio; None: 1."""
+    """None: 1."""
 
 
 def law_of(table: LawTable) -> PointingLaw | None:

@@ -41,18 +41,18 @@ def _signs(value: object) -> object:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class AboutTable(kinds.Telescope):
-    """``[instrument]``: the telescope as a whole."""
+    """``[instrument]``: the telescope."""
 
     name: Id
     basis_id: Id | None = None
-    """Pins the RTC's basis; None: the first seen is adopted."""
+    """Required basis of the RTC; None: the first one is adopted."""
 
     config_id: Id | None = None
-    """Pins the RTC's sensor configuration; None: the first seen is adopted."""
+    """Required sensor configuration; None: the first one is adopted."""
 
     pupil: str | None = None
-    """Map of the pupil, ``path:/dataset``, ``path.fits`` or ``path.npy`` of ``(ny, nx)``: the share
-    of each point that is lit, [y, x] in the mirror's plane, centred; None: a ring."""
+    """Map of the pupil, ``path:/dataset``, ``path.fits`` or ``path.npy`` of ``(ny, nx)``:
+    transmission, centred, in the mirror's plane; None: a ring."""
 
     pupil_pitch_m: kinds.Positive | None = None
     """Step of that map; None: ``diameter_m`` over its points."""
@@ -63,11 +63,11 @@ class MirrorTable(kinds.InfluenceShape):
     """``[mirror]``: analytic (``layout``) or measured (``modes``, ``influence_functions``)."""
 
     layout: Literal["rings", "grid", "hexagonal", "positions"] | None = None
-    """Placement of an analytic mirror's actuators."""
+    """Actuators of an analytic mirror."""
 
     pitch_m: kinds.Positive | None = None
-    """Distance between neighbours, metres; None: 0.30 for rings, measured for positions. Hexagonal:
-    rows along +x, one actuator in the middle."""
+    """Distance of neighbours; None: 0.30 for rings, measured for positions. Hexagonal rows are
+    along +x, with one actuator in the middle."""
 
     first_ring: kinds.Count = 2
     """Rings only."""
@@ -76,51 +76,50 @@ class MirrorTable(kinds.InfluenceShape):
     """Rings only."""
 
     ring_actuators: tuple[kinds.Count, ...] | None = None
-    """Rings only: number of actuators on each ring, from the inside, the first of each on +x;
-    instead of ``first_ring`` and ``last_ring``."""
+    """Rings only, instead of ``first_ring`` and ``last_ring``: actuators on each ring, from the
+    inside, the first on +x."""
 
     ring_radii_m: tuple[kinds.Positive, ...] | None = None
-    """Radius of each ring, metres; together with ``ring_actuators``."""
+    """Radius of each of these rings."""
 
     n_across: Annotated[int, Field(ge=2, le=1000)] | None = None
     """Grid only: actuators along a diameter."""
 
     diameter_m: kinds.Positive | None = None
-    """Grid and hexagonal: actuators beyond this circle do not exist."""
+    """Grid and hexagonal: diameter of the circle that contains all actuators."""
 
     hole_m: kinds.Positive | None = None
-    """Hexagonal only: diameter of a hole in the middle, where there are no actuators."""
+    """Hexagonal only: diameter of the middle without actuators."""
 
     position_error_pitch: Annotated[float, Field(ge=0.0, le=0.2)] | None = None
-    """RMS error of an actuator's position along each axis, in pitches, which sigma of a fit covers;
+    """RMS error of actuator positions along each axis, in pitches, that is part of σ of a fit;
     None: 0.02."""
 
     segments_deg: tuple[float, ...] = ()
-    """Direction of each gap between segments from the centre outwards, degrees from +x towards +y;
-    Gaussian influence only. No function crosses a gap, no actuator of a grid is on one, and KL
-    modes exclude the differential pistons of the segments."""
+    """Gaussian influence only: direction of each gap between segments outwards, from +x towards +y.
+    No influence function crosses a gap, no actuator of a grid is on one, and KL modes contain no
+    differential piston."""
 
     positions: str | None = None
-    """Positions only: ``path:/dataset`` of ``(n_actuators, 2)``, x and y in metres."""
+    """Positions only: ``path:/dataset`` of ``(n_actuators, 2)``, x and y, metres."""
 
     mode_to_actuator: str | None = None
-    """``path:/dataset`` of the user's modes, ``(n_actuators, n_modes)``."""
+    """``path:/dataset`` of your own modes, ``(n_actuators, n_modes)``."""
 
     basis: kinds.BasisKind = kinds.BasisKind.KARHUNEN_LOEVE
     """Modes of an analytic mirror without ``mode_to_actuator``."""
 
     nominal_rotation_deg: float | None = None
-    """Rotation at which a fit starts; None to find it from tip and tilt."""
+    """Rotation at which a fit starts; None: found from tip and tilt."""
 
     nominal_anamorphosis: tuple[Stretch, Stretch] | None = None
-    """Stretch of the mirror's turned image along the sensor's x over the mean of both axes, ratio
-    less 1, and along 45 deg: where a fit starts; None: 0."""
+    """Anamorphosis (a0, a45) at which a fit starts; None: 0."""
 
     parity: Sign | None = None
-    """-1: the mirror is seen from behind; None: found from tip and tilt."""
+    """-1: mirrored image; None: found from tip and tilt."""
 
     stroke: Literal["known", "unknown"] = "known"
-    """"unknown": only shapes are compared."""
+    """unknown: only shapes are compared."""
 
     modes: str | None = None
     """``path:/dataset`` of measured modes, ``(n_modes, ny, nx)``."""
@@ -129,16 +128,15 @@ class MirrorTable(kinds.InfluenceShape):
     """Grid step of the measured modes."""
 
     modes_kind: Literal["opd", "surface"] = "opd"
-    """Meaning of the user's modes: OPD, or surface."""
+    """Quantity of your own modes."""
 
     influence_functions: str | None = None
-    """``path:/dataset`` of measured influence functions, ``(n_actuators, ny, nx)``, or cropped.
-    From 200 on, those that end are kept as far as they are higher than a millionth of their height:
-    on an ELT, crop them."""
+    """``path:/dataset`` of measured influence functions, ``(n_actuators, ny, nx)``, or cropped, as
+    an ELT needs. From 200 on, values below a millionth of the peak are dropped."""
 
     influence_origin: str | None = None
-    """Cropped functions only: ``path:/dataset`` of ``(n_actuators, 2)``, row and column where each
-    begins in the whole table; beyond its crop a function is 0."""
+    """Cropped functions only: ``path:/dataset`` of ``(n_actuators, 2)``, first row and column of
+    each in the whole table, which is 0 elsewhere."""
 
     influence_table: tuple[kinds.Count, kinds.Count] | None = None
     """Cropped functions only: rows and columns of the whole table, centred on the pupil."""
@@ -155,18 +153,17 @@ class OrientationTable(Table):
 
 
 class SlopesTable(Table):
-    """``[slopes]``: the RTC's own signals: kind, order, sign and recipe."""
+    """``[slopes]``: signals of the RTC."""
 
     kind: kinds.SignalKind = kinds.SignalKind.XY
-    """Two slopes for each subaperture, or its four normalised pixels."""
+    """Two slopes of each subaperture, or its four normalised pixels."""
 
     order: kinds.SlopeOrder | None = None
-    """`xy`, `yx`, `interleaved` of slopes, the others of pixels; None: `xy`, or `images`."""
+    """`xy`, `yx`, `interleaved`: of slopes; others: of pixels; None: `xy`, or `images`."""
 
     orientation: Annotated[OrientationTable | None, BeforeValidator(_auto_is_none)] = None
     normalisation: kinds.Normalisation = kinds.Normalisation.GLOBAL
-    """Normalisation by the mean flux of all subapertures, or by each one's own: of its four pixels
-    together."""
+    """Normalisation by the mean flux of all subapertures, or by that of each one."""
 
 
 @cache

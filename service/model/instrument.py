@@ -236,10 +236,10 @@ class Instrument(Telescope):
     """Remarks for users of this description: one sentence each, with the key."""
 
     basis_id: str | None = None
-    """Pins the RTC's basis; None: the first seen is adopted."""
+    """Required basis of the RTC; None: the first one is adopted."""
 
     config_id: str | None = None
-    """Pins the RTC's sensor configuration; None: the first seen is adopted."""
+    """Required sensor configuration; None: the first one is adopted."""
 
     pupil: PupilMap | None = None
     """Outline and obscurations as they are; None: a ring, with the spider's arms."""

@@ -153,10 +153,10 @@ class Telescope(Read):
     """A telescope as a whole."""
 
     name: str
-    """Also the ``{system}`` of the wire."""
+    """Also the ``{system}`` of the contract's keys."""
 
     diameter_m: Positive
-    """Pupil diameter, metres."""
+    """Pupil diameter."""
 
     obscuration_ratio: Annotated[float, Ge(0.0), Lt(1.0)] = 0.0
     """Linear central obscuration."""
@@ -165,13 +165,13 @@ class Telescope(Read):
     """Element that limits the beam."""
 
     double_pass: bool = False
-    """A measured matrix sees the mirror twice."""
+    """True if the light meets the mirror twice in a measured matrix."""
 
     spiders_m: Positive | None = None
-    """Width of the shadows that the secondary's arms cast on the pupil, metres; None: none."""
+    """Width of the spider's shadows on the pupil; None: no spider."""
 
     spiders_deg: tuple[float, ...] = ()
-    """Direction of each arm from the centre outwards, degrees from +x towards +y."""
+    """Direction of each arm outwards, from +x towards +y."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -182,36 +182,36 @@ class InfluenceShape(Read):
     """Shape of an influence function."""
 
     coupling: Annotated[float, Gt(0.0), Lt(1.0)] = 0.35
-    """Gaussian only: height at a distance of one pitch; "unknown" until a matrix is fitted."""
+    """Gaussian only: height at one pitch; "unknown" until a matrix is fitted."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KarhunenLoeve(Read):
-    """The modal basis: Karhunen-Loeve modes of von Karman turbulence in mirror space.
+    """The modal basis: Karhunen-Loeve modes of von Karman turbulence.
 
-    A basis of the user's own takes only the turbulence from here.
+    Your own basis takes only the turbulence from here.
     """
 
     n_modes: Count = 594
-    """Modes of the basis, controlled or not; of a user's own basis as many as it has. Left out:
-    no more than nine tenths of what the actuators make."""
+    """Modes of the basis, controlled or not. Left out: at most nine tenths of what the actuators
+    make."""
 
     r0_m: Positive = 0.10
-    """Fried parameter at 500 nm, metres."""
+    """Fried parameter at 500 nm."""
 
     outer_scale_m: Positive = 25.0
-    """Outer scale, metres."""
+    """Outer scale."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopFacts(Read):
-    """The loop: the loop, for work without an RTC."""
+    """The loop: used without an RTC."""
 
     frame_rate_hz: Positive | None = None
-    """Frames per second."""
+    """Frame rate."""
 
     delay_frames: Annotated[float, Ge(1.0)] | None = None
-    """Frames from an exposure to the first one that sees its correction."""
+    """Frames from an exposure to its correction."""
 
     n_controlled: Count | None = None
-    """Modes in the loop, the first ones."""
+    """Controlled modes, the first ones."""

@@ -80,7 +80,7 @@ def worst_severity(state: TrackerState) -> Severity | None:
 
 
 def acknowledge(context: StepContext, command: cmd.AcknowledgeAlarm) -> None:
-    """Acknowledge an alarm; one that is over goes.
+    """Acknowledge an alarm; an ended one disappears.
 
     Raises
     ------

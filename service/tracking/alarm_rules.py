@@ -304,7 +304,7 @@ def _own_definition(rule: Rule) -> AlarmDefinition:
 
 
 def set_value(context: StepContext, command: cmd.SetValue) -> None:
-    """Store a value that the observatory reports, for the stated validity time.
+    """Store a value of the observatory for its time of validity.
 
     Raises
     ------

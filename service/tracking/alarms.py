@@ -76,35 +76,35 @@ class Interlock(StrEnum):
     """Things that an alarm may forbid."""
 
     MEASURE = auto()
-    """Take a window or ordinary telemetry for a measurement."""
+    """Use windows or ordinary telemetry as measurements."""
 
     DECIDE = auto()
-    """Make, send or dither without being asked: mode auto does nothing."""
+    """Make, send or dither without an order: mode auto does nothing."""
 
     HOLD = auto()
-    """Rely on the loop: after some seconds the service acquires by itself."""
+    """Keep the loop as it is: after some seconds the service acquires by itself."""
 
     SEND_NEW = auto()
-    """Send a matrix that was never in use, with or without an approval; acquisitions need this."""
+    """Send a matrix that was never in use, as approvals and acquisitions do."""
 
     SEND_KNOWN = auto()
-    """Send one that has been in use before: a rollback."""
+    """Send one that was in use before, as a rollback does."""
 
     ASK = auto()
-    """Ask anything of the RTC, or use its telemetry."""
+    """Send requests to the RTC, or use its telemetry."""
 
 
 class Severity(StrEnum):
     """Severity of an alarm, lowest first."""
 
     WARNING = auto()
-    """Somebody should know; the service does its work."""
+    """The service does its work."""
 
     SERIOUS = auto()
-    """The service does less than it should until it is over."""
+    """The service does less than it should."""
 
     CRITICAL = auto()
-    """The loop is in danger, or its telemetry cannot be relied on."""
+    """The loop is in danger, or its telemetry cannot be used."""
 
     def above(self, other: Severity | None) -> bool:
         """Return whether it matters more than another; None: than nothing."""
@@ -194,13 +194,13 @@ class AlarmState(StrEnum):
     """State of an alarm with operators."""
 
     ACTIVE = "active"
-    """It lasts and is not acknowledged."""
+    """Active and not acknowledged."""
 
     ACKNOWLEDGED = "acknowledged"
-    """It lasts and is acknowledged; it goes when it is over."""
+    """Active and acknowledged; it disappears when it ends."""
 
     STALE = "stale"
-    """It ended unseen; it stays until acknowledged."""
+    """Ended unseen; it stays until acknowledged."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -133,7 +133,7 @@ def allow_dither(context: StepContext, *, allowed: bool = True) -> None:
 
 
 def stop_by_operator(context: StepContext, _: cmd.StopDither) -> None:
-    """Stop the dither, and start none until ordered to."""
+    """Stop the dither until it is ordered again."""
     forget_dither(context)
     allow_dither(context, allowed=False)
     note_found(context)
@@ -206,7 +206,7 @@ def follow_status(context: StepContext, rtc: Status) -> None:
 
 
 def on_silence(context: StepContext, event: ev.DitherSilent) -> None:
-    """Report a dither that the frames do not contain; then request it again.
+    """Report a dither missing in the frames; request it again.
 
     The frames decide, whatever the status says. An RTC that begins late is given a longer time
     after each attempt.

@@ -325,7 +325,7 @@ def _answers(
 
 
 def note_recognised(context: StepContext, event: ev.ModesRecognised) -> None:
-    """Record which modes of the matrix in use the model has recognised."""
+    """Record the recognised modes of the matrix in use."""
     proof = replace(
         context.matrices.mode_proof,
         strange=frozenset(event.strange),

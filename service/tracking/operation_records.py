@@ -20,31 +20,31 @@ class AcquisitionStage(StrEnum):
     """None yet."""
 
     OPENING = "opening"
-    """The RTC has been asked to open the loop."""
+    """The RTC was requested to open the loop."""
 
     COARSE = "coarse"
-    """Smooth modes are dithered with the loop open, to find α."""
+    """Smooth modes are dithered with the loop open, to estimate α."""
 
     CONFIRMING = "confirming"
-    """Other modes are dithered, to confirm it."""
+    """Other modes are dithered, to confirm α."""
 
     PARTIAL = "partial"
-    """A reconstructor for a part of the modes is made, judged and sent; then the loop closes."""
+    """A reconstructor of a part of the modes is made, judged and sent; then the loop closes."""
 
     WIDENING = "widening"
-    """The loop is closed: α sharpens, and more modes are controlled."""
+    """The loop is closed; σ decreases, and more modes are controlled."""
 
     TRACKING = "tracking"
-    """Done: α is known and the loop closed on it."""
+    """Done: α is known and the loop closed."""
 
     FAILED = "failed"
-    """Given up; the text says why, and what to do."""
+    """Given up; the text says why."""
 
     ABORTED = "aborted"
     """An operator ended it."""
 
     INTERRUPTED = "interrupted"
-    """The service ended or the RTC vanished during it; the text says what follows."""
+    """The service ended or the RTC vanished; the text says what follows."""
 
 
 UNDER_WAY = frozenset(
@@ -171,7 +171,7 @@ class ProbationState(StrEnum):
     """Stage of the probation of an applied matrix."""
 
     RUNNING = "running"
-    """Telemetry is being compared with that of the matrix before."""
+    """Telemetry is compared with that of the previous matrix."""
 
     OVERDUE = "overdue"
     """Telemetry is late; nothing waits for the verdict."""
@@ -180,25 +180,25 @@ class ProbationState(StrEnum):
     """The loop is as good as before, or better."""
 
     ROLLING_BACK = "rolling-back"
-    """It is worse: the matrix before is on its way back."""
+    """The loop is worse: the previous matrix is being sent."""
 
     WATCHED = "watched"
-    """It was worse; the matrix before is in use again, and the loop is being checked."""
+    """The previous matrix is in use again, and the loop is checked."""
 
     ROLLED_BACK = "rolled-back"
-    """It was worse; the matrix before is in use again."""
+    """The previous matrix is in use again."""
 
     KEPT = "kept"
-    """It is worse, and the service could not go back; the text says why."""
+    """The loop is worse, and the service could not go back; the text says why."""
 
     OPENING = "opening"
-    """The loop was lost, and going back did not help: the RTC is asked to open it."""
+    """The loop was lost, and going back did not help: the RTC is requested to open it."""
 
     OPENED = "opened"
-    """The loop opened when it was asked to."""
+    """The RTC has opened the loop."""
 
     NOT_JUDGED = "not-judged"
-    """There was nothing to compare with; the text says why."""
+    """No comparison was possible; the text says why."""
 
 
 _ON_PROBATION = (ProbationState.RUNNING, ProbationState.ROLLING_BACK, ProbationState.WATCHED)
@@ -264,28 +264,28 @@ class MeasureState(StrEnum):
     """Stage of a measurement of an interaction matrix, by the RTC or by random signs."""
 
     WAITING = "waiting"
-    """The service's own dither has to end first."""
+    """The service's own dither must end first."""
 
     ASKED = "asked"
-    """The RTC has not answered yet."""
+    """No answer of the RTC yet."""
 
     RUNNING = "running"
-    """The RTC measures, or the random signs play and are summed."""
+    """The RTC measures, or the random dither runs."""
 
     FINISHING = "finishing"
-    """The random signs are over; the matrix is being fitted and archived."""
+    """The matrix is being fitted and archived."""
 
     REFUSED = "refused"
-    """The RTC would not; the reason is the RTC's."""
+    """Refused by the RTC, for its reason."""
 
     FAILED = "failed"
-    """There is no matrix; the reason says why."""
+    """No matrix; the reason says why."""
 
     STORED = "stored"
     """The matrix is in the archive."""
 
     GIVEN_UP = "given-up"
-    """An operator gave it up; the RTC may go on, its matrix is ignored."""
+    """An operator ended the wait; a matrix of the RTC is ignored."""
 
 
 _MEASURING = (
@@ -447,11 +447,11 @@ class CommandState(StrEnum):
     """State of a command to the RTC."""
 
     ASKED = "asked"
-    """The RTC has not answered yet."""
+    """No answer of the RTC yet."""
 
     ACCEPTED = "accepted"
     REFUSED = "refused"
-    """The RTC would not; the reason is the RTC's."""
+    """Refused by the RTC, for its reason."""
 
     FAILED = "failed"
     """No answer: whether it was carried out is unknown."""

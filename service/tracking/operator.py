@@ -35,7 +35,7 @@ from service.wire import DitherKind, Loop, LoopRequest, RampRequest, Status
 
 
 def set_mode(context: StepContext, command: cmd.SetMode) -> None:
-    """Go on in the mode an operator orders; that of the settings is remembered."""
+    """Set the mode; remember that of the settings."""
     mode = command.mode
     of_settings = context.operator.settings_mode or context.operator.mode
     change_mode(context, mode, None if mode is of_settings else of_settings)
@@ -57,12 +57,12 @@ def reject(context: StepContext, command: cmd.Reject) -> None:
 
 
 def publish(context: StepContext, command: cmd.Publish) -> None:
-    """Offer a reconstructor again; what has never been in use only if the gate can judge it."""
+    """Offer a reconstructor again; a new one only if the gate can judge it."""
     _republish(context, command.id, f"the operator publishes {command.id} again")
 
 
 def roll_back(context: StepContext, command: cmd.Rollback) -> None:
-    """Offer the reconstructor again that was in use before."""
+    """Offer the previous reconstructor again."""
     earlier = context.state.previous
     if earlier is not None:
         _republish(context, earlier, f"the operator goes back to {earlier}", anyway=command.anyway)
@@ -84,7 +84,7 @@ def refit(context: StepContext, command: cmd.Refit) -> None:
 
 
 def start_dither(context: StepContext, command: cmd.StartDither) -> None:
-    """Start a dither; the service chooses what is not given.
+    """Start a dither; choose missing parameters.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def _republish(context: StepContext, source: str, why: str, *, anyway: bool = Fa
 
 
 def set_pointing(context: StepContext, command: cmd.SetPointing) -> None:
-    """Note where the telescope points, as the observatory reports it."""
+    """Store the pointing that the observatory reports."""
     note_pointing(context, command.pointing)
 
 
@@ -179,7 +179,7 @@ purpose."""
 
 
 def set_loop(context: StepContext, command: cmd.SetLoop) -> None:
-    """Ask the RTC to change its loop.
+    """Request a change of the loop.
 
     Raises
     ------
@@ -208,7 +208,7 @@ def set_loop(context: StepContext, command: cmd.SetLoop) -> None:
 
 
 def ramp(context: StepContext, command: cmd.Ramp) -> None:
-    """Ask the RTC to try gains on groups of modes.
+    """Request a gain ramp.
 
     Raises
     ------

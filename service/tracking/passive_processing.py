@@ -37,7 +37,7 @@ Array = NDArray[Any]
 
 
 def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
-    """Fold the passive estimate in, its bias allowed for, or doubt α where it does not fit."""
+    """Update α by the passive estimate and its bias, or mark α as doubtful."""
     reason = _check_passive_estimate(context.state, event) or _find_later_telemetry(
         context.state, event
     )
@@ -98,7 +98,7 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
 
 
 def on_passive_unavailable(context: StepContext, event: ev.PassiveUnavailable) -> None:
-    """Note why ordinary telemetry says nothing of α now."""
+    """Store why there is no passive estimate."""
     _note_unavailable(context, event.text)
 
 

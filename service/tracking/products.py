@@ -24,32 +24,32 @@ class MatrixState(StrEnum):
     """States of a reconstructor on its way to the RTC."""
 
     REFUSED = "refused"
-    """The stability gate refused it: it is never offered."""
+    """The stability gate refused it."""
 
     PROPOSED = "proposed"
-    """It passed the gate and waits for an operator, half a minute at least."""
+    """Passed the gate; waits for an operator, half a minute at least."""
 
     DISCARDED = "discarded"
-    """An operator rejected it, or another α or proposal has overtaken it."""
+    """Rejected by an operator, or overtaken by another α or proposal."""
 
     PUBLISHED = "published"
-    """Sent; the RTC has not answered yet."""
+    """Sent; no answer of the RTC yet."""
 
     STAGED = "staged"
-    """The RTC holds it, checked, ready to swap."""
+    """Checked by the RTC, ready to swap."""
 
     APPLIED = "applied"
-    """It multiplies the slopes now."""
+    """The RTC uses it."""
 
     SUPERSEDED = "superseded"
-    """It was applied, and another one has been since."""
+    """Replaced by another one."""
 
     REJECTED = "rejected"
-    """The RTC refused it; the reason is the RTC's."""
+    """Refused by the RTC, for its reason."""
 
     FAILED = "failed"
-    """No acknowledgement came in time, the RTC holds other numbers, or the loop was worse with it
-    and the service went back; the reason says which."""
+    """Not acknowledged in time, other numbers in the RTC, or taken back because the loop was worse;
+    the reason says which."""
 
 
 _ON_ITS_WAY = (MatrixState.PUBLISHED, MatrixState.STAGED)

@@ -222,7 +222,7 @@ def send_once_judged(context: StepContext, matrix_id: str, *, wanted: bool = Tru
 
 
 def on_proposal_judged(context: StepContext, event: ev.ProposalJudged) -> None:
-    """Send a reconstructor that has passed the gate again, unless something changed."""
+    """Send a reconstructor that has passed the gate again, if nothing changed."""
     record, rtc = context.state.reconstructor(event.id), context.rtc
     if record is None or record.state is not MatrixState.PROPOSED:
         return
@@ -297,7 +297,7 @@ def _send(
 
 
 def on_acknowledgement(context: StepContext, event: Acknowledgement) -> None:
-    """Fold the RTC's answer to a reconstructor back in; a late one is accepted.
+    """Process the RTC's acknowledgement, also a late one.
 
     A rejection without an id is of a commit that the RTC could not read. It says nothing of a
     matrix of this service that is on its way: anyone may have sent that commit, and one of the
@@ -346,7 +346,7 @@ def _on_state(context: StepContext, record: ReconstructorRecord, event: Acknowle
 
 
 def on_fetched(context: StepContext, fetched: ev.MatrixFetched) -> None:
-    """Keep the matrix that the RTC uses and the service did not make, or recognise one of its own.
+    """Store the RTC's own matrix, or recognise one of the service.
 
     Ids are not sufficient: a restarted RTC may order its slopes differently, and use a different
     matrix under a known id.
@@ -383,7 +383,7 @@ def apply_named(context: StepContext, matrix_id: str) -> None:
 
 
 def on_margin(context: StepContext, event: ev.MarginJudged) -> None:
-    """Note margin and loss of the matrix in use."""
+    """Store margin and loss of the matrix in use."""
     record, verdict, judged = context.state.reconstructor(event.id), event.verdict, event.judged
     if record is None:
         return

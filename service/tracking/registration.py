@@ -42,10 +42,10 @@ class Validity(StrEnum):
     """σ grows towards the limit."""
 
     STALE = "stale"
-    """σ has passed the limit, or nothing has confirmed α since a restart."""
+    """σ is beyond the limit, or α is unconfirmed since a restart."""
 
     INVALID = "invalid"
-    """α may be elsewhere: nothing is made from it by itself."""
+    """α may have changed: nothing is made from it without an order."""
 
 
 class Purpose(StrEnum):

@@ -39,7 +39,7 @@ _RESTARTED = {
 
 
 def stop_everything(context: StepContext, command: cmd.StopEverything) -> None:
-    """End what runs as its own command would; from then on ask only for dithers to end.
+    """End everything; then request only the end of dithers.
 
     An acquisition gives back the loop as it was found, now. One that a measurement has opened is
     closed again when all is released: the RTC is busy until then. A gain ramp is the RTC's, and
@@ -62,7 +62,7 @@ def stop_everything(context: StepContext, command: cmd.StopEverything) -> None:
 
 
 def resume_everything(context: StepContext, command: cmd.Resume) -> None:
-    """Go on in the mode and with the dither that were ordered before, or meanwhile."""
+    """Return to the mode and the dither ordered."""
     context.operator = replace(context.operator, stopped_because="")
     context.log("resumed", command.signed)
 

@@ -53,7 +53,7 @@ def on_tick(context: StepContext) -> None:
 
 
 def on_status(context: StepContext, rtc: Status) -> None:
-    """Take over what the RTC says of itself."""
+    """Store the RTC's report."""
     if rtc.config_id != context.loop.config_id and rtc.config_id in context.policy.sensor_modes:
         _enter_sensor_mode(context, rtc.config_id)
     before, registration = context.rtc, context.registration
@@ -81,7 +81,7 @@ def on_status(context: StepContext, rtc: Status) -> None:
 
 
 def on_vibrations(context: StepContext, event: ev.Vibrations) -> None:
-    """Note where the slopes vibrate; the next dither keeps clear of it."""
+    """Store vibrations, which the next dither avoids."""
     before, lines = context.loop.vibrations_hz, event.lines_hz
     context.loop = replace(context.loop, vibrations_hz=lines)
     # a line between two bins of the spectrum shows now in one, now in the other
@@ -90,7 +90,7 @@ def on_vibrations(context: StepContext, event: ev.Vibrations) -> None:
 
 
 def on_loop_held(context: StepContext, event: ev.LoopHeld) -> None:
-    """Note whether the loop holds well."""
+    """Store whether the loop is stable."""
     context.loop = replace(context.loop, holds=event.holds)
 
 
@@ -137,7 +137,7 @@ def _enter_sensor_mode(context: StepContext, config_id: str) -> None:
 
 
 def on_new_session(context: StepContext, started: ev.SessionStarted) -> None:
-    """Void what belonged to the old session; α is the telescope's and stays, to be confirmed."""
+    """Void the old session; α stays, to be confirmed."""
     _begin_anew(context, "the RTC was in another session")
     context.log("rtc.session", f"the RTC started session {started.session}")
 
@@ -159,7 +159,7 @@ def _begin_anew(context: StepContext, because: str) -> None:
 
 
 def on_vanished(context: StepContext, _: ev.RtcVanished) -> None:
-    """Forget what belonged to the RTC, and nothing else."""
+    """Forget the state of the RTC."""
     dither.forget_dither(context)
     context.loop = replace(context.loop, rtc=None)
     dither.note_found(context)
@@ -172,7 +172,7 @@ def on_vanished(context: StepContext, _: ev.RtcVanished) -> None:
 
 
 def on_services(context: StepContext, event: ev.ServicesMet) -> None:
-    """Go to standby while another service drives the RTC, or report that one is in standby."""
+    """Enter or leave standby; report services in standby."""
     who = " and ".join(event.others)
     stood_by = context.state.alarm(alarms.STANDING_BY) is not None
     if not event.others:

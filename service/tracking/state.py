@@ -99,13 +99,13 @@ class Mode(StrEnum):
     """Modes: how much the service may do by itself."""
 
     AUTO = "auto"
-    """Measure, compute and publish what passes the gate."""
+    """Measure, compute, and publish what passes the gate."""
 
     PROPOSE = "propose"
     """Measure and compute; an operator approves each publication."""
 
     HOLD = "hold"
-    """Measure only: nothing is computed or published without an order."""
+    """Measure; compute and publish by order only."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -104,7 +104,7 @@ def on_window(context: StepContext, event: ev.WindowFitted) -> None:
 
 
 def on_lost(context: StepContext, event: ev.WindowLost) -> None:
-    """Count a window that nothing could be made of."""
+    """Count a window that could not be evaluated."""
     reject_window(context, event.refused.reason, event.refused.kind)
 
 

@@ -80,13 +80,13 @@ class Strokes:
     """Modes to be moved on the mirror, and their amplitudes."""
 
     id: codec.Id
-    """Id of the command and of the matrix that results. A repeated id is carried out once."""
+    """Id of the command, and of the measured matrix."""
 
     modes: tuple[codec.Count, ...]
     """0-based indices in the modal basis."""
 
     amplitude_m: tuple[codec.Positive, ...]
-    """RMS amplitude of each mode, metres OPD."""
+    """RMS amplitude of each mode."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,13 +97,13 @@ class DitherRequest(Strokes):
     """Shape in time: sines, or random signs."""
 
     frequency_hz: tuple[codec.Positive, ...] | None = None
-    """Frequency of each mode, below half the frame rate; None if the dither is binary."""
+    """Frequency of each mode, below half the frame rate; None if binary."""
 
     duration_s: _Duration
-    """Duration; the dither ends by itself after ``round(duration_s * frame_rate_hz)`` frames."""
+    """Duration, after which the dither ends by itself."""
 
     seed: codec.Count | None = None
-    """Seed of the binary sequence; None if the dither is a sine."""
+    """Seed of the binary sequence; None if sine."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,19 +119,19 @@ class LoopRequest:
     """Command to change the loop. None leaves a value unchanged; opening zeroes the integrator."""
 
     id: codec.Id
-    """Id of the command. A repeated id is carried out once."""
+    """Id of the command."""
 
     loop: Loop | None = None
-    """New state of the loop; the service sends ``open`` or ``closed``, never ``partial``."""
+    """New state of the loop; the service never sends ``partial``."""
 
     gains: tuple[Annotated[float, codec.number(0.0)], ...] | None = None
-    """Integrator gain of each mode of the basis, 0 for an uncontrolled mode."""
+    """Integrator gain of each mode of the basis."""
 
     leak: Annotated[float, codec.number(0.0, 1.0)] | None = None
-    """Leak factor per frame; 1 is a pure integrator."""
+    """Leak factor per frame; 1: pure integrator."""
 
     n_controlled: codec.Count | None = None
-    """Number of controlled modes; takes effect with the next reconstructor of that many rows."""
+    """Number of controlled modes, from the next reconstructor of that many rows on."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,10 +139,10 @@ class MatrixStrokes(Strokes):
     """Strokes for the measurement of an interaction matrix."""
 
     frequency_hz: tuple[codec.Positive, ...] | None = None
-    """Frequency of each mode; None unless the pattern is ``sine``."""
+    """Frequency of each mode; for ``sine`` only."""
 
     duration_s: _Duration | None = None
-    """Duration of the measurement; None unless the pattern is ``sine``."""
+    """Duration; for ``sine`` only."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -150,10 +150,10 @@ class MeasureRequest(MatrixStrokes):
     """Command to measure an interaction matrix."""
 
     pattern: Pattern
-    """Pattern of mirror commands; an RTC must know the first and may know the others."""
+    """Pattern of mirror commands."""
 
     n_average: Annotated[int, codec.integer(1, AVERAGE_LIMIT)] | None = None
-    """Number of repetitions; None if the pattern is ``sine``."""
+    """Number of repetitions; None for ``sine``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -166,16 +166,16 @@ class RampRequest:
     """
 
     id: codec.Id
-    """Id of the command. A repeated id is carried out once."""
+    """Id of the command."""
 
     groups: tuple[_Pair, ...]
-    """First and last mode of each group, 0-based basis indices, both included; none overlap."""
+    """First and last mode of each group, both included; no overlap."""
 
     gains: tuple[codec.Positive, ...]
-    """Loop gains, tried in this order on every group."""
+    """Loop gains in the order of the trials."""
 
     frames_per_gain: Annotated[int, codec.integer(1, RAMP_LIMIT)]
-    """Number of frames at each gain, settling included."""
+    """Frames at each gain, settling included."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -186,7 +186,7 @@ class OffloadRequest(codec.RegistrationNumbers):
     """
 
     id: codec.Id
-    """Id of the command. A repeated id is carried out once."""
+    """Id of the command."""
 
 
 Command = DitherRequest | DitherStop | LoopRequest | MeasureRequest | RampRequest | OffloadRequest
@@ -197,16 +197,16 @@ class Reply:
     """Reply of the RTC to a command."""
 
     id: codec.Id | None
-    """Id of the command; None if the command had no readable id."""
+    """Id of the command; None if unreadable."""
 
     accepted: bool
-    """True if the command is being, or has been, carried out."""
+    """True if the command is or was carried out."""
 
     reason: codec.Text
-    """Reason of a refusal, begins with missing, v, id, busy, range or unsupported; else empty."""
+    """Code and reason of a refusal; else empty."""
 
     start_seq: codec.Count | None
-    """First frame whose exposure contains the effect; None if the command has none."""
+    """First frame whose exposure contains the effect; None if there is none."""
 
 
 _KINDS: dict[type[Command], CommandKind] = {

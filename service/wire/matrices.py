@@ -42,16 +42,16 @@ class MatrixLayout:
     """Shape, chunks and checksum of a float32 matrix on the wire."""
 
     shape: Annotated[tuple[_Axis, _Axis], Meta(description=_AXES)]
-    """Rows and columns, C order, little-endian float32."""
+    """Rows and columns, C order."""
 
     n_chunks: codec.Count
-    """Number of chunks; 0 if there is no matrix because a measurement failed."""
+    """Number of chunks; 0 after a failed measurement."""
 
     chunk_bytes: Annotated[int, codec.integer(1, CHUNK_LIMIT)]
     """Bytes of each chunk; the last one may be shorter."""
 
     sha256: Annotated[str, Meta(pattern=r"\A([0-9a-f]{64})?\Z", description=codec.SHA256_EXPECTED)]
-    """SHA-256 of all bytes, 64 lower-case hex digits; empty if there is no matrix."""
+    """SHA-256 of all bytes; empty after a failed measurement."""
 
     @property
     def n_bytes(self) -> int:
@@ -74,28 +74,28 @@ class Manifest:
     """Shape ``(n_controlled, n_slopes)``, chunks and checksum; row i commands basis mode i."""
 
     alpha: Mapping[str, float] | None
-    """Registration it was computed for: shifts in subapertures, rotation in degrees, ratio."""
+    """Registration for which it was computed."""
 
     sigma: Mapping[str, float] | None
-    """1 σ of ``alpha``, same names and units."""
+    """1 σ of ``alpha``."""
 
     im_id: codec.Text | None
-    """Id of the interaction matrix that was inverted; informative."""
+    """Id of the inverted interaction matrix; informative."""
 
     parent: codec.Text | None
     """Id of the reconstructor that it replaces; informative."""
 
     basis_id: codec.Opaque
-    """Id of the modal basis that it commands."""
+    """Modal basis that it commands."""
 
     config_id: codec.Opaque
-    """Id of the sensor configuration whose slopes it multiplies."""
+    """Sensor configuration whose slopes it multiplies."""
 
     system: codec.Id
     """The ``{system}`` of the keys."""
 
     created_ns: codec.Count
-    """Time of its computation, nanoseconds since the Unix epoch, UTC."""
+    """Time of its computation."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,19 +103,19 @@ class MeasuredManifest:
     """Manifest of an interaction matrix measured by the RTC, in slope per metre OPD."""
 
     id: codec.Id
-    """Id of the command to measure it."""
+    """Id of the measure command."""
 
     layout: MatrixLayout
     """Shape ``(n_slopes, n_modes_measured)``; no chunks if the measurement failed."""
 
     reason: codec.Text | None
-    """Reason for which the measurement failed; None if there is a matrix."""
+    """Reason of a failure."""
 
     modes: tuple[_Axis, ...]
-    """0-based basis indices, one per column."""
+    """0-based basis index of each column."""
 
     amplitude_m: tuple[codec.Positive, ...]
-    """RMS of each mode's stroke, metres OPD."""
+    """RMS stroke of each mode."""
 
     n_average: Annotated[int, codec.integer(1)]
     """Number of repetitions averaged."""
@@ -124,22 +124,22 @@ class MeasuredManifest:
     """Pattern of mirror commands."""
 
     double_pass: bool
-    """True if the light is reflected by the mirror twice, so that slopes are doubled."""
+    """True if the light meets the mirror twice, which doubles the slopes."""
 
     session: codec.Opaque
     """Session of the RTC."""
 
     basis_id: codec.Opaque
-    """Id of the modal basis, as in the frames."""
+    """Modal basis."""
 
     config_id: codec.Opaque
-    """Id of the sensor configuration, as in the frames."""
+    """Sensor configuration."""
 
     system: codec.Id
     """The ``{system}`` of the keys."""
 
     created_ns: codec.Count
-    """Time of the measurement, nanoseconds since the Unix epoch, UTC."""
+    """Time of the measurement."""
 
 
 class AckState(StrEnum):
@@ -155,13 +155,13 @@ class Acknowledgement:
     """Acknowledgement of one reconstructor by the RTC."""
 
     session: codec.Opaque
-    """Session of the RTC, as in the frames; the service ignores one of another session."""
+    """Session of the RTC; others are ignored."""
 
     id: codec.Id | None
-    """Id of the reconstructor; None if the rejected commit could not be read."""
+    """Id of the reconstructor; None if the commit was unreadable."""
 
     sha256: codec.Sha256 | None
-    """SHA-256 of the matrix, 64 lower-case hex digits; None if ``id`` is None."""
+    """SHA-256 of the matrix; None if ``id`` is None."""
 
     state: AckState
     """Progress of the reconstructor."""

@@ -45,32 +45,31 @@ class FrameHeader:
     """Sequence number of row 0; row i is ``seq0 + i``."""
 
     n: Annotated[int, codec.integer(1, FRAMES_PER_BATCH)]
-    """Number of rows, 1..50."""
+    """Number of rows."""
 
     t0_ns: Annotated[int, codec.integer(high=2**62)]
-    """End of exposure of row 0, nanoseconds since the Unix epoch, UTC."""
+    """End of exposure of row 0."""
 
     dt_ns: Annotated[int, codec.integer(1, 10**12)]
-    """Nominal frame period, nanoseconds."""
+    """Nominal frame period."""
 
     n_slopes: Annotated[int, codec.integer(1, COLUMN_LIMIT)]
     """Number of slopes in a row."""
 
     n_modes: Annotated[int, codec.integer(1, COLUMN_LIMIT)]
-    """Number of modal commands in a row: the whole basis, controlled or not."""
+    """Number of modal commands in a row: all modes of the basis."""
 
     dither: bool
-    """True if each row ends with the part of its commands that is dither."""
+    """True if each row has dither columns."""
 
     cm_id: codec.Id | None
-    """Id of the reconstructor that multiplies these slopes; None if the RTC does not know it."""
+    """Reconstructor in use; None if the RTC does not know its id."""
 
     basis_id: codec.Opaque
-    """Id of the modal basis; changes with modes, order and scale."""
+    """Modal basis; changes with modes, order and scale."""
 
     config_id: codec.Opaque
-    """Id of the sensor configuration; changes with mask, slope recipe, reference slopes, binning
-    and modulation."""
+    """Sensor configuration; changes with mask, slopes, reference slopes, binning, modulation."""
 
     @property
     def n_columns(self) -> int:
@@ -214,7 +213,7 @@ class Pointing:
     """Elevation above the horizon."""
 
     azimuth_deg: Annotated[float, codec.number(-720.0, 720.0)]
-    """Azimuth from north over east; only differences matter."""
+    """Azimuth from north over east."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -222,13 +221,13 @@ class ControlLaw:
     """Integrator of the loop: ``c[k+d] = leak * c[k+d-1] - gain * R s[k]``."""
 
     delay_frames: Annotated[float, codec.number(0.0, 100.0)]
-    """Delay d from an exposure to the command that corrects it."""
+    """Delay d from an exposure to its correction."""
 
     gains: tuple[Annotated[float, codec.number(0.0)], ...]
-    """Integrator gain of each mode of the basis, 0 for an uncontrolled mode."""
+    """Integrator gain of each mode of the basis."""
 
     leak: Annotated[float, codec.number(0.0, 1.0)]
-    """Leak factor per frame; 1 is a pure integrator."""
+    """Leak factor per frame; 1: pure integrator."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -236,16 +235,16 @@ class Status(ControlLaw):
     """Status of the RTC's loop, sent a few times a second."""
 
     session: codec.Opaque
-    """Session, as in the frames."""
+    """Session of the RTC."""
 
     seq: codec.Count | None
-    """Last frame processed; None before the first."""
+    """Last processed frame; None before the first."""
 
     t_ns: codec.Count
-    """Time of the status, nanoseconds since the Unix epoch, UTC."""
+    """Time of the status."""
 
     loop: commands.Loop
-    """State: closed, open, or closed with the gain of some controlled modes at 0."""
+    """State of the loop; partial: closed with some gains at 0."""
 
     frame_rate_hz: Annotated[float, codec.above(0.0, 1e6)]
     """Frame rate, nominal or measured."""
@@ -254,40 +253,40 @@ class Status(ControlLaw):
     """Number of slopes in a frame."""
 
     n_modes: Annotated[int, codec.integer(1)]
-    """Number of modes of the whole basis, controlled or not."""
+    """Number of modes of the basis."""
 
     n_controlled: codec.Count
-    """Number of modes that the reconstructor in use commands, the first ones of the basis."""
+    """Number of modes that the reconstructor commands, the first ones."""
 
     cm_id: codec.Id | None
-    """Id of the reconstructor in use; None if the RTC does not know it."""
+    """Reconstructor in use; None if the RTC does not know its id."""
 
     basis_id: codec.Opaque
-    """Id of the modal basis, as in the frames."""
+    """Modal basis."""
 
     config_id: codec.Opaque
-    """Id of the sensor configuration, as in the frames."""
+    """Sensor configuration."""
 
     dither: DitherStatus | None
-    """Dither that is running; None if there is none."""
+    """Running dither."""
 
     max_dither_m: Annotated[float, codec.number(0.0)]
-    """Largest amplitude that the RTC accepts for one mode, metres RMS."""
+    """Largest amplitude that the RTC accepts, RMS of one mode."""
 
     max_dither_modes: codec.Count
-    """Largest number of modes that the RTC dithers at once."""
+    """Largest number of modes dithered at once."""
 
     magnitude: codec.Finite | None
-    """Magnitude of the guide star; None if unknown."""
+    """Magnitude of the guide star."""
 
     flux: bytes | None = field(default=None, repr=False)
-    """``<f4`` ``[4, n_subapertures, n_subapertures]``, counts per frame averaged over a second."""
+    """Pupil images, ``<f4`` ``[4, n_subapertures, n_subapertures]``, counts per frame."""
 
     pointing: Pointing | None = None
-    """Pointing of the telescope; an extension that an RTC may leave out."""
+    """Pointing of the telescope."""
 
     trouble: codec.Text | None = None
-    """Fault on the RTC's side, for people; an extension; None or left out if there is none."""
+    """Fault of the RTC, for people."""
 
     @property
     def dither_id(self) -> str | None:
@@ -321,30 +320,28 @@ class StateMessage:
     """The ``{system}`` of the keys."""
 
     t_ns: codec.Count
-    """Time of the message, nanoseconds since the Unix epoch, UTC."""
+    """Time of the message."""
 
     mode: codec.Text
-    """Degree of autonomy of the service: auto, propose or hold."""
+    """Mode of the service: auto, propose or hold."""
 
     alpha: Mapping[str, float] | None
-    """Registration: shifts in subapertures, rotation in degrees, ratio; None if not known yet."""
+    """Registration; None if unknown."""
 
     sigma: Mapping[str, float] | None
-    """1 σ of ``alpha``, same names and units."""
+    """1 σ of ``alpha``."""
 
     in_use: codec.Id | None
-    """Id of the reconstructor that the RTC uses; None if unknown."""
+    """Reconstructor that the RTC uses; None if unknown."""
 
     validity: codec.Text | None = None
-    """Validity of ``alpha``: fresh, ageing, stale or invalid; None if there is no ``alpha``, or the
-    service is older than this key."""
+    """Validity of ``alpha``: fresh, ageing, stale or invalid."""
 
     waiting_for: tuple[codec.Text, ...] = ()
-    """Conditions that the service waits for, each with what somebody should do."""
+    """Conditions that the service waits for, each with its remedy."""
 
     operation: codec.Text | None = None
-    """State and operation of the service, like "Operational, Tracking"; None if the service is
-    older than this key."""
+    """State and operation, like "Operational, Tracking"."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -355,16 +352,16 @@ class AlarmMessage:
     """The ``{system}`` of the keys."""
 
     t_ns: codec.Count
-    """Time at which it began or ended, nanoseconds since the Unix epoch, UTC."""
+    """Time at which it began or ended."""
 
     name: codec.Opaque
-    """Name of the alarm, for programs."""
+    """Name of the alarm."""
 
     active: bool
     """True if it began, false if it ended."""
 
     text: codec.Text
-    """Description of the finding and of what to do."""
+    """Finding and remedy."""
 
 
 def essentials(data: bytes) -> tuple[object, ...]:

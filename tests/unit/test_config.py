@@ -186,11 +186,11 @@ def test_every_value_of_the_packaged_soul_names_its_source():
     lines = packaged_file("soul-lbt").read_text(encoding="utf-8").splitlines()
     values = [line for line in lines if "=" in line and not line.startswith("#")]
     mirror = values[values.index('layout = "rings"') :][:5]
-    named = re.compile(r"# (\[[SLF]\]|ours)")
+    named = re.compile(r"# (\[[SLF]\]|assumed)")
     assert [v for v in values if not named.search(v) and v not in mirror] == [
         'name = "soul-lbt"',
     ]
-    assert "[mirror] # [L]" in "\n".join(lines)
+    assert "[mirror] # assumed: rings as in [F]; [L]" in "\n".join(lines)
 
 
 def test_the_packaged_gpao_is_what_its_sources_say():
@@ -208,7 +208,7 @@ def test_the_packaged_gpao_is_what_its_sources_say():
 def test_every_value_of_the_packaged_gpao_names_its_source():
     lines = packaged_file("gpao-ut").read_text(encoding="utf-8").splitlines()
     values = [line for line in lines if "=" in line and not line.startswith("#")]
-    named = re.compile(r"# (\[[AW]\]|ours)")
+    named = re.compile(r"# (\[[AW]\]|assumed)")
     assert [value for value in values if not named.search(value)] == ['name = "gpao-ut"']
 
 
@@ -236,7 +236,7 @@ def test_the_packaged_aof_is_what_its_sources_say():
 def test_every_value_of_the_packaged_aof_names_its_source():
     lines = packaged_file("aof-ut4").read_text(encoding="utf-8").splitlines()
     values = [line for line in lines if "=" in line and not line.startswith("#")]
-    named = re.compile(r"# (\[[SEG]\]|ours)")
+    named = re.compile(r"# (\[[SEG]\]|assumed)")
     assert [value for value in values if not named.search(value)] == ['name = "aof-ut4"']
 
 
@@ -296,7 +296,7 @@ def test_the_packaged_canary_is_what_soapys_tutorial_says():
 def test_every_value_of_maps_and_canary_names_its_source(name):
     lines = packaged_file(name).read_text(encoding="utf-8").splitlines()
     values = [line for line in lines if "=" in line and not line.startswith("#")]
-    named = re.compile(r"# (\[[JTSCOM]\]|ours)")
+    named = re.compile(r"# (\[[JTSCOM]\]|assumed)")
     assert [value for value in values if not named.search(value)] == [f'name = "{name}"']
 
 

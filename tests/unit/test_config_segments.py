@@ -35,7 +35,7 @@ def test_the_packaged_instruments_of_the_elt_are_what_their_sources_say():
 def test_every_value_of_the_packaged_instruments_of_the_elt_names_its_source(name, sources):
     lines = packaged_file(name).read_text(encoding="utf-8").splitlines()
     values = [line for line in lines if "=" in line and not line.startswith("#")]
-    named = re.compile(rf"# (\[[{sources}]\]|ours)")
+    named = re.compile(rf"# (\[[{sources}]\]|assumed)")
     assert [value for value in values if not named.search(value)] == [f'name = "{name}"']
 
 

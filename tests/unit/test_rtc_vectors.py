@@ -98,7 +98,7 @@ def test_what_must_be_refused_is_refused_in_the_words_of_its_file(vector):
 @pytest.mark.parametrize("name", [name for name in MESSAGES if name != "stop"])
 def test_every_key_of_the_pages_tables_must_be_there_unless_it_says_otherwise(name):
     example = next(vector for vector in WRITTEN if vector.kind == name)
-    told = {row[0].strip("`"): row[4] for row in rows_of(name)}
+    told = {row[0].strip("`"): row[3] for row in rows_of(name)}
     assert set(told) == set(example.told["message"])
     for key, nil in told.items():
         without = {k: v for k, v in example.told["message"].items() if k != key}
@@ -114,7 +114,7 @@ def test_every_key_of_the_pages_tables_must_be_there_unless_it_says_otherwise(na
 def test_every_key_that_may_be_nil_is_read_so_and_no_other(name):
     """A key whose nil depends on others (frame_seq, seed, n_average) may be refused for that."""
     example = next(vector for vector in WRITTEN if vector.kind == name)
-    for key, _, _, _, nil, _ in rows_of(name):
+    for key, _, _, nil, _ in rows_of(name):
         nothing = {**example.told["message"], key.strip("`"): None}
         vector = Vector(example.name, {**example.told, "message": nothing})
         if not nil.startswith(("yes", "may")) and key not in READ_AS_EMPTY.get(name, ()):

@@ -53,13 +53,13 @@ _LOST_STATES = (MatrixState.REJECTED, MatrixState.FAILED)
 
 
 def acquire_on_command(context: StepContext, _: cmd.Acquire) -> None:
-    """Begin one because an operator says so."""
+    """Begin an acquisition by order."""
     allow_dither(context)
     _begin(context, present(context.rtc), "the operator asks", commanded=True)
 
 
 def abort_on_command(context: StepContext, _: cmd.AbortAcquisition) -> None:
-    """End one because an operator says so."""
+    """End an acquisition by order."""
     stages.abort_acquisition(context, "by the operator", held_off=True)
 
 

@@ -46,7 +46,7 @@ MEASURING = "an interaction matrix is being measured: these frames are no ordina
 
 
 def measure(context: StepContext, command: cmd.Measure) -> None:
-    """Ask the RTC to measure an interaction matrix.
+    """Request a measured interaction matrix.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def measure(context: StepContext, command: cmd.Measure) -> None:
 
 
 def give_up_on_command(context: StepContext, command: cmd.GiveUp) -> None:
-    """Wait no longer for a matrix because an operator says so."""
+    """Stop waiting for a matrix by order."""
     give_up(context, command.id)
 
 
@@ -124,7 +124,7 @@ def on_answer(context: StepContext, request: MeasureRequest, reply: Reply) -> No
 
 
 def on_measured(context: StepContext, event: ev.MatrixMeasured) -> None:
-    """Take over the progress of a measurement."""
+    """Store the progress of a measurement."""
     before = context.state.measurement(event.record.id)
     with context.because_of("" if before is None else before.cause):
         _update(context, event.record)

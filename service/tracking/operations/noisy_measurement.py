@@ -31,7 +31,7 @@ FIT_TIMEOUT_S = 120.0
 
 
 def measure_noisy(context: StepContext, command: cmd.MeasureNoisy) -> None:
-    """Measure a noisy interaction matrix: first the dither that runs has to end.
+    """Measure a noisy interaction matrix after the running dither.
 
     Raises
     ------

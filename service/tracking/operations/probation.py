@@ -98,7 +98,7 @@ def _go_on(context: StepContext, trial: Probation, event: Event) -> None:
 
 
 def on_compared(context: StepContext, event: ev.Compared) -> None:
-    """Take the verdict on a new matrix: one that makes the loop worse gives way.
+    """Process the verdict of a probation; a worse matrix is replaced.
 
     What was said of other matrices than the two on record is not meant.
     """

@@ -114,19 +114,19 @@ class ServiceState(StrEnum):
     """State of the service; the first that applies, from the bottom."""
 
     OPERATIONAL = "Operational"
-    """It works for an RTC whose loop is closed, or has the mirror."""
+    """The loop is closed, or the service has the mirror."""
 
     READY = "Ready"
-    """It could work: there is no RTC, the loop is open, or everything was stopped."""
+    """No RTC, an open loop, or everything was stopped."""
 
     DEGRADED = "Degraded"
-    """A serious alarm lasts."""
+    """A serious alarm is active."""
 
     NOT_READY = "NotReady"
-    """It is starting, standing by, or waiting for something that everything needs."""
+    """Starting, standing by, or waiting for a prerequisite."""
 
     ERROR = "Error"
-    """A critical alarm lasts."""
+    """A critical alarm is active."""
 
 
 class CurrentOperation(StrEnum):
@@ -142,7 +142,7 @@ class CurrentOperation(StrEnum):
     """Mode hold, or everything is stopped."""
 
     TRACKING = "Tracking"
-    """α is known, and followed in a closed loop."""
+    """α is followed in closed loop."""
 
     IDLE = "Idle"
     """α is unknown, or the loop is open."""

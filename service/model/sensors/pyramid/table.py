@@ -36,17 +36,16 @@ class PyramidNumbers(Read):
     """Subapertures across the sensor grid."""
 
     wavelength_m: Annotated[float, Gt(1e-7), Lt(1e-4)]
-    """Sensing wavelength, metres; may be "unknown" until a matrix is fitted."""
+    """Sensing wavelength; "unknown" until a matrix is fitted."""
 
     modulation_lambda_over_d: Modulation
-    """Radius of the modulation circle, λ/D; may be "unknown" until a matrix is fitted."""
+    """Radius of the modulation, λ/D; "unknown" until a matrix is fitted."""
 
     pupil_separation_subap: Positive | None = None
-    """Distance between the centres of neighbouring pupil images, subapertures; None: 1.2 diameters
-    of the pupil."""
+    """Distance of the centres of neighbouring pupil images; None: 1.2 diameters of the pupil."""
 
     pupil_diameter_subap: Positive | None = None
-    """Diameter of the pupil image, subapertures; None: ``n_subapertures``."""
+    """Diameter of the pupil image; None: ``n_subapertures``."""
 
     flux_threshold: Annotated[float, Gt(0.0), Le(1.0)] = 0.5
     """Smallest flux of a valid subaperture, relative to a full one."""
@@ -64,29 +63,28 @@ class PyramidNumbers(Read):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PyramidMode(Read):
-    """``[[wfs.mode]]``: a mode that the RTC may change to at night, as another binning is."""
+    """``[[wfs.mode]]``: a configuration that the RTC may use instead, such as a binning."""
 
     config_id: Annotated[str, MinLen(1), MaxLen(128)]
-    """The RTC's name of it: a mode is a configuration of its own."""
+    """Name that the RTC gives it."""
 
     binning: Count = 1
-    """Subapertures of ``[wfs]`` that are one along each axis."""
+    """Subapertures of ``[wfs]`` that become one along each axis."""
 
     n_subapertures: Across | None = None
-    """Subapertures across the binned grid; None: those of ``[wfs]`` over ``binning``, which must
-    divide them."""
+    """Subapertures across the binned grid; None: those of ``[wfs]`` over ``binning``."""
 
     modulation_lambda_over_d: Modulation | None = None
-    """Radius of the modulation circle, λ/D; None: that of ``[wfs]``."""
+    """Radius of the modulation, λ/D; None: that of ``[wfs]``."""
 
     valid_subapertures: str = "auto"
-    """"auto": by ``flux_threshold``; else a mask ``path:/dataset``."""
+    """"auto": by ``flux_threshold``; or a mask ``path:/dataset``."""
 
     frame_rate_hz: Positive | None = None
-    """Frames per second, for work without an RTC; None: that of ``[loop]``."""
+    """Frame rate without an RTC; None: that of ``[loop]``."""
 
     n_controlled: Count | None = None
-    """Largest number of controlled modes; None for the number in the settings."""
+    """Largest number of controlled modes; None: that of the settings."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -96,24 +94,23 @@ class PyramidTable(PyramidNumbers):
     kind: Literal["pyramid"]
 
     valid_subapertures: str = "auto"
-    """"auto": by ``flux_threshold``; else a mask ``path:/dataset``."""
+    """"auto": by ``flux_threshold``; or a mask ``path:/dataset``."""
 
     input: Literal["slopes", "frames"] = "slopes"
     """Signals that the RTC sends."""
 
     pupil_centres_px: Centres | None = None
-    """Centres of the four pupil images, row and column; "auto" to find them in a flux frame. Frames
-    only."""
+    """Frames only: centres of the four pupil images, row and column; "auto": found in a flux
+    frame."""
 
     pixels_per_subaperture: Count = 1
     """Frames only."""
 
     image_offsets_px: Offsets | None = None
-    """Displacement [x, y] of each pupil image from its place on the pixel grid, detector pixels,
-    in the RTC's axes, in the order of the images' places: -x -y, +x -y, -x +y, +x +y. With
-    ``stop = "mirror"`` only differences from their mean count: the mean is the shift itself. Not
-    given: fitted to a measured matrix. "unknown": so, and the uncertainty of live estimates allows
-    for 0.15 pixel."""
+    """Displacement [x, y] of each pupil image from the pixel grid, in the RTC's axes, in the order
+    -x -y, +x -y, -x +y, +x +y; None: fitted to a measured matrix; "unknown": likewise, and σ of
+    live estimates allows for 0.15 pixel. With ``stop = "mirror"`` their mean is the shift and does
+    not count."""
 
     mode: tuple[PyramidMode, ...] = ()
-    """A table ``[[wfs.mode]]`` for each; the service begins with the first."""
+    """Sensor modes; the service begins with the first."""

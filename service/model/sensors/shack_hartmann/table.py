@@ -36,7 +36,7 @@ class PartlyLit(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LaserStar(Read):
-    """``[wfs.laser]``: a laser's star: a layer of sodium, of which each lenslet sees a streak."""
+    """``[wfs.laser]``: a laser star in the sodium layer, elongated on each lenslet."""
 
     height_m: Annotated[float, Ge(1e3), Le(1e6)]
     """Distance of the middle of the layer along the line of sight."""
@@ -45,11 +45,10 @@ class LaserStar(Read):
     """Full width at half maximum of the layer along the line of sight."""
 
     spot_arcsec: Annotated[float, Gt(0.0), Le(60.0)]
-    """Full width at half maximum of the star across its beam."""
+    """Full width at half maximum of the star."""
 
     launcher_m: tuple[float, float]
-    """Position of the laser's launcher, x and y from the middle of the pupil, metres, in the
-    sensor's axes."""
+    """Launcher, x and y from the middle of the pupil, in the sensor's axes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -60,37 +59,34 @@ class ShackHartmannNumbers(Read):
     """Subapertures across the sensor grid."""
 
     wavelength_m: Annotated[float, Gt(1e-7), Lt(1e-4)]
-    """Sensing wavelength, metres: a slope is in waves across a subaperture; may be "unknown" until
-    a matrix is fitted."""
+    """Sensing wavelength, to which slopes are relative; "unknown" until a matrix is fitted."""
 
     pupil_diameter_subap: Positive | None = None
-    """Diameter of the pupil image, subapertures; None: ``n_subapertures``."""
+    """Diameter of the pupil image; None: ``n_subapertures``."""
 
     flux_threshold: Annotated[float, Gt(0.0), Le(1.0)] = 0.5
     """Smallest flux of a valid subaperture, relative to a full one."""
 
     pixels_per_subaperture: Annotated[int, Ge(2), Le(64)] = 6
-    """Pixels along a side of a subaperture's field."""
+    """Pixels across a subaperture."""
 
     pixel_scale_arcsec: Positive | None = None
-    """Width of a pixel on the sky, arcseconds; None: λ/d, d the width of a subaperture."""
+    """Width of a pixel on the sky; None: λ/d, d the width of a subaperture."""
 
     centroid: Centroid = Centroid.CENTRE_OF_GRAVITY
-    """Computation of a spot's position from its pixels: `cog`, all pixels weighted by their light;
-    `weighted`, also by the spot of a flat wavefront; `threshold`, without the faint ones;
-    `gradient`, of a geometric simulator: no pixels, the mean gradient of the wavefront over the
-    lenslet's light."""
+    """Centroid: `cog`, of all pixels; `weighted`, by the spot of a flat wavefront; `threshold`,
+    without faint pixels; `gradient`, the mean gradient of the wavefront, without pixels, as in a
+    geometric simulator."""
 
     threshold: Annotated[float, Gt(0.0), Lt(1.0)] | None = None
-    """With `threshold` only: pixels fainter than this share of the spot's brightest do not
-    count."""
+    """With `threshold` only: faintest pixel used, relative to the brightest."""
 
     partly_lit: PartlyLit | None = None
-    """Treatment, in fits of matrices, of subapertures that the pupil's edge cuts: `use` or `leave
-    out`; None: used, except with a threshold, which makes their centroids nonlinear."""
+    """Treatment of subapertures at the pupil's edge in fits; None: used, except with a threshold,
+    which makes their centroids nonlinear."""
 
     laser: LaserStar | None = None
-    """A laser star, a table `[wfs.laser]`; None: a star at infinity, a point."""
+    """Laser star; None: a point at infinity."""
 
     @property
     def pupil_diameter(self) -> float:
@@ -105,7 +101,7 @@ class ShackHartmannTable(ShackHartmannNumbers):
     kind: Literal["shack-hartmann"]
 
     valid_subapertures: str = "auto"
-    """"auto": by ``flux_threshold``; else a mask ``path:/dataset``."""
+    """"auto": by ``flux_threshold``; or a mask ``path:/dataset``."""
 
     guide_star_height_m: Literal["infinity"] = "infinity"
-    """A laser star has a table `[wfs.laser]` instead."""
+    """Natural star only; a laser star has `[wfs.laser]`."""

@@ -54,7 +54,7 @@ def test_every_link_within_the_page_leads_to_a_heading():
 
 
 def test_the_page_is_short():
-    assert len(PAGE.read_text(encoding="utf-8").split()) <= 4500
+    assert len(PAGE.read_text(encoding="utf-8").split()) <= 3400
 
 
 def test_twelve_figures_are_on_the_page_and_small_enough():

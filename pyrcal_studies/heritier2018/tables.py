@@ -93,10 +93,9 @@ def table_1(budget: Budget, store: Store) -> str:
     filled = [cells + [""] * (len(head) - len(cells)) for cells in rows.values()]
     return (
         "`pyrcal fit flao-lbt MATRIX --method paper --start 0,0,64.5,1` follows the ten steps from "
-        "equation 9: χ of 400 modes, no free gain. A value is the minimum of a second order "
-        "polynomial through the five lowest samples. First scans cover "
-        f"“{paper.QUOTES['rough'].text}”, the others five samples on either side; the paper prints "
-        "no number of samples.\n\n"
+        "equation 9. A value is the minimum of a second order polynomial through the five lowest "
+        f"samples. First scans cover “{paper.QUOTES['rough'].text}”, the others five samples on "
+        "either side; the paper prints no number.\n\n"
         f"Table: δα: the paper's value, ours on telescope {budget.seeds[0]}. Scans follow in "
         f"columns, magnification last.\n\n{table(head, filled)}"
     )
@@ -307,11 +306,10 @@ def _needed(budget: Budget, store: Store, combined: Mapping[tuple[float, float],
     reasonable = max(error for (d, n), error in combined.items() if d <= 0.5 and n <= 0.25)
     return (
         f"{reached} Our measured matrix has noise of {ours:.0%}, {once:.0%} with every mode "
-        "pushed and pulled once; beyond 25 % the fibre would be faint. Up to 50 % missing and 25 % "
-        f"of noise leave at most {reasonable:.0f} nm: the paper's two suspects do not explain "
-        f"{target_nm:g} nm. They do not add up either, because missing signal raises the loop's "
-        "effective gain and noise lowers it. The paper's figure 12 excludes a misregistration of "
-        "that cost; what else its matrix differed by is not printed."
+        "pushed and pulled once. Up to 50 % missing and 25 % of noise leave at most "
+        f"{reasonable:.0f} nm: the paper's two suspects do not explain {target_nm:g} nm. They do "
+        "not add up either, because missing signal raises the loop's effective gain and noise "
+        "lowers it. The paper's figure 12 excludes a misregistration of that cost."
     )
 
 
@@ -368,15 +366,12 @@ def open_questions(budget: Budget, store: Store) -> str:
     return "\n".join(
         f"- {line}"
         for line in [
-            f"**Number of signals**: {of_few}in operation four dithered modes are enough "
-            "([windows](tracking.md#windows-of-5-s)).",
-            "**Noise**: a matrix that is mostly noise "
-            "[is enough](accuracy.md#diffractive-telescopes-by-day).",
-            f"**Tracking**, “{paper.QUOTES['tracking'].text.split(', ', 1)[1]}”: pyrcal dithers "
-            "with 1 to 5 nm; without, the wind "
+            f"**Number of signals**: {of_few}in operation four dithered modes "
+            "[are enough](tracking.md#windows-of-5-s).",
+            "**Noise**, **illumination**: a matrix that is mostly noise, and measured light in the "
+            "model, [were tried](accuracy.md#diffractive-telescopes-by-day).",
+            "**Tracking**: with a dither of 1 to 5 nm; without, the wind "
             "[biases shifts](tracking.md#ordinary-telemetry-without-a-dither).",
-            "**Illumination**: measured light in the model "
-            "[helps where it is the only imperfection](accuracy.md#diffractive-telescopes-by-day).",
             "**Many actuators**: [a telescope of 39 m](scale.md#a-telescope-of-39-m).",
         ]
     )

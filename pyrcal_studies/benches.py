@@ -419,7 +419,7 @@ def _of_bench(bench: Bench, fit: Fit) -> list[str]:
         f"- **Reconstructor:** {control.reason}.",
         f"- Advice: {fit.recommendation}.",
         f"- Explanations that add most to the systematic part of σ: {terms or 'none'}.",
-        f"- What is left over: {left or 'nothing stands out'}.",
+        f"- What is left over: {left or 'nothing significant'}.",
         "",
         "| α | Value | Statistical σ | Systematic σ |",
         "| --- | --- | --- | --- |",

@@ -13,7 +13,7 @@ import argparse
 import json
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -475,13 +475,20 @@ def _of_sets(fit: Fit, registration: Registration) -> Iterator[str]:
     yield ""
     yield "| Largest difference of | Shift x, y | Rotation | Magnification | Largest, σ |"
     yield "| --- | --- | --- | --- | --- |"
-    yield from map(_set_row, registration.sets)
+    for even in (True, False):  # those that enter σ of α, then those of one side of the pupil
+        yield _sets_row([one for one in registration.sets if one.even == even])
     yield ""
 
 
-def _set_row(one: DisjointSets) -> str:
-    x, y, turn, size = np.ptp(one.steps, axis=0) * BOUNDARY_SCALE
-    return f"| {one.words} | {x:.3f}, {y:.3f} | {turn:.3f} | {size:.4f} | {one.tension.max():.1f} |"
+def _sets_row(sets: Sequence[DisjointSets]) -> str:
+    """Return the largest difference of every parameter, and the largest one over its σ."""
+    spans = [np.ptp(one.steps, axis=0) * BOUNDARY_SCALE for one in sets]
+    x, y, turn, size = np.max(spans, axis=0)
+    worst = max(sets, key=lambda one: float(one.tension.max()))
+    return (
+        f"| {', '.join(one.words for one in sets)} | {x:.3f}, {y:.3f} | {turn:.3f} | {size:.4f} | "
+        f"{worst.tension.max():.1f} ({worst.words}) |"
+    )
 
 
 def _of_wrong(found: list[dict[str, Any]]) -> Iterator[str]:

@@ -135,7 +135,8 @@ def _equations(budget: Budget, store: Store) -> Iterator[tuple[str, ...]]:
         "Equation 1",
         "D = M_WFS M_DM",
         "`service/model/interaction.py`",
-        f"explains all but {float(drawn['residual_fraction']):.1%} of a diffractive telescope",
+        f"explains all but {float(drawn['residual_fraction']):.1%} of D of a diffractive telescope "
+        "with the same mirror",
     )
     yield (
         "Equation 2",

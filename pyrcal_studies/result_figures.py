@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from pyrcal_studies.sections import RESULTS
 
 NUMBER = re.compile(r"[+-]?\d+(?:\.\d+)?")
-BLUE, GREY = "#4477aa", "#bbbbbb"
+BLUE = "#4477aa"
 
 
 def read_table(page: str, heading: str) -> list[list[str]]:
@@ -31,18 +31,13 @@ def read_table(page: str, heading: str) -> list[list[str]]:
 
 
 def draw_faults(axes: Axes) -> None:
-    """Draw when each fault is named and when the next window comes after its end."""
+    """Draw when each fault is named after its beginning."""
     rows = read_table("reliability.md", "Faults on real processes")
     at = np.arange(len(rows))[::-1]
-    for column, offset, colour, label in (
-        (1, 0.2, BLUE, "named after the beginning"),
-        (2, -0.2, GREY, "next window after the end"),
-    ):
-        worst = [max((float(s) for s in _seconds(row[column])), default=0.0) for row in rows]
-        axes.barh(at + offset, worst, height=0.38, color=colour, label=label)
+    worst = [max((float(s) for s in _seconds(row[1])), default=0.0) for row in rows]
+    axes.barh(at, worst, height=0.6, color=BLUE)
     axes.set_yticks(at, [row[0] for row in rows], fontsize=7)
-    axes.set_xlabel("seconds (the longest of each row)")
-    axes.legend(fontsize=8)
+    axes.set_xlabel("named after, seconds (the longest of each row; none: harmless or on return)")
     axes.grid(axis="x", alpha=0.4)
 
 

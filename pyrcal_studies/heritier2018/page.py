@@ -1,4 +1,4 @@
-"""The page docs/results/heritier2018.md: the paper beside ours, row by row and figure by figure."""
+"""The page docs/results/heritier2018.md: the paper and pyrcal, row by row and figure by figure."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PICTURES = "heritier2018"
 def write(budget: Budget, store: Store, minutes: float) -> str:
     """Return the page as Markdown."""
     parts = [
-        "# Heritier et al. 2018 beside pyrcal",
+        "# Heritier et al. 2018 and pyrcal",
         _opening(budget),
         "## Figures of the paper",
         rows.figures_index(budget, store),
@@ -26,8 +26,7 @@ def write(budget: Budget, store: Store, minutes: float) -> str:
         "## Conditions",
         _conditions(budget, minutes),
         "## Equations, tables and claims",
-        "Equations have the published numbers: LaTeX counts ten. Quotation marks hold the "
-        "paper's words.",
+        "Quotation marks hold the paper's words. Where nothing else is said, pyrcal does the same.",
         rows.markdown(budget, store),
         "## Table 1: step by step",
         tables.table_1(budget, store),
@@ -56,17 +55,17 @@ def _opening(budget: Budget) -> str:
     return (
         f"{rehearsal}The paper (MNRAS 481, 2829) calibrates an adaptive telescope with a synthetic "
         "interaction matrix whose misregistration is fitted to a measured one. This page does the "
-        "same on a simulated telescope. It shows no real telescope: the paper's figures 13 and 14 "
-        "and its Table 2 were measured at the LBT, ours are simulated."
+        "same on a simulated telescope: the paper's figures 13 and 14 and its Table 2 were "
+        "measured at the LBT, ours are simulated."
     )
 
 
 def _conditions(budget: Budget, minutes: float) -> str:
     frames = plan.measurement(budget, budget.seeds[0]).n_frames
     return (
-        "- **Command**: `make paper` computes every step into one folder, or continues there, and "
-        f"writes this page from it. Written on {datetime.now(UTC).date().isoformat()}; all steps "
-        f"took {minutes:.0f} minutes of processor time on two shared cores.\n"
+        "- **Command**: `make paper`, which writes this page; "
+        f"{datetime.now(UTC).date().isoformat()}, {minutes:.0f} minutes of processor time on two "
+        "shared cores.\n"
         "- **Telescope**: a diffractive simulation of FLAO at the LBT "
         "(`service/instrument/packaged/flao-lbt.toml`) with another pupil grid and mirror than the "
         "model, light uneven by 10 % and displaced actuators, at the registration of equation 10. "
@@ -78,7 +77,7 @@ def _conditions(budget: Budget, minutes: float) -> str:
         f"- **Loops**: 1 kHz, two frames of delay; by night gain {plan.NIGHT_GAIN:g} and "
         f"{budget.influence_frames} frames, by day the gains of the ramp and "
         f"{budget.closed_frames} frames. The paper prints neither wind, frame rate, gain nor flux "
-        "by night, so levels agree only as far as these choices do."
+        "by night: levels agree only as far as these choices do."
     )
 
 

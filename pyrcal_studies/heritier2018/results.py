@@ -75,6 +75,18 @@ def scan_lines(record: Record) -> list[ScanLine]:
     return lines
 
 
+def departure_from_parabola(record: Record) -> float:
+    """Return how far χ departs from a parabola in steps 7 to 10, as a share of its range."""
+    departures = []
+    for k in range(6, len(record["steps"])):
+        samples = (record[f"samples_{k}"] - record["minima"][k]) / record["step_sizes"][k]
+        near = np.abs(samples) < 2.6
+        chi = record[f"chi_{k}"]
+        fitted = np.polyval(record[f"coefficients_{k}"], samples[near])
+        departures.append(float(np.abs(chi[near] - fitted).max() / np.ptp(chi[near])))
+    return max(departures)
+
+
 def fit_errors(budget: Budget, store: Store, *, near: bool = False) -> dict[str, Array]:
     """Return the errors of Table 1's procedure by matrix, the paper's units."""
     sources: Mapping[str, Measurement | Answer] = (

@@ -32,6 +32,8 @@ class Reader:
         """Type the blocks of a page that are not marked; compare their output with the page."""
         for kind, text, printed in steps(page):
             expected = printed or ""
+            for process in self.beside.values():
+                assert process.popen.poll() in {None, 0}, process.log
             output = self.run_python(text, page) if kind == "python" else self.run_shell(text)
             if output is None:  # a process beside the page: its output comes as it runs
                 process = list(self.beside.values())[-1]

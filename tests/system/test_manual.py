@@ -74,7 +74,8 @@ def write_bench(folder, _):
     np.save(folder / "matrix.npy", 2.0 * matrix)
     imported = folder / "bench"
     imported.mkdir()
-    shutil.copy(folder / "bench.toml", imported / "instrument.toml")
+    measured = f"{bench}\n[modes]\nn_modes = 60\n"
+    (imported / "instrument.toml").write_text(measured, encoding="utf-8")
     shutil.copy(folder / "im.h5", imported / "matrix.h5")
 
 

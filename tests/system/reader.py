@@ -147,6 +147,8 @@ class Reader:
         self.beside[command] = process
         if command in {"run", "demo"}:
             wait_for(lambda: night.ready(process), 90.0, lambda: process.log)
+        elif "run" in self.beside:
+            night.wait_for_rtc(process)
 
     def end(self, command):
         """End what runs beside the page as Ctrl-C does, if it still runs."""

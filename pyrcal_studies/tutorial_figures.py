@@ -26,7 +26,7 @@ from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
 
 ROOT = Path(__file__).parents[1]
-FILES = ROOT / "tests" / "data" / "imported"
+FILES = ROOT / "pyrcal" / "samples" / "data"
 GAIN = 0.5
 
 
@@ -61,9 +61,9 @@ def _specula(code: str) -> tuple[Instrument, Fit]:
 
 @cache
 def _made(kind: str, *words: str) -> tuple[Instrument, Fit]:
-    """Return the fit of files that ``examples.made_files`` wrote."""
+    """Return the fit of files that ``pyrcal.samples`` wrote."""
     with TemporaryDirectory() as folder:
-        made = [sys.executable, "-m", "examples.made_files", kind, folder]
+        made = [sys.executable, "-m", "pyrcal.samples", kind, folder]
         subprocess.run(made, cwd=ROOT, check=True)
         return _fitted({"papyrus": "files", "cacao": "cacao"}[kind], folder, *words)
 
@@ -174,11 +174,11 @@ def specula_mask() -> Figure:
 
 
 def _frames(kind: str, columns: tuple[int, ...], titles: str) -> Figure:
-    """Draw camera frames of the files that ``examples.made_files`` writes."""
+    """Draw camera frames of the files that ``pyrcal.samples`` writes."""
     from astropy.io import fits
 
     with TemporaryDirectory() as folder:
-        made = [sys.executable, "-m", "examples.made_files", kind, folder]
+        made = [sys.executable, "-m", "pyrcal.samples", kind, folder]
         subprocess.run(made, cwd=ROOT, check=True)
         if kind == "cacao":
             cube = fits.getdata(Path(folder) / "zrespM-H.fits").astype(float)

@@ -32,7 +32,7 @@ from astropy.io import fits
 from tests.malformed import mutated
 
 ROOT = Path(__file__).parents[1]
-IMPORTED = ROOT / "tests" / "data" / "imported"
+IMPORTED = ROOT / "pyrcal" / "samples" / "data"
 LONGEST_S = 60.0
 """Processor time after which a command counts as one that does not end."""
 

@@ -447,11 +447,14 @@ def _describe_registration(moved: Any, tel: Any, n_subapertures: int) -> tuple[s
     if np.allclose(_linear(moved), np.eye(2)) and not moved.shiftX and not moved.shiftY:
         return ()
     alpha = registration_of(moved, tel, n_subapertures)
+    # a fit has 1 sigma of 0.001 subapertures: two decimals would look like a disagreement
+    x, y, turned, size = (round(value, 4) + 0.0 for value in alpha.to_boundary().values())
     stretched = np.abs(alpha.stretches).max() > _MAX_ROUNDING
     text = f", stretched by {alpha.stretches[0]:+.4f}, {alpha.stretches[1]:+.4f}"
     return (
         "α is relative to OOPAO's mirror without its misReg, which is "
-        f"α = {alpha}{text if stretched else ''}",
+        f"α = ({x:+.4f}, {y:+.4f} subap, {turned:+.4f} deg, {size:.4f})"
+        f"{text if stretched else ''}",
     )
 
 

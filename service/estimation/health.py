@@ -438,6 +438,8 @@ class PlayedCommands(Detector):
         watch, terms = frames.loop.actuators, frames.terms
         if watch is None or terms is None:
             return self
+        if watch.modes[-1] >= len(terms.reconstructor):
+            return self  # a swap to fewer modes that the status has yet to report
         return observe_played(self, frames.block, watch, terms.reconstructor)
 
     @property

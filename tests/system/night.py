@@ -79,7 +79,7 @@ def children_of(pid):
 class Process:
     """A child in a session of its own, its output in a file."""
 
-    def __init__(self, name, words, directory):
+    def __init__(self, name, words, directory, cwd=ROOT):
         self.log_path = directory / f"{name}-{time.monotonic_ns()}.log"
         with self.log_path.open("wb") as log:
             self.popen = subprocess.Popen(
@@ -87,7 +87,7 @@ class Process:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
-                cwd=ROOT,
+                cwd=cwd,
                 env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
             )
 
@@ -131,8 +131,8 @@ class Night:
         self.settings.write_text(SETTINGS, encoding="utf-8")
         self.processes = []
 
-    def start(self, name, words):
-        process = Process(name, words, self.directory)
+    def start(self, name, words, cwd=ROOT):
+        process = Process(name, words, self.directory, cwd)
         self.processes.append(process)
         return process
 

@@ -62,7 +62,8 @@ def test_the_loop_is_registered_and_takes_up_a_matrix_and_what_is_wrong_is_said(
         night.settings.write_text(same, encoding="utf-8")
         sizes = {"n_slopes": n_slopes, "n_modes": n_modes, "unit": UNIT, "hz": HZ, "gain": GAIN}
         config = folder / "cacao.toml"
-        config.write_text(SETTINGS.format(zenoh=night.zenoh, folder=folder, **sizes))
+        text = SETTINGS.format(zenoh=night.zenoh, folder=folder, **sizes)
+        config.write_text(text.replace('interlock = "restart"', 'interlock = "operator"'))
         night.service("auto")
         loop = night.start("loop", ["tests.system.milk_loop", str(folder), str(plant)])
         wait_for(lambda: "runs" in loop.log, 20.0, lambda: loop.log)
@@ -73,6 +74,8 @@ def test_the_loop_is_registered_and_takes_up_a_matrix_and_what_is_wrong_is_said(
         )
         for name, truth in ALPHA.items():
             assert abs(known["alpha"][name] - truth) < 4 * known["sigma"][name], (name, known)
+        wait_for(lambda: "matrix.waits" in bridge.log, 40.0, lambda: (night.state, bridge.log))
+        assert pyrcal("cacao", "--config", str(config), "--apply").startswith("cm-")
         night.wait_for_modes(N_START)
         in_use = night.state["in_use"]
         wait_for(lambda: night.rtc_says("cm_id") == in_use, 10.0, "its status names it")

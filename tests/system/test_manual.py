@@ -1,39 +1,68 @@
-"""The commands of the manual, run as somebody types them who has nothing else.
+"""The pages of the manual, from top to bottom, each in a folder of its own.
 
-In an empty folder with the two files that the manual speaks of: ``bench.toml``, as it prints it,
-and ``im.h5``, measured on the diffractive simulator with that file. Its ports are others', so each
-program is told its own; nothing else is changed.
+Every block of commands or Python that is not marked is run as it is written, and prints the block
+of text after it. A page's folder holds what the page says that its reader has: ``bench.toml`` as
+the manual prints it, a matrix ``im.h5`` measured on the diffractive simulator with that file, and
+so on; a page without an entry in :data:`PREPARED` starts in an empty folder.
 """
 
+import json
 import os
 import shutil
 import subprocess
 import sys
 
 import h5py
+import numpy as np
 import pytest
 
+from pyrcal.samples.__main__ import main as write_sample
 from service.instrument import load_instrument
+from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import PARAMETERS, Misregistration
+from service.model.modes import modal_basis
 from tests.data.tiny.make import push_pull
 from tests.system.night import ROOT, a_night, wait_for
 from tests.system.pace import patience
+from tests.system.reader import Reader
+from tests.unit.fitting import systems
 from tests.unit.test_docs import PAGES, blocks_of, commands
+from tests.unit.tutorial_blocks import steps
 
-pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(600)]
+
+DOCS = ROOT / "docs"
+PYRTC_BENCH = """
+[instrument]
+name = "pyrtc"
+diameter_m = 8.0
+obscuration_ratio = 0.112
+stop = "telescope"
+[wfs]
+kind = "pyramid"
+n_subapertures = 20
+pupil_separation_subap = 24
+wavelength_m = 640e-9
+modulation_lambda_over_d = 5.0
+[mirror]
+layout = "grid"
+n_across = 17
+pitch_m = 0.5
+diameter_m = 8.7
+influence = "gaussian"
+coupling = 0.35
+[modes]
+n_modes = 100
+"""
 
 ALPHA = dict(zip(PARAMETERS, (0.2, -0.1, 0.4, 1.003), strict=True))
-ALONE = {"fit", "reconstruct", "key"}
-"""Commands that work on files, need nothing that runs, and take seconds."""
 
 
-@pytest.fixture(scope="module")
-def desk(tmp_path_factory):
-    """A folder with what the manual takes for granted."""
-    folder = tmp_path_factory.mktemp("desk")
+def write_bench(folder, _):
+    """``bench.toml`` and ``im.h5``, and the same as ``pyrcal import`` writes them."""
     bench = next(  # the smallest one comes first, one with lenslets after it
         text
-        for text, _ in blocks_of(ROOT / "docs" / "howto" / "fitting.md", "toml")
+        for text, _ in blocks_of(DOCS / "howto" / "fitting.md", "toml")
         if text.startswith("[instrument]")
     )
     (folder / "bench.toml").write_text(bench, encoding="utf-8")
@@ -42,19 +71,145 @@ def desk(tmp_path_factory):
     matrix = push_pull(instrument, alpha, n_modes=60, noise=1e-4, seed=4)
     with h5py.File(folder / "im.h5", "w") as file:
         file["interaction_matrix"] = 2.0 * matrix  # the file says double_pass
-    imported = folder / "bench"  # what pyrcal import writes, of another code's files
+    np.save(folder / "matrix.npy", 2.0 * matrix)
+    imported = folder / "bench"
     imported.mkdir()
-    shutil.copy(folder / "bench.toml", imported / "instrument.toml")
+    measured = f"{bench}\n[modes]\nn_modes = 60\n"
+    (imported / "instrument.toml").write_text(measured, encoding="utf-8")
     shutil.copy(folder / "im.h5", imported / "matrix.h5")
-    shutil.copytree(ROOT / "tests" / "data" / "tiny", folder / "tests" / "data" / "tiny")
-    return folder
 
 
-HOWTO = ROOT / "docs" / "operate" / "howto.md"
-OPERATING = HOWTO.with_name("operating.md")
+def write_bench_and_serve(folder, reader):
+    """The files of a bench, and a service that runs with them."""
+    write_bench(folder, reader)
+    reader.start(["run", "--instrument", "bench.toml", "--mode", "hold"])
+
+
+def track_a_night(folder, reader, mode="hold", modes=None):
+    """Run a service and a simulated RTC of the bench; return once α is known."""
+    write_bench(folder, reader)
+    reader.start(["run", "--instrument", "bench.toml", "--mode", mode])
+    reader.start(["sim", "--instrument", "bench.toml", *(modes or ())])
+    wait_for(lambda: reader.night.state["registration"], 60.0, lambda: reader.night.state)
+
+
+def write_archive(folder, reader):
+    """An archive ``var`` with a reconstructor of the service that is in use."""
+    track_a_night(folder, reader, "auto", ["--n-controlled", "40"])
+    wait_for(reader.night.n_modes_in_use, 60.0, lambda: reader.night.state)
+    (folder / "var").symlink_to(folder / "data")
+
+
+def write_recording(folder, reader):
+    """``night.h5``, 20 s of a loop with the service's dither, and a recorder's own file."""
+    track_a_night(folder, reader, "hold", ["--record", "night.h5", "--seconds", "30"])
+    reader.beside.pop("sim").ended(60.0)
+    reader.end("run")
+
+
+def write_imports(folder, _):
+    """Files of each code that ``pyrcal import`` reads, by the names on the page."""
+    write_sample(["cacao", str(folder / "conf")])
+    write_sample(["papyrus", str(folder / "data")])
+    write_sample(["specula", str(folder)])
+    for name, other in (("im", "im"), ("pup", "pupdata"), ("ifunc", "ifunc")):
+        (folder / f"specula-{name}.fits").rename(folder / f"{other}.fits")
+    systems.written(folder)  # ground.toml: a Shack-Hartmann of 10 subapertures
+    instrument = load_instrument(folder / "ground.toml")
+    model = RtcInteractionModel(instrument, modal_basis(instrument))
+    matrix = np.asarray(model.interaction_matrix(Misregistration.from_boundary(ALPHA)))
+    positions = instrument.analytic_mirror.positions_m
+    arrays = {"D": matrix * 1e-6, "valid": model.valid, "positions": positions}
+    np.savez(folder / "bench.npz", **arrays)
+
+
+def write_pyrtc(folder, _):
+    """A matrix and a mask as pyRTC saves them, and the arrays of its mirror."""
+    (folder / "told.toml").write_text(PYRTC_BENCH, encoding="utf-8")
+    instrument = load_instrument(folder / "told.toml")
+    basis = modal_basis(instrument)
+    model = RtcInteractionModel(instrument, basis)
+    matrix = np.asarray(model.interaction_matrix(Misregistration.from_boundary(ALPHA)))
+    valid = np.zeros((24, 24), dtype=bool)
+    valid[2:-2, 2:-2] = model.valid
+    for kind, data in (("interaction_matrix", matrix), ("valid_sub_aps", np.hstack([valid] * 2))):
+        record = {"format": 2, "kind": kind, "image_axes": "yx", "pyrtc_version": "2.1.0"}
+        record |= {"wfs_type": "pywfs"} if kind == "valid_sub_aps" else {}
+        name = {"interaction_matrix": "im", "valid_sub_aps": "valid"}[kind]
+        np.savez(folder / f"{name}.npz", data=data, pyrtc_calibration=json.dumps(record))
+    np.save(folder / "m2c.npy", basis.mode_to_actuator)
+    np.save(folder / "xy.npy", instrument.analytic_mirror.positions_m)
+
+
+def write_system(folder, _):
+    """The system of the page, and a matrix of each pair by the model."""
+    page = DOCS / "howto" / "systems.md"
+    high, text = [text for text, _ in blocks_of(page, "toml")][:2]
+    ground = high.replace('"high"', '"ground"').replace("pitch_m = 0.6", "pitch_m = 0.42")
+    (folder / "ground.toml").write_text(ground.replace("12.5", "8.8"), encoding="utf-8")
+    (folder / "high.toml").write_text(high, encoding="utf-8")
+    (folder / "system.toml").write_text(text, encoding="utf-8")
+    system = systems.load_system(folder / "system.toml")
+    rng = np.random.default_rng(2)
+    values = systems.moved(system, rng)
+    matrices = []
+    for pair in system.pairs:
+        one = systems.matrix(system, pair, values)
+        matrices.append(one + 0.005 * np.abs(one).max() * rng.normal(size=one.shape))
+        sensor, mirror = system.names(pair)
+        with h5py.File(folder / f"im_{sensor}_{mirror}.h5", "w") as file:
+            file["interaction_matrix"] = matrices[-1]
+    systems.recorded(folder / "all.h5", matrices, system)
+
+
+PREPARED = {
+    "fitting": write_bench_and_serve,
+    "importing": write_imports,
+    "pyrtc": write_pyrtc,
+    "systems": write_system,
+    "tracking": write_recording,
+    "bundle": write_archive,
+    "howto": write_bench,
+}
+"""What the reader of a page has before its first command."""
+
+READ = sorted(
+    page
+    for page in PAGES
+    if page.parent.name in {"start", "tutorials", "howto", "explanation"} or page.stem == "howto"
+    if next(steps(page), None) is not None
+)
+
+
+@pytest.mark.parametrize("page", READ, ids=lambda page: page.stem)
+def test_a_page_runs_and_prints_what_it_says(page, tmp_path, monkeypatch):
+    folder = tmp_path / "desk"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    with a_night(tmp_path) as night:
+        reader = Reader(folder, night)
+        PREPARED.get(page.stem, lambda *_: None)(folder, reader)
+        reader.read(page)
+        for command in list(reader.beside):
+            reader.end(command)
+
+
+ALONE = {"fit", "reconstruct", "key"}
+"""Commands that work on files, need nothing that runs, and take seconds."""
+
+OPERATING = DOCS / "operate" / "operating.md"
 
 ASKED = {"status", "reconstructors", "export", "audit", "dither", "stop", "resume"}
 """Commands to a running service that end at once and leave the night as it was."""
+
+
+def desk_of(folder):
+    """A folder with the files of the smallest bench and those of the checkout."""
+    desk = folder / "desk"
+    desk.mkdir()
+    write_bench(desk, None)
+    shutil.copytree(ROOT / "tests" / "data" / "tiny", desk / "tests" / "data" / "tiny")
+    return desk
 
 
 def pyrcal(words, folder, data, **environment):
@@ -87,23 +242,17 @@ def typed(page):
     [
         page
         for page in PAGES
-        if page.parent.name != "tutorials"  # tests/system/test_tutorials.py
-        and any(words[0] in ALONE for words in typed(page))
+        if page not in READ and any(words[0] in ALONE for words in typed(page))
     ],
     ids=lambda page: page.stem,
 )
-def test_what_works_on_files_works_as_it_is_written(page, desk, tmp_path):
+def test_what_works_on_files_works_as_it_is_written(page, tmp_path):
+    desk = desk_of(tmp_path)
     for words in typed(page):
         if words[0] in ALONE and "flao-lbt" not in words:
             words = words[: words.index(">")] if ">" in words else words
             done = pyrcal(words, desk, tmp_path)
             assert done.returncode == 0, (words, done.stderr)
-
-
-def test_the_bench_of_the_manual_is_fitted_where_it_was_measured(desk, tmp_path):
-    done = pyrcal(["fit", "bench.toml", "im.h5", "--json"], desk, tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert '"verdict": "accepted' in done.stdout
 
 
 def asked_for_real(night, folder):
@@ -118,36 +267,20 @@ def asked_for_real(night, folder):
     assert set(done) == ASKED
 
 
-def test_a_night_is_rehearsed_with_the_bench_of_the_manual(desk, tmp_path):
-    """Run, sim and check-rtc of docs/operate/howto.md, each as it is written there."""
-    written = [words for words in typed(HOWTO) if "bench.toml" in words]
-    by_name = {name: [w for w in written if w[0] == name] for name in ("run", "sim", "check-rtc")}
+def test_what_operating_types_at_a_service_is_answered(tmp_path):
+    """The service and the simulated RTC of the manual's bench; then its archive."""
+    desk = desk_of(tmp_path)
     with a_night(tmp_path) as night:
-
-        def start(words, *own):
-            words = [str(desk / word) if word == "bench.toml" else word for word in words]
-            return night.start(words[0], ["pyrcal", *words, *own])
-
-        own = ["--listen", night.zenoh, "--port", str(night.port)]
-        own += ["--data-dir", str(night.directory / "data")]
-        service = start(by_name["run"][0], *own)
-        wait_for(lambda: night.ready(service), 60.0, lambda: service.log)
-        start(by_name["sim"][0], "--connect", night.zenoh, "--seed", "3")
+        reader = Reader(desk, night)
+        reader.start(["run", "--instrument", "bench.toml", "--mode", "propose"])
+        reader.start(["sim", "--instrument", "bench.toml", "--seconds", "300"])
         known = wait_for(lambda: night.state["registration"], 60.0, lambda: night.state)
         assert max(known["sigma"].values()) < 0.2
         wait_for(lambda: night.ids("proposed"), 60.0, lambda: night.state)
         asked_for_real(night, tmp_path)
-        passive = start(["check-rtc", "--connect", night.zenoh, "--passive", "--seconds", "3"])
-        assert passive.ended(60.0) == 0, passive.log
-        assert "system bench" in passive.log
-        os.kill(service.popen.pid, 2)
-        service.ended(20.0)
+        reader.end("run")
         kept = [words for words in typed(OPERATING) if words[0] == "archive" and "aot" not in words]
         for words in kept:
-            done = pyrcal(words, desk, night.directory / "data")
+            done = pyrcal(words, desk, desk / "data")
             assert done.returncode == 0, (words, done.stderr)
         assert [words[1] for words in kept] == ["list", "verify", "prune"]
-        for words in by_name["check-rtc"]:
-            check = start(words, "--listen", night.zenoh, "--seconds", "3")
-            assert check.ended(90.0) == 0, check.log
-        assert len(by_name["check-rtc"]) == 2

@@ -58,6 +58,7 @@ def test_a_wheel_has_what_the_program_reads_besides_its_code(wheel):
     expected = [
         *(ROOT / "service" / "instrument" / "packaged").glob("*.toml"),
         *(ROOT / "service" / "web" / "dashboard").iterdir(),
+        *(ROOT / "pyrcal" / "samples" / "data").iterdir(),
         ROOT / "service" / "commands.toml",
         ROOT / "service" / "tracking" / "alarms.toml",
         ROOT / "service" / "web" / "openapi.json",

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.unit.tutorial_blocks import missing_lines
+from tests.unit.tutorial_blocks import agrees, missing_lines
 
 PRINTED = "shift x             -0.0978      0.0029  subapertures\n...\nverdict: accepted\n"
 
@@ -18,3 +18,20 @@ PRINTED = "shift x             -0.0978      0.0029  subapertures\n...\nverdict: 
 )
 def test_lines_are_found_in_their_order_with_their_numbers(output, missing):
     assert len(missing_lines(PRINTED, output)) == missing
+
+
+@pytest.mark.parametrize(
+    ("line", "agreed"),
+    [
+        ("mode auto; up 1 min 8 s", True),
+        ("mode auto; up 12 s, late", True),
+        ("mode hold; up 12 s", False),
+        ("  x  +0.4931  +0.31", True),
+        ("  x  +0.6000  +0.31", False),
+        ("a is made: cm-7, 500 modes: stable", True),
+        ("a is made: cm-7, 500 modes: refused", False),
+    ],
+)
+def test_three_dots_within_a_line_stand_for_any_text(line, agreed):
+    printed = ["mode auto; up ...", "x +0.4930 ...", "... is made: ..., 500 modes: stable"]
+    assert any(agrees(one, line) for one in printed) == agreed

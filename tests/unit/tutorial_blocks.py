@@ -6,6 +6,9 @@ from itertools import zip_longest
 BLOCK = re.compile(
     r"(?P<mark><!-- not run: [^\n]+ -->\n)?^```(?P<kind>\w+)\n(?P<text>.*?)^```", re.M | re.S
 )
+ENDING = re.compile(r"^<!-- printed by (\w+) at its end -->\n```text\n(.*?)^```", re.M | re.S)
+"""Output of a command that ran beside the page, after Ctrl-C."""
+
 NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?(?![\w])")
 
 
@@ -30,6 +33,18 @@ def close(written, found):
     return abs(one - other) <= max(0.05 * abs(one), 3.0 * 10.0**-digits)
 
 
+def agrees(line, candidate):
+    """Whether a line is the printed one; "..." within it stands for any text.
+
+    Numbers are compared up to the first "...".
+    """
+    shape, _ = parts(line)
+    other, values = parts(candidate)
+    pieces = [re.escape(piece.strip()) for piece in shape.split("...")]
+    _, numbers = parts(line.partition("...")[0])
+    return bool(re.fullmatch(" ?.* ?".join(pieces), other)) and all(map(close, numbers, values))
+
+
 def missing_lines(printed, output):
     """The lines of ``printed`` that ``output`` does not have, in their order; "..." skips some."""
     lines = iter(output.splitlines())
@@ -37,11 +52,9 @@ def missing_lines(printed, output):
     for line in printed.splitlines():
         if line.strip() in {"", "..."}:
             continue
-        shape, numbers = parts(line)
         rest = list(lines)
         for k, candidate in enumerate(rest):
-            other, values = parts(candidate)
-            if other == shape and all(map(close, numbers, values)):
+            if agrees(line, candidate):
                 lines = iter(rest[k + 1 :])
                 break
         else:

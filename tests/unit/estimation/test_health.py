@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from service.control.loop import pole_radius
+from service.estimation.description import ActuatorWatch
 from service.estimation.estimator import Change, LoopContext
 from service.estimation.health import (
     CALM_RATIO,
@@ -16,6 +18,7 @@ from service.estimation.health import (
     LOST_S,
     MIN_UPPER_MODES,
     LoopHealth,
+    PlayedCommands,
     observe,
 )
 from service.model.misregistration import Misregistration
@@ -250,3 +253,22 @@ def test_commands_that_are_metres_again_are_sane_at_once():
     health = after(after(LoopHealth(), 1e9), 1.0, n_blocks=1)
     assert not health.absurd
     assert not health.diverging
+
+
+def test_a_matrix_of_fewer_modes_than_the_status_says_is_waited_for():
+    """A swap from 60 to 52 modes: frames name the new matrix before the status does."""
+    rng = np.random.default_rng(1)
+    block = SimpleNamespace(
+        cm_id="cm-2",
+        dt_ns=2_000_000,
+        n_frames=200,
+        slopes=rng.normal(size=(200, 24)).astype(np.float32),
+        commands_m=rng.normal(size=(200, 60)).astype(np.float32),
+    )
+    watch = ActuatorWatch(modes=np.arange(10, 60), shapes=np.ones((8, 50), np.float32))
+    terms = SimpleNamespace(reconstructor=np.ones((52, 24), np.float32))
+    before = PlayedCommands()
+    frames = SimpleNamespace(block=block, loop=SimpleNamespace(actuators=watch), terms=terms)
+    assert before.update(frames) is before
+    frames.terms.reconstructor = np.ones((60, 24), np.float32)
+    assert before.update(frames).turbulence.shape[1] == 8

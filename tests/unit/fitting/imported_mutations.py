@@ -1,6 +1,6 @@
 """Files of OOPAO, SPECULA and SynIM, and ways to get them wrong, each with what must become of it.
 
-``tests/data/imported`` holds what OOPAO 1.0.0 and SPECULA 1.1.0 saved of their pyramids, and a
+``pyrcal/samples/data`` holds what OOPAO 1.0.0 and SPECULA 1.1.0 saved of their pyramids, and a
 matrix of SynIM 2.0.0 for 8 x 8 lenslets in SPECULA's files, whose mirror lies at +0.25, -0.1
 subapertures and is turned by 1 degree.
 """
@@ -22,7 +22,7 @@ from service.model.kinds import SlopeOrder
 from service.model.slopes import Orientation
 from tests.unit.test_house import ROOT
 
-DATA = ROOT / "tests" / "data" / "imported"
+DATA = ROOT / "pyrcal" / "samples" / "data"
 
 REFUSED, MENDED = "refused", "mended and said"
 """What may become of a mutation beside a broken rule: an error of one line; the good import with a

@@ -5,6 +5,7 @@ fit advises is written into that file, by its key, without any thought; the seco
 accepted and right. Where nothing is advised, the first fit must be.
 """
 
+import json
 import re
 import tomllib
 from dataclasses import dataclass, replace
@@ -13,6 +14,7 @@ import h5py
 import numpy as np
 import pytest
 
+from pyrcal.__main__ import main
 from pyrcal.fitting.advice import Advice
 from pyrcal.fitting.matrix import FitOptions, Method, fit_matrix
 from pyrcal_studies.fft_pyramid import FftPyramid
@@ -23,6 +25,7 @@ from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from service.model.pupil import Illumination, rtc_valid_subapertures
+from tests.unit.estimation.lamps import counts_of
 
 EXPLAIN = FitOptions(explain=True)
 
@@ -314,18 +317,54 @@ def test_uneven_light_is_right_with_a_gain_map(tmp_path):
     check_right(fitted(about, values, gain_map=True))
 
 
-def test_uneven_light_is_right_with_the_light(tmp_path):
-    """What ``--flux-map`` hands to the fit: a beam that fades outwards and along x."""
+def command(capsys, *words):
+    """Type ``pyrcal fit``; return its exit status, its JSON document, and the errors."""
+    status = main(["fit", *map(str, words), "--json"])
+    said = capsys.readouterr()
+    return status, json.loads(said.out or "{}"), said.err
+
+
+def cut_out(frame):
+    """Return the four pupil images of a frame ``(2n, 2n)`` in the order of its rows and columns."""
+    upper, lower = np.split(frame, 2)
+    return np.stack([image for rows in (upper, lower) for image in np.split(rows, 2, axis=1)])
+
+
+@pytest.mark.parametrize("flip_y", [False, True])
+def test_uneven_light_is_right_with_a_file_of_the_light(flip_y, tmp_path, capsys):
+    """A beam that fades outwards and along x; the detector may be read from its top row.
+
+    The file of the orientation says "auto", so the advice of the first fit leads to a second one,
+    which asks for the orientation found; with both the fit is accepted and right.
+    """
     x = np.linspace(-6.0, 6.0, 49)
     fading = 1.0 - 0.7 * (x[:, np.newaxis] ** 2 + x**2) / 25.0 + 0.05 * x
     light = Illumination(coordinates=x, intensity=np.maximum(fading, 0.05))
-    about = loaded(tmp_path, PYRAMID)
-    values = measured(about, illumination=light)
-    first = fitted(about, values)
-    assert "--flux-map" in " ".join(first.remarks)
-    found = fitted(about, values, illumination=light)
-    check_right(found)
-    assert found.residual_fraction < 0.3 * first.residual_fraction
+    true = {"swap_xy": False, "flip_x": False, "flip_y": flip_y, "sign": 1}
+    about = loaded(tmp_path, changed(PYRAMID, orientation=true))
+    with h5py.File(tmp_path / "im.h5", "w") as file:
+        file["interaction_matrix"] = measured(about, illumination=light)
+    images = counts_of(about, light=light).reshape(2, 2, 10, 10)
+    frame = images.transpose(0, 2, 1, 3).reshape(20, 20)
+    with h5py.File(tmp_path / "flux.h5", "w") as file:
+        file["flux"] = cut_out(frame[::-1] if flip_y else frame)
+
+    stated = changed(PYRAMID, orientation="auto")
+    loaded(tmp_path, stated)
+    bench, matrix = tmp_path / "bench.toml", tmp_path / "im.h5"
+    with_map = (bench, matrix, "--flux-map", tmp_path / "flux.h5")
+    _, first, _ = command(capsys, bench, matrix)
+    assert "--flux-map" in " ".join(first["notes"])
+    status, _, err = command(capsys, *with_map)
+    assert status == 2
+    assert "copy the orientation found" in err
+    order = first["orientation"].pop("order")
+    loaded(tmp_path, changed(stated, order=order, orientation=first["orientation"]))
+    status, found, _ = command(capsys, *with_map)
+    assert status == 0
+    for name, value in ALPHA.to_boundary().items():
+        assert abs(found[name] - value) < 3.0 * found["sigma"][name], name
+    assert found["residual_fraction"] < 0.4 * first["residual_fraction"]
 
 
 def test_modes_measured_at_another_registration_are_right_once_they_are_left_out(tmp_path):

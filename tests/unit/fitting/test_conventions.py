@@ -21,7 +21,7 @@ from service.model.modes import modal_basis
 from tests.unit.fitting.mutations import GOOD_FILE, MATRICES, STREAMS, good
 from tests.unit.test_house import ROOT
 
-DATA = ROOT / "tests" / "data" / "imported"
+DATA = ROOT / "pyrcal" / "samples" / "data"
 RULES = {
     *(conventions.AXES, conventions.ROTATION, conventions.OPD, conventions.MODES),
     *(conventions.ORDER, conventions.SIGN, conventions.MATRIX, conventions.LAW),

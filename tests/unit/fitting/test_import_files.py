@@ -1,6 +1,6 @@
 """Files of SPECULA, pyRTC, cacao and arrays by name become an instrument and its matrix.
 
-``tests/data/imported`` holds what SPECULA 1.1.0 saved of a pyramid of 14 subapertures whose images
+``pyrcal/samples/data`` holds what SPECULA 1.1.0 saved of a pyramid of 14 subapertures whose images
 it has moved by 0.25 of one, 20 Zernike modes, and what pyRTC 2.1 saved of random numbers.
 """
 
@@ -30,7 +30,7 @@ from pyrcal.importers.specula import from_specula
 from service.errors import MatrixError
 from tests.unit.test_house import ROOT
 
-DATA = ROOT / "tests" / "data" / "imported"
+DATA = ROOT / "pyrcal" / "samples" / "data"
 SPECULA = [DATA / f"specula-{name}.fits" for name in ("im", "pup", "ifunc")]
 REPORTED = Reported(
     diameter_m=2.0, sensor="pyramid", stop="mirror", obscuration_ratio=0.2, unit="nm"

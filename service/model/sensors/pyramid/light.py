@@ -387,6 +387,12 @@ _LIT_SHARE = 0.5
 _SMOOTHING_SUBAP = 1.0
 """Smoothing of the map, subapertures: finer structure is not resolved, and diffraction ripples."""
 
+_PLANE = ((0, 0), (1, 0), (0, 1))
+"""Powers of x and y of a plane."""
+
+_RIDGE = 1e-3
+"""Regularisation of the slopes of a plane, for places whose surroundings are hardly known."""
+
 _SPREAD_SUBAP = 1.0
 _MARGIN = 4
 """Subapertures around the sensor's grid: the pupil may have moved when the map is used."""
@@ -399,9 +405,9 @@ def measure_illumination(
 
     Each image is divided by that of an even beam at the same place, diffraction included; the
     median of the four is robust to bad pixels and, to first order, to static aberrations, which
-    move light from one image to another. Its mean over the pupil is 1. Nothing is deconvolved:
-    scattered light hides a tenth of the unevenness, but undoing that also amplifies what the
-    aberrations left.
+    move light from one image to another. Its mean over the pupil is 1. Diffraction scatters light
+    from the bright part of the beam into the dark one, so the map is corrected once by the images
+    that its own light would make. More corrections would amplify what the aberrations left.
 
     Raises
     ------
@@ -411,9 +417,15 @@ def measure_illumination(
     images, _ = repair_pixels(counts, instrument)
     if not images.mean() > 0.0:
         raise ModelError("illumination: found no light; expected the mean counts of the images")
-    shown = compute_even_images(build_even_optics(instrument), position.at)
-    lit = shown.sum(axis=0) > _LIT_SHARE * np.percentile(shown.sum(axis=0), 75.0)
-    return _beam(_fill_outside(_excess(images, shown, lit), lit), position)
+    optics = build_even_optics(instrument)
+    even = compute_even_images(optics, position.at)
+    lit = even.sum(axis=0) > _LIT_SHARE * np.percentile(even.sum(axis=0), 75.0)
+    share = _excess(images, even, lit)
+    beam = _beam(_fill_outside(share, lit), position)
+    if not beam.intensity.any():
+        return beam
+    shown = compute_even_images(replace(optics, pupil=optics.pupil.lit_by(beam)), position.at)
+    return _beam(_fill_outside(share * _excess(images, shown, lit), lit), position)
 
 
 def relative_light(
@@ -446,25 +458,49 @@ def _excess(images: Array, shown: Array, lit: NDArray[np.bool_]) -> Array:
 def _fill_outside(share: Array, lit: NDArray[np.bool_]) -> Array:
     """Return the smoothed map, extrapolated from inside the pupil to its outside.
 
-    It is a normalised convolution that widens until everything is reached.
+    A plane is fitted to the surroundings of each subaperture inside: a weighted mean would flatten
+    the rim of a beam that fades outwards, because only its inner side is known. Planes reach one
+    subaperture beyond the rim, which the edge of the pupil may cross. Further outside, the map is a
+    weighted mean of these, whose weights widen until everything is reached.
     """
-    padded = np.pad(np.where(lit, share, 0.0), _MARGIN)
-    known = np.pad(lit.astype(np.float64), _MARGIN)
-
-    def spread(width: float) -> tuple[Array, Array]:
-        weight = scipy.ndimage.gaussian_filter(known, width, mode="constant")
-        light = scipy.ndimage.gaussian_filter(padded, width, mode="constant")
-        return light / np.maximum(weight, 1e-12), weight
-
-    filled, _ = spread(_SMOOTHING_SUBAP)
-    reached, width = known > 0.0, _SPREAD_SUBAP
+    measured = np.pad(lit, _MARGIN)
+    known = scipy.ndimage.binary_dilation(measured)
+    smooth = _smooth_by_planes(np.pad(np.where(lit, share, 0.0), _MARGIN), measured, known)
+    filled, reached, width = smooth, known, _SPREAD_SUBAP
     while not reached.all():
-        wider, weight = spread(width)
+        weight = scipy.ndimage.gaussian_filter(known.astype(np.float64), width, mode="constant")
+        light = scipy.ndimage.gaussian_filter(smooth, width, mode="constant")
         new = ~reached & (weight > 1e-3)
-        filled = np.where(new, wider, filled)
+        filled = np.where(new, light / np.maximum(weight, 1e-12), filled)
         reached = reached | new
         width *= 2.0
     return np.asarray(filled)
+
+
+def _smooth_by_planes(
+    values: Array, measured: NDArray[np.bool_], known: NDArray[np.bool_]
+) -> Array:
+    """Return the level, at the known places, of planes fitted to the measured ones; 0 elsewhere."""
+    weights = measured.astype(np.float64)
+    normal = np.array([[_moment(weights, a, b) for b in _PLANE] for a in _PLANE])
+    right = np.array([_moment(values, a, (0, 0)) for a in _PLANE])
+    ridge = normal[0, 0][known][:, None, None] * np.diag([0.0, _RIDGE, _RIDGE])
+    planes = normal[:, :, known].transpose(2, 0, 1) + ridge
+    level = np.linalg.solve(planes, right[:, known].T[:, :, None])[:, 0, 0]
+    smooth = np.zeros_like(values)
+    smooth[known] = np.maximum(level, 0.0)
+    return smooth
+
+
+def _moment(values: Array, one: tuple[int, int], other: tuple[int, int]) -> Array:
+    """Return the weighted sum of values times powers of x and y around each subaperture."""
+    half = int(4.0 * _SMOOTHING_SUBAP + 0.5)
+    u = np.arange(-half, half + 1) / _SMOOTHING_SUBAP
+    weight = np.exp(-0.5 * u**2) / np.exp(-0.5 * u**2).sum()
+    rows = weight * u ** (one[1] + other[1])
+    columns = weight * u ** (one[0] + other[0])
+    along_y = scipy.ndimage.correlate1d(values, rows, axis=0, mode="constant")
+    return np.asarray(scipy.ndimage.correlate1d(along_y, columns, axis=1, mode="constant"))
 
 
 def _beam(smooth: Array, position: PupilPosition) -> Illumination:

@@ -30,11 +30,23 @@ def inside(illumination, function, radius: float = 13.0):
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (-0.92, 0.35)])
 def test_a_fibres_beam_is_found_whatever_the_images_have_moved(shift):
-    """0.025: an eighth of its unevenness of 16 % is hidden by scattered light."""
+    """0.012: scattered light hides little of its unevenness of 16 % after one correction."""
     found = measure_illumination(counts_of(flao(), shift, beam(gaussian)), flao(), at(*shift))
     measured, true = inside(found, gaussian)
     assert np.std(true) > 0.1
-    assert np.std(measured - true) < 0.025
+    assert np.std(measured - true) < 0.012
+
+
+def test_a_beam_that_fades_to_a_third_is_known_at_its_rim():
+    """A weighted mean of the surroundings missed 26 % of the unevenness; planes miss 10 %."""
+
+    def fading(x, y):
+        return 1.0 - 0.7 * (x**2 + y**2) / 15.0**2 + 0.1 * x / 15.0
+
+    light = beam(lambda x, y: np.maximum(fading(x, y), 0.05))
+    found = measure_illumination(counts_of(flao(), light=light), flao(), at())
+    measured, true = inside(found, fading, radius=15.0)
+    assert np.std(measured - true) < 0.15 * np.std(true)
 
 
 def test_an_even_beam_is_found_even():

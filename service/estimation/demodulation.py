@@ -48,8 +48,11 @@ class DemodulationBank:
     """Length of the window."""
 
     def empty(self, n_columns: int) -> Array:
-        """Return sums over no frames yet, ``(n_shapes, 2 * n_lines, n_columns)``."""
-        return np.zeros((_N_SHAPES, 2 * len(self.lines_hz), n_columns), np.float32)
+        """Return sums over no frames yet, ``(n_lines, 2, n_shapes, n_columns)``.
+
+        The second axis has the real and the imaginary parts.
+        """
+        return np.zeros((len(self.lines_hz), 2, _N_SHAPES, n_columns), np.float32)
 
     def add(self, sums: Array, columns: Array, place: int) -> None:
         """Add frames ``(n, n_columns)`` to the sums; the first is frame ``place`` of the window."""
@@ -58,7 +61,7 @@ class DemodulationBank:
         cuts = [place, *range(place // length * length + length, end, length), end]
         stretches = [_segment(self, first // length) for first in cuts[:-1]]
         bins = np.hstack([stretch.bins for stretch in stretches])
-        n_columns = columns.shape[1]
+        n_columns, by_shape = columns.shape[1], sums.transpose(2, 1, 0, 3)
         for start in range(0, n_columns, _COLUMNS_AT_ONCE):
             some = slice(start, min(start + _COLUMNS_AT_ONCE, n_columns))
             width = some.stop - start
@@ -67,18 +70,19 @@ class DemodulationBank:
                 here = slice(first % length, first % length + stop - first)
                 frames = columns[first - place : stop - place, some]
                 np.matmul(stretch.lines[:, here], frames, out=part)
-            sums[:, :, some] += (bins @ found.reshape(bins.shape[1], -1)).reshape(
-                len(sums), -1, width
-            )
+            product = bins @ found.reshape(bins.shape[1], -1)
+            by_shape[..., some] += product.reshape(*by_shape.shape[:3], width)
 
     def at_bins(self, sums: Array) -> Array:
-        """Return ``(n_lines, 1 + n_side, n_columns)`` sums of ``h_k x_k exp(-i w k)``."""
-        n_lines, n_columns = sums.shape[1] // 2, sums.shape[2]
+        """Return ``(n_lines, 1 + n_side, n_columns)`` sums of ``h_k x_k exp(-i w k)``.
+
+        They replace the sums of the shapes in memory: with a hundred lines both have 60 MB.
+        """
         which = np.searchsorted(_OFFSETS_HZ, np.abs(SIDE_OFFSETS_HZ))
         turning = (1j * np.sign(SIDE_OFFSETS_HZ)).astype(np.complex64)[:, None]
-        found = np.empty((n_lines, 1 + len(which), n_columns), np.complex64)
-        for line, bins in enumerate(found):
-            shapes = sums[:, line] + np.complex64(1j) * sums[:, n_lines + line]
+        found = sums.reshape(-1).view(np.complex64).reshape(len(sums), 1 + len(which), -1)
+        for (real, imaginary), bins in zip(sums, found, strict=True):
+            shapes = real + np.complex64(1j) * imaginary
             cosines, sines = np.split(shapes[1:], 2)
             bins[0] = shapes[0]
             bins[1:] = cosines[which] - turning * sines[which]

@@ -9,7 +9,7 @@ from typing import Any, Final
 from msgspec import inspect as types
 
 from check_rtc.requirements import REQUIREMENTS
-from service.instrument.schema_texts import described
+from pyrcal.instruments.schema_texts import described
 from service.wire import (
     ATTACHMENT_LIMIT,
     BATCH_LIMIT,

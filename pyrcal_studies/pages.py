@@ -11,11 +11,11 @@ from enum import StrEnum
 from pathlib import Path
 from typing import get_args
 
+from pyrcal.instruments.schema_texts import described
 from pyrcal_studies import dispatch, reference
 from pyrcal_studies.contract_tables import with_tables
 from pyrcal_studies.openapi import document
 from pyrcal_studies.packaged import packaged
-from service.instrument.schema_texts import described
 from service.tracking.alarms import AlarmState, Interlock, Severity
 from service.tracking.commands import Command
 from service.tracking.interlocks import ALLOWS

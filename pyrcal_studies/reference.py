@@ -17,10 +17,10 @@ from pyrcal.client import remote
 from pyrcal.demo.arguments import demo_parser
 from pyrcal.fitting import arguments as offline_arguments
 from pyrcal.fitting.system_file import SystemFile
+from pyrcal.instruments.schema_texts import KeyText, tables_of
 from service.config.settings import Settings
 from service.files.toml import Table
 from service.instrument.schema import whole_of
-from service.instrument.schema_texts import KeyText, tables_of
 from service.model.sensors.kind import SensorKind
 from service.model.sensors.registry import KINDS
 from service.parser import OneLineParser, operand_text, option_text, wrap_usage

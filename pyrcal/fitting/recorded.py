@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import MatrixError
-from service.files.bounds import check_number
-from service.files.container import DATASET, Container, StoredArray, opened
+from service.files.container import DATASET, Container, StoredArray, check_number, opened
 from service.files.whole import open_hdf5
 
 Array = NDArray[np.float64]

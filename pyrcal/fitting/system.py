@@ -22,11 +22,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.guide_star import GuideStar
+from pyrcal.fitting.guide_star import GuideStar, Similarity
 from service.model.instrument import Instrument, Mirror, TabulatedModes
 from service.model.kinds import BasisKind, Stop
 from service.model.modes import Basis, ModalBasis, modal_basis
-from service.model.similarity import Similarity
 from service.model.surface import mirror_surface
 
 Array = NDArray[np.float64]

@@ -10,14 +10,13 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
+from pyrcal.fitting.guide_star import GuideStar, Similarity
 from pyrcal.fitting.system import ARCSEC_RAD, PlacedMirror, PlacedSensor, System
 from service.errors import ConfigurationError, ModelError
 from service.files.toml import Id, Table, in_file, read_toml, refuse, validated
 from service.instrument import load_instrument
-from service.model.guide_star import GuideStar
 from service.model.instrument import Instrument, Mirror
 from service.model.kinds import BasisKind, Positive, Stop
-from service.model.similarity import Similarity
 
 SAME_DIAMETER = 1e-6
 

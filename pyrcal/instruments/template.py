@@ -6,8 +6,8 @@ import json
 import textwrap
 from collections.abc import Iterator, Mapping
 
+from pyrcal.instruments.schema_texts import KeyText, TableText, tables_of
 from service.instrument.schema import whole_of
-from service.instrument.schema_texts import KeyText, TableText, tables_of
 from service.model.sensors.kind import SensorKind
 
 EXAMPLES: Mapping[str, Mapping[str, object]] = {

@@ -23,7 +23,7 @@ from cryptography.hazmat.primitives.serialization import (
 from cryptography.x509.oid import ExtendedKeyUsageOID as Usage
 from cryptography.x509.oid import NameOID
 
-from service.config.certificates import read_certificate
+from service.config.link_tables import read_certificate
 from service.errors import ConfigurationError, say
 from service.wire.access import LinkRole
 

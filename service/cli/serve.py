@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import ctypes
 import logging
 import signal
 import socket
@@ -37,6 +36,7 @@ from service.runtime.actions import Actions, Publishing
 from service.runtime.archiving import restore_tracking
 from service.runtime.clock import ServiceClock
 from service.runtime.policy import policy_of
+from service.runtime.processes import set_allocator
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitLimits, FitQueue
 from service.runtime.workers import WorkerPool
@@ -51,9 +51,6 @@ from service.tracking.state import (
     TrackerState,
 )
 from service.web.keys import KeyFile
-
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
-"""Parameters of mallopt(3)."""
 
 LARGE_BYTES = 2_500_000
 """Size from which an allocation is a memory map of its own, which is returned at once: frames of
@@ -85,11 +82,7 @@ def share_memory() -> None:
     itself the C library would soon take what is large from there, too: 30 MB more lay unused
     between what stays, and 45 MB more at the most, for 0.006 of a core.
     """
-    with contextlib.suppress(OSError, AttributeError):  # only the GNU C library has it
-        library = ctypes.CDLL(None)
-        library.mallopt(M_ARENA_MAX, 2)
-        library.mallopt(M_MMAP_THRESHOLD, LARGE_BYTES)
-        library.mallopt(M_TRIM_THRESHOLD, UNUSED_BYTES)
+    set_allocator(map_bytes=LARGE_BYTES, keep_bytes=UNUSED_BYTES, n_pools=2)
 
 
 async def _serve(settings: Settings, instrument: Instrument, workers: WorkerPool) -> int:

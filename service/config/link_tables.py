@@ -10,7 +10,6 @@ from typing import Annotated, Final
 
 from pydantic import Field, model_validator
 
-from service.config.certificates import read_certificate
 from service.files.toml import Table, in_file, read_toml, refuse, validated
 from service.wire.access import (
     DAY_S,
@@ -331,3 +330,26 @@ def _secret(path: Path, key: str) -> str:
     if path.stat().st_mode & 0o077:
         refuse(key, f"{path}, which others can read", f"it to be yours alone: chmod 600 {path}")
     return found
+
+
+def read_certificate(path: Path, key: str) -> Certificate:
+    """Return the first certificate in a file; ``key`` of the settings names the file.
+
+    Raises
+    ------
+    ConfigurationError
+        If the file has none.
+    """
+    from cryptography import x509
+    from cryptography.x509.oid import NameOID
+
+    try:
+        read = x509.load_pem_x509_certificate(path.read_bytes())
+    except (OSError, ValueError) as error:
+        refuse(key, f"{path}: {error!s:.120}", "a certificate, PEM")
+    names = read.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    return Certificate(
+        path=str(path),
+        name=str(names[0].value) if names else "",
+        ends_s=read.not_valid_after_utc.timestamp(),
+    )

@@ -48,37 +48,42 @@ class DemodulationBank:
     """Length of the window."""
 
     def empty(self, n_columns: int) -> Array:
-        """Return sums over no frames yet, ``(n_shapes, 2 * n_lines, n_columns)``."""
-        return np.zeros((_N_SHAPES, 2 * len(self.lines_hz), n_columns), np.float32)
+        """Return sums over no frames yet, ``(n_lines, 2, n_shapes, n_columns)``.
+
+        The second axis has the real and the imaginary parts.
+        """
+        return np.zeros((len(self.lines_hz), 2, _N_SHAPES, n_columns), np.float32)
 
     def add(self, sums: Array, columns: Array, place: int) -> None:
         """Add frames ``(n, n_columns)`` to the sums; the first is frame ``place`` of the window."""
         length = _smooth(self.frame_rate_hz, self.n_frames).shape[1]
         end = place + len(columns)
         cuts = [place, *range(place // length * length + length, end, length), end]
-        stretches = [_segment(self, first // length) for first in cuts[:-1]]
-        bins = np.hstack([stretch.bins for stretch in stretches])
-        n_columns = columns.shape[1]
+        segments = [first // length for first in cuts[:-1]]
+        shaped = [_shaped_lines(self, index) for index in segments]
+        bins = np.hstack([_segment(self, index).bins for index in segments])
+        n_columns, by_shape = columns.shape[1], sums.transpose(2, 1, 0, 3)
         for start in range(0, n_columns, _COLUMNS_AT_ONCE):
             some = slice(start, min(start + _COLUMNS_AT_ONCE, n_columns))
             width = some.stop - start
-            found = np.empty((len(stretches), len(stretches[0].lines), width), np.float32)
-            for stretch, (first, stop), part in zip(stretches, pairwise(cuts), found, strict=True):
+            found = np.empty((len(segments), len(shaped[0]), width), np.float32)
+            for lines, (first, stop), part in zip(shaped, pairwise(cuts), found, strict=True):
                 here = slice(first % length, first % length + stop - first)
                 frames = columns[first - place : stop - place, some]
-                np.matmul(stretch.lines[:, here], frames, out=part)
-            sums[:, :, some] += (bins @ found.reshape(bins.shape[1], -1)).reshape(
-                len(sums), -1, width
-            )
+                np.matmul(lines[:, here], frames, out=part)
+            product = bins @ found.reshape(bins.shape[1], -1)
+            by_shape[..., some] += product.reshape(*by_shape.shape[:3], width)
 
     def at_bins(self, sums: Array) -> Array:
-        """Return ``(n_lines, 1 + n_side, n_columns)`` sums of ``h_k x_k exp(-i w k)``."""
-        n_lines, n_columns = sums.shape[1] // 2, sums.shape[2]
+        """Return ``(n_lines, 1 + n_side, n_columns)`` sums of ``h_k x_k exp(-i w k)``.
+
+        They replace the sums of the shapes in memory: with a hundred lines both have 60 MB.
+        """
         which = np.searchsorted(_OFFSETS_HZ, np.abs(SIDE_OFFSETS_HZ))
         turning = (1j * np.sign(SIDE_OFFSETS_HZ)).astype(np.complex64)[:, None]
-        found = np.empty((n_lines, 1 + len(which), n_columns), np.complex64)
-        for line, bins in enumerate(found):
-            shapes = sums[:, line] + np.complex64(1j) * sums[:, n_lines + line]
+        found = sums.reshape(-1).view(np.complex64).reshape(len(sums), 1 + len(which), -1)
+        for (real, imaginary), bins in zip(sums, found, strict=True):
+            shapes = real + np.complex64(1j) * imaginary
             cosines, sines = np.split(shapes[1:], 2)
             bins[0] = shapes[0]
             bins[1:] = cosines[which] - turning * sines[which]
@@ -92,10 +97,10 @@ class DemodulationBank:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Segment:
-    """Matrices that lead from the frames of a segment to shapes, and from shapes to bins."""
+    """The lines in a segment, and the matrix that leads from smooth shapes to bins."""
 
     lines: Array
-    """``(n_smooth * 2 * n_lines, length)`` each smooth shape times the two parts of each line."""
+    """``(2 * n_lines, length)`` both parts of each line."""
 
     bins: Array
     """``(n_shapes, n_smooth)`` the combinations: of 1, the cosines, then the sines."""
@@ -103,17 +108,26 @@ class _Segment:
 
 @lru_cache(maxsize=48)
 def _segment(bank: DemodulationBank, index: int) -> _Segment:
-    """Return the matrices of one segment, which are the same in every window."""
+    """Return the lines and the bins of one segment, which are the same in every window."""
     smooth = _smooth(bank.frame_rate_hz, bank.n_frames)
     length = smooth.shape[1]
     frames = index * length + np.arange(length)
     turns = np.outer(_OFFSETS_HZ / bank.frame_rate_hz, frames)
     turning = np.vstack([np.ones(length), *cosines_and_sines(turns)])
-    lines = smooth[:, None] * _lines(bank, frames)
     return _Segment(
-        lines=lines.reshape(-1, length),
+        lines=_lines(bank, frames),
         bins=np.asarray((turning * _hann(bank.n_frames, frames)) @ smooth.T, np.float32),
     )
+
+
+@lru_cache(maxsize=4)
+def _shaped_lines(bank: DemodulationBank, index: int) -> Array:
+    """Return ``(n_smooth * 2 * n_lines, length)``: each smooth shape times both parts of each line.
+
+    Only those in use are kept: with a hundred lines a segment has 1.4 MB, a window twenty segments.
+    """
+    smooth, lines = _smooth(bank.frame_rate_hz, bank.n_frames), _segment(bank, index).lines
+    return np.asarray((smooth[:, None] * lines).reshape(-1, smooth.shape[1]))
 
 
 @lru_cache(maxsize=4)

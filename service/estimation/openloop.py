@@ -30,7 +30,7 @@ from service.model.slopes import Orientation
 
 Array = NDArray[Any]
 
-COARSE_STEP_LIMIT = np.array([0.02, 0.02, np.deg2rad(0.1), 2e-3])
+WIDE_STEP_LIMIT = np.array([0.02, 0.02, np.deg2rad(0.1), 2e-3])
 """A step shorter than this leaves the rest to the finer model (numeric units)."""
 
 SEARCH_RANGE = np.array([3.0, 3.0, np.deg2rad(20.0), 0.15])
@@ -105,7 +105,7 @@ def find(spectra: Spectra, search: WideCaptureSearch) -> WideCaptureEstimate | W
     reason = "no start was given"
     for tried, start in enumerate(search.starts, start=1):
         landed = solver.approach(
-            search.coarse, columns, start, approached=COARSE_STEP_LIMIT, allowed=search.contains
+            search.coarse, columns, start, approached=WIDE_STEP_LIMIT, allowed=search.contains
         )
         if not landed.converged:
             reason = f"steps from {start} do not converge"

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.slope_convention import MAX_CONDITION
+from service.control.reconstructor import MAX_CONDITION
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service.control.reconstructor import MAX_CONDITION
 from service.errors import MatrixError
 from service.estimation.orientation import (
     MIN_CORRELATION,
@@ -37,9 +38,6 @@ Array = NDArray[Any]
 
 MAX_ROTATION_RAD = np.deg2rad(30.0)
 """Rotations further than this from where a fit starts are another mounting, or other axes."""
-
-MAX_CONDITION = 100.0
-"""Largest condition number of a reconstructor that is inverted; beyond it the inverse is noise."""
 
 MIN_AXES_CORRELATION = 0.5
 """Smallest correlation of a dither's response with the model for axes to be accepted."""

@@ -97,6 +97,7 @@ def _other_kind(begins: bytes) -> tuple[str, str]:
 
 
 MAX_MODES = 100_000
+"""Largest number of modes that a request may list."""
 
 _PART = re.compile(r"(\d+)(?::(\d+)(?::(\d+))?)?")
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tokenize import TokenError
-from typing import Any, Protocol
+from typing import Any, NoReturn, Protocol
 
 import h5py
 import numpy as np
@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from service.errors import MatrixError
 from service.files import FileKind, kind_of
-from service.files.bounds import attributes, datasets
 from service.files.whole import open_hdf5
 from service.model.misregistration import COVARIANCE_SCALE, PARAMETERS
 
@@ -301,3 +300,70 @@ def put_array(file: h5py.File, name: str, values: NDArray[Any], description: str
     """Write an array with a sentence that says what it holds."""
     file[name] = values
     file[name].attrs["description"] = description
+
+
+MAX_DEPTH = 32
+"""Groups within groups of an HDF5 file."""
+
+MAX_OBJECTS = 10_000
+"""Groups, datasets and links of an HDF5 file, and attributes of it."""
+
+
+def datasets(file: h5py.File, path: Path) -> Iterator[tuple[str, h5py.Dataset]]:
+    """Yield the datasets of an HDF5 file with their names; no link leads anywhere else.
+
+    Raises
+    ------
+    MatrixError
+        If its groups are too many, or too deep.
+    """
+    seen = {h5py.h5o.get_info(file.id).addr}
+    open_groups = [("", file["/"])]
+    while open_groups:
+        prefix, group = open_groups.pop()
+        check_number(len(seen) + len(group), path)
+        if prefix.count("/") > MAX_DEPTH:
+            _refuse(str(path), f"more than {MAX_DEPTH} groups within each other", "no more")
+        within = []
+        for name in group:
+            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                continue
+            item = group[name]
+            address = h5py.h5o.get_info(item.id).addr
+            if address in seen:
+                continue
+            seen.add(address)
+            if isinstance(item, h5py.Dataset):
+                yield f"{prefix}{name}", item
+            elif isinstance(item, h5py.Group):
+                within.append((f"{prefix}{name}/", item))
+        open_groups += reversed(within)
+
+
+def check_number(n_objects: int, path: Path) -> None:
+    """Refuse an HDF5 file of too many things.
+
+    Raises
+    ------
+    MatrixError
+        If it has so many.
+    """
+    if n_objects > MAX_OBJECTS:
+        _refuse(str(path), f"more than {MAX_OBJECTS} groups, datasets or links", "no more")
+
+
+def attributes(file: h5py.File, path: Path) -> dict[str, Any]:
+    """Return the attributes of an HDF5 file.
+
+    Raises
+    ------
+    MatrixError
+        If they are too many.
+    """
+    if len(file.attrs) > MAX_OBJECTS:
+        _refuse(str(path), f"{len(file.attrs)} attributes", f"at most {MAX_OBJECTS}")
+    return dict(file.attrs)
+
+
+def _refuse(where: str, found: str, expected: str) -> NoReturn:
+    raise MatrixError(f"{where}: found {found}, expected {expected}")

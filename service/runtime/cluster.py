@@ -6,7 +6,6 @@ Quick to import: ``distributed`` (the extra ``cluster``) is imported when a clus
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import platform
 import threading
 import time
@@ -22,6 +21,7 @@ import scipy
 import service
 from service.errors import ClusterError, shown
 from service.files.disk_cache import code_sha256
+from service.runtime.processes import set_allocator
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -41,9 +41,6 @@ CLUSTER_CHECK_INTERVAL_S = 1.0
 
 MAX_EMPTY_S = 20.0
 """A cluster that has had no worker for so long has lost them: a nanny restarts one in less."""
-
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
-"""Parameters of mallopt(3)."""
 
 PACKAGES = ("service", "sim_rtc", "pyrcal_studies")
 """Packages whose code a task may run."""
@@ -317,10 +314,7 @@ def _keep_freed_memory() -> None:
     Dask's nanny has a worker give back all above 64 KB at once: a product then takes 2.5 times the
     processor time.
     """
-    with contextlib.suppress(OSError, AttributeError):  # only the GNU C library has it
-        library = ctypes.CDLL(None)
-        library.mallopt(M_MMAP_THRESHOLD, 32 << 20)
-        library.mallopt(M_TRIM_THRESHOLD, 256 << 20)
+    set_allocator(map_bytes=32 << 20, keep_bytes=256 << 20)
 
 
 def _other_version(where: str, who: str, found: object, expected: Versions | None = None) -> str:

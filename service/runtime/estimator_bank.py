@@ -25,7 +25,7 @@ from service.runtime.registry import REGISTRY, Entry
 from service.tracking.dither_request import Dither, expected_dither, lock_in_plan, random_plan
 from service.wire import DitherKind, Status
 
-MATRICES_KEPT = 2
+N_MATRICES_FOLLOWED = 2
 """The reconstructor in use, and the one before: frames of it may still come."""
 
 Member = TypeVar("Member", bound=Streaming)
@@ -135,7 +135,7 @@ def _reset_members(bank: EstimatorBank, loop: LoopContext, changes: Change) -> E
 def with_matrix(bank: EstimatorBank, cm_id: str, matrix: NDArray[np.float32]) -> EstimatorBank:
     """Know the numbers of one more reconstructor."""
     others = tuple(known for known in bank.loop.matrices if known[0] != cm_id)
-    matrices = (*others, (cm_id, matrix))[-MATRICES_KEPT:]
+    matrices = (*others, (cm_id, matrix))[-N_MATRICES_FOLLOWED:]
     return replace(bank, loop=replace(bank.loop, matrices=matrices))
 
 

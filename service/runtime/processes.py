@@ -11,6 +11,7 @@ This module is quick to import: a process can be started at once, and imports
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import io
 import multiprocessing
 import os
@@ -152,6 +153,36 @@ class Worker(JobProcess):
             self.do(self._enter, sent=self._enters)
             self._enter = None
         return self.do(job)
+
+
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
+"""Parameters of mallopt(3)."""
+
+
+def set_allocator(*, map_bytes: int, keep_bytes: int, n_pools: int | None = None) -> None:
+    """Set how the GNU C library takes and returns this process's memory; others are left alone.
+
+    Parameters
+    ----------
+    map_bytes
+        Size from which an allocation is a memory map of its own, which is returned once it is free.
+    keep_bytes
+        Free memory at the end of the heap above which it is returned.
+    n_pools
+        Pools of memory that all threads share; None for one of each thread, up to a limit.
+    """
+    with contextlib.suppress(OSError, AttributeError):
+        library = ctypes.CDLL(None)
+        library.mallopt(_M_MMAP_THRESHOLD, map_bytes)
+        library.mallopt(_M_TRIM_THRESHOLD, keep_bytes)
+        if n_pools is not None:
+            library.mallopt(_M_ARENA_MAX, n_pools)
+
+
+def return_free_memory() -> None:
+    """Return all free memory of this process to the system, where the C library is GNU's."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _work(line: Connection, nice: int, imports: str) -> None:

@@ -14,13 +14,13 @@ from annotated_types import Ge, Gt, Le, Len, MaxLen
 from typing_extensions import override
 
 from service.errors import shown
+from service.files import MAX_MODES
 from service.tracking.alarms import Severity
 from service.tracking.products import ModeSet
 from service.tracking.state import Mode
 from service.wire import DitherKind, Pattern, Pointing
 
 MAX_SINES = 64
-MAX_MODES = 100_000
 MAX_GROUPS = 1000
 MAX_NOISY_MEASUREMENT_S = 3600.0
 MAX_MUTE_S = 43_200.0

@@ -27,8 +27,8 @@ from service.tracking.update_policy import (
 )
 from service.wire import Status
 
-MATRIX_TIMEOUT_S = 3.0
-"""Time for the RTC's matrix to arrive before it is requested again."""
+FIRST_MATRIX_INTERVAL_S = 3.0
+"""Interval between requests for a new matrix of the RTC until it has arrived."""
 
 MATRIX_REQUEST_INTERVAL_S = 10.0
 """Interval between two requests for a matrix that was not available or has no name."""
@@ -60,7 +60,7 @@ def fetch_in_use(context: StepContext) -> None:
         and not state.matrices.read_back_error
         and state.matrices.mismatched_id is None
     )
-    every_s = MATRIX_TIMEOUT_S if anew else MATRIX_REQUEST_INTERVAL_S
+    every_s = FIRST_MATRIX_INTERVAL_S if anew else MATRIX_REQUEST_INTERVAL_S
     if context.now_ns - state.matrices.applied_asked_ns_utc >= every_s * SECOND_NS:
         request_applied(context, rtc)
 

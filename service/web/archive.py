@@ -157,7 +157,6 @@ TRAIL = define_view("AuditView", Trail)
         200: {
             **shows(TRAIL),
             "content": {
-                **shows(TRAIL)["content"],
                 "application/jsonl": {"schema": {"type": "string"}},
                 "text/csv": {"schema": {"type": "string"}},
             },
@@ -201,8 +200,7 @@ def _json_lines(entries: Iterator[dict[str, Any]]) -> Iterator[str]:
 def _csv_lines(entries: Iterator[dict[str, Any]]) -> Iterator[str]:
     """Yield a table; a cell that a spreadsheet would work out is kept from it by an apostrophe."""
     buffer = io.StringIO()
-    names = (n for name, part in ENTRY.parts.items() for n in (name, part.clock) if n)
-    table = csv.DictWriter(buffer, list(names))
+    table = csv.DictWriter(buffer, list(ENTRY.model_fields))
     table.writeheader()
     while True:
         yield buffer.getvalue()

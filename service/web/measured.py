@@ -237,6 +237,133 @@ class FitAcceptedView(BaseModel):
     """Paths where its result appears."""
 
 
+class FitDocument(BaseModel):
+    """What a fit has found: the object that ``pyrcal fit --json`` prints."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+    shift_x_subap: float | None
+    """Along sensor +x, subapertures."""
+
+    shift_y_subap: float | None
+    """Along sensor +y, subapertures."""
+
+    rotation_deg: float | None
+    """From sensor +x towards +y, degrees."""
+
+    magnification: float | None
+    """Ratio; 1 is nominal."""
+
+    sigma: dict[str, float | None]
+    """1 σ of the four, by name; noise, disagreement of subsets and model error together."""
+
+    covariance: list[list[float | None]]
+    """4 x 4, in the units of the names."""
+
+    gains: list[float | None]
+    """Measured column over the model's, one for each mode used, passes divided out."""
+
+    residual_fraction: float | None
+    """RMS of what is left over RMS of the measurement."""
+
+    condition_number: float | None
+    """Of the synthetic matrix, modes used."""
+
+    n_modes_used: int
+    orientation: dict[str, Any]
+    """Of the slopes, as the instrument file would say it."""
+
+    subset_scatter: dict[str, float | None]
+    """1 σ scatter of disjoint sets of modes, by name."""
+
+    converged: bool
+    verdict: str
+    """Begins with "accepted" or "refused"; names what was left out."""
+
+    registration: dict[str, Any] | None = None
+    """Whether the registration is determined: determined, reason, sigma_statistical,
+    sigma_systematic (by name), disjoint_sets."""
+
+    reconstructor: dict[str, Any] | None = None
+    """Whether the model's reconstructor holds the loop of the measured matrix: stable_modes of
+    n_modes, gain, pole_radius, pole_radius_all, wavefront_ratio, noise_limited, reason."""
+
+    anamorphosis: list[float] | None = None
+    """Stretch of the mirror's image along x over the mean of both axes, less 1, and along 45 deg;
+    null: the modes do not tell, or it was not to be fitted."""
+
+    anamorphosis_sigma: list[float] | None = None
+    """1 σ of both; null: it was not to be fitted."""
+
+    image_offsets_px: list[list[float]] | None = None
+    """Displacements [x, y] of a pyramid's four pupil images that were fitted, detector pixels, as
+    `wfs.image_offsets_px` states them; null if the instrument file states them."""
+
+    instrument_found: dict[str, dict[str, float | None]] = {}
+    """What of the instrument was fitted, too, by its key: found, sigma, and as the file says it."""
+
+    recommendation: str = ""
+    """What to do with it, in one sentence: begins with "use it", "measure more" or "do not use"."""
+
+    found_not_told: list[dict[str, Any]] = []
+    unknown_not_found: list[str] = []
+    """What the matrix has told: key, found, told (as the file says it), how, and whether to correct
+    the file."""
+
+    alternatives: list[dict[str, Any]] = []
+    """What else might explain the matrix: words, misfit (χ² over the fit's; null: not comparable),
+    moved (by name), moved_sigma, preferred, undecided."""
+
+    left_over: dict[str, Any] | None = None
+    """Where the residual is: border (over inside), subapertures and modes that stand out."""
+
+    notes: list[str]
+    """What was decided on the way, or overruled, and should be known."""
+
+    seconds: float | None
+
+
+class FitMap(BaseModel):
+    """The signals of one mode: rows from the lowest y on, Sx beside Sy; null: not valid.
+
+    Of pixels the four images, as they lie on the detector.
+    """
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+    mode: int
+    measured: list[list[int | None]]
+    """Percent of three times the RMS of what was measured, cut there."""
+
+    synthetic: list[list[int | None]]
+    """The model's, gain applied, in the same unit."""
+
+
+class FitFigures(BaseModel):
+    """What the figures of a fit are drawn from."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+    own_instrument: bool
+    """Whether it is a fit of the service's own instrument, whose α it may be held against."""
+
+    modes: list[int]
+    """Basis indices of the modes used; ``gains`` of the fit are of these."""
+
+    residual_by_mode: list[float | None]
+    """RMS of what is left over RMS of the measurement, of each."""
+
+    singular_values: dict[str, list[float | None]]
+    """"measured" and "synthetic", each over its largest."""
+
+    residual_map: list[list[int | None]]
+    """What is left in each subaperture, percent of the measured RMS: rows from the lowest y on, Sx
+    beside Sy; null: not valid."""
+
+    maps: list[FitMap]
+    """Of a few modes, the paper's where they were used."""
+
+
 _UPLOAD: dict[str, Any] = {
     "requestBody": {
         "required": True,
@@ -290,17 +417,13 @@ async def fits_known(desk: FitsDep) -> Response:
     return answer(FitJobs(fits=tuple(desk.jobs())))
 
 
-_FOUND = {"anyOf": [{"$ref": f"{views.SCHEMAS}{one}"} for one in ("FitDocument", FIT_JOB.name)]}
-_DRAWN = {"$ref": f"{views.SCHEMAS}FitFigures"}
-
-
 @fits.get(
     "/fits/{id}",
     responses={
         200: {
             "description": "What was found; of a fit that failed or was given up the job itself: "
             "its `state` and the `reason`",
-            "content": {"application/json": {"schema": _FOUND}},
+            "model": FitDocument | FIT_JOB,
         },
         202: shows(FIT_JOB) | {"description": "Not finished yet"},
         **UNKNOWN,
@@ -324,7 +447,7 @@ async def fit_found(desk: FitsDep, fit_id: FitId) -> Response:
     responses={
         200: {
             "description": "What the figures of a fit are drawn from.",
-            "content": {"application/json": {"schema": _DRAWN}},
+            "model": FitFigures,
         },
         **UNKNOWN,
     },

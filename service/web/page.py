@@ -22,6 +22,7 @@ from fastapi import APIRouter, FastAPI, Header, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse, StreamingResponse
 from numpy.typing import NDArray
+from pydantic_core import from_json
 from starlette.datastructures import MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.middleware.gzip import GZipMiddleware
@@ -43,7 +44,7 @@ from service.tracking.step_context import LOG_LENGTH
 from service.web.authentication import OPEN
 from service.web.connections import Middleware
 from service.web.problems import INVALID, problem_response
-from service.web.views import ServiceDep, answer, as_json, define_view, held, shows, to_json
+from service.web.views import ServiceDep, answer, as_json, define_view, held, shows
 
 router = APIRouter(prefix="/v1", tags=["state"])
 
@@ -371,11 +372,11 @@ class Stream:
             if self._log is not snapshot.tracker.log:
                 self._log = snapshot.tracker.log
                 self._ids = _ids(self._log, snapshot.started_ns)
-            shown = to_json(snapshot)
-            lasting = _without_clocks(shown)
+            shown = as_json(snapshot)
+            lasting = _without_clocks(from_json(shown))
             self._version += lasting != self._lasting
             self._lasting = lasting
-            self._state = _event("state", as_json(shown))
+            self._state = _event("state", shown.encode())
         return now
 
     async def _next_look(self) -> None:
@@ -392,7 +393,7 @@ class Stream:
             return _event("reset", b'{"log":"/v1/events"}', self._ids[-1])
         first = self._ids.index(heard)
         lines = zip(self._ids[first + 1 :], (self._log or ())[first:], strict=True)
-        return b"".join(_event("log", as_json(to_json(e)), k) for k, e in lines)
+        return b"".join(_event("log", as_json(e).encode(), k) for k, e in lines)
 
 
 def _ids(log: Log, started_ns: int) -> list[str]:

@@ -1,35 +1,55 @@
-"""Views: the fields of the service's records that REST shows.
+"""Views: response models of the service's records.
 
-Records leave as they are: a view names the fields of one, in boundary units. A registration, or its
-1 σ, leaves as its four parameters; a number that is not finite is null. The OpenAPI document takes
-types and descriptions from the records themselves when it is written: ``pyrcal_studies.openapi``.
+A view lists the fields of a record that REST shows, and takes their types from the record. A
+registration, or its 1 σ, is shown as its four parameters in boundary units; a number that is not
+finite is null; a time in nanoseconds is shown as RFC 3339, too. FastAPI describes the models in its
+OpenAPI document. ``pyrcal_studies.openapi`` adds the descriptions of fields, which are the
+docstrings in the records' source.
 """
 
 from __future__ import annotations
 
 import inspect
-import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from datetime import UTC, datetime
-from functools import lru_cache
+from functools import cache
 from hashlib import blake2b
-from operator import attrgetter, methodcaller
-from typing import Annotated, Any, NamedTuple, TypeVar
+from types import NoneType, UnionType
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    NotRequired,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
-import msgspec
 import numpy as np
 from fastapi import Depends, Request, Response
-from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
+from pydantic import (
+    AliasPath,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    WithJsonSchema,
+    create_model,
+)
+from pydantic_core import from_json
+from typing_extensions import TypedDict  # pydantic needs it before Python 3.12
 
-from service import archive, errors, wire
+from service import errors, wire
 from service.control.expected_gain import ExpectedGain
 from service.control.gains import ModeGain
 from service.control.gate import GateVerdict
 from service.estimation.comparison import ProbationFinding
 from service.link.statistics import LinkStatistics
-from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
+from service.model.misregistration import Misregistration, at_boundary
 from service.runtime.snapshot import AlarmStatus, Alpha, ModeGainTable, Rtc, Snapshot, WorkerLoad
 from service.runtime.supervisor import Supervisor
 from service.tracking import alarms, dither_request, interlocks, mode_limits, products
@@ -50,89 +70,42 @@ _LATEST_NS = 253_402_300_800 * 1_000_000_000
 """RFC 3339 has years of four digits."""
 
 
-class FieldView(NamedTuple):
-    """A field of a picture."""
-
-    path: str
-    """Attributes from the record to the field, separated by dots."""
-
-    taken: Callable[[Any], Any]
-    below: View | None
-    """View of the records in the field; None if it is their usual one."""
-
-    clock: str
-    """Name under which it leaves by the clock, too; empty: it is no time."""
+# --- types as which values are shown
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class View:
-    """A picture of a record."""
+class FourView(TypedDict):
+    """The four parameters of a registration, or their 1 σ."""
 
-    name: str
-    """Name of its schema in OpenAPI."""
+    __pydantic_config__ = ConfigDict(use_attribute_docstrings=True)  # type: ignore[misc]
 
-    record: type
-    text: str
-    """Description of the schema."""
+    shift_x_subap: float | None
+    """Along sensor +x, subapertures."""
 
-    parts: Mapping[str, FieldView]
-    """Fields by their names in JSON."""
+    shift_y_subap: float | None
+    """Along sensor +y, subapertures."""
 
+    rotation_deg: float | None
+    """From sensor +x towards +y, degrees."""
 
-USUAL_VIEWS: dict[type, View] = {}
-"""Usual view of each type of record."""
+    magnification: float | None
+    """Ratio; 1 is nominal."""
 
-NAMED_VIEWS: dict[str, View] = {}
-"""All of them, by name."""
-
-
-def define_view(
-    name: str, record: type, fields_of: str = "", text: str = "", **below: View
-) -> View:
-    """Make a view known, and return it.
-
-    Parameters
-    ----------
-    name
-        Of its schema.
-    record
-        The record's type; the first view of one is its usual view.
-    fields_of
-        Which fields leave, separated by spaces; ``name=path`` for one that leaves under another
-        name. Empty: all of them.
-    text
-        What it shows; empty: the record's own words.
-    **below
-        Views of the records in its fields, where they are not the usual ones.
-    """
-    parts = {}
-    for word in fields_of.split() or [field.name for field in fields(record)]:
-        own, _, path = word.rpartition("=")
-        own = own or path.rpartition(".")[2]
-        parts[own] = FieldView(path, attrgetter(path), below.get(own), clock_of(own))
-    text = text or inspect.cleandoc(record.__doc__ or "")
-    made = View(name=name, record=record, text=text, parts=parts)
-    NAMED_VIEWS[name] = made
-    USUAL_VIEWS.setdefault(record, made)
-    return made
+    anamorphosis: NotRequired[list[float]]
+    """Of a registration where it is followed: stretch along x over the mean of both axes, less 1,
+    and along 45 deg."""
 
 
-def to_json(record: object, of: View | None = None) -> dict[str, Any]:
-    """Return what JSON can hold of a record, as its usual view or another shows it."""
-    of = of or USUAL_VIEWS[type(record)]
-    shown = {}
-    for name, (_, taken, below, clock) in of.parts.items():
-        value = taken(record)
-        shown[name] = _plain(value, below)
-        if clock:
-            shown[clock] = rfc3339(value)
-    return shown
+def _named(value: Any) -> Any:  # noqa: ANN401  of a field that has not been validated
+    """Return a registration or a 4-vector in numeric units under its names."""
+    if isinstance(value, np.ndarray):
+        return at_boundary(value)
+    if isinstance(value, Misregistration):
+        stretched = {"anamorphosis": value.anamorphosis} if value.anamorphosis else {}
+        return at_boundary(value.vector) | stretched
+    return value
 
 
-@lru_cache(maxsize=1500)
-def _cache_view(record: HistoryEntry | LogEntry | archive.AuditEntry) -> dict[str, Any]:
-    """Return the view of a record that never changes and is requested often."""
-    return to_json(record)
+_Four = Annotated[FourView, BeforeValidator(_named)]
 
 
 def clock_of(name: str) -> str:
@@ -149,13 +122,114 @@ def rfc3339(t_ns: int | None) -> str | None:
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest_ns // 1000:06d}Z"
 
 
-SCHEMAS = "#/components/schemas/"
+_Clock = Annotated[
+    str | None,
+    BeforeValidator(rfc3339),
+    WithJsonSchema({"anyOf": [{"type": "string", "format": "date-time"}, {"type": "null"}]}),
+]
 
 
-def shows(of: View) -> dict[str, Any]:
+# --- views
+
+
+class View(BaseModel):
+    """Response model of one type of record: its fields are taken from the record's attributes."""
+
+    model_config = ConfigDict(from_attributes=True)
+
+    record: ClassVar[type]
+    """Type of the records that it shows."""
+
+
+USUAL_VIEWS: dict[type, type[View]] = {}
+"""Usual view of each type of record."""
+
+
+def define_view(
+    name: str, record: type, fields_of: str = "", text: str = "", **below: type[View]
+) -> type[View]:
+    """Return the response model that shows some fields of a record.
+
+    Parameters
+    ----------
+    name
+        Name of its schema in OpenAPI.
+    record
+        The record's type; the first view of one is its usual view.
+    fields_of
+        Fields to show, separated by spaces; ``name=path`` for one that is shown under another name.
+        Empty for all of them.
+    text
+        Description of the schema; empty for the record's own docstring.
+    **below
+        Views of the records in its fields, where they are not the usual ones.
+    """
+    shown: dict[str, Any] = {}
+    for word in fields_of.split() or [field.name for field in fields(record)]:
+        own, _, path = word.rpartition("=")
+        own = own or path.rpartition(".")[2]
+        steps = path.split(".")
+        kind = _types_of(owner_of(record, steps))[steps[-1]]
+        shown[own] = _shown_type(kind, below.get(own)), Field(validation_alias=AliasPath(*steps))
+        if clock := clock_of(own):
+            shown[clock] = _Clock, Field(validation_alias=AliasPath(*steps))
+    text = text or inspect.cleandoc(record.__doc__ or "")
+    made = create_model(name, __base__=View, __doc__=text, **shown)
+    made.record = record
+    USUAL_VIEWS.setdefault(record, made)
+    return made
+
+
+def owner_of(record: type, steps: Sequence[str]) -> type:
+    """Return the type of the record that has the attribute at the end of a path."""
+    for step in steps[:-1]:
+        kind = _types_of(record)[step]
+        record = next((one for one in get_args(kind) if one is not NoneType), kind)
+    return record
+
+
+@cache
+def _types_of(record: type) -> dict[str, Any]:
+    """Return the types of a record's fields and properties by name."""
+    found = get_type_hints(record)
+    for base in record.__mro__:
+        for name, value in vars(base).items():
+            if isinstance(value, property):
+                known = vars(sys.modules[base.__module__])
+                found.setdefault(name, get_type_hints(value.fget, known)["return"])
+    return found
+
+
+def _shown_type(kind: Any, below: type[View] | None) -> Any:  # noqa: ANN401  types
+    """Return the type as which a value of this type is shown."""
+    origin, inside = get_origin(kind), get_args(kind)
+    if kind is float:
+        return float | None
+    if kind is Misregistration or origin is np.ndarray:
+        return _Four
+    if origin in {Union, UnionType}:
+        return Union[tuple(_shown_type(one, below) for one in inside)]  # noqa: UP007
+    if origin in {tuple, list}:
+        return list[_shown_type(inside[0], below)]  # type: ignore[misc]
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        return dict[str, _shown_type(inside[1], below)]  # type: ignore[misc]
+    return below or USUAL_VIEWS[kind] if isinstance(kind, type) and is_dataclass(kind) else kind
+
+
+def as_json(record: object, of: type[View] | None = None) -> str:
+    """Return a record as JSON, as its usual view or another shows it."""
+    return (of or USUAL_VIEWS[type(record)]).model_validate(record).model_dump_json()
+
+
+def to_json(record: object, of: type[View] | None = None) -> dict[str, Any]:
+    """Return the JSON object of a record, as its usual view or another shows it."""
+    shown: dict[str, Any] = from_json(as_json(record, of))
+    return shown
+
+
+def shows(of: type[View]) -> dict[str, Any]:
     """Return the OpenAPI description of an answer that shows a record."""
-    content = {"application/json": {"schema": {"$ref": f"{SCHEMAS}{of.name}"}}}
-    return {"description": of.text.partition("\n\n")[0], "content": content}
+    return {"description": (of.__doc__ or "").partition("\n\n")[0], "model": of}
 
 
 def binary(*media_types: str) -> dict[str, Any]:
@@ -163,16 +237,12 @@ def binary(*media_types: str) -> dict[str, Any]:
     return {kind: {"schema": {"type": "string", "format": "binary"}} for kind in media_types}
 
 
-as_json = msgspec.json.Encoder(enc_hook=methodcaller("item")).encode
-"""Returns the JSON of a picture, in which numbers may be NumPy's."""
-
-
-def answer(record: object, of: View | None = None) -> Response:
+def answer(record: object, of: type[View] | None = None) -> Response:
     """Return the answer that shows a record."""
-    return Response(as_json(to_json(record, of)), media_type="application/json")
+    return Response(as_json(record, of), media_type="application/json")
 
 
-def tagged(record: object, of: View | None = None) -> Response:
+def tagged(record: object, of: type[View] | None = None) -> Response:
     """Return the answer that shows a record, with an ETag that changes when it does."""
     shown = answer(record, of)
     shown.headers["ETag"] = f'"{blake2b(shown.body, digest_size=12).hexdigest()}"'
@@ -190,40 +260,6 @@ def found_or_refuse(record: Record | None, refusal: str) -> Record:
     if record is None:
         raise errors.UnknownIdError(refusal)
     return record
-
-
-def named_parameters(vector: NDArray[np.float64]) -> dict[str, float | None]:
-    """Return a 4-vector in numeric units under its names and in the units of every boundary."""
-    values = (vector * BOUNDARY_SCALE).tolist()
-    return {name: finite(value) for name, value in zip(PARAMETERS, values, strict=True)}
-
-
-def finite(value: float) -> float | None:
-    """Return the number, or None where it is not finite."""
-    return value if math.isfinite(value) else None
-
-
-def _plain(value: Any, of: View | None) -> Any:  # noqa: ANN401  any value of a record
-    if value is None or isinstance(value, (str, int)):
-        return value
-    if isinstance(value, float):
-        return finite(value)
-    if isinstance(value, _LASTING):
-        return _cache_view(value)
-    if isinstance(value, Misregistration):
-        four = named_parameters(value.vector)
-        told = value.anamorphosis
-        return four if told is None else four | {"anamorphosis": list(told)}
-    if isinstance(value, np.ndarray):
-        return named_parameters(value)
-    if isinstance(value, tuple | list):
-        return [_plain(entry, of) for entry in value]
-    if isinstance(value, Mapping):
-        return {key: _plain(entry, of) for key, entry in value.items()}
-    return to_json(value, of)
-
-
-_LASTING = (HistoryEntry, LogEntry, archive.AuditEntry)
 
 
 class Parameters(BaseModel):

@@ -8,6 +8,7 @@ from service.tracking.commands import Refit
 from service.tracking.events import MakeMatrix
 from service.tracking.policy import Policy
 from service.tracking.state import TrackerState
+from tests.unit.test_api import LINK
 from tests.unit.tracking.situations import POLICY
 
 
@@ -26,7 +27,7 @@ class Obedient:
     def snapshot(self):
         return Snapshot(
             tracker=self.tracker,
-            link=None,
+            link=LINK,
             now_ns=self.now_ns,
             started_ns=0,
             ready=True,

@@ -9,10 +9,10 @@ import pytest
 import zenoh
 
 from service.config import load_settings
-from service.config.certificates import read_certificate
 from service.config.link_tables import (
     AccessTable,
     link_security,
+    read_certificate,
     read_link_tables,
     secret_of,
 )

@@ -7,7 +7,6 @@ with lower priority does not.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import functools
 import os
 import time
@@ -16,7 +15,7 @@ from dataclasses import dataclass
 from typing import Concatenate, Generic, ParamSpec, TypeVar
 
 from service.model.instrument import Instrument
-from service.runtime.processes import Worker
+from service.runtime.processes import Worker, return_free_memory
 from service.runtime.worker.optics_worker import OpticsWorker
 from service.runtime.worker.records import Compute, Conditions, Made, Sampling
 
@@ -66,15 +65,9 @@ def run_job(
         result = job(optics, *args, **kwargs)
     finally:
         optics.tidy()
-        _return_memory()
+        return_free_memory()  # a linearisation leaves hundreds of megabytes behind
     spent_s = time.process_time() - before_s
     return Done(result=result, cpu_s=spent_s, cluster_problem=optics.rows.problem)
-
-
-def _return_memory() -> None:
-    """Return what is free to the system: a linearisation leaves hundreds of megabytes behind."""
-    with contextlib.suppress(OSError, AttributeError):  # only the GNU C library has it
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _enter(instrument: Instrument, compute: Compute) -> None:

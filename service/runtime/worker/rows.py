@@ -9,17 +9,19 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import operator
+import pickle
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, InvalidStateError, ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from service.errors import ClusterError
-from service.model.sensors.sensor import RowTask
+from service.model.sensors.sensor import Array, RowsElsewhere, RowTask
 from service.runtime.cluster import Cluster
-from service.runtime.worker.remote_rows import RemoteRows
 
 MIN_REMOTE_ROW_S = 0.2
 """Shortest computation of a row that is sent to a worker of the cluster: Dask and the transfer take
@@ -153,3 +155,51 @@ def _compute(
             except BaseException as error:  # noqa: BLE001 - raised where rows are put together
                 with contextlib.suppress(InvalidStateError):
                     answer.set_exception(error)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RemoteRows:
+    """Rows of D(α) computed by a Dask worker with a model of its own.
+
+    Instrument and modes are sent once and kept there. Of each matrix only α and the numbers of its
+    rows are sent: kilobytes.
+    """
+
+    described: bytes
+    """Pickled instrument and modes, which identify the model."""
+
+    @classmethod
+    def of(cls, rows: RowsElsewhere) -> RemoteRows:
+        """Return what is sent of a function of rows: all but its parts."""
+        return cls(described=pickle.dumps((rows.prepare, rows.make)))
+
+    def __call__(self, row: int, *parts: object) -> Array:
+        """Return a row, of what this process has made of the parts before, or makes of them now."""
+        return _HERE.rows(self.described, parts)(row)
+
+
+class _Kept:
+    """The last model and the last function of rows of this process."""
+
+    def __init__(self) -> None:
+        self._making = threading.Lock()
+        self._parts: tuple[object, ...] = ()
+        self._model: Any = None
+        self._described = b""
+        self._rows: RowTask | None = None
+
+    def rows(self, described: bytes, parts: tuple[object, ...]) -> RowTask:
+        """Return a function of rows; one thread makes it, the others wait."""
+        with self._making:
+            known = len(parts) == len(self._parts) and all(map(operator.is_, parts, self._parts))
+            if self._rows is None or not known or described != self._described:
+                self._rows = None  # before the next one takes memory
+                prepare, make = pickle.loads(described)  # of this very program
+                if not known:
+                    self._model = None
+                    self._model, self._parts = prepare(*parts), parts
+                self._rows, self._described = make(self._model), described
+            return self._rows
+
+
+_HERE = _Kept()

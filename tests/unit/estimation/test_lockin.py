@@ -267,6 +267,12 @@ def test_a_dither_a_little_weaker_than_its_request_is_used():
     assert isinstance(spectra, Spectra)
 
 
+def test_spectra_take_the_memory_of_the_sums():
+    bank = PLAN.demodulation
+    sums = bank.empty(7)
+    assert np.shares_memory(bank.at_bins(sums), sums)
+
+
 # --- windows that are joined
 
 
@@ -282,6 +288,7 @@ def test_joined_windows_show_the_dither_as_each_of_them_does():
     assert both is not None
     lines = np.arange(2), [3, 1]
     np.testing.assert_allclose(both.dither[lines], first.dither[lines], rtol=1e-4)
+    assert np.shares_memory(both.slopes, second.slopes)
     assert (both.n_windows, both.window_s) == (2, 2.0)
     assert (both.first_seq, both.t_end_ns_utc) == (first.first_seq, second.t_end_ns_utc)
 
@@ -308,8 +315,8 @@ def test_noise_falls_as_in_a_longer_window_at_the_lines_and_beside_them():
 
 def test_three_windows_count_the_same():
     windows = run(white(3200, seed=4))
-    both = join_windows(join_windows(*windows[:2]), windows[2])
     mean = np.mean([w.slopes[0, 0] for w in windows], axis=0)
+    both = join_windows(join_windows(*windows[:2]), windows[2])
     # the lines have whole periods in a window, so there is no phase to turn
     np.testing.assert_allclose(both.slopes[0, 0], mean, atol=1e-3 * np.abs(mean).max())
 

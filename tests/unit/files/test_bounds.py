@@ -10,7 +10,7 @@ import pytest
 
 from pyrcal.fitting.recorded import check_sealed
 from service.errors import MatrixError
-from service.files import bounds
+from service.files import container
 from service.files.container import opened
 from tests.unit.files.forged import TWO_BY_THREE, fits_bytes
 
@@ -113,7 +113,7 @@ def test_groups_within_each_other_are_followed_so_far_and_no_further(deep):
 
 
 def test_too_many_things_are_not_looked_at_one_by_one(tmp_path, monkeypatch):
-    monkeypatch.setattr(bounds, "MAX_OBJECTS", 50)
+    monkeypatch.setattr(container, "MAX_OBJECTS", 50)
     path = tmp_path / "wide.h5"
     with h5py.File(path, "w") as file:
         for k in range(60):

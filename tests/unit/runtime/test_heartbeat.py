@@ -1,6 +1,6 @@
 """A service that lives and stands still is found out."""
 
-from service.runtime.heartbeat import MAX_ROUND_S, Heartbeat
+from service.runtime.supervisor import MAX_ROUND_S, Heartbeat
 
 
 class Clock:

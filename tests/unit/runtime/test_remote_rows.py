@@ -11,8 +11,8 @@ from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.runtime.cluster import Cluster
-from service.runtime.worker import remote_rows, rows
-from service.runtime.worker.remote_rows import RemoteRows
+from service.runtime.worker import rows
+from service.runtime.worker.rows import RemoteRows
 from tests.unit.model.test_local import basis, many_actuators
 from tests.unit.runtime.test_cluster import scheduler
 from tests.unit.runtime.test_shared_rows import helped_by
@@ -100,7 +100,7 @@ def test_a_worker_makes_the_model_once_and_keeps_the_last_rows():
     def described(alpha):
         return pickle.dumps((prepare_there, partial(Rows, alpha=alpha)))
 
-    kept, parts = remote_rows._Kept(), ("instrument", "modes")
+    kept, parts = rows._Kept(), ("instrument", "modes")
     MADE.clear()
     first = kept.rows(described(1), parts)
     assert kept.rows(described(1), parts) is first

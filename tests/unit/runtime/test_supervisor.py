@@ -14,7 +14,7 @@ import pytest
 from service.archive import Actor, AuditEntry, Channel, Range
 from service.errors import ArchiveError, CommandError, PyrcalError
 from service.rtc_bridge import Bridge, Endpoint
-from service.runtime import heartbeat
+from service.runtime import supervisor as supervising
 from service.runtime.archiving import restore_tracking
 from service.runtime.engine import follow_state
 from service.runtime.supervisor import Supervisor
@@ -330,7 +330,7 @@ async def test_an_intake_that_hangs_is_named_though_the_process_lives(
     gone_on = threading.Event()
     async with running(supervisor):
         assert not supervisor.snapshot().stalled
-        monkeypatch.setattr(heartbeat, "MAX_ROUND_S", 0.3)
+        monkeypatch.setattr(supervising, "MAX_ROUND_S", 0.3)
         monkeypatch.setattr(bridge, "drain", lambda **_: gone_on.wait(60.0) and [])
         await until(lambda: "the intake of telemetry has stood" in supervisor.snapshot().stalled)
         gone_on.set()

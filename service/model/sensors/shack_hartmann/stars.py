@@ -17,8 +17,7 @@ from service.model.sensors.shack_hartmann.description import (
     shack_hartmann_in,
 )
 from service.model.sensors.shack_hartmann.elongated import ElongatedSpots, blur_of, elongation_rad
-from service.model.sensors.shack_hartmann.gradients import MeanGradients
-from service.model.sensors.shack_hartmann.spots import Spots
+from service.model.sensors.shack_hartmann.spots import MeanGradients, Spots
 from service.model.sensors.shack_hartmann.table import Centroid, LaserStar
 
 if TYPE_CHECKING:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from pyrcal.fitting.guide_star import Similarity
 from service.model.misregistration import Misregistration, rotation
-from service.model.similarity import Similarity
 
 ALPHA = Misregistration(shift_x_subap=0.3, shift_y_subap=-0.2, rotation_rad=0.4, magnification=1.1)
 POINTS = np.random.default_rng(1).normal(size=(20, 2))

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
+from pyrcal.fitting.guide_star import GuideStar, Similarity
 from service.errors import ModelError
-from service.model.guide_star import GuideStar
-from service.model.similarity import Similarity
 
 ARCSEC = np.pi / 180 / 3600
 

@@ -101,7 +101,9 @@ def nominal(azimuth_deg):
     ("sensor", "telescope"),
     [*FIRST, *(pytest.param(*one, marks=pytest.mark.long) for one in EVERY if one not in FIRST)],
 )
-def test_offset_scaling_and_anamorphoses_are_those_of_the_table(lenslets, shapes, sensor, telescope):
+def test_offset_scaling_and_anamorphoses_are_those_of_the_table(
+    lenslets, shapes, sensor, telescope
+):
     """Each to half of the table's last digit; the fit begins where the law and the sensor lead."""
     offset_deg, scaling, along, askew = EVERY[sensor, telescope]
     law = nominal(AZIMUTHS[telescope])

@@ -33,7 +33,10 @@ settings.load_profile("busy")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 ORDER = ("tests/unit/", "tests/properties/", "tests/physics/", "tests/system/")
-"""What is known soonest comes first."""
+"""What is known soonest comes first; one worker begins at the end."""
+
+WAITING = "tests/system/"
+"""Tests of processes: 370 s of time and 65 s of a processor, all one after the other."""
 
 REAL_TIME = ("tests/system/test_demo.py", "tests/system/test_sim_rtc.py")
 """The full instrument at 1 kHz: one after the other, on one worker."""
@@ -143,12 +146,32 @@ def _place(nodeid):
 
 
 class InOrder(LoadScopeScheduling):
-    """Hands out whole modules in order, system tests one by one; outlives a worker that dies."""
+    """Hands out whole modules in order, system tests one by one; outlives a worker that dies.
+
+    With the quick tests one worker after the other is given system tests from the beginning: they
+    wait more than they work, and the processors are the others' meanwhile.
+    """
+
+    one_waits = False
+
+    def _assign_work_unit(self, node):
+        if self.one_waits:
+            waits = not any(
+                scope.startswith(WAITING) and not all(unit.values())
+                for other, units in self.assigned_work.items()
+                for scope, unit in units.items()
+                if other is not node
+            )
+            for scope in self.workqueue:
+                if scope.startswith(WAITING) is waits:
+                    self.workqueue.move_to_end(scope, last=False)
+                    break
+        super()._assign_work_unit(node)
 
     def _split_scope(self, nodeid):
         if nodeid.startswith(REAL_TIME):
             return "real time"
-        alone = nodeid.startswith("tests/system/") and not nodeid.startswith(SHARED)
+        alone = nodeid.startswith(WAITING) and not nodeid.startswith(SHARED)
         return nodeid if alone else nodeid.split("::")[0]
 
     def remove_node(self, node):
@@ -174,4 +197,6 @@ class InOrder(LoadScopeScheduling):
 def pytest_xdist_make_scheduler(config, log):
     """Hand out tests in the order of this suite."""
     config.option.loadscopereorder = False
-    return InOrder(config, log)
+    scheduler = InOrder(config, log)
+    scheduler.one_waits = not _only_long(config)
+    return scheduler

@@ -51,15 +51,11 @@ class OtherRtc(Stranger):
         )
         self.wavefront_m = np.abs(scale)
         self.loads = loads or (lambda matrix: matrix)
-        self.stands = ""
-        """zeros, frozen: what the camera shows; empty: what there is."""
-
         self.errors = []
         """(monotonic s, RMS wavefront in m, the same without a service) of each batch."""
 
         self._own, self._own_gains = self.matrix.copy(), self.gains.copy()
         self._alone = np.zeros((2, self.n_modes))
-        self._last = np.zeros((2, self.n_slopes))
         self._played = (self.cm_id, self.matrix)
 
     def worse_s(self, ratio=1.1, stretch=12):
@@ -90,7 +86,7 @@ class OtherRtc(Stranger):
             commands[k] = np.clip(self._integrator + dithers[k], -STROKE_M, STROKE_M)
             seen = np.array([commands[k], self._alone[0]]) + self._turbulence
             powers += np.sum((seen * self.wavefront_m)[:, : len(self._own)] ** 2, axis=1)
-            read = self._read(seen @ self.response.T + noise)
+            read = seen @ self.response.T + noise
             slopes[k] = read[0]
             answer = np.zeros(self.n_modes)
             if self.closed:
@@ -102,11 +98,6 @@ class OtherRtc(Stranger):
         rms = np.sqrt(powers / n)
         self.errors.append((self.t_ns(self.seq) * 1e-9, *rms))
         return self.header(seq0, n), slopes, commands, dithers
-
-    def _read(self, slopes):
-        if not self.stands:
-            self._last = slopes
-        return np.zeros_like(slopes) if self.stands == "zeros" else self._last
 
     def _answer(self, decided, matrix, gains, slopes):
         answer, m = self.leak * decided, len(matrix)

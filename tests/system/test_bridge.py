@@ -3,7 +3,6 @@
 import asyncio
 import subprocess
 import sys
-import threading
 import time
 from contextlib import contextmanager
 from dataclasses import replace
@@ -17,7 +16,6 @@ from service.errors import LinkError, UnknownIdError, WireError
 from service.link.matrices import MeasuredMatrix
 from service.rtc_bridge import Bridge, Endpoint
 from service.tracking.events import (
-    ConditionChanged,
     LogEvent,
     RtcVanished,
     ServicesMet,
@@ -210,18 +208,6 @@ def test_a_missing_batch_is_lost_until_it_comes_late_and_finds_its_place(bridge,
     assert (statistics.frames_lost, statistics.frames_recovered) == (0, 10)
 
 
-def test_a_hole_that_nothing_fills_holds_frames_back_for_half_a_second_only(bridge, rtc):
-    begin = time.monotonic()
-    rtc.send(0)
-    rtc.send(20)
-    blocks = drained(bridge, 20)
-    assert 0.3 < time.monotonic() - begin < patience(1.5)
-    assert [(b.first_seq, b.n_frames) for b in blocks] == [(0, 10), (20, 10)]
-    rtc.send(10)
-    wait_until(lambda: bridge.statistics().frames_late == 10)
-    assert bridge.statistics().frames_lost == 10
-
-
 def test_a_hole_is_not_waited_for_without_a_publisher_that_remembers(endpoint):
     patient = replace(endpoint, recovery_s=1000.0)
     with Bridge(patient) as bridge, FakeRtc(endpoint.listen[0]) as rtc:
@@ -229,26 +215,6 @@ def test_a_hole_is_not_waited_for_without_a_publisher_that_remembers(endpoint):
         rtc.send(0, plain=True)
         rtc.send(20, plain=True)
         assert sequence(drained(bridge, 20)) == [*range(10), *range(20, 30)]
-
-
-def test_the_first_of_two_equal_frames_wins(bridge, rtc):
-    rtc.send(0)
-    rtc.send(5, rows=np.full((10, 10), 99.0, np.float32))
-    blocks = drained(bridge, 15)
-    assert sequence(blocks) == list(range(15))
-    slopes = np.concatenate([b.slopes[:, 0] for b in blocks])
-    assert slopes.tolist() == [*range(10), *([99.0] * 5)]
-    assert bridge.statistics().frames_duplicate == 5
-
-
-def test_a_frame_that_is_not_finite_costs_itself_only(bridge, rtc):
-    rows = rtc.rows(rtc.header(0))
-    rows[3, 2], rows[7, -1] = np.nan, np.inf
-    rtc.send(0, rows=rows)
-    blocks = drained(bridge, 8)
-    assert [(b.first_seq, b.n_frames) for b in blocks] == [(0, 3), (4, 3), (8, 2)]
-    statistics = bridge.statistics()
-    assert (statistics.frames_nonfinite, statistics.frames_lost) == (2, 0)
 
 
 def test_malformed_batches_are_counted_reported_once_and_survived(bridge, rtc):
@@ -268,20 +234,6 @@ def test_malformed_batches_are_counted_reported_once_and_survived(bridge, rtc):
     assert bridge.statistics().callback_errors == 0
 
 
-def test_frames_of_another_basis_or_configuration_are_refused(bridge, rtc):
-    bridge.expect("kl-1", "mask-1")
-    seen = Seen(bridge)
-    rtc.send(0)
-    rtc.send(10, basis_id="kl-2")
-    rtc.send(20, config_id="mask-2")
-    rtc.send(30)
-    blocks = drained(bridge, 20)
-    assert sequence(blocks) == [*range(10), *range(30, 40)]
-    assert bridge.statistics().frames_refused == {"basis": 10, "config": 10}
-    mismatch = seen.first(ConditionChanged, name="basis-mismatch")
-    assert "are kl-2 and mask-1, expected kl-1 and mask-1" in mismatch.text
-
-
 def test_the_first_basis_seen_is_adopted_when_none_is_pinned(bridge, rtc):
     seen = Seen(bridge)
     rtc.send(0)
@@ -298,38 +250,6 @@ def test_frames_of_another_system_are_not_heard(bridge, rtc, endpoint):
         drained(bridge, 10)
         time.sleep(0.2)
     assert bridge.statistics().frames_received == 10
-
-
-def test_another_reconstructor_a_clock_step_and_a_dither_begin_new_blocks(bridge, rtc):
-    rtc.send(0)
-    rtc.send(10, cm_id="r-2")
-    late = rtc.header(20).t0_ns + 600_000
-    rtc.send(20, cm_id="r-2", t0_ns=late)
-    rtc.send(30, cm_id="r-2", dither=True)
-    blocks = wait_until(lambda: _whole(bridge, 40))
-    assert [(b.first_seq, b.cm_id) for b in blocks] == [
-        (0, None),
-        (10, "r-2"),
-        (20, "r-2"),
-        (30, "r-2"),
-    ]
-    assert [b.dither_m is None for b in blocks] == [True, True, True, False]
-
-
-def _whole(bridge, n_frames):
-    """Drain only once everything is there, so that blocks end where they must and nowhere else."""
-    return bridge.drain() if bridge.statistics().frames_received >= n_frames else None
-
-
-def test_frames_nobody_drains_are_overwritten_oldest_first_and_counted(endpoint):
-    small = Endpoint(system=SYSTEM, listen=endpoint.listen, ring_seconds=0.2)
-    with Bridge(small) as bridge, FakeRtc(endpoint.listen[0]) as rtc:
-        for k in range(30):
-            rtc.send(10 * k)
-        wait_until(lambda: bridge.statistics().frames_received == 300)
-        assert sequence(bridge.drain()) == list(range(100, 300))
-        assert bridge.statistics().frames_overwritten == 100
-        assert bridge.statistics().frames_lost == 0
 
 
 def test_the_consumer_is_woken_once_until_it_looks(bridge, rtc):
@@ -390,20 +310,6 @@ def test_a_killed_rtc_vanishes_within_the_lease(bridge, endpoint):
         process.kill()
         seen.first(RtcVanished, 4.0)
     assert not bridge.statistics().rtc_alive
-
-
-def test_interleaved_sessions_are_a_second_rtc(bridge, rtc, endpoint):
-    seen = Seen(bridge)
-    with FakeRtc(endpoint.listen[0], session="s2") as other:
-        rtc.send(0)
-        wait_until(lambda: bridge.statistics().session == "s1")
-        for k in range(1, 16):
-            rtc.send(10 * k)
-            other.send(10 * k)
-            time.sleep(0.1)
-    assert "sessions s1 and s2" in seen.first(ConditionChanged, name="second-rtc").text
-    wait_until(lambda: bridge.statistics().frames_refused == {"session": 150})
-    assert {b.session for b in bridge.drain()} == {"s1"}
 
 
 def test_a_status_is_reported_and_a_bad_one_counted(bridge, rtc):
@@ -471,42 +377,6 @@ def test_a_later_service_stands_by_and_takes_over_when_the_first_has_gone(endpoi
             wait_until(lambda: tokens(rtc.zenoh, rtc.keys.alive(Role.SERVICE)), 3.0)
             assert drives(second, rtc, "l-3")
         assert [command.id for command in rtc.commands] == ["l-1", "l-3"]
-
-
-def test_of_services_that_come_at_the_same_time_exactly_one_drives(endpoint):
-    router = Bridge(replace(endpoint, system="router"))
-    with router, FakeRtc(endpoint.listen[0]) as rtc:
-        bridges = [Bridge(Endpoint(system=SYSTEM, connect=endpoint.listen)) for _ in range(4)]
-        threads = [threading.Thread(target=bridge.open) for bridge in bridges]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join(patience(10.0))
-        for left in (4, 3, 2, 1):
-            driving = wait_until(
-                lambda left=left: [
-                    bridge
-                    for k, bridge in enumerate(bridges)
-                    if drives(bridge, rtc, f"l-{left}-{k}-{time.monotonic_ns()}")
-                ]
-            )
-            assert len(driving) == 1
-            driving[0].close()
-            bridges.remove(driving[0])
-
-
-def test_a_service_that_holds_only_the_contracts_token_was_first_if_it_was_there_first(endpoint):
-    router = Bridge(replace(endpoint, system="router"))
-    with router, FakeRtc(endpoint.listen[0]) as rtc:
-        token = rtc.zenoh.liveliness().declare_token(rtc.keys.alive(Role.SERVICE))
-        wait_until(lambda: tokens(rtc.zenoh, rtc.keys.alive(Role.SERVICE)))
-        with Bridge(Endpoint(system=SYSTEM, connect=endpoint.listen)) as late:
-            event = Seen(late).first(ServicesMet)
-            assert (event.drives, event.others) == (False, ("one that gives no name",))
-            assert not drives(late, rtc, "l-1")
-            token.undeclare()
-            assert Seen(late).first(ServicesMet).drives
-            assert drives(late, rtc, "l-2")
 
 
 def test_a_service_that_opens_its_link_anew_is_there_again_and_drives(bridge, rtc):
@@ -585,12 +455,6 @@ def test_an_applied_reconstructor_becomes_the_current_one(bridge, rtc):
     wait_until(lambda: rtc.fetch(rtc.keys.current) != "nothing to offer")
     fetched, _ = rtc.fetch_current()
     assert fetched.id == manifest.id
-
-
-async def test_an_id_is_never_reused_for_another_matrix(bridge, rtc):
-    await bridge.publish(*reconstructor(rtc, seed=0))
-    with pytest.raises(WireError, match="r-1 already names a matrix"):
-        await bridge.publish(*reconstructor(rtc, seed=1))
 
 
 async def test_a_manifest_that_does_not_describe_its_matrix_is_not_sent(bridge, rtc):

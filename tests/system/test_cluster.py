@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import signal
 import subprocess
 import sys
 
@@ -20,7 +21,7 @@ from tests.unit.runtime.test_shared_rows import helped_by
 
 pytestmark = [pytest.mark.system, pytest.mark.long]
 
-N_NIGHTS = 6
+N_NIGHTS = 3
 NIGHTS = (
     f"--instrument={INSTRUMENT}",
     "--n-controlled=45",
@@ -82,13 +83,13 @@ def test_a_worker_that_is_killed_changes_nothing_but_time(tmp_path, played_here)
     assert rows_of(path) == played_here
 
 
-@pytest.mark.parametrize("how", ["kill", "stop"])
-def test_nights_that_a_lost_scheduler_leaves_are_played_here(tmp_path, played_here, how):
+def test_nights_that_a_lost_scheduler_leaves_are_played_here(tmp_path, played_here):
+    """It stands still: one that is killed is seen sooner, by its closed connection."""
     with dask_cluster(tmp_path) as dask:
         path = tmp_path / "rows.jsonl"
         running = campaign(path, "--cluster", dask.address)
         wait_for(lambda: n_rows(path), 60, "no row of the cluster's")
-        dask.scheduler.send_signal({"kill": 9, "stop": 19}[how])
+        dask.scheduler.send_signal(signal.SIGSTOP)
         status, told = ended(running)
     (line,) = [line for line in told.splitlines() if "played here" in line]
     assert status == 0

@@ -64,6 +64,7 @@ def test_the_main_job_is_done_within_a_minute(night):
     process.alone()
 
 
+@pytest.mark.slow  # two minutes of a whole processor: the same program with another file
 def test_another_telescope_is_another_instrument_and_nothing_else(night):
     figures = night.directory / "figures.json"
     words = ["--instrument", "soul-lbt", "--seconds", "120", "--json", str(figures)]

@@ -281,11 +281,10 @@ def generous(folder):
 # ---------------------------------------------------------------- what becomes of them
 
 
-@pytest.mark.parametrize("attack", ATTACKS)
-def test_on_an_open_link_every_attack_succeeds(attack):
+def test_on_an_open_link_every_attack_succeeds():
     listen = (f"tcp/127.0.0.1:{free_port()}",)
     with bench(listen, NO_SECURITY) as scene, attacker(listen[0]) as session:
-        assert attack(session, scene)
+        assert [attack.__name__ for attack in ATTACKS if not attack(session, scene)] == []
 
 
 @pytest.mark.parametrize("mode", ["client", "peer", "router"])
@@ -299,14 +298,13 @@ def test_what_does_leave_an_attacker_is_refused_on_arrival(generous, folder):
         assert [attack.__name__ for attack in ATTACKS if attack(session, generous)] == []
 
 
-@pytest.mark.parametrize("mode", ["client", "peer", "router"])
-def test_a_certificate_of_no_role_lets_in_and_to_nothing(folder, mode):
+def test_a_certificate_of_no_role_lets_in_and_to_nothing(folder):
     zenoh_table = tables(folder, free_port())
     roles = AccessTable(viewer=())
     security = link_security(zenoh_table.model_copy(update={"access": roles}), "bench")
     with (
         bench(zenoh_table.listen, security, **certificate(folder / "ours", "rtc")) as scene,
-        attacker(zenoh_table.listen[0], mode, **certificate(folder / "ours", "viewer")) as session,
+        attacker(zenoh_table.listen[0], **certificate(folder / "ours", "viewer")) as session,
     ):
         assert [attack.__name__ for attack in ATTACKS if attack(session, scene)] == []
 

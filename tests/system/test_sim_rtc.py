@@ -20,15 +20,8 @@ from pyrcal.rtc.session import client_config
 from service.config.link_tables import Router
 from service.wire import (
     Acknowledgement,
-    CommandKind,
-    DitherKind,
-    DitherRequest,
-    DitherStop,
     Keys,
-    LoopRequest,
     Manifest,
-    MeasureRequest,
-    Pattern,
     Reply,
     Role,
     Status,
@@ -132,21 +125,8 @@ class Listener:
             ]
         return sorted(chosen, key=lambda batch: batch.header.seq0)
 
-    def command(self, kind: CommandKind, command):
-        replies = self.session.get(
-            KEYS.command(kind), payload=encode(command), timeout=patience(5.0)
-        )
-        (reply,) = [r.ok.payload.to_bytes() for r in replies if r.ok is not None]
-        return decode(Reply, reply)
-
     def rest(self) -> None:
-        """Leave nothing of the test before: no dither, a closed loop, no answers to matrices."""
-        status = self.next_status()
-        if status.dither is not None:
-            self.command(CommandKind.DITHER, DitherStop(id=fresh("stop")))
-        if status.loop != "closed":
-            self.command(CommandKind.LOOP, LoopRequest(id=fresh("l"), loop="closed"))
-        self.next_status(lambda status: status.dither is None and status.loop == "closed")
+        """Leave no answers to matrices of the test before."""
         while not self.acknowledgements.empty():
             self.acknowledgements.get()
 
@@ -277,109 +257,6 @@ def test_status_describes_the_telemetry(rtc):
     assert 1e5 < float(status.flux_images.sum()) < 3e5
 
 
-def test_commands_obey_the_integrator_equation_of_the_wire(rtc):
-    """c[k+2] = leak c[k+1] - gain R s[k], from nothing but what the RTC publishes."""
-    status = rtc.next_status()
-    _, matrix = rtc.applied()
-    batches = rtc.frames(status.seq, status.seq + 200)
-    slopes = np.concatenate([b.slopes for b in batches])
-    commands = np.concatenate([b.commands_m for b in batches])
-    expected = status.leak * commands[1:-1] - np.pad(
-        np.array(status.gains[:400]) * (slopes[:-2] @ matrix.T), ((0, 0), (0, 194))
-    )
-    # float32 sums over 1400 slopes of commands of a micrometre: 1e-11 m of rounding.
-    np.testing.assert_allclose(commands[2:], expected, atol=2e-11)
-
-
-def test_a_sine_dither_appears_as_announced_and_stays_out_of_the_integrator(rtc):
-    request = DitherRequest(
-        id=fresh("sine"),
-        kind=DitherKind.SINE,
-        modes=(501, 450),
-        amplitude_m=(5e-9, 3e-9),
-        frequency_hz=(240.0, 313.0),
-        duration_s=0.305,
-    )
-    reply = rtc.command(CommandKind.DITHER, request)
-    assert reply.accepted
-    assert rtc.command(CommandKind.DITHER, request) == reply
-    start = reply.start_seq
-    batches = rtc.frames(start, start + 400)
-    seq = np.concatenate([b.header.seq0 + np.arange(b.header.n) for b in batches])
-    dither = np.concatenate(
-        [np.zeros_like(b.commands_m) if b.dither_m is None else b.dither_m for b in batches]
-    )
-    commands = np.concatenate([b.commands_m for b in batches])
-    expected = np.zeros_like(dither)
-    playing = (seq >= start) & (seq < start + 305)
-    for mode, amplitude, frequency in zip(
-        request.modes, request.amplitude_m, request.frequency_hz, strict=True
-    ):
-        phase = 2 * np.pi * frequency * (seq[playing] - start) * 1e-3
-        expected[playing, mode] = amplitude * np.sqrt(2) * np.sin(phase)
-    np.testing.assert_allclose(dither, expected, atol=1e-14)
-    # Mode 501 is not controlled: its command is the dither and nothing else.
-    np.testing.assert_array_equal(commands[:, 501], dither[:, 501])
-    assert batches[-1].dither_m is None
-
-
-def test_a_second_dither_is_refused_until_the_first_is_stopped(rtc):
-    def request(name):
-        return DitherRequest(
-            id=name,
-            kind=DitherKind.BINARY,
-            modes=(500,),
-            amplitude_m=(4e-9,),
-            duration_s=20.0,
-            seed=3,
-        )
-
-    first = rtc.command(CommandKind.DITHER, request(fresh("binary")))
-    assert first.accepted
-    assert rtc.command(CommandKind.DITHER, request(fresh("binary"))).reason.startswith("busy")
-    (batch, *_) = rtc.frames(first.start_seq, first.start_seq + 10)
-    np.testing.assert_allclose(np.abs(batch.dither_m[:, 500]), 4e-9, rtol=1e-6)
-    assert rtc.next_status().dither.start_seq == first.start_seq
-    assert rtc.command(CommandKind.DITHER, DitherStop(id=fresh("stop"))).accepted
-    rtc.next_status(lambda status: status.dither is None)
-
-
-@pytest.mark.parametrize(
-    ("kind", "command", "reason"),
-    [
-        (
-            CommandKind.MEASURE,
-            MeasureRequest(
-                id="measure-1",
-                pattern=Pattern.PUSH_PULL_MODAL,
-                modes=(600,),
-                amplitude_m=(1e-8,),
-                n_average=1,
-            ),
-            "range: mode 600, expected 0 to 593",
-        ),
-        (CommandKind.LOOP, LoopRequest(id="loop-1", gains=(0.4,) * 400), "range: 400 gains"),
-        (CommandKind.LOOP, LoopRequest(id="loop-2", n_controlled=700), "range: n_controlled"),
-        (
-            CommandKind.DITHER,
-            DitherRequest(
-                id="far",
-                kind=DitherKind.SINE,
-                modes=(600,),
-                amplitude_m=(1e-9,),
-                frequency_hz=(200.0,),
-                duration_s=1.0,
-            ),
-            "range: mode 600, expected 0 to 593",
-        ),
-    ],
-)
-def test_commands_it_cannot_carry_out_are_refused_with_a_reason(rtc, kind, command, reason):
-    reply = rtc.command(kind, command)
-    assert not reply.accepted
-    assert reply.reason.startswith(reason)
-
-
 def test_an_unreadable_command_is_answered(rtc):
     (reply,) = rtc.session.get(KEYS.command("dither"), payload=b"\x01nonsense", timeout=5.0)
     refused = decode(Reply, reply.ok.payload.to_bytes())
@@ -422,58 +299,6 @@ def test_a_missing_chunk_is_asked_for(rtc):
     queryable.undeclare()
 
 
-@pytest.mark.parametrize(
-    ("rows", "changes", "reason"),
-    [
-        (399, {}, r"range: shape [399, 1408], expected [400, 1408]"),
-        (400, {"basis_id": "zernike"}, "id: basis_id 'zernike'"),
-        (400, {"config_id": "other"}, "id: config_id 'other'"),
-    ],
-)
-def test_a_reconstructor_that_does_not_fit_is_rejected(rtc, rows, changes, reason):
-    base, matrix = rtc.applied()
-    new = manifest_for(base, matrix[:rows], fresh("misfit"), **changes)
-    rtc.send_chunks(new, matrix[:rows])
-    rtc.commit(new)
-    answer = rtc.acknowledgement()
-    assert (answer.state, answer.id) == ("rejected", new.id)
-    assert answer.reason.startswith(reason)
-    assert rtc.next_status().cm_id == base.id
-
-
-def test_wrong_bytes_and_a_used_id_are_rejected(rtc):
-    base, matrix = rtc.applied()
-    new = manifest_for(base, matrix, fresh("bytes"))
-    rtc.send_chunks(new, matrix * 2)
-    rtc.commit(new)
-    assert "sha256" in rtc.acknowledgement().reason
-    again = manifest_for(base, matrix * 3, base.id)
-    rtc.commit(again)
-    answer = rtc.acknowledgement()
-    assert (answer.state, answer.sha256) == ("rejected", again.layout.sha256)
-    assert answer.reason.startswith("id:")
-
-
-def test_more_modes_take_effect_with_the_next_matrix_of_that_shape(rtc):
-    base, matrix = rtc.applied()
-    reply = rtc.command(CommandKind.LOOP, LoopRequest(id=fresh("modes"), n_controlled=401))
-    assert reply.accepted
-    assert rtc.next_status().n_controlled == 400
-    more = np.vstack([matrix, np.zeros_like(matrix[:1])])
-    new = manifest_for(base, more, fresh("more"))
-    rtc.commit(new)
-    rtc.send_chunks(new, more)
-    assert [rtc.acknowledgement().state for _ in range(2)] == ["staged", "applied"]
-    status = rtc.next_status(lambda status: status.n_controlled == 401)
-    assert status.gains[400] == pytest.approx(0.35)
-    back = rtc.command(CommandKind.LOOP, LoopRequest(id=fresh("modes"), n_controlled=400))
-    assert back.accepted
-    fewer = manifest_for(base, matrix, fresh("fewer"))
-    rtc.commit(fewer)
-    rtc.send_chunks(fewer, matrix)
-    assert [rtc.acknowledgement().state for _ in range(2)] == ["staged", "applied"]
-
-
 def test_the_truth_is_beside_the_run_and_not_on_the_wire(rtc):
     def lines(kind):
         # the last line may be under way
@@ -492,17 +317,6 @@ def test_the_truth_is_beside_the_run_and_not_on_the_wire(rtc):
     assert 0.0 < shift <= 0.2
     # The only registration on the wire is the one the matrix in use was made for: none.
     assert set(rtc.applied()[0].alpha.values()) == {0.0, 1.0}
-
-
-def test_opening_the_loop_zeroes_the_integrator_and_begins_a_session(rtc):
-    before = rtc.next_status()
-    assert rtc.command(CommandKind.LOOP, LoopRequest(id=fresh("open"), loop="open")).accepted
-    status = rtc.next_status(lambda status: status.loop == "open")
-    assert status.session != before.session
-    (batch, *_) = rtc.frames(status.seq + 10, status.seq + 20)
-    assert not batch.commands_m.any()
-    assert rtc.command(CommandKind.LOOP, LoopRequest(id=fresh("close"), loop="closed")).accepted
-    rtc.next_status(lambda status: status.loop == "closed")
 
 
 def test_it_waits_for_the_service_outlives_it_and_ends_cleanly(tmp_path):

@@ -1,8 +1,12 @@
 """Products that outlive the service: real files, a real index, real processes killed on the way."""
 
+import asyncio
 import contextlib
+import hashlib
+import json
 import os
 import random
+import re
 import resource
 import signal
 import sqlite3
@@ -11,19 +15,37 @@ import subprocess
 import sys
 import threading
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
 from service.archive import Archive, AuditEntry, Pin, Range
+from service.archive.nights import TREND_S, TrendSample
+from service.archive.serialisation import TrackingFile
+from service.control.expected_gain import ExpectedGain
+from service.control.gains import ModeGain
 from service.control.gate import GateVerdict
 from service.errors import ArchiveError, StorageError, UnknownIdError, WireError
+from service.estimation.frames import FrameBlock
 from service.model.misregistration import Misregistration
-from service.tracking.products import Judged, MatrixState, ReconstructorRecord
+from service.runtime import telemetry_recorder as of_moments
+from service.runtime.telemetry_recorder import TrendSampler, residual_of, sample_of
+from service.tracking import commands as cmd
+from service.tracking.mode_limits import ModeAnswer, ModeProof
+from service.tracking.products import Assessment, Judged, MatrixState, ReconstructorRecord
+from service.tracking.registration import Registration
+from service.tracking.resume import saved_of
+from service.tracking.state import Mode, Orders
 from service.web.keys import KeyFile, KeyScope
-from service.wire import checksum
+from service.wire import Pointing, checksum
+from tests.states import changed
+from tests.unit.test_api import ALPHA, SECOND, SIGMA, STATE, service
+from tests.unit.tracking.operations.test_acquisition import Acquiring
+from tests.unit.tracking.situations import START_NS, Story, moved
+from tests.unit.tracking.test_watchdog import learnt, watch
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(3, 4)
 VERDICT = GateVerdict(
@@ -648,3 +670,374 @@ def test_a_disk_that_refuses_leaves_nothing_behind(tmp_path):
     assert "StorageError" in complaint
     assert "cm-000000.h5: cannot be written" in complaint
     assert assert_nothing_told_is_lost(tmp_path) == []
+
+
+# --- what is left for the next service
+
+
+DATA = Path(__file__).parents[1] / "data" / "archive"
+
+
+@pytest.fixture(scope="module")
+def saved():
+    """What a night with windows, looks and a known pointing has left."""
+    story = Story(Mode.AUTO).meet()
+    story.state = changed(story.state, pointing=Pointing(elevation_deg=61.0, azimuth_deg=120.0))
+    story.see(n_windows=3, modes=(501, 509, 517, 525), gain_sigma=np.full(4, 0.01))
+    learnt(story, n_looks=3)
+    watch(story, moved(shift_x_subap=0.06))
+    return saved_of(story.state, story.now_ns)
+
+
+@pytest.fixture
+def file(tmp_path):
+    return TrackingFile(tmp_path / "tracking.json")
+
+
+def same(one, other):
+    if isinstance(one, np.ndarray):
+        return np.array_equal(one, other)
+    if hasattr(one, "__dataclass_fields__"):
+        return all(same(getattr(one, f.name), getattr(other, f.name)) for f in fields(one))
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(same, one, other))
+    return one == other
+
+
+def test_there_is_nothing_before_the_first_night(file):
+    assert file.read() is None
+
+
+def test_what_is_read_is_what_was_written_but_for_what_depends_on_the_time(file, saved):
+    file.write(saved)
+    found = file.read()
+    fresh = {
+        f.name: f.default for f in fields(Registration) if f.name in {"validity", "suspected_jump"}
+    }
+    expected = replace(saved, registration=replace(saved.registration, grown=np.zeros(4), **fresh))
+    for f in fields(Registration):
+        left, right = getattr(found.registration, f.name), getattr(expected.registration, f.name)
+        assert same(left, right), f.name
+    assert same(found, expected)
+    assert found.registration.biases != ()
+    assert len(found.registration.optical_gains) == 4
+
+
+def test_what_modes_have_shown_is_read_as_it_was_written(file, saved):
+    proof = ModeProof(
+        proven=frozenset(range(400)),
+        suspected=frozenset({430}),
+        answers=(ModeAnswer(mode=430, gain=-0.6, like=77),),
+        own_uneven="by the RTC's own matrix mode 3 2.1 times as strongly as its neighbours",
+        own_response_ratio=0.7,
+    )
+    file.write(replace(saved, mode_proof=proof))
+    assert file.read().mode_proof == proof
+
+
+@pytest.fixture(scope="module")
+def cut_off():
+    """What a service has left that ended while its loop was open."""
+    story = Acquiring()
+    story.tell(cmd.Acquire())
+    story.open()
+    return saved_of(story.state, story.now_ns)
+
+
+def test_an_acquisition_under_way_is_read_as_it_was_written(file, cut_off):
+    file.write(cut_off)
+    found = file.read()
+    assert found.registration is None
+    # who began it is known to that service alone
+    assert cut_off.acquisition.cause
+    assert same(found, replace(cut_off, acquisition=replace(cut_off.acquisition, cause="")))
+    assert found.acquisition.found.gains == (0.4,) * 400 + (0.0,) * 194
+    assert found.acquisition.interruption.session == "s2"
+    assert found.acquisition.interruption.cause == "the service ended"
+
+
+def test_that_an_operator_ended_one_is_read_as_it_was_written(file, cut_off):
+    file.write(replace(cut_off, acquisition=replace(cut_off.acquisition, held_off=True)))
+    assert file.read().acquisition.held_off is True
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"stage": "lost"},
+        {"attempt": "two"},
+        {"found": {"gains": [0.4, None]}},
+        {"interruption": {"doing": "coarse"}},
+        {"shoe_size": 43},
+    ],
+)
+def test_a_damaged_acquisition_is_no_acquisition(file, cut_off, tmp_path, values):
+    file.write(cut_off)
+    path = tmp_path / "tracking.json"
+    found = content_of(path.read_text())
+    found["acquisition"] |= values
+    path.write_text(signed(found))
+    with pytest.raises(ArchiveError, match="damaged"):
+        file.read()
+
+
+def content_of(text):
+    """Return what a file says besides its checksum."""
+    return {name: value for name, value in json.loads(text).items() if name != "sha256"}
+
+
+def signed(values):
+    """Return the text of a file whose checksum is right."""
+    return json.dumps(values | {"sha256": hashlib.sha256(json.dumps(values).encode()).hexdigest()})
+
+
+ORDERS = Orders(mode=Mode.HOLD, settings_mode=Mode.AUTO, dither_stopped=True)
+
+
+def test_orders_are_read_as_they_were_given(file, saved):
+    file.write(replace(saved, orders=ORDERS))
+    assert file.read().orders == ORDERS
+    assert file.read().orders.mode is Mode.HOLD
+
+
+def test_orders_alone_are_worth_a_file(file, saved):
+    file.write(replace(saved, registration=None, orders=ORDERS))
+    found = file.read()
+    assert (found.registration, found.orders) == (None, ORDERS)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"mode": "fast"}, {"mode": None}, {"dither_stopped": "no"}, {"shoe_size": 43}],
+)
+def test_damaged_orders_are_none(file, saved, tmp_path, values):
+    file.write(replace(saved, orders=ORDERS))
+    path = tmp_path / "tracking.json"
+    found = content_of(path.read_text())
+    found["orders"] |= values
+    path.write_text(signed(found))
+    with pytest.raises(ArchiveError, match="damaged, moved to"):
+        file.read()
+
+
+def test_the_newest_replaces_what_was_there(file, saved, tmp_path):
+    file.write(saved)
+    file.write(replace(saved, saved_ns_utc=START_NS + 1))
+    assert file.read().saved_ns_utc == START_NS + 1
+    assert [path.name for path in tmp_path.iterdir()] == ["tracking.json"]
+
+
+@pytest.mark.parametrize(("was", "became"), [('"alpha": [0', '"alpha": [1'), ("HOLD", "AUTO")])
+def test_one_digit_or_word_that_has_changed_is_damage(file, saved, tmp_path, was, became):
+    file.write(replace(saved, orders=ORDERS))
+    path = tmp_path / "tracking.json"
+    text = path.read_text()
+    changed = re.sub(was.replace("[", "\\["), became, text, count=1, flags=re.IGNORECASE)
+    assert changed != text
+    path.write_text(changed)
+    with pytest.raises(ArchiveError, match="found checksum"):
+        file.read()
+
+
+def altered(**values):
+    def change(text):
+        return signed({**content_of(text), **values})
+
+    return change
+
+
+def with_registration(**values):
+    def change(text):
+        found = content_of(text)
+        found["registration"] |= values
+        return signed(found)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: text[: len(text) // 2],
+        lambda text: "",
+        lambda text: "[]",
+        altered(version=7),
+        altered(registration=None),
+        altered(shoe_size=43),
+        with_registration(alpha=[0.1, 0.2, 0.3]),
+        with_registration(alpha=[0.1, 0.2, float("nan"), 1.0]),
+        with_registration(covariance=np.diag([1.0, 1.0, -1.0, 1.0]).tolist()),
+        with_registration(t_ns_utc="yesterday"),
+        with_registration(optical_gains=[{"mode": 3}]),
+    ],
+)
+def test_a_damaged_file_is_put_aside_and_the_next_can_be_written(file, saved, tmp_path, damage):
+    file.write(saved)
+    path = tmp_path / "tracking.json"
+    path.write_text(damage(path.read_text()))
+    with pytest.raises(ArchiveError, match="damaged, moved to"):
+        file.read()
+    assert sorted(found.name for found in tmp_path.iterdir()) == ["tracking.damaged"]
+    assert file.read() is None
+    file.write(saved)
+    assert file.read() is not None
+
+
+def test_a_disk_that_refuses_is_named(tmp_path, saved):
+    with pytest.raises(ArchiveError, match="cannot be written"):
+        TrackingFile(tmp_path / "nowhere" / "tracking.json").write(saved)
+
+
+def test_it_lies_in_the_archives_directory(tmp_path, saved):
+    with Archive(tmp_path) as archive:
+        archive.open()
+        archive.tracking.write(saved)
+    assert (tmp_path / "tracking.json").exists()
+
+
+# --- trends
+
+
+__all__ = ["service"]  # a fixture
+
+FULL = TrendSample(
+    t_ns_utc=SECOND,
+    telemetry_ns_utc=7,
+    alpha=ALPHA,
+    sigma=SIGMA,
+    wavefront_m=6e-8,
+    residual_m=5e-8,
+    margin=0.9,
+    optical_gain=0.5,
+    n_controlled=400,
+    magnitude=11.5,
+    flux=3.25,
+    elevation_deg=61.0,
+    azimuth_deg=-12.0,
+)
+
+
+def at(t_s, **changes):
+    return replace(FULL, t_ns_utc=round(t_s * SECOND), **changes)
+
+
+def test_a_sample_comes_back_as_it_was(archive):
+    nothing = TrendSample(t_ns_utc=2 * SECOND)
+    archive.record((), (), (), (FULL, nothing))
+    full, bare = archive.nights.samples(0, 2 * SECOND, 10)
+    assert isinstance(full.n_controlled, int)
+    assert bare == nothing or bare.alpha is bare.sigma is bare.residual_m is None
+    for field in fields(TrendSample):
+        ours, theirs = getattr(full, field.name), getattr(FULL, field.name)
+        if isinstance(theirs, Misregistration):
+            ours, theirs = ours.vector, theirs.vector
+        np.testing.assert_allclose(ours, theirs, rtol=1e-14, err_msg=field.name)
+
+
+def test_of_many_the_worst_and_the_ends_remain(archive):
+    night = [at(15 * k, residual_m=9e-7 if k == 777 else 5e-8) for k in range(3000)]
+    archive.record((), (), (), night)
+    found = archive.nights.samples(0, 10**18, 200)
+    assert 100 <= len(found) <= 200
+    assert found[-1].t_ns_utc == night[-1].t_ns_utc
+    assert max(one.residual_m for one in found) == 9e-7
+    gaps = np.diff([one.t_ns_utc for one in found]) / SECOND
+    assert gaps.max() <= 2 * 15 * 3000 / 200 * 1.5
+
+
+def block(slopes, cm_id="cm-1", t0_ns=5 * SECOND):
+    n = len(slopes)
+    return FrameBlock(
+        session="s-1",
+        first_seq=0,
+        t0_ns_utc=t0_ns,
+        dt_ns=1_000_000,
+        slopes=slopes.astype(np.float32),
+        commands_m=np.zeros((n, 2), np.float32),
+        dither_m=None,
+        cm_id=cm_id,
+    )
+
+
+def test_the_residual_is_what_the_matrix_reads_in_the_slopes():
+    matrix = np.array([[1e-7, 0.0, 0.0], [0.0, 2e-7, 0.0]], np.float32)
+    slopes = np.array([[0.3, 0.2, 9.0], [-0.3, -0.2, 9.0]])
+    assert residual_of(block(slopes), matrix) == pytest.approx(5e-8), "3 and 4 at right angles"
+    assert residual_of(block(slopes[:, :2]), matrix) is None
+
+
+def test_what_is_known_is_in_the_sample():
+    expected = ExpectedGain(loss_m=1e-8, wavefront_m=5e-8, pole_radius=0.8, fresh_pole_radius=0.8)
+    gains = tuple(ModeGain(mode=k, gain=g, sigma=0.1, scatter=0.1, t_ns_utc=1) for k, g in
+                  enumerate((0.4, 0.6)))  # fmt: skip
+    state = changed(
+        STATE,
+        registration=replace(STATE.alpha.registration, optical_gains=gains),
+        assessment=Assessment(id="rtc-0", alpha=ALPHA, expected=expected, t_ns_utc=1),
+        pointing=Pointing(elevation_deg=61.0, azimuth_deg=120.0),
+        rtc=replace(STATE.loop.rtc, magnitude=11.0, flux=np.full(4, 2.5, "<f4").tobytes()),
+    )
+    found = sample_of(state, 9, 8, 7e-8)
+    assert (found.t_ns_utc, found.telemetry_ns_utc, found.residual_m) == (9, 8, 7e-8)
+    assert found.wavefront_m == pytest.approx(6e-8)
+    assert found.margin == pytest.approx(0.8 / 0.95)
+    assert found.optical_gain == pytest.approx(0.5)
+    assert (found.n_controlled, found.magnitude, found.flux) == (400, 11.0, 2.5)
+    assert (found.elevation_deg, found.azimuth_deg) == (61.0, 120.0)
+    np.testing.assert_array_equal(found.sigma, state.alpha.registration.sigma)
+    another = changed(state, in_use="cm-9")
+    assert sample_of(another, 9, 8, None).wavefront_m is None, "it is of another matrix"
+
+
+async def test_telemetry_that_stands_is_none(monkeypatch):
+    monkeypatch.setattr(of_moments, "TREND_S", 0.001)
+    taken, frames = [], block(np.ones((4, 3)), cm_id="cm-1")
+
+    def unknown(_):
+        raise ArchiveError("nobody has its numbers")
+
+    sampler = TrendSampler(
+        state=lambda: STATE, frames=lambda: frames, matrix=unknown, keep=taken.append
+    )
+    running = asyncio.create_task(sampler.run())
+    async with asyncio.timeout(5.0):
+        while len(taken) < 3:  # noqa: ASYNC110 - as it goes on
+            await asyncio.sleep(0.001)
+    running.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await running
+    ends = [one.telemetry_ns_utc for one in taken[:3]]
+    assert ends == [5 * SECOND + 4_000_000, None, None]
+    assert taken[0].residual_m is None
+
+
+async def test_the_trends_are_answered_with_how_far_apart_they_are(client, service):
+    service.archive.record((), (), (), [at(15 * k) for k in range(100)])
+    told = (await client.get("/v1/trends", params={"since_ns": 15 * SECOND})).json()
+    assert (len(told["samples"]), told["interval_s"]) == (99, TREND_S)
+    first = told["samples"][0]
+    assert first["t_utc"] == "1970-01-01T00:00:15.000000Z"
+    assert first["alpha"]["rotation_deg"] == pytest.approx(0.3)
+    thin = (await client.get("/v1/trends", params={"points": 8})).json()
+    assert len(thin["samples"]) <= 8
+    assert thin["interval_s"] > 15 * 100 / 8
+
+
+PATHS = ("trends", "nights", "marks", "annotations", "audit", "alpha/history")
+
+
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("query", ["since=0020-01-01T00:00:00Z", "until=9999-01-01T00:00:00Z"])
+async def test_a_time_that_no_clock_here_can_have_is_refused_with_those_that_can(
+    client, path, query
+):
+    told = await client.get(f"/v1/{path}?{query}")
+    assert told.status_code == 422, told.text
+    expected = "expected a time from 1970-01-01T00:00:00Z to 2262-04-11T23:47:16Z"
+    assert expected in told.json()["detail"]
+
+
+@pytest.mark.parametrize("path", ["trends", "nights", "marks", "annotations"])
+async def test_the_first_and_the_last_time_there_can_be_are_answered(client, path):
+    query = "since=1970-01-01T00:00:00Z&until=2262-04-11T23:47:16Z"
+    assert (await client.get(f"/v1/{path}?{query}")).status_code == 200

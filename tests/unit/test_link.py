@@ -623,7 +623,8 @@ def test_frames_of_a_known_mode_of_the_sensor_are_used_and_of_another_named(cloc
     assert intake.statistics().config_id == "c"
     intake.expect("b", "other", ("other", "third"))
     send(intake, 10)
-    assert intake.statistics().frames_refused == {"config": 10}
+    send(intake, 20)
+    assert intake.statistics().frames_refused == {"config": 20}
     (told,) = [e.text for e in intake.events() if isinstance(e, ev.ConditionChanged)]
     assert told.endswith(
         "the instrument file has the modes other, third: set the RTC to one of them, or add "

@@ -2,19 +2,39 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
 
 from service.control.dither import (
+    CLEARANCE_HZ,
+    COARSE_BAND,
+    FINE_BAND,
+    LINE_BAND_RATIO,
+    MAX_LINES,
+    MIN_LINES,
+    PRECISION_RATIO_RANGE,
+    PRECISION_TABLE,
+    TABLE_MAGNITUDES,
     DitherRequirement,
     Schedule,
     choose_burst_s,
     choose_window_s,
+    compute_information,
+    compute_precision_ratio,
     compute_schedule,
+    look_up_precision,
     place_lines,
+    select_informative_modes,
+    spread_lines,
+    spread_modes,
+    update_mean_ratio,
 )
+from service.model.interaction import Linearisation
+from service.model.misregistration import Misregistration
 
 KAPPA = np.array([0.02, 0.02, np.deg2rad(0.08), 0.004]) * 1e-9
 """Magnitude 10 of the design study: 2 % of a subaperture in 1 s at 1 nm."""
@@ -169,3 +189,162 @@ def test_lines_on_the_products_of_others_are_moved():
 
 def test_a_spectrum_full_of_vibrations_leaves_no_room():
     assert lines(tuple(np.arange(195.0, 360.0, 10.0))) is None
+
+
+# --- which modes are dithered
+
+
+RNG = np.random.default_rng(3)
+WANTED = np.array([0.003, 0.003, 1e-4, 3e-4])
+
+
+@pytest.fixture(scope="module")
+def linearisation():
+    return Linearisation(
+        alpha=Misregistration(),
+        matrix=RNG.normal(size=(60, 12)).astype(np.float32),
+        derivatives=RNG.normal(size=(4, 60, 12)).astype(np.float32),
+    )
+
+
+def worst(found, modes):
+    covariance = np.linalg.inv(found[list(modes)].sum(axis=0))
+    return (np.diag(covariance) / WANTED**2).max()
+
+
+def test_information_is_that_of_a_fit_with_the_modes_gain_free(linearisation):
+    found = compute_information(linearisation)
+    for mode in (0, 7):
+        regressors = np.column_stack(
+            [*linearisation.derivatives[:, :, mode], linearisation.matrix[:, mode]]
+        ).astype(float)
+        covariance = np.linalg.inv(regressors.T @ regressors)
+        np.testing.assert_allclose(np.linalg.inv(found[mode]), covariance[:4, :4], rtol=1e-5)
+
+
+def test_no_exchange_of_one_mode_improves_the_chosen_set(linearisation):
+    found = compute_information(linearisation)
+    chosen = select_informative_modes(found, range(12), 4, WANTED)
+    assert len(set(chosen)) == 4
+    for place, other in itertools.product(range(4), set(range(12)) - set(chosen)):
+        exchanged = [*chosen[:place], other, *chosen[place + 1 :]]
+        assert worst(found, exchanged) >= worst(found, chosen) * (1 - 1e-5)
+
+
+def test_only_candidates_are_chosen(linearisation):
+    assert set(
+        select_informative_modes(compute_information(linearisation), range(5, 30), 3, WANTED)
+    ) <= set(range(5, 12))
+
+
+def test_fewer_candidates_than_wanted_are_all_taken(linearisation):
+    assert select_informative_modes(
+        compute_information(linearisation), range(9, 40), 4, WANTED
+    ) == (9, 10, 11)
+
+
+def test_what_is_wanted_decides_which_modes_tell_most(linearisation):
+    found = compute_information(linearisation)
+    only_rotation = select_informative_modes(found, range(12), 1, np.array([1e3, 1e3, 1e-4, 1e3]))
+    variances = [np.linalg.inv(found[mode])[2, 2] for mode in range(12)]
+    assert only_rotation == (int(np.argmin(variances)),)
+
+
+# --- the precision that a dither reaches
+
+
+@pytest.mark.parametrize("row", range(3))
+def test_the_table_is_met_at_its_own_magnitudes(row):
+    np.testing.assert_allclose(look_up_precision(TABLE_MAGNITUDES[row]), PRECISION_TABLE[row])
+
+
+def test_between_two_magnitudes_it_is_their_geometric_mean():
+    np.testing.assert_allclose(
+        look_up_precision(8.5), np.sqrt(PRECISION_TABLE[0] * PRECISION_TABLE[1])
+    )
+
+
+def test_the_brightest_are_no_better_than_the_table_and_fainter_ones_worse():
+    np.testing.assert_allclose(look_up_precision(3.0), PRECISION_TABLE[0])
+    np.testing.assert_allclose(
+        look_up_precision(15.0), PRECISION_TABLE[2] ** 2 / PRECISION_TABLE[1]
+    )
+
+
+def test_an_unknown_star_is_taken_for_a_faint_one():
+    np.testing.assert_allclose(look_up_precision(None), PRECISION_TABLE[2])
+
+
+def test_a_window_of_the_tables_own_precision_has_the_ratio_one():
+    """σ = κ / (A sqrt(T)): 4 nm for 25 s is 20 times the precision of 1 nm for 1 s."""
+    sigma = look_up_precision(10.0) / (4e-9 * 5.0)
+    ratio = compute_precision_ratio(np.diag(sigma**2), 4e-9, 25.0, 10.0)
+    np.testing.assert_allclose(ratio, 1.0)
+    ratio = compute_precision_ratio(np.diag(4.0 * sigma**2), 4e-9, 25.0, 10.0)
+    np.testing.assert_allclose(ratio, 2.0)
+
+
+def test_a_window_beyond_belief_counts_as_the_edge_of_belief():
+    ratio = compute_precision_ratio(np.diag([1e6, 1e-30, 1.0, 1.0]), 1e-9, 1.0, 10.0)
+    assert (ratio[0], ratio[1]) == (PRECISION_RATIO_RANGE[1], PRECISION_RATIO_RANGE[0])
+
+
+def test_the_first_window_is_believed_and_a_change_after_a_dozen():
+    mean = None
+    for number in range(20):
+        mean = update_mean_ratio(mean, number, np.full(4, 0.5))
+    np.testing.assert_allclose(mean, 0.5)
+    for number in range(20, 36):
+        mean = update_mean_ratio(mean, number, np.full(4, 2.0))
+    # (7/8)^16 = 12 % of the mean square is still the old one
+    np.testing.assert_allclose(mean, np.sqrt(0.118 * 0.25 + 0.882 * 4.0), rtol=1e-2)
+
+
+# --- the dithers of an acquisition
+
+
+@pytest.mark.parametrize("n_modes", [16, 30, 60, 224, 594])
+def test_the_modes_that_confirm_are_others_than_those_that_lead(n_modes):
+    lead, confirm = (spread_modes(reach, n_modes, 8) for reach in (COARSE_BAND, FINE_BAND))
+    assert not set(lead) & set(confirm)
+    assert max(lead) < min(confirm)
+    assert max(confirm) < n_modes
+    assert len(lead) >= MIN_LINES
+    assert len(confirm) >= MIN_LINES
+
+
+def test_in_a_long_basis_the_bands_are_those_that_were_studied():
+    assert spread_modes(COARSE_BAND, 594, 8) == (0, 4, 8, 12, 16, 20, 24, 28)
+    assert spread_modes(FINE_BAND, 594, 8) == (36, 45, 54, 63, 72, 81, 90, 99)
+
+
+@pytest.mark.parametrize("rate_hz", [300.0, 500.0, 990.0, 1000.0, 2000.0])
+def test_every_line_has_whole_periods_and_room_for_its_noise(rate_hz):
+    lines = spread_lines(rate_hz, 2.0, 8)
+    assert MIN_LINES <= len(lines) <= MAX_LINES
+    assert all((2.0 * line) % 1.0 == 0.0 for line in lines)
+    assert min(b - a for a, b in combinations(sorted(lines), 2)) >= CLEARANCE_HZ
+    assert LINE_BAND_RATIO[0] * rate_hz <= min(lines)
+    assert max(lines) <= LINE_BAND_RATIO[1] * rate_hz
+
+
+def test_no_line_is_made_by_three_others():
+    lines = spread_lines(1000.0, 2.0, 8)
+    for a, b in combinations(lines, 2):
+        for c in set(lines) - {a, b}:
+            rest = set(lines) - {a, b, c}
+            assert all(abs(a + b - c - line) >= 2.0 for line in rest)
+
+
+def test_a_slow_camera_has_fewer_lines_and_a_very_slow_one_none():
+    assert len(spread_lines(500.0, 2.0, 8)) < len(spread_lines(1000.0, 2.0, 8))
+    assert spread_lines(150.0, 2.0, 8) == ()
+
+
+def test_an_rtc_that_plays_few_modes_gets_few():
+    assert len(spread_lines(1000.0, 2.0, 4)) == 4
+    assert spread_lines(1000.0, 2.0, 2) == ()
+
+
+def test_finer_modes_are_the_more_precise_ones():
+    assert np.all(FINE_BAND.floor < COARSE_BAND.floor)

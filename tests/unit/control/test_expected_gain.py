@@ -1,5 +1,7 @@
 """Against closed forms, a direct solution per frequency, and a loop run frame by frame."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np
@@ -9,13 +11,14 @@ from service.control.expected_gain import (
     Sky,
     compute_radial_orders,
     estimate_noise_loss_m,
+    estimate_slope_noise,
     extrapolate_variance_m2,
     predict_gain,
 )
 from service.control.loop import ControlLoop
 from service.control.reconstructor import invert
 from service.model.misregistration import Misregistration
-from tests.numerics import N_CONTROLLED, N_MODES, small_basis, small_model
+from tests.numerics import N_CONTROLLED, N_MODES, small_basis, small_instrument, small_model
 
 NOISE = 0.05
 SKY = Sky(
@@ -171,3 +174,16 @@ class TestNoise:
         assert estimate_noise_loss_m(1e-9, np.array([20.0, 0, 0, 0]), np.eye(4)) == pytest.approx(
             1e-11
         )
+
+
+# --- noise
+
+
+def test_a_bright_star_has_photon_noise_and_a_faint_one_four_reads_besides():
+    bright, dimmer, faint = (
+        estimate_slope_noise(small_instrument(), magnitude=m, frame_rate_hz=1000.0, n_valid=100)
+        for m in (-5.0, 0.0, 12.5)
+    )
+    assert dimmer == pytest.approx(10.0 * bright, rel=1e-3)
+    electrons = bright**-2.0 * 10.0**-7.0
+    assert faint == pytest.approx(np.sqrt(electrons + 4 * 4.0**2) / electrons, rel=1e-3)

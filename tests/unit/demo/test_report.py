@@ -85,6 +85,12 @@ def truth(tmp_path):
     return file
 
 
+def names(texts, *words):
+    """Whether there is one text, which has these numbers and names."""
+    (text,) = texts
+    return all(word in text for word in words)
+
+
 def test_a_night_that_went_well_is_good(truth):
     report = make_report(service_state(), shelf(), truth, WELL)
     assert report.failures == []
@@ -111,9 +117,7 @@ def test_before_and_after_stand_side_by_side(truth):
 def test_a_night_that_won_less_than_was_promised_fails(truth):
     promised = replace(WELL, wanted_ratio=1.5)
     report = make_report(service_state(), shelf(), truth, promised)
-    assert report.failures == [
-        "the wavefront error of the start is 1.14 times that with more modes, expected 1.5 times"
-    ]
+    assert names(report.failures, "1.14 times", "expected 1.5")
 
 
 def test_the_picture_shows_both_stages(truth, tmp_path):
@@ -155,13 +159,13 @@ def test_a_small_pupil_may_turn_until_its_edge_moves_as_far(truth, across_subap,
 
 def test_an_estimate_within_its_tolerance_but_surer_than_it_may_be_fails(truth):
     report = make_report(service_state(rotation_deg=0.03), shelf(), truth, WELL)
-    assert report.failures == ["rotation_deg is off by +5.0 sigma"]
+    assert names(report.failures, "rotation_deg", "+5.0 sigma")
     assert report.error_in_sigma["rotation_deg"] == pytest.approx(5.0)
 
 
 def test_a_margin_that_did_not_recover_fails(truth):
     report = make_report(service_state(), shelf(cm_400={"gate": gate(0.94)}), truth, WELL)
-    assert report.failures == ["the stability margin has not recovered"]
+    assert names(report.failures, "margin")
 
 
 def test_a_matrix_that_nobody_had_time_to_judge_is_no_margin_that_did_not_recover(truth):
@@ -169,7 +173,7 @@ def test_a_matrix_that_nobody_had_time_to_judge_is_no_margin_that_did_not_recove
     assert report.good
     assert "not judged" in table(report)
     unknown = make_report(service_state(), shelf(cm_400={"gate": None}), truth, WELL)
-    assert unknown.failures == ["the stability margin has not recovered"]
+    assert names(unknown.failures, "margin")
 
 
 def test_a_worker_that_is_behind_is_told_and_fails_nothing_by_itself(truth):
@@ -185,7 +189,7 @@ def test_more_modes_that_do_not_lower_the_wavefront_error_fail(truth):
         if line["cm_id"] == "cm-500":
             line["wavefront_error_nm"] = 121.0
     report = make_report(service_state(), shelf(), truth, WELL)
-    assert report.failures == ["the wavefront error with more modes is not below that of the start"]
+    assert names(report.failures, "wavefront error")
 
 
 def test_a_matrix_applied_just_before_the_end_is_not_yet_the_one_that_is_judged(truth):
@@ -205,7 +209,7 @@ def test_a_night_without_more_modes_fails(truth):
 def test_frames_skipped_at_a_swap_fail(truth):
     truth.lines.append({"kind": "swap", "cm_id": "cm-500", "frames_skipped": 3})
     report = make_report(service_state(), shelf(), truth, WELL)
-    assert report.failures == ["3 frames skipped at the swap to cm-500"]
+    assert names(report.failures, "3 frames", "cm-500")
 
 
 def test_an_alarm_that_lasts_to_the_end_fails(truth):
@@ -216,13 +220,13 @@ def test_an_alarm_that_lasts_to_the_end_fails(truth):
 def test_without_a_registration_there_is_nothing_to_compare(truth):
     state = service_state() | {"registration": None}
     report = make_report(state, shelf(), truth, Circumstances())
-    assert "no estimate of the registration" in report.failures
+    assert any("registration" in text for text in report.failures)
     assert report.true_alpha == TRUE
 
 
 def test_a_service_that_never_answered_fails(truth):
     report = make_report(None, [], truth, Circumstances())
-    assert report.failures == ["the service never answered"]
+    assert names(report.failures, "never answered")
 
 
 def test_what_was_refused_and_rejected_is_counted(truth):
@@ -258,32 +262,31 @@ def test_a_good_night_needs_no_reasons(truth):
 
 def test_refused_windows_are_the_reason_with_what_was_said_of_the_last(truth):
     circumstances = Circumstances(refusal="the loop changed within the window")
-    assert failed(truth, circumstances, windows_refused=27) == [
-        "refused windows: 27 of 27; the last: the loop changed within the window"
-    ]
+    reasons = failed(truth, circumstances, windows_refused=27)
+    assert names(reasons, "27 of 27", circumstances.refusal)
 
 
 def test_telemetry_that_gave_no_window_at_all_is_the_reason(truth):
-    assert failed(truth, windows_refused=0) == ["no window of telemetry was finished"]
+    assert names(failed(truth, windows_refused=0), "no window")
 
 
 def test_frames_that_never_came_or_stopped_are_the_reason(truth):
     link = {"frames_received": 0, "frames_lost": 0}
-    assert "no frames: none has reached the service" in failed(truth, link=link)
+    assert any("no frames: none" in text for text in failed(truth, link=link))
     stopped = failed(truth, Circumstances(frameless_s=12.3))
-    assert "no frames: the last reached the service 12 s ago" in stopped
+    assert any("no frames" in text and "12 s ago" in text for text in stopped)
 
 
 def test_a_simulator_that_is_slow_or_silent_is_the_reason(truth):
     slow = failed(truth, Circumstances(pace=0.62))
-    assert "too slow: the simulator made 0.62 s of telemetry a second" in slow
+    assert any("simulator" in text and "0.62 s" in text for text in slow)
     silent = failed(truth, Circumstances(silent_s=8.0))
-    assert "the simulator has made nothing for 8 s" in silent
+    assert any("simulator" in text and "for 8 s" in text for text in silent)
 
 
 def test_a_service_that_was_never_ready_says_what_it_waited_for(truth):
     reasons = failed(truth, waiting_for=[waiting("model", "worker", "the model is prepared")])
-    assert reasons == ["the service was not ready: for the worker: the model is prepared"]
+    assert names(reasons, "not ready", "worker", "the model is prepared")
 
 
 def waiting(name, party, text):
@@ -300,13 +303,13 @@ def test_what_the_service_waits_for_is_passed_on_once(truth):
 def test_a_process_that_ended_is_named_with_its_last_words(truth):
     ending = "the service ended with status 2: pyrcal: no such thing"
     report = make_report(None, [], truth, Circumstances(endings=(ending,)))
-    assert report.failures == ["the service never answered"]
+    assert names(report.failures, "never answered")
     assert report.reasons == [ending]
 
 
 def test_an_old_answer_is_not_a_good_one(truth):
     report = make_report(service_state(), shelf(), truth, Circumstances(unanswered_s=7.2))
-    assert report.failures == ["the service has not answered for 7 s"]
+    assert names(report.failures, "not answered", "7 s")
 
 
 def test_the_table_says_what_failed_or_that_all_is_good():

@@ -27,6 +27,8 @@ RNG = np.random.default_rng(1)
 RESPONSE = np.linalg.qr(RNG.normal(size=(N_SLOPES, N_MODES)))[0]
 MATRIX = np.float32(RESPONSE.T)
 GAIN, DELAY = 0.4, 2
+SEEDS = [0, 1, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(2, 8))]
+"""A verdict on noise needs many draws; two of them come with every run."""
 
 
 def turbulence(seconds, rng, strength=1.0):
@@ -141,15 +143,15 @@ def test_a_loop_that_is_worse_by_a_half_is_found_however_restless_it_was_before(
     assert healthy.verdict is Verdict.AS_GOOD
 
 
-@pytest.mark.parametrize("seeing", [0.6, 0.8, 1.25, 1.6])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seeing", [0.6, 1.6])
+@pytest.mark.parametrize("seed", SEEDS)
 def test_the_same_matrix_in_other_seeing_is_not(seeing, seed):
     (found,) = judged([("a", 4.0, MATRIX, 1.0), ("b", 4.5, MATRIX, seeing)], seed)
     assert found.verdict is Verdict.AS_GOOD, found.text
     assert found.residual_ratio < found.residual_limit
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_a_loop_is_no_worse_for_what_the_matrix_before_takes_for_its_own(seed):
     """The loop of the one before had that at zero, and the other's has not."""
     loops = [("a", 4.0, reading_beyond(1), 1.0), ("b", 4.5, reading_beyond(2), 1.0)]

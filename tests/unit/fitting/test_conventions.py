@@ -12,10 +12,8 @@ import pyrcal
 from pyrcal import conventions
 from pyrcal.__main__ import main
 from pyrcal.conventions import check
-from pyrcal.importers.files import Reported
 from pyrcal.importers.oopao import from_saved
 from pyrcal.importers.saved import read_npz
-from pyrcal.importers.specula import from_specula
 from service.instrument import load_instrument
 from service.model.modes import modal_basis
 from tests.unit.fitting.mutations import GOOD_FILE, MATRICES, STREAMS, good
@@ -52,7 +50,11 @@ def test_there_are_forty_mutations():
     assert len(MATRICES) + len(STREAMS) >= 40
 
 
-@pytest.mark.parametrize("name", MATRICES)
+@pytest.mark.parametrize(
+    "name",
+    # no start is near the rolled one: its fit takes as long as ten others
+    [pytest.param(k, marks=[pytest.mark.long] * ("shifted by three" in k)) for k in MATRICES],
+)
 def test_a_mutated_matrix_breaks_its_rule(name, files):
     mutate, rules = MATRICES[name]
     assert broken(check(files.instrument, mutate(files))) & named(rules)
@@ -81,21 +83,12 @@ def test_what_a_file_leaves_open_breaks_no_rule(files):
     assert broken(check(silent, 3.0 * files.matrix)) == set()
 
 
-def test_what_was_imported_keeps_them(tmp_path):
-    reported = Reported(
-        diameter_m=2.0, sensor="pyramid", stop="mirror", obscuration_ratio=0.2, unit="nm"
-    )
-    for name, imported in (
-        ("oopao", from_saved(read_npz(DATA / "oopao-pyramid.npz"), "it")),
-        ("lenslets", from_saved(read_npz(DATA / "oopao-lenslets.npz"), "it")),
-        (
-            "specula",
-            from_specula([DATA / f"specula-{k}.fits" for k in ("im", "pup", "ifunc")], reported),
-        ),
-    ):
-        saved = imported.save(tmp_path / name)
-        findings = check(load_instrument(saved.instrument), imported.arrays["interaction_matrix"])
-        assert broken(findings) == set(), name
+def test_imported_lenslets_keep_them(tmp_path):
+    """The other good imports are in test_imported_files_mutated."""
+    imported = from_saved(read_npz(DATA / "oopao-lenslets.npz"), "it")
+    saved = imported.save(tmp_path / "lenslets")
+    findings = check(load_instrument(saved.instrument), imported.arrays["interaction_matrix"])
+    assert broken(findings) == set()
 
 
 def test_the_command_says_which_rules_are_broken(files, tmp_path, capsys):

@@ -94,9 +94,9 @@ def clean_fits(seed):
 
 @pytest.mark.long
 @pytest.mark.timeout(600)
-def test_of_a_hundred_clean_matrices_nothing_is_said():
-    found = [fit for seed in range(300, 325) for fit in clean_fits(seed)]
-    assert len(found) == 100
+def test_of_forty_clean_matrices_nothing_is_said():
+    found = [fit for seed in range(300, 310) for fit in clean_fits(seed)]
+    assert len(found) == 40
     assert [said(one) for one in found if said(one)] == []
 
 
@@ -124,7 +124,8 @@ def test_the_move_told_of_an_image_that_is_not_stretched_is_the_fits():
     assert np.all(np.abs(told.moved - moved) < 0.25 * found.sigma)
 
 
-@pytest.mark.parametrize("half", ["lower", pytest.param("upper", marks=pytest.mark.long)])
+@pytest.mark.long  # that of the anamorphosis above is with every run
+@pytest.mark.parametrize("half", ["lower", "upper"])
 def test_the_move_told_of_half_the_modes_is_that_of_a_fit_of_them(half):
     noisy = matrix(noise=0.15)
     kept = np.arange(20) if half == "lower" else np.arange(20, 40)
@@ -145,8 +146,7 @@ def test_another_modulation_is_worse_and_would_move_it_by_sigmas():
 @pytest.mark.parametrize(
     "off",
     [
-        (0.1, -0.05),
-        (0.5, 0.0),
+        (0.5, -0.05),
         pytest.param((0.0, 0.2), marks=pytest.mark.long),
         pytest.param((0.35, -0.35), marks=pytest.mark.long),
     ],
@@ -350,7 +350,9 @@ def test_too_few_modes_and_too_much_noise_are_reasons_to_measure_more():
     assert np.all(np.abs(noisy.alpha.vector - ELSEWHERE.vector) < 3.0 * noisy.sigma)
 
 
-@pytest.mark.parametrize("unknown", [(), ("wfs.modulation_lambda_over_d",)])
+@pytest.mark.parametrize(
+    "unknown", [pytest.param((), marks=pytest.mark.long), ("wfs.modulation_lambda_over_d",)]
+)
 def test_of_pure_noise_nothing_is_called_found(unknown):
     noise = np.random.default_rng(2).normal(size=modal().shape) * modal().std()
     found = explained(replace(modal_bench(), unknown=unknown), noise)

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pyrcal.fitting.matrix import FitOptions
+from pyrcal.fitting.matrix import FitOptions, fit_matrix
 from pyrcal.fitting.uncertainty import (
     EXACT_RESIDUAL,
     FAR_SHARE,
@@ -11,10 +11,13 @@ from pyrcal.fitting.uncertainty import (
     misplacement_sigma,
 )
 from service.errors import ModelError
-from service.model.instrument import Mirror
+from service.estimation.reference import Reference
+from service.model.instrument import Mirror, TabulatedModes
 from service.model.kinds import Method, Stop
 from service.model.misregistration import Misregistration
+from service.model.modes import modal_basis
 from service.model.pupil import Illumination
+from tests.numerics import small_basis
 from tests.unit.estimation.bench import ELSEWHERE, GRID, PLAIN, error, fit, instrument, matrix
 
 
@@ -247,3 +250,38 @@ def test_misplaced_actuators_are_in_sigma_as_far_as_the_residual_has_room_for_th
     assert not misplacement_sigma(mirror, 1.5, 0.5, residual=EXACT_RESIDUAL).any()
     unstated = replace(mirror, position_error_pitch=None)
     np.testing.assert_allclose(misplacement_sigma(unstated, 1.5, 0.5, residual=0.1), sigma * 0.4)
+
+
+# --- tables
+
+
+FAR = Misregistration(
+    shift_x_subap=0.55, shift_y_subap=-0.3, rotation_rad=np.deg2rad(1.0), magnification=0.995
+)
+
+STEP_SUBAP = 0.25
+
+
+@pytest.mark.parametrize("half_subap", [6.0, 7.5])
+def test_a_table_that_ends_at_the_pupil_costs_slopes_and_no_accuracy(half_subap):
+    line = np.arange(-7.5, 7.51, STEP_SUBAP)
+    x, y = np.meshgrid(line, line)
+    shapes = small_basis().render(np.column_stack([x.ravel(), y.ravel()]))
+    known = np.hypot(x, y) <= half_subap
+    cube = np.where(known, shapes.T.reshape(-1, *x.shape), 0.0)
+    about = instrument()
+    table = TabulatedModes(cube=cube, pitch_m=STEP_SUBAP * about.subaperture_m, known=known)
+    about = replace(about, mirror=table)
+    found = fit_matrix(about, Reference(matrix=matrix(FAR)), basis=modal_basis(about))
+    assert found.accepted
+    # 0.06 % of a subaperture was seen with every filling of the unknown part
+    assert np.all(np.abs(error(found, FAR)[:2]) < 2e-3)
+    assert bool(found.left_out) == (half_subap < 7.0)
+
+
+def test_single_actuators_are_a_basis_too():
+    strokes = small_basis().mode_to_actuator
+    poked = small_basis().combine_modes(np.linalg.pinv(strokes)[:, ::3])
+    found = fit_matrix(instrument(None), Reference(matrix=matrix(FAR, basis=poked)), basis=poked)
+    assert found.accepted
+    assert np.all(np.abs(error(found, FAR)[:2]) < 2e-3)

@@ -1,5 +1,7 @@
 """Telemetry of any recorder, through the estimators: what comes out, and what is refused."""
 
+import contextlib
+import io
 import json
 
 import h5py
@@ -89,11 +91,25 @@ def tracked(capsys, path, *words):
     return status, json.loads(out) if out else None, err
 
 
-def test_sines_in_an_npz_give_alpha(telemetry, tmp_path, capsys):
-    h5, png = tmp_path / "track.h5", tmp_path / "track.png"
-    path = saved(tmp_path, telemetry)
-    status, found, _ = tracked(capsys, path, f"--output={h5}", f"--plot={png}")
-    assert status == 0
+@pytest.fixture(scope="module")
+def answer(telemetry, tmp_path_factory):
+    """The folder with what is written of the whole file, and what is printed of it."""
+    folder, out = tmp_path_factory.mktemp("whole"), io.StringIO()
+    words = [f"--output={folder / 'track.h5'}", f"--plot={folder / 'track.png'}"]
+    with contextlib.redirect_stdout(out):
+        assert main(["track", SMALL, str(saved(folder, telemetry)), "--json", *words]) == 0
+    return folder, json.loads(out.getvalue())
+
+
+def cut(telemetry, n=1500):
+    """The first frames, of a dither that stays as it is described."""
+    per_frame = ("slopes", "commands_m", "dither_m")
+    return {name: values[:n] if name in per_frame else values for name, values in telemetry.items()}
+
+
+def test_sines_in_an_npz_give_alpha(answer):
+    folder, found = answer
+    h5, png = folder / "track.h5", folder / "track.png"
     entries = [entry for entry in found["entries"] if entry["source"] == "lock-in"]
     assert len(entries) >= 1
     for name, value in TRUE.items():
@@ -119,7 +135,7 @@ def test_the_library_takes_names_and_gives_arrays(telemetry, tmp_path):
     assert (tmp_path / "night.png").stat().st_size > 10_000
 
 
-def test_hdf5_says_the_same_as_npz(telemetry, tmp_path, capsys):
+def test_hdf5_says_the_same_as_npz(telemetry, answer, tmp_path, capsys):
     path = tmp_path / "night.h5"
     numbers = ("frame_rate_hz", "delay_frames", "leak")
     with h5py.File(path, "w") as file:
@@ -128,10 +144,9 @@ def test_hdf5_says_the_same_as_npz(telemetry, tmp_path, capsys):
                 file.attrs[name] = float(values)
             else:
                 file[name] = values
-    _, one, _ = tracked(capsys, path)
-    _, other, _ = tracked(capsys, saved(tmp_path, telemetry))
-    assert one["entries"] == other["entries"]
-    assert one["entries"]
+    _, found, _ = tracked(capsys, path)
+    assert found["entries"] == answer[1]["entries"]
+    assert found["entries"]
 
 
 def test_commands_as_asked_that_the_mirror_clipped_are_named(tmp_path, capsys):
@@ -164,22 +179,20 @@ def test_without_a_dither_it_says_what_ordinary_telemetry_says(telemetry, tmp_pa
     assert status == 1
     assert found["alpha"] is None
     assert found["passive"][-1]["sigma"]["shift_x_subap"] > 0.05  # nothing is made from it alone
-    assert main(["track", SMALL, str(tmp_path / "night.npz")]) == 1
+    assert main(["track", SMALL, str(saved(tmp_path, cut(plain)))]) == 1
     assert "alpha was not found: no dithered window" in capsys.readouterr().out
 
 
 def test_a_rest_of_a_second_does_not_outdo_the_estimates_before_it(telemetry, tmp_path, capsys):
     """Looks are of four seconds; what is left over knows less, and is the last to be told."""
     plain = {k: v for k, v in telemetry.items() if not k.startswith("dither")}
-    cut = {k: v[:5000] if k in ("slopes", "commands_m") else v for k, v in plain.items()}
-    _, found, _ = tracked(capsys, saved(tmp_path, cut))
+    _, found, _ = tracked(capsys, saved(tmp_path, cut(plain, 5000)))
     assert len(found["passive"]) == 1
 
 
 def test_a_file_too_short_for_one_look_gives_what_it_can(telemetry, tmp_path, capsys):
     plain = {k: v for k, v in telemetry.items() if not k.startswith("dither")}
-    cut = {k: v[:1500] if k in ("slopes", "commands_m") else v for k, v in plain.items()}
-    _, found, _ = tracked(capsys, saved(tmp_path, cut))
+    _, found, _ = tracked(capsys, saved(tmp_path, cut(plain)))
     assert len(found["passive"]) == 1
 
 
@@ -223,7 +236,7 @@ def given(name, change):
         (counted(lambda n: np.arange(n) + 0.5), "seq: found 0.5 in row 0"),
         (counted(lambda n: 2.0**53 + 2.0 * np.arange(n)), "seq: found 9007199254740994 in row 1"),
         (counted(lambda n: np.arange(n, dtype=np.uint64) + 2**63), "found 9223372036854775808"),
-        (counted(lambda n: np.r_[np.arange(n - 1), 7]), "seq: found 7 in row 9009 after 9008"),
+        (counted(lambda n: np.r_[np.arange(n - 1), 7]), "seq: found 7 in row 1499 after 1498"),
         (set_in("reconstructor", (7, 3), np.nan), "reconstructor: found nan in row 7, column 3"),
         (set_in("reconstructor", 7, np.nan), "(1 of 45 rows hold such numbers)"),
         (set_in("reconstructor", (7, 3), 1e30), "reconstructor: found 1e+30 in row 7, column 3"),
@@ -244,7 +257,7 @@ def given(name, change):
     ],
 )
 def test_what_does_not_fit_is_named(telemetry, tmp_path, capsys, spoil, text):
-    arrays = dict(telemetry)
+    arrays = cut(telemetry)
     spoil(arrays)
     status, found, err = tracked(capsys, saved(tmp_path, arrays))
     assert (status, found) == (2, None)
@@ -255,13 +268,9 @@ def test_what_does_not_fit_is_named(telemetry, tmp_path, capsys, spoil, text):
 def test_frame_numbers_beyond_what_a_double_holds_are_taken_as_they_are(
     telemetry, tmp_path, capsys
 ):
-    n = 1500
-    cut = {
-        k: v[:n] if k in ("slopes", "commands_m", "dither_m") else v for k, v in telemetry.items()
-    }
-    far = cut | {"seq": 2**53 + 1 + np.arange(n)}
+    far = cut(telemetry, 500) | {"seq": 2**53 + 1 + np.arange(500)}
     _, found, _ = tracked(capsys, saved(tmp_path, far))
-    assert (found["n_frames"], found["n_missing"]) == (n, 0)
+    assert (found["n_frames"], found["n_missing"]) == (500, 0)
 
 
 def test_frames_that_are_not_finite_are_left_out_and_named(telemetry, tmp_path, capsys):
@@ -276,13 +285,10 @@ def test_frames_that_are_not_finite_are_left_out_and_named(telemetry, tmp_path, 
     assert "lock-in" in {entry["source"] for entry in found["entries"]}
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.5, 10.9, 11.0, 25.0, 100.0])
+@pytest.mark.parametrize("delay", [0.5, 10.9, 11.0, 100.0])
 def test_a_delay_beyond_the_filter_gives_no_estimate(telemetry, tmp_path, capsys, delay):
-    n = 1500
-    cut = {
-        k: v[:n] if k in ("slopes", "commands_m", "dither_m") else v for k, v in telemetry.items()
-    }
-    status, found, _ = tracked(capsys, saved(tmp_path, cut | {"delay_frames": np.array(delay)}))
+    arrays = cut(telemetry) | {"delay_frames": np.array(delay)}
+    status, found, _ = tracked(capsys, saved(tmp_path, arrays))
     assert status == 1
     assert not found["passive"] or 2.0 <= delay < 11.0
 
@@ -364,16 +370,12 @@ def test_streams_that_are_frames_apart_are_said_to_be_so_and_no_sign_is_blamed(
     }
     others = {name: values for name, values in telemetry.items() if values.ndim < 2}
     path = saved(tmp_path, others | moved)
-    status, found, _ = tracked(capsys, path)
-    assert status == 1
-    assert f"commands change {2 + frames} frames after" in found["misaligned"]
-    assert f"{abs(frames)} frames apart" in found["misaligned"]
-    main(["track", SMALL, str(path)])
+    assert main(["track", SMALL, str(path)]) == 1
     said = capsys.readouterr().out
-    assert found["misaligned"] in said
+    assert f"commands change {2 + frames} frames after" in said
+    assert f"{abs(frames)} frames apart" in said
     assert "modes-contrary" not in said
 
 
-def test_streams_of_the_same_frames_are_not_said_to_be_apart(telemetry, tmp_path, capsys):
-    _, found, _ = tracked(capsys, saved(tmp_path, telemetry))
-    assert found["misaligned"] is None
+def test_streams_of_the_same_frames_are_not_said_to_be_apart(answer):
+    assert answer[1]["misaligned"] is None

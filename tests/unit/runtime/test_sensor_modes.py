@@ -104,7 +104,7 @@ def night(tmp_path_factory):
                 found.restart_rtc()
                 found.advance(0.5)
                 found.parts[-1]["after"] = found.state
-            found.advance(12.0)
+            found.advance(10.0)
             found.parts.append({"mode": mode, "state": found.state})
     return found
 

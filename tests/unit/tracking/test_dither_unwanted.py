@@ -2,12 +2,17 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.alarms import NOT_AS_ASKED, NOT_STOPPED, OVER_BUDGET
-from service.tracking.dither import FAILED_DITHER_PAUSE_S, STOP_REQUEST_INTERVAL_S
+from service.tracking.dither import (
+    COST_AVERAGING_TIME_S,
+    FAILED_DITHER_PAUSE_S,
+    STOP_REQUEST_INTERVAL_S,
+)
 from service.tracking.dither_request import MAX_STOP_DELAY_S, DitherPhase, total_m
 from service.tracking.operation_records import AcquisitionStage, MeasureState
 from service.wire import DitherRequest, DitherStop
@@ -100,8 +105,9 @@ class TestOffByTheOperator:
         dither = story.state.dithers.dither
         accept(story, dither)
         story.tell(cmd.StopDither())
-        playing(story, dither, 2700)  # four and a half of its memories
-        expected = pytest.approx(total_m(dither.request), rel=0.01)
+        playing(story, dither, round(COST_AVERAGING_TIME_S))
+        share = -np.expm1(-1.0)  # of the mean square, after one averaging time from zero
+        expected = pytest.approx(total_m(dither.request) * np.sqrt(share), rel=0.01)
         assert story.state.dithers.policy.mean_cost_m == expected
 
     @pytest.mark.parametrize("alarm", ["loop-diverging", "edge-slip"])

@@ -109,14 +109,17 @@ def test_windows_that_scatter_by_more_than_they_say_are_no_jumps_once_that_is_le
     assert "registration.jump" in {name for at_s, name in flagged if at_s > 500.0}
 
 
-def test_what_a_gust_does_to_windows_for_seconds_is_no_jump():
+@pytest.mark.parametrize(
+    "seeds", [range(2), pytest.param(range(2, 6), marks=pytest.mark.long)], ids=str
+)
+def test_what_a_gust_does_to_windows_for_seconds_is_no_jump(seeds):
     """9 σ for four seconds, then as far to the other side, where a loop slips off the pyramid.
 
     A mirror that jumps is suspected by the first window of the new place, so that nothing is made
     for the old one, and called so once that has lasted longer than a gust.
     """
     named, suspected_s, named_s = [], [], []
-    for seed in range(6):
+    for seed in seeds:
         sky = Sky(seed, scatter=1.5, gusts=9.0, jump=np.array([0.1, 0, 0, 0]), at_s=375.0)
         for end_s in range(1, 391):
             sky.window(float(end_s), over_s=1.0)

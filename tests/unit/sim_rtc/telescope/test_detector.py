@@ -1,11 +1,21 @@
+import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from service.errors import ConfigurationError
 from service.model.kinds import SlopeOrder
+from service.model.pupil import valid_subapertures
 from service.model.slopes import SlopeRecipe
-from sim_rtc.telescope.detector import Camera, Detector
+from sim_rtc.telescope.detector import (
+    FLAO_PRESETS,
+    Camera,
+    Detector,
+    PixelDetector,
+    bin_pixels,
+    preset_for,
+)
 
 N = 10
 
@@ -78,3 +88,81 @@ def test_the_noise_of_pixels_is_each_pixels_own_and_makes_that_of_slopes(small_i
     np.testing.assert_allclose(made.sigma[: len(first)], expected, rtol=1e-6)
     variance = (made.sigma.reshape(4, -1) ** 2).sum(axis=0)
     np.testing.assert_allclose(variance, slopes.sigma[: len(first)] ** 2, rtol=1e-5)
+
+
+# --- pixels
+
+
+N_DRAWS = 40_000
+
+
+@pytest.mark.parametrize("electrons", [0.0, 0.3, 3.0, 25.0, 60.0, 500.0])
+@pytest.mark.parametrize("excess", [1.0, 2.0])
+def test_counts_have_the_mean_and_variance_of_photons_and_reading(electrons, excess):
+    camera = Camera(read_noise_electrons=2.0, excess_noise=excess)
+    detector = PixelDetector(electrons_per_light=10.0, camera=camera)
+    light = np.full(N_DRAWS, electrons / 10.0, dtype=np.float32)
+    read = detector.read(light, np.random.default_rng(1)).astype(np.float64)
+    variance = excess * electrons + 4.0
+    assert read.mean() == pytest.approx(electrons, abs=4 * np.sqrt(variance / N_DRAWS))
+    # 4 σ of a variance; few photons have heavier tails than a normal law.
+    assert read.var() == pytest.approx(variance, rel=4 * np.sqrt(2 / N_DRAWS) * (1 + excess))
+
+
+def test_bright_and_dark_pixels_of_one_frame_each_get_their_own_noise():
+    detector = PixelDetector(electrons_per_light=1.0, camera=Camera(read_noise_electrons=0.0))
+    light = np.tile(np.array([1.0, 1000.0], dtype=np.float32), (N_DRAWS, 1))
+    read = detector.read(light, np.random.default_rng(2))
+    assert set(np.unique(read[:, 0])) <= set(range(20))
+    assert read[:, 1].std() == pytest.approx(np.sqrt(1000.0), rel=0.02)
+
+
+def test_light_is_left_as_it_was():
+    light = np.full((2, 3), 5.0, dtype=np.float32)
+    PixelDetector(electrons_per_light=1.0).read(light, np.random.default_rng(3))
+    np.testing.assert_array_equal(light, 5.0)
+
+
+def test_five_magnitudes_are_a_factor_of_a_hundred(small_instrument):
+    bright, faint = (
+        Camera().electrons_per_frame(small_instrument, magnitude=m, frame_rate_hz=500.0)
+        for m in (5.0, 10.0)
+    )
+    assert bright / faint == pytest.approx(100.0)
+
+
+def test_presets_get_slower_and_coarser_as_stars_get_fainter():
+    for brighter, fainter in itertools.pairwise(FLAO_PRESETS):
+        assert fainter.faintest > brighter.faintest
+        assert fainter.binning >= brighter.binning
+        assert fainter.frame_rate_hz <= brighter.frame_rate_hz
+        assert fainter.n_controlled <= brighter.n_controlled
+
+
+def test_the_preset_is_the_first_that_reaches_the_star():
+    assert preset_for(8.0).binning == 1
+    assert preset_for(12.0).binning == 2
+    with pytest.raises(ConfigurationError, match=r"found magnitude 19; expected a star of 16\.5"):
+        preset_for(19.0)
+
+
+def test_binning_keeps_the_beam_and_halves_the_subapertures(small_instrument):
+    coarse = bin_pixels(small_instrument, 2)
+    assert coarse.wfs.n_subapertures == 5
+    assert coarse.subaperture_m == pytest.approx(2 * small_instrument.subaperture_m)
+    assert coarse.wfs.pupil_separation_subap * coarse.subaperture_m == pytest.approx(
+        small_instrument.wfs.pupil_separation_subap * small_instrument.subaperture_m
+    )
+    assert bin_pixels(small_instrument, 1) is small_instrument
+
+
+def test_a_binning_that_does_not_divide_is_refused(small_instrument):
+    with pytest.raises(ConfigurationError, match="found 3; 10 subapertures must divide by it"):
+        bin_pixels(small_instrument, 3)
+
+
+def test_binning_a_mask_of_valid_subapertures_is_refused(small_instrument):
+    mask = valid_subapertures(small_instrument)
+    wfs = replace(small_instrument.wfs, valid_subapertures=mask)
+    with pytest.raises(ConfigurationError, match="their mask must be found by flux"):
+        bin_pixels(replace(small_instrument, wfs=wfs), 2)

@@ -291,6 +291,7 @@ def test_detector_frames_become_slopes_as_a_fit_makes_them(written, bench, small
 BENCHES = Path(os.environ.get("PYRCAL_BENCH_DATA", "../shared/data"))
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not (BENCHES / "ao188").is_dir(), reason="the measured data are not here")
 def test_a_loop_closes_on_the_measured_matrix_of_ao188(tmp_path):
     """188 actuators as camera frames, strokes unknown: the import is taken as it is."""

@@ -173,7 +173,7 @@ def _causes(budget: Budget, store: Store) -> str:
         f"{imperfections:.2f} %, 20 nm pokes and noise {noise:.2f} %, the model's grid "
         f"{grid:.2f} %. On {n_order} of {len(by_seed)} the order is the largest part: shifts are "
         "found at 100 % of magnification, step 10 changes that to 98 %, and the shifts are not "
-        "found again. The minimum of χ_400 has no such error (largest "
+        "found again. The minimum of χ_400 is free of this part (largest "
         f"{_largest_minimum(budget, store)[0]:.2f} %; {far:.2f} % with a free gain per mode)."
     )
 

@@ -18,7 +18,7 @@ from service.estimation.loop import explain_open_loop, same_but_for_modes
 from service.estimation.probation import MAX_PROBATION_S
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking import reconstructors, validity
+from service.tracking import mode_proof, reconstructors, validity
 from service.tracking.alarms import (
     DIVERGING,
     LOOP_OPENED,
@@ -131,6 +131,9 @@ def on_compared(context: StepContext, event: ev.Compared) -> None:
     elif found.verdict is Verdict.AS_GOOD:
         _end(context, trial, ProbationState.PASSED, found.text)
         context.clear_alarm(PROBATION)
+        passed = context.state.reconstructor(trial.id)
+        if passed is not None:
+            mode_proof.note_passed(context, passed)
     elif jump := _check_jump(context, trial):
         _end(context, trial, ProbationState.NOT_JUDGED, f"{jump}: {found.text}")
     else:

@@ -263,6 +263,12 @@ def test_a_jump_that_windows_have_shown_since_is_not_blamed_on_the_matrix():
     assert told.asked(ev.RepublishMatrix) == []
 
 
+def test_modes_that_a_good_matrix_has_held_stay_proven_when_fewer_are_controlled():
+    told = story()
+    told.tell(found(verdict=Verdict.AS_GOOD))
+    assert told.state.matrices.mode_proof.proven >= frozenset(range(400))
+
+
 def test_where_there_is_no_way_back_a_lost_loop_is_opened():
     told = story()
     (effect,) = (e for e in told.tell(found()) if isinstance(e, ev.RepublishMatrix))

@@ -244,8 +244,12 @@ def _note_runaway(state: Comparison, block: FrameBlock) -> Comparison:
 
 
 def _end_comparison(state: Comparison, found: ProbationFinding) -> Comparison:
-    """Return what is left of a comparison that is over."""
-    healthy = state.before if found.verdict is Verdict.WORSE else None
+    """Return what is left of a comparison that is over.
+
+    If the loop is no better with the matrix before, the level before both is out of reach, and the
+    next matrix is compared with the loop as it is.
+    """
+    healthy = state.before if found.verdict is Verdict.WORSE and not state.returned else None
     return replace(state, found=found, before=None, healthy=healthy, n_runaway=0)
 
 

@@ -219,18 +219,21 @@ class ResidualLevel:
     def lost(self, parts: tuple[Residual, ...]) -> bool:
         """Return True if the loop no longer corrects.
 
-        Its residual is far larger than before, and either as large as the turbulence that the
-        mirror followed then, or the mirror itself moves by far more. Where the sensor saturates,
-        its commands run away (``runs_away``).
+        Its residual is far larger than before in each of the last parts, and either as large as
+        the turbulence that the mirror followed then, or the mirror itself moves by far more. Where
+        the sensor saturates, its commands run away (``runs_away``). The mean of the parts would not
+        do: turbulence that changes within a frame fills one part with what the loop then corrects.
         """
-        last = total_of(parts[-N_LOST_PARTS:])
-        if last is None or not last.n_seen:
-            return False
-        if runs_away(*self._upper_powers(parts[-N_LOST_PARTS:])):
+        parts = parts[-N_LOST_PARTS:]
+        if runs_away(*self._upper_powers(parts)):
             return True
+        if len(parts) < N_LOST_PARTS or not all(part.n_seen for part in parts):
+            return False
         followed = self.total.commanded.sum() / self.total.n_seen
         before = self.total.seen.sum() / self.total.n_seen
-        left, moves = last.seen.sum() / last.n_seen, last.commanded.sum() / last.n_seen
+        left = min(part.seen.sum() / part.n_seen for part in parts)
+        n_seen = sum(part.n_seen for part in parts)
+        moves = sum(part.commanded.sum() for part in parts) / n_seen
         far_larger = left > LOST_POWER_RATIO * before
         return bool(far_larger and (left > followed or moves > 10.0 * followed))
 

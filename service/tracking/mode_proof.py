@@ -340,6 +340,18 @@ def note_recognised(context: StepContext, event: ev.ModesRecognised) -> None:
     context.log("modes.recognised", f"{event.id}: {event.text}")
 
 
+def note_passed(context: StepContext, record: ReconstructorRecord) -> None:
+    """Record that the loop was as good with this matrix as before: its modes are verified.
+
+    They remain so when a matrix of fewer modes follows, after a jump for example.
+    """
+    proof = context.matrices.mode_proof
+    held = frozenset(range(record.n_modes)) - proof.contrary - proof.suspected
+    if not held <= proof.proven:
+        proof = replace(proof, proven=proof.proven | held)
+        context.matrices = replace(context.matrices, mode_proof=proof)
+
+
 def proof_to_keep(state: TrackerState) -> ModeProof | None:
     """Return the results on modes to keep over a restart; None if there are none.
 

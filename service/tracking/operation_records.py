@@ -197,6 +197,12 @@ class ProbationState(StrEnum):
     OPENED = "opened"
     """The RTC has opened the loop."""
 
+    ACQUIRING = "acquiring"
+    """The loop was lost, and going back did not help: the registration is acquired again."""
+
+    NOT_CONFIRMED = "not-confirmed"
+    """The loop was no better with the matrix before: the swap was not the cause."""
+
     NOT_JUDGED = "not-judged"
     """No comparison was possible; the text says why."""
 
@@ -241,6 +247,12 @@ class Probation:
 
     opens: bool = False
     """True if opening the loop is permitted when the loop is lost and a rollback does not help."""
+
+    resumes: bool = False
+    """True if the service goes on in mode auto if the rollback does not help."""
+
+    resumed_ns_utc: int | None = None
+    """Time at which the service last went on in this way; None if it did not."""
 
     @property
     def judges(self) -> str | None:

@@ -158,6 +158,13 @@ def enter_hold(context: StepContext, why: str) -> None:
     context.log("mode", f"hold: {why}")
 
 
+def leave_hold(context: StepContext, why: str) -> None:
+    """Go on in mode auto after :func:`enter_hold`."""
+    of_settings = context.operator.settings_mode
+    change_mode(context, Mode.AUTO, None if of_settings is Mode.AUTO else of_settings)
+    context.warn("mode", f"auto: {why}")
+
+
 def change_mode(context: StepContext, mode: Mode, of_settings: Mode | None) -> None:
     """Go on in a mode; ``of_settings`` is that of the settings, None: the same."""
     context.operator = replace(context.operator, mode=mode, settings_mode=of_settings)

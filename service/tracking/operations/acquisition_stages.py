@@ -204,25 +204,25 @@ def begin_acquisition(context: StepContext, rtc: Status, *, why: str, commanded:
     forget_verdict(context)
 
 
+def may_acquire(state: TrackerState, policy: Policy) -> bool:
+    """Return whether the service may acquire by itself in mode auto, if it has a reason to."""
+    rtc, acquisition = state.loop.rtc, state.operations.acquisition
+    if not policy.acquires or rtc is None or rtc.loop == "open":
+        return False
+    if not policy.dither_enabled or state.dithers.stopped or state.measuring is not None:
+        return False
+    failed = acquisition.stage is AcquisitionStage.FAILED
+    blocked = blocking_alarm(state.alarms.active, Interlock.SEND_NEW) is not None
+    return not (failed or acquisition.held_off or blocked)
+
+
 def explain_acquisition(state: TrackerState, policy: Policy, now_ns: int) -> str | None:
     """Return why the service should acquire by itself, or None."""
-    rtc, acquisition = state.loop.rtc, state.operations.acquisition
-    if (
-        not policy.acquires
-        or state.operator.mode is not Mode.AUTO
-        or rtc is None
-        or rtc.loop == "open"
-    ):
+    if state.operator.mode is not Mode.AUTO or not may_acquire(state, policy):
         return None
-    if not policy.dither_enabled or state.dithers.stopped or state.measuring is not None:
-        return None
-    failed = acquisition.stage is AcquisitionStage.FAILED
-    if (
-        failed
-        or acquisition.held_off
-        or blocking_alarm(state.alarms.active, Interlock.SEND_NEW) is not None
-    ):
-        return None
+    trial = state.operations.probation
+    if trial is not None and trial.state is ProbationState.ACQUIRING:
+        return f"the loop is lost with {trial.id} and with {trial.before}"
     for alarm in state.alarms.active:
         lasted_ns = now_ns - alarm.since_ns_utc
         # During a rollback the loop is given the time in which the previous matrix can recover it.
@@ -232,7 +232,7 @@ def explain_acquisition(state: TrackerState, policy: Policy, now_ns: int) -> str
     # Bad telemetry alone also refuses windows. Only a loop that has stopped correcting is opened
     # for it.
     if has_missed_enough(state) and not state.loop.holds:
-        return f"{acquisition.misses} windows in a row found no registration"
+        return f"{state.operations.acquisition.misses} windows in a row found no registration"
     return None
 
 

@@ -1,8 +1,12 @@
 """Probation: return from a matrix that makes the loop worse.
 
 The previous matrix was stable until a moment ago, whatever its origin. It is sent again regardless
-of what the gate or the telemetry have reported since. If the loop is lost nevertheless, it is
-opened.
+of what the gate or the telemetry have reported since.
+
+If the loop is no better with the previous matrix, the swap was not the cause: the mirror may have
+jumped within seconds of it. The service then goes on as after a jump at any other time, and
+acquires the registration again if the loop is lost. It does so once in a while; if the same
+happens again soon, or where it may not acquire, a lost loop is opened and the mode remains hold.
 """
 
 from __future__ import annotations
@@ -14,19 +18,21 @@ from service.estimation.loop import explain_open_loop, same_but_for_modes
 from service.estimation.probation import MAX_PROBATION_S
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking import reconstructors
+from service.tracking import mode_proof, reconstructors, validity
 from service.tracking.alarms import (
     DIVERGING,
     LOOP_OPENED,
     OFF_LOOP,
     PROBATION,
     WRONG_LOOP,
+    Alarm,
     Interlock,
     alarm_blocks,
 )
 from service.tracking.events import Event
 from service.tracking.operation_records import CommandState, Probation, ProbationState
-from service.tracking.operator import enter_hold, set_loop
+from service.tracking.operations.acquisition_stages import may_acquire
+from service.tracking.operator import enter_hold, leave_hold, set_loop
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.sending import check_sendable
@@ -47,8 +53,14 @@ MAX_CALMING_S = 1.0
 """Time for a diverging loop to become calm with the previous matrix; its detector remembers half a
 second."""
 
+RESUMPTION_INTERVAL_S = 600.0
+"""Shortest time between two resumptions after a rollback that did not help: a matrix that is wrong
+must not be sent again and again."""
+
 OPEN_REQUEST_INTERVAL_S = 2.0
 """Interval between two requests to open the loop."""
+
+MAY_HAVE_JUMPED = "the mirror may have jumped at the time of a swap"
 
 _CONCLUSIVE_ALARMS = (WRONG_LOOP, OFF_LOOP, DIVERGING)
 """Alarms that say by themselves that the RTC plays another matrix, or one that does not hold."""
@@ -76,9 +88,10 @@ def advance(context: StepContext, event: Event) -> None:
     trial = context.operations.probation
     if trial is None:
         return
-    alarm_text = _alarm_of_swap(context, trial)
-    if alarm_text:
-        _begin_rollback(context, trial, alarm_text)
+    alarm = _alarm_of_swap(context, trial)
+    if alarm is not None:
+        # Commands that contradict the law of the loop are the RTC's fault and not the mirror's.
+        _begin_rollback(context, trial, alarm.text, resumes=alarm.name == DIVERGING)
     else:
         _go_on(context, trial, event)
 
@@ -93,6 +106,8 @@ def _go_on(context: StepContext, trial: Probation, event: Event) -> None:
             _watch(context, trial)
         case ProbationState.OPENING:
             _await_opening(context, trial, event)
+        case ProbationState.ACQUIRING:
+            _await_acquisition(context, trial, event)
         case ProbationState.OPENED if context.rtc is not None and context.rtc.in_loop:
             _set(context, replace(trial, state=ProbationState.ROLLED_BACK))
 
@@ -107,7 +122,8 @@ def on_compared(context: StepContext, event: ev.Compared) -> None:
         return
     # The comparison now concerns the previous matrix, which is in use again.
     if trial.state is ProbationState.WATCHED:
-        _end_watch(context, trial, found.text, lost=found.lost)
+        helped = found.verdict is not Verdict.WORSE
+        _end_watch(context, trial, found.text, lost=found.lost, helped=helped)
         return
     trial = replace(trial, finding=found)
     if found.verdict is Verdict.UNKNOWN:
@@ -115,6 +131,11 @@ def on_compared(context: StepContext, event: ev.Compared) -> None:
     elif found.verdict is Verdict.AS_GOOD:
         _end(context, trial, ProbationState.PASSED, found.text)
         context.clear_alarm(PROBATION)
+        passed = context.state.reconstructor(trial.id)
+        if passed is not None:
+            mode_proof.note_passed(context, passed)
+    elif jump := _check_jump(context, trial):
+        _end(context, trial, ProbationState.NOT_JUDGED, f"{jump}: {found.text}")
     else:
         _begin_rollback(context, trial, found.text)
 
@@ -145,10 +166,16 @@ def send_way_back(context: StepContext, made: ev.MatrixMade) -> None:
     _set(context, replace(trial, rollback=made.record.id))
 
 
-def _begin_rollback(context: StepContext, trial: Probation, found: str) -> None:
-    """Have the matrix before sent again; where that cannot be say why."""
+def _begin_rollback(
+    context: StepContext, trial: Probation, found: str, *, resumes: bool = True
+) -> None:
+    """Have the matrix before sent again; where that cannot be say why.
+
+    ``resumes`` is False if the cause cannot be the mirror.
+    """
+    resumes = resumes and context.operator.mode is Mode.AUTO
     enter_hold(context, f"{trial.id} made the loop worse")
-    trial = replace(trial, worse=f"made the loop worse: {found}")
+    trial = replace(trial, worse=f"made the loop worse: {found}", resumes=resumes)
     why = _check_rollback(context, trial)
     if why is not None:
         _keep_worse(context, trial, why)
@@ -194,6 +221,7 @@ def _on_swap(context: StepContext, before: str | None, in_use: str | None) -> No
             until_ns_utc=context.now_ns + round(MAX_PROBATION_S * SECOND_NS),
             loop=context.before.loop.rtc,
             opens=context.before.operator.mode is Mode.AUTO if asked is None else asked,
+            resumed_ns_utc=None if trial is None else trial.resumed_ns_utc,
         ),
     )
 
@@ -240,13 +268,18 @@ def _watch(context: StepContext, trial: Probation) -> None:
     # The detector of divergence averages over half a second, so that it still shows the rejected
     # matrix.
     elif lost is not None and waited_s > MAX_CALMING_S:
-        _end_watch(context, trial, lost.text, lost=True)
+        _end_watch(context, trial, lost.text, lost=True, helped=False)
     elif waited_s > MAX_PROBATION_S + MAX_VERDICT_DELAY_S:
         _end_watch(context, trial, "telemetry does not show how the loop is since", lost=False)
 
 
-def _end_watch(context: StepContext, trial: Probation, found: str, *, lost: bool) -> None:
+def _end_watch(
+    context: StepContext, trial: Probation, found: str, *, lost: bool, helped: bool = True
+) -> None:
     trial = replace(trial, text=f"{trial.text}. Since then: {found}")
+    if not helped and _may_resume(context, trial, lost=lost):
+        _resume(context, trial, lost=lost)
+        return
     if lost and trial.opens:
         _open(context, trial)
         return
@@ -254,6 +287,35 @@ def _end_watch(context: StepContext, trial: Probation, found: str, *, lost: bool
     do = ". Open the loop" if lost else ""
     text = f"{trial.id} {trial.text}. The mode is hold until an operator sets another{do}"
     context.raise_alarm(PROBATION, text, critical=lost)
+
+
+def _may_resume(context: StepContext, trial: Probation, *, lost: bool) -> bool:
+    """Return whether the service may go on by itself after a rollback that did not help."""
+    since_ns = trial.resumed_ns_utc
+    again = since_ns is not None and (context.now_ns - since_ns < RESUMPTION_INTERVAL_S * SECOND_NS)
+    # An operator who has set a mode meanwhile has taken over.
+    if again or not trial.resumes or context.operator.mode is not Mode.HOLD:
+        return False
+    return not lost or may_acquire(context.state, context.policy)
+
+
+def _resume(context: StepContext, trial: Probation, *, lost: bool) -> None:
+    """Go on as after a jump at any other time: the loop is no better with the matrix before."""
+    state = ProbationState.ACQUIRING if lost else ProbationState.NOT_CONFIRMED
+    reconstructors.change_state(
+        context, trial.id, MatrixState.FAILED, "rolled back, but it was not the cause"
+    )
+    _end(context, replace(trial, resumed_ns_utc=context.now_ns), state, trial.text)
+    context.clear_alarm(PROBATION)
+    leave_hold(
+        context,
+        f"the loop is no better with {trial.before}, so {trial.id} was not the cause. The mirror "
+        "may have jumped",
+    )
+    # Windows from before the event say nothing of where the mirror is now.
+    validity.invalidate_telemetry(context, MAY_HAVE_JUMPED)
+    validity.require_new_windows(context)
+    validity.request_window(context, MAY_HAVE_JUMPED)
 
 
 def _open(context: StepContext, trial: Probation) -> None:
@@ -276,6 +338,13 @@ def _await_opening(context: StepContext, trial: Probation, event: Event) -> None
             set_loop(context, cmd.SetLoop(loop="open"))
 
 
+def _await_acquisition(context: StepContext, trial: Probation, event: Event) -> None:
+    """Note that the acquisition has begun, or that the operator or the RTC has taken over."""
+    closed = context.rtc is not None and context.rtc.in_loop
+    if context.acquisition.under_way or not closed or isinstance(event, cmd.SetMode):
+        _set(context, replace(trial, state=ProbationState.NOT_CONFIRMED))
+
+
 def explain_opening(context: StepContext) -> str | None:
     """Return that the loop was lost and is asked to open, and whether it did; None: it is not."""
     trial, asked = context.operations.probation, context.loop.command
@@ -294,15 +363,17 @@ def explain_opening(context: StepContext) -> str | None:
     )
 
 
-def _alarm_of_swap(context: StepContext, trial: Probation) -> str:
-    """Return what an alarm says of a matrix just applied; empty: none has come with it."""
+def _alarm_of_swap(context: StepContext, trial: Probation) -> Alarm | None:
+    """Return an alarm that has come with a matrix just applied, or None."""
     judged = {ProbationState.RUNNING, ProbationState.OVERDUE, ProbationState.PASSED}
     # A later alarm has another cause than the swap.
     late = context.now_ns > trial.since_ns_utc + MAX_LAW_DETECTION_S * SECOND_NS
     if trial.state not in judged or late or _check_comparable(context):
-        return ""
+        return None
+    if _check_jump(context, trial):
+        return None
     since = (a for a in context.alarms.active if a.since_ns_utc >= trial.since_ns_utc)
-    return next((alarm.text for alarm in since if alarm.name in _CONCLUSIVE_ALARMS), "")
+    return next((alarm for alarm in since if alarm.name in _CONCLUSIVE_ALARMS), None)
 
 
 def _explain_missing_probation(
@@ -328,6 +399,14 @@ def _check_comparable(context: StepContext) -> str:
     if context.acquisition.under_way:
         return "an acquisition watches its matrices itself"
     return ""
+
+
+def _check_jump(context: StepContext, trial: Probation) -> str:
+    """Return that windows have shown a jump since the swap; empty: they have not."""
+    registration = context.registration
+    jumped_ns = None if registration is None else registration.jumped_ns_utc
+    jumped = jumped_ns is not None and jumped_ns >= trial.since_ns_utc
+    return "the mirror has jumped since the swap" if jumped else ""
 
 
 def _explain_failed_rollback(context: StepContext, trial: Probation, event: Event) -> str:

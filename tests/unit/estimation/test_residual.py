@@ -236,6 +236,19 @@ def test_commands_that_wander_are_no_lost_loop():
     ones = np.ones(4)
     before = Residual(n_seen=10, seen=ones, n_moved=1, moved=ones, commanded=100.0 * ones)
     level = ResidualLevel.of((before, before, before), 3)
-    wandered = replace(before, commanded=2000.0 * ones)
-    assert not level.lost((wandered,))
-    assert level.lost((replace(wandered, seen=20.0 * ones),))
+    upper_as_before = np.array([4000.0, 4000.0, 100.0, 100.0])
+    wandered = replace(before, commanded=upper_as_before)
+    assert not level.lost((wandered,) * N_LOST_PARTS)
+    assert level.lost((replace(wandered, seen=20.0 * ones),) * N_LOST_PARTS)
+
+
+@pytest.mark.parametrize("which", range(N_LOST_PARTS))
+def test_turbulence_that_changes_within_a_frame_is_no_lost_loop(which):
+    """A gust of the swap campaign, 60 times the power in one part, while tip and tilt wander."""
+    ones = np.ones(4)
+    before = Residual(n_seen=10, seen=ones, n_moved=1, moved=ones, commanded=100.0 * ones)
+    level = ResidualLevel.of((before, before, before), 3)
+    wandered = replace(before, commanded=np.array([4000.0, 4000.0, 100.0, 100.0]))
+    parts = [wandered] * N_LOST_PARTS
+    parts[which] = replace(wandered, seen=60.0 * ones)
+    assert not level.lost(tuple(parts))

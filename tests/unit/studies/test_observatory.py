@@ -272,6 +272,27 @@ def test_a_loop_lost_to_a_jump_is_opened_within_a_second_and_back_on_all_modes_w
     assert found["after_nm"] < 1.1 * found["before_nm"]
 
 
+def test_a_jump_a_second_after_a_swap_leaves_the_loop_neither_open_nor_in_hold():
+    """Neither matrix holds the loop then: none is to blame, and α is acquired again."""
+    jump_s = 12.5
+    words = [
+        f"--instrument={SMALL}",
+        *("--plant=linear", "--seed=1", "--mag=7", "--n-controlled=45"),
+        "--alpha=-0.25,-0.03,-2,1.002",
+        f"--jump={jump_s}:0.5,0,4,0",
+    ]
+    policy = policy_of(load_settings(None, {}, {**SETTINGS, "control.n_modes_target": N_TARGET}))
+    night = Observatory(
+        words, policy, Mode.AUTO, bench_of(SMALL), latencies=latencies_of(), with_poles=False
+    )
+    night.advance(jump_s + 12.0)
+    assert jump_s - 5.0 < max(swap.time_s for swap in night.swaps if swap.time_s < jump_s)
+    assert any(not one.closed for one in night.dome.moments if one.time_s < jump_s + 2.0)
+    assert night.dome.moments[-1].closed
+    assert night.state.operator.mode is Mode.AUTO
+    assert not night.state.alarms.active
+
+
 Seen = list[tuple[float, LoopHealth, PlayedCommands]]
 
 

@@ -11,8 +11,9 @@ from service.tracking.operation_records import ProbationState
 from service.tracking.products import MatrixState
 from service.tracking.resume import restored
 from service.tracking.state import Mode
+from service.tracking.update_policy import is_settled
 from service.wire import Loop, LoopRequest
-from tests.unit.tracking.situations import POLICY, Story, foreign, loop_answered, rtc
+from tests.unit.tracking.situations import POLICY, Story, foreign, loop_answered, moved, rtc
 
 OWN_SUM, OUR_SUM = "a" * 64, "b" * 64
 LAW = "gain 3 times the one in the status"
@@ -164,13 +165,108 @@ def test_one_that_goes_on_diverging_is_opened_before_telemetry_has_been_compared
     assert len(opened(told)) == 1
 
 
-def test_one_that_is_only_somewhat_worse_stays_closed():
-    """Open it would be worse by far."""
+@pytest.mark.parametrize("mode", [Mode.AUTO, Mode.PROPOSE])
+def test_one_that_is_only_somewhat_worse_stays_closed(mode):
+    """Open it would be far worse. In auto the service goes on: the swap was not the cause."""
+    told = gone_back(story(mode))
+    told.tell(found(after="cm-2", lost=False), after_s=2.0)
+    assert opened(told) == []
+    assert told.matrix_state("cm-1") is MatrixState.FAILED
+    if mode is Mode.AUTO:
+        assert trial(told).state is ProbationState.NOT_CONFIRMED
+        assert (told.state.operator.mode, told.state.operator.settings_mode) == (mode, None)
+        assert "probation" not in told.alarms
+        assert not is_settled(told.state.alpha.registration)
+        assert told.state.alpha.dither_due_since_ns_utc is not None
+    else:
+        assert trial(told).state is ProbationState.ROLLED_BACK
+        assert told.state.operator.mode is Mode.HOLD
+        assert "20 um" in alarm(told, "probation").text
+
+
+ACQUIRES = replace(POLICY, acquires=True)
+
+
+def acquires(told):
+    return told.state.operations.acquisition.under_way
+
+
+def test_a_loop_that_neither_matrix_holds_is_opened_and_acquired_again():
+    """The mirror has jumped within seconds of the swap: neither matrix is to blame."""
+    told = gone_back(story(policy=ACQUIRES))
+    told.tell(found(after="cm-2"), after_s=2.0)
+    assert acquires(told)
+    assert len(opened(told)) == 1
+    assert told.state.operator.mode is Mode.AUTO
+    assert not told.alarms.intersection({"probation", "loop-opened"})
+    told.wait(1)
+    assert trial(told).state is ProbationState.NOT_CONFIRMED
+
+
+def test_one_whose_alarm_lasts_though_the_matrix_before_is_back_is_acquired_again():
+    told = story(policy=ACQUIRES)
+    told.tell(ev.ConditionChanged(name="loop-diverging", text="ten times"), after_s=0.1)
+    gone_back(told)
+    told.wait(1.5, every_s=0.5)
+    assert acquires(told)
+
+
+@pytest.mark.parametrize("name", ["loop-law", "commands-off-loop"])
+def test_commands_that_contradict_the_law_are_no_jump(name):
+    """An RTC that does not apply the matrix would not apply the next one either."""
+    told = story(policy=ACQUIRES)
+    told.tell(ev.ConditionChanged(name=name, text=LAW), after_s=1.0)
+    copied(told)
+    told.acknowledge("cm-2")
+    told.tell(replace(rtc(), cm_id="cm-2"), after_s=0.2)
+    told.tell(found(after="cm-2"), after_s=2.0)
+    assert not acquires(told)
+    assert trial(told).state is ProbationState.OPENING
+    assert told.state.operator.mode is Mode.HOLD
+
+
+def test_an_operator_who_sets_a_mode_meanwhile_has_taken_over():
+    told = gone_back(story(policy=ACQUIRES))
+    told.tell(cmd.SetMode(mode=Mode.PROPOSE), after_s=0.1)
+    told.tell(found(after="cm-2"), after_s=2.0)
+    assert not acquires(told)
+    assert told.state.operator.mode is Mode.PROPOSE
+
+
+@pytest.mark.parametrize(("after_s", "again"), [(60.0, False), (700.0, True)])
+def test_the_service_goes_on_by_itself_once_in_ten_minutes(after_s, again):
+    """A matrix that is wrong, and spoils the loop for the next one too, is not sent for ever."""
     told = gone_back(story())
     told.tell(found(after="cm-2", lost=False), after_s=2.0)
-    assert trial(told).state is ProbationState.ROLLED_BACK
-    assert opened(told) == []
-    assert "20 um" in alarm(told, "probation").text
+    told.wait(after_s, every_s=10.0)
+    told.see(n_windows=3)
+    told.make("cm-3", wanted=True, sha256="d" * 64)
+    told.acknowledge("cm-3")
+    told.tell(replace(rtc(), cm_id="cm-3"), after_s=0.2)
+    told.tell(found(before="cm-2", after="cm-3", lost=False))
+    assert trial(told).state is ProbationState.ROLLING_BACK
+    copied(told, "cm-4")
+    told.acknowledge("cm-4")
+    told.tell(replace(rtc(), cm_id="cm-4"), after_s=0.2)
+    told.tell(found(before="cm-2", after="cm-4", lost=False), after_s=2.0)
+    assert (trial(told).state is ProbationState.NOT_CONFIRMED) == again
+    assert (told.state.operator.mode is Mode.AUTO) == again
+
+
+def test_a_jump_that_windows_have_shown_since_is_not_blamed_on_the_matrix():
+    told = story()
+    told.see(moved(shift_x_subap=0.3), n_windows=3, every_s=0.5)
+    assert told.state.alpha.registration.jumped_ns_utc is not None
+    told.tell(found(lost=False))
+    assert trial(told).state is ProbationState.NOT_JUDGED
+    assert told.state.operator.mode is Mode.AUTO
+    assert told.asked(ev.RepublishMatrix) == []
+
+
+def test_modes_that_a_good_matrix_has_held_stay_proven_when_fewer_are_controlled():
+    told = story()
+    told.tell(found(verdict=Verdict.AS_GOOD))
+    assert told.state.matrices.mode_proof.proven >= frozenset(range(400))
 
 
 def test_where_there_is_no_way_back_a_lost_loop_is_opened():

@@ -420,14 +420,14 @@ def _project_columns(
     nuisances
         What they are.
     """
-    model = matrix + np.tensordot(nuisances.linear(values), near[4:], axes=1)
+    model = matrix + np.tensordot(nuisances.linear(values).astype(near.dtype), near[4:], axes=1)
     if not len(nuisances.maps):
-        return columns.project(model, near), near
-    gain = nuisances.slope_gain(values)[:, None]
-    every = np.empty((len(near) + len(nuisances.maps), *model.shape))
+        return columns.project(model, near, np.float32), near
+    gain = nuisances.slope_gain(values)[:, None].astype(near.dtype)
+    every = np.empty((len(near) + len(nuisances.maps), *model.shape), near.dtype)
     np.multiply(near, gain, out=every[: len(near)])
-    np.multiply(nuisances.maps[:, :, None], model, out=every[len(near) :])
-    return columns.project(model * gain, every), every
+    np.multiply(nuisances.maps[:, :, None], model, out=every[len(near) :], casting="same_kind")
+    return columns.project(model * gain, every, np.float32), every
 
 
 def _limit_step(seen: Projection, values: Array, nuisances: Nuisances, counts: float) -> Array:

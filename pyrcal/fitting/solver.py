@@ -187,14 +187,12 @@ class Nuisances:
         models: FitModels,
         alpha: Misregistration,
         matrix: NDArray[Any],
-        of_alpha: Array,
-        of_images: Array | None = None,
+        of_images: Sequence[Array] | Array = (),
     ) -> Array:
         """Return the derivatives of D by each nuisance except the gain map.
 
-        Shape ``(n_nuisances - n_maps, n_slopes, n_modes)``. ``of_alpha`` ``(4, n_slopes, n_modes)``
-        are the derivatives by α, ``of_images`` those by the image displacements if they are already
-        known.
+        Shape ``(n_nuisances - n_maps, n_slopes, n_modes)``. ``of_images`` are those by the image
+        displacements, one for each pattern.
         """
         model = models.cheap
         kind = model.instrument.slopes.kind
@@ -204,14 +202,9 @@ class Nuisances:
             models.counter.n += 2
             found += list(model.stretch_derivatives(alpha))
         found += models.optics_derivatives(alpha, [optic for optic, _ in self.optics])
-        if of_images is not None:
-            found += list(of_images)
-        elif len(self.images):
-            models.counter.n += 2
-            found += list(self._of_images(model.image_derivatives(alpha), of_alpha))
-        return np.array(found)
+        return np.array([*found, *of_images])
 
-    def _of_images(self, apart: Array, of_alpha: Array) -> Array:
+    def combine_images(self, apart: Array, of_alpha: Array) -> Array:
         """Return the change with each pattern, of the changes ``(8, ...)`` with each image."""
         rates = np.tensordot(self.images.astype(apart.dtype), apart, axes=1)
         common = self.images.reshape(-1, 2, 4).mean(axis=2)
@@ -360,10 +353,7 @@ def refine(
     decides = models.fine if decides is None else decides
     matrix = models.matrix(decides, start)
     if near is None:
-        models.counter.n += 4
-        frozen = models.cheap.derivatives(start)
-        nuisance_rates = nuisances.derivatives(models, start, matrix, frozen, of_images)
-        near = np.concatenate([frozen, nuisance_rates])
+        near = _compute_derivatives(models, start, matrix, nuisances, of_images)
     seen, every = _project_columns(columns, matrix, near, values, nuisances)
     regions = nuisances.regions[columns.rows]
     counts = dispersion(seen, regions)
@@ -393,6 +383,29 @@ def refine(
         dispersion=counts,
         converged=converged,
     )
+
+
+def _compute_derivatives(
+    models: FitModels,
+    alpha: Misregistration,
+    matrix: NDArray[Any],
+    nuisances: Nuisances,
+    of_images: Array | None,
+) -> Array:
+    """Return the derivatives by α and each nuisance except the gain map, ``Solution.near``."""
+    model = models.cheap
+    models.counter.n += 4
+    if of_images is not None or not len(nuisances.images):
+        of_alpha = model.derivatives(alpha)
+    else:
+        models.counter.n += 2
+        apart = model.image_derivatives(alpha)
+        of_alpha = model.derivatives(alpha, apart)
+        of_images = nuisances.combine_images(apart, of_alpha)
+    of_nuisances = nuisances.derivatives(
+        models, alpha, matrix, () if of_images is None else of_images
+    )
+    return np.concatenate([of_alpha, of_nuisances])
 
 
 def _project_columns(

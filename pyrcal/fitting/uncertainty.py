@@ -260,7 +260,7 @@ def uncertainty(
     )
     sets = (
         *comparison.of_modes(mode_sets, by_mode),
-        *comparison.of_rows(pupil_sets, by_row, by_mode),
+        *comparison.of_rows(pupil_sets, by_row),
     )
     steps, covariances = _subsets(max(n_sets, 1), normals, held, scores, pull, noise)
     statistical = from_modes

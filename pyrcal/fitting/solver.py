@@ -57,6 +57,14 @@ LONGEST_STRETCH = 0.03
 SETTLED_STRETCH = 1e-5
 """Step of a stretch below which the fit has converged: 1.5e-4 subapertures at the edge of 30."""
 
+LINEAR_STEP = np.array([5e-3, 5e-3, np.deg2rad(0.02), 4e-4])
+"""Step below which the coarse model is extrapolated with its derivatives, 0.005 subapertures at the
+edge of 30 (numeric units). The fine model is always computed: extrapolated as well, it moved a
+result that is known to 0.001 subapertures by 0.2 sigma."""
+
+LINEAR_STRETCH = 4e-4
+"""The same limit for a stretch."""
+
 STRETCH_FLOOR = 1e-4
 """Smallest 1 σ of an anamorphosis; the same floor as the magnification's: both are image scales."""
 
@@ -357,19 +365,25 @@ def refine(
     seen, every = _project_columns(columns, matrix, near, values, nuisances)
     regions = nuisances.regions[columns.rows]
     counts = dispersion(seen, regions)
-    converged = False
+    moving, settled, linear, converged = np.arange(4), SETTLED_STEP, LINEAR_STEP, False
+    if nuisances.anamorphosis:
+        moving = np.append(moving, 4 + np.arange(STRETCHES.start, STRETCHES.stop))
+        settled = np.append(settled, [SETTLED_STRETCH] * 2)
+        linear = np.append(linear, [LINEAR_STRETCH] * 2)
     for _ in range(max_steps):
         step = _limit_step(seen, values, nuisances, counts)
         if not within_limits(vector + step[:4]):
             break
         vector, values = vector + step[:4], values + step[4:]
-        matrix = models.matrix(decides, nuisances.at(start, vector, values))
+        if decides is models.cheap and np.all(np.abs(step[moving]) < linear):
+            # the error, some percent of the step, is that of a start for the fine grid
+            matrix = matrix + sum(step[k].astype(near.dtype) * near[k] for k in moving)
+        else:
+            matrix = models.matrix(decides, nuisances.at(start, vector, values))
         seen, every = _project_columns(columns, matrix, near, values, nuisances)
         counts = dispersion(seen, regions)
         next_step = _limit_step(seen, values, nuisances, counts)
-        stretching = next_step[4:][STRETCHES] if nuisances.anamorphosis else np.zeros(1)
-        at_rest = np.all(np.abs(next_step[:4]) < SETTLED_STEP)
-        if at_rest and np.all(np.abs(stretching) < SETTLED_STRETCH):
+        if np.all(np.abs(next_step[moving]) < settled):
             converged = True
             break
     return Solution(

@@ -85,12 +85,14 @@ class Columns:
             gains = np.maximum(gains, 0.0)
         # one unknown at a time, which stays in the cache
         jacobian = np.empty((len(derivatives), *matrix.shape), dtype)
-        shape = matrix.astype(dtype, copy=False)
+        shape: NDArray[Any] = matrix.astype(dtype, copy=False)
         for k, rates in enumerate(derivatives):
-            counted = rates if self.rows.all() else rates[self.rows]
-            along = np.einsum("sm,sm->m", counted, shape, dtype=dtype, casting="same_kind") / power
+            counted: NDArray[Any] = np.asarray(
+                rates if self.rows.all() else rates[self.rows], dtype
+            )
+            along = np.einsum("sm,sm->m", counted, shape) / power
             np.multiply(shape, along.astype(dtype), out=jacobian[k])
-            np.subtract(counted, jacobian[k], out=jacobian[k], casting="same_kind")
+            np.subtract(counted, jacobian[k], out=jacobian[k])
             jacobian[k] *= gains.astype(dtype)
         return Projection(
             gains=gains,

@@ -361,7 +361,7 @@ class PyramidOptics:
         return np.asarray(images / (2.0 * self._source()[2].sum()))
 
     def _plane_signs(self, grid: _Grid) -> Array:
-        """Return the sign of each image in every plane of signals, ``(n_planes, n_sides, n_sides)``.
+        """Return the sign of each image in every plane of signals ``(n_planes, n_sides, n_sides)``.
 
         With local normalisation the flux is one more plane.
         """

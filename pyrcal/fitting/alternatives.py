@@ -537,9 +537,9 @@ def _move_with_weights(settled: Settled, weights: Array) -> Array:
     values = np.concatenate([np.zeros(4), nuisances.from_prior(settled.solution.nuisances)])
 
     def step(weights: Array) -> Array:
-        other = replace(seen, weights=weights)
-        held = other.normal + np.diag(prior)
-        return np.linalg.solve(held, other.scores.sum(axis=1) - prior * values)
+        ratio = weights / seen.weights
+        held = np.tensordot(ratio, seen.normals, axes=1) + np.diag(prior)
+        return np.linalg.solve(held, seen.scores @ ratio - prior * values)
 
     # the step with the fit's own weights is subtracted, because it is not exactly zero
     return np.asarray(step(weights) - step(seen.weights))[:4]

@@ -134,15 +134,33 @@ class Normals:
     """``(n_parts,)`` cluster number of each part; parts of a cluster are treated as dependent."""
 
     @classmethod
-    def of_modes(cls, seen: Projection, rows: NDArray[np.bool_] | None = None) -> Normals:
-        """Return the normal equations of each mode, of some slopes ``(n_rows,)`` or of all."""
-        if rows is None:
-            normals, scores = seen.normals, seen.scores
-        else:
-            by_mode = seen.jacobian[:, rows].transpose(2, 0, 1)
-            normals = by_mode @ by_mode.transpose(0, 2, 1) * seen.weights[:, None, None]
-            scores = np.einsum("mks,sm->km", by_mode, seen.residual[rows] * seen.weights)
-        return cls(normals=normals, scores=scores, clusters=np.arange(len(seen.gains)))
+    def of_modes(cls, seen: Projection) -> Normals:
+        """Return the normal equations of each mode."""
+        clusters = np.arange(len(seen.gains))
+        return cls(normals=seen.normals, scores=seen.scores, clusters=clusters)
+
+    @classmethod
+    def of_modes_in_groups(cls, seen: Projection, groups: Labels) -> list[Normals]:
+        """Return the normal equations of each mode, of every group of slopes ``(n_rows,)``."""
+        order, found = np.argsort(groups, kind="stable"), []
+        by_mode = np.ascontiguousarray(seen.jacobian[:, order].transpose(2, 0, 1))
+        pulled = (seen.residual[order] * seen.weights).T.astype(by_mode.dtype)
+        edges = np.cumsum(np.bincount(groups))
+        for rows in map(slice, (0, *edges[:-1]), edges):
+            part = by_mode[:, :, rows]
+            normals = part @ part.transpose(0, 2, 1) * seen.weights[:, None, None]
+            scores = (part @ pulled[:, rows, None])[:, :, 0].T
+            found.append(cls(normals=normals, scores=scores, clusters=np.arange(len(by_mode))))
+        return found
+
+    @classmethod
+    def add(cls, parts: Sequence[Normals]) -> Normals:
+        """Return the sums of the same parts."""
+        return replace(
+            parts[0],
+            normals=np.sum([one.normals for one in parts], axis=0),
+            scores=np.sum([one.scores for one in parts], axis=0),
+        )
 
     @classmethod
     def of_rows(
@@ -153,18 +171,13 @@ class Normals:
         ``regions`` ``(n_rows,)`` are the clusters.
         """
         kept = slice(None) if modes is None else modes
-        root = np.sqrt(seen.weights[kept])
+        root = np.sqrt(seen.weights[kept]).astype(seen.jacobian.dtype)
         by_row = seen.jacobian[:, :, kept].transpose(1, 0, 2) * root
+        pulled = (seen.residual[:, kept] * root).astype(by_row.dtype)
         return cls(
-            normals=by_row @ by_row.transpose(0, 2, 1),
-            scores=np.einsum("skm,sm->ks", by_row, seen.residual[:, kept] * root),
+            normals=np.asarray(by_row @ by_row.transpose(0, 2, 1), np.float64),
+            scores=np.einsum("skm,sm->ks", by_row, pulled),
             clusters=regions,
-        )
-
-    def without(self, other: Normals) -> Normals:
-        """Return the same parts without what others hold of each."""
-        return replace(
-            self, normals=self.normals - other.normals, scores=self.scores - other.scores
         )
 
     def leave_one_out(
@@ -283,24 +296,24 @@ class SetComparison:
                     sets.append((step, self._at_least_noise(sigma, parts, inside), moved))
                 yield self._make_sets(words, labels, sets, parts)
 
-    def of_rows(
-        self, partitions: Mapping[str, Labels], parts: Normals, by_mode: Normals
-    ) -> Iterator[DisjointSets]:
-        """Yield partitions of the slopes.
-
-        ``parts`` are the normal equations of each slope, ``by_mode`` those of each mode.
-        """
+    def of_rows(self, partitions: Mapping[str, Labels], parts: Normals) -> Iterator[DisjointSets]:
+        """Yield partitions of the slopes; ``parts`` are the normal equations of each slope."""
+        if not partitions:
+            return
         every = np.ones(len(self.seen.gains), dtype=bool)
-        for words, labels in partitions.items():
+        # slopes that are in the same set of every partition are added up once
+        labels_of, groups = np.unique(
+            np.column_stack(list(partitions.values())), axis=0, return_inverse=True
+        )
+        by_group = Normals.of_modes_in_groups(self.seen, groups.ravel())
+        for column, (words, labels) in enumerate(partitions.items()):
             with suppress(np.linalg.LinAlgError):
-                sets, rest, numbers = [], by_mode, np.unique(labels)
-                for number in numbers:
+                sets = []
+                for number in np.unique(labels):
                     inside = labels == number
                     step, sigma = parts.leave_one_out(inside, self.held, self.pull)
-                    # the last set has what the others leave: half of the work
-                    last = number == numbers[-1]
-                    own = rest if last else Normals.of_modes(self.seen, inside)
-                    rest = rest.without(own)
+                    members = np.flatnonzero(labels_of[:, column] == number)
+                    own = Normals.add([by_group[k] for k in members])
                     _, single = own.leave_one_out(every, self.held, self.pull)
                     sigma = self._at_least_noise(np.hypot(sigma, single), parts, inside)
                     moved = parts.solve_displacement(inside, self.held, self.distortion.field)

@@ -220,6 +220,9 @@ def _find_arms(by_place: Array) -> list[Arm]:
                 continue
             # the median, so that a single bad subaperture does not look like an arm
             mean = float(np.median(excess[on]))
+            significance = (mean - 1.0) / max(scatter * 1.25 / np.sqrt(on.sum()), 1e-9)
+            if mean <= ARM_EXCESS or significance <= ARM_SIGMA:
+                continue
             neighbours = (np.abs(np.abs(left - offset) - 3.0 * _ARM_WIDTH) < _ARM_WIDTH) & (
                 forward > 0.35 * radius
             )
@@ -227,10 +230,8 @@ def _find_arms(by_place: Array) -> list[Arm]:
                 np.quantile(excess[neighbours], 0.7)
             ):
                 continue  # a broad feature, such as uneven light, is not an arm
-            significance = (mean - 1.0) / max(scatter * 1.25 / np.sqrt(on.sum()), 1e-9)
-            if mean > ARM_EXCESS and significance > ARM_SIGMA:
-                arm = Arm(angle_deg=float(angle), offset_subap=round(float(offset), 1), excess=mean)
-                found.append((significance, arm))
+            arm = Arm(angle_deg=float(angle), offset_subap=round(float(offset), 1), excess=mean)
+            found.append((significance, arm))
     return _select_directions(found)
 
 

@@ -154,7 +154,7 @@ class FitSubset:
         self.target = settled.target.column_subset(self.modes)
         self.here = solution.alpha
         known = np.concatenate([solution.derivatives, solution.nuisance_derivatives])
-        self.derivatives = np.asarray(known[:, :, self.modes], dtype=np.float64)
+        self.derivatives = known[:, :, self.modes]
         """Derivatives of the unchanged instrument; they hardly depend on the alternative."""
 
         self._last: tuple[tuple[Array, ...], Projection] | None = None
@@ -218,7 +218,8 @@ class FitSubset:
     @staticmethod
     def _left_at_best(seen: Projection) -> Array:
         """Return the weighted squares of the residual after the best step ``(n_rows, n_few)``."""
-        left = seen.residual - np.tensordot(seen.best_step, seen.jacobian, axes=1)
+        step = seen.best_step.astype(seen.jacobian.dtype)
+        left = seen.residual - np.tensordot(step, seen.jacobian, axes=1)
         return np.asarray(left**2 * seen.weights)
 
     def tells(self, matrix: Array, rate: Array) -> bool:
@@ -243,20 +244,22 @@ class FitSubset:
             if len(known) == len(asked) and all(map(operator.is_, known, asked)):
                 return seen
         self._last = None  # its memory is needed for the next one
-        seen = self.target.project(matrix, self._with(more))
+        seen = self.target.project(matrix, self._with(more), np.float32)
         self._last = asked, seen
         return seen
 
     @cached_property
     def _own_seen(self) -> Projection:
-        return self.target.project(self.own, self.derivatives)
+        return self.target.project(self.own, self.derivatives, np.float32)
 
     def _at_solution(self, model: InteractionModel) -> Array:
         self.models.counter.n += 1
         return np.asarray(model.interaction_matrix(self.here), dtype=np.float64)
 
     def _with(self, more: tuple[Array, ...]) -> Array:
-        return np.concatenate([self.derivatives, np.array(more)]) if more else self.derivatives
+        if not more:
+            return self.derivatives
+        return np.concatenate([self.derivatives, np.array(more, self.derivatives.dtype)])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

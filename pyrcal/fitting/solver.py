@@ -57,6 +57,14 @@ LONGEST_STRETCH = 0.03
 SETTLED_STRETCH = 1e-5
 """Step of a stretch below which the fit has converged: 1.5e-4 subapertures at the edge of 30."""
 
+LINEAR_STEP = np.array([5e-3, 5e-3, np.deg2rad(0.02), 4e-4])
+"""Step below which the coarse model is extrapolated with its derivatives, 0.005 subapertures at the
+edge of 30 (numeric units). The fine model is always computed: extrapolated as well, it moved a
+result that is known to 0.001 subapertures by 0.2 sigma."""
+
+LINEAR_STRETCH = 4e-4
+"""The same limit for a stretch."""
+
 STRETCH_FLOOR = 1e-4
 """Smallest 1 σ of an anamorphosis; the same floor as the magnification's: both are image scales."""
 
@@ -187,14 +195,12 @@ class Nuisances:
         models: FitModels,
         alpha: Misregistration,
         matrix: NDArray[Any],
-        of_alpha: Array,
-        of_images: Array | None = None,
+        of_images: Sequence[Array] | Array = (),
     ) -> Array:
         """Return the derivatives of D by each nuisance except the gain map.
 
-        Shape ``(n_nuisances - n_maps, n_slopes, n_modes)``. ``of_alpha`` ``(4, n_slopes, n_modes)``
-        are the derivatives by α, ``of_images`` those by the image displacements if they are already
-        known.
+        Shape ``(n_nuisances - n_maps, n_slopes, n_modes)``. ``of_images`` are those by the image
+        displacements, one for each pattern.
         """
         model = models.cheap
         kind = model.instrument.slopes.kind
@@ -204,14 +210,9 @@ class Nuisances:
             models.counter.n += 2
             found += list(model.stretch_derivatives(alpha))
         found += models.optics_derivatives(alpha, [optic for optic, _ in self.optics])
-        if of_images is not None:
-            found += list(of_images)
-        elif len(self.images):
-            models.counter.n += 2
-            found += list(self._of_images(model.image_derivatives(alpha), of_alpha))
-        return np.array(found)
+        return np.array([*found, *of_images])
 
-    def _of_images(self, apart: Array, of_alpha: Array) -> Array:
+    def combine_images(self, apart: Array, of_alpha: Array) -> Array:
         """Return the change with each pattern, of the changes ``(8, ...)`` with each image."""
         rates = np.tensordot(self.images.astype(apart.dtype), apart, axes=1)
         common = self.images.reshape(-1, 2, 4).mean(axis=2)
@@ -360,26 +361,29 @@ def refine(
     decides = models.fine if decides is None else decides
     matrix = models.matrix(decides, start)
     if near is None:
-        models.counter.n += 4
-        frozen = models.cheap.derivatives(start)
-        nuisance_rates = nuisances.derivatives(models, start, matrix, frozen, of_images)
-        near = np.concatenate([frozen, nuisance_rates])
+        near = _compute_derivatives(models, start, matrix, nuisances, of_images)
     seen, every = _project_columns(columns, matrix, near, values, nuisances)
     regions = nuisances.regions[columns.rows]
     counts = dispersion(seen, regions)
-    converged = False
+    moving, settled, linear, converged = np.arange(4), SETTLED_STEP, LINEAR_STEP, False
+    if nuisances.anamorphosis:
+        moving = np.append(moving, 4 + np.arange(STRETCHES.start, STRETCHES.stop))
+        settled = np.append(settled, [SETTLED_STRETCH] * 2)
+        linear = np.append(linear, [LINEAR_STRETCH] * 2)
     for _ in range(max_steps):
         step = _limit_step(seen, values, nuisances, counts)
         if not within_limits(vector + step[:4]):
             break
         vector, values = vector + step[:4], values + step[4:]
-        matrix = models.matrix(decides, nuisances.at(start, vector, values))
+        if decides is models.cheap and np.all(np.abs(step[moving]) < linear):
+            # the error, some percent of the step, is that of a start for the fine grid
+            matrix = matrix + sum(step[k].astype(near.dtype) * near[k] for k in moving)
+        else:
+            matrix = models.matrix(decides, nuisances.at(start, vector, values))
         seen, every = _project_columns(columns, matrix, near, values, nuisances)
         counts = dispersion(seen, regions)
         next_step = _limit_step(seen, values, nuisances, counts)
-        stretching = next_step[4:][STRETCHES] if nuisances.anamorphosis else np.zeros(1)
-        at_rest = np.all(np.abs(next_step[:4]) < SETTLED_STEP)
-        if at_rest and np.all(np.abs(stretching) < SETTLED_STRETCH):
+        if np.all(np.abs(next_step[moving]) < settled):
             converged = True
             break
     return Solution(
@@ -393,6 +397,29 @@ def refine(
         dispersion=counts,
         converged=converged,
     )
+
+
+def _compute_derivatives(
+    models: FitModels,
+    alpha: Misregistration,
+    matrix: NDArray[Any],
+    nuisances: Nuisances,
+    of_images: Array | None,
+) -> Array:
+    """Return the derivatives by α and each nuisance except the gain map, ``Solution.near``."""
+    model = models.cheap
+    models.counter.n += 4
+    if of_images is not None or not len(nuisances.images):
+        of_alpha = model.derivatives(alpha)
+    else:
+        models.counter.n += 2
+        apart = model.image_derivatives(alpha)
+        of_alpha = model.derivatives(alpha, apart)
+        of_images = nuisances.combine_images(apart, of_alpha)
+    of_nuisances = nuisances.derivatives(
+        models, alpha, matrix, () if of_images is None else of_images
+    )
+    return np.concatenate([of_alpha, of_nuisances])
 
 
 def _project_columns(
@@ -420,14 +447,14 @@ def _project_columns(
     nuisances
         What they are.
     """
-    model = matrix + np.tensordot(nuisances.linear(values), near[4:], axes=1)
+    model = matrix + np.tensordot(nuisances.linear(values).astype(near.dtype), near[4:], axes=1)
     if not len(nuisances.maps):
-        return columns.project(model, near), near
-    gain = nuisances.slope_gain(values)[:, None]
-    every = np.empty((len(near) + len(nuisances.maps), *model.shape))
+        return columns.project(model, near, np.float32), near
+    gain = nuisances.slope_gain(values)[:, None].astype(near.dtype)
+    every = np.empty((len(near) + len(nuisances.maps), *model.shape), near.dtype)
     np.multiply(near, gain, out=every[: len(near)])
-    np.multiply(nuisances.maps[:, :, None], model, out=every[len(near) :])
-    return columns.project(model * gain, every), every
+    np.multiply(nuisances.maps[:, :, None], model, out=every[len(near) :], casting="same_kind")
+    return columns.project(model * gain, every, np.float32), every
 
 
 def _limit_step(seen: Projection, values: Array, nuisances: Nuisances, counts: float) -> Array:

@@ -260,7 +260,7 @@ def uncertainty(
     )
     sets = (
         *comparison.of_modes(mode_sets, by_mode),
-        *comparison.of_rows(pupil_sets, by_row, by_mode),
+        *comparison.of_rows(pupil_sets, by_row),
     )
     steps, covariances = _subsets(max(n_sets, 1), normals, held, scores, pull, noise)
     statistical = from_modes
@@ -377,7 +377,8 @@ def _at_least(covariance: Array, other: Array) -> Array:
 def _regional_scores(projection: Projection, regions: NDArray[np.intp]) -> Array:
     """Return the gradient by the unknowns from each region ``(n_unknowns, n_regions)``."""
     weighted = projection.residual * projection.weights
-    by_slope = np.einsum("ksm,sm->ks", projection.jacobian, weighted)
+    single = weighted.astype(projection.jacobian.dtype, copy=False)
+    by_slope = np.einsum("ksm,sm->ks", projection.jacobian, single)
     return np.array([np.bincount(regions, row) for row in by_slope])
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -33,13 +34,17 @@ from service.model.misregistration import Misregistration, rotation, wrap_angle
 from service.model.modes import Basis
 from service.model.pupil import rtc_valid_subapertures
 from service.model.sensors.registry import kind_of
-from service.model.sensors.sensor import Mapper
+from service.model.sensors.sensor import Mapper, by_rows
 from service.model.slopes import FLIPS, Orientation, SlopeRecipe, orient_mask
 
 Array = NDArray[np.float64]
 
 ANGLES_RAD = np.deg2rad(np.arange(0.0, 360.0, 6.0))
 """Rotations tried; shapes of degree 5 have lost a tenth half-way between two of them."""
+
+_POINTS_TOGETHER = 4096
+"""Pupil points whose shapes are evaluated at once: with fewer, tiles of thin plates would be split.
+"""
 
 NOMINAL = Misregistration()
 
@@ -243,7 +248,7 @@ def _judge_classes(poses: list[Pose], nominal_rad: float | None) -> Search:
     return Search(best=chosen, ties=ties)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Turned:
     """A coarse model's lowest modes at every rotation."""
 
@@ -259,17 +264,20 @@ class _Turned:
         """Turn the smoothest shapes of a model's modes round."""
         lowest = low_order_of(model)
         points = (model.pupil.points - about.vector[:2]) / about.magnification
-
-        def at(angle_rad: float) -> Array:
-            return lowest.shapes.render(points @ rotation(angle_rad))
-
+        turned = np.concatenate([points @ rotation(angle) for angle in ANGLES_RAD])
+        rendered = by_rows(mapper, lowest.shapes.render, turned, _POINTS_TOGETHER)
+        by_point = rendered.reshape(len(ANGLES_RAD), len(points), -1).swapaxes(0, 1)
         # one product for all: each by itself would read the whole sensor again
-        shapes = np.concatenate(list(mapper(at, ANGLES_RAD.tolist())), axis=1)
-        seen = model.measure_signals(Misregistration(), shapes).reshape(
+        seen = model.measure_signals(Misregistration(), by_point.reshape(len(points), -1)).reshape(
             model.n_slopes, len(ANGLES_RAD), -1
         )
         columns = np.ascontiguousarray(seen.transpose(2, 1, 0), dtype=np.float64)
         return cls(lowest=lowest, columns=columns, valid=model.valid)
+
+    @cached_property
+    def _norm(self) -> Array:
+        """``(n_low, n_angles)`` norm of every answer."""
+        return np.asarray(np.linalg.norm(self.columns, axis=2))
 
     def pose(self, target: Target, slopes: SlopeRecipe) -> Pose:
         """Return the rotation at which the model explains these columns best."""
@@ -277,7 +285,7 @@ class _Turned:
         seen = np.tile(target.valid[self.valid], slopes.kind.n_planes)
         columns = self.columns if seen.all() else self.columns[:, :, seen]
         along = np.matmul(columns, low.T[:, :, None])[:, :, 0]
-        norm = np.sqrt(np.einsum("las,las->la", columns, columns))
+        norm = self._norm if seen.all() else np.linalg.norm(columns, axis=2)
         correlation = (along / norm).mean(axis=0)
         best = int(np.argmax(correlation))
         before, at, after = np.take(correlation, [best - 1, best, best + 1], mode="wrap")

@@ -65,10 +65,16 @@ class Columns:
     """True if a gain may be negative. Otherwise such a column has no response in common with the
     model and does not enter."""
 
-    def project(self, model: NDArray[Any], derivatives: NDArray[Any]) -> Projection:
+    def project(
+        self,
+        model: NDArray[Any],
+        derivatives: NDArray[Any],
+        dtype: type[np.float32] | type[np.float64] = np.float64,
+    ) -> Projection:
         """Return the gains, residual and Jacobian of a model ``(n_slopes, n_columns)``.
 
-        ``derivatives`` is ``(n_unknowns, n_slopes, n_columns)``.
+        ``derivatives`` is ``(n_unknowns, n_slopes, n_columns)``, ``dtype`` the precision of the
+        Jacobian.
         """
         matrix = np.asarray(model[self.rows], dtype=np.float64)
         measured = self.matrix[self.rows]
@@ -77,16 +83,17 @@ class Columns:
         gains = np.sum(matrix * measured, axis=0) / power
         if not self.signed:
             gains = np.maximum(gains, 0.0)
-        # laid out row by row: every product of it would else copy it first
-        if self.rows.all():
-            jacobian = derivatives.astype(np.float64, order="C")
-        else:
-            counted = np.compress(self.rows, derivatives, axis=1)
-            jacobian = counted.astype(np.float64, order="C", copy=False)
-        along = np.einsum("ksm,sm->km", jacobian, matrix) / power
-        for k, part in enumerate(along):
-            jacobian[k] -= matrix * part
-        jacobian *= gains
+        # one unknown at a time, which stays in the cache
+        jacobian = np.empty((len(derivatives), *matrix.shape), dtype)
+        shape: NDArray[Any] = matrix.astype(dtype, copy=False)
+        for k, rates in enumerate(derivatives):
+            counted: NDArray[Any] = np.asarray(
+                rates if self.rows.all() else rates[self.rows], dtype
+            )
+            along = np.einsum("sm,sm->m", counted, shape) / power
+            np.multiply(shape, along.astype(dtype), out=jacobian[k])
+            np.subtract(counted, jacobian[k], out=jacobian[k])
+            jacobian[k] *= gains.astype(dtype)
         return Projection(
             gains=gains,
             residual=measured - matrix * gains,
@@ -142,23 +149,25 @@ class Projection:
     @cached_property
     def scores(self) -> Array:
         """``(n_unknowns, n_modes)`` what each mode says each unknown should do."""
-        along = np.einsum("ksm,sm->km", self.jacobian, self.residual)
+        residual = self.residual.astype(self.jacobian.dtype, copy=False)
+        along = np.einsum("ksm,sm->km", self.jacobian, residual)
         return np.asarray(along * self.weights)
 
     @cached_property
     def normal(self) -> Array:
         """Normal matrix of all modes together, ``(n_unknowns, n_unknowns)``."""
         n_unknowns, n_rows, _ = self.jacobian.shape
-        root, total = np.sqrt(self.weights), np.zeros((n_unknowns, n_unknowns))
+        root = np.sqrt(self.weights).astype(self.jacobian.dtype)
+        total = np.zeros((n_unknowns, n_unknowns))
         for start in range(0, n_rows, _ROWS_AT_ONCE):
             flat = (self.jacobian[:, start : start + _ROWS_AT_ONCE] * root).reshape(n_unknowns, -1)
             total += flat @ flat.T
         return total
 
-    @property
+    @cached_property
     def normals(self) -> Array:
         """Normal matrix of every mode, ``(n_modes, n_unknowns, n_unknowns)``."""
-        by_mode = self.jacobian.transpose(2, 0, 1)
+        by_mode = np.ascontiguousarray(self.jacobian.transpose(2, 0, 1))
         return np.asarray(by_mode @ by_mode.transpose(0, 2, 1) * self.weights[:, None, None])
 
 

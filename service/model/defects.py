@@ -31,16 +31,16 @@ def find_defects(values: NDArray[Any]) -> dict[int, str]:
     """
     array = np.asarray(values)
     flat = array.reshape(len(array), array[0].size if len(array) else 0)
-    n_unknown = np.array([np.sum(~np.isfinite(entry)) for entry in flat])
-    usual = ~np.isfinite(flat[int(np.argmin(n_unknown))]) if len(flat) else np.zeros(0, bool)
+    unknown = ~np.isfinite(flat)
+    n_unknown = unknown.sum(axis=1)
+    usual = unknown[int(np.argmin(n_unknown))] if len(flat) else np.zeros(0, bool)
     found: dict[int, str] = {}
     seen: dict[bytes, int] = {}
     for number, entry in enumerate(flat):
-        missing = ~np.isfinite(entry)
-        if n_unknown[number] == flat.shape[1] or np.any(missing & ~usual):
+        if n_unknown[number] == flat.shape[1] or np.any(unknown[number] & ~usual):
             found[number] = NOT_FINITE
             continue
-        if not np.nan_to_num(entry).any():
+        if not (np.nan_to_num(entry) if n_unknown[number] else entry).any():
             found[number] = ZERO
             continue
         # a digest, for the entries of a large table would double the memory

@@ -13,8 +13,8 @@ Beatson & Newsam 1992, Computers & Mathematics with Applications 24, 7.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,6 +83,14 @@ class PlateSum:
             near = ThinPlate(self.surface.positions[tile.near]).slope(points[some], direction[some])
             out[some] = self._add_terms(tile, far, near)
         return out
+
+    def of_columns(self, combine: Callable[[Array], Array]) -> PlateSum:
+        """Return the sum of other modes, the columns that ``combine`` makes of these modes'."""
+        tiles = {
+            place: replace(tile, series=combine(tile.series))
+            for place, tile in list(self._tiles.items())
+        }
+        return replace(self, coefficients=combine(self.coefficients), _tiles=tiles)
 
     def _add_terms(self, tile: _Tile, far: Array, near: Array) -> Array:
         """Return the sum of the terms of all far plates, and of near ones and the plane."""

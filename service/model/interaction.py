@@ -224,10 +224,18 @@ class InteractionModel:
         """
         return self._as_listed(self.measure_signals(alpha, self._render_modes(alpha)))
 
-    def derivatives(self, alpha: Misregistration) -> Array:
-        """Return dD/dα ``(4, n_slopes, n_modes)``: per subaperture, radian, magnification."""
+    def derivatives(self, alpha: Misregistration, of_images: Array | None = None) -> Array:
+        """Return dD/dα ``(4, n_slopes, n_modes)``: per subaperture, radian, magnification.
+
+        ``of_images`` are those by each pupil image if they are known, see ``image_derivatives``:
+        with the mirror as stop a shift moves all images, so that their sums are its derivatives.
+        """
         if self.instrument.stop is Stop.TELESCOPE:
             rates = self._measure_shapes(alpha, self._rates_of_modes(alpha))
+        elif of_images is not None and len(of_images):
+            rates = self._measure_shapes(alpha, self._rates_of_modes(alpha))
+            by_axis = of_images.reshape(_AXES, -1, *of_images.shape[1:]).sum(axis=1)
+            return np.stack([*by_axis, *(self._as_listed(rate) for rate in rates)])
         else:
             _, *rates = self._with_rates(alpha)
         return np.stack([self._as_listed(rate) for rate in rates])

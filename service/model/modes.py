@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
@@ -133,11 +133,8 @@ class ModalBasis:
 
     def subset(self, indices: Indices) -> ModalBasis:
         """Return a basis of these modes only, in this order."""
-        return replace(
-            self,
-            mode_to_actuator=np.ascontiguousarray(self.mode_to_actuator[:, indices]),
-            coefficients=np.ascontiguousarray(self.coefficients[:, indices]),
-            variance_m2=self.variance_m2[indices],
+        return self._of_columns(
+            lambda columns: np.ascontiguousarray(columns[:, indices]), self.variance_m2[indices]
         )
 
     def combine_modes(self, weights: Array) -> ModalBasis:
@@ -145,12 +142,20 @@ class ModalBasis:
 
         Modes are taken to vary apart from one another.
         """
-        return replace(
+        return self._of_columns(lambda columns: columns @ weights, self.variance_m2 @ weights**2)
+
+    def _of_columns(self, combine: Callable[[Array], Array], variance_m2: Array) -> ModalBasis:
+        """Return a basis of the columns that ``combine`` makes of those of these modes."""
+        other = replace(
             self,
-            mode_to_actuator=self.mode_to_actuator @ weights,
-            coefficients=self.coefficients @ weights,
-            variance_m2=self.variance_m2 @ weights**2,
+            mode_to_actuator=combine(self.mode_to_actuator),
+            coefficients=combine(self.coefficients),
+            variance_m2=variance_m2,
         )
+        plates = self.__dict__.get("_plates")
+        if plates is not None:  # what is known of their tiles is combined alike
+            other.__dict__["_plates"] = plates.of_columns(combine)
+        return other
 
 
 Basis = ModalBasis | TabulatedBasis

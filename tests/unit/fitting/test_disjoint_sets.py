@@ -102,7 +102,7 @@ def test_the_sigma_of_a_set_holds_errors_that_all_modes_share_in_a_region():
         wrong -= np.tensordot(replace(seen, residual=wrong).best_step, seen.jacobian, axes=1)
         parts, sets = comparison(replace(seen, residual=wrong))
         halves = (np.arange(N_ROWS) % N_REGIONS) % 2
-        (one,) = sets.of_rows({"halves": halves}, parts, Normals.of_modes(sets.seen))
+        (one,) = sets.of_rows({"halves": halves}, parts)
         ratios.append(one.ratios[0, 0])
     assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.3
 
@@ -127,7 +127,7 @@ def test_a_distortion_is_found_and_explains_the_difference_of_inner_and_outer_se
     # only the noise is left
     assert sets.distortion.share == pytest.approx(0.1**2 / np.mean(residual**2), rel=0.05)
     outer = (radius > np.median(radius)).astype(int)
-    (rings,) = sets.of_rows({"rings": outer}, parts, Normals.of_modes(sets.seen))
+    (rings,) = sets.of_rows({"rings": outer}, parts)
     assert rings.straight_tension[3] > 3.0
     assert rings.tension[3] < 1.5
     # and sigma holds it: the magnification of a distorted mirror is a matter of where one looks

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -179,26 +180,36 @@ class PyramidOptics:
     def prepare(self, of_row: RowResponse) -> PreparedRows:
         """Return what all rows of subapertures share."""
         images = np.empty((2, self.wfs.n_subapertures, 2, self.wfs.n_subapertures))
-        parts = []
-        for grid in self._grids:
+        parts: list[PreparedGrid] = []
+        # signals that differ in many places of the sum are cheaper image by image
+        apart = self._is_few(of_row.shapes) or self.recipe.kind is SignalKind.INTENSITY
+        for grid in _SINGLE_IMAGES if apart and self.offsets is None else self._grids:
             roof_y = self._roof(of_row.shift[1] + grid.y, of_row.nodes_y, grid.sides_y)
             roof_x = self._roof(of_row.shift[0] + grid.x, of_row.nodes_x, grid.sides_x)
             modulated_y, modulated_x = self._modulate_roof(roof_y, roof_x)
             fields_at_rest = self._fields(modulated_y, modulated_x)
             images[grid.sides_y, :, grid.sides_x] = self._images(fields_at_rest, roof_y, roof_x)
+            shares_y = bool(parts) and parts[-1].grid.has_same_y(grid)
+            planes = np.ones((1, 1, 1)) if apart else self._plane_signs(grid)
             parts.append(
                 PreparedGrid(
                     grid=grid,
                     fields=fields_at_rest,
-                    factors_y=_weight_parts(modulated_y, roof_y, axis=1),
+                    factors_y=parts[-1].factors_y
+                    if shares_y
+                    else _weight_parts(modulated_y, roof_y, axis=1),
                     factors_x=self.arrays.there(_weight_parts(modulated_x, roof_x, axis=-2)),
-                    signs=self._signs(len(roof_y.weights), len(roof_x.weights), grid),
+                    signs=self._signs(len(roof_y.weights), len(roof_x.weights), planes),
                 )
             )
-        return PreparedRows(images=images, parts=tuple(parts), finish=self._finish(of_row.shapes))
+        return PreparedRows(
+            images=images, parts=tuple(parts), finish=self._finish(of_row.shapes), apart=apart
+        )
 
     def lines(self, row: int, columns: Array, rows: PreparedRows) -> Array:
         """Return the lines of subapertures in these columns of a row, ``(n_lines, n_shapes)``."""
+        if rows.apart:
+            return self._combine_images(self._image_lines(row, columns, rows))
         factors = [self._row_factors(row, columns, part) for part in rows.parts]
         if len(factors) == 1:
             return self.arrays.here(rows.finish(*factors[0]))
@@ -208,6 +219,25 @@ class PyramidOptics:
         every_x = zip(*(along_x for _, along_x in factors), strict=True)
         along_x = [xp.concat(list(same), axis=1) for same in every_x]
         return self.arrays.here(rows.finish(along_y, along_x))
+
+    def _image_lines(self, row: int, columns: Array, rows: PreparedRows) -> Array:
+        """Return the lines of each image by itself, ``(4, n_columns, n_shapes)``."""
+        found = []
+        for _, group in groupby(rows.parts, key=lambda part: id(part.factors_y)):
+            factors = [self._row_factors(row, columns, part) for part in group]
+            along_x = [line for _, lines in factors for line in lines]
+            found.append(self.arrays.here(rows.finish(factors[0][0], along_x)))
+        lines = np.concatenate(found)
+        return lines.reshape(4, len(columns), -1)
+
+    def _combine_images(self, lines: Array) -> Array:
+        """Return the lines of the signals, and of what normalises them, of those of the images."""
+        whole = _Grid(sides_y=slice(0, 2), sides_x=slice(0, 2))
+        planes = self._plane_signs(whole).reshape(-1, 4).astype(lines.dtype)
+        signals = np.tensordot(planes, lines, axes=1).reshape(-1, lines.shape[2])
+        if self.recipe.normalisation is Normalisation.LOCAL:
+            return signals
+        return np.concatenate([signals, lines.sum(axis=(0, 1))[None]])
 
     @property
     def n_pairs(self) -> int:
@@ -330,11 +360,10 @@ class PyramidOptics:
         # what the halo loses beyond the grid still falls on the detector, only without signal
         return np.asarray(images / (2.0 * self._source()[2].sum()))
 
-    def _signs(self, n_y: int, n_x: int, grid: _Grid) -> Array:
-        """Return with which sign each field at rest has a part in every plane of signals.
+    def _plane_signs(self, grid: _Grid) -> Array:
+        """Return the sign of each image in every plane of signals ``(n_planes, n_sides, n_sides)``.
 
-        ``(n_planes, 1, 1, 2, n_sides, n_y, n_sides, 2, n_x)``: with local normalisation the flux
-        is one more plane. Of the two parts of a field, times i and as it is, see ``_row_factors``.
+        With local normalisation the flux is one more plane.
         """
         if self.recipe.kind is SignalKind.INTENSITY:
             signs = np.eye(4).reshape(4, 2, 2)
@@ -342,7 +371,14 @@ class PyramidOptics:
             signs = np.stack([np.tile(_SIGNS, (2, 1)), np.tile(_SIGNS, (2, 1)).T])
         if self.recipe.normalisation is Normalisation.LOCAL:
             signs = np.concatenate([signs, np.ones((1, 2, 2))])
-        signs = signs[:, grid.sides_y, grid.sides_x]
+        return np.asarray(signs[:, grid.sides_y, grid.sides_x])
+
+    def _signs(self, n_y: int, n_x: int, signs: Array) -> Array:
+        """Return with which sign each field at rest has a part in every plane of signals.
+
+        ``(n_planes, 1, 1, 2, n_sides, n_y, n_sides, 2, n_x)``, of ``signs`` as ``_plane_signs``
+        returns them. Of the two parts of a field, times i and as it is, see ``_row_factors``.
+        """
         parts = np.array([1j, 1.0])[:, None, None, None, None, None]
         every = signs[:, None, None, None, :, None, :, None, None] * parts
         n_planes, on_y, on_x = signs.shape
@@ -374,7 +410,7 @@ class PyramidOptics:
         right = xp.reshape(right, (n_columns, n_source, -1, n_u))
         lines = xp.matmul(there(left), right)
         along_x = [xp.reshape(lines, (n_planes * n_columns, -1, n_u))]
-        if self.recipe.normalisation is Normalisation.GLOBAL:
+        if self.recipe.normalisation is Normalisation.GLOBAL and not rows.is_single:
             along_x.append(self._flux_factor(lines, along_y, rows.grid))
         return there(along_y.reshape(-1, n_u).T), along_x
 
@@ -395,10 +431,13 @@ class PyramidOptics:
             return TiledResponse(shapes, self._scale, self.arrays)
         there = self.arrays.there
         lit, scale = there(np.flatnonzero(self.pupil.lit)), there(self._scale[self.pupil.lit])
-        if shapes is not None and self.are_few(shapes.shape[1]):
+        if shapes is not None and self._is_few(shapes):
             return partial(self._fold_few, weighted=self._weight_shapes(shapes))
         known = None if shapes is None else there(shapes)
         return partial(self._fold, lit=lit, scale=scale, shapes=known)
+
+    def _is_few(self, shapes: Shapes | None) -> bool:
+        return isinstance(shapes, np.ndarray) and self.are_few(shapes.shape[1])
 
     def are_few(self, n_shapes: int) -> bool:
         """Return whether so few shapes cost less than the gradient at every point of a row."""
@@ -461,6 +500,16 @@ class _Grid:
 
     y: float = 0.0
 
+    def has_same_y(self, other: _Grid) -> bool:
+        """Return True if the factors along y are those of another grid."""
+        return self.sides_y == other.sides_y and self.y == other.y
+
+
+_SINGLE_IMAGES = tuple(
+    _Grid(sides_y=slice(y, y + 1), sides_x=slice(x, x + 1)) for y in range(2) for x in range(2)
+)
+"""Each of four images in its place."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PreparedGrid:
@@ -477,6 +526,11 @@ class PreparedGrid:
     signs: Array
     """Factor of a field in every plane of signals."""
 
+    @property
+    def is_single(self) -> bool:
+        """True if it gives the lines of one image, not of signals."""
+        return len(self.signs) == 1
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PreparedRows:
@@ -488,6 +542,9 @@ class PreparedRows:
 
     finish: Callable[[Foreign, list[Foreign]], Foreign]
     """Function that turns a row's factors into its gradient, or into its response to shapes."""
+
+    apart: bool
+    """True if each image is computed by itself, and the signals are combined of them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pyrcal_studies.campaign.telemetry import blocks_of
+from pyrcal_studies.campaign.night import blocks_of
 from pyrcal_studies.noisy_figure import draw
 from service.archive import Archive
 from service.config.settings import Settings

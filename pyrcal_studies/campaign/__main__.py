@@ -2,7 +2,7 @@
 
 Run: ``python -m pyrcal_studies.campaign --magnitudes 7,10,12.5 --seeds 0:10 --output
 var/campaign.jsonl``; rows that are there already are not run again. ``--table FILE.md`` writes the
-table, ``--plot FILE.png`` draws errors against stated σ.
+table.
 """
 
 from __future__ import annotations
@@ -16,12 +16,9 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-from pyrcal_studies.campaign.night import play
-from pyrcal_studies.campaign.plan import Estimator, Night
-from pyrcal_studies.campaign.plots import plot
+from pyrcal_studies.campaign.night import Night, play
 from pyrcal_studies.campaign.rows import RowFile, add_workers, floats, played, range_of, tell, words
 from pyrcal_studies.campaign.summary import table
-from pyrcal_studies.campaign.trouble import Trouble
 from service.config import load_settings
 from service.instrument import load_instrument
 from service.program import status_of
@@ -46,8 +43,6 @@ def main() -> int:
     floor = floor_of(load_settings(None, environment), load_instrument(given.instrument))
     text = table(file.rows, floor, pooled=given.winds_in_turn is not None)
     tell(text, given.table, "python -m pyrcal_studies.campaign")
-    if given.plot is not None:
-        plot(given.plot, file.rows, floor)
     return 0
 
 
@@ -59,7 +54,6 @@ def campaign_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--output", type=Path, default=Path("campaign.jsonl"), help="rows, resumed")
     parser.add_argument("--table", type=Path, metavar="FILE.md")
-    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="needs the extra 'plots'")
     parser.add_argument("--seeds", type=range_of, default=range(2), metavar="FIRST:END")
     parser.add_argument("--magnitudes", type=floats, default=(10.0,), metavar="R,R...")
     parser.add_argument("--winds", type=floats, default=(12.0,), metavar="M_S,M_S...")
@@ -71,14 +65,6 @@ def campaign_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--profile", help="named layers instead of winds")
     parser.add_argument("--truths", type=words, default=("ideal",), metavar="NAME,NAME...")
-    parser.add_argument("--estimators", type=words, default=("lock-in",), metavar="NAME,NAME...")
-    parser.add_argument(
-        "--troubles",
-        type=words,
-        default=("none",),
-        metavar="NAME,NAME...",
-        help=", ".join(Trouble),
-    )
     parser.add_argument("--plant", choices=("linear", "diffractive"), default="diffractive")
     parser.add_argument("--gain", type=float, default=0.6)
     parser.add_argument("--n-controlled", type=int, default=400)
@@ -97,17 +83,13 @@ def campaign_parser() -> argparse.ArgumentParser:
 
 def _nights(given: argparse.Namespace) -> Iterator[Night]:
     """Yield every night of the grid."""
-    grid = itertools.product(
-        given.seeds, given.truths, given.estimators, given.troubles, given.magnitudes, given.winds
-    )
+    grid = itertools.product(given.seeds, given.truths, given.magnitudes, given.winds)
     turns = given.winds_in_turn
-    for seed, truth, estimator, trouble, magnitude, wind in grid:
+    for seed, truth, magnitude, wind in grid:
         wind_m_s = wind if turns is None else turns[seed % len(turns)]
         yield Night(
             plant=given.plant,
             truth=truth,
-            estimator=Estimator(estimator),
-            trouble=Trouble(trouble),
             magnitude=magnitude,
             wind_m_s=wind_m_s,
             profile=given.profile,

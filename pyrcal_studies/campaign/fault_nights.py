@@ -17,7 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,6 @@ from pyrcal_studies.campaign.observatory_dome import Dome, Moment
 from pyrcal_studies.campaign.observatory_link import OwnHands, ShortLink
 from pyrcal_studies.campaign.rows import Row, RowFile, heading, line, range_of, tell
 from pyrcal_studies.campaign.small import SETTINGS, SMALL, bench_of, latencies_of
-from pyrcal_studies.campaign.trouble import Trouble, troubled
 from service.config import load_settings
 from service.errors import LinkError, PyrcalError
 from service.estimation.frames import FrameBlock
@@ -69,6 +68,9 @@ LEAST_NM = 20.0
 WIND_M = 0.012
 """What the air moves from a frame to the next: at a lower rate the wind is as much slower. Gains of
 0.4 would leave a radian of wavefront else, and a matrix that reads too much would do better."""
+
+MISSING = 0.045
+"""Share of frames that are lost at random: a tenth less than a window may lack."""
 
 _OWNERS = {
     OperationKind.MEASURING,
@@ -175,8 +177,11 @@ class FaultNight(KeptNight):
     def _arriving(self, blocks: list[FrameBlock]) -> Iterator[FrameBlock]:
         if self.burst:
             return
-        trouble = Trouble.GAPS if self.gaps else Trouble.NONE
-        yield from troubled(blocks, trouble, self._rng)
+        for block in blocks:
+            if self.gaps:
+                yield from _runs(block, self._rng.random(block.n_frames) >= MISSING)
+            else:
+                yield block
 
     @override
     def _hear(self, event: ev.Event) -> None:
@@ -493,6 +498,21 @@ def _after_words(seed: int, what: Night) -> np.random.Generator:
     rng = np.random.default_rng([_SEED, seed])
     _words(rng, seed, what)
     return rng
+
+
+def _runs(block: FrameBlock, arrives: np.ndarray) -> Iterator[FrameBlock]:
+    """Yield each stretch of frames that arrive."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], arrives, [False]]).astype(int)))
+    for start, stop in edges.reshape(-1, 2):
+        rows = slice(int(start), int(stop))
+        yield replace(
+            block,
+            first_seq=block.first_seq + rows.start,
+            t0_ns_utc=block.t0_ns_utc + rows.start * block.dt_ns,
+            slopes=block.slopes[rows],
+            commands_m=block.commands_m[rows],
+            dither_m=None if block.dither_m is None else block.dither_m[rows],
+        )
 
 
 def _median(moments: Sequence[Moment]) -> float:

@@ -16,14 +16,11 @@ from service.estimation.estimate import model_error
 Array = NDArray[np.float64]
 
 GROUPED_BY = (
-    "plant", "truth", "estimator", "trouble", "magnitude", "profile", "wind_m_s", "gain",
+    "plant", "truth", "magnitude", "profile", "wind_m_s", "gain",
     "n_controlled", "amplitude_nm", "window_s", "working_point_modes", "modes", "camera",
     "instrument", "rate_hz",
 )  # fmt: skip
 """Nights that differ in nothing but the seed make one line of the table."""
-
-LATER: Row = {"instrument": "flao-lbt", "rate_hz": None}
-"""What rows of before do not have."""
 
 HEADER = heading(
     *("night", "windows (refused)", "bias x, y % / mdeg / %", "scatter", "scatter/σ", "chi2/4"),
@@ -39,7 +36,7 @@ def table(rows: list[Row], floor: Array, *, pooled: bool = False) -> str:
     groups: dict[tuple[Any, ...], list[Row]] = defaultdict(list)
     for row in rows:
         common = row | {"wind_m_s": None} if pooled else row
-        values = ((LATER | common)[name] for name in GROUPED_BY)
+        values = (common[name] for name in GROUPED_BY)
         groups[tuple(tuple(v) if isinstance(v, list) else v for v in values)].append(row)
     return HEADER + "".join(_line(key, group, floor) for key, group in groups.items())
 
@@ -96,7 +93,7 @@ def _name(key: dict[str, Any]) -> str:
     wind = "many winds" if key["wind_m_s"] is None else f"{key['wind_m_s']:g} m/s"
     sky = key["profile"] or wind
     words = [
-        f"{key['estimator']}, {key['plant']} {key['truth']}, mag {key['magnitude']:g}, {sky}",
+        f"{key['plant']} {key['truth']}, mag {key['magnitude']:g}, {sky}",
         f"{key['n_controlled']} modes g {key['gain']:g}",
         f"4 x {key['amplitude_nm']:g} nm, {key['window_s']:g} s",
     ]
@@ -110,6 +107,4 @@ def _name(key: dict[str, Any]) -> str:
         words.append(f"{key['rate_hz']:g} Hz")
     if key["camera"] != "ccd":
         words.append(key["camera"])
-    if key["trouble"] != "none":
-        words.append(f"**{key['trouble']}**")
     return ", ".join(words)

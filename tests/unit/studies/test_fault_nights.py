@@ -1,5 +1,7 @@
 """Random faults in simulated time: what must hold is looked at, and what does not is said."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,6 @@ from pyrcal_studies.campaign.fault_nights import (
 )
 from pyrcal_studies.campaign.observatory_dome import Moment
 from pyrcal_studies.campaign.small import latencies_of
-from pyrcal_studies.campaign.trouble import Trouble, strike
 from service.tracking import commands as cmd
 from service.tracking.state import Mode
 from tests.system.night import INSTRUMENT
@@ -74,7 +75,10 @@ def test_a_matrix_of_another_name_than_the_rtc_has_is_told(tmp_path, monkeypatch
     night = Deaf(WORDS, tmp_path, 1, listening=True)
     night.play((), 1.5)
     assert night.broken == []
-    strike(Trouble.SWAPPED, night.dome.computer)
+    in_use = night.dome.computer.reconstructor
+    night.dome.computer.stage(
+        replace(in_use, manifest=replace(in_use.manifest, id=f"{in_use.manifest.id}-again"))
+    )
     night.play((), 3.0)
     assert ["is said to be in use" in text for text in night.broken] == [True]
     night.close()

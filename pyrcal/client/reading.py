@@ -25,7 +25,7 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
     one = getattr(options, "id", None)
     path = request.path if one is None else f"{request.path}/{quote(one, safe='')}"
     document = service.get(path, **collect_arguments(options, ("since", "until", "limit"))).document
-    lines = _SCREENS[request.name]
+    lines = SCREENS[request.name]
     with understood(service):
         text_lines = [] if options.json else list(lines(document))
         well = request.name != "status" or (document["ready"] and not document["alarms"])
@@ -127,7 +127,7 @@ def _recordings(document: Document) -> Iterator[str]:
     yield from table(rows) if rows else ["no recordings"]
 
 
-_SCREENS = {
+SCREENS = {
     "status": status_lines,
     "alpha": _alpha,
     "reconstructors list": _reconstructors,
@@ -136,3 +136,4 @@ _SCREENS = {
     "recordings list": _recordings,
     "audit": _audit,
 }
+"""Function that prints the answer, by command."""

@@ -68,7 +68,7 @@ def check_reference(
         unit is not the metre.
     """
     _check_shape(reference, n_slopes, n_modes)
-    damaged = np.abs(reference.matrix) > LARGEST_VALUE
+    damaged = np.abs(reference.matrix) > np.float64(LARGEST_VALUE)
     if damaged.any():
         reference = replace(
             reference,

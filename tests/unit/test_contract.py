@@ -46,8 +46,14 @@ TESTS = {
         f"{COMPUTER}/test_activities_dither.py",
         "test_a_binary_sequence_repeats_with_its_seed_whatever_the_blocks",
     ),
-    48: (SIMULATED, "test_a_second_dither_is_refused_until_the_first_is_stopped"),
-    53: (SIMULATED, "test_more_modes_take_effect_with_the_next_matrix_of_that_shape"),
+    48: (
+        f"{COMPUTER}/test_real_time_computer.py",
+        "test_a_second_dither_is_refused_until_the_first_is_stopped",
+    ),
+    53: (
+        f"{COMPUTER}/test_real_time_computer.py",
+        "test_the_number_of_modes_waits_for_a_matrix_of_that_shape",
+    ),
     55: (
         f"{COMPUTER}/test_gains_loop.py",
         "test_while_one_runs_another_is_refused_and_so_is_what_would_spoil_it",

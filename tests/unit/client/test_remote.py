@@ -15,6 +15,7 @@ import pytest
 
 from pyrcal.__main__ import main
 from pyrcal.client import orders
+from pyrcal.client.reading import SCREENS
 from pyrcal.client.remote import REQUESTS
 from service.api import create_app
 from service.archive import AuditEntry, Channel
@@ -308,6 +309,10 @@ def test_an_acquisition_is_followed_to_its_end(capsys, service, monkeypatch, end
 
 
 # --- reading
+
+
+def test_every_command_that_reads_prints_its_answer():
+    assert set(SCREENS) == {one.name for one in REQUESTS if one.module == "reading"}
 
 
 def test_every_screen_is_there_and_json_is_what_rest_answers(capsys, service):

@@ -9,6 +9,7 @@ from service.model.misregistration import Misregistration
 from service.wire import (
     DitherKind,
     DitherRequest,
+    DitherStop,
     Loop,
     LoopRequest,
     Manifest,
@@ -184,6 +185,13 @@ def test_a_dither_starts_at_the_announced_frame_and_ends_by_itself(computer):
     playing = [b for b in batches if b.dither_m is not None]
     assert (playing[0].seq0, playing[-1].seq0) == (reply.start_seq, reply.start_seq + 990)
     assert computer.status().dither is None
+
+
+def test_a_second_dither_is_refused_until_the_first_is_stopped(computer):
+    assert computer.execute(dither_request("first")).accepted
+    assert computer.execute(dither_request("second")).reason.startswith("busy")
+    assert computer.execute(DitherStop(id="stop")).accepted
+    assert computer.execute(dither_request("third")).accepted
 
 
 def test_a_command_is_carried_out_once_for_ten_minutes(computer):

@@ -17,7 +17,9 @@ from service.wire import (
     Keys,
     Loop,
     Manifest,
+    MeasuredManifest,
     OffloadRequest,
+    Pattern,
     Pointing,
     RampRequest,
     Role,
@@ -91,6 +93,23 @@ MANIFEST = Manifest(
     sigma=ALPHA,
     im_id=None,
     parent="r-0",
+    basis_id="kl/594",
+    config_id="mask 1",
+    system="flao-lbt",
+    created_ns=7,
+)
+
+
+MEASURED = MeasuredManifest(
+    id="m-1",
+    layout=layout_of(MATRIX, 20),
+    reason=None,
+    modes=(0, 5, 9, 2),
+    amplitude_m=(1e-8,) * 4,
+    n_average=4,
+    pattern=Pattern.PUSH_PULL_MODAL,
+    double_pass=True,
+    session="s1",
     basis_id="kl/594",
     config_id="mask 1",
     system="flao-lbt",
@@ -348,6 +367,15 @@ def test_a_bad_manifest_is_refused_by_key_found_and_expected(changes, words):
 def test_a_matrix_is_cut_into_equal_parts_and_a_shorter_last_one():
     assert [len(part) for part in split(MATRIX, 20)] == [20, 20, 8]
     assert b"".join(split(MATRIX, 20)) == MATRIX.tobytes()
+
+
+def test_a_measured_manifest_names_its_columns_or_why_there_are_none():
+    data = encode(MEASURED)
+    assert decode(MeasuredManifest, data) == MEASURED
+    with pytest.raises(WireError, match="one for each of 4 measured modes"):
+        decode(MeasuredManifest, changed(data, modes=[0], amplitude_m=[1e-8]))
+    failed = decode(MeasuredManifest, changed(data, n_chunks=0, reason="no light", sha256=None))
+    assert (failed.layout.n_chunks, failed.reason) == (0, "no light")
 
 
 def test_a_matrix_stored_by_columns_travels_by_rows():

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.unit.tutorial_blocks import agrees, missing_lines
+from tests.unit.tutorial_blocks import ENDING, agrees, missing_lines, steps
 
 PRINTED = "shift x             -0.0978      0.0029  subapertures\n...\nverdict: accepted\n"
 
@@ -35,3 +35,11 @@ def test_lines_are_found_in_their_order_with_their_numbers(output, missing):
 def test_three_dots_within_a_line_stand_for_any_text(line, agreed):
     printed = ["mode auto; up ...", "x +0.4930 ...", "... is made: ..., 500 modes: stable"]
     assert any(agrees(one, line) for one in printed) == agreed
+
+
+def test_what_a_program_prints_at_its_end_is_not_the_output_of_the_block_before(tmp_path):
+    page = tmp_path / "page.md"
+    ending = "<!-- printed by demo at its end -->\n```text\nGOOD\n```\n"
+    page.write_text(f"```sh\npyrcal audit\n```\n{ending}", encoding="utf-8")
+    assert list(steps(page)) == [("sh", "pyrcal audit\n", None)]
+    assert ENDING.findall(page.read_text("utf-8")) == [("demo", "GOOD\n")]

@@ -4,7 +4,8 @@ import re
 from itertools import zip_longest
 
 BLOCK = re.compile(
-    r"(?P<mark><!-- not run: [^\n]+ -->\n)?^```(?P<kind>\w+)\n(?P<text>.*?)^```", re.M | re.S
+    r"(?P<mark><!-- (?:not run:|printed by) [^\n]+ -->\n)?^```(?P<kind>\w+)\n(?P<text>.*?)^```",
+    re.M | re.S,
 )
 ENDING = re.compile(r"^<!-- printed by (\w+) at its end -->\n```text\n(.*?)^```", re.M | re.S)
 """Output of a command that ran beside the page, after Ctrl-C."""
@@ -17,7 +18,8 @@ def steps(page):
     found = list(BLOCK.finditer(page.read_text("utf-8")))
     for block, after in zip_longest(found, found[1:]):
         if block["kind"] in {"sh", "python"} and not block["mark"]:
-            printed = after["text"] if after is not None and after["kind"] == "text" else None
+            follows = after is not None and after["kind"] == "text" and not after["mark"]
+            printed = after["text"] if follows else None
             yield block["kind"], block["text"], printed
 
 

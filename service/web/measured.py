@@ -238,7 +238,7 @@ class FitAcceptedView(BaseModel):
 
 
 class FitDocument(BaseModel):
-    """What a fit has found: the object that ``pyrcal fit --json`` prints."""
+    """Result of a fit: the object that ``pyrcal fit --json`` prints."""
 
     model_config = ConfigDict(use_attribute_docstrings=True)
 
@@ -267,11 +267,11 @@ class FitDocument(BaseModel):
     """RMS of what is left over RMS of the measurement."""
 
     condition_number: float | None
-    """Of the synthetic matrix, modes used."""
+    """Condition number of the synthetic matrix over the modes used."""
 
     n_modes_used: int
     orientation: dict[str, Any]
-    """Of the slopes, as the instrument file would say it."""
+    """Orientation of the slopes, in the words of the instrument file."""
 
     subset_scatter: dict[str, float | None]
     """1 σ scatter of disjoint sets of modes, by name."""
@@ -281,44 +281,44 @@ class FitDocument(BaseModel):
     """Begins with "accepted" or "refused"; names what was left out."""
 
     registration: dict[str, Any] | None = None
-    """Whether the registration is determined: determined, reason, sigma_statistical,
-    sigma_systematic (by name), disjoint_sets."""
+    """Verdict on the registration: determined, reason, sigma_statistical, sigma_systematic (by
+    name), disjoint_sets."""
 
     reconstructor: dict[str, Any] | None = None
-    """Whether the model's reconstructor holds the loop of the measured matrix: stable_modes of
+    """Verdict on the model's reconstructor in the loop of the measured matrix: stable_modes of
     n_modes, gain, pole_radius, pole_radius_all, wavefront_ratio, noise_limited, reason."""
 
     anamorphosis: list[float] | None = None
     """Stretch of the mirror's image along x over the mean of both axes, less 1, and along 45 deg;
-    null: the modes do not tell, or it was not to be fitted."""
+    null: the modes do not determine it, or it was not fitted."""
 
     anamorphosis_sigma: list[float] | None = None
-    """1 σ of both; null: it was not to be fitted."""
+    """1 σ of both; null: it was not fitted."""
 
     image_offsets_px: list[list[float]] | None = None
     """Displacements [x, y] of a pyramid's four pupil images that were fitted, detector pixels, as
     `wfs.image_offsets_px` states them; null if the instrument file states them."""
 
     instrument_found: dict[str, dict[str, float | None]] = {}
-    """What of the instrument was fitted, too, by its key: found, sigma, and as the file says it."""
+    """Values of the instrument that were fitted too, by key: found, sigma, and the file's value."""
 
     recommendation: str = ""
-    """What to do with it, in one sentence: begins with "use it", "measure more" or "do not use"."""
+    """Advice in one sentence, which begins with "use it", "measure more" or "do not use"."""
 
     found_not_told: list[dict[str, Any]] = []
     unknown_not_found: list[str] = []
-    """What the matrix has told: key, found, told (as the file says it), how, and whether to correct
+    """Values that the matrix determines: key, found, told (the file's), how, and whether to correct
     the file."""
 
     alternatives: list[dict[str, Any]] = []
-    """What else might explain the matrix: words, misfit (χ² over the fit's; null: not comparable),
+    """Other explanations of the matrix: words, misfit (χ² over the fit's; null: not comparable),
     moved (by name), moved_sigma, preferred, undecided."""
 
     left_over: dict[str, Any] | None = None
-    """Where the residual is: border (over inside), subapertures and modes that stand out."""
+    """Places of the residual: border (over inside), subapertures and modes that stand out."""
 
     notes: list[str]
-    """What was decided on the way, or overruled, and should be known."""
+    """Decisions of the fit that the user should know."""
 
     seconds: float | None
 
@@ -326,7 +326,7 @@ class FitDocument(BaseModel):
 class FitMap(BaseModel):
     """The signals of one mode: rows from the lowest y on, Sx beside Sy; null: not valid.
 
-    Of pixels the four images, as they lie on the detector.
+    For pixels, the four images as they lie on the detector.
     """
 
     model_config = ConfigDict(use_attribute_docstrings=True)
@@ -340,12 +340,12 @@ class FitMap(BaseModel):
 
 
 class FitFigures(BaseModel):
-    """What the figures of a fit are drawn from."""
+    """Data of the figures of a fit."""
 
     model_config = ConfigDict(use_attribute_docstrings=True)
 
     own_instrument: bool
-    """Whether it is a fit of the service's own instrument, whose α it may be held against."""
+    """True for a fit of the service's own instrument: its α can be compared with the service's."""
 
     modes: list[int]
     """Basis indices of the modes used; ``gains`` of the fit are of these."""
@@ -357,11 +357,11 @@ class FitFigures(BaseModel):
     """"measured" and "synthetic", each over its largest."""
 
     residual_map: list[list[int | None]]
-    """What is left in each subaperture, percent of the measured RMS: rows from the lowest y on, Sx
+    """Residual in each subaperture, percent of the measured RMS: rows from the lowest y on, Sx
     beside Sy; null: not valid."""
 
     maps: list[FitMap]
-    """Of a few modes, the paper's where they were used."""
+    """Signals of a few modes: those of the paper where they were used."""
 
 
 _UPLOAD: dict[str, Any] = {

@@ -91,8 +91,8 @@ class FourView(TypedDict):
     """Ratio; 1 is nominal."""
 
     anamorphosis: NotRequired[list[float]]
-    """Of a registration where it is followed: stretch along x over the mean of both axes, less 1,
-    and along 45 deg."""
+    """Stretch along x over the mean of both axes, less 1, and along 45 deg; only where the service
+    follows it."""
 
 
 def _named(value: Any) -> Any:  # noqa: ANN401  of a field that has not been validated

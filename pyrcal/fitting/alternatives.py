@@ -470,8 +470,10 @@ def _try_images_in_place(settled: Settled) -> Iterator[Alternative]:
     found = kind_of(about).offsets_px(about, nuisances.image_offsets(solution.nuisances))
     if np.abs(found).max() < PLAUSIBLE_DISPLACEMENT_PX:
         return
-    models = settled.models.with_displaced_images(-nuisances.displaced)
-    others = replace(nuisances, images=np.zeros((0, 8)), displaced=np.zeros(8))
+    models = settled.models.with_displaced_images(np.zeros_like(nuisances.displaced))
+    others = replace(
+        nuisances, images=np.zeros((0, 8)), displaced=np.zeros_like(nuisances.displaced)
+    )
     there = refine(models, settled.target, solution.alpha, others, decides=models.cheap)
     share = _ratio(there.projection.chi, solution.projection.chi)
     yield Alternative(

@@ -15,7 +15,7 @@ FOLDERS = (
 NAMED = re.compile(rf"`((?:{FOLDERS})/[\w./-]*\w\.(?:py|toml|md|yml|json|js))`")
 DECISIONS = sorted((DOCS / "decisions").glob("0*.md"))
 MOST_DECISIONS, MOST_WORDS = 30, 600
-TOPS = (ROOT / "service", ROOT / "pyrcal")
+TOPS = (ROOT / "service", ROOT / "pyrcal", ROOT)
 DEPENDENCIES = "0001-dependencies.md"
 """One line for each: as long as it must be."""
 

@@ -354,7 +354,7 @@ def runbook(acts: Mapping[str, str]) -> str:
         "the numbers. *Critical*: the loop is in danger, or its telemetry cannot be used. "
         "*Serious*: the service does less than it should. *Warning*: it does its work.",
         "## What an alarm may forbid",
-        "Each alarm names what it `blocks`, as a rule of your own does:",
+        "What the service does not do while an alarm lasts is in its `blocks`:",
         listed((f"`{act}`", text) for act, text in acts.items()),
     ]
     for name, kind in ALARMS.items():

@@ -27,7 +27,10 @@ async def bounded(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> N
         try:
             body = await _whole(request, receive)
         except PyrcalError as error:
-            return await known_problem(request, error)(scope, receive, send)
+            refusal = known_problem(request, error)
+            # otherwise the server would read the rest of the body, which may have no end
+            refusal.headers["Connection"] = "close"
+            return await refusal(scope, receive, send)
         if body is None:
             return None
         receive = again(body, receive)

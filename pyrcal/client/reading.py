@@ -136,4 +136,4 @@ SCREENS = {
     "recordings list": _recordings,
     "audit": _audit,
 }
-"""Function that prints the answer, by command."""
+"""Function that returns the lines of an answer, by command."""

@@ -60,7 +60,7 @@ class UsersTable(Table):
     """Name of the service."""
 
     password_file: Path
-    """File with its password; no other user may read it."""
+    """File whose first line is its password; no other user may read it."""
 
     file: Path | None = None
     """File of lines ``NAME:PASSWORD`` of all that may connect, for the embedded router."""
@@ -94,7 +94,7 @@ class SigningTable(Table):
     """``[zenoh.signing]``: signatures of service and RTC, if the router is not trusted."""
 
     key_file: Path
-    """File with the shared secret; no other user may read it."""
+    """File whose first line is the shared secret; no other user may read it."""
 
 
 class CredentialsTable(Table):

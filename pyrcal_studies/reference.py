@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, get_args
 
 from cacao_bridge.__main__ import arguments_parser
 from check_rtc.__main__ import check_parser
-from pyrcal.arguments import HEADINGS, OLD_WORDS, command_line
+from pyrcal.arguments import HEADINGS, command_line
 from pyrcal.client import remote
 from pyrcal.demo.arguments import demo_parser
 from pyrcal.fitting import arguments as offline_arguments
@@ -201,7 +201,6 @@ def commands() -> str:
         "`--help` of each command has examples. What a usage shows without brackets is required. "
         "Exit status: 0 done; 2 wrong command line or unusable input; 130 interrupted; others at "
         f"each command. INSTRUMENT is an {offline_arguments.INSTRUMENT}.",
-        f"Names that work until version 1.0, with a hint at the new one: {', '.join(OLD_WORDS)}.",
         "## Options of several commands",
     ]
     for title, group in shared.items():

@@ -10,16 +10,20 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
 import platform
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -27,26 +31,29 @@ import numpy as np
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from benchmarks import plant
-from benchmarks.bench_alone import alone_rows, peak_mb
-from benchmarks.bench_page import Row, plot, section
 from benchmarks.peer_rounds import cpu_s
 from pyrcal.fitting.fit_file import fit_file, make_reference
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.matrix import FitOptions, fit_matrix
 from pyrcal.fitting.recorded import read_recorded
 from pyrcal.fitting.report import FitReport
-from pyrcal_studies.peers import ROOT, environment, measured, variables
-from pyrcal_studies.peers_cases import (
+from pyrcal_studies.peers import (
+    LISTINGS,
     N_MODES,
+    ROOT,
     SMALL,
     Case,
     bench,
+    environment,
+    error,
     in_degrees,
     instrument,
     job_arrays,
+    measured,
+    variables,
+    write_instrument,
+    write_reference,
 )
-from pyrcal_studies.peers_files import LISTINGS, write_instrument, write_reference
-from pyrcal_studies.peers_fits import error
 from pyrcal_studies.peers_pushpull import Array, Measured, read_product, write_job
 from pyrcal_studies.sections import RESULTS, write_section
 from service.instrument import load_instrument
@@ -54,7 +61,169 @@ from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
 from service.model.misregistration import PARAMETERS, Misregistration
-from service.model.modes import ModalBasis, karhunen_loeve_basis
+from service.model.modes import Basis, ModalBasis, karhunen_loeve_basis, modal_basis
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """One piece of work, by pyrcal and by a peer."""
+
+    what: str
+    peer: str
+    own_s: tuple[float, ...]
+    """Of pyrcal, round by round."""
+
+    peer_s: tuple[float, ...]
+    """Of the peer, in the same rounds."""
+
+    remark: str
+    """How far the two differ."""
+
+    @property
+    def spread(self) -> tuple[float, float, float]:
+        """Time of the peer over ours: median over the rounds, least and most."""
+        ratios = np.array(self.peer_s) / np.array(self.own_s)
+        return float(np.median(ratios)), float(ratios.min()), float(ratios.max())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Alone:
+    """One figure of pyrcal's that no peer has."""
+
+    what: str
+    found: str
+    asked: str
+
+
+def section(rows: Sequence[Row], alone: Sequence[Alone], facts: Sequence[str]) -> str:
+    """Return the section of docs/results/speed.md in Markdown: one row for each piece of work."""
+    lines = [
+        "| Work | pyrcal, s | Other code, s | Ratio: median (range over rounds) |",
+        "| --- | --- | --- | --- |",
+    ]
+    for what, group in groupby(rows, lambda row: row.what):
+        compared = list(group)
+        own = _figure(float(np.median(compared[0].own_s)))
+        peers = "; ".join(f"{row.peer} {_figure(float(np.median(row.peer_s)))}" for row in compared)
+        lines.append(f"| {what} | {own} | {peers} | {'; '.join(map(_ratio, compared))} |")
+    remarks = list(dict.fromkeys(f"{row.peer}: {row.remark}" for row in rows))
+    remarks += [f"{one.what}: {one.found}; target {one.asked}" for one in alone]
+    return "\n".join([*lines, "", *(f"- {line}" for line in [*remarks, *facts])])
+
+
+def plot(path: Path, rows: Sequence[Row]) -> None:
+    """Draw how many times faster pyrcal is, row by row."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 0.36 * len(rows) + 1.0), layout="constrained")
+    axes = figure.subplots()
+    at = np.arange(len(rows))[::-1]
+    middle, low, high = np.array([row.spread for row in rows]).T
+    axes.barh(
+        at,
+        middle,
+        xerr=(middle - low, high - middle),
+        color="#4477aa",
+        ecolor="#222222",
+        height=0.7,
+    )
+    axes.set_yticks(at, [f"{row.what}: {row.peer.split(',')[0]}" for row in rows], fontsize=8)
+    axes.set_xscale("log")
+    axes.axvline(1.0, color="#222222", linewidth=0.8)
+    axes.set_xlabel("processor time of the peer over pyrcal's")
+    axes.grid(axis="x", alpha=0.4)
+    figure.savefig(path, dpi=90)
+
+
+def _ratio(row: Row) -> str:
+    middle, low, high = row.spread
+    spread = f" ({_figure(low)} to {_figure(high)})" if len(row.own_s) > 1 else ""
+    return f"{_figure(middle)}{spread}"
+
+
+def _figure(value: float) -> str:
+    """Return a figure with as many digits as it is worth."""
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
+
+
+INGEST_S = 20
+COPIED = 64 * 2**20
+"""Numbers that are copied to see what memory can do, float32."""
+
+
+def alone_rows(
+    gflops: float, shift_s: Mapping[int, float], peers_mb: Mapping[str, float]
+) -> list[Alone]:
+    """Return the figures; ``shift_s`` is what D at a new shift took, by its number of modes."""
+    model = InteractionModel(*_flao())
+    n_bytes = 4.0 * model.n_slopes * int(model.pupil.lit.sum())
+    copy_s = _copy_s_per_byte() * n_bytes
+    rows = []
+    for n_modes, took_s in shift_s.items():
+        floor_s = model.sensor.work(n_modes).flop / gflops / 1e9
+        rows.append(
+            Alone(
+                what=f"D of {n_modes} modes at a new shift: its products at this machine's rate",
+                found=f"{floor_s:.3f} s, took {took_s / floor_s:.2f} times as long; to copy the "
+                f"sensor's Jacobian once, {n_bytes / 1e6:.0f} MB, takes {copy_s:.4f} s",
+                asked="2 times",
+            )
+        )
+    others = ", ".join(f"{peer} {mb:.0f}" for peer, mb in peers_mb.items())
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        own_mb = pool.submit(_own_peak_mb).result()
+    rows.append(
+        Alone(
+            what="memory of a process with FLAO's modes, D and four derivatives",
+            found=f"{own_mb:.0f} MB; peers that have pushed some modes, MB: {others}",
+            asked="-",
+        )
+    )
+    return [*rows, _ingest()]
+
+
+def peak_mb(pid: int | str) -> float:
+    """Return the most memory that a process has had, as Linux counts it."""
+    status = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
+    return float(status.partition("VmHWM:")[2].split()[0]) * 1024 / 1e6
+
+
+def _flao() -> tuple[Instrument, Basis]:
+    instrument = load_instrument("flao-lbt")
+    return instrument, modal_basis(instrument)
+
+
+def _own_peak_mb() -> float:
+    InteractionModel(*_flao()).linearise(Misregistration(shift_x_subap=0.1, rotation_rad=0.01))
+    return peak_mb("self")
+
+
+def _copy_s_per_byte() -> float:
+    """Return what a byte takes that is read and written."""
+    numbers, out = np.ones(COPIED, np.float32), np.empty(COPIED, np.float32)
+    took_s = []
+    for _ in range(5):
+        begun = time.process_time()
+        np.copyto(out, numbers)
+        took_s.append(time.process_time() - begun)
+    return min(took_s) / numbers.nbytes
+
+
+def _ingest() -> Alone:
+    with tempfile.TemporaryDirectory() as folder:
+        answer = Path(folder) / "ingest.json"
+        command = [sys.executable, "-m", "benchmarks.ingest", "--seconds", str(INGEST_S)]
+        subprocess.run([*command, "--json", str(answer)], check=True, stdout=subprocess.DEVNULL)
+        seen = json.loads(answer.read_text(encoding="utf-8"))
+    return Alone(
+        what=f"telemetry at {seen['frame_rate_hz']:.0f} Hz, {seen['bytes_per_frame'] / 1e3:.1f} kB "
+        f"a frame, {INGEST_S} s, beside a worker that computes without pause",
+        found=f"{seen['frames_lost']} of {seen['frames_sent']} frames lost, "
+        f"{seen['frames_overwritten']} overwritten; {1e3 * seen['latency_p50_s']:.1f} ms late, "
+        f"{1e3 * seen['latency_p99_s']:.0f} ms at 99 %",
+        asked="none lost",
+    )
+
 
 PEERS = ("oopao", "hcipy", "specula")
 MODES = (0, 50, 100, 200, 300, 399)

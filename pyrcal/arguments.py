@@ -14,7 +14,6 @@ from pyrcal.client import remote
 from pyrcal.fitting import arguments as file_arguments
 from pyrcal.playback import arguments as playback_arguments
 from service import __version__, program
-from service.errors import say
 from service.parser import HelpFormatter, OneLineParser, closest
 
 OTHER_PROGRAMS = {
@@ -34,26 +33,6 @@ HEADINGS = {
     "demo": "try it, or connect an RTC",
 }
 """Heading before the first command of a group."""
-
-OLD_WORDS = {
-    "approve": "reconstructors approve",
-    "reject": "reconstructors reject",
-    "publish": "reconstructors publish",
-    "rollback": "reconstructors rollback",
-    "refit": "reconstructors compute",
-    "hold": "mode hold",
-    "acknowledge": "alarms ack",
-    "mute": "alarms mute",
-    "unmute": "alarms unmute",
-    "acquire": "loop acquire",
-    "abort": "loop abort",
-    "measure-noisy": "measure noisy",
-    "give-up": "measure cancel",
-    "record": "recordings start",
-    "end-recording": "recordings end",
-    "remove-recording": "recordings remove",
-}
-"""Commands of versions before the groups, and their names now; they work until 1.0."""
 
 DEFAULTS = {"alarms": "list", "reconstructors": "list", "recordings": "list"}
 """Command of a group that is meant if none is given."""
@@ -93,15 +72,11 @@ def command_line() -> OneLineParser:
 
 
 class CommandLine(OneLineParser):
-    """Parser that also accepts the command words of earlier versions, with a hint."""
+    """Parser that completes a group without a command, and suggests commands of all groups."""
 
     @override
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
-        given = list(sys.argv[1:] if args is None else args)
-        words, new = current_words(given)
-        if new:
-            old = " ".join(given[: 1 if given[0] in OLD_WORDS else 2])
-            say(f"pyrcal: {old!r} is now 'pyrcal {new}'; the old form works until version 1.0")
+        words = with_default(sys.argv[1:] if args is None else args)
         return super().parse_args(with_negative_numbers(words), namespace)
 
     @override
@@ -109,40 +84,20 @@ class CommandLine(OneLineParser):
         if action.dest != "command":
             return super().explain_choice(action, value)
         known = {name: name for name in action.choices or ()}
-        known |= {request.name.split()[-1]: request.name for request in remote.REQUESTS} | OLD_WORDS
+        known |= {request.name.split()[-1]: request.name for request in remote.REQUESTS}
         near = closest(value, known)
         return f"found {value!r}, which is no command" + near.replace(
             word := near.rpartition(" ")[2], known.get(word, word)
         )
 
 
-def current_words(given: Sequence[str]) -> tuple[list[str], str]:
-    """Return the words of a command line in their present form.
-
-    Returns
-    -------
-    The words, and the present name of the command if the given one is an old form; else empty.
-    """
-    first, *others = given or ("",)
-    following = others[0] if others else ""
-    is_option = not following or (following.startswith("-") and following not in {"-h", "--help"})
-    if first in OLD_WORDS:
-        return [*OLD_WORDS[first].split(), *others], OLD_WORDS[first]
-    if first in DEFAULTS and is_option:
-        return [first, DEFAULTS[first], *others], ""
-    if first == "measure" and is_option:
-        return [first, "matrix", *others], "measure matrix"
-    is_id = not (following in _MEMBERS or following.startswith("-") or closest(following, _MEMBERS))
-    if first == "reconstructors" and is_id:
-        return [first, "show", *others], "reconstructors show"
-    return list(given), ""
-
-
-_MEMBERS = {
-    request.name.split()[1]
-    for request in remote.REQUESTS
-    if request.name.startswith("reconstructors ")
-}
+def with_default(given: Sequence[str]) -> list[str]:
+    """Return the words of a command line with the default command of a group that has none."""
+    if given and given[0] in DEFAULTS:
+        following = given[1] if len(given) > 1 else ""
+        if not following or (following.startswith("-") and following not in {"-h", "--help"}):
+            return [given[0], DEFAULTS[given[0]], *given[1:]]
+    return list(given)
 
 
 class _Grouped(HelpFormatter):

@@ -29,6 +29,7 @@ from pyrcal.fitting.figures import shown_modes
 from pyrcal.fitting.fit_file import fit_file
 from pyrcal.fitting.fitted import Fit, Registration
 from pyrcal.fitting.matrix import FitOptions
+from pyrcal_studies.campaign.rows import RowFile
 from pyrcal_studies.peers import ROOT
 from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
@@ -277,23 +278,19 @@ def answer(wrong: WrongValue, data: Path, right: Fit) -> dict[str, Any]:
 
 def kept_answers() -> list[dict[str, Any]]:
     """Return the answers to wrong values that were measured before."""
-    if not KEPT.exists():
-        return []
-    return [json.loads(line) for line in KEPT.read_text(encoding="utf-8").splitlines()]
+    return RowFile(KEPT).rows
 
 
 def ask_wrong(bench: Bench, data: Path) -> None:
     """Fit a bench with every wrong value that has no answer yet, and keep the answers."""
-    known = {(one["bench"], one["words"]) for one in kept_answers()}
-    KEPT.parent.mkdir(parents=True, exist_ok=True)
+    file = RowFile(KEPT)
+    known = {(one["bench"], one["words"]) for one in file.rows}
     right = fit_bench(coarse_bench(bench.name), data, some_columns(bench.name))
     for wrong in WRONG_VALUES:
         if wrong.bench != bench.name or (wrong.bench, wrong.words) in known:
             continue
-        found = json.dumps(answer(wrong, data, right))
-        print(found, flush=True)
-        with KEPT.open("a", encoding="utf-8") as file:
-            print(found, file=file)
+        file.add(answer(wrong, data, right))
+        print(json.dumps(file.rows[-1]), flush=True)
 
 
 def draw(fit: Fit, path: Path) -> None:

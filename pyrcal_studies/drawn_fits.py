@@ -34,6 +34,7 @@ from threadpoolctl import threadpool_limits
 from pyrcal.fitting.fit_file import fit
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.matrix import FitOptions, fit_matrix
+from pyrcal_studies.campaign.rows import RowFile
 from pyrcal_studies.fft_pyramid import slopes_of
 from pyrcal_studies.image_offsets import (
     TRUTH,
@@ -47,9 +48,7 @@ from pyrcal_studies.image_offsets import (
     model_of,
 )
 from pyrcal_studies.mistold_fits import AS_IT_IS, MISTELLINGS, PUPILS, error
-from pyrcal_studies.peers import ROOT, environment, variables
-from pyrcal_studies.peers_cases import mirror_points
-from pyrcal_studies.peers_files import LISTINGS
+from pyrcal_studies.peers import LISTINGS, ROOT, environment, mirror_points, variables
 from pyrcal_studies.peers_pushpull import JOB, Bench, Measured, read_product, write_job
 from service.estimation.reference import Reference
 from service.instrument import load_instrument
@@ -378,17 +377,15 @@ CAMPAIGNS: dict[str, Callable[[argparse.Namespace], Iterator[Condition]]] = {
 
 def run(name: str, given: argparse.Namespace) -> None:
     """Measure and fit what is not there yet, and append a line for each fit."""
-    path = FOLDER / f"{name}.jsonl"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    known = {_key(one) for one in _read(name)}
+    file = _kept(name)
+    known = {_key(one) for one in file.rows}
     codes = ["diffractive"] if name == "small" else given.codes
     for condition, code in product(CAMPAIGNS[name](given), codes):
         seeds = range(given.first_seed, given.first_seed + given.draws)
         draws = [Draw(code=code, condition=condition, seed=seed) for seed in seeds]
         draws = [one for one in draws if (code, str(asdict(condition)), one.seed) not in known]
         for draw, found, cpu_s in _fits(draws):
-            with path.open("a") as file:
-                print(json.dumps(row(draw, found, cpu_s)), file=file)
+            file.add(row(draw, found, cpu_s))
 
 
 def _fits(draws: list[Draw]) -> Iterator[tuple[Draw, Fit, float]]:
@@ -404,9 +401,8 @@ def _fits(draws: list[Draw]) -> Iterator[tuple[Draw, Fit, float]]:
         yield draw, done, time.process_time() - begun
 
 
-def _read(name: str) -> list[dict[str, Any]]:
-    path = FOLDER / f"{name}.jsonl"
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+def _kept(name: str) -> RowFile:
+    return RowFile(FOLDER / f"{name}.jsonl")
 
 
 def _key(one: dict[str, Any]) -> tuple[str, str, int]:
@@ -468,7 +464,7 @@ def main() -> int:
     if not given.table:
         with threadpool_limits(1):
             run(given.campaign, given)
-    print("\n".join(table(_read(given.campaign))))
+    print("\n".join(table(_kept(given.campaign).rows)))
     return 0
 
 

@@ -11,7 +11,6 @@ var/fit_realistic.jsonl``.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pyrcal.fitting.matrix import FitOptions, fit_matrix
+from pyrcal_studies.campaign.rows import RowFile
 from service.estimation.reference import Reference
 from service.instrument import load_instrument
 from service.model.instrument import Instrument
@@ -142,10 +142,8 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--out", type=Path, required=True, help="results, a line of JSON each")
     given = parser.parse_args()
-    found = []
-    if given.out.exists():
-        found = [json.loads(line) for line in given.out.read_text().splitlines()]
-    done = {one["seed"] for one in found}
+    file = RowFile(given.out)
+    done = {one["seed"] for one in file.rows}
     instrument = load_instrument("flao-lbt")
     basis = karhunen_loeve_basis(instrument)
     with threadpool_limits(1), ThreadPoolExecutor(2) as pool:
@@ -153,11 +151,8 @@ def main() -> int:
             if seed in done:
                 continue
             alpha, matrix = measured(instrument, basis, given.truth, seed)
-            one = {"seed": seed, **fitted(instrument, basis, alpha, matrix, pool.map)}
-            found.append(one)
-            with given.out.open("a") as file:
-                file.write(json.dumps(one) + "\n")
-    sys.stdout.write(table(given.truth, found) + "\n")
+            file.add({"seed": seed, **fitted(instrument, basis, alpha, matrix, pool.map)})
+    sys.stdout.write(table(given.truth, file.rows) + "\n")
     return 0
 
 

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import get_args
 
 from pyrcal.instruments.schema_texts import described
-from pyrcal_studies import dispatch, reference
+from pyrcal_studies import reference
 from pyrcal_studies.contract_tables import with_tables
 from pyrcal_studies.openapi import document
-from pyrcal_studies.packaged import packaged
+from pyrcal_studies.reference import packaged
 from service.tracking.alarms import AlarmState, Interlock, Severity
 from service.tracking.commands import Command
 from service.tracking.interlocks import ALLOWS
@@ -94,7 +94,7 @@ PAGES = {
     "reference/instruments.md": packaged,
     "reference/system.md": reference.system,
     "reference/cli.md": reference.commands,
-    "developer/tracker.md": dispatch.page,
+    "developer/tracker.md": reference.tracker_page,
     "reference/rest.md": rest,
     "operate/runbook.md": runbook,
 }

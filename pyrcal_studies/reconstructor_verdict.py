@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pyrcal.fitting.control_check import DELAY_FRAMES, GAIN, ReconstructorVerdict, check_control
+from pyrcal_studies.campaign.rows import RowFile
 from service.control.reconstructor import MAX_CONDITION
 from service.instrument import load_instrument
 from service.model.instrument import Instrument
@@ -237,18 +238,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
-    given.out.parent.mkdir(parents=True, exist_ok=True)
-    kept = given.out.read_text().splitlines() if given.out.exists() else []
-    found = {one["case"]: one for one in map(json.loads, kept)}
+    file = RowFile(given.out)
+    known = {one["case"] for one in file.rows}
     for case in CASES:
-        if case.words in found:
+        if case.words in known:
             continue
         with threadpool_limits(1):
-            found[case.words] = answers(case)
-        with given.out.open("a", encoding="utf-8") as file:
-            print(json.dumps(found[case.words]), file=file)
-        print(json.dumps(found[case.words]), flush=True)
-    right = [is_right(one) for one in found.values()]
+            file.add(answers(case))
+        print(json.dumps(file.rows[-1]), flush=True)
+    right = [is_right(one) for one in file.rows]
     print(f"stable or not right: {sum(one for one, _ in right)} of {len(right)}")
     print(f"modes within 15 %: {sum(one for _, one in right)} of {len(right)}")
     return 0

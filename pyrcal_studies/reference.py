@@ -1,30 +1,41 @@
-"""Writes the reference pages of the manual: settings, instrument file, commands, REST, alarms."""
+"""Write the generated pages of the manual.
+
+Settings, instrument file, packaged instruments with the source of each value, commands, REST,
+alarms, and the functions and operations that process each event of the tracker.
+"""
 
 from __future__ import annotations
 
 import argparse
+import ast
 import re
 import textwrap
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import fields
-from typing import Any
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple, get_args
 
 from cacao_bridge.__main__ import arguments_parser
 from check_rtc.__main__ import check_parser
-from pyrcal.arguments import HEADINGS, OLD_WORDS, command_line
+from pyrcal.arguments import HEADINGS, command_line
 from pyrcal.client import remote
 from pyrcal.demo.arguments import demo_parser
 from pyrcal.fitting import arguments as offline_arguments
 from pyrcal.fitting.system_file import SystemFile
 from pyrcal.instruments.schema_texts import KeyText, tables_of
+from pyrcal_studies.contract_tables import table as table_of
 from service.config.settings import Settings
 from service.files.toml import Table
 from service.instrument.schema import whole_of
 from service.model.sensors.kind import SensorKind
 from service.model.sensors.registry import KINDS
 from service.parser import OneLineParser, operand_text, option_text, wrap_usage
+from service.tracker import REACTIONS
 from service.tracking.alarms import ALARMS
+from service.tracking.commands import Command
+from service.tracking.events import Event
 from service.wire import Keys
 from service.wire.access import Rights, list_rights
 from sim_rtc.options import sim_parser
@@ -190,7 +201,6 @@ def commands() -> str:
         "`--help` of each command has examples. What a usage shows without brackets is required. "
         "Exit status: 0 done; 2 wrong command line or unusable input; 130 interrupted; others at "
         f"each command. INSTRUMENT is an {offline_arguments.INSTRUMENT}.",
-        f"Names that work until version 1.0, with a hint at the new one: {', '.join(OLD_WORDS)}.",
         "## Options of several commands",
     ]
     for title, group in shared.items():
@@ -367,3 +377,187 @@ def runbook(acts: Mapping[str, str]) -> str:
         parts += [f"## {name}", " ".join([f"*{head}.* {kind.means}", *notes])]
         parts += [f"**Do**: {kind.do}"]
     return page("Runbook: what to do about an alarm", *parts)
+
+
+FOLDER = Path(__file__).parents[1] / "service" / "instrument" / "packaged"
+
+_KEY = re.compile(r"(?P<key>[a-z0-9_]+) *= *(?P<value>\"[^\"]*\"|[^#]*?) *(?:# *(?P<source>.*))?")
+
+_TABLE = re.compile(r"\[+(?P<name>[a-z._]+)\]+ *(?:# *(?P<source>.*))?")
+
+ASSUMED = "assumed"
+
+
+class Value(NamedTuple):
+    """One key of an instrument file with its value and source."""
+
+    table: str
+    key: str
+    value: str
+    labels: str
+    """Labels of the sources, such as ``[S] [D]``; empty if the value is assumed."""
+
+    note: str
+
+
+def packaged() -> str:
+    """Return docs/reference/instruments.md: the values of every packaged instrument by source."""
+    paths = sorted(FOLDER.glob("*.toml"))
+    heads, values = {}, {}
+    for path in paths:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        n_head = next(k for k, line in enumerate(lines) if line.startswith("["))
+        heads[path.stem] = [line.removeprefix("#").strip() for line in lines[:n_head]]
+        values[path.stem] = list(_values(lines[n_head:]))
+    everywhere = [
+        one
+        for one in values[paths[0].stem]
+        if all(
+            any((each.table, each.key, each.value) == one[:3] for each in found)
+            for found in values.values()
+        )
+    ]
+    common = {one[:3] for one in everywhere}
+    intro = (
+        "Each is a file in `service/instrument/packaged`, used by its name, which is `name` in "
+        "`[instrument]`: `pyrcal demo --instrument papyrus`. A value is public, with its source, "
+        f"or {ASSUMED}: chosen by the authors of pyrcal because no public source was found. Check "
+        "assumed values before you use a file on the real telescope. An `r0_m` of 0.126 is a "
+        "seeing of 0.8 arcseconds at 500 nm. Equal in all, and assumed where no source is named: "
+        f"{', '.join(f'`{one.key}` {one.value} in `[{one.table}]`' for one in everywhere)}."
+    )
+    parts = [
+        part
+        for name, head in heads.items()
+        for part in _instrument(name, head, [one for one in values[name] if _own(one, common)])
+    ]
+    return page("Packaged instruments", intro, *parts)
+
+
+def _own(one: Value, common: set[tuple[str, str, str]]) -> bool:
+    """Return whether the section of an instrument lists a value."""
+    return one.key != "name" and (one[:3] not in common or bool(one.labels))
+
+
+def _instrument(name: str, head: list[str], values: list[Value]) -> Iterator[str]:
+    yield f"## {name}"
+    about = [line for line in head if line and not _is_source(line)]
+    last = next((k for k, line in enumerate(about) if line.startswith("Sources")), len(about))
+    yield " ".join(about[:last])
+    yield "\n".join(f"- [{label}] {text}" for label, text in _sources(head))
+    tables = dict.fromkeys(one.table for one in values)
+    rows = (
+        (
+            f"`{table}`",
+            _cell(one for one in values if one.table == table and one.labels),
+            _cell(one for one in values if one.table == table and not one.labels),
+        )
+        for table in tables
+    )
+    yield table_of(("table", "public", ASSUMED), list(rows))
+
+
+def _cell(values: Iterable[Value]) -> str:
+    """Return keys and values, each with its sources and note."""
+    return ", ".join(
+        " ".join(
+            filter(None, (f"`{one.key}`", one.value, one.labels, one.note and f"({one.note})"))
+        )
+        for one in values
+    )
+
+
+def _is_source(line: str) -> bool:
+    return re.match(r"\[[A-Z]\] |assumed:", line) is not None
+
+
+def _sources(head: list[str]) -> Iterator[tuple[str, str]]:
+    """Yield the letter and the text of each source; a text may go on in the next lines."""
+    letter, words = "", list[str]()
+    begun = False
+    for line in [*head, ""]:
+        begun |= line.startswith("Sources")
+        match = re.match(r"\[([A-Z])\] (.*)", line)
+        if not begun or (letter and not match and line and not line.startswith("assumed:")):
+            words += [line] if letter else []
+            continue
+        if letter:
+            yield letter, " ".join(words)
+            letter, words = "", []
+        if match:
+            letter, words = match[1], [match[2]]
+
+
+def _values(lines: list[str]) -> Iterator[Value]:
+    table, default = "", ""
+    n_modes = 0
+    for line in lines:
+        if (match := _TABLE.fullmatch(line)) is not None:
+            table, default = match["name"], match["source"] or ""
+            if table == "wfs.mode":  # one of several tables of this name
+                n_modes += 1
+                table += f" {n_modes}"
+        elif (match := _KEY.fullmatch(line)) is not None:
+            source = (match["source"] or default).replace("|", "\\|")
+            default = ASSUMED if default.startswith(ASSUMED) else default  # its note is given once
+            rest = re.sub(r"^(\[[A-Z]\] ?)+", "", source)
+            labels = source.removesuffix(rest).strip()
+            note = rest.removeprefix(ASSUMED).strip(":; ")
+            yield Value(table, match["key"], match["value"], labels, note)
+
+
+ROOT = Path(__file__).parents[1]
+
+
+def tracker_page() -> str:
+    """Return docs/developer/tracker.md: what each event and command does."""
+    commands = get_args(Command)
+    events = [kind for kind in get_args(Event) if kind not in commands]
+    parts = [
+        "# What each event and command does",
+        "Generated by `python -m pyrcal_studies.pages` from `REACTIONS` of `service/tracker.py`.",
+        "Each event is processed by the function named, then by the operations named, if they run.",
+    ]
+    for title, kinds in (("Events", events), ("Commands", commands)):
+        parts += [f"## {title}", listed(_reaction(kind) for kind in kinds)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _reaction(kind: type) -> Row:
+    """Return an event with its function, what that does, and the operations that process it."""
+    seen = ", ".join(
+        name for name, looked_for in _operations().items() if kind.__name__ in looked_for
+    )
+    then = f"*then {seen}*" if seen else ""
+    function = REACTIONS.get(kind)
+    if function is None:
+        return f"`{kind.__name__}`", then
+    place = function.__module__.removeprefix("service.").removeprefix("tracking.")
+    does = (function.__doc__ or "").partition("\n")[0]
+    taken_in = f"`{kind.__name__}`, `{place}.{function.__name__.lstrip('_')}`"
+    return taken_in, f"{does} {then}".rstrip()
+
+
+@cache
+def _operations() -> dict[str, set[str]]:
+    """Return the names of the events and commands that each operation processes."""
+    return {
+        path.stem.replace("_", " "): {
+            ast.unparse(seen).partition(".")[2]
+            for node in ast.walk(ast.parse(path.read_text("utf-8")))
+            for seen in _matched_types(node)
+        }
+        for path in sorted((ROOT / "service" / "tracking" / "operations").glob("*.py"))
+        if path.stem not in {"__init__", "running", "acquisition_stages"}
+    }
+
+
+def _matched_types(node: ast.AST) -> tuple[ast.expr, ...]:
+    """Return the types in a pattern or an ``isinstance``."""
+    match node:
+        case ast.MatchClass(cls=asked):
+            return (asked,)
+        case ast.Call(func=ast.Name(id="isinstance"), args=[_, asked]):
+            return (asked,)
+        case _:
+            return ()

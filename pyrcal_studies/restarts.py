@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import io
-import json
 import statistics
 import sys
 import tempfile
@@ -28,6 +27,7 @@ from typing import Any
 import httpx
 import numpy as np
 
+from pyrcal_studies.campaign.rows import RowFile
 from pyrcal_studies.live import WITHIN_S, Telescope, tracks
 
 ASKED_S = 5.0
@@ -205,6 +205,7 @@ def _is_older(path: Path) -> bool:
 def run(n_rounds: int, seed: int, output: Path, directory: Path) -> list[Round]:
     """Run rounds, and write what came of each at once."""
     telescope, told, rounds = Telescope(directory, seed), Acknowledged(), []
+    file = RowFile(output)
     try:
         begun_s = telescope.start()
         telescope.start_rtc()
@@ -212,8 +213,7 @@ def run(n_rounds: int, seed: int, output: Path, directory: Path) -> list[Round]:
             raise RuntimeError(f"no matrix was applied within {WITHIN_S:g} s: see {directory}")
         for number in range(n_rounds):
             rounds.append(one_round(telescope, told, number, seed))
-            with output.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(asdict(rounds[-1])) + "\n")
+            file.add(asdict(rounds[-1]))
             if rounds[-1].tracks_s is None:
                 break
     finally:
@@ -248,7 +248,6 @@ def main() -> int:
     parser.add_argument("--directory", type=Path, help="data folder and logs, kept afterwards")
     parser.add_argument("--output", type=Path, default=Path("var/restarts.jsonl"))
     given = parser.parse_args()
-    given.output.parent.mkdir(parents=True, exist_ok=True)
     given.output.unlink(missing_ok=True)
     with tempfile.TemporaryDirectory(prefix="restarts-") as folder:
         directory = given.directory or Path(folder)

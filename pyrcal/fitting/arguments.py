@@ -470,7 +470,6 @@ def _describe_import(bring: OneLineParser) -> None:
             arrays,
             "matrix=im.npy positions=xy.npy --unit um --diameter-m 8.2",
         ),
-        ("npz", "same as files", arrays, "arrays.npz --diameter-m 8.2"),
     ):
         parser = sources.add_parser(
             source, help=purpose, examples=[f"pyrcal import {source} {example} --output imported"]

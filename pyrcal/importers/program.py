@@ -174,7 +174,6 @@ IMPORTERS: Mapping[str, Callable[[argparse.Namespace], Imported]] = {
     "pyrtc": _arrays,
     "aot": _aot,
     "files": _arrays,
-    "npz": _arrays,
 }
 """Importers by their name on the command line."""
 

@@ -116,7 +116,7 @@ def _write_cacao(folder: Path) -> None:
         instrument = load_instrument(file.name)
     positions = instrument.analytic_mirror.positions_m
     frames, lit = _compute_frames(instrument, None, ((17, 17), (17, 47), (47, 17), (47, 47)), 64, 1)
-    at = np.rint(positions / 0.18182 + 5.5).astype(int)
+    at = np.rint(positions / instrument.analytic_mirror.pitch_m + 5.5).astype(int)
     cube, mask = np.zeros((144, 64, 64), np.float32), np.zeros((12, 12), np.float32)
     cube[at[:, 1] * 12 + at[:, 0]] = frames
     mask[at[:, 1], at[:, 0]] = 1.0

@@ -11,18 +11,18 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pyrcal_studies.campaign.acquisition_table import table
-from pyrcal_studies.campaign.observatory import Observatory
-from pyrcal_studies.campaign.rows import Row, RowFile, range_of, tell
-from pyrcal_studies.campaign.small import bench_of
+from pyrcal_studies.campaign.observatory import Observatory, bench_of
+from pyrcal_studies.campaign.rows import UNITS, Row, RowFile, heading, line, range_of, tell
 from pyrcal_studies.campaign.system_nights import GAINS
 from service.config import load_settings
 from service.estimation.openloop import WideCaptureEstimate
@@ -200,6 +200,65 @@ def _starts(given: argparse.Namespace) -> Iterator[Start]:
             within_s=given.within,
             sampling=given.sampling,
         )
+
+
+WRONG = np.array([0.1, 0.1, 0.1, 0.005])
+"""An α further off than this is wrong (boundary units): what a loop needs, and ten times the
+accuracy asked for; or further than 5 of its own σ."""
+
+WRONG_SIGMA = 5.0
+
+_HEADER = heading(
+    *("telescope, plant, truth", "starts", "tracking (share)", "time s: median, longest"),
+    *("opened again", "failed, clear state", "unclear", "wrong α", "unstable matrix applied"),
+    "error RMS x, y % / mdeg / %",
+)
+
+
+def table(rows: list[Row]) -> str:
+    """Return the table, one line for each kind of start."""
+    groups: dict[tuple[Any, ...], list[Row]] = defaultdict(list)
+    for row in rows:
+        name = Path(row["instrument"]).stem
+        key = (name, row["plant"], row["truth"], row["magnitude"], row["gain"], row["n_controlled"])
+        groups[key].append(row)
+    return _HEADER + "".join(_line(key, group) for key, group in sorted(groups.items()))
+
+
+def wrong(row: Row) -> bool:
+    """Return whether the service relied on a registration that is not the telescope's."""
+    if row["error"] is None or row["stage"] != "tracking":
+        return False
+    error = np.abs(row["error"])
+    return bool(np.any(error > WRONG) or np.any(error > WRONG_SIGMA * np.array(row["sigma"])))
+
+
+def _line(key: tuple[Any, ...], rows: list[Row]) -> str:
+    name, plant, truth, magnitude, gain, n_controlled = key
+    tracking = [row for row in rows if row["stage"] == "tracking"]
+    failed = [row for row in rows if row["stage"] == "failed"]
+    times = [row["time_s"] for row in tracking]
+    spent = f"{np.median(times):.0f}, {max(times):.0f}" if times else "-"
+    again = sum(row["attempts"] > 1 for row in rows)
+    unstable = sum(radius is not None and radius >= 1.0 for row in rows for radius in _sent(row))
+    errors = np.array([row["error"] for row in tracking if row["error"] is not None])
+    rms = "-"
+    if len(errors):
+        x, y, rotation, magnification = np.sqrt(np.mean(errors**2, axis=0)) * UNITS
+        rms = f"{x:.2f} {y:.2f} {rotation:.1f} {magnification:.3f}"
+    return line(
+        f"{name}, {plant}, {truth}, mag {magnitude:g}, {n_controlled} modes g {gain:g}",
+        len(rows),
+        f"{len(tracking)} ({len(tracking) / len(rows):.0%})",
+        *(spent, again, len(failed), len(rows) - len(tracking) - len(failed)),
+        *(sum(map(wrong, rows)), unstable, rms),
+    )
+
+
+def _sent(row: Row) -> list[float | None]:
+    """Return the true pole radii of the matrices the service has sent."""
+    radii: list[float | None] = row["radii"]
+    return radii
 
 
 if __name__ == "__main__":

@@ -25,11 +25,18 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 from typing_extensions import override
 
-from pyrcal_studies.campaign.kept_night import KeptNight
-from pyrcal_studies.campaign.observatory_dome import Dome, Moment
-from pyrcal_studies.campaign.observatory_link import OwnHands, ShortLink
+from pyrcal_studies.campaign.observatory import (
+    SETTINGS,
+    SMALL,
+    Dome,
+    KeptNight,
+    Moment,
+    OwnHands,
+    ShortLink,
+    bench_of,
+    latencies_of,
+)
 from pyrcal_studies.campaign.rows import Row, RowFile, heading, line, range_of, tell
-from pyrcal_studies.campaign.small import SETTINGS, SMALL, bench_of, latencies_of
 from service.config import load_settings
 from service.errors import LinkError, PyrcalError
 from service.estimation.frames import FrameBlock

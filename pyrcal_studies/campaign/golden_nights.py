@@ -1,4 +1,4 @@
-"""Records the golden nights: short nights in which everything happens to the service once.
+"""Record the golden nights: short nights in which everything happens to the service once.
 
 Run: ``python -m pyrcal_studies.campaign.golden_nights [--only jump,steady]``. Recorded twice on one
 machine they are the same but for the names of the RTC's sessions, drawn at random; another
@@ -11,17 +11,987 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
+from typing_extensions import override
 
-from pyrcal_studies.campaign.golden import FOLDER, INSTRUMENT, read, replayed, retold, written
-from pyrcal_studies.campaign.golden_night import GoldenNight
-from pyrcal_studies.campaign.golden_orders import COMMANDED, MEASURING
-from pyrcal_studies.campaign.golden_skies import ACQUIRING, FAULTS, TRACKING
-from pyrcal_studies.campaign.small import SMALL
+from pyrcal_studies.campaign.golden import (
+    FOLDER,
+    INSTRUMENT,
+    Entry,
+    Teller,
+    encoded,
+    read,
+    replayed,
+    retold,
+    written,
+)
+from pyrcal_studies.campaign.observatory import SETTINGS as SMALL_SETTINGS
+from pyrcal_studies.campaign.observatory import (
+    SMALL,
+    Observatory,
+    OwnHands,
+    latencies_of,
+    true_radius,
+)
+from pyrcal_studies.campaign.strange_rtc import Mischief, StrangeDome, StrangeLink
+from service.config import load_settings
+from service.control.reconstructor import Recipe, reconstruct
+from service.errors import LinkError, PyrcalError
 from service.instrument import load_instrument
+from service.runtime.policy import policy_of
 from service.runtime.worker import Compute, OpticsWorker
+from service.tracking import commands as cmd
+from service.tracking import events as ev
+from service.tracking.commands import Command
+from service.tracking.events import Effect, Event
+from service.tracking.operation_records import MeasurementRecord, MeasureState, NoisyFinding
+from service.tracking.policy import Policy
+from service.tracking.products import MatrixState, ModeSet
+from service.tracking.state import Level, Mode, TrackerState
+from service.wire import (
+    Acknowledgement,
+    AckState,
+    DitherKind,
+    DitherRequest,
+    Loop,
+    LoopRequest,
+    MeasureRequest,
+    Pattern,
+    RampRequest,
+    Reply,
+)
+from service.wire import Command as Order
+
+WORDS = (
+    f"--instrument={SMALL}",
+    "--plant=linear",
+    "--imperfections=ideal",
+    "--optical-gain=0.7,0.9",
+    "--n-controlled=45",
+    "--mag=8",
+    "--seed=1",
+    "--alpha=0.05,-0.03,0.1,1.002",
+)
+"""The simulator's command line, where a night has no other."""
+
+SETTINGS: Mapping[str, object] = {
+    **SMALL_SETTINGS,
+    "dither.budget_m": 20e-9,
+    "dither.amplitude_m": 10e-9,
+    "dither.longest_window_s": 2.0,
+    "dither.longest_pause_s": 0.0,
+    "control.n_modes_target": 45,
+}
+"""Of the service, where a night has no others."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """One night."""
+
+    name: str
+    seconds: float
+    words: tuple[str, ...] = ()
+    """Of the simulator's command line, besides ``WORDS``."""
+
+    settings: Mapping[str, object] = field(default_factory=dict)
+    """Of the service, besides ``SETTINGS``."""
+
+    mode: Mode = Mode.AUTO
+    slow: float = 1.0
+    """How much longer the worker takes than usual."""
+
+    deeds: tuple[tuple[float, Callable[[GoldenNight], None]], ...] = ()
+    """What happens and after how many seconds, in its order."""
+
+
+class GoldenDome(StrangeDome):
+    """A telescope whose RTC may refuse or ignore what it is asked, or not be reached."""
+
+    def __init__(self, words: Sequence[str]) -> None:
+        super().__init__(words)
+        self.refused: tuple[type[Order], ...] = ()
+        """Kinds of commands the RTC refuses."""
+
+        self.deaf = False
+        """It accepts dithers and plays none."""
+
+        self.unreachable = False
+        """No answer comes from it."""
+
+    @override
+    def order(self, command: Order) -> Reply:
+        """Tell the RTC something and return its answer."""
+        if isinstance(command, self.refused):
+            reason = "busy: it is told to refuse"
+            return Reply(id=command.id, accepted=False, reason=reason, start_seq=None)
+        if self.deaf and isinstance(command, DitherRequest):
+            return Reply(id=command.id, accepted=True, reason="", start_seq=self.frame + 50)
+        return super().order(command)
+
+
+class GoldenLink(StrangeLink):
+    """The way to it, which may be cut."""
+
+    _strange: GoldenDome
+
+    @override
+    async def command(self, command: Order) -> Reply:
+        """Return the RTC's answer.
+
+        Raises
+        ------
+        LinkError
+            If none comes.
+        """
+        if self._strange.unreachable:
+            raise LinkError("the RTC did not answer within 2 s")
+        return await super().command(command)
+
+
+class GoldenNight(Observatory):
+    """A night that is recorded where the tracker is told of events."""
+
+    dome: GoldenDome
+
+    def __init__(self, plan: Plan, bench: OpticsWorker) -> None:
+        self._teller: Teller | None = None
+        self._settings = {**SETTINGS, **plan.settings}
+        self._plan = plan
+        self.silent = False
+        """No status comes from the RTC."""
+
+        words = [*(w for w in WORDS if not _again(w, plan.words)), *plan.words]
+        self._n_slopes = bench.describe().n_slopes
+        self._bench = bench
+        super().__init__(
+            words,
+            policy_of(load_settings(None, {}, self._settings)),
+            plan.mode,
+            bench,
+            latencies=replace(latencies_of(plan.slow), watch_s=0.5),
+            with_poles=False,
+            dome=GoldenDome(words),
+            link=GoldenLink,
+        )
+
+    @property
+    def recorded(self) -> list[Entry]:
+        """What was told so far, and how it began."""
+        begin = {
+            "night": self._plan.name,
+            "system": self.state.system,
+            "mode": self._plan.mode.value,
+            "settings": self._settings,
+        }
+        return [begin, *self._told.entries]
+
+    @property
+    def instrument(self) -> Entry:
+        """What the tracker knows of the telescope."""
+        return {
+            "mode_information": encoded(self._engine.policy.mode_information),
+            "start": encoded(self._engine.policy.start),
+        }
+
+    @property
+    def worker(self) -> OwnHands:
+        """What computes for the service."""
+        return self._workers
+
+    def play(self) -> None:
+        """Let the night pass and everything happen in it."""
+        for time_s, happen in self._plan.deeds:
+            self.advance(time_s - self.time_s)
+            happen(self)
+        self.advance(self._plan.seconds - self.time_s)
+
+    def ask(self, command: Command) -> None:
+        """Let an operator ask for something; a refusal is an answer, too."""
+        try:
+            self.command(command)
+        except PyrcalError:
+            return
+
+    def post(self, event: Event) -> None:
+        """Let the tracker hear of something."""
+        self._post(event)
+
+    def restart_service(self, mode: Mode) -> None:
+        """End the service and begin it anew; telescope and RTC go on."""
+        self._told.restart(mode, self.dome.now_ns)
+        self._agenda.clear()
+        self._link.sent.clear()
+        self._idle_worker()
+        self._engine.state = self._told.state
+        self._engine.begin_anew()
+        self._begin()
+
+    def measured(self) -> None:
+        """Let the RTC send the interaction matrix it measures."""
+        record = self.state.measuring
+        if record is not None:
+            session = self.dome.computer.session
+            stored = replace(
+                record,
+                state=MeasureState.STORED,
+                created_ns_utc=self.dome.now_ns,
+                n_slopes=self._n_slopes,
+                double_pass=False,
+                session=session,
+                sha256="0" * 64,
+            )
+            self._post(ev.MatrixMeasured(record=stored))
+
+    def unstable(self, radius: float) -> None:
+        """Force a matrix through whose loop has this largest pole radius on this telescope."""
+        alpha, recipe = self.dome.alpha, Recipe(n_modes=self.dome.status().n_controlled)
+        found = 0.0
+        while found < radius:
+            alpha = replace(alpha, shift_x_subap=alpha.shift_x_subap + 0.1)
+            matrix = reconstruct(self._bench.response(alpha), recipe).matrix
+            found = true_radius(matrix, self.dome.optics, self.dome.computer.settings)
+        self.force(matrix)
+
+    def proposed(self) -> str:
+        """Return the id of the last proposal, or of nothing."""
+        records = self.state.matrices.reconstructors
+        return next((r.id for r in reversed(records) if r.state is MatrixState.PROPOSED), "none")
+
+    @override
+    def step(
+        self, state: TrackerState, event: Event, policy: Policy, now_ns: int, cause: str
+    ) -> tuple[TrackerState, tuple[Effect, ...]]:
+        """Let the tracker decide, and write down what it is told."""
+        if self._teller is None:
+            self._teller = Teller(state, policy)
+        effects = self._teller.tell(event, now_ns, cause)
+        return self._teller.state, effects
+
+    @property
+    def _told(self) -> Teller:
+        if self._teller is None:
+            raise ValueError("a night that has not begun")
+        return self._teller
+
+    @override
+    def _do(self, effect: Effect, state: TrackerState) -> None:
+        if isinstance(effect, ev.FinishNoisy) and not self.worker.broken:
+            event = ev.MatrixMeasured(record=self._finished(effect.record))
+            self._in(self.latencies.make_s, partial(self._post, event, effect.cause))
+            return
+        super()._do(effect, state)
+
+    @override
+    def _hear_status(self) -> None:
+        if not self.silent and Mischief.NO_STATUS not in self.dome.mischief:
+            super()._hear_status()
+
+    @override
+    def _hear(self, event: Event) -> None:
+        told = isinstance(event, Acknowledgement)
+        if not (told and Mischief.NO_ACK in self.dome.mischief):
+            super()._hear(event)
+
+    def _finished(self, record: MeasurementRecord) -> MeasurementRecord:
+        """Return a noisy matrix as if it had been fitted: only that it was matters here."""
+        finding = NoisyFinding(
+            n_slopes=self._n_slopes,
+            n_frames=round((record.duration_s or 0.0) * self.dome.rate_hz),
+            n_missing=0,
+            snr=1.2,
+            alpha=None,
+            covariance=None,
+            optical_gain=None,
+            misfit=None,
+            cm_id=self.state.matrices.in_use,
+            session=self.dome.computer.session,
+            created_ns_utc=self.dome.now_ns,
+            sha256="0" * 64,
+        )
+        return replace(record, state=MeasureState.STORED, finding=finding)
+
+
+def _again(word: str, words: Sequence[str]) -> bool:
+    """Return whether an option is given again."""
+    return any(other.split("=")[0] == word.split("=")[0] for other in words)
+
+
+Do = Callable[[GoldenNight], None]
+Deeds = tuple[tuple[float, Do], ...]
+
+
+def ask(command: Command) -> Do:
+    """Return an operator's command."""
+    return lambda night: night.ask(command)
+
+
+def hear(event: Event) -> Do:
+    """Return something that is heard of."""
+    return lambda night: night.post(event)
+
+
+def order(command: Order) -> Do:
+    """Return what somebody else orders of the RTC."""
+    return lambda night: _ordered(night, command)
+
+
+def trouble(name: str, text: str = "as it is said", *, over: bool = False) -> Do:
+    """Return an alarm of the link, or its end."""
+    return hear(ev.ConditionChanged(name=name, text=text, over=over))
+
+
+def begin(mischief: Mischief) -> Do:
+    """Return the beginning of a mischief."""
+    return lambda night: night.dome.begin(mischief)
+
+
+def end(mischief: Mischief) -> Do:
+    """Return the end of one."""
+    return lambda night: night.dome.end(mischief)
+
+
+def speak(mischief: Mischief | None) -> Do:
+    """Return an RTC's start in another dialect."""
+
+    def start(night: GoldenNight) -> None:
+        night.dome.speak(mischief)
+        night.restart_rtc()
+
+    return start
+
+
+def refuse(*kinds: type[Order]) -> Do:
+    """Return an RTC that refuses these; none: that refuses nothing any more."""
+    return lambda night: setattr(night.dome, "refused", kinds)
+
+
+def cut(*, off: bool = True) -> Do:
+    """Return a link on which no answer comes."""
+    return lambda night: setattr(night.dome, "unreachable", off)
+
+
+def deaf(*, ears: bool = False) -> Do:
+    """Return an RTC that accepts dithers and plays none."""
+    return lambda night: setattr(night.dome, "deaf", not ears)
+
+
+def break_worker(why: str = "the worker has ended") -> Do:
+    """Return a worker that does no job; an empty reason: that does them again."""
+    return lambda night: setattr(night.worker, "broken", why)
+
+
+def restart(mode: Mode = Mode.AUTO) -> Do:
+    """Return a restart of the service."""
+    return lambda night: night.restart_service(mode)
+
+
+def restart_rtc(night: GoldenNight) -> None:
+    """Let the RTC start anew."""
+    night.restart_rtc()
+
+
+def vanish(night: GoldenNight) -> None:
+    """Let the RTC be gone."""
+    night.silent = True
+    night.post(ev.RtcVanished())
+
+
+def appear(night: GoldenNight) -> None:
+    """Let it be there again."""
+    night.silent = False
+    night.post(ev.LogEvent(name="rtc.appeared", text="the RTC is there"))
+
+
+def approve(night: GoldenNight) -> None:
+    """Approve the last proposal."""
+    night.ask(cmd.Approve(id=night.proposed()))
+
+
+def reject(night: GoldenNight) -> None:
+    """Reject it."""
+    night.ask(cmd.Reject(id=night.proposed(), reason="not this one"))
+
+
+def publish_first(night: GoldenNight) -> None:
+    """Send the oldest reconstructor again."""
+    night.ask(cmd.Publish(id=night.state.matrices.reconstructors[0].id))
+
+
+def measured(night: GoldenNight) -> None:
+    """Let the RTC's matrix come."""
+    night.measured()
+
+
+LAST = "last"
+
+
+def acknowledged(state: AckState, reason: str, name: str | None = LAST) -> Do:
+    """Return an answer of the RTC's to the last reconstructor, or another one."""
+
+    def answer(night: GoldenNight) -> None:
+        rtc, last = night.state.loop.rtc, night.state.matrices.reconstructors[-1].id
+        acknowledgement = Acknowledgement(
+            session="" if rtc is None else rtc.session,
+            id=last if name == LAST else name,
+            sha256=None,
+            state=state,
+            reason=reason,
+            frame_seq=3 if state is AckState.APPLIED else None,
+        )
+        night.post(acknowledgement)
+
+    return answer
+
+
+def _ordered(night: GoldenNight, command: Order) -> None:
+    night.dome.order(command)
+
+
+def slew(first_deg: float, rate_deg_s: float, begin_s: float, seconds: float) -> Deeds:
+    """Return a telescope that moves in elevation, told once a second."""
+    return tuple(
+        (
+            begin_s + k,
+            ask(cmd.SetPointing(elevation_deg=first_deg + k * rate_deg_s, azimuth_deg=30.0)),
+        )
+        for k in range(round(seconds))
+    )
+
+
+NOISY = 4.0
+"""Seconds of a noisy matrix."""
+
+CLOSE, OPEN = cmd.SetLoop(loop="closed"), cmd.SetLoop(loop="open")
+STOP, START = cmd.StopDither(), cmd.StartDither()
+ACQUIRE, ABORT, REFIT = cmd.Acquire(), cmd.AbortAcquisition(), cmd.Refit()
+GROUPS = (cmd.ModeGroup(first=0, last=1), cmd.ModeGroup(first=2, last=44))
+RAMP = cmd.Ramp(groups=GROUPS, gains=(0.3, 0.4), step_s=0.5)
+MEASURE = cmd.Measure(id="im-1", pattern=Pattern.PUSH_PULL_MODAL, n_average=1)
+SINE = cmd.Measure(id="im-2", pattern=Pattern.SINE, modes=(50, 52), duration_s=2.0)
+EVERYTHING: tuple[Command, ...] = (
+    REFIT,
+    cmd.Rollback(),
+    START,
+    RAMP,
+    MEASURE,
+    SINE,
+    ACQUIRE,
+    CLOSE,
+    cmd.SetLoop(leak=0.99),
+    cmd.MeasureNoisy(id="noisy-late", duration_s=NOISY),
+    cmd.GiveUp(id="im-1"),
+    cmd.GiveUp(id="noisy-1"),
+    ABORT,
+    cmd.Approve(id="nobody"),
+    cmd.Reject(id="nobody"),
+    cmd.Publish(id="nobody"),
+    cmd.SetPointing(elevation_deg=70.0, azimuth_deg=0.0),
+)
+"""One command of each kind; what ends things comes last."""
+
+
+def everything(begin_s: float, step_s: float = 0.1, *, ending: bool = False) -> Deeds:
+    """Return all commands one after the other; those that end things only where that is meant."""
+    given = [c for c in EVERYTHING if ending or not isinstance(c, _ENDING)]
+    return tuple((begin_s + k * step_s, ask(command)) for k, command in enumerate(given))
+
+
+_ENDING = (cmd.GiveUp, cmd.AbortAcquisition)
+
+
+def dither(name: str) -> DitherRequest:
+    """Return a dither that somebody else asks for."""
+    return DitherRequest(
+        id=name,
+        kind=DitherKind.SINE,
+        modes=(60, 65),
+        amplitude_m=(5e-9, 5e-9),
+        frequency_hz=(210.0, 260.0),
+        duration_s=20.0,
+    )
+
+
+COMMANDED = (
+    Plan(
+        name="propose",
+        seconds=30.0,
+        mode=Mode.PROPOSE,
+        words=("--jump=18.0:0.1,0,0,0",),
+        deeds=(
+            (9.0, approve),
+            (12.0, publish_first),
+            (15.0, ask(cmd.Rollback())),
+            (17.0, ask(REFIT)),
+            (21.0, approve),
+            (23.0, reject),
+            (24.0, ask(cmd.SetMode(mode=Mode.AUTO))),
+        ),
+    ),
+    Plan(
+        name="stale-approval",
+        seconds=24.0,
+        mode=Mode.PROPOSE,
+        words=("--jump=12.0:0.2,0,0,0",),
+        deeds=(
+            (8.0, ask(cmd.SetLoop(gains=(cmd.GainGroup(first=0, last=44, gain=0.3),)))),
+            (9.0, approve),
+            (9.5, order(LoopRequest(id="other-1", leak=0.98))),
+            (16.0, approve),
+            (20.0, approve),
+        ),
+    ),
+    Plan(
+        name="probation",
+        seconds=26.0,
+        deeds=(
+            (10.0, lambda night: night.unstable(1.02)),
+            (16.0, ask(cmd.SetMode(mode=Mode.AUTO))),
+            (20.0, lambda night: night.unstable(1.1)),
+            (20.8, ask(cmd.StopEverything())),
+        ),
+    ),
+    Plan(
+        name="hold",
+        seconds=26.0,
+        mode=Mode.HOLD,
+        deeds=(
+            (1.0, ask(REFIT)),
+            (8.0, ask(REFIT)),
+            (9.0, ask(REFIT)),
+            (12.0, approve),
+            (15.0, ask(cmd.Refit(n_modes=85))),
+            (18.0, approve),
+            (20.0, ask(cmd.Refit(n_modes=500))),
+            (21.0, ask(cmd.Rollback())),
+            (24.0, restart(Mode.HOLD)),
+        ),
+    ),
+    Plan(name="everything-before-alpha", seconds=12.0, deeds=everything(0.3, 0.05, ending=True)),
+    Plan(
+        name="everything-in-peace",
+        seconds=40.0,
+        deeds=tuple((6.0 + 2.0 * k, ask(command)) for k, command in enumerate(EVERYTHING)),
+    ),
+    Plan(
+        name="ramp",
+        seconds=24.0,
+        deeds=(
+            (6.0, ask(RAMP)),
+            *everything(6.4, 0.05),
+            (10.0, ask(RAMP)),
+            (10.8, ask(OPEN)),
+            (12.0, ask(CLOSE)),
+            (15.0, ask(cmd.Ramp())),
+            (16.0, ask(cmd.StopDither())),
+            (18.0, refuse(RampRequest)),
+            (20.0, ask(RAMP)),
+        ),
+    ),
+    Plan(
+        name="loop",
+        seconds=32.0,
+        deeds=(
+            (5.0, ask(cmd.SetLoop(leak=0.98))),
+            (7.0, ask(cmd.SetLoop(gains=(cmd.GainGroup(first=40, last=44, gain=0.0),)))),
+            (10.0, ask(cmd.SetLoop(effective_gain=0.3))),
+            (13.0, ask(cmd.SetLoop(n_controlled=30))),
+            (17.0, ask(OPEN)),
+            (18.0, ask(cmd.SetLoop(gains=(cmd.GainGroup(first=0, last=3, gain=0.2),)))),
+            (19.0, ask(CLOSE)),
+            (22.0, order(LoopRequest(id="other-1", loop=Loop.OPEN))),
+            (25.0, order(LoopRequest(id="other-2", loop=Loop.CLOSED))),
+            (28.0, ask(cmd.SetLoop(n_controlled=500))),
+            (29.0, refuse(LoopRequest)),
+            (30.0, ask(OPEN)),
+        ),
+    ),
+    Plan(
+        name="dithers",
+        seconds=45.0,
+        deeds=(
+            (5.0, ask(STOP)),
+            (6.0, ask(cmd.StartDither(modes=(50, 55, 60), duration_s=4.0))),
+            (12.0, ask(cmd.StartDither(modes=(50,), amplitude_m=30e-9))),
+            (13.0, ask(cmd.StartDither(amplitude_m=15e-9, duration_s=3.0, over_budget=True))),
+            (18.0, ask(cmd.StartDither(kind=DitherKind.BINARY, modes=ModeSet.ALL, duration_s=6.0))),
+            (27.0, ask(cmd.StartDither(modes=(200,)))),
+            (29.0, order(dither("somebodys"))),
+            (33.0, ask(STOP)),
+            (36.0, order(dither("dither-1"))),
+            (40.0, ask(START)),
+        ),
+    ),
+)
+
+MEASURING = (
+    Plan(
+        name="noisy",
+        seconds=45.0,
+        deeds=(
+            (6.0, ask(cmd.MeasureNoisy(id="noisy-1", duration_s=NOISY))),
+            *everything(8.0, 0.05),
+            (20.0, ask(cmd.MeasureNoisy(id="noisy-1"))),
+            (21.0, ask(cmd.MeasureNoisy(id="noisy-2", modes=ModeSet.ALL, duration_s=NOISY))),
+            (24.0, ask(cmd.GiveUp(id="noisy-2"))),
+            (25.0, ask(cmd.GiveUp(id="noisy-2"))),
+            (28.0, ask(cmd.MeasureNoisy(id="noisy-3", total_amplitude_m=1e-6))),
+            (29.0, ask(cmd.MeasureNoisy(id="noisy-4", duration_s=NOISY))),
+            (30.0, ask(STOP)),
+            (33.0, ask(cmd.MeasureNoisy(id="noisy-5", duration_s=NOISY))),
+            (35.5, break_worker()),
+            (42.0, break_worker("")),
+        ),
+    ),
+    Plan(
+        name="noisy-refused",
+        seconds=40.0,
+        deeds=(
+            (5.0, refuse(DitherRequest)),
+            (6.0, ask(cmd.MeasureNoisy(id="noisy-1", duration_s=4.0))),
+            (23.0, refuse()),
+            (25.0, ask(cmd.MeasureNoisy(id="noisy-2", duration_s=NOISY))),
+            (27.0, restart_rtc),
+            (31.0, ask(cmd.MeasureNoisy(id="noisy-3", duration_s=NOISY))),
+            (33.0, ask(ACQUIRE)),
+        ),
+    ),
+    Plan(
+        name="measure",
+        seconds=45.0,
+        deeds=(
+            (6.0, ask(STOP)),
+            (8.0, ask(MEASURE)),
+            *everything(9.0, 0.05),
+            (16.0, measured),
+            (18.0, ask(SINE)),
+            (21.0, measured),
+            (24.0, ask(START)),
+            (26.0, ask(STOP)),
+            (28.0, ask(cmd.Measure(id="im-3", pattern=Pattern.HADAMARD))),
+            (29.0, ask(cmd.GiveUp(id="im-3"))),
+            (36.0, refuse(MeasureRequest)),
+            (37.0, ask(cmd.Measure(id="im-4", pattern=Pattern.SYSTEM_MODES))),
+            (39.0, refuse()),
+            (40.0, ask(cmd.Measure(id="im-5", pattern=Pattern.PUSH_PULL_ZONAL))),
+            (41.0, restart_rtc),
+        ),
+    ),
+    Plan(
+        name="measure-lost",
+        seconds=30.0,
+        deeds=(
+            (5.0, ask(STOP)),
+            (7.0, cut()),
+            (7.5, ask(MEASURE)),
+            (9.0, cut(off=False)),
+            (12.0, ask(cmd.Measure(id="im-6", pattern=Pattern.PUSH_PULL_MODAL))),
+            (14.0, vanish),
+            (17.0, appear),
+            (20.0, ask(START)),
+        ),
+    ),
+)
+
+
+FAR = ("--alpha=0.9,-0.6,3.0,1.02",)
+"""Registrations that no window finds."""
+
+SPARSE = {"dither.longest_pause_s": 6.0}
+BEND = {"tracking.flexure_subap_per_degree": 0.01, "tracking.flexure_deg_per_degree": 0.01}
+TRACKING = (
+    Plan(name="steady", seconds=15.0),
+    Plan(name="jump", seconds=18.0, words=("--jump=8.3:0.1,0,0,0",)),
+    Plan(name="jump-rotation", seconds=18.0, words=("--jump=8.8:0,0,0.12,0",)),
+    Plan(
+        name="jump-and-back",
+        seconds=20.0,
+        words=("--jump=8.0:0.3,0.1,0,0", "--jump=9.1:-0.3,-0.1,0,0", "--jump=13.5:0.2,0.2,0.3,0"),
+    ),
+    Plan(name="drift", seconds=25.0, words=("--drift=0.4,-0.3,0.3,0.002",)),
+    Plan(
+        name="slew",
+        seconds=24.0,
+        settings=BEND,
+        deeds=(*slew(60.0, 0.0, 1.0, 2), *slew(60.0, 2.0, 9.0, 6), *slew(72.0, 0.0, 16.0, 2)),
+    ),
+    Plan(
+        name="faint", seconds=25.0, words=("--mag=12.5",), settings={"dither.longest_window_s": 5.0}
+    ),
+    Plan(name="pauses", seconds=60.0, settings=SPARSE, words=("--jump=41.0:0.1,0,0,0",)),
+    Plan(
+        name="vibrations",
+        seconds=20.0,
+        words=("--vibration=tilt:239:40", "--vibration=focus:47:15"),
+        settings={"dither.avoid_hz": (283.0,)},
+    ),
+    Plan(name="slow-worker", seconds=30.0, slow=4.0, words=("--jump=14.0:0.2,0,0.2,0",)),
+    Plan(
+        name="seeing-gains",
+        seconds=15.0,
+        deeds=((3.0, begin(Mischief.SEEING_GAINS)),),
+    ),
+    Plan(
+        name="more-modes",
+        seconds=30.0,
+        words=("--n-controlled=20",),
+        settings={"control.n_modes_target": 80},
+    ),
+    Plan(
+        name="modes-declined",
+        seconds=30.0,
+        words=("--n-controlled=30",),
+        mode=Mode.PROPOSE,
+        settings={"control.n_modes_target": 60},
+        deeds=(
+            (8.0, reject),
+            (14.0, approve),
+            (16.0, refuse(LoopRequest)),
+            (20.0, approve),
+            (23.0, refuse()),
+            (26.0, ask(cmd.Refit(n_modes=80))),
+        ),
+    ),
+)
+
+ACQUIRING = (
+    Plan(
+        name="acquire-ordered",
+        seconds=35.0,
+        words=FAR,
+        mode=Mode.PROPOSE,
+        deeds=((2.0, ask(ACQUIRE)), *everything(3.0)),
+    ),
+    Plan(name="acquire-alone", seconds=45.0, words=FAR, settings={"acquisition.auto": True}),
+    Plan(
+        name="acquire-aborted",
+        seconds=25.0,
+        words=FAR,
+        deeds=(
+            (2.0, ask(ACQUIRE)),
+            (5.0, ask(ABORT)),
+            (7.0, ask(CLOSE)),
+            (9.0, ask(ABORT)),
+            (11.0, ask(ACQUIRE)),
+            (13.0, ask(STOP)),
+            (16.0, ask(ACQUIRE)),
+            (17.0, ask(cmd.SetMode(mode=Mode.HOLD))),
+            (18.0, ask(ABORT)),
+            (20.0, ask(cmd.SetMode(mode=Mode.AUTO))),
+        ),
+    ),
+    Plan(
+        name="acquire-refused",
+        seconds=25.0,
+        words=FAR,
+        deeds=(
+            (2.0, refuse(LoopRequest)),
+            (2.5, ask(ACQUIRE)),
+            (5.0, refuse(DitherRequest)),
+            (6.0, ask(ACQUIRE)),
+            (18.0, refuse()),
+            (19.0, ask(ACQUIRE)),
+        ),
+    ),
+    Plan(
+        name="acquire-cut-off",
+        seconds=30.0,
+        words=FAR,
+        deeds=((2.0, ask(ACQUIRE)), (4.0, cut()), (8.0, cut(off=False)), (12.0, restart_rtc)),
+    ),
+    Plan(
+        name="acquire-gap",
+        seconds=40.0,
+        words=FAR,
+        settings={"acquisition.auto": True},
+        deeds=((2.0, ask(ACQUIRE)), (5.0, vanish), (9.0, appear)),
+    ),
+    Plan(
+        name="acquire-restart",
+        seconds=40.0,
+        words=FAR,
+        settings={"acquisition.auto": True},
+        deeds=((2.0, ask(ACQUIRE)), (6.0, restart())),
+    ),
+    Plan(
+        name="acquire-restart-propose",
+        seconds=25.0,
+        words=FAR,
+        mode=Mode.PROPOSE,
+        deeds=(
+            (2.0, ask(ACQUIRE)),
+            (6.0, restart(Mode.PROPOSE)),
+            (10.0, ask(CLOSE)),
+            (16.0, restart(Mode.PROPOSE)),
+        ),
+    ),
+    Plan(
+        name="acquire-somebody-closes",
+        seconds=30.0,
+        words=FAR,
+        deeds=(
+            (2.0, ask(ACQUIRE)),
+            (5.0, order(LoopRequest(id="other-1", loop=Loop.CLOSED))),
+            (9.0, break_worker()),
+            (16.0, break_worker("")),
+        ),
+    ),
+    Plan(
+        name="diverging",
+        seconds=30.0,
+        settings={"acquisition.auto": True},
+        deeds=((7.0, order(LoopRequest(id="other-1", gains=(1.6,) * 45 + (0.0,) * 45))),),
+    ),
+)
+
+FAULTS = (
+    Plan(
+        name="worker-broken",
+        seconds=28.0,
+        deeds=(
+            (4.0, break_worker()),
+            (10.0, break_worker("")),
+            (14.0, break_worker()),
+            (15.0, ask(REFIT)),
+            (17.0, ask(cmd.Rollback())),
+            (19.0, break_worker("")),
+        ),
+    ),
+    Plan(
+        name="no-acknowledgement",
+        seconds=24.0,
+        deeds=((3.0, begin(Mischief.NO_ACK)), (16.0, end(Mischief.NO_ACK)), (18.0, ask(REFIT))),
+    ),
+    Plan(
+        name="not-applied",
+        seconds=26.0,
+        words=("--jump=13.0:0.1,0,0,0",),
+        deeds=(
+            (6.0, acknowledged(AckState.REJECTED, "range: it says")),
+            (9.0, restart_rtc),
+            (15.0, acknowledged(AckState.REJECTED, "it says")),
+            (
+                17.0,
+                acknowledged(AckState.REJECTED, "what?", None),
+            ),
+            (
+                18.0,
+                acknowledged(AckState.APPLIED, "", "unknown"),
+            ),
+        ),
+    ),
+    Plan(
+        name="other-sha",
+        seconds=20.0,
+        deeds=((3.0, begin(Mischief.OTHER_SHA)), (13.0, end(Mischief.OTHER_SHA))),
+    ),
+    Plan(
+        name="no-cm-id",
+        seconds=16.0,
+        deeds=((0.1, begin(Mischief.NO_CM_ID)), (9.0, end(Mischief.NO_CM_ID))),
+    ),
+    Plan(
+        name="strong-dither",
+        seconds=24.0,
+        deeds=((4.0, begin(Mischief.STRONG_DITHER)), (14.0, end(Mischief.STRONG_DITHER))),
+    ),
+    Plan(
+        name="loop-law",
+        seconds=34.0,
+        deeds=(
+            (3.0, begin(Mischief.LEAK)),
+            (12.0, end(Mischief.LEAK)),
+            (14.0, begin(Mischief.DELAY)),
+            (22.0, end(Mischief.DELAY)),
+            (24.0, begin(Mischief.GAIN)),
+            (31.0, end(Mischief.GAIN)),
+        ),
+    ),
+    Plan(name="sign", seconds=20.0, deeds=((0.5, speak(Mischief.SIGN)), (12.0, speak(None)))),
+    Plan(name="flip", seconds=20.0, deeds=((5.0, speak(Mischief.FLIP_X)), (14.0, speak(None)))),
+    Plan(
+        name="nanometres",
+        seconds=18.0,
+        deeds=((5.0, speak(Mischief.NANOMETRES)), (12.0, speak(None))),
+    ),
+    Plan(
+        name="rtc-restarts",
+        seconds=26.0,
+        words=("--jump=16.0:0.1,0,0,0",),
+        deeds=(
+            (7.0, restart_rtc),
+            (14.0, restart_rtc),
+            (14.2, vanish),
+            (17.0, appear),
+            (20.0, begin(Mischief.NO_STATUS)),
+            (24.0, end(Mischief.NO_STATUS)),
+        ),
+    ),
+    Plan(
+        name="service-restarts",
+        seconds=36.0,
+        deeds=(
+            (8.0, restart()),
+            (14.0, ask(cmd.SetMode(mode=Mode.HOLD))),
+            (15.0, ask(STOP)),
+            (17.0, restart()),
+            (22.0, ask(START)),
+            (23.0, ask(cmd.SetMode(mode=Mode.AUTO))),
+            (28.0, ask(cmd.SetMode(mode=Mode.HOLD))),
+            (29.0, restart(Mode.PROPOSE)),
+        ),
+    ),
+    Plan(
+        name="second-service",
+        seconds=24.0,
+        deeds=(
+            (6.0, hear(ev.ServicesMet(drives=False, others=("one on host a, process 1",)))),
+            *everything(8.0, 0.05),
+            (12.0, hear(ev.ServicesMet(drives=True, others=("one on b",)))),
+            (16.0, hear(ev.ServicesMet(drives=True, others=()))),
+        ),
+    ),
+    Plan(
+        name="alarms",
+        seconds=44.0,
+        deeds=(
+            (5.0, trouble("second-rtc")),
+            (7.0, trouble("basis-mismatch")),
+            (26.0, trouble("archive-failed")),
+            (29.0, trouble("archive-failed", over=True)),
+            (31.0, trouble("worker-behind")),
+            (33.0, trouble("worker-behind", over=True)),
+            (34.0, trouble("columns-misaligned")),
+            (
+                36.0,
+                hear(ev.LogEvent(name="message.malformed", text="status: 3", level=Level.WARNING)),
+            ),
+            (
+                36.5,
+                hear(ev.LogEvent(name="message.malformed", text="status: 4", level=Level.WARNING)),
+            ),
+            (38.0, trouble("commands-off-loop")),
+            (40.0, trouble("commands-off-loop", over=True)),
+        ),
+    ),
+    Plan(name="deaf", seconds=30.0, deeds=((4.0, deaf()), (16.0, deaf(ears=True)))),
+    Plan(
+        name="dither-refused",
+        seconds=34.0,
+        deeds=(
+            (0.1, refuse(DitherRequest)),
+            (12.0, refuse()),
+            (20.0, cut()),
+            (26.0, cut(off=False)),
+        ),
+    ),
+)
+
 
 NIGHTS = (*TRACKING, *ACQUIRING, *COMMANDED, *MEASURING, *FAULTS)
 

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import sys
 import time
 from collections.abc import Iterator
@@ -32,8 +31,8 @@ import scipy
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pyrcal_studies.campaign.observatory_dome import Dome
-from pyrcal_studies.campaign.small import SMALL, bench_of
+from pyrcal_studies.campaign.observatory import SMALL, Dome, bench_of
+from pyrcal_studies.campaign.rows import RowFile
 from service.control.reconstructor import Recipe, reconstruct
 from service.estimation import health
 from service.estimation.comparison import REFERENCE_PERIOD_S
@@ -669,14 +668,12 @@ def main() -> int:
     parser.add_argument("--rate", type=float, metavar="HZ", help="all swaps at this frame rate")
     parser.add_argument("--output", type=Path, default=Path("var/healthy_swaps.jsonl"))
     given = parser.parse_args()
-    given.output.parent.mkdir(parents=True, exist_ok=True)
-    begun = time.process_time()
-    with threadpool_limits(1), given.output.open("a", encoding="utf-8") as file:
+    file, begun = RowFile(given.output), time.process_time()
+    with threadpool_limits(1):
         for kind in ("healthy", "worse", "diverging"):
             n = getattr(given, kind)
             for row in rows_of(given.plant, kind, n, given.seed, given.rate):
-                file.write(json.dumps(row) + "\n")
-                file.flush()
+                file.add(row)
     sys.stdout.write(f"{time.process_time() - begun:.0f} s of processor time\n")
     return 0
 

@@ -27,8 +27,7 @@ from threadpoolctl import threadpool_limits
 from typing_extensions import override
 
 from pyrcal.rtc.identity import Identity, Reconstructor
-from pyrcal_studies.campaign.observatory import Latencies, Observatory
-from pyrcal_studies.campaign.observatory_dome import START_NS, Dome, Moment
+from pyrcal_studies.campaign.observatory import START_NS, Dome, Latencies, Moment, Observatory
 from pyrcal_studies.campaign.rows import Row, RowFile, heading, line, tell
 from service.config import load_settings
 from service.control.loop import pole_radius

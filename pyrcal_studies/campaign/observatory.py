@@ -3,6 +3,12 @@
 What the service does is the service's own code: streams, worker, tracker, actions, translation of
 the wire. Only what waits is replaced: an agenda says when each thing is over, by the frames' time,
 so a night takes as long as it computes and is the same every time.
+
+``Dome`` is the telescope with its RTC, ``ShortLink``, ``OwnHands`` and ``Shelf`` replace the link,
+the worker process and the archive, ``Observatory`` is the service at the dome, and ``KeptNight``
+one that keeps its state on a disk, may be killed and continues from it. ``published`` judges the
+matrices of a night by the telescope alone: the wavefront after each swap, and the poles of the
+loop with the telescope's own response, which the service has not seen.
 """
 
 from __future__ import annotations
@@ -10,36 +16,557 @@ from __future__ import annotations
 import asyncio
 import heapq
 import itertools
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import partial
-from typing import Any
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
-from pyrcal_studies.campaign.observatory_checks import Publication, Swap, published, true_radius
-from pyrcal_studies.campaign.observatory_dome import Dome
-from pyrcal_studies.campaign.observatory_link import OwnHands, Shelf, ShortLink
-from service.errors import PyrcalError
+from pyrcal.rtc import staging
+from pyrcal.rtc.identity import Reconstructor
+from service.archive import Archive
+from service.archive.products import NoisyNumbers
+from service.archive.store import Provenance
+from service.control.gate import GateVerdict
+from service.control.loop import pole_radius
+from service.errors import PyrcalError, UnknownIdError, WorkerError
 from service.estimation.dither_windows import EndedWindow
+from service.estimation.frames import FrameBlock
 from service.estimation.loop import select_gains
 from service.estimation.passive_sums import PASSIVE_INTERVAL_S
 from service.estimation.random_dither import Correlated
+from service.instrument import load_instrument
+from service.model.misregistration import Misregistration
+from service.model.slopes import SlopeRecipe
 from service.runtime.actions import Actions, Publishing, present_conditions
+from service.runtime.archiving import (
+    SAVE_INTERVAL_S,
+    is_unsaved,
+    is_urgent,
+    leave,
+    restore_tracking,
+)
 from service.runtime.engine import Engine
 from service.runtime.estimates import PendingWindow, fit_passive, fitted, read_own_matrix
 from service.runtime.ports import StorePort
-from service.runtime.worker import OpticsWorker
+from service.runtime.worker import Compute, Done, OpticsWorker, Sampling
 from service.runtime.worker.records import patience_s
 from service.tracker import step
+from service.tracking import commands
 from service.tracking import events as ev
-from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
+from service.tracking.operation_records import MeasurementRecord
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.state import LoopState, Mode, OperatorState, TrackerState
-from service.wire import CHUNK_LIMIT, Manifest, Status, checksum
+from service.tracking.resume import restored
+from service.tracking.state import LoopState, MatrixStates, Mode, OperatorState, TrackerState
+from service.wire import (
+    CHUNK_LIMIT,
+    Acknowledgement,
+    Command,
+    Manifest,
+    Reply,
+    Status,
+    checksum,
+    decode,
+    encode,
+    split,
+)
+from sim_rtc.assembly import Telescope, build_telescope
+from sim_rtc.computer.feed import BATCH_FRAMES, Block
+from sim_rtc.computer.telemetry import Batch, FrameClock, LoopSettings
+from sim_rtc.options import Options, parse_options
+from sim_rtc.telescope.diffractive import DiffractiveOptics
+from sim_rtc.telescope.linear import LinearOptics
+from sim_rtc.telescope.plant import Optics
+from sim_rtc.truth import WavefrontError
+
+START_NS = 1_800_000_000_000_000_000
+"""When simulated nights begin: every timestamp counts from here."""
+
+P = ParamSpec("P")
+T = TypeVar("T")
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Moment:
+    """The truth during one block of frames."""
+
+    time_s: float
+    """End of the block, since the night began."""
+
+    alpha: Misregistration
+    """Where the mirror truly lay at its end."""
+
+    wavefront_nm: float
+    """RMS of the residual wavefront over pupil and block."""
+
+    n_clipped: int
+    """Commands that met a limit of the mirror."""
+
+    cm_id: str
+    """Of the matrix that multiplied its last slopes."""
+
+    n_controlled: int
+    closed: bool
+    dither_nm: float
+    """RMS of the dither on the mirror, all modes together; 0: none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Order:
+    """Something the RTC was told."""
+
+    frame: int
+    """Frames since the night began when it was told."""
+
+    what: Command | Reconstructor
+
+
+class Inline(Executor):
+    """Does what it is given at once, so that nothing depends on how fast the machine is."""
+
+    @override
+    def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+        """Return a future that is done."""
+        future: Future[T] = Future()
+        future.set_result(fn(*args, **kwargs))
+        return future
+
+
+class Dome:
+    """The telescope, frame by frame; time passes in ``play`` alone."""
+
+    def __init__(self, words: Sequence[str], *, block_batches: int = 5) -> None:
+        """Take the simulator's command line; ``block_batches`` messages make a block."""
+        options = parse_options(list(words))
+        self.instrument = load_instrument(options.instrument)
+        self.telescope = self._built(options)
+        self.computer = self.telescope.computer(self._blocks())
+        self.magnitude = options.magnitude
+        self.rate_hz = options.frame_rate_hz
+        self.jump_times_s = tuple(sorted(jump.time_s for jump in options.jumps))
+        self.frame = 0
+        """Frames played since the night began."""
+
+        self.moments: list[Moment] = []
+        self.orders: list[Order] = []
+        self._dt_ns = round(1e9 / options.frame_rate_hz)
+        self._clock = FrameClock(start_ns_utc=START_NS, dt_ns=self._dt_ns)
+        self._error = WavefrontError(self.telescope.weights)
+        self._block_batches = block_batches
+        self._optics: Optics = self.telescope.optics.at(0.0)
+
+    @property
+    def now_ns(self) -> int:
+        """The time, nanoseconds UTC."""
+        return START_NS + self.frame * self._dt_ns
+
+    @property
+    def time_s(self) -> float:
+        """Seconds since the night began."""
+        return self.frame / self.rate_hz
+
+    @property
+    def optics(self) -> Optics:
+        """The true optics, as of the last frame."""
+        return self._optics
+
+    @property
+    def alpha(self) -> Misregistration:
+        """Where the mirror truly lies on the sensor, as of the last frame."""
+        return self._optics.alpha
+
+    def play(self) -> list[FrameBlock]:
+        """Let one block of frames pass and return it as the link would, joined while it may be."""
+        batches = [self.computer.next_batch() for _ in range(self._block_batches)]
+        self.frame += self._block_batches * BATCH_FRAMES
+        self._optics = batches[-1].optics
+        self.moments.append(self._moment(batches))
+        return [self._block(part) for part in _alike(batches, _on_the_wire)]
+
+    def order(self, command: Command) -> Reply:
+        """Tell the RTC something and return its answer."""
+        self.orders.append(Order(frame=self.frame, what=command))
+        return self.computer.execute(command)
+
+    def stage(self, reconstructor: Reconstructor) -> None:
+        """Hand the loop a checked matrix; it multiplies from the next frame on."""
+        self.orders.append(Order(frame=self.frame, what=reconstructor))
+        self.computer.stage(reconstructor)
+
+    def restart(self) -> None:
+        """Let the RTC begin again, at frame 0 and with the matrix of the start."""
+        self.computer.restart()
+        self._clock.restart(self.now_ns)
+
+    def step_clock(self, by_ns: int) -> None:
+        """Have the RTC's clock leap."""
+        self._clock.step(by_ns)
+
+    def status(self) -> Status:
+        """Return what the RTC says of itself, as it comes out of the wire."""
+        status = replace(
+            self._clock.stamp_status(self.computer.status()),
+            magnitude=self.magnitude,
+            flux=self.telescope.detector.flux(self.computer.images),
+        )
+        return decode(Status, encode(status))
+
+    def _built(self, options: Options) -> Telescope:
+        """Return the telescope; another one may be built of the same options."""
+        return build_telescope(options, self.instrument, Inline())
+
+    def _blocks(self) -> Iterator[Block]:
+        """Yield what comes to the sensor."""
+        return self.telescope.feed.blocks()
+
+    def _moment(self, batches: list[Batch]) -> Moment:
+        last = batches[-1]
+        errors_nm = [
+            error for part in _alike(batches, _optics_of) for error in self._error.rms_nm(part)
+        ]
+        return Moment(
+            time_s=self.time_s,
+            alpha=last.optics.alpha,
+            wavefront_nm=float(np.sqrt(np.mean(np.square(errors_nm)))),
+            n_clipped=sum(batch.n_clipped for batch in batches),
+            cm_id=last.cm_id,
+            n_controlled=last.n_controlled,
+            closed=last.closed,
+            dither_nm=_dither_nm(batches),
+        )
+
+    def _block(self, batches: list[Batch]) -> FrameBlock:
+        first = batches[0]
+        dithers = [batch.dither_m for batch in batches if batch.dither_m is not None]
+        return FrameBlock(
+            session=first.session,
+            first_seq=first.seq0,
+            t0_ns_utc=self._clock.end_of_exposure_ns(first.seq0),
+            dt_ns=self._dt_ns,
+            slopes=np.concatenate([batch.slopes for batch in batches]),
+            commands_m=np.concatenate([batch.commands_m for batch in batches]),
+            dither_m=np.concatenate(dithers) if dithers else None,
+            cm_id=first.cm_id,
+        )
+
+
+def replayed(words: Sequence[str], orders: Sequence[Order], seconds: float) -> Dome:
+    """Return the same telescope after a night of the same orders, nobody listening.
+
+    With the dithers left out of ``orders``, its wavefront error tells what they cost.
+    """
+    dome, left = Dome(words), list(orders)
+    while dome.time_s < seconds:
+        while left and left[0].frame <= dome.frame:
+            what = left.pop(0).what
+            if isinstance(what, Reconstructor):
+                dome.stage(what)
+            else:
+                dome.order(what)
+        dome.play()
+    return dome
+
+
+def _dither_nm(batches: list[Batch]) -> float:
+    """Return the RMS of a dither: a mode's command is its own RMS over the pupil."""
+    squares = [
+        0.0 if batch.dither_m is None else float(np.mean(np.sum(batch.dither_m**2, axis=1)))
+        for batch in batches
+    ]
+    return float(np.sqrt(np.mean(squares))) * 1e9
+
+
+def _on_the_wire(batch: Batch) -> object:
+    return batch.session, batch.cm_id, batch.dither_m is None
+
+
+def _optics_of(batch: Batch) -> object:
+    return id(batch.optics)
+
+
+def _alike(batches: list[Batch], by: Callable[[Batch], object]) -> list[list[Batch]]:
+    """Return the batches in runs of which all are alike."""
+    return [list(run) for _, run in itertools.groupby(batches, by)]
+
+
+R = TypeVar("R")
+
+
+class ShortLink:
+    """A link without a network: commands are carried out at once, matrices wait to be delivered."""
+
+    def __init__(self, dome: Dome) -> None:
+        self._dome = dome
+        self._staging = self._new_staging()
+        self.sent: list[tuple[Manifest, NDArray[np.float32]]] = []
+        """Matrices on their way to the RTC."""
+
+    def _new_staging(self) -> staging.Staging:
+        computer = self._dome.computer
+        return staging.Staging(computer.terms, limit_bytes=computer.largest_matrix_bytes)
+
+    async def command(self, command: Command) -> Reply:
+        """Return the RTC's answer."""
+        return self._dome.order(command)
+
+    async def publish(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
+        """Put a matrix on its way; ``deliver`` brings it to the RTC."""
+        self.sent.append((manifest, matrix))
+
+    async def fetch_applied(self) -> tuple[Manifest, NDArray[np.float32]]:
+        """Return the matrix the RTC uses."""
+        active = self._dome.computer.reconstructor
+        return active.manifest, active.matrix
+
+    def offer(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
+        """Do nothing: the RTC is never late."""
+
+    def set_current(self, matrix_id: str | None) -> None:
+        """Do nothing: the RTC is never late."""
+
+    def deliver(self, manifest: Manifest, matrix: NDArray[np.float32]) -> list[Acknowledgement]:
+        """Hand the RTC a matrix the way it comes over the wire, and return what it says."""
+        parts = split(matrix, manifest.layout.chunk_bytes)
+        for index, part in enumerate(parts):
+            self._carry_out(self._staging.chunk(manifest.id, index, part))
+        return self._carry_out(self._staging.commit(manifest, self._dome.time_s))
+
+    def swapped(self) -> list[Acknowledgement]:
+        """Return what the RTC says of the matrices it has begun to use."""
+        said = [self._staging.applied(*swap) for swap in self._dome.computer.take_swaps()]
+        return [self._told(one) for one in said if one is not None]
+
+    def void(self) -> None:
+        """Forget what was on its way: the RTC has restarted."""
+        self.sent.clear()
+        self._staging = self._new_staging()
+
+    def _carry_out(self, outcome: staging.Outcome) -> list[Acknowledgement]:
+        for reconstructor in outcome.staged:
+            self._dome.stage(reconstructor)
+        return [self._told(one) for one in outcome.acknowledgements]
+
+    def _told(self, acknowledgement: Acknowledgement) -> Acknowledgement:
+        """Return what is heard of it."""
+        return acknowledgement
+
+
+class OwnHands:
+    """A worker that is no process of its own: the workbench itself."""
+
+    def __init__(self, workbench: OpticsWorker) -> None:
+        self.first: Callable[[], Done[None]] | None = None
+        self.found_slopes: SlopeRecipe | None = None
+        self.cpu_s: defaultdict[str, float] = defaultdict(float)
+        """Processor time of the jobs, seconds, by name."""
+
+        self.broken = ""
+        """Why no job can be done; empty: all can."""
+
+        self._workbench = workbench
+
+    async def call(
+        self, job: Callable[Concatenate[OpticsWorker, P], R], *args: P.args, **kwargs: P.kwargs
+    ) -> R:
+        """Run a method of the workbench now; what goes wrong is said as the worker would."""
+        before_s = time.process_time()
+        if self.broken:
+            raise WorkerError(self.broken)
+        try:
+            return job(self._workbench, *args, **kwargs)
+        except PyrcalError:
+            raise
+        except Exception as error:
+            raise WorkerError(f"{job.__name__} failed in the worker: {error!r}") from error
+        finally:
+            self.cpu_s[job.__name__] += time.process_time() - before_s
+
+
+class Kept:
+    """Keeps interaction matrices in memory."""
+
+    def __init__(self) -> None:
+        self.records: list[MeasurementRecord] = []
+
+    def store(
+        self,
+        record: MeasurementRecord,
+        numbers: NDArray[np.float32] | NoisyNumbers,
+        name: str,
+    ) -> None:
+        """Keep what is known of one; nobody asks for its numbers."""
+        self.records.append(record)
+
+
+class KeptReconstructors:
+    """Keeps reconstructors in memory."""
+
+    def __init__(self) -> None:
+        self._matrices: dict[str, NDArray[np.float32]] = {}
+
+    def store(
+        self,
+        record: ReconstructorRecord,
+        matrix: NDArray[np.float32],
+        covariance: NDArray[np.float64] | None,
+        provenance: Mapping[str, Provenance],
+    ) -> None:
+        """Keep the numbers."""
+        self._matrices[record.id] = matrix
+
+    def matrix(self, matrix_id: str) -> NDArray[np.float32]:
+        """Return a reconstructor, ``(n_modes, n_slopes)``.
+
+        Raises
+        ------
+        UnknownIdError
+            If it was never stored here.
+        """
+        if matrix_id not in self._matrices:
+            raise UnknownIdError(f"no reconstructor {matrix_id}")
+        return self._matrices[matrix_id]
+
+
+class Shelf:
+    """Keeps matrices in memory: a simulated night is over when its program ends."""
+
+    def __init__(self) -> None:
+        self.reconstructors = KeptReconstructors()
+        self.measured, self.noisy = Kept(), Kept()
+
+
+WATCHED_S = 20.0
+"""After a swap: an unstable loop needs a fraction of it, an edge may slip after seconds."""
+
+LEAST_S = 0.5
+"""Less than this of a matrix in use tells nothing."""
+
+GROWTH = 2.0
+"""A wavefront error that ends so much above the one before, and above the night's best, has grown:
+seeing that gets worse by a half in this time makes 1.4."""
+
+STROKE_M = 1e-8
+"""Of the push and pull that find a telescope's response, metres RMS: a pyramid is linear there."""
+
+
+class Outcome(StrEnum):
+    """What a matrix did to the loop."""
+
+    HELD = "held"
+    DIVERGED = "diverged"
+    UNTESTED = "untested"
+    """It was not applied, or not for long enough to tell."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Swap:
+    """A matrix as it came into use."""
+
+    id: str
+    n_modes: int
+    time_s: float
+    alpha: Misregistration
+    """Where the mirror truly lay."""
+
+    made_for: Misregistration | None
+    """The registration it was computed for; None: not by the service."""
+
+    gate: GateVerdict | None
+    """The service's own verdict before it was sent; None: not judged."""
+
+    radius: float | None
+    """Largest pole radius around the telescope's true response to a flat wavefront: without the
+    optical gain, which lowers the loop gain; 1 is the edge. None: it was not looked at."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Publication:
+    """A swap, and what came of it."""
+
+    swap: Swap
+    before_nm: float
+    """RMS wavefront error during the second before the swap."""
+
+    after_nm: float
+    """The same during the last second of the watch; NaN: there is none."""
+
+    n_clipped: int
+    """Commands that met a limit of the mirror during the watch, beyond those before it."""
+
+    outcome: Outcome
+
+
+def published(swap: Swap, moments: Sequence[Moment], until_s: float) -> Publication:
+    """Judge one swap by the moments around it; the watch ends at ``until_s`` at the latest.
+
+    That is the next swap, the next jump of the mirror or the end of the night: what comes after is
+    not the matrix's doing.
+    """
+    end_s = min(swap.time_s + WATCHED_S, until_s)
+    before = [m for m in moments if swap.time_s - 1.0 < m.time_s <= swap.time_s]
+    after = [m for m in moments if swap.time_s < m.time_s <= end_s]
+    late = [m for m in after if m.time_s > end_s - 1.0]
+    before_nm, after_nm = _rms_nm(before), _rms_nm(late)
+    n_clipped = sum(m.n_clipped for m in after) if not any(m.n_clipped for m in before) else 0
+    quiet_nm = min((m.wavefront_nm for m in moments if m.time_s > 1.0), default=np.nan)
+    grown = after_nm > GROWTH * max(before_nm, quiet_nm)
+    outcome = Outcome.HELD
+    if grown or n_clipped or (swap.radius or 0.0) >= 1.0:
+        outcome = Outcome.DIVERGED
+    elif end_s - swap.time_s < LEAST_S:
+        outcome = Outcome.UNTESTED
+    return Publication(
+        swap=swap,
+        before_nm=before_nm,
+        after_nm=after_nm,
+        n_clipped=n_clipped,
+        outcome=outcome,
+    )
+
+
+def true_radius(
+    reconstructor: NDArray[np.float32], optics: Optics, settings: LoopSettings
+) -> float:
+    """Return the largest pole radius of the loop of these optics, its gains and this matrix."""
+    n_modes = len(reconstructor)
+    coupling = reconstructor @ true_response(optics, n_modes)
+    gains = np.array(settings.gains[:n_modes], np.float32)
+    eigenvalues = np.linalg.eigvals(gains[:, None] * coupling)
+    radii = pole_radius(eigenvalues, leak=settings.leak, delay_frames=settings.delay_frames)
+    return float(radii.max())
+
+
+def true_response(optics: Optics, n_modes: int) -> NDArray[np.float32]:
+    """Return the true interaction matrix ``(n_slopes, n_modes)``: known, or pushed and pulled."""
+    if isinstance(optics, LinearOptics):
+        return optics.slopes_per_command[:, :n_modes]
+    if not isinstance(optics, DiffractiveOptics):
+        raise TypeError(f"poles: found {type(optics).__name__}; expected a simulated telescope")
+    rng = np.random.default_rng(0)
+    columns = []
+    for mode in range(n_modes):
+        stroke = np.float32(STROKE_M) * optics.opd_per_command[:, mode]
+        push, pull = (optics.slopes(sign * stroke, None, rng) for sign in (1.0, -1.0))
+        columns.append((push - pull) / np.float32(2.0 * STROKE_M))
+    return np.column_stack(columns)
+
+
+def _rms_nm(moments: Sequence[Moment]) -> float:
+    if not moments:
+        return float("nan")
+    return float(np.sqrt(np.mean([m.wavefront_nm**2 for m in moments])))
+
 
 _Job = tuple[float, Callable[[], None]]
 """How long the worker is at something, seconds, and what it has done then."""
@@ -182,7 +709,7 @@ class Observatory:
             self._acknowledged()
             self._look()
 
-    def command(self, command: Command) -> None:
+    def command(self, command: commands.Command) -> None:
         """Do what an operator would: raises what the tracker refuses."""
         self._post(command)
 
@@ -480,3 +1007,133 @@ class Observatory:
 
 def _nothing() -> None:
     pass
+
+
+DOWN_S = 3.0
+"""From the end of a service until the next one listens."""
+
+
+class KeptNight(Observatory):
+    """With a ``folder`` the service can be killed and begun again."""
+
+    def __init__(
+        self,
+        policy: Policy,
+        mode: Mode,
+        bench: OpticsWorker,
+        folder: Path | None,
+        *,
+        latencies: Latencies,
+        dome: Dome,
+        link: Callable[[Any], ShortLink],
+    ) -> None:
+        self._policy, self._mode, self._folder = policy, mode, folder
+        self._archive = None if folder is None else _opened(folder)
+        self._saved: TrackerState | None = None
+        self._saved_s = 0.0
+        super().__init__(
+            (),
+            policy,
+            mode,
+            bench,
+            latencies=latencies,
+            with_poles=False,
+            dome=dome,
+            link=link,
+            archive=self._archive,
+        )
+
+    def kill(self) -> None:
+        """End the service as ``kill -9`` does; another takes up what is on the disk.
+
+        What was on its way to the RTC arrives; telescope and RTC go on.
+
+        Raises
+        ------
+        ValueError
+            If the night has no folder to begin again from.
+        """
+        if self._archive is None or self._folder is None:
+            raise ValueError("kill: found a night without a folder; expected one that has")
+        self._arrive()
+        self._agenda.clear()
+        self._idle_worker()
+        self._archive.close()
+        begun_s = self.time_s + DOWN_S
+        while self.time_s < begun_s:
+            self.dome.play()
+            for _ in self._link.swapped():
+                self._note_swap()
+        self._archive = self._shelf = _opened(self._folder)
+        self._actions = self._new_actions()
+        state = TrackerState(
+            system=self.state.system,
+            operator=OperatorState(mode=self._mode),
+            matrices=MatrixStates(reconstructors=restored(self._archive.reconstructors.records())),
+        )
+        self._engine.state = restore_tracking(self._archive, state, self._policy, self.now_ns())
+        self._engine.begin_anew()
+        self._begin()
+
+    def close(self) -> None:
+        """Close the archive."""
+        if self._archive is not None:
+            self._archive.close()
+
+    @override
+    def stepped(self, before: TrackerState, event: Event) -> None:
+        """Keep what the tracker heard, and write what the service would."""
+        super().stepped(before, event)
+        after = self.state
+        if (
+            self._archive is not None
+            and after.matrices.reconstructors is not before.matrices.reconstructors
+        ):
+            old = {record.id: record for record in before.matrices.reconstructors}
+            news = tuple(r for r in after.matrices.reconstructors if old.get(r.id) is not r)
+            self._archive.record(news, (), ())
+
+    def save(self) -> None:
+        """Write what the next service needs as seldom as the service does."""
+        archive, state = self._archive, self.state
+        before, due = self._saved, self.time_s >= self._saved_s + SAVE_INTERVAL_S
+        if archive is None:
+            return
+        if before is None or ((due or is_urgent(before, state)) and is_unsaved(before, state)):
+            leave(archive, state, self.now_ns())
+            self._saved, self._saved_s = state, self.time_s
+
+
+def _opened(folder: Path) -> Archive:
+    archive = Archive(folder)
+    archive.open()
+    return archive
+
+
+SMALL = "tests/system/small.toml"
+
+N_TARGET = 60
+"""Modes that its matrices are to control in the end."""
+
+SETTINGS: Mapping[str, object] = {
+    "dither.budget_m": 40e-9,
+    "dither.amplitude_m": 20e-9,
+    "dither.window_s": 1.0,
+    "dither.longest_window_s": 1.0,
+    "control.n_modes_target": N_TARGET,
+    "tracking.floor_rotation_deg": 0.04,
+    "tracking.floor_magnification": 0.0007,
+}
+"""Of the service: few modes must tell as much as many."""
+
+
+def latencies_of(slower: float = 1.0) -> Latencies:
+    """Return how long things take with a worker that takes so many times longer."""
+    return Latencies(fit_s=0.5 * slower, make_s=2.0 * slower, judge_s=slower, watch_s=0.5 * slower)
+
+
+@cache
+def bench_of(instrument: str, sampling: int | None = None) -> OpticsWorker:
+    """Return the worker of an instrument, one per process; ``sampling`` None: the usual one."""
+    points = Sampling() if sampling is None else Sampling(sampling, sampling)
+    return OpticsWorker(load_instrument(instrument), Compute(threads=1, sampling=points))

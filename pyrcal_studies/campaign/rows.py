@@ -30,10 +30,11 @@ UNITS = np.array([100.0, 100.0, 1000.0, 100.0])
 
 
 class RowFile:
-    """Rows in a file, one JSON object a line; it is made if it is not there."""
+    """Rows in a file, one JSON object a line; file and folder are made if they are not there."""
 
     def __init__(self, path: Path) -> None:
-        path.touch()  # a folder that is not there is said before anything is played
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()  # a path that cannot be written is refused before anything is played
         self._path = path
         self.rows: list[Row] = [json.loads(line) for line in path.read_text().splitlines()]
         """All there are, those of earlier runs first."""

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from pyrcal.rtc.identity import Reconstructor
-from pyrcal_studies.campaign.observatory_dome import Dome
-from pyrcal_studies.campaign.observatory_link import ShortLink
+from pyrcal_studies.campaign.observatory import Dome, ShortLink
 from service.estimation.frames import FrameBlock
 from service.model.pupil import valid_subapertures
 from service.wire import (

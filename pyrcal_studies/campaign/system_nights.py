@@ -11,34 +11,414 @@ import itertools
 import json
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from enum import StrEnum
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pyrcal_studies.campaign.observatory import Observatory
-from pyrcal_studies.campaign.observatory_dome import replayed
+from pyrcal_studies.campaign.observatory import (
+    START_NS,
+    Moment,
+    Observatory,
+    Outcome,
+    Publication,
+    replayed,
+)
 from pyrcal_studies.campaign.rows import (
+    UNITS,
     Row,
     RowFile,
     add_workers,
     floats,
+    four,
+    heading,
+    line,
     played,
     range_of,
     tell,
     words,
 )
-from pyrcal_studies.campaign.system_cases import Case, Plan
-from pyrcal_studies.campaign.system_measures import recovery_of, row_of, wavefront_rms_nm
-from pyrcal_studies.campaign.system_table import table
 from service.config import load_settings
 from service.instrument import load_instrument
+from service.model.misregistration import BOUNDARY_SCALE
 from service.program import status_of
 from service.runtime.policy import policy_of
 from service.runtime.worker import Compute, OpticsWorker, Sampling
+from service.tracking import alarms
+from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import DitherRequest
+
+LATER_S = 10.0
+"""A jump comes up to so much later, at random: in a window, or in the pause between two."""
+
+SWING_S = 2.0
+"""Of seeing that takes the optical gain with it: from one extreme to the other."""
+
+
+class Case(StrEnum):
+    """What the night is about."""
+
+    DRIFT = "drift"
+    """5 % of a subaperture and 0.05 deg a minute, all the time."""
+
+    JUMP = "jump"
+    """10 % of a subaperture, then 0.1 deg, at once."""
+
+    JUMP_ROTATION = "jump-rotation"
+    """0.1 deg at once, then 10 % of a subaperture."""
+
+    BUSY = "busy"
+    """Both of them together."""
+
+    BUDGET = "budget"
+    """Nothing: what does the dither cost? Played again without it."""
+
+    SEEING = "seeing"
+    """Seeing that grows from 0.8 to 1.3 arcsec and falls again, within minutes."""
+
+    GAIN = "gain"
+    """Seeing that swings by 15 % every two seconds, and the optical gain with it."""
+
+    LOST = "lost"
+    """A jump of 0.3 subapertures and 1 deg, which no loop of many modes survives."""
+
+    RESTART = "restart"
+    """The RTC begins again with the matrix of the start, in the middle of a drift."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """One night; two that are equal give the same row."""
+
+    case: Case
+    plant: str = "linear"
+    truth: str = "ideal"
+    """The simulator's set of imperfections."""
+
+    magnitude: float = 10.0
+    seed: int = 0
+    gain: float = 0.6
+    n_controlled: int = 400
+    seconds: float = 90.0
+    period_s: float = 30.0
+    """Between two things that happen; the first comes after it, when all should have settled."""
+
+    instrument: str = "flao-lbt"
+    settings: tuple[str, ...] = ()
+    """Of the service, ``dither.window_s=5``, where they are not the defaults."""
+
+    @property
+    def jump_times_s(self) -> tuple[float, ...]:
+        """When the mirror jumps."""
+        if self.case is Case.LOST:
+            return (self.period_s,)
+        if self.case not in {Case.JUMP, Case.JUMP_ROTATION, Case.BUSY}:
+            return ()
+        due_s = np.arange(self.period_s, self.seconds - LATER_S - self.period_s / 2, self.period_s)
+        later_s = np.random.default_rng((11, self.seed)).uniform(0.0, LATER_S, len(due_s))
+        return tuple(np.round(due_s + later_s, 2).tolist())
+
+    @property
+    def restart_s(self) -> float | None:
+        """When the RTC begins again."""
+        return self.period_s if self.case is Case.RESTART else None
+
+    @property
+    def words(self) -> list[str]:
+        """The simulator's command line."""
+        options = {
+            "instrument": self.instrument,
+            "plant": self.plant,
+            "imperfections": self.truth,
+            "mag": self.magnitude,
+            "seed": self.seed,
+            "gain": self.gain,
+            "n-controlled": self.n_controlled,
+            "wind": f"12,{37 + 61 * self.seed % 360}",
+        }
+        return [f"--{name}={value}" for name, value in options.items()] + self._motion()
+
+    def _motion(self) -> list[str]:
+        angle = np.random.default_rng((7, self.seed)).uniform(0.0, 2.0 * np.pi)
+        x, y, turn = np.cos(angle), np.sin(angle), -1.0 if self.seed % 2 else 1.0
+        drift = f"--drift={0.05 * x:.4f},{0.05 * y:.4f},{0.05 * turn},0"
+        steps = (f"{0.1 * x:.4f},{0.1 * y:.4f},0,0", f"0,0,{0.1 * turn},0")
+        first = int(self.case is Case.JUMP_ROTATION)
+        jumps = [
+            f"--jump={time_s}:{steps[k % 2]}" for k, time_s in enumerate(self.jump_times_s, first)
+        ]
+        match self.case:
+            case Case.DRIFT | Case.RESTART:
+                return [drift]
+            case Case.JUMP | Case.JUMP_ROTATION:
+                return jumps
+            case Case.LOST:
+                return [f"--jump={self.period_s}:0.3,0,1,0"]
+            case Case.BUSY:
+                return [drift, *jumps]
+            case Case.SEEING:
+                third = self.seconds / 3.0
+                return ["--seeing=0.8", f"--seeing-at={third}:1.3", f"--seeing-at={2 * third}:0.9"]
+            case Case.GAIN:
+                times = np.arange(SWING_S, self.seconds, SWING_S)
+                return [f"--seeing-at={t}:{0.85 if k % 2 else 1.15}" for k, t in enumerate(times)]
+            case Case.BUDGET:
+                return []
+
+
+GOOD = np.array([0.02, 0.02, 0.02, 0.001])
+"""An α this near the truth is a good one: two floors of the shift (boundary units)."""
+
+CORRECTED = np.array([0.03, 0.03, 0.03, 0.002])
+"""A matrix made for an α this near the truth corrects a jump: a third of what is to be flagged."""
+
+STEADY_S = 10.0
+"""After the first own matrix: the loop has settled and α has been confirmed."""
+
+AFTER_JUMP_S = 15.0
+"""What has been corrected so long after a jump is tracking again; before, it is not judged so."""
+
+FLAGS = ("registration.jump-suspected", "registration.jump", "registration.passive-jump")
+"""Log entries that say that the mirror has jumped, or may have."""
+
+Array = NDArray[np.float64]
+
+
+def row_of(night: Observatory, jump_times_s: tuple[float, ...]) -> Row:
+    """Return the row; errors in boundary units (subapertures, degrees, ratio)."""
+    publications = night.publications()
+    own_s = min((p.swap.time_s for p in publications if _own(p)), default=None)
+    good_s = first_good_s(night)
+    begin_s = STEADY_S + max(own_s or 0.0, good_s or 0.0)
+    steady = [m for m in night.dome.moments if m.time_s >= begin_s]
+    errors, sigma = tracking_errors(night, begin_s, jump_times_s)
+    return {
+        "good_alpha_s": good_s,
+        "own_matrix_s": own_s,
+        "modes_reached": night.dome.moments[-1].n_controlled,
+        "steady_from_s": begin_s,
+        "tracking_rms": _rms(errors),
+        "tracking_sigma": _rms(sigma),
+        "tracking_inside_2_sigma": np.mean(np.abs(errors) <= 2.0 * sigma, axis=0).tolist()
+        if len(errors)
+        else None,
+        "jumps": [jump_row(night, publications, t) for t in jump_times_s],
+        "wavefront_nm": wavefront_rms_nm(steady),
+        "dither_nm": float(np.sqrt(np.mean([m.dither_nm**2 for m in steady]))) if steady else None,
+        "windows": [night.state.windows.accepted, night.state.windows.refused],
+        "published": [publication_row(p) for p in publications],
+        "refused": sum(r.state is MatrixState.REFUSED for r in night.state.matrices.reconstructors),
+        "unstable": sum(p.outcome is Outcome.DIVERGED for p in publications),
+        "log": [
+            (round((e.t_ns_utc - START_NS) * 1e-9, 2), e.level.value, e.name, e.text)
+            for e in night.state.log
+        ],
+    }
+
+
+def recovery_of(night: Observatory, jump_s: float) -> Row:
+    """Return when a loop that a jump lost was opened and back on all modes, after the jump."""
+    moments = night.dome.moments
+    before = [m for m in moments if jump_s - 3.0 < m.time_s < jump_s]
+    opened_s = next((m.time_s for m in moments if m.time_s > jump_s and not m.closed), None)
+    back_s = None
+    if opened_s is not None and before:
+        n_modes = before[-1].n_controlled
+        later = (m for m in moments if m.time_s > opened_s)
+        back_s = next((m.time_s for m in later if m.closed and m.n_controlled >= n_modes), None)
+    lost_s = (g.time_s for g in night.glances if g.time_s > jump_s and alarms.LOST in g.alarms)
+    return {
+        "lost_after_s": _after(next(lost_s, None), jump_s),
+        "opened_after_s": _after(opened_s, jump_s),
+        "all_modes_after_s": _after(back_s, jump_s),
+        "before_nm": wavefront_rms_nm(before),
+        "after_nm": None
+        if back_s is None
+        else wavefront_rms_nm([m for m in moments if m.time_s > back_s + 1.0]),
+    }
+
+
+def _after(time_s: float | None, jump_s: float) -> float | None:
+    return None if time_s is None else round(time_s - jump_s, 2)
+
+
+def first_good_s(night: Observatory) -> float | None:
+    """Return when α was first within ``GOOD`` of the truth."""
+    for moment, glance in zip(night.dome.moments, night.glances, strict=True):
+        if glance.alpha is not None:
+            error = (glance.alpha - moment.alpha.vector) * BOUNDARY_SCALE
+            if np.all(np.abs(error) <= GOOD):
+                return glance.time_s
+    return None
+
+
+def tracking_errors(
+    night: Observatory, begin_s: float, jump_times_s: tuple[float, ...] = ()
+) -> tuple[Array, Array]:
+    """Return ``(n, 4)`` errors of what the service held to be true, and their 1 σ, block by block.
+
+    Against where the mirror is at that moment: the age of the estimate is part of the error. What
+    comes within ``AFTER_JUMP_S`` of a jump is left out.
+    """
+    found = [
+        (glance.alpha - moment.alpha.vector, glance.sigma)
+        for moment, glance in zip(night.dome.moments, night.glances, strict=True)
+        if glance.alpha is not None
+        and glance.time_s >= begin_s
+        and not any(0.0 <= glance.time_s - t < AFTER_JUMP_S for t in jump_times_s)
+    ]
+    errors, sigma = (np.array([pair[k] for pair in found]).reshape(-1, 4) for k in range(2))
+    return errors * BOUNDARY_SCALE, sigma * BOUNDARY_SCALE
+
+
+def jump_row(night: Observatory, publications: list[Publication], time_s: float) -> Row:
+    """Return how long after a jump it was flagged, and a corrected matrix applied, seconds."""
+    flags = (
+        (entry.t_ns_utc - START_NS) * 1e-9 - time_s
+        for entry in night.state.log
+        if entry.name in FLAGS
+    )
+    corrected = (
+        p.swap.time_s - time_s for p in publications if p.swap.time_s > time_s and _corrects(p)
+    )
+    return {
+        "at_s": time_s,
+        "flagged_s": min((t for t in flags if t > 0.0), default=None),
+        "corrected_s": min(corrected, default=None),
+    }
+
+
+def publication_row(publication: Publication) -> Row:
+    """Return one published matrix as JSON can hold it."""
+    swap = publication.swap
+    return {
+        "id": swap.id,
+        "at_s": swap.time_s,
+        "n_modes": swap.n_modes,
+        "gate_radius": None if swap.gate is None else swap.gate.worst_pole_radius,
+        "true_radius": swap.radius,
+        "before_nm": publication.before_nm,
+        "after_nm": publication.after_nm,
+        "outcome": publication.outcome.value,
+    }
+
+
+def wavefront_rms_nm(moments: list[Moment]) -> float | None:
+    """Return the RMS over these moments, or None where there is none."""
+    if not moments:
+        return None
+    return float(np.sqrt(np.mean([m.wavefront_nm**2 for m in moments])))
+
+
+def _own(publication: Publication) -> bool:
+    return publication.swap.made_for is not None
+
+
+def _corrects(publication: Publication) -> bool:
+    made_for = publication.swap.made_for
+    if made_for is None:
+        return False
+    error = (made_for.vector - publication.swap.alpha.vector) * BOUNDARY_SCALE
+    return bool(np.all(np.abs(error) <= CORRECTED))
+
+
+def _rms(errors: Array) -> list[float] | None:
+    return np.sqrt(np.mean(errors**2, axis=0)).tolist() if len(errors) else None
+
+
+GROUPED_BY = (
+    "case", "plant", "truth", "magnitude", "gain", "n_controlled", "seconds", "period_s",
+    "instrument", "settings",
+)  # fmt: skip
+"""Nights that differ in nothing but the seed make one line."""
+
+HEADER = heading(
+    *("nights", "good α after s", "own matrix after s", "tracking RMS x, y % / mdeg / %"),
+    *("flagged after s", "corrected after s", "wavefront nm", "dither nm", "cost nm"),
+    *("windows (refused)", "published", "refused by the gate", "unstable"),
+)
+
+
+def table(rows: list[Row]) -> str:
+    """Return the nights as a Markdown table, the worst of each group in brackets."""
+    groups: dict[str, list[Row]] = defaultdict(list)
+    for row in rows:
+        groups[str([row[name] for name in GROUPED_BY])].append(row)
+    return HEADER + "".join(line_of(_name(group[0]), group) for group in groups.values())
+
+
+def line_of(name: str, rows: list[Row]) -> str:
+    """Return the line of a group of nights."""
+    jumps = [jump for row in rows for jump in row["jumps"]]
+    return line(
+        f"{len(rows)} x {name}",
+        _worst([row["good_alpha_s"] for row in rows]),
+        _worst([row["own_matrix_s"] for row in rows]),
+        _tracking(rows),
+        _worst([jump["flagged_s"] for jump in jumps]),
+        _worst([jump["corrected_s"] for jump in jumps]),
+        _mean([row["wavefront_nm"] for row in rows], ".1f"),
+        _mean([row["dither_nm"] for row in rows], ".2f"),
+        _cost(rows),
+        f"{sum(sum(row['windows']) for row in rows)} ({sum(row['windows'][1] for row in rows)})",
+        sum(len(row["published"]) for row in rows),
+        sum(row["refused"] for row in rows),
+        sum(row["unstable"] for row in rows),
+    )
+
+
+def _name(row: Row) -> str:
+    words = [
+        f"**{row['case']}**, {row['plant']} {row['truth']}, mag {row['magnitude']:g}",
+        f"{row['n_controlled']} modes g {row['gain']:g}",
+        f"{row['seconds']:g} s",
+        *row["settings"],
+    ]
+    if row["instrument"] != "flao-lbt":
+        words.append("another instrument")
+    return ", ".join(words)
+
+
+def _tracking(rows: list[Row]) -> str:
+    """Return the RMS over all nights."""
+    found = [row["tracking_rms"] for row in rows if row["tracking_rms"] is not None]
+    if not found:
+        return "-"
+    return four(np.sqrt(np.mean(np.square(found), axis=0)) * UNITS)
+
+
+def _worst(values: list[Any]) -> str:
+    """Return mean and worst; what never came is counted."""
+    came = [value for value in values if value is not None]
+    if not values:
+        return "-"
+    never = f", {len(values) - len(came)} never" if len(came) < len(values) else ""
+    if not came:
+        return f"never ({len(values)})"
+    return f"{np.mean(came):.1f} ({max(came):.1f}{never})"
+
+
+def _mean(values: list[Any], form: str) -> str:
+    found = [value for value in values if value is not None]
+    return format(float(np.mean(found)), form) if found else "-"
+
+
+def _cost(rows: list[Row]) -> str:
+    """Return the plain difference of wavefront errors with and without dither, nm."""
+    found = [
+        row["wavefront_nm"] - row["twin_nm"]
+        for row in rows
+        if row.get("twin_nm") is not None and row["wavefront_nm"] is not None
+    ]
+    return f"{np.mean(found):.3f} ({max(found):.3f})" if found else "-"
+
 
 GAINS = {"linear": 0.4, "diffractive": 0.6}
 """Integrator gains that make about the same loop: the pyramid's optical gain lowers the second."""

@@ -7,9 +7,8 @@ import sys
 from pathlib import Path
 
 from pyrcal_studies.heritier2018 import figures, page
-from pyrcal_studies.heritier2018.crew import carry_out, processor_minutes
 from pyrcal_studies.heritier2018.plan import FULL, QUICK, every_task
-from pyrcal_studies.heritier2018.store import Store
+from pyrcal_studies.heritier2018.store import Store, carry_out, processor_minutes
 
 PAGES = Path(__file__).parents[2] / "docs" / "results"
 

@@ -14,11 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal_studies.heritier2018 import paper, plan, results, telescope
-from pyrcal_studies.heritier2018.loops import wavefront_error_nm
+from pyrcal_studies.heritier2018.loops import FIELD, OVERSAMPLING, strehl, wavefront_error_nm
 from pyrcal_studies.heritier2018.plan import Budget, Variant
-from pyrcal_studies.heritier2018.psf import FIELD, OVERSAMPLING, strehl
 from pyrcal_studies.heritier2018.registration import fitted_alpha
-from pyrcal_studies.heritier2018.spectra import smoothed
 from pyrcal_studies.heritier2018.store import Store
 
 if TYPE_CHECKING:
@@ -26,6 +24,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
+
+_WIDTH = 9
+_EXACT = 10
+"""First modes, shown as they are."""
+
+
+def smoothed(variance_nm2: Array) -> tuple[NDArray[np.intp], Array]:
+    """Return mode numbers from 1 and variances: as they are, then a running mean over 9 modes."""
+    mean = np.convolve(variance_nm2, np.full(_WIDTH, 1 / _WIDTH), mode="same")
+    high = len(variance_nm2) - _WIDTH // 2
+    values = np.concatenate([variance_nm2[:_EXACT], mean[_EXACT:high]])
+    return np.arange(1, high + 1), values
+
 
 MAX_BYTES = 95_000
 _DPI = 85

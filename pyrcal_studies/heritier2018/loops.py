@@ -1,28 +1,88 @@
-"""Closed loops of the diffractive telescope, and what they leave of the wavefront."""
+"""Closed loops of the diffractive telescope: wavefront error, long exposures, gains, poles.
+
+The poles come from the model alone. With D(α) the plant and R the inverse of D(0) they are those of
+the eigenvalues of g R D(α): at which misregistration the loop becomes unstable with a gain g.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import fft2, fftshift, next_fast_len
 from scipy.linalg import cholesky, solve_triangular
 
 from pyrcal_studies.heritier2018 import telescope
 from pyrcal_studies.heritier2018.calibration import FRAME_COST_S
-from pyrcal_studies.heritier2018.closing import OVERHEAD_S, ClosedLoop, GainTuning
-from pyrcal_studies.heritier2018.psf import Camera
 from pyrcal_studies.heritier2018.reconstructors import Inverse
 from pyrcal_studies.heritier2018.registration import Found, resolved
 from pyrcal_studies.heritier2018.store import Record, Store, Task
 from pyrcal_studies.heritier2018.telescope import Occasion
+from service.control.loop import pole_radius
+from service.control.reconstructor import invert
+from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
-from sim_rtc.computer.feed import BATCH_FRAMES
-from sim_rtc.computer.gains import by_group
-from sim_rtc.telescope.diffractive import DiffractiveOptics
+from service.wire import RampRequest
+from sim_rtc.computer.feed import BATCH_FRAMES, PhaseBlock
+from sim_rtc.computer.gains import GROUP_ENDS, GainRamp, by_group
+from sim_rtc.computer.loop import LoopBlock, LoopTerms, ModalLoop
+from sim_rtc.telescope.diffractive import DiffractiveOptics, DiffractivePlant
 
 Array = NDArray[np.float64]
+
+H_BAND_M = 1.65e-6
+OVERSAMPLING = 4
+"""Samples per λ/D."""
+
+FIELD = 128
+"""Samples across the part that is kept: 32 λ/D."""
+
+
+class Camera:
+    """A perfect camera behind the telescope's pupil."""
+
+    def __init__(self, plant: DiffractivePlant) -> None:
+        place = np.round((plant.points_m - plant.points_m.min(axis=0)) / plant.pitch_m)
+        self._column, self._row = place.astype(np.intp).T
+        # a grey cell of the pupil has the amplitude of its area
+        self._amplitude = plant.weights / plant.weights.sum()
+        across = int(max(self._row.max(), self._column.max())) + 1
+        self._size = next_fast_len(OVERSAMPLING * across)
+        self._peak = float(self._exposure(np.zeros(len(self._row))).max())
+
+    def image(self, residuals_m: NDArray[Any]) -> Array:
+        """Return the long exposure ``(FIELD, FIELD)`` over these wavefronts, perfect peak 1.
+
+        ``residuals_m`` is ``(n_snapshots, n_points)``; tilt is left in.
+        """
+        total = np.zeros((FIELD, FIELD))
+        for residual in residuals_m:
+            total += self._exposure(residual)
+        return total / (len(residuals_m) * self._peak)
+
+    def _exposure(self, opd_m: NDArray[Any]) -> Array:
+        field = np.zeros((self._size, self._size), dtype=np.complex128)
+        phase = 2 * np.pi / H_BAND_M * opd_m
+        field[self._row, self._column] = self._amplitude * np.exp(1j * phase)
+        power = np.abs(fftshift(fft2(field))) ** 2
+        first = self._size // 2 - FIELD // 2
+        return np.asarray(power[first : first + FIELD, first : first + FIELD])
+
+
+def strehl(image: NDArray[Any]) -> float:
+    """Return the peak of a long exposure whose perfect peak is 1."""
+    return float(image.max())
+
+
+def marechal(wavefront_error_nm: float) -> float:
+    """Return the Strehl ratio that goes with a wavefront error, by Maréchal's approximation."""
+    return float(np.exp(-((2e-9 * np.pi / H_BAND_M * wavefront_error_nm) ** 2)))
+
+
 Array32 = NDArray[np.float32]
 
 N_PARTS = 3
@@ -190,3 +250,193 @@ def wavefront_error_nm(record: Record, *, without_first: int = 0, over: Over = O
             shown = record["mirror_nm2"][without_first : int(record["n_controlled"])]
             variance = float(shown.sum())
     return float(np.sqrt(max(variance, 0.0)))
+
+
+DELAY_FRAMES = 2
+LEAK = 0.999
+STROKE_M = 10e-6
+"""Largest command of a mode: a loop that diverges stays finite."""
+
+RAMP_GAINS = (0.4, 0.6, 0.8, 1.0)
+"""Tried in this order on every group."""
+
+RAMP_START = 0.4
+"""Of groups whose turn has not come."""
+
+OVERHEAD_S = 2.5
+
+
+class ClosedLoop:
+    """The loop of an occasion, from rest, on the turbulence that all its loops share."""
+
+    def __init__(
+        self,
+        occasion: Occasion,
+        alpha: Misregistration,
+        matrix: Array32,
+        n_frames: int,
+        *,
+        played_modes: int | None = None,
+    ) -> None:
+        """Take the truth, and how many modes the played turbulence has (None: all there are)."""
+        self.optics = telescope.optics(occasion, alpha)
+        phases, played = telescope.incoming(occasion, n_frames)
+        if played is not None and played_modes is not None:
+            played = played.copy()
+            played[:, played_modes:] = 0.0
+        self.block = PhaseBlock(
+            first_frame=0,
+            optics=self.optics,
+            phases_m=phases,
+            played_m=played,
+            detector=telescope.pixels(occasion, self.optics),
+            rng=telescope.photons(occasion),
+        )
+        self.matrix = matrix
+        self._loop = ModalLoop(
+            n_modes=self.optics.opd_per_command.shape[1],
+            delay_frames=DELAY_FRAMES,
+            stroke_m=STROKE_M,
+        )
+
+    def batch(self, row: int, gains: NDArray[np.floating]) -> LoopBlock:
+        """Run the batch of frames that begins at ``row`` with these gains, ``(n_controlled,)``."""
+        terms = LoopTerms.of(self.optics, self.matrix, gains.astype(np.float32), LEAK)
+        return self.block.run(row, self._loop, terms, None)
+
+    def residual_m(self, row: int, result: LoopBlock) -> Array32:
+        """Return the OPD ``(n_points,)`` left in the first frame of that batch."""
+        return self.block.phase_at(row) + self.optics.mirror_opd_m(result.commands_m[0])
+
+    def incoming_m(self, first: int) -> Array32:
+        """Return each batch's first OPD before any correction, ``(n, n_points)``, from a row on."""
+        coming = self.block.phases_m[first::BATCH_FRAMES]
+        if self.block.played_m is None:
+            return coming
+        played = self.block.played_m[first::BATCH_FRAMES]
+        return np.asarray(coming + played @ self.optics.opd_per_command.T)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GainTuning:
+    """The paper's gain ramp: tip and tilt, modes to 100, the rest, each by its residual slopes."""
+
+    occasion: Occasion
+    alpha: Misregistration
+    """The truth."""
+
+    reconstructor: Inverse
+    frames_per_gain: int
+    """Half of them settle."""
+
+    @property
+    def label(self) -> str:
+        """What the progress bar shows."""
+        return f"gain ramp, {self.reconstructor.label}"
+
+    @property
+    def cost_s(self) -> float:
+        """Rough time on one idle core, seconds."""
+        return self.n_frames * FRAME_COST_S + OVERHEAD_S
+
+    @property
+    def needs(self) -> tuple[Task, ...]:
+        """The reconstructor."""
+        return (self.reconstructor,)
+
+    @property
+    def n_frames(self) -> int:
+        """Frames it takes at most."""
+        return self.frames_per_gain * len(RAMP_GAINS) * (len(GROUP_ENDS) + 1)
+
+    def compute(self, store: Store) -> Record:
+        """Return ``gains`` one per mode, and what was tried: ``group``, ``gain``, ``residual_nm``.
+
+        ``by_group`` has the gain of each group.
+        """
+        matrix = store.read(self.reconstructor)["matrix"]
+        ramp = GainRamp(
+            (RAMP_START,) * len(matrix), self.request(len(matrix)), frame_rate_hz=1000.0
+        )
+        closed = ClosedLoop(self.occasion, self.alpha, matrix, self.n_frames)
+        for row in range(0, self.n_frames, BATCH_FRAMES):
+            if ramp.done:
+                break
+            modes = ramp.modes
+            result = closed.batch(row, np.array(ramp.gains))
+            ramp.take(result.slopes @ matrix[modes].T)
+        return {
+            "gains": np.array(ramp.gains),
+            "by_group": np.array(ramp.gains_by_group),
+            "group": np.array([step.group for step in ramp.steps]),
+            "gain": np.array([step.gain for step in ramp.steps]),
+            "residual_nm": np.array([step.residual_m * 1e9 for step in ramp.steps]),
+        }
+
+    def request(self, n_modes: int) -> RampRequest:
+        """Return what would be asked of an RTC."""
+        starts = (0, *(end for end in GROUP_ENDS if end < n_modes))
+        return RampRequest(
+            id="paper",
+            groups=tuple((first, after - 1) for first, after in pairwise((*starts, n_modes))),
+            gains=RAMP_GAINS,
+            frames_per_gain=self.frames_per_gain,
+        )
+
+
+_COST_S = 2.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoleSweep:
+    """Eigenvalues of R D(α) along a sweep."""
+
+    alphas: tuple[Misregistration, ...]
+    values: tuple[float, ...]
+    """Of the swept parameter, in the sweep's unit."""
+
+    n_modes: int
+
+    @property
+    def label(self) -> str:
+        """What the progress bar shows."""
+        return f"poles of {self.n_modes} modes"
+
+    @property
+    def cost_s(self) -> float:
+        """Rough time on one idle core, seconds."""
+        return _COST_S * len(self.alphas)
+
+    @property
+    def needs(self) -> tuple[Task, ...]:
+        """Nothing but the model."""
+        return ()
+
+    def compute(self, store: Store) -> Record:
+        """Return ``eigenvalues`` ``(n_values, n_modes)``, complex."""
+        basis = telescope.basis().subset(np.arange(self.n_modes))
+        model = InteractionModel(telescope.instrument(), basis)
+        nominal = model.interaction_matrix(Misregistration())
+        inverse = invert(np.asarray(nominal, dtype=np.float64), self.n_modes).matrix
+        found = [
+            np.linalg.eigvals(inverse @ np.asarray(model.interaction_matrix(alpha)))
+            for alpha in self.alphas
+        ]
+        return {"eigenvalues": np.array(found).astype(np.complex128)}
+
+
+def limit_of_stability(record: Record, values: tuple[float, ...], gain: float) -> float | None:
+    """Return the first value at which a pole leaves the unit circle; None if none does."""
+    radius = np.array([largest_pole(row, gain) for row in record["eigenvalues"]])
+    unstable = np.flatnonzero(radius > 1.0)
+    if not len(unstable) or unstable[0] == 0:
+        return None
+    k = int(unstable[0])
+    share = (1.0 - radius[k - 1]) / (radius[k] - radius[k - 1])
+    return float(values[k - 1] + share * (values[k] - values[k - 1]))
+
+
+def largest_pole(eigenvalues: NDArray[np.complex128], gain: float) -> float:
+    """Return the radius of the largest pole of the loop with these eigenvalues of R D."""
+    radius = pole_radius(gain * eigenvalues, leak=LEAK, delay_frames=float(DELAY_FRAMES))
+    return float(np.max(radius))

@@ -8,11 +8,9 @@ from enum import StrEnum
 import numpy as np
 
 from pyrcal_studies.heritier2018.calibration import Answer, Measurement
-from pyrcal_studies.heritier2018.closing import GainTuning
 from pyrcal_studies.heritier2018.illumination import Change, ChangedReconstructor, Feature
-from pyrcal_studies.heritier2018.loops import LoopRun
+from pyrcal_studies.heritier2018.loops import GainTuning, LoopRun, PoleSweep
 from pyrcal_studies.heritier2018.patterns import Pattern, PatternRun
-from pyrcal_studies.heritier2018.poles import PoleSweep
 from pyrcal_studies.heritier2018.reconstructors import (
     FittedReconstructor,
     Inverse,

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 
 from pyrcal_studies.heritier2018 import plan
 from pyrcal_studies.heritier2018.calibration import Answer, Measurement
-from pyrcal_studies.heritier2018.loops import Over, wavefront_error_nm
+from pyrcal_studies.heritier2018.loops import Over, limit_of_stability, strehl, wavefront_error_nm
 from pyrcal_studies.heritier2018.plan import Budget, Sweep, Variant
-from pyrcal_studies.heritier2018.poles import limit_of_stability
-from pyrcal_studies.heritier2018.psf import strehl
 from pyrcal_studies.heritier2018.reconstructors import synthetic_matrix
 from pyrcal_studies.heritier2018.registration import (
     CriterionMinimum,

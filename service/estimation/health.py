@@ -26,6 +26,7 @@ ones reaches 9 to 27 (docs/results/reliability.md).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Any
@@ -74,6 +75,23 @@ _CALMING_S = 0.05
 holds again shows it within a second, not after seven memories."""
 
 
+def count_part_frames(dt_s: float) -> int:
+    """Return the number of frames of a part."""
+    return max(round(PART_S / dt_s), MIN_PART_FRAMES)
+
+
+def cut_parts(n_frames: int, n_open: int, n_part: int) -> Iterator[tuple[slice, int]]:
+    """Yield the rows of a block that belong to each part, and how many frames the part then has.
+
+    ``n_open`` frames of the first part came with earlier blocks; the last one may be incomplete.
+    """
+    start = 0
+    while start < n_frames:
+        stop = min(start + max(n_part - n_open, 0), n_frames)
+        yield slice(start, stop), n_open + stop - start
+        start, n_open = stop, 0
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UpperPower:
     """Power of the commands in the upper half of the modes, now and in the seconds before."""
@@ -105,19 +123,12 @@ class UpperPower:
         state = self if n_modes == self.n_modes else UpperPower(n_modes=n_modes)
         if upper_m.shape[1] < MIN_UPPER_MODES:
             return state
-        n_part = max(round(PART_S / dt_s), MIN_PART_FRAMES)
-        powers, start = np.einsum("km,km->k", upper_m, upper_m), 0
-        while start < len(powers):
-            stop = start + n_part - state.n_open
-            some = powers[start:stop]
-            state = replace(
-                state,
-                open_m2=state.open_m2 + float(some.sum()),
-                n_open=state.n_open + len(some),
-            )
-            if state.n_open == n_part:
+        powers, n_part = np.einsum("km,km->k", upper_m, upper_m), count_part_frames(dt_s)
+        for rows, n_open in cut_parts(len(powers), state.n_open, n_part):
+            open_m2 = state.open_m2 + float(powers[rows].sum())
+            state = replace(state, open_m2=open_m2, n_open=n_open)
+            if n_open >= n_part:
                 state = state.close_part(n_part * dt_s)
-            start = stop
         return state
 
     def close_part(self, part_s: float) -> UpperPower:
@@ -468,20 +479,19 @@ def observe_played(
     """Return the state after one more block of a loop closed by ``(n_modes, n_slopes)``."""
     if block.cm_id != state.cm_id:
         state = replace(state, cm_id=block.cm_id, slopes=None, commands_m=(), n_frames=0)
-    start, n_part = 0, max(round(PART_S * 1e9 / block.dt_ns), MIN_PART_FRAMES)
-    while start < block.n_frames:
-        stop = min(start + n_part - state.n_frames, block.n_frames)
-        rows = slice(start, stop, _PLAYED_STRIDE_FRAMES)
+    dt_s = block.dt_ns * 1e-9
+    n_part = count_part_frames(dt_s)
+    for part, n_frames in cut_parts(block.n_frames, state.n_frames, n_part):
+        rows = slice(part.start, part.stop, _PLAYED_STRIDE_FRAMES)
         total = block.slopes[rows].sum(axis=0)
         state = replace(
             state,
             slopes=total if state.slopes is None else state.slopes + total,
             commands_m=(*state.commands_m, block.commands_m[rows, watch.modes]),
-            n_frames=state.n_frames + stop - start,
+            n_frames=n_frames,
         )
-        start = stop
-        if state.n_frames >= n_part:
-            state = _close_played(state, watch, reconstructor, n_part * block.dt_ns * 1e-9)
+        if n_frames >= n_part:
+            state = _close_played(state, watch, reconstructor, n_part * dt_s)
     return state
 
 

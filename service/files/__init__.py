@@ -33,7 +33,7 @@ _OTHERS = {
     b"MATLAB 5": ("a MATLAB file older than 7.3", "save it with -v7.3"),
     b"PK\x03\x04": (
         "a zip archive, as np.savez writes",
-        "save the matrix alone with np.save, or read it with pyrcal import npz",
+        "save the matrix alone with np.save, or read it with pyrcal import files",
     ),
     b"\x80": ("objects that Python pickled", "save the matrix alone with np.save"),
 }

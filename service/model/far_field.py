@@ -56,7 +56,7 @@ class PlateSum:
     coefficients: Array
     """``(n_actuators + 3, n_modes)`` weights of its functions."""
 
-    _tiles: dict[tuple[int, int], _Tile] = field(default_factory=dict)
+    tiles: dict[tuple[int, int], _Tile] = field(default_factory=dict)
     """Tiles computed so far, by their place on the grid; two threads may compute the same one."""
 
     def heights(self, points: Array) -> Array:
@@ -84,13 +84,10 @@ class PlateSum:
             out[some] = self._add_terms(tile, far, near)
         return out
 
-    def of_columns(self, combine: Callable[[Array], Array]) -> PlateSum:
-        """Return the sum of other modes, the columns that ``combine`` makes of these modes'."""
-        tiles = {
-            place: replace(tile, series=combine(tile.series))
-            for place, tile in list(self._tiles.items())
-        }
-        return replace(self, coefficients=combine(self.coefficients), _tiles=tiles)
+    def take_tiles(self, other: PlateSum, combine: Callable[[Array], Array]) -> None:
+        """Take over the tiles of modes of which these are the columns that ``combine`` makes."""
+        for place, tile in list(other.tiles.items()):
+            self.tiles[place] = replace(tile, series=combine(tile.series))
 
     def _add_terms(self, tile: _Tile, far: Array, near: Array) -> Array:
         """Return the sum of the terms of all far plates, and of near ones and the plane."""
@@ -104,9 +101,9 @@ class PlateSum:
         edges = np.flatnonzero(np.any(np.diff(places[order], axis=0), axis=1)) + 1
         for some in np.split(order, edges):
             for x, y in places[some[:1]].tolist():
-                if (x, y) not in self._tiles:
-                    self._tiles[x, y] = self._tile(TILE_SUBAP * complex(x + 0.5, y + 0.5))
-                yield self._tiles[x, y], some
+                if (x, y) not in self.tiles:
+                    self.tiles[x, y] = self._tile(TILE_SUBAP * complex(x + 0.5, y + 0.5))
+                yield self.tiles[x, y], some
 
     def _tile(self, middle: complex) -> _Tile:
         b = _complex(self.surface.positions) - middle

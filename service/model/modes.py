@@ -57,15 +57,15 @@ class ModalBasis:
     def render(self, points: Array) -> Array:
         """Return the modes ``(n_points, n_modes)`` at mirror ``points`` ``(n_points, 2)``."""
         at = points * [1.0, self.y_sign]
-        if self._plates is not None:
-            return self._plates.heights(at)
+        if self.plates is not None:
+            return self.plates.heights(at)
         return self.surface.basis(at) @ self.coefficients
 
     def render_slope(self, points: Array, direction: Array) -> Array:
         """Return the derivative of the modes along ``direction``, ``(n_points, n_modes)``."""
         side = np.array([1.0, self.y_sign])
-        if self._plates is not None:
-            return self._plates.slopes(points * side, direction * side)
+        if self.plates is not None:
+            return self.plates.slopes(points * side, direction * side)
         return self.surface.slope(points * side, direction * side) @ self.coefficients
 
     def render_wider(self, points: Array) -> Array:
@@ -78,7 +78,7 @@ class ModalBasis:
         return smooth_shapes(self.render, points)
 
     @cached_property
-    def _plates(self) -> PlateSum | None:
+    def plates(self) -> PlateSum | None:
         """The sum of its plates; None: it has none."""
         if isinstance(self.surface, Gaussian):
             return None
@@ -152,9 +152,8 @@ class ModalBasis:
             coefficients=combine(self.coefficients),
             variance_m2=variance_m2,
         )
-        plates = self.__dict__.get("_plates")
-        if plates is not None:  # what is known of their tiles is combined alike
-            other.__dict__["_plates"] = plates.of_columns(combine)
+        if self.plates is not None and other.plates is not None:
+            other.plates.take_tiles(self.plates, combine)
         return other
 
 

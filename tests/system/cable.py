@@ -6,7 +6,7 @@ import socket
 import tempfile
 from pathlib import Path
 
-from pyrcal_studies.cable import Cable
+from pyrcal_studies.live import Cable
 
 __all__ = ["Cable", "free_port"]
 

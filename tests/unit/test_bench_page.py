@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from benchmarks.bench_page import Alone, Row, plot, section
+from benchmarks.bench import Alone, Row, plot, section
 
 ROW = Row(
     what="D of 594 modes",

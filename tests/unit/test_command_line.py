@@ -15,10 +15,8 @@ from check_rtc.__main__ import check_parser
 from pyrcal.__main__ import main
 from pyrcal.arguments import (
     HEADINGS,
-    OLD_WORDS,
     OTHER_PROGRAMS,
     command_line,
-    current_words,
     with_negative_numbers,
 )
 from pyrcal.demo.arguments import demo_parser
@@ -154,44 +152,6 @@ def test_required_options_are_marked():
         assert not any(f"[{a.option_strings[0]} " in parser.format_usage() for a in required)
 
 
-IN_FULL = {
-    "hold": [],
-    "approve": ["cm-1", "--yes"],
-    "reject": [],
-    "publish": ["previous"],
-    "rollback": ["--anyway", "--why", "so"],
-    "refit": ["--n-modes", "3"],
-    "acknowledge": ["margin"],
-    "mute": ["margin", "600"],
-    "unmute": ["margin"],
-    "acquire": [],
-    "abort": [],
-    "measure": ["--pattern", "sine"],
-    "measure-noisy": ["--duration-s", "9"],
-    "give-up": ["im-1"],
-    "record": ["--before-s", "5"],
-    "end-recording": ["tm-1"],
-    "remove-recording": ["tm-1"],
-    "reconstructors": ["cm-1"],
-}
-
-
-def test_every_old_word_is_tried_below():
-    assert set(OLD_WORDS) | {"measure", "reconstructors"} == set(IN_FULL)
-
-
-@pytest.mark.parametrize("old", IN_FULL)
-def test_an_old_word_is_its_new_command_with_one_line_of_hint(capsys, old):
-    words, new = current_words([old, *IN_FULL[old]])
-    assert words == [*new.split(), *IN_FULL[old]]
-    now = command_line().parse_args(words)
-    assert capsys.readouterr() == ("", "")
-    assert command_line().parse_args([old, *IN_FULL[old]]) == now
-    said = capsys.readouterr()
-    assert (said.out, said.err.count("\n")) == ("", 1)
-    assert f"pyrcal {new}" in said.err
-
-
 @pytest.mark.parametrize("group", ["alarms", "reconstructors", "recordings"])
 def test_a_group_alone_lists_without_a_hint(capsys, group):
     for more in ([], ["--json"]):
@@ -205,7 +165,6 @@ def test_a_group_alone_lists_without_a_hint(capsys, group):
     ("words", "close"),
     [
         (["aprove"], "reconstructors approve"),
-        (["acknowlege"], "alarms ack"),
         (["statsu"], "status"),
         (["reconstructors", "aprove"], "approve"),
         (["fit", "a", "b", "--metod", "joint"], "--method"),

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from benchmarks import load_page, soak_page
+from benchmarks import load, soak
 from benchmarks.load import Phase, Seen
 from benchmarks.standing import Sample, size_mb
 
@@ -42,7 +42,7 @@ def samples(mb_per_s=0.0, archive_mb_per_s=0.0, *, warm_up_mb=0.0):
 
 
 def verdicts(seen):
-    return {row.what: row.reached for row in soak_page.judge(seen)}
+    return {row.what: row.reached for row in soak.judge(seen)}
 
 
 def test_a_quiet_hour_reaches_all_and_its_warm_up_is_no_growth():
@@ -60,17 +60,17 @@ def test_what_is_not_reached_is_said_for_itself():
 
 
 def test_a_short_run_is_told_as_the_hour_that_it_would_be():
-    archive = soak_page.judge(samples(archive_mb_per_s=12.0 / 3600.0)[:21])[-1]
+    archive = soak.judge(samples(archive_mb_per_s=12.0 / 3600.0)[:21])[-1]
     assert archive.found.startswith("12.0 MB, from the 4.0 MB")
 
 
 def test_the_page_of_a_long_run_has_its_length_its_load_and_a_picture(tmp_path):
     seen = samples()
-    text = soak_page.section(seen, soak_page.judge(seen), {"answers": 7}, cores=2)
+    text = soak.section(seen, soak.judge(seen), {"answers": 7}, cores=2)
     assert "| 60 minutes |" in text
     assert "load 2.0 to 2.0" in text
     assert "0, 0 of 3600000" in text
-    soak_page.plot(tmp_path / "soak.png", seen)
+    soak.plot(tmp_path / "soak.png", seen)
     assert (tmp_path / "soak.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -81,13 +81,13 @@ def phase(answer_s, stop_s, lost=0):
 
 
 def test_load_is_judged_and_drawn(tmp_path):
-    assert [row.reached for row in load_page.judge(phase(0.01, 0.1))] == [True, True, True]
+    assert [row.reached for row in load.judge(phase(0.01, 0.1))] == [True, True, True]
     loaded = phase(0.06, 1.2, lost=1)
-    rows = load_page.judge(loaded)
+    rows = load.judge(loaded)
     assert [row.reached for row in rows] == [False, False, False]
-    text = load_page.section(loaded, rows, cores=2)
+    text = load.section(loaded, rows, cores=2)
     assert "| frames lost, overwritten | 1, 0 of 30000 | 0, 0 |" in text
-    load_page.plot(tmp_path / "load.png", loaded)
+    load.plot(tmp_path / "load.png", loaded)
     assert (tmp_path / "load.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -178,7 +178,7 @@ def test_a_bare_array_has_no_record_and_is_refused_without_its_role(tmp_path, ca
 def test_arrays_are_known_by_their_names(tmp_path):
     np.savez(tmp_path / "bench.npz", D=MATRIX, valid=VALID, modes=CUBE)
     folder = tmp_path / "bench"
-    words = ["import", "npz", str(tmp_path / "bench.npz"), "--diameter-m", "2", "--unit", "um"]
+    words = ["import", "files", str(tmp_path / "bench.npz"), "--diameter-m", "2", "--unit", "um"]
     assert main([*words, "--output", str(folder)]) == 0
     with pyrcal.fitting.recorded.opened(folder / "matrix.h5") as file:
         np.testing.assert_allclose(file.find("interaction_matrix").read(), MATRIX * 1e6)

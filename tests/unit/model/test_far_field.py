@@ -69,7 +69,7 @@ def test_a_plane_stays_a_plane_whatever_tile_it_is_read_in():
 
 def test_no_actuator_is_far_from_a_tile_that_is_near():
     modes().heights(places())
-    for tile in modes()._tiles.values():
+    for tile in modes().tiles.values():
         apart = np.abs(mirror().positions @ [1.0, 1.0j] - tile.middle)
         expected = int(np.sum(apart < FAR_DISTANCE_RATIO * TILE_SUBAP / np.sqrt(2.0)))
         assert len(tile.near) == expected

@@ -9,7 +9,7 @@ import pytest
 
 from pyrcal.playback.aot import read_telemetry
 from pyrcal.playback.arrays import Arrays
-from pyrcal_studies.campaign.small import SMALL
+from pyrcal_studies.campaign.observatory import SMALL
 from service.errors import ConfigurationError, MatrixError
 from service.instrument import load_instrument
 from service.model.pupil import rtc_valid_subapertures

@@ -11,8 +11,7 @@ import pytest
 import pyrcal
 from pyrcal.__main__ import main
 from pyrcal_studies.campaign.night import LINE_FRACTIONS
-from pyrcal_studies.campaign.observatory_dome import Dome
-from pyrcal_studies.campaign.small import SMALL
+from pyrcal_studies.campaign.observatory import SMALL, Dome
 from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE
 from sim_rtc.assembly import build_telescope

@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pyrcal_studies.campaign.golden_night import SETTINGS
-from pyrcal_studies.campaign.observatory import Observatory
-from pyrcal_studies.campaign.small import latencies_of
+from pyrcal_studies.campaign.golden_nights import SETTINGS
+from pyrcal_studies.campaign.observatory import Observatory, latencies_of
 from service.archive.serialisation import TrackingFile
 from service.config import load_settings
 from service.instrument import load_instrument

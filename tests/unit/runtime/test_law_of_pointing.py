@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from pyrcal_studies.campaign.observatory import Observatory
-from pyrcal_studies.campaign.observatory_dome import Dome
+from pyrcal_studies.campaign.observatory import Dome, Observatory
 from service.config import load_settings
 from service.errors import ConfigurationError
 from service.instrument import load_instrument

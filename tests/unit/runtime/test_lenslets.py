@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from pyrcal.fitting.matrix import fit_matrix
-from pyrcal_studies.campaign.golden_night import SETTINGS, WORDS
-from pyrcal_studies.campaign.observatory import Observatory
-from pyrcal_studies.campaign.small import latencies_of
+from pyrcal_studies.campaign.golden_nights import SETTINGS, WORDS
+from pyrcal_studies.campaign.observatory import Observatory, latencies_of
 from service.config import load_settings
 from service.estimation.reference import Reference
 from service.instrument import load_instrument

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from pyrcal_studies.campaign.observatory import Observatory
-from pyrcal_studies.campaign.observatory_dome import Dome
-from pyrcal_studies.campaign.observatory_link import OwnHands
+from pyrcal_studies.campaign.observatory import Dome, Observatory, OwnHands
 from service.config import load_settings
 from service.errors import ModelError
 from service.estimation.windows import RefusalKind

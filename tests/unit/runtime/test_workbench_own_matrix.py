@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pyrcal_studies.campaign.observatory_link import OwnHands
+from pyrcal_studies.campaign.observatory import OwnHands
 from service.errors import UnknownIdError
 from service.model.misregistration import Misregistration
 from service.runtime.estimates import read_own_matrix

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pyrcal_studies.campaign.acquisition import Start, play
-from pyrcal_studies.campaign.acquisition_table import wrong
+from pyrcal_studies.campaign.acquisition import Start, play, wrong
 
 SMALL = Path(__file__).parents[2] / "system" / "small.toml"
 

@@ -1,7 +1,6 @@
 """How acquisitions are counted."""
 
-from pyrcal_studies.campaign.acquisition import RANGE, Start
-from pyrcal_studies.campaign.acquisition_table import table, wrong
+from pyrcal_studies.campaign.acquisition import RANGE, Start, table, wrong
 
 ROW = {
     "instrument": "flao-lbt",

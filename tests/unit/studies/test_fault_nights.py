@@ -14,8 +14,7 @@ from pyrcal_studies.campaign.fault_nights import (
     deeds_of,
     worse,
 )
-from pyrcal_studies.campaign.observatory_dome import Moment
-from pyrcal_studies.campaign.small import latencies_of
+from pyrcal_studies.campaign.observatory import Moment, latencies_of
 from service.tracking import commands as cmd
 from service.tracking.state import Mode
 from tests.system.night import INSTRUMENT

@@ -6,12 +6,13 @@ import pytest
 from pyrcal_studies.campaign.golden import (
     INSTRUMENT,
     Teller,
+    decoded,
+    encoded,
     first_difference,
     nights_in,
     read,
     written,
 )
-from pyrcal_studies.campaign.golden_codec import decoded, encoded
 from service.estimation.random_dither import RandomEstimate
 from service.tracking import commands as cmd
 from service.tracking import events as ev

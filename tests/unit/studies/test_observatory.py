@@ -6,11 +6,23 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from pyrcal_studies.campaign.observatory import Latencies, Observatory
-from pyrcal_studies.campaign.observatory_checks import Outcome, Swap, published, true_radius
-from pyrcal_studies.campaign.observatory_dome import START_NS, Dome, replayed
-from pyrcal_studies.campaign.small import N_TARGET, SETTINGS, SMALL, bench_of, latencies_of
-from pyrcal_studies.campaign.system_measures import recovery_of, row_of
+from pyrcal_studies.campaign.observatory import (
+    N_TARGET,
+    SETTINGS,
+    SMALL,
+    START_NS,
+    Dome,
+    Latencies,
+    Observatory,
+    Outcome,
+    Swap,
+    bench_of,
+    latencies_of,
+    published,
+    replayed,
+    true_radius,
+)
+from pyrcal_studies.campaign.system_nights import recovery_of, row_of
 from service.config import load_settings
 from service.errors import CommandError
 from service.estimation.description import actuator_watch

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from pyrcal_studies.campaign import system_nights
-from pyrcal_studies.campaign.system_cases import Case, Plan
-from pyrcal_studies.campaign.system_table import line_of, table
+from pyrcal_studies.campaign.system_nights import Case, Plan, line_of, table
 from sim_rtc.options import parse_options
 from tests.unit.runtime.small import INSTRUMENT, N_CONTROLLED
 

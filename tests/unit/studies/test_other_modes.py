@@ -6,12 +6,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pyrcal_studies.campaign.kept_night import DOWN_S
-from pyrcal_studies.campaign.observatory_checks import Swap
-from pyrcal_studies.campaign.other_campaign import differing
-from pyrcal_studies.campaign.other_modes import came_of, corrected_s, longest, names, smoothed
-from pyrcal_studies.campaign.other_night import OtherNight, Plan
-from pyrcal_studies.campaign.other_truth import Kind, Truth
+from pyrcal_studies.campaign.observatory import DOWN_S, Swap
+from pyrcal_studies.campaign.other_modes import (
+    Kind,
+    OtherNight,
+    Plan,
+    Truth,
+    came_of,
+    corrected_s,
+    differing,
+    longest,
+    names,
+    smoothed,
+)
 from service.errors import LinkError
 from service.model.misregistration import Misregistration
 from service.tracking.state import Level, LogEntry

@@ -5,7 +5,7 @@ import tomllib
 
 import pytest
 
-from pyrcal_studies.packaged import FOLDER, packaged
+from pyrcal_studies.reference import FOLDER, packaged
 from service.files.toml import read_toml
 
 PAGE = packaged()

@@ -7,10 +7,24 @@ import h5py
 import numpy as np
 import pytest
 
-from pyrcal_studies.peers_cases import LARGE, Case, bench, cases, digest, mirror_points
-from pyrcal_studies.peers_files import LISTINGS, turned, write_instrument, write_reference
-from pyrcal_studies.peers_fits import KEPT_ANSWERS, Answer, Question, error, kept_answers
-from pyrcal_studies.peers_page import page
+from pyrcal_studies.peers import (
+    KEPT_ANSWERS,
+    LARGE,
+    LISTINGS,
+    Answer,
+    Case,
+    Question,
+    bench,
+    cases,
+    digest,
+    error,
+    kept_answers,
+    mirror_points,
+    page,
+    turned,
+    write_instrument,
+    write_reference,
+)
 from pyrcal_studies.peers_pushpull import (
     Bench,
     Measured,

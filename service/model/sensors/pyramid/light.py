@@ -419,7 +419,7 @@ def measure_illumination(
         raise ModelError("illumination: found no light; expected the mean counts of the images")
     optics = build_even_optics(instrument)
     even = compute_even_images(optics, position.at)
-    lit = even.sum(axis=0) > _LIT_SHARE * np.percentile(even.sum(axis=0), 75.0)
+    lit = _lit_part(even)
     share = _excess(images, even, lit)
     beam = _beam(_fill_outside(share, lit), position)
     if not beam.intensity.any():
@@ -442,10 +442,16 @@ def relative_light(
         If the counts are not four images of the instrument's size.
     """
     images, _ = repair_pixels(counts, instrument)
-    even = compute_even_images(build_even_optics(instrument), position.at).sum(axis=0)
-    lit = even > _LIT_SHARE * np.percentile(even, 75.0)
-    share = images.sum(axis=0) / np.where(lit, even, 1.0)
+    even = compute_even_images(build_even_optics(instrument), position.at)
+    lit = _lit_part(even)
+    share = images.sum(axis=0) / np.where(lit, even.sum(axis=0), 1.0)
     return np.where(lit, share / share[lit].mean(), 1.0), lit
+
+
+def _lit_part(even: Array) -> NDArray[np.bool_]:
+    """Return the pixels ``(n, n)`` that an even beam lights, from its images ``(4, n, n)``."""
+    light = even.sum(axis=0)
+    return np.asarray(light > _LIT_SHARE * np.percentile(light, 75.0))
 
 
 def _excess(images: Array, shown: Array, lit: NDArray[np.bool_]) -> Array:

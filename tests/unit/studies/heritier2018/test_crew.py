@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pyrcal_studies.heritier2018.crew import carry_out, processor_minutes
-from pyrcal_studies.heritier2018.store import Record, Store, Task
+from pyrcal_studies.heritier2018.store import Record, Store, Task, carry_out, processor_minutes
 
 DONE: list[str] = []
 

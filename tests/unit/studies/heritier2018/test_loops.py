@@ -7,9 +7,15 @@ import numpy as np
 import pytest
 
 from pyrcal_studies.heritier2018 import telescope
-from pyrcal_studies.heritier2018.closing import RAMP_GAINS, GainTuning
-from pyrcal_studies.heritier2018.loops import LoopRun, Over, statistics, wavefront_error_nm
-from pyrcal_studies.heritier2018.psf import strehl
+from pyrcal_studies.heritier2018.loops import (
+    RAMP_GAINS,
+    GainTuning,
+    LoopRun,
+    Over,
+    statistics,
+    strehl,
+    wavefront_error_nm,
+)
 from pyrcal_studies.heritier2018.reconstructors import ModelReconstructor
 from pyrcal_studies.heritier2018.store import Record, Store, Task, in_order
 from pyrcal_studies.heritier2018.telescope import Occasion

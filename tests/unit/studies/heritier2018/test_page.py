@@ -6,8 +6,9 @@ import re
 
 import pytest
 
-from pyrcal_studies.heritier2018 import captions, figures
-from pyrcal_studies.heritier2018.markdown import listed, table
+from pyrcal_studies.heritier2018 import figures
+from pyrcal_studies.heritier2018.page import CAPTIONS, heading_anchor
+from pyrcal_studies.heritier2018.tables import listed, table
 from tests.unit.studies.heritier2018.test_paper import PAGE, ROOT
 
 
@@ -45,9 +46,7 @@ def test_every_file_that_the_page_names_exists():
 
 def test_every_link_within_the_page_leads_to_a_heading():
     text = PAGE.read_text(encoding="utf-8")
-    headings = {
-        captions.heading_anchor(title) for title in re.findall(r"^##+ (.*)$", text, re.MULTILINE)
-    }
+    headings = {heading_anchor(title) for title in re.findall(r"^##+ (.*)$", text, re.MULTILINE)}
     links = re.findall(r"\]\(#([\w-]+)\)", text)
     assert len(links) >= 15
     assert [link for link in links if link not in headings] == []
@@ -65,7 +64,7 @@ def test_twelve_figures_are_on_the_page_and_small_enough():
         picture = (PAGE.parent / path).read_bytes()
         assert picture.startswith(b"\x89PNG")
         assert len(picture) < 100_000
-    assert set(figures.DRAWN) == set(captions.CAPTIONS) == set(range(3, 15))
+    assert set(figures.DRAWN) == set(CAPTIONS) == set(range(3, 15))
 
 
 def test_the_page_is_that_of_a_full_run():

@@ -3,7 +3,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pyrcal_studies.heritier2018.psf import FIELD, H_BAND_M, OVERSAMPLING, Camera, marechal, strehl
+from pyrcal_studies.heritier2018.loops import (
+    FIELD,
+    H_BAND_M,
+    OVERSAMPLING,
+    Camera,
+    marechal,
+    strehl,
+)
 from sim_rtc.telescope.diffractive import DiffractivePlant
 from sim_rtc.telescope.imperfections import SETS
 from tests.numerics import small_basis, small_instrument

@@ -7,8 +7,8 @@ import pytest
 
 from pyrcal_studies.heritier2018 import plan, results
 from pyrcal_studies.heritier2018.illumination import Change, Feature, image_offsets, missing
+from pyrcal_studies.heritier2018.loops import largest_pole, limit_of_stability
 from pyrcal_studies.heritier2018.patterns import registration_by_set, sensitivities
-from pyrcal_studies.heritier2018.poles import largest_pole, limit_of_stability
 from pyrcal_studies.heritier2018.registration import ROUGH_ESTIMATE
 from service.model.misregistration import Misregistration
 

@@ -182,7 +182,7 @@ def _judge_rtc(data: Commissioning) -> Iterator[Criterion]:
 
 def _judge_fit(data: Commissioning) -> Iterator[Criterion]:
     names = ("registration determined", "σ of the registration", "stable modes")
-    limits = ("yes", _sigma_text(data.policy.stale_sigma), f"{_n_wanted(data)} modes")
+    limits = ("yes", _sigma_text(_stale_sigma(data)), f"{_n_wanted(data)} modes")
     if data.fit is None or data.fit["registration"] is None:
         reason = "no fit was given" if data.fit is None else "the fit has no registration"
         for name, limit in zip(names, limits, strict=True):
@@ -201,7 +201,7 @@ def _judge_fit(data: Commissioning) -> Iterator[Criterion]:
     yield _line(
         "Fit",
         names[1],
-        bool((sigma <= data.policy.stale_sigma).all()),
+        bool((sigma <= _stale_sigma(data)).all()),
         _sigma_text(sigma),
         limits[1],
         "more averages or more modes",
@@ -218,6 +218,11 @@ def _judge_fit(data: Commissioning) -> Iterator[Criterion]:
         f"{wanted} modes",
         "a lower gain, fewer modes, or a better instrument file",
     )
+
+
+def _stale_sigma(data: Commissioning) -> NDArray[np.float64]:
+    """Return 1 σ of α ``(4,)`` from which on it is stale, the model error included."""
+    return np.hypot(data.policy.stale_sigma, data.policy.floor)
 
 
 def _n_wanted(data: Commissioning) -> int:
@@ -264,7 +269,7 @@ def _judge_tracking(data: Commissioning) -> Iterator[Criterion]:
         "σ is too small, or the mirror moves: set [tracking] drift_*, look for vibrations",
     )
     known = [one.sigma for one in data.samples if one.sigma is not None]
-    fresh = [bool((sigma <= data.policy.stale_sigma).all()) for sigma in known]
+    fresh = [bool((sigma <= _stale_sigma(data)).all()) for sigma in known]
     share = float(np.mean(fresh)) if fresh else 0.0
     yield _line(
         "Tracking",

@@ -167,10 +167,10 @@ class TrackingTable(Table):
     30 subapertures, more for fewer modes."""
 
     stale_rotation_deg: Positive | None = None
-    """1 σ of the rotation; None: 0.1 for 500 modes."""
+    """The same of the rotation; None: 0.1 for 500 modes."""
 
     stale_magnification: Positive | None = None
-    """1 σ of the magnification; None: 0.003 for 500 modes."""
+    """The same of the magnification; None: 0.003 for 500 modes."""
 
 
 class AcquisitionTable(Table):

@@ -110,7 +110,10 @@ def policy_of(settings: Settings, instrument: Instrument | None = None) -> Polic
             tracking.flexure_magnification_per_degree,
         ),
         slew_limit_deg=tracking.slew_limit_deg,
-        stale_sigma=_stale_sigma(settings, instrument),
+        stale_sigma=_limits(
+            (tracking.stale_shift_subap, tracking.stale_rotation_deg, tracking.stale_magnification),
+            STALE * tolerance_scale(settings, instrument)[1:],
+        ),
         useless_sigma=USELESS / BOUNDARY_SCALE * tolerance_scale(settings, instrument),
         tolerance=tolerance_scale(settings, instrument),
         acquires=settings.acquisition.auto,
@@ -166,17 +169,6 @@ def tolerance_scale(
     finer = float(np.sqrt(REFERENCE_MODES / n_modes))
     shift = finer * instrument.wfs.n_subapertures / REFERENCE_SUBAPERTURES
     return np.maximum([shift, shift, finer, finer], 1.0)
-
-
-def _stale_sigma(settings: Settings, instrument: Instrument | None) -> NDArray[np.float64]:
-    """Return from which σ on α is stale: no window mends what a coarse mirror adds to the floor."""
-    tracking = settings.tracking
-    limit = _limits(
-        (tracking.stale_shift_subap, tracking.stale_rotation_deg, tracking.stale_magnification),
-        STALE * tolerance_scale(settings, instrument)[1:],
-    )
-    usual, floor = (floor_of(settings, about) / BOUNDARY_SCALE for about in (None, instrument))
-    return np.where(floor > usual, np.sqrt(limit**2 + floor**2 - usual**2), limit)
 
 
 def _limits(

@@ -261,10 +261,9 @@ def add_history(context: StepContext, entry: HistoryEntry) -> None:
 def n_agreeing(context: StepContext, registration: Registration, prior: Joint) -> int:
     """Return the number of agreeing windows after this one; 1 if α had become stale."""
     policy = context.policy
-    sigma = np.sqrt(np.diag(prior.alpha_covariance) + registration.floor**2)
-    limit = validity.beyond_model_error(policy.stale_sigma, registration.floor, policy)
+    sigma = np.sqrt(np.diag(prior.alpha_covariance))
     slewed = validity.slewed_deg(context.state, registration) > policy.slew_limit_deg
-    return 1 if slewed or np.any(sigma > limit) else registration.n_windows + 1
+    return 1 if slewed or np.any(sigma > policy.stale_sigma) else registration.n_windows + 1
 
 
 def accept(

@@ -36,13 +36,13 @@ class Validity(StrEnum):
     """Validity of α: whether it may be used."""
 
     FRESH = "fresh"
-    """σ is below half of the limit."""
+    """σ, less the model error, is below half of the limit."""
 
     AGEING = "ageing"
     """σ grows towards the limit."""
 
     STALE = "stale"
-    """σ is beyond the limit, or α is unconfirmed since a restart."""
+    """σ, less the model error, is beyond the limit, or α is unconfirmed since a restart."""
 
     INVALID = "invalid"
     """α may have changed: nothing is made from it without an order."""

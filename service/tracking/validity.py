@@ -258,8 +258,8 @@ def _validity_of(context: StepContext, registration: Registration) -> ValiditySt
     )
     if reason is not None:
         return ValidityState(level=Validity.INVALID, reason=reason)
-    sigma, before = registration.sigma, context.before.alpha.registration
-    limit = beyond_model_error(policy.stale_sigma, registration.floor, policy)
+    sigma, before = sigma_beyond_floor(registration), context.before.alpha.registration
+    limit = policy.stale_sigma
     if registration.n_windows == 0:
         return ValidityState(level=Validity.STALE, reason="no window has confirmed it yet")
     was_stale = before is not None and before.validity.level is Validity.STALE
@@ -287,27 +287,27 @@ def _explain_invalidity(
     # With a pointing law α follows the slew.
     if moved_deg > policy.slew_limit_deg and registration.nominal is None:
         return f"the telescope has moved by {moved_deg:.0f} deg since the last dithered window"
-    limit = beyond_model_error(policy.useless_sigma, registration.floor, policy)
-    if np.any(registration.sigma > limit):
-        return _worst(registration.sigma, limit)
+    sigma = sigma_beyond_floor(registration)
+    if np.any(sigma > policy.useless_sigma):
+        return _worst(sigma, policy.useless_sigma)
     return None
 
 
-def beyond_model_error(limit: Array, floor: Array, policy: Policy) -> Array:
-    """Return a limit on σ ``(4,)``, increased by the model error that windows have found.
+def sigma_beyond_floor(registration: Registration) -> Array:
+    """Return 1 σ of α now ``(4,)`` without the model error, which is what limits of age apply to.
 
-    No further window reduces that error. Whether a loop is safe with it is decided by the stability
-    gate, which examines α ± 3σ.
+    The model error is neither age nor reduced by a window: it includes unknown places of pupil
+    images, a coarse mirror and what windows leave unexplained. Whether a loop is safe with it is
+    decided by the stability gate, which examines α ± 3σ.
     """
-    found = np.maximum(floor**2 - policy.floor**2, 0.0)
-    return np.asarray(np.sqrt(limit**2 + found))
+    return np.sqrt(np.diag(registration.covariance) + registration.grown)
 
 
 def _worst(sigma: Array, limit: Array) -> str:
     worst = int(np.argmax(sigma / limit))
     most = limit[worst] * BOUNDARY_SCALE[worst]
     # the present value would make another alarm of it every second
-    return f"1 sigma of {PARAMETERS[worst]} has grown beyond {most:.4g}"
+    return f"1 sigma of {PARAMETERS[worst]}, less the model error, has grown beyond {most:.4g}"
 
 
 def _without_old_suspicion(registration: Registration, now_ns: int) -> Registration:

@@ -110,7 +110,7 @@ class TestTime:
     def test_stale_is_an_alarm_with_the_parameter_and_a_dither_is_due(self, story):
         story.wait(80)
         alarm = next(a for a in story.state.alarms.active if a.name == "estimate-stale")
-        assert "shift_x_subap has grown beyond 0.05" in alarm.text
+        assert "shift_x_subap, less the model error, has grown beyond 0.05" in alarm.text
         assert story.state.alpha.dither_due_since_ns_utc is not None
         story.see()
         assert not story.alarms
@@ -174,13 +174,27 @@ class TestTime:
         assert "estimate-stale" in story.alarms
         known = story.state.alpha.registration
         sigma = share * POLICY.stale_sigma
-        after = replace(
-            known, covariance=np.diag(sigma**2 - known.floor**2), t_ns_utc=story.state.loop.rtc.t_ns
-        )
+        after = replace(known, covariance=np.diag(sigma**2), t_ns_utc=story.state.loop.rtc.t_ns)
         story.state = changed(story.state, registration=replace(after, arrived_ns_utc=story.now_ns))
         story.tell(ev.Tick())
         assert ("estimate-stale" in story.alarms) is stale
         assert (worth(story) is Validity.STALE) is stale
+
+    @pytest.mark.parametrize("of", ["policy", "window"])
+    def test_a_model_error_is_not_age(self, story, of):
+        """Images somewhere within 0.15 pixel made α ageing at once and for good."""
+        floor = np.array([2.0, 2.0, 4.0, 4.0]) * POLICY.useless_sigma
+        if of == "policy":
+            story = Story(Mode.AUTO, replace(story.policy, floor=floor)).meet()
+            story.see(n_windows=2)
+        else:
+            known = replace(story.state.alpha.registration, floor=floor)
+            story.state = changed(story.state, registration=known)
+        story.tell(ev.Tick())
+        assert worth(story) is Validity.FRESH
+        assert np.all(story.state.alpha.registration.sigma > POLICY.useless_sigma)
+        story.wait(80)
+        assert worth(story) is Validity.STALE
 
     def test_what_is_judged_is_judged_with_the_sigma_of_now(self, story):
         story.wait(40)

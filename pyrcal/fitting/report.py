@@ -11,7 +11,7 @@ from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pyrcal.fitting.alternatives import Alternative
 from pyrcal.fitting.control_check import ReconstructorVerdict
@@ -414,10 +414,10 @@ def _of_document(values: dict[str, Any], path: Path) -> KnownFit:
     sign_x, sign_y = sign if isinstance(sign, list) else (sign, sign)
     alpha = Misregistration.from_boundary(values)
     if values.get("anamorphosis") is not None:
-        alpha = alpha.with_anamorphosis(np.array(values["anamorphosis"], dtype=np.float64))
+        alpha = alpha.with_anamorphosis(_numbers(values["anamorphosis"], "anamorphosis", (2,)))
     return KnownFit(
         alpha=alpha,
-        covariance=np.array(values["covariance"], dtype=np.float64) / COVARIANCE_SCALE,
+        covariance=_numbers(values["covariance"], "covariance", (4, 4)) / COVARIANCE_SCALE,
         orientation=Orientation(
             **{name: words[name] for name in FLIPS}, sign_x=sign_x, sign_y=sign_y
         ),
@@ -427,9 +427,19 @@ def _of_document(values: dict[str, Any], path: Path) -> KnownFit:
         instrument_found=_otherwise(values.get("instrument_found", {})),
         image_offsets_px=None
         if values.get("image_offsets_px") is None
-        else np.array(values["image_offsets_px"], dtype=np.float64),
+        else _numbers(values["image_offsets_px"], "image_offsets_px", (4, 2)),
         origin=str(path),
     )
+
+
+def _numbers(values: ArrayLike, name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return finite numbers of a fit's file; ValueError if they are not, or of another shape."""
+    found = np.asarray(values, dtype=np.float64)
+    if found.shape != shape:
+        raise ValueError(f"{name}: found shape {found.shape}, expected {shape}")
+    if not np.isfinite(found).all():
+        raise ValueError(f"{name}: found NaN or infinity, expected numbers")
+    return found
 
 
 def _control(found: dict[str, Any] | None) -> dict[str, Any]:
@@ -461,10 +471,17 @@ def _otherwise(found: dict[str, dict[str, float | None]]) -> dict[str, float]:
 
 def _of_product(file: h5py.File, path: Path) -> KnownFit:
     fit = _of_document(json.loads(file.attrs["document"]), path)
+    gains = file["gains"][()]
+    n_used = np.size(gains)
+    numbers = _numbers(file["modes"][()], "modes", (n_used,))
+    with np.errstate(invalid="ignore"):  # a number beyond the range of integers differs as well
+        modes = numbers.astype(np.intp)
+    if not np.array_equal(modes, numbers):
+        raise ValueError("modes: found a number that is not whole, expected indices of modes")
     return replace(
         fit,
-        modes=np.asarray(file["modes"][()], dtype=np.intp),
-        gains=np.asarray(file["gains"][()], dtype=np.float64),
+        modes=modes,
+        gains=_numbers(gains, "gains", (n_used,)),
         double_pass=bool(file.attrs["double_pass"]),
         accepted=bool(file.attrs["accepted"]),
         instrument_sha256=str(file.attrs["instrument_sha256"]),

@@ -26,7 +26,7 @@ from service.config.settings import Settings
 from service.errors import ConfigurationError, say
 from service.files.documents import json_text
 from service.files.recording import FORMAT, Message, Recording
-from service.files.whole import open_hdf5, write_whole
+from service.files.whole import open_growing_hdf5, write_whole
 from service.instrument import load_instrument
 from service.model.instrument import Instrument
 
@@ -91,9 +91,9 @@ def track(
 
 def _is_recording(path: Path) -> bool:
     try:
-        with open_hdf5(path, swmr=True) as file:
+        with open_growing_hdf5(path) as file:
             return str(file.attrs.get("format")) == FORMAT
-    except (OSError, RuntimeError):  # read as arrays it is refused with the reason
+    except (OSError, RuntimeError, KeyError):  # read as arrays it is refused with the reason
         return False
 
 

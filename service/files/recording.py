@@ -35,7 +35,7 @@ import numpy as np
 import structlog
 
 from service.errors import ConfigurationError
-from service.files.whole import open_hdf5
+from service.files.whole import open_growing_hdf5, open_hdf5
 
 _log = structlog.get_logger()
 
@@ -108,7 +108,7 @@ class Recording:
             If it cannot be read or is no recording of a version this code knows.
         """
         try:
-            self._file = open_hdf5(self._path, swmr=True)
+            self._file = open_growing_hdf5(self._path)
         except OSError as error:
             raise ConfigurationError(f"{self._path}: cannot be read: {error}") from error
         reason = self._check()

@@ -25,6 +25,8 @@ def no_locks(monkeypatch):
     opened = h5py.File
 
     def open_file(name, mode="r", *, locking=None, **options):
+        if isinstance(name, h5py.h5f.FileID) and not name.get_access_plist().get_file_locking()[0]:
+            return opened(name)
         if locking is False:
             return opened(name, mode, locking=False, **options)
         opened(name, mode, **options).close()

@@ -1,3 +1,4 @@
+import re
 import signal
 import subprocess
 import sys
@@ -114,3 +115,23 @@ def test_other_files_are_refused_with_what_was_expected(tmp_path):
     path.write_bytes(b"no hdf5")
     with pytest.raises(ConfigurationError, match="cannot be read"), Recording(path):
         pass
+
+
+def test_damaged_headers_are_refused_at_once(tmp_path):
+    """HDF5 reads metadata of a growing file again and again while its checksum is wrong."""
+    path = tmp_path / "night.h5"
+    with RecordingWriter(path, system="small") as recorder:
+        recorder.put(RecordedKind.STATUS, b"one")
+    content = path.read_bytes()
+    headers = [m.start() for m in re.finditer(b"OHDR", content)]
+    assert len(headers) == 4  # of the file, its two growing datasets, and the number of dropped
+    for start in headers:
+        damaged = bytearray(content)
+        damaged[start + 12] ^= 0xFF
+        path.write_bytes(damaged)
+        script = f"from tests.unit.files.test_recording import read; read({str(path)!r})"
+        done = subprocess.run(
+            [sys.executable, "-c", script], capture_output=True, timeout=60, check=False
+        )
+        assert b"ConfigurationError" in done.stderr
+        assert b"damaged" in done.stderr

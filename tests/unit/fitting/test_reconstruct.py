@@ -243,6 +243,50 @@ def test_a_file_that_is_no_fit_is_refused():
         made("fit.json")
 
 
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("gains", np.array(1.0)),
+        ("gains", np.ones((40, 2))),
+        ("gains", np.ones(39)),
+        ("gains", np.full(40, np.inf)),
+        ("gains", np.full(40, b"x")),
+        ("modes", np.array(3)),
+        ("modes", np.arange(40.0) + 0.5),
+        ("modes", np.full(40, np.nan)),
+        ("modes", np.arange(40.0) * 1e30),
+    ],
+)
+def test_damaged_gains_or_modes_of_a_fit_are_refused(name, values):
+    path = kept(a_tiny_report())
+    with h5py.File(path, "r+") as file:
+        del file[name]
+        file[name] = values
+    with pytest.raises(MatrixError, match=r"fit\.h5"):
+        made(path)
+    assert not Path("cm.h5").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("covariance", [[1.0, 2.0]]),
+        ("covariance", [[float("nan")] * 4] * 4),
+        ("anamorphosis", [0.01]),
+        ("anamorphosis", [0.01, 0.02, 0.03]),
+        ("image_offsets_px", [[0.1, 0.2]] * 3),
+        ("image_offsets_px", [[0.1, 0.2, 0.3]] * 4),
+        ("image_offsets_px", 3.0),
+    ],
+)
+def test_a_document_with_an_array_of_another_shape_is_refused(name, values):
+    written = document(a_tiny_report()) | {name: values}
+    Path("fit.json").write_text(json.dumps(written), encoding="utf-8")
+    with pytest.raises(MatrixError, match=r"fit\.json"):
+        made("fit.json")
+    assert not Path("cm.h5").exists()
+
+
 def test_pupil_images_that_the_fit_found_displaced_are_so_in_the_reconstructors_model(capsys):
     """As the instrument file would say it; on the pixel grid D would differ by much more."""
     places = np.array([[0.2, 0.1], [-0.2, 0.0], [0.1, -0.2], [-0.1, 0.1]])

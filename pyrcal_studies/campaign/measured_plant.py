@@ -7,6 +7,12 @@ each mode's column. Half of that error is what a mirror with other influence fun
 half a random smooth pattern. The turbulence of each mode is an autoregressive process, and the
 RTC starts with the pseudo-inverse of the first columns of M.
 
+With ``--plant diffractive`` the plant is the diffractive simulated telescope, and M is its
+interaction matrix by push-pull of 10 nm without noise. The service's instrument file is wrong:
+misplaced actuators, another obscuration, another modulation and, in half of the draws from 20 %
+on, other influence functions. Together they leave the given share of the columns unexplained at
+the true registration.
+
 Run: ``python -m pyrcal_studies.campaign.measured_plant --output var/measured_plant.jsonl --table
 table.md``. Rows that are in the file already are not computed again.
 """
@@ -23,6 +29,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 from threadpoolctl import threadpool_limits
 from typing_extensions import override
 
@@ -35,8 +42,11 @@ from service.estimation.own_matrix import recognise_modes
 from service.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel, RtcInteractionModel
+from service.model.kinds import Influence, InfluenceShape
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from service.model.modes import analytic_basis
+from service.model.modes import analytic_basis, modal_basis
+from service.model.pupil import rtc_valid_subapertures
+from service.model.sensors.registry import kind_of
 from service.model.surface import mirror_surface
 from service.runtime.policy import policy_of
 from service.runtime.worker import Compute, OpticsWorker
@@ -44,15 +54,22 @@ from service.tracking import commands as cmd
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import Status, checksum, decode, encode
+from sim_rtc.assembly import Telescope
 from sim_rtc.computer.feed import BATCH_FRAMES, Block, OpenLoopBlock
 from sim_rtc.computer.real_time_computer import RealTimeComputer
+from sim_rtc.computer.reconstructors import own_reconstructor
 from sim_rtc.computer.telemetry import Batch, FrameClock, LoopSettings
+from sim_rtc.options import Options
+from sim_rtc.telescope.diffractive import DiffractiveOptics
 from sim_rtc.telescope.linear import LinearOptics
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 
 INSTRUMENT = "tests/data/bench.toml"
+DIFFRACTIVE = "tests/system/small.toml"
+"""Instrument of the diffractive plant: pyramid of 12 subapertures, 144 actuators, 90 modes."""
+
 ALPHA = (-0.30, -0.03, -3.1, 1.008)
 """Registration of the plant, boundary units: a bench whose mirror is mounted 3 deg askew."""
 
@@ -68,6 +85,11 @@ MAX_DITHER_MODES = 8
 """Modes that the RTC dithers at once, as that of examples/rtc.py."""
 
 SLOPE_NOISE = 2e-3
+POKE_M = 10e-9
+MIN_GAUSSIAN_ERROR = 0.2
+"""Model error from which on an instrument file may have other influence functions: they alone leave
+16 to 19 % of the columns."""
+
 N_FIRST = 20
 """Modes that the RTC controls at the start."""
 
@@ -88,6 +110,9 @@ class Plan:
     """RMS error of the model over the norm of a mode's column."""
 
     mode: str = "auto"
+    plant: str = "linear"
+    """"linear", or "diffractive"."""
+
     matrix: str = ""
     """File of a measured matrix, npz with ``D`` (n_slopes, n_modes); empty: made from the model."""
 
@@ -263,8 +288,107 @@ def true_alpha(plan: Plan) -> Misregistration:
     return Misregistration.from_vector((np.array(ALPHA) + spread) / BOUNDARY_SCALE)
 
 
+class DiffractiveDome(Dome):
+    """The diffractive telescope, whose RTC begins with its own matrix of the true registration."""
+
+    def __init__(self, plan: Plan) -> None:
+        """Take the plan of the run."""
+        self._n_first = plan.n_first
+        alpha = ",".join(f"{value:.6f}" for value in true_alpha(plan).vector * BOUNDARY_SCALE)
+        super().__init__(
+            f"--plant diffractive --imperfections ideal --instrument {plan.instrument} --mag 8 "
+            f"--rate {FRAME_RATE_HZ} --gain {GAIN} --leak {LEAK} --delay {DELAY_FRAMES} "
+            f"--n-controlled {plan.n_first} --seed {plan.seed} --alpha={alpha}".split()
+        )
+
+    @override
+    def _built(self, options: Options) -> Telescope:
+        telescope = super()._built(options)
+        optics = telescope.optics.start()
+        if not isinstance(optics, DiffractiveOptics):
+            raise TypeError(f"study: found {type(optics).__name__}; expected diffractive optics")
+        self.response = noise_free_matrix(optics)
+        first = self.response[:, : self._n_first]
+        return replace(telescope, reconstructor=own_reconstructor(first, telescope.identity))
+
+
+def noise_free_matrix(optics: DiffractiveOptics) -> Array:
+    """Return the matrix by push-pull without noise, ``(n_slopes, n_modes)``."""
+    rng = np.random.default_rng(0)
+    columns = []
+    for shape in optics.opd_per_command.T:
+        push, pull = (optics.slopes(sign * POKE_M * shape, None, rng) for sign in (1.0, -1.0))
+        columns.append((push - pull).astype(float) / (2.0 * POKE_M))
+    return np.column_stack(columns)
+
+
+@lru_cache(maxsize=8)
+def _wrong_model(plan: Plan) -> tuple[Instrument, RtcInteractionModel]:
+    """Return a wrong instrument and its model, which leave ``plan.error`` of the columns."""
+    right, response = load_instrument(plan.instrument), response_of(plan)
+    mirror, wfs, alpha = right.analytic_mirror, right.wfs, true_alpha(plan)
+    rng = np.random.default_rng([plan.seed, round(100 * plan.error), 36])
+    of_places, of_modulation, of_obscuration = rng.uniform(0.5, 1.0, 3)
+    of_modulation *= 2.0 * rng.choice([-1.0, 1.0])
+    # a shift, a rotation or a magnification of all actuators would be another true registration
+    x, y = mirror.positions_m.T
+    similarity = np.column_stack([np.ones_like(x), x + 1j * y])
+    moved = rng.standard_normal((len(x), 2)) @ [1.0, 1.0j]
+    moved = moved - similarity @ np.linalg.lstsq(similarity, moved, rcond=None)[0]
+    displacements_m = mirror.pitch_m * np.column_stack([moved.real, moved.imag])
+    shape = mirror.shape
+    if plan.error >= MIN_GAUSSIAN_ERROR and rng.uniform() < 0.5:
+        shape = InfluenceShape(influence=Influence.GAUSSIAN, coupling=OTHER_COUPLING)
+    strokes = analytic_basis(right).mode_to_actuator
+    key = kind_of(right).find_fitted_key(wfs)
+
+    def make_wrong(size: float) -> tuple[Instrument, RtcInteractionModel]:
+        optics = {} if key is None else {key: getattr(wfs, key) * np.exp(size * of_modulation)}
+        positions_m = mirror.positions_m + size * of_places * displacements_m
+        about = replace(
+            right,
+            # the RTC's mask is known, whatever else the file has wrong
+            wfs=replace(wfs, valid_subapertures=rtc_valid_subapertures(right), **optics),
+            obscuration_ratio=right.obscuration_ratio + size * of_obscuration,
+            mirror=replace(mirror, shape=shape, positions_m=positions_m, mode_to_actuator=strokes),
+        )
+        return about, RtcInteractionModel(about, modal_basis(about))
+
+    def excess(size: float) -> float:
+        matrix = make_wrong(size)[1].interaction_matrix(alpha).astype(float)
+        gains = np.sum(response * matrix, axis=0) / np.sum(matrix**2, axis=0)
+        left = np.linalg.norm(response - matrix * gains, axis=0) / np.linalg.norm(response, axis=0)
+        return float(np.sqrt(np.mean(left**2))) - plan.error
+
+    return make_wrong(0.0 if excess(0.0) > 0.0 else brentq(excess, 0.0, 0.5, xtol=1e-3))
+
+
+def service_model(plan: Plan) -> tuple[Instrument, RtcInteractionModel]:
+    """Return the instrument of the service, and its model."""
+    if plan.plant == "linear":
+        return models_of(plan.instrument)[:2]
+    return _wrong_model(replace(plan, mode="", seconds=0.0, n_first=N_FIRST, settings=()))
+
+
+def dome_of(plan: Plan, response: Array, own: Array | None = None) -> Dome:
+    """Return the telescope; ``own`` as for ``ModalDome``."""
+    if plan.plant == "diffractive":
+        return DiffractiveDome(plan)
+    return ModalDome(
+        models_of(plan.instrument)[0],
+        response,
+        alpha=true_alpha(plan),
+        seed=plan.seed,
+        slope_noise=plan.slope_noise,
+        n_first=plan.n_first,
+        own=own,
+    )
+
+
 def response_of(plan: Plan) -> Array:
     """Return the plant's matrix ``(n_slopes, n_modes)``."""
+    if plan.plant == "diffractive":
+        return DiffractiveDome(plan).response
     if plan.matrix:
         with np.load(plan.matrix) as file:
             return np.asarray(file["D"], float)
@@ -273,7 +397,7 @@ def response_of(plan: Plan) -> Array:
 
 def fitted_alpha(plan: Plan, response: Array) -> Misregistration:
     """Return the registration that best explains all columns of the plant's matrix."""
-    _, model, _ = models_of(plan.instrument)
+    _, model = service_model(plan)
     start = true_alpha(plan) if not plan.matrix else model.instrument.start
     found = recognise_modes(
         np.linalg.pinv(response, rcond=1e-6).astype(np.float32), model.linearise, start
@@ -285,22 +409,15 @@ def fitted_alpha(plan: Plan, response: Array) -> Misregistration:
 
 def best_nm(plan: Plan, n_modes: int) -> float:
     """Return the wavefront error with the measured matrix' own inverse of so many modes."""
-    return _best_nm(replace(plan, mode="", seconds=0.0, settings=()), n_modes)
+    seconds = LATE_S + 2.0 if plan.plant == "linear" else plan.seconds
+    return _best_nm(replace(plan, mode="", seconds=seconds, n_first=n_modes, settings=()))
 
 
 @lru_cache(maxsize=16)
-def _best_nm(plan: Plan, n_modes: int) -> float:
+def _best_nm(plan: Plan) -> float:
     """Return the same; whatever the service does on this plant, it is computed once."""
-    instrument, *_ = models_of(plan.instrument)
-    dome = ModalDome(
-        instrument,
-        response_of(plan),
-        alpha=true_alpha(plan),
-        seed=plan.seed,
-        slope_noise=plan.slope_noise,
-        n_first=n_modes,
-    )
-    while dome.time_s < LATE_S + 2.0:
+    dome = dome_of(plan, response_of(plan))
+    while dome.time_s < plan.seconds:
         dome.play()
     return late_nm(dome.moments)
 
@@ -313,7 +430,7 @@ def late_nm(moments: Sequence[Moment]) -> float:
 
 def stable_modes(plan: Plan, response: Array, alpha: Misregistration) -> int:
     """Return how many modes the model's reconstructor at ``alpha`` holds on the plant."""
-    _, model, _ = models_of(plan.instrument)
+    _, model = service_model(plan)
     matrix, most = model.interaction_matrix(alpha), 0
     for n in range(1, response.shape[1] + 1):
         inverse = np.linalg.pinv(matrix[:, :n], rcond=0.01)
@@ -328,18 +445,11 @@ class Night(Observatory):
 
     def __init__(self, plan: Plan, response: Array, own: Array | None = None) -> None:
         """Take the plant's matrix and, if it is another than that of the plan, the RTC's own."""
-        instrument, *_ = models_of(plan.instrument)
+        instrument, _ = service_model(plan)
         settings = load_settings(None, {}, dict(plan.settings))
         self.said: dict[tuple[str, str], float] = {}
-        dome = ModalDome(
-            instrument,
-            response,
-            alpha=true_alpha(plan),
-            seed=plan.seed,
-            slope_noise=plan.slope_noise,
-            n_first=plan.n_first,
-            own=own,
-        )
+        dome = dome_of(plan, response, own)
+        dome.instrument = instrument
         super().__init__(
             (),
             policy_of(settings, instrument),
@@ -408,6 +518,7 @@ def came_of(plan: Plan, night: Night, response: Array, fit: Misregistration) -> 
         "accepted": night.state.windows.accepted,
         "refused": night.state.windows.refused,
         "said": [(at, name, text) for (name, text), at in night.said.items()],
+        "hindrance": night.state.matrices.hindrance,
         "closed": last.closed,
         "always_closed": all(moment.closed for moment in night.dome.moments),
         "misfit": night.state.matrices.mode_proof.own_misfit_ratio,
@@ -416,14 +527,16 @@ def came_of(plan: Plan, night: Night, response: Array, fit: Misregistration) -> 
 
 def plans(given: argparse.Namespace) -> list[Plan]:
     """Return the runs that are asked for."""
+    diffractive = given.plant == "diffractive"
     return [
         Plan(
             error=error,
             mode=mode,
+            plant=given.plant,
             seed=seed,
             matrix=given.matrix,
-            instrument=given.instrument,
-            n_first=given.n_first,
+            instrument=given.instrument or diffractive * DIFFRACTIVE or INSTRUMENT,
+            n_first=given.n_first or (60 if diffractive else N_FIRST),
             seconds=given.seconds,
         )
         for seed in range(given.first, given.first + given.draws)
@@ -497,11 +610,10 @@ def main() -> int:
     parser.add_argument("--draws", type=int, default=20)
     parser.add_argument("--first", type=int, default=1, help="first draw")
     parser.add_argument("--seconds", type=float, default=36.0, help="of each run")
+    parser.add_argument("--plant", choices=["linear", "diffractive"], default="linear")
     parser.add_argument("--matrix", default="", help="a measured matrix instead, npz with D")
-    parser.add_argument("--instrument", default=INSTRUMENT, help="its instrument file")
-    parser.add_argument(
-        "--n-first", type=int, default=N_FIRST, help="modes of the RTC's own matrix"
-    )
+    parser.add_argument("--instrument", help="its instrument file")
+    parser.add_argument("--n-first", type=int, help="modes of the RTC's own matrix")
     parser.add_argument("--output", type=Path, default=Path("measured_plant.jsonl"))
     parser.add_argument("--table", type=Path, metavar="FILE.md")
     given = parser.parse_args()

@@ -31,6 +31,7 @@ from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration, unit_like, wrap_angle
 from service.model.modes import Basis
 from service.model.pupil import rtc_valid_subapertures
+from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import Mapper
 from service.model.slopes import FLIPS, SlopeRecipe, orient_mask, to_conventions
 
@@ -101,7 +102,7 @@ def identify_from_reconstructor(
     lower = used[: (len(used) + 1) // 2]
     sizes = np.linalg.norm(measured[:, : len(lower)], axis=0)
     ratio = float(np.median(sizes / np.linalg.norm(response[:, lower], axis=0)))
-    unit = _unit_of_matrix(ratio, double_pass=instrument.double_pass)
+    unit = _unit_of_matrix(ratio, instrument)
     try:
         poses = poses_of(
             instrument,
@@ -146,7 +147,10 @@ def identify_from_response(
         as_stated >= MIN_AXES_CORRELATION
         and not RESPONSE_RATIO_RANGE[0] < ratio < RESPONSE_RATIO_RANGE[1]
     ):
-        unit = f"slopes answer commands {ratio:.2g} times as the model does: {_unit_named(ratio)}"
+        unit = (
+            f"slopes answer commands {ratio:.2g} times as the model does: "
+            f"{_unit_named(ratio, instrument)}"
+        )
     every = {
         setting: _resemblance(_planes(slopes, setting, mask), model)
         for setting in settings_of(reported, reported.kind.orders)
@@ -233,30 +237,39 @@ def _axes_named(witness: str, found: SlopeRecipe, reported: SlopeRecipe) -> str:
     )
 
 
-def _unit_of_matrix(ratio: float, *, double_pass: bool) -> str:
+def _unit_of_matrix(ratio: float, instrument: Instrument) -> str:
     """Return what is wrong with the unit of a matrix that expects so many times the model's slopes.
 
-    An optical gain makes them fewer, the two passes of a day twice as many.
+    An optical gain makes them fewer, the two passes of a day twice as many, and a pyramid whose
+    modulation is half of the instrument file's nearly so.
     """
-    if DOUBLED_RESPONSE_RANGE[0] < ratio < DOUBLED_RESPONSE_RANGE[1] and not double_pass:
+    if DOUBLED_RESPONSE_RANGE[0] < ratio < DOUBLED_RESPONSE_RANGE[1] and not instrument.double_pass:
         return (
             f"the RTC's own matrix expects {ratio:.2f} times the model's slopes: its commands are "
             "metres of surface, not of OPD, or it was measured in double pass ([instrument] "
-            "double_pass = true)"
+            f"double_pass = true){_optic_named(instrument)}"
         )
     if RESPONSE_RATIO_RANGE[0] < ratio < RESPONSE_RATIO_RANGE[1]:
         return ""
     return (
-        f"the RTC's own matrix expects {ratio:.2g} times the model's slopes: {_unit_named(ratio)}"
+        f"the RTC's own matrix expects {ratio:.2g} times the model's slopes: "
+        f"{_unit_named(ratio, instrument)}"
     )
 
 
-def _unit_named(ratio: float) -> str:
-    """Return which unit of commands makes them answer so many times as metres of OPD would."""
+def _optic_named(instrument: Instrument) -> str:
+    """Return the value of the sensor that also explains too large a response; empty if none."""
+    key = kind_of(instrument).find_fitted_key(instrument.wfs)
+    return "" if key is None else f", or [wfs] {key} is too large"
+
+
+def _unit_named(ratio: float, instrument: Instrument) -> str:
+    """Return what makes commands answer so many times as metres of OPD would."""
     unit = unit_like(1.0 / max(ratio, 1e-30), _UNIT_DECADES)
     if unit:
         return f"commands look like {unit}; metres of OPD are expected"
-    return "commands are in another unit than metres of OPD, or decoded wrongly"
+    optic = _optic_named(instrument) if ratio > 1.0 else ""
+    return f"commands are in another unit than metres of OPD, or decoded wrongly{optic}"
 
 
 def _planes(rows: Array, slopes: SlopeRecipe, mask: NDArray[np.bool_]) -> Array:

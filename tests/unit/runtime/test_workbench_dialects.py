@@ -200,6 +200,14 @@ def test_commands_in_another_unit_are_named_by_the_rtcs_own_matrix(metres, named
     assert named in dialect.wrong
 
 
+@pytest.mark.parametrize("ratio", [1.9, 3.2])
+def test_a_modulation_that_is_too_large_may_be_why_the_own_matrix_expects_more(ratio):
+    """A pyramid's response grows as its modulation shrinks, as if light met the mirror twice."""
+    rtc = Mistold()
+    wrong = rtc.told.read_slope_convention((rtc.own / ratio).astype(np.float32), None).wrong
+    assert "modulation_lambda_over_d" in wrong
+
+
 def test_commands_in_another_unit_are_named_by_the_answer_to_the_dither():
     rtc = Mistold()
     window = dithered_window(Sensor(rtc.seen), ALPHA_SMALL)

@@ -53,7 +53,7 @@ UNEVEN_RATIO = 1.6
 healthy telescopes are within 1.12, but for the last of a basis that has all of a mirror's."""
 
 N_NEIGHBOURS = 10
-"""Modes on either side that a mode's response is compared with."""
+"""Number of neighbours that a mode's response is compared with."""
 
 MIN_ROLLED_SHARE = 0.8
 """Share of misplaced modes that are so by as many places, when all are said to be rolled."""
@@ -167,12 +167,13 @@ class OwnMatrix:
     def uneven(self) -> str:
         """Text on modes whose response differs from their neighbours'; empty without any."""
         recognised = np.flatnonzero(self.modes >= 0)
-        size = np.abs(self.response)
+        size = np.abs(self.response[recognised])
         ratio = {
-            int(self.columns[k]): float(
-                size[k] / np.median(size[recognised[np.abs(recognised - k) <= N_NEIGHBOURS]])
+            int(self.columns[mode]): float(
+                size[k] / np.median(size[find_neighbours(recognised, k)])
             )
-            for k in recognised
+            for k, mode in enumerate(recognised)
+            if len(recognised) > 1
         }
         odd = [
             f"mode {mode} {times:.2g} times"
@@ -230,6 +231,11 @@ class OwnMatrix:
             return f"modes {exchanged} are exchanged by the RTC's own matrix"
         told = _list_in_words([f"{one} is the instrument file's {to}" for one, to in place.items()])
         return f"modes have other places by the RTC's own matrix: {told}"
+
+
+def find_neighbours(modes: NDArray[np.intp], k: int) -> NDArray[np.intp]:
+    """Return the indices of the ``N_NEIGHBOURS`` modes nearest in number to ``modes[k]``."""
+    return np.argsort(np.abs(modes - modes[k]), kind="stable")[1 : N_NEIGHBOURS + 1]
 
 
 def recognise_modes(

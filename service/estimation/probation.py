@@ -21,7 +21,7 @@ Numbers are from docs/results/reliability.md.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -87,6 +87,9 @@ RETURN_PERIOD_S = 1.0
 
 N_RETURN_PARTS = 10
 """Number of the last parts that decide if the loop has returned."""
+
+N_SINE_BASES = 8
+"""Bases of sines that are kept: a dither's, for each of the few lengths of blocks that come."""
 
 _LAG_SPAN_FRAMES = LAG_FRAMES + 1
 _POWER_STRIDE_FRAMES = 4
@@ -336,7 +339,7 @@ def _part(
     return Part(n_frames=n_frames, power=power, peak=peak)
 
 
-@cache
+@lru_cache(maxsize=N_SINE_BASES)
 def _sines(n_frames: int, lines: tuple[float, ...]) -> NDArray[np.float32]:
     """Return ``(n_frames, 2 n_lines)`` an orthonormal basis of sines, whatever their phases."""
     angles = 2.0 * np.pi * np.outer(np.arange(n_frames), lines)

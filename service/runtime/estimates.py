@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import assert_never
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,6 +137,8 @@ async def _outcome(
         )
     if isinstance(window, Correlated):
         return await workers.call(OpticsWorker.fit_random, window, start)
+    if not isinstance(window, lockin.Spectra):
+        assert_never(window)
     if state.operations.acquisition.uses_wide_capture:
         flux = None if rtc is None else rtc.flux
         found, nominal = state.operations.acquisition.alpha, state.alpha.law.nominal

@@ -28,6 +28,9 @@ from service.wire import DitherKind, Status
 N_MATRICES_FOLLOWED = 2
 """The reconstructor in use, and the one before: frames of it may still come."""
 
+_PLANS = {DitherKind.SINE: lock_in_plan, DitherKind.BINARY: random_plan}
+"""How the windows of each kind of dither are planned."""
+
 Member = TypeVar("Member", bound=Streaming)
 
 
@@ -154,9 +157,8 @@ def with_dither(bank: EstimatorBank, dither: Dither | None, window_s: float) -> 
         return bank
     if dither is not None and rtc is not None:
         played = expected_dither(dither, rtc, bank.loop.description.products)
-        binary = dither.request.kind is DitherKind.BINARY
         try:
-            plan = (random_plan if binary else lock_in_plan)(dither, rtc, window_s)
+            plan = _PLANS[dither.request.kind](dither, rtc, window_s)
             played = replace(played, plan=plan)
         except ModelError as error:
             played = replace(played, why_unreadable=str(error))

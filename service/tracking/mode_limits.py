@@ -8,9 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-UNEVEN_RATIO, HEALTHY_RATIO = 1.6, 1.3
-"""A mode whose response differs from that of its neighbours by the first factor or its inverse is
-reported if it certainly exceeds the second, which healthy modes do not exceed. It may still be
+from service.estimation.own_matrix import N_NEIGHBOURS, UNEVEN_RATIO, find_neighbours
+
+HEALTHY_RATIO = 1.3
+"""A mode whose response differs from that of its neighbours by ``UNEVEN_RATIO`` or its inverse is
+reported if it certainly exceeds this factor, which healthy modes do not exceed. It may still be
 controlled."""
 
 DOUBTFUL_RATIO = 1.45
@@ -18,10 +20,6 @@ DOUBTFUL_RATIO = 1.45
 
 CERTAINTY_SIGMA = 3.0
 """A ratio is certainly beyond a limit if it exceeds it by this many σ."""
-
-N_NEIGHBOURS = 10
-"""Number of neighbours that a mode is compared with. A window with fewer dithered modes is not
-compared."""
 
 MAX_NEIGHBOUR_DISTANCE = 2 * N_NEIGHBOURS
 """Modes away that one of them may be: others have another optical gain."""
@@ -112,14 +110,14 @@ def compare(
 ) -> dict[int, ModeRatio]:
     """Compare the response of each mode in one window with those of its neighbours in the basis.
 
-    Optical gains change slowly with the mode number. With few modes in a window there is nothing to
-    compare with.
+    Optical gains change slowly with the mode number. A window with fewer than ``N_NEIGHBOURS``
+    other modes is not compared.
     """
     found: dict[int, ModeRatio] = {}
     if len(modes) <= N_NEIGHBOURS:
         return found
     for k, mode in enumerate(modes.tolist()):
-        beside = np.argsort(np.abs(modes - mode), kind="stable")[1 : N_NEIGHBOURS + 1]
+        beside = find_neighbours(modes, k)
         usual = float(np.median(gains[beside]))
         if usual > 0.0 and abs(modes[beside[-1]] - mode) <= MAX_NEIGHBOUR_DISTANCE:
             found[mode] = ModeRatio(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from service.estimation.demodulation import SIDE_OFFSETS_HZ
 from service.estimation.estimate import DitheredEstimate
 from service.estimation.lockin import LockInEstimate
+from service.estimation.own_matrix import N_NEIGHBOURS, UNEVEN_RATIO
 from service.estimation.random_dither import RandomEstimate
 from service.tracking import alarms
 from service.tracking import events as ev
@@ -23,8 +24,6 @@ from service.tracking.dither_modes import N_LINES, PROVING_LINE_RANGE, choose_mo
 from service.tracking.dither_request import VIBRATION_CLEARANCES_HZ, step_of
 from service.tracking.mode_limits import (
     MAX_LISTED_MODES,
-    N_NEIGHBOURS,
-    UNEVEN_RATIO,
     ModeAnswer,
     ModeProof,
     ModeRatio,

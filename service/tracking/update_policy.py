@@ -262,12 +262,13 @@ def _apart(
     return bool(np.any(distance > np.maximum(threshold, 3.0 * noise)))
 
 
-MODE_NUMBERS = (
-    *(594, 550, 500, 450, 400, 350, 300, 260, 230, 200, 175, 150),
-    *(130, 115, 100, 90, 80, 70, 60, 52, 45, 40, 35, 30),
-)
-"""Numbers of modes that are tried. A step costs 2 nm of wavefront at 594 modes, 6 at 400, 11 at 100
-(FLAO, 1", where 400 leave 117); halves are tried, so that a finer list costs a trial at most."""
+MODE_STEP_RATIO = 1.05
+"""Ratio of two numbers of modes that are tried one after the other. A step costs at most 3 nm of
+wavefront at 500 and 400 modes, 4 at 100 (FLAO, 1", where 400 leave 117). Halves are tried, so that
+six trials find the most of 594 that pass; half of this step would take one more."""
+
+MIN_TRIED_MODES = 30
+"""Fewest modes that are tried instead of more."""
 
 FIRST_MODES_DELAY_S = 60.0
 """First delay after the number of modes was lowered before more are tried."""
@@ -288,13 +289,14 @@ _DECLINED_STATES = frozenset({MatrixState.REFUSED, MatrixState.REJECTED, MatrixS
 
 
 def half_of_modes(n_modes: int) -> int:
-    """Return the largest rung that is at most half of ``n_modes``, or these where there is none."""
-    return max((rung for rung in MODE_NUMBERS if 2 * rung <= n_modes), default=n_modes)
+    """Return half of ``n_modes``, or these where that is fewer than are ever tried."""
+    return n_modes if n_modes // 2 < MIN_TRIED_MODES else n_modes // 2
 
 
 def fewer_modes_than(n_modes: int) -> tuple[int, ...]:
-    """Return the rungs below ``n_modes``, largest first."""
-    return tuple(rung for rung in MODE_NUMBERS if rung < n_modes)
+    """Return the numbers of modes that are tried where ``n_modes`` fail, largest first."""
+    n_steps = max(int(np.log(n_modes / MIN_TRIED_MODES) / np.log(MODE_STEP_RATIO)), 0)
+    return tuple(round(n_modes / MODE_STEP_RATIO**k) for k in range(1, n_steps + 1))
 
 
 def more_modes_to_try(

@@ -329,7 +329,7 @@ def _make(context: StepContext, n_modes: int, rtc: Status, *, at_least: int = 0)
             why=f"acquisition: {n_modes} modes",
             gains=stages.gains_for(found, n_modes, rtc.n_modes),
             fewer=tuple(
-                rung for rung in update_policy.fewer_modes_than(n_modes) if rung > at_least
+                fewer for fewer in update_policy.fewer_modes_than(n_modes) if fewer > at_least
             ),
         )
         reconstructors.request_matrix(context, effect)

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from service.estimation.own_matrix import (
+    N_NEIGHBOURS,
     LeftOver,
+    find_neighbours,
     left_over,
     recognise_modes,
     weights_of_modes,
@@ -23,6 +25,13 @@ ALPHAS = {
     "as a night leaves it": (0.12, -0.08, 0.2, 1.003),
     "as badly as it may be": (-1.4, 1.2, 6.0, 0.98),
 }
+
+
+def test_neighbours_are_the_nearest_modes_on_either_side_and_not_the_mode_itself():
+    modes = np.array([*range(20), 40])
+    assert sorted(modes[find_neighbours(modes, 10)]) == [5, 6, 7, 8, 9, 11, 12, 13, 14, 15]
+    assert len(find_neighbours(modes, 20)) == N_NEIGHBOURS
+    assert list(find_neighbours(np.array([3, 9]), 0)) == [1]
 
 
 @cache

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy
 
+from service.estimation import probation
 from service.estimation.comparison import PRIOR_SCATTER, Verdict, measure_sigma
 from service.estimation.frames import FrameBlock
 from service.estimation.probation import MAX_PROBATION_S, Comparison, begun_anew, observe
@@ -127,6 +128,16 @@ def test_a_dither_that_begins_or_ends_with_the_swap_does_not_count(first):
     assert judged(parts, N_MODES - 2, (), None).verdict is (
         Verdict.AS_GOOD if first else Verdict.WORSE
     ), "the lines do count where nobody tells of them: the test would show it"
+
+
+def test_a_night_of_many_dithers_keeps_the_sines_of_a_few():
+    """Each dither has other lines."""
+    played = np.zeros((400, N_MODES))
+    played[:, -1] = 1e-9
+    for k in range(4 * probation.N_SINE_BASES):
+        lines = (205.0 + k, 293.0)
+        judged([("a", residual(np.random.default_rng(1), 0.4))], N_MODES - 2, lines, played)
+    assert probation._sines.cache_info().currsize <= probation.N_SINE_BASES
 
 
 def test_without_enough_before_nothing_is_said():

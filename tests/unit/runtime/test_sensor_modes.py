@@ -244,6 +244,12 @@ async def test_a_second_matrix_of_the_rtc_does_not_make_workers_forget_the_orien
     assert workers.first.args[1] == found
 
 
+async def test_a_window_of_an_unknown_dither_is_not_taken_for_sines(night):
+    window = SimpleNamespace(session=night.state.loop.rtc.session, t_end_ns_utc=7)
+    with pytest.raises(AssertionError):
+        await fitted(window, night.state, workers=None, matrix_of=None)
+
+
 async def test_a_window_of_a_session_before_is_not_fitted(night):
     """The worker has another model by then: of another mode, it could only fail."""
     window = SimpleNamespace(session="before", t_end_ns_utc=7)

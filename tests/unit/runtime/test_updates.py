@@ -116,7 +116,7 @@ class TestEdge:
 
     def test_one_that_is_to_be_closed_gets_fewer(self, bench, just_beyond):
         made = make_in(bench, just_beyond, fewer_modes_than(N_CONTROLLED))
-        assert len(made.matrix) == fewer_modes_than(N_CONTROLLED)[0] == 40
+        assert len(made.matrix) == fewer_modes_than(N_CONTROLLED)[0] == 43
         assert "outer ring" in made.why_fewer
 
     def test_one_that_holds_with_as_many_keeps_them(self, bench, just_beyond):

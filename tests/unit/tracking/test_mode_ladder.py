@@ -13,7 +13,7 @@ from service.tracking.update_policy import (
     DECLINED_MODES_DELAY_S,
     FIRST_MODES_DELAY_S,
     MAX_MODES_DELAY_S,
-    MODE_NUMBERS,
+    MIN_TRIED_MODES,
     fewer_modes_than,
 )
 from tests.unit.tracking.situations import (
@@ -76,13 +76,23 @@ def test_every_request_of_the_services_own_names_fewer_modes_to_try():
     (effect,) = of_kind(Night().see(n_windows=2), ev.MakeMatrix)
     assert effect.n_modes == 400
     assert effect.fewer == fewer_modes_than(400)
-    assert (effect.fewer[0], effect.fewer[-1]) == (350, 30)
+    assert (effect.fewer[0], effect.fewer[-1]) == (381, 30)
 
 
-def test_no_rung_is_far_below_the_next_and_five_more_trials_find_the_most_that_pass():
-    """Six with the one asked for: 400 modes take a second each, and nothing else waits so long."""
-    assert all(lower >= 0.84 * upper for upper, lower in pairwise(MODE_NUMBERS))
-    assert len(MODE_NUMBERS) < 2**5
+@pytest.mark.parametrize(("n_modes", "n_trials"), [(5000, 7), (594, 6), (500, 6), (45, 4)])
+def test_no_number_is_far_below_the_next_and_a_few_trials_find_the_most_that_pass(
+    n_modes, n_trials
+):
+    """400 modes take a second each."""
+    tried = (n_modes, *fewer_modes_than(n_modes))
+    assert all(upper > lower >= 0.93 * upper for upper, lower in pairwise(tried))
+    assert MIN_TRIED_MODES <= tried[-1] <= MIN_TRIED_MODES + 2
+    assert len(tried) - 1 < 2**n_trials
+
+
+@pytest.mark.parametrize("n_modes", [1, 30, 31])
+def test_no_fewer_than_thirty_are_tried(n_modes):
+    assert fewer_modes_than(n_modes) == ()
 
 
 def test_raising_never_ends_below_the_present_number():
@@ -91,7 +101,7 @@ def test_raising_never_ends_below_the_present_number():
     night.make_for(first, 400)
     night.policy = replace(WANTED, n_modes_target=594)
     (more,) = of_kind(night.wait(6), ev.MakeMatrix)
-    assert (more.n_modes, more.fewer) == (594, (550, 500, 450))
+    assert (more.n_modes, more.fewer) == (594, (566, 539, 513, 489, 465, 443, 422, 402))
 
 
 def test_a_short_margin_lowers_the_number_of_modes_and_says_why():
@@ -106,7 +116,7 @@ def test_more_are_tried_after_a_wait_while_the_margin_is_comfortable():
     night = Night().lowered()
     assert not of_kind(night.wait(FIRST_MODES_DELAY_S - 5), ev.MakeMatrix)
     (more,) = of_kind(night.wait(10), ev.MakeMatrix)
-    assert (more.n_modes, more.fewer) == (500, (450, 400, 350))
+    assert (more.n_modes, more.fewer[0], more.fewer[-1]) == (500, 476, 307)
 
 
 @pytest.mark.parametrize("radius", [0.93, 0.949])

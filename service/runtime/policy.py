@@ -101,6 +101,7 @@ def policy_of(settings: Settings, instrument: Instrument | None = None) -> Polic
         dither_frequencies_hz=dither.frequencies_hz,
         window_s=dither.window_s,
         longest_window_s=dither.longest_window_s,
+        # A random walk: its σ grows with the square root of time.
         drift_rate=per_minute / np.sqrt(60.0),
         floor=floor_of(settings, instrument) / BOUNDARY_SCALE,
         bias_memory_s=tracking.bias_memory_s,
@@ -176,6 +177,7 @@ def _stale_sigma(settings: Settings, instrument: Instrument | None) -> NDArray[n
         STALE * tolerance_scale(settings, instrument)[1:],
     )
     usual, floor = (floor_of(settings, about) / BOUNDARY_SCALE for about in (None, instrument))
+    # The limit contains the usual floor already: only the difference of the variances is added.
     return np.where(floor > usual, np.sqrt(limit**2 + floor**2 - usual**2), limit)
 
 

@@ -97,6 +97,8 @@ class Archive:
         """
         try:
             self.directory.mkdir(mode=FOLDER_MODE, parents=True, exist_ok=True)
+            # Before anything is read: products are adopted below, which two services must not do at
+            # once.
             self._lock = _lock_archive(self.directory / "lock")
         except OSError as error:
             self.close()
@@ -130,6 +132,7 @@ class Archive:
         """Do the same in memory, for as long as the disk refuses to be written."""
         anew = self.index.open_copy()
         told = [line for folder in self.stores for line in folder.adopt(anew=anew)]
+        # After the adoption, which changes the copy.
         self.index.forbid_writing()
         return [*told, f"{error}: the service runs on what it could read, and records nothing yet"]
 
@@ -195,9 +198,11 @@ class Archive:
         StorageError
             If the disk refuses.
         """
+        # The disk refused when the archive was opened: the index is still the copy in memory.
         if not self._on_disk:
             self._take_in()
         for record in records:
+            # Files before the index: the index can be rebuilt from them.
             self.reconstructors.write_state(record)
         self.index.record(records, entries, estimates, samples)
 
@@ -219,6 +224,7 @@ class Archive:
             with path.open("wb") as file:
                 for start in range(0, self.reconstructors.largest_bytes, PROBE_BYTES):
                     left = self.reconstructors.largest_bytes - start
+                    # Real zeros are written, because a sparse file would take no space.
                     file.write(bytes(min(PROBE_BYTES, left)))
                 file.flush()
                 os.fsync(file.fileno())

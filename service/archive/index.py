@@ -200,6 +200,8 @@ class Index:
         """
         memory = sqlite3.connect(self._name_of_copy, uri=True, **_OPTIONS)
         with contextlib.suppress(sqlite3.Error):
+            # immutable: without it SQLite must create files next to the index to read it, which a
+            # full disk refuses.
             name = f"{self._path.absolute().as_uri()}?mode=ro&immutable=1"
             with closing(sqlite3.connect(name, uri=True)) as file:
                 file.backup(memory)
@@ -219,9 +221,14 @@ class Index:
         """Use a connection once its tables are those of this version; return if there were none."""
         try:
             with self._explained():
+                # Before any statement that changes the file: one of a later version must stay as it
+                # is.
                 version = self._version(connection)
                 connection.execute("PRAGMA journal_mode = WAL")
+                # With NORMAL a power cut loses the last transactions of a write-ahead log, which
+                # were reported as stored.
                 connection.execute("PRAGMA synchronous = FULL")
+                # One transaction, or a kill in between would leave a file with some of the tables.
                 connection.executescript(f"BEGIN;{_SCHEMA}")
         except ArchiveError:
             connection.close()
@@ -282,6 +289,7 @@ class Index:
                 f"INSERT INTO {table} VALUES (?, ?, ?, ?)"
                 " ON CONFLICT (id) DO UPDATE SET"
                 " record = excluded.record, product_sha256 = excluded.product_sha256"
+                # A product that is stored is never replaced.
                 " WHERE product_sha256 IS NULL",
                 (record.id, begun_ns_utc(record), to_json(record), sha256),
             )
@@ -299,6 +307,8 @@ class Index:
         A reconstructor that has no product here is entered.
         """
         with self._use() as connection:
+            # Takes the write lock at once: a deferred transaction may fail half-way with "database
+            # is locked".
             connection.execute("BEGIN IMMEDIATE")
             connection.executemany(
                 "INSERT INTO reconstructor VALUES (?, ?, ?, NULL)"
@@ -402,6 +412,7 @@ class Index:
                 with self._explained():
                     yield self._connection
             finally:
+                # An exception must not leave the transaction open for the next caller.
                 if self._connection.in_transaction:
                     self._connection.rollback()
 

@@ -262,6 +262,7 @@ class Nights:
             )
         if n_there <= n_points:
             return self.estimates(first_ns, last_ns, n_points)
+        # Each part gives a lowest and a highest entry of every parameter.
         n_parts = n_points // (2 * len(PARAMETERS))
         # of the row that has it, where there is one min or max: https://sqlite.org/lang_select.html
         extremes = " UNION ".join(
@@ -272,6 +273,7 @@ class Nights:
         )
         rows = self._asked(
             f"SELECT {_COLUMNS} FROM estimate WHERE rowid IN ({extremes}) ORDER BY t_ns_utc",
+            # Plus 1: the last entry would otherwise begin a part of its own.
             times | {"begin": begin_ns, "width": (end_ns - begin_ns) // n_parts + 1},
         )
         return tuple(map(_entry, rows))

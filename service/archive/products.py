@@ -116,6 +116,7 @@ class ReconstructorArchive(Store[ReconstructorRecord]):
             If the disk refuses.
         """
         path = self.path_of(record.id)
+        # A record without a stored matrix is in the index only.
         if not path.exists():
             return
         _write_beside(path, to_json(record).encode())
@@ -129,6 +130,8 @@ class ReconstructorArchive(Store[ReconstructorRecord]):
             fate = None
         if fate is not None and fate.id == record.id:
             return fate
+        # Without the index nobody knows whether it was ever sent: it must not wait for approval
+        # again.
         if anew:
             reason = "what became of it was lost with the index"
             return replace(record, state=MatrixState.DISCARDED, reason=reason)
@@ -321,6 +324,7 @@ class Recordings(Folder):
             raw = path.with_suffix(".json").read_bytes()
             return msgspec.json.decode(raw, type=RecordingRecord)
         except (OSError, msgspec.MsgspecError):
+            # A recording whose record is lost is still listed, with what its file shows.
             made_ns = path.stat().st_mtime_ns if path.exists() else 0
             return RecordingRecord(
                 id=recording_id,
@@ -356,6 +360,7 @@ class Recordings(Folder):
         """
         try:
             with Recording(self.path_of(recording_id)) as recording:
+                # Reading finds the damage: a recording has no checksum.
                 for _ in recording.messages():
                     pass
         except (ConfigurationError, OSError, RuntimeError, ValueError, KeyError) as error:

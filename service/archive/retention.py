@@ -145,6 +145,7 @@ def remove(archive: Archive, item: Item, why: str) -> AuditEntry | None:
     ArchiveError
         If the disk refuses.
     """
+    # Asked again, because the list of what is due may be minutes old.
     if any(pin.id == item.id for pin in archive.index.pins()):
         return None
     next(store for store in archive.stores if store.noun == item.kind).remove(item.id)

@@ -179,6 +179,7 @@ class TrackingFile:
                 raise ValueError(f"found checksum {_sha256(values)}, expected {expected}")
             return _convert_saved(values)
         except (OSError, AttributeError, *NOT_UNDERSTOOD) as error:
+            # Renamed, or every start would fail at the same file.
             aside = self._path.with_suffix(".damaged")
             self._path.replace(aside)
             raise ArchiveError(
@@ -217,6 +218,7 @@ def _convert_saved(values: dict[str, Any]) -> Saved:
     saved = msgspec.convert(
         values, Saved, dec_hook=lambda _kind, value: np.array(value, dtype=np.float64)
     )
+    # msgspec ignores unknown keys: those of a later version would be lost with the next write.
     refuse_unknown(values, saved)
     parts = (saved.registration, saved.acquisition, saved.orders, saved.offload)
     if all(part is None for part in parts):

@@ -147,9 +147,12 @@ class Store(Folder, Generic[Record]):
                     became = self._became(record, anew=anew)
                     self._index.add(self._table, became, checksum(matrix))
         _, wrong = self._index.records(self._table, self.kind)
+        # Only opened here: the checksums of all matrices would take minutes, and each is verified
+        # when it is read.
         self._unsound = self._find_damage(sorted(known.keys() - wrong.keys()))
         self._stand_ins.clear()
         for name in wrong:
+            # A product that is damaged as well is reported by its file.
             with contextlib.suppress(ArchiveError):
                 self._stand_ins[name] = self._became(self._record(name), anew=False)
         return [*told, *self._unsound.values(), *wrong.values()]
@@ -228,6 +231,7 @@ class Store(Folder, Generic[Record]):
         if self._is_sound(record.id, known) or known not in {None, found}:
             raise taken
         if known is None and path.exists():
+            # Kept for inspection: it may be the only trace of what was stored.
             path.replace(path.with_suffix(".damaged"))
 
         def whole(file: h5py.File) -> None:
@@ -240,6 +244,7 @@ class Store(Folder, Generic[Record]):
             file.attrs["record"] = to_json(record)
 
         write_whole(path, whole)
+        # Entered last: an index entry without its file would be a product that is missing.
         if not self._index.add(self._table, record, found) and known is None:
             raise taken
         self._unsound.pop(record.id, None)

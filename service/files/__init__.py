@@ -120,6 +120,7 @@ def parse_modes(text: str) -> NDArray[np.intp]:
             raise ValueError(f"found {text!r}, {expected}")
         first, end, step = match.groups()
         last = int(end) if end is not None else int(first) + 1
+        # Before the range is made: a request must not fill the memory.
         if last > MAX_MODES or step == "0":
             raise ValueError(f"found {text!r}, expected modes below {MAX_MODES} and a step above 0")
         indices.extend(range(int(first), last, int(step or 1)))
@@ -127,6 +128,7 @@ def parse_modes(text: str) -> NDArray[np.intp]:
         raise ValueError(f"found {text!r}, which is no mode at all; {expected}")
     if len(set(indices)) < len(indices):
         raise ValueError(f"found {text!r}, expected no mode twice")
+    # Imported late, so that a mistake in the command line is reported at once.
     import numpy as np
 
     return np.array(indices, dtype=np.intp)

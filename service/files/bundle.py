@@ -111,6 +111,7 @@ def read_bundle(path: str | Path) -> Bundle:
     """
     path = Path(path)
     with opened(path) as container:
+        # FITS names are in capitals.
         stored = {name.lower(): array for name, array in container.arrays.items()}
         if MANIFEST not in stored:
             raise MatrixError(f"{path}: found {container.listing()}, expected a bundle's manifest")
@@ -119,6 +120,7 @@ def read_bundle(path: str | Path) -> Bundle:
         for name, told in manifest["arrays"].items():
             if name not in stored:
                 raise MatrixError(f"{path}: {name} is missing, which its manifest has")
+            # FITS is big-endian: the checksum is of the little-endian numbers.
             values = _plain(stored[name].read())
             found = {"dtype": values.dtype.str, "shape": list(values.shape), **_sum_of(values)}
             if found != told:
@@ -128,6 +130,7 @@ def read_bundle(path: str | Path) -> Bundle:
                     f"{told.get('shape')} {str(told.get('sha256'))[:12]}"
                 )
             arrays[name] = values
+        # What the manifest does not name has no checksum.
         others = stored.keys() - arrays.keys()
         if others:
             raise MatrixError(f"{path}: found {', '.join(sorted(others))}, not in its manifest")
@@ -194,6 +197,7 @@ def _other_basis(mode_to_actuator: Array | None, modes: Array) -> str:
         found = "modes of {1} actuators".format(*theirs.shape)
         return f"found {len(theirs)} {found}, expected {len(modes)} of {modes.shape[1]}"
     length = np.linalg.norm(theirs, axis=1) * np.linalg.norm(modes, axis=1)
+    # A mode without strokes has cosine 0 and is refused, instead of dividing by zero.
     along = np.einsum("ma,ma->m", theirs, modes) / np.where(length > 0.0, length, np.inf)
     k = int(np.argmin(along))
     if along[k] < SAME_MODE:

@@ -79,6 +79,7 @@ class StoredArray:
         MatrixError
             If it is too large, claims more than the file can hold, or the file is damaged there.
         """
+        # At least 8 bytes each: the numbers become float64.
         n_bytes = max(math.prod(self.shape), math.prod(self.at_once)) * max(self.dtype.itemsize, 8)
         most = min(MAX_BYTES, max(ROOMY_BYTES, MAX_SWELLING * self.stored_bytes))
         if n_bytes > most:
@@ -173,6 +174,7 @@ def _hdf5(path: Path) -> Iterator[Container]:
 
 
 def _dataset(item: object, where: str) -> StoredArray | None:
+    # A dataset without a shape is HDF5's empty one (a null dataspace).
     if not isinstance(item, h5py.Dataset) or item.shape is None:
         return None
     return StoredArray(
@@ -209,6 +211,7 @@ def _fits(path: Path) -> Iterator[Container]:
                 if hdu.is_image and getattr(hdu, "shape", ()):  # a damaged one has none
                     name = str(hdu.header.get("EXTNAME", number))
                     array = _image(hdu, f"{path}[{name}]", path.stat().st_size)
+                    # EXTNAME need not be unique.
                     arrays[str(number) if name in arrays else name] = array
                     known.setdefault(name.lower(), array)
                     known[str(number)] = array
@@ -262,6 +265,7 @@ NUMPY_DAMAGE = (OSError, EOFError, ValueError, TypeError, OverflowError, SyntaxE
 def _numpy(path: Path) -> Iterator[Container]:
     """Open the one array of a NumPy file; nothing that would have to be unpickled."""
     try:
+        # Unpickling would execute code of the file's author.
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except NUMPY_DAMAGE as error:
         said = str(error).replace("\n", " ")
@@ -326,10 +330,12 @@ def datasets(file: h5py.File, path: Path) -> Iterator[tuple[str, h5py.Dataset]]:
             _refuse(str(path), f"more than {MAX_DEPTH} groups within each other", "no more")
         within = []
         for name in group:
+            # Soft and external links may lead out of the file, or in a circle.
             if not isinstance(group.get(name, getlink=True), h5py.HardLink):
                 continue
             item = group[name]
             address = h5py.h5o.get_info(item.id).addr
+            # Hard links may also form a circle of groups.
             if address in seen:
                 continue
             seen.add(address)
@@ -337,6 +343,7 @@ def datasets(file: h5py.File, path: Path) -> Iterator[tuple[str, h5py.Dataset]]:
                 yield f"{prefix}{name}", item
             elif isinstance(item, h5py.Group):
                 within.append((f"{prefix}{name}/", item))
+        # Reversed, because the stack is read from its end: groups come in the order of the file.
         open_groups += reversed(within)
 
 

@@ -118,6 +118,7 @@ class DiskCache:
         if sum(array.nbytes for array in arrays.values()) > self._max_bytes:
             return
         path.parent.mkdir(parents=True, exist_ok=True)
+        # In the same folder, because a file can only be renamed within its file system.
         number, name = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=_SUFFIX)
         try:
             with os.fdopen(number, "wb") as file:
@@ -152,6 +153,7 @@ def _read(path: Path) -> Arrays | None:
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
     with contextlib.suppress(OSError):
+        # The time of modification is that of the last use: _tidy removes the oldest.
         os.utime(path)
     return arrays
 

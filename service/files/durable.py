@@ -55,6 +55,7 @@ def replace_file(path: Path, text: bytes, mode: int = 0o666) -> None:
             file.flush()
             os.fsync(file.fileno())
         part.replace(path)
+        # A new name is on the disk only when its folder is.
         flush(path.parent)
     except OSError:
         part.unlink(missing_ok=True)

@@ -40,6 +40,7 @@ class _Chunk:
     def of(cls, messages: Iterable[Message]) -> Self:
         """Return a chunk of these messages."""
         joined = b"".join(part for one in messages for part in (one.payload, one.attachment))
+        # A memory map cannot be empty.
         data = mmap.mmap(-1, max(len(joined), 1))
         data.write(joined)
         return cls(
@@ -131,6 +132,8 @@ class LastTelemetry:
         """Return the messages that came at most so many seconds ago."""
         with self._lock:
             since_s = time.monotonic() - min(before_s, self._seconds)
+            # The chunks are immutable: they are read outside the lock, even after they were dropped
+            # here.
             chunks = tuple(chunk for chunk in self._chunks if chunk.newest_s >= since_s)
             return Past(chunks=chunks, waiting=tuple(self._waiting), since_s=since_s)
 

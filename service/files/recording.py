@@ -154,6 +154,7 @@ class Recording:
         for first in range(0, len(rows), _SLAB_ROWS):
             try:
                 slab = rows[first : first + _SLAB_ROWS]
+                # int64, because the sum of two uint32 may wrap around.
                 lengths = slab["payload_bytes"].astype(np.int64) + slab["attachment_bytes"]
                 start, end = int(slab["start"][0]), int(slab["start"][-1]) + int(lengths[-1])
                 chunk = data[start : max(start, end)].tobytes()
@@ -161,6 +162,7 @@ class Recording:
                 raise ConfigurationError(f"{self._path}: damaged: {error}") from error
             for number, (row, length) in enumerate(zip(slab, lengths, strict=True), first):
                 at = int(row["start"]) - start
+                # A killed writer may have left rows whose bytes are not all on the disk.
                 if at + int(length) > len(chunk):
                     return
                 if at < 0 or int(row["kind"]) not in _KINDS or not np.isfinite(row["time_s"]):
@@ -213,6 +215,7 @@ class RecordingWriter:
             If it exists already, or cannot be created.
         """
         try:
+            # Single-writer mode needs the latest file format.
             self._file = open_hdf5(self._path, "x", libver="latest")
         except OSError as error:
             exists = isinstance(error, FileExistsError)
@@ -224,6 +227,7 @@ class RecordingWriter:
         self._bytes = _create_growing(self._file, "bytes", np.dtype("u1"), 1 << 20)
         self._rows = _create_growing(self._file, "messages", _ROW, 4096)
         self._dropped = self._file.create_dataset("dropped", data=np.zeros(1, np.int64))
+        # After all datasets and attributes: HDF5 creates none in single-writer mode.
         self._file.swmr_mode = True
         self._thread.start()
         return self
@@ -272,10 +276,12 @@ class RecordingWriter:
         with self._lock:
             self.n_dropped += len(self._waiting)
             self._waiting.clear()
+            # The first reason counts: later ones follow from it.
             self.trouble = self.trouble or str(error) or type(error).__name__
 
     def _write(self) -> None:
         """Append what waits: first of what was there before the recording, bit by bit."""
+        # In parts, because a minute of telemetry may be gigabytes.
         while part := self._part_of_past():
             n_bytes = self._append(part)
             with self._lock:

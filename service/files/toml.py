@@ -89,6 +89,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     where, at_most = str(path), f"at most {MAX_TOML_DEPTH} tables and arrays within each other"
     try:
         with path.open("rb") as file:
+            # One byte more than allowed shows that the file is larger, without reading all of it.
             written = file.read(MAX_TOML_BYTES + 1)
         if len(written) > MAX_TOML_BYTES:
             refuse(where, "a larger file", f"at most {MAX_TOML_BYTES / 1e6:g} MB of TOML")
@@ -193,6 +194,7 @@ def read_dataset(reference: str, folder: Path, where: str) -> NDArray[Any]:
         If the reference has another form, or the file or dataset is missing, damaged or not
         numeric.
     """
+    # h5py takes long to import, and most TOML files refer to no array.
     from service.files.container import opened
 
     parts = reference_parts(reference)
@@ -207,6 +209,7 @@ def read_dataset(reference: str, folder: Path, where: str) -> NDArray[Any]:
             values = stored.read()
     except MatrixError as error:
         raise ConfigurationError(f"{where}: {error}") from error
+    # FITS arrays are big-endian, which some libraries refuse.
     return values.astype(values.dtype.newbyteorder("="), copy=False)
 
 

@@ -73,6 +73,7 @@ def write_whole(path: Path, fill: Callable[[h5py.File], None]) -> None:
         flush(part)
         part.rename(path)
         flush(path.parent)
+    # h5py raises RuntimeError when a full disk refuses to close the file.
     except (OSError, RuntimeError) as error:
         part.unlink(missing_ok=True)
         raise StorageError(f"{path}: cannot be written: {error}") from error

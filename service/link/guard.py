@@ -76,10 +76,13 @@ class LinkGuard:
         """Note something that was refused, and log it unless that was done a moment ago."""
         now_s, key = time.monotonic(), (who, what, where)
         with self._lock:
+            # A stranger can choose names and keys without end: the table must not grow with them.
             if key not in self._refused and len(self._refused) >= MAX_LISTED_REFUSALS:
                 self._forget(now_s)
             if key not in self._refused and len(self._refused) >= MAX_LISTED_REFUSALS:
                 key = OTHER_REFUSALS
+            # monotonic() may be less than the interval after a boot: the first refusal is logged
+            # all the same.
             entry = self._refused.setdefault(key, [0, 0.0, -LOG_INTERVAL_S])
             entry[0] += 1
             entry[1] = now_s
@@ -129,11 +132,13 @@ def count_waiting(listen: Sequence[str], tables: Sequence[Path] = _SOCKET_TABLES
     found: dict[int, int] = {}
     for table in tables if ports else ():
         try:
+            # The first line is the heading.
             lines = table.read_text(encoding="ascii").splitlines()[1:]
         except OSError:
             continue
         for line in lines:
             _, local, _, state, *_ = line.split()
+            # The kernel writes addresses and ports in hexadecimal.
             port = int(local.rpartition(":")[2], 16)
             if state == _CLOSE_WAIT and port in ports:
                 found[port] = found.get(port, 0) + 1

@@ -139,6 +139,8 @@ class Intake:
         """Say that something new is there, at most once between two visits of the consumer."""
         callback = self._callback
         if callback is not None and not self._rung:
+            # The consumer resets it when it visits. A message in between needs no second call
+            # across threads.
             self._rung = True
             callback()
 
@@ -161,6 +163,8 @@ class Intake:
         latency_s
             Put-to-callback, None when the publisher does not stamp its messages.
         """
+        # Without the lock: zenoh's thread must not wait while frames are copied. A deque appends
+        # atomically.
         self._arrived.append(
             _Arrived(
                 payload=payload,
@@ -182,6 +186,8 @@ class Intake:
         """Hold the lock, all frames that have come in their places."""
         with self._lock:
             while self._arrived:
+                # Under the lock, so that batches are placed in the order of arrival, whichever
+                # thread decodes them.
                 arrived = self._arrived.popleft()
                 try:
                     self._take_frames(arrived)
@@ -212,9 +218,11 @@ class Intake:
         now_s = self._clock()
         with self._lock:
             if self._superfluous(found, now_s):
+                # Kept and not dropped: if the flood ends here, it is the RTC's last word.
                 self._coalesced = data
                 self._counters.add("status", COALESCED, 1, now_s)
                 return
+            # This status is newer than the one that was put aside.
             self._coalesced = None
         self._take_status(data, found)
         self._wake()
@@ -245,6 +253,7 @@ class Intake:
 
     def acknowledgement(self, acknowledgement: wire.Acknowledgement, *, known: bool) -> None:
         """Take the RTC's word on a reconstructor."""
+        # Events keep the order in which the RTC sent them.
         self._take_coalesced(at_once=True)
         now_s = self._clock()
         with self._up_to_date():
@@ -300,6 +309,8 @@ class Intake:
         """Return whether a complaint is the first of a burst of equal ones."""
         if now_s - self._complained_s.get(complaint, -math.inf) < COMPLAINT_INTERVAL_S:
             return False
+        # Expired complaints are forgotten here, because their texts name sessions and ids of any
+        # sender.
         recent = {
             kind: s for kind, s in self._complained_s.items() if now_s - s < COMPLAINT_INTERVAL_S
         }
@@ -445,8 +456,11 @@ class Intake:
             self._counters.add("frames", name, counts[name] - before[name], now_s, text)
 
     def _capacity(self, header: wire.FrameHeader) -> int:
+        # Dither columns included, although they come only while a dither plays.
         row_bytes = 4 * (header.n_slopes + 2 * header.n_modes)
         wanted = int(self._endpoint.ring_seconds * 1e9 / header.dt_ns)
+        # At least two batches, or a single one would overwrite itself, whatever the limit on
+        # memory.
         return max(2 * wire.FRAMES_PER_BATCH, min(wanted, self._endpoint.ring_bytes // row_bytes))
 
     def _admit(self, kind: str, session: str, n: int, now_s: float) -> bool:
@@ -454,6 +468,7 @@ class Intake:
         current = self._sessions.current
         admission = self._sessions.admit(session, now_s)
         if admission.changed:
+            # A new session may have other sizes; its first status says them.
             self._shape, self._begun_s = None, now_s
             # The first status of a session is never superfluous.
             self._last_status_s, self._essentials = None, ()

@@ -81,9 +81,11 @@ class SessionWatch:
             return SessionDecision(accepted=True, other_session=self._other_session(now_s))
         if self.current is None or self._left or now_s - self._received_s >= SESSION_SILENCE_S:
             return self._begun(session, now_s)
+        # Messages of the session before may still arrive after the new one; that is no second RTC.
         echo = session == self._previous and now_s - self._since_s < SESSION_SILENCE_S
         if not echo:
             self.other = session
+            # A faulty sender may put a new session into every message.
             if len(self._other_sessions) < MAX_OTHER_SESSIONS:
                 self._other_sessions.setdefault(session, now_s)
         return SessionDecision(accepted=False)
@@ -135,6 +137,7 @@ class LeaderElection:
         """Take a name after all that are there, and return it."""
         self._names = {name for name in found if NAME_PATTERN.fullmatch(name)}
         latest_ns = max((_rank(name)[0] for name in self._names), default=0)
+        # The clock of this machine may be behind: the newcomer must rank last all the same.
         self.name = f"{max(now_ns, latest_ns + 1)}-{own_id}"
         return self.name
 
@@ -227,6 +230,7 @@ class Standby:
             self._election = LeaderElection()
             self._election.contract_held = bool(link.tokens(session, contract))
             name = self._election.join(found, str(session.zid()), time.time_ns())
+        # Announced before the decision: of two that start together each must see the other.
         held = [
             link.announce(session, keys.rank(name)),
             link.watch(session, keys.all_ranks, guarded("alive", self._on_token)),
@@ -244,6 +248,7 @@ class Standby:
         """Give the place up."""
         with self._lock:
             self._session = None
+            # The subscribers end when the last reference to them goes.
             self._driving.clear()
 
     def look_again(self) -> None:
@@ -278,6 +283,7 @@ class Standby:
             met = (drives, self._election.others(time.monotonic()))
             news, self._met = met != self._met, met
         if news:
+            # Outside the lock, because the receiver takes a lock of its own.
             self._report(ServicesMet(drives=met[0], others=met[1]))
 
 

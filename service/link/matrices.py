@@ -83,12 +83,14 @@ class Outbox:
         """
         name, found = offer.manifest.id, offer.manifest.layout.sha256
         with self._lock:
+            # Checksums are kept longer than offers: an id is never reused, however old.
             known = self._sums.setdefault(name, found)
             if known != found:
                 raise WireError(f"id: {name} already names a matrix with sha256 {known}")
             if len(self._sums) > MAX_REMEMBERED_IDS:
                 self._sums.popitem(last=False)
             self._offers[name] = offer
+            # _forget drops from the front: an offer that is repeated counts as new.
             self._offers.move_to_end(name)
             self._forget(offer.offered_s)
 
@@ -113,6 +115,7 @@ class Outbox:
     def adopt(self, matrix_id: str, sha256: str | None) -> None:
         """Make an offer the current one if it is still there, and of this sum."""
         with self._lock:
+            # An acknowledgement with another checksum is of other numbers under this id.
             if matrix_id in self._offers and self._sums.get(matrix_id) == sha256:
                 self._current = matrix_id
 
@@ -189,6 +192,7 @@ class MeasuredIntake:
             self._assembler(name).add(index, data)
         else:
             manifest = self._check(name, data)
+            # A measurement that failed has a manifest and no parts, so it is complete.
             if not manifest.layout.n_chunks:
                 self._forget(name)
                 return MeasuredMatrix(manifest=manifest, matrix=None)
@@ -217,6 +221,8 @@ class MeasuredIntake:
         if not assembler.complete:
             return None
         manifest = self._manifests[name]
+        # First, because matrix() raises if the checksum is wrong, and that matrix must be forgotten
+        # too.
         self._forget(name)
         return MeasuredMatrix(manifest=manifest, matrix=assembler.matrix())
 

@@ -93,6 +93,7 @@ class FrameRing:
         A number that was there before on a frame of a later time is no frame come late.
         """
         ahead = header.seq0 - self._head
+        # A leap beyond the capacity would void all frames in the ring.
         far = min(round(MAX_LEAP_S * 1e9 / header.dt_ns), self._capacity)
         if ahead > far:
             return LEAP, (
@@ -114,6 +115,7 @@ class FrameRing:
         """Return the batches of a leap that enough of them confirm, else none; keep this one."""
         before = self._leapt[-1].header if self._leapt else None
         header = batch.header
+        # Some frames may be missing between the batches of a leap, but none may go back.
         if before is None or not 0 <= header.seq0 - before.seq0 - before.n <= self._capacity:
             self._leapt = []
         self._leapt.append(batch)
@@ -145,6 +147,7 @@ class FrameRing:
         counts["duplicate"] += duplicate
         counts["late"] += header.n - duplicate - int(np.count_nonzero(free))
         counts["recovered"] += int(np.count_nonzero(free[:older]))
+        # Runs of free places: with False at both ends every run has a start and a stop.
         edges = np.flatnonzero(np.diff(free, prepend=False, append=False)).tolist()
         for start, stop in zip(edges[::2], edges[1::2], strict=True):
             # copied: a few frames must not keep the memory of all that came with them
@@ -168,6 +171,8 @@ class FrameRing:
         slots = np.arange(self._cursor, last) % self._capacity
         waiting = (self._state[slots] == MISSING) & (now_s - self._noticed_s[slots] < patience_s)
         if waiting.any():
+            # argmax of booleans is the first True: what lies behind the first missing frame waits
+            # with it.
             slots = slots[: int(np.argmax(waiting))]
         blocks: list[list[FrameBatch]] = []
         for part in self._held(self._cursor, self._cursor + len(slots)):
@@ -191,12 +196,15 @@ class FrameRing:
         """Move the head, making places that are missing until they are filled."""
         if head <= self._head:
             return
+        # The new frames need these places: what the reader has not taken by now is lost.
         cursor = max(self._cursor, head - self._capacity)
         if cursor > self._cursor:
             passed = np.arange(self._cursor, min(cursor, self._head)) % self._capacity
             self._counts["overwritten"] += int(np.count_nonzero(self._state[passed] == HELD))
+        # All are lost at first; those that come are taken out again by _hold.
         self._counts["lost"] += head - self._head
         self._cursor = cursor
+        # A leap of more than the capacity needs no more places than there are.
         first = max(self._head, head - self._capacity)
         slots = _span(first, head - first, self._capacity)
         self._seq[slots] = np.arange(first, head)
@@ -252,6 +260,8 @@ def _finite(rows: NDArray[np.float32]) -> NDArray[np.bool_]:
 def _goes_on(before: FrameHeader, after: FrameHeader) -> bool:
     """Return whether frames may share a block with those before them."""
     late_ns = after.t0_ns - before.t0_ns - before.n * before.dt_ns
+    # A block has one start time and one period: a smaller deviation is jitter, a larger one a step
+    # of the clock.
     return (
         after.seq0 == before.seq0 + before.n
         and abs(late_ns) <= 0.5 * before.dt_ns
@@ -262,6 +272,7 @@ def _goes_on(before: FrameHeader, after: FrameHeader) -> bool:
 def _block(parts: list[FrameBatch]) -> FrameBlock:
     """Return frames that go on one after the other as a block, copied."""
     header = parts[0].header
+    # Copied: the batches' memory is returned as soon as the reader has passed them.
     together = FrameBatch(header=header, rows=np.concatenate([part.rows for part in parts]))
     return FrameBlock(
         session=header.session,

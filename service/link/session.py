@@ -106,6 +106,8 @@ def open_session(endpoint: Endpoint) -> zenoh.Session:
         "listen/endpoints": [] if client else list(endpoint.listen),
         "connect/endpoints": list(endpoint.connect),
         "connect/retry": RETRY_OPTIONS,
+        # Only the configured endpoints count: scouting would connect any zenoh program of the
+        # network.
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "timestamping/enabled": True,
@@ -150,6 +152,8 @@ def subscribe_frames(
     return zenoh.ext.declare_advanced_subscriber(
         session,
         key,
+        # indirect=False calls on zenoh's own thread, without a queue and a switch of threads for
+        # each batch.
         zenoh.handlers.Callback(callback, indirect=False),
         history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_age=FETCHED_HISTORY_S),
         recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
@@ -196,6 +200,7 @@ def last_value(session: zenoh.Session, key: str) -> zenoh.ext.AdvancedPublisher:
     return zenoh.ext.declare_advanced_publisher(
         session,
         key,
+        # A slow viewer must not hold up the service; the next message replaces this one.
         congestion_control=zenoh.CongestionControl.DROP,
         cache=zenoh.ext.CacheConfig(1),
     )
@@ -253,6 +258,7 @@ def ask(
                 if reply.err is None
                 else reply.err.payload.to_bytes()[:160].decode(errors="replace")
             )
+            # zenoh reports a timeout as an error reply with this text.
             if text == "Timeout":
                 return None
             raise LinkError(f"{selector} was refused: {text}")
@@ -309,6 +315,7 @@ def send_command(
         if attempt:
             time.sleep(ABSENT_PAUSE_S)
         timeout_s, began_s = endpoint.command_timeout_s, time.monotonic()
+        # Signed anew each time: the RTC takes a repeated signature for a replay.
         signed = signatures.sign(selector, payload)
         answer = ask(session, selector, timeout_s, signed, wire.Encodings.COMMAND)
         if answer is not None:

@@ -74,6 +74,7 @@ class Counters:
 
     def __init__(self) -> None:
         self.totals: Counter[tuple[str, str]] = Counter()
+        # Counted in bins, because a list of single messages would grow with the rate of the sender.
         self._bins: deque[tuple[float, Counter[tuple[str, str]]]] = deque(
             maxlen=round(STATISTICS_PERIOD_S / BIN_S) + 1
         )
@@ -104,6 +105,7 @@ class Counters:
         for start_s, counts in self._bins:
             if now_s - start_s <= STATISTICS_PERIOD_S:
                 recent.update(counts)
+        # An outcome stays listed with n = 0 after its last message: alarms decide by its age.
         fates = (
             Disposition(
                 kind=kind, outcome=outcome, n=recent[kind, outcome], age_s=now_s - s, text=text

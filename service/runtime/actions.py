@@ -73,6 +73,8 @@ class Actions:
         self._publishing = publishing
         self._clock_ns = clock_ns
         self._matrices: OrderedDict[str, NDArray[np.float32]] = OrderedDict()
+        # The cache of matrices is read from threads as well: the archive is waited for off the
+        # event loop.
         self._guard = threading.Lock()
         self._commanded_modes: int | None = None
         self._judging: set[str] = set()
@@ -131,6 +133,8 @@ class Actions:
             If the worker dies of it.
         """
         slopes = self._workers.found_slopes
+        # Before the call: if the worker dies while it makes the models, its successor must start in
+        # the new mode.
         self._workers.first = partial(run_job, OpticsWorker.adopt, slopes, None, config_id)
         self._commanded_modes = None
         self.instrument = self.instrument.in_mode(config_id)
@@ -162,6 +166,7 @@ class Actions:
             If it cannot be written, or another one has its id.
         """
         record = MeasurementRecord.sent(received.manifest)
+        # An aborted measurement has a manifest and no numbers.
         if received.matrix is not None:
             instrument = self.instrument.name
             store = self._archive.measured.store
@@ -178,11 +183,15 @@ class Actions:
 
     async def _make(self, effect: ev.MakeMatrix, state: TrackerState) -> Event:
         rtc, registration = _there(state), _registration_to_use(state)
+        # More modes than are controlled now have no gain in the status: the gate needs one for
+        # each.
         gains = (effect.gains or extend_gains(rtc, effect.n_modes))[: effect.n_modes]
         conditions = self._conditions(state, gains)
         made = await self._workers.call(OpticsWorker.make, conditions, effect.fewer)
         accepted = made.gate.accepted
         parent = state.matrices.in_use or UNKNOWN_PARENT
+        # The gate may have passed fewer modes than requested, so the matrix counts, not the
+        # request.
         record = self._record(len(made.matrix), effect.why, registration, parent)
         record = replace(
             record,
@@ -286,6 +295,7 @@ class Actions:
     async def _ask_judged(self, request: wire.LoopRequest, state: TrackerState) -> Event | None:
         """Ask for gains only if the gate lets the matrix in use run with them."""
         if state.matrices.in_use is None or request.gains is None:
+            # Not sent without a verdict: higher gains can make a stable loop unstable.
             raise CommandError("the reconstructor in use is not known: its gains cannot be judged")
         matrix = await asyncio.to_thread(self.matrix, state.matrices.in_use)
         verdict = await self._verdict(matrix, request.gains[: len(matrix)], state)
@@ -315,8 +325,11 @@ class Actions:
         if record is None:
             raise UnknownIdError(f"unknown reconstructor {effect.id}")
         matrix = await asyncio.to_thread(self.matrix, effect.id)
+        # The status lags behind an accepted command, which would then be sent twice.
         commanded = self._commanded_modes or rtc.n_controlled
         if effect.gains is not None or commanded != effect.n_modes:
+            # First, because the RTC rejects a matrix with another number of rows than was commanded
+            # (R-53).
             await self._command_modes(effect)
         layout = wire.layout_of(matrix, self._publishing.chunk_bytes)
         manifest = record.manifest(layout, rtc, self._publishing.system)

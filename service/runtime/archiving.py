@@ -111,6 +111,8 @@ class ArchiveWriter:
         """Take what a step has changed, to be written soon."""
         if after.matrices.reconstructors is not before.matrices.reconstructors:
             old = {record.id: record for record in before.matrices.reconstructors}
+            # Records are immutable, so identity finds the changed ones without comparing their
+            # arrays.
             new = {r.id: r for r in after.matrices.reconstructors if old.get(r.id) is not r}
             with self._guard:
                 self._records |= new
@@ -118,6 +120,8 @@ class ArchiveWriter:
                 self._lines.set()
         if after.alpha.history is not before.alpha.history:
             last = before.alpha.history[-1:]
+            # The history is bounded and drops its oldest entries, so positions in it do not
+            # identify the new ones.
             new_ones = takewhile(lambda entry: entry not in last, reversed(after.alpha.history))
             with self._guard:
                 room = MAX_WAITING_LINES - len(self._estimates)
@@ -191,7 +195,9 @@ class ArchiveWriter:
     def failed(self, error: StorageError) -> None:
         """Raise the alarm, until the disk can be written again."""
         self.failures += 1
+        # Nothing new may come for hours: the writer must try again all the same.
         self._lines.set()
+        # The disk is tried every two seconds; the same failure would be a new line each time.
         if self._trouble != str(error):
             self._trouble = str(error)
             text = (
@@ -208,6 +214,7 @@ class ArchiveWriter:
             try:
                 await asyncio.to_thread(self._write)
                 if self._trouble:
+                    # A few lines may fit on a disk that is still too full for a matrix.
                     await asyncio.to_thread(self._archive.probe)
                     self._trouble = ""
                     self._post(ev.ConditionChanged(name=ARCHIVE_FAILED, text="", over=True))
@@ -242,6 +249,7 @@ class ArchiveWriter:
         ArchiveError
             As :func:`leave`.
         """
+        # The state is read inside the lock, so that an older state never overwrites a newer one.
         async with self._saving:
             state = self._state()
             await asyncio.to_thread(leave, self._archive, state, time.time_ns())
@@ -251,6 +259,8 @@ class ArchiveWriter:
         """Prune and watch the disk until cancelled; in threads."""
         next_s = time.monotonic() + SPACE_CHECK_INTERVAL_S
         while True:
+            # While the alarm is active more space is required, so that it does not come and go at
+            # the limit.
             low = self._state().alarm(DISK_LOW) is not None
             try:
                 folder = self._archive.directory
@@ -272,6 +282,8 @@ class ArchiveWriter:
         """Remove what is old or too much, one by one; what has come into use meanwhile stays."""
         every = await asyncio.to_thread(items, self._archive, needed(self._state()))
         for item, why in tuple(due(every, retention, time.time_ns())):
+            # Removal may take minutes with its pauses: meanwhile a rollback may need what was old
+            # before.
             if item.id in needed(self._state()):
                 continue
             entry = await asyncio.to_thread(remove, self._archive, item, why)
@@ -317,10 +329,13 @@ class ArchiveWriter:
     def _write(self) -> None:
         """Write all that waits as one; in a thread, one at a time."""
         with self._writing:
+            # Held for copying only: the event loop takes this lock for each line and must not wait
+            # for the disk.
             with self._guard:
                 records, entries = dict(self._records), tuple(self._entries)
                 estimates, samples = tuple(self._estimates), tuple(self._samples)
                 lost = self._lost
+            # The gap is recorded in the trail itself, or a reader would take it for complete.
             told = _loss_text(lost) if lost else ()
             try:
                 entries_told = (*entries, *told)
@@ -333,10 +348,14 @@ class ArchiveWriter:
             with self._guard:
                 del self._entries[: len(entries)]
                 del self._estimates[: len(estimates)]
+                # Samples are compared by identity because the oldest may have been dropped during
+                # the write, which shifts positions.
                 written = set(map(id, samples))
                 self._samples = [one for one in self._samples if id(one) not in written]
                 self._lost -= lost
                 for name, record in records.items():
+                    # A newer record of the same matrix may have come while this one was written: it
+                    # still waits.
                     if self._records[name] is record:
                         del self._records[name]
 
@@ -399,6 +418,7 @@ def leave(archive: Archive, state: TrackerState, now_ns: int) -> None:
     """
     saved = saved_of(state, now_ns)
     if saved is None or not saved.tells_of_alpha:
+        # A service that has measured nothing yet must not overwrite the α of the service before it.
         left = archive.tracking.read()
         if left is not None and left.system == state.system:
             saved = with_orders(left, state)

@@ -63,6 +63,7 @@ class Cluster:
         self.address = address
         self._client = _connect_client(address)
         self._seen_s = time.monotonic()
+        # Two jobs that share parts would otherwise scatter each of them twice.
         self._submitting = threading.Lock()
         self._parts: list[tuple[object, Future]] = []
         """Functions and data that the workers already have."""
@@ -171,6 +172,7 @@ class Cluster:
                 function=self._scatter(function) if is_large else function,
                 expected=own_versions(),
                 parts=there,
+                # A pure task would be named by a hash of its arguments, which are megabytes.
                 pure=False,
             )
         except Exception as error:
@@ -181,8 +183,11 @@ class Cluster:
         """Return parts as every worker has them; those that it had before are not sent again."""
         if not parts:
             return []
+        # Scattered data has no recipe: if the workers that had it died, it must be sent again.
         there = {id(part): future for part, future in self._parts if future.status == "finished"}
         found = [there.get(id(part)) or self._scatter(part) for part in parts]
+        # The part itself is kept beside its future: while it is alive its id cannot be reused by
+        # another object.
         self._parts = list(zip(parts, found, strict=True))
         return found
 
@@ -193,6 +198,8 @@ class Cluster:
         """Wait for the first of them, for no longer than a look; return those that are done."""
         from distributed import CancelledError, wait
 
+        # wait() of distributed uses the default client of the thread, and this one is not the
+        # default.
         with self._client.as_current(), contextlib.suppress(TimeoutError, CancelledError):
             wait(list(waiting), timeout=CLUSTER_CHECK_INTERVAL_S, return_when="FIRST_COMPLETED")
         done = [future for future in waiting if future.done()]
@@ -301,6 +308,7 @@ def _perform(
 ) -> Result:
     """Do a task on a worker, also on one that has come after the others were asked."""
     _keep_freed_memory()
+    # A worker may join between the check and the task. Another version would return wrong numbers.
     found = own_versions()
     if found != expected:
         raise ClusterError(_other_version(platform.node(), "a worker", found, expected))

@@ -130,11 +130,16 @@ class Engine:
         """
         before = self.state
         now_ns = self._driver.now_ns()
+        # If the step refuses the event it raises before the assignment, and the state stays as it
+        # was.
         self.state, effects = self._step(before, event, self.policy, now_ns, cause)
+        # Log and audit lines of the step come before any effect begins, whose own lines follow from
+        # them.
         self._driver.stepped(before, event)
         if self.state.matrices.mode_proof.own_weights != before.matrices.mode_proof.own_weights:
             self._weigh_modes()
         self._note_sensor_mode(before)
+        # Estimators follow before effects begin: frames after a new dither must find it known.
         self._follow()
         for effect in effects:
             self._driver.perform(effect)
@@ -262,6 +267,7 @@ def follow_state(
     bank = with_rtc(bank, state.loop.rtc)
     before, bank = bank, with_dither(bank, state.dithers.dither, policy.window_s)
     dither = bank.loop.dither
+    # Reported once per dither, not with every event that follows.
     if dither is None or dither is before.loop.dither or not dither.why_unreadable:
         return bank, None
     return bank, ev.DitherUnusable(text=dither.why_unreadable)

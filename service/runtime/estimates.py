@@ -146,6 +146,7 @@ async def _outcome(
     if rtc is None:
         return WindowRefused(reason="the RTC is not known", t_ns_utc=window.t_end_ns_utc)
     loop = ClosedLoop(
+        # In a thread, because a matrix that is not in memory is read from the archive.
         reconstructor=await asyncio.to_thread(_reconstructor, window, state, matrix_of),
         gains=np.array(rtc.gains),
         leak=rtc.leak,
@@ -223,6 +224,7 @@ async def read_own_matrix(
     try:
         dialect = await workers.call(OpticsWorker.read_slope_convention, matrix, near)
         own, response = None, None
+        # The modes can only be compared once order and signs of the slopes are right.
         if not dialect.wrong:
             own, response = await workers.call(
                 OpticsWorker.recognise, matrix, near, dialect.rotation_rad
@@ -281,6 +283,8 @@ def _report_own_matrix(
                 text=own.text,
                 response=own.typical_response,
                 uneven="" if wrong else own.uneven,
+                # A matrix that contradicts the instrument file also fits some α, but not the
+                # telescope's.
                 alpha=None if wrong or not own.tells_registration else own.alpha,
                 weights=() if wrong else own.weights,
                 misfit=own.typical_misfit,
@@ -298,6 +302,7 @@ def _origin_of(
     The record itself if its ancestors are no longer known, or are of another mode of the sensor.
     """
     ancestor = record
+    # Bounded by the number of records: damaged records may name each other as parents.
     for _ in state.matrices.reconstructors:
         if ancestor.parent is None:
             return ancestor if ancestor.config_id == record.config_id else record
@@ -413,4 +418,5 @@ def _single(values: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def _mean_gain(estimate: RandomEstimate) -> float:
+    # Inverse variance: modes that the dither hardly moved say almost nothing.
     return float(np.average(estimate.optical_gain, weights=estimate.gain_sigma**-2.0))

@@ -89,6 +89,7 @@ def with_rtc(bank: EstimatorBank, rtc: Status | None) -> EstimatorBank:
     if Change.LOOP in changes:
         bank, loop = replace(bank, begun_with=rtc), _of_modes(loop, rtc)
     if Change.RATE in changes:
+        # The plan of a dither counts in frames: at another rate its windows and lines are others.
         bank, loop = replace(bank, dither=None), replace(loop, dither=None)
     bank = _reset_members(bank, loop, changes)
     fresh = before is None or before.seq != rtc.seq
@@ -103,6 +104,8 @@ def _changes(bank: EstimatorBank, before: Status | None, rtc: Status) -> Change:
         changes |= Change.STATUS
     if before is not None and before.session != rtc.session:
         changes |= Change.SESSION
+    # Compared with the start of the window, not with the last status: gains that creep add up
+    # inside a window.
     if before is None or bank.begun_with is None or not same_loop(bank.begun_with, rtc):
         changes |= Change.LOOP
         if before is None or not same_rate(before.frame_rate_hz, rtc.frame_rate_hz):
@@ -137,6 +140,7 @@ def _reset_members(bank: EstimatorBank, loop: LoopContext, changes: Change) -> E
 
 def with_matrix(bank: EstimatorBank, cm_id: str, matrix: NDArray[np.float32]) -> EstimatorBank:
     """Know the numbers of one more reconstructor."""
+    # Removed and appended again, so that the last two are those most recently in use.
     others = tuple(known for known in bank.loop.matrices if known[0] != cm_id)
     matrices = (*others, (cm_id, matrix))[-N_MATRICES_FOLLOWED:]
     return replace(bank, loop=replace(bank.loop, matrices=matrices))
@@ -152,6 +156,8 @@ def with_dither(bank: EstimatorBank, dither: Dither | None, window_s: float) -> 
     if dither is None or dither.start_seq is None or rtc is None:
         dither = None
     else:
+        # This time changes when the RTC accepts the dither. Without it the comparison below finds
+        # the same dither.
         dither = replace(dither, asked_ns_utc=0)
     if dither == bank.dither:
         return bank
@@ -182,6 +188,8 @@ def process_blocks(bank: EstimatorBank, blocks: Iterable[FrameBlock]) -> Fed:
 def process_block(bank: EstimatorBank, block: FrameBlock) -> Fed:
     """Return the state after one more block, and the windows that ended in it."""
     loop, rtc = bank.loop, bank.loop.rtc
+    # Frames travel faster than statuses: the first frames of a session come before the status that
+    # describes it.
     if rtc is None or block.session != rtc.session or not _fits(rtc, block):
         return bank, []
     closed = len(loop.in_loop) > 0
@@ -201,6 +209,7 @@ def process_block(bank: EstimatorBank, block: FrameBlock) -> Fed:
             member = member.begun_anew(frames.loop, why)
         if (closed or not member.only_closed) and not frames.marks & member.unless:
             member = member.update(frames)
+        # Later members of the registry see the mark in this very block and leave it out.
         if member.marks:
             frames = _mark_block(frames, member.marks)
             changes |= Change.STANDSTILL if Mark.STANDS in member.marks else estimator.NOTHING
@@ -236,6 +245,8 @@ def _with_windows(bank: EstimatorBank, members: list[Streaming]) -> Fed:
                 members[k], reason = member.vet(window, bank.loop)
                 reasons += [] if reason is None else [reason]
         t_ns = window.t_end_ns_utc
+        # All detectors were asked, although one reason is enough: each of them keeps count of the
+        # windows it has vetted.
         windows.append(WindowRefused(reason=reasons[0], t_ns_utc=t_ns) if reasons else window)
     # the next one begins with the gains of now
     return replace(bank, members=tuple(members), begun_with=bank.loop.rtc), windows

@@ -59,6 +59,7 @@ class Losses:
         """
         counts = self._counts
         counts.append((now_s, link))
+        # The second entry decides, so that the first is always at least a whole period old.
         while len(counts) > 1 and now_s - counts[1][0] >= LOSS_PERIOD_S:
             counts.popleft()
         slow = self._slowness.complaint(counts)
@@ -67,13 +68,16 @@ class Losses:
     def _lost(
         self, since_s: float, before: LinkStatistics, link: LinkStatistics, now_s: float
     ) -> str:
+        # The counter falls when a lost frame is recovered after all.
         never_came = max(link.frames_lost - before.frames_lost, 0)
         not_finite = link.frames_nonfinite - before.frames_nonfinite
         overwritten = link.frames_overwritten - before.frames_overwritten
         received = link.frames_received - before.frames_received
         lost = never_came + not_finite + overwritten
+        # Overwritten frames were received before, so that they are not added again.
         n_frames = max(received + never_came + not_finite, 1)
         share = lost / n_frames
+        # A burst right after the start would be a large share of few frames.
         enough = now_s - since_s >= LOSS_PERIOD_S
         self._raised = share > (0.5 if self._raised else 1.0) * MAX_LOST_SHARE and enough
         if not self._raised:
@@ -106,6 +110,7 @@ class _Slowness:
         """Return how slowly they come; empty: as before, or not at all, which others name."""
         now_s, now = counts[-1]
         recent = next((at for at in reversed(counts) if now_s - at[0] >= RATE_PERIOD_S), None)
+        # Frames that stopped have the alarm no-frames; a rate of zero is no slowness.
         if recent is None or now.frames_received == counts[-2][1].frames_received:
             self._before_hz = None
             return ""
@@ -113,6 +118,8 @@ class _Slowness:
         if self._before_hz is not None:
             slow = rate_hz < 2.0 * MIN_RATE_SHARE * self._before_hz
         else:
+            # Kept from the moment before the slowdown: a moving average would adapt to the slow
+            # rate and end the alarm.
             self._before_hz = _rate_hz(counts[0], recent)
             slow = rate_hz < MIN_RATE_SHARE * self._before_hz
         if not slow:

@@ -101,6 +101,7 @@ def policy_of(settings: Settings, instrument: Instrument | None = None) -> Polic
         dither_frequencies_hz=dither.frequencies_hz,
         window_s=dither.window_s,
         longest_window_s=dither.longest_window_s,
+        # A random walk: its σ grows with the square root of time.
         drift_rate=per_minute / np.sqrt(60.0),
         floor=floor_of(settings, instrument) / BOUNDARY_SCALE,
         bias_memory_s=tracking.bias_memory_s,

@@ -68,6 +68,8 @@ class JobProcess:
             words = Path(f"/proc/{self.pid}/stat").read_text("ascii").rpartition(")")[2].split()
         except (OSError, UnicodeDecodeError):
             return time.monotonic()
+        # Split after the last ")": the name of a program may contain spaces and brackets. 11 and 12
+        # are utime and stime.
         return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
 
     def do(self, work: Callable[[], R], *, sent: bool = False) -> R:
@@ -101,6 +103,8 @@ class JobProcess:
         process = self._process
         if process is not None:
             process.kill()
+            # Reaped here, outside the lock: whoever holds it waits for the pipe, which the death
+            # closes.
             process.join()
         with self._busy:
             if self._line is not None:
@@ -110,10 +114,15 @@ class JobProcess:
         if self._ended.is_set():
             raise EOFError
         if self._line is None:
+            # Not fork: a child would inherit zenoh's and the event loop's locks in any state,
+            # without their threads.
             context = multiprocessing.get_context("spawn")
             ours, theirs = context.Pipe()
             process = context.Process(
-                target=_work, args=(theirs, self._nice, WORKER_MODULE), daemon=True
+                # Daemon, so that the interpreter does not wait for a fit at exit.
+                target=_work,
+                args=(theirs, self._nice, WORKER_MODULE),
+                daemon=True,
             )
             with _deaf_to_the_keyboard():
                 process.start()
@@ -208,6 +217,7 @@ def _send(line: Connection, what: object) -> None:
 
     head = io.BytesIO()
     ForkingPickler(head, pickle.HIGHEST_PROTOCOL, True, is_small).dump(what)
+    # The sizes go first, so that the receiver can read arrays into memory that is allocated once.
     line.send_bytes(pickle.dumps([buffer.nbytes for buffer in buffers]))
     line.send_bytes(head.getbuffer())
     for buffer in buffers:
@@ -263,4 +273,5 @@ def _follow_parent() -> None:
     if parent is not None:
         with contextlib.suppress(OSError):
             parent.join()
+        # Not sys.exit: this is a thread, and the main one may be in a computation of minutes.
         os._exit(1)

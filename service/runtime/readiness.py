@@ -162,6 +162,8 @@ def detect_link_changes(
         f.outcome in OUTCOMES_WITH_ALARM and f.age_s < STATISTICS_PERIOD_S
         for f in link.dispositions
     ):
+        # Frames of another basis or configuration do come: their own alarms name the cause, and "no
+        # frames" would hide it.
         also = silence(state.loop.rtc, link.frame_age_s) | dict(also)
     made |= {name: text for name, text in also.items() if text}
     raised = {
@@ -235,6 +237,7 @@ def _for_the_worker(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
 def _for_messages(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
     """Yield what of the RTC's telemetry does not come."""
     link, where, rtc = inputs.link, f"ao/v1/{inputs.state.system}", inputs.state.loop.rtc
+    # An RTC that is gone cannot be in trouble: its last status is only a memory.
     if rtc is not None and rtc.trouble and link.rtc_alive:
         yield Prerequisite(
             name="rtc-trouble", responsible=Responsible.RTC, text=rtc.trouble, blocks=True
@@ -408,6 +411,7 @@ class Revival:
 
     def due(self, link: LinkStatistics, now_s: float) -> bool:
         """Return whether it is time; each time in vain, it is twice as long to the next."""
+        # Any message counts, even a malformed one: it proves that the connection works.
         heard = any(disposition.age_s < STATUS_TIMEOUT_S for disposition in link.dispositions)
         if heard:
             self._wait_s = FIRST_REOPENING_DELAY_S
@@ -436,6 +440,7 @@ class ReadinessLog:
         self, waiting: tuple[Prerequisite, ...], alarms: tuple[Alarm, ...], now_ns: int
     ) -> list[str]:
         """Return what is to be put on record now; alarms are by themselves."""
+        # Rebuilt from what is there now, so that a condition that returns starts its time again.
         self._since_ns = {w.name: self._since_ns.get(w.name, now_ns) for w in waiting}
         named = {alarm.name for alarm in alarms}
         due = [wait for wait in waiting if wait.name not in named and self._due(wait.name, now_ns)]

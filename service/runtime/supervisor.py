@@ -203,6 +203,7 @@ class Supervisor:
                 self._writer.refused(order, actor, error)
                 raise
         try:
+            # After the order is on record, so that the audit trail has refused orders too.
             actor.check()
             answer = await self._result_of(order)
         except PyrcalError as error:
@@ -235,6 +236,7 @@ class Supervisor:
 
     async def run(self) -> None:
         """Work until cancelled: prepare the model, then listen, tick, fit, watch and record."""
+        # Lines that were logged while the state was restored have not been written anywhere yet.
         self._tell(replace(self._engine.state, log=()))
         try:
             await self._work()
@@ -243,10 +245,13 @@ class Supervisor:
                 action.cancel()
             await asyncio.gather(*self._running, return_exceptions=True)
             self._telemetry_executor.shutdown(wait=False)
+            # Last: actions that were cancelled may have left lines for the audit trail.
             self._writer.close()
 
     async def _work(self) -> None:
         async with asyncio.TaskGroup() as group:
+            # These run before the model is prepared, which takes seconds to minutes: orders and
+            # alarms are recorded meanwhile.
             group.create_task(self._writer.run())
             group.create_task(self._writer.save())
             group.create_task(self.recordings.run())
@@ -275,6 +280,8 @@ class Supervisor:
         """Take what the link has: frames, then the events after them."""
         rung = asyncio.Event()
         loop = asyncio.get_running_loop()
+        # Frames do not wake it: they come many times a second and are gathered. An event acts at
+        # once.
         self._bridge.set_wakeup(lambda: loop.call_soon_threadsafe(rung.set), for_frames=False)
         while True:
             self._heartbeat.beat("the intake of telemetry")
@@ -283,6 +290,8 @@ class Supervisor:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(self._engine.gather_s - LINK_POLL_INTERVAL_S):
                     await rung.wait()
+            # Cleared before the link is read: what comes during the read rings again and is not
+            # missed.
             rung.clear()
             # Frames before events: the last window of a dither must end before the event that stops
             # it.
@@ -309,6 +318,8 @@ class Supervisor:
                         self._telemetry_executor, self._take_in, bank
                     )
                 finally:
+                    # In any case, also after an error: without it the engine would never follow a
+                    # change again.
                     self._engine.checkin(*found)
             self.newest_frames = blocks[-1] if blocks else self.newest_frames
             for block in blocks:
@@ -337,6 +348,7 @@ class Supervisor:
     def fit(self, window: dither_windows.EndedWindow) -> None:
         """Put a window where the worker finds it."""
         if isinstance(window, random_dither.Correlated):
+            # Before the window is joined with another: each counts once in the sum.
             self._actions.noisy.take(window, self._engine.state)
         if self._pending_window.waits:
             self._worker_load.was_late()
@@ -399,6 +411,7 @@ class Supervisor:
             # a fit about the nominal registration may end in a wrong place, and takes longer
             await self._own_matrix_read.wait()
             async with self._workers.turn(worker.OpticsWorker.fit):
+                # Taken only now that the worker is free: until then later windows are joined to it.
                 window = self._pending_window.take()
                 if window is None:
                     continue
@@ -441,6 +454,7 @@ class Supervisor:
         """
         if in_use is not None and self._engine.state.alpha.registration is None:
             self._own_matrix_read.clear()
+        # Readings may overlap if the RTC swaps twice; windows wait for the last of them.
         self._n_readings += 1
         self._start("the offer of the matrix in use", self._offer(in_use))
 
@@ -457,6 +471,8 @@ class Supervisor:
                 await action
 
         task = asyncio.get_running_loop().create_task(survived())
+        # The event loop keeps only weak references to tasks: without this one it could vanish while
+        # it runs.
         self._running.add(task)
         task.add_done_callback(self._running.discard)
 

@@ -134,6 +134,8 @@ class TelemetryRecorder:
             recorder = RecordingWriter(
                 self._archive.recordings.path_of(record.id), system=self._system
             )
+            # Opened before the tap, because the frames that the link still holds are put in at
+            # once.
             await asyncio.to_thread(self._open, recorder, record)
             held_s = self._tap(recorder, before_s)
             record = replace(record, before_s=round(held_s, 3))
@@ -172,6 +174,7 @@ class TelemetryRecorder:
             if recorder is None or record is None or recording_id not in {None, record.id}:
                 raise CommandError(f"{recording_id or 'no recording'} is not under way")
             self._recorder = self._record = None
+            # The tap is closed first, so that nothing is put into a recorder whose file is closed.
             self._tap(None, 0.0)
             await asyncio.to_thread(recorder.__exit__)
             record = replace(
@@ -220,6 +223,7 @@ class TelemetryRecorder:
             If the disk refuses.
         """
         async with self._guard:
+            # Looked up for its errors only: a recording under way, or an unknown one, is refused.
             await asyncio.to_thread(self.file, recording_id)
             await asyncio.to_thread(self._archive.recordings.remove, recording_id)
 
@@ -323,6 +327,7 @@ class TrendSampler:
     def _take(self) -> TrendSample:
         state, frames = self._state(), self._frames()
         end_ns = None if frames is None else frames.t0_ns_utc + frames.n_frames * frames.dt_ns
+        # The last block stays after telemetry has stopped: it must not be drawn again as new.
         is_new, self._seen_ns = end_ns != self._seen_ns, end_ns
         residual_m = None
         if (
@@ -374,6 +379,7 @@ def residual_of(frames: FrameBlock, matrix: NDArray[np.float32]) -> float | None
     if slopes.shape[1] != matrix.shape[1]:
         return None
     modes_m = slopes @ matrix.T
+    # Modes have unit RMS over the pupil: the sum of their squares is the variance of the wavefront.
     return _finite(math.sqrt(np.square(modes_m, dtype=np.float64).sum() / len(slopes)))
 
 

@@ -241,6 +241,7 @@ class FitQueue:
             raise errors.StorageError(
                 f"fit: the upload cannot be kept: {error.strerror}"
             ) from error
+        # A client that hangs up cancels this task: its place in the queue must be freed as well.
         except BaseException:
             await self._forget(job.id)
             raise
@@ -275,6 +276,7 @@ class FitQueue:
 
     async def _receive(self, fit_id: str, file: IO[bytes], body: AsyncIterator[bytes]) -> None:
         """Write the body to the disk, block by block."""
+        # Chunks of HTTP are some kilobytes: gathered, they cost one visit to a thread per megabyte.
         digest, n_bytes, block = hashlib.sha256(), 0, bytearray()
 
         async def flush() -> None:
@@ -287,6 +289,7 @@ class FitQueue:
             if n_bytes == 0 and chunk:
                 _check_kind(chunk)
             n_bytes += len(chunk)
+            # The stated length was checked before, but it may be missing or wrong.
             if n_bytes > self._limits.max_bytes:
                 raise _too_large("more", self._limits.max_bytes)
             block += chunk
@@ -413,6 +416,7 @@ async def run_program(words: Sequence[str], *, limit_s: float) -> None:
         if process.returncode is None:
             process.kill()
             await process.wait()
+    # Ended by a signal: usually the kernel's, which is short of memory.
     if status < 0:
         raise errors.WorkerError("the process of the job died; out of memory?")
     if status > 0:

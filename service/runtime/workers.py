@@ -102,6 +102,7 @@ class WorkerPool:
         """
         mine: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         due_s = time.monotonic() + patience_s(job)
+        # The number decides between equal times, in order of arrival; futures cannot be compared.
         heapq.heappush(self._waiting, (due_s, next(self._numbers), mine))
         self._admit()
         try:
@@ -109,6 +110,7 @@ class WorkerPool:
             self._owner = asyncio.current_task()
             yield
         finally:
+            # If the task was cancelled while it waited, its place in the heap is skipped by _admit.
             mine.cancel()
             if self._turn is mine:
                 self._turn = self._owner = None
@@ -126,6 +128,7 @@ class WorkerPool:
             job; or if the job raised an unexpected exception, which must not end the service.
         """
         work = partial(run_job, job, *args, **kwargs)
+        # The turn is already this task's: another request would wait for itself.
         if self._owner is asyncio.current_task():
             done = await self._done(job.__name__, work)
         else:
@@ -177,6 +180,7 @@ class WorkerPool:
         self.problem = ""
         self.cluster_problem = done.cluster_problem
         self._longest_s[name] = max(self._longest_s[name], done.cpu_s)
+        # Limits are of processor time: on a loaded machine a healthy job takes long by the clock.
         self._limit_s[name] = max(MIN_JOB_LIMIT_S, JOB_LIMIT_RATIO * self._longest_s[name])
         return done
 
@@ -334,6 +338,7 @@ class WorkerLoadMeter:
         if spent["clock_s"] < MIN_LOAD_HISTORY_S or load.busy_ratio is None:
             return ""
         if self._behind:
+            # Two limits, so that the alarm does not come and go at one.
             self._behind = load.busy_ratio > RELIEF_SHARE and load.windows_late > 0
         else:
             self._behind = load.busy_ratio > OVERLOAD_SHARE and load.windows_late >= N_LATE_WINDOWS

@@ -175,6 +175,7 @@ async def audit(service: ServiceDep, parameters: Annotated[AuditParameters, Quer
         AuditFormat.JSONL: ("application/jsonl", _json_lines),
         AuditFormat.CSV: ("text/csv", _csv_lines),
     }[parameters.format]
+    # From the beginning: without ``after`` the index returns the newest entries.
     whole = replace(parameters.part, after=parameters.after or 0)
     name = f"audit.{parameters.format}"
     return StreamingResponse(

@@ -111,6 +111,7 @@ class Hosts:
         match = _HOST.fullmatch(host)
         if match is None:
             return False
+        # A trailing dot names the same host.
         name = match[1].strip("[]").rstrip(".").lower()
         if name in {"localhost", self.bound.lower(), *(n.lower() for n in self.allowed)}:
             return True
@@ -296,6 +297,7 @@ class Authentication(Middleware):
             detail = f"key {key.name} is of scope {key.scope}, this needs one of scope {needed}"
             headers = _challenge(f', error="insufficient_scope", scope="{needed}"')
             return key, Refusal(HTTPStatus.FORBIDDEN, "scope", detail, headers, key.name)
+        # Browsers send a cookie by themselves; only a page's script sends an Origin with it.
         if by_cookie and request.method not in _READS and "origin" not in request.headers:
             detail = "found a browser's cookie and no Origin, expected both: is it this page's?"
             return key, Refusal(HTTPStatus.FORBIDDEN, "foreign-origin", detail, who=key.name)
@@ -309,6 +311,7 @@ class Authentication(Middleware):
                 route.methods is None or request.method in route.methods
             ):
                 return scope_of(route, request.method)
+        # Unknown paths need a key, too, so that they do not show which routes exist.
         return KeyScope.READ if request.method in _READS else KeyScope.OPERATE
 
     def _while_valid(self, key: Key | None, send: Send) -> Send:
@@ -321,7 +324,9 @@ class Authentication(Middleware):
                 return
             if message.get("more_body", False):
                 try:
+                    # Asked with each part: a stream may stay open for days.
                     ended = not self._is_valid(key)
+                # A file of keys that cannot be read permits nothing.
                 except ConfigurationError:
                     ended = True
                 if ended:
@@ -340,6 +345,8 @@ class Authentication(Middleware):
         """
         keys = () if self._keys is None else self._keys.all()
         if key is None:
+            # The file remains when the last key is revoked: no keys in it is not the same as no
+            # file.
             return self._keys is None or (self._hosts.local and not self._keys.path.exists())
         return key in keys
 
@@ -445,6 +452,7 @@ async def log_in(request: Request) -> Response:
     answered = await session(request)
     secret, _ = read_key(request)
     if request.user is not None and secret is not None:
+        # Behind a proxy the request comes over http: the origin shows how the browser reached it.
         safe = request.url.scheme == "https" or request.headers.get("origin", "")[:6] == "https:"
         answered.set_cookie(COOKIE, secret, secure=safe, httponly=True, samesite="strict")
         request.app.state.service.audit(actor_of(request).entry("session.begun"))

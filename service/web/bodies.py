@@ -46,6 +46,7 @@ async def _whole(request: Request, receive: Receive) -> bytes | None:
         If it exceeds the limit of size or time.
     """
     length = request.headers.get("content-length", "")
+    # Refused before anything is read, if the client states the length.
     if length.isdecimal() and int(length) > MAX_BODY_BYTES:
         raise _too_large(f"{int(length) / 1e6:.1f} MB")
     body = bytearray()
@@ -56,6 +57,7 @@ async def _whole(request: Request, receive: Receive) -> bytes | None:
                 if message["type"] == "http.disconnect":
                     return None
                 body += message.get("body", b"")
+                # The stated length may be missing or wrong.
                 if len(body) > MAX_BODY_BYTES:
                     raise _too_large("more")
                 if not message.get("more_body", False):

@@ -51,6 +51,7 @@ class Body:
 
     def __init__(self, kind: Any) -> None:  # noqa: ANN401  of the type of a type
         self.adapter = TypeAdapter[Any](kind)
+        # A command whose fields all have defaults may come without a body.
         self.required = not self._reads(b"{}")
 
     async def __call__(self, request: Request) -> Any:  # noqa: ANN401  the command
@@ -198,6 +199,7 @@ class OrderRoute:
             return Annotated[Union[self.kinds], Discriminator("action")]  # noqa: UP007
         told = {self.named, "id" if self.makes else ""}
         bases = self.kinds[0].__mro__
+        # The base class without these fields, so that a client that sends them is refused.
         return next(base for base in bases if told.isdisjoint(f.name for f in fields(base)))
 
     def commanded(self, said: Instruction, **given: str) -> Instruction:
@@ -271,8 +273,10 @@ class Client:
         command: Any = order.commanded(said, **{order.named or "id": name or made})
         actor = self.actor
         if order.decides_on:
+            # Checked later, in the same step of the event loop in which the tracker gets the order.
             actor = replace(actor, check=lambda: self._check(order.decides_on, name))
         if actor.key:
+            # The name is only a claim; the key is known.
             by = f"{command.by} ({actor.key})" if command.by else actor.key
             command = replace(command, by=by)
         text = await self.service.submit(command, actor, made)
@@ -368,6 +372,7 @@ def _endpoint(order: OrderRoute) -> Callable[..., Awaitable[AcceptedView]]:
     signature = Signature(
         [Parameter(name, Parameter.KEYWORD_ONLY, annotation=kind) for name, kind in taken.items()]
     )
+    # FastAPI reads parameters from the signature, which differs from order to order.
     vars(give)["__signature__"] = signature
     return give
 

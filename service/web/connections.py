@@ -179,9 +179,11 @@ class Idempotency(Middleware):
         if not (0 < len(key) <= MAX_KEY_LENGTH and key.isprintable()):
             found = f"found {len(key)} characters, expected 1 to {MAX_KEY_LENGTH} printable ones"
             return await self._refuse(request, send, found)
+        # Per key holder: nobody gets an answer that was made for somebody else.
         name = (request.user and request.user.name, key)
         body = await request.body()
         print_ = hashlib.sha256(f"{request.method} {request.url}\n".encode() + body).digest()
+        # Asked again after the wait: if nothing was done, one of those that waited does it.
         while (before := self._given.get(name)) is not None:
             if before.print != print_:
                 found = "found a key that was used with another request, expected a new one"
@@ -213,6 +215,7 @@ class Idempotency(Middleware):
         finally:
             if not given.answer and self._given.get(name) is given:
                 del self._given[name]
+            # In any case, or those that wait would wait for ever.
             given.done.set()
             while len(self._given) > MAX_KEPT_ANSWERS:
                 self._given.popitem(last=False)
@@ -296,6 +299,7 @@ def tag_of(*parts: object) -> str:
 def has_already(headers: Headers, tag: str) -> bool:
     """Return whether a request says that the client has what carries this ETag."""
     sent = {one.strip().removeprefix("W/") for one in headers.get("if-none-match", "").split(",")}
+    # Weak comparison, as If-None-Match demands (RFC 9110, section 13.1.2).
     return "*" in sent or tag.removeprefix("W/") in sent
 
 
@@ -329,12 +333,14 @@ class Unchanged(Middleware):
 
         async def sent(message: Message) -> None:
             nonlocal head
+            # The start is held back until the body is known: its ETag and status depend on it.
             if message["type"] == "http.response.start" and _can_be_kept(scope, message):
                 head = message
                 return None
             if head is None:
                 return await send(message)
             begun, head = head, None
+            # A response in parts has no tag: it would have to be kept whole in memory.
             if message.get("more_body", False):
                 await send(begun)
                 return await send(message)
@@ -343,6 +349,7 @@ class Unchanged(Middleware):
             headers.setdefault("Cache-Control", _KEPT)
             if has_already(asked, tag):
                 begun["status"], message["body"] = HTTPStatus.NOT_MODIFIED.value, b""
+                # They describe the body, which a 304 does not have.
                 del headers["content-length"], headers["content-type"]
             await send(begun)
             return await send(message)

@@ -124,6 +124,7 @@ def _history(request: Request, service: Supervisor, asked: RangeParameters) -> R
     if (same := connections.not_modified(request, tag)) is not None:
         return same
     if asked.points or asked.after is not None or len(found) < asked.limit:
+        # Only what is older than memory is read from the disk, or entries would come twice.
         last_ns = min([last_ns, *(entry.t_ns_utc - 1 for entry in tracker.alpha.history)])
         found = (*_older(service.archive, first_ns, last_ns, asked), *found)
     told = answer(
@@ -157,6 +158,8 @@ def _cut(found: History, asked: RangeParameters) -> History:
         return found[-asked.limit :]
     page = found[: asked.limit]
     rest = found[asked.limit :]
+    # The next page begins after the last time of this one: entries of the same time must not be cut
+    # apart.
     return (*page, *(entry for entry in rest if entry.t_ns_utc == page[-1].t_ns_utc))
 
 
@@ -170,6 +173,7 @@ def downsample(history: History, n_points: int) -> History:
     values = np.array([entry.filtered.vector for entry in history])
     times_s = np.array([entry.t_ns_utc - history[0].t_ns_utc for entry in history]) * 1e-9
     n_parts = n_points // (2 * values.shape[1])
+    # Clipped, because the last entry lies exactly at the end of the last part.
     part = (times_s / (np.ptp(times_s) or 1.0) * n_parts).clip(0, n_parts - 1).astype(int)
     kept: set[int] = set()
     for members in (np.flatnonzero(part == k) for k in range(n_parts)):
@@ -259,6 +263,7 @@ async def trends(service: ServiceDep, parameters: Annotated[TrendParameters, Que
     interval_s = TREND_S
     if len(found) > parameters.points // 2:  # there may have been more
         span_s = (found[-1].t_ns_utc - found[0].t_ns_utc) / 1e9
+        # Each part of the time has two samples, the last and the worst.
         interval_s = max(TREND_S, 2.0 * span_s / parameters.points)
     return answer(TrendList(interval_s=interval_s, samples=found))
 

@@ -90,6 +90,8 @@ class KeyFile:
         """
         try:
             found = self.path.stat()
+            # The file is replaced, not rewritten: its inode changes even within one tick of the
+            # clock.
             stamp = (found.st_ino, found.st_mtime_ns, found.st_size)
             before, keys = self._seen
             if stamp != before:
@@ -172,6 +174,7 @@ class KeyFile:
         except OSError as error:
             raise ConfigurationError(f"{self.path.parent}: cannot be used: {error}") from error
         try:
+            # The folder is locked and not the file, which each change replaces.
             lock_file(folder, self.path.parent, wait=True)
             yield
         finally:
@@ -185,4 +188,5 @@ class KeyFile:
 
 
 def _digest(secret: str) -> str:
+    # Headers may hold any bytes: a strange key is a wrong one, not an error.
     return sha256(secret.encode(errors="surrogateescape")).hexdigest()

@@ -143,6 +143,7 @@ async def numbers_of(
             content = _as_fits(numbers, matrix_id)
             return Response(content, media_type=MEDIA_TYPES[form], headers=headers)
         head = b"" if form is MatrixFormat.RAW else _npy_head(numbers)
+        # Stated, so that a client notices a transfer that breaks off.
         headers["Content-Length"] = str(len(head) + numbers.nbytes)
         parts = _parts(head, numbers)
         return StreamingResponse(parts, media_type=MEDIA_TYPES[form], headers=headers)
@@ -338,6 +339,7 @@ async def singular_values(
             found.headers["Cache-Control"] = "private, max-age=86400"  # an id is never reused
         return found
 
+    # The answer changes once the model is prepared.
     return await unless_kept(request, tag_of(matrix_id, products is None), made)
 
 
@@ -346,10 +348,13 @@ def _singular_values(
 ) -> SingularValues:
     """Return those that are not lost in rounding, of a reconstructor and of as many modes."""
     power = np.linalg.eigvalsh(_products(matrix))
+    # Eigenvalues are squares of singular values: below 1e-13 of the largest they are rounding
+    # errors of float64.
     inverted = power[power > power[-1] * 1e-13] ** -0.5
     nominal = None
     if products is not None:
         modelled = np.linalg.eigvalsh(products[: len(matrix), : len(matrix)].astype(np.float64))
+        # Rounding makes the smallest eigenvalues of a singular matrix slightly negative.
         nominal = _round(np.sqrt(np.maximum(modelled[::-1], 0.0)))
     return SingularValues(id=matrix_id, values=_round(inverted), nominal=nominal)
 
@@ -399,6 +404,7 @@ def _compare(service: Supervisor, matrix_id: str, other: str) -> MatrixCompariso
     n_modes = min(len(first), len(second))
     sums = np.array([_sums(first[mode], second[mode]) for mode in range(n_modes)])
     sizes, others, between = np.sqrt(sums[:, :3].T)
+    # A row of zeros gives NaN, which is shown as null.
     with np.errstate(divide="ignore", invalid="ignore"):
         gain = sizes / others
         cosine = sums[:, 3] / (sizes * others)

@@ -354,6 +354,7 @@ class Stream:
                 version, news = self._version, self._state
             elif now - quiet_since >= MAX_STREAM_SILENCE_S / STREAM_PERIOD_S:
                 news = b": nothing new\n\n" + self._state
+            # The list is made anew only when the log has changed.
             if self._ids is not ids:
                 ids = self._ids
                 news += self._since(heard)
@@ -373,6 +374,8 @@ class Stream:
                 self._log = snapshot.tracker.log
                 self._ids = _ids(self._log, snapshot.started_ns)
             shown = as_json(snapshot)
+            # Ages change with every look: with them the state would be sent twice a second for
+            # ever.
             lasting = _without_clocks(from_json(shown))
             self._version += lasting != self._lasting
             self._lasting = lasting
@@ -384,6 +387,7 @@ class Stream:
         time_s = asyncio.get_running_loop().time()
         rest_s = STREAM_PERIOD_S - time_s % STREAM_PERIOD_S
         with suppress(TimeoutError):
+            # A little later than the moment, so that the clock has surely reached it.
             async with asyncio.timeout(rest_s + 1e-3):
                 await self._over.wait()
 
@@ -427,12 +431,14 @@ class _EventStream(StreamingResponse):
     media_type = "text/event-stream"
 
     def __init__(self, stream: Stream, heard: str) -> None:
+        # The second header keeps nginx from holding the events back.
         headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
         super().__init__(stream.listen(heard), headers=headers)
         self._stream = stream
 
     @override
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        # Counted here and not in listen(), which begins only with the first byte.
         self._stream.n_listeners += 1
         try:
             await super().__call__(scope, receive, send)

@@ -125,6 +125,7 @@ def install(app: FastAPI) -> None:
 
 def known_problem(request: Request, error: errors.PyrcalError) -> JSONResponse:
     """Return the problem that an error of this service is."""
+    # The nearest class counts: StorageError is an ArchiveError, too.
     status, kind = next(_OF_ERROR[cls] for cls in type(error).__mro__ if cls in _OF_ERROR)
     later = {"Retry-After": str(BUSY_RETRY_S)} if status is HTTPStatus.SERVICE_UNAVAILABLE else None
     return problem(request, status, kind, str(error), later)
@@ -177,5 +178,6 @@ def _methods(request: Request) -> set[str]:
 
 
 async def _fault(request: Request, _error: Exception) -> JSONResponse:
+    # Without the exception's text, which may hold paths or data.
     detail = "a fault of the service itself; its log says more"
     return problem(request, HTTPStatus.INTERNAL_SERVER_ERROR, "internal", detail)

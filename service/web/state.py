@@ -172,6 +172,7 @@ def find_problems(snapshot: Snapshot) -> dict[str, str]:
 async def metrics(request: Request, service: ServiceDep) -> Response:
     """Return all metrics for Prometheus."""
     encode, content_type = choose_encoder(request.headers.get("accept", ""))
+    # auto_describe would collect everything once more at registration.
     registry = CollectorRegistry(auto_describe=False)
     registry.register(SnapshotCollector(service.snapshot))
     ProcessCollector(registry=registry)
@@ -247,6 +248,7 @@ def _of_alarms(snapshot: Snapshot) -> Iterator[Metric]:
     names = {alarm.record.name: 1 for alarm in lasting}
     yield _gauge("alarm", "1 for each alarm that lasts", names, "name")
     by_severity = Counter(str(alarm.severity) for alarm in lasting if alarm.record.muted is None)
+    # Zero for severities without alarms, so that no series vanishes.
     shown = {str(severity): by_severity[severity] for severity in Severity}
     yield _gauge("alarms_shown", "Alarms that last and are not muted", shown, "severity")
     active = sum(alarm.record.alarm_state is AlarmState.ACTIVE for alarm in lasting)
@@ -281,6 +283,7 @@ def _of_link(link: LinkStatistics) -> Iterator[Metric]:
     malformed = "Messages that broke the contract"
     yield _counter("messages_malformed", malformed, link.messages_malformed, "kind")
     lost = "Frames missing in the sequence; falls again when they are recovered"
+    # A gauge, because a counter of Prometheus must not fall.
     yield _gauge("frames_lost", lost, link.frames_lost)
     yield _gauge("rtc_alive", "1 while the RTC's liveliness token is there", link.rtc_alive)
     yield _gauge("frame_age_seconds", "Since the last frame arrived", link.frame_age_s)

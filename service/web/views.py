@@ -171,6 +171,7 @@ def define_view(
         steps = path.split(".")
         kind = _types_of(owner_of(record, steps))[steps[-1]]
         shown[own] = _shown_type(kind, below.get(own)), Field(validation_alias=AliasPath(*steps))
+        # A time appears twice: exact in nanoseconds, and as people read it.
         if clock := clock_of(own):
             shown[clock] = _Clock, Field(validation_alias=AliasPath(*steps))
     text = text or inspect.cleandoc(record.__doc__ or "")
@@ -203,6 +204,7 @@ def _types_of(record: type) -> dict[str, Any]:
 def _shown_type(kind: Any, below: type[View] | None) -> Any:  # noqa: ANN401  types
     """Return the type as which a value of this type is shown."""
     origin, inside = get_origin(kind), get_args(kind)
+    # JSON has no NaN or infinity: any float may be null.
     if kind is float:
         return float | None
     if kind is Misregistration or origin is np.ndarray:

@@ -95,6 +95,7 @@ INGRESS, EGRESS = "ingress", "egress"
 """Directions as zenoh's router names them: from a program, and to a program."""
 
 _MESSAGES_BY_RIGHT: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
+    # A publisher must learn of the subscribers, or zenoh sends nothing to them.
     "puts": {INGRESS: ("put",), EGRESS: ("declare_subscriber",)},
     "subscribes": {INGRESS: ("declare_subscriber",), EGRESS: ("put",)},
     "queries": {INGRESS: ("query",), EGRESS: ("reply", "declare_queryable")},

@@ -329,6 +329,7 @@ def read(values: Map, kind: type[_R], where: str, absent: tuple[str, ...] = ()) 
         if name not in absent:
             require(values, name, where)
     try:
+        # bytes are builtin here: otherwise msgspec would expect them in base64, as in JSON.
         record = msgspec.convert(values, kind, builtin_types=(bytes,))
     except msgspec.ValidationError as error:
         raise _find_mismatch(values, kind, where) from error
@@ -461,6 +462,7 @@ def _describe_type(kind: Any) -> str:  # noqa: ANN401 - a type
 
 def _show(value: object) -> str:
     if isinstance(value, bytes | list | tuple | dict):
+        # msgpack has lists only; a tuple is one of our own records.
         kind = "list" if isinstance(value, tuple) else type(value).__name__
         return f"a {kind} of {len(value)}"
     return f"{value!r:.60} ({type(value).__name__})"

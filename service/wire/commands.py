@@ -217,6 +217,7 @@ _KINDS: dict[type[Command], CommandKind] = {
     RampRequest: CommandKind.RAMP,
     OffloadRequest: CommandKind.OFFLOAD,
 }
+# Two commands share the key of the dither: its "action" tells them apart.
 _STARTING = {kind: command for command, kind in _KINDS.items() if command is not DitherStop}
 _START, _STOP = "start", "stop"
 
@@ -283,6 +284,7 @@ def _check_modes(command: Strokes, where: str) -> None:
 
 def _check_ramp(command: RampRequest, where: str) -> None:
     groups = sorted(command.groups)
+    # Both ends belong to a group, so that equal ends overlap.
     apart = all(before[1] < after[0] for before, after in pairwise(groups))
     if not groups or not apart or any(first > last for first, last in groups):
         expected = "one or more [first, last], first <= last, none overlapping another"

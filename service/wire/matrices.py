@@ -193,6 +193,7 @@ def _manifest_fields(values: codec.Map, where: str) -> codec.Map:
 
 def _measured_manifest_fields(values: codec.Map, where: str) -> codec.Map:
     values = _nest_layout(values, where, may_fail=True)
+    # A reason beside a matrix is ignored, not refused.
     return values | {"reason": None} if values["layout"]["n_chunks"] else values
 
 
@@ -217,6 +218,7 @@ def _nest_layout(values: codec.Map, where: str, *, may_fail: bool = False) -> co
         raise codec.refusal("dtype", values["dtype"], repr(DTYPE), where)
     failed = may_fail and values.get("n_chunks") == 0
     if failed:
+        # The contract allows nil or an empty text here (R-77).
         values["sha256"] = ""
     layout = codec.read(values, MatrixLayout, where)
     if layout.n_bytes > MATRIX_LIMIT:
@@ -276,6 +278,7 @@ def layout_of(matrix: NDArray[np.float32], chunk_bytes: int) -> MatrixLayout:
 
 def checksum(matrix: NDArray[np.float32]) -> str:
     """Return the SHA-256 of a matrix's bytes on the wire, 64 lower-case hex digits."""
+    # Of the bytes on the wire, whatever order and byte order the array has in memory.
     return hashlib.sha256(np.ascontiguousarray(matrix, dtype=DTYPE).data).hexdigest()
 
 

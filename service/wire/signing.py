@@ -60,6 +60,7 @@ class ReplayWindow:
         ahead = n - self._newest
         if ahead > 0:
             mask = (1 << self._size) - 1
+            # Limited, because a shift by a distance of up to 2**63 would exhaust the memory.
             self._seen = (self._seen << min(ahead, self._size) | 1) & mask
             self._newest = n
             return True
@@ -79,6 +80,7 @@ class Signatures:
         self, secret: bytes | None, role: Role, clock_ns: Callable[[], int] = time.time_ns
     ) -> None:
         self._signs = secret is not None
+        # Copied for each message: the key is hashed once.
         self._blank = hmac.new(secret or b"", digestmod=sha256)
         self._role = role
         self._other = Role.SERVICE if role is Role.RTC else Role.RTC
@@ -165,6 +167,8 @@ class Signatures:
 
     def _mac(self, role: Role, key: str, text: bytes, rows: bytes) -> bytes:
         mac = self._blank.copy()
+        # The role, so that a message cannot be sent back as the other side's; the key, so that it
+        # cannot be sent elsewhere. Neither contains a NUL.
         mac.update(f"{role}\0{key}\0".encode())
         mac.update(text)
         mac.update(rows)
@@ -189,6 +193,7 @@ def _split_map(data: bytes) -> tuple[int, bytes]:
 
 def _read_signature(data: bytes) -> dict[str, Any]:
     """Return the four keys of a message's signature, without parsing the rest of it."""
+    # The last one: the message itself may contain these bytes.
     begin = data.rfind(_FIRST_KEY)
     try:
         signature = msgpack.unpackb(_MAP_HEAD + data[begin:]) if begin >= 0 else None

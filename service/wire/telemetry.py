@@ -175,6 +175,7 @@ def _check_sizes(payload: bytes, header: FrameHeader) -> None:
 # --- status, state, alarms
 
 
+# Four images of 512 x 512 pixels, 4 bytes each.
 STATUS_LIMIT: Final = codec.MESSAGE_LIMIT + 16 * 512**2
 """Largest status, in bytes; its flux images may add to the size of an ordinary message."""
 
@@ -382,6 +383,7 @@ def _unpack_status(data: bytes, where: str) -> codec.Map:
     """Return the map of a status after the check of its size, with and without flux images."""
     values = codec.unpack(data, where, STATUS_LIMIT)
     flux = values.get("flux")
+    # The images must not make room for an oversized text elsewhere in the status.
     n_bytes = len(data) - (len(flux) if isinstance(flux, bytes) else 0)
     if n_bytes > codec.MESSAGE_LIMIT:
         raise WireError(

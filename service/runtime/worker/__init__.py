@@ -73,7 +73,10 @@ def run_job(
 def _enter(instrument: Instrument, compute: Compute) -> None:
     """Prepare the worker process."""
     global _open_worker
+    # The process began before the settings were read, at the service's own priority.
     os.nice(compute.nice)
+    # Cached on success only: an error is raised again by the next job, in whose answer it can be
+    # reported.
     _open_worker = functools.cache(lambda: OpticsWorker(instrument, compute))
     with contextlib.suppress(Exception):  # the first job meets it again, fails and says why
         _open_worker()

@@ -163,6 +163,7 @@ class OpticsWorker:
         if config_id != instrument.config_id:
             instrument = instrument.in_mode(config_id)
             self._basis = self._disk_cache.basis(instrument)
+            # Both were measured on the RTC's matrix of the mode before.
             self._mode_response = self._left_over = None
             self._equip(instrument)
         return self.describe()
@@ -210,6 +211,7 @@ class OpticsWorker:
         if isinstance(outcome, LockInEstimate):
             gains = outcome.optical_gain
             if (
+                # The real part, because a response of the wrong sign has a large magnitude too.
                 gains.real.min() > RESPONSE_RATIO_RANGE[0]
                 and np.abs(gains).max() < RESPONSE_RATIO_RANGE[1]
             ):
@@ -300,6 +302,7 @@ class OpticsWorker:
         if near is None and rotation_rad is not None:
             start = replace(start, rotation_rad=rotation_rad)
         found = recognise_modes(own, self._coarse.linearise, start)
+        # A residual of the matrix before must not widen the verdicts on this one.
         self._left_over = None
         if found is None or found.wrong or not found.known.any():
             return found, self._mode_response
@@ -309,6 +312,8 @@ class OpticsWorker:
         if np.any(np.abs(response - 1.0) > NOMINAL_RESPONSE_TOLERANCE):
             n_modes = self._basis.n_modes
             gains = CalibrationGains.of_modes(response, found.columns[found.known], n_modes).values
+            # The matrix was compared with a model that already contains the response found before:
+            # the factors multiply.
             now = 1.0 if self._mode_response is None else self._mode_response
             self.adopt(None, now * gains)
         self._left_over = left_over(own, found, self._coarse.interaction_matrix(found.alpha))
@@ -343,6 +348,7 @@ class OpticsWorker:
         ``flux`` is the RTC's: where the pupil images move with the mirror's they are a start.
         """
         modes = spectra.plan.modes
+        # Kept between attempts of an acquisition, which dither the same modes each time.
         if modes not in self._wide_capture:
             basis, every = self._model.basis.subset(np.array(modes)), self._mode_response
             self._wide_capture[modes] = tuple(

@@ -60,6 +60,7 @@ class SharedRows:
             yield from self._threads.map(function, rows)
             return
         begun = time.monotonic()
+        # One row is computed here to time it: only long products gain from the cluster.
         yield function(rows[0])
         row_s = time.monotonic() - begun
         if row_s < MIN_REMOTE_ROW_S or row_s * len(rows) / self._n_threads < MIN_REMOTE_JOB_S:
@@ -69,6 +70,8 @@ class SharedRows:
 
     def _share(self, cluster: Cluster, function: Row, rows: list[int]) -> Iterator[Any]:
         answers: list[Future[Any]] = [Future() for _ in rows]
+        # next() of itertools.count is atomic under the interpreter's lock, so that threads share it
+        # without one of their own.
         enough, places = threading.Event(), itertools.count()
         help_out = partial(self._have_help, cluster, function, rows, answers, enough)
         threading.Thread(target=help_out, name=RECEIVER_THREAD, daemon=True).start()
@@ -77,6 +80,7 @@ class SharedRows:
         try:
             for place in range(len(answers)):
                 yield answers[place].result()
+                # Rows are megabytes: one that was handed on is released at once.
                 answers[place] = _DISCARDED_RESULT
         finally:
             enough.set()

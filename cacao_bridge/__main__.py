@@ -15,8 +15,7 @@ import structlog
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from cacao_bridge.bundles import apply, roll_back
-from cacao_bridge.calibration import consent
+from cacao_bridge.calibration import apply, consent, roll_back
 from cacao_bridge.computer import Cacao
 from cacao_bridge.settings import Settings, load
 from pyrcal.rtc.background import Background

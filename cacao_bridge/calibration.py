@@ -1,16 +1,18 @@
-"""Write matrices into cacao's streams.
+"""Write matrices and whole bundles into cacao's streams, and restore what was there before.
 
 cacao copies its modes when the process that multiplies them starts, and does not read the streams
 again. A matrix is therefore in use once that process has been replaced after the streams were
-written. The process is recorded in a folder and survives this program. Parts of the calibration
-that act at once (:mod:`cacao_bridge.parts`) are written afterwards; a program that ends in between
-writes the rest when it runs again.
+written. The process is recorded in a folder and survives this program. What acts at once, the gains
+of the modes and the reference of the slopes, is written afterwards, and the previous values are
+kept under the name of the previous matrix. A program that ends in between writes the rest when it
+runs again.
 """
 
 from __future__ import annotations
 
 import io
 import json
+import time
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,15 +21,102 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
-from cacao_bridge.parts import Parts
 from cacao_bridge.settings import Settings, load_index, load_modes
 from cacao_bridge.streams import Stream, StreamError, create, path_of
 from pyrcal.rtc.identity import Identity, Reconstructor
 from service.errors import ConfigurationError
+from service.files.bundle import RECONSTRUCTOR, Bundle, Place, read_bundle, why_not
 from service.files.durable import replace_file
-from service.wire import Manifest, checksum, decode, encode
+from service.wire import Manifest, checksum, decode, encode, validate_id
 
 Array32 = NDArray[np.float32]
+
+GAINS, REFERENCE = "gain_factor", "reference_slopes"
+"""Names in a bundle."""
+
+
+class Parts:
+    """Gains and reference of matrices, in a folder and in cacao's streams."""
+
+    def __init__(self, settings: Settings, index: NDArray[np.int64]) -> None:
+        self._names, self._loop, self._index = settings.streams, settings.loop, index
+        self._folder = Path(settings.calibration.folder)
+
+    @property
+    def takes(self) -> frozenset[str]:
+        """Return the parts of a bundle that this loop can use."""
+        can = {GAINS: self._names.gains and self._loop.gain > 0.0, REFERENCE: self._names.reference}
+        return frozenset(name for name, has in can.items() if has)
+
+    def keep_of(self, name: str, bundle: Bundle) -> None:
+        """Keep the parts of a bundle other than its matrix, in the layout of cacao's streams.
+
+        Raises
+        ------
+        StreamError
+            If a stream that it needs is not there, or has another size.
+        OSError
+            If the disk refuses.
+        """
+        kept: dict[str, Array32] = {}
+        if GAINS in self.takes and GAINS in bundle.arrays:
+            gains = self._stream(self._names.gains).latest().copy()
+            factors = bundle.arrays[GAINS]
+            if gains.size < len(factors):
+                found = f"{self._names.gains}: found {gains.size} gains"
+                raise StreamError(f"{found}, expected {len(factors)}")
+            gains.reshape(-1)[: len(factors)] = self._loop.gain * factors
+            kept[self._names.gains] = gains
+        if REFERENCE in bundle.arrays:
+            reference = self._stream(self._names.reference).latest().copy()
+            if reference.size <= self._index.max():
+                found = f"{self._names.reference}: found {reference.size} values"
+                raise StreamError(f"{found}, expected at least {self._index.max() + 1}")
+            reference.reshape(-1)[self._index] = bundle.arrays[REFERENCE]
+            kept[self._names.reference] = reference
+        self._keep(name, kept)
+
+    def keep_now(self, name: str) -> None:
+        """Keep what the streams have now as what belongs to a matrix."""
+        streams = [one for one in (self._names.gains, self._names.reference) if one]
+        self._keep(name, {one: self._stream(one).latest() for one in streams})
+
+    def set(self, name: str) -> None:
+        """Set what is kept with a matrix; what is so already is not written again.
+
+        Raises
+        ------
+        StreamError
+            If a stream is not there, or has another size by now.
+        """
+        path = self._path(name)
+        if not path.exists():
+            return
+        with np.load(path, allow_pickle=False) as kept:
+            parts = {one: kept[one] for one in kept.files}
+        for one, values in parts.items():
+            stream = self._stream(one)
+            if stream.n_values != values.size:
+                raise StreamError(
+                    f"{one}: found {stream.n_values} values, expected {values.size} of {name}"
+                )
+        for one, values in parts.items():
+            stream = self._stream(one, writable=True)
+            if not np.array_equal(stream.latest().ravel(), values.ravel()):
+                stream.write(values)
+
+    def _keep(self, name: str, parts: dict[str, Array32]) -> None:
+        buffer = io.BytesIO()
+        np.savez(buffer, **parts)  # type: ignore[arg-type]
+        replace_file(self._path(name), buffer.getvalue())
+
+    def _path(self, name: str) -> Path:
+        return self._folder / f"{name}.parts.npz"
+
+    def _stream(self, name: str, *, writable: bool = False) -> Stream:
+        return Stream(path_of(name, self._names.directory), writable=writable)
+
+
 _log = structlog.get_logger("cacao")
 
 _STATE: Final = "state.json"
@@ -249,3 +338,64 @@ def consent(settings: Settings, name: str) -> str:
         raise ConfigurationError(f"--apply: found {name}, expected {waiting or 'none: none waits'}")
     (folder / _CONSENT).write_text(waiting, "utf-8")
     return str(waiting)
+
+
+def apply(settings: Settings, path: Path) -> str:
+    """Have the bridge bring a bundle into cacao, all of it or nothing; return its id.
+
+    Raises
+    ------
+    MatrixError
+        If it is no bundle, or not as it was written.
+    ConfigurationError
+        If it does not fit this loop; nothing is changed then.
+    StreamError
+        If a stream that it needs is not there, or has another size.
+    """
+    bundle = read_bundle(path)
+    name = validate_id(bundle.id, f"the bundle {path}")
+    index, modes, wire = load_index(settings), load_modes(settings), settings.wire
+    parts = Parts(settings, index)
+    place = Place(
+        system=wire.system,
+        config_id=wire.config_id,
+        n_slopes=len(index),
+        modes=modes.reshape(len(modes), -1),
+        takes=parts.takes,
+    )
+    why = why_not(bundle, place)
+    if why:
+        hint = " ([streams] gains and [loop] gain, [streams] reference)" * ("no place" in why)
+        raise ConfigurationError(f"{path}: {why}{hint}; nothing was changed")
+    folder = Path(settings.calibration.folder)
+    if name == known(folder)["in_use"]:
+        raise ConfigurationError(f"{path}: {name} is in use already; nothing was changed")
+    matrix = bundle.arrays[RECONSTRUCTOR].astype(np.float32)
+    kept = folder / f"{name}.npy"
+    if kept.exists() and not np.array_equal(np.load(kept, allow_pickle=False), matrix):
+        raise ConfigurationError(
+            f"{path}: {folder} has other numbers under {name}: ids are never reused; nothing was "
+            "changed"
+        )
+    parts.keep_of(name, bundle)
+    if not kept.with_suffix(".json").exists():  # the service's own sources say more
+        identity = Identity(system=wire.system, basis_id=wire.basis_id, config_id=wire.config_id)
+        keep(folder, Reconstructor.own(name, matrix, identity, created_ns=time.time_ns()))
+    order(folder, name)
+    return name
+
+
+def roll_back(settings: Settings) -> str:
+    """Have the bridge bring back what was in use before, all of it; return its id.
+
+    Raises
+    ------
+    ConfigurationError
+        If nothing was.
+    """
+    folder = Path(settings.calibration.folder)
+    before = known(folder).get("before")
+    if before is None:
+        raise ConfigurationError(f"{folder}: found no matrix before the one in use")
+    order(folder, before)
+    return str(before)

@@ -47,14 +47,13 @@ from pyrcal_studies.image_offsets import (
     filmed,
     model_of,
 )
-from pyrcal_studies.mistold_fits import AS_IT_IS, MISTELLINGS, PUPILS, error
 from pyrcal_studies.peers import LISTINGS, ROOT, environment, mirror_points, variables
 from pyrcal_studies.peers_pushpull import JOB, Bench, Measured, read_product, write_job
 from service.estimation.reference import Reference
 from service.instrument import load_instrument
 from service.model.instrument import Instrument
-from service.model.kinds import Normalisation, SlopeOrder, Stop
-from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.model.kinds import Influence, InfluenceShape, Normalisation, SlopeOrder, Stop
+from service.model.misregistration import BOUNDARY_SCALE, Misregistration, rotation
 from service.model.modes import karhunen_loeve_basis
 from service.model.pupil import valid_subapertures
 from service.model.sensors.pyramid.description import FrameWindows
@@ -85,7 +84,127 @@ def strokes() -> Array:
     return karhunen_loeve_basis(bench(Stop.MIRROR)).mode_to_actuator[:, ::EVERY]
 
 
-TOLD = {one.words: one for one in (AS_IT_IS, *MISTELLINGS, *PUPILS[:2])}
+_POINTS = 80
+"""Across a peer's pupil: OOPAO's metre is longer by one in so many."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mistelling:
+    """One thing that a user says and that is not so."""
+
+    words: str
+    tell: Callable[[Instrument], Instrument]
+    """From the instrument as it is to the one that is told."""
+
+    image: tuple[tuple[float, float], tuple[float, float]] = ((1.0, 0.0), (0.0, 1.0))
+    """What the told coordinates of actuators are of the true ones, but for their size."""
+
+    size: float = 1.0
+    """How much larger the mirror is told to be."""
+
+
+def _coupling(value: float) -> Callable[[Instrument], Instrument]:
+    return lambda about: replace(
+        about,
+        mirror=replace(
+            about.analytic_mirror,
+            shape=InfluenceShape(influence=Influence.GAUSSIAN, coupling=value),
+        ),
+    )
+
+
+def _modulation(radius: float) -> Callable[[Instrument], Instrument]:
+    return lambda about: replace(about, wfs=replace(about.wfs, modulation_lambda_over_d=radius))
+
+
+def _other_wavelength(about: Instrument) -> Instrument:
+    return replace(about, wfs=replace(about.wfs, wavelength_m=900e-9))
+
+
+def _sized(factor: float) -> Callable[[Instrument], Instrument]:
+    def tell(about: Instrument) -> Instrument:
+        mirror = about.analytic_mirror
+        return replace(
+            about,
+            mirror=replace(
+                mirror, positions_m=mirror.positions_m * factor, pitch_m=mirror.pitch_m * factor
+            ),
+        )
+
+    return tell
+
+
+def _other_stop(about: Instrument) -> Instrument:
+    return replace(about, stop=Stop.MIRROR if about.stop is Stop.TELESCOPE else Stop.TELESCOPE)
+
+
+def _other_order(about: Instrument) -> Instrument:
+    order = SlopeOrder.YX if about.slopes.order is SlopeOrder.XY else SlopeOrder.XY
+    return replace(about, slopes=replace(about.slopes, order=order))
+
+
+def _mirrored(about: Instrument) -> Instrument:
+    mirror = about.analytic_mirror
+    return replace(about, mirror=replace(mirror, positions_m=mirror.positions_m * [-1.0, 1.0]))
+
+
+def _diameter(factor: float) -> Callable[[Instrument], Instrument]:
+    return lambda about: replace(about, diameter_m=about.diameter_m * factor)
+
+
+def _pupil(factor: float) -> Callable[[Instrument], Instrument]:
+    return lambda about: replace(
+        about,
+        wfs=replace(about.wfs, pupil_diameter_subap=about.wfs.pupil_diameter * factor),
+    )
+
+
+MISTELLINGS = (
+    Mistelling(words="coupling 0.20", tell=_coupling(0.2)),
+    Mistelling(words="coupling 0.50", tell=_coupling(0.5)),
+    Mistelling(words="modulation 2", tell=_modulation(2.0)),
+    Mistelling(words="modulation 6", tell=_modulation(6.0)),
+    Mistelling(words="the other stop", tell=_other_stop),
+    Mistelling(words="pitch 5 % large", tell=_sized(1.05), size=1.05),
+    Mistelling(words="wavelength 900 nm", tell=_other_wavelength),
+    Mistelling(
+        words="OOPAO's metre", tell=_sized(_POINTS / (_POINTS - 1)), size=_POINTS / (_POINTS - 1)
+    ),
+    Mistelling(words="order of slopes", tell=_other_order),
+    Mistelling(words="mirror image", tell=_mirrored, image=((-1.0, 0.0), (0.0, 1.0))),
+    Mistelling(words="diameter 2 % large", tell=_diameter(1.02), size=1.0 / 1.02),
+    Mistelling(words="pupil image 2 % small", tell=_pupil(0.98), size=0.98),
+)
+AS_IT_IS = Mistelling(words="nothing", tell=lambda about: about)
+
+
+def error(alpha: Misregistration, truth: Misregistration, told: Mistelling) -> Array:
+    """Return found less true ``(4,)``, numeric units, in the axes found and the metre told.
+
+    No matrix tells which way round sensor and drawing are together: of the eight ways the nearest
+    counts, as long as sensor and drawing are mirrored together.
+    """
+    turn = rotation(truth.rotation_rad)
+    errors = []
+    for flip, quarters in product((1.0, -1.0), range(4)):
+        axes = np.diag([flip, 1.0]) @ np.linalg.matrix_power([[0.0, -1.0], [1.0, 0.0]], quarters)
+        seen = axes @ turn @ np.array(told.image)
+        if np.linalg.det(seen) < 0.0:
+            continue
+        expected = np.array(
+            [
+                *(axes @ truth.vector[:2]),
+                np.arctan2(seen[1, 0], seen[0, 0]),
+                truth.magnification / told.size,
+            ]
+        )
+        off = alpha.vector - expected
+        off[2] = (off[2] + np.pi) % (2.0 * np.pi) - np.pi
+        errors.append(off)
+    return np.asarray(min(errors, key=lambda off: float(np.abs(off[:3]).sum())))
+
+
+TOLD = {one.words: one for one in (AS_IT_IS, *MISTELLINGS)}
 """Instrument files with one thing wrong."""
 
 

@@ -1,11 +1,13 @@
 """Build an instrument and its matrix from arrays in files, recognised and checked by shape.
 
 Each array has a role: the matrix, the valid subapertures, the modes. Parameters missing from the
-files can be given as options. Otherwise they are read from the mask or marked unknown.
+files can be given as options. Otherwise they are read from the mask or marked unknown. Files of
+pyRTC are such arrays; since its version 2.0 they have a record of their role.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -28,6 +30,34 @@ from pyrcal.importers.layouts import ROLES, maps_of, mask_of
 from service.errors import ConfigurationError, MatrixError
 from service.model.aperture import measure_aperture
 from service.model.defects import explain_defects, find_defects
+
+RECORD, DATA, FORMAT = "pyrtc_calibration", "data", 2
+KINDS = {"interaction_matrix": "matrix", "valid_sub_aps": "valid"}
+"""Roles by the kind in pyRTC's record."""
+
+
+def calibration_of(arrays: Mapping[str, Array], where: str) -> tuple[str, Array]:
+    """Return the role and the array of a calibration file of pyRTC 2.
+
+    Raises
+    ------
+    MatrixError
+        If it has no record, or one that is newer or of another calibration.
+    """
+    try:
+        record = json.loads(str(np.asarray(arrays[RECORD])[()]))
+        kind, version, values = record["kind"], int(record["format"]), arrays[DATA]
+    except (KeyError, TypeError, ValueError) as error:
+        raise MatrixError(
+            f"{where}: found no record of pyRTC 2 ({RECORD}), expected one, or ROLE=FILE"
+        ) from error
+    if version > FORMAT or kind not in KINDS:
+        raise MatrixError(
+            f"{where}: found {kind} of format {version}, expected {' or '.join(KINDS)} of format "
+            f"{FORMAT}"
+        )
+    return KINDS[kind], values
+
 
 UNITS_M = {"m": 1.0, "um": 1e-6, "nm": 1e-9}
 """Metres of OPD in a unit of the commands."""

@@ -14,10 +14,9 @@ from pyrcal.importers import oopao
 from pyrcal.importers.aot import from_aot
 from pyrcal.importers.cacao import from_cacao
 from pyrcal.importers.described import from_described
-from pyrcal.importers.files import Reported, from_arrays
+from pyrcal.importers.files import RECORD, Reported, calibration_of, from_arrays
 from pyrcal.importers.imported import Array, Imported
 from pyrcal.importers.layouts import by_role, numbers_of_name, role_of_name
-from pyrcal.importers.pyrtc import RECORD, calibration_of
 from pyrcal.importers.saved import read_npz
 from pyrcal.importers.specula import UNIT, from_specula
 from service.errors import ConfigurationError, MatrixError

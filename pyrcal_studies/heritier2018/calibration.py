@@ -24,8 +24,6 @@ PART_MODES = 50
 SMALL_STROKE_M = 1e-9
 """Small enough for the pyramid to be linear."""
 
-FRAME_COST_S = 7e-3
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasuredPart:
@@ -39,17 +37,6 @@ class MeasuredPart:
     n_modes: int
     n_average: int
     """Pushes, and as many pulls, of each mode."""
-
-    @property
-    def label(self) -> str:
-        """What the progress bar shows."""
-        last = self.first_mode + self.n_modes
-        return f"measuring modes {self.first_mode + 1} to {last}, seed {self.occasion.seed}"
-
-    @property
-    def cost_s(self) -> float:
-        """Rough time on one idle core, seconds."""
-        return self.n_frames * FRAME_COST_S
 
     @property
     def needs(self) -> tuple[Task, ...]:
@@ -131,16 +118,6 @@ class Answer:
     occasion: Occasion
     alpha: Misregistration
     n_modes: int
-
-    @property
-    def label(self) -> str:
-        """What the progress bar shows."""
-        return f"noise-free matrix, {self.occasion.imperfections}, seed {self.occasion.seed}"
-
-    @property
-    def cost_s(self) -> float:
-        """Rough time on one idle core, seconds."""
-        return 2 * self.n_modes * FRAME_COST_S + 2.0
 
     @property
     def needs(self) -> tuple[Task, ...]:

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from pyrcal_studies.heritier2018 import telescope
 from pyrcal_studies.heritier2018.reconstructors import (
-    INVERSION_COST_S,
     inverse_record,
     synthetic_matrix,
 )
@@ -101,16 +100,6 @@ class ChangedReconstructor:
     def passes(self) -> int:
         """How often the light meets the mirror."""
         return 1
-
-    @property
-    def label(self) -> str:
-        """What the progress bar shows."""
-        return f"reconstructor of a changed matrix ({self.change.feature})"
-
-    @property
-    def cost_s(self) -> float:
-        """Rough time on one idle core, seconds."""
-        return INVERSION_COST_S
 
     @property
     def needs(self) -> tuple[Task, ...]:

@@ -17,7 +17,6 @@ from scipy.fft import fft2, fftshift, next_fast_len
 from scipy.linalg import cholesky, solve_triangular
 
 from pyrcal_studies.heritier2018 import telescope
-from pyrcal_studies.heritier2018.calibration import FRAME_COST_S
 from pyrcal_studies.heritier2018.reconstructors import Inverse
 from pyrcal_studies.heritier2018.registration import Found, resolved
 from pyrcal_studies.heritier2018.store import Record, Store, Task
@@ -123,19 +122,6 @@ class LoopRun:
 
     played_modes: int | None = None
     """By day: modes of the played turbulence; None: all the mirror can make."""
-
-    @property
-    def label(self) -> str:
-        """What the progress bar shows."""
-        where = "where a fit found it"
-        if isinstance(self.alpha, Misregistration):
-            where = f"at {self.alpha.to_boundary()['rotation_deg']:.2f} deg"
-        return f"loop {where}, {self.reconstructor.label}"
-
-    @property
-    def cost_s(self) -> float:
-        """Rough time on one idle core, seconds."""
-        return self.n_frames_run * FRAME_COST_S + OVERHEAD_S
 
     @property
     def needs(self) -> tuple[Task, ...]:
@@ -263,8 +249,6 @@ RAMP_GAINS = (0.4, 0.6, 0.8, 1.0)
 RAMP_START = 0.4
 """Of groups whose turn has not come."""
 
-OVERHEAD_S = 2.5
-
 
 class ClosedLoop:
     """The loop of an occasion, from rest, on the turbulence that all its loops share."""
@@ -330,16 +314,6 @@ class GainTuning:
     """Half of them settle."""
 
     @property
-    def label(self) -> str:
-        """What the progress bar shows."""
-        return f"gain ramp, {self.reconstructor.label}"
-
-    @property
-    def cost_s(self) -> float:
-        """Rough time on one idle core, seconds."""
-        return self.n_frames * FRAME_COST_S + OVERHEAD_S
-
-    @property
     def needs(self) -> tuple[Task, ...]:
         """The reconstructor."""
         return (self.reconstructor,)
@@ -384,9 +358,6 @@ class GainTuning:
         )
 
 
-_COST_S = 2.0
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoleSweep:
     """Eigenvalues of R D(α) along a sweep."""
@@ -396,16 +367,6 @@ class PoleSweep:
     """Of the swept parameter, in the sweep's unit."""
 
     n_modes: int
-
-    @property
-    def label(self) -> str:
-        """What the progress bar shows."""
-        return f"poles of {self.n_modes} modes"
-
-    @property
-    def cost_s(self) -> float:
-        """Rough time on one idle core, seconds."""
-        return _COST_S * len(self.alphas)
 
     @property
     def needs(self) -> tuple[Task, ...]:

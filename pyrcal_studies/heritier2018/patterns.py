@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal_studies.heritier2018 import telescope
-from pyrcal_studies.heritier2018.calibration import FRAME_COST_S, STROKE_M, Answer
+from pyrcal_studies.heritier2018.calibration import STROKE_M, Answer
 from pyrcal_studies.heritier2018.reconstructors import synthetic_matrix
 from pyrcal_studies.heritier2018.registration import DERIVATIVE_STEPS
 from pyrcal_studies.heritier2018.store import Record, Store, Task
@@ -74,16 +74,6 @@ class PatternRun:
     n_modes: int
     truth: Answer
     """Noise-free matrix of the same telescope."""
-
-    @property
-    def label(self) -> str:
-        """What the progress bar shows."""
-        return f"calibration, {self.pattern}"
-
-    @property
-    def cost_s(self) -> float:
-        """Rough time on one idle core, seconds."""
-        return TONES_FRAMES_PER_MODE * self.n_modes * FRAME_COST_S + 6.0
 
     @property
     def needs(self) -> tuple[Task, ...]:

@@ -19,8 +19,6 @@ from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 
-INVERSION_COST_S = 3.0
-
 
 class Inverse(Task, Protocol):
     """A task whose result is a reconstructor."""
@@ -48,16 +46,6 @@ class ModelReconstructor:
         return self.occasion.passes
 
     @property
-    def label(self) -> str:
-        """What the progress bar shows."""
-        return f"reconstructor of the model, {self.n_modes} modes"
-
-    @property
-    def cost_s(self) -> float:
-        """Rough time on one idle core, seconds."""
-        return INVERSION_COST_S
-
-    @property
     def needs(self) -> tuple[Task, ...]:
         """Nothing but the model, and the fit where that says where it lies."""
         return (self.alpha.fit,) if isinstance(self.alpha, Found) else ()
@@ -79,16 +67,6 @@ class MeasuredReconstructor:
     def passes(self) -> int:
         """How often the light met the mirror when it was measured."""
         return self.measurement.occasion.passes
-
-    @property
-    def label(self) -> str:
-        """What the progress bar shows."""
-        return "reconstructor of the measured matrix"
-
-    @property
-    def cost_s(self) -> float:
-        """Rough time on one idle core, seconds."""
-        return 1.0
 
     @property
     def needs(self) -> tuple[Task, ...]:
@@ -118,17 +96,6 @@ class FittedReconstructor:
     def passes(self) -> int:
         """How often the light met the mirror when the fitted matrix was measured."""
         return self.fit.source.occasion.passes
-
-    @property
-    def label(self) -> str:
-        """What the progress bar shows."""
-        tuned = ", gains tuned" if self.tuned else ""
-        return f"synthetic reconstructor, {self.n_modes} modes{tuned}"
-
-    @property
-    def cost_s(self) -> float:
-        """Rough time on one idle core, seconds."""
-        return INVERSION_COST_S
 
     @property
     def needs(self) -> tuple[Task, ...]:

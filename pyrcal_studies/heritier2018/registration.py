@@ -27,8 +27,6 @@ Array = NDArray[np.float64]
 DERIVATIVE_STEPS = np.array([1e-2, 1e-2, 1e-3, 1e-3])
 """Steps of the derivatives of a matrix by the registration, numeric units."""
 
-_COST_S = {Method.JOINT: 12.0, Method.PAPER: 35.0, Method.SENSITIVITY: 12.0}
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FitRun:
@@ -39,17 +37,6 @@ class FitRun:
     start: Misregistration
     modes_every: int = 1
     """Only each such mode takes part."""
-
-    @property
-    def label(self) -> str:
-        """What the progress bar shows."""
-        rotation = self.start.to_boundary()["rotation_deg"]
-        return f"fit ({self.method}) from {rotation:.1f} deg"
-
-    @property
-    def cost_s(self) -> float:
-        """Rough time on one idle core, seconds."""
-        return float(_COST_S[self.method] / self.modes_every**0.5)
 
     @property
     def needs(self) -> tuple[Task, ...]:
@@ -130,16 +117,6 @@ class CriterionMinimum:
     """
 
     source: Measurement | Answer
-
-    @property
-    def label(self) -> str:
-        """What the progress bar shows."""
-        return "minimum of the criterion"
-
-    @property
-    def cost_s(self) -> float:
-        """Rough time on one idle core, seconds."""
-        return 8.0
 
     @property
     def needs(self) -> tuple[Task, ...]:

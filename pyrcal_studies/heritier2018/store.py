@@ -22,9 +22,9 @@ from typing import Any, Protocol
 import numpy as np
 import structlog
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from threadpoolctl import threadpool_limits
+
+from service.errors import say
 
 Record = Mapping[str, NDArray[Any]]
 """Named arrays: what a task comes to."""
@@ -32,14 +32,6 @@ Record = Mapping[str, NDArray[Any]]
 
 class Task(Protocol):
     """One step, small enough to be repeated and large enough to be worth keeping."""
-
-    @property
-    def label(self) -> str:
-        """What the progress bar shows."""
-
-    @property
-    def cost_s(self) -> float:
-        """Rough time on one idle core, seconds."""
 
     @property
     def needs(self) -> tuple[Task, ...]:
@@ -100,8 +92,8 @@ PROCESSOR_S = "processor_s"
 """Name of the array that says what a step took of a processor, seconds."""
 
 _NICENESS = 5
-_PLAIN_EVERY_S = 30.0
-"""Between two lines where the bar cannot be redrawn in place."""
+_SHOWN_EVERY_S = 10.0
+"""Time between two lines on the progress."""
 
 
 def carry_out(
@@ -120,23 +112,20 @@ def carry_out(
             n_workers, multiprocessing.get_context("spawn"), initializer=_settle_in
         )
     running: dict[Future[None], Task] = {}
+    shown_s = 0.0
     try:
-        with _progress() as bar:
-            work, told_s = bar.add_task("", total=sum(task.cost_s for task in waiting)), started
-            while waiting or running:
-                for task in _ready(waiting, store)[: n_workers - len(running)]:
-                    waiting.remove(task)
-                    running[executor.submit(_work, task, store.folder)] = task
-                ended, _ = wait(running, return_when=FIRST_COMPLETED)
-                for future in ended:
-                    task = running.pop(future)
-                    future.result()
-                    n_done = n_steps - len(waiting) - len(running)
-                    told = f"{n_done}/{n_steps}  {task.label:.48s}"
-                    bar.update(work, advance=task.cost_s, description=told)
-                    if not bar.console.is_terminal and time.monotonic() - told_s > _PLAIN_EVERY_S:
-                        bar.console.print(f"paper {told}", markup=False)
-                        told_s = time.monotonic()
+        while waiting or running:
+            for task in _ready(waiting, store)[: n_workers - len(running)]:
+                waiting.remove(task)
+                running[executor.submit(_work, task, store.folder)] = task
+            ended, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in ended:
+                task = running.pop(future)
+                future.result()
+                left = len(waiting) + len(running)
+                if time.monotonic() - shown_s > _SHOWN_EVERY_S or not left:
+                    shown_s = time.monotonic()
+                    say(f"paper: {n_steps - left} of {n_steps} steps, {type(task).__name__}")
     except KeyboardInterrupt:
         sys.stderr.write("\npaper: interrupted; the steps under way are finished first\n")
         raise
@@ -148,19 +137,6 @@ def carry_out(
 def processor_minutes(tasks: tuple[Task, ...], store: Store) -> float:
     """Return what all steps took of a processor, minutes."""
     return sum(float(store.read(task)[PROCESSOR_S]) for task in in_order(tasks)) / 60.0
-
-
-def _progress() -> Progress:
-    """Return a line: share of the work, time left by its cost, steps, what ended last."""
-    return Progress(
-        TextColumn("paper"),
-        BarColumn(24),
-        TaskProgressColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.description}", markup=False),
-        console=Console(stderr=True),
-        speed_estimate_period=3600.0,
-    )
 
 
 def _ready(waiting: list[Task], store: Store) -> list[Task]:

@@ -25,8 +25,7 @@ from typing_extensions import override
 
 from service.archive import Actor, AuditEntry, Channel
 from service.errors import ConfigurationError, UnknownIdError
-from service.web.bodies import bounded
-from service.web.connections import UNAVAILABLE_RETRY_S, Middleware, to_its_end
+from service.web.connections import UNAVAILABLE_RETRY_S, Middleware, bounded, to_its_end
 from service.web.keys import Key, KeyFile, KeyScope
 from service.web.problems import INVALID, UNKNOWN, problem
 from service.web.views import answer, define_view, held, shows

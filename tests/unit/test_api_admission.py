@@ -10,7 +10,7 @@ import httpx
 import pytest
 
 from service.api import create_app
-from service.web import bodies, connections
+from service.web import connections
 from service.web.authentication import Hosts
 from service.web.connections import Server
 from service.web.keys import KeyFile, KeyScope
@@ -194,7 +194,7 @@ async def state_of(port):
 
 
 async def test_a_body_that_does_not_come_is_ended_with_408(service, monkeypatch):
-    monkeypatch.setattr(bodies, "MAX_BODY_S", 0.5)
+    monkeypatch.setattr(connections, "MAX_BODY_S", 0.5)
     async with serving(service) as port:
         head = b"POST /v1/refit HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100\r\n\r\n{"
         reader, writer = await connected(port, head)

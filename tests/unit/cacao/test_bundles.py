@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from cacao_bridge.bundles import apply, roll_back
-from cacao_bridge.calibration import Calibration
-from cacao_bridge.parts import Parts
+from cacao_bridge.calibration import Calibration, Parts, apply, roll_back
 from cacao_bridge.settings import Settings
 from cacao_bridge.streams import StreamError, create, path_of
 from service.errors import ConfigurationError, PyrcalError

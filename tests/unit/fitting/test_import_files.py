@@ -22,9 +22,8 @@ from pyrcal.__main__ import main
 from pyrcal.fitting.specula import write_specula
 from pyrcal.importers.aot import from_aot
 from pyrcal.importers.cacao import from_cacao
-from pyrcal.importers.files import Reported, from_arrays
+from pyrcal.importers.files import Reported, calibration_of, from_arrays
 from pyrcal.importers.layouts import by_role, cube_of, maps_of, mask_of
-from pyrcal.importers.pyrtc import calibration_of
 from pyrcal.importers.saved import read_npz
 from pyrcal.importers.specula import from_specula
 from service.errors import MatrixError

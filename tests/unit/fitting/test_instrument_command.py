@@ -7,9 +7,13 @@ import pytest
 
 from pyrcal.__main__ import main
 from pyrcal.fitting.system_file import SystemFile
-from pyrcal.instruments.implied import derive_properties, describe_properties
+from pyrcal.instruments.program import (
+    EXAMPLES,
+    derive_properties,
+    describe_properties,
+    make_template,
+)
 from pyrcal.instruments.schema_texts import tables_of
-from pyrcal.instruments.template import EXAMPLES, make_template
 from service.errors import ConfigurationError
 from service.instrument import load_instrument
 from service.instrument.schema import whole_of

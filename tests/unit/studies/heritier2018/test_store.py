@@ -17,14 +17,6 @@ class Doubled:
     source: Doubled | None = None
 
     @property
-    def label(self) -> str:
-        return f"double {self.value}"
-
-    @property
-    def cost_s(self) -> float:
-        return 1.0
-
-    @property
     def needs(self) -> tuple[Task, ...]:
         return () if self.source is None else (self.source,)
 

@@ -51,11 +51,12 @@ nights: $(STAMP) ## random sequences of faults in simulated time; hours, ARGS="-
 restarts: $(STAMP) ## the service killed two hundred times, and what it had acknowledged; half an hour
 	@$(PY) -m pyrcal_studies.restarts $(ARGS)
 
-check: $(STAMP) ## lint, formatting, types and import contracts
+check: $(STAMP) ## lint, formatting, types, import contracts and unused code
 	@$(PY) -m ruff check .
 	@$(PY) -m ruff format --check .
 	@$(PY) -m mypy
 	@.venv/bin/lint-imports --no-logo
+	@$(PY) -m tests.unused_code
 
 paper: $(STAMP) ## the seed paper beside pyrcal: docs/results/heritier2018.md and its figures; ten minutes on two cores, ARGS=--quick three
 	@$(PY) -m pyrcal_studies.heritier2018 $(ARGS)

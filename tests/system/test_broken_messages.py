@@ -146,35 +146,6 @@ def test_frames_that_are_not_finite_are_named_within_three_seconds(night, rtc):
     named(night, alarms, "frames-unused", "nonfinite")
 
 
-@pytest.mark.long
-def test_statuses_that_break_the_contract_are_named_and_missed(night, rtc):
-    rtc.on_status = lambda status: status | {"leak": 1.5}
-    named(night, alarms, "messages-refused", "leak is 1.5")
-    named(night, waits, "status", "no status", 8.0)
-    assert night.client.get("/readyz").status_code == 503
-
-
-@pytest.mark.long
-def test_frames_without_any_status_are_named(night):
-    with stranger(night, "mute") as rtc:
-        rtc.on_status = lambda _: None
-        named(night, waits, "status", "tel/status", 3.0 + TOLD_WITHIN_S + SLACK_S)
-        assert not night.state["ready"]
-        rtc.on_status = None
-        met(night, rtc)
-        wait_for(lambda: "status" not in waits(night), 5.0, "it is waited for no more")
-
-
-@pytest.mark.long
-def test_an_rtc_that_pauses_is_waited_for(night, rtc):
-    rtc.on_frames = lambda *_: None
-    named(night, waits, "frames", "no frames", 3.0 + SLACK_S)
-    rtc.on_status = lambda _: None
-    named(night, waits, "telemetry", "no message arrives", 4.0 + SLACK_S)
-    rtc.on_frames = rtc.on_status = None
-    wait_for(lambda: not {"frames", "telemetry"} & set(waits(night)), 5.0, "all well")
-
-
 def test_an_rtc_that_is_not_there_is_waited_for(night):
     named(night, waits, "rtc", "no RTC is there", 5.0)
     wait_for(lambda: night.state["ready"], 5.0, "it is ready for one")
@@ -205,31 +176,6 @@ def test_telemetry_that_makes_no_sense_is_counted_and_the_service_goes_on(night)
     assert night.state["rtc"] is None
     events = night.client.get("/v1/events").json()["log"]
     assert any(event["name"] == "message.malformed" for event in events)
-
-
-@pytest.mark.long
-def test_a_loop_whose_matrix_has_no_name_is_registered_all_the_same(night):
-    with stranger(night, "nameless") as rtc:
-        rtc.told = {"cm_id": None}
-        rtc.on_frames = lambda header, *rows: (header | {"cm_id": None}, *rows)
-        met(night, rtc)
-        before = night.state["windows_accepted"]
-        named(night, waits, "matrix-name", "cm_id is nil")
-        wait_for(lambda: night.state["windows_accepted"] > before + 1, 40.0, "windows of a dither")
-
-
-@pytest.mark.long
-def test_another_sum_in_an_acknowledgement_is_an_alarm_until_the_matrix_is_read_back(night):
-    response, variance_m2 = small_telescope(shift_x_subap=0.1)
-    assumed, _ = small_telescope()
-    rtc = Stranger(night.zenoh, response, variance_m2, assumed=assumed)
-    rtc.session = f"liar-{time.monotonic_ns()}"
-    rtc.on_ack = lambda ack: ack | {"sha256": "0" * 64}
-    with rtc:
-        named(night, alarms, "wrong-matrix", "0" * 64, 60.0)
-        n_sent = len({ack["id"] for ack in rtc.acks})
-        wait_for(lambda: "wrong-matrix" not in night.alarms, 15.0, "read back")
-        assert n_sent == 1
 
 
 @pytest.mark.long

@@ -17,9 +17,7 @@ WIDE = (1400, 900)
 SEEN = [
     "index",
     "start/concepts",
-    "explanation/limits",
     "tutorials/oopao",
-    "reference/python",
     "reference/cli",
     "operate/runbook",
 ]

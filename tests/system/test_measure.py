@@ -113,31 +113,6 @@ def test_a_matrix_is_measured_by_sines_with_the_loop_closed(night):
     check_against_model(numbers_of(night, record), record["modes"])
 
 
-def test_what_cannot_be_done_now_is_refused_with_the_reason(night):
-    night.service("hold")
-    answer = night.client.post("/v1/measurements", json={})
-    assert answer.status_code == httpx.codes.CONFLICT
-    assert "no RTC is there" in answer.json()["detail"]
-    night.rtc()
-    wait_for(lambda: night.state["dither"], what="a dither")
-    answer = night.client.post("/v1/measurements", json={})
-    assert answer.status_code == httpx.codes.CONFLICT
-    assert "is running; stop it first" in answer.json()["detail"]
-    no_dither(night)
-
-    answer = night.client.post("/v1/measurements", json={"amplitude_m": 1e-6})
-    assert answer.status_code == httpx.codes.CONFLICT
-    assert "the RTC refused: range: amplitude_m 1e-06" in answer.json()["detail"]
-
-    answer = night.client.post("/v1/measurements", json={"n_average": 200})
-    assert answer.status_code == httpx.codes.ACCEPTED, answer.text
-    answer = night.client.post("/v1/dither", json={"action": "start"})
-    assert answer.status_code == httpx.codes.CONFLICT
-    assert "is being measured; wait for it" in answer.json()["detail"]
-    states = [m["state"] for m in night.client.get("/v1/measurements").json()["measurements"]]
-    assert states == ["refused", "running"]
-
-
 def test_measured_matrices_outlive_the_service_and_a_lost_rtc_is_named(night):
     quiet_night(night)
     record = measured(night, {"n_average": 1, "modes": [0, 1]})

@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from tests.system.night import ALPHA, INSTRUMENT, a_night, wait_for
+from tests.system.night import ALPHA, a_night, wait_for
 from tests.system.stranger import Stranger, small_telescope
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(150)]
@@ -15,32 +15,6 @@ pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(150)]
 def night(tmp_path):
     with a_night(tmp_path) as night:
         yield night
-
-
-def wrong(night):
-    """Texts of the alarms that speak of an RTC that is not as it is told."""
-    names = {"matrix-mismatch", "response-mismatch", "loop-law", "command-unit"}
-    return {a["name"]: a["text"] for a in night.state["alarms"] if a["name"] in names}
-
-
-def pinned(night, orientation):
-    path = night.directory / "pinned.toml"
-    text = INSTRUMENT.read_text(encoding="utf-8")
-    path.write_text(f"{text}\n[slopes]\norientation = {orientation}\n", encoding="utf-8")
-    return path
-
-
-def test_slopes_of_the_other_sign_are_named_and_no_matrix_is_sent(night):
-    night.service("auto", pinned(night, "{ sign = 1 }"))
-    response, variance_m2 = small_telescope(**ALPHA)
-    assumed, _ = small_telescope()
-    with Stranger(night.zenoh, -response, variance_m2, assumed=-assumed) as rtc:
-        wait_for(
-            lambda: rtc.applied or "sign" in "".join(wrong(night).values()),
-            40.0,
-            lambda: f"the sign is named; {wrong(night)}",
-        )
-        assert not rtc.applied
 
 
 def test_an_orientation_left_open_is_found_adopted_and_the_matrix_sent_holds(night):
@@ -59,36 +33,6 @@ def test_an_orientation_left_open_is_found_adopted_and_the_matrix_sent_holds(nig
         wait_for(lambda: len(rtc.residuals) > n_batches + 100, 10.0, "two seconds more")
         after = np.median([value for _, value in rtc.residuals[n_batches:]])
         assert after < 1.1 * np.median([value for _, value in rtc.residuals[:n_batches]])
-
-
-def test_another_leak_than_told_is_named_and_no_matrix_is_sent(night):
-    night.service("auto")
-    response, variance_m2 = small_telescope(**ALPHA)
-    assumed, _ = small_telescope()
-    with Stranger(night.zenoh, response, variance_m2, assumed=assumed, leak=0.9) as rtc:
-        rtc.told["leak"] = 0.99
-        text = wait_for(lambda: wrong(night).get("loop-law"), 20.0, "an alarm")
-        assert "leak 0.900 found, 0.990 in the status" in text
-        time.sleep(5.0)
-        assert not rtc.applied
-
-
-def test_commands_in_nanometres_are_named_and_the_healthy_loop_stays_closed(night):
-    night.service("auto")
-    response, variance_m2 = small_telescope(**ALPHA)
-    assumed, _ = small_telescope()
-    with Stranger(night.zenoh, response, variance_m2, assumed=assumed) as rtc:
-        rtc.on_frames = lambda header, slopes, commands, dither: (
-            header,
-            slopes,
-            1e9 * commands,
-            1e9 * dither,
-        )
-        assert "nanometres" in wait_for(lambda: wrong(night).get("command-unit"), 20.0, "an alarm")
-        time.sleep(8.0)
-        assert not rtc.applied
-        assert "loop" not in [kind for kind, _ in rtc.commands]
-        assert "nanometres" in wrong(night)["command-unit"]
 
 
 def test_an_rtc_that_starts_anew_with_other_slopes_is_not_believed_by_the_id_of_its_matrix(night):

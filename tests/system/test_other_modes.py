@@ -59,24 +59,6 @@ def test_modes_that_differ_are_named_and_the_loop_is_left_as_good_as_it_was(nigh
         assert found[0] <= NAMED_S, found
 
 
-def test_rolled_modes_are_named_as_another_basis_and_no_reason_to_open_the_loop(night):
-    night.service("auto")
-    with OtherRtc(night.zenoh, order=np.roll(np.arange(90), 1)) as rtc:
-        found = watched(night, rtc, "order|another basis")
-        assert rtc.closed
-        assert rtc.worse_s() <= 1.0, (rtc.applied, night.alarms)
-        assert found is not None, night.alarms
-
-
-def test_a_sensor_of_half_the_strength_has_the_loop_gain_that_it_had(night):
-    night.service("auto")
-    with OtherRtc(night.zenoh, strength=0.5) as rtc:
-        wait_for(lambda: rtc.applied, 40.0, lambda: f"a matrix applied; {night.alarms}")
-        at = rtc.seq
-        wait_for(lambda: rtc.seq > at + 5 * rtc.rate_hz, 10.0, "five seconds with it")
-        assert rtc.worse_s() <= 1.0, (rtc.applied, night.alarms)
-
-
 def test_an_rtc_that_plays_another_matrix_than_it_acknowledges_is_not_left_with_it(night):
     """Whatever it is sent it plays three times as strongly: going back does not help it."""
     night.service("auto")

@@ -6,11 +6,8 @@ import socket
 import time
 
 import pytest
-import zenoh
 
 from service.archive import Archive
-from service.wire import Keys
-from tests.system.fake_rtc import client_session
 from tests.system.night import (
     ALPHA,
     INSTRUMENT,
@@ -43,17 +40,6 @@ def check_registration(known):
         error = known["alpha"][name] - ALPHA[name]
         assert abs(error) < tolerance, (name, error)
         assert abs(error) < 4 * known["sigma"][name], (name, error, known["sigma"][name])
-
-
-def other_instrument(night, **replacements):
-    text = INSTRUMENT.read_text(encoding="utf-8")
-    for old, new in replacements.items():
-        key = f"{old} = "
-        (line,) = [line for line in text.splitlines() if line.startswith(key)]
-        text = text.replace(line, f"{key}{new}")
-    path = night.directory / "other.toml"
-    path.write_text(text, encoding="utf-8")
-    return path
 
 
 def test_in_auto_the_registration_is_found_and_the_loop_served_first_its_modes_then_more(night):
@@ -211,46 +197,3 @@ class TestRefusedAtTheStart:
             archive.open()
             line = self.refused(night, "--port", "0", "--data-dir", str(data))
         assert "in use by another service" in line
-
-
-@pytest.mark.long
-def test_a_stranger_on_the_network_cannot_stop_the_telemetry(night):
-    night.service("hold")
-    night.wait_for_rtc(night.rtc())
-    with client_session(night.zenoh) as session:
-        for size in (0, 1, 10_000):
-            session.put(
-                Keys("small").frames,
-                b"\x01" * size,
-                congestion_control=zenoh.CongestionControl.BLOCK,
-            )
-        received = night.state["link"]["frames_received"]
-        wait_for(
-            lambda: night.state["link"]["frames_received"] > received + 500, 10.0, "more frames"
-        )
-    night.no_frame_is_lost()
-
-
-@pytest.mark.long
-def test_an_rtc_of_another_basis_or_instrument_is_named_and_gets_nothing(night):
-    night.service("auto", other_instrument(night, name='"small"\nbasis_id = "kl-of-last-year"'))
-    rtc = night.rtc()
-    wait_for(lambda: "basis-mismatch" in night.alarms, 30.0, "the alarm")
-    assert "kl-of-last-year" in night.alarms["basis-mismatch"]
-    time.sleep(4.0)
-    rtc.kill()
-    night.rtc(instrument=other_instrument(night, n_modes="80"), seed=4)
-    wait_for(lambda: "instrument-mismatch" in night.alarms, 30.0, "the alarm")
-    assert "80 modes, the instrument file 224 and 90" in night.alarms["instrument-mismatch"]
-    time.sleep(4.0)
-    assert night.state["registration"] is None
-    assert not [record for record in night.shelf if record["published_ns_utc"]]
-
-
-@pytest.mark.long
-def test_a_loop_that_diverges_is_recognised_and_named(night):
-    night.service("auto")
-    night.rtc("--gain", "1.2")
-    wait_for(lambda: "loop-diverging" in night.alarms, 30.0, "the alarm")
-    assert "lower the gain" in night.alarms["loop-diverging"]
-    assert not [record for record in night.shelf if record["published_ns_utc"]]

@@ -257,22 +257,16 @@ class FakeService:
         self.now = replace(self.now, tracker=changed(self.now.tracker, **changes))
 
 
+def a_snapshot(tracker=STATE, **changes):
+    """Return what a service of 60 s knows, with changes."""
+    given = {"link": LINK, "ready": True, "ready_reason": "telemetry flows"} | changes
+    given = {"now_ns": 100 * SECOND, "started_ns": 40 * SECOND} | given
+    return Snapshot(policy=POLICY, tracker=tracker, **given)
+
+
 @pytest.fixture
 def service(archive):
-    return FakeService(
-        archive=archive,
-        now=Snapshot(
-            policy=POLICY,
-            tracker=STATE,
-            link=LINK,
-            now_ns=100 * SECOND,
-            started_ns=40 * SECOND,
-            ready=True,
-            ready_reason="telemetry flows",
-            archive_failures=3,
-            archive_waiting=2,
-        ),
-    )
+    return FakeService(a_snapshot(archive_failures=3, archive_waiting=2), archive=archive)
 
 
 async def body_of(client, path, **parameters):

@@ -15,25 +15,14 @@ from service.web.authentication import Hosts
 from service.web.connections import Server
 from service.web.keys import KeyFile, KeyScope
 from tests.system.pace import in_time
-from tests.unit.test_api import LINK, STATE, FakeService, Snapshot, assert_problem
-from tests.unit.tracking.situations import POLICY
+from tests.unit.test_api import FakeService, a_snapshot, assert_problem
 
 pytestmark = pytest.mark.timeout(60)
 
 
 @pytest.fixture
 def service():
-    return FakeService(
-        Snapshot(
-            policy=POLICY,
-            tracker=STATE,
-            link=LINK,
-            now_ns=100,
-            started_ns=40,
-            ready=True,
-            ready_reason="ready",
-        )
-    )
+    return FakeService(a_snapshot())
 
 
 def client_of(service, hosts=None, host="127.0.0.1:8080"):

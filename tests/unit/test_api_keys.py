@@ -14,9 +14,8 @@ from service.api import create_app
 from service.web import authentication, page
 from service.web.authentication import COOKIE, Hosts, Refusal, RefusalLog
 from service.web.keys import KeyFile, KeyScope
-from tests.unit.test_api import LINK, STATE, FakeService, Snapshot, assert_problem
+from tests.unit.test_api import FakeService, a_snapshot, assert_problem
 from tests.unit.test_api_admission import serving
-from tests.unit.tracking.situations import POLICY
 
 ORIGIN = "http://127.0.0.1:8080"
 OPEN = {("GET", "/healthz"), ("GET", "/readyz"), ("DELETE", "/v1/session")}
@@ -30,17 +29,7 @@ FILES = {"/", "/docs", "/openapi.json", "/dashboard/page.js", "/docs/files/start
 
 @pytest.fixture
 def service():
-    return FakeService(
-        Snapshot(
-            policy=POLICY,
-            tracker=STATE,
-            link=LINK,
-            now_ns=100,
-            started_ns=40,
-            ready=True,
-            ready_reason="ready",
-        )
-    )
+    return FakeService(a_snapshot())
 
 
 @pytest.fixture

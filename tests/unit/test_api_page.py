@@ -13,11 +13,9 @@ from service.model.misregistration import PARAMETERS
 from service.web.page import FILES
 from tests.unit.test_api import (
     ALPHA,
-    LINK,
     SECOND,
-    STATE,
     FakeService,
-    Snapshot,
+    a_snapshot,
     assert_problem,
     body_of,
     entry,
@@ -29,18 +27,7 @@ LIMIT_BYTES = 300_000
 
 @pytest.fixture
 def service(archive):
-    service = FakeService(
-        archive=archive,
-        now=Snapshot(
-            policy=POLICY,
-            tracker=STATE,
-            link=LINK,
-            now_ns=100,
-            started_ns=40,
-            ready=True,
-            ready_reason="ready",
-        ),
-    )
+    service = FakeService(a_snapshot(), archive=archive)
     service.instrument = packaged_instrument("flao-lbt")
     service.policy = POLICY
     return service

@@ -15,8 +15,7 @@ from service.tracking.step_context import LOG_LENGTH
 from service.web import page
 from service.web.connections import Server
 from tests.system.pace import patience
-from tests.unit.test_api import LINK, STATE, FakeService, Snapshot
-from tests.unit.tracking.situations import POLICY
+from tests.unit.test_api import LINK, STATE, FakeService, a_snapshot
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -29,17 +28,7 @@ def quick(monkeypatch):
 
 @pytest.fixture
 def service():
-    return FakeService(
-        Snapshot(
-            policy=POLICY,
-            tracker=STATE,
-            link=LINK,
-            now_ns=100,
-            started_ns=40,
-            ready=True,
-            ready_reason="ready",
-        )
-    )
+    return FakeService(a_snapshot())
 
 
 @dataclass

@@ -21,15 +21,14 @@ from service.api import create_app
 from service.archive import AuditEntry, Channel
 from service.archive.products import RecordingRecord
 from service.errors import CommandError
-from service.runtime.snapshot import Snapshot
 from service.tracking.events import MakeMatrix, MatrixMade
 from service.tracking.operation_records import AcquisitionStage
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.state import Mode
 from service.web.connections import Server
 from tests.states import changed
-from tests.unit.test_api import LINK, MATRIX, SECOND, STATE, FakeService
-from tests.unit.tracking.situations import ALL_SHOWN, POLICY
+from tests.unit.test_api import MATRIX, SECOND, STATE, FakeService, a_snapshot
+from tests.unit.tracking.situations import ALL_SHOWN
 
 BEFORE = ReconstructorRecord(
     id="cm-0", state=MatrixState.SUPERSEDED, n_modes=300, created_ns_utc=SECOND
@@ -89,15 +88,7 @@ def service(served, monkeypatch):
         verified_ids=frozenset({STATE.loop.rtc.cm_id}),
         mode_proof=ALL_SHOWN,
     )
-    service.now = Snapshot(
-        policy=POLICY,
-        tracker=tracker,
-        link=LINK,
-        now_ns=100 * SECOND,
-        started_ns=40 * SECOND,
-        ready=True,
-        ready_reason="telemetry flows",
-    )
+    service.now = a_snapshot(tracker)
     service.commands, service.callers, service.refusal = [], [], None
     return service
 

@@ -10,28 +10,17 @@ import pytest
 
 from pyrcal.__main__ import main
 from pyrcal.client.status import status_lines
-from service.runtime.snapshot import Snapshot
 from service.tracking.state import Level, LogEntry
 from service.web.views import STATE as STATE_VIEW
 from service.web.views import to_json
 from tests.states import changed, tracker_state
-from tests.unit.test_api import LINK, SECOND, STATE
-from tests.unit.tracking.situations import POLICY
+from tests.unit.test_api import SECOND, STATE, a_snapshot
 
 
 def told(tracker=STATE, *, ready=True, **changes):
     """What the service would answer."""
-    snapshot = Snapshot(
-        policy=POLICY,
-        tracker=changed(tracker, **changes),
-        link=LINK,
-        now_ns=100 * SECOND,
-        started_ns=40 * SECOND,
-        ready=ready,
-        ready_reason="telemetry flows" if ready else "no RTC is there",
-        archive_failures=0,
-        archive_waiting=0,
-    )
+    reason = "telemetry flows" if ready else "no RTC is there"
+    snapshot = a_snapshot(changed(tracker, **changes), ready=ready, ready_reason=reason)
     return to_json(snapshot, STATE_VIEW)
 
 

@@ -94,9 +94,9 @@ def clean_fits(seed):
 
 @pytest.mark.long
 @pytest.mark.timeout(600)
-def test_of_forty_clean_matrices_nothing_is_said():
-    found = [fit for seed in range(300, 310) for fit in clean_fits(seed)]
-    assert len(found) == 40
+def test_of_twelve_clean_matrices_nothing_is_said():
+    found = [fit for seed in range(300, 303) for fit in clean_fits(seed)]
+    assert len(found) == 12
     assert [said(one) for one in found if said(one)] == []
 
 
@@ -125,14 +125,12 @@ def test_the_move_told_of_an_image_that_is_not_stretched_is_the_fits():
 
 
 @pytest.mark.long  # that of the anamorphosis above is with every run
-@pytest.mark.parametrize("half", ["lower", "upper"])
-def test_the_move_told_of_half_the_modes_is_that_of_a_fit_of_them(half):
+def test_the_move_told_of_half_the_modes_is_that_of_a_fit_of_them():
     noisy = matrix(noise=0.15)
-    kept = np.arange(20) if half == "lower" else np.arange(20, 40)
     found = fit(noisy, options=EXPLAIN)
-    alone = fit(noisy, options=FitOptions(modes=kept))
+    alone = fit(noisy, options=FitOptions(modes=np.arange(20, 40)))
     moved = alone.alpha.vector - found.alpha.vector
-    told = named(found, f"the {half} half of the modes")
+    told = named(found, "the upper half of the modes")
     assert np.all(np.abs(told.moved - moved) < 0.5 * alone.sigma)
 
 
@@ -143,16 +141,9 @@ def test_another_modulation_is_worse_and_would_move_it_by_sigmas():
     assert np.max(np.abs(told.moved[:2])) > 1e-3  # subapertures
 
 
-@pytest.mark.parametrize(
-    "off",
-    [
-        (0.5, -0.05),
-        pytest.param((0.0, 0.2), marks=pytest.mark.long),
-        pytest.param((0.35, -0.35), marks=pytest.mark.long),
-    ],
-)
-def test_a_pupil_off_the_middle_is_found_as_the_mean_place_of_its_images(off):
+def test_a_pupil_off_the_middle_is_found_as_the_mean_place_of_its_images():
     """A stop at the mirror, which would move the pupil by the shift, is not preferred for it."""
+    off = (0.5, -0.05)
     found = explained(modal_bench(), zonal(TRUTH, off) @ MODES)
     assert found.accepted
     assert np.all(sigmas_off(found) < 3.0)
@@ -160,17 +151,14 @@ def test_a_pupil_off_the_middle_is_found_as_the_mean_place_of_its_images(off):
     assert not any(one.preferred for one in found.alternatives)
 
 
-@pytest.mark.parametrize(
-    ("factor", "words"), [(1.05, "stronger"), pytest.param(0.95, "weaker", marks=pytest.mark.long)]
-)
-def test_gains_of_each_axis_are_named(factor, words):
+def test_gains_of_each_axis_are_named():
     half = len(modal()) // 2
-    found = explained(modal_bench(), np.concatenate([factor * modal()[:half], modal()[half:]]))
+    found = explained(modal_bench(), np.concatenate([1.05 * modal()[:half], modal()[half:]]))
     told = named(found, "than Sy")
     assert told.preferred
     share = float(told.words.split()[1].strip("%")) / 100.0
-    assert share == pytest.approx(abs(factor - 1.0), abs=0.006)
-    assert words in told.words
+    assert share == pytest.approx(0.05, abs=0.006)
+    assert "stronger" in told.words
     assert np.all(sigmas_off(found) < 3.0)
 
 
@@ -350,12 +338,10 @@ def test_too_few_modes_and_too_much_noise_are_reasons_to_measure_more():
     assert np.all(np.abs(noisy.alpha.vector - ELSEWHERE.vector) < 3.0 * noisy.sigma)
 
 
-@pytest.mark.parametrize(
-    "unknown", [pytest.param((), marks=pytest.mark.long), ("wfs.modulation_lambda_over_d",)]
-)
-def test_of_pure_noise_nothing_is_called_found(unknown):
+def test_of_pure_noise_nothing_is_called_found():
     noise = np.random.default_rng(2).normal(size=modal().shape) * modal().std()
-    found = explained(replace(modal_bench(), unknown=unknown), noise)
+    about = replace(modal_bench(), unknown=("wfs.modulation_lambda_over_d",))
+    found = explained(about, noise)
     assert not found.accepted
     assert "there is too much noise" in found.verdict
     assert found.optics == found.origins == found.remarks == ()

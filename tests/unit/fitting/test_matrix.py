@@ -83,11 +83,10 @@ def test_a_start_from_which_nothing_is_found_is_refused():
     assert not found.converged
 
 
-@pytest.mark.parametrize("n_modes", [9, 20])
-def test_few_modes_suffice(n_modes):
-    found = fit(matrix(noise=0.05)[:, :n_modes])
+def test_few_modes_suffice():
+    found = fit(matrix(noise=0.05)[:, :9])
     assert found.accepted
-    assert list(found.modes) == list(range(n_modes))
+    assert list(found.modes) == list(range(9))
     sigma = np.sqrt(np.diag(found.covariance))
     assert np.all(np.abs(error(found)) < 3.0 * sigma)
 
@@ -152,16 +151,6 @@ def test_nine_modes_under_thirty_percent_of_static_structure_are_accepted_with_a
     assert np.all(np.abs(error(found)) < 2.5 * sigma)
 
 
-def test_a_smooth_gain_over_the_pupil_is_found_when_asked_for():
-    found = fit(matrix())
-    gain = 1.0 + 0.02 * (np.nonzero(found.valid)[1] - 5.5)
-    uneven = matrix() * np.tile(gain, 2)[:, None]
-    mapped = fit(uneven, options=FitOptions(gain_map=True))
-    # the common part of the gain belongs to the modes
-    np.testing.assert_allclose(mapped.gain_map[mapped.valid], gain / gain.mean(), atol=0.02)
-    assert mapped.residual_fraction < fit(uneven).residual_fraction / 3.0
-
-
 GAIN_SHAPES = {
     "along x": lambda x, y: x,
     "along the diagonal": lambda x, y: (x + y) / np.sqrt(2.0),
@@ -172,13 +161,12 @@ GAIN_SHAPES = {
 """Odd and even over the pupil; x and y reach 1 at its edge."""
 
 
-@pytest.mark.parametrize("share", [0.3, 0.5])
 @pytest.mark.parametrize("shape", GAIN_SHAPES)
-def test_a_large_smooth_gain_moves_nothing_by_its_sigma_when_a_map_is_fitted(shape, share):
+def test_a_large_smooth_gain_moves_nothing_by_its_sigma_when_a_map_is_fitted(shape):
     """Multiplied by D of the start, the map left magnification 8 and anamorphosis 21 sigma off."""
     valid = fit(matrix()).valid
     y, x = (np.stack(np.nonzero(valid)) - (len(valid) - 1) / 2) / (len(valid) / 2)
-    gain = 1.0 + share * GAIN_SHAPES[shape](x, y)
+    gain = 1.0 + 0.5 * GAIN_SHAPES[shape](x, y)
     found = fit(matrix() * np.tile(gain, 2)[:, None], options=FitOptions(gain_map=True))
     assert found.accepted
     assert np.all(np.abs(error(found)) < 1.5 * found.sigma)
@@ -186,7 +174,7 @@ def test_a_large_smooth_gain_moves_nothing_by_its_sigma_when_a_map_is_fitted(sha
     np.testing.assert_allclose(found.gain_map[valid], gain / gain.mean(), atol=0.02)
 
 
-@pytest.mark.parametrize("stretches", [(0.004, 0.0), (-0.003, 0.002), (0.02, -0.02)])
+@pytest.mark.parametrize("stretches", [(-0.003, 0.002), (0.02, -0.02)])
 def test_a_stretched_image_of_the_mirror_is_found_unasked(stretches):
     """2.8 % is more than any telescope's; the largest of GPAO is 1.9 %."""
     found = fit(matrix(ELSEWHERE.with_anamorphosis(np.array(stretches))))

@@ -18,7 +18,7 @@ from service.errors import ModelError
 from service.estimation.reference import Reference
 from service.instrument.mirrors import grid
 from service.model.instrument import Instrument, Mirror
-from service.model.kinds import BasisKind, Influence, InfluenceShape, Normalisation, Stop
+from service.model.kinds import BasisKind, Influence, InfluenceShape, Stop
 from service.model.misregistration import Misregistration
 from service.model.pupil import lit_subapertures
 from service.model.sensors.pyramid.description import Pyramid
@@ -95,8 +95,9 @@ def sigmas_off(found) -> np.ndarray:
     return np.abs(found.alpha.vector - TRUTH.vector) / found.sigma
 
 
-@pytest.mark.parametrize("modal", [False, True])
-@pytest.mark.parametrize("told", [0.2, 0.3, 0.35, 0.5])
+@pytest.mark.parametrize(
+    ("told", "modal"), [(0.2, False), (0.35, False), (0.35, True), (0.5, True)]
+)
 def test_whatever_coupling_is_told_the_registration_is_right_and_the_coupling_found(told, modal):
     about = bench(coupling=told, mode_to_actuator=MODES if modal else None)
     found = fitted(about, zonal() @ MODES if modal else zonal())
@@ -110,7 +111,7 @@ def test_whatever_coupling_is_told_the_registration_is_right_and_the_coupling_fo
     assert not any("modulation" in remark for remark in found.remarks)
 
 
-@pytest.mark.parametrize("told", [1.5, 4.0, 6.0])
+@pytest.mark.parametrize("told", [1.5, 6.0])
 def test_whatever_modulation_is_told_the_registration_is_right_and_the_modulation_named(told):
     found = fitted(modulated(told))
     assert found.accepted
@@ -132,21 +133,6 @@ def test_four_modes_and_nine_say_the_same_of_a_modulation():
         assert np.all(sigmas_off(found) < 3.0)
 
 
-def test_a_kind_of_influence_functions_that_is_not_the_mirrors_is_named():
-    about = bench()
-    plate = replace(about.mirror, shape=InfluenceShape(influence=Influence.THIN_PLATE))
-    found = fitted(replace(about, mirror=plate))
-    assert not found.accepted
-    assert 'influence = "gaussian"' in found.verdict
-
-
-def test_a_normalisation_that_is_not_the_rtcs_is_named():
-    local = replace(bench().slopes, normalisation=Normalisation.LOCAL)
-    found = fitted(replace(bench(), slopes=local))
-    assert not found.accepted or np.all(sigmas_off(found) < 3.0)
-    assert 'normalisation = "global"' in found.verdict + found.recommendation
-
-
 def test_a_wavelength_told_wrong_is_named_and_moves_nothing():
     found = fitted(replace(bench(), wfs=replace(bench().wfs, wavelength_m=900e-9)))
     assert found.accepted
@@ -162,9 +148,8 @@ def test_a_pitch_told_wrong_is_a_magnification_and_is_told_to_be_one_or_the_othe
     assert any("pitch_m" in remark for remark in found.remarks)
 
 
-@pytest.mark.parametrize("image", [[-1.0, 1.0], [1.0, -1.0]])
-def test_mirrored_actuators_are_noted_with_any_orientation_and_refused_with_one_that_is_told(image):
-    about = bench(positions_m=ACTUATORS_M * image)
+def test_mirrored_actuators_are_noted_with_any_orientation_and_refused_with_one_that_is_told():
+    about = bench(positions_m=ACTUATORS_M * [-1.0, 1.0])
     told = fitted(about)
     assert not told.accepted
     assert "mirrored" in told.verdict
@@ -211,8 +196,7 @@ def noisy(share: float) -> np.ndarray:
     return zonal() + share * zonal().std() * scatter
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.15])
-@pytest.mark.parametrize("told", [0.25, 0.3])
+@pytest.mark.parametrize(("told", "noise"), [(0.25, 0.0), (0.3, 0.15)])
 def test_an_obscuration_told_wrong_is_in_sigma_and_the_right_one_advised(told, noise):
     about = masked(replace(bench(), obscuration_ratio=told))
     found = fitted(about, noisy(noise), explain=True)
@@ -223,7 +207,7 @@ def test_an_obscuration_told_wrong_is_in_sigma_and_the_right_one_advised(told, n
     assert float(named[1]) == pytest.approx(OBSCURATION, abs=0.04)
 
 
-@pytest.mark.parametrize("noise", [0.1, 0.2, 0.3])
+@pytest.mark.parametrize("noise", [0.1, 0.3])
 def test_noise_that_nobody_has_told_of_is_no_cause_to_refuse(noise):
     found = fitted(bench(), noisy(noise))
     assert found.residual_fraction > noise
@@ -242,10 +226,9 @@ def test_a_shade_that_nothing_explains_moves_the_registration_by_less_than_sigma
     assert np.all(sigmas_off(found) < 3.0)
 
 
-@pytest.mark.parametrize("factor", [0.98, 1.02])
-def test_a_diameter_told_wrong_is_a_magnification_and_is_told_to_be_one_or_the_other(factor):
-    found = fitted(replace(bench(), diameter_m=DIAMETER_M * factor))
-    as_told = TRUTH.vector * [1.0, 1.0, 1.0, factor]
+def test_a_diameter_told_wrong_is_a_magnification_and_is_told_to_be_one_or_the_other():
+    found = fitted(replace(bench(), diameter_m=DIAMETER_M * 0.98))
+    as_told = TRUTH.vector * [1.0, 1.0, 1.0, 0.98]
     assert np.all(np.abs(found.alpha.vector - as_told) < 3.0 * found.sigma)
     assert any("diameter_m" in remark for remark in found.remarks)
 

@@ -1,20 +1,13 @@
 """Subapertures without light tell how wide the pupil's image is."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from pyrcal.fitting.matrix import FitOptions, fit_matrix
 from pyrcal.fitting.pupil_width import compute_responses, measure_pupil
-from service.estimation.reference import Reference
-from service.model.pupil import lit_subapertures
-from tests.unit.fitting.test_mistold import MODES, N, bench, zonal
 
 WIDE = 14
 ROWS, COLUMNS = np.mgrid[:WIDE, :WIDE] - (WIDE - 1) / 2
 AWAY = np.hypot(ROWS, COLUMNS)
-FEW = MODES[:, :24]
 
 
 def disc(diameter, silent=0.05):
@@ -49,29 +42,3 @@ def test_subapertures_of_which_nothing_is_expected_do_not_count():
     np.testing.assert_array_equal(
         compute_responses(measured, expected, valid), [[1.0, 2.0], [np.nan, np.nan]]
     )
-
-
-def wider():
-    """A bench whose mask is wider than its pupil, and its matrix: stray light answers a little."""
-    about = bench(mode_to_actuator=FEW)
-    mask = AWAY < WIDE / 2
-    edge = (WIDE - N) // 2
-    lit = np.pad(lit_subapertures(bench()), edge)
-    values = np.random.default_rng(3).normal(size=(2, WIDE, WIDE, FEW.shape[1]))
-    own = (zonal() @ FEW).reshape(2, -1, FEW.shape[1])
-    values *= 0.02 * np.std(own)
-    values[:, lit] = own
-    wfs = replace(about.wfs, n_subapertures=WIDE, valid_subapertures=mask | lit)
-    return replace(about, wfs=wfs), values[:, mask | lit].reshape(-1, FEW.shape[1])
-
-
-def test_a_mask_wider_than_the_pupil_is_refused_and_its_diameter_named():
-    about, values = wider()
-    told = replace(about, wfs=replace(about.wfs, pupil_diameter_subap=float(N)))
-    right = fit_matrix(told, Reference(matrix=values), FitOptions())
-    assert right.accepted, right.verdict
-    wrong = fit_matrix(about, Reference(matrix=values), FitOptions())
-    assert not wrong.accepted
-    assert f"the pupil's image looks {N} subapertures wide" in wrong.verdict
-    assert wrong.recommendation.startswith("do not use it: ")
-    assert f"{N} subapertures wide" in wrong.recommendation

@@ -89,15 +89,44 @@ def test_layers_jumps_and_drift_are_read():
         (["--plant", "cubic"], "--plant: found 'cubic', expected one of "),
         (["--connect", "localhost"], "--connect: found 'localhost'; expected PROTOCOL/ADDRESS"),
         (["--nonsense"], "found '--nonsense'"),
+        (["--dead-actuators", "1,x"], "found '1,x'; expected whole numbers from 0, like 12,40"),
+        (["--stuck-actuators", "5"], "found '5'; expected N:METRES"),
+        (["--stuck-actuators", "5:1"], "at most 1e-4 m"),
+        (["--image-offsets", "0,0,0,0"], "expected X1,Y1"),
+        (["--image-offsets", "0,0,0,0,0,0,0,0", "--image-offset-rms", "0.1"], "one of them"),
+        (["--excess-noise", "0.5"], "expected a number from 1 to 4"),
+        (["--rise-ms", "-1"], "expected a number from 0 to 100"),
+        (["--preset", "flao", "--mag", "19"], "expected a star of 16.5 or brighter"),
+        (["--scene", "dusk"], "--scene: found 'dusk', expected one of "),
+        (["--scene", "daytime", "--spiders", "2:0.1"], "--spiders: the fibre by day"),
+        (["--spiders", "2.5:0.1"], "--spiders: found '2.5:0.1'; expected N:WIDTH_M"),
+        (["--profile", "single", "--wind", "8,0"], "--profile: found together with --wind"),
+        (["--seeing", "-1"], "--seeing: found '-1'; expected a number from 0.05 to 5"),
+        (["--seeing-at", "5:-1"], "--seeing-at: found '5:-1'; expected T:ARCSEC"),
+        (["--seeing-at", "5:1", "--seeing-at", "5:2"], "--seeing-at: found 5 s twice"),
+        (["--vibration", "coma:10:5"], "--vibration: found 'coma:10:5'; expected tip, tilt or"),
+        (["--vibration", "tip:600:5"], "--vibration: found 600 Hz; expected less than half"),
+        (["--flexure", "0.1,0,0,0:5"], "--flexure: found '0.1,0,0,0:5'; expected DX,DY"),
+        (["--walk=-0.1,0,0,0"], "--walk: found '-0.1,0,0,0'; expected X,Y,ROT_DEG,MAG"),
+        (["--optical-gain", "0,1"], "--optical-gain: found '0,1'; expected LOW,HIGH"),
+        (
+            ["--optical-gain", "0.5,1", "--plant", "diffractive"],
+            "--optical-gain: found --plant diffractive",
+        ),
+        (["--bad-pixels", "1.5"], "--bad-pixels: found '1.5'; expected a whole number"),
+        (["--truth", "a", "--truth", "b"], "--truth: found 2 files; expected one"),
+        (["--truth", "ideal", "--imperfections", "usual"], "found ideal and usual; expected one"),
+        (["--fault", "lots@3"], "argument --fault: found 'lots@3'; expected KIND@T"),
+        (["--fault", "lost@3:2"], "expected SHARE from 0 to 1"),
+        (["--replay", "a.h5", "--record", "b.h5"], "--replay: plays a file as it is"),
     ],
 )
 def test_an_impossible_option_is_one_line_and_status_two(capsys, arguments, text):
     with pytest.raises(SystemExit) as ended:
         parse_options(arguments)
     assert ended.value.code == 2
-    said = capsys.readouterr().err
-    assert text in said
-    assert said.count("\n") == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert text in line
 
 
 @pytest.mark.parametrize(
@@ -127,19 +156,13 @@ def test_help_reads_like_a_manual(capsys):
         parse_options(["--help"])
     assert ended.value.code == 0
     manual = capsys.readouterr().out
-    for word in ("registration", "truth file", "exit status", "--jump T:DX,DY,DROT_DEG,DMAG"):
+    named = ("registration", "truth file", "exit status", "--jump T:DX,DY,DROT_DEG,DMAG")
+    recording = ("/messages", "swmr=True")
+    for word in (*named, *recording, *(f"    {kind} " for kind in FaultKind)):
         assert word in manual
 
 
 # --- the device
-
-
-def refusal(capsys, *given):
-    with pytest.raises(SystemExit) as ended:
-        parse_options(list(given))
-    assert ended.value.code == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    return line
 
 
 def test_by_default_mirror_and_detector_are_as_before():
@@ -171,23 +194,6 @@ def test_a_preset_follows_the_magnitude():
     options = parse_options(["--preset", "flao", "--mag", "12", "--plant", "diffractive"])
     assert (options.frame_rate_hz, options.n_controlled(594)) == (800.0, 153)
     assert options.binning == 2
-
-
-@pytest.mark.parametrize(
-    ("given", "text"),
-    [
-        (["--dead-actuators", "1,x"], "found '1,x'; expected whole numbers from 0, like 12,40"),
-        (["--stuck-actuators", "5"], "found '5'; expected N:METRES"),
-        (["--stuck-actuators", "5:1"], "at most 1e-4 m"),
-        (["--image-offsets", "0,0,0,0"], "expected X1,Y1"),
-        (["--image-offsets", "0,0,0,0,0,0,0,0", "--image-offset-rms", "0.1"], "one of them"),
-        (["--excess-noise", "0.5"], "expected a number from 1 to 4"),
-        (["--rise-ms", "-1"], "expected a number from 0 to 100"),
-        (["--preset", "flao", "--mag", "19"], "expected a star of 16.5 or brighter"),
-    ],
-)
-def test_devices_that_cannot_be_are_refused_in_one_line(capsys, given, text):
-    assert text in refusal(capsys, *given)
 
 
 def test_an_ideal_linear_mirror_needs_no_drive(small_instrument, small_basis):
@@ -300,39 +306,6 @@ def test_the_shares_of_a_profile_add_up(name):
     assert sum(layer.fraction for layer in PROFILES[name]) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        (["--scene", "dusk"], "--scene: found 'dusk', expected one of "),
-        (["--scene", "daytime", "--spiders", "2:0.1"], "--spiders: the fibre by day"),
-        (["--spiders", "2.5:0.1"], "--spiders: found '2.5:0.1'; expected N:WIDTH_M"),
-        (["--profile", "single", "--wind", "8,0"], "--profile: found together with --wind"),
-        (["--seeing", "-1"], "--seeing: found '-1'; expected a number from 0.05 to 5"),
-        (["--seeing-at", "5:-1"], "--seeing-at: found '5:-1'; expected T:ARCSEC"),
-        (["--seeing-at", "5:1", "--seeing-at", "5:2"], "--seeing-at: found 5 s twice"),
-        (["--vibration", "coma:10:5"], "--vibration: found 'coma:10:5'; expected tip, tilt or"),
-        (["--vibration", "tip:600:5"], "--vibration: found 600 Hz; expected less than half"),
-        (["--flexure", "0.1,0,0,0:5"], "--flexure: found '0.1,0,0,0:5'; expected DX,DY"),
-        (["--walk=-0.1,0,0,0"], "--walk: found '-0.1,0,0,0'; expected X,Y,ROT_DEG,MAG"),
-        (["--optical-gain", "0,1"], "--optical-gain: found '0,1'; expected LOW,HIGH"),
-        (
-            ["--optical-gain", "0.5,1", "--plant", "diffractive"],
-            "--optical-gain: found --plant diffractive",
-        ),
-        (["--bad-pixels", "1.5"], "--bad-pixels: found '1.5'; expected a whole number"),
-        (["--truth", "a", "--truth", "b"], "--truth: found 2 files; expected one"),
-        (["--truth", "ideal", "--imperfections", "usual"], "found ideal and usual; expected one"),
-    ],
-)
-def test_an_impossible_scene_is_one_line_and_status_two(capsys, words, text):
-    with pytest.raises(SystemExit) as ended:
-        parse_options(words)
-    assert ended.value.code == 2
-    said = capsys.readouterr().err
-    assert text in said
-    assert said.count("\n") == 1
-
-
 # --- rehearsals
 
 
@@ -346,28 +319,3 @@ def test_faults_are_read_in_any_number_and_a_recording_beside_them():
     ]
     assert options.record.name == "night.h5"
     assert parse_options([]).faults == ()
-
-
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        (["--fault", "lots@3"], "argument --fault: found 'lots@3'; expected KIND@T"),
-        (["--fault", "lost@3:2"], "expected SHARE from 0 to 1"),
-        (["--replay", "a.h5", "--record", "b.h5"], "--replay: plays a file as it is"),
-    ],
-)
-def test_impossible_ones_are_refused_in_one_line(words, text, capsys):
-    with pytest.raises(SystemExit, match="2"):
-        parse_options(words)
-    said = capsys.readouterr().err
-    assert text in said
-    assert said.count("\n") == 1
-
-
-def test_the_manual_explains_faults_and_recordings(capsys):
-    with pytest.raises(SystemExit, match="0"):
-        parse_options(["--help"])
-    manual = capsys.readouterr().out
-    assert all(f"    {kind} " in manual for kind in FaultKind)
-    assert "/messages" in manual
-    assert "swmr=True" in manual

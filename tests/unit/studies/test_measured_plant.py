@@ -3,7 +3,6 @@
 from functools import cache
 
 import numpy as np
-import pytest
 
 from pyrcal_studies.campaign.measured_plant import (
     N_FIRST,
@@ -78,17 +77,9 @@ def test_nothing_is_the_matter():
     assert night.state.matrices.hindrance == ""
 
 
-@pytest.mark.parametrize(
-    ("change", "modes"),
-    [
-        (lambda d: d.__setitem__((slice(None), 30), -d[:, 30]), {30}),
-        (lambda d: d.__setitem__((slice(None), [30, 35]), d[:, [35, 30]]), {30, 35}),
-    ],
-    ids=["another sign", "exchanged"],
-)
-def test_a_mode_that_is_another_is_never_controlled_where_the_model_is_wrong_too(change, modes):
-    night = twisted(change)
-    assert night.state.matrices.mode_proof.contrary == modes
+def test_a_mode_that_is_another_is_never_controlled_where_the_model_is_wrong_too():
+    night = twisted(lambda d: d.__setitem__((slice(None), [30, 35]), d[:, [35, 30]]))
+    assert night.state.matrices.mode_proof.contrary == {30, 35}
     assert max(swap.n_modes for swap in night.swaps) == 30
     assert "modes-contrary" in {name for name, _ in night.said}
     assert late_nm(night.dome.moments) < 70.0  # 84 nm with the RTC's own 20 modes

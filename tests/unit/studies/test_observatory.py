@@ -261,9 +261,8 @@ def test_a_mirror_that_does_not_answer_is_named_within_a_second_and_the_dither_i
     assert "mirror-silent" not in {alarm.name for alarm in night.state.alarms.active}
 
 
-def test_a_loop_lost_to_a_jump_is_opened_within_a_second_and_back_on_all_modes_within_20():
+def night_with_a_jump(jump_s, seconds):
     """Half a subaperture and 4 degrees: no loop of 60 modes survives; 45 of them begin."""
-    jump_s = 20.0
     words = [
         f"--instrument={SMALL}",
         *("--plant=linear", "--seed=1", "--mag=7", "--n-controlled=45"),
@@ -274,7 +273,12 @@ def test_a_loop_lost_to_a_jump_is_opened_within_a_second_and_back_on_all_modes_w
     night = Observatory(
         words, policy, Mode.AUTO, bench_of(SMALL), latencies=latencies_of(), with_poles=False
     )
-    night.advance(jump_s + 20.0)
+    night.advance(jump_s + seconds)
+    return night
+
+
+def test_a_loop_lost_to_a_jump_is_opened_within_a_second_and_back_on_all_modes_within_20():
+    night, jump_s = night_with_a_jump(20.0, 18.0), 20.0
     found = recovery_of(night, jump_s)
     assert found["lost_after_s"] < 1.0
     assert found["opened_after_s"] < found["lost_after_s"] + 1.0
@@ -286,18 +290,7 @@ def test_a_loop_lost_to_a_jump_is_opened_within_a_second_and_back_on_all_modes_w
 
 def test_a_jump_a_second_after_a_swap_leaves_the_loop_neither_open_nor_in_hold():
     """Neither matrix holds the loop then: none is to blame, and α is acquired again."""
-    jump_s = 12.5
-    words = [
-        f"--instrument={SMALL}",
-        *("--plant=linear", "--seed=1", "--mag=7", "--n-controlled=45"),
-        "--alpha=-0.25,-0.03,-2,1.002",
-        f"--jump={jump_s}:0.5,0,4,0",
-    ]
-    policy = policy_of(load_settings(None, {}, {**SETTINGS, "control.n_modes_target": N_TARGET}))
-    night = Observatory(
-        words, policy, Mode.AUTO, bench_of(SMALL), latencies=latencies_of(), with_poles=False
-    )
-    night.advance(jump_s + 12.0)
+    night, jump_s = night_with_a_jump(12.5, 12.0), 12.5
     assert jump_s - 5.0 < max(swap.time_s for swap in night.swaps if swap.time_s < jump_s)
     assert any(not one.closed for one in night.dome.moments if one.time_s < jump_s + 2.0)
     assert night.dome.moments[-1].closed

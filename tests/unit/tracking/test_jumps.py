@@ -88,11 +88,11 @@ class Sky:
 
 
 def test_a_drift_of_five_percent_a_minute_is_no_jump_however_it_is_watched():
-    """12 minutes of windows, then 45 of looks with a window every half minute."""
+    """6 minutes of windows, then 20 of looks with a window every half minute."""
     busy, sparse = Sky(1), Sky(2)
-    for k in range(1, 301):
+    for k in range(1, 151):
         busy.window(k * WINDOW_S)
-    for k in range(1, 676):
+    for k in range(1, 301):
         sparse.look(k * LOOK_S)
         if k % 7 == 1:
             sparse.window(k * LOOK_S + 0.5)
@@ -110,7 +110,7 @@ def test_windows_that_scatter_by_more_than_they_say_are_no_jumps_once_that_is_le
 
 
 @pytest.mark.parametrize(
-    "seeds", [range(2), pytest.param(range(2, 6), marks=pytest.mark.long)], ids=str
+    "seeds", [range(1), pytest.param(range(1, 4), marks=pytest.mark.long)], ids=str
 )
 def test_what_a_gust_does_to_windows_for_seconds_is_no_jump(seeds):
     """9 σ for four seconds, then as far to the other side, where a loop slips off the pyramid.

@@ -10,7 +10,7 @@ from service.model.pupil import instrument_pupil
 from service.model.surface import ThinPlate
 from sim_rtc.telescope.imperfections import Imperfections
 from sim_rtc.telescope.linear import LinearPlant, optical_gain
-from sim_rtc.telescope.mirror import MirrorFaults, misplace_actuators
+from sim_rtc.telescope.mirror import MirrorFaults
 from sim_rtc.telescope.plant import light_unevenly
 
 ALIGNED = Misregistration()
@@ -84,18 +84,6 @@ def test_the_telescope_as_stop_moves_the_mirror_instead_of_the_images(
     np.testing.assert_array_equal(moved.images, plant.optics(ALIGNED).images)
     model = InteractionModel(instrument, small_basis).interaction_matrix(TURNED)
     assert distance(model, moved.slopes_per_command) < 0.01
-
-
-def test_position_errors_contain_no_registration(small_instrument):
-    mirror = small_instrument.mirror
-    moved = misplace_actuators(mirror, 0.02, np.random.default_rng(2)).positions_m
-    error = moved - mirror.positions_m
-    x, y = mirror.positions_m.T
-    assert np.abs(error.mean(axis=0)).max() < 1e-12
-    assert abs(np.sum(x * error[:, 0] + y * error[:, 1])) < 1e-9
-    assert abs(np.sum(x * error[:, 1] - y * error[:, 0])) < 1e-9
-    # 77 actuators: 8 % on an RMS.
-    assert error.std() == pytest.approx(0.02 * mirror.pitch_m, rel=0.25)
 
 
 def test_the_illumination_is_uneven_by_ten_per_cent(small_instrument):

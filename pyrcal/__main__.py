@@ -6,9 +6,10 @@ import os
 import sys
 from collections.abc import Sequence
 
-from pyrcal.arguments import OTHER_PROGRAMS, command_line
-from pyrcal.fitting.arguments import check_files
-from service.program import run_command
+from service.program import INTERRUPTED, leave_when_asked, run_command
+
+SERVING = frozenset({"run", "sim"})
+"""Commands that run until they are interrupted, which is then no failure."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -17,6 +18,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0 done, 1 failed, 2 refused at the start, 3 a service that was to be asked is not reached.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments is None:
+        leave_when_asked(0 if SERVING.intersection(words[:1]) else INTERRUPTED)
+    from pyrcal.arguments import OTHER_PROGRAMS, command_line
+    from pyrcal.fitting.arguments import check_files
+
     if words and words[0] in OTHER_PROGRAMS:
         program, _ = OTHER_PROGRAMS[words[0]]
         os.execv(sys.executable, [sys.executable, "-m", program, *words[1:]])

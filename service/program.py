@@ -85,7 +85,7 @@ def run_command(
         True if the command runs until it is stopped, and handles signals itself.
     """
     if own_process:
-        _leave_when_asked(0 if serves else INTERRUPTED)
+        leave_when_asked(0 if serves else INTERRUPTED)
 
     def perform(options: argparse.Namespace) -> int:
         check(options)
@@ -111,10 +111,10 @@ def run_command(
         return 0
 
 
-def _leave_when_asked(status: int) -> None:
-    """End at once on SIGINT and SIGTERM, which must not interrupt an import.
+def leave_when_asked(status: int) -> None:
+    """End at once with this status on SIGINT and SIGTERM, which must not interrupt an import.
 
-    It applies to ``run`` until the service handles the signals itself.
+    It applies until the program handles the signals itself.
     """
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: leave(status))

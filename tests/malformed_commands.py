@@ -617,7 +617,7 @@ def mutated_array(values, rng):
         case 8 if values.ndim:
             return values[place[0]]
         case 9:
-            return np.zeros((0, *values.shape[1:]), values.dtype)
+            return np.take(values, [], axis=axis) if values.ndim else np.zeros(0, values.dtype)
         case 10:
             return wide.astype(rng.choice([np.complex128, np.int8, np.bool_, ">f4", np.float16]))
         case 11:

@@ -16,6 +16,7 @@ from pyrcal.importers.files import Reported, from_arrays
 from pyrcal.importers.imported import Array, Imported
 from pyrcal.importers.registration import Registrations, registrations_of
 from service.errors import ConfigurationError, MatrixError
+from service.files.container import opened
 
 SENSORS = {"Pyramid": "pyramid", "ShackHartmann": "shack-hartmann"}
 """Kinds of sensors by AOT's class names."""
@@ -44,13 +45,22 @@ def read_system(path: Path) -> Any:  # noqa: ANN401 - aotpy has no types
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # aotpy warns of whatever a file leaves empty
-            return aotpy.AOSystem.read_from_file(path)
+            system = aotpy.AOSystem.read_from_file(path)
     except Exception as error:  # aotpy does not export its own class
         raise MatrixError(f"{path}: found {error}, expected an AOT file") from error
+    for part in (*system.wavefront_sensors, *system.wavefront_correctors, *system.loops):
+        for name, value in vars(part).items():
+            if isinstance(value, aotpy.Image) and value.data is None:
+                setattr(part, name, None)  # an image without data says as little as none
+    return system
 
 
 def _check(path: Path) -> None:
-    """Raise if a file is not an AOT file, because aotpy's own message suggests unusable options."""
+    """Raise if a file is not an AOT file.
+
+    aotpy's own message suggests unusable options, and it reads the parts of some damaged files
+    without end.
+    """
     try:
         with path.open("rb") as file:
             begins = file.read(_HEADER_BYTES)
@@ -60,6 +70,8 @@ def _check(path: Path) -> None:
         raise MatrixError(f"{path}: found no FITS, expected an AOT file")
     if b"AOT-VERS" not in begins:
         raise MatrixError(f"{path}: found FITS without AOT-VERS, expected an AOT file")
+    with opened(path):  # refuses a damaged file
+        pass
 
 
 def from_aot(

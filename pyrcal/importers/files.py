@@ -363,7 +363,7 @@ def _remove_dead_rows(
         return found, valid
     turned = found.shape[0] != n_rows
     slopes = found.T if turned else found
-    planes = slopes.reshape(2, -1, slopes.shape[1])
+    planes = slopes.reshape(2, len(slopes) // 2, slopes.shape[1])
     with np.errstate(invalid="ignore"):
         silent = ~np.isfinite(planes) | (planes == 0.0)
     dead = silent.all(axis=2).any(axis=0)

@@ -200,7 +200,9 @@ class _Reader:
             raise self._refusal(
                 f"found signals of shape {values.shape}, expected (n, {planes}, {len(listed)})"
             )
-        by_row = np.ascontiguousarray(values[..., listed].reshape(len(values), -1))
+        by_row = np.ascontiguousarray(
+            values[..., listed].reshape(len(values), planes * len(listed))
+        )
         if not own:
             return by_row
         return np.ascontiguousarray(

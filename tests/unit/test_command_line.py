@@ -2,6 +2,7 @@ import argparse
 import json
 import os
 import shlex
+import signal
 import socket
 import subprocess
 import sys
@@ -282,6 +283,43 @@ def test_each_has_a_module_of_its_own(monkeypatch, words):
     program, (_, dash_m, module, *rest) = asked
     assert (program, dash_m, rest) == (sys.executable, "-m", words[1:])
     assert find_spec(f"{module}.__main__") or find_spec(module)
+
+
+def interrupted_at(module, words, number):
+    """Send a signal once a module is imported; return exit status and what was said after it.
+
+    Python lists on standard error what it has imported, in the process that this one becomes too.
+    """
+    process = subprocess.Popen(
+        [sys.executable, "-m", "pyrcal", *words],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "PYTHONPROFILEIMPORTTIME": "1"},
+    )
+    try:
+        for line in process.stderr:
+            if line.rpartition("|")[2].strip() == module:
+                process.send_signal(number)
+                break
+        _, said = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    listed = "import time:"
+    return process.returncode, [x for x in said.splitlines() if not x.startswith(listed)]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    ("module", "words", "status"),
+    [
+        ("pyrcal.options", ["sim", "--seconds", "1"], 0),  # imported before sim_rtc takes over
+        ("structlog", ["sim", "--seconds", "1"], 0),
+        ("pyrcal.options", ["fit", "flao-lbt", __file__], 130),
+    ],
+)
+def test_an_interrupted_import_ends_without_a_traceback(module, words, status, number):
+    assert interrupted_at(module, words, number) == (status, [])
 
 
 def processor_s(*words, enough_s):

@@ -363,6 +363,12 @@ def test_an_aot_file_without_a_matrix_and_what_is_none_are_refused(tmp_path):
         from_aot(SPECULA[0], REPORTED)
 
 
+def test_a_matrix_without_columns_is_refused(tmp_path):
+    aot_file(tmp_path / "it.fits", interaction_matrix=MATRIX.reshape(2, -1, 5)[..., :0])
+    with pytest.raises(MatrixError, match="found no column"):
+        from_aot(tmp_path / "it.fits", REPORTED)
+
+
 def test_subapertures_of_an_aot_file_are_where_its_mask_says(tmp_path):
     listed = np.random.default_rng(5).permutation(int(VALID.sum()))
     matrix = MATRIX.reshape(2, -1, 5)[:, np.argsort(listed)].swapaxes(0, 1)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.io import fits
 
 from pyrcal.playback.aot import read_telemetry
 from pyrcal.playback.arrays import Arrays
@@ -168,6 +169,59 @@ def test_numbers_that_cannot_be_played_are_refused(spoil, match, small, tmp_path
     spoil(hand)
     with pytest.raises((MatrixError, ConfigurationError), match=match):
         played(hand.read(tmp_path, small).arrays, small)
+
+
+def without_rows(image):
+    image.data = image.data[:0]
+
+
+@pytest.mark.parametrize(
+    ("image_of", "match"),
+    [
+        (lambda hand: hand.loop.measurements_to_modes, "reconstructor"),
+        (lambda hand: hand.sensor.measurements, "of 0 measurements"),
+        (lambda hand: hand.loop.modal_coefficients, "of 0 commands"),
+    ],
+)
+def test_arrays_without_rows_are_refused(image_of, match, small, tmp_path):
+    hand = Hand(small)
+    without_rows(image_of(hand))
+    with pytest.raises((MatrixError, ConfigurationError), match=match):
+        played(hand.read(tmp_path, small).arrays, small)
+
+
+def rewritten(path, extension, keyword, value):
+    """Give a header of a FITS file another value; astropy itself writes only what is consistent."""
+    content = path.read_bytes()
+    part = content.index(f"EXTNAME = '{extension}".encode())
+    place = content.rindex(b"XTENSION", 0, part)
+    place = content.index(f"{keyword:8}=".encode(), place)
+    card = f"{keyword:8}= {value:>20}".ljust(80).encode()
+    path.write_bytes(content[:place] + card + content[place + 80 :])
+
+
+@pytest.mark.parametrize("extension", ["SLOPES", "MASK", "MODAL", "CONTROL"])
+def test_an_image_without_data_is_as_one_that_is_missing(extension, small, tmp_path):
+    Hand(small).read(tmp_path, small)
+    path = tmp_path / "hand.fits"
+    with fits.open(path, memmap=False) as units:
+        units[extension].data = None
+        units.writeto(path, overwrite=True)
+    if extension == "CONTROL":
+        assert "reconstructor" not in read_telemetry(path, small).arrays
+    elif extension in {"SLOPES", "MODAL"}:  # without frames, alpha may still be read
+        assert read_telemetry(path, small).arrays == {}
+    else:
+        with pytest.raises(MatrixError, match="found no subaperture_mask"):
+            read_telemetry(path, small)
+
+
+def test_a_part_of_negative_size_is_refused(small, tmp_path):
+    """astropy would go back by that size, and read the same part again and again."""
+    Hand(small).read(tmp_path, small)
+    rewritten(tmp_path / "hand.fits", "CONTROL", "NAXIS3", -5)
+    with pytest.raises(MatrixError, match=r"hand\.fits"):
+        read_telemetry(tmp_path / "hand.fits", small)
 
 
 def played(arrays, about):

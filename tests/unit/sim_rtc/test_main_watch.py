@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 from structlog.testing import capture_logs
 
-from sim_rtc.__main__ import Watch
 from sim_rtc.computer.telemetry import Pace
 from sim_rtc.options import parse_options
+from sim_rtc.simulator import Watch
 from tests.system.pace import Deadline
 
 COMPUTER = SimpleNamespace(reconstructor=SimpleNamespace(manifest=SimpleNamespace(id="cm")))

@@ -248,7 +248,9 @@ def _judge_tracking(data: Commissioning) -> Iterator[Criterion]:
     )
     # The precision that the service itself requires of α; its σ includes the model error.
     policy = data.policy
-    target = np.hypot(policy.tolerance * policy.dither_sigma, policy.floor)
+    target = np.sqrt(
+        (policy.tolerance * policy.dither_sigma) ** 2 + policy.floor**2 + policy.image_floor**2
+    )
     enough = len(windows) >= MIN_WINDOWS
     median = np.median([one.filtered_sigma for one in windows], axis=0) if windows else target
     yield _line(
@@ -269,7 +271,8 @@ def _judge_tracking(data: Commissioning) -> Iterator[Criterion]:
         "σ is too small, or the mirror moves: set [tracking] drift_*, look for vibrations",
     )
     known = [one.sigma for one in data.samples if one.sigma is not None]
-    fresh = [bool((sigma <= _stale_sigma(data)).all()) for sigma in known]
+    stale = np.hypot(_stale_sigma(data), policy.image_floor)
+    fresh = [bool((sigma <= stale).all()) for sigma in known]
     share = float(np.mean(fresh)) if fresh else 0.0
     yield _line(
         "Tracking",

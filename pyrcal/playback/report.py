@@ -64,7 +64,7 @@ def table(track: Track) -> str:
     registration = track.state.alpha.registration
     if registration is not None:
         rows.append(("alpha at the end", *_cells(registration.alpha.vector * BOUNDARY_SCALE)))
-        rows.append(("1 sigma", *_cells(registration.sigma * BOUNDARY_SCALE)))
+        rows.append(("1 sigma", *_cells(registration.shown_sigma * BOUNDARY_SCALE)))
     for source in Source:
         of_it = [entry for entry in track.entries if entry.source is source]
         if of_it:

@@ -104,6 +104,9 @@ def policy_of(settings: Settings, instrument: Instrument | None = None) -> Polic
         # A random walk: its σ grows with the square root of time.
         drift_rate=per_minute / np.sqrt(60.0),
         floor=floor_of(settings, instrument) / BOUNDARY_SCALE,
+        image_floor=np.zeros(4)
+        if instrument is None
+        else kind_of(instrument).unstated_image_floor(instrument),
         bias_memory_s=tracking.bias_memory_s,
         flexure_per_degree=_vector(
             tracking.flexure_subap_per_degree,

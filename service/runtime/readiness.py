@@ -465,7 +465,7 @@ def state_message(
         t_ns=now_ns,
         mode=state.operator.mode.value,
         alpha=None if registration is None else registration.alpha.to_boundary(),
-        sigma=None if registration is None else at_boundary(registration.sigma),
+        sigma=None if registration is None else at_boundary(registration.shown_sigma),
         in_use=state.matrices.in_use,
         validity=None if registration is None else registration.validity.level.value,
         waiting_for=tuple(f"{w.responsible}: {w.text}"[:TEXT_LIMIT] for w in waiting),

@@ -196,8 +196,8 @@ class Alpha:
 
     @property
     def covariance(self) -> list[list[float]]:
-        """4 x 4, now, floor included, in the units of the names and the order of ``parameters``."""
-        found: list[list[float]] = (self.registration.total_covariance * COVARIANCE_SCALE).tolist()
+        """4 x 4, of the error of α now, in units of the names and the order of ``parameters``."""
+        found: list[list[float]] = (self.registration.shown_covariance * COVARIANCE_SCALE).tolist()
         return found
 
     @property

@@ -360,7 +360,7 @@ def sample_of(
         t_ns_utc=now_ns,
         telemetry_ns_utc=telemetry_ns,
         alpha=None if registration is None else registration.alpha,
-        sigma=None if registration is None else registration.sigma,
+        sigma=None if registration is None else registration.shown_sigma,
         wavefront_m=_wavefront_m(state),
         residual_m=residual_m,
         margin=None if margin is None else _finite(margin.worst_pole_radius / margin.bound),

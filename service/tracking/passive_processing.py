@@ -87,7 +87,7 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
         measured=Misregistration.from_vector(measured - joint.bias(block)),
         measured_sigma=sigma,
         filtered=registration.alpha,
-        filtered_sigma=registration.sigma,
+        filtered_sigma=registration.shown_sigma,
         innovation=kalman.innovation(prior, measured, estimate.covariance, block),
         misfit=estimate.misfit,
         source=Source.PASSIVE,

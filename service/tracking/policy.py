@@ -125,6 +125,9 @@ class Policy:
     floor: NDArray[np.float64]
     """``(4,)`` 1 σ model error, numeric units."""
 
+    image_floor: NDArray[np.float64]
+    """``(4,)`` 1 σ of α by places of pupil images that the instrument file does not state."""
+
     bias_memory_s: float
     """Time after which the information learnt on the passive estimate's bias has decayed to 1/e."""
 

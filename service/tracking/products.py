@@ -69,7 +69,8 @@ class Judged(ControlLaw):
 
     alpha: Misregistration
     sigma: NDArray[np.float64]
-    """``(4,)`` 1 σ, floor included, numeric units."""
+    """``(4,)`` 1 σ, floor included, numeric units; without unstated places of pupil images, for
+    which the reconstructor compensates."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

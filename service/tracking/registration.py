@@ -211,6 +211,11 @@ class Registration:
     window_began_ns_utc: int = 0
     """Start of that window, by the RTC's clock; 0 if unknown."""
 
+    image_floor: Array = field(default_factory=lambda: np.zeros(4))
+    """``(4,)`` 1 σ by places of pupil images that the instrument file does not state, numeric
+    units. It is no part of ``total_covariance``: a reconstructor of this α compensates for the
+    displaced images, one of the true α does not."""
+
     grown: Array = field(default_factory=lambda: np.zeros(4))
     """``(4,)`` variance that drift and flexure have added since ``t_ns_utc``, numeric units."""
 
@@ -292,6 +297,16 @@ class Registration:
         return np.sqrt(np.diag(self.total_covariance))
 
     @property
+    def shown_covariance(self) -> Array:
+        """``(4, 4)`` covariance of the error of α now, unstated places of images included."""
+        return self.total_covariance + np.diag(self.image_floor**2)
+
+    @property
+    def shown_sigma(self) -> Array:
+        """``(4,)`` 1 σ of the error of α now, unstated places of images included."""
+        return np.sqrt(np.diag(self.shown_covariance))
+
+    @property
     def usable(self) -> bool:
         """Return True if reconstructors may be computed and published from it without an order."""
         return self.validity.level is not Validity.INVALID
@@ -314,7 +329,8 @@ class HistoryEntry:
     """The Kalman estimate after it."""
 
     filtered_sigma: Array
-    """``(4,)`` 1 σ of the filtered estimate, floor included, numeric units."""
+    """``(4,)`` 1 σ of the filtered estimate, numeric units, floor and unstated places of images
+    included."""
 
     innovation: float
     """Normalised innovation squared (4 degrees of freedom); 0 for the first window."""

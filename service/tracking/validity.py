@@ -166,6 +166,7 @@ def in_subapertures(registration: Registration, scale: Array, config_id: str) ->
         covariance=registration.covariance * np.outer(scale, scale),
         stretches=known and replace(known, shared=known.shared * scale),
         floor=registration.floor * scale,
+        image_floor=registration.image_floor * scale,
         grown=registration.grown * scale**2,
         optical_gain=None,
         optical_gains=(),

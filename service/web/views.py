@@ -305,8 +305,8 @@ define_view(
 ALPHA = define_view(
     "AlphaView",
     Alpha,
-    "registration.alpha registration.sigma anamorphosis_sigma registration.floor covariance "
-    "parameters "
+    "registration.alpha sigma=registration.shown_sigma anamorphosis_sigma registration.floor "
+    "covariance parameters "
     "registration.t_ns_utc age_s window_age_s "
     "registration.n_windows validity=registration.validity.level "
     "validity_reason=registration.validity.reason "

@@ -1,5 +1,6 @@
 """From the user's settings to the tracker's policy."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -92,6 +93,18 @@ def test_the_limit_of_a_stale_alpha_is_what_a_mode_across_tolerates():
 def test_a_floor_that_is_given_overrules_the_measured_one():
     settings = load_settings(None, {"PYRCAL_TRACKING__FLOOR_ROTATION_DEG": "0"})
     np.testing.assert_array_equal(floor_of(settings), [FLAT[0], FLAT[0], 0.0, FLAT[2]])
+
+
+def test_places_of_images_that_are_not_stated_widen_only_what_is_shown():
+    """Called unknown they are part of the floor, which the gate allows for."""
+    settings, about = load_settings(None, {}), load_instrument("flao-lbt")
+    left_out = policy_of(settings, about)
+    unknown = policy_of(settings, replace(about, unknown=("wfs.image_offsets_px",)))
+    assert left_out.image_floor[0] == pytest.approx(0.25 * 0.15)
+    assert left_out.floor[0] == FLAT[0]
+    assert not unknown.image_floor.any()
+    np.testing.assert_allclose(unknown.floor, np.hypot(left_out.floor, left_out.image_floor))
+    assert not policy_of(settings, load_instrument(LENSLETS)).image_floor.any()
 
 
 def test_a_coarse_basis_tolerates_more():

@@ -310,6 +310,12 @@ class SensorKind(ABC):
 
         return np.zeros(4)
 
+    def unstated_image_floor(self, instrument: Instrument) -> NDArray[np.float64]:
+        """Return the same by places that the file neither states nor calls unknown."""
+        import numpy as np
+
+        return np.zeros(4)
+
     def displace_images(
         self, instrument: Instrument, offsets: NDArray[np.float64]
     ) -> SensorDescription:

@@ -438,6 +438,7 @@ def on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
         alpha=estimate.alpha,
         covariance=covariance,
         floor=context.policy.floor,
+        image_floor=context.policy.image_floor,
         t_ns_utc=estimate.t_ns_utc,
         arrived_ns_utc=context.now_ns,
         n_windows=1,

@@ -196,6 +196,21 @@ class TestTime:
         story.wait(80)
         assert worth(story) is Validity.STALE
 
+    def test_places_of_images_widen_what_is_shown_and_decide_nothing(self):
+        places = np.array([0.04, 0.04, 3e-4, 3e-4])
+        stories = [
+            Story(Mode.AUTO, replace(POLICY, image_floor=each)).meet()
+            for each in (np.zeros(4), places)
+        ]
+        for story in stories:
+            story.see(n_windows=2)
+        before, after = (story.state.alpha.registration for story in stories)
+        np.testing.assert_array_equal(before.sigma, after.sigma)
+        np.testing.assert_array_equal(before.covariance_to_hold_in, after.covariance_to_hold_in)
+        np.testing.assert_allclose(after.shown_sigma, np.hypot(before.sigma, places))
+        shown = stories[1].state.alpha.history[-1].filtered_sigma
+        assert np.all(shown >= places)
+
     def test_what_is_judged_is_judged_with_the_sigma_of_now(self, story):
         story.wait(40)
         total = story.state.alpha.registration.total_covariance

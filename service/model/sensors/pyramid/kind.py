@@ -210,6 +210,14 @@ class PyramidKind(SensorKind):
         return image_floor(instrument)
 
     @override
+    def unstated_image_floor(self, instrument: Instrument) -> NDArray[np.float64]:
+        from service.model.sensors.pyramid.description import image_floor
+
+        if f"wfs.{_IMAGES}" in instrument.unknown:
+            return super().unstated_image_floor(instrument)
+        return image_floor(instrument)
+
+    @override
     def turned_edge_sigma(
         self, instrument: Instrument, displaced_subap: NDArray[np.float64]
     ) -> NDArray[np.float64]:

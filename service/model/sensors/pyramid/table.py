@@ -108,9 +108,9 @@ class PyramidTable(PyramidNumbers):
 
     image_offsets_px: Offsets | None = None
     """Displacement [x, y] of each pupil image from the pixel grid, in the RTC's axes, in the order
-    -x -y, +x -y, -x +y, +x +y; None: fitted to a measured matrix; "unknown": likewise, and σ of
-    live estimates allows for 0.15 pixel. With ``stop = "mirror"`` their mean is the shift and does
-    not count."""
+    -x -y, +x -y, -x +y, +x +y. None: fitted to a measured matrix, and σ that the service shows
+    allows for 0.15 pixel; "unknown": likewise, and the stability gate allows for it. With ``stop =
+    "mirror"`` their mean is the shift and does not count."""
 
     mode: tuple[PyramidMode, ...] = ()
     """Sensor modes; the service begins with the first."""

@@ -110,7 +110,10 @@ def test_unknown_places_widen_the_floor_and_known_ones_do_not():
     assert not kind.image_floor(about).any()
     unknown = replace(about, unknown=("wfs.image_offsets_px",))
     assert kind.image_floor(unknown)[0] == pytest.approx(0.25 * 0.15)
+    np.testing.assert_array_equal(kind.unstated_image_floor(about), kind.image_floor(unknown))
+    assert not kind.unstated_image_floor(unknown).any()
     told = replace(about, wfs=displace_pyramid(about, np.zeros(8)))
+    assert not kind.unstated_image_floor(told).any()
     assert kind.image_sigma_subap(told) is None
 
 

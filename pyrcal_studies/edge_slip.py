@@ -3,7 +3,8 @@
 Runs mis-registered loops on the diffractive telescope, prints the wavefront error of every half
 second, when the watch on the outer ring speaks, and what the gate knew beforehand: the worst pole
 radius and the motion of the outer ring per unit of slope noise. A case is modes:registration:leak;
-without one all of docs/results/reliability.md are run.
+without one all of docs/results/reliability.md are run. The matrix is that of a registered mirror,
+or with ``--registered`` the right one.
 Run: ``python -m pyrcal_studies.edge_slip --case 594:0,0,0,1.025:1.0 --case 400:0.3,0,0,1:1.0``.
 """
 
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from service.control.gains import ModeGain, gain_table
 from service.control.gate import compute_edge_motion_m
 from service.control.loop import ControlLoop, pole_radius
 from service.control.reconstructor import invert
@@ -49,8 +51,8 @@ CASES = (
     "594:0,0,0,1.025:0.99",
 )
 STROKE_M = 3e-5
-OPTICAL_GAIN = 0.6
-"""Of the residual wavefront of these loops, on average over the modes."""
+N_MEASURED = 4
+"""Dithered modes, the highest controlled ones, whose optical gains the gate is given."""
 
 
 class Case(NamedTuple):
@@ -94,12 +96,22 @@ def actuators_of(instrument: Instrument) -> Actuators:
     )
 
 
-def foreseen(case: Case, gain: float, model: InteractionModel) -> tuple[float, float]:
-    """Return the worst pole radius and the motion of the outer ring, metres per unit of slope."""
+def foreseen(
+    case: Case, gain: float, model: InteractionModel, matrix: NDArray[np.float32]
+) -> tuple[float, float]:
+    """Return the pole radius and the motion of the outer ring, metres per unit of slope noise.
+
+    With the optical gains that the gate takes: the highest that the loop may have after a dither of
+    a few modes at 1".
+    """
     n = case.n_controlled
-    matrix = invert(model.interaction_matrix(Misregistration()), n).matrix
     coupling = matrix @ model.interaction_matrix(parse_alpha(case.alpha))[:, :n]
-    gains = np.full(n, gain * OPTICAL_GAIN)
+    usual = gain_table((), n).optical_gain
+    measured = [
+        ModeGain(mode=k, gain=float(usual[k]), sigma=0.01, scatter=0.01, t_ns_utc=0)
+        for k in range(n - N_MEASURED, n)
+    ]
+    gains = gain * gain_table(measured, n).highest
     eigenvalues = np.linalg.eigvals(gains[:, None] * coupling)
     actuators = actuators_of(model.instrument)
     outer = actuators.strokes[actuators.outer]
@@ -108,7 +120,9 @@ def foreseen(case: Case, gain: float, model: InteractionModel) -> tuple[float, f
     return float(pole_radius(eigenvalues, leak=case.leak).max()), motion
 
 
-def run(case: Case, given: argparse.Namespace, instrument: Instrument) -> Outcome:
+def run(
+    case: Case, given: argparse.Namespace, instrument: Instrument, matrix: NDArray[np.float32]
+) -> Outcome:
     """Run one loop and its watch."""
     options = parse_options(
         f"--plant diffractive --alpha {case.alpha} --seed {given.seed} --mag {given.mag} "
@@ -127,7 +141,7 @@ def run(case: Case, given: argparse.Namespace, instrument: Instrument) -> Outcom
     ratios: list[float] = []
     slips: list[bool] = []
     for block in telescope.feed.blocks():
-        terms = LoopTerms.of(block.optics, telescope.reconstructor.matrix, gains, case.leak)
+        terms = LoopTerms.of(block.optics, matrix, gains, case.leak)
         for row in range(0, block.n_frames, BATCH_FRAMES):
             rows = block.run(row, loop, terms, None)
             health = observe_edge(health, _frames(len(errors), rows.slopes, rows.commands_m), watch)
@@ -166,6 +180,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--case", type=parse_case, action="append", metavar="MODES:ALPHA:LEAK")
     parser.add_argument("--seconds", type=float, default=4.0)
+    parser.add_argument("--registered", action="store_true", help="matrix of the registration")
     parser.add_argument("--gain", type=float, default=0.8, help="about 0.5 in effect")
     parser.add_argument("--wind", type=float, default=15.0)
     parser.add_argument("--mag", default="8")
@@ -179,8 +194,10 @@ def main() -> None:
         instrument = load_instrument("flao-lbt")
         model = InteractionModel(instrument, modes_of(instrument))
         for case in given.case or [parse_case(text) for text in CASES]:
-            radius, motion = foreseen(case, given.gain, model)
-            found = run(case, given, instrument)
+            made_for = parse_alpha(case.alpha) if given.registered else Misregistration()
+            matrix = invert(model.interaction_matrix(made_for), case.n_controlled).matrix
+            radius, motion = foreseen(case, given.gain, model, matrix)
+            found = run(case, given, instrument, matrix)
             when = "no slip" if found.first_slip_s is None else f"{found.first_slip_s:.2f} s"
             errors = " ".join(f"{error:.0f}" for error in found.wavefront_nm)
             sys.stdout.write(

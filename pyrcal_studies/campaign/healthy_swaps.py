@@ -13,6 +13,10 @@ matrix raises the residual of the same stretch of turbulence by 1.5; a diverging
 unstable. Telemetry goes to the service's own comparison, in blocks of 50 ms, and to its watch of
 the loop and (of the simulator's telescope) of commands that are not played, which must raise no
 alarm while a healthy matrix is in use.
+
+A healthy swap on the simulator's telescope that is judged worse is played once more with the matrix
+before under the new id. If that is judged worse too, the turbulence has lost the loop and the
+matrix is not the cause (``unchanged_verdict``, and the true wavefront errors of both).
 """
 
 from __future__ import annotations
@@ -35,7 +39,7 @@ from pyrcal_studies.campaign.observatory import SMALL, Dome, bench_of
 from pyrcal_studies.campaign.rows import RowFile
 from service.control.reconstructor import Recipe, reconstruct
 from service.estimation import health
-from service.estimation.comparison import REFERENCE_PERIOD_S
+from service.estimation.comparison import REFERENCE_PERIOD_S, Verdict
 from service.estimation.description import actuator_watch
 from service.estimation.frames import FrameBlock
 from service.estimation.health import LoopHealth, PlayedCommands, observe_played
@@ -75,6 +79,7 @@ LIMIT_M = 2e-5
 N_SMALL = 60
 SWAP_EVERY_S = 6.0
 SWAPS_A_NIGHT = 10
+SWAPS_A_HARD_NIGHT = 2
 GUST_SEEING = GUST_RATIO ** (6 / 5)
 """Of the seeing: the wavefront goes with its power of 5/6."""
 
@@ -518,7 +523,7 @@ class SimulatedNight:
             words.append("--optical-gain=0.7,0.9")
         else:
             words.append("--imperfections=realistic")
-        self.dome, self._n_swaps = Dome(words), 0
+        self.dome, self._n_swaps, self._n_planned = Dome(words), 0, n_swaps
         self._matrices: dict[str | None, Array32] = {}
         about = bench_of(SMALL).describe()
         self._variance = about.mode_variance_m2
@@ -538,12 +543,28 @@ class SimulatedNight:
     def swaps(self, n: int) -> Iterator[dict[str, object]]:
         """Swap right matrices and slightly misregistered ones in, in turns."""
         for k in range(n):
-            begun_s = self.dome.time_s
-            self._swap(self._matrix(0.1 if k % 2 else 0.0))
-            found_before = self.state.found
-            self._pass(SWAP_EVERY_S)
-            found = self.state if self.state.found is not found_before else Comparison()
-            yield _row(self._trial, (found, self.alarms), swap_s=begun_s, swap=k)
+            row = self._swap_row(k, self._matrix(0.1 if k % 2 else 0.0))
+            if row["verdict"] == Verdict.WORSE:
+                row |= SimulatedNight(self._trial, self._n_planned).unchanged(k)
+            yield row
+
+    def unchanged(self, k: int) -> dict[str, object]:
+        """Play the night as far as swap ``k`` and leave its matrix in use under the new id."""
+        for earlier in range(k):
+            self._swap_row(earlier, self._matrix(0.1 if earlier % 2 else 0.0))
+        row = self._swap_row(k, next(reversed(self._matrices.values())))
+        return {f"unchanged_{key}": row[key] for key in ("verdict", "text", "after_nm")}
+
+    def _swap_row(self, k: int, matrix: Array32) -> dict[str, object]:
+        """Swap a matrix in, let the time until the next pass, and return what is found."""
+        begun_s, found_before = self.dome.time_s, self.state.found
+        before_nm = self._wavefront_nm(REFERENCE_PERIOD_S)
+        self._swap(matrix)
+        self._pass(SWAP_EVERY_S)
+        found = self.state if self.state.found is not found_before else Comparison()
+        after_nm = self._wavefront_nm(SWAP_EVERY_S)
+        more = {"swap_s": begun_s, "swap": k, "before_nm": before_nm, "after_nm": after_nm}
+        return _row(self._trial, (found, self.alarms), **more)
 
     def worse(self, share: float, healthy_nm: float | None = None) -> dict[str, object]:
         """Swap a matrix of so much of the loop gain in.
@@ -613,16 +634,22 @@ class SimulatedNight:
 
 
 def simulated_rows(
-    plant: str, kind: str, n: int, seed: int, rate_hz: float | None = None
+    plant: str, kind: str, n: int, seed: int, rate_hz: float | None = None, *, hard: bool = False
 ) -> Iterator[dict[str, object]]:
-    """Yield what comes of swaps on the simulator's telescope, a few in each night."""
+    """Yield what comes of swaps on the simulator's telescope, a few in each night.
+
+    ``hard``: the seeing doubles in every night, with few swaps, so that a lost loop ends it soon.
+    """
     done = night_number = 0
     while done < n:
         usual_hz = RATES_HZ[night_number % len(RATES_HZ)]
         trial = replace(drawn(plant, kind, seed + night_number), rate_hz=rate_hz or usual_hz)
+        if hard:
+            trial = replace(trial, seeing_trend=1)
         if plant == "diffractive" and kind != "healthy":
             trial = _calm(trial, night_number)
-        n_swaps = min(SWAPS_A_NIGHT if kind == "healthy" else 1, n - done)
+        most = SWAPS_A_HARD_NIGHT if hard else SWAPS_A_NIGHT
+        n_swaps = min(most if kind == "healthy" else 1, n - done)
         night = SimulatedNight(trial, n_swaps)
         if kind == "healthy":
             yield from night.swaps(n_swaps)
@@ -645,11 +672,11 @@ def _calm(trial: Trial, night_number: int) -> Trial:
 
 
 def rows_of(
-    plant: str, kind: str, n: int, seed: int, rate_hz: float | None
+    plant: str, kind: str, n: int, seed: int, rate_hz: float | None, *, hard: bool
 ) -> Iterator[dict[str, object]]:
     """Yield a row for each swap; ``rate_hz`` None: the rates in turns or at random."""
     if plant != "outside":
-        return simulated_rows(plant, kind, n, seed, rate_hz)
+        return simulated_rows(plant, kind, n, seed, rate_hz, hard=hard)
     trials = (drawn(plant, kind, seed + k) for k in range(n))
     return (
         outside_trial(trial if rate_hz is None else replace(trial, rate_hz=rate_hz))
@@ -666,13 +693,14 @@ def main() -> int:
     parser.add_argument("--diverging", type=int, default=0, metavar="N")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--rate", type=float, metavar="HZ", help="all swaps at this frame rate")
+    parser.add_argument("--hard", action="store_true", help="the seeing doubles in each night")
     parser.add_argument("--output", type=Path, default=Path("var/healthy_swaps.jsonl"))
     given = parser.parse_args()
     file, begun = RowFile(given.output), time.process_time()
     with threadpool_limits(1):
         for kind in ("healthy", "worse", "diverging"):
             n = getattr(given, kind)
-            for row in rows_of(given.plant, kind, n, given.seed, given.rate):
+            for row in rows_of(given.plant, kind, n, given.seed, given.rate, hard=given.hard):
                 file.add(row)
     sys.stdout.write(f"{time.process_time() - begun:.0f} s of processor time\n")
     return 0

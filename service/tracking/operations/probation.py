@@ -4,9 +4,10 @@ The previous matrix was stable until a moment ago, whatever its origin. It is se
 of what the gate or the telemetry have reported since.
 
 If the loop is no better with the previous matrix, the swap was not the cause: the mirror may have
-jumped within seconds of it. The service then goes on as after a jump at any other time, and
-acquires the registration again if the loop is lost. It does so once in a while; if the same
-happens again soon, or where it may not acquire, a lost loop is opened and the mode remains hold.
+jumped within seconds of it, or turbulence that saturates the sensor may have lost the loop. The
+service then goes on as after a jump at any other time, and acquires the registration again if the
+loop is lost. It does so once in a while; if the same happens again soon, or where it may not
+acquire, a lost loop is opened and the mode remains hold.
 """
 
 from __future__ import annotations
@@ -310,7 +311,7 @@ def _resume(context: StepContext, trial: Probation, *, lost: bool) -> None:
     leave_hold(
         context,
         f"the loop is no better with {trial.before}, so {trial.id} was not the cause. The mirror "
-        "may have jumped",
+        "may have jumped, or turbulence may have lost the loop",
     )
     # Windows from before the event say nothing of where the mirror is now.
     validity.invalidate_telemetry(context, MAY_HAVE_JUMPED)

@@ -79,6 +79,7 @@ class DiffractiveLenslets:
         ``opd_m`` is ``(n_points,)``, at the lit points of the pupil. The unit is the light of a
         full lenslet, the wings beyond its pixels counted.
         """
+        # Continued linearly beyond the rim of the pupil, where nodes of partly lit lenslets fall.
         phase = self._wavenumber * self._under(2.0 * opd_m[self._edge] - opd_m[self._inside])
         field = np.empty(phase.shape, np.complex64)
         np.multiply(self._amplitude, np.cos(phase), out=field.real)

@@ -42,6 +42,7 @@ class SodiumStar:
         sheets = np.linspace(-2.0, 2.0, _SHEETS)
         light = np.exp(-(sheets**2) / 2.0)
         heights = laser.height_m + sheets * laser.thickness_m / _FWHM
+        # Relative to the mean height, on which the sensor is focused.
         parallax = (1.0 / laser.height_m - 1.0 / heights) / lambda_over_d
         from_launcher = subaperture_m * (np.arange(n) - (n - 1) / 2)[:, None] - laser.launcher_m
         aside = from_launcher[:, :, None] * parallax  # (n, 2, n_sheets)

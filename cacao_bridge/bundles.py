@@ -53,6 +53,8 @@ def apply(settings: Settings, path: Path) -> str:
             f"{path}: {folder} has other numbers under {name}: ids are never reused; nothing was "
             "changed"
         )
+    # Parts before the matrix: the order comes last, so that a program that ends in between has
+    # changed nothing.
     parts.keep_of(name, bundle)
     if not kept.with_suffix(".json").exists():  # the service's own sources say more
         identity = Identity(system=wire.system, basis_id=wire.basis_id, config_id=wire.config_id)

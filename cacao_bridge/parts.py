@@ -84,6 +84,8 @@ class Parts:
             parts = {one: kept[one] for one in kept.files}
         for one, values in parts.items():
             stream = self._stream(one)
+            # All sizes are checked before the first is written: half of a calibration is another
+            # loop.
             if stream.n_values != values.size:
                 raise StreamError(
                     f"{one}: found {stream.n_values} values, expected {values.size} of {name}"

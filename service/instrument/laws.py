@@ -38,6 +38,7 @@ def _term(value: object, *, north_step: float, turn: float = 0.0) -> Term:
         step = term.north_step()
     except ModelError as error:
         raise ValueError(str(error)) from error
+    # A rotation that grows by whole turns with azimuth comes back to the same angle.
     left = math.remainder(step, turn) if turn else step
     if abs(left) > north_step:
         raise ValueError(
@@ -50,8 +51,10 @@ def _term(value: object, *, north_step: float, turn: float = 0.0) -> Term:
 
 def _convert_term(value: object) -> Term:
     match value:
+        # Before int(): a bool of Python is an int.
         case bool():
             raise ModelError(f"found {value}, expected a number, an expression or {_FORM}")
+        # repr() keeps all digits of a float.
         case int() | float():
             return Term(repr(float(value)))
         case str():

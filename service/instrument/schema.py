@@ -245,6 +245,7 @@ def read_instrument_file(name_or_path: str | Path) -> InstrumentFile:
     tables = dict(written)
     for key in unknown:
         table, name = key.split(".")
+        # "unknown" is replaced before the schema is applied, whose types are numbers.
         tables[table] = {**tables[table], name: taken[key]}
     if isinstance(tables.get("wfs"), dict):
         with refused_at(path, "wfs"):

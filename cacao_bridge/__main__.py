@@ -161,6 +161,7 @@ class Bridge:
                 if self._cacao.has_news:
                     link.report_matrices()
                 now_s = time.monotonic()
+                # A new session is announced at once: frames of it count only after its status.
                 if now_s >= next_status_s or self._cacao.session != last_session:
                     link.publish_status(self._cacao.status())
                     last_session, next_status_s = self._cacao.session, now_s + STATUS_PERIOD_S

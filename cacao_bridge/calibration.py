@@ -96,6 +96,8 @@ class Parts:
             parts = {one: kept[one] for one in kept.files}
         for one, values in parts.items():
             stream = self._stream(one)
+            # All sizes are checked before the first is written: half of a calibration is another
+            # loop.
             if stream.n_values != values.size:
                 raise StreamError(
                     f"{one}: found {stream.n_values} values, expected {values.size} of {name}"
@@ -178,6 +180,7 @@ class Calibration:
             If the streams of cacao's modes cannot be read or written.
         """
         self._obey()
+        # cacao copies the matrix when this process starts: another process means another copy.
         restarted = process != self._known["process"]
         if restarted or self.in_use is None:
             before = self._known["in_use"]
@@ -235,6 +238,7 @@ class Calibration:
         if not consent.exists():
             return False
         name = consent.read_text("utf-8").strip()
+        # Used once, also if it names another matrix: it must not hold for a later one.
         consent.unlink()
         if name != self.waiting:
             _log.error("matrix.not-that-one", found=name, expected=self.waiting)
@@ -250,6 +254,7 @@ class Calibration:
         if self.index.max() >= cube.shape[1]:
             found = f"{self._settings.streams.modes_wfs}: {cube.shape[1]} values a slice"
             raise StreamError(f"{found}, expected at least {self.index.max() + 1}")
+        # The numbers decide: the process may have started before or after the streams were written.
         for name in (self.waiting, recorded):
             if name is not None:
                 kept = self._kept(name)
@@ -260,6 +265,7 @@ class Calibration:
     def _foreign(self, cube: Array32) -> Reconstructor:
         """Return numbers that another program has written, under an id of their own."""
         matrix = np.ascontiguousarray(cube[:, self.index] * self._unit)
+        # The checksum makes the same numbers have the same id after each restart of the bridge.
         name = f"own-{checksum(matrix)[:12]}"
         own = Reconstructor.own(name, matrix, self._identity, created_ns=0)
         keep(self._folder, own)
@@ -276,6 +282,7 @@ class Calibration:
         cube = self._slices(of, int(np.prod(shape)))
         keywords = {_KEYWORD: (checksum(of.matrix)[:15], name)}
         modes = self.dm_modes[: len(of.matrix)]
+        # The mirror's modes as well: their number must be that of the matrix.
         create(self._path(streams.modes_dm), modes, keywords)
         create(self._path(streams.modes_wfs), cube.reshape(-1, *shape), keywords)
 
@@ -377,6 +384,8 @@ def apply(settings: Settings, path: Path) -> str:
             f"{path}: {folder} has other numbers under {name}: ids are never reused; nothing was "
             "changed"
         )
+    # Parts before the matrix: the order comes last, so that a program that ends in between has
+    # changed nothing.
     parts.keep_of(name, bundle)
     if not kept.with_suffix(".json").exists():  # the service's own sources say more
         identity = Identity(system=wire.system, basis_id=wire.basis_id, config_id=wire.config_id)

@@ -118,6 +118,7 @@ class Cacao:
         """Longest sleep between two reads that loses no frame, seconds."""
         streams = [self._streams.get(name) for name in ("slopes", "commands")]
         n_kept = min((stream.n_kept for stream in streams if stream is not None), default=64)
+        # A quarter of the ring leaves time for a late wake-up; without a ring, four looks a frame.
         return min(max(n_kept / 4, 0.25) / self._loop.frame_rate_hz, _PAUSE_S)
 
     def poll(self) -> list[tuple[FrameHeader, Array32]]:
@@ -162,6 +163,7 @@ class Cacao:
             found = f"{commands.n_values} values {commands.shape}"
             raise StreamError(f"{commands.name}: found {found}, expected {expected}")
         if self._names.dither:
+            # A bridge that was killed may have left a dither in its channel.
             self._channel().write(np.zeros(n_actuators, dtype=np.float32))
         self._streams = {"slopes": slopes, "commands": commands, "multiplied": multiplied}
         self._commands_writer = commands.writer
@@ -204,6 +206,7 @@ class Cacao:
         self._moved_s["commands"] = time.monotonic()
         moves = np.concatenate([[self._moves], frames.values.any(axis=1)])
         self._moves = bool(moves[-1])
+        # All commands exactly zero after some that were not: noise never does that.
         if np.any(moves[:-1] & ~moves[1:]):
             raise GoneError(f"{commands.name}: set to zero (loopZERO): the integrator was reset")
         before = self._offset
@@ -241,6 +244,8 @@ class Cacao:
             taken_up = self._calibration.look(multiplied.writer, slopes.shape)
             if taken_up is not None and known:
                 found = multiplied.made_by(slopes.inode)
+                # Frames around the swap are left out: which matrix multiplied them is not known
+                # exactly.
                 self._rows.skip(self._rows.newest if found is None else found[1])
                 self._swaps.append((taken_up, self._rows.next))
 
@@ -386,6 +391,7 @@ class Cacao:
             for row, name in zip(both, (self._names.gains, self._names.factors), strict=True):
                 if name:
                     values = self._open(name).latest().ravel()[:n_modes]
+                    # Modes beyond the stream have no gain.
                     row[:], row[: len(values)] = 0.0, values
         except StreamError as error:
             self._law_trouble = str(error)
@@ -394,6 +400,7 @@ class Cacao:
         n_controlled = len(self.reconstructor.matrix)
         in_loop = factors[:n_controlled][gains[:n_controlled] > 0]
         leak, self._law_trouble = float(np.median(in_loop)) if len(in_loop) else self._loop.leak, ""
+        # The contract has one leak for all modes.
         if len(in_loop) and np.ptp(in_loop) > _LEAK_SPREAD:
             span = f"{in_loop.min():.4f} to {in_loop.max():.4f}"
             self._law_trouble = (
@@ -469,6 +476,7 @@ class Cacao:
         if any(changed.values()):
             what = ", ".join(name for name, does in changed.items() if does)
             return f"unsupported: {what}: set at cacao, by cacao-fpsctrl or its operators"
+        # Accepted, because it takes effect with the next matrix only.
         self._n_next = request.n_controlled or self._n_next
         return ""
 

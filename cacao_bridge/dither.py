@@ -93,11 +93,14 @@ class Player(Background):
                 time.sleep(pause_s)
                 continue
             moved_s = time.monotonic()
+            # Frames that were missed had the value that was still in the channel.
             if now > before + 1:
                 self._played(before + 1, now - 1, value_m)
+            # A counter that goes back is another stream: the dither does not continue there.
             over = stands or now + self._mirror.lead >= last or now < before
             over = over or self._stopped.is_set()
             value_m = np.zeros_like(value_m) if over else self._value_m(now + self._mirror.lead)
+            # Zeros are written at the end: cacao keeps adding what a channel holds.
             self._mirror.channel.write(value_m @ self._mirror.per_metre)
             self._played(now, now, value_m)
             self.seen = before = now

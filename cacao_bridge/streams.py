@@ -192,6 +192,7 @@ class Stream:
             self._n_bytes = os.fstat(self._fd).st_size
             if self._n_bytes < _METADATA.itemsize:
                 raise self._error(f"{self._n_bytes} bytes", f"at least {_METADATA.itemsize}")
+            # Read-only mapping of the system: no mistake here can change cacao's streams.
             access = mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ
             self._map = mmap.mmap(self._fd, self._n_bytes, access=access)
             self._about = np.frombuffer(self._map, _METADATA, 1)[0]
@@ -302,6 +303,7 @@ class Stream:
     def orphaned(self) -> str:
         """Text that the last writer has ended; empty: it runs."""
         try:
+            # Signal 0 only asks whether the process exists.
             os.kill(self.writer, 0)
         except ProcessLookupError:
             return f"process {self.writer}, which wrote it, has ended"
@@ -358,6 +360,8 @@ class Stream:
             return None
         first = max(counter + 1, now - self.n_kept + 1)
         values = self._slots[self._slots_of(first, now, turn)].astype(np.float32, copy=False)
+        # Read again after the copy: frames that the writer has passed meanwhile may be torn. One
+        # slot more, because it may be writing.
         overwritten = max(0, self.counter - len(self._slots) + 2 - first)
         first, values = first + overwritten, values[overwritten:]
         return Frames(first, values, first - counter - 1) if len(values) else None
@@ -377,6 +381,7 @@ class Stream:
         if self._is_cube:
             place = self._at.counters
             kept = np.frombuffer(self._map, "<u8", len(self._slots), place)[slots]
+            # All but the newest, whose counter may not be written yet.
             if not np.array_equal(kept[:-1], counters[:-1]):
                 told = f"slices of frames {kept[:4].tolist()}..."
                 raise self._error(told, f"{counters[:4].tolist()}...: another process writes it")
@@ -425,6 +430,7 @@ class Stream:
 
     def _same_as_newest(self) -> NDArray[np.bool_]:
         """Return for each slot of the ring whether it holds the frame of the stream, bit by bit."""
+        # Compared as integers: NaN is not equal to itself.
         newest = self._data[0].view(f"u{self._data.itemsize}")
         found: NDArray[np.bool_] = (self._slots.view(newest.dtype) == newest).all(axis=1)
         return found
@@ -449,6 +455,8 @@ class Stream:
     def write(self, values: Array32) -> None:
         """Write a frame of ``shape`` as the library does: ring, counter, semaphores."""
         about = self._about
+        # The order is the library's: readers take what they see between the flag and the counter as
+        # unfinished.
         self._writing[0] = 1
         self._data[0] = values.ravel()
         if len(self._slots):
@@ -469,6 +477,7 @@ class Stream:
             place = self._at.semaphores + k * _SEMAPHORE_BYTES
             semaphore = ctypes.c_char.from_buffer(self._map, place)
             libc.sem_getvalue(ctypes.byref(semaphore), ctypes.byref(value))
+            # A reader that is gone never takes its semaphore down; it must not overflow.
             if value.value < _MOST_SEMAPHORE:
                 libc.sem_post(ctypes.byref(semaphore))
 
@@ -521,6 +530,7 @@ def create(path: Path, values: Array32, keywords: Mapping[str, tuple[str, str]])
     for row, (name, (value, comment)) in zip(rows, keywords.items(), strict=True):
         row["name"], row["type"], row["value"] = name.encode(), b"S", value.encode()
         row["comment"] = comment.encode()
+    # Under another name first: programs that wait for the stream must not open half of it.
     fresh = path.with_name(f".{path.name}.new")
     try:
         with fresh.open("wb") as file:

@@ -184,6 +184,7 @@ def compare_matrix(instrument: Instrument, matrix: NDArray[np.float32]) -> Slope
         )
     except ModelError as error:
         return f"the model of {instrument.name} cannot be computed: {error}"
+    # A file that leaves the orientation open agrees with whatever is found.
     return replace(convention, adopted=instrument.slopes.orientation is None)
 
 
@@ -224,6 +225,8 @@ def make_registration_fit(instrument: Instrument) -> RegistrationFit:
 
     def fit_registration(window: Spectra, loop: ClosedLoop) -> LockInEstimate | WindowRefused:
         try:
+            # Before the fit, which needs the order and signs that a file with orientation "auto"
+            # leaves open.
             worker().read_slope_convention(loop.reconstructor, None)
             return worker().fit(window, loop, None)
         except ModelError as error:

@@ -223,6 +223,7 @@ def check_signatures(client: RtcClient, status: Status) -> CheckResult:
         return skipped("signatures", "no secret is shared: [zenoh.signing] in --config")
     plain = encode(LoopRequest(id=connection.new_id("signed"), leak=status.leak))
     signed = connection.sign(kind, plain)
+    # The last byte belongs to the HMAC: the message itself stays readable.
     changed = signed[:-1] + bytes([signed[-1] ^ 1])
     problems = []
     for what, payload, expected in (

@@ -86,6 +86,7 @@ def find_systems_with_rtc(endpoint: Endpoint, wait_s: float) -> list[str]:
     session = link.open_session(endpoint)
     end_s = time.monotonic() + wait_s
     try:
+        # Asked again and again: an RTC that waits for its router connects within a second.
         while not (found := link.tokens(session, Keys.all_alive(Role.RTC))):
             if time.monotonic() >= end_s:
                 return []
@@ -267,6 +268,7 @@ class RtcConnection:
                     data=data,
                     attachment=attachment,
                     refused=self._check_signature(topic, key, data, attachment),
+                    # Only an advanced publisher numbers its messages.
                     recoverable=sample.source_info is not None,
                 )
             )

@@ -106,6 +106,7 @@ def check_chunks(client: RtcClient, before: MatrixInUse) -> tuple[CheckResult, M
     name = new.manifest.id
     client.connection.offer(new.manifest, new.matrix)
     began_s = client.clock()
+    # The commit comes first here: zenoh may deliver it so, because it has the higher priority.
     client.connection.put_commit(name, encode(new.manifest))
     for index, part in enumerate(new.parts):
         if index != _OMITTED_CHUNK:

@@ -97,6 +97,7 @@ def _check_move(
         return skipped("offload", f"α cannot be measured: {before}")
     demand = OffloadRequest(
         id=client.connection.new_id("offload"),
+        # Towards zero, so that the check never makes the registration worse.
         shift_x_subap=STEP_SUBAP if before.alpha.shift_x_subap < 0.0 else -STEP_SUBAP,
         shift_y_subap=0.0,
         rotation_deg=0.0,
@@ -194,6 +195,7 @@ def _dither(client: RtcClient, status: Status) -> DitherRequest:
         modes = np.arange(status.n_modes)[-len(ALPHA_LINE_RATIOS) :]
     modes = modes[: max(status.max_dither_modes, 1)]
     each_m = min(DITHER_RMS_M / np.sqrt(len(modes)), status.max_dither_m)
+    # Whole periods in a window, so that lines do not leak into each other.
     lines = [round(line * status.frame_rate_hz * WINDOW_S) / WINDOW_S for line in ALPHA_LINE_RATIOS]
     return DitherRequest(
         id=client.connection.new_id("dither"),

@@ -158,6 +158,7 @@ class TelemetryObserver:
         """Count frames with the slopes of the frame before: photon noise never repeats exactly."""
         before = self._last_slopes
         if before is None or before.shape != slopes[0].shape:
+            # NaN equals nothing, so that the first frame is never a repetition.
             before = np.full_like(slopes[0], np.nan)
         same = np.all(slopes == np.concatenate([before[None], slopes[:-1]]), axis=1)
         self._last_slopes = slopes[-1].copy()
@@ -241,5 +242,6 @@ def select_session(arrivals: list[Arrival], session: str | None) -> list[Arrival
 
 def sort_by_frame(arrivals: list[Arrival]) -> list[Arrival]:
     """Return batches in the order of their frames, without repetitions."""
+    # Reversed, so that the first of two batches with the same number stays.
     by_seq = {arrival.header.seq0: arrival for arrival in reversed(arrivals)}
     return [by_seq[seq0] for seq0 in sorted(by_seq)]

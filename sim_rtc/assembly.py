@@ -208,6 +208,7 @@ def build_telescope(
         If the instrument is not simulated, or more modes are to be controlled than it has.
     """
     instrument = _select_mode(options, instrument)
+    # A stream for each part: a different plant does not change the sky of the same seed.
     plant_rng, sky_rng, noise_rng, alpha_rng = np.random.default_rng(options.seed).spawn(4)
     basis, instrument = _bin_instrument(options, _modes(options, instrument), instrument)
     n_modes = basis.n_modes
@@ -229,6 +230,7 @@ def build_telescope(
     schedule = Schedule(
         start=start,
         corners_s=() if law is None else options.elevation.corners_s,
+        # The start contains the law at time 0 already.
         law=None if law is None else lambda time_s: law(time_s).vector - law(0.0).vector,
         drift=options.drift,
         flexure=options.flexure,
@@ -282,6 +284,7 @@ def build_detector(
     magnitude = options.magnitude
     if isinstance(plant, MeasuredPlant):
         ratio = (options.sky_diameter_m or sky_diameter(instrument)) / instrument.diameter_m
+        # The light grows with the area: 5 log10 of the ratio of diameters in magnitudes.
         magnitude -= 5.0 * math.log10(ratio)
     detector = Detector(
         instrument,
@@ -294,6 +297,7 @@ def build_detector(
         # the light of a measured matrix was not measured with it
         reports_light=not isinstance(plant, MeasuredPlant),
     )
+    # abs, because an orientation may turn signs, and a σ has none.
     detector.sigma = np.abs(plant.sort_rows(detector.sigma))
     return detector
 

@@ -247,6 +247,8 @@ class ComputerFaults:
     def before_batch(self, time_s: float, stopped: threading.Event) -> None:
         """Begin and end what is due at this loop time; a stall waits here."""
         self._plan.now_s = time_s
+        # Ends come before beginnings, so that a fault that follows another of its kind is not ended
+        # by it.
         while self._lasting and min(f.end_s for f in self._lasting) <= time_s:
             over = min(self._lasting, key=lambda fault: fault.end_s)
             self._lasting.remove(over)
@@ -305,6 +307,7 @@ Sendable = tuple[bytes, bytes]
 """Payload and attachment of one batch."""
 
 _OTHER_BASIS = "another-basis"
+# 0xc1 is the one byte that msgpack never uses.
 _NONSENSE = b"\xc1 no header of frames"
 
 
@@ -351,6 +354,7 @@ class WireFaults:
         fault = self._plan.active(FaultKind.NAN, time_s)
         if fault is not None:
             struck = self._rng.random(header.n) < fault.value("SHARE")
+            # The rows are recorded and judged elsewhere: only what is sent is damaged.
             rows = rows.copy()
             rows[struck, self._rng.integers(n_slopes)] = np.nan
         if self._plan.active(FaultKind.SHAPE, time_s):

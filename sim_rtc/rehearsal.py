@@ -94,6 +94,7 @@ def write_live_instrument(instrument: str | Path, path: Path, n_modes: int | Non
         raise ConfigurationError(
             f"--write-instrument: cannot write {path}: {error.strerror or error}"
         ) from error
+    # Read back, so that a file that the service would refuse is reported now.
     load_instrument(path)
 
 
@@ -130,5 +131,7 @@ def _format_value(value: object, folder: Path) -> str:
         name, colon, inside_file = value.partition(":/")
         file = folder / name
         referred = f"{file.resolve()}{colon}{inside_file}" if name and file.is_file() else value
+        # A basic string of TOML has the escapes of JSON.
         return json.dumps(referred, ensure_ascii=False)
+    # TOML writes true and false as JSON does; repr() of a float keeps all its digits.
     return json.dumps(value) if isinstance(value, bool) else repr(value)

@@ -72,6 +72,8 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
     with ExitStack() as stack:
         ahead = stack.enter_context(Ahead(telescope.feed.blocks()))
         computer = telescope.computer(iter(ahead))
+        # Before the clock starts: the first blocks take seconds, which the timestamps must not
+        # contain.
         computer.prepare()
         clock = FrameClock(start_ns_utc=time.time_ns(), dt_ns=round(1e9 / options.frame_rate_hz))
         plan, recorder = FaultPlan(options.faults), None

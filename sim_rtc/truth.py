@@ -62,6 +62,7 @@ class WavefrontError:
         # in this order: for ten commands a copy of the modes would cost as much as the product
         residual = np.ascontiguousarray((modes[:, :n_moved] @ commands[:, :n_moved].T).T)
         residual += np.array([batch.phase_m for batch in batches])
+        # Piston is no wavefront error: no image shows it.
         residual -= (residual @ self._weights)[:, None]
         return [float(rms) * 1e9 for rms in np.sqrt(residual**2 @ self._weights)]
 
@@ -114,6 +115,7 @@ class TruthRecorder(Background):
 
         ``overrun_frames`` so far came late; the batch came ``behind_s`` after it was due.
         """
+        # Waits, unlike the telemetry: the truth must have no gaps.
         self._queue.put((batch, overrun_frames, behind_s))
 
     @override
@@ -297,6 +299,7 @@ def write_snapshot(telescope: Telescope, path: Path) -> None:
     rows = list(moments(telescope))
     figure = Figure(figsize=(4 * _INCHES, len(rows) * _INCHES), layout="constrained")
     axes = figure.subplots(len(rows), 4, squeeze=False)
+    # The same scale in all rows: that of the open loop.
     slope = 3.0 * float(np.nanstd(rows[0].slopes))
     for moment, (images, along_x, along_y, left) in zip(rows, axes, strict=True):
         images.set_ylabel(f"frame {moment.frame}")

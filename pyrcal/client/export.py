@@ -70,6 +70,7 @@ def run_command(service: Service, _request: Request, options: argparse.Namespace
         with part.open("wb") as file:
             for each in write(service, path, form, query):
                 _write(file, each, target)
+        # A transfer that breaks off leaves no file under the name.
         part.replace(target)
     finally:
         part.unlink(missing_ok=True)
@@ -109,6 +110,7 @@ def _history(service: Service, path: str, form: str, query: dict[str, str]) -> I
             entries = [dict(entry) for entry in document["entries"]]
             lines = _format_entries(entries, form, head=head)
             now = int(entries[-1]["t_ns_utc"]) if entries else 0
+        # Also if the last page repeats: a service that ignores "after" must not be asked for ever.
         if now <= after:
             return
         yield lines
@@ -120,6 +122,7 @@ def _format_entries(entries: list[Document], form: str, *, head: bool) -> bytes:
         return "".join(json.dumps(entry) + "\n" for entry in entries).encode()
     rows = [_flat(entry) for entry in entries]
     buffer = io.StringIO()
+    # A later page may have optional keys that the heading of the first does not have.
     table = csv.DictWriter(buffer, list(rows[0]) if rows else [], extrasaction="ignore")
     if head:
         table.writeheader()

@@ -51,9 +51,11 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
         Errors of the service.
     """
     headers = {}
+    # Only if somebody will be asked: a script learns the refusal from the order itself.
     if (request.needs_why and not options.why) or (request.asks and not options.yes):
         _refuse_early(service, request)
     if request.decides_on:
+        # The order holds for what was shown here, and is refused if that has changed meanwhile.
         headers["If-Match"] = _show(service, request, options)
     why = options.why or (_prompt_user(request, "why", "--why") if request.needs_why else "")
     agreed = (
@@ -65,6 +67,7 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
         say(f"pyrcal {request.name}: nothing was ordered")
         return NOT_DONE
     if request.method == "POST":
+        # Lets the order be sent again if its answer is lost.
         headers["Idempotency-Key"] = str(uuid.uuid4())
     who = login() if options.who is None else options.who
     given = collect_arguments(options, request.body)
@@ -126,6 +129,7 @@ def _progress(service: Service, request: Request, options: argparse.Namespace) -
     if request.follows != RECONSTRUCTORS:
         return service.get(path_of(request.follows, options)).document
     every = _reconstructors(service).items()
+    # The source keeps its state; what goes out is a copy with an id that is not known before.
     copies = [
         one for name, one in every if name not in options.known and one["parent"] == options.source
     ]

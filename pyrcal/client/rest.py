@@ -159,12 +159,15 @@ class Service:
         connection = kind(self._host, self._port, timeout=limit_s)
         late = threading.Event()
         try:
+            # Separately, because a request that was never sent is certain not to have been carried
+            # out.
             connection.connect()
         except OSError as error:
             raise UnreachableError(
                 f"{self.url}: nothing answers ({error}); start the service with pyrcal run, or "
                 "name its address with --url or PYRCAL_URL"
             ) from error
+        # A timeout of the socket is for each read: an answer that trickles would never meet it.
         timer = threading.Timer(limit_s, _cut, (connection.sock, late))
         timer.daemon = True
         if within_s is not None:
@@ -191,7 +194,9 @@ class Service:
 
     def _read(self, response: http.client.HTTPResponse) -> Fetched:
         """Return the JSON object in an answer."""
+        # One byte more than allowed shows that it is larger.
         raw = response.read(MAX_ANSWER_BYTES + 1)
+        # http.client returns what came without an error if a connection ends early.
         if response.length:
             raise http.client.IncompleteRead(raw, response.length)
         try:
@@ -228,6 +233,7 @@ def _cut(sock: socket.socket, late: threading.Event) -> None:
     """End a connection, whether or not somebody waits for it."""
     late.set()
     try:
+        # shutdown() wakes a thread that waits in recv(); close() does not.
         sock.shutdown(socket.SHUT_RDWR)
     except OSError:
         return  # the connection has already ended

@@ -31,6 +31,7 @@ def status_lines(state: Document) -> list[str]:
     lines += [
         f"Waiting for the {wait['responsible']}: {wait['text']}"
         for wait in state["waiting_for"]
+        # An alarm with this name is on the screen already.
         if wait["name"] not in alarms
     ]
     return [*lines, "", *_rtc(state), *_alpha(state), *_matrix(state), *_activity_lines(state)]

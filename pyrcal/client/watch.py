@@ -67,6 +67,7 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
     """
     latest = Latest()
     coming = events(service, request.path, latest)
+    # The first event is fetched before anything is drawn, so that an error is an exit status.
     coming = chain([next(coming)], coming)
     try:
         if options.json:

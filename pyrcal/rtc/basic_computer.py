@@ -186,6 +186,8 @@ class BasicComputer:
 
     def time_ns(self, seq: int) -> int:
         """Return the end of exposure of a frame, nanoseconds since the Unix epoch, UTC."""
+        # From the sequence and not from the clock: timestamps must be even, however late a batch is
+        # processed.
         return self._start_ns + round(seq * 1e9 / self._frame_rate_hz)
 
     def status(self) -> Status:
@@ -287,6 +289,8 @@ class BasicComputer:
             self.leak = request.leak
         self._n_next = request.n_controlled or self._n_next
         if request.loop is Loop.OPEN and self.closed:
+            # Zeroing the integrator begins a new session by the contract, and a dither belongs to
+            # one session.
             self._session, self._dither, self.closed = new_session(), None, False
         elif request.loop is Loop.CLOSED:
             self.closed = True

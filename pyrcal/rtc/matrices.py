@@ -119,6 +119,7 @@ class Matrices(Background):
                 event = self._events.get(timeout=_POLL_S)
             except queue.Empty:
                 event = None
+            # First, so that a matrix of the new session is not voided with the old ones.
             self._follow_session()
             if event is not None:
                 event()

@@ -180,6 +180,8 @@ class ReplyCache:
 
     def handle(self, command: Command, now_s: float) -> Reply:
         """Return the reply to a command. ``now_s`` is a monotonic time in seconds."""
+        # Held while the command is executed: a repetition that comes meanwhile waits for the same
+        # reply.
         with self._lock:
             self._answered = {
                 key: answered

@@ -89,12 +89,16 @@ def frames_publisher(
         session,
         keys.frames,
         encoding=Encodings.FRAMES,
+        # The loop must not wait for a slow network: the service requests what is dropped from the
+        # cache.
         congestion_control=zenoh.CongestionControl.DROP,
         priority=zenoh.Priority.DATA,
         cache=zenoh.ext.CacheConfig(math.ceil(_CACHE_S * batches_per_s)),
         sample_miss_detection=zenoh.ext.MissDetectionConfig(
             heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None
         ),
+        # A service that has subscribed before notices the publisher and requests what it has
+        # missed.
         publisher_detection=True,
     )
 

@@ -95,6 +95,7 @@ class Staging:
 
     def chunk(self, matrix_id: str, index: int, data: bytes) -> Outcome:
         """Add one chunk. An invalid chunk is dropped and requested again after the timeout."""
+        # Late or repeated chunks of a matrix that is settled.
         if matrix_id in self._answers:
             return Outcome()
         with suppress(WireError):
@@ -107,6 +108,7 @@ class Staging:
         if known is not None:
             return self._repeat_answer(manifest, known)
         collection = self._collection(manifest.id)
+        # A repeated commit must not extend the deadline.
         if collection.manifest is not None:
             return Outcome()
         collection.manifest = manifest
@@ -145,6 +147,7 @@ class Staging:
         """Drop all matrices that are not applied yet, because a new session begins."""
         self._collected.clear()
         for matrix_id, acknowledgement in list(self._answers.items()):
+            # Applied and rejected ones stay settled: their ids are never used again.
             if acknowledgement.state is AckState.STAGED:
                 del self._answers[matrix_id]
 
@@ -173,6 +176,7 @@ class Staging:
 
     def _reject(self, matrix_id: str, reason: str) -> Outcome:
         manifest = self._collected.pop(matrix_id).manifest
+        # Without a manifest there is no order to answer.
         if manifest is None:
             return Outcome()
         return Outcome(
@@ -182,6 +186,7 @@ class Staging:
     def _repeat_answer(self, manifest: Manifest, known: Acknowledgement) -> Outcome:
         """Repeat the answer to a repeated commit; reject an id that belongs to another matrix."""
         if manifest.layout.sha256 == known.sha256:
+            # In the present session, because the service ignores acknowledgements of others.
             return Outcome(acknowledgements=[replace(known, session=self._terms().session)])
         reason = f"id: {manifest.id} was used with sha256 {known.sha256}, expected a new id"
         return Outcome(acknowledgements=[self.answer(manifest, AckState.REJECTED, reason)])

@@ -457,5 +457,6 @@ def update_mean_ratio(mean: Array | None, n_windows: int, ratio: Array) -> Array
     """Return the forgetting quadratic mean of ``n_windows`` ratios after one more, ``(4,)``."""
     if mean is None or n_windows == 0:
         return ratio
+    # A plain mean at first: with a constant share the first window would weigh too much.
     share = max(1.0 / (n_windows + 1), 1.0 / MEMORY_WINDOWS)
     return np.asarray(np.sqrt((1.0 - share) * mean**2 + share * ratio**2))

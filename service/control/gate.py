@@ -122,6 +122,7 @@ def judge(
     steps = _ellipsoid_ends(covariance).astype(np.float32)
     aligned = float(loop.pole_radius(gains).max())
     bound = max(bound, (1.0 + aligned) / 2)
+    # Above the bound the verdict is certain, so that the search ends there.
     worst = _worst_pole(centre, np.array(slopes), steps, gains, loop, min(bound, 1.0))
     stable = _make_verdict(worst, aligned, bound, 1 + 2 * len(steps))
     if loop.outer is None or not stable.accepted:
@@ -215,6 +216,8 @@ def _bound_numerical_range(matrix: Coupling) -> NDArray[np.float64]:
     For many modes these are bounds that are wider by about ``EIGENVALUE_TOLERANCE``.
     """
     even, odd = (matrix + matrix.T) / 2, (matrix - matrix.T) / 2
+    # The eigenvalues of an antisymmetric matrix are imaginary: those of its square are their
+    # squares.
     square = odd.T @ odd
     if len(matrix) < _N_MODES_FOR_BOUNDS:
         (low, high), (_, most) = _extreme_eigenvalues(even), _extreme_eigenvalues(square)
@@ -246,6 +249,7 @@ def _bound_largest_eigenvalue(symmetric: Symmetric) -> float:
     """
     row_sum = float(np.abs(symmetric).sum(axis=0).max())
     typical = float(np.linalg.norm(symmetric)) / len(symmetric) ** 0.5
+    # A fixed start, so that the same matrix always has the same verdict.
     start = np.random.default_rng(0).standard_normal(len(symmetric)).astype(symmetric.dtype)
     try:
         largest = float(
@@ -276,6 +280,7 @@ def _bound_largest_eigenvalue(symmetric: Symmetric) -> float:
 def _largest_radius_on_border(extent: NDArray[np.float64], loop: ControlLoop) -> float:
     low, high, turn = extent
     along, up = np.linspace(low, high, _N_SIDE_POINTS), np.linspace(0.0, turn, _N_SIDE_POINTS)
+    # The upper half only: the pole radius of a conjugate eigenvalue is the same.
     border = np.concatenate([along + 1j * turn, low + 1j * up, high + 1j * up])
     radii = loop.pole_radius(border)
     return float(radii.max()) + EIGENVALUE_TOLERANCE

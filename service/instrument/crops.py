@@ -97,6 +97,7 @@ def modes_of_crops(
         if strokes is None:
             modes[k][at] = part
         else:
+            # Crop by crop: whole tables of all functions would take far more memory.
             modes[:, *at] += np.multiply.outer(strokes[k].astype(crops.dtype), part)
     return modes, known
 
@@ -118,6 +119,7 @@ def remarks_on_crops(file: Section[MirrorTable], crops: NDArray[np.floating]) ->
     if file.said.influence_origin is None:
         return ()
     rim = np.abs(crops)
+    # Never zero, so that crops of nothing but zeros do not divide by it.
     highest = max(float(rim.max()), float(np.finfo(rim.dtype).tiny))
     rim[:, 1:-1, 1:-1] = 0
     left = float(rim.max()) / highest

@@ -93,6 +93,7 @@ def read_mirror(
 def _read(file: MirrorSection, key: str) -> NDArray[np.floating]:
     """Return the array a key refers to, as float32 where it is no finer, else float64."""
     values = file.array(key)
+    # Never finer than the file: double precision of a large table only doubles the memory.
     single = values.dtype.kind == "f" and values.dtype.itemsize <= 4
     return values.astype(np.float32 if single else np.float64, copy=False)
 
@@ -275,6 +276,7 @@ def _beside_gaps(file: MirrorSection, positions_m: NDArray[np.float64]) -> NDArr
     kept = np.ones(len(positions_m), dtype=np.bool_)
     for angle in np.deg2rad(file.said.segments_deg):
         along, across = (positions_m @ rotation(angle)).T
+        # A gap is a ray from the centre: the opposite half of its line is not one.
         kept &= (np.abs(across) > _ON_A_GAP * np.abs(positions_m).max()) | (along < 0.0)
     return positions_m[kept]
 
@@ -376,6 +378,7 @@ def hexagonal(pitch_m: float, diameter_m: float, hole_m: float = 0.0) -> NDArray
     y upwards: the layout is its own mirror image under y -> -y. Points closer to the centre than
     half of ``hole_m`` are excluded.
     """
+    # The small number keeps a row exactly on the rim.
     rows = int(diameter_m / 2 / (pitch_m * np.sqrt(0.75)) + 1e-9)
     row = np.arange(-rows, rows + 1)
     columns = int(diameter_m / 2 / pitch_m) + 1
@@ -390,6 +393,7 @@ def _inside(
 ) -> NDArray[np.float64]:
     """Return the points in or on a circle, ``(n, 2)``, row by row."""
     points = np.column_stack([x_m.ravel(), y_m.ravel()])
+    # Actuators exactly on the circle belong to the mirror.
     rounding = 1.0 + 1e-9
     inside = np.linalg.norm(points, axis=1) <= diameter_m / 2 * rounding
     return np.asarray(points[inside])
@@ -403,6 +407,7 @@ def typical_pitch(positions_m: NDArray[np.float64]) -> float:
 def coincident(positions_m: NDArray[np.float64]) -> tuple[int, int] | None:
     """Return the indices of two actuators in the same place, or None."""
     distances, neighbours = _nearest(positions_m)
+    # Two actuators in one place make the system of the influence functions singular.
     same = np.flatnonzero(distances <= 1e-6 * np.ptp(positions_m))
     if same.size == 0:
         return None

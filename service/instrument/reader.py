@@ -128,6 +128,7 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
         **_made(_parts(said)),
         unknown=tuple(one for one in schema.unknown_values(kind) if one in said.unknown),
     )
+    # A remark, not a refusal: light and flux threshold of a real sensor may well cut another mask.
     difference = check_mask(instrument)
     if difference is not None:
         instrument = replace(instrument, remarks=(*instrument.remarks, difference))

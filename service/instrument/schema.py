@@ -49,6 +49,7 @@ def _term(value: object, *, north_step: float, turn: float = 0.0) -> Term:
         step = term.north_step()
     except ModelError as error:
         raise ValueError(str(error)) from error
+    # A rotation that grows by whole turns with azimuth comes back to the same angle.
     left = math.remainder(step, turn) if turn else step
     if abs(left) > north_step:
         raise ValueError(
@@ -61,8 +62,10 @@ def _term(value: object, *, north_step: float, turn: float = 0.0) -> Term:
 
 def _convert_term(value: object) -> Term:
     match value:
+        # Before int(): a bool of Python is an int.
         case bool():
             raise ModelError(f"found {value}, expected a number, an expression or {_FORM}")
+        # repr() keeps all digits of a float.
         case int() | float():
             return Term(repr(float(value)))
         case str():
@@ -356,6 +359,7 @@ def read_instrument_file(name_or_path: str | Path) -> InstrumentFile:
     tables = dict(written)
     for key in unknown:
         table, name = key.split(".")
+        # "unknown" is replaced before the schema is applied, whose types are numbers.
         tables[table] = {**tables[table], name: taken[key]}
     if isinstance(tables.get("wfs"), dict):
         with refused_at(path, "wfs"):

@@ -69,6 +69,7 @@ def measure_aperture(valid: NDArray[np.bool_]) -> Aperture:
     middle = (np.array(valid.shape) - 1) / 2.0
     centre = np.argwhere(filled).mean(axis=0)
     row, column = np.rint(centre).astype(int)
+    # The hole nearest to the centre: dead subapertures elsewhere are holes, too.
     around = labels[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
     hole = int(np.sum(labels == around.max())) if around.max() else 0
     offset = centre - middle

@@ -33,6 +33,7 @@ def find_defects(values: NDArray[Any]) -> dict[int, str]:
     flat = array.reshape(len(array), array[0].size if len(array) else 0)
     unknown = ~np.isfinite(flat)
     n_unknown = unknown.sum(axis=1)
+    # The entry with the fewest: what it lacks, as outside a pupil, all others may lack.
     usual = unknown[int(np.argmin(n_unknown))] if len(flat) else np.zeros(0, bool)
     found: dict[int, str] = {}
     seen: dict[bytes, int] = {}

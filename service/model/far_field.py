@@ -97,6 +97,7 @@ class PlateSum:
     def _iterate_tiles(self, points: Array) -> Iterator[tuple[_Tile, Indices]]:
         """Yield every tile that has any of the points, and which they are."""
         places = np.floor(points / TILE_SUBAP).astype(np.intp)
+        # Sorted, so that the points of a tile are one run.
         order = np.lexsort(places.T)
         edges = np.flatnonzero(np.any(np.diff(places[order], axis=0), axis=1)) + 1
         for some in np.split(order, edges):

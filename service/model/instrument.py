@@ -369,6 +369,7 @@ def instrument_sha256(instrument: Instrument) -> str:
     Two files that describe the same instrument, one with the defaults spelt out, are the same.
     """
     digest = hashlib.sha256()
+    # Remarks contain paths, which do not change the instrument.
     _add(digest, replace(instrument, remarks=()))
     return digest.hexdigest()
 
@@ -381,11 +382,13 @@ def _add(digest: hashlib._Hash, value: object) -> None:
             _add(digest, part)
         digest.update(b")")
     elif isinstance(value, np.ndarray):
+        # The same bytes mean other numbers in another type or shape.
         digest.update(f"{value.dtype.str}{value.shape}".encode())
         digest.update(np.ascontiguousarray(value).tobytes())
     elif isinstance(value, tuple):
         for item in value:
             _add(digest, item)
+        # The length ends a tuple: (1, 2), 3 and 1, (2, 3) must differ.
         digest.update(f"{len(value)};".encode())
     else:
         digest.update(f"{value!r};".encode())

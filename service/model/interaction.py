@@ -109,6 +109,7 @@ class Linearisation:
         moved = np.tensordot(step[:4].astype(np.float32), self.derivatives, axes=1)
         if self.stretches is not None and len(step) > 4:
             moved += np.tensordot(step[4:].astype(np.float32), self.stretches, axes=1)
+        # Into the new array: D of a large telescope takes gigabytes.
         moved += self.matrix
         return np.asarray(moved)
 
@@ -326,6 +327,7 @@ class InteractionModel:
         centre = (len(self.valid) - 1) / 2
         seen = np.column_stack([x, y]) - centre - self._image_shift(alpha)
         distance, _ = scipy.spatial.cKDTree(self.pupil.points[unknown]).query(seen, p=np.inf)
+        # Half a subaperture from its centre to its edge; p = inf, because subapertures are square.
         return np.tile(distance <= 0.5 + UNKNOWN_REACH_SUBAP, self.n_slopes // len(x))
 
     def _at(self, shift: tuple[float, float]) -> Response:
@@ -347,11 +349,15 @@ class InteractionModel:
         self, alpha: Misregistration, points: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return the positions of pupil points on the mirror, ``(n_points, 2)``."""
+        # Zero with the mirror as stop, whose image carries the pupil's points along; minus the
+        # shift with a fixed pupil.
         beside = np.array(self._image_shift(alpha)) - alpha.vector[:2]
         return self.instrument.with_anamorphosis(alpha).on_mirror(points + beside)
 
     def _render_modes(self, alpha: Misregistration) -> Shapes:
         shift = self._image_shift(alpha)
+        # A shift that the pupil's images follow is not in the key: it does not move the mirror over
+        # the pupil.
         moved = alpha.vector - np.array([*shift, 0.0, 0.0])
         stretches = self.instrument.with_anamorphosis(alpha).stretches
         return self._modes.get((*moved, *stretches), lambda: self._move_modes(alpha, None))
@@ -376,12 +382,16 @@ class InteractionModel:
         ways: list[Way] = [_rotation_rate, partial(_scale_rate, magnification=alpha.magnification)]
         if self.instrument.stop is Stop.TELESCOPE:
             ways[:0] = self._shift_ways(alpha)
+        # With more ways than axes the gradient along both axes is cheaper than a rendering for each
+        # way.
         if len(ways) > _AXES and isinstance(self._render_modes(alpha), np.ndarray):
             return self._along(alpha, ways)
         return [self._move_modes(alpha, way) for way in ways]
 
     def _shift_ways(self, alpha: Misregistration) -> list[Way]:
         """Return the ways of the mirror's points with shifts of the mirror along x and along y."""
+        # Minus: when the mirror's image moves by +x, a fixed point of the pupil sees the mirror at
+        # -x.
         steps = -self.instrument.with_anamorphosis(alpha).on_mirror(np.eye(_AXES))
         return [partial(_shift_rate, step=step) for step in steps]
 
@@ -514,6 +524,7 @@ class RtcInteractionModel(InteractionModel):
     @override
     def unknown_rows(self, alpha: Misregistration) -> NDArray[np.bool_]:
         """Return which of the RTC's slopes are near unknown surface, ``(n_slopes,)``."""
+        # As numbers, because signs are multiplied into the rows.
         marks = self._sort_rows(super().unknown_rows(alpha).astype(np.float32))
         return np.asarray(marks != 0.0)
 
@@ -521,6 +532,7 @@ class RtcInteractionModel(InteractionModel):
     @cached_property
     def noise_shape(self) -> NDArray[np.float64] | None:
         shape = kind_of(self.instrument).noise_shape(self.instrument)
+        # abs, because the order of slopes may turn signs, and a σ has none.
         return None if shape is None else np.abs(self._sort_rows(shape))
 
     def _sort_rows(self, rows: Array) -> Array:

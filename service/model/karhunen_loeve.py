@@ -63,6 +63,7 @@ def compute_modes(instrument: Instrument, surface: Surface) -> tuple[Array, Arra
     strokes, variance = _diagonalise(
         gram, covariance, sectors, n_modes, _left_out(instrument, surface)
     )
+    # Once more on finer points: the statistics of turbulence are computed on coarser ones.
     strokes = _unit_rms(strokes, _gram(surface, strokes, fine))
     strokes = _tilts_along_axes(strokes, positions_m)
     return _fix_signs(strokes, positions_m), variance

@@ -95,6 +95,7 @@ class LocalShapes:
     drawing: Drawing | None = None
     """From what somebody else can make them; None: he cannot."""
 
+    # Makes numpy hand ``array @ shapes`` to __rmatmul__ instead of making an array of objects.
     __array_ufunc__: ClassVar[None] = None
 
     @property
@@ -147,6 +148,7 @@ class LocalShapes:
         by_function = np.zeros((self.n_all_functions, len(rows)), rows.dtype)
         for patch in self.patches:
             heights = patch.weights[patch.tile.lit]
+            # A function reaches into several tiles, whose parts add up.
             by_function[patch.functions] += heights.T @ rows[:, patch.tile.places].T
         return self.combine_functions(by_function.T)
 

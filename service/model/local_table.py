@@ -141,6 +141,7 @@ def _splines_through(samples: Any, shape: tuple[int, ...], floor: float) -> Any:
         high = np.minimum([row.max() + _TAIL, column.max() + _TAIL], np.array(shape) - 1)
         box = np.zeros(high - low + 1, samples.dtype)
         box[row - low[0], column - low[1]] = samples.data[part]
+        # In a box around the samples: beyond its tail a spline is nothing.
         box = scipy.ndimage.spline_filter(box, order=3, output=box.dtype)
         y, x = np.nonzero(np.abs(box) > floor * np.abs(box).max())
         values.append(box[y, x])

@@ -122,6 +122,7 @@ class Misregistration:
         The difference in magnification includes that of the anamorphosis.
         """
         apart = np.abs(self.vector - other.vector)
+        # A stretch displaces the rim as a magnification of the same size does.
         apart[3] += float(np.abs(self.stretches - other.stretches).max())
         return apart
 
@@ -134,6 +135,7 @@ class Misregistration:
     def on_mirror(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return mirror positions of sensor points ``(n_points, 2)``, without the shift."""
         if self.anamorphosis is not None:
+            # Undone first, because it acts last on the way from the mirror to the sensor.
             points = points @ np.linalg.inv(stretch_matrix(self.stretches))
         return points @ rotation(self.rotation_rad) / self.magnification
 

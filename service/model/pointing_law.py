@@ -106,7 +106,9 @@ class Term:
         if self.at and self.expression.strip() == "azimuth":
             return self.values[-1] - self.values[0]
         steps = [0.0]
+        # Several pointings, because a step may vanish at one of them.
         for elevation, azimuth in itertools.product((20.0, 50.0, 80.0), (-180.0, 0.0)):
+            # Values of the observatory are not known here: any number will do for a difference.
             others = dict.fromkeys(self.names, 1.0) | {"elevation": elevation}
             ends = [others | {"azimuth": azimuth + turn} for turn in (0.0, 360.0)]
             with contextlib.suppress(ModelError):  # of values that nobody has reported yet
@@ -125,6 +127,7 @@ class Term:
             found = _evaluate(_parse(self.expression), reported)
         except (ArithmeticError, ValueError, TypeError) as error:
             raise ModelError(f"{self.expression} is no number now: {error}") from error
+        # A negative number to a fractional power is complex in Python.
         if isinstance(found, complex) or not math.isfinite(found):
             raise ModelError(f"{self.expression} is no number now: {found}")
         if not self.at:
@@ -181,6 +184,7 @@ def _parse(text: str) -> ast.expr:
         f"numbers, {' and '.join(ANGLES)} (degrees), names of the observatory's values, "
         f"+ - * / ** ( ) and {', '.join(FUNCTIONS)}"
     )
+    # Python's parser may exhaust its stack on deeply nested expressions.
     if len(text) > MAX_EXPRESSION_LENGTH:
         raise ModelError(
             f"found {len(text)} letters, expected at most {MAX_EXPRESSION_LENGTH}: {expected}"
@@ -200,6 +204,7 @@ def _strange(node: ast.AST) -> str:
     """Return what a part of an expression is that may not be; empty: it may."""
     match node:
         case ast.Constant(value=value):
+            # type() and not isinstance(): True is an int.
             return "" if type(value) in {int, float} else repr(value)
         case ast.Call(func=ast.Name(id=name), args=[_], keywords=[]):
             return "" if name in FUNCTIONS else f"{name}()"

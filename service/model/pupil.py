@@ -173,6 +173,7 @@ def _pupil_from_map(outline: _Outline, own: PupilMap, sampling: int) -> PupilGri
     """Return a pupil from its map: of every cell the share of its area that is lit."""
     step = own.pitch_m / outline.subaperture_m
     width = max(outline.n_subapertures, outline.diameter, max(own.lit.shape) * step)
+    # Rounding of the pitch must not add a ring of dark points.
     n = sampling * int(np.ceil(width - 1e-6))
     coordinates = (np.arange(n) - (n - 1) / 2) / sampling
     along_y, along_x = (_shares(coordinates, sampling, m, step) for m in own.lit.shape)
@@ -213,7 +214,9 @@ def _shadows(pupil: PupilGrid, outline: _Outline) -> NDArray[np.float64]:
         width = part * (abs(cosine) + abs(sine))  # of a square part, seen along the edge
         across = np.abs(cosine * y - sine * x)
         covered = np.clip((outline.spiders / 2 - across) / width + 0.5, 0.0, 1.0)
+        # An arm is a ray from the centre: nothing is hidden on the other side.
         covered *= np.clip((cosine * x + sine * y) / width + 0.5, 0.0, 1.0)
+        # The larger share and not the sum: where arms meet they hide the same light.
         np.maximum(hidden, covered, out=hidden)
     shares = np.zeros(near.shape)
     shares[near] = hidden.mean(axis=(1, 2))
@@ -255,6 +258,7 @@ def fully_lit_subapertures(instrument: Instrument) -> NDArray[np.bool_]:
 def _light_per_subaperture(outline: _Outline) -> NDArray[np.float64]:
     """Return the share of each subaperture ``(n, n)`` that the pupil lights."""
     n, fine = outline.n_subapertures, _drawn(outline, 8).amplitude
+    # The grid of the pupil may be larger than that of the sensor; both have the same centre.
     margin = (len(fine) - 8 * n) // 2
     inner = fine[margin : margin + 8 * n, margin : margin + 8 * n]
     return np.asarray(inner.reshape(n, 8, n, 8).mean(axis=(1, 3)))

@@ -70,6 +70,7 @@ def find_pupil_images(light_map: NDArray[Any], where: str) -> PupilImages:
     light = np.nan_to_num(np.asarray(light_map, dtype=np.float64))
     if light.ndim != 2 or min(light.shape) < 4 * _SMALLEST_PX:
         raise MatrixError(f"{where}: found shape {light.shape}, expected a frame of a camera")
+    # The darkest pixels show the background: bias and stray light.
     light = light - np.percentile(light, 2)
     row, column = _dark_line(light.sum(axis=1)), _dark_line(light.sum(axis=0))
     centres, diameters, holes = [], [], []
@@ -113,6 +114,7 @@ def _dark_line(profile: Array) -> int:
 
 def _disc(light: Array) -> tuple[float, float, float, float] | None:
     """Return row, column, diameter of the disc and of its hole; None if there is no disc."""
+    # The 98th percentile and not the maximum, which may be a hot pixel.
     bright = light[light > np.percentile(light, 98) / 3]
     if not bright.size or bright.max() <= 0.0:
         return None
@@ -175,6 +177,7 @@ def _circle(edges: Array) -> tuple[Array, float] | None:
             return None
         radius = float(np.sqrt(squared))
         away = np.abs(np.hypot(*(edges - centre).T) - radius)
+        # At least half of the points stay, however bad the first circle is.
         kept = edges[away < max(_OUTLIER_PX, float(np.median(away)))]
     return centre, radius
 
@@ -184,6 +187,7 @@ def _hole_radius(light: Array, centre: Array, radius: float) -> float:
     distances = np.arange(0.0, 0.8 * radius, _RAY_STEP_PX)
     angles = 2.0 * np.pi * np.arange(_N_RAYS) / _N_RAYS
     directions = np.column_stack([np.sin(angles), np.cos(angles)])
+    # The median over all rays ignores the arms of a spider.
     profile = np.median(_along(light, centre, directions, distances), axis=0)
     plateau = float(np.median(profile[distances > 0.5 * radius]))
     dark = profile < _HALF * plateau

@@ -181,6 +181,7 @@ def _list_signals(
             f"{n_planes} for each of the {n_valid} valid subapertures"
             f"{likely_kind(len(values), n_planes * n_valid)}"
         )
+    # Indices are turned as maps: flips and swaps then need no formula of their own.
     planes = np.full((n_planes, *mask.shape), -1, dtype=np.intp)
     planes[:, mask] = _places(order, mask)
     valid = orient_mask(mask, orientation)
@@ -190,10 +191,12 @@ def _list_signals(
         [orientation.flip_x, orientation.flip_y]
     )
     if order.kind is SignalKind.INTENSITY:
+        # A sign of -1 exchanges images, because a pixel's light has no sign.
         images = turned.reshape(2, 2, n_valid)[:: signs[1], :: signs[0]]
         images = images.swapaxes(0, 1) if orientation.swap_xy else images
         return images.reshape(-1), np.ones(len(values), dtype=np.int8)
     if orientation.swap_xy:
+        # Swapping the axes also exchanges Sx and Sy.
         turned, signs = turned[::-1], signs[::-1]
     return turned.reshape(-1), np.repeat(signs, n_valid)
 
@@ -219,6 +222,7 @@ def signals_of_slopes(slopes: NDArray[Any], kind: SignalKind) -> NDArray[Any]:
     Of ``slopes_of`` its pseudo-inverse.
     """
     rows = TO_SLOPES[kind]
+    # The rows are orthogonal and of the same length, so that this is the pseudo-inverse.
     part = (rows.T / (rows[0] @ rows[0])).astype(slopes.dtype)
     return np.tensordot(part, slopes, axes=1).reshape(-1, *slopes.shape[2:])
 
@@ -248,6 +252,8 @@ def _places(order: SlopeOrder, mask: NDArray[np.bool_]) -> NDArray[np.intp]:
     if order is SlopeOrder.DETECTOR:
         side_y, side_x, place = np.indices((2, 2, n_valid)).reshape(3, -1)
         row, column = (axis[place] for axis in np.nonzero(mask))
+        # lexsort gives the signal at each place of the list; argsort inverts it to the place of
+        # each signal.
         return np.argsort(np.lexsort((column, side_x, row, side_y))).reshape(4, n_valid)
     return places.reshape(n_planes, n_valid)[_PLANE_PLACES[order]]
 

@@ -33,6 +33,8 @@ class ThinPlate:
         system[:n, :n] = _bending_kernel(*_offsets(self.positions, self.positions))
         system[:n, n:] = affine
         system[n:, :n] = affine.T
+        # Three equations more: the weights have no sum and no moment, which keeps the plate finite
+        # far away.
         padded = np.vstack([strokes, np.zeros((3, strokes.shape[1]))])
         return np.asarray(scipy.linalg.lu_solve(scipy.linalg.lu_factor(system), padded))
 
@@ -51,6 +53,7 @@ class ThinPlate:
         dx, dy = _offsets(points, self.positions)
         along = dx * direction[:, :1] + dy * direction[:, 1:]
         out = np.empty((len(points), n + 3))
+        # Derivative of r² log r along a direction: (2 log r + 1) times the offset along it.
         out[:, :n] = (_log_squared(dx, dy) + 1.0) * along
         out[:, n] = 0.0
         out[:, n + 1 :] = direction
@@ -87,6 +90,8 @@ class Gaussian:
         middle = points.mean(axis=0)
         around = np.linalg.norm(points - middle, axis=1).max()
         apart = np.linalg.norm(self.positions - middle, axis=1)
+        # A circle around all points first: distances to every point are computed for few functions
+        # only.
         candidates = np.flatnonzero(apart <= around + reach)
         dx, dy = _offsets(points, self.positions[candidates])
         reached = (dx**2 + dy**2).min(axis=0, initial=np.inf) <= reach**2

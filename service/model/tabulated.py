@@ -117,6 +117,7 @@ class TabulatedBasis:
         for n, place in zip(self.surface_known.shape, self._place(points).T, strict=True):
             cell = np.clip(np.floor(place).astype(np.intp), 0, n - 2)
             lines = cell[:, None] + np.arange(-1, 3)
+            # Mirrored at the ends, as the spline filter assumes.
             lines = np.where(lines < 0, -lines, np.where(lines > n - 1, 2 * (n - 1) - lines, lines))
             found.append((lines, _cubic(np.clip(place - cell, 0.0, 1.0))))
         return tuple(found)
@@ -161,6 +162,8 @@ def build_table_basis(instrument: Instrument, table: TabulatedModes) -> Tabulate
     known = pad_mask(table.known, margin)
     samples = fill_table(table.cube, table.known, margin)
     for mode in samples.T:
+        # Mode by mode: the filter returns a copy, which for all modes at once would double the
+        # memory.
         mode[:] = scipy.ndimage.spline_filter(
             mode.reshape(known.shape), order=3, output=mode.dtype
         ).ravel()
@@ -225,6 +228,7 @@ def known_samples(cube: Table) -> Mask:
     Samples that are not finite in any mode say nothing, nor do regions where every mode is exactly
     zero. A line of zeros one sample wide does: odd modes vanish together on an axis.
     """
+    # Padded, so that zeros at the rim of the table form a region with the outside.
     zero = np.pad(~np.any(cube, axis=0), 1, constant_values=True)
     region = scipy.ndimage.binary_opening(zero, np.ones((2, 2), bool))
     zeros = scipy.ndimage.binary_dilation(region, mask=zero)[1:-1, 1:-1]
@@ -266,6 +270,7 @@ def continuation(known: Mask) -> tuple[NDArray[np.intp], scipy.sparse.csr_array]
     inside = np.all((mirrored >= 0) & (mirrored < known.shape), axis=1)
     inside[inside] = known[tuple(mirrored[inside].T)]
     at_edge = np.ravel_multi_index(tuple(edge.T), known.shape)
+    # Where the mirrored sample is unknown, too, the edge takes its place: 2 f(b) - f(b) is f(b).
     at_image = at_edge.copy()
     at_image[inside] = np.ravel_multi_index(tuple(mirrored[inside].T), known.shape)
     rows = np.arange(len(place))

@@ -146,6 +146,7 @@ class Activities:
             measuring.take(batch.seq0, batch.slopes, batch.commands_m)
             if batch.seq0 + len(batch.slopes) >= measuring.stop_seq:
                 self._end_measurement(batch.session)
+                # The service may have closed the loop during the last batch.
                 settings = replace(settings, closed=settings.closed or self._closes_again)
         ramp = self._ramp
         if ramp is not None and batch.closed and ramp.look(batch, matrix):

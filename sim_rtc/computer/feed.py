@@ -100,6 +100,7 @@ class OpenModes:
         """Return ``(n_frames, n_controlled)`` of the block's ``slopes`` from ``row`` on."""
         if self._reconstructor is not reconstructor:
             self._reconstructor, self._first = reconstructor, row
+            # Only what is left of the block: another matrix came in the middle of it.
             self._modes = slopes[row:] @ reconstructor.T
         return self._modes[row - self._first : row - self._first + n_frames]
 
@@ -180,6 +181,7 @@ class Feed(ABC):
     def __init__(self, batch_frames: int, block_frames: int, source: Source) -> None:
         self.batch_frames = batch_frames
         """Frames of a batch."""
+        # Whole batches only: a batch never spans two blocks.
         self._block_frames = block_frames // batch_frames * batch_frames
         self._sky, self._optics, self._rng = source["sky"], source["optics"], source["rng"]
         self._frame_rate_hz = source["frame_rate_hz"]
@@ -305,6 +307,8 @@ class Ahead:
             yield block
 
     def _next(self) -> Future[Block]:
+        # One thread, so that blocks are made in order: sky and noise are sequences of random
+        # numbers.
         return self._thread.submit(next, self._blocks)
 
 

@@ -124,6 +124,7 @@ class GainRamp:
         self._frames += len(residual_m)
         if self.done or self._frames <= self._settling_frames:
             return False
+        # A fault may put NaN into slopes; one such frame would spoil the whole step.
         finite = residual_m[np.isfinite(residual_m).all(axis=1)].astype(np.float64)
         self._power += float((finite**2).sum())
         self._judged += finite.size
@@ -185,6 +186,8 @@ def ramp_refusal(request: RampRequest, settings: LoopSettings, n_controlled: int
     last = max(last for _, last in request.groups)
     if last >= n_controlled:
         return f"range: mode {last} in groups, expected 0 to {n_controlled - 1}"
+    # With a delay of two frames an integrator is stable up to a gain of 1; an optical gain below 1
+    # allows more.
     if max(request.gains) > LARGEST_GAIN:
         return f"range: gain {max(request.gains):g}, expected at most {LARGEST_GAIN:g}"
     return ""

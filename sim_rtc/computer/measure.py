@@ -233,7 +233,9 @@ class MeasurementRules:
         if lines_hz[-1] >= highest_hz:
             return f"range: frequency_hz {lines_hz[-1]:g}, expected below {highest_hz:g}"
         duration_s = request.duration_s or 0.0
+        # The first tone's distance from 0 counts as well: a constant slope leaks like another tone.
         spacing_hz = float(np.diff(lines_hz, prepend=0.0).min())
+        # With a margin for rounding: tones at exactly the least distance are accepted.
         if spacing_hz * duration_s < _LINE_SPACING * (1 - 1e-9):
             return (
                 f"range: frequency_hz {spacing_hz:.3g} Hz apart, expected at least "

@@ -125,6 +125,7 @@ class RealTimeComputer:
             hidden = added if self._hides_dithers and activities.telemetry_dithers else None
             result = block.run(row, self._loop, terms, added if hidden is None else None)
             if hidden is not None:
+                # The telemetry contains the dither although the mirror never got it.
                 result.commands_m, result.dither_m = result.commands_m + hidden, hidden
             batch = Batch(
                 session=self._session,
@@ -194,6 +195,7 @@ class RealTimeComputer:
     def terms(self) -> Terms:
         """Return what a new reconstructor must fit at present."""
         with self._lock:
+            # A dict keeps the order and drops the second of two equal numbers.
             rows = {self._settings.n_controlled_next: None, len(self._active.matrix): None}
         return Terms(
             session=self._session,
@@ -283,6 +285,8 @@ class RealTimeComputer:
         self._active = self._staged.popleft()
         self._terms = None
         if fewer:
+            # The contract requires it (R-73): what no row corrects any more must not stay on the
+            # mirror.
             self._loop.release(len(self._active.matrix))
             self._set(self._activities.end_ramp(self._settings, "fewer modes are controlled"))
         self._swaps.append((self._active.manifest.id, self._seq))
@@ -345,6 +349,7 @@ class RealTimeComputer:
         reason = self._rules.refusal(request, len(in_use))
         if reason:
             return refuse(request.id, reason)
+        # Before the lock: the decomposition for system modes would hold up the loop.
         measurement = self._rules.measurement(request, in_use)
         with self._lock:
             activities, was_closed = self._activities, self._settings.closed
@@ -399,6 +404,7 @@ class RealTimeComputer:
         self._set(self._activities.end_all(self._settings, self._session))
         self._loop.reset()
         self._session = new_session()
+        # They were checked against the session that has ended.
         self._staged.clear()
 
 

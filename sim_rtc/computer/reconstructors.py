@@ -60,6 +60,7 @@ def own_reconstructor(
 def identity_of(instrument: Instrument, valid: NDArray[np.bool_]) -> Identity:
     """Return the names of basis and sensor configuration: they change when either does."""
     mirror, wfs = instrument.analytic_mirror, instrument.wfs
+    # Rounded to a micrometre, so that rounding errors of a platform do not make another basis.
     basis = hashlib.sha256(np.round(mirror.positions_m, 6).tobytes())
     basis.update(repr((mirror.shape.influence, mirror.shape.coupling, instrument.modes)).encode())
     kind = "kl"

@@ -41,6 +41,7 @@ class PushPull:
     def commands(self, frame: NDArray[np.int64]) -> Array32:
         """Return the commands ``(n_frames, n_modes)``, metres, of frames counted from the first."""
         shape, turn = np.divmod(frame, frames_per_shape(self.n_average))
+        # turn 0, 1, 2, 3, 4 gives + - - + +.
         signs = np.where((turn + 1) // 2 % 2 == 0, 1.0, -1.0)
         signs[turn >= 2 * self.n_average] = 0.0
         return (self.shapes_m[shape] * signs[:, None]).astype(np.float32)
@@ -109,6 +110,7 @@ def system_shapes(
     are orthogonal to one another, so none is mistaken for a mixture of the others.
     """
     rows = reconstructor[list(modes)].astype(np.float64)
+    # Of the small Gram matrix: its eigenvectors are the left singular vectors of the rows.
     _, vectors = scipy.linalg.eigh(rows @ rows.T)
     shapes = np.zeros((len(modes), n_modes), dtype=np.float32)
     shapes[:, list(modes)] = amplitude_m * vectors.T
@@ -169,6 +171,7 @@ class Regression:
             self._powers[np.ix_(moved, moved)], self._products[moved].astype(np.float64), rcond=None
         )
         every = np.zeros_like(self._products)
+        # Back from micrometres.
         every[moved] = columns * 1e6
         return np.ascontiguousarray(every[self._modes].T)
 
@@ -191,7 +194,9 @@ class Demodulation:
     def take(self, frame: NDArray[np.int64], slopes: Array32, commands_m: Array32) -> None:
         """Take consecutive frames."""
         phase = 2 * np.pi * self._tones.cycles_per_frame * frame[:, None]
+        # Hann: the leakage of one tone at another falls with the cube of their distance.
         window = np.sin(np.pi * (frame + 0.5) / self._tones.n_frames)[:, None] ** 2
+        # Real and imaginary part of exp(-i phase), kept apart because the sums are real products.
         waves = (np.hstack([np.cos(phase), -np.sin(phase)]) * window).astype(np.float32)
         self._slopes += waves.T @ slopes
         self._commands_um += waves.T @ (commands_m[:, self._tones.modes] * np.float32(1e6))

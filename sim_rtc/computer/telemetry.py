@@ -142,6 +142,7 @@ class Pace:
         if self._batch_s > 0.0:
             left_s = self._start_s + self._batches * self._batch_s - time.perf_counter()
             if left_s > 0.0:
+                # Not sleep(), so that a signal ends the wait.
                 stopped.wait(left_s)
 
     def forgive(self, seconds: float) -> None:

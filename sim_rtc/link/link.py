@@ -82,6 +82,7 @@ class Link(Background):
         with self._ready:
             if len(self._backlog) * len(batch.slopes) * self._clock.dt_ns >= _BACKLOG_S * 1e9:
                 self._dropped += len(self._backlog.popleft()[0].slopes)
+            # Now, in the loop's thread: a fault may step the clock before the batch is sent.
             t0_ns = self._clock.end_of_exposure_ns(batch.seq0)
             self._backlog.append((batch, t0_ns, self._plan.now_s))
             self._ready.notify()
@@ -154,6 +155,7 @@ class Link(Background):
     def _next(self) -> tuple[Batch, int, float] | None:
         with self._ready:
             if not self._backlog:
+                # Shorter than the period of the status, which is sent without frames, too.
                 self._ready.wait(STATUS_PERIOD_S / 2)
             return self._backlog.popleft() if self._backlog else None
 

@@ -150,6 +150,7 @@ class Replay:
         while self._refused and self._status is not None:
             matrix_id, sha256 = self._refused.popleft()
             refused = Acknowledgement(
+                # The service accepts acknowledgements of the session that it follows only.
                 session=self._status.session,
                 id=matrix_id,
                 sha256=sha256,

@@ -86,16 +86,20 @@ class ExtrudedScreen:
         capacity = 8 * self._n_kept
         self._rows = np.zeros((capacity, n_columns))
         self._newest = capacity - self._n_kept
+        # The rows begin at zero: after some outer scales nothing is left of that.
         self.extrude(int(_BURN_IN_OUTER_SCALES * turbulence.outer_scale_m / pitch_m))
 
     def extrude(self, n_rows: int = 1) -> None:
         """Add rows upwind, one after the other; the oldest are forgotten."""
         fresh = self._rng.standard_normal((n_rows, self._n_columns)) @ self._noise.T
         for row in fresh:
+            # The strip is filled from its end to its beginning. At the beginning the newest rows
+            # are copied back.
             if self._newest == 0:
                 keep = self._rows[: self._n_kept].copy()
                 self._newest = len(self._rows) - self._n_kept
                 self._rows[self._newest :] = keep
+            # A view: the stencil is one gather from flat memory.
             flat = self._rows.reshape(-1)[self._newest * self._n_columns :]
             row += self._weights @ flat[self._offset]
             self._newest -= 1
@@ -235,6 +239,7 @@ class FrozenLayer:
             turbulence=turbulence,
             rng=rng,
         )
+        # The fraction is of Cn², and so of the variance.
         self._amplitude = np.sqrt(layer.fraction)
         # Oldest first: the row at n_rows - 1 + k is the newest one that step first_step + k sees.
         newest_first = self._screen.window(self._n_rows - 1)
@@ -257,9 +262,12 @@ class FrozenLayer:
             return
         passed = min(first_step - self._first_step, self._n_steps)
         self._first_step += passed
+        # Responses that were not requested since the last time belong to optics that are no longer
+        # used.
         self._answers = {one: self._answers[one][passed:] for one in self._asked}
         self._asked.clear()
         together = _BLOCKS_TOGETHER * self._block_steps
+        # Rounded up to whole blocks, for which the Fourier transforms are made.
         n_new = -(-n_missing // together) * together
         self._rows = np.concatenate([self._rows[passed:], *self._extrude_rows(n_new)])
 
@@ -293,6 +301,8 @@ class FrozenLayer:
             outputs = slice(start, start + _OUTPUTS_TOGETHER)
             part = matrix[outputs]
             cells = self._reading.T @ np.ascontiguousarray(part.T)
+            # The mean of the window is taken out of the phase; here it is taken out of the filter
+            # instead.
             cells -= part.sum(axis=1) / np.float32(len(cells))
             filters = cells.reshape(self._n_rows, self._n_rows, -1)
             spectra[:, :, outputs] = scipy.fft.rfft(filters, self._length, axis=0)
@@ -302,6 +312,8 @@ class FrozenLayer:
         """Return the windows over the pupil at these steps, ``(n_steps, n_rows²)``, mean 0."""
         newest = step - self._first_step + self._n_rows - 1
         windows = self._rows[newest[:, None] - np.arange(self._n_rows)].reshape(len(step), -1)
+        # No sensor sees piston, which is larger than the rest: without it float32 keeps more
+        # digits.
         windows -= windows.mean(axis=1, keepdims=True)
         return np.asarray(windows)
 
@@ -318,6 +330,7 @@ class FrozenLayer:
         padded[: len(rows)] = rows
         blocks = sliding_window_view(padded, self._length, axis=0)[:: self._block_steps]
         parts = np.ascontiguousarray(scipy.fft.rfft(blocks, axis=2).transpose(2, 0, 1))
+        # The first n_rows - 1 outputs of a circular convolution wrap around (overlap-save).
         answers = scipy.fft.irfft(parts @ spectra, self._length, axis=0)[self._n_rows - 1 :]
         return np.asarray(answers.transpose(1, 0, 2).reshape(-1, spectra.shape[2])[:n_steps])
 

@@ -91,6 +91,8 @@ class Detector:
             lights, n_pixels = pixels.reshape(-1) * self.electrons_per_frame, 1
         if sensor.normalised:
             variance = camera.excess_noise * lights + n_pixels * camera.read_noise_electrons**2
+            # The slopes are normalised by the mean light of all valid subapertures (global
+            # normalisation).
             sigma = np.sqrt(variance) / own.mean()
         else:
             of_photons, of_pixels = sensor.noise_terms(instrument)
@@ -152,6 +154,7 @@ class PixelDetector:
         few = expected < _MANY
         faint = bool(few.any())
         if faint:
+            # Their photons are drawn below; only the read noise is added as a normal number.
             variance[few] = 0.0
         variance += np.float32(self._camera.read_noise_electrons**2)
         read = rng.standard_normal(expected.shape, dtype=np.float32)
@@ -234,6 +237,7 @@ def _arrivals(expected: Array32, excess: float, rng: np.random.Generator) -> Arr
     A sum of n exponential gains has a gamma distribution; its shape is chosen so that the
     variance of the result is ``excess`` times that of the photons.
     """
+    # Rounding in the propagation can make dark pixels slightly negative.
     photons = rng.poisson(np.maximum(expected, 0.0))
     if excess == 1.0:
         return photons.astype(np.float32)

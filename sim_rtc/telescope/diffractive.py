@@ -122,6 +122,7 @@ class DiffractiveOptics(Optics):
         at_rest = np.flatnonzero(command_m == 0.0)
         n_first = int(at_rest[0]) if len(at_rest) else len(command_m)
         others = n_first + np.flatnonzero(command_m[n_first:])
+        # With so many the indexed sum is slower than the whole product.
         if len(others) > _FEW_MODES:
             return np.asarray(command_m @ modes)
         opd_m = command_m[:n_first] @ modes[:n_first]
@@ -146,6 +147,8 @@ class DiffractiveOptics(Optics):
         """
         light = self.light(opd_m)
         if detector is not None:
+            # Divided by the light of all images, dead pixels included: the electrons of a frame are
+            # those of the whole star.
             light = detector.read(light / np.float32(self.light_at_rest), rng)
         slopes = self.sensor.signals(light, self.valid, self.errors.recipe)
         return self.errors.add_errors((slopes - self.slopes_at_rest).astype(np.float32, copy=False))
@@ -355,6 +358,8 @@ class DiffractivePyramid:
         np.matmul(group.left, self._field, out=group.by_row)
         n_pairs, n_y, _ = group.light.shape
         np.matmul(group.by_row.reshape(n_pairs, n_y, -1), group.right, out=group.light)
+        # Complex numbers seen as pairs of reals: the power is the sum of their squares, without a
+        # temporary.
         parts = group.light.view(self._amplitude.dtype)
         power = np.einsum("mij,mij->ij", parts, parts)
         n, nodes = self._wfs.n_subapertures, self._quadrature.n_nodes
@@ -407,6 +412,8 @@ class DiffractivePyramid:
         distance = x[..., None] - self._pupil.coordinates
         near, far = ((distance + sign * half) * self._pupil.sampling for sign in (1.0, -1.0))
         kernel = np.sinc(far) + np.sinc(near) + 1j * (_half_plane(near) - _half_plane(far))
+        # Square root, because the light is the square of the field; Gauss-Legendre weights sum to
+        # 2.
         kernel *= 0.5 * np.sqrt(weights / 2)[:, None]
         # Each of M points has 1/M of the light.
         kernel /= np.sqrt(np.sqrt(self._quadrature.n_modulation))
@@ -415,6 +422,7 @@ class DiffractivePyramid:
     def _tilts(self) -> tuple[Array, Array]:
         """Return modulation phasors ``(M/2, N)`` along y and ``(M/2, 2, N)`` along x."""
         n_modulation = self._quadrature.n_modulation
+        # Half a step off the axes: every point then has a partner with the opposite x.
         angle = 2 * np.pi * (np.arange(n_modulation // 2) + 0.5) / n_modulation
         radius = 2 * np.pi * self._wfs.modulation_lambda_over_d / self._wfs.pupil_diameter
         u = self._pupil.coordinates
@@ -448,6 +456,7 @@ def build_centred_pupil(instrument: Instrument, sampling: int) -> PupilGrid:
 
 def _lit_in_map(own: PupilMap, fine_m: Array) -> NDArray[np.bool_]:
     """Return where a map is lit, by its nearest point; beyond it all is dark."""
+    # A dark border: indices beyond the map are clipped onto it.
     lit, ny, nx = np.pad(own.lit > _HALF, 1), *own.lit.shape
     row, column = (
         np.clip(np.rint(fine_m / own.pitch_m + (n - 1) / 2).astype(int) + 1, 0, n + 1)

@@ -127,6 +127,7 @@ class SlopeErrors:
         bad = rng.choice(pixels.size, size=n_bad, replace=False)
         self.silent: NDArray[np.bool_] = np.zeros(n_valid, dtype=np.bool_)
         """``(n_valid,)`` subapertures whose slopes read 0."""
+        # pixels is (n_pixels, n_valid), so the remainder is the subaperture.
         self.silent[bad % n_valid] = True
         self._dark = pixels.reshape(-1)[bad]
 
@@ -228,6 +229,7 @@ class ShapeErrors:
             return shapes
         at = on_mirror / np.abs(on_mirror).max()
         terms = np.prod(at[:, None, :] ** self._powers, axis=2)
+        # A constant would be a gain of the mode, which is no error of its shape.
         terms -= terms.mean(axis=0)
         errors = shapes * (terms @ self._weights).astype(np.float32)
         scale = self._model_error * self._roughness(shapes) / self._roughness(errors)
@@ -303,4 +305,5 @@ def low_orders(points: Array, weights: Array, order: int) -> Array:
         columns += [x**2 + y**2, *monomials[:2]] if degree == 2 else monomials
     root = np.sqrt(weights)[:, None]
     factor, triangle = np.linalg.qr(np.column_stack(columns) * root)
+    # QR leaves the signs open: with these each shape rises as its polynomial does.
     return np.asarray(factor * np.sign(np.diag(triangle)) / root)

@@ -49,6 +49,7 @@ class SodiumStar:
         sheets = np.linspace(-2.0, 2.0, _SHEETS)
         light = np.exp(-(sheets**2) / 2.0)
         heights = laser.height_m + sheets * laser.thickness_m / _FWHM
+        # Relative to the mean height, on which the sensor is focused.
         parallax = (1.0 / laser.height_m - 1.0 / heights) / lambda_over_d
         from_launcher = subaperture_m * (np.arange(n) - (n - 1) / 2)[:, None] - laser.launcher_m
         aside = from_launcher[:, :, None] * parallax  # (n, 2, n_sheets)
@@ -133,6 +134,7 @@ class DiffractiveLenslets:
         ``opd_m`` is ``(n_points,)``, at the lit points of the pupil. The unit is the light of a
         full lenslet, the wings beyond its pixels counted.
         """
+        # Continued linearly beyond the rim of the pupil, where nodes of partly lit lenslets fall.
         phase = self._wavenumber * self._under(2.0 * opd_m[self._edge] - opd_m[self._inside])
         field = np.empty(phase.shape, np.complex64)
         np.multiply(self._amplitude, np.cos(phase), out=field.real)

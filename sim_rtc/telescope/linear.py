@@ -126,6 +126,7 @@ class LinearPlant(SimulatedPlant):
             responses=((1.0, PhaseResponse(jacobian)),),
             slopes_per_command=np.asfortranarray(matrix * (self._gain * self._passes)),
             opd_per_command=modes * self._passes,
+            # Over the light of all pixels, the dead ones included: their share is lost.
             images=light / float(response.light.sum()),
             stuck_opd_m=stuck_opd_m * self._passes,
         )

@@ -103,6 +103,7 @@ class TensionedPlate:
         diagonal = np.arange(len(held))
         system[diagonal, diagonal] += self.softness
         system[-1, -1] = 0.0
+        # The last equation makes the weights sum to zero: it determines the constant.
         padded = np.vstack([strokes[held], np.zeros((1, strokes.shape[1]))])
         weights = np.zeros((n + 1, strokes.shape[1]))
         weights[np.append(held, n)] = scipy.linalg.lu_solve(scipy.linalg.lu_factor(system), padded)
@@ -147,7 +148,9 @@ class DrawnSurface:
 
 def _tension_kernel(scaled: Array) -> Array:
     """Return ``-(K0(x) + log x + γ - log 2)``, by its series where the terms would cancel."""
+    # log 0 at an actuator itself; the kernel's limit there is 0.
     x = np.maximum(scaled, 1e-12)
+    # K0(x) and log(x / 2) cancel to the second order: their difference has no digits left.
     near = x < 1e-3
     exact = -(scipy.special.k0(x) + np.log(x / 2) + _EULER)
     half = (x / 2) ** 2
@@ -242,8 +245,10 @@ class MirrorDrive:
         self._to_actuators = mode_to_actuator.astype(np.float32)
         self._to_modes = np.linalg.pinv(mode_to_actuator).astype(np.float32)
         self._neighbour_mean = _neighbour_mean(mirror.positions_m, mirror.pitch_m)
+        # A first-order response takes log 9 time constants from 10 to 90 %.
         steps = frame_rate_hz * rise_s / np.log(9.0)
         self._left_at_end = np.float32(np.exp(-1.0 / steps)) if steps > 0.0 else np.float32(0.0)
+        # Mean of exp(-t / τ) over a frame: (τ / T)(1 - exp(-T / τ)).
         self._left_on_average = np.float32(steps * (1.0 - float(self._left_at_end)))
         n_modes = mode_to_actuator.shape[1]
         self._position = np.zeros(n_modes, dtype=np.float32)
@@ -274,6 +279,7 @@ class MirrorDrive:
         clipped = np.clip(strokes, -self._limits.stroke_m, self._limits.stroke_m)
         n_limited += int(np.count_nonzero(clipped != strokes))
         if n_limited:
+            # Fitted back to the modes: the integrator must know what the mirror does.
             command_m[:] = self._to_modes @ clipped
         return n_limited
 
@@ -291,6 +297,8 @@ def _neighbour_mean(positions_m: Array, pitch_m: float) -> scipy.sparse.csr_arra
     for corners in scipy.spatial.Delaunay(positions_m).simplices:
         near[np.ix_(corners, corners)] = True
     distance = np.hypot(*(positions_m[:, None] - positions_m).transpose(2, 0, 1))
+    # Delaunay joins actuators across the central obscuration and along the rim, which are no
+    # neighbours.
     near &= (distance > 0.0) & (distance < 2 * pitch_m)
     share = near / np.maximum(near.sum(axis=1, keepdims=True), 1)
     return scipy.sparse.csr_array(share.astype(np.float32))

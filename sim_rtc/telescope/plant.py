@@ -154,6 +154,8 @@ class SimulatedPlant(Plant):
         """Take the pupil of the instrument file, and detector pixels along a subaperture's side."""
         imperfections = made.get("imperfections") or Imperfections()
         scene = made.get("scene") or Scene()
+        # A stream for each imperfection, so that changing one leaves the others of a seed as they
+        # are.
         uneven_rng, position_rng, pixel_rng, path_rng, *later_rngs = made["rng"].spawn(6)
         self._passes = np.float32(scene.passes)
         width_m = instrument.subaperture_m
@@ -196,6 +198,7 @@ class SimulatedPlant(Plant):
         on_mirror = self._on_mirror(alpha)
         blocks = [
             self._surface.basis(on_mirror[start : start + _RENDER_ROWS]) @ self._weights
+            # In rows, because the basis of all points at once would be larger than the modes.
             for start in range(0, len(on_mirror), _RENDER_ROWS)
         ]
         shapes = np.concatenate([block.astype(np.float32) for block in blocks])
@@ -243,4 +246,5 @@ def light_unevenly(pupil: PupilGrid, unevenness: float, rng: np.random.Generator
     departure -= departure[pupil.lit] @ pupil.weights
     departure *= unevenness / np.abs(departure[pupil.lit]).max()
     flux = np.maximum(1.0 + np.where(pupil.lit, departure, 0.0), 0.0)
+    # The map is of the flux; the field goes with its square root.
     return replace(pupil, amplitude=pupil.amplitude * np.sqrt(flux))

@@ -181,6 +181,7 @@ def random_registration(rng: np.random.Generator, nominal_rad: float = 0.0) -> M
 
     The rotation is that far from the nominal one.
     """
+    # The square root makes the shifts uniform over the disc.
     radius = _LARGEST_SHIFT_SUBAP * np.sqrt(rng.uniform())
     angle = rng.uniform(0.0, 2 * np.pi)
     return Misregistration.from_vector(
@@ -268,6 +269,7 @@ class MovingOptics:
         self._seen_s = time_s
         if not self._demands.empty():
             there_s, vector = self._demands.get()
+            # A demand moves everything that follows, jumps and drifts included.
             start = self._schedule.start.add_step(vector)
             self._schedule = replace(self._schedule, start=start)
             self._next = self._executor.submit(self._compute, there_s, None)
@@ -276,9 +278,12 @@ class MovingOptics:
         segment = self._segment
         if segment is None:
             return self.start()
+        # Nothing drifts: the same object, so that the loop keeps its products of it.
         if segment.first is segment.last:
             return segment.first
+        # If the next segment is late, the registration stays at the end of this one.
         share = min(1.0, (time_s - segment.start_s) / (segment.stop_s - segment.start_s))
+        # In steps, because each new optics costs the loop its prepared products.
         step = round(share * _STEPS_PER_SEGMENT)
         if self._current is None or self._current[0] != step:
             blend = segment.first.towards(segment.last, step / _STEPS_PER_SEGMENT)
@@ -288,6 +293,8 @@ class MovingOptics:
     def _adopt(self, segment: _Segment) -> None:
         self._segment, self._current, self._next = segment, None, None
         if segment.stop_s < float("inf"):
+            # Without a jump the end of one segment is the beginning of the next and is not computed
+            # twice.
             last = None if self._jumps_at(segment.stop_s) else segment.last
             self._next = self._executor.submit(self._compute, segment.stop_s, last)
 

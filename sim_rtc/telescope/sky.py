@@ -99,6 +99,7 @@ class _Between:
 
         ``strength`` ``(n_frames,)`` is the factor of the phases.
         """
+        # One step ahead: the cubic interpolation needs a step before the first frame.
         position = time_s * layer.steps_per_second + 1.0
         step = position.astype(np.intp)
         layer.reach(int(step[0]) - 1, int(step[-1]) + 2)
@@ -128,6 +129,7 @@ class _Between:
 
 
 def _total(parts: list[Array32]) -> Array32:
+    # In place: the parts are new arrays, and large ones.
     total = parts[0]
     for part in parts[1:]:
         total += part
@@ -280,6 +282,8 @@ class _Shaken:
         gain2 = (1.0 + a2) / ((1.0 - a2) * ((1.0 + a2) ** 2 - a1**2))
         self._noise = line.rms_m / np.sqrt(gain2)
         correlation = -a1 / (1.0 + a2)
+        # The first two values are drawn from the stationary distribution, so that the line does not
+        # have to build up.
         before = line.rms_m * rng.standard_normal()
         last = (
             correlation * before

@@ -123,6 +123,7 @@ def _refine_centres(instrument: Instrument, flux_frame: Array, pixels: int) -> A
 
     centres = found_centres(flux_frame, instrument.wfs.pupil_diameter * pixels)
     n = instrument.wfs.n_subapertures
+    # The centre of an even number of pixels is between two of them.
     between = (n * pixels / 2 - 0.5) % 1.0
     whole = np.round(centres - between) + between
     try:

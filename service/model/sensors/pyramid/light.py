@@ -163,6 +163,7 @@ def find_pupil(counts: NDArray[Any], instrument: Instrument) -> PupilPosition | 
             f"unexplained, expected at most {_MAX_RESIDUAL:.0%}; check the mask, the pupil "
             "diameter and the obscuration"
         )
+    # The four images are four independent measurements of one position.
     scatter = steps.std(axis=0, ddof=1) / np.sqrt(len(steps))
     sigma = np.sqrt(scatter**2 + (formal**2).mean(axis=0) / len(steps) + _FLOOR_SUBAP**2)
     if not np.all(sigma < _LARGEST_SIGMA_SUBAP):
@@ -279,11 +280,13 @@ def repair_pixels(counts: NDArray[Any], instrument: Instrument) -> tuple[Array, 
     images = np.where(np.isfinite(counts), counts, np.nan).astype(np.float64)
     if np.isnan(images).all():
         return np.zeros_like(images), np.ones(images.shape, dtype=np.bool_)
+    # Clipped, so that a hot pixel does not set the scale of its image.
     level = np.nanmean(np.clip(images, 0.0, np.nanpercentile(images, 95.0)), axis=(1, 2))
     level = np.where(level > 0.0, level, 1.0)
     scaled = images / level[:, None, None]
     middle = np.nanmedian(scaled, axis=0)
     difference = scaled - middle
+    # 1.4826 makes a median absolute deviation the σ of a normal distribution.
     spread = 1.4826 * np.nanmedian(np.abs(difference))
     lit = np.nanpercentile(middle, 75.0)
     bad = ~(np.abs(difference) <= _BAD_SIGMA * spread + _BAD_SHARE * np.maximum(middle, lit))
@@ -297,6 +300,7 @@ def _settle_position(
     """Return position, the four images' own departures and their formal σ, and the residual."""
     for _ in range(10):
         steps, formal, residual = _departures(images, optics, position)
+        # Limited: the edge is linear over less than a subaperture.
         step = np.clip(steps.mean(axis=0), -_LARGEST_STEP_SUBAP, _LARGEST_STEP_SUBAP)
         position = position + step
         if np.abs(step).max() < 1e-3:
@@ -311,6 +315,7 @@ def _first_guess(images: Array, optics: PyramidOptics) -> Array:
 
     def left(x: float, y: float) -> float:
         even = compute_even_images(optics, (x, y)).sum(axis=0).reshape(-1, 1)
+        # Ones for the background, which is no light of the pupil.
         columns = np.hstack([surface * even, np.ones_like(even)])
         return float(np.linalg.norm(total - columns @ np.linalg.lstsq(columns, total)[0]))
 

@@ -173,6 +173,7 @@ class PyramidOptics:
             begin, end = end, end + int(valid[row].sum())
             n_signals = len(gradient) * (end - begin)
             gradient[:, begin:end] = lines[:n_signals].reshape(len(gradient), -1, n_out)
+            # Copied, because a view would keep the whole row in memory.
             light.append(lines[n_signals:].copy())
         return LightGradient(
             images=images,
@@ -363,6 +364,8 @@ class PyramidOptics:
                 for radius, weight, n in zip(halo.radii, halo.weights, halo.n_points, strict=True)
             ]
         radii = np.concatenate([np.full(n // 2, radius) for radius, _, n in rings])
+        # Half of a circle and half a step off the axes: every point then has a partner with the
+        # opposite x.
         angles = np.concatenate([2 * np.pi * (np.arange(n // 2) + 0.5) / n for _, _, n in rings])
         weights = np.concatenate([np.full(n // 2, weight / n) for _, weight, n in rings])
         return radii, angles, weights
@@ -409,6 +412,7 @@ class PyramidOptics:
 
     def _images(self, fields: Array, roof_y: _Roof, roof_x: _Roof) -> NDArray[np.float64]:
         parts = fields.view(self.dtype).reshape(*fields.shape[:3], -1)
+        # In double precision, because a halo has hundreds of source points to sum over.
         power = np.square(parts).sum(axis=2, dtype=np.float64)
         power = power.reshape(*fields.shape[:2], *fields.shape[3:], 2)
         images = np.einsum("ijyaxpbc,a,b->yixj", power, roof_y.weights, roof_x.weights)

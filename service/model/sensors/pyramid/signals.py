@@ -214,6 +214,7 @@ class PyramidResponse:
 
     def _per_metre(self, jacobian: Array) -> Array:
         wavelength_m = self.sensor.optics.wfs.wavelength_m
+        # Gradients are per radian of phase until here; in place, because they may take gigabytes.
         jacobian *= np.asarray(2 * np.pi / wavelength_m, dtype=jacobian.dtype)
         return jacobian
 
@@ -297,6 +298,7 @@ def differentiate_signals(
         rows = slice(start, start + _ROWS)
         own = response.flux_gradient
         if own.ndim > 1:
+            # With local normalisation all planes of a subaperture share its flux.
             own = own[np.arange(len(slopes))[rows] % len(own)]
         moved = slopes[rows, None].astype(own.dtype) * own
         np.subtract(response.gradient[rows], moved, out=jacobian[rows])

@@ -49,6 +49,7 @@ def blur_of(laser: LaserStar, places_m: Array, lambda_over_d: float) -> Array:
     """Return the star's covariance ``(..., 2, 2)`` [x, y], in (λ/d)², as lenslets there see it."""
     along = elongation_rad(laser, places_m) / (FWHM * lambda_over_d)
     across = math.radians(laser.spot_arcsec / 3600.0) / (FWHM * lambda_over_d)
+    # A line blurred by a round spot: covariances of a convolution add.
     return along[..., :, None] * along[..., None, :] + across**2 * np.eye(2)
 
 
@@ -103,6 +104,7 @@ class ElongatedSpots(Spots):
         y, x = f[:, None], f
         xx, xy, yy = (self.blur[:, i, j, None, None] for i, j in ((0, 0), (0, 1), (1, 1)))
         square = xx * x**2 + 2.0 * xy * x * y + yy * y**2
+        # Fourier transform of a Gaussian of this covariance.
         return np.asarray(np.exp(-2.0 * np.pi**2 * square))
 
     @cached_property

@@ -84,6 +84,7 @@ class ShackHartmannSensor:
         drawn = instrument_pupil(self.instrument, self.pupil.sampling)
         if drawn.amplitude.shape != self.pupil.amplitude.shape:
             return self.pupil
+        # A multiple of the pupil's sampling, so that both grids have the same cells.
         times = -(-_LIGHT_SAMPLING // self.pupil.sampling)
         fine = instrument_pupil(self.instrument, times * self.pupil.sampling)
         root = np.divide(
@@ -108,6 +109,8 @@ class ShackHartmannSensor:
         _, nearest = scipy.spatial.cKDTree(inside).query(beyond, n)
         y, x = np.moveaxis(inside[nearest] - beyond[:, None], 2, 0)
         shapes = np.stack([np.ones(x.shape), x, y, x**2, x * y, y**2], axis=2)
+        # The constant of the parabola is its height at the point itself, from which distances are
+        # counted.
         height = np.linalg.pinv(shapes)[:, 0]
         rows = np.concatenate([np.flatnonzero(lit), np.repeat(np.flatnonzero(near), n)])
         columns = np.concatenate([np.arange(len(inside)), nearest.reshape(-1)])
@@ -246,7 +249,9 @@ class ShackHartmannResponse:
         (on_x, rate_x), (on_y, rate_y) = ((axis.weights, axis.rate) for axis in self._read)
         rates = []
         for change, of_y, of_x in ((moved[0], on_y, rate_x), (moved[1], rate_y, on_x)):
+            # Twice, because the light is the square of the amplitude.
             dimmer = 2.0 * spots.light(amplitude, change)[:, None, None] / light
+            # Below the limit the divisor is constant and does not change with the shift.
             dimmer[spots.light(amplitude, amplitude) < light[:, 0, 0]] = 0.0
             parts = zip(
                 pulls,
@@ -301,6 +306,7 @@ class ShackHartmannResponse:
         sensor = self.sensor
         y, x = np.nonzero(sensor.valid)
         rows, columns, inside = self._window(y, x)
+        # Points outside the grid have weight 0, whatever index they get.
         places = np.where(inside, rows * sensor.side + columns, 0)
         values = np.concatenate([np.where(inside, plane, 0.0) for plane in planes])
         values *= 2 * np.pi / sensor.instrument.wfs.wavelength_m

@@ -22,11 +22,16 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pyrcal_studies.campaign.kept_night import KeptNight
-from pyrcal_studies.campaign.other_night import CALIBRATED, LATENCIES, Plan
-from pyrcal_studies.campaign.other_truth import OtherDome, OtherLink, Truth
+from pyrcal_studies.campaign.observatory import SETTINGS, SMALL, KeptNight
+from pyrcal_studies.campaign.other_modes import (
+    CALIBRATED,
+    LATENCIES,
+    OtherDome,
+    OtherLink,
+    Plan,
+    Truth,
+)
 from pyrcal_studies.campaign.rows import Row, RowFile, heading, line, range_of
-from pyrcal_studies.campaign.small import SETTINGS, SMALL
 from service.config import load_settings
 from service.control.loop import pole_radius
 from service.instrument import load_instrument

@@ -47,12 +47,15 @@ REAL_TIME = ("tests/system/test_demo.py", "tests/system/test_sim_rtc.py")
 """The full instrument at 1 kHz: one after the other, on one worker."""
 
 LASTING = (
-    "tests/system/test_faults.py",
-    "tests/system/test_page.py",
+    "tests/system/test_page.py",  # one service for all its tests: they stay on one worker
+    "tests/system/test_manual.py",
+    "tests/system/test_commission.py",
     "tests/system/test_replay.py",
     "tests/system/test_worker.py",
+    "tests/system/test_faults.py",
+    "tests/system/test_harm.py",
 )
-"""Of the long tests those that take longest: begun late they would have three workers wait."""
+"""Long tests of a minute and more, longest first: started late, they would leave workers idle."""
 
 SHARED = (
     "tests/system/test_broken_messages.py",
@@ -142,7 +145,9 @@ def _only_long(config):
 def _place_among_long(nodeid):
     """What waits first; what computes fills the gaps in the end."""
     folder, is_other = _place(nodeid)
-    return not nodeid.startswith(REAL_TIME + LASTING), -folder, is_other
+    first = (*REAL_TIME, *LASTING)
+    place = next((k for k, name in enumerate(first) if nodeid.startswith(name)), len(first))
+    return place, -folder, is_other
 
 
 def _place(nodeid):

@@ -8,39 +8,23 @@ import pytest
 from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.operation_records import MeasureState, NoisyFinding
+from service.tracking.operation_records import MeasureState
 from service.tracking.operations.noisy_measurement import DITHER_END_TIMEOUT_S
 from service.tracking.products import ModeSet
 from service.wire import DitherKind, DitherRequest, DitherStop
 from tests.unit.tracking.situations import (
-    ALPHA,
     POLICY,
-    PRECISE,
-    START_NS,
     Story,
     dither_answered,
     of_kind,
     rtc,
 )
+from tests.unit.tracking.world import FOUND
 
 ASK = cmd.MeasureNoisy(
     id="noisy-1", modes=ModeSet.CONTROLLED, total_amplitude_m=5e-9, duration_s=30.0
 )
 STILL = replace(POLICY, dither_enabled=False)
-FINDING = NoisyFinding(
-    n_slopes=1384,
-    n_frames=29_994,
-    n_missing=0,
-    snr=1.4,
-    alpha=ALPHA,
-    covariance=PRECISE,
-    optical_gain=0.6,
-    misfit=1.0,
-    cm_id="initial",
-    session="s1",
-    created_ns_utc=START_NS,
-    sha256="0" * 64,
-)
 
 
 @pytest.fixture
@@ -124,7 +108,7 @@ def test_the_end_of_the_dither_is_the_beginning_of_the_fit(story):
 def finished(story):
     begun(story)
     status(story, dither_id=None, seq=1100 + 31_000)
-    record = replace(story.state.noisy_measurement, state=MeasureState.STORED, finding=FINDING)
+    record = replace(story.state.noisy_measurement, state=MeasureState.STORED, finding=FOUND)
     story.tell(ev.MatrixMeasured(record=record))
     return story
 
@@ -173,7 +157,7 @@ def test_one_given_up_ends_its_dither_and_stays_given_up(story):
     effects = story.tell(cmd.GiveUp(id="noisy-1"))
     assert of_kind(effects, DitherStop)
     assert story.state.dithers.dither is None
-    record = replace(story.state.noisy[-1], state=MeasureState.STORED, finding=FINDING)
+    record = replace(story.state.noisy[-1], state=MeasureState.STORED, finding=FOUND)
     story.tell(ev.MatrixMeasured(record=record))
     assert state_of(story) is MeasureState.GIVEN_UP
 

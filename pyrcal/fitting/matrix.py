@@ -49,7 +49,13 @@ from pyrcal.fitting.pupil_checks import FitSubset, fit_smooth_gain, try_pupils
 from pyrcal.fitting.pupil_width import SeenPupil, compute_responses, measure_pupil
 from pyrcal.fitting.reference import check_reference
 from pyrcal.fitting.remarks import collect_remarks
-from pyrcal.fitting.solver import Nuisances, Solution, image_patterns, nuisances_of
+from pyrcal.fitting.solver import (
+    STRETCHES,
+    Nuisances,
+    Solution,
+    image_patterns,
+    nuisances_of,
+)
 from pyrcal.fitting.uncertainty import (
     LOCAL_MAGNIFICATION_FLOOR,
     MAGNIFICATION_FLOOR,
@@ -527,6 +533,7 @@ def _make_fit(
         noise_share=_noise_share(residual_fraction, structured),
         mode_sets=mode_partitions(target, n_planes, by_actuator=is_by_actuator(models.instrument)),
         pupil_sets=pupil_partitions(target.valid, n_planes, target.rows),
+        stretches=STRETCHES if nuisances.anamorphosis else None,
     )
     optics = list_optics(as_in_file, settled, before)
     stroke_known = _stroke_known(models.instrument)

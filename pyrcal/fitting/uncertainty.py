@@ -191,6 +191,7 @@ def uncertainty(
     noise_share: float,
     mode_sets: Mapping[str, NDArray[np.intp]],
     pupil_sets: Mapping[str, NDArray[np.intp]],
+    stretches: slice | None = None,
 ) -> Uncertainty:
     """Return the uncertainty of the first four unknowns of a projection at its solution.
 
@@ -225,6 +226,8 @@ def uncertainty(
     mode_sets, pupil_sets
         Partitions into disjoint sets: the set of each mode ``(n_modes,)``, of each slope
         ``(n_rows,)``.
+    stretches
+        Places of the anamorphosis among the nuisances; None if it is not fitted.
     """
     n_modes = len(projection.gains)
     n_sets = min(MAX_SETS, n_modes // MIN_PER_SET)
@@ -237,10 +240,14 @@ def uncertainty(
     from_modes = _at_least(every[:4, :4], (spread * noise)[:4, :4])
     by_region = _sandwich(spread, _regional_scores(projection, regions))
     # noise also scatters between regions, but the statistical part already includes it
-    white = np.diag(spread)[:4] * noise * noise_share
-    regional = np.diag(np.maximum(np.diag(by_region)[:4] - white, 0.0))
+    white = np.diag(spread) * noise * noise_share
+    regional = np.sqrt(np.maximum(np.diag(by_region) - white, 0.0))
     few = (1.0 + FEW_MODES_EXCESS * np.exp(-n_modes / FEW_MODES)) ** FEW_MODES_POWER
-    share = few * REGIONAL_SHARE * np.sqrt(np.diag(regional))
+    share = few * REGIONAL_SHARE * regional[:4]
+    model_error = np.sqrt(np.diag(by_region))[4:]
+    if stretches is not None:
+        # an anamorphosis is a magnification along one axis and its inverse along the other
+        model_error[stretches] = few[3] * REGIONAL_SHARE[3] * regional[4:][stretches]
     kind_share = min(1.0, residual_fraction / STRANGE_RESIDUAL)
     far = kind_share * FAR_SHARE * shift_subap
     floor = np.array([FLOOR_SUBAP, FLOOR_SUBAP, FLOOR_SUBAP / radius_subap, magnification_floor])
@@ -272,7 +279,7 @@ def uncertainty(
         statistical=statistical,
         sets=sets,
         distortion=distortion,
-        nuisance_sigma=np.sqrt(np.diag(every + by_region + spread * noise))[4:],
+        nuisance_sigma=np.sqrt(np.diag(every + spread * noise)[4:] + model_error**2),
         subset_steps=steps,
         subset_covariance=covariances + from_model,
     )

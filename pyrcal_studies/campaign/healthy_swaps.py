@@ -25,10 +25,11 @@ import argparse
 import itertools
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy
@@ -634,16 +635,18 @@ class SimulatedNight:
 
 
 def simulated_rows(
-    plant: str, kind: str, n: int, seed: int, rate_hz: float | None = None, *, hard: bool = False
+    plant: str, kind: str, n: int, seed: int, *, fixed: Mapping[str, Any], hard: bool = False
 ) -> Iterator[dict[str, object]]:
     """Yield what comes of swaps on the simulator's telescope, a few in each night.
 
-    ``hard``: the seeing doubles in every night, with few swaps, so that a lost loop ends it soon.
+    ``fixed`` are conditions that are not drawn. ``hard``: the seeing doubles in every night, with
+    few swaps, so that a lost loop ends it soon.
     """
     done = night_number = 0
     while done < n:
         usual_hz = RATES_HZ[night_number % len(RATES_HZ)]
-        trial = replace(drawn(plant, kind, seed + night_number), rate_hz=rate_hz or usual_hz)
+        trial = replace(drawn(plant, kind, seed + night_number), rate_hz=usual_hz)
+        trial = replace(trial, **fixed)
         if hard:
             trial = replace(trial, seeing_trend=1)
         if plant == "diffractive" and kind != "healthy":
@@ -672,16 +675,13 @@ def _calm(trial: Trial, night_number: int) -> Trial:
 
 
 def rows_of(
-    plant: str, kind: str, n: int, seed: int, rate_hz: float | None, *, hard: bool
+    plant: str, kind: str, n: int, seed: int, *, fixed: Mapping[str, Any], hard: bool
 ) -> Iterator[dict[str, object]]:
-    """Yield a row for each swap; ``rate_hz`` None: the rates in turns or at random."""
+    """Yield a row for each swap; ``fixed`` are conditions that are not drawn."""
     if plant != "outside":
-        return simulated_rows(plant, kind, n, seed, rate_hz, hard=hard)
+        return simulated_rows(plant, kind, n, seed, fixed=fixed, hard=hard)
     trials = (drawn(plant, kind, seed + k) for k in range(n))
-    return (
-        outside_trial(trial if rate_hz is None else replace(trial, rate_hz=rate_hz))
-        for trial in trials
-    )
+    return (outside_trial(replace(trial, **fixed)) for trial in trials)
 
 
 def main() -> int:
@@ -693,14 +693,17 @@ def main() -> int:
     parser.add_argument("--diverging", type=int, default=0, metavar="N")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--rate", type=float, metavar="HZ", help="all swaps at this frame rate")
+    parser.add_argument("--seeing", type=float, metavar="ARCSEC", help="all nights begin with it")
     parser.add_argument("--hard", action="store_true", help="the seeing doubles in each night")
     parser.add_argument("--output", type=Path, default=Path("var/healthy_swaps.jsonl"))
     given = parser.parse_args()
     file, begun = RowFile(given.output), time.process_time()
+    asked = {"rate_hz": given.rate, "seeing_arcsec": given.seeing}
+    fixed = {key: value for key, value in asked.items() if value is not None}
     with threadpool_limits(1):
         for kind in ("healthy", "worse", "diverging"):
             n = getattr(given, kind)
-            for row in rows_of(given.plant, kind, n, given.seed, given.rate, hard=given.hard):
+            for row in rows_of(given.plant, kind, n, given.seed, fixed=fixed, hard=given.hard):
                 file.add(row)
     sys.stdout.write(f"{time.process_time() - begun:.0f} s of processor time\n")
     return 0

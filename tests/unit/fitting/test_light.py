@@ -6,7 +6,9 @@ import h5py
 import numpy as np
 import pytest
 
+from pyrcal.fitting.fit_file import fit_file
 from pyrcal.fitting.light import read_light
+from pyrcal.fitting.matrix import FitOptions
 from service.errors import MatrixError
 from service.instrument import load_instrument
 from service.model.misregistration import Misregistration
@@ -76,6 +78,15 @@ def test_the_light_alone_puts_the_pupil_within_a_tenth_of_a_subaperture(path, in
     assert abs(found.position.at[0] - ALPHA["shift_x_subap"]) < 0.1
     assert abs(found.position.at[1] - ALPHA["shift_y_subap"]) < 0.1
     assert "x = -0." in found.note
+
+
+def test_a_model_lit_as_measured_leaves_less_over(path, instrument):
+    matrix = HERE / "tiny.h5"
+    even = fit_file(instrument, matrix, FitOptions()).fit
+    lit = FitOptions(illumination=read_light(path, instrument).illumination)
+    found = fit_file(instrument, matrix, lit).fit
+    assert found.residual_fraction < 0.75 * even.residual_fraction
+    assert abs(found.alpha.shift_x_subap - ALPHA["shift_x_subap"]) < 0.005
 
 
 def test_the_axes_of_a_flux_map_must_be_known(path):

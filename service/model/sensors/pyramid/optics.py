@@ -23,6 +23,7 @@ from service.model.kinds import Normalisation, SignalKind
 from service.model.local import LocalShapes, Shapes
 from service.model.pupil import PupilGrid, gauss_legendre
 from service.model.sensors.pyramid.description import Pyramid
+from service.model.sensors.pyramid.few import FewShapes
 from service.model.sensors.pyramid.tiles import TiledResponse
 from service.model.sensors.pyramid.working_point import Halo
 from service.model.sensors.sensor import Mapper, RowsElsewhere, RowTask
@@ -153,13 +154,16 @@ class PyramidOptics:
         With ``shapes`` it is the response to them, and the gradient exists for one row of
         subapertures at a time.
         """
+        nodes = nodes_y or Nodes.area(self.n_nodes), nodes_x or Nodes.area(self.n_nodes)
+        if isinstance(shapes, np.ndarray) and self.are_few(shapes.shape[1]):
+            return self._respond_to_few(shapes, valid, shift, nodes, mapper)
         of_row = RowResponse(
             optics=self,
             valid=valid,
             shift=shift,
             shapes=shapes,
-            nodes_y=nodes_y or Nodes.area(self.n_nodes),
-            nodes_x=nodes_x or Nodes.area(self.n_nodes),
+            nodes_y=nodes[0],
+            nodes_x=nodes[1],
         )
         images = of_row.shared.images  # once, before several threads ask
         n_out = int(self.pupil.lit.sum()) if shapes is None else shapes.shape[1]
@@ -177,12 +181,63 @@ class PyramidOptics:
             recipe=self.recipe,
         )
 
+    def _respond_to_few(
+        self,
+        shapes: Array,
+        valid: NDArray[np.bool_],
+        shift: tuple[float, float],
+        nodes: tuple[Nodes, Nodes],
+        mapper: Mapper,
+    ) -> LightGradient:
+        """Return the response to so few shapes that a gradient at every point would cost more.
+
+        ``nodes`` are those along y and x.
+        """
+        n, n_u, n_shapes = self.wfs.n_subapertures, len(self.pupil.coordinates), shapes.shape[1]
+        on_grid = np.zeros((n_u, n_u, n_shapes), self.dtype)
+        on_grid[self.pupil.lit] = shapes * self._scale[self.pupil.lit][:, None]
+        images = np.empty((2, n, 2, n))
+        changes = np.empty((2, 2, n, n, n_shapes), self.dtype)
+        # image by image, arrays of all subapertures stay in the cache
+        for grid in _SINGLE_IMAGES if self.offsets is None else self._grids:
+            roof_y = self._roof(shift[1] + grid.y, nodes[0], grid.sides_y)
+            roof_x = self._roof(shift[0] + grid.x, nodes[1], grid.sides_x)
+            modulated_y, modulated_x = self._modulate_roof(roof_y, roof_x)
+            few = FewShapes(
+                amplitude=self.pupil.amplitude.astype(self.dtype),
+                shapes=on_grid.reshape(n_u, -1),
+                modulated_y=modulated_y[:, :, 0],
+                modulated_x=modulated_x.reshape(n, len(modulated_y), -1, n_u),
+                weights_y=roof_y.weights,
+                weights_x=np.tile(roof_x.weights, 2),
+            )
+            light, change = few.respond(mapper)
+            place = grid.sides_y.start, grid.sides_x.start
+            images[place[0], :, place[1]] = light / self._all_light
+            changes[place] = change
+        lines = changes[:, :, valid].reshape(4, -1, n_shapes)
+        whole = _Grid(sides_y=slice(0, 2), sides_x=slice(0, 2))
+        planes: Array = self._plane_signs(whole).reshape(-1, 4).astype(self.dtype)
+        signals = (planes @ lines.reshape(4, -1)).reshape(-1, *lines.shape[1:])
+        n_planes = self.recipe.kind.n_planes
+        match self.recipe.normalisation:
+            case Normalisation.GLOBAL:
+                flux = lines.sum(axis=(0, 1)) / lines.shape[1]
+            case Normalisation.LOCAL:
+                flux = signals[n_planes]
+        return LightGradient(
+            images=images,
+            gradient=signals[:n_planes].reshape(-1, n_shapes),
+            flux_gradient=flux,
+            recipe=self.recipe,
+        )
+
     def prepare(self, of_row: RowResponse) -> PreparedRows:
         """Return what all rows of subapertures share."""
         images = np.empty((2, self.wfs.n_subapertures, 2, self.wfs.n_subapertures))
         parts: list[PreparedGrid] = []
-        # signals that differ in many places of the sum are cheaper image by image
-        apart = self._is_few(of_row.shapes) or self.recipe.kind is SignalKind.INTENSITY
+        # pixels that differ in many places of the sum are cheaper image by image
+        apart = self.recipe.kind is SignalKind.INTENSITY
         for grid in _SINGLE_IMAGES if apart and self.offsets is None else self._grids:
             roof_y = self._roof(of_row.shift[1] + grid.y, of_row.nodes_y, grid.sides_y)
             roof_x = self._roof(of_row.shift[0] + grid.x, of_row.nodes_x, grid.sides_x)
@@ -357,8 +412,15 @@ class PyramidOptics:
         power = np.square(parts).sum(axis=2, dtype=np.float64)
         power = power.reshape(*fields.shape[:2], *fields.shape[3:], 2)
         images = np.einsum("ijyaxpbc,a,b->yixj", power, roof_y.weights, roof_x.weights)
-        # what the halo loses beyond the grid still falls on the detector, only without signal
-        return np.asarray(images / (2.0 * self._source()[2].sum()))
+        return np.asarray(images / self._all_light)
+
+    @property
+    def _all_light(self) -> float:
+        """Light of all source points.
+
+        What the halo loses beyond the grid still falls on the detector, only without signal.
+        """
+        return float(2.0 * self._source()[2].sum())
 
     def _plane_signs(self, grid: _Grid) -> Array:
         """Return the sign of each image in every plane of signals ``(n_planes, n_sides, n_sides)``.
@@ -431,40 +493,14 @@ class PyramidOptics:
             return TiledResponse(shapes, self._scale, self.arrays)
         there = self.arrays.there
         lit, scale = there(np.flatnonzero(self.pupil.lit)), there(self._scale[self.pupil.lit])
-        if shapes is not None and self._is_few(shapes):
-            return partial(self._fold_few, weighted=self._weight_shapes(shapes))
         known = None if shapes is None else there(shapes)
         return partial(self._fold, lit=lit, scale=scale, shapes=known)
 
-    def _is_few(self, shapes: Shapes | None) -> bool:
-        return isinstance(shapes, np.ndarray) and self.are_few(shapes.shape[1])
-
     def are_few(self, n_shapes: int) -> bool:
-        """Return whether so few shapes cost less than the gradient at every point of a row."""
+        """Return True if so few shapes cost less than the gradient at every point of a row."""
         n_lines = self.recipe.kind.n_planes * self.wfs.n_subapertures
         n_points = len(self.pupil.coordinates)
         return n_shapes * (n_points + n_lines) < n_points * n_lines
-
-    def _weight_shapes(self, shapes: Array) -> Foreign:
-        """Return shapes ``(n_lit, n_shapes)`` times the amplitude on the grid ``(N, N n_shapes)``.
-
-        0 at points that are not lit.
-        """
-        on_grid = np.zeros((*self.pupil.lit.shape, shapes.shape[1]), self.dtype)
-        on_grid[self.pupil.lit] = shapes * self._scale[self.pupil.lit][:, None]
-        return self.arrays.there(on_grid.reshape(len(on_grid), -1))
-
-    def _fold_few(self, along_y: Foreign, along_x: list[Foreign], *, weighted: Foreign) -> Foreign:
-        """Return the response of every line ``(n_lines, n_shapes)`` without its gradient.
-
-        The sums over y, then over x and the terms: products of matrices both.
-        """
-        xp = self.arrays.xp
-        over_y = xp.matmul(along_y.T, weighted)
-        n_terms, n_u = along_x[0].shape[1:]
-        over_y = xp.reshape(over_y, (n_terms * n_u, -1))
-        flat = [xp.reshape(part, (part.shape[0], -1)) for part in along_x]
-        return xp.concat([xp.matmul(part, over_y) for part in flat], axis=0)
 
     @property
     def _scale(self) -> Array:

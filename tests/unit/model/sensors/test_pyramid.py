@@ -37,6 +37,9 @@ from tests.unit.estimation.lamps import (
     with_diameter,
 )
 
+N_MANY = 30
+"""Shapes of a sensor of 20 subapertures for which the gradient at every point is computed."""
+
 
 def optics(*, modulation: float = 3.0, **arguments) -> PyramidOptics:
     instrument = small_instrument()
@@ -292,11 +295,30 @@ def test_the_memory_of_a_response_is_known_beforehand(normalisation, keeps):
     assert sensor.keeps_gradient is keeps
     tracemalloc.start()
     try:
-        sensor.at((0.0, 0.0)).apply(np.ones((len(pupil.points), 1), np.float32))
+        sensor.at((0.0, 0.0)).apply(np.ones((len(pupil.points), N_MANY), np.float32))
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert sensor.work(0).memory_bytes == pytest.approx(peak, rel=0.2)
+    assert not sensor.optics.are_few(N_MANY)
+    assert sensor.work(N_MANY).memory_bytes == pytest.approx(peak, rel=0.2)
+
+
+@pytest.mark.parametrize("offsets", [None, np.arange(8.0).reshape(2, 2, 2) / 50.0])
+@pytest.mark.parametrize("normalisation", Normalisation)
+@pytest.mark.parametrize("order", [SlopeOrder.XY, SlopeOrder.IMAGES])
+def test_a_few_shapes_have_the_same_response_as_by_the_gradient(order, normalisation, offsets):
+    """In double precision; with displaced images, and images that move."""
+    sensor, pupil = sensor_of(instrument_with(order, normalisation), 3, np.float64)
+    optics = replace(sensor.optics, offsets=offsets)
+    shapes = np.random.default_rng(1).standard_normal((len(pupil.points), 3))
+    assert optics.are_few(3)
+    for edges in ({}, {"nodes_x": Nodes.edges()}, {"nodes_y": Nodes.edges()}):
+        whole = optics.response(sensor.valid, SHIFT, **edges).to(shapes, np.matmul)
+        few = optics.response(sensor.valid, SHIFT, shapes=shapes, **edges)
+        for name in ("images", "gradient", "flux_gradient"):
+            expected = getattr(whole, name)
+            found, size = getattr(few, name), np.abs(expected).max()
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * size)
 
 
 def test_work_grows_with_shapes_by_one_product():

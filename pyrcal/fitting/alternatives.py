@@ -31,9 +31,6 @@ from service.model.sensors.registry import kind_of
 
 Array = NDArray[np.float64]
 
-OFFSET_STEP_SUBAP = 0.05
-"""Step of the pupil offset for the finite difference that approximates its derivative."""
-
 NOTABLE_OFFSET_SUBAP = 0.05
 """Smallest pupil offset that is reported: the border of a pupil on a grid is not known better."""
 
@@ -306,14 +303,9 @@ def is_open(lead: Lead) -> bool:
 def _try_off_centre(few: FitSubset) -> Iterator[Alternative]:
     """Yield the alternative with the pupil image off the centre of the subapertures."""
     about, alpha = few.models.instrument, few.here
-    here = np.array(about.pupil_shift_subap or (0.0, 0.0))
-    if about.stop is Stop.MIRROR:
-        # with the mirror as stop, the pupil is displaced together with the mirror
-        here = alpha.vector[:2]
-    rates = []
-    for step in np.eye(2) * OFFSET_STEP_SUBAP:
-        displaced = replace(about, stop=Stop.TELESCOPE, pupil_shift_subap=tuple(here + step))
-        rates.append((few.matrix(few.of(displaced)) - few.own) / OFFSET_STEP_SUBAP)
+    if few.has_free_pupil:
+        return  # the fit itself displaced the pupil
+    rates = few.pupil_rates
     if not all(few.tells(few.own, rate) for rate in rates):
         return
     (x, y), lead, moved = _fit_with_rates(few, *rates)

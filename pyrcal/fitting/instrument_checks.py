@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.fitting.disjoint_sets import SIGNIFICANT
-from pyrcal.fitting.methods import Settled
+from pyrcal.fitting.methods import SEARCH_RESIDUAL, Settled
 from pyrcal.fitting.models import FAR_PREFERRED_SHARE, FitModels, InstrumentChange, Optic
 from pyrcal.fitting.pupil_checks import FitSubset, Lead, TriedPupil
 from pyrcal.fitting.solver import refine
@@ -228,10 +228,30 @@ def list_optics(models: FitModels, settled: Settled, sure: Uncertainty) -> tuple
 
 
 def fit_file_values(models: FitModels, settled: Settled) -> FileValuesFit:
-    """Return the fit with coupling and modulation fixed to those of the file's ``models``."""
+    """Return the fit with coupling and modulation fixed to those of the file's ``models``.
+
+    Both are compared on the coarse grid, unless so little is left over that its own error counts.
+    """
     nothing = replace(settled.nuisances, optics=())
-    there = refine(models, settled.target, settled.solution.alpha, nothing)
+    if np.any(nothing.displaced):
+        models = models.with_displaced_images(nothing.displaced)
+    found, coarse = settled.solution, settled.share > SEARCH_RESIDUAL
+    if coarse:
+        found = refine(
+            settled.models,
+            settled.target,
+            found.alpha,
+            settled.nuisances,
+            near=found,
+            decides=settled.models.cheap,
+        )
+    there = refine(
+        models,
+        settled.target,
+        found.alpha,
+        nothing,
+        decides=models.cheap if coarse else models.fine,
+    )
     return FileValuesFit(
-        share=settled.solution.projection.chi / there.projection.chi,
-        moved=there.vector - settled.solution.vector,
+        share=found.projection.chi / there.projection.chi, moved=there.vector - found.vector
     )

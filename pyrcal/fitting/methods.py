@@ -244,7 +244,7 @@ def settle(
     )
     if settled.share < SEARCH_RESIDUAL:
         # so little is left over that the cheap grid's own error would displace pupil images
-        solution = refine(models, seen, solution.alpha, nuisances, near=solution.near)
+        solution = refine(models, seen, solution.alpha, nuisances, near=solution)
         settled = replace(settled, solution=solution, on_fine_grid=True)
     settled = _with_nearest_instrument(settled)
     models, nuisances = settled.models, settled.nuisances
@@ -259,9 +259,9 @@ def settle(
         if models is settled.models and np.array_equal(there.rows, settled.target.rows):
             if settled.on_fine_grid:
                 break
-            approaching, near = False, settled.solution.near
+            approaching, near = False, settled.solution
         decides = models.cheap if approaching else models.fine
-        start, images = settled.solution.alpha, _images_of(taken, start, nuisances)
+        start, images = settled.solution.alpha, reuse_image_derivatives(taken, start, nuisances)
         solution = refine(
             models, there, start, nuisances, near=near, of_images=images, decides=decides
         )
@@ -279,14 +279,16 @@ def settle(
     return replace(settled, solution=solution, on_fine_grid=True)
 
 
-def _images_of(settled: Settled, alpha: Misregistration, nuisances: Nuisances) -> Array | None:
+def reuse_image_derivatives(
+    settled: Settled, alpha: Misregistration, nuisances: Nuisances
+) -> Array | None:
     """Return the derivatives by image displacements of an earlier fit, if they still hold.
 
     They take as long as all others together. None if α, the images or the sensor differ too much.
     """
     before = settled.nuisances
     sensors = [dict(one.optics).get(Optic.SENSOR, 0.0) for one in (before, nuisances)]
-    apart = np.abs(alpha.vector - settled.solution.alpha.vector)
+    apart = np.abs(alpha.vector - settled.solution.near_alpha.vector)
     if (
         abs(sensors[1] - sensors[0]) > SAME_SENSOR
         or np.any(apart > SAME_MINIMUM)
@@ -343,7 +345,7 @@ def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
         matrix = changed.model(COARSE_SAMPLING, once=True).interaction_matrix(solution.alpha)
         return few.project(matrix, every).chi_at_best
 
-    found = _scan_outwards(left)
+    found = _scan_outwards(left, first=1 if step > 0.0 else -1)
     best = int(np.argmin(found))
     change = SENSOR_CHANGES[best]
     nothing = float(np.log(NO_SENSOR_NUMBER / models.sensor_number))
@@ -360,15 +362,18 @@ def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
     return moved, replace(nuisances, optics=tuple(optics))
 
 
-def _scan_outwards(left: Callable[[float], float]) -> Array:
+def _scan_outwards(left: Callable[[float], float], first: int) -> Array:
     """Return χ² at ``SENSOR_CHANGES``, outwards from no change until it grows; infinite beyond.
 
-    The widest modulations take longest, so they are not computed without need.
+    ``first`` is the side to begin with, 1 or -1. The other one is not computed if χ² fell on this
+    side, and neither are the widest modulations, which take longest.
     """
     found = np.full(len(SENSOR_CHANGES), np.inf)
     middle = len(SENSOR_CHANGES) // 2
     found[middle] = left(0.0)
-    for side in (-1, 1):
+    for side in (first, -first):
+        if found.min() < found[middle]:
+            break
         k = middle + side
         while 0 <= k < len(found):
             found[k] = left(SENSOR_CHANGES[k])

@@ -21,11 +21,19 @@ from pyrcal.fitting.uncertainty import pupil_regions
 from service.estimation.solver import Projection
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
+from service.model.kinds import Stop
 
 Array = NDArray[np.float64]
 
 MIN_PUPIL_EXPLAINED = 0.03
 """RMS share of the signal that a pupil must explain; less may be the model's own error."""
+
+OFFSET_STEP_SUBAP = 0.05
+"""Step of the pupil offset for the finite difference that approximates its derivative."""
+
+EXCLUDED_SHARE = 0.98
+"""Share of χ² left by a pupil to first order, above which its own model is not computed: it would
+have to leave 0.95 to be reported."""
 
 _N_STEPS = 2
 """Number of steps towards the value that explains the most."""
@@ -66,34 +74,37 @@ class PupilNumber:
         there = few.matrix(few.of(self.with_value(few.models.instrument, stepped)))
         return np.asarray((there - few.own) / self.step)
 
-    def near(self, few: FitSubset) -> tuple[float, Lead, Array]:
-        """Return the best value, its improvement and the change of α, to first order."""
-        light, rate = self.reported**self.power, self.rate(few)
-        if not few.tells(few.own, rate):
-            return self.reported, Lead(share=1.0, sigma=0.0), np.zeros(4)
-        step = few.step(few.own, rate)
+    def limit(self, light: float) -> float:
+        """Return a power of the value, limited to the plausible range."""
         low, high = (limit**self.power for limit in self.range)
-        value = float(np.clip(light + step[-1], low, high)) ** (1.0 / self.power)
-        return value, few.lead(few.own, rate), step[:4] - few.step(few.own)[:4]
+        return float(np.clip(light, low, high))
 
-    def far(self, few: FitSubset) -> tuple[float, Lead, Array]:
+    def near(self, few: FitSubset, rate: Array) -> tuple[float, Lead, Array]:
+        """Return the best value, its improvement and the change of α, to first order."""
+        if few.tells(few.own, rate):
+            step, light = few.step(few.own, rate), self.reported**self.power
+            value = self.limit(light + step[-1])
+            if value != light:
+                moved = step[:4] - few.step(few.own)[:4]
+                return value ** (1.0 / self.power), few.lead(few.own, rate), moved
+        return self.reported, Lead(share=1.0, sigma=0.0), np.zeros(4)
+
+    def far(self, few: FitSubset, rate: Array) -> tuple[float, Lead, Array]:
         """Return the best value, its improvement and the change of α, with D of that value."""
-        value, matrix = self.found(few)
+        value, matrix = self.found(few, rate)
         return value, few.lead(matrix), few.step(matrix)[:4] - few.step(few.own)[:4]
 
-    def found(self, few: FitSubset) -> tuple[float, Array]:
+    def found(self, few: FitSubset, rate: Array) -> tuple[float, Array]:
         """Return the value that explains the most, and its D ``(n_slopes, n_few)``.
 
         A second step takes its derivative from the first, unless that was too short.
         """
-        light, matrix, rate = self.reported**self.power, few.own, self.rate(few)
-        low, high = (limit**self.power for limit in self.range)
+        light, matrix = self.reported**self.power, few.own
         for _ in range(_N_STEPS):
             if not few.tells(matrix, rate):
                 break
             before, left = light, matrix
-            light += float(few.step(matrix, rate)[-1])
-            light = float(np.clip(light, low, high))
+            light = self.limit(light + float(few.step(matrix, rate)[-1]))
             if light == before:
                 break
             matrix = few.matrix(few.of(self.with_value(few.models.instrument, light)))
@@ -153,6 +164,7 @@ class FitSubset:
         self.modes = spread(settled.target.n_modes)
         self.target = settled.target.column_subset(self.modes)
         self.here = solution.alpha
+        self._images = settled.nuisances.images
         known = np.concatenate([solution.derivatives, solution.nuisance_derivatives])
         self.derivatives = known[:, :, self.modes]
         """Derivatives of the unchanged instrument; they hardly depend on the alternative."""
@@ -168,6 +180,23 @@ class FitSubset:
     def own(self) -> Array:
         """D of the unchanged instrument, ``(n_slopes, n_few)``."""
         return self._at_solution(self.model)
+
+    @property
+    def has_free_pupil(self) -> bool:
+        """True if a displacement of the pupil is among the unknowns, by its images together."""
+        return bool(np.any(self._images.reshape(-1, 2, 4).sum(axis=2)))
+
+    @cached_property
+    def pupil_rates(self) -> Array:
+        """``(2, n_slopes, n_few)`` derivatives of D by the pupil's position, the mirror unmoved."""
+        about = self.models.instrument
+        if about.stop is Stop.MIRROR:  # the pupil is displaced together with the mirror
+            return np.asarray(self.derivatives[:2] - self.model.mirror_shift_derivatives(self.here))
+        place, rates = np.array(about.pupil_shift_subap or (0.0, 0.0)), []
+        for step in np.eye(2) * OFFSET_STEP_SUBAP:
+            displaced = replace(about, pupil_shift_subap=tuple(place + step))
+            rates.append((self.matrix(self.of(displaced)) - self.own) / OFFSET_STEP_SUBAP)
+        return np.array(rates)
 
     def of(self, about: Instrument) -> FitModels:
         """Return the models of another instrument with the same modes."""
@@ -283,12 +312,15 @@ def try_pupils(few: FitSubset) -> tuple[TriedPupil, ...]:
     """Return other pupils, each at the value that explains the most.
 
     They are computed to first order only, if the residual is smaller than a pupil would have to
-    explain.
+    explain, or if the pupil explains next to nothing.
     """
     found = []
     little = few.residual_fraction < MIN_PUPIL_EXPLAINED
     for number in _numbers(few.models.instrument):
-        value, lead, moved = number.near(few) if little else number.far(few)
+        rate = number.rate(few)
+        value, lead, moved = number.near(few, rate)
+        if not little and lead.share < EXCLUDED_SHARE:
+            value, lead, moved = number.far(few, rate)
         explained = few.residual_fraction * np.sqrt(max(1.0 - lead.share, 0.0))
         notable = (
             abs(value - number.reported) >= number.notable and explained >= MIN_PUPIL_EXPLAINED

@@ -306,8 +306,11 @@ class Solution:
     """``(n_slopes, n_modes)`` model matrix at the solution."""
 
     near: Array
-    """``(n_unknowns - n_maps, n_slopes, n_modes)`` derivatives of the model, taken nearby, before
-    the gain map is applied and without the map's own derivatives."""
+    """``(n_unknowns - n_maps, n_slopes, n_modes)`` derivatives of the model at ``near_alpha``,
+    before the gain map is applied and without the map's own derivatives."""
+
+    near_alpha: Misregistration
+    """Registration at which the derivatives were computed."""
 
     derivatives: Array
     """``(4, n_slopes, n_modes)`` derivatives of the model with the gain map applied, taken nearby.
@@ -335,7 +338,7 @@ def refine(
     nuisances: Nuisances,
     max_steps: int = MAX_NEAR_STEPS,
     *,
-    near: Array | None = None,
+    near: Solution | None = None,
     of_images: Array | None = None,
     decides: InteractionModel | None = None,
 ) -> Solution:
@@ -351,7 +354,7 @@ def refine(
     max_steps
         Largest number of steps.
     near
-        Derivatives of a nearby solution, ``Solution.near``; None if they are to be computed.
+        Nearby solution whose derivatives are used; None if they are to be computed.
     of_images
         Derivatives by the image displacements only, of a nearby solution; None to compute them.
     decides
@@ -360,9 +363,13 @@ def refine(
     vector, values = start.vector, nuisances.begin(start)
     decides = models.fine if decides is None else decides
     matrix = models.matrix(decides, start)
-    if near is None:
-        near = _compute_derivatives(models, start, matrix, nuisances, of_images)
-    seen, every = _project_columns(columns, matrix, near, values, nuisances)
+    near_alpha = start if near is None else near.near_alpha
+    rates = (
+        _compute_derivatives(models, start, matrix, nuisances, of_images)
+        if near is None
+        else near.near
+    )
+    seen, every = _project_columns(columns, matrix, rates, values, nuisances)
     regions = nuisances.regions[columns.rows]
     counts = dispersion(seen, regions)
     moving, settled, linear, converged = np.arange(4), SETTLED_STEP, LINEAR_STEP, False
@@ -377,10 +384,10 @@ def refine(
         vector, values = vector + step[:4], values + step[4:]
         if decides is models.cheap and np.all(np.abs(step[moving]) < linear):
             # the error, some percent of the step, is that of a start for the fine grid
-            matrix = matrix + sum(step[k].astype(near.dtype) * near[k] for k in moving)
+            matrix = matrix + sum(step[k].astype(rates.dtype) * rates[k] for k in moving)
         else:
             matrix = models.matrix(decides, nuisances.at(start, vector, values))
-        seen, every = _project_columns(columns, matrix, near, values, nuisances)
+        seen, every = _project_columns(columns, matrix, rates, values, nuisances)
         counts = dispersion(seen, regions)
         next_step = _limit_step(seen, values, nuisances, counts)
         if np.all(np.abs(next_step[moving]) < settled):
@@ -390,7 +397,8 @@ def refine(
         alpha=nuisances.at(start, vector, values),
         nuisances=values,
         matrix=matrix,
-        near=near,
+        near=rates,
+        near_alpha=near_alpha,
         derivatives=every[:4],
         nuisance_derivatives=every[4:],
         projection=seen,

@@ -240,6 +240,12 @@ class InteractionModel:
             _, *rates = self._with_rates(alpha)
         return np.stack([self._as_listed(rate) for rate in rates])
 
+    def mirror_shift_derivatives(self, alpha: Misregistration) -> Array:
+        """Return how D changes with a shift of the mirror, the pupil unmoved, ``(2, ...)``."""
+        moved = [self._move_modes(alpha, way) for way in self._shift_ways(alpha)]
+        rates = self._measure_shapes(alpha, moved)
+        return np.stack([self._as_listed(rate) for rate in rates])
+
     def stretch_derivatives(self, alpha: Misregistration) -> Array:
         """Return how D changes with an anamorphosis of the mirror's image, ``(2, ...)``.
 
@@ -369,11 +375,15 @@ class InteractionModel:
         """
         ways: list[Way] = [_rotation_rate, partial(_scale_rate, magnification=alpha.magnification)]
         if self.instrument.stop is Stop.TELESCOPE:
-            steps = -self.instrument.with_anamorphosis(alpha).on_mirror(np.eye(2))
-            ways[:0] = [partial(_shift_rate, step=step) for step in steps]
+            ways[:0] = self._shift_ways(alpha)
         if len(ways) > _AXES and isinstance(self._render_modes(alpha), np.ndarray):
             return self._along(alpha, ways)
         return [self._move_modes(alpha, way) for way in ways]
+
+    def _shift_ways(self, alpha: Misregistration) -> list[Way]:
+        """Return the ways of the mirror's points with shifts of the mirror along x and along y."""
+        steps = -self.instrument.with_anamorphosis(alpha).on_mirror(np.eye(_AXES))
+        return [partial(_shift_rate, step=step) for step in steps]
 
     def _along(self, alpha: Misregistration, ways: list[Way]) -> list[Shapes]:
         """Return the rates of modes that are arrays along several ways, from their gradient."""

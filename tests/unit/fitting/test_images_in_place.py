@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 
 import pyrcal.fitting.alternatives as alternatives
+from pyrcal.fitting.instrument_checks import fit_file_values
+from pyrcal.fitting.methods import settle_at
+from pyrcal.fitting.models import FitModels
+from pyrcal.fitting.solver import image_patterns, nuisances_of
 from pyrcal_studies.benches import coarse_bench, fit_bench, some_columns
-from tests.unit.estimation.bench import ELSEWHERE, fit, matrix
+from service.estimation.reference import Reference, target_of
+from tests.numerics import small_basis
+from tests.unit.estimation.bench import ELSEWHERE, fit, instrument, matrix
 
 
 def in_place(found):
@@ -30,6 +36,28 @@ def test_images_displaced_beyond_belief_are_tried_in_their_places(monkeypatch):
     # the true images are in their places: nothing is lost and hardly anything moves
     assert one.share == pytest.approx(1.0, abs=0.05)
     assert np.all(np.abs(one.moved) < 0.01)
+
+
+def test_file_values_are_fitted_with_the_images_where_the_fit_displaced_them():
+    """The file's values are the true ones, so that fitted ones explain no more."""
+    models = FitModels(instrument=instrument(), basis=small_basis())
+    patterns = image_patterns(instrument().stop)
+    displaced = 0.4 * patterns[0] - 0.4 * patterns[4]
+    there = models.with_displaced_images(displaced)
+    exact = there.fine.interaction_matrix(ELSEWHERE)
+    noise = 0.01 * exact.std(axis=0) * np.random.default_rng(3).normal(size=exact.shape)
+    target = target_of(Reference(matrix=exact + noise), instrument())
+    nuisances = nuisances_of(
+        target.valid,
+        instrument().slopes.kind,
+        optics=models.optics,
+        images=patterns,
+        image_sigma=0.2,
+    )
+    settled = settle_at(there, target, ELSEWHERE, replace(nuisances, displaced=displaced))
+    found = fit_file_values(models, settled)
+    assert found.share == pytest.approx(1.0, abs=0.05)
+    assert np.all(np.abs(found.moved) < 1e-3)
 
 
 BENCHES = Path(os.environ.get("PYRCAL_BENCH_DATA", "../shared/data"))

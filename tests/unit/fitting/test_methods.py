@@ -8,8 +8,18 @@ import numpy as np
 import pytest
 
 from pyrcal.fitting.matrix import FitOptions
-from pyrcal.fitting.methods import FITTED_HALF_WIDTH, TABLE_1, ScanStep, chi_n, scan
+from pyrcal.fitting.methods import (
+    FITTED_HALF_WIDTH,
+    SAME_MINIMUM,
+    TABLE_1,
+    ScanStep,
+    Settled,
+    chi_n,
+    reuse_image_derivatives,
+    scan,
+)
 from pyrcal.fitting.models import FitModels
+from pyrcal.fitting.solver import image_patterns, nuisances_of, refine
 from service.errors import ModelError
 from service.estimation.reference import Reference, Target, target_of
 from service.model.kinds import Method
@@ -98,3 +108,19 @@ def test_a_matrix_of_unknown_strokes_is_refused():
 def test_every_parameter_of_table_1_is_one_of_the_registration():
     assert {parameter for parameter, _ in TABLE_1} == set(PARAMETERS)
     assert len(ALL_MODES) == target(matrix()).n_modes
+
+
+@pytest.mark.parametrize(("away", "reused"), [(0.5, True), (1.5, False)])
+def test_derivatives_by_image_displacements_hold_near_where_they_were_computed(away, reused):
+    """A fit that moved far has them from its start, so that they do not hold at its result."""
+    seen, kind = target(matrix(ELSEWHERE)), instrument().slopes.kind
+    patterns = image_patterns(instrument().stop)
+    nuisances = nuisances_of(seen.valid, kind, images=patterns, image_sigma=0.2)
+    begin = ELSEWHERE.with_vector(ELSEWHERE.vector + away * SAME_MINIMUM * [1.0, 0.0, 0.0, 0.0])
+    solution = refine(models(), seen, begin, nuisances)
+    assert np.all(np.abs(solution.vector - ELSEWHERE.vector) < SAME_MINIMUM / 10.0)
+    settled = Settled(solution=solution, target=seen, models=models(), nuisances=nuisances)
+    found = reuse_image_derivatives(settled, solution.alpha, nuisances)
+    assert (found is not None) == reused
+    if found is not None:
+        np.testing.assert_array_equal(found, solution.near[-len(patterns) :])

@@ -264,14 +264,18 @@ class _Turned:
         """Turn the smoothest shapes of a model's modes round."""
         lowest = low_order_of(model)
         points = (model.pupil.points - about.vector[:2]) / about.magnification
-        turned = np.concatenate([points @ rotation(angle) for angle in ANGLES_RAD])
+        angles = ANGLES_RAD[:: _SMOOTH_STEP if lowest.is_smooth else 1]
+        turned = np.concatenate([points @ rotation(angle) for angle in angles])
         rendered = by_rows(mapper, lowest.shapes.render, turned, _POINTS_TOGETHER)
-        by_point = rendered.reshape(len(ANGLES_RAD), len(points), -1).swapaxes(0, 1)
+        by_point = rendered.reshape(len(angles), len(points), -1).swapaxes(0, 1)
         # one product for all: each by itself would read the whole sensor again
         seen = model.measure_signals(Misregistration(), by_point.reshape(len(points), -1)).reshape(
-            model.n_slopes, len(ANGLES_RAD), -1
+            model.n_slopes, len(angles), -1
         )
         columns = np.ascontiguousarray(seen.transpose(2, 1, 0), dtype=np.float64)
+        if lowest.is_smooth:
+            spectrum = np.fft.rfft(columns, axis=1, norm="forward")
+            columns = np.fft.irfft(spectrum, n=len(ANGLES_RAD), axis=1, norm="forward")
         return cls(lowest=lowest, columns=columns, valid=model.valid)
 
     @cached_property
@@ -296,6 +300,10 @@ class _Turned:
 
 POLYNOMIAL_DEGREE = 5
 """Degree of the polynomials that represent the lowest orders: 20 without piston."""
+
+_SMOOTH_STEP = 3
+"""Step of the angles at which smooth shapes are computed, and interpolated by their Fourier series
+between them: 20 angles determine angular orders below 10, twice those of such polynomials."""
 
 MIN_REPRESENTED_SHARE = 0.5
 """Least share of a smooth shape's amplitude that the modes must be able to make."""
@@ -325,6 +333,9 @@ class LowOrder:
 
     combinations: Array
     """``(n_modes, n_low)`` of measured columns of unit size."""
+
+    is_smooth: bool
+    """True if they are close to polynomials; False if they are single modes."""
 
     def combine_columns(self, matrix: Array) -> Array:
         """Return the combinations ``(n_slopes, n_low)`` of measured columns, in any order of rows.
@@ -368,10 +379,11 @@ def low_order_of(model: InteractionModel) -> LowOrder:
     _, size, axes = np.linalg.svd(modes @ combined, full_matrices=False)
     kept = size > MIN_REPRESENTED_SHARE
     combined = combined @ (axes[kept].T / size[kept])
-    if combined.shape[1] < MIN_COMBINATIONS:
+    is_smooth = combined.shape[1] >= MIN_COMBINATIONS
+    if not is_smooth:
         combined = np.eye(len(response))[:, :MAX_SINGLE_MODES]
     shapes = model.basis.combine_modes(combined / response[:, None])
-    return LowOrder(shapes=shapes, combinations=combined)
+    return LowOrder(shapes=shapes, combinations=combined, is_smooth=is_smooth)
 
 
 def _smooth(points: Array, root: Array) -> Array:

@@ -66,6 +66,7 @@ from service.estimation.orientation import (
     DOUBTFUL_CORRELATION,
     MIN_CORRELATION,
     MIN_CORRELATION_LEAD,
+    LowOrder,
     Search,
     check_stated_orientation,
     find_orientation,
@@ -207,11 +208,15 @@ def _fit_usable(
     reported = replace(
         instrument.slopes, orientation=options.orientation or instrument.slopes.orientation
     )
-    slopes, pose, axes_doubt = _find_axes(instrument, usable, used, options, mapper)
+    slopes, pose, axes_doubt, lowest = _find_axes(instrument, usable, used, options, mapper)
     instrument = replace(instrument, slopes=slopes)
     target = target_of(usable, instrument)
     models = FitModels(
-        instrument=instrument, basis=used, illumination=options.illumination, mapper=mapper
+        instrument=instrument,
+        basis=used,
+        illumination=options.illumination,
+        mapper=mapper,
+        lowest=lowest,
     )
     report_stage("fit")
     if options.start is not None:
@@ -232,7 +237,7 @@ def _fit_usable(
         report_stage("fit")
         usable = _remove_noise(usable, noisy)
         used = basis.subset(usable.columns)
-        target, models = target_of(usable, instrument), replace(models, basis=used)
+        target, models = target_of(usable, instrument), replace(models, basis=used, lowest=None)
         begin = instrument.with_anamorphosis(found.settled.solution.alpha)
         found = _run_method(models, target, begin, options, report_stage)
     smear = measure_smear(found.settled.solution, found.settled.target)
@@ -390,8 +395,10 @@ EQUAL_CORRELATION = 0.02
 
 def _find_axes(
     instrument: Instrument, usable: Reference, basis: Basis, options: FitOptions, mapper: Mapper
-) -> tuple[SlopeRecipe, Misregistration | None, str]:
+) -> tuple[SlopeRecipe, Misregistration | None, str, LowOrder | None]:
     """Return the slope recipe, the start pose, and the reason if the axes are uncertain.
+
+    The last are the smooth combinations of modes that the search compared.
 
     The search also determines the rotation, so it is skipped only if both orientation and start are
     given. It is made around the start, because a mirror displaced by subapertures has different
@@ -400,7 +407,7 @@ def _find_axes(
     stated = options.orientation or instrument.slopes.orientation
     slopes = replace(instrument.slopes, orientation=stated)
     if stated is not None and options.start is not None:
-        return slopes, None, ""
+        return slopes, None, "", None
     about = options.start or instrument.start
 
     def search_about(place: Misregistration, setting: Orientation | None) -> Search:
@@ -425,10 +432,11 @@ def _find_axes(
     sure = best.correlation >= MIN_CORRELATION
     pose = replace(about, rotation_rad=best.rotation_rad) if sure else None
     if stated is None:
-        return best.slopes, pose, search.refusal
+        return best.slopes, pose, search.refusal, search.lowest
     if best.correlation >= DOUBTFUL_CORRELATION:
-        return best.slopes, pose, ""
-    return best.slopes, pose, check_stated_orientation(best, search_about(about, None).best)
+        return best.slopes, pose, "", search.lowest
+    doubt = check_stated_orientation(best, search_about(about, None).best)
+    return best.slopes, pose, doubt, search.lowest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

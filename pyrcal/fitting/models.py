@@ -106,6 +106,9 @@ class FitModels:
     made: dict[int, InteractionModel] = field(default_factory=dict)
     """Models of one instrument by sampling; models of other modes share their optics."""
 
+    lowest: LowOrder | None = None
+    """Smooth combinations of the modes if they are known; None to compute them."""
+
     def model(
         self, sampling: int, basis: Basis | None = None, *, once: bool = False
     ) -> InteractionModel:
@@ -133,7 +136,7 @@ class FitModels:
     @cached_property
     def low_order(self) -> LowOrder:
         """Smoothest combinations of the modes."""
-        return low_order_of(self._coarse)
+        return self.lowest or low_order_of(self._coarse)
 
     @cached_property
     def far(self) -> InteractionModel:

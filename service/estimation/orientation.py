@@ -118,6 +118,9 @@ class Search:
     ties: tuple[Pose, ...]
     """Others that explain them as well; empty: it is unique."""
 
+    lowest: LowOrder
+    """Smooth combinations of the modes that were compared."""
+
     @property
     def refusal(self) -> str:
         """Why no orientation is clear; empty: one is."""
@@ -167,8 +170,9 @@ def find_orientation(
     """
     stated = instrument.slopes
     settings = [stated] if stated.orientation is not None else list(_settings(stated))
-    poses = poses_of(instrument, reference, basis, settings, mapper=mapper, about=about)
-    return _judge_classes(poses, instrument.mirror.nominal_rotation_rad)
+    turned = _Turned.of(_any_way_round(instrument, basis, mapper), mapper, about)
+    poses = _poses(turned, instrument, reference, settings)
+    return _judge_classes(poses, instrument.mirror.nominal_rotation_rad, turned.lowest)
 
 
 def poses_of(
@@ -182,6 +186,12 @@ def poses_of(
 ) -> list[Pose]:
     """Return how well each of these orders and orientations explains the lowest orders."""
     turned = _Turned.of(_any_way_round(instrument, basis, mapper), mapper, about)
+    return _poses(turned, instrument, reference, settings)
+
+
+def _poses(
+    turned: _Turned, instrument: Instrument, reference: Reference, settings: Sequence[SlopeRecipe]
+) -> list[Pose]:
     low = replace(
         reference,
         matrix=turned.lowest.combine_columns(reference.matrix),
@@ -230,7 +240,7 @@ def settings_of(reported: SlopeRecipe, orders: Iterable[SlopeOrder]) -> Iterator
         yield replace(reported, order=listed, orientation=axes)
 
 
-def _judge_classes(poses: list[Pose], nominal_rad: float | None) -> Search:
+def _judge_classes(poses: list[Pose], nominal_rad: float | None, lowest: LowOrder) -> Search:
     best = max(pose.correlation for pose in poses)
     near = [pose for pose in poses if pose.correlation > best - MIN_CORRELATION_LEAD]
     leader = max(near, key=lambda pose: pose.correlation)
@@ -245,7 +255,7 @@ def _judge_classes(poses: list[Pose], nominal_rad: float | None) -> Search:
         classes.setdefault(pose.turned_class, []).append(pose)
     chosen = min(classes.pop(leader.turned_class), key=preference)
     ties = tuple(min(others, key=preference) for others in classes.values())
-    return Search(best=chosen, ties=ties)
+    return Search(best=chosen, ties=ties, lowest=lowest)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -27,6 +27,9 @@ MIN_STAR_ARCSEC = 0.01
 """Smallest distance of a guide star that is not on the axis; a smaller one is in radians: 0.01 rad
 are 2000 arcseconds."""
 
+StarHeight = Annotated[float, Field(gt=0.0, le=1e7)]
+"""Height of a laser star, metres. They are below 1e6; a larger one is at infinity, or in mm."""
+
 
 class PlaceTable(Table):
     """Keys common to sensors and mirrors: a name, an instrument file, a nominal position."""
@@ -53,7 +56,7 @@ class SensorTable(PlaceTable):
     star_arcsec: tuple[float, float] = (0.0, 0.0)
     """Direction of its guide star, x and y in the pupil's axes."""
 
-    star_height_m: Positive | Literal["infinity"] = "infinity"
+    star_height_m: StarHeight | Literal["infinity"] = "infinity"
     """Height of a laser star, along the line of sight."""
 
     shift_subap: tuple[float, float] = (0.0, 0.0)

@@ -156,6 +156,7 @@ def test_a_mirror_is_turned_as_its_own_file_says_unless_this_one_does(tmp_path):
         ("altitude_m", "altitude", "mirrors.1.altitude: unknown key, did you mean altitude_m?"),
         ('name = "lgs2"', 'name = "lgs1"', "name: found 'lgs1' 2 times, expected each name once"),
         ("star_height_m = 90e3", 'star_height_m = "sodium"', "sensors.0.star_height_m"),
+        ("star_height_m = 90e3", "star_height_m = 1e308", "sensors.0.star_height_m"),
         ('[system]\nname = "small"\ninstrument = "ground.toml"', '[system]\nname = "small"',
          "sensors.0.instrument: missing, and system.instrument is, too"),
         ('name = "ngs"', 'name = "ngs"\ninstrument = "flao-lbt"',

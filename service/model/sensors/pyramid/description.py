@@ -40,8 +40,8 @@ deg with a radius of 6 subapertures."""
 
 LOCATED_SIGMA_PX = 0.005
 """1 σ of a shift by the places of images that were located on frames, in detector pixels: each is
-found to 0.0065 pixel, and errors of shifts are 0.0027 RMS with images 0.1 pixel off the grid (40
-draws) and 0.0042 with 0.3 pixel (12 draws, 0.0095 at most)."""
+found to 0.0065 pixel, and errors of shifts are 0.0025 RMS with images 0.1 pixel off the grid (40
+draws) and 0.0039 with 0.3 pixel (16 draws, 0.0095 at most)."""
 
 SHIFT_ERROR_RATIO = 0.25
 """Error of a shift that takes no account of displaced images, over their RMS displacement along an

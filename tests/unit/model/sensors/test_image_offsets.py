@@ -16,6 +16,8 @@ from service.model.misregistration import Misregistration
 from service.model.sensors.pyramid.description import (
     EDGE_SHIFT,
     EDGE_TURN,
+    LOCATED_SIGMA_PX,
+    FrameWindows,
     displace_pyramid,
     image_offsets,
     orient_offsets,
@@ -125,6 +127,11 @@ def test_turned_edges_widen_shift_and_rotation_by_the_square_of_the_displacement
     shift = EDGE_SHIFT * 0.025 / separation
     turn = EDGE_TURN * shift / (about.wfs.pupil_diameter / 2.0)
     np.testing.assert_allclose(found, [shift, shift, turn, 0.0])
+    framed = replace(about, frames=FrameWindows(pixels_per_subaperture=2))
+    located = kind.turned_edge_sigma(framed, sheared)
+    shift = EDGE_SHIFT * 0.025 / separation
+    assert located[:2] == pytest.approx(np.hypot(shift, LOCATED_SIGMA_PX / 2))
+    np.testing.assert_allclose(located[2:], [turn, 0.0])
     stated = replace(about, wfs=displace_pyramid(about, sheared.T.ravel()))
     np.testing.assert_allclose(kind.turned_edge_sigma(stated, np.zeros((4, 2))), found)
     np.testing.assert_allclose(kind.turned_edge_sigma(stated, sheared), 4.0 * found)

@@ -30,6 +30,9 @@ are 2000 arcseconds."""
 StarHeight = Annotated[float, Field(gt=0.0, le=1e7)]
 """Height of a laser star, metres. They are below 1e6; a larger one is at infinity, or in mm."""
 
+ShiftSubap = Annotated[float, Field(ge=-1e3, le=1e3)]
+"""Shift of the pupil on a sensor, subapertures; sensors have fewer than 1000 across."""
+
 
 class PlaceTable(Table):
     """Keys common to sensors and mirrors: a name, an instrument file, a nominal position."""
@@ -59,7 +62,7 @@ class SensorTable(PlaceTable):
     star_height_m: StarHeight | Literal["infinity"] = "infinity"
     """Height of a laser star, along the line of sight."""
 
-    shift_subap: tuple[float, float] = (0.0, 0.0)
+    shift_subap: tuple[ShiftSubap, ShiftSubap] = (0.0, 0.0)
     """Nominal position of the pupil's centre on the sensor's grid."""
 
 

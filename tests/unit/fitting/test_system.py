@@ -157,6 +157,7 @@ def test_a_mirror_is_turned_as_its_own_file_says_unless_this_one_does(tmp_path):
         ('name = "lgs2"', 'name = "lgs1"', "name: found 'lgs1' 2 times, expected each name once"),
         ("star_height_m = 90e3", 'star_height_m = "sodium"', "sensors.0.star_height_m"),
         ("star_height_m = 90e3", "star_height_m = 1e308", "sensors.0.star_height_m"),
+        ("star_height_m = 90e3", "shift_subap = [1e308, 0.0]", "sensors.0.shift_subap"),
         ('[system]\nname = "small"\ninstrument = "ground.toml"', '[system]\nname = "small"',
          "sensors.0.instrument: missing, and system.instrument is, too"),
         ('name = "ngs"', 'name = "ngs"\ninstrument = "flao-lbt"',

@@ -90,6 +90,7 @@ class Rows:
         self._dither_m[np.arange(max(first, last - self._kept + 1), last + 1) % self._kept] = values
 
     def _put(self, kept: Array32, counters: NDArray[np.int64], first: int, values: Array32) -> None:
+        # More frames than places would write several into one place.
         values = values[-self._kept :]
         frames = np.arange(len(values)) + first
         kept[frames % self._kept], counters[frames % self._kept] = values, frames
@@ -121,6 +122,7 @@ class Rows:
 
     def _complete(self, frames: NDArray[Any]) -> NDArray[np.bool_]:
         whole: NDArray[np.bool_] = self._of_slopes[frames % self._kept] == frames
+        # A whole number of frames needs no older answer, which may not exist.
         for answered in (frames - self._delay, frames - self._delay - 1)[: 1 + bool(self._older)]:
             whole &= self._of_commands[answered % self._kept] == answered
         return whole

@@ -158,6 +158,7 @@ def _draw(coming: Iterator[Event], latest: Latest) -> None:
     from rich.console import Console
     from rich.live import Live
 
+    # A thread, because the age on the screen must grow while the stream is silent.
     listener = threading.Thread(target=lambda: any(False for _ in coming), daemon=True)
     listener.start()
     with Live(console=Console(), screen=True, auto_refresh=False) as live:

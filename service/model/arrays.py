@@ -70,6 +70,7 @@ def arrays_of(library: ArrayLibrary | str) -> Arrays:
             )
     found = Arrays(f"{_COMPAT}.{name}")
     try:
+        # Tried now: a library can be imported and still lack a driver for its device.
         found.there(np.zeros(1, np.float32))
     except Exception as error:
         raise ModelError(

@@ -42,6 +42,7 @@ def von_karman_covariance(separation_m: Array, turbulence: KarhunenLoeve) -> Arr
     x = 2 * np.pi * np.asarray(separation_m, dtype=np.float64) / turbulence.outer_scale_m
     at_zero = scale * shape * scipy.special.gamma(5 / 6) / 2
     safe = np.maximum(x, 1e-12)
+    # K_5/6 is infinite at 0, though the product has a limit there.
     phase = np.where(
         x > 1e-9,
         scale * shape / 2 ** (5 / 6) * safe ** (5 / 6) * scipy.special.kv(5 / 6, safe),
@@ -102,6 +103,7 @@ def local_statistics(instrument: Instrument, functions: LocalShapes) -> tuple[Ar
     covariance -= np.outer(mean, on_piston)
     covariance -= np.outer(on_piston, mean)
     covariance += piston.sum() * np.outer(mean, mean)
+    # Rounding leaves it slightly unsymmetric.
     return pupil_gram(heights, weights), (covariance + covariance.T) / 2
 
 
@@ -121,6 +123,7 @@ class Spread:
     def __init__(self, instrument: Instrument, pupil: PupilGrid) -> None:
         n = len(pupil.coordinates)
         self._lit = pupil.lit
+        # Twice the pupil, so that what a circular convolution wraps around stays off the pupil.
         self._size = scipy.fft.next_fast_len(2 * n, real=True)
         lag = np.minimum(np.arange(self._size), self._size - np.arange(self._size))
         separation = np.hypot(lag[:, None], lag) / pupil.sampling * instrument.subaperture_m

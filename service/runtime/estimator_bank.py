@@ -209,7 +209,8 @@ def process_block(bank: EstimatorBank, block: FrameBlock) -> Fed:
             member = member.begun_anew(frames.loop, why)
         if (closed or not member.only_closed) and not frames.marks & member.unless:
             member = member.update(frames)
-        # Later members of the registry see the mark in this very block and leave it out.
+        # Later members of the registry see the mark with this very block, and skip it if they
+        # declare so.
         if member.marks:
             frames = _mark_block(frames, member.marks)
             changes |= Change.STANDSTILL if Mark.STANDS in member.marks else estimator.NOTHING

@@ -241,7 +241,7 @@ class FitQueue:
             raise errors.StorageError(
                 f"fit: the upload cannot be kept: {error.strerror}"
             ) from error
-        # A client that hangs up cancels this task: its place in the queue must be freed as well.
+        # Whatever ends the upload, a cancelled task included, must free its place in the queue.
         except BaseException:
             await self._forget(job.id)
             raise

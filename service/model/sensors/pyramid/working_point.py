@@ -91,6 +91,8 @@ def working_point(
     shape = (coherence - far) * scipy.special.j0(circle * distance) * distance
     tilt = np.linspace(0.0, np.pi * sampling, _N_SAMPLES)
     halo = scipy.special.j0(np.outer(tilt, distance)) @ (shape * radius * node_weights)
+    # Times the tilt, because a ring's circumference grows with it; not below 0, where the truncated
+    # integral oscillates.
     return _rings(tilt, np.maximum(halo * tilt, 0.0), far)
 
 

@@ -135,6 +135,7 @@ class Spots:
         """
         _, weights = self.nodes
         seen = self._transform_amplitude(inner).conj()
+        # The transform contains the quadrature weights, and so does ``lit``: count them once.
         back = self._transform / weights
         lit = -2.0 * outer * np.outer(weights, weights)
         along_x, along_y = (

@@ -220,7 +220,8 @@ class BasicComputer:
             session=self._session,
             identity=self.identity,
             n_slopes=self.n_slopes,
-            n_controlled=tuple({len(self._reconstructor.matrix), self._n_next}),
+            # A dict keeps the order, so that a refusal names the present number first.
+            n_controlled=tuple(dict.fromkeys((len(self._reconstructor.matrix), self._n_next))),
         )
 
     def stage(self, reconstructor: Reconstructor) -> None:
@@ -289,9 +290,10 @@ class BasicComputer:
             self.leak = request.leak
         self._n_next = request.n_controlled or self._n_next
         if request.loop is Loop.OPEN and self.closed:
-            # Zeroing the integrator begins a new session by the contract, and a dither belongs to
-            # one session.
+            # Zeroing the integrator begins a new session by the contract. A dither and a
+            # matrix that waits to be swapped in belong to the session that ends.
             self._session, self._dither, self.closed = new_session(), None, False
+            self._staged = None
         elif request.loop is Loop.CLOSED:
             self.closed = True
         return ""

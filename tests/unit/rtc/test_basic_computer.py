@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from pyrcal import rtc
-from service.wire import DitherKind
+from pyrcal.rtc.identity import Reconstructor
+from service.wire import DitherKind, Loop, LoopRequest
 
 N_MODES, N_SLOPES = 6, 10
 
@@ -44,3 +45,18 @@ def test_a_dither_is_played_from_its_first_frame_whatever_the_batch(n_frames):
     assert not mode[: reply.start_seq].any()
     # a sine of a quarter of the frame rate: zero in its first frame, full in the second
     assert mode[reply.start_seq + 1] == pytest.approx(10e-9 * np.sqrt(2.0))
+
+
+def test_a_matrix_that_waits_when_the_loop_opens_is_void():
+    """R-27: it belongs to the session that ends."""
+    loop = computer()
+    staged = Reconstructor.own(
+        "staged", np.ones((4, N_SLOPES), np.float32), loop.identity, created_ns=1
+    )
+    loop.stage(staged)
+    assert loop.execute(LoopRequest(id="o", loop=Loop.OPEN)).accepted
+    loop.begin_batch(10)
+    assert not loop.take_swaps()
+    loop.stage(staged)
+    loop.begin_batch(10)
+    assert [name for name, _ in loop.take_swaps()] == ["staged"]

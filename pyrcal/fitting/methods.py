@@ -345,7 +345,7 @@ def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
         matrix = changed.model(COARSE_SAMPLING, once=True).interaction_matrix(solution.alpha)
         return few.project(matrix, every).chi_at_best
 
-    found = _scan_outwards(left, first=1 if step > 0.0 else -1)
+    found = _scan_outwards(left)
     best = int(np.argmin(found))
     change = SENSOR_CHANGES[best]
     nothing = float(np.log(NO_SENSOR_NUMBER / models.sensor_number))
@@ -362,18 +362,16 @@ def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
     return moved, replace(nuisances, optics=tuple(optics))
 
 
-def _scan_outwards(left: Callable[[float], float], first: int) -> Array:
+def _scan_outwards(left: Callable[[float], float]) -> Array:
     """Return χ² at ``SENSOR_CHANGES``, outwards from no change until it grows; infinite beyond.
 
-    ``first`` is the side to begin with, 1 or -1. The other one is not computed if χ² fell on this
-    side, and neither are the widest modulations, which take longest.
+    The widest modulations take longest, so they are not computed without need.
     """
     found = np.full(len(SENSOR_CHANGES), np.inf)
     middle = len(SENSOR_CHANGES) // 2
     found[middle] = left(0.0)
-    for side in (first, -first):
-        if found.min() < found[middle]:
-            break
+    # Both sides: four low modes have a minimum on either, and the first one found may be the wrong.
+    for side in (-1, 1):
         k = middle + side
         while 0 <= k < len(found):
             found[k] = left(SENSOR_CHANGES[k])

@@ -214,6 +214,8 @@ def joint_of(registration: Registration) -> Joint:
     if known is not None:
         mean = np.concatenate([joint.mean, registration.alpha.stretches])
         every = [[joint.covariance, known.shared.T], [known.shared, known.covariance]]
+        # The anamorphosis comes directly after the four of α, before any bias: ``stretches_of`` and
+        # ``biases_of`` read the state in this order.
         joint = begin_joint(mean, np.block(every))
     for bias in registration.biases:
         covariance = [[joint.covariance, bias.shared.T], [bias.shared, bias.covariance]]
@@ -288,6 +290,7 @@ def accept(
         window_began_ns_utc=when.began_ns_utc,
         optical_gain=measured.optical_gain,
         optical_gains=measured.optical_gains,
+        # What was known before a jump is of another registration.
         biases=without_previous(biases) if anew else biases,
         previous_estimate=None if anew else _previous_estimate(previous, update, measured),
         jumped_ns_utc=_jumped_ns_utc(previous, update, context.now_ns),
@@ -337,6 +340,7 @@ def _previous_estimate(
     registration: Registration | None, update: FilterUpdate, measured: WindowEstimate
 ) -> PreviousEstimate | None:
     """Return what was known before a window, and before the one that came before it."""
+    # After a first window, or a jump, no earlier estimate describes the same registration.
     if registration is None or update.n_windows == 1:
         return None
     before = registration.previous_estimate

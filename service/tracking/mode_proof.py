@@ -224,6 +224,7 @@ def lines_clear(context: StepContext, rtc: Status, window_s: float) -> tuple[flo
     # mix within one second.
     spacing = np.ceil(max(MIN_LINE_SPACING_STEPS * step, (high - low) / MAX_SHOWN_MODES))
     avoid = (*context.policy.dither_avoid_hz, *context.loop.vibrations_hz)
+    # Both start and spacing are whole hertz, and so are all lines.
     lines = np.arange(np.ceil(low), high, spacing)
     return tuple(
         float(line)
@@ -271,6 +272,7 @@ def learn_modes(context: StepContext, estimate: LockInEstimate | RandomEstimate)
     accused = (proof.suspected | bad | proof.contrary) - good
     proof = replace(
         proof,
+        # One contrary response revokes a verification; only the exclusion of a mode needs two.
         proven=(proof.proven | (good - doubted)) - bad,
         compared=proof.compared | compared.keys(),
         contrary=(proof.contrary | sure) - good,
@@ -302,7 +304,9 @@ def _judge_ratios(
     before = {one.mode: one for one in proof.doubtful}
     together = add_ratios(before, compared)
     uneven = {mode for mode, one in together.items() if one.certain}
+    # A mode stays uneven until a window compares it again and it no longer stands out.
     uneven |= {m for m in proof.uneven if m not in compared or compared[m].stands_out}
+    # A contrary mode is judged by its response, not by its ratio to others.
     rest = _without(before | together, bad | uneven)
     return frozenset(uneven - bad), tuple(one for one in rest.values() if one.undecided)
 

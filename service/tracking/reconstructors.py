@@ -358,6 +358,7 @@ def on_fetched(context: StepContext, fetched: ev.MatrixFetched) -> None:
         _distrust(context, before, MatrixState.APPLIED, record.sha256)
         return
     _trust(context, record.id)
+    # After _trust: the numbers are verified now, even where the id is no news.
     if context.matrices.in_use == record.id:
         return
     if before is None:
@@ -484,7 +485,10 @@ def _is_old(state: TrackerState, record: ReconstructorRecord, event: Acknowledge
     if state.loop.rtc is not None and event.session != state.loop.rtc.session:
         return True
     if event.state is AckState.STAGED:
+        # An acknowledgement that arrives after "applied" must not set the record back to "staged".
         return record.state is not MatrixState.PUBLISHED
+    # A rollback applies a superseded matrix again, from another frame: only the same frame means
+    # the same acknowledgement.
     repeated = record.applied_frame_seq == event.frame_seq
     return record.state is MatrixState.SUPERSEDED and repeated
 

@@ -143,6 +143,7 @@ class UpperPower:
             return replace(state, parts_m2=(), lost_from_m2=None) if calm else state
         if len(before) * part_s < MIN_HISTORY_S:
             return state
+        # The median, which a gust in less than half of the parts does not move.
         usual_m2 = float(np.median(before))
         return replace(state, lost_from_m2=usual_m2) if runs_away(last, usual_m2) else state
 
@@ -248,16 +249,21 @@ def observe(
     levels = np.sqrt(np.einsum("km,km->k", commands, commands).astype(float) / expected)
     absurd = _absurd(health, levels)
     if absurd != health.absurd:
+        # The mean restarts: values in another unit would dominate it long after they have ended.
         health = LoopHealth(ratio=float(np.sqrt(np.mean(levels**2))))
+    # A dither begins and ends with the service, not with the loop: it must not look like a runaway.
     own = commands if block.dither_m is None else commands - block.dither_m[:, upper]
     upper_power = health.power.plus(own, len(in_loop), block.dt_ns * 1e-9)
     if absurd:
+        # Powers in another unit must not become the reference.
         upper_power = UpperPower()
     power = float(np.mean(levels**2))
     calming = health.diverging and power < health.ratio**2
     memory_s = _CALMING_S if calming else _MEMORY_S
     fade = float(np.exp(-block.n_frames * block.dt_ns * 1e-9 / memory_s))
+    # The mean is one of powers, the ratio that is kept one of RMS.
     ratio = float(np.sqrt(fade * health.ratio**2 + (1.0 - fade) * power))
+    # Hysteresis: a ratio near the limit must not switch the alarm on and off.
     limit = CALM_RATIO if health.diverging else DIVERGING_RATIO
     diverging = not absurd and (ratio > limit or upper_power.ratio is not None)
     beyond_s = _beyond_s(health, levels, block.dt_ns * 1e-9)
@@ -285,6 +291,8 @@ def _absurd(health: LoopHealth, levels: NDArray[np.float64]) -> bool:
     beyond = levels > ABSURD_RATIO
     if health.absurd or not beyond.any():
         return health.absurd and bool(beyond[-1])
+    # argmax of booleans is the first frame beyond. A loop that runs away grows frame by frame and
+    # passes DIVERGING_RATIO first; another unit appears from one frame to the next.
     before = levels[: int(np.argmax(beyond))]
     return not health.diverging and not bool((before > DIVERGING_RATIO).any())
 

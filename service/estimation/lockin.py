@@ -79,6 +79,7 @@ class LockInPlan(WindowPlan):
             raise ModelError(
                 f"lock-in: {self.n_frames} frames cut a period of {lines} Hz; expected whole ones"
             )
+        # The main lobe of a Hann window is four bins wide.
         gaps = np.diff(np.sort(lines)) * self.n_frames / self.frame_rate_hz
         if gaps.size and gaps.min() < 4:
             raise ModelError(f"lock-in: lines {lines} Hz closer than 4 bins in one window")
@@ -164,6 +165,8 @@ class LockIn(WindowCutter[LockInPlan, LockInSums, Spectra]):
         plan, sums = self.plan, window.sums
         real, imaginary = np.split(sums.dither, 2)
         dither = (real + 1j * imaginary).astype(np.complex64)
+        # The Hann window has a mean of 0.5, and a sine of RMS 1 appears at its frequency with half
+        # of its amplitude √2. So ``applied`` is an RMS, as in the request.
         weight = 0.5 * plan.n_frames / np.sqrt(2.0)
         applied = np.abs(dither[np.arange(len(plan.modes)), list(plan.modes)]) / weight
         reason = plan.refusal(applied, tuple(f"{line} Hz" for line in plan.frequencies_hz))
@@ -275,11 +278,13 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
         normal, score = _normal_equations(slopes, seen, known, gains, step)
         change = np.linalg.solve(normal, score)
         step = step + change[:n]
+        # After the numbers of α come real and imaginary part of each line's gain in turn.
         gains = gains + change[n::2] + 1j * change[n + 1 :: 2]
     normal, _ = _normal_equations(slopes, seen, known, gains, step)
     spread, misfit, unexplained = _side_bins(spectra, linearisation, seen, known, gains, step)
     inverse = np.linalg.inv(normal)
     every = inverse @ spread @ inverse.T
+    # Rounding leaves the product slightly asymmetric.
     every = (every + every.T) / 2
     turns = 2 * np.pi * np.array(spectra.plan.frequencies_hz) / loop.frame_rate_hz
     return LockInEstimate(
@@ -288,6 +293,7 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
         with_stretches=every[:n, :n] if n > 4 else None,
         stretched=float(np.abs(step[4:]).max(initial=0.0)),
         optical_gain=gains,
+        # Slopes that are late by n frames turn a line of w radians per frame by -n w.
         lag_frames=-np.angle(gains) / turns,
         misfit=misfit,
         unexplained=unexplained,
@@ -313,6 +319,7 @@ def _select_moved_modes(
 ) -> tuple[Spectra, Linearisation]:
     """Return both without the modes that are never commanded, if these are most modes."""
     moves = np.any(spectra.commands, axis=(0, 1)) | np.any(spectra.dither, axis=0)
+    # The loop responds to every line with all modes that it controls.
     moves[: len(loop.reconstructor)] = True
     if _FEW_MOVED_RATIO * np.count_nonzero(moves) > len(moves):
         return spectra, linearisation
@@ -346,9 +353,11 @@ def compute_total_commands(
     """
     n = len(coupling)
     w = 2 * np.pi * np.array(frequencies_hz) / loop.frame_rate_hz
+    # Transfer function of the leaky integrator with its delay, at the lines.
     integrator = np.exp(-1j * w * loop.delay_frames) / (1.0 - loop.leak * np.exp(-1j * w))
     answer = (np.outer(loop.gains[:n], integrator * gains)).astype(np.complex64)
     own = np.ascontiguousarray(coupling[:, :n])
+    # Minus: the loop counteracts what the sensor sees of the dither.
     first = -answer * _apply(coupling, dither).T
     reply = _sum_series(first, answer, own)
     if reply is None:

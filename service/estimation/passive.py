@@ -361,6 +361,8 @@ def _sum_frames(state: Passive, frames: FrameBlock, *, last: bool) -> Passive:
     if len(others):
         moving = np.hstack([commands[now][:, others], commands[before][:, others]])
         shapes, size, _ = np.linalg.svd(moving.astype(float), full_matrices=False)
+        # The columns may be linearly dependent. Only the directions that they span are projected
+        # out of the instrument; the others are rounding errors.
         known = shapes[:, size > _RANK_TOLERANCE * size[0]].astype(np.float32)
         filtered -= known @ (known.T @ filtered)
     weight = np.ones((n, 1), np.float32)
@@ -373,6 +375,7 @@ def _sum_frames(state: Passive, frames: FrameBlock, *, last: bool) -> Passive:
     with_z = (frames.slopes[now], commands[now, : state.n_modes], filtered)
     sums = tuple(rows.T @ filtered for rows in with_z)
     fade = np.float32(np.exp(-n / state.memory_frames))
+    # Not strict: before the first chunk there are no old sums.
     for new, old in zip(sums, state.sums, strict=False):
         new += fade * old
     n_effective = float(fade) * state.n_effective + float(weight.sum())
@@ -478,6 +481,8 @@ def fit_matrix(
     normal = np.linalg.inv(seen.normal)
     step = normal @ seen.scores.sum(axis=1)
     left = seen.residual - np.tensordot(step, seen.jacobian, axes=1)
+    # Each column has one gain fitted, and all columns together the four of α. weights @ noise is
+    # ``least`` for each column that moves.
     freedom = (len(left) - 1) * (weights @ noise) - 4 * least
     variance = float(np.sum(left**2, axis=0) @ weights / freedom)
     scores = _patterns(left, noise).T @ (seen.jacobian * weights)
@@ -485,6 +490,7 @@ def fit_matrix(
     covariance = variance * normal @ spread @ normal
     return PassiveEstimate(
         alpha=near.add_step(step),
+        # Shrinks the correlations only: the variances on the diagonal are unchanged.
         covariance=(1.0 - CORRELATION_SHRINKAGE) * covariance
         + CORRELATION_SHRINKAGE * np.diag(np.diag(covariance)),
         optical_gain=seen.gains,
@@ -509,5 +515,6 @@ def _slope_variance(state: Passive, matrix: Array) -> float:
         return float("nan")
     slopes = np.array([slopes for slopes, _ in state.samples])
     commands = np.array([commands for _, commands in state.samples])
+    # The gain of the filter for the power of white noise.
     passed = float(np.sum(state.instrument_filter.taps**2))
     return float(np.mean((slopes - commands @ matrix.T) ** 2)) / passed

@@ -282,6 +282,8 @@ def _observe(
     lines = tuple(f * block.dt_ns * 1e-9 for f in lines_hz) if moved else ()
     reader, residual = (None, None) if state.reader is None else state.reader.read(block, state.own)
     state = replace(state, reader=reader)
+    # The sines of each line take two dimensions of the steps: in a shorter block too little of the
+    # loop's own motion is left.
     if len(steps) < 3 * (1 + 2 * len(lines)):
         return state
     part = replace(_part(block, steps, lines, edge), residual=residual)
@@ -335,6 +337,7 @@ def _part(
         last = block.commands_m[-1, edge.modes]
         outer = edge.outer @ last
         power[OUTER] = n_frames * (outer @ outer) / len(outer)
+        # Rounding in single precision may make a small quadratic form negative.
         power[INNER] = n_frames * max(float(last @ (edge.inner @ last)), 0.0)
     return Part(n_frames=n_frames, power=power, peak=peak)
 

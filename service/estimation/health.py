@@ -390,7 +390,9 @@ def _update_health(
         average += fade * health.command
     power = float(fade) * health.turbulence**2 + float(1 - fade) * max(inner, 0.0)
     turbulence = float(np.sqrt(power))
+    # Rounding may make a small quadratic form negative.
     steady = max(float(average @ watch.inner @ average), 0.0) ** 0.5
+    # The last value avoids a division by zero while the mirror rests.
     scale = max(turbulence, SLOW_TURBULENCE_RATIO * steady, 1e-3)
     ratio = float(np.abs(watch.outer @ average).max()) / scale
     suspect_s = health.suspect_s + lasted_s if ratio > SUSPECT_RATIO else 0.0
@@ -527,12 +529,14 @@ def _close_played(
     part = (float(ratio[far].max()) if len(far) else 0.0, frozenset(far.tolist()))
     beyond = (*state.beyond, part)[-max(round(UNPLAYED_MEMORY_S / part_s), 1) :]
     n_beyond = sum(bool(actuators) for _, actuators in beyond)
+    # Hysteresis: the alarm lasts until no part of the last seconds is beyond.
     unplayed = n_beyond >= (1 if state.unplayed else N_UNPLAYED_PARTS)
     return replace(state, beyond=beyond, unplayed=unplayed)
 
 
 def _sigma(values: Array) -> float:
     """Return 1 σ of values around zero by their median, which a few far ones do not change."""
+    # Half of a normal distribution is within 0.6745 σ.
     return float(np.median(np.abs(values))) / 0.6745
 
 
@@ -609,7 +613,9 @@ class SlopeSpectra:
 
     def _with_segment(self, rows: Array) -> SlopeSpectra:
         window = np.hanning(SEGMENT_FRAMES)[:, None]
+        # Without its mean: the window would spread a static slope over the lowest bins.
         power = np.abs(np.fft.rfft((rows - rows.mean(axis=0)) * window, axis=0)).T ** 2
+        # A plain mean at first, then a forgetting one.
         share = max(1.0 / (self.n_segments + 1), 1.0 / _MEMORY_SEGMENTS)
         if self.power is not None:
             power = (1.0 - share) * self.power + share * power
@@ -668,8 +674,10 @@ class VibrationMonitor(Detector):
         """
         quiet, dithered = self.quiet, self.dithered
         if block.dither_m is None:
+            # The last lines are kept over a pause, so that the spectra under the same dither go on.
             quiet, dither_hz = quiet.with_frames(block), self.dither_hz
         else:
+            # The lines of another dither would remain in the mean as vibrations.
             if dither_hz != self.dither_hz:
                 dithered = SlopeSpectra(views=dithered.views)
             dithered = dithered.with_frames(block)
@@ -744,6 +752,8 @@ class Standstill(Detector):
     def follow(self, block: FrameBlock) -> Standstill:
         """Return it after one more block."""
         state = self
+        # By frame number: which frames are compared does not depend on how they are cut into
+        # blocks.
         for row in range(
             -block.first_seq % STANDSTILL_STRIDE_FRAMES, block.n_frames, STANDSTILL_STRIDE_FRAMES
         ):
@@ -753,6 +763,7 @@ class Standstill(Detector):
                 continue
             state = Standstill(
                 session=block.session,
+                # Copied: a view would keep the whole block in memory.
                 slopes=slopes.copy(),
                 first_seq=block.first_seq + row,
                 since_ns_utc=t_ns,

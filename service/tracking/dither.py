@@ -374,6 +374,7 @@ def _end_when_done(context: StepContext, rtc: Status, dither: Dither, wanted: Wa
     registration = context.registration
     seen = registration is not None and registration.window_ns_utc > dither.asked_ns_utc
     pause_s = (wanted.next_ns_utc - context.now_ns) / SECOND_NS
+    # Stopped only where the pause is worth a start and its settling.
     done = seen and wanted.phase is DitherPhase.SPARSE and pause_s >= dither_plan.MIN_DITHER_PAUSE_S
     weak = (
         wanted.phase is DitherPhase.ACQUIRE

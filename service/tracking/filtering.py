@@ -116,6 +116,7 @@ def _update_gain(
     farthest = _MAX_SCATTER_SIGMA * float(np.sqrt(prior + gain.scatter**2))
     # A single outlier must not inflate the scatter for the next ten windows.
     innovation = float(np.clip(measured - gain.gain, -farthest, farthest))
+    # The innovation scatters by the uncertainty of the gain, too: what is left is the window's own.
     learnt = max(innovation**2 - prior, noise**2)
     scatter = float(np.sqrt((1 - SCATTER_WEIGHT) * gain.scatter**2 + SCATTER_WEIGHT * learnt))
     weight = prior / (prior + scatter**2)

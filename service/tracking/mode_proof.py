@@ -124,6 +124,7 @@ def check_proven(state: TrackerState, record: ReconstructorRecord) -> str | None
     if state.operations.acquisition.under_way:
         return None  # An acquisition closes the loop on smooth modes first, and watches it.
     proven = proven_modes(state)
+    # A matrix commands all modes from the first on.
     missing = [mode for mode in range(record.n_modes) if mode not in proven]
     if not missing:
         return None
@@ -349,6 +350,8 @@ def note_passed(context: StepContext, record: ReconstructorRecord) -> None:
     They remain so when a matrix of fewer modes follows, after a jump for example.
     """
     proof = context.matrices.mode_proof
+    # A loop may hold with a wrong mode or two: what a dither has found wrong is not verified by
+    # that.
     held = frozenset(range(record.n_modes)) - proof.contrary - proof.suspected
     if not held <= proof.proven:
         proof = replace(proof, proven=proof.proven | held)
@@ -414,6 +417,7 @@ def _classify(
         max(PLAUSIBLE_RESPONSE_RATIO[0] * typical, MIN_RESPONSE_RATIO),
         PLAUSIBLE_RESPONSE_RATIO[1] * typical,
     )
+    # The signed gain: a response with the other sign is never seen here, however strong.
     seen = gains > RESPONSE_LIMIT_SIGMA * sigma
     proven = seen & (gains > low) & (gains < high)
     contrary = (gains + RESPONSE_LIMIT_SIGMA * sigma < low) | (
@@ -495,6 +499,7 @@ def give_up_unseen(context: StepContext, rtc: Status) -> None:
     proof = context.matrices.mode_proof
     if proof.n_tries < MAX_PROOF_TRIES:
         return
+    # Several dithers could not confirm the suspicion: it must not have these modes tried for ever.
     suspected = proof.suspected - proof.shown
     given_up = replace(proof, shown=frozenset(), n_tries=0, suspected=suspected)
     context.matrices = replace(context.matrices, mode_proof=given_up)

@@ -376,6 +376,7 @@ def _sum_series(first: Array, answer: Array, coupling: Array) -> Array | None:
         change, size = (np.abs(x).max(initial=0.0) for x in (reply - before, reply))
         if change <= _ROUNDING * size:  # "<=" because zeros have converged, too
             return np.asarray(reply)
+        # "not <" because NaN ends the series as well.
         if not change < _DIVERGENCE_RATIO * largest:
             return None
     return None
@@ -402,6 +403,7 @@ def _modulus_sigma(gains: Array, covariance: Array) -> Array:
     found = []
     for line, gain in enumerate(gains):
         part = slice(2 * line, 2 * line + 2)
+        # To first order only the noise along the gain's own phase changes its modulus.
         along = np.array([gain.real, gain.imag]) / abs(gain)
         found.append(np.sqrt(along @ covariance[part, part] @ along))
     return np.array(found)
@@ -421,6 +423,8 @@ def _answers_as(spectra: Spectra, matrix: Array) -> tuple[int, ...]:
     best = np.argmax(size, axis=1)
     lines = np.arange(len(own))
     for line in np.flatnonzero(size[lines, best] > OTHER_MODE_POWER_RATIO * size[lines, own]):
+        # Turbulence resembles low modes at all frequencies: the resemblance must be one of the
+        # line.
         beside = np.abs(slopes[line, 1:] @ unit[:, best[line]])
         if size[line, best[line]] < IDENTIFICATION_RATIO * np.sqrt(np.mean(beside**2)):
             best[line] = own[line]
@@ -436,6 +440,7 @@ def _weak(spectra: Spectra) -> tuple[int, ...]:
 
 def _total_dither_m(spectra: Spectra) -> float:
     """Return the RMS of all lines together, from the dither columns of the window."""
+    # RMS of each line: see ``LockIn.close`` for the factors.
     amplitudes = np.abs(spectra.dither).max(axis=1) * np.sqrt(2.0) / (0.5 * spectra.plan.n_frames)
     return float(np.sqrt(np.sum(amplitudes**2)))
 

@@ -392,6 +392,7 @@ def _wait_after(
         return None
     if record.state in _DECLINED_STATES:
         return FIRST_MODES_DELAY_S
+    # A proposal that another one has replaced is discarded, too, and says nothing of its modes.
     if record.state is MatrixState.DISCARDED and rejected:
         return DECLINED_MODES_DELAY_S
     return None

@@ -494,10 +494,12 @@ def _side_bins(
         residual = spectra.slopes[line, 1:] - explained
         score = _regressors(known[line], gain, step).conj() @ residual.T
         at = _unknowns(line, len(step))
+        # Half of the power of a complex bin is in its real part, which the score takes.
         spread[np.ix_(at, at)] += 0.5 * (score @ score.conj().T).real / score.shape[1]
         left = spectra.slopes[line, 0] - gain * _regressors(seen[line], gain, step)[-2]
         power, noise = np.sum(np.abs(left) ** 2), np.mean(np.sum(np.abs(residual) ** 2, axis=1))
         misfit.append(power / noise)
+        # The noise may exceed the line: a share above 1 has no meaning.
         seen_power = max(float(np.sum(np.abs(spectra.slopes[line, 0]) ** 2) - noise), power)
         unexplained.append(max(float(power - noise), 0.0) / seen_power)
     return spread, float(np.mean(misfit)), np.array(unexplained)

@@ -393,7 +393,9 @@ def _sample(frames: FrameBlock, loop: ClosedLoop) -> _Sample:
     return _Sample(
         seq=frames.first_seq + frames.n_frames - 1,
         slopes=_twice(slopes)[::-1],
+        # The part of the command that the leak keeps is known: what remains is -g R s.
         steps_m=_twice(commands[1:] - np.float32(loop.leak) * commands[:-1])[0],
+        # Exactly equal: with the sensor's noise a free command never repeats in single precision.
         held=commands[-1] == commands[-2],
     )
 
@@ -410,6 +412,7 @@ def _multiply_waiting(check: LoopCheck, loop: ClosedLoop) -> LoopCheck:
     asked = (loop.reconstructor @ slopes.reshape(-1, slopes.shape[-1]).T).T
     batch = _Batch(
         seq=np.array([sample.seq for sample in check.waiting]),
+        # Minus, as in the loop law at the top: a command counteracts the slopes.
         asked_m=(-loop.gains.astype(np.float32) * asked).reshape(_TAPS, len(check.waiting), -1),
         taken_m=np.array([sample.steps_m for sample in check.waiting]),
         held=np.array([sample.held for sample in check.waiting]),

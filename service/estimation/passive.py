@@ -145,7 +145,9 @@ def high_pass(delay_frames: float) -> HighPass:
             f"{MIN_DELAY_FRAMES}: a faster loop answers noise in the frames in which its "
             "response is measured"
         )
+    # A delay of d frames: commands up to d - 1 frames after k do not know the noise of frame k.
     ahead = int(delay_frames) - 1
+    # Frequencies in cycles per frame, up to half of the frame rate.
     turns = (np.arange(4096) + 0.5) / 8192
     z = np.exp(-2j * np.pi * turns)
     power = 1.0 / np.abs(1.0 - 0.999 * z + _LOOP_GAIN * z ** round(delay_frames)) ** 2
@@ -154,10 +156,12 @@ def high_pass(delay_frames: float) -> HighPass:
     signal = (shifted * power).real.mean(axis=1)
     noise = ((shifted * power * (1.0 + turbulence)) @ shifted.conj().T).real / len(turns)
     taps = np.linalg.solve(noise, signal)
+    # A static command must not pass: the taps sum to 0.
     taps -= taps.mean()
     taps = (taps / np.abs(taps).max()).astype(np.float32)
     band = np.zeros((FILTER_BLOCK_FRAMES, FILTER_BLOCK_FRAMES + N_TAPS - 1), np.float32)
     for k, row in enumerate(band):
+        # Reversed, because a convolution is written as a product of matrices.
         row[k : k + N_TAPS] = taps[::-1]
     return HighPass(taps=taps, ahead=ahead, band=band)
 

@@ -364,6 +364,8 @@ def _add_sums(state: Comparison, part: Part, block: FrameBlock) -> Comparison:
     parts = parts[-round(HISTORY_S / dt_s / length) :]
     n_recent = round(REFERENCE_PERIOD_S / dt_s / length)
     if len(parts) > n_recent:
+        # Samples of slopes are kept for recent parts only, from which the new matrix reads the
+        # residual; older ones would take memory for nothing.
         old = parts[-n_recent - 1]
         parts = (*parts[: -n_recent - 1], old.without_samples(), *parts[-n_recent:])
     return replace(state, parts=parts)
@@ -379,10 +381,12 @@ def _judge_parts(state: Comparison, block: FrameBlock) -> Comparison:
     if state.parts[-1].n_frames < max(PART_S / dt_s, MIN_PART_FRAMES) - _LAG_SPAN_FRAMES:
         return state
     known = np.intersect1d(before.modes, () if state.modes is None else state.modes)
+    # A mode that was dithered in one part and not in another would look as if it had changed.
     modes = np.setdiff1d(known, np.fromiter(state.dithered, np.intp))
     after_s = sum(part.n_frames for part in state.parts) * dt_s
     if state.returned and after_s < RETURN_PERIOD_S:
         return state
+    # After a rollback the loop recovers during the first parts: the last ones decide.
     looked_at = state.parts[-N_RETURN_PARTS:] if state.returned else state.parts
     over = after_s >= MAX_PROBATION_S - PART_S
     decides = over or state.returned

@@ -330,6 +330,7 @@ def _there(path: Path, key: str) -> str:
 
 def _secret(path: Path, key: str) -> str:
     found = _there(path, key)
+    # Any permission of group or others.
     if path.stat().st_mode & 0o077:
         refuse(key, f"{path}, which others can read", f"it to be yours alone: chmod 600 {path}")
     return found

@@ -70,7 +70,7 @@ def on_status(context: StepContext, rtc: Status) -> None:
     context.loop = replace(
         context.loop,
         rtc=rtc,
-        # Pinned by the first status or the settings: a later status does not replace them.
+        # Pinned by the instrument file or the first status: a later one does not replace them.
         basis_id=context.loop.basis_id or rtc.basis_id,
         config_id=context.loop.config_id or rtc.config_id,
     )

@@ -395,7 +395,7 @@ def _sample(frames: FrameBlock, loop: ClosedLoop) -> _Sample:
         slopes=_twice(slopes)[::-1],
         # The part of the command that the leak keeps is known: what remains is -g R s.
         steps_m=_twice(commands[1:] - np.float32(loop.leak) * commands[:-1])[0],
-        # Exactly equal: with the sensor's noise a free command never repeats in single precision.
+        # Exactly equal: noise moves a free command by more than single precision resolves.
         held=commands[-1] == commands[-2],
     )
 

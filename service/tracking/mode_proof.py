@@ -350,8 +350,7 @@ def note_passed(context: StepContext, record: ReconstructorRecord) -> None:
     They remain so when a matrix of fewer modes follows, after a jump for example.
     """
     proof = context.matrices.mode_proof
-    # A loop may hold with a wrong mode or two: what a dither has found wrong is not verified by
-    # that.
+    # The loop was judged as a whole: that does not verify a mode which a dither has found wrong.
     held = frozenset(range(record.n_modes)) - proof.contrary - proof.suspected
     if not held <= proof.proven:
         proof = replace(proof, proven=proof.proven | held)

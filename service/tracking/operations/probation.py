@@ -135,8 +135,7 @@ def on_compared(context: StepContext, event: ev.Compared) -> None:
         passed = context.state.reconstructor(trial.id)
         if passed is not None:
             mode_proof.note_passed(context, passed)
-    # A jump explains why the loop is worse: the matrix is not to blame, and a rollback would not
-    # help.
+    # A jump explains why the loop is worse: the matrix need not be to blame.
     elif jump := _check_jump(context, trial):
         _end(context, trial, ProbationState.NOT_JUDGED, f"{jump}: {found.text}")
     else:

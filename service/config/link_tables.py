@@ -131,6 +131,7 @@ class ZenohTable(CredentialsTable):
 
     @model_validator(mode="after")
     def _with_certificates_no_way_around_them(self) -> ZenohTable:
+        # With ``connect`` there is no router of its own, and ``listen`` is not used.
         open_ones = [each for each in self.connect or self.listen if not _ENCRYPTED.match(each)]
         if self.tls is not None and open_ones:
             raise ValueError(
@@ -160,6 +161,7 @@ def _host_of(endpoint: str) -> str | None:
     protocol, _, address = endpoint.partition("/")
     if protocol.startswith("unix"):
         return None
+    # Metadata and options of zenoh's endpoints follow ? and #; brackets are those of IPv6.
     return re.split(r"[?#]", address)[0].rpartition(":")[0].strip("[]")
 
 
@@ -180,6 +182,7 @@ def read_link_tables(
         One line: where, what was found, what was expected.
     """
     table = {} if path is None else read_toml(path).get("zenoh", {})
+    # Anything else is left to the validation, which says what it is.
     if isinstance(table, dict):
         given = {"listen": listen, "connect": connect}
         table |= {key: [value] for key, value in given.items() if value is not None}
@@ -327,6 +330,7 @@ def _there(path: Path, key: str) -> str:
 
 def _secret(path: Path, key: str) -> str:
     found = _there(path, key)
+    # Any permission of group or others.
     if path.stat().st_mode & 0o077:
         refuse(key, f"{path}, which others can read", f"it to be yours alone: chmod 600 {path}")
     return found

@@ -403,6 +403,7 @@ class Settings(Table):
         kinds: dict[str, type] = {}
         for rule in self.rules:
             about, _, than = rule.when
+            # bool first: in Python a bool is an int.
             kind = bool if isinstance(than, bool) else str if isinstance(than, str) else float
             if kinds.setdefault(about, kind) is not kind:
                 raise ValueError(f"found {than!r} for {about}: another rule compares it otherwise")
@@ -442,13 +443,16 @@ def load_settings(
         overrides[key] = (f"environment: {name}", _environment_value(key, env[name]))
     for dotted, value in (command_line or {}).items():
         overrides[tuple(dotted.split("."))] = (f"command line: {dotted}", value)
+    # What the command line says has replaced the environment here already.
     for (section, name), (_, value) in overrides.items():
         table = tables.setdefault(section, {})
+        # A section that is no table in the file is left to the validation, which names it.
         if isinstance(table, dict):
             table[name] = value
 
     def place(key: _Key) -> str:
         origin = overrides.get(key[:2])
+        # An error names the source of the value that counted, not the file that it replaced.
         return origin[0] if origin is not None else file_place(key)
 
     return validated(Settings, tables, place)
@@ -461,6 +465,7 @@ def _environment_key(name: str) -> _Key:
             f"environment: {name}: expected {PREFIX}<SECTION>__<KEY>, like {PREFIX}API__PORT"
         )
     section, key = match[1].lower(), match[2].lower()
+    # Rules are a list of tables, which no single key can address.
     if section not in Settings.model_fields or section == "rules":
         raise ConfigurationError(
             f"environment: {name}: unknown section {section}"

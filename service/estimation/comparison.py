@@ -225,6 +225,7 @@ class Before:
         powers = _powers(groups)
         power = np.asarray(np.median(powers[-n_recent:], axis=0))
         moving = modes[power[modes] > 0.0]
+        # A mode may rest in a group and move in the median of all.
         logs = np.log(np.maximum(powers[:, moving] / power[moving], 1e-30))
         if logs.size:
             logs -= np.median(logs, axis=1, keepdims=True)
@@ -261,8 +262,11 @@ def measure_sigma(logs: Array, min_sigma: float, *, lower_half: bool = False) ->
         means = logs[len(logs) - n * length :].reshape(n, length, -1).mean(axis=1)
         low, middle, high = np.quantile(means - np.median(means, axis=0), (0.25, 0.5, 0.75))
         spread = 2.0 * (middle - low) if lower_half else high - low
+        # 1.349 σ is the interquartile range of a normal distribution. The variance of a mean of
+        # independent groups, times their number, is that of one group.
         square = length * (float(spread) / 1.349) ** 2
         n_values = n * logs.shape[1]
+        # The prior is for short histories, whose scatter is hardly known.
         mixed = (n_values * square + PRIOR_VALUES * PRIOR_SCATTER**2) / (n_values + PRIOR_VALUES)
         found = mixed if length == 1 else max(found, mixed)
     return max(float(np.sqrt(found)), min_sigma)
@@ -389,6 +393,7 @@ class _Look:
         if self.decides:
             return np.asarray(np.median(logs, axis=0))
         if len(logs) < self.n_last:
+            # Too few parts: a value below any limit, whose exponential is still finite.
             return np.full(logs.shape[1:], -40.0)
         return np.asarray(np.quantile(logs[-self.n_last :], 1.0 - LARGE_CHANGE_SHARE, axis=0))
 
@@ -406,6 +411,7 @@ class _Look:
                 if self.decides
                 else float(np.log(EARLY_POWER_RATIO))
             )
+        # Half, because the logarithms are of powers and the finding states RMS.
         rms = float(np.exp(0.5 * max(value, -40.0)))
         return _Ground(value > limit, words.format(rms), rms, float(np.exp(0.5 * limit)))
 

@@ -212,21 +212,27 @@ def _fit_laws(commands: Array, seen: Array, at: Array, n_taps: int) -> _Fits:
     inputs = np.stack([before, *(answered[:, at - tap] for tap in taps)], axis=1)
     inputs -= inputs.mean(axis=2, keepdims=True)
     scale = np.sqrt(np.einsum("mkn,mkn->mk", inputs, inputs))
+    # A mode that rests divides by 1 and not by 0; it is not clear and does not count.
     scale[scale == 0.0] = 1.0
     inputs /= scale[:, :, None]
     wanted = (target - target.mean(axis=1, keepdims=True))[:, :, None]
+    # pinv, because a mode that rests makes the normal matrix singular.
     inverse = np.linalg.pinv(inputs @ inputs.transpose(0, 2, 1), hermitian=True)
     weights = inverse @ (inputs @ wanted)
     missed = wanted - inputs.transpose(0, 2, 1) @ weights
     left, steps = np.sum(missed**2, axis=(1, 2)), target - before
     weights = weights[:, :, 0] / scale
+    # Minus: the law subtracts g R s. A fraction of a frame of delay spreads the gain over
+    # neighbouring taps.
     gain = -weights[:, 1:].sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
+        # The delay is the mean tap, weighted by the gain of each.
         late = -(weights[:, 1:] @ taps) / gain
     return _Fits(
         clear=(steps.std(axis=1) >= _STILL_M)
         & (left <= MAX_UNEXPLAINED_SHARE * np.sum(steps**2, axis=1)),
         leak=weights[:, 0],
+        # The regression was made with inputs scaled to 1: the result is scaled back.
         leak_sigma=np.sqrt(inverse[:, 0, 0] * left / len(at)) / scale[:, 0],
         gain=gain,
         delay_frames=np.where(gain == 0.0, np.inf, late),
@@ -242,6 +248,8 @@ def _compare_law(fits: _Fits, clear: Array, gains: Array, loop: ClosedLoop) -> I
     wrong = []
     if abs(leak - loop.leak) > LEAK_TOLERANCE + SIGNIFICANCE_SIGMA * sigma:
         wrong.append(f"leak {leak:.3f} found, {loop.leak:.3f} in the status")
+    # The spread is limited by the gain: modes that scatter wildly must not hide a gain that is far
+    # off.
     tolerance = GAIN_TOLERANCE + SIGNIFICANCE_SIGMA * min(spread, abs(gain)) / np.sqrt(len(clear))
     if abs(gain - 1.0) > tolerance:
         wrong.append(f"gain {gain:.3g} times the one in the status{_hint(gain)}")
@@ -254,6 +262,7 @@ def _hint(gain: float) -> str:
     """Return a likely cause of a gain that no loop has."""
     if gain < 0.0:
         return ": slopes or commands have the other sign than the matrix that the RTC names"
+    # Either side may have the wrong unit: the ratio is looked up as a factor above 1.
     unit = unit_like(max(gain, 1.0 / max(gain, 1e-30)), 1.0)
     whose = "commands" if gain > 1.0 else "the matrix's commands"
     return f": {whose} look like {unit}, metres of OPD are expected" if unit else ""
@@ -261,6 +270,7 @@ def _hint(gain: float) -> str:
 
 def _begun(law: ControlLawCheck, cm_id: str | None, loop: ClosedLoop) -> ControlLawCheck:
     in_loop = np.flatnonzero(loop.gains > 0.0)
+    # unique: a loop with fewer modes than are watched would list some twice.
     chosen = np.unique(np.linspace(0, len(in_loop) - 1, N_WATCHED_MODES).round().astype(int))
     modes = in_loop[chosen] if len(in_loop) else in_loop
     none = np.zeros((0, len(modes)), np.float32)

@@ -80,6 +80,8 @@ class DemodulationBank:
         They replace the sums of the shapes in memory: with a hundred lines both have 60 MB.
         """
         which = np.searchsorted(_OFFSETS_HZ, np.abs(SIDE_OFFSETS_HZ))
+        # Shapes are kept for positive offsets only. cos(-v k) = cos(v k) and sin(-v k) = -sin(v k)
+        # give the negative ones.
         turning = (1j * np.sign(SIDE_OFFSETS_HZ)).astype(np.complex64)[:, None]
         found = sums.reshape(-1).view(np.complex64).reshape(len(sums), 1 + len(which), -1)
         for (real, imaginary), bins in zip(sums, found, strict=True):
@@ -145,6 +147,7 @@ def _smooth(frame_rate_hz: float, n_frames: int) -> Array:
 def _lines(bank: DemodulationBank, frames: Array) -> Array:
     """Return ``exp(-i w k)`` of every line, ``(2 * n_lines, n)``: real parts, imaginary ones."""
     cosines, sines = cosines_and_sines(np.outer(bank.lines_hz, frames / bank.frame_rate_hz))
+    # Minus: the imaginary part of exp(-i w k).
     return np.concatenate([cosines, -sines])
 
 

@@ -146,6 +146,7 @@ def _shapes_in_sigma(
     """Return ``(n_actuators, n_modes)`` in σ of turbulence; None if it moves one not at all."""
     strokes = actuators.strokes[:, modes]
     expected = np.sqrt(strokes**2 @ mode_variance_m2[modes])
+    # The division below needs an expected position for every actuator.
     if not len(modes) or expected.min() <= 0.0:
         return None
     return np.asarray(strokes / expected[:, None])

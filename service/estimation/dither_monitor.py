@@ -161,6 +161,7 @@ class DitherWatch(Detector):
             return replace(watch, seen_seq=block.next_seq, silent_s=0.0)
         if dither is None:
             return watch
+        # Frames after the end of the dither need not contain it.
         silent = max(min(block.next_seq, dither.stop_seq) - watch.seen_seq, 0)
         return replace(watch, silent_s=silent / frames.rtc.frame_rate_hz)
 
@@ -223,6 +224,7 @@ def _demodulate(
     if not asked.frequency_hz:
         return monitor, np.zeros((2, len(asked.modes)), complex)
     commands = block.commands_m[:, list(asked.modes)].astype(float)
+    # Across a gap the first step is unknown: it is set to 0.
     follows = monitor.last_m is not None and monitor.next_seq == block.first_seq
     before = monitor.last_m if follows else commands[0]
     steps = np.diff(commands, axis=0, prepend=np.asarray(before)[None])
@@ -252,6 +254,7 @@ def _add_slopes(monitor: DitherMonitor, slopes: Array, first_seq: int) -> Dither
 def _count_repeated(slopes: Array) -> int:
     """Return how many frames have the very slopes of the frame before."""
     first = slopes[:, :_N_COMPARED_SLOPES]
+    # Only frames whose first slopes are the same are compared completely.
     again = 1 + np.flatnonzero((first[1:] == first[:-1]).all(axis=1))
     return int(np.count_nonzero((slopes[again] == slopes[again - 1]).all(axis=1)))
 
@@ -268,6 +271,7 @@ def _powers(monitor: DitherMonitor) -> tuple[float, float, float]:
     power = parts.reshape(2, len(heard), -1).sum(axis=0)
     sides = power[:, 1:]
     beyond = np.sum(power[:, 0] - sides.mean(axis=1))
+    # The second term is the error of the mean of the side bins, which was subtracted.
     variance = np.sum(sides.var(axis=1, ddof=1)) * (1.0 + 1.0 / sides.shape[1])
     expected = np.sum(np.abs(monitor.lines[0][heard]) ** 2 * np.array(asked.response)[heard])
     return before[0] + beyond, before[1] + variance, before[2] + expected
@@ -295,10 +299,12 @@ def _found(monitor: DitherMonitor) -> tuple[DitherMeasurement, bool]:
     asked = monitor.asked
     rms = np.sqrt(monitor.squares / monitor.n_frames)
     wanted, modes = np.array(asked.amplitude_m), list(asked.modes)
+    # A sine of RMS a has the amplitude √2 a, of which half appears in the sum over n frames.
     told, moved = np.abs(monitor.lines) * np.sqrt(2.0) / monitor.n_frames
     carried, own, doubted = rms[modes], np.array(asked.own), False
     if asked.frequency_hz:
         fraction = np.array(asked.frequency_hz) / asked.frame_rate_hz
+        # Undoes the difference from frame to frame, which multiplies a sine by this factor.
         moved = moved / np.abs(2.0 * np.sin(np.pi * fraction))
         beyond = own & (moved > MAX_AMPLITUDE_RATIO * told)
         doubted = bool(np.any(beyond & (moved <= MAX_AMPLIFICATION_RATIO * told)))

@@ -65,6 +65,7 @@ class DitherWindows(Estimator):
             return DitherWindows()
         cutter, ended = self.cutter.accumulate(frames.block)
         dither, window = frames.loop.dither, cutter.window
+        # A window that the end of the dither would cut is given up at once, and not refused later.
         over = (
             dither is not None
             and window is not None

@@ -157,4 +157,5 @@ def model_error(covariance: NDArray[Any], misfit: float) -> NDArray[Any]:
     faint one hides, so the telescope need not be known. It does not average out, because the next
     window has the same error.
     """
+    # Noise alone has a misfit of 1: only what is beyond it is the model's.
     return np.sqrt(MODEL_ERROR_VARIANCE_RATIO * max(misfit - 1.0, 0.0) * np.diag(covariance))

@@ -111,6 +111,7 @@ class LoopContext:
         matrix = next((matrix for known, matrix in self.matrices if known == cm_id), None)
         if rtc is None or rtc.loop == "open" or cm_id is None or matrix is None:
             return None
+        # A matrix of another session or sensor mode may have other sizes under a known id.
         if matrix.shape[1] != rtc.n_slopes or len(matrix) > rtc.n_modes:
             return None
         return build_loop(rtc, cm_id, matrix)
@@ -143,6 +144,7 @@ class FrameContext:
         if not len(still):
             return block
         commands = block.commands_m.copy()
+        # A dither on such a mode is kept: it moves.
         commands[:, still] = 0.0 if block.dither_m is None else block.dither_m[:, still]
         return replace(block, commands_m=commands)
 

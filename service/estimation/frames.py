@@ -59,6 +59,8 @@ class FrameBlock:
     def is_dithered(self) -> bool:
         """Return True if a dither moves any mode; an RTC may send the columns without one."""
         dither = self.dither_m
+        # The last row first: it answers at once in most dithered blocks, without a search through
+        # all.
         return dither is not None and bool(dither[-1:].any() or dither.any())
 
     def rows(self, start: int, stop: int) -> FrameBlock:
@@ -93,6 +95,7 @@ class FrameBlock:
 
     def follows(self, before: FrameBlock) -> bool:
         """Return whether this block goes on where another ends."""
+        # Sequence numbers mean nothing outside of their session.
         return (self.session, self.dt_ns, self.first_seq) == (
             before.session,
             before.dt_ns,

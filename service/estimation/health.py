@@ -143,6 +143,7 @@ class UpperPower:
             return replace(state, parts_m2=(), lost_from_m2=None) if calm else state
         if len(before) * part_s < MIN_HISTORY_S:
             return state
+        # The median, which a gust in less than half of the parts does not move.
         usual_m2 = float(np.median(before))
         return replace(state, lost_from_m2=usual_m2) if runs_away(last, usual_m2) else state
 
@@ -248,16 +249,21 @@ def observe(
     levels = np.sqrt(np.einsum("km,km->k", commands, commands).astype(float) / expected)
     absurd = _absurd(health, levels)
     if absurd != health.absurd:
+        # The mean restarts: values in another unit would dominate it long after they have ended.
         health = LoopHealth(ratio=float(np.sqrt(np.mean(levels**2))))
+    # A dither begins and ends with the service, not with the loop: it must not look like a runaway.
     own = commands if block.dither_m is None else commands - block.dither_m[:, upper]
     upper_power = health.power.plus(own, len(in_loop), block.dt_ns * 1e-9)
     if absurd:
+        # Powers in another unit must not become the reference.
         upper_power = UpperPower()
     power = float(np.mean(levels**2))
     calming = health.diverging and power < health.ratio**2
     memory_s = _CALMING_S if calming else _MEMORY_S
     fade = float(np.exp(-block.n_frames * block.dt_ns * 1e-9 / memory_s))
+    # The mean is one of powers, the ratio that is kept one of RMS.
     ratio = float(np.sqrt(fade * health.ratio**2 + (1.0 - fade) * power))
+    # Hysteresis: a ratio near the limit must not switch the alarm on and off.
     limit = CALM_RATIO if health.diverging else DIVERGING_RATIO
     diverging = not absurd and (ratio > limit or upper_power.ratio is not None)
     beyond_s = _beyond_s(health, levels, block.dt_ns * 1e-9)
@@ -285,6 +291,8 @@ def _absurd(health: LoopHealth, levels: NDArray[np.float64]) -> bool:
     beyond = levels > ABSURD_RATIO
     if health.absurd or not beyond.any():
         return health.absurd and bool(beyond[-1])
+    # argmax of booleans is the first frame beyond. A loop that runs away grows frame by frame and
+    # passes DIVERGING_RATIO first; another unit appears from one frame to the next.
     before = levels[: int(np.argmax(beyond))]
     return not health.diverging and not bool((before > DIVERGING_RATIO).any())
 
@@ -382,7 +390,9 @@ def _update_health(
         average += fade * health.command
     power = float(fade) * health.turbulence**2 + float(1 - fade) * max(inner, 0.0)
     turbulence = float(np.sqrt(power))
+    # Rounding may make a small quadratic form negative.
     steady = max(float(average @ watch.inner @ average), 0.0) ** 0.5
+    # The last value avoids a division by zero while the mirror rests.
     scale = max(turbulence, SLOW_TURBULENCE_RATIO * steady, 1e-3)
     ratio = float(np.abs(watch.outer @ average).max()) / scale
     suspect_s = health.suspect_s + lasted_s if ratio > SUSPECT_RATIO else 0.0
@@ -519,12 +529,14 @@ def _close_played(
     part = (float(ratio[far].max()) if len(far) else 0.0, frozenset(far.tolist()))
     beyond = (*state.beyond, part)[-max(round(UNPLAYED_MEMORY_S / part_s), 1) :]
     n_beyond = sum(bool(actuators) for _, actuators in beyond)
+    # Hysteresis: the alarm lasts until no part of the last seconds is beyond.
     unplayed = n_beyond >= (1 if state.unplayed else N_UNPLAYED_PARTS)
     return replace(state, beyond=beyond, unplayed=unplayed)
 
 
 def _sigma(values: Array) -> float:
     """Return 1 σ of values around zero by their median, which a few far ones do not change."""
+    # Half of a normal distribution is within 0.6745 σ.
     return float(np.median(np.abs(values))) / 0.6745
 
 
@@ -601,7 +613,9 @@ class SlopeSpectra:
 
     def _with_segment(self, rows: Array) -> SlopeSpectra:
         window = np.hanning(SEGMENT_FRAMES)[:, None]
+        # Without its mean: the window would spread a static slope over the lowest bins.
         power = np.abs(np.fft.rfft((rows - rows.mean(axis=0)) * window, axis=0)).T ** 2
+        # A plain mean at first, then a forgetting one.
         share = max(1.0 / (self.n_segments + 1), 1.0 / _MEMORY_SEGMENTS)
         if self.power is not None:
             power = (1.0 - share) * self.power + share * power
@@ -660,8 +674,10 @@ class VibrationMonitor(Detector):
         """
         quiet, dithered = self.quiet, self.dithered
         if block.dither_m is None:
+            # The last lines are kept over a pause, so that the spectra under the same dither go on.
             quiet, dither_hz = quiet.with_frames(block), self.dither_hz
         else:
+            # The lines of another dither would remain in the mean as vibrations.
             if dither_hz != self.dither_hz:
                 dithered = SlopeSpectra(views=dithered.views)
             dithered = dithered.with_frames(block)
@@ -736,6 +752,8 @@ class Standstill(Detector):
     def follow(self, block: FrameBlock) -> Standstill:
         """Return it after one more block."""
         state = self
+        # By frame number: which frames are compared does not depend on how they are cut into
+        # blocks.
         for row in range(
             -block.first_seq % STANDSTILL_STRIDE_FRAMES, block.n_frames, STANDSTILL_STRIDE_FRAMES
         ):
@@ -745,6 +763,7 @@ class Standstill(Detector):
                 continue
             state = Standstill(
                 session=block.session,
+                # Copied: a view would keep the whole block in memory.
                 slopes=slopes.copy(),
                 first_seq=block.first_seq + row,
                 since_ns_utc=t_ns,

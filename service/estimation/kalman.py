@@ -133,6 +133,7 @@ def with_stretches(joint: Joint, nominal: Array) -> Joint:
     """Return the estimate with an anamorphosis as it is expected, where it has none yet."""
     if joint.n_alpha > 4:
         return joint
+    # Inserted between α and the biases; nothing correlates with them yet.
     at, expected = [4, 4], np.square(STRETCH_SIGMA) * np.eye(2)
     covariance = np.insert(np.insert(joint.covariance, at, 0.0, axis=0), at, 0.0, axis=1)
     covariance[4:6, 4:6] = expected
@@ -158,6 +159,7 @@ def forget(joint: Joint, block: BiasBlock, excess: Array | None = None) -> Joint
     place, n_states, biases = joint.place(block), len(joint.mean), joint.biases
     n_more = place.stop - n_states if place.stop > n_states else 0
     covariance = np.pad(joint.covariance, (0, n_more))
+    # Correlations with α go as well: they were learnt with the bias.
     covariance[place] = covariance[:, place] = 0.0
     covariance[place, place] = np.diag(np.square(block.floor) + excess)
     mean = np.pad(joint.mean, (0, n_more))
@@ -196,6 +198,8 @@ def predict_state(
     if flexure is not None:
         growth[:4] += flexure**2
     for bias in joint.biases:
+        # A first-order process: what has faded of the variance returns as the floor, so that the
+        # variance of an unobserved bias tends to the floor and does not vanish.
         growth[joint.place(bias.block)] = np.square(bias.block.floor) * (1.0 - fading**2)
     covariance = joint.covariance * np.outer(keep, keep) + np.diag(growth)
     # what fades of the excess the next look that tells of it brings back
@@ -228,8 +232,10 @@ def correct_state(
 
 def _update(prior: Joint, sees: Array, measured: Array, noise: Array) -> Joint:
     total = sees @ prior.covariance @ sees.T + noise
+    # K = P Hᵀ S⁻¹ without an inverse: S and P are symmetric.
     gain = np.linalg.solve(total, sees @ prior.covariance).T
     keep = np.eye(len(prior.mean)) - gain @ sees
+    # Joseph's form stays positive under rounding, unlike (I - K H) P.
     posterior = keep @ prior.covariance @ keep.T + gain @ noise @ gain.T
     return replace(
         prior,
@@ -257,6 +263,7 @@ def learnt(scatter: float, innovation: float) -> float:
     innovation
         Squared innovation of the newest, normalised with that scatter included: 4 is expected.
     """
+    # Limited: one jump must not make the filter expect a large scatter of all later windows.
     seen = min(innovation, JUMP_THRESHOLD) / 4.0
     return max(scatter * (1.0 + SCATTER_LEARNING * (seen - 1.0)), 1.0)
 
@@ -267,5 +274,7 @@ def widen_after_jump(prior: Joint, noise: Array) -> Joint:
     The bias is kept: the wind has not moved with the mirror.
     """
     moved = np.zeros(len(prior.mean))
+    # Only the four of α: the anamorphosis changes where optics are mounted, and the bias with the
+    # wind.
     moved[:4] = np.diag(prior.covariance)[:4] + np.diag(noise)
     return replace(prior, covariance=prior.covariance + JUMP_INFLATION**2 * np.diag(moved))

@@ -79,6 +79,7 @@ class LockInPlan(WindowPlan):
             raise ModelError(
                 f"lock-in: {self.n_frames} frames cut a period of {lines} Hz; expected whole ones"
             )
+        # The main lobe of a Hann window is four bins wide.
         gaps = np.diff(np.sort(lines)) * self.n_frames / self.frame_rate_hz
         if gaps.size and gaps.min() < 4:
             raise ModelError(f"lock-in: lines {lines} Hz closer than 4 bins in one window")
@@ -164,6 +165,8 @@ class LockIn(WindowCutter[LockInPlan, LockInSums, Spectra]):
         plan, sums = self.plan, window.sums
         real, imaginary = np.split(sums.dither, 2)
         dither = (real + 1j * imaginary).astype(np.complex64)
+        # The Hann window has a mean of 0.5, and a sine of RMS 1 appears at its frequency with half
+        # of its amplitude √2. So ``applied`` is an RMS, as in the request.
         weight = 0.5 * plan.n_frames / np.sqrt(2.0)
         applied = np.abs(dither[np.arange(len(plan.modes)), list(plan.modes)]) / weight
         reason = plan.refusal(applied, tuple(f"{line} Hz" for line in plan.frequencies_hz))
@@ -275,11 +278,13 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
         normal, score = _normal_equations(slopes, seen, known, gains, step)
         change = np.linalg.solve(normal, score)
         step = step + change[:n]
+        # After the numbers of α come real and imaginary part of each line's gain in turn.
         gains = gains + change[n::2] + 1j * change[n + 1 :: 2]
     normal, _ = _normal_equations(slopes, seen, known, gains, step)
     spread, misfit, unexplained = _side_bins(spectra, linearisation, seen, known, gains, step)
     inverse = np.linalg.inv(normal)
     every = inverse @ spread @ inverse.T
+    # Rounding leaves the product slightly asymmetric.
     every = (every + every.T) / 2
     turns = 2 * np.pi * np.array(spectra.plan.frequencies_hz) / loop.frame_rate_hz
     return LockInEstimate(
@@ -288,6 +293,7 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
         with_stretches=every[:n, :n] if n > 4 else None,
         stretched=float(np.abs(step[4:]).max(initial=0.0)),
         optical_gain=gains,
+        # Slopes that are late by n frames turn a line of w radians per frame by -n w.
         lag_frames=-np.angle(gains) / turns,
         misfit=misfit,
         unexplained=unexplained,
@@ -313,6 +319,7 @@ def _select_moved_modes(
 ) -> tuple[Spectra, Linearisation]:
     """Return both without the modes that are never commanded, if these are most modes."""
     moves = np.any(spectra.commands, axis=(0, 1)) | np.any(spectra.dither, axis=0)
+    # The loop responds to every line with all modes that it controls.
     moves[: len(loop.reconstructor)] = True
     if _FEW_MOVED_RATIO * np.count_nonzero(moves) > len(moves):
         return spectra, linearisation
@@ -346,9 +353,11 @@ def compute_total_commands(
     """
     n = len(coupling)
     w = 2 * np.pi * np.array(frequencies_hz) / loop.frame_rate_hz
+    # Transfer function of the leaky integrator with its delay, at the lines.
     integrator = np.exp(-1j * w * loop.delay_frames) / (1.0 - loop.leak * np.exp(-1j * w))
     answer = (np.outer(loop.gains[:n], integrator * gains)).astype(np.complex64)
     own = np.ascontiguousarray(coupling[:, :n])
+    # Minus: the loop counteracts what the sensor sees of the dither.
     first = -answer * _apply(coupling, dither).T
     reply = _sum_series(first, answer, own)
     if reply is None:
@@ -367,6 +376,7 @@ def _sum_series(first: Array, answer: Array, coupling: Array) -> Array | None:
         change, size = (np.abs(x).max(initial=0.0) for x in (reply - before, reply))
         if change <= _ROUNDING * size:  # "<=" because zeros have converged, too
             return np.asarray(reply)
+        # "not <" because NaN ends the series as well.
         if not change < _DIVERGENCE_RATIO * largest:
             return None
     return None
@@ -393,6 +403,7 @@ def _modulus_sigma(gains: Array, covariance: Array) -> Array:
     found = []
     for line, gain in enumerate(gains):
         part = slice(2 * line, 2 * line + 2)
+        # To first order only the noise along the gain's own phase changes its modulus.
         along = np.array([gain.real, gain.imag]) / abs(gain)
         found.append(np.sqrt(along @ covariance[part, part] @ along))
     return np.array(found)
@@ -412,6 +423,8 @@ def _answers_as(spectra: Spectra, matrix: Array) -> tuple[int, ...]:
     best = np.argmax(size, axis=1)
     lines = np.arange(len(own))
     for line in np.flatnonzero(size[lines, best] > OTHER_MODE_POWER_RATIO * size[lines, own]):
+        # Turbulence resembles low modes at all frequencies: the resemblance must be one of the
+        # line.
         beside = np.abs(slopes[line, 1:] @ unit[:, best[line]])
         if size[line, best[line]] < IDENTIFICATION_RATIO * np.sqrt(np.mean(beside**2)):
             best[line] = own[line]
@@ -427,6 +440,7 @@ def _weak(spectra: Spectra) -> tuple[int, ...]:
 
 def _total_dither_m(spectra: Spectra) -> float:
     """Return the RMS of all lines together, from the dither columns of the window."""
+    # RMS of each line: see ``LockIn.close`` for the factors.
     amplitudes = np.abs(spectra.dither).max(axis=1) * np.sqrt(2.0) / (0.5 * spectra.plan.n_frames)
     return float(np.sqrt(np.sum(amplitudes**2)))
 
@@ -480,10 +494,12 @@ def _side_bins(
         residual = spectra.slopes[line, 1:] - explained
         score = _regressors(known[line], gain, step).conj() @ residual.T
         at = _unknowns(line, len(step))
+        # Half of the power of a complex bin is in its real part, which the score takes.
         spread[np.ix_(at, at)] += 0.5 * (score @ score.conj().T).real / score.shape[1]
         left = spectra.slopes[line, 0] - gain * _regressors(seen[line], gain, step)[-2]
         power, noise = np.sum(np.abs(left) ** 2), np.mean(np.sum(np.abs(residual) ** 2, axis=1))
         misfit.append(power / noise)
+        # The noise may exceed the line: a share above 1 has no meaning.
         seen_power = max(float(np.sum(np.abs(spectra.slopes[line, 0]) ** 2) - noise), power)
         unexplained.append(max(float(power - noise), 0.0) / seen_power)
     return spread, float(np.mean(misfit)), np.array(unexplained)

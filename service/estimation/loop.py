@@ -42,6 +42,7 @@ def same_gains(some: Sequence[float], others: Sequence[float]) -> bool:
     """Return whether these are the gains of one loop."""
     if some == others:  # as nearly always, and a hundred times as quick
         return True
+    # No absolute tolerance: a mode that enters or leaves a gain of 0 makes another loop.
     return len(some) == len(others) and np.allclose(some, others, rtol=SAME_GAIN, atol=0.0)
 
 
@@ -84,6 +85,7 @@ def same_loop(one: Status, other: Status) -> bool:
 
 def same_but_for_modes(one: Status, other: Status) -> bool:
     """Return whether two loops differ in nothing but how many modes they control."""
+    # The gains of the modes that both control decide; those of added modes have no counterpart.
     n_modes = min(one.n_controlled, other.n_controlled)
     some, others = (_numbers(rtc, n_modes, rtc.gains[:n_modes]) for rtc in (one, other))
     return _same_state(one, other) and same_numbers(some, others)

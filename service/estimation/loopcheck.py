@@ -232,6 +232,7 @@ def observe(check: LoopCheck, block: FrameBlock, loop: ClosedLoop) -> LoopCheck:
         tail = None
     stride = max(1, round(loop.frame_rate_hz / SAMPLES_PER_S))
     waiting = list(check.waiting)
+    # By frame number: the samples do not depend on how the frames are cut into blocks.
     for row in range(-block.first_seq % stride, block.n_frames, stride):
         if row + 1 < depth:
             frames = _last(tail, block.rows(0, row + 1), depth)
@@ -331,6 +332,7 @@ def _judge(asked: Array, taken: Array, held: Array, loop: ClosedLoop) -> Command
     )
     if asked_for.any():
         mean = abs(share[asked_for].mean() - 1.0)
+        # 1 σ of a mean of independent modes.
         uncertain = np.linalg.norm(error[asked_for]) / np.count_nonzero(asked_for)
         if mean > MEAN_STEP_TOLERANCE + SIGNIFICANCE_SIGMA * uncertain:
             off |= np.abs(share - 1.0) > MEAN_STEP_TOLERANCE
@@ -344,6 +346,7 @@ def _judge(asked: Array, taken: Array, held: Array, loop: ClosedLoop) -> Command
 
 def _shares(products: _Products, weights: Array) -> tuple[Array, Array]:
     """Return ``(n_controlled,)`` regressions of what was taken on what was asked, and 1 σ."""
+    # No division by zero for a mode that rests.
     power = products.power(weights) + _STILL_M**2
     common = weights @ products.common
     left = np.maximum(products.taken - common**2 / power, 0.0)
@@ -357,12 +360,15 @@ def _lag(products: _Products, loop: ClosedLoop) -> Array:
     used.
     """
     late = loop.delay_frames - int(loop.delay_frames)
+    # Each mode's own power, so that all modes have the same weight whatever their amplitudes; the
+    # second term avoids a division by zero for modes that rest.
     scale = np.trace(products.asked) + products.n_samples * _STILL_M**2
     fitted = np.linalg.lstsq(
         (products.asked / scale).sum(axis=2), (products.common / scale).sum(axis=1)
     )[0]
     if fitted.sum() > STEP_TOLERANCE and (fitted > -0.1 * fitted.sum()).all():
         return np.asarray(fitted / fitted.sum())
+    # A delay of n and a fraction splits each step between two frames in that proportion.
     return np.array([1.0 - late, late, 0.0])
 
 
@@ -387,7 +393,9 @@ def _sample(frames: FrameBlock, loop: ClosedLoop) -> _Sample:
     return _Sample(
         seq=frames.first_seq + frames.n_frames - 1,
         slopes=_twice(slopes)[::-1],
+        # The part of the command that the leak keeps is known: what remains is -g R s.
         steps_m=_twice(commands[1:] - np.float32(loop.leak) * commands[:-1])[0],
+        # Exactly equal: noise moves a free command by more than single precision resolves.
         held=commands[-1] == commands[-2],
     )
 
@@ -404,6 +412,7 @@ def _multiply_waiting(check: LoopCheck, loop: ClosedLoop) -> LoopCheck:
     asked = (loop.reconstructor @ slopes.reshape(-1, slopes.shape[-1]).T).T
     batch = _Batch(
         seq=np.array([sample.seq for sample in check.waiting]),
+        # Minus, as in the loop law at the top: a command counteracts the slopes.
         asked_m=(-loop.gains.astype(np.float32) * asked).reshape(_TAPS, len(check.waiting), -1),
         taken_m=np.array([sample.steps_m for sample in check.waiting]),
         held=np.array([sample.held for sample in check.waiting]),

@@ -91,6 +91,7 @@ def find(spectra: Spectra, search: WideCaptureSearch) -> WideCaptureEstimate | W
     """Return where the first start leads from which the model explains the columns."""
     columns, noise = _columns(spectra)
     loop = ClosedLoop(
+        # A loop that controls no mode: the commands are the dither alone.
         reconstructor=np.zeros((0, len(columns.matrix)), np.float32),
         gains=np.zeros(0),
         leak=1.0,
@@ -139,9 +140,12 @@ def _columns(spectra: Spectra) -> tuple[Columns, Array]:
     lines = np.arange(len(spectra.plan.modes))
     known = spectra.dither[lines, list(spectra.plan.modes)].astype(complex)
     beside = np.sum(np.abs(spectra.slopes[:, 1:]) ** 2, axis=2).mean(axis=1)
+    # The real part: columns of an interaction matrix are real, and the phase of the dither was
+    # divided out.
     measured = (spectra.slopes[:, 0] / known[:, None]).real.T
     columns = Columns(
         matrix=measured,
+        # Each column counts alike, whatever the amplitude of its mode.
         weights=1.0 / np.sum(measured**2, axis=0),
         rows=np.ones(len(measured), dtype=np.bool_),
         signed=False,
@@ -153,8 +157,10 @@ def _columns(spectra: Spectra) -> tuple[Columns, Array]:
 def _unexplained_share(columns: Columns, noise: Array, matrix: Array) -> float:
     """Return the mean share of the columns that a matrix leaves, the noise taken off both."""
     power, total = np.sum(matrix**2, axis=0), np.sum(columns.matrix**2, axis=0)
+    # A column with a negative gain counts as not explained at all.
     along = np.maximum(np.sum(matrix * columns.matrix, axis=0), 0.0)
     left = total - along**2 / power - noise
+    # Noise may exceed the measured power of a weak column: the denominator must stay positive.
     return float(np.mean(left / np.maximum(total - noise, 0.1 * total)))
 
 

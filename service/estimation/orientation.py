@@ -302,6 +302,7 @@ class _Turned:
         norm = self._norm if seen.all() else np.linalg.norm(columns, axis=2)
         correlation = (along / norm).mean(axis=0)
         best = int(np.argmax(correlation))
+        # The angles go round: the first follows the last.
         before, at, after = np.take(correlation, [best - 1, best, best + 1], mode="wrap")
         step = vertex(before, at, after)
         angle = ANGLES_RAD[best] + step * (ANGLES_RAD[1] - ANGLES_RAD[0])
@@ -384,6 +385,8 @@ def low_order_of(model: InteractionModel) -> LowOrder:
     modes -= root * (root.T @ modes) / np.sum(root**2)
     smooth = _smooth(points, root)
     gram = modes.T @ modes
+    # A ridge, because modes may be nearly dependent: without it their combinations would be large
+    # and of opposite signs.
     held = gram + 1e-3 * np.trace(gram) / len(gram) * np.eye(len(gram))
     combined = np.linalg.solve(held, modes.T @ smooth)
     _, size, axes = np.linalg.svd(modes @ combined, full_matrices=False)
@@ -401,4 +404,5 @@ def _smooth(points: Array, root: Array) -> Array:
     x, y = (points / np.abs(points).max()).T
     powers = [x**i * y ** (n - i) for n in range(POLYNOMIAL_DEGREE + 1) for i in range(n + 1)]
     orthonormal, _ = np.linalg.qr(np.column_stack(powers) * root)
+    # The first power is the constant, so that the first orthonormal column is piston.
     return np.asarray(orthonormal[:, 1:])

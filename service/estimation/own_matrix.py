@@ -141,6 +141,7 @@ class OwnMatrix:
         """
         if not self.weights or not self.tells_registration:
             return None
+        # The error of a mean of all known modes is scaled to one of the few that a window has.
         share = self.known.sum() / N_DITHERED
         x, y, rotation, magnification = np.sqrt(np.diag(self.covariance) * share).tolist()
         return x, y, rotation, magnification
@@ -225,6 +226,7 @@ class OwnMatrix:
                 f"{len(whole)} modes"
             )
         place = dict(zip(columns.tolist(), modes.tolist(), strict=True))
+        # one < to lists each pair once.
         pairs = [(one, to) for one, to in place.items() if place.get(to) == one and one < to]
         if 2 * len(pairs) == len(columns):
             exchanged = _list_in_words([f"{one} and {to}" for one, to in pairs])
@@ -262,6 +264,7 @@ def recognise_modes(
     if not len(columns):
         return None
     inverse = _inverse_of(reconstructor[columns])
+    # Columns of unit length: gains differ by mode and say nothing of the registration.
     seen = inverse / np.maximum(np.linalg.norm(inverse, axis=0), np.finfo(float).tiny)
     alpha, near = start, linearise(start)
     n = min(N_FIRST_COLUMNS, len(columns))
@@ -307,8 +310,11 @@ def weights_of_modes(found: OwnMatrix, power: NDArray[np.floating]) -> tuple[flo
         return ()
     typical, every = float(np.median(misfit)), np.arange(len(power))
     slope, _ = np.polyfit(columns, misfit, 1)
+    # Never below the typical misfit: modes that were not measured are not assumed to be better.
     expected = typical + np.maximum(slope * (every - np.median(columns)), 0.0)
     expected[columns] = misfit
+    # The constant is for the error that the model has in any mode: no mode gets an unlimited
+    # weight.
     weights = 1.0 / (power * (MAX_UNWEIGHTED_MISFIT**2 + expected**2))
     return tuple((weights / weights.max()).tolist())
 
@@ -348,6 +354,7 @@ def _scatter(
         seen[:, usable], response[:, modes[usable]], near.derivatives[:, :, modes[usable]]
     )
     inverse = np.linalg.inv(normals)
+    # Corrects for the parameters that were fitted to the same modes.
     spread = scores @ scores.T * (len(usable) / (len(usable) - N_PARAMETERS))
     return np.asarray(inverse @ spread @ inverse.T)
 
@@ -386,6 +393,7 @@ def _recognise_columns(
     A column is the mode of its own number unless another one fits it clearly better.
     """
     size = np.maximum(np.linalg.norm(response, axis=0), np.finfo(np.float32).tiny)
+    # The absolute value: a mode with the other sign is recognised, and reported as such.
     likeness = np.abs((response / size).T @ seen)
     own = likeness[columns, np.arange(len(columns))]
     best = np.argmax(likeness, axis=0)

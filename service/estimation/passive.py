@@ -145,7 +145,9 @@ def high_pass(delay_frames: float) -> HighPass:
             f"{MIN_DELAY_FRAMES}: a faster loop answers noise in the frames in which its "
             "response is measured"
         )
+    # A delay of d frames: commands up to d - 1 frames after k do not know the noise of frame k.
     ahead = int(delay_frames) - 1
+    # Frequencies in cycles per frame, up to half of the frame rate.
     turns = (np.arange(4096) + 0.5) / 8192
     z = np.exp(-2j * np.pi * turns)
     power = 1.0 / np.abs(1.0 - 0.999 * z + _LOOP_GAIN * z ** round(delay_frames)) ** 2
@@ -154,10 +156,12 @@ def high_pass(delay_frames: float) -> HighPass:
     signal = (shifted * power).real.mean(axis=1)
     noise = ((shifted * power * (1.0 + turbulence)) @ shifted.conj().T).real / len(turns)
     taps = np.linalg.solve(noise, signal)
+    # A static command must not pass: the taps sum to 0.
     taps -= taps.mean()
     taps = (taps / np.abs(taps).max()).astype(np.float32)
     band = np.zeros((FILTER_BLOCK_FRAMES, FILTER_BLOCK_FRAMES + N_TAPS - 1), np.float32)
     for k, row in enumerate(band):
+        # Reversed, because a convolution is written as a product of matrices.
         row[k : k + N_TAPS] = taps[::-1]
     return HighPass(taps=taps, ahead=ahead, band=band)
 
@@ -361,6 +365,8 @@ def _sum_frames(state: Passive, frames: FrameBlock, *, last: bool) -> Passive:
     if len(others):
         moving = np.hstack([commands[now][:, others], commands[before][:, others]])
         shapes, size, _ = np.linalg.svd(moving.astype(float), full_matrices=False)
+        # The columns may be linearly dependent. Only the directions that they span are projected
+        # out of the instrument; the others are rounding errors.
         known = shapes[:, size > _RANK_TOLERANCE * size[0]].astype(np.float32)
         filtered -= known @ (known.T @ filtered)
     weight = np.ones((n, 1), np.float32)
@@ -373,6 +379,7 @@ def _sum_frames(state: Passive, frames: FrameBlock, *, last: bool) -> Passive:
     with_z = (frames.slopes[now], commands[now, : state.n_modes], filtered)
     sums = tuple(rows.T @ filtered for rows in with_z)
     fade = np.float32(np.exp(-n / state.memory_frames))
+    # Not strict: before the first chunk there are no old sums.
     for new, old in zip(sums, state.sums, strict=False):
         new += fade * old
     n_effective = float(fade) * state.n_effective + float(weight.sum())
@@ -478,6 +485,8 @@ def fit_matrix(
     normal = np.linalg.inv(seen.normal)
     step = normal @ seen.scores.sum(axis=1)
     left = seen.residual - np.tensordot(step, seen.jacobian, axes=1)
+    # Each column has one gain fitted, and all columns together the four of α. weights @ noise is
+    # ``least`` for each column that moves.
     freedom = (len(left) - 1) * (weights @ noise) - 4 * least
     variance = float(np.sum(left**2, axis=0) @ weights / freedom)
     scores = _patterns(left, noise).T @ (seen.jacobian * weights)
@@ -485,6 +494,7 @@ def fit_matrix(
     covariance = variance * normal @ spread @ normal
     return PassiveEstimate(
         alpha=near.add_step(step),
+        # Shrinks the correlations only: the variances on the diagonal are unchanged.
         covariance=(1.0 - CORRELATION_SHRINKAGE) * covariance
         + CORRELATION_SHRINKAGE * np.diag(np.diag(covariance)),
         optical_gain=seen.gains,
@@ -509,5 +519,6 @@ def _slope_variance(state: Passive, matrix: Array) -> float:
         return float("nan")
     slopes = np.array([slopes for slopes, _ in state.samples])
     commands = np.array([commands for _, commands in state.samples])
+    # The gain of the filter for the power of white noise.
     passed = float(np.sum(state.instrument_filter.taps**2))
     return float(np.mean((slopes - commands @ matrix.T) ** 2)) / passed

@@ -110,11 +110,14 @@ class PassiveSums(Estimator):
             return sums, why
         rate_hz = loop.rtc.frame_rate_hz
         if not beside or sums.tail is None:
+            # Frames that wait are kept for the next estimate, which therefore began earlier.
             waiting_ns = round(sums.n_waiting * 1e9 / rate_hz)
             return replace(sums.empty(rests=False), since_ns_utc=now_ns - waiting_ns), sums
         rest_s = PASSIVE_INTERVAL_S * (LONG_RESTS if has_windows else RESTS)
         begun = replace(
             sums.empty(rests=True),
+            # The pause is counted in frames for the sums, and by the clock for the decision to wake
+            # up.
             from_seq=sums.tail.next_seq + round(rest_s * rate_hz),
             since_ns_utc=now_ns + round(rest_s * 1e9),
         )

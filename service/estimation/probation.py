@@ -282,6 +282,8 @@ def _observe(
     lines = tuple(f * block.dt_ns * 1e-9 for f in lines_hz) if moved else ()
     reader, residual = (None, None) if state.reader is None else state.reader.read(block, state.own)
     state = replace(state, reader=reader)
+    # The sines of each line take two dimensions of the steps: in a shorter block too little of the
+    # loop's own motion is left.
     if len(steps) < 3 * (1 + 2 * len(lines)):
         return state
     part = replace(_part(block, steps, lines, edge), residual=residual)
@@ -335,6 +337,7 @@ def _part(
         last = block.commands_m[-1, edge.modes]
         outer = edge.outer @ last
         power[OUTER] = n_frames * (outer @ outer) / len(outer)
+        # Rounding in single precision may make a small quadratic form negative.
         power[INNER] = n_frames * max(float(last @ (edge.inner @ last)), 0.0)
     return Part(n_frames=n_frames, power=power, peak=peak)
 
@@ -361,6 +364,8 @@ def _add_sums(state: Comparison, part: Part, block: FrameBlock) -> Comparison:
     parts = parts[-round(HISTORY_S / dt_s / length) :]
     n_recent = round(REFERENCE_PERIOD_S / dt_s / length)
     if len(parts) > n_recent:
+        # Samples of slopes are kept for recent parts only, from which the new matrix reads the
+        # residual; older ones would take memory for nothing.
         old = parts[-n_recent - 1]
         parts = (*parts[: -n_recent - 1], old.without_samples(), *parts[-n_recent:])
     return replace(state, parts=parts)
@@ -376,10 +381,12 @@ def _judge_parts(state: Comparison, block: FrameBlock) -> Comparison:
     if state.parts[-1].n_frames < max(PART_S / dt_s, MIN_PART_FRAMES) - _LAG_SPAN_FRAMES:
         return state
     known = np.intersect1d(before.modes, () if state.modes is None else state.modes)
+    # A mode that was dithered in one part and not in another would look as if it had changed.
     modes = np.setdiff1d(known, np.fromiter(state.dithered, np.intp))
     after_s = sum(part.n_frames for part in state.parts) * dt_s
     if state.returned and after_s < RETURN_PERIOD_S:
         return state
+    # After a rollback the loop recovers during the first parts: the last ones decide.
     looked_at = state.parts[-N_RETURN_PARTS:] if state.returned else state.parts
     over = after_s >= MAX_PROBATION_S - PART_S
     decides = over or state.returned

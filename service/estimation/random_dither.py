@@ -139,6 +139,7 @@ class RandomDither(WindowCutter[RandomPlan, Correlations | None, Correlated]):
         start = self.overlap
         while start < block.n_frames:
             batch = (place + start) * n_batches // n_frames
+            # Rounded up: the first frame that the line above assigns to the next batch.
             next_batch = -(-(batch + 1) * n_frames // n_batches)
             end = min(block.n_frames, next_batch - place)
             sums = self._sum_batch(sums, block.rows(start - self.overlap, end), batch)
@@ -188,6 +189,7 @@ def join_random_windows(one: Correlated, other: Correlated) -> Correlated:
         )
     a, b = one.sums, other.sums
     both = {part.name: getattr(a, part.name) + getattr(b, part.name) for part in fields(a)}
+    # All other fields are sums and have been added; this one is a mean.
     both["memory"] = (a.memory * a.n_pairs + b.memory * b.n_pairs) / both["n_pairs"]
     return replace(
         other,
@@ -243,6 +245,7 @@ class NoisyMatrix:
     @property
     def snr_of_modes(self) -> NDArray[np.float64]:
         """``(n_dithered,)`` RMS signal of a column's elements over their noise; 0: none seen."""
+        # Noise alone has a mean square of 1. Its scatter may make the difference negative.
         power = np.mean((self.matrix / self.noise) ** 2, axis=0) - 1.0
         return np.asarray(np.sqrt(np.maximum(power, 0.0)))
 
@@ -366,6 +369,7 @@ def _answers(
     # the late response was not whitened: its noise is that of the slopes as they are
     louder = np.sqrt(sums.slope_power.sum() / sums.noise_power.sum())
     late = later * np.sqrt(norm) / louder
+    # A negative share is the loop's own reply, and no lag.
     lag = max(later / (at_once + later), 0.0) if at_once + later > 0.0 else 0.0
     return min(lag, 1.0), _check_responses(seen, late)
 
@@ -395,6 +399,7 @@ def _noise_variance(sums: Correlations) -> Array:
     left = sums.noise_power - explained
     # of a noise-free sensor nothing but rounding is left
     left = np.maximum(left, 1e-12 * sums.noise_power)
+    # One response per dithered mode has been fitted to each slope.
     variance = np.where(left > 0.0, left, left.mean()) / max(sums.n_pairs - len(power), 1)
     return np.asarray(variance)
 
@@ -423,7 +428,10 @@ def _scatter(scores: Array, normal: Array) -> Array:
     noise, which is ``normal``.
     """
     n, own = len(scores), scores - scores.mean(axis=0)
+    # The mean of the scores has been removed; the sum of n has n times the variance of one.
     found = own.T @ own * n / (n - 1)
+    # White noise of variance 1 has a scatter equal to the normal matrix: inflation is how much
+    # louder the noise is on average.
     inflation = float(np.trace(np.linalg.solve(normal, found))) / len(normal)
     return np.asarray(
         (WHITE_PRIOR_PARTS * inflation * normal + n * found) / (WHITE_PRIOR_PARTS + n)

@@ -94,6 +94,7 @@ def target_of(reference: Reference, instrument: Instrument) -> Target:
     MatrixError
         If hardly any slope answers the mirror.
     """
+    # The model's light meets the mirror once.
     single_pass = np.asarray(reference.matrix, dtype=np.float64) / reference.passes
     mask = rtc_valid_subapertures(instrument)
     matrix = to_conventions(single_pass, instrument.slopes, mask)

@@ -148,8 +148,10 @@ class Reader:
         residual = block.slopes[rows] @ self.matrix.T
         commands = block.commands_m[rows, :n_modes]
         seq = np.concatenate([self.seq, block.first_seq + rows])
+        # The residual is the turbulence plus the command, which counteracts it.
         turbulence = np.concatenate([self.turbulence_m, residual - commands])
         moved = turbulence[LAG_SAMPLES:] - turbulence[:-LAG_SAMPLES]
+        # Pairs across a gap of frames are further apart in time and would show too much motion.
         moved = moved[seq[LAG_SAMPLES:] - seq[:-LAG_SAMPLES] == LAG_SAMPLES * stride]
         kept = (block.first_seq + rows) % (KEPT_STRIDE_SAMPLES * stride) == 0
         sums = Residual(
@@ -159,6 +161,8 @@ class Reader:
             moved=_squares(moved),
             commanded=_squares(commands),
             own=None if own is None else _squares(block.slopes[rows] @ own.T),
+            # Slopes are kept only before a swap, for the matrix to come; after it that matrix reads
+            # them here.
             kept=(block.slopes[rows[kept]],) if own is None and kept.any() else (),
         )
         return replace(self, seq=seq[-LAG_SAMPLES:], turbulence_m=turbulence[-LAG_SAMPLES:]), sums
@@ -208,6 +212,7 @@ class ResidualLevel:
         usual = self.total.commanded / self.total.n_seen
         upper = np.flatnonzero(usual > 0.0)
         upper = upper[len(upper) // 2 :]
+        # Parts of another number of modes have another upper half, so that nothing can be compared.
         comparable = [p for p in parts if len(p.commanded) == len(usual) and p.n_seen]
         if len(comparable) < len(parts) or not len(upper):
             return [], 0.0
@@ -329,6 +334,8 @@ class Rejection(Detector):
         own = block.without_dither().commands_m[:, in_loop].astype(float)
         if len(own) < 2:
             return self
+        # The loop law solved for R s: the residual follows from the commands alone, whatever matrix
+        # is in use. The delay only shifts it in time.
         residual = np.square((leak * own[:-1] - own[1:]) / gains).sum(axis=0)
         commanded, lasts_s = np.square(own[1:]).sum(axis=0), block.n_frames * block.dt_ns * 1e-9
         if self.residual is None or self.commanded is None or len(self.residual) != len(residual):
@@ -345,6 +352,7 @@ class Rejection(Detector):
         """Return True if the loop holds well; None if there is too little telemetry."""
         if self.residual is None or self.commanded is None or self.lasts_s < RESIDUAL_MEMORY_S:
             return None
+        # A mode that never moved would divide by zero.
         commanded = np.maximum(self.commanded, 1e-40)
         left = float(np.sqrt(self.residual.sum() / commanded.sum()))
         median = float(np.sqrt(np.median(self.residual / commanded)))

@@ -156,6 +156,8 @@ def identify_from_response(
         for setting in settings_of(reported, reported.kind.orders)
     }
     best = max(every.values())
+    # A lag that explains the slopes better takes precedence: half a period of delay looks like the
+    # other sign.
     if best < MIN_AXES_CORRELATION or as_stated * OTHER_AXES_ADVANTAGE > best or lagging > best:
         return SlopeConvention(wrong=unit)
     if (

@@ -143,6 +143,7 @@ class Projection:
     @cached_property
     def best_step(self) -> Array:
         """``(n_unknowns,)`` the step to where least is left, to first order."""
+        # A ridge far below noise, for unknowns that the columns cannot tell apart.
         held = self.normal + 1e-9 * np.diag(np.diag(self.normal))
         return np.linalg.solve(held, self.scores.sum(axis=1))
 
@@ -208,17 +209,20 @@ def approach(
     converged = False
     for _ in range(MAX_FAR_STEPS):
         derivatives = model.derivatives(start.with_vector(vector))
+        # Four derivatives cost as much as four matrices.
         seen, n = columns.project(matrix, derivatives), n + 4
         if not seen.gains.any():
             break
         damped = seen.normal + 1e-6 * np.diag(np.diag(seen.normal))
         step = np.linalg.solve(damped, seen.scores.sum(axis=1))
+        # All four are shortened by one factor, so that the direction of the step is kept.
         step /= max(1.0, float(np.max(np.abs(step) / MAX_STEP)))
         converged, tried = bool(np.all(np.abs(step) < approached)), step
         for _ in range(_HALVINGS):
             if allowed(vector + tried):
                 found = model.interaction_matrix(start.with_vector(vector + tried))
                 left, n = columns.misfit(found), n + 1
+                # At the minimum rounding may make the misfit slightly larger.
                 if left <= misfit * (1.0 + 1e-9):
                     vector, matrix, misfit = vector + tried, found, left
                     break

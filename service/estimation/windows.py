@@ -231,6 +231,7 @@ class Window(Generic[S]):
             "session": self.session,
             "cm_id": self.cm_id,
             "first_seq": self.first_seq,
+            # The last frame is the one before the next.
             "t_end_ns_utc": self.next_t_ns - self.dt_ns,
             "n_missing": self.n_missing,
         }
@@ -258,6 +259,7 @@ class Window(Generic[S]):
         if abs(block.t0_ns_utc - expected_ns) > block.dt_ns / 2:
             return RefusalKind.OTHER, "the RTC's clock stepped or it paused inside the window"
         end_seq = self.first_seq + n_frames
+        # A gap that goes beyond the end counts only as far as the window reaches.
         missing = self.n_missing + min(block.first_seq, end_seq) - self.next_seq
         if missing > MAX_MISSING_FRACTION * n_frames:
             share = f"more than {MAX_MISSING_FRACTION:.0%}"
@@ -328,9 +330,12 @@ class WindowCutter(Generic[P, S, F]):
                 dt_ns=block.dt_ns,
                 sums=self.begin(block),
             )
+        # Before the test for the end: a new session or a stepped clock voids the frame numbers that
+        # this test relies on.
         why = window.check_continuity(block, n_frames)
         if why is not None:
             kind, reason = why
+            # No row was used: the same block may begin the next window.
             return None, 0, WindowRefused(reason=reason, t_ns_utc=window.next_t_ns, kind=kind)
         end_seq = window.first_seq + n_frames
         if block.first_seq >= end_seq:  # the window's last frames never came
@@ -343,6 +348,8 @@ class WindowCutter(Generic[P, S, F]):
 
     def _with_rows(self, window: Window[S], rows: FrameBlock) -> Window[S]:
         """Return the window after some rows, which wait until there are enough to be added."""
+        # Only consecutive frames are joined: the place of a block in the window is that of its
+        # first frame.
         if window.waiting and not rows.follows(window.waiting[-1]):
             window = replace(self._add_waiting(window), waiting=())
         window = replace(

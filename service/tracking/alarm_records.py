@@ -153,6 +153,8 @@ def _with_alarm(record: AlarmRecord, alarm: Alarm) -> AlarmRecord:
         since_ns_utc=alarm.since_ns_utc,
         text=alarm.text,
         over_ns_utc=None,
+        # An acknowledgement is of what was seen: an alarm that became more severe must be seen
+        # again.
         acknowledged=None if worse else record.acknowledged,
     )
 
@@ -164,11 +166,14 @@ def _without_alarm(context: StepContext, record: AlarmRecord, *, ordered: bool) 
     if record.over_ns_utc is None:
         if ordered or record.acknowledged is not None:
             return _blank(record)
+        # The alarm has just ended: only the state before the event still has its last text.
         last = next(
             (a.text for a in context.before.alarms.active if a.name == record.name), record.text
         )
         return replace(record, over_ns_utc=context.now_ns, text=last)
     waited_ns = context.now_ns - record.over_ns_utc
+    # After a restart an alarm that goes on is raised again within this time, and must find its
+    # acknowledgement.
     if record.acknowledged is not None and waited_ns > RESTART_GRACE_S * SECOND_NS:
         return _blank(record)
     return record

@@ -120,6 +120,7 @@ def _acquisition(context: StepContext) -> str | None:
 def _not_found(context: StepContext) -> str | None:
     if context.acquisition.under_way or not context.acquisition.misses:
         return None
+    # Hysteresis: an alarm that is raised lasts until a window finds the registration.
     if not (context.loop.holds and has_missed_enough(context.state)):
         return context.alarm_text(alarms.NOT_FOUND)
     proof = context.matrices.mode_proof
@@ -225,6 +226,7 @@ def _is_over_budget(context: StepContext) -> bool:
     if memory.unwanted_id is not None:
         return True
     plays = own is not None and rtc is not None and rtc.dither_id == own.id
+    # Ends with the next dither that plays without being too strong, or when none is wanted.
     return not (plays and not memory.loud_text) and not _is_given_up(context)
 
 
@@ -287,6 +289,7 @@ FIELDS: Final[dict[str, Callable[[TrackerState], cmd.Value | None]]] = {
 
 def _rule_text(context: StepContext, rule: Rule) -> str | None:
     """Return what an operators' rule says that holds now, else None."""
+    # Values of the observatory expire: a program that stopped reporting leaves the value unknown.
     found = _value_of(context, rule)
     holds = rule.holds_unknown if found is None else _COMPARE[rule.how](found, rule.than)
     shown = "not known" if found is None else format_value(found)

@@ -355,6 +355,7 @@ def _ask(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
         replace(
             context.dither_policy,
             lines_hz=wanted.parameters.last_hz if wanted.parameters.modes else dither.frequency_hz,
+            # The count that accepted windows reach once all of this dither have arrived.
             results_due=context.windows.accepted + wanted.parameters.n_windows,
             ended_ns_utc=None,
             next_ns_utc=None,
@@ -365,6 +366,7 @@ def _ask(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
 
 def _end_when_done(context: StepContext, rtc: Status, dither: Dither, wanted: WantedDither) -> None:
     """Stop a dither that has done its work, or is no longer the one to ask for."""
+    # The service's clock: what is left only decides whether a command to stop is worth sending.
     left_s = dither.request.duration_s - (context.now_ns - dither.asked_ns_utc) / SECOND_NS
     was_stopped = dither.id == context.dither_policy.stopped_id
     if dither.start_seq is None or left_s < MIN_STOPPED_REMAINDER_S or was_stopped:
@@ -372,9 +374,11 @@ def _end_when_done(context: StepContext, rtc: Status, dither: Dither, wanted: Wa
     registration = context.registration
     seen = registration is not None and registration.window_ns_utc > dither.asked_ns_utc
     pause_s = (wanted.next_ns_utc - context.now_ns) / SECOND_NS
+    # Stopped only where the pause is worth a start and its settling.
     done = seen and wanted.phase is DitherPhase.SPARSE and pause_s >= dither_plan.MIN_DITHER_PAUSE_S
     weak = (
         wanted.phase is DitherPhase.ACQUIRE
+        # Only a dither with less than half of the wanted amplitude is worth a restart.
         and 2.0 * total_m(dither.request) < wanted.parameters.total_m
     )
     moved = dither_plan.check_dithered_modes(dither, rtc, context.policy, wanted.parameters.shunned)
@@ -429,6 +433,7 @@ def _update_cost(context: StepContext, rtc: Status) -> None:
     playing = dither if followed else rtc.dither
     power = 0.0 if playing is None else total_m(playing.request) ** 2
     since_ns = context.now_ns if dithering.seen_ns_utc is None else dithering.seen_ns_utc
+    # 1 - exp(-t/T), accurate for short steps. A clock that was set back adds nothing.
     share = -np.expm1(-max(context.now_ns - since_ns, 0) / (COST_AVERAGING_TIME_S * SECOND_NS))
     passive_ns = dithering.passive_ns_utc
     windows_ns = 0 if registration is None else registration.window_ns_utc
@@ -448,6 +453,7 @@ def _update_cost(context: StepContext, rtc: Status) -> None:
 
 def _set_phase(context: StepContext, phase: DitherPhase, reason: str) -> None:
     none_follows = phase in {DitherPhase.OFF, DitherPhase.OPERATOR}
+    # A phase in which the service starts no dither must not announce one.
     next_ns = None if none_follows else context.dither_policy.next_ns_utc
     _set_policy(
         context, replace(context.dither_policy, phase=phase, reason=reason, next_ns_utc=next_ns)

@@ -76,6 +76,8 @@ def expected_amplification(rtc: Status, policy: Policy, chosen: tuple[int, ...] 
     found = compute_amplification(
         gains[:, None], lines, leak=rtc.leak, delay_frames=max(rtc.delay_frames, 1.0)
     )
+    # The mean is over the lines, of power; the largest is over the optical gains, because the
+    # seeing is not known. A loop that attenuates the dither must not raise the request.
     return max(float(np.sqrt(np.mean(found**2, axis=-1)).max()), 1.0)
 
 
@@ -100,6 +102,7 @@ def _without_choice(
     """Return the modes to dither where there is no choice; None: there is."""
     if policy.dither_modes:
         return policy.dither_modes[: rtc.max_dither_modes]
+    # Enough free modes are left to choose among.
     if rtc.n_modes - _first_free(rtc, policy) >= N_LINES:
         return None
     if policy.mode_information is None:

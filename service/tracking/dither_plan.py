@@ -193,9 +193,11 @@ def _with_others(context: StepContext, rtc: Status, choice: DitherParameters) ->
     others = others[: min(len(free), rtc.max_dither_modes - len(telling))]
     if not others:
         return choice
+    # As far apart as the free lines allow.
     spread = np.linspace(0, len(free) - 1, len(others)).round().astype(int)
     share = min(WEAK_LINES_POWER_SHARE / len(others), MAX_WEAK_LINE_POWER_SHARE)
     lines = {mode: (free[k], share) for mode, k in zip(others, spread.tolist(), strict=True)}
+    # Shares are of power: together they make 1, and the total amplitude stays that of the choice.
     rest = (1.0 - share * len(others)) / len(telling)
     lines |= {mode: (line, rest) for mode, line in zip(telling, strong, strict=True)}
     return replace(
@@ -221,6 +223,7 @@ def _parameters(
     return DitherParameters(
         total_m=total_m,
         window_s=window_s,
+        # The tolerance keeps rounding from losing a window of an exact multiple.
         n_windows=max(int(lasting_s / window_s + 1e-6), 1),
         avoid_hz=(*context.policy.dither_avoid_hz, *context.loop.vibrations_hz),
         last_hz=context.dither_policy.lines_hz,
@@ -249,6 +252,7 @@ def _plan(
         interval_s=interval_s,
         sigma=found.sigma,
         sufficient=found.sufficient,
+        # An RMS over time: it goes with the root of the share of the time with dither.
         mean_cost_m=total_m * float(np.sqrt(on_s / interval_s)),
     )
 
@@ -262,6 +266,7 @@ def precision(state: TrackerState, rtc: Status) -> NDArray[np.float64]:
 def budget_m(rtc: Status, policy: Policy) -> float:
     """Return the largest RMS of all lines together that policy, settings and RTC allow, metres."""
     n = n_lines(rtc, policy)
+    # Both limits are of one mode; the total of n equal modes is the root of n times larger.
     largest = min(rtc.max_dither_m, policy.dither_amplitude_m or np.inf)
     return float(min(policy.dither_budget_m, largest * np.sqrt(max(n, 1))))
 
@@ -311,6 +316,7 @@ def _requirement(
     policy = context.policy
     requirement = DitherRequirement(
         sigma=policy.dither_sigma,
+        # Both the schedule and the pauses divide by the drift.
         drift_rate=np.sqrt(np.maximum(_walk_rate(context), _MIN_DRIFT_RATE**2)),
         budget_m=quiet_budget_m(rtc, policy),
         window_s=policy.window_s,
@@ -340,6 +346,7 @@ def _walk_rate(context: StepContext) -> NDArray[np.float64]:
     registration, base = context.registration, context.policy.drift_rate**2
     if registration is None:
         return base
+    # Over less than a second, growth divided by age would be noise, or a division by zero.
     age_s = (context.now_ns - registration.arrived_ns_utc) / SECOND_NS
     # During a slew flexure adds more than the drift of the settings.
     return np.maximum(base, registration.grown / age_s) if age_s >= 1.0 else base
@@ -390,12 +397,15 @@ def _pace_without_passive(
     registration: Registration, requirement: DitherRequirement, longest_ns: int
 ) -> tuple[DitherPhase, str, int]:
     """Pace by how far α may have walked since the last window."""
+    # α walks randomly, so that its variance grows linearly with time. The parameter with the least
+    # room decides.
     room = requirement.sigma**2 - np.diag(registration.covariance)
     on_s = DITHER_SETTLING_S + requirement.window_s + DITHER_MARGIN_S
     pause_s = float(np.min(room / requirement.drift_rate**2)) - on_s
     if pause_s < MIN_DITHER_PAUSE_S:
         text = "α walks too fast for a pause, or no window brings σ to its target"
         return DitherPhase.FOLLOW, text, registration.arrived_ns_utc
+    # Bounded, because a slow drift allows any pause; the longest one is applied below.
     due_ns = registration.arrived_ns_utc + round(min(pause_s, 1e6) * SECOND_NS)
     return (
         DitherPhase.SPARSE,

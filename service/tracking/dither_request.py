@@ -197,6 +197,7 @@ def expected_dither(
 
     ``products`` is that of ``Description``; None if the slopes' response is unknown.
     """
+    # There is no start before the RTC has accepted the dither.
     first_seq, request = dither.start_seq or 0, dither.request
     modes = list(request.modes)
     response: tuple[float, ...] = ()
@@ -223,6 +224,8 @@ def clear_lines(rtc: Status, n_lines: int, choice: DitherParameters) -> tuple[fl
     """
     last = choice.last_hz
     rate, step = rtc.frame_rate_hz, step_of(rtc, choice.window_s)
+    # The side bins of a line must stay between 0 and the Nyquist frequency after the line was
+    # rounded to a whole period.
     edge = float(SIDE_OFFSETS_HZ.max()) + step
     near = [abs(line - vibration) for line in last for vibration in choice.avoid_hz]
     told = all(edge <= line <= rate / 2 - edge for line in last)
@@ -244,6 +247,7 @@ def clear_lines(rtc: Status, n_lines: int, choice: DitherParameters) -> tuple[fl
 
 def on_vibrations(dither: Dither, avoid_hz: tuple[float, ...]) -> tuple[float, ...]:
     """Return the lines of a dither that are not clear of vibrations."""
+    # A line that was placed at exactly the clearance is clear.
     near = VIBRATION_CLEARANCES_HZ[-1] - 1e-6
     return tuple(f for f in dither.frequency_hz if any(abs(f - v) < near for v in avoid_hz))
 
@@ -296,6 +300,7 @@ def plan_random(
         If the RTC would not play it, or no window fits into it.
     """
     modes = _modes(modes, rtc)
+    # Powers of modes add, so that the RMS of each is the total over the root of their number.
     amplitude_m = float(total_m / np.sqrt(len(modes)))
     if amplitude_m > rtc.max_dither_m:
         raise CommandError(
@@ -306,6 +311,7 @@ def plan_random(
         policy.window_s,
         RANDOM_WINDOW_MARGIN_RATIO * FRAMES_PER_MODE * len(modes) / rtc.frame_rate_hz,
     )
+    # The tolerance keeps rounding from losing a window of a duration that is an exact multiple.
     n_windows = int(duration_s / least_s * (1.0 + 1e-9))
     if n_windows < 1:
         raise CommandError(
@@ -333,6 +339,8 @@ def random_plan(dither: Dither, rtc: Status, window_s: float) -> RandomPlan:
     return RandomPlan(
         modes=dither.request.modes,
         amplitude_m=dither.request.amplitude_m,
+        # Rounded down, so that all windows fit into the dither; the tolerance is for rounding
+        # errors.
         n_frames=int((dither.window_s or window_s) * rtc.frame_rate_hz * (1.0 + 1e-12)),
         first_seq=(dither.start_seq or 0) + round(DITHER_SETTLING_S * rtc.frame_rate_hz),
     )
@@ -360,6 +368,7 @@ def cost_of(total_m: float, policy: Policy, *, over_budget: bool) -> str:
         If it is not.
     """
     cost = f"{1e9 * total_m:.3g} nm RMS in all, budget {1e9 * policy.dither_budget_m:.3g} nm"
+    # Rounding must not put a dither of exactly the budget over it.
     if total_m <= policy.dither_budget_m * (1.0 + 1e-9):
         return cost
     if not over_budget:

@@ -116,6 +116,7 @@ def _update_gain(
     farthest = _MAX_SCATTER_SIGMA * float(np.sqrt(prior + gain.scatter**2))
     # A single outlier must not inflate the scatter for the next ten windows.
     innovation = float(np.clip(measured - gain.gain, -farthest, farthest))
+    # The innovation scatters by the uncertainty of the gain, too: what is left is the window's own.
     learnt = max(innovation**2 - prior, noise**2)
     scatter = float(np.sqrt((1 - SCATTER_WEIGHT) * gain.scatter**2 + SCATTER_WEIGHT * learnt))
     weight = prior / (prior + scatter**2)
@@ -214,6 +215,8 @@ def joint_of(registration: Registration) -> Joint:
     if known is not None:
         mean = np.concatenate([joint.mean, registration.alpha.stretches])
         every = [[joint.covariance, known.shared.T], [known.shared, known.covariance]]
+        # The anamorphosis comes directly after the four of α, before any bias: ``stretches_of`` and
+        # ``biases_of`` read the state in this order.
         joint = begin_joint(mean, np.block(every))
     for bias in registration.biases:
         covariance = [[joint.covariance, bias.shared.T], [bias.shared, bias.covariance]]
@@ -288,6 +291,7 @@ def accept(
         window_began_ns_utc=when.began_ns_utc,
         optical_gain=measured.optical_gain,
         optical_gains=measured.optical_gains,
+        # What was known before a jump is of another registration.
         biases=without_previous(biases) if anew else biases,
         previous_estimate=None if anew else _previous_estimate(previous, update, measured),
         jumped_ns_utc=_jumped_ns_utc(previous, update, context.now_ns),
@@ -337,6 +341,7 @@ def _previous_estimate(
     registration: Registration | None, update: FilterUpdate, measured: WindowEstimate
 ) -> PreviousEstimate | None:
     """Return what was known before a window, and before the one that came before it."""
+    # After a first window, or a jump, no earlier estimate describes the same registration.
     if registration is None or update.n_windows == 1:
         return None
     before = registration.previous_estimate

@@ -107,6 +107,7 @@ def innovation_of(difference: Array, covariance: Array) -> Innovation:
     score = weight @ difference
     return Innovation(
         mahalanobis_squared=float(score @ difference),
+        # Likelihood ratio for a step of the rotation alone, given the correlations with the others.
         rotation=float(score[_ROTATION] ** 2 / weight[_ROTATION, _ROTATION]),
     )
 
@@ -177,6 +178,8 @@ def _jump_inside_first(
     # excludes turbulence (docs/decisions/0025-jumps.md).
     if found.excess <= MAX_TURBULENCE_EXCESS:
         return ZERO_INNOVATION
+    # Both steps are measured in units of the noise, otherwise the units of the four parameters
+    # would decide their angle.
     total = _noise_of_two(first, window, policy)
     part, whole = (one.alpha.vector - registration.alpha.vector for one in (first, window))
     along = float(part @ np.linalg.solve(total, whole))
@@ -239,10 +242,14 @@ def passive_innovation(
     for earlier in (sum_of(registration, joint, block), before):
         if earlier is not None:
             elapsed_s = max(window.t_ns_utc - earlier.t_ns_utc, 0) / SECOND_NS
+            # 1 - exp(-2t/T): the variance of a bias with memory T that has been forgotten. Twice
+            # the rate, because it is a variance.
             fading = -np.expm1(-2.0 * elapsed_s / policy.bias_memory_s)
             # The bias fades with its memory, so an old comparison must allow for a new bias.
             forgot = np.square(block.floor) * fading + off
             found.append(_innovation_from(earlier, window, policy, forgot).mahalanobis_squared)
+    # The larger of the two, because a change within one estimate shows fully only in comparison
+    # with the state before it.
     return max(found)
 
 
@@ -275,6 +282,7 @@ def _with_scatter(registration: Registration, window: EstimateT) -> EstimateT:
 def _together(first: TimedEstimate, window: PointedEstimate) -> PointedEstimate:
     """Return the mean of two windows, each by its precision, at the time of the second."""
     weights = [np.linalg.inv(noise) for noise in (first.covariance, window.covariance)]
+    # Independent windows: their inverse covariances add.
     noise = np.linalg.inv(weights[0] + weights[1])
     value = noise @ (weights[0] @ first.alpha.vector + weights[1] @ window.alpha.vector)
     return replace(window, alpha=Misregistration.from_vector(value), covariance=noise)
@@ -309,6 +317,7 @@ def _model_scatter(registration: Registration, policy: Policy) -> Array:
     A window of other modes, or of a loop with another reconstructor, has another share of it: the
     whole of it may differ.
     """
+    # Variances: only the part beyond the usual error differs between windows.
     usual = USUAL_MODEL_ERROR_RATIO * policy.floor
     return np.asarray(np.maximum(registration.floor**2 - usual**2, 0.0))
 

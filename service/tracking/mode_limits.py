@@ -73,6 +73,7 @@ class ModeRatio:
 
     def plus(self, other: ModeRatio) -> ModeRatio:
         """Return what two sets of windows say together."""
+        # Weights by inverse variance; the variance of such a mean is σ² times the weight.
         weight = other.sigma**2 / (self.sigma**2 + other.sigma**2)
         return ModeRatio(
             mode=self.mode,
@@ -93,6 +94,7 @@ class ModeRatio:
         return self.n_windows > 1 and beyond
 
     def _beyond(self, limit: float) -> bool:
+        # Too weak by a factor counts as much as too strong by it.
         return self.ratio > limit or self.ratio < 1.0 / limit
 
     def _certainly_beyond(self, limit: float) -> bool:
@@ -119,6 +121,8 @@ def compare(
     for k, mode in enumerate(modes.tolist()):
         beside = find_neighbours(modes, k)
         usual = float(np.median(gains[beside]))
+        # A ratio to neighbours that do not respond, or that are far away in the basis, means
+        # nothing.
         if usual > 0.0 and abs(modes[beside[-1]] - mode) <= MAX_NEIGHBOUR_DISTANCE:
             found[mode] = ModeRatio(
                 mode=mode, ratio=float(gains[k]) / usual, sigma=float(sigma[k]) / usual

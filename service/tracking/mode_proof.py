@@ -124,6 +124,7 @@ def check_proven(state: TrackerState, record: ReconstructorRecord) -> str | None
     if state.operations.acquisition.under_way:
         return None  # An acquisition closes the loop on smooth modes first, and watches it.
     proven = proven_modes(state)
+    # A matrix commands all modes from the first on.
     missing = [mode for mode in range(record.n_modes) if mode not in proven]
     if not missing:
         return None
@@ -224,6 +225,7 @@ def lines_clear(context: StepContext, rtc: Status, window_s: float) -> tuple[flo
     # mix within one second.
     spacing = np.ceil(max(MIN_LINE_SPACING_STEPS * step, (high - low) / MAX_SHOWN_MODES))
     avoid = (*context.policy.dither_avoid_hz, *context.loop.vibrations_hz)
+    # Both start and spacing are whole hertz, and so are all lines.
     lines = np.arange(np.ceil(low), high, spacing)
     return tuple(
         float(line)
@@ -271,6 +273,7 @@ def learn_modes(context: StepContext, estimate: LockInEstimate | RandomEstimate)
     accused = (proof.suspected | bad | proof.contrary) - good
     proof = replace(
         proof,
+        # One contrary response revokes a verification; only the exclusion of a mode needs two.
         proven=(proof.proven | (good - doubted)) - bad,
         compared=proof.compared | compared.keys(),
         contrary=(proof.contrary | sure) - good,
@@ -302,7 +305,9 @@ def _judge_ratios(
     before = {one.mode: one for one in proof.doubtful}
     together = add_ratios(before, compared)
     uneven = {mode for mode, one in together.items() if one.certain}
+    # A mode stays uneven until a window compares it again and it no longer stands out.
     uneven |= {m for m in proof.uneven if m not in compared or compared[m].stands_out}
+    # A contrary mode is judged by its response, not by its ratio to others.
     rest = _without(before | together, bad | uneven)
     return frozenset(uneven - bad), tuple(one for one in rest.values() if one.undecided)
 
@@ -345,6 +350,7 @@ def note_passed(context: StepContext, record: ReconstructorRecord) -> None:
     They remain so when a matrix of fewer modes follows, after a jump for example.
     """
     proof = context.matrices.mode_proof
+    # The loop was judged as a whole: that does not verify a mode which a dither has found wrong.
     held = frozenset(range(record.n_modes)) - proof.contrary - proof.suspected
     if not held <= proof.proven:
         proof = replace(proof, proven=proof.proven | held)
@@ -410,6 +416,7 @@ def _classify(
         max(PLAUSIBLE_RESPONSE_RATIO[0] * typical, MIN_RESPONSE_RATIO),
         PLAUSIBLE_RESPONSE_RATIO[1] * typical,
     )
+    # The signed gain: a response with the other sign is never seen here, however strong.
     seen = gains > RESPONSE_LIMIT_SIGMA * sigma
     proven = seen & (gains > low) & (gains < high)
     contrary = (gains + RESPONSE_LIMIT_SIGMA * sigma < low) | (
@@ -491,6 +498,7 @@ def give_up_unseen(context: StepContext, rtc: Status) -> None:
     proof = context.matrices.mode_proof
     if proof.n_tries < MAX_PROOF_TRIES:
         return
+    # Several dithers could not confirm the suspicion: it must not have these modes tried for ever.
     suspected = proof.suspected - proof.shown
     given_up = replace(proof, shown=frozenset(), n_tries=0, suspected=suspected)
     context.matrices = replace(context.matrices, mode_proof=given_up)

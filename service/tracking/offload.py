@@ -84,6 +84,7 @@ def wanted_step(
     off = _apart(alpha, start)
     step = np.clip(-limits.share * off, -limits.max_step, limits.max_step)
     done = np.zeros(4) if state.alpha.offload is None else state.alpha.offload.total
+    # The travel limits the sum of all moves, not a single one.
     step = np.clip(done + step, -limits.travel, limits.travel) - done
     used = state.reconstructor(state.matrices.in_use) if state.matrices.in_use else None
     made_for = start if used is None or used.alpha is None else used.alpha.vector
@@ -99,6 +100,7 @@ def on_answer(context: StepContext, request: OffloadRequest, reply: Reply) -> No
     if offload is None or limits is None or offload.id != request.id:
         return
     if not reply.accepted:
+        # The image has not moved: the telemetry since the request is a measurement after all.
         make_valid(context, Purpose.MEASURE, MOVING)
         _end(context, offload, OffloadState.REFUSED, reply.reason)
         context.warn("offload.refused", f"{offload.id}: {reply.reason}")
@@ -106,6 +108,7 @@ def on_answer(context: StepContext, request: OffloadRequest, reply: Reply) -> No
     lasts_s = limits.settle_s
     if reply.start_seq is not None and rtc is not None and rtc.seq is not None:
         until_s = (reply.start_seq - rtc.seq) / rtc.frame_rate_hz
+        # The frame may be in the past already, and a wrong one must not void telemetry for hours.
         lasts_s = min(max(until_s, 0.0), MAX_MOVE_DURATION_S)
     spread = OFFLOAD_ERROR_SIGMA * np.abs(offload.step) + _cross_talk(offload.step, limits)
     still_ns = _clock_ns(context, lasts_s)
@@ -124,6 +127,7 @@ def on_failure(context: StepContext, name: str, text: str) -> None:
     still_ns = max(end_of(context.state, MOVING), _clock_ns(context, limits.settle_s))
     void_until(context, still_ns, MOVING)
     _end(context, offload, OffloadState.FAILED, text)
+    # The move was made or not: α is left where it was, and the whole step is its uncertainty.
     spread = np.abs(offload.step) + _cross_talk(offload.step, limits)
     validity.shift_estimate(context, np.zeros(4), spread, still_ns)
     context.warn("offload.failed", f"{offload.id}: {text}; whether it was made must be measured")
@@ -181,6 +185,7 @@ def _clock_ns(context: StepContext, after_s: float) -> int:
     return (
         0
         if context.rtc is None
+        # The RTC's clock has run on since its last status.
         else context.rtc.t_ns + round((MAX_STATUS_AGE_S + after_s) * SECOND_NS)
     )
 
@@ -191,11 +196,13 @@ def _end(context: StepContext, offload: Offload, state: OffloadState, text: str)
 
 def _cross_talk(step: Array, limits: Offloading) -> Array:
     """Return ``(4,)`` 1 σ of what a step may do to the axes that it does not mean."""
+    # An axis that is never moved may have a largest step of 0.
     share = np.abs(step) / np.maximum(limits.max_step, 1e-12)
     return np.asarray(CROSS_TALK_SIGMA * share.max() * limits.max_step)
 
 
 def _apart(alpha: Array, other: Array) -> Array:
     apart = alpha - other
+    # Rotations are compared by the shorter turn.
     apart[2] = wrap_angle(float(apart[2]))
     return np.asarray(apart)

@@ -300,6 +300,7 @@ def _gains(rtc: Status, groups: tuple[GainGroup, ...], n_modes: int) -> tuple[fl
             f"found gains for {named} modes; expected all {n_modes} while the loop is open, "
             "whose gains its status does not report"
         )
+    # Modes outside of all groups keep their gains.
     gains = list(extend_gains(rtc, n_modes))
     for group in groups:
         gains[group.first : group.last + 1] = [group.gain] * (group.last - group.first + 1)

@@ -264,6 +264,7 @@ def _registration_after_passive(
         alpha=filtering.alpha_of(joint, registration.alpha),
         covariance=joint.alpha_covariance,
         stretches=filtering.stretches_of(joint),
+        # A passive fit may end after that of a window with newer telemetry.
         t_ns_utc=max(event.t_ns_utc, registration.t_ns_utc),
         arrived_ns_utc=context.now_ns,
         biases=_biases_after_look(context.state, registration, joint, event, was),

@@ -74,6 +74,7 @@ def follow_law(context: StepContext) -> None:
         return
     now = _nominal(context, law)
     if isinstance(now, str):
+        # The last nominal registration is kept: a missing report is no motion of the telescope.
         _set(context, replace(context.alpha.law, problem=now))
         return
     state = context.alpha.law
@@ -168,6 +169,7 @@ def law_at(state: TrackerState, t_ns_utc: int) -> Misregistration | None:
     later = next((k for k, (t_ns, _) in enumerate(way) if t_ns >= t_ns_utc), len(way))
     if not way:
         return state.alpha.law.nominal
+    # Outside of the recorded path its nearest end counts: nothing is extrapolated.
     if later in {0, len(way)}:
         return way[min(later, len(way) - 1)][1]
     (before_ns, before), (after_ns, after) = way[later - 1], way[later]
@@ -225,6 +227,7 @@ def _reported_values(context: StepContext) -> Reported:
     values = {
         value.name: float(value.value)
         for value in context.alarms.observatory_values
+        # Not isinstance: a bool is an int, but no number of a law.
         if context.now_ns < value.until_ns_utc and type(value.value) in {int, float}
     }
     pointing = context.alpha.pointing
@@ -234,6 +237,7 @@ def _reported_values(context: StepContext) -> Reported:
 
 
 def _is_far(one: Misregistration, other: Misregistration, since_s: float) -> bool:
+    # A clock that was set back must not reduce what is allowed at once.
     allowed = MAX_STEP * (1.0 + max(since_s, 0.0))
     return bool(np.any(np.abs(difference(one, other)) > allowed))
 
@@ -246,6 +250,7 @@ def _outruns_pointing(context: StepContext, law: PointingLaw, now: Misregistrati
     if not law.names <= set(ANGLES):  # values of the observatory change by themselves
         return False
     turned_deg = abs(pointing.elevation_deg - state.pointing.elevation_deg) + abs(
+        # From 359 to 1 deg the telescope turns by 2 deg.
         math.remainder(pointing.azimuth_deg - state.pointing.azimuth_deg, 360.0)
     )
     allowed = MAX_STEP_AT_REST + STEP_PER_DEG * turned_deg
@@ -269,6 +274,7 @@ def _hold(context: StepContext, before: Misregistration, now: Misregistration) -
     if context.now_ns - leap.since_ns_utc < LEAP_CONFIRMATION_S * SECOND_NS:
         _set(context, replace(law, leap=leap))
         return
+    # The path restarts: interpolation across the leap would yield registrations that never were.
     _set(context, replace(law, way=()))
     _carry(context, now)
     because = "the values reported for the pointing law jumped"
@@ -290,6 +296,8 @@ def _carry(context: StepContext, now: Misregistration) -> None:
     registration, acquisition = context.registration, context.acquisition
     before = context.alpha.law.nominal
     if registration is not None and registration.nominal != now:
+        # A registration that was not related to the law yet has not moved with it: it only gets a
+        # place.
         if registration.nominal is not None:
             registration = moved(registration, difference(registration.nominal, now))
         store_registration(context, replace(registration, nominal=now))
@@ -313,6 +321,8 @@ def _way(context: StepContext, now: Misregistration) -> tuple[tuple[int, Misregi
         return way
     t_ns = context.rtc.t_ns
     if way and t_ns <= way[-1][0]:
+        # The RTC's clock was set back, or the status has the same time again: the path must stay in
+        # order for the interpolation.
         kept = tuple(place for place in way if place[0] < t_ns)
         return (*kept, (t_ns, now))
     # While nothing moves one point is enough: the last one is replaced.

@@ -203,4 +203,5 @@ class Policy:
         if before is None or now is None or not {before, now} <= modes.keys():
             return None
         shift = modes[before].subaperture_m / modes[now].subaperture_m
+        # Only shifts are measured in subapertures; rotation and magnification have no width.
         return np.array([shift, shift, 1.0, 1.0])

@@ -75,6 +75,7 @@ def mark_applied(context: StepContext, matrix_id: str) -> None:
     if context.matrices.in_use == matrix_id and record.state is MatrixState.APPLIED:
         return
     for other in context.matrices.reconstructors:
+        # The RTC multiplies with one matrix only.
         if other.id != matrix_id and other.state is MatrixState.APPLIED:
             change_state(context, other.id, MatrixState.SUPERSEDED, f"{matrix_id} is in use")
     replace_record(context, replace(record, state=MatrixState.APPLIED))
@@ -213,6 +214,8 @@ def send_once_judged(context: StepContext, matrix_id: str, *, wanted: bool = Tru
     if stale is None or (rtc.loop == "open" and record.gate is None):
         send(context, matrix_id)
         return
+    # An open loop's status does not contain the gains that it will close with: those of the last
+    # verdict are used.
     if rtc.loop == "open" and record.judged is not None:
         gains = record.judged.gains
     text = f"{matrix_id} is judged again before it is sent: {stale}"
@@ -262,6 +265,7 @@ def send(context: StepContext, matrix_id: str, swapped_ns_utc: int | None = None
     """
     record, rtc = _sendable(context, matrix_id, swapped_ns_utc)
     same = record.n_modes == rtc.n_controlled
+    # Gains travel with the matrix only where the number of modes changes: the RTC keeps its own.
     _send(context, record, None if same else extend_gains(rtc, record.n_modes))
 
 
@@ -358,6 +362,7 @@ def on_fetched(context: StepContext, fetched: ev.MatrixFetched) -> None:
         _distrust(context, before, MatrixState.APPLIED, record.sha256)
         return
     _trust(context, record.id)
+    # After _trust: the numbers are verified now, even where the id is no news.
     if context.matrices.in_use == record.id:
         return
     if before is None:
@@ -484,7 +489,10 @@ def _is_old(state: TrackerState, record: ReconstructorRecord, event: Acknowledge
     if state.loop.rtc is not None and event.session != state.loop.rtc.session:
         return True
     if event.state is AckState.STAGED:
+        # An acknowledgement that arrives after "applied" must not set the record back to "staged".
         return record.state is not MatrixState.PUBLISHED
+    # A rollback applies a superseded matrix again, from another frame: only the same frame means
+    # the same acknowledgement.
     repeated = record.applied_frame_seq == event.frame_seq
     return record.state is MatrixState.SUPERSEDED and repeated
 

@@ -137,6 +137,7 @@ def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
         registration = replace(
             registration,
             biases=without_previous(registration.biases),
+            # The window that would confirm or refute the jump belongs to the run that ends.
             suspected_jump=None,
             previous_estimate=None,
         )
@@ -196,6 +197,7 @@ def _in_present_mode(context: StepContext, saved: Saved) -> Saved:
     scale = context.policy.alpha_scale(registration.config_id, now)
     if scale is None:
         return saved
+    # Modes were verified as another mode of the sensor sees them.
     return replace(saved, registration=in_subapertures(registration, scale, now), mode_proof=None)
 
 
@@ -213,6 +215,7 @@ def _take_over_alpha(context: StepContext, saved: Saved, now_ns: int) -> None:
         restore_acquisition(context, saved.acquisition)
     registration = saved.registration
     if registration is not None:
+        # The clock may have been set back meanwhile.
         away_s = max(now_ns - registration.arrived_ns_utc, 0) / SECOND_NS
         restore_registration(context, registration)
         text = f"α of {away_s:.0f} s ago; {saved.in_use or 'no known matrix'} was in use then"

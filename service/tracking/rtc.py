@@ -34,6 +34,7 @@ COMPUTATION_TIMEOUT_S = 60.0
 def on_tick(context: StepContext) -> None:
     """Give up what has been waited for too long."""
     for record in context.matrices.reconstructors:
+        # Without a time of publication nothing is overdue.
         sent_ns = record.published_ns_utc or context.now_ns
         if record.on_its_way and context.now_ns - sent_ns > ACKNOWLEDGEMENT_TIMEOUT_S * SECOND_NS:
             text = (
@@ -54,6 +55,7 @@ def on_tick(context: StepContext) -> None:
 
 def on_status(context: StepContext, rtc: Status) -> None:
     """Store the RTC's report."""
+    # First, because all below takes α to be in the subapertures of the present mode.
     if rtc.config_id != context.loop.config_id and rtc.config_id in context.policy.sensor_modes:
         _enter_sensor_mode(context, rtc.config_id)
     before, registration = context.rtc, context.registration
@@ -68,6 +70,7 @@ def on_status(context: StepContext, rtc: Status) -> None:
     context.loop = replace(
         context.loop,
         rtc=rtc,
+        # Pinned by the instrument file or the first status: a later one does not replace them.
         basis_id=context.loop.basis_id or rtc.basis_id,
         config_id=context.loop.config_id or rtc.config_id,
     )

@@ -59,6 +59,7 @@ def check_approved(
 def check_return(state: TrackerState) -> str | None:
     """Return why the matrix in use could not be sent back after another one, or None."""
     rtc = state.loop.rtc
+    # A rollback sends numbers: an id whose numbers were not seen in this session is not enough.
     if rtc is None or (rtc.cm_id or state.matrices.in_use) in state.matrices.verified_ids:
         return None
     name = "its matrix" if rtc.cm_id is None else rtc.cm_id
@@ -115,4 +116,5 @@ def beyond_judging(state: TrackerState, record: ReconstructorRecord) -> bool:
 def _was_in_use(state: TrackerState, record: ReconstructorRecord) -> bool:
     """Return whether the very numbers of this reconstructor have been in use before."""
     same = (r for r in state.matrices.reconstructors if r.sha256 == record.sha256)
+    # Empty checksums are unknown ones and do not make two matrices the same.
     return bool(record.sha256) and any(r.was_used for r in same)

@@ -236,6 +236,7 @@ class StepContext:
             self.now_ns + round(put_off_s * SECOND_NS) if put_off_s else 0
             for put_off_s in (dither_s, make_s)
         )
+        # A pause that was asked for before is never shortened.
         dither_ns = max(self.dithers.no_dither_before_ns_utc, dither_ns)
         make_ns = max(self.matrices.no_making_before_ns_utc, make_ns)
         self._put_off_until(dither_ns, make_ns)
@@ -251,6 +252,7 @@ class StepContext:
     def log(self, name: str, text: str, level: Level = Level.INFO) -> LogEntry:
         """Add a line to the log, and return it; one that repeats is counted instead."""
         self.state = logged(self.state, name, text, self.now_ns, level, self.cause)
+        # The line may not be the last one: a repeated one is counted where it was first logged.
         lines = (line for line in reversed(self.state.log) if line.name == name)
         return max(lines, key=lambda line: line.last_ns_utc or line.t_ns_utc)
 

@@ -178,6 +178,8 @@ def _gain_reason(
 
 def _margin_lost(last: Assessment) -> float:
     """Return how much of the margin of a new reconstructor the one in use no longer has."""
+    # The margin is the distance of the largest pole from the unit circle. A new matrix without any
+    # has nothing that could have been lost.
     whole = 1.0 - last.expected.fresh_pole_radius
     return (1.0 - (1.0 - last.expected.pole_radius) / whole) if whole > 0.0 else 0.0
 
@@ -199,6 +201,8 @@ def _step_since(
     if in_use.alpha is None or in_use.sigma is None:
         return None
     step = alpha.vector - in_use.alpha.vector
+    # The record's σ includes the model error, which must not count as an error of the step. The
+    # model error may have grown since: the difference must not be negative.
     then = np.maximum(in_use.sigma**2 - registration.floor**2, 0.0)
     covariance = registration.covariance + np.diag(then)
     far = step @ np.linalg.solve(covariance, step) >= MIN_SIGNIFICANT_STEP
@@ -245,6 +249,7 @@ def is_beyond_verdict(state: TrackerState, record: ReconstructorRecord) -> bool:
     registration = state.alpha.registration
     if registration is None or record.alpha is None or record.sigma is None:
         return False
+    # Certainly outside: even the end of α ± 3σ that is nearest to the matrix.
     moved = registration.alpha.distance(record.alpha) - 3.0 * registration.sigma
     return bool(np.any(moved > 3.0 * record.sigma + VERDICT_MARGIN))
 
@@ -257,6 +262,7 @@ def _apart(
         return False
     if record.alpha is None or record.sigma is None:
         return True
+    # σ without the model error: both registrations share that error.
     distance = registration.alpha.distance(record.alpha)
     noise = np.sqrt(np.diag(registration.covariance))
     return bool(np.any(distance > np.maximum(threshold, 3.0 * noise)))
@@ -311,6 +317,8 @@ def more_modes_to_try(
         return ()
     target = policy.wanted_modes(rtc)
     limit = state.matrices.mode_limit
+    # The end of the delay alone is not enough: the present number of modes must have margin to
+    # spare.
     if limit is not None and (now_ns < limit.until_ns_utc or not _comfortable(state)):
         target = min(target, limit.n_modes)
     rungs = {target, *fewer_modes_than(target)}
@@ -384,6 +392,7 @@ def _wait_after(
         return None
     if record.state in _DECLINED_STATES:
         return FIRST_MODES_DELAY_S
+    # A proposal that another one has replaced is discarded, too, and says nothing of its modes.
     if record.state is MatrixState.DISCARDED and rejected:
         return DECLINED_MODES_DELAY_S
     return None

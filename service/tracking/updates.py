@@ -60,6 +60,7 @@ def fetch_in_use(context: StepContext) -> None:
         and not state.matrices.read_back_error
         and state.matrices.mismatched_id is None
     )
+    # An RTC that could not show its matrix, or shows other numbers, is asked less often.
     every_s = FIRST_MATRIX_INTERVAL_S if anew else MATRIX_REQUEST_INTERVAL_S
     if context.now_ns - state.matrices.applied_asked_ns_utc >= every_s * SECOND_NS:
         request_applied(context, rtc)

@@ -153,6 +153,8 @@ def change_subapertures(context: StepContext, scale: Array, config_id: str) -> N
     registration = context.registration
     if registration is not None:
         scaled = in_subapertures(registration, scale, config_id)
+        # α is kept, because the mirror has not moved; it needs windows of this sensor mode to be
+        # trusted.
         store_registration(context, replace(scaled, n_windows=0))
         age_registration(context)
 
@@ -164,6 +166,7 @@ def in_subapertures(registration: Registration, scale: Array, config_id: str) ->
         registration,
         alpha=registration.alpha.with_vector(registration.alpha.vector * scale),
         covariance=registration.covariance * np.outer(scale, scale),
+        # A stretch has no unit: only the columns of α in its covariance are scaled.
         stretches=known and replace(known, shared=known.shared * scale),
         floor=registration.floor * scale,
         image_floor=registration.image_floor * scale,
@@ -268,6 +271,7 @@ def _validity_of(context: StepContext, registration: Registration) -> ValiditySt
     ends = STALE_END_SHARE if was_stale and before and before.n_windows else 1.0
     if np.any(sigma > ends * limit):
         return ValidityState(level=Validity.STALE, reason=_worst(sigma, limit))
+    # No division by zero without a drift: α then never becomes stale.
     rate = np.maximum(policy.drift_rate**2, np.finfo(float).tiny)
     left_s = float(np.min((limit**2 - sigma**2) / rate))
     # a rate of zero never ends it; a century is beyond any night
@@ -350,6 +354,7 @@ def _too_wide_for_the_gate(state: TrackerState, registration: Registration) -> b
 
 def separation_deg(one: Pointing, other: Pointing) -> float:
     """Return the angle on the sky between two directions, degrees."""
+    # Rounding may take the product of equal directions beyond 1, where arccos is NaN.
     return float(np.rad2deg(np.arccos(np.clip(_unit(one) @ _unit(other), -1.0, 1.0))))
 
 
@@ -375,6 +380,7 @@ def telemetry_span(began_ns_utc: int, ended_ns_utc: int) -> TelemetrySpan:
 def precedes(state: TrackerState, span: TelemetrySpan, since_ns_utc: int) -> bool:
     """Return True if telemetry began before a time, so that it contains earlier states."""
     rtc = state.loop.rtc
+    # A time so far in the future is of before the RTC's clock was set back: it voids nothing.
     if rtc is not None and since_ns_utc - rtc.t_ns > CLOCK_SET_BACK_S * SECOND_NS:
         return False
     return span.began_ns_utc < since_ns_utc - _ROUNDING_NS
@@ -410,6 +416,7 @@ def void_until(
         each
         for each in context.alpha.void_intervals
         if (each.purpose, each.because) != (purpose, because)
+        # Telemetry that old is no longer on its way: intervals that ended before it are forgotten.
         and until_ns_utc - each.until_ns_utc <= MAX_TELEMETRY_AGE_S * SECOND_NS
     ]
     _store_intervals(context, [*others, new][-INTERVALS_KEPT:])
@@ -432,6 +439,7 @@ def restore_intervals(context: StepContext, intervals: Iterable[VoidInterval]) -
 
 def cast_doubt(context: StepContext, since_ns_utc: int) -> None:
     """Let no window settle the doubt that began before what has cast it, or has done so before."""
+    # void_until replaces the interval of the same reason, so that the later end must be kept here.
     until_ns = max(end_of(context.state, BEFORE_DOUBT), since_ns_utc)
     void_until(context, until_ns, BEFORE_DOUBT, Purpose.SETTLE)
 

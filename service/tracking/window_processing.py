@@ -63,6 +63,7 @@ def on_window(context: StepContext, event: ev.WindowFitted) -> None:
     smeared = pointing_law.check_pointing_motion(
         context.state, when.began_ns_utc, when.ended_ns_utc
     )
+    # Last, so that it replaces any other reason: what a smeared window says proves no fault.
     if smeared is not None:
         why = RefusalKind.VOID, smeared
     if why is not None:
@@ -160,6 +161,7 @@ def process_window(context: StepContext, measured: WindowEstimate) -> None:
         n_outlying = context.windows.outlying + 1
         context.windows = replace(context.windows, outlying=n_outlying)
         context.warn("window.outlier", text)
+        # The rejected window shows that windows scatter: it counts with the most that one may.
         registration = replace(
             registration, scatter=kalman.learnt(registration.scatter, kalman.JUMP_THRESHOLD)
         )
@@ -234,6 +236,7 @@ def _jump(
     whole = jumps.is_after_jump(first, measured, registration.alpha, policy)
     if whole:
         elapsed_s = max(measured.t_ns_utc - first.t_ns_utc, 0) / SECOND_NS
+        # The first window is older: α has drifted between the two.
         noise = first.covariance + np.diag(policy.drift_rate**2 * elapsed_s)
     # The earlier estimates contain no information on the new registration.
     joint = kalman.widen_after_jump(prior, noise)
@@ -250,6 +253,7 @@ def _jump(
     validity.store_registration(context, registration)
     # Ordinary telemetry summed until now mixes both registrations.
     validity.void_until(context, first.t_ns_utc, BOTH_SIDES, Purpose.PASSIVE)
+    # A window that was held was not counted when it came; one that had entered was.
     held = whole and registration.suspected_jump is not None
     filtering.accept(context, update, measured, n_accepted=2 if held else 1)
     context.warn(

@@ -135,6 +135,7 @@ def on_compared(context: StepContext, event: ev.Compared) -> None:
         passed = context.state.reconstructor(trial.id)
         if passed is not None:
             mode_proof.note_passed(context, passed)
+    # A jump explains why the loop is worse: the matrix need not be to blame.
     elif jump := _check_jump(context, trial):
         _end(context, trial, ProbationState.NOT_JUDGED, f"{jump}: {found.text}")
     else:
@@ -150,6 +151,7 @@ def is_way_back(state: TrackerState, made: ev.MatrixMade) -> bool:
     if trial is None or trial.state is not ProbationState.ROLLING_BACK or trial.rollback:
         return False
     before = state.reconstructor(trial.before)
+    # An unknown checksum is empty and equals nothing.
     return before is not None and made.record.sha256 == before.sha256 != ""
 
 
@@ -185,6 +187,7 @@ def _begin_rollback(
     _set(context, replace(trial, state=ProbationState.ROLLING_BACK, text=text))
     context.raise_alarm(PROBATION, f"{trial.id} {text}")
     why = f"the service goes back to {trial.before}: {trial.id} made the loop worse"
+    # Not judged: the loop ran with this matrix, and α may be what is wrong.
     reconstructors.request_matrix(
         context, ev.RepublishMatrix(source=trial.before, why=why, judged=False)
     )
@@ -220,6 +223,7 @@ def _on_swap(context: StepContext, before: str | None, in_use: str | None) -> No
             text=why or f"compared with {before}",
             since_ns_utc=context.now_ns,
             until_ns_utc=context.now_ns + round(MAX_PROBATION_S * SECOND_NS),
+            # A rollback requires the loop to be as it was before the swap.
             loop=context.before.loop.rtc,
             opens=context.before.operator.mode is Mode.AUTO if asked is None else asked,
             resumed_ns_utc=None if trial is None else trial.resumed_ns_utc,

@@ -198,6 +198,7 @@ class Normals:
     def solve_displacement(self, inside: NDArray[np.bool_], held: Array, field: Array) -> Array:
         """Return the change of selected parts by a displacement of each slope ``(n_parts, 2)``."""
         normals = self.normals[inside]
+        # The first two unknowns are the shifts: a displaced point has the derivatives of a shift.
         along = np.einsum("ski,si->k", normals[:, :, :2], field[inside])
         return np.asarray(np.linalg.solve(normals.sum(axis=0) + held, along)[:4])
 
@@ -248,6 +249,7 @@ def _smooth_shapes(places: Array) -> Array:
     x, y = places.T
     lower = [np.ones_like(x), x, y]
     found = []
+    # Lower orders are removed, because α and the anamorphosis already describe them.
     for term in (x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3):
         base = np.column_stack(lower)
         own = term - base @ np.linalg.lstsq(base, term, rcond=None)[0]

@@ -209,6 +209,7 @@ def _find_arms(by_place: Array) -> list[Arm]:
     x, y = columns - middle[1], rows - middle[0]
     radius = float(np.hypot(x, y).max())
     excess = _excess(by_place[rows, columns], np.hypot(x, y) / radius)
+    # Robust, so that the arms themselves do not widen the scatter that they are compared with.
     scatter = 1.4826 * float(np.median(np.abs(excess - np.median(excess))))
     found: list[tuple[float, Arm]] = []
     for angle in _ARM_ANGLES:

@@ -236,6 +236,7 @@ def _fit_usable(
             f"{instrument.name}: the fit ended where {n_lost} of {used.n_modes} modes change no "
             "slope; start closer to the true registration (--start), or leave the start out"
         )
+    # After a first fit, because noise is distinguished from signal by comparison with a model at α.
     noisy = find_noise_columns(
         found.settled.solution, found.settled.target, instrument.slopes.kind.n_planes
     )
@@ -715,6 +716,7 @@ def _image_offsets(
 def _find_narrow_pupil(settled: Settled) -> SeenPupil | None:
     """Return the pupil image if it is narrower than in the instrument file, else None."""
     target, solution = settled.target, settled.solution
+    # Gains included: the measured columns contain them, the model's do not.
     squares = solution.projection.gains**2
     measured = np.einsum("ij,ij->i", target.matrix, target.matrix)
     counted = np.where(target.rows | (measured == 0.0), 1.0, np.nan)

@@ -346,6 +346,7 @@ def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
         return few.project(matrix, every).chi_at_best
 
     found = _scan_outwards(left, first=1 if step > 0.0 else -1)
+    # The scan stops where χ² grows, so the rest is infinite and never the minimum.
     best = int(np.argmin(found))
     change = SENSOR_CHANGES[best]
     nothing = float(np.log(NO_SENSOR_NUMBER / models.sensor_number))
@@ -503,6 +504,8 @@ def scan(
         chi = partial(_compute_chi, models, model, target, start, known, index)
         first = all(done.parameter != parameter for done in table)
         reach = ROUGH_RANGE.get(parameter, 0.0) if first else 0.0
+        # The first scan must cover the error of the rough estimate; later ones start near the
+        # minimum.
         half_width = max(HALF_WIDTH, round(reach / step))
         table.append(_scan_parameter(chi, parameter, float(values[index]), step, half_width))
         values[index] = table[-1].minimum
@@ -543,6 +546,7 @@ def _other_starts(start: Array) -> list[Array]:
     """Return further starts: corners of the range, and rotations."""
     corners = [np.array([x, y, 0.0, 0.0]) for x, y in product(_SHIFTS, _SHIFTS)]
     turns = [np.array([0.0, 0.0, turn, 0.0]) for turn in _TURNS_RAD]
+    # The rotation is kept: it is from the orientation search or was given.
     nominal = np.array([0.0, 0.0, start[2], 1.0])
     return [nominal, *(nominal + step for step in [*turns, *corners])]
 

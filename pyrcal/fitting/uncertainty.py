@@ -148,6 +148,7 @@ class Uncertainty:
         """
         if not len(moves):
             return self
+        # Only variances are added: correlations between the parameters' changes are left out.
         added = np.diag(shares @ moves**2)
         return replace(
             self,
@@ -312,6 +313,7 @@ def misplacement_sigma(
     room = float(np.sqrt(max(residual**2 - EXACT_RESIDUAL**2, 0.0)))
     error = min(POSITION_ERROR_PITCH if stated is None else stated, room)
     each_m = error * mirror.pitch_m / np.sqrt(len(seen))
+    # The same value for rotation and magnification, which both move a point by its radius.
     turn = each_m / float(np.sqrt(np.mean(seen**2)))
     shift = each_m / subaperture_m
     return np.array([shift, shift, turn, turn])
@@ -399,6 +401,7 @@ def _subsets(
     """
     steps, covariances = [], []
     for k in range(n_sets):
+        # Every n-th mode, so that each set has low and high orders.
         own, scored = normals[k::n_sets], scores[:, k::n_sets]
         spread = np.linalg.inv(own.sum(axis=0) + held)
         step = spread @ (scored.sum(axis=1) - pull)

@@ -78,7 +78,7 @@ def _end_children(started: list[Child]) -> None:
     # ignored meanwhile, so that no second Ctrl-C interrupts the clean-up
     before = {number: signal.signal(number, signal.SIG_IGN) for number in _ENDING}
     try:
-        # All are asked before any is awaited, so that they share one period of grace.
+        # All are signalled before any is awaited, so that they share one period of grace.
         for child in started:
             child.signal(signal.SIGINT)
         until_s = time.monotonic() + GRACE_S

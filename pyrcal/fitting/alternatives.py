@@ -545,6 +545,7 @@ def _try_without_border(few: FitSubset) -> Iterator[Alternative]:
     """Yield the fit without the subapertures at the border of the pupil."""
     border = find_border(few.target.valid)
     rows = np.tile(border[few.target.valid], len(few.own) // int(few.target.valid.sum()))
+    # On a coarse sensor most subapertures are at the border: too few would remain.
     if (few.target.rows & ~rows).sum() < len(rows) // 3:
         return
     inside = few.target.without(rows)

@@ -100,6 +100,7 @@ def find_strange_columns(solution: Solution, target: Target) -> Iterator[str]:
         sign = alike[column, other] < 0.0
         if not (foreign[other] and likest[other] == column):
             moved.append(f"{pair[0]} is mode {pair[1]}'s{' with the other sign' if sign else ''}")
+        # Each exchanged pair is named once.
         elif column < other:
             signs = sign or alike[other, column] < 0.0
             exchanged.append(f"{pair[0]} and {pair[1]}{' with other signs' if signs else ''}")

@@ -190,6 +190,7 @@ class Normals:
         np.add.at(normals, cluster, self.normals[inside])
         scores = np.array([np.bincount(cluster, row) for row in self.scores[:, inside]])
         every, scored = normals.sum(axis=0) + held, scores.sum(axis=1) - pull
+        # All fits with one cluster left out are solved at once.
         left = np.linalg.solve(every - normals, (scored[:, None] - scores).T[:, :, None])[:, :4, 0]
         spread = np.sum((left - left.mean(axis=0)) ** 2, axis=0)
         sigma = np.sqrt((n_clusters - 1) / n_clusters * spread)
@@ -362,6 +363,7 @@ def mode_partitions(target: Target, n_planes: int, *, by_actuator: bool) -> dict
     response.
     """
     n_modes = target.n_modes
+    # Ranks, not indices: the measured modes may have gaps and any order.
     rank = np.argsort(np.argsort(target.modes, kind="stable"), kind="stable")
     n_combs = min(N_COMBS, n_modes // MIN_MODES)
     found = {"odd and even modes": rank % 2}

@@ -273,6 +273,7 @@ def _find_outlying_places(
 ) -> list[tuple[int, int, float]]:
     """Return outlying subapertures, compared separately at the border and inside."""
     found = []
+    # The border leaves more in general: a common median would list all of it.
     for part in (border, ~border):
         values = np.where(part & np.isfinite(by_place), by_place, 0.0)
         typical = float(np.median(values[values > 0.0])) if values.any() else 0.0

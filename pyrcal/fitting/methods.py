@@ -259,6 +259,7 @@ def settle(
         if models is settled.models and np.array_equal(there.rows, settled.target.rows):
             if settled.on_fine_grid:
                 break
+            # Nothing changed on the coarse grid: the derivatives still hold for the fine one.
             approaching, near = False, settled.solution
         decides = models.cheap if approaching else models.fine
         start, images = settled.solution.alpha, reuse_image_derivatives(taken, start, nuisances)
@@ -411,6 +412,7 @@ def _with_nearest_images(settled: Settled) -> tuple[FitModels, Nuisances]:
 
     def left(displaced: Array) -> float:
         improbable = unlikely * float(np.sum((nuisances.images @ displaced) ** 2))
+        # Without computing the matrix: no fit could make up for a prior that costs this much.
         if improbable > seen.chi:
             return np.inf
         models.counter.n += 1
@@ -464,6 +466,7 @@ def settle_at(
     """Return the model evaluated at a registration from another method."""
     seen = _remove_unknown_rows(models, target, alpha)
     there = refine(models, seen, alpha, nuisances, max_steps=0)
+    # No step was made here, so only the limits can be checked.
     solution = replace(there, converged=within_limits(alpha.vector))
     return Settled(solution=solution, target=seen, models=models, nuisances=nuisances)
 

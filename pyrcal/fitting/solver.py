@@ -284,11 +284,13 @@ def nuisances_of(
     if not gain_map:
         return unknowns
     n = len(valid)
+    # About -1 to 1 across the pupil, so that high powers stay comparable with low ones.
     y, x = (np.stack(np.nonzero(valid)) - (n - 1) / 2) / (n / 2)
     order = GAIN_MAP_ORDER
     powers = [x**i * y**j for i in range(order + 1) for j in range(order + 1 - i) if i + j > 0]
     # without their mean, because the free gain of each mode describes a common factor
     centred = np.array(powers) - np.mean(powers, axis=1, keepdims=True)
+    # Orthonormal over the subapertures, so that one prior suits all coefficients.
     orthonormal, _ = np.linalg.qr(centred.T)
     maps = np.tile(orthonormal.T * np.sqrt(valid.sum()), kind.n_planes)
     return replace(unknowns, maps=maps)

@@ -65,6 +65,8 @@ def run_children(directory: Path, commands: Mapping[str, Sequence[str]]) -> Iter
 def _start_child(name: str, words: Sequence[str], directory: Path) -> Child:
     path = directory / f"{name}.log"
     with path.open("wb") as log:
+        # A session of its own: Ctrl-C in the terminal does not reach it, and kill_all ends its
+        # group.
         process = subprocess.Popen(
             [sys.executable, *words], stdout=log, stderr=subprocess.STDOUT, start_new_session=True
         )
@@ -76,11 +78,13 @@ def _end_children(started: list[Child]) -> None:
     # ignored meanwhile, so that no second Ctrl-C interrupts the clean-up
     before = {number: signal.signal(number, signal.SIG_IGN) for number in _ENDING}
     try:
+        # All are signalled before any is awaited, so that they share one period of grace.
         for child in started:
             child.signal(signal.SIGINT)
         until_s = time.monotonic() + GRACE_S
         while time.monotonic() < until_s and any(c.process.poll() is None for c in started):
             time.sleep(_POLL_S)
+        # Those that ended in time too: their own children may still run.
         for child in started:
             child.kill_all()
             child.process.wait()

@@ -185,6 +185,7 @@ def find_alternatives(
         *_yield_determined(_try_mode_subsets(settled)),
         *_yield_determined(_try_without_border(few)),
     ]
+    # A nearly singular alternative gives no finite step and would make σ infinite.
     sure = [one for one in found if np.all(np.isfinite(one.moved))]
     return tuple(sorted(sure, key=lambda one: (not one.preferred, not one.undecided, _share(one))))
 
@@ -338,6 +339,7 @@ def _try_separate_gains(few: FitSubset) -> Iterator[Alternative]:
     half = len(few.own) // 2
     rate = np.concatenate([few.own[:half], -few.own[half:]])
     (value,), lead, moved = _fit_with_rates(few, rate)
+    # The unknown raises Sx and lowers Sy by the same share, so the ratio has it twice.
     apart = float((1.0 + value) / (1.0 - value)) - 1.0
     side = "stronger" if apart > 0.0 else "weaker"
     yield Alternative(
@@ -543,6 +545,7 @@ def _try_without_border(few: FitSubset) -> Iterator[Alternative]:
     """Yield the fit without the subapertures at the border of the pupil."""
     border = find_border(few.target.valid)
     rows = np.tile(border[few.target.valid], len(few.own) // int(few.target.valid.sum()))
+    # On a coarse sensor most subapertures are at the border: too few would remain.
     if (few.target.rows & ~rows).sum() < len(rows) // 3:
         return
     inside = few.target.without(rows)
@@ -552,6 +555,7 @@ def _try_without_border(few: FitSubset) -> Iterator[Alternative]:
 
 def find_border(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the valid subapertures ``(n, n)`` that have an invalid neighbour."""
+    # Padded with False: subapertures at the edge of the grid are at the border.
     wide = np.pad(valid, 1)
     inside = wide[:-2, 1:-1] & wide[2:, 1:-1] & wide[1:-1, :-2] & wide[1:-1, 2:]
     return np.asarray(valid & ~inside)

@@ -100,6 +100,7 @@ def find_strange_columns(solution: Solution, target: Target) -> Iterator[str]:
         sign = alike[column, other] < 0.0
         if not (foreign[other] and likest[other] == column):
             moved.append(f"{pair[0]} is mode {pair[1]}'s{' with the other sign' if sign else ''}")
+        # Each exchanged pair is named once.
         elif column < other:
             signs = sign or alike[other, column] < 0.0
             exchanged.append(f"{pair[0]} and {pair[1]}{' with other signs' if signs else ''}")
@@ -183,6 +184,7 @@ def measure_smear(solution: Solution, target: Target) -> Smear:
     measured = target.matrix[target.rows]
     model = np.asarray(solution.matrix, np.float64)[target.rows] * solution.projection.gains
     steps = np.diff(target.modes) == 1
+    # Both neighbours must be consecutive modes: the next one is the control for model errors.
     middles = np.flatnonzero(steps[:-1] & steps[1:]) + 1
     if len(middles) < _MIN_MODES:
         return Smear(share=0.0, sigma=np.inf)
@@ -192,6 +194,7 @@ def measure_smear(solution: Solution, target: Target) -> Smear:
         found.append((before - after) / (abs(own) + abs(before) + abs(after)))
     # medians, so that a few outlying columns do not decide
     middle = float(np.median(found))
+    # 1.4826 makes the median deviation a σ; 1.25 is the σ of a median over that of a mean.
     scatter = 1.4826 * float(np.median(np.abs(np.array(found) - middle)))
     return Smear(share=middle, sigma=1.25 * scatter / float(np.sqrt(len(found))))
 

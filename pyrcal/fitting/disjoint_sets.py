@@ -190,6 +190,7 @@ class Normals:
         np.add.at(normals, cluster, self.normals[inside])
         scores = np.array([np.bincount(cluster, row) for row in self.scores[:, inside]])
         every, scored = normals.sum(axis=0) + held, scores.sum(axis=1) - pull
+        # All fits with one cluster left out are solved at once.
         left = np.linalg.solve(every - normals, (scored[:, None] - scores).T[:, :, None])[:, :4, 0]
         spread = np.sum((left - left.mean(axis=0)) ** 2, axis=0)
         sigma = np.sqrt((n_clusters - 1) / n_clusters * spread)
@@ -198,6 +199,7 @@ class Normals:
     def solve_displacement(self, inside: NDArray[np.bool_], held: Array, field: Array) -> Array:
         """Return the change of selected parts by a displacement of each slope ``(n_parts, 2)``."""
         normals = self.normals[inside]
+        # The first two unknowns are the shifts: a displaced point has the derivatives of a shift.
         along = np.einsum("ski,si->k", normals[:, :, :2], field[inside])
         return np.asarray(np.linalg.solve(normals.sum(axis=0) + held, along)[:4])
 
@@ -248,6 +250,7 @@ def _smooth_shapes(places: Array) -> Array:
     x, y = places.T
     lower = [np.ones_like(x), x, y]
     found = []
+    # Lower orders are removed, because α and the anamorphosis already describe them.
     for term in (x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3):
         base = np.column_stack(lower)
         own = term - base @ np.linalg.lstsq(base, term, rcond=None)[0]
@@ -360,6 +363,7 @@ def mode_partitions(target: Target, n_planes: int, *, by_actuator: bool) -> dict
     response.
     """
     n_modes = target.n_modes
+    # Ranks, not indices: the measured modes may have gaps and any order.
     rank = np.argsort(np.argsort(target.modes, kind="stable"), kind="stable")
     n_combs = min(N_COMBS, n_modes // MIN_MODES)
     found = {"odd and even modes": rank % 2}

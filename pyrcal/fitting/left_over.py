@@ -209,6 +209,7 @@ def _find_arms(by_place: Array) -> list[Arm]:
     x, y = columns - middle[1], rows - middle[0]
     radius = float(np.hypot(x, y).max())
     excess = _excess(by_place[rows, columns], np.hypot(x, y) / radius)
+    # Robust, so that the arms themselves do not widen the scatter that they are compared with.
     scatter = 1.4826 * float(np.median(np.abs(excess - np.median(excess))))
     found: list[tuple[float, Arm]] = []
     for angle in _ARM_ANGLES:
@@ -272,6 +273,7 @@ def _find_outlying_places(
 ) -> list[tuple[int, int, float]]:
     """Return outlying subapertures, compared separately at the border and inside."""
     found = []
+    # The border leaves more in general: a common median would list all of it.
     for part in (border, ~border):
         values = np.where(part & np.isfinite(by_place), by_place, 0.0)
         typical = float(np.median(values[values > 0.0])) if values.any() else 0.0

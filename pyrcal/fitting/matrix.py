@@ -236,6 +236,7 @@ def _fit_usable(
             f"{instrument.name}: the fit ended where {n_lost} of {used.n_modes} modes change no "
             "slope; start closer to the true registration (--start), or leave the start out"
         )
+    # After a first fit, because noise is distinguished from signal by comparison with a model at α.
     noisy = find_noise_columns(
         found.settled.solution, found.settled.target, instrument.slopes.kind.n_planes
     )
@@ -244,6 +245,7 @@ def _fit_usable(
         usable = _remove_noise(usable, noisy)
         used = basis.subset(usable.columns)
         target, models = target_of(usable, instrument), replace(models, basis=used, lowest=None)
+        # From the first result: noise columns moved it little, so the search need not begin again.
         begin = instrument.with_anamorphosis(found.settled.solution.alpha)
         found = _run_method(models, target, begin, options, report_stage)
     smear = measure_smear(found.settled.solution, found.settled.target)
@@ -313,6 +315,7 @@ def _remove_smear(
             break
         step = float(np.clip(-left.share / rate, -_LONGEST_SMEAR_STEP, _LONGEST_SMEAR_STEP))
         before, left_before, share = share, left.share, min(share + step, MAX_SMEAR)
+    # Any additional unknown explains a little: it must explain a tenth of the residual.
     if again.settled.share > _SMEAR_EXPLAINS * found.settled.share:
         return found, usable
     again = replace(again, smear=Smear(share=share, sigma=sigma), before=found.settled.solution)
@@ -522,6 +525,7 @@ def _make_fit(
     power = np.sum(target.matrix[target.rows] ** 2, axis=0)
     noise = None if usable.noise is None else usable.noise / usable.passes
     structured = measure_structure(seen.residual, power, noise)
+    # The share of the power that a smooth gain over the pupil would explain.
     by_light = residual_fraction**2 * (1.0 - fit_smooth_gain(few))
     n_planes = slopes.kind.n_planes
     floor_of_size, floor_words = _magnification_floor(models.instrument)
@@ -554,6 +558,7 @@ def _make_fit(
     )
     if found.smear is not None and found.before is not None:
         by_smear = solution.vector - found.before.vector
+        # The registration moves in proportion to the share that is removed.
         error = by_smear * found.smear.sigma / found.smear.share
         sure = sure.with_moves(error[np.newaxis], np.ones(1))
     misplaced = _misplacement_sigma(models.instrument, structured)
@@ -715,8 +720,10 @@ def _image_offsets(
 def _find_narrow_pupil(settled: Settled) -> SeenPupil | None:
     """Return the pupil image if it is narrower than in the instrument file, else None."""
     target, solution = settled.target, settled.solution
+    # Gains included: the measured columns contain them, the model's do not.
     squares = solution.projection.gains**2
     measured = np.einsum("ij,ij->i", target.matrix, target.matrix)
+    # Slopes that were left out but not silent are unknown: NaN, and not zero response.
     counted = np.where(target.rows | (measured == 0.0), 1.0, np.nan)
     expected = np.einsum("ij,ij,j->i", solution.matrix, solution.matrix, squares)
     answers = compute_responses(measured * counted, expected * counted, target.valid)
@@ -739,6 +746,7 @@ def _residual_map(found: _Found) -> Array:
     """Return the RMS residual of every slope over the RMS of all, modes counted alike."""
     target, seen = found.settled.target, found.settled.solution.projection
     scale = np.sqrt(target.weights)
+    # Weighted as the fit weighs them, or the modes with the largest strokes would decide.
     typical = np.sqrt(np.mean((target.matrix[target.rows] * scale) ** 2))
     by_slope = np.full(len(target.rows), np.nan)
     by_slope[target.rows] = np.sqrt(np.mean((seen.residual * scale) ** 2, axis=1)) / typical

@@ -259,6 +259,7 @@ def settle(
         if models is settled.models and np.array_equal(there.rows, settled.target.rows):
             if settled.on_fine_grid:
                 break
+            # Nothing changed on the coarse grid: the derivatives still hold for the fine one.
             approaching, near = False, settled.solution
         decides = models.cheap if approaching else models.fine
         start, images = settled.solution.alpha, reuse_image_derivatives(taken, start, nuisances)
@@ -346,6 +347,7 @@ def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
         return few.project(matrix, every).chi_at_best
 
     found = _scan_outwards(left)
+    # The scan stops where χ² grows, so the rest is infinite and never the minimum.
     best = int(np.argmin(found))
     change = SENSOR_CHANGES[best]
     nothing = float(np.log(NO_SENSOR_NUMBER / models.sensor_number))
@@ -408,6 +410,7 @@ def _with_nearest_images(settled: Settled) -> tuple[FitModels, Nuisances]:
 
     def left(displaced: Array) -> float:
         improbable = unlikely * float(np.sum((nuisances.images @ displaced) ** 2))
+        # Without computing the matrix: no fit could make up for a prior that costs this much.
         if improbable > seen.chi:
             return np.inf
         models.counter.n += 1
@@ -461,6 +464,7 @@ def settle_at(
     """Return the model evaluated at a registration from another method."""
     seen = _remove_unknown_rows(models, target, alpha)
     there = refine(models, seen, alpha, nuisances, max_steps=0)
+    # No step was made here, so only the limits can be checked.
     solution = replace(there, converged=within_limits(alpha.vector))
     return Settled(solution=solution, target=seen, models=models, nuisances=nuisances)
 
@@ -501,6 +505,8 @@ def scan(
         chi = partial(_compute_chi, models, model, target, start, known, index)
         first = all(done.parameter != parameter for done in table)
         reach = ROUGH_RANGE.get(parameter, 0.0) if first else 0.0
+        # The first scan must cover the error of the rough estimate; later ones start near the
+        # minimum.
         half_width = max(HALF_WIDTH, round(reach / step))
         table.append(_scan_parameter(chi, parameter, float(values[index]), step, half_width))
         values[index] = table[-1].minimum
@@ -541,6 +547,7 @@ def _other_starts(start: Array) -> list[Array]:
     """Return further starts: corners of the range, and rotations."""
     corners = [np.array([x, y, 0.0, 0.0]) for x, y in product(_SHIFTS, _SHIFTS)]
     turns = [np.array([0.0, 0.0, turn, 0.0]) for turn in _TURNS_RAD]
+    # The rotation is kept: it is from the orientation search or was given.
     nominal = np.array([0.0, 0.0, start[2], 1.0])
     return [nominal, *(nominal + step for step in [*turns, *corners])]
 

@@ -205,6 +205,7 @@ class Nuisances:
         model = models.cheap
         kind = model.instrument.slopes.kind
         along_x, along_y = slopes_of(matrix, kind)
+        # A small rotation of the axes adds (-Sy, Sx) times the angle to (Sx, Sy).
         found = [signals_of_slopes(np.stack([-along_y, along_x]), kind)]
         if self.anamorphosis:
             models.counter.n += 2
@@ -252,6 +253,7 @@ class Nuisances:
         """Return ``(n_nuisances - n_maps,)`` values, 0 for those that the model itself applies."""
         rest = values[: len(values) - len(self.maps)].copy()
         if self.anamorphosis:
+            # The matrix is computed with the stretches: their derivatives would count them twice.
             rest[STRETCHES] = 0.0
         return rest
 
@@ -282,11 +284,13 @@ def nuisances_of(
     if not gain_map:
         return unknowns
     n = len(valid)
+    # About -1 to 1 across the pupil, so that high powers stay comparable with low ones.
     y, x = (np.stack(np.nonzero(valid)) - (n - 1) / 2) / (n / 2)
     order = GAIN_MAP_ORDER
     powers = [x**i * y**j for i in range(order + 1) for j in range(order + 1 - i) if i + j > 0]
     # without their mean, because the free gain of each mode describes a common factor
     centred = np.array(powers) - np.mean(powers, axis=1, keepdims=True)
+    # Orthonormal over the subapertures, so that one prior suits all coefficients.
     orthonormal, _ = np.linalg.qr(centred.T)
     maps = np.tile(orthonormal.T * np.sqrt(valid.sum()), kind.n_planes)
     return replace(unknowns, maps=maps)
@@ -379,6 +383,7 @@ def refine(
         linear = np.append(linear, [LINEAR_STRETCH] * 2)
     for _ in range(max_steps):
         step = _limit_step(seen, values, nuisances, counts)
+        # The last point inside the limits is kept, and the fit counts as not converged.
         if not within_limits(vector + step[:4]):
             break
         vector, values = vector + step[:4], values + step[4:]

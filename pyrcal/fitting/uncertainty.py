@@ -148,6 +148,7 @@ class Uncertainty:
         """
         if not len(moves):
             return self
+        # Only variances are added: correlations between the parameters' changes are left out.
         added = np.diag(shares @ moves**2)
         return replace(
             self,
@@ -312,6 +313,7 @@ def misplacement_sigma(
     room = float(np.sqrt(max(residual**2 - EXACT_RESIDUAL**2, 0.0)))
     error = min(POSITION_ERROR_PITCH if stated is None else stated, room)
     each_m = error * mirror.pitch_m / np.sqrt(len(seen))
+    # The same value for rotation and magnification, which both move a point by its radius.
     turn = each_m / float(np.sqrt(np.mean(seen**2)))
     shift = each_m / subaperture_m
     return np.array([shift, shift, turn, turn])
@@ -347,8 +349,10 @@ def dispersion(projection: Projection, regions: NDArray[np.intp]) -> float:
     """
     n_unknowns = len(projection.jacobian)
     noise = projection.chi / max(projection.residual.size - len(projection.gains), 1)
+    # A fit without residual has no correlations to measure.
     if not noise > 0.0:
         return 1.0
+    # pinv, because unknowns without effect make the matrix singular; here they count nothing.
     spread = np.linalg.pinv(projection.normal, hermitian=True) / (noise * n_unknowns)
     found = 1.0
     for scores in (projection.scores, _regional_scores(projection, regions)):
@@ -362,6 +366,7 @@ def pupil_regions(valid: NDArray[np.bool_], n_planes: int) -> NDArray[np.intp]:
     y, x = np.stack(np.nonzero(valid)) - (n - 1) / 2
     sector = np.floor((np.arctan2(y, x) / (2 * np.pi) + 0.5) * N_SECTORS).astype(np.intp)
     radius = np.hypot(x, y)
+    # The square of the radius makes rings of equal area; 1e-9 keeps the outermost inside.
     ring = np.floor((radius / (radius.max() + 1e-9)) ** 2 * N_RINGS).astype(np.intp)
     return np.tile(np.minimum(sector, N_SECTORS - 1) * N_RINGS + ring, n_planes)
 
@@ -375,6 +380,7 @@ def _sandwich(spread: Array, scores: Array) -> Array:
 def _at_least(covariance: Array, other: Array) -> Array:
     """Return the first covariance, scaled to the larger σ of both with its correlations."""
     own, least = np.sqrt(np.diag(covariance)), np.sqrt(np.diag(other))
+    # Without a σ there is nothing to scale: a fit without residual has none.
     if not np.all(own > 0.0):
         return other
     grown = np.maximum(own, least) / own
@@ -399,6 +405,7 @@ def _subsets(
     """
     steps, covariances = [], []
     for k in range(n_sets):
+        # Every n-th mode, so that each set has low and high orders.
         own, scored = normals[k::n_sets], scores[:, k::n_sets]
         spread = np.linalg.inv(own.sum(axis=0) + held)
         step = spread @ (scored.sum(axis=1) - pull)

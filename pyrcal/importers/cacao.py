@@ -95,6 +95,7 @@ class _Folder:
         whole = re.compile(rf"(?:.*[._-])?(?:{pattern})")
         found = [path for path, name in self.files.items() if whole.fullmatch(name)]
         exact = [path for path in found if re.fullmatch(pattern, self.files[path])]
+        # An exact name has priority over one that only ends with the pattern.
         return exact or found
 
     def one(self, pattern: str, purpose: str) -> Path | None:
@@ -149,6 +150,7 @@ class _Folder:
         """Return a note for each file that was not used."""
         notes = []
         for path, name in sorted(self.files.items()):
+            # A copy of a file that was used holds nothing that is missing: it needs no note.
             real = self.copies.get(path.resolve(), path.resolve())
             if real in self.used:
                 continue
@@ -223,6 +225,7 @@ def _survey(folder: Path) -> _Folder:
     found = _Folder(root=folder, files=files, texts=texts, variables=variables)
     scripts = [path for path in texts if path.name.lower().startswith("cacaovars")]
     for path in scripts[:1]:
+        # Limited, because any file of this name is read.
         text = path.read_text(encoding="utf-8", errors="replace")[:1_000_000]
         variables.update((key, value.strip()) for key, value in _VARIABLES.findall(text))
         found.taken.append(
@@ -247,6 +250,7 @@ def _response(found: _Folder, requested: str | None) -> tuple[Array, _Kind]:
         return _cube(found, path, kinds[0]), kinds[0]
     for kind in RESPONSES:
         path = found.one(kind.response, f"the response of {kind.words}")
+        # A response of modes is of no use without the modes that were poked.
         if path is None or (kind.modes is not None and not found.find(kind.modes)):
             continue
         return _cube(found, path, kind), kind
@@ -348,6 +352,7 @@ def _on_grid(
 ) -> dict[str, Array]:
     inside = np.ones(shape, dtype=bool) if mask is None else np.asarray(mask)
     row, column = np.nonzero(inside)
+    # Without a stated radius the outermost actuators are at the edge of the pupil.
     radius = _numbers(found.variables, "DM_beam_rad") or (max(shape) - 1) / 2.0
     stated_centres = (_numbers(found.variables, f"DM_beam_{axis}cent") for axis in "xy")
     grid = ((n - 1) / 2.0 for n in reversed(shape))
@@ -380,6 +385,7 @@ def _positions(found: _Folder, n_actuators: int) -> Array | None:
         except ValueError as error:
             raise MatrixError(f"{path}: found {error}, expected number, x, y in a row") from error
         if table.shape == (n_actuators, 3) and np.isfinite(table).all():
+            # Sorted by number: the rows of the file need not be in the order of the columns.
             order = np.argsort(table[:, 0])
             if not np.array_equal(table[order, 0], np.arange(n_actuators) + table[:, 0].min()):
                 raise MatrixError(f"{path}: expected each actuator's number once, in column 1")

@@ -140,6 +140,7 @@ def _prune(settings: Settings, *, dry_run: bool, as_json: bool) -> int:
     retention, archive = retention_policy(settings), Archive(settings.service.data_dir)
     with archive:
         archive.look()  # reject a folder without an archive before anything is written
+        # Opening takes the lock: a dry run must work while a service runs.
         if not dry_run:
             archive.close()
             archive.open()
@@ -197,6 +198,7 @@ def _list_saved_matrices(archive: Archive) -> tuple[str, ...]:
     saved = archive.tracking.read()
     if saved is None:
         return ()
+    # A restarted service continues an acquisition, so its matrix must be kept too.
     acquiring = None if saved.acquisition is None else saved.acquisition.matrix
     return tuple(one for one in (saved.in_use, acquiring) if one is not None)
 

@@ -171,6 +171,7 @@ class Arrays:
         stated = self._number("delay_frames", 2.0, MAX_DELAY_FRAMES)
         n_frames, n_slopes = self._shape("slopes", (None, None))
         _, n_given = self._shape("commands_m", (n_frames, None))
+        # Only frames before the first gap: a delay in frames has no meaning across one.
         edges = np.flatnonzero(np.diff(self._sequence(n_frames)) > 1)
         n = min(int(edges[0]) + 1 if len(edges) else n_frames, MAX_FRAMES)
         rows = self._rows(0, n, n_given).astype(float)
@@ -178,6 +179,7 @@ class Arrays:
         rows = rows[: n if usable.all() else int(np.argmin(usable))]
         commands = rows[:, n_slopes : n_slopes + n_given]
         if self._has("dither_m"):
+            # The dither is not a response to slopes.
             commands = commands - rows[:, n_slopes + n_given :]
         found = measure_delay(rows[:, :n_slopes], commands, stated)
         if found is None or abs(found - stated) < MIN_APART_FRAMES:
@@ -260,6 +262,7 @@ class Arrays:
         gains[: max(n_controlled, len(given) if len(given) > 1 else 0)] = given
         rate_hz = self._number("frame_rate_hz", None, MAX_RATE_HZ)
         n_frames, _ = self._shape("slopes", (None, None))
+        # Written with not, so that NaN is refused too.
         if not rate_hz * MAX_SPAN_S >= n_frames:
             found = f"{rate_hz:g}, at which {n_frames} frames last longer than a day"
             raise self._refusal("frame_rate_hz", found, "frames a second")
@@ -302,6 +305,7 @@ class Arrays:
             moving = np.any(self.found["dither_m"][:_N_CHECKED_FRAMES], axis=0)
             still = "modes that dither_m moves (indices are counted from 0)"
             self._check_each("dither_modes", modes, moving[modes.astype(int)], still)
+        # A sine above half of the frame rate is sampled as another frequency.
         most_hz = rate_hz / 2.0
         fits = (frequencies > 0.0) & (frequencies < most_hz)
         below = f"above 0 and below half of frame_rate_hz, {most_hz:g} Hz"
@@ -345,11 +349,13 @@ class Arrays:
             found = f"{array.dtype} of shape {array.shape}"
             raise self._refusal("seq", found, f"whole numbers ({n_frames},)")
         given = np.asarray(array[()])
+        # A double beyond 2^53 cannot hold every whole number: neighbours would be equal.
         limit = _MOST_EXACT if given.dtype.kind == "f" else _MOST_SEQ
         expected = f"whole numbers from 0 to {limit}"
         if given.dtype.kind == "f" and len(given) and np.nanmax(given) > limit:
             expected += ", or larger ones as integers"
         fits = (given >= 0) & (given <= limit)
+        # Checked before the conversion to integers, which would cut fractions off.
         if given.dtype.kind == "f":
             fits &= given == np.round(given)
         self._check_each("seq", given, fits, expected)
@@ -457,6 +463,7 @@ def _frames_at_once(n_columns: int) -> int:
 
 def _runs(usable: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
     """Return first and end of runs of usable rows."""
+    # With False at both ends every run has a start and an end.
     edges = np.flatnonzero(np.diff(usable, prepend=False, append=False)).tolist()
     return zip(edges[::2], edges[1::2], strict=True)
 

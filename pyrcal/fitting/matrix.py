@@ -104,7 +104,7 @@ _LEAST_RATE = 0.1
 """Smallest slope of the measured share over the removed share used in the uncertainty."""
 
 _SMEAR_EXPLAINS = 0.9
-"""Residual without the smear over that with it, above which the smear is rejected."""
+"""Residual left after the smear is removed over that left before; above this it is rejected."""
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]

@@ -194,11 +194,11 @@ def _aot(options: argparse.Namespace, settings: Settings) -> int:
 
 
 def _list_saved_matrices(archive: Archive) -> tuple[str, ...]:
-    """Return the α that the next service would start with."""
+    """Return the ids of the matrices that the saved state names, in use and of an acquisition."""
     saved = archive.tracking.read()
     if saved is None:
         return ()
-    # A restarted service continues an acquisition, so its matrix must be kept too.
+    # The saved state refers to it, so it must be kept.
     acquiring = None if saved.acquisition is None else saved.acquisition.matrix
     return tuple(one for one in (saved.in_use, acquiring) if one is not None)
 

@@ -372,7 +372,7 @@ def _scan_outwards(left: Callable[[float], float]) -> Array:
     found = np.full(len(SENSOR_CHANGES), np.inf)
     middle = len(SENSOR_CHANGES) // 2
     found[middle] = left(0.0)
-    # Both sides: four low modes have a minimum on either, and the first one found may be the wrong.
+    # Both sides: four low modes have a minimum on each, and the first may be the wrong one.
     for side in (-1, 1):
         k = middle + side
         while 0 <= k < len(found):

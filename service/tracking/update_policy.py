@@ -274,7 +274,7 @@ wavefront at 500 and 400 modes, 4 at 100 (FLAO, 1", where 400 leave 117). Halves
 six trials find the most of 594 that pass; half of this step would take one more."""
 
 MIN_TRIED_MODES = 30
-"""Fewest modes that are tried instead of more."""
+"""Smallest number of modes that is tried where more are refused."""
 
 FIRST_MODES_DELAY_S = 60.0
 """First delay after the number of modes was lowered before more are tried."""
@@ -295,7 +295,7 @@ _DECLINED_STATES = frozenset({MatrixState.REFUSED, MatrixState.REJECTED, MatrixS
 
 
 def half_of_modes(n_modes: int) -> int:
-    """Return half of ``n_modes``, or these where that is fewer than are ever tried."""
+    """Return half of ``n_modes``, or all of them where half is below ``MIN_TRIED_MODES``."""
     return n_modes if n_modes // 2 < MIN_TRIED_MODES else n_modes // 2
 
 

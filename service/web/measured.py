@@ -306,9 +306,11 @@ class FitDocument(BaseModel):
     """Advice in one sentence, which begins with "use it", "measure more" or "do not use"."""
 
     found_not_told: list[dict[str, Any]] = []
-    unknown_not_found: list[str] = []
     """Values that the matrix determines: key, found, told (the file's), how, and whether to correct
     the file."""
+
+    unknown_not_found: list[str] = []
+    """Values that the file calls "unknown" and the matrix does not determine, with the reason."""
 
     alternatives: list[dict[str, Any]] = []
     """Other explanations of the matrix: words, misfit (χ² over the fit's; null: not comparable),

@@ -38,7 +38,7 @@ from service.instrument import load_instrument
 from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import analytic_basis
-from service.model.sensors.pyramid.description import with_images_at
+from service.model.sensors.registry import kind_of
 from service.runtime.policy import policy_of
 from service.runtime.worker import Compute, OpticsWorker
 from service.tracking.state import Mode
@@ -150,7 +150,7 @@ def poles(seed: int, rms_px: float) -> Iterator[str]:
     offsets -= offsets.mean(axis=0)
     offsets *= rms_px / np.sqrt(np.mean(offsets**2))
     basis = analytic_basis(instrument)
-    displaced = replace(instrument, wfs=with_images_at(instrument, offsets))
+    displaced = replace(instrument, wfs=kind_of(instrument).with_images_at(instrument, offsets))
     near, there = (
         RtcInteractionModel(each, basis).linearise(true) for each in (instrument, displaced)
     )

@@ -152,7 +152,7 @@ def _parts(said: schema.InstrumentFile) -> Mapping[str, Callable[[], Any]]:
     @cache
     def frames() -> object | None:
         with schema.refused_at(wfs.path, wfs.name):
-            return kind.frames(wfs.said, wfs.given)
+            return kind.model.frames(wfs.said, wfs.given)
 
     return {
         "wfs": sensor,
@@ -194,7 +194,7 @@ def _in_first_mode(
 ) -> Instrument:
     """Return the instrument with the modes of its sensor, in the first of them."""
     with schema.refused_at(file.path, file.name):
-        modes = kind.in_modes(file.said, instrument.wfs)
+        modes = kind.model.in_modes(file.said, instrument.wfs)
     if not modes:
         return instrument
     if instrument.config_id is not None:
@@ -332,8 +332,7 @@ def _loop(file: schema.Section[LoopFacts], n_modes: int) -> LoopFacts | None:
 
 def _sensor(file: schema.Section[SensorTable], kind: SensorKind, pupil: Pupil) -> SensorDescription:
     with schema.refused_at(file.path, file.name):
-        sensor = kind.read_sensor(file.said, file.given)
-        kind.check(sensor, pupil.subaperture_m)
+        sensor = kind.model.read_sensor(file.said, file.given, pupil.subaperture_m)
     if file.said.valid_subapertures == "auto":
         return sensor
     if "flux_threshold" in file.given:

@@ -25,7 +25,6 @@ from service.model.local import Drawing, LocalShapes, Patch, Shapes, beside, til
 from service.model.misregistration import Misregistration, rotation, stretch_matrix
 from service.model.modes import Basis, local_of
 from service.model.pupil import Illumination, instrument_pupil
-from service.model.sensors.kind import WorkingPoint
 from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import (
     KEPT_BYTES,
@@ -34,6 +33,7 @@ from service.model.sensors.sensor import (
     Response,
     Sensor,
     SeveralImages,
+    WorkingPoint,
     by_rows,
 )
 from service.model.slopes import rtc_mask, to_rtc

@@ -66,7 +66,8 @@ def floor_of(settings: Settings, instrument: Instrument | None = None) -> NDArra
     if instrument is None:
         return floor
     # places of the pupil images that the file calls unknown displace every estimate alike
-    return np.asarray(np.hypot(floor, kind_of(instrument).image_floor(instrument) * BOUNDARY_SCALE))
+    unknown, _ = kind_of(instrument).image_floors(instrument)
+    return np.asarray(np.hypot(floor, unknown * BOUNDARY_SCALE))
 
 
 def _coarser(instrument: Instrument | None) -> float:
@@ -106,7 +107,7 @@ def policy_of(settings: Settings, instrument: Instrument | None = None) -> Polic
         floor=floor_of(settings, instrument) / BOUNDARY_SCALE,
         image_floor=np.zeros(4)
         if instrument is None
-        else kind_of(instrument).unstated_image_floor(instrument),
+        else kind_of(instrument).image_floors(instrument)[1],
         bias_memory_s=tracking.bias_memory_s,
         flexure_per_degree=_vector(
             tracking.flexure_subap_per_degree,

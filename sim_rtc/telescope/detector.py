@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from service.errors import ConfigurationError
 from service.model.instrument import Instrument
 from service.model.kinds import SignalKind
-from service.model.sensors.registry import kind_of
+from service.model.sensors.registry import KINDS, kind_of
 from service.model.sensors.sensor import CannotTell
 
 Array = NDArray[np.float64]
@@ -89,7 +89,7 @@ class Detector:
             lights, n_pixels = np.tile(own, 2), len(pixels)
         else:
             lights, n_pixels = pixels.reshape(-1) * self.electrons_per_frame, 1
-        if sensor.normalised:
+        if KINDS[instrument.wfs.kind].normalised:
             variance = camera.excess_noise * lights + n_pixels * camera.read_noise_electrons**2
             # The slopes are normalised by the mean light of all valid subapertures (global
             # normalisation).

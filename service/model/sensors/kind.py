@@ -1,32 +1,17 @@
-"""The interface of a kind of sensor: its table in an instrument file, its optics, its light.
+"""The keys of a kind of sensor in an instrument file.
 
-All code that needs something specific to a sensor asks here; only the folder of a kind knows which
-kind it is. A kind omits what it does not have. Mathematics is imported inside the methods, because
-this module is loaded when a command line starts.
+Loaded when a command line starts: all that needs mathematics is behind ``SensorKind.model``.
 """
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
-from service.errors import ModelError
-
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from service.model.instrument import Instrument, SensorDescription, SensorMode
     from service.model.kinds import SignalKind
-    from service.model.pupil import PupilGrid
-    from service.model.sensors.sensor import CannotTell, Fineness, Light, Sensor
-    from service.model.slopes import SlopeRecipe
-
-    Term = float | NDArray[np.float64]
-    """Variance of slopes: one value for all, or ``(n_signals,)``."""
+    from service.model.sensors.model import SensorModel
 
 
 class SensorTable(Protocol):
@@ -45,25 +30,8 @@ class SensorTable(Protocol):
         """A mask ``path:/dataset``, or "auto": by ``flux_threshold``, which no mask allows."""
 
 
-class WorkingPoint:
-    """Effect of a loop's residual on the source; its content is private to its kind."""
-
-    __slots__ = ()
-
-
-@dataclass(frozen=True, slots=True)
-class LeftOut:
-    """Signals that exist but do not measure what the model computes."""
-
-    subapertures: NDArray[np.bool_]
-    """``(n, n)`` [y, x], in the axes of conventions.md."""
-
-    reason: str
-    """Description of the signals, with the key that excludes them."""
-
-
 class SensorKind(ABC):
-    """One kind of wavefront sensor."""
+    """One kind of wavefront sensor, as an instrument file has it."""
 
     name: ClassVar[str]
     """``wfs.kind`` of an instrument file."""
@@ -81,15 +49,10 @@ class SensorKind(ABC):
     normalised: ClassVar[bool] = False
     """True if signals are divided by a flux; ``slopes.normalisation`` selects which."""
 
-    loses_gain: ClassVar[bool] = False
-    """Whether it answers less the larger the residual wavefront is."""
-
-    fine_sampling: ClassVar[int] = 3
-    """Pupil points along a subaperture, and nodes, of the model that decides the fit of a matrix:
-    against 8 a pyramid's is biased by 0.02 % of a subaperture and 0.004 % of magnification."""
-
-    edge_slips: ClassVar[bool] = False
-    """True if the sensor can lock on a mirror edge that is displaced by one wavelength."""
+    @property
+    @abstractmethod
+    def model(self) -> SensorModel:
+        """Its optics and its light; imported when they are first asked for."""
 
     def as_read(self, written: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return ``[wfs]`` as it is to be held against the table.
@@ -101,297 +64,6 @@ class SensorKind(ABC):
         """
         return written
 
-    @abstractmethod
-    def read_sensor(self, table: Any, given: frozenset[str]) -> SensorDescription:  # noqa: ANN401 - its own
-        """Return the sensor that a table describes, its mask apart; ``given``: keys written.
-
-        Raises
-        ------
-        ModelError
-            One line that begins with the key.
-        """
-
-    def left_out(self, instrument: Instrument) -> LeftOut | None:
-        """Return valid subapertures whose signals a measured matrix is not compared in."""
-        return None
-
-    def check(self, sensor: Any, subaperture_m: float) -> None:  # noqa: ANN401, B027 - its own
-        """Refuse a sensor that cannot work with this subaperture width; by default accept any.
-
-        Raises
-        ------
-        ModelError
-            One line that begins with the key.
-        """
-
-    def in_modes(
-        self,
-        table: Any,  # noqa: ANN401 - its own
-        sensor: Any,  # noqa: ANN401 - its own
-    ) -> tuple[tuple[SensorMode, str], ...]:
-        """Return the modes that a table makes of its sensor, each with where its own mask is.
-
-        ``path:/dataset``, or "auto": by ``flux_threshold``. Empty: the sensor has no modes.
-
-        Raises
-        ------
-        ModelError
-            One line that begins with the key.
-        """
-        return ()
-
-    def frames(self, table: Any, given: frozenset[str]) -> object | None:  # noqa: ANN401 - its own
-        """Return how signals are made of the frames that the RTC sends; None: it sends signals."""
-        return None
-
     def list_assumptions(self, table: Any, given: frozenset[str]) -> Iterator[tuple[str, str]]:  # noqa: ANN401
         """Yield keys that the table leaves out, and what is taken instead."""
         yield from ()
-
-    def signals_of_frames(
-        self, instrument: Instrument, frames: NDArray[Any], flux_frame: NDArray[Any]
-    ) -> NDArray[np.float64]:
-        """Return the signals ``(n_signals, n_modes)`` of frames ``(n_modes, ny, nx)``.
-
-        They are changes per unit of each mode, relative to a mean frame ``(ny, nx)``; see
-        ``frames``.
-
-        Raises
-        ------
-        ModelError
-            If the frames do not fit the sensor.
-        """
-        raise ModelError(f"{instrument.name}: found frames; expected signals of a {self.name}")
-
-    def locate_images(
-        self, instrument: Instrument, flux_frame: NDArray[Any]
-    ) -> tuple[Instrument, tuple[str, ...]]:
-        """Return the instrument with its pupil images located in a mean frame, and remarks.
-
-        Only images that the instrument file leaves open are located.
-        """
-        return instrument, ()
-
-    def is_weakly_modulated(self, sensor: Any) -> bool:  # noqa: ANN401 - its own
-        """Return whether a modulation is so narrow that models of the focus differ."""
-        return False
-
-    def image_centres(
-        self, instrument: Instrument, flux_frame: NDArray[Any]
-    ) -> NDArray[np.float64] | None:
-        """Return where a mean frame shows the pupil images, ``(4, 2)`` row and column, pixels.
-
-        Whatever the instrument file says of them. None if they cannot be found, or there is one.
-        """
-        return None
-
-    def identity(self, sensor: Any) -> tuple[float, ...]:  # noqa: ANN401 - its own
-        """Return the numbers that make another configuration of it when they change."""
-        return (sensor.wavelength_m,)
-
-    def bin_sensor(self, sensor: Any, binning: int) -> SensorDescription:  # noqa: ANN401 - its own
-        """Return the sensor with so many subapertures made one along each axis.
-
-        Raises
-        ------
-        ModelError
-            If it cannot be binned.
-        """
-        raise ModelError(f"a {self.name}: found binning {binning}, expected none")
-
-    @abstractmethod
-    def noise_terms(self, instrument: Instrument) -> tuple[Term, Term]:
-        """Return the variance of a slope by each photon, and by noise 1 of its pixels.
-
-        Both over the square of the photons yet; numbers, or ``(n_signals,)`` where the spots of
-        subapertures are not alike.
-        """
-
-    def slope_noise(
-        self, instrument: Instrument, electrons: float, read_noise: float, excess: float = 1.0
-    ) -> float:
-        """Return 1 σ of a slope of a subaperture with so many electrons, read with this noise.
-
-        ``excess`` is the variance of the photon noise over Poisson's. RMS of all slopes.
-        """
-        of_photons, of_pixels = (_mean(term) for term in self.noise_terms(instrument))
-        return math.sqrt(excess * of_photons * electrons + of_pixels * read_noise**2) / electrons
-
-    def noise_shape(self, instrument: Instrument) -> NDArray[np.float64] | None:
-        """Return 1 σ of each signal ``(n_signals,)`` over their RMS, by photons of the same light.
-
-        None: all alike.
-        """
-        of_photons, _ = self.noise_terms(instrument)
-        if isinstance(of_photons, float):
-            return None
-        shape: NDArray[np.float64] = (of_photons / of_photons.mean()) ** 0.5
-        return shape
-
-    @abstractmethod
-    def pixels(self, instrument: Instrument, valid: NDArray[np.bool_]) -> NDArray[np.intp]:
-        """Return the indices of the pixels of valid subapertures in a response's flat light.
-
-        ``(n_pixels, n_valid)``; the light has n_pixels for every subaperture of the grid.
-        """
-
-    @abstractmethod
-    def sensor(
-        self,
-        instrument: Instrument,
-        pupil: PupilGrid,
-        fineness: Fineness,
-        working_point: WorkingPoint | None = None,
-    ) -> Sensor:
-        """Return the sensor of an instrument on this pupil, by default for a flat wavefront.
-
-        Raises
-        ------
-        ModelError
-            If it cannot be computed so.
-        """
-
-    def working_point(
-        self,
-        instrument: Instrument,
-        *,
-        n_controlled: int,
-        r0_m: float | None = None,
-        sampling: int,
-    ) -> WorkingPoint | None:
-        """Return what a loop of so many modes makes of a star; None: nothing, to this sensor.
-
-        ``sampling`` are the pupil's points along a subaperture.
-
-        Raises
-        ------
-        ModelError
-            If no mode is controlled or r0 is not positive.
-        """
-        return None
-
-    def coarsest_sampling(self, sensor: Any) -> int:  # noqa: ANN401 - its own
-        """Return how many pupil points along a subaperture the smoothest shapes need."""
-        return 1
-
-    def find_fitted_key(self, sensor: Any) -> str | None:  # noqa: ANN401 - its own
-        """Return the key of a sensor parameter that is fitted together with α, by its logarithm.
-
-        Fitting it keeps a wrong value in the file from biasing α. None if there is no such
-        parameter.
-        """
-        return None
-
-    def other_recipes(self, recipe: SlopeRecipe) -> dict[str, SlopeRecipe]:
-        """Return recipes that this one may be taken for, by what a file would say of them."""
-        return {}
-
-    def other_sensors(self, sensor: Any) -> dict[str, SensorDescription]:  # noqa: ANN401 - its own
-        """Return sensors that this one may be taken for, by what a file would say of them."""
-        return {}
-
-    @abstractmethod
-    def aot(self, recipe: SlopeRecipe) -> tuple[str, dict[str, int]]:
-        """Return its class in AOT files, and the fields that only this class is given."""
-
-    def image_sigma_subap(self, instrument: Instrument) -> float | None:
-        """Return the prior 1 σ of the position of each pupil image, in subapertures.
-
-        None if the sensor has one pupil image, or if the file states the positions.
-        """
-        return None
-
-    def image_floor(self, instrument: Instrument) -> NDArray[np.float64]:
-        """Return 1 σ of α ``(4,)`` by places of pupil images that the file calls unknown.
-
-        Numeric units (subapertures, radians, ratio); 0 where nothing is unknown.
-        """
-        import numpy as np
-
-        return np.zeros(4)
-
-    def unstated_image_floor(self, instrument: Instrument) -> NDArray[np.float64]:
-        """Return the same by places that the file neither states nor calls unknown."""
-        import numpy as np
-
-        return np.zeros(4)
-
-    def displace_images(
-        self, instrument: Instrument, offsets: NDArray[np.float64]
-    ) -> SensorDescription:
-        """Return the sensor with its pupil images displaced by ``offsets`` ``(2 n_images,)``.
-
-        Subapertures, axes of conventions.md: of each image along x, then of each along y.
-
-        Raises
-        ------
-        ModelError
-            If it has only one image.
-        """
-        raise ModelError(f"a {self.name}: found several images to be moved, expected a pyramid's")
-
-    def image_offsets(self, instrument: Instrument) -> NDArray[np.float64] | None:
-        """Return the displacements of the pupil images in the instrument file, ``(4, 2)``.
-
-        They are relative to the pixel grid, less their mean, in subapertures and the axes of
-        conventions.md: (x, y) of the images at -x -y, +x -y, -x +y, +x +y. None if the file does
-        not state them.
-        """
-        return None
-
-    def turned_edge_sigma(
-        self, instrument: Instrument, displaced_subap: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return 1 σ of α ``(4,)`` from the turned edges of what displaces the pupil images.
-
-        ``displaced_subap`` ``(4, 2)`` is added to what the instrument file states. Numeric units; 0
-        for a sensor with one image.
-        """
-        import numpy as np
-
-        return np.zeros(4)
-
-    def offsets_px(
-        self, instrument: Instrument, offsets: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return displacements ``(n_images, 2)`` in pixels, as an instrument file has them.
-
-        Raises
-        ------
-        ModelError
-            If it has only one image.
-        """
-        raise ModelError(f"a {self.name}: found several images, expected a pyramid's")
-
-    def with_images_at(
-        self, instrument: Instrument, offsets_px: NDArray[np.float64]
-    ) -> SensorDescription:
-        """Return the sensor with its images displaced as an instrument file states it, ``(4, 2)``.
-
-        The inverse of ``offsets_px``.
-
-        Raises
-        ------
-        ModelError
-            If it has only one image.
-        """
-        raise ModelError(f"a {self.name}: found several images, expected a pyramid's")
-
-    def pupil_offset(self, instrument: Instrument) -> tuple[float, float] | None:
-        """Return where the instrument file places the pupil's image on the grid, (x, y).
-
-        Subapertures, axes of conventions.md; None if the file does not say.
-        """
-        return None
-
-    def light(self, instrument: Instrument) -> Light | CannotTell:
-        """Return what an instrument's light says of the pupil, or why it says nothing."""
-        from service.model.sensors.sensor import CannotTell
-
-        return CannotTell(
-            reason=f"the position of the pupil cannot be estimated from the flux of a {self.name}"
-        )
-
-
-def _mean(term: Term) -> float:
-    return term if isinstance(term, float) else float(term.mean())

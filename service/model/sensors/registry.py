@@ -11,11 +11,12 @@ from service.model.sensors.shack_hartmann.kind import ShackHartmannKind
 
 if TYPE_CHECKING:
     from service.model.instrument import Instrument
+    from service.model.sensors.model import SensorModel
 
 KINDS: Mapping[str, SensorKind] = {kind.name: kind for kind in (PyramidKind(), ShackHartmannKind())}
 """Sensor kinds by ``wfs.kind`` of an instrument file; the first one is the default."""
 
 
-def kind_of(instrument: Instrument) -> SensorKind:
-    """Return the kind of an instrument's sensor."""
-    return KINDS[instrument.wfs.kind]
+def kind_of(instrument: Instrument) -> SensorModel:
+    """Return the model of an instrument's kind of sensor."""
+    return KINDS[instrument.wfs.kind].model

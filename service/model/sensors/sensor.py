@@ -57,6 +57,12 @@ class RowsElsewhere:
     """Makes of that the function: a kilobyte."""
 
 
+class WorkingPoint:
+    """Effect of a loop's residual on the source; its content is private to its kind."""
+
+    __slots__ = ()
+
+
 KEPT_BYTES = 1e9
 """Enough for K of 40 subapertures at every sampling; of the ELT it takes 3.8 GB."""
 

@@ -51,7 +51,7 @@ from service.files.disk_cache import DiskCache
 from service.model.instrument import Instrument
 from service.model.interaction import Linearisation, RtcInteractionModel
 from service.model.misregistration import Misregistration
-from service.model.sensors.kind import WorkingPoint
+from service.model.sensors.sensor import WorkingPoint
 from service.model.slopes import SlopeRecipe
 from service.runtime.worker.records import (
     Compute,

@@ -17,8 +17,8 @@ from service.estimation.estimate import DitheredEstimate
 from service.model.instrument import Instrument
 from service.model.interaction import Linearisation, RtcInteractionModel
 from service.model.misregistration import Misregistration
-from service.model.sensors.kind import WorkingPoint
 from service.model.sensors.registry import kind_of
+from service.model.sensors.sensor import WorkingPoint
 
 Array = NDArray[np.float64]
 

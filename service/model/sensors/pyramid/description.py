@@ -16,40 +16,6 @@ from service.model.slopes import Orientation
 
 _SEPARATION_TOLERANCE = 0.1
 
-IMAGE_SIGMA_PX = 0.15
-"""1 σ of the displacement of a pupil image from its place on the pixel grid, along an axis, in
-detector pixels. Real pyramids have 0.05 to 0.3 px: faces differ by some 0.1 % of their angle, and
-the windows that cut out the images begin at whole pixels."""
-
-MEASURED_SIGMA_PX = 0.1
-"""The same of centres that were measured on the detector's frames. Under even light they are found
-to 0.01 pixel; on real benches, where light is uneven and spiders cross the edge, two ways to find
-them differ by 0.1 to 0.4."""
-
-EDGE_SHIFT = 1.3
-"""1 σ of a shift over the mean square displacement of the pupil images and over the distance
-between their centres, all in subapertures. Faces that displace two images by d against each other
-meet at an edge that is turned by d over that distance S. The light that it exchanges is seen at two
-places d apart, so that a shift is wrong by up to d**2 / (4 S); the model moves the images alone.
-Matrices of OOPAO with images displaced by 0.2 and 0.3 of 18 subapertures were fitted with errors of
-0.0023 and 0.0069 (RMS of a shift), which sets of modes and regions of the pupil share."""
-
-EDGE_TURN = 0.3
-"""The same of a rotation, at the pupil's edge, over that of a shift: errors were 0.008 and 0.018
-deg with a radius of 6 subapertures."""
-
-LOCATED_SIGMA_PX = 0.005
-"""1 σ of a shift by the places of images that were located on frames, in detector pixels: each is
-found to 0.0065 pixel, and errors of shifts are 0.0025 RMS with images 0.1 pixel off the grid (40
-draws) and 0.0039 with 0.3 pixel (16 draws, 0.0095 at most)."""
-
-SHIFT_ERROR_RATIO = 0.25
-"""Error of a shift that takes no account of displaced images, over their RMS displacement along an
-axis. Of 12 and 24 subapertures, modulated by 0 and 3 λ/D, low and high modes: 0.15 to 0.27."""
-
-EDGE_ERROR_RATIO = 0.03
-"""The same of rotation and magnification, at the pupil's edge: 0.001 to 0.032."""
-
 _FRAME_KEYS = ("pupil_centres_px", "pixels_per_subaperture")
 
 
@@ -169,102 +135,22 @@ def _in_mode(sensor: Pyramid, mode: PyramidMode, where: str) -> SensorMode:
 def image_offsets(instrument: Instrument) -> NDArray[np.float64] | None:
     """Return displacements of the images from their places ``(2, 2, 2)``: side y, side x, (x, y).
 
-    They are in subapertures and in the axes of conventions.md. With the mirror as stop their mean
-    is subtracted, because it is the shift of α; with the telescope as stop ``pupil_offset`` is the
-    mean. None if they are unknown.
+    As ``stated_offsets``, their mean subtracted: with the mirror as stop it is the shift of α, with
+    the telescope as stop the place of the pupil.
+    """
+    stated = stated_offsets(instrument)
+    return None if stated is None else np.asarray(stated - stated.mean(axis=(0, 1)))
+
+
+def stated_offsets(instrument: Instrument) -> NDArray[np.float64] | None:
+    """Return what the file says of the images' places ``(2, 2, 2)``: side y, side x, (x, y).
+
+    In subapertures and in the axes of conventions.md; None if they are unknown.
     """
     told = pyramid_in(instrument).image_offsets_subap
     if told is None:
         return None
-    turned = orient_offsets(np.array(told).reshape(2, 2, 2), instrument.slopes.assumed_orientation)
-    return np.asarray(turned - turned.mean(axis=(0, 1)))
-
-
-def pupil_offset(instrument: Instrument) -> tuple[float, float] | None:
-    """Return the mean displacement (x, y) of the images, subapertures; None if unknown."""
-    told = pyramid_in(instrument).image_offsets_subap
-    if told is None:
-        return None
-    turned = orient_offsets(np.array(told).reshape(2, 2, 2), instrument.slopes.assumed_orientation)
-    x, y = turned.mean(axis=(0, 1))
-    return float(x), float(y)
-
-
-def image_sigma_subap(instrument: Instrument) -> float | None:
-    """Return 1 σ of an image's displacement from its place along an axis, subapertures.
-
-    None if the instrument file states the positions of the images.
-    """
-    if pyramid_in(instrument).image_offsets_subap is not None:
-        return None
-    measured = isinstance(instrument.frames, FrameWindows)
-    return (MEASURED_SIGMA_PX if measured else IMAGE_SIGMA_PX) / _pixels(instrument)
-
-
-def image_floor(instrument: Instrument) -> NDArray[np.float64]:
-    """Return 1 σ of α ``(4,)`` caused by unknown image displacements of ``image_sigma_subap``.
-
-    Numeric units. Rotation and magnification displace the pupil's edge.
-    """
-    sigma, radius = image_sigma_subap(instrument) or 0.0, instrument.wfs.pupil_diameter / 2.0
-    shift, edge = SHIFT_ERROR_RATIO * sigma, EDGE_ERROR_RATIO * sigma / radius
-    return np.array([shift, shift, edge, edge])
-
-
-def turned_edge_sigma(
-    instrument: Instrument, displaced_subap: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return 1 σ of α ``(4,)`` from the edges of faces that displace the pupil images.
-
-    It includes the error of images that are located on frames. ``displaced_subap`` ``(4, 2)`` is
-    added to what the instrument file states. Numeric units.
-    """
-    stated = image_offsets(instrument)
-    offsets = displaced_subap + (0.0 if stated is None else stated.reshape(4, 2))
-    apart = offsets - offsets.mean(axis=0)
-    wfs = pyramid_in(instrument)
-    shift = EDGE_SHIFT * float(np.mean(apart**2)) / wfs.image_separation_subap
-    turn = EDGE_TURN * shift / (wfs.pupil_diameter / 2.0)
-    if isinstance(instrument.frames, FrameWindows):
-        shift = float(np.hypot(shift, LOCATED_SIGMA_PX / _pixels(instrument)))
-    return np.array([shift, shift, turn, 0.0])
-
-
-def displace_pyramid(instrument: Instrument, offsets: NDArray[np.float64]) -> Pyramid:
-    """Return the pyramid with its images displaced from their places ``(8,)``.
-
-    Subapertures, axes of conventions.md: along x of the images at -x -y, +x -y, -x +y, +x +y, then
-    along y.
-    """
-    places = tuple((float(x), float(y)) for x, y in _in_rtc_axes(instrument, offsets))
-    return replace(pyramid_in(instrument), image_offsets_subap=places)
-
-
-def offsets_px(instrument: Instrument, offsets: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return displacements ``(8,)`` of ``displace_pyramid`` in units of the file, ``(4, 2)``."""
-    return _in_rtc_axes(instrument, offsets) * _pixels(instrument)
-
-
-def with_images_at(instrument: Instrument, offsets_px: NDArray[np.float64]) -> Pyramid:
-    """Return the pyramid with its images displaced as the file's key states it, ``(4, 2)``."""
-    pixels = _pixels(instrument)
-    places = tuple((float(x) / pixels, float(y) / pixels) for x, y in offsets_px)
-    return replace(pyramid_in(instrument), image_offsets_subap=places)
-
-
-def _in_rtc_axes(instrument: Instrument, offsets: NDArray[np.float64]) -> NDArray[np.float64]:
-    turned = orient_offsets(
-        offsets.reshape(2, 2, 2).transpose(1, 2, 0),
-        instrument.slopes.assumed_orientation,
-        back=True,
-    )
-    return turned.reshape(4, 2)
-
-
-def _pixels(instrument: Instrument) -> int:
-    """Return the detector pixels along a side of a subaperture."""
-    frames = instrument.frames
-    return frames.pixels_per_subaperture if isinstance(frames, FrameWindows) else 1
+    return orient_offsets(np.array(told).reshape(2, 2, 2), instrument.slopes.assumed_orientation)
 
 
 def orient_offsets(

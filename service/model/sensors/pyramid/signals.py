@@ -14,7 +14,6 @@ from service.model.instrument import Instrument
 from service.model.kinds import Normalisation, SignalKind, SlopeOrder
 from service.model.local import Shapes
 from service.model.pupil import PupilGrid, valid_subapertures
-from service.model.sensors.kind import WorkingPoint
 from service.model.sensors.pyramid.description import image_offsets, pyramid_in
 from service.model.sensors.pyramid.optics import (
     LightGradient,
@@ -23,7 +22,7 @@ from service.model.sensors.pyramid.optics import (
     enough_modulation_points,
 )
 from service.model.sensors.pyramid.working_point import Halo
-from service.model.sensors.sensor import KEPT_BYTES, Fineness, Mapper, Work, by_rows
+from service.model.sensors.sensor import KEPT_BYTES, Fineness, Mapper, Work, WorkingPoint, by_rows
 from service.model.slopes import PLAIN, TO_SLOPES, SlopeRecipe
 
 Array = NDArray[Any]

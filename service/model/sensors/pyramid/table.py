@@ -12,6 +12,9 @@ from service.model.kinds import Count, Positive, Read
 USUAL_SEPARATION = 1.2
 """Default distance of neighbouring pupil images over their diameter."""
 
+IMAGE_KEY = "image_offsets_px"
+"""Key of the displacements of the pupil images."""
+
 MAX_OFFSET_PX = 4.0
 """Largest displacement of a pupil image from its place on the pixel grid, detector pixels. Whole
 pixels belong into the windows that cut the images."""

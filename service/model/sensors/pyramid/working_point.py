@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.model.instrument import Instrument
-from service.model.sensors.kind import WorkingPoint
 from service.model.sensors.pyramid.description import pyramid_in
+from service.model.sensors.sensor import WorkingPoint
 from service.model.turbulence import REFERENCE_WAVELENGTH_M
 
 Array = NDArray[np.float64]

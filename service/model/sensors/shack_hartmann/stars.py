@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from service.errors import ModelError
 from service.model.instrument import Instrument
 from service.model.pupil import valid_subapertures
+from service.model.sensors.model import Term
 from service.model.sensors.shack_hartmann.description import (
     ShackHartmann,
     point_variances,
@@ -19,10 +20,6 @@ from service.model.sensors.shack_hartmann.description import (
 from service.model.sensors.shack_hartmann.elongated import ElongatedSpots, blur_of, elongation_rad
 from service.model.sensors.shack_hartmann.spots import MeanGradients, Spots
 from service.model.sensors.shack_hartmann.table import Centroid, LaserStar
-
-if TYPE_CHECKING:
-    from service.model.sensors.kind import Term
-
 
 LINEARITY_RANGE = (0.8, 1.25)
 """Range of a centroid's motion relative to the motion computed with the pixels used at rest;

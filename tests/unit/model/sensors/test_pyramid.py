@@ -17,15 +17,15 @@ from service.model.interaction import InteractionModel
 from service.model.kinds import Normalisation, SlopeOrder
 from service.model.misregistration import Misregistration
 from service.model.pupil import instrument_pupil
-from service.model.sensors.kind import SensorKind, WorkingPoint
+from service.model.sensors.model import SensorModel
 from service.model.sensors.pyramid.description import Pyramid
-from service.model.sensors.pyramid.kind import PyramidKind
 from service.model.sensors.pyramid.light import find_pupil, repair_pixels
+from service.model.sensors.pyramid.model import PyramidModel
 from service.model.sensors.pyramid.optics import Nodes, PyramidOptics, enough_modulation_points
 from service.model.sensors.pyramid.signals import pixel_places
 from service.model.sensors.pyramid.working_point import Halo, working_point
 from service.model.sensors.registry import KINDS, kind_of
-from service.model.sensors.sensor import CannotTell, Fineness, PupilPosition
+from service.model.sensors.sensor import CannotTell, Fineness, PupilPosition, WorkingPoint
 from tests.numerics import small_basis, small_instrument, small_model
 from tests.unit.estimation.lamps import (
     beam,
@@ -346,10 +346,10 @@ class Another:
 def test_a_pyramid_asked_for_another_sensor_says_what_it_found():
     instrument = replace(small_instrument(), wfs=Another())
     with pytest.raises(ModelError, match=r"found wfs\.kind = another, expected pyramid"):
-        PyramidKind().sensor(instrument, instrument_pupil(small_instrument(), 2), Fineness())
+        PyramidModel().sensor(instrument, instrument_pupil(small_instrument(), 2), Fineness())
 
 
-class Plain(SensorKind):
+class Plain(SensorModel):
     """A kind that has only what it must."""
 
     name = "plain"
@@ -374,7 +374,8 @@ def test_a_kind_without_light_frames_or_working_point_says_so():
 def test_every_kind_is_found_under_the_name_its_records_have():
     for name, kind in KINDS.items():
         assert kind.name == name
-    assert kind_of(small_instrument()) is KINDS["pyramid"]
+        assert kind.model.name == name
+    assert kind_of(small_instrument()).name == "pyramid"
 
 
 # --- the working point

@@ -14,6 +14,7 @@ from service.model.instrument import instrument_sha256
 from service.model.kinds import SignalKind
 from service.model.sensors import registry
 from service.model.sensors.kind import SensorKind
+from service.model.sensors.model import SensorModel
 from service.runtime.worker.sensor import SensorAtWork
 from tests.unit.test_config import ABOUT, MIRROR, MODES
 
@@ -52,17 +53,24 @@ class Curvature(Numbers):
     valid_subapertures: np.ndarray | None = None
 
 
+class CurvatureModel(SensorModel):
+    """A model that has nothing but what it must."""
+
+    name = "curvature"
+    sensor = pixels = noise_terms = aot = None
+
+    def read_sensor(self, table, given, subaperture_m):
+        return Curvature(**{one.name: getattr(table, one.name) for one in fields(Numbers)})
+
+
 class CurvatureKind(SensorKind):
-    """A kind that has nothing but what it must."""
+    """Its keys."""
 
     name = "curvature"
     table = CurvatureTable
     unknown: ClassVar[dict[str, float]] = {"extra_m": 2.0}
     signals = (SignalKind.XY,)
-    sensor = pixels = noise_terms = aot = None
-
-    def read_sensor(self, table, given):
-        return Curvature(**{one.name: getattr(table, one.name) for one in fields(Numbers)})
+    model = CurvatureModel()
 
 
 @pytest.fixture(autouse=True)

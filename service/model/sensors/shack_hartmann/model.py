@@ -1,0 +1,83 @@
+"""The Shack-Hartmann as a model of a kind of sensor."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from service.model.instrument import Instrument, SensorDescription
+from service.model.pupil import PupilGrid, fully_lit_subapertures, valid_subapertures
+from service.model.sensors.model import LeftOut, SensorModel, Term
+from service.model.sensors.sensor import Fineness, WorkingPoint
+from service.model.sensors.shack_hartmann.description import (
+    ShackHartmann,
+    check_field,
+    pixel_places,
+    shack_hartmann_in,
+    shack_hartmann_of,
+)
+from service.model.sensors.shack_hartmann.optics import ShackHartmannSensor
+from service.model.sensors.shack_hartmann.stars import centroid_variances, check_star
+from service.model.sensors.shack_hartmann.table import Centroid, ShackHartmannTable
+from service.model.slopes import SlopeRecipe
+
+
+class ShackHartmannModel(SensorModel):
+    """Lenslets, each with a spot whose centroid measures the wavefront's gradient."""
+
+    name = "shack-hartmann"
+    fine_sampling = 4
+    """With three points fits of OOPAO's matrices are off by 0.004 deg on 20 by 20 lenslets, twice
+    their σ; with four by 0.0015, and six change no more than noise."""
+
+    @override
+    def read_sensor(
+        self, table: ShackHartmannTable, given: frozenset[str], subaperture_m: float
+    ) -> ShackHartmann:
+        sensor = shack_hartmann_of(table)
+        check_field(sensor, subaperture_m)
+        check_star(sensor, subaperture_m)
+        return sensor
+
+    @override
+    def left_out(self, instrument: Instrument) -> LeftOut | None:
+        if not shack_hartmann_in(instrument).leaves_out_partly_lit:
+            return None
+        cut = valid_subapertures(instrument) & ~fully_lit_subapertures(instrument)
+        return LeftOut(cut, "cut by the edge of the pupil, left out by wfs.partly_lit")
+
+    @override
+    def noise_terms(self, instrument: Instrument) -> tuple[Term, Term]:
+        return centroid_variances(instrument)
+
+    @override
+    def pixels(self, instrument: Instrument, valid: NDArray[np.bool_]) -> NDArray[np.intp]:
+        return pixel_places(shack_hartmann_in(instrument), valid)
+
+    @override
+    def sensor(
+        self,
+        instrument: Instrument,
+        pupil: PupilGrid,
+        fineness: Fineness,
+        working_point: WorkingPoint | None = None,
+    ) -> ShackHartmannSensor:
+        return ShackHartmannSensor(instrument=instrument, pupil=pupil, dtype=fineness.dtype)
+
+    @override
+    def coarsest_sampling(self, sensor: ShackHartmann) -> int:
+        # from one point to the next a mode of a few subapertures is no cubic any more
+        return 2
+
+    @override
+    def other_sensors(self, sensor: ShackHartmann) -> dict[str, SensorDescription]:
+        if sensor.centroid is not Centroid.CENTRE_OF_GRAVITY or sensor.laser is not None:
+            return {}
+        return {'centroid = "gradient"': replace(sensor, centroid=Centroid.GRADIENT)}
+
+    @override
+    def aot(self, recipe: SlopeRecipe) -> tuple[str, dict[str, int]]:
+        return "ShackHartmann", {}

@@ -20,7 +20,7 @@ from service.config.settings import Settings
 from service.errors import ModelError, UnknownIdError, WireError
 from service.estimation.dither_windows import EndedWindow
 from service.estimation.frames import FrameBlock
-from service.estimation.passive_sums import PASSIVE_INTERVAL_S
+from service.estimation.passive import PASSIVE_INTERVAL_S
 from service.estimation.random_dither import (
     Correlated,
     NoisyMatrix,

@@ -41,7 +41,7 @@ from service.errors import PyrcalError, UnknownIdError, WorkerError
 from service.estimation.dither_windows import EndedWindow
 from service.estimation.frames import FrameBlock
 from service.estimation.loop import select_gains
-from service.estimation.passive_sums import PASSIVE_INTERVAL_S
+from service.estimation.passive import PASSIVE_INTERVAL_S
 from service.estimation.random_dither import Correlated
 from service.instrument import load_instrument
 from service.model.misregistration import Misregistration

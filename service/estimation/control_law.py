@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from service.estimation.estimator import Change, Detector, FrameContext, LoopContext, Mark
+from service.estimation.estimator import Change, FrameContext, LoopContext, Mark, Streaming
 from service.estimation.frames import FrameBlock
 from service.estimation.loop import last_seq
 from service.estimation.loopcheck import RECHECK_INTERVAL_S, SIGNIFICANCE_SIGMA
@@ -58,7 +58,7 @@ _STILL_M = 1e-13
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ControlLawCheck(Detector):
+class ControlLawCheck(Streaming):
     """Frames of a loop that has not changed, but for gains that follow the seeing."""
 
     resets = Change.GONE | Change.STATUS | Change.STANDSTILL

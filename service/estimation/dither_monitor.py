@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.estimation.demodulation import cosines_and_sines
-from service.estimation.estimator import Change, Detector, FrameContext, LoopContext, Mark
+from service.estimation.estimator import Change, FrameContext, LoopContext, Mark, Streaming
 from service.estimation.frames import FrameBlock
 from service.estimation.loop import last_seq
 from service.estimation.windows import ExpectedDither
@@ -110,7 +110,7 @@ class DitherMonitor:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DitherWatch(Detector):
+class DitherWatch(Streaming):
     """Checks that the requested dither is in the frames with the requested amplitude."""
 
     resets = Change.GONE | Change.RATE | Change.LOOP | Change.DITHER

@@ -9,10 +9,10 @@ from typing_extensions import override
 from service.estimation.estimator import (
     UNMARKED,
     Change,
-    Estimator,
     FrameContext,
     LoopContext,
     Mark,
+    Streaming,
 )
 from service.estimation.lockin import LockIn, LockInPlan, Spectra
 from service.estimation.random_dither import Correlated, RandomDither, RandomPlan
@@ -25,7 +25,7 @@ Window = EndedWindow | WindowRefused
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DitherWindows(Estimator):
+class DitherWindows(Streaming):
     """The window under way, cut as the dither allows."""
 
     resets = Change.GONE | Change.RATE | Change.LOOP | Change.DITHER | Change.STANDSTILL

@@ -150,9 +150,16 @@ class FrameContext:
 
 
 class Streaming:
-    """Fed with ``update``, block by block; what has been found is read off the record."""
+    """An estimator of α or a detector, fed with ``update`` block by block.
+
+    What it has found is read off the record: ``conditions`` that must be seen while they last,
+    windows that ``ended``, or sums.
+    """
 
     __slots__ = ()
+
+    ended: Sequence[Any] = ()
+    """Windows that ended in the last block, as the worker fits them, or why they cannot be."""
 
     resets: ClassVar[Change] = NOTHING
     """Changes that reset the estimator; all others leave it as it is."""
@@ -188,12 +195,6 @@ class Streaming:
         """Return its marks on the last block."""
         return UNMARKED
 
-
-class Detector(Streaming):
-    """Finds what must be seen while it lasts."""
-
-    __slots__ = ()
-
     @property
     def conditions(self) -> tuple[str | None, ...]:
         """Return for each of its alarms what is wrong and what to do, or None."""
@@ -201,23 +202,4 @@ class Detector(Streaming):
 
     def vet(self, window: Telemetry, loop: LoopContext) -> tuple[Self, str | None]:
         """Return why a window that has ended must not be used; None: it may."""
-        return self, None
-
-
-class Estimator(Streaming):
-    """Estimates α, from windows that end with a dither or from sums on request."""
-
-    __slots__ = ()
-
-    ended: Sequence[Any] = ()
-    """Windows that ended in the last block, as the worker fits them, or why they cannot be."""
-
-    def close(
-        self, loop: LoopContext, marks: Mark, *, has_windows: bool
-    ) -> tuple[Self, Self | str | None]:
-        """Return the reset estimator with the sums to fit; None if no estimate is due.
-
-        In place of the sums it may return the reason why there are none. ``marks`` are those of the
-        last block; ``has_windows`` is True if dithered windows have recently measured α.
-        """
         return self, None

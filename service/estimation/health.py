@@ -37,7 +37,14 @@ from typing_extensions import override
 
 from service.estimation.comparison import REFERENCE_PERIOD_S
 from service.estimation.description import ActuatorWatch, EdgeWatch
-from service.estimation.estimator import UNMARKED, Change, Detector, FrameContext, LoopContext, Mark
+from service.estimation.estimator import (
+    UNMARKED,
+    Change,
+    FrameContext,
+    LoopContext,
+    Mark,
+    Streaming,
+)
 from service.estimation.frames import FrameBlock
 from service.estimation.probation import MIN_HISTORY_S, MIN_PART_FRAMES, PART_S
 from service.estimation.residual import N_LOST_PARTS, RUNAWAY_POWER_RATIO, runs_away
@@ -149,7 +156,7 @@ class UpperPower:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LoopHealth(Detector):
+class LoopHealth(Streaming):
     """Forgetting mean of how far the high modes are beyond what turbulence asks of them."""
 
     resets = Change.GONE | Change.SESSION | Change.OPEN | Change.MATRIX | Change.LOOP
@@ -317,7 +324,7 @@ memory; the largest of a ring of healthy actuators is then at 1.2 to 1.8."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class EdgeHealth(Detector):
+class EdgeHealth(Streaming):
     """Forgetting means of what the two parts of the mirror do."""
 
     resets = Change.LOOP
@@ -426,7 +433,7 @@ _PLAYED_STRIDE_FRAMES = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PlayedCommands(Detector):
+class PlayedCommands(Streaming):
     """Turbulence at every actuator, as commands and slopes imply it."""
 
     resets = Change.GONE | Change.SESSION | Change.LOOP | Change.OPEN
@@ -623,7 +630,7 @@ class SlopeSpectra:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class VibrationMonitor(Detector):
+class VibrationMonitor(Streaming):
     """Detector of vibrations with and without a dither; ``update`` takes the blocks.
 
     The spectra with and without a dither are kept apart, because only a pause distinguishes a
@@ -704,7 +711,7 @@ STANDSTILL_ALARM_S = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Standstill(Detector):
+class Standstill(Streaming):
     """The last slopes, and for how long they have been the same."""
 
     resets = Change.OPEN

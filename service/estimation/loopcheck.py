@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from service.estimation.estimator import Change, Detector, FrameContext, LoopContext, Mark
+from service.estimation.estimator import Change, FrameContext, LoopContext, Mark, Streaming
 from service.estimation.frames import FrameBlock, join_frames
 from service.estimation.loop import last_seq
 from service.estimation.windows import ClosedLoop, Telemetry
@@ -72,7 +72,7 @@ _SPANS_NAMED = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LoopCheck(Detector):
+class LoopCheck(Streaming):
     """Samples of an unchanged loop, and the result of the last of them."""
 
     resets = Change.GONE | Change.LOOP | Change.STANDSTILL

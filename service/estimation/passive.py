@@ -23,9 +23,9 @@ from typing_extensions import override
 
 from service.errors import ModelError
 from service.estimation.estimate import PassiveEstimate
-from service.estimation.estimator import FrameContext, LoopContext
+from service.estimation.estimator import Change, FrameContext, LoopContext, Mark, Streaming
 from service.estimation.frames import FrameBlock, join_frames
-from service.estimation.passive_sums import MIN_FRAMES_PER_MODE, PASSIVE_INTERVAL_S, PassiveSums
+from service.estimation.loop import explain_open_loop
 from service.estimation.solver import Columns
 from service.estimation.windows import CHUNK_FRAMES
 from service.model.interaction import Linearisation
@@ -34,6 +34,20 @@ from service.model.misregistration import Misregistration
 Array = NDArray[Any]
 
 PASSIVE_MEMORY_S = 10.0
+
+PASSIVE_INTERVAL_S = 4.0
+"""Duration of telemetry in a passive estimate, and interval between two: a jump must be detected
+within 5 s."""
+
+MIN_PASSIVE_S = 3.0
+"""Shortest telemetry for an estimate next to a dither."""
+
+RESTS, LONG_RESTS = 1, 3
+"""Intervals skipped after an estimate next to a dither, and while its windows are accepted: windows
+detect a jump sooner than a passive estimate."""
+
+MIN_FRAMES_PER_MODE = 5
+"""Fewer effective frames leave the command covariance too noisy to invert."""
 
 N_TAPS = 11
 """Longer filters know turbulence from noise no better, and lose more frames at every gap."""
@@ -167,14 +181,24 @@ def high_pass(delay_frames: float) -> HighPass:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Passive(PassiveSums):
-    """Forgetting sums over filtered commands."""
+class Passive(Streaming):
+    """Forgetting sums over filtered commands of one loop, closed every few seconds for a fit."""
+
+    resets = Change.GONE | Change.LOOP | Change.STANDSTILL
+    unless = Mark.STANDS
+    only_closed = True
+
+    n_modes: int
+    """Controlled modes: the only ones that move by themselves."""
 
     memory_frames: float
     """Frames after which a sample's weight has fallen to 1/e."""
 
     delay_frames: float = 2.0
     """Delay of the loop. Below two frames nothing is summed."""
+
+    n_effective: float = 0.0
+    """Frames in the sums, forgetting included."""
 
     sums: tuple[NDArray[np.float32], ...] = ()
     """Sums of s z^T ``(n_slopes, n_instruments)``, metres, of c z^T ``(n_modes, n_instruments)``
@@ -183,6 +207,9 @@ class Passive(PassiveSums):
 
     samples: tuple[tuple[Array, Array], ...] = ()
     """Filtered slopes ``(n_slopes,)`` and commands ``(n_modes,)`` of single frames."""
+
+    tail: FrameBlock | None = None
+    """The last frames, as many as the filter reaches back."""
 
     waiting: tuple[FrameBlock, ...] = ()
     """Frames that are not multiplied yet and, before them, those that the filter reaches back to;
@@ -193,6 +220,12 @@ class Passive(PassiveSums):
 
     begun: bool = False
     """True if frames of this run have been multiplied."""
+
+    from_seq: int = 0
+    """Frames before this one are left out."""
+
+    since_ns_utc: int = 0
+    """No frame in the sums is older, by the RTC's clock; 0: not known."""
 
     @classmethod
     @override
@@ -208,29 +241,27 @@ class Passive(PassiveSums):
         )
 
     @override
+    def begun_anew(self, loop: LoopContext, why: Change) -> Passive:
+        """Return sums that have begun with nothing, for another loop or after a standstill."""
+        from_seq = loop.settled_seq if Change.STANDSTILL in why else 0
+        return replace(self.begin(loop), since_ns_utc=loop.received_ns_utc, from_seq=from_seq)
+
+    @override
     def update(self, frames: FrameContext) -> Passive:
         """Return them with one more block."""
         return accumulate(self, frames.moving)
 
-    @override
-    def empty(self, *, rests: bool) -> Passive:
-        """Return them with nothing multiplied, nor anything that waits where they rest."""
-        anew = replace(self, sums=(), n_effective=0.0)
-        return replace(anew, waiting=(), begun=False) if rests else anew
-
-    @override
-    def fit(self, linearisation: Linearisation) -> PassiveEstimate | None:
-        """Estimate α about a linearisation; None: too few frames have come."""
-        return fit(self, linearisation)
-
     @property
-    @override
     def n_waiting(self) -> int:
         """Frames that the filter reaches both ends of and that are not multiplied yet."""
         return max(sum(block.n_frames for block in self.waiting) - _FILTER_SPAN_FRAMES, 0)
 
     @property
-    @override
+    def end_ns_utc(self) -> int:
+        """End of exposure of the last frame; 0: none has come."""
+        return 0 if self.tail is None else self.tail.next_t_ns - self.tail.dt_ns
+
+    @property
     def why_unusable(self) -> str | None:
         """Return why this loop's telemetry says nothing, or None."""
         if self.delay_frames >= N_TAPS:
@@ -241,11 +272,6 @@ class Passive(PassiveSums):
                 f"{MIN_DELAY_FRAMES} are needed to separate the response of the mirror from noise"
             )
         return None
-
-    @property
-    def instrument_filter(self) -> HighPass:
-        """Return the high-pass filter that converts commands to instruments."""
-        return high_pass(self.delay_frames)
 
     @property
     def instruments(self) -> NDArray[np.intp]:
@@ -263,11 +289,63 @@ class Passive(PassiveSums):
         n_kept = max(int(n_look / (2 * MIN_FRAMES_PER_MODE)), 1)
         return every[np.arange(n_kept) * self.n_modes // n_kept]
 
-    @property
-    @override
-    def n_instruments(self) -> int:
-        """Modes whose commands are the instruments of the regression."""
-        return len(self.instruments)
+    def close(
+        self, loop: LoopContext, marks: Mark, *, has_windows: bool
+    ) -> tuple[Passive, Passive | str | None]:
+        """Return reset sums with the finished ones, or the reason why there is no estimate yet.
+
+        ``marks`` are those of the last block; ``has_windows`` is True if dithered windows have
+        recently measured α. Two estimates never share telemetry, so that their errors are
+        independent and an estimate entirely after a jump shows it. Next to a dither some telemetry
+        is skipped, more if windows have recently measured α; the reason is then None. The pause
+        ends early when they stop.
+        """
+        beside, now_ns, sums = Mark.WINDOWS in marks, loop.received_ns_utc, self
+        ahead_ns = self.since_ns_utc - now_ns
+        # A rest that would last longer than any: the clock went back.
+        oversleeps = ahead_ns > 2 * LONG_RESTS * PASSIVE_INTERVAL_S * 1e9
+        if ahead_ns > 0 and (oversleeps or not (has_windows and beside)):
+            sums = replace(self, from_seq=0, since_ns_utc=now_ns)
+        since_ns = sums.since_ns_utc if beside else 0
+        if now_ns - since_ns < MIN_PASSIVE_S * 1e9 and since_ns:
+            return sums, None
+        why = sums.check_fittable(loop)
+        if loop.rtc is None or why is not None:
+            return sums, why
+        rate_hz = loop.rtc.frame_rate_hz
+        begun = replace(sums, sums=(), n_effective=0.0)
+        if not beside or sums.tail is None:
+            # Frames that wait are kept for the next estimate, which therefore began earlier.
+            waiting_ns = round(sums.n_waiting * 1e9 / rate_hz)
+            return replace(begun, since_ns_utc=now_ns - waiting_ns), sums
+        rest_s = PASSIVE_INTERVAL_S * (LONG_RESTS if has_windows else RESTS)
+        begun = replace(
+            begun,
+            waiting=(),
+            begun=False,
+            # The pause is counted in frames for the sums, and by the clock for the decision to wake
+            # up.
+            from_seq=sums.tail.next_seq + round(rest_s * rate_hz),
+            since_ns_utc=now_ns + round(rest_s * 1e9),
+        )
+        return begun, sums
+
+    def check_fittable(self, loop: LoopContext) -> str | None:
+        """Return why the sums cannot be fitted, or None."""
+        if loop.rtc is None:
+            return "no passive estimate: there is no telemetry that could be used"
+        if not loop.rtc.in_loop:
+            return f"no passive estimate: {explain_open_loop(loop.rtc)}"
+        if self.why_unusable is not None:
+            return self.why_unusable
+        n_instruments = len(self.instruments)
+        least = MIN_FRAMES_PER_MODE * n_instruments
+        if self.n_effective >= least:
+            return None
+        return (
+            f"no passive estimate yet: {self.n_effective:.0f} frames in runs without gaps, "
+            f"{least} are needed for {n_instruments} modes"
+        )
 
 
 def accumulate(state: Passive, block: FrameBlock) -> Passive:
@@ -345,7 +423,8 @@ def _keep_sample(state: Passive, *blocks: FrameBlock) -> Passive:
     if n_rows < 1 or not n_due:
         return state
     head = join_frames(tuple(block.rows(0, N_TAPS) for block in blocks)).rows(0, N_TAPS)
-    n_before, chosen = n_rows + _FILTER_SPAN_FRAMES - blocks[-1].n_frames, state.instrument_filter
+    chosen = high_pass(state.delay_frames)
+    n_before = n_rows + _FILTER_SPAN_FRAMES - blocks[-1].n_frames
     later = range(SAMPLE_FRAMES - n_before, n_rows - n_before, SAMPLE_FRAMES)[: n_due - 1]
     samples = list(state.samples)
     for rows in (head, *(blocks[-1].rows(start, start + N_TAPS) for start in later)):
@@ -356,7 +435,7 @@ def _keep_sample(state: Passive, *blocks: FrameBlock) -> Passive:
 
 def _sum_frames(state: Passive, frames: FrameBlock, *, last: bool) -> Passive:
     """Add frames to the sums: the first of a run, the last, or some between."""
-    chosen, commands = state.instrument_filter, frames.commands_m
+    chosen, commands = high_pass(state.delay_frames), frames.commands_m
     # those that the filter reaches both ends of
     now = slice(chosen.behind, frames.n_frames - chosen.ahead)
     before = slice(now.start - 1, now.stop - 1)
@@ -408,7 +487,7 @@ def passive_matrix(state: Passive) -> PassiveMatrix | None:
     its columns go as ``X^-T (sum z z^T) X^-1`` with ``X = sum c z^T``. Where some modes alone are
     instruments, the columns are ``D_z + D_o (sum o z^T) X^-1``, with o the commands of the others.
     """
-    if not state.sums or state.n_effective < MIN_FRAMES_PER_MODE * state.n_instruments:
+    if not state.sums or state.n_effective < MIN_FRAMES_PER_MODE * len(state.instruments):
         return None
     cross, moved, power = (part.astype(np.float64) for part in state.sums)
     others, moved = np.delete(moved, state.instruments, axis=0), _of(moved.T, state.instruments).T
@@ -520,5 +599,5 @@ def _slope_variance(state: Passive, matrix: Array) -> float:
     slopes = np.array([slopes for slopes, _ in state.samples])
     commands = np.array([commands for _, commands in state.samples])
     # The gain of the filter for the power of white noise.
-    passed = float(np.sum(state.instrument_filter.taps**2))
+    passed = float(np.sum(high_pass(state.delay_frames).taps ** 2))
     return float(np.mean((slopes - commands @ matrix.T) ** 2)) / passed

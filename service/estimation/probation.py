@@ -42,7 +42,7 @@ from service.estimation.comparison import (
     not_compared,
 )
 from service.estimation.description import EdgeWatch
-from service.estimation.estimator import Change, Detector, FrameContext, LoopContext, Mark
+from service.estimation.estimator import Change, FrameContext, LoopContext, Mark, Streaming
 from service.estimation.frames import FrameBlock
 from service.estimation.loop import same_but_for_modes
 from service.estimation.residual import Reader
@@ -101,7 +101,7 @@ rate may be 0 in all of them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Comparison(Detector):
+class Comparison(Streaming):
     """Telemetry with the matrix in use and with the one before."""
 
     resets = Change.GONE

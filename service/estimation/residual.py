@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from service.estimation.estimator import Change, Detector, FrameContext, Mark
+from service.estimation.estimator import Change, FrameContext, Mark, Streaming
 from service.estimation.frames import FrameBlock
 
 Array = NDArray[np.float64]
@@ -305,7 +305,7 @@ MAX_MEDIAN_RESIDUAL_RATIO = 0.35
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Rejection(Detector):
+class Rejection(Streaming):
     """Forgetting sums over frames of one loop."""
 
     resets = Change.OPEN

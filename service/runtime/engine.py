@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from service.estimation.description import Description
 from service.estimation.dither_windows import EndedWindow, Window
 from service.estimation.frames import FrameBlock
-from service.estimation.passive_sums import PassiveSums
+from service.estimation.passive import Passive
 from service.estimation.windows import WindowRefused
 from service.model.slopes import likely_kind
 from service.runtime.estimator_bank import (
@@ -224,14 +224,13 @@ class Engine:
         steady = all(running.kind in dithers for running in running_operations(state, now_ns))
         return IDLE_GATHER_S if steady else 0.0
 
-    def take_sums(self) -> list[PassiveSums | str | None]:
+    def take_sums(self) -> Passive | str | None:
         """Return the sums of ordinary telemetry and begin new ones, or why there are none yet.
 
-        One entry per estimator; None if telemetry is skipped next to a dither. To be called every
-        ``PASSIVE_INTERVAL_S``.
+        None if telemetry is skipped next to a dither. To be called every ``PASSIVE_INTERVAL_S``.
         """
         if self.bank is None:
-            return ["no passive estimate: the optical model is being prepared"]
+            return "no passive estimate: the optical model is being prepared"
         registration, now_ns = self.state.alpha.registration, self._driver.now_ns()
         told = (
             registration is not None
@@ -239,7 +238,7 @@ class Engine:
             and now_ns - registration.window_ns_utc < RECENT_WINDOW_S * SECOND_NS
         )
         self.bank, sums = close_sums(self.bank, has_windows=told)
-        return list(sums.values())
+        return sums
 
     def learn(self, matrix_id: str, matrix: NDArray[np.float32]) -> None:
         """Know the numbers of a reconstructor, to compare commands with them."""

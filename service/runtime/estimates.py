@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import assert_never
@@ -17,7 +17,7 @@ from service.estimation import lockin, openloop, orientation, random_dither
 from service.estimation.dither_windows import EndedWindow
 from service.estimation.loop import loop_numbers
 from service.estimation.own_matrix import OwnMatrix
-from service.estimation.passive_sums import PassiveSums
+from service.estimation.passive import Passive
 from service.estimation.random_dither import Correlated, RandomEstimate, noisy_matrix
 from service.estimation.slope_convention import SlopeConvention
 from service.estimation.windows import (
@@ -172,35 +172,31 @@ def _reconstructor(
 
 
 async def fit_passive(
-    every: Sequence[PassiveSums | str | None], state: TrackerState, workers: WorkerPort
+    sums: Passive | str | None, state: TrackerState, workers: WorkerPort
 ) -> list[Event]:
-    """Return the passive estimates, or the reason why there are none.
+    """Return the passive estimate, or the reason why there is none.
 
     Empty if nothing is new.
     """
-    reasons = [sums for sums in every if isinstance(sums, str)]
-    if len(reasons) == len(every):
+    if isinstance(sums, str):
         known = state.alpha.passive_unavailable_reason
-        return [ev.PassiveUnavailable(text=why) for why in reasons[:1] if why != known]
-    events: list[Event] = []
-    for sums in every:
-        if not isinstance(sums, PassiveSums) or sums.tail is None:
-            continue
-        try:
-            estimate = await workers.call(OpticsWorker.fit_passive, sums, fit_begins_at(state))
-        except PyrcalError as error:
-            text = str(error)
-            events.append(ev.LogEvent(name="watchdog.failed", text=text, level=Level.WARNING))
-            continue
-        if estimate is not None:
-            found = ev.PassiveFitted(
-                estimate=estimate,
-                t_ns_utc=sums.end_ns_utc,
-                began_ns_utc=sums.since_ns_utc,
-                loop=loop_numbers(state.loop.rtc),
-            )
-            events.append(found)
-    return events
+        return [] if sums == known else [ev.PassiveUnavailable(text=sums)]
+    if sums is None or sums.tail is None:
+        return []
+    try:
+        estimate = await workers.call(OpticsWorker.fit_passive, sums, fit_begins_at(state))
+    except PyrcalError as error:
+        text = str(error)
+        return [ev.LogEvent(name="watchdog.failed", text=text, level=Level.WARNING)]
+    if estimate is None:
+        return []
+    found = ev.PassiveFitted(
+        estimate=estimate,
+        t_ns_utc=sums.end_ns_utc,
+        began_ns_utc=sums.since_ns_utc,
+        loop=loop_numbers(state.loop.rtc),
+    )
+    return [found]
 
 
 async def read_own_matrix(

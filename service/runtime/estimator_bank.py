@@ -19,7 +19,7 @@ from service.estimation.dither_windows import Window
 from service.estimation.estimator import Change, FrameContext, LoopContext, Mark, Streaming
 from service.estimation.frames import FrameBlock
 from service.estimation.loop import last_seq, same_loop, same_rate
-from service.estimation.passive_sums import PassiveSums
+from service.estimation.passive import Passive
 from service.estimation.windows import DITHER_SETTLING_S, WindowRefused
 from service.runtime.registry import REGISTRY, Entry
 from service.tracking.dither_request import Dither, expected_dither, lock_in_plan, random_plan
@@ -229,10 +229,7 @@ def _mark_block(frames: FrameContext, marks: Mark) -> FrameContext:
 
 def _with_windows(bank: EstimatorBank, members: list[Streaming]) -> Fed:
     """Return the bank with these members, and the windows that ended, refused where one must be."""
-    ended: list[Window] = []
-    for member in members:
-        if isinstance(member, estimator.Estimator):
-            ended += member.ended
+    ended: list[Window] = [window for member in members for window in member.ended]
     if not ended:
         return replace(bank, members=tuple(members)), []
     windows: list[Window] = []
@@ -242,11 +239,10 @@ def _with_windows(bank: EstimatorBank, members: list[Streaming]) -> Fed:
             continue
         reasons: list[str] = []
         for k, member in enumerate(members):
-            if isinstance(member, estimator.Detector):
-                members[k], reason = member.vet(window, bank.loop)
-                reasons += [] if reason is None else [reason]
+            members[k], reason = member.vet(window, bank.loop)
+            reasons += [] if reason is None else [reason]
         t_ns = window.t_end_ns_utc
-        # All detectors were asked, although one reason is enough: each of them keeps count of the
+        # All members were asked, although one reason is enough: each of them keeps count of the
         # windows it has vetted.
         windows.append(WindowRefused(reason=reasons[0], t_ns_utc=t_ns) if reasons else window)
     # the next one begins with the gains of now
@@ -255,22 +251,18 @@ def _with_windows(bank: EstimatorBank, members: list[Streaming]) -> Fed:
 
 def close_sums(
     bank: EstimatorBank, *, has_windows: bool = False
-) -> tuple[EstimatorBank, dict[type[Streaming], PassiveSums | str | None]]:
-    """Return the bank with new sums of ordinary telemetry, and the old ones of each estimator.
+) -> tuple[EstimatorBank, Passive | str | None]:
+    """Return the bank with new sums of ordinary telemetry, and the old ones.
 
     A text is the reason why there are none; None means that telemetry is skipped next to a dither.
     """
-    marks, members = bank.marks, list(bank.members)
-    found: dict[type[Streaming], PassiveSums | str | None] = {}
-    for k, member in enumerate(members):
-        if isinstance(member, PassiveSums):
-            members[k], sums = member.close(bank.loop, marks, has_windows=has_windows)
-            found[type(member)] = sums
-    begun = any(isinstance(sums, PassiveSums) for sums in found.values())
+    marks, closed = bank.marks, bank[Passive]
+    begun, sums = closed.close(bank.loop, marks, has_windows=has_windows)
+    members = tuple(begun if member is closed else member for member in bank.members)
     # a window that is under way is of the gains with which it began
-    anew = begun and Mark.WINDOWS not in marks
+    anew = isinstance(sums, Passive) and Mark.WINDOWS not in marks
     begun_with = bank.loop.rtc if anew else bank.begun_with
-    return replace(bank, members=tuple(members), begun_with=begun_with), found
+    return replace(bank, members=members, begun_with=begun_with), sums
 
 
 def _fits(rtc: Status, block: FrameBlock) -> bool:

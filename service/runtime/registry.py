@@ -12,7 +12,7 @@ from typing import Any, Final
 from service.estimation.control_law import ControlLawCheck
 from service.estimation.dither_monitor import MAX_AMPLITUDE_RATIO, DitherMeasurement, DitherWatch
 from service.estimation.dither_windows import DitherWindows
-from service.estimation.estimator import Detector, LoopContext, Streaming
+from service.estimation.estimator import LoopContext, Streaming
 from service.estimation.health import (
     EdgeHealth,
     LoopHealth,
@@ -121,8 +121,7 @@ class Entry:
 
     def conditions(self, member: Streaming) -> list[tuple[str, str | None, str]]:
         """Return name, text (None: all is well) and what is said when it is over, of each alarm."""
-        texts = member.conditions if isinstance(member, Detector) else ()
-        found = zip(self.alarms.items(), texts, strict=True)
+        found = zip(self.alarms.items(), member.conditions, strict=True)
         return [(name, text, over) for (name, over), text in found]
 
 

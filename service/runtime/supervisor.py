@@ -19,7 +19,7 @@ from service import rtc_bridge
 from service.archive import Actor, Archive, AuditEntry
 from service.archive.retention import EVERYTHING, RetentionPolicy
 from service.errors import LinkError, PyrcalError, StorageError
-from service.estimation import dither_windows, frames, lockin, passive_sums, random_dither
+from service.estimation import dither_windows, frames, lockin, passive, random_dither
 from service.estimation.description import Description
 from service.estimation.windows import RefusalKind
 from service.link import matrices, statistics
@@ -423,7 +423,7 @@ class Supervisor:
 
     async def _fit_passive(self) -> None:
         while True:
-            await asyncio.sleep(passive_sums.PASSIVE_INTERVAL_S)
+            await asyncio.sleep(passive.PASSIVE_INTERVAL_S)
             async with self._workers.turn(worker.OpticsWorker.fit_passive):
                 async with self._telemetry_lock:
                     sums = self._engine.take_sums()

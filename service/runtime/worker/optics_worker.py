@@ -21,6 +21,7 @@ from service.control.gains import CalibrationGains
 from service.control.gate import GateVerdict, judge
 from service.control.loop import ControlLoop
 from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
+from service.estimation import passive
 from service.estimation.description import Description
 from service.estimation.estimate import DitheredEstimate, PassiveEstimate
 from service.estimation.lockin import LockInEstimate, Spectra, fit_window
@@ -38,7 +39,6 @@ from service.estimation.own_matrix import (
     recognise_modes,
     weights_of_modes,
 )
-from service.estimation.passive_sums import PassiveSums
 from service.estimation.random_dither import Correlated, RandomEstimate, fit_random
 from service.estimation.slope_convention import (
     RESPONSE_RATIO_RANGE,
@@ -522,13 +522,13 @@ class OpticsWorker:
 
     @waits(at_most_s=6.0)
     def fit_passive(
-        self, sums: PassiveSums, start: Misregistration | None
+        self, sums: passive.Passive, start: Misregistration | None
     ) -> PassiveEstimate | None:
         """Estimate α from ordinary telemetry; None if there is too little of it.
 
         The fit begins at ``start``, by default at the nominal rotation.
         """
-        found = sums.fit(self._sensor.near(start or self._start))
+        found = passive.fit(sums, self._sensor.near(start or self._start))
         if found is None:
             return None
         gains = found.optical_gain * self._sensor.ratio()[: sums.n_modes]

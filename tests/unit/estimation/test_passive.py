@@ -11,8 +11,15 @@ import pytest
 from service.errors import ModelError
 from service.estimation.estimate import PASSIVE_BIAS, PassiveEstimate
 from service.estimation.frames import FrameBlock
-from service.estimation.passive import N_TAPS, Passive, accumulate, fit, high_pass, passive_matrix
-from service.estimation.passive_sums import MIN_FRAMES_PER_MODE
+from service.estimation.passive import (
+    MIN_FRAMES_PER_MODE,
+    N_TAPS,
+    Passive,
+    accumulate,
+    fit,
+    high_pass,
+    passive_matrix,
+)
 from service.model.misregistration import Misregistration
 from tests.numerics import (
     N_CONTROLLED,

@@ -165,7 +165,7 @@ def test_of_more_modes_than_its_memory_can_tell_some_are_summed_evenly_spread():
     np.testing.assert_array_equal(telling.instruments, np.arange(1000))
     extreme = Passive(n_modes=4300, memory_frames=5000.0)
     assert extreme.why_unusable is None
-    assert extreme.n_instruments == 200
+    assert len(extreme.instruments) == 200
     steps = np.diff(extreme.instruments)
     assert extreme.instruments[0] == 0
     assert set(steps) == {21, 22}

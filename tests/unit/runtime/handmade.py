@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from service.estimation.passive import Passive
 from service.model.misregistration import Misregistration
 from service.runtime.estimator_bank import close_sums
 from service.tracking.registration import Registration
@@ -86,8 +85,7 @@ class Clock:
 
 def take_sums(bank, **told):
     """Return the bank, and what the passive estimate has summed or why it has not."""
-    bank, every = close_sums(bank, **told)
-    return bank, every[Passive]
+    return close_sums(bank, **told)
 
 
 def with_member(bank, member):

@@ -38,21 +38,21 @@ def sums():
 async def test_a_look_is_taken_though_alpha_is_not_known(sums):
     """It says what it can tell, from the nominal rotation on; the tracker says what it is worth."""
     worker, story = Worker(), Story(Mode.HOLD).meet()
-    (event,) = await fit_passive([sums], story.state, worker)
+    (event,) = await fit_passive(sums, story.state, worker)
     assert worker.begun_at == [None]
     assert event.loop == loop_numbers(story.state.loop.rtc)
     assert event.t_ns_utc == sums.tail.t0_ns_utc + 39 * sums.tail.dt_ns
     story.tell(event)
-    await fit_passive([sums], story.state, worker)
+    await fit_passive(sums, story.state, worker)
     assert worker.begun_at[1] == ALPHA
 
 
 async def test_why_there_is_none_is_told_once():
     worker, story = Worker(), Story(Mode.HOLD).meet()
-    (event,) = await fit_passive(["the loop is open"], story.state, worker)
+    (event,) = await fit_passive("the loop is open", story.state, worker)
     assert event == ev.PassiveUnavailable(text="the loop is open")
     story.tell(event)
-    assert await fit_passive(["the loop is open"], story.state, worker) == []
+    assert await fit_passive("the loop is open", story.state, worker) == []
     assert worker.begun_at == []
 
 

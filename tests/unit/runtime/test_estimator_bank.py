@@ -5,10 +5,8 @@ from dataclasses import dataclass, replace
 import pytest
 from typing_extensions import override
 
-from service.estimation.estimator import UNMARKED, Change, Detector, LoopContext, Mark
+from service.estimation.estimator import UNMARKED, Change, LoopContext, Mark, Streaming
 from service.estimation.health import LoopHealth
-from service.estimation.passive import Passive
-from service.estimation.passive_sums import PassiveSums
 from service.runtime.estimator_bank import EstimatorBank, process_block, with_dither, with_rtc
 from service.runtime.registry import Entry
 from service.tracking.alarms import ALARMS
@@ -16,7 +14,7 @@ from tests.unit.runtime.test_streams import DESCRIPTION, DITHER, RTC, WINDOW_S, 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Counter(Detector):
+class Counter(Streaming):
     """Counts blocks and how often it has begun anew."""
 
     resets = Change.LOOP | Change.STANDSTILL
@@ -36,7 +34,7 @@ class Counter(Detector):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Marker(Detector):
+class Marker(Streaming):
     """Says of every block what it was made to say."""
 
     mark: Mark = UNMARKED
@@ -103,12 +101,6 @@ def test_a_loop_that_ran_away_is_forgotten_with_its_rtc():
     bank = replace(bank, members=(ran_away,))
     assert with_rtc(bank, RTC)[LoopHealth] == ran_away
     assert with_rtc(bank, None)[LoopHealth] == LoopHealth()
-
-
-def test_one_passive_estimate_is_fed_and_never_two():
-    """Two would be made of the same noise, which the filter would then count twice."""
-    members = EstimatorBank.of(DESCRIPTION).members
-    assert [type(member) for member in members if isinstance(member, PassiveSums)] == [Passive]
 
 
 def test_each_detector_has_as_many_conditions_as_alarms():

@@ -86,8 +86,8 @@ def modes_of_crops(
     n_modes = len(crops) if strokes is None else strokes.shape[1]
     n_bytes = n_modes * shape[0] * shape[1] * crops.dtype.itemsize
     if n_bytes > MAX_BYTES:
-        refuse(
-            file.where("influence_table"),
+        file.refuse(
+            "influence_table",
             f"{n_modes} modes over {shape[0]} x {shape[1]} points, {n_bytes / 1e9:.1f} GB",
             f"at most {MAX_BYTES / 1e9:.2g} GB: a coarser table, or fewer modes",
         )
@@ -110,7 +110,7 @@ def _table_of(file: Section[MirrorTable], crops: NDArray[np.floating]) -> tuple[
             f"{file.where('influence_table')}: missing; mirror.influence_origin requires it"
         )
     if not np.isfinite(crops).all():
-        refuse(file.where("influence_functions"), "a height that is not finite", "numbers alone")
+        file.refuse("influence_functions", "a height that is not finite", "numbers alone")
     return shape
 
 

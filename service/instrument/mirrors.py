@@ -113,16 +113,11 @@ def _check_keys(file: MirrorSection) -> None:
     if len(kinds) != 1:
         expected = f"one of {', '.join(_KINDS)}"
         refuse(f"{file.path}: mirror", " and ".join(kinds) or "none of them", expected)
-    for key in sorted(_FOREIGN[kinds[0]] & given):
-        raise ConfigurationError(
-            f"{file.where(key)}: has no effect together with mirror.{kinds[0]}; remove it"
-        )
+    file.refuse_useless(_FOREIGN[kinds[0]], f"together with mirror.{kinds[0]}")
     if table.mode_to_actuator is not None and "basis" in given:
-        refuse(
-            file.where("basis"), "it together with mirror.mode_to_actuator", "only one of the two"
-        )
+        file.refuse("basis", "it together with mirror.mode_to_actuator", "only one of the two")
     if "modes_kind" in given and table.layout is not None and table.mode_to_actuator is None:
-        refuse(file.where("modes_kind"), "it", "it only with own modes")
+        file.refuse("modes_kind", "it", "it only with own modes")
 
 
 def _mount(table: MirrorTable) -> dict[str, Any]:
@@ -147,6 +142,10 @@ def _analytic(file: MirrorSection) -> tuple[Mirror, tuple[str, ...]]:
     table = file.said
     _check_layout_keys(file)
     positions = _LAYOUTS[str(table.layout)](file)
+    if len(positions) < 4:
+        where = file.where("positions") if table.layout == "positions" else f"{file.path}: mirror"
+        expected = "at least 4: tip, tilt and something to correct"
+        refuse(where, f"{len(positions)} actuators", expected)
     pair = coincident(positions)
     if pair is not None:
         refuse(
@@ -187,8 +186,8 @@ def _check_width(file: MirrorSection, positions_m: NDArray[np.float64], pupil: P
     unit = unit_like(width, _UNIT_DECADES)
     hint = f": they look like {unit}" if unit else ""
     key = "positions" if file.said.layout == "positions" else "pitch_m"
-    refuse(
-        file.where(key),
+    file.refuse(
+        key,
         f"actuators over {width * pupil.diameter_m:.3g} m, {width:.3g} pupil diameters{hint}",
         f"metres in the pupil plane: about diameter_m = {pupil.diameter_m:g}",
     )
@@ -218,8 +217,8 @@ def _segments(file: MirrorSection, positions_m: NDArray[np.float64]) -> tuple[fl
         return ()
     n_in_each = np.unique(segment_of(positions_m, gaps_deg), return_counts=True)[1]
     if len(gaps_deg) < 2 or len(n_in_each) < len(gaps_deg):
-        refuse(
-            file.where("segments_deg"),
+        file.refuse(
+            "segments_deg",
             f"gaps at {list(file.said.segments_deg)}, actuators in {len(n_in_each)} segments",
             "at least two gaps, each in a place of its own, and actuators between them",
         )
@@ -231,44 +230,30 @@ def _rings(file: MirrorSection) -> NDArray[np.float64]:
     if table.ring_actuators is not None or table.ring_radii_m is not None:
         return _read_rings(file)
     if table.last_ring < table.first_ring:
-        refuse(
-            file.where("last_ring"),
-            str(table.last_ring),
-            f"at least first_ring = {table.first_ring}",
-        )
-    positions = rings(table.first_ring, table.last_ring, table.pitch_m or 0.30)
-    _check_number(len(positions), f"{file.path}: mirror")
-    return positions
+        file.refuse("last_ring", str(table.last_ring), f"at least first_ring = {table.first_ring}")
+    return rings(table.first_ring, table.last_ring, table.pitch_m or 0.30)
 
 
 def _read_rings(file: MirrorSection) -> NDArray[np.float64]:
     numbers, radii_m = _mandatory(file, ("ring_actuators", "ring_radii_m"))
     if len(numbers) != len(radii_m):
-        refuse(
-            file.where("ring_radii_m"),
+        file.refuse(
+            "ring_radii_m",
             f"{len(radii_m)} radii",
             f"one for each of the {len(numbers)} rings of ring_actuators",
         )
-    for key in sorted({"first_ring", "last_ring"} & file.given):
-        raise ConfigurationError(
-            f"{file.where(key)}: has no effect together with mirror.ring_actuators; remove it"
-        )
-    _check_number(sum(numbers), f"{file.path}: mirror")
+    file.refuse_useless(("first_ring", "last_ring"), "together with mirror.ring_actuators")
     return np.concatenate([ring_of(n, radius) for n, radius in zip(numbers, radii_m, strict=True)])
 
 
 def _grid(file: MirrorSection) -> NDArray[np.float64]:
     n_across, pitch_m, diameter_m = _mandatory(file, ("n_across", "pitch_m", "diameter_m"))
-    positions = _beside_gaps(file, grid(n_across, pitch_m, diameter_m))
-    _check_number(len(positions), f"{file.path}: mirror")
-    return positions
+    return _beside_gaps(file, grid(n_across, pitch_m, diameter_m))
 
 
 def _hexagonal(file: MirrorSection) -> NDArray[np.float64]:
     pitch_m, diameter_m = _mandatory(file, ("pitch_m", "diameter_m"))
-    positions = _beside_gaps(file, hexagonal(pitch_m, diameter_m, file.said.hole_m or 0.0))
-    _check_number(len(positions), f"{file.path}: mirror")
-    return positions
+    return _beside_gaps(file, hexagonal(pitch_m, diameter_m, file.said.hole_m or 0.0))
 
 
 def _beside_gaps(file: MirrorSection, positions_m: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -290,7 +275,6 @@ def _read_positions(file: MirrorSection) -> NDArray[np.float64]:
         refuse(where, f"shape {values.shape}{turned}", "(n_actuators, 2), x and y in metres")
     if not np.isfinite(values).all():
         refuse(where, "a position that is not finite", "metres in the pupil plane")
-    _check_number(len(values), where)
     return values.astype(np.float64)
 
 
@@ -309,11 +293,6 @@ def _mandatory(file: MirrorSection, keys: tuple[str, ...]) -> tuple[Any, ...]:
                 f'{file.where(key)}: missing, layout = "{file.said.layout}" needs {", ".join(keys)}'
             )
     return tuple(getattr(file.said, key) for key in keys)
-
-
-def _check_number(n_actuators: int, where: str) -> None:
-    if n_actuators < 4:
-        refuse(where, f"{n_actuators} actuators", "at least 4: tip, tilt and something to correct")
 
 
 def _mode_to_actuator(
@@ -442,19 +421,15 @@ def _read_table(file: MirrorSection, pupil: Pupil) -> tuple[TabulatedModes, tupl
         raise ConfigurationError(
             f"{file.where('modes_pitch_m')}: missing, mirror.{key} needs the step of its grid"
         )
-    cube = crops = _read(file, key)
+    cube = _read(file, key)
     if cube.ndim != 3 or min(cube.shape) < 1:
-        refuse(file.where(key), f"shape {cube.shape}", "(n, ny, nx), one table for each")
-    strokes: NDArray[np.floating] | None = None
-    of_strokes: tuple[str, ...] = ()
-    if key == "influence_functions":
-        strokes, of_strokes = _strokes(file, len(cube))
-    cube, broken = _without_defects(file, key, cube)
-    crops = cube
-    whole = None if file.said.influence_origin is not None else known_samples(cube)
+        file.refuse(key, f"shape {cube.shape}", "(n, ny, nx), one table for each")
     of_functions = key == "influence_functions"
+    strokes, of_strokes = _strokes(file, len(cube)) if of_functions else (None, ())
+    crops, broken = _without_defects(file, key, cube)
+    cube, local = crops, None
+    whole = None if file.said.influence_origin is not None else known_samples(cube)
     ending = local_functions(file, _opd(file, cube), strokes, whole) if of_functions else None
-    local = None
     if ending is not None:
         local, known = ending
     elif whole is None:
@@ -529,22 +504,22 @@ def _check_table(
     """Refuse a table that cannot be of this pupil; return notes on one that is poor."""
     density = pupil.subaperture_m / pitch_m
     if density < MIN_POINTS_PER_SUBAPERTURE:
-        refuse(
-            file.where("modes_pitch_m"),
+        file.refuse(
+            "modes_pitch_m",
             f"{pitch_m:g} m, {density:.2g} table points per subaperture",
             f"at least {MIN_POINTS_PER_SUBAPERTURE:g}, {ENOUGH_POINTS_PER_SUBAPERTURE:g} for 0.5 %",
         )
     width = max(known.shape) * pitch_m / pupil.diameter_m
     if width > _LARGEST_TABLE:
-        refuse(
-            file.where("modes_pitch_m"),
+        file.refuse(
+            "modes_pitch_m",
             f"{pitch_m:g} m, a table of {width:.3g} pupil diameters",
             f"at most {_LARGEST_TABLE:g}: is it in metres of the pupil plane?",
         )
     covered = known.sum() * pitch_m**2 / (np.pi / 4 * pupil.diameter_m**2)
     if covered < 0.5:
-        refuse(
-            file.where(key),
+        file.refuse(
+            key,
             f"a surface known over {covered:.0%} of the pupil's area "
             f"(table of {known.shape[0]} x {known.shape[1]} points, {pitch_m:g} m apart)",
             "at least half of it",

@@ -62,11 +62,7 @@ def read_pupil(file: Section[AboutTable], subaperture_m: float) -> PupilMap | No
                 f"{file.where('pupil_pitch_m')}: has no meaning without instrument.pupil"
             )
         return None
-    for key in ("obscuration_ratio", "spiders_m"):
-        if key in file.given:
-            raise ConfigurationError(
-                f"{file.where(key)}: has no effect together with instrument.pupil; remove it"
-            )
+    file.refuse_useless(("obscuration_ratio", "spiders_m"), "together with instrument.pupil")
     return _read_pupil_map(file, subaperture_m)
 
 
@@ -82,8 +78,8 @@ def _read_pupil_map(file: Section[AboutTable], subaperture_m: float) -> PupilMap
         refuse(where, "no lit point", f"a pupil of {diameter_m:g} m")
     pitch_m = file.said.pupil_pitch_m or diameter_m / max(lit.shape)
     if pitch_m > subaperture_m:
-        refuse(
-            file.where("pupil_pitch_m"),
+        file.refuse(
+            "pupil_pitch_m",
             f"{pitch_m:.3g} m between points",
             f"at most a subaperture, {subaperture_m:.3g} m",
         )
@@ -295,16 +291,12 @@ def _slopes(
 ) -> SlopeRecipe:
     table = file.said
     if table.kind not in sensor.signals:
-        refuse(file.where("kind"), f"{table.kind} of a {sensor.name}", " or ".join(sensor.signals))
-    if not sensor.normalised and "normalisation" in file.given:
-        raise ConfigurationError(
-            f'{file.where("normalisation")}: has no effect with kind = "{sensor.name}"; remove it'
-        )
-    if has_frames and "order" in file.given:
-        raise ConfigurationError(
-            f'{file.where("order")}: has no effect with wfs.input = "frames", '
-            "whose slopes are computed by the service; remove it"
-        )
+        file.refuse("kind", f"{table.kind} of a {sensor.name}", " or ".join(sensor.signals))
+    if not sensor.normalised:
+        file.refuse_useless(["normalisation"], f'with kind = "{sensor.name}"')
+    if has_frames:
+        why = 'with wfs.input = "frames", whose slopes are computed by the service'
+        file.refuse_useless(["order"], why)
     orientation = None
     if table.orientation is not None:
         flips = table.orientation.model_dump(exclude={"sign"})
@@ -313,7 +305,7 @@ def _slopes(
     orders = table.kind.orders
     order = table.order or orders[0]
     if order not in orders:
-        refuse(file.where("order"), f'{order} with kind = "{table.kind}"', " or ".join(orders))
+        file.refuse("order", f'{order} with kind = "{table.kind}"', " or ".join(orders))
     return SlopeRecipe(order=order, orientation=orientation, normalisation=table.normalisation)
 
 
@@ -322,10 +314,8 @@ def _loop(file: schema.Section[LoopFacts], n_modes: int) -> LoopFacts | None:
         return None
     table = file.said
     if table.n_controlled is not None and table.n_controlled > n_modes:
-        refuse(
-            file.where("n_controlled"),
-            str(table.n_controlled),
-            f"at most the {n_modes} modes of the basis",
+        file.refuse(
+            "n_controlled", str(table.n_controlled), f"at most the {n_modes} modes of the basis"
         )
     return table
 
@@ -335,11 +325,7 @@ def _sensor(file: schema.Section[SensorTable], kind: SensorKind, pupil: Pupil) -
         sensor = kind.model.read_sensor(file.said, file.given, pupil.subaperture_m)
     if file.said.valid_subapertures == "auto":
         return sensor
-    if "flux_threshold" in file.given:
-        raise ConfigurationError(
-            f"{file.where('flux_threshold')}: has no effect together with a mask file "
-            "(wfs.valid_subapertures): remove one of the two"
-        )
+    file.refuse_useless(["flux_threshold"], "together with a mask file (wfs.valid_subapertures)")
     where = file.where("valid_subapertures")
     mask = _mask(file.array("valid_subapertures"), where, file.said.n_subapertures)
     return replace(sensor, valid_subapertures=mask)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, NoReturn, TypeVar
 
 from pydantic import BeforeValidator, Field, PlainValidator, create_model
 
@@ -320,6 +320,15 @@ class Section(Generic[Said]):
     def where(self, key: str) -> str:
         """Return the file and key, for messages."""
         return f"{self.path}: {self.name}.{key}"
+
+    def refuse(self, key: str, found: str, expected: str) -> NoReturn:
+        """Refuse the value of a key that the schema alone cannot judge."""
+        refuse(self.where(key), found, expected)
+
+    def refuse_useless(self, keys: Iterable[str], beside: str) -> None:
+        """Refuse those of some keys that are written, and have no effect beside something."""
+        for key in sorted(self.given.intersection(keys)):
+            raise ConfigurationError(f"{self.where(key)}: has no effect {beside}; remove it")
 
     def array(self, key: str) -> NDArray[Any]:
         """Return the array that a key refers to."""

@@ -25,6 +25,23 @@ _HEADER_BYTES = 20 * 2880
 """Number of leading bytes that must contain the version."""
 
 
+def import_aotpy() -> Any:  # noqa: ANN401 - aotpy has no types
+    """Return the module of the standard.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is not installed.
+    """
+    try:
+        import aotpy
+    except ImportError as error:
+        raise ConfigurationError(
+            "AOT files need aotpy, which is not installed: pip install 'pyrcal[aot]'"
+        ) from error
+    return aotpy
+
+
 def read_system(path: Path) -> Any:  # noqa: ANN401 - aotpy has no types
     """Return aotpy's system of a file.
 
@@ -35,12 +52,7 @@ def read_system(path: Path) -> Any:  # noqa: ANN401 - aotpy has no types
     MatrixError
         If it is no AOT file.
     """
-    try:
-        import aotpy
-    except ImportError as error:
-        raise ConfigurationError(
-            f"{path}: AOT files need aotpy: pip install 'pyrcal[aot]'"
-        ) from error
+    aotpy = import_aotpy()
     _check(path)
     try:
         with warnings.catch_warnings():

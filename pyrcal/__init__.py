@@ -16,74 +16,37 @@ from service.errors import (
 )
 
 if TYPE_CHECKING:
-    from pyrcal.client.rest import Service
-    from pyrcal.fitting.design import dither_sigma, interaction_matrix
-    from pyrcal.fitting.fit_file import fit, fit_file
-    from pyrcal.fitting.fitted import Fit
-    from pyrcal.fitting.matrix import FitOptions
-    from pyrcal.fitting.report import FitReport, KnownFit, read_fit
-    from pyrcal.importers.oopao import from_oopao, to_oopao
-    from pyrcal.playback.player import Track
-    from pyrcal.playback.track import track
-    from service.config.settings import Settings
-    from service.control.reconstructor import (
-        Inversion,
-        InversionMethod,
-        Prior,
-        Recipe,
-        reconstruct,
-    )
+    # "as" the same name tells type checkers that a name is offered.
+    from pyrcal.client.rest import Service as Service
+    from pyrcal.fitting.design import dither_sigma as dither_sigma
+    from pyrcal.fitting.design import interaction_matrix as interaction_matrix
+    from pyrcal.fitting.fit_file import fit as fit
+    from pyrcal.fitting.fit_file import fit_file as fit_file
+    from pyrcal.fitting.fitted import Fit as Fit
+    from pyrcal.fitting.matrix import FitOptions as FitOptions
+    from pyrcal.fitting.report import FitReport as FitReport
+    from pyrcal.fitting.report import KnownFit as KnownFit
+    from pyrcal.fitting.report import read_fit as read_fit
+    from pyrcal.importers.oopao import from_oopao as from_oopao
+    from pyrcal.importers.oopao import to_oopao as to_oopao
+    from pyrcal.playback.player import Track as Track
+    from pyrcal.playback.track import track as track
+    from service.config.settings import Settings as Settings
+    from service.control.reconstructor import Inversion as Inversion
+    from service.control.reconstructor import InversionMethod as InversionMethod
+    from service.control.reconstructor import Prior as Prior
     from service.control.reconstructor import Recipe as InversionOptions
-    from service.files.bundle import Bundle, read_bundle, write_bundle
-    from service.instrument.reader import load_instrument
-    from service.model.arrays import arrays_of
+    from service.control.reconstructor import reconstruct as reconstruct
+    from service.files.bundle import Bundle as Bundle
+    from service.files.bundle import read_bundle as read_bundle
+    from service.files.bundle import write_bundle as write_bundle
+    from service.instrument.reader import load_instrument as load_instrument
     from service.model.arrays import arrays_of as array_backend
-    from service.model.instrument import Instrument
-    from service.model.interaction import RtcInteractionModel
-    from service.model.misregistration import Misregistration
-    from service.model.modes import modal_basis
-    from service.model.slopes import Orientation
-
-__all__ = [
-    "Bundle",
-    "ConfigurationError",
-    "Fit",
-    "FitOptions",
-    "FitReport",
-    "Instrument",
-    "Inversion",
-    "InversionMethod",
-    "InversionOptions",
-    "KnownFit",
-    "MatrixError",
-    "Misregistration",
-    "ModelError",
-    "Orientation",
-    "Prior",
-    "PyrcalError",
-    "Recipe",
-    "RtcInteractionModel",
-    "Service",
-    "Settings",
-    "StorageError",
-    "Track",
-    "__version__",
-    "array_backend",
-    "arrays_of",
-    "dither_sigma",
-    "fit",
-    "fit_file",
-    "from_oopao",
-    "interaction_matrix",
-    "load_instrument",
-    "modal_basis",
-    "read_bundle",
-    "read_fit",
-    "reconstruct",
-    "to_oopao",
-    "track",
-    "write_bundle",
-]
+    from service.model.instrument import Instrument as Instrument
+    from service.model.interaction import RtcInteractionModel as RtcInteractionModel
+    from service.model.misregistration import Misregistration as Misregistration
+    from service.model.modes import modal_basis as modal_basis
+    from service.model.slopes import Orientation as Orientation
 
 _HOMES = {
     "Bundle": "service.files.bundle",
@@ -93,18 +56,14 @@ _HOMES = {
     "Instrument": "service.model.instrument",
     "Inversion": "service.control.reconstructor",
     "InversionMethod": "service.control.reconstructor",
-    "InversionOptions": "service.control.reconstructor",
     "KnownFit": "pyrcal.fitting.report",
     "Misregistration": "service.model.misregistration",
     "Orientation": "service.model.slopes",
     "Prior": "service.control.reconstructor",
-    "Recipe": "service.control.reconstructor",
     "RtcInteractionModel": "service.model.interaction",
     "Service": "pyrcal.client.rest",
     "Settings": "service.config.settings",
     "Track": "pyrcal.playback.player",
-    "array_backend": "service.model.arrays",
-    "arrays_of": "service.model.arrays",
     "dither_sigma": "pyrcal.fitting.design",
     "fit": "pyrcal.fitting.fit_file",
     "fit_file": "pyrcal.fitting.fit_file",
@@ -120,17 +79,30 @@ _HOMES = {
     "write_bundle": "service.files.bundle",
 }
 
-_RENAMED = {"InversionOptions": "Recipe", "array_backend": "arrays_of"}
+_RENAMED = {
+    "InversionOptions": ("service.control.reconstructor", "Recipe"),
+    "array_backend": ("service.model.arrays", "arrays_of"),
+}
 """Public names that differ from the names in their modules."""
 
-_MODULES = {"conventions"}
-"""Modules that are available without an explicit import."""
+__all__ = [
+    "ConfigurationError",
+    "InversionOptions",
+    "MatrixError",
+    "ModelError",
+    "PyrcalError",
+    "StorageError",
+    "__version__",
+    "array_backend",
+    *_HOMES,
+]
 
 
 def __getattr__(name: str) -> object:
     """Import a name of the library when it is first used."""
-    if name in _MODULES:
-        return import_module(f"{__name__}.{name}")
-    if name not in _HOMES:
+    if name == "conventions":
+        return import_module("pyrcal.conventions")
+    if name not in _HOMES and name not in _RENAMED:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name]), _RENAMED.get(name, name))
+    module, own_name = _RENAMED.get(name) or (_HOMES[name], name)
+    return getattr(import_module(module), own_name)

@@ -58,6 +58,8 @@ class Service:
         ``http://HOST:PORT``, or https.
     key
         API key; empty to send none.
+    timeout_s
+        Timeout of a request that only reads, seconds.
 
     Raises
     ------
@@ -65,7 +67,7 @@ class Service:
         If the address or the key is none.
     """
 
-    def __init__(self, url: str, key: str = "") -> None:
+    def __init__(self, url: str, key: str = "", timeout_s: float = REQUEST_TIMEOUT_S) -> None:
         try:
             parts = urlsplit(url)
             self._port = parts.port
@@ -78,7 +80,7 @@ class Service:
             )
         if not (key.isascii() and key.isprintable()) or " " in key:
             raise ConfigurationError("API key: found blanks or control characters, expected a word")
-        self.url = url
+        self.url, self._timeout_s = url, timeout_s
         self._host, self._path = parts.hostname, parts.path.rstrip("/")
         self._secure = parts.scheme == "https"
         self._headers = {"User-Agent": f"pyrcal/{__version__}"}
@@ -95,7 +97,7 @@ class Service:
         """
         given = {name: value for name, value in query.items() if value is not None}
         path = f"{path}?{urlencode(given)}" if given else path
-        with self.open_response("GET", path, within_s=REQUEST_TIMEOUT_S) as response:
+        with self.open_response("GET", path, within_s=self._timeout_s) as response:
             return self._read(response)
 
     def order(self, method: str, path: str, body: Document, headers: Mapping[str, str]) -> Fetched:

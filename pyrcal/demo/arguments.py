@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 from pathlib import Path
 
+from pyrcal.options import add, words
 from service.parser import OneLineParser
+from service.program import such, whole
 
 FORWARDED = {
     "alpha": ("X,Y,ROT_DEG,MAG", "true registration; default: far from nominal, see --near"),
@@ -37,75 +38,50 @@ def demo_parser() -> OneLineParser:
         "1 one of these failed (the reason is printed); 2 wrong argument.",
         examples=("pyrcal demo", "pyrcal demo --seconds 120 --jump 60:0.2,0,0,0 --plot demo.png"),
     )
-    demo.add_argument(
-        "--seconds",
-        type=_seconds,
-        metavar="N",
-        help="end once the outcome is good and has lasted for 5 s, at the latest after N s of "
-        "telemetry (with --jump, --drift or --fault: after N s); default: run until Ctrl-C",
-    )
-    for name, (metavar, text) in FORWARDED.items():
-        demo.add_argument(f"--{name}", metavar=metavar, help=text)
-    for name, (metavar, text) in REPEATED.items():
-        demo.add_argument(f"--{name}", action="append", metavar=metavar, help=text)
-    demo.add_argument(
-        "--instrument",
-        default="flao-lbt",
-        metavar="NAME|FILE",
-        help="packaged instrument or instrument file, default flao-lbt",
-    )
-    demo.add_argument(
-        "--near",
-        action="store_true",
-        help="begin near the nominal registration, where a loop of 400 modes is stable (as with "
-        "--plant or --scene); by default the RTC begins with 120 modes, far from it",
-    )
-    demo.add_argument(
-        "--seed", type=_seed, default=1, metavar="S", help="seed of all random numbers, default 1"
-    )
-    demo.add_argument("--json", type=Path, metavar="FILE", help="write the results there")
-    demo.add_argument("--plot", type=Path, metavar="FILE", help="draw the wavefront error there")
-    demo.add_argument(
-        "--port",
-        type=_port,
-        default=8080,
-        metavar="PORT",
-        help="port of the REST API, default 8080",
-    )
-    demo.add_argument(
-        "--zenoh-port",
-        type=_port,
-        default=7447,
-        metavar="PORT",
-        help="port of the link to the RTC, default 7447",
-    )
-    demo.add_argument(
-        "--dir",
-        type=Path,
-        default=Path("var/demo"),
-        metavar="DIR",
-        help="folder of logs, truth and archive, default var/demo; emptied first",
+    add(
+        demo,
+        words(
+            "--seconds N",
+            "end once the outcome is good and has lasted for 5 s, at the latest after N s of "
+            "telemetry (with --jump, --drift or --fault: after N s); default: run until Ctrl-C",
+            type=_seconds,
+        ),
+        *(words(f"--{name} {value}", text) for name, (value, text) in FORWARDED.items()),
+        *(
+            words(f"--{name} {value}", text, action="append")
+            for name, (value, text) in REPEATED.items()
+        ),
+        words(
+            "--instrument NAME|FILE",
+            "packaged instrument or instrument file, default flao-lbt",
+            default="flao-lbt",
+        ),
+        words(
+            "--near",
+            "begin near the nominal registration, where a loop of 400 modes is stable (as with "
+            "--plant or --scene); by default the RTC begins with 120 modes, far from it",
+        ),
+        words("--seed S", "seed of all random numbers, default 1", type=_seed, default=1),
+        words("--json FILE", "write the results there", type=Path),
+        words("--plot FILE", "draw the wavefront error there", type=Path),
+        words("--port PORT", "port of the REST API, default 8080", type=_port, default=8080),
+        words(
+            "--zenoh-port PORT",
+            "port of the link to the RTC, default 7447",
+            type=_port,
+            default=7447,
+        ),
+        words(
+            "--dir DIR",
+            "folder of logs, truth and archive, default var/demo; emptied first",
+            type=Path,
+            default=Path("var/demo"),
+        ),
     )
     return demo
 
 
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected a number of seconds > 0")
-    return value
-
-
-def _seed(text: str) -> int:
-    if not (text.isascii() and text.isdecimal()):
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number from 0")
-    return int(text)
-
-
-def _port(text: str) -> int:
-    if not (text.isascii() and text.isdecimal() and 1 <= int(text) <= 65535):
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected a port from 1 to 65535")
-    return int(text)
+_seconds = such(float, lambda value: 0.0 < value < math.inf, "a number of seconds > 0")
+_seed = such(whole, lambda value: value >= 0, "a whole number from 0")
+# The service and the demo must know the port: 0, which leaves the choice to the system, is refused.
+_port = such(whole, lambda value: 1 <= value <= 65535, "a port from 1 to 65535")

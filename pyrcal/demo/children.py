@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +34,7 @@ class Child:
         status = self.process.poll()
         if status is None:
             return None
+        # Its last line, because a program says why it ends just before.
         words = self.log.read_text(encoding="utf-8", errors="replace").split("\n")
         last = next((line.strip() for line in reversed(words) if line.strip()), "without a message")
         how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
@@ -75,9 +76,7 @@ def _start_child(name: str, words: Sequence[str], directory: Path) -> Child:
 
 def _end_children(started: list[Child]) -> None:
     """End all processes within ``GRACE_S``; a repeated Ctrl-C cannot interrupt this."""
-    # ignored meanwhile, so that no second Ctrl-C interrupts the clean-up
-    before = {number: signal.signal(number, signal.SIG_IGN) for number in _ENDING}
-    try:
+    with _handle_ending(signal.SIG_IGN):
         # All are signalled before any is awaited, so that they share one period of grace.
         for child in started:
             child.signal(signal.SIGINT)
@@ -88,9 +87,6 @@ def _end_children(started: list[Child]) -> None:
         for child in started:
             child.kill_all()
             child.process.wait()
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextmanager
@@ -100,9 +96,16 @@ def interrupt_on_end() -> Iterator[None]:
     def interrupt(_number: int, _frame: object) -> None:
         raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, interrupt) for number in _ENDING}
+    with _handle_ending(interrupt):
+        yield
+
+
+@contextmanager
+def _handle_ending(handler: Callable[[int, object], None] | signal.Handlers) -> Iterator[None]:
+    """Have a handler receive the signals that end a program while the ``with`` block lasts."""
+    before = {number: signal.signal(number, handler) for number in _ENDING}
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, earlier in before.items():
+            signal.signal(number, earlier)

@@ -28,7 +28,8 @@ def draw(report: Report, truth: TruthFile, path: Path) -> None:
 def _over_time(axes: Axes, report: Report, truth: TruthFile) -> None:
     lines = [line for line in truth.lines if line["kind"] == "truth"]
     start_ns = lines[0]["t_ns_utc"] if lines else 0
-    later = lines[1:]  # the loop has just been closed in the first
+    # The loop has just been closed in the first line.
+    later = lines[1:]
     ids = list(dict.fromkeys(line["cm_id"] for line in later))
     top_nm = 1.25 * max((line["wavefront_error_nm"] for line in later), default=1.0)
     for cm_id in ids:

@@ -175,6 +175,7 @@ def _reasons(state: View | None, circumstances: Circumstances) -> Iterator[str]:
     if state is None:
         return
     waited_for = waits(state)
+    # Without a model nothing else can have worked: the other reasons would only follow from it.
     if MODEL in waited_for:
         yield f"the service was not ready: {waited_for[MODEL]}"
         return
@@ -188,6 +189,7 @@ def _reasons(state: View | None, circumstances: Circumstances) -> Iterator[str]:
     if circumstances.pace is not None and circumstances.pace < REAL_TIME:
         yield f"too slow: the simulator made {circumstances.pace:.2f} s of telemetry a second"
     yield from _explain_refused_windows(state, circumstances.refusal)
+    # What has an alarm is a failure already.
     alarm_names = {alarm["name"] for alarm in state["alarms"]}
     yield from (f"waiting: {text}" for name, text in waited_for.items() if name not in alarm_names)
 
@@ -217,6 +219,7 @@ def _explain_refused_windows(state: View, refusal: str | None) -> Iterator[str]:
 
 
 def _count(report: Report, reconstructors: list[View]) -> None:
+    # The RTC's first matrix has no parent: it is not the service's.
     own = [r for r in reconstructors if r["parent"] is not None]
     report.reconstructors_published = sum(r["published_ns_utc"] is not None for r in own)
     report.reconstructors_applied = sum(r["applied_frame_seq"] is not None for r in own)
@@ -244,7 +247,7 @@ def _stages(
         if report.start.n_modes and r["n_modes"] > report.start.n_modes
     ]
     if larger:
-        # a matrix applied just before the end has no measured wavefront error yet
+        # A matrix applied just before the end has no measured wavefront error yet.
         seen = [stage for stage in larger if stage.wavefront_error_nm is not None]
         report.target_modes = (seen or larger)[-1]
     last = report.target_modes if larger or not measured_plant else report.first_update
@@ -265,6 +268,7 @@ def _stage(record: View, truth: TruthFile) -> Stage:
 
 def _compare(report: Report, state: View, truth: TruthFile) -> None:
     known, last = state["registration"], truth.last
+    # A measured plant has no true registration.
     if last is not None and last[PARAMETERS[0]] is not None:
         report.true_alpha = {name: last[name] for name in PARAMETERS}
     if known is None:
@@ -323,6 +327,7 @@ def _failures_on_measured_plant(report: Report, circumstances: Circumstances) ->
 
 
 def _tolerances(across_subap: float) -> dict[str, float]:
+    # An angle moves the edge of a smaller pupil by less.
     wider = max(TOLERANCE_ACROSS_SUBAP / across_subap, 1.0)
     return {
         name: round(allowed if name.endswith("_subap") else wider * allowed, 4)

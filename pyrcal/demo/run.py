@@ -12,8 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
-import httpx
-
+from pyrcal.client.rest import Service
 from pyrcal.demo.arguments import FORWARDED, REPEATED
 from pyrcal.demo.children import interrupt_on_end, run_children
 from pyrcal.demo.report import table
@@ -59,22 +58,14 @@ MEASURED_RATIO = 1 / 1.1
 """Required ratio for a measured plant, which begins with the reconstructor of the measurement
 itself: the service's may leave 10 % more."""
 
-PLACE_TEXT = """\
-The mirror is misregistered by 0.4 subapertures and 0.65 deg from the RTC's matrix."""
-FAR_TEXT = f"""\
-{PLACE_TEXT} With that matrix a
-loop of 400 modes diverges, so the RTC begins with 120. WFE is the simulator's true wavefront error.
+FAR_TEXT = """\
+The mirror is misregistered by 0.4 subapertures and 0.65 deg from the RTC's matrix. {start} WFE is
+the simulator's true wavefront error.
 """
-OTHER_FAR_TEXT = f"""\
-{PLACE_TEXT} The RTC begins
-with 120 modes, or with 70 % of all its modes if that is fewer. WFE is the simulator's true
-wavefront error.
-"""
-SMALL_FAR_TEXT = f"""\
-{PLACE_TEXT} The RTC begins
-with a third of its modes, on a star that gives this small telescope the light of an 8 m telescope
-at magnitude 8. WFE is the simulator's true wavefront error.
-"""
+FLAO_START = "With that matrix a\nloop of 400 modes diverges, so the RTC begins with 120."
+OTHER_START = """The RTC begins
+with 120 modes, with 70 % of all its modes if that is fewer, or with a third on a telescope below
+2 m, whose star is brighter."""
 TOO_LARGE_TEXT = """\
 This telescope is too large for real time: {gflop_s:.0f} GFLOP/s at {rate_hz:g} Hz. Its loop runs as
 fast as this machine can: at the highest sustained rate or, if a dither needs more, in slow motion.
@@ -101,6 +92,7 @@ def run_demo(options: argparse.Namespace) -> int:
     _prepare_directory(options.dir)
     if _is_measured(options):
         write_live_instrument(options.instrument, options.dir / LIVE_INSTRUMENT)
+    # Only programs of this machine shall reach a demo, which has no keys.
     url = f"http://127.0.0.1:{options.port}"
     _say(f"service    pyrcal {' '.join(service_words)}")
     _say(f"simulator  pyrcal sim {' '.join(sim_words)}")
@@ -115,18 +107,19 @@ def run_demo(options: argparse.Namespace) -> int:
         "simulator": ["-m", "sim_rtc", *sim_words],
     }
     with (
-        httpx.Client(base_url=url, timeout=REQUEST_TIMEOUT_S) as client,
         interrupt_on_end(),
         run_children(options.dir, commands) as started,
     ):
         truth = TruthFile(options.dir / "truth.jsonl")
-        watch = TelemetryObserver(client, truth, started, _make_promise(options), _say)
+        service = Service(url, timeout_s=REQUEST_TIMEOUT_S)
+        watch = TelemetryObserver(service, truth, started, _make_promise(options), _say)
         try:
             watch.run()
         except KeyboardInterrupt:
             _say("\nstopping")
         report = watch.make_final_report()
     _say(table(report))
+    # Imported late, because matplotlib is an extra.
     if options.plot is not None:
         from pyrcal.demo.figure import draw
 
@@ -152,9 +145,8 @@ def _is_far(options: argparse.Namespace) -> bool:
 
 def _choose_introduction(options: argparse.Namespace) -> str:
     """Return the introduction of a demo with a large misregistration; only FLAO has 400 modes."""
-    if options.instrument == DEFAULT_INSTRUMENT:
-        return FAR_TEXT
-    return OTHER_FAR_TEXT if _find_small_diameter_m(options) is None else SMALL_FAR_TEXT
+    is_flao = options.instrument == DEFAULT_INSTRUMENT
+    return FAR_TEXT.format(start=FLAO_START if is_flao else OTHER_START)
 
 
 def _find_small_diameter_m(options: argparse.Namespace) -> float | None:
@@ -201,6 +193,7 @@ def _measure_load(options: argparse.Namespace) -> _Large | None:
     """
     if options.plant == "diffractive":
         return None
+    # The diffractive plant is slow on any machine: it has no load that could be held.
     instrument_file = read_instrument_file(options.instrument)
     rate_hz = instrument_file.section(LoopFacts).said.frame_rate_hz
     if rate_hz is None:
@@ -233,7 +226,6 @@ def _make_promise(options: argparse.Namespace) -> Promise:
         wanted_ratio=_choose_ratio(options),
         across_subap=_across_subap(read_instrument_file(options.instrument)),
         measured_plant=_is_measured(options),
-        held_rate=options.instrument != DEFAULT_INSTRUMENT,
         large=large is not None,
         requested_rate_hz=USUAL_RATE_HZ if large is None else large.rate_hz,
     )
@@ -266,7 +258,7 @@ def _check(options: argparse.Namespace, sim_words: list[str]) -> None:
         raise ConfigurationError("--plot: found no matplotlib; expected the extra 'plots'")
     if options.port == options.zenoh_port:
         raise ConfigurationError(f"--port and --zenoh-port: both {options.port}, expected two")
-    # tried now, because the service would report an occupied port only after its start
+    # Tried now, because the service would report an occupied port only after its start.
     for name, port in (("--port", options.port), ("--zenoh-port", options.zenoh_port)):
         try:
             socket.create_server(("127.0.0.1", port)).close()
@@ -275,7 +267,8 @@ def _check(options: argparse.Namespace, sim_words: list[str]) -> None:
                 f"{name} {port}: cannot listen on 127.0.0.1:{port}: {error.strerror or error}; "
                 "choose another, the service would not start"
             ) from error
-    # only the simulator can check its own options, and pyrcal does not import the simulator
+    # Only the simulator can check its own options, and they must not be wrong after the service
+    # has been started.
     checked = subprocess.run(
         [sys.executable, "-m", "sim_rtc.options", *sim_words],
         capture_output=True,
@@ -312,6 +305,7 @@ def _make_commands(options: argparse.Namespace) -> tuple[list[str], list[str]]:
     simulator = ["--connect", endpoint, "--seed", str(options.seed)]
     simulator += ["--instrument", options.instrument]
     simulator += ["--truth", str(options.dir / "truth.jsonl"), "--quiet"]
+    # FLAO keeps real time on an ordinary machine; others run at the rate that this one sustains.
     if options.instrument != DEFAULT_INSTRUMENT:
         simulator.append("--held-rate")
     large = _measure_load(options)

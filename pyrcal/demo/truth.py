@@ -23,12 +23,13 @@ class TruthFile:
         if not self._path.exists():
             return
         status = self._path.stat()
+        # A simulator that was started again writes another file, or this one from its beginning.
         if status.st_size < self._offset or status.st_ino != self._inode:
             self._offset, self._inode = 0, status.st_ino
         with self._path.open("rb") as file:
             file.seek(self._offset)
             text = file.read()
-        # the simulator may be in the middle of writing the last line
+        # The simulator may be in the middle of writing the last line.
         whole = text[: text.rfind(b"\n") + 1]
         self._offset += len(whole)
         self.lines += [json.loads(line) for line in whole.splitlines()]
@@ -48,6 +49,7 @@ class TruthFile:
         under = [line for line in self.lines if line["kind"] == "truth" and line["cm_id"] == cm_id]
         if not under:
             return None
+        # The integrator has not settled in the first moments of a matrix.
         begin_ns = under[0]["t_ns_utc"] + settling_s * 1e9
         squares = [
             line["wavefront_error_nm"] ** 2 for line in under if line["t_ns_utc"] >= begin_ns

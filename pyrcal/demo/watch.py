@@ -5,10 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
-import httpx
-
+from pyrcal.client.rest import RefusedError, Service, UnreachableError
 from pyrcal.demo.children import Child
 from pyrcal.demo.report import (
     MODEL,
@@ -16,6 +14,7 @@ from pyrcal.demo.report import (
     TOLERANCE_ACROSS_SUBAP,
     Circumstances,
     Report,
+    View,
     make_report,
     waits,
 )
@@ -67,8 +66,6 @@ service."""
 _TRUTH_PERIOD_S = 0.5
 """Loop time between two lines of the truth file, seconds. It may be one line ahead of the clock."""
 
-View = dict[str, Any]
-
 
 class Stopwatch:
     """Seconds of telemetry since the end of preparation, including time without telemetry."""
@@ -86,7 +83,7 @@ class Stopwatch:
         ``frames_grown_s`` is the wall-clock time of the last frame that the service received: in
         slow motion lines of the truth are far apart.
         """
-        # limited by the wall clock: a step of the simulator's clock is no telemetry
+        # Limited by the wall clock: a step of the simulator's clock is no telemetry.
         step_s = (telemetry_ns - self._telemetry_ns) / 1e9
         if step_s != 0.0:
             self.telemetry_s += min(max(step_s, 0.0), now_s - self._grown_s + _TRUTH_PERIOD_S)
@@ -145,22 +142,19 @@ class Promise:
     measured_plant: bool = False
     """True if the plant is a measured matrix, whose true registration is unknown."""
 
-    held_rate: bool = False
-    """True if the simulator runs at the highest rate that this machine sustains."""
-
 
 class TelemetryObserver:
     """Observer that polls REST and the truth file, and prints the progress."""
 
     def __init__(
         self,
-        client: httpx.Client,
+        service: Service,
         truth: TruthFile,
         started: Sequence[Child],
         promise: Promise,
         say: Callable[[str], None],
     ) -> None:
-        self._client = client
+        self._service = service
         self._truth = truth
         self._children = started
         self._promise = promise
@@ -214,8 +208,8 @@ class TelemetryObserver:
 
     def _last_refusal(self) -> str | None:
         try:
-            log = self._client.get("/v1/events").raise_for_status().json()["log"]
-        except (httpx.HTTPError, ValueError):
+            log = self._service.get("/v1/events").document["log"]
+        except (RefusedError, UnreachableError):
             return None
         return next((e["text"] for e in reversed(log) if e["name"] == "window.refused"), None)
 
@@ -226,6 +220,7 @@ class TelemetryObserver:
         while (waited_s := time.monotonic() - self._begun_s) < within_s:
             self._look()
             last = self._truth.last
+            # A process that has ended will never be ready.
             if self._endings():
                 return False
             if last is not None and self._state is not None and MODEL not in waits(self._state):
@@ -244,9 +239,11 @@ class TelemetryObserver:
         clock, promise = self._stopwatch, self._promise
         if clock is None or promise.seconds is None:
             return any(child.name == "service" for child in self._children if child.ended)
+        # The outcome must last, because an update just before may still turn out bad.
         right_s = 0.0 if self._right_since_s is None else clock.spent_s - self._right_since_s
         if self._endings() or (right_s >= HOLD_S and not promise.whole):
             return True
+        # Once all is well no slowness has to be allowed for.
         patience = 1.0 if self._right_since_s is not None else self._time_factor(clock)
         over = clock.spent_s >= patience * promise.seconds
         stretch = LARGE_STRETCH if promise.large else MAX_STRETCH
@@ -266,12 +263,14 @@ class TelemetryObserver:
         for ending in self._endings():
             self._say_once(f"         {ending}")
         try:
-            state = self._client.get("/v1/state").raise_for_status().json()
-            shelf = self._client.get("/v1/reconstructors").raise_for_status().json()
-        except (httpx.HTTPError, ValueError):
+            state = self._service.get("/v1/state").document
+            reconstructors = self._service.get("/v1/reconstructors").document["reconstructors"]
+        except (RefusedError, UnreachableError):
+            # The old answer stays for the report, but no success is counted on it.
             self._right_since_s = None
             return
-        self._state, self._reconstructors = state, shelf["reconstructors"]
+        # Both or none: a state and reconstructors of different moments would contradict each other.
+        self._state, self._reconstructors = state, reconstructors
         self._answered_s = time.monotonic()
         if self._stopwatch is not None:
             self._take_note(state, self._stopwatch)
@@ -293,21 +292,14 @@ class TelemetryObserver:
     def _say_lines(self, n_lines: int) -> None:
         if n_lines % HEADING_EVERY == 0:
             self._say(HEADING)
-        clock = self._stopwatch
-        slow = slow_line(
-            None if clock is None else clock.pace,
-            real_time=self._promise.real_time,
-            behind=self._behind,
-        )
-        if slow is not None:
-            self._say_once(slow)
-        slower = (
-            rate_line(self._state, self._promise.requested_rate_hz)
-            if self._promise.held_rate
-            else None
-        )
-        if slower is not None:
-            self._say_once(slower)
+        clock, promise = self._stopwatch, self._promise
+        pace = None if clock is None else clock.pace
+        for line in (
+            slow_line(pace, real_time=promise.real_time, behind=self._behind),
+            rate_line(self._state, promise.requested_rate_hz),
+        ):
+            if line is not None:
+                self._say_once(line)
         seconds = 0.0 if clock is None else clock.wall_s
         silent_s = time.monotonic() - self._answered_s
         if silent_s > MAX_ANSWER_AGE_S:
@@ -339,7 +331,7 @@ _FORMATS = {
 }
 
 
-def live_line(seconds: float, state: dict[str, Any] | None, truth: Line | None) -> str:
+def live_line(seconds: float, state: View | None, truth: Line | None) -> str:
     """Return one line of the running table."""
     if state is None:
         return f"{seconds:7.1f}  the service is starting"
@@ -362,7 +354,7 @@ def live_line(seconds: float, state: dict[str, Any] | None, truth: Line | None) 
     )
 
 
-def explain_waiting(state: dict[str, Any] | None) -> str:
+def explain_waiting(state: View | None) -> str:
     """Return the reason why the clock has not started."""
     if state is None:
         return "the service is starting"
@@ -371,7 +363,7 @@ def explain_waiting(state: dict[str, Any] | None) -> str:
     return "the simulated telescope is being prepared"
 
 
-def rate_line(state: dict[str, Any] | None, asked_hz: float = USUAL_RATE_HZ) -> str | None:
+def rate_line(state: View | None, asked_hz: float = USUAL_RATE_HZ) -> str | None:
     """Return a line on a frame rate below the requested one, else None."""
     rtc = None if state is None else state["rtc"]
     if rtc is None or (held_hz := rtc["frame_rate_hz"]) >= asked_hz:
@@ -389,7 +381,7 @@ def slow_line(pace: float | None, *, real_time: bool, behind: bool) -> str | Non
     return None
 
 
-def _matrix(state: dict[str, Any]) -> str:
+def _matrix(state: View) -> str:
     alarms = " ".join([*(f"[{alarm['name']}]" for alarm in state["alarms"]), *_waits(state)])
     if not state["ready"]:
         return f"- {state['ready_reason']} {alarms}"
@@ -398,7 +390,7 @@ def _matrix(state: dict[str, Any]) -> str:
     return f"{state['in_use'] or '-'} ({state['rtc']['n_controlled']} modes) {alarms}"
 
 
-def _waits(state: dict[str, Any]) -> list[str]:
+def _waits(state: View) -> list[str]:
     """Return the pending conditions that are not alarms."""
     known = {alarm["name"] for alarm in state["alarms"]}
     names = [wait["name"] for wait in state.get("waiting_for", ()) if wait["name"] not in known]

@@ -76,23 +76,15 @@ def read_mirror(
 
 def _read_positions(given: Array, notes: list[str]) -> Mirror:
     longer = max(np.shape(given), default=0)
-    places = np.asarray(given)
-    if places.ndim == 2 and 2 in places.shape and np.issubdtype(places.dtype, np.floating):
-        turned = places if places.shape[1] == 2 else places.T
-        if not np.isfinite(turned).all():
+    places = orient_matrix(given, longer, 2, "positions", "(n_actuators, 2)", notes)
+    for number, reason in find_defects(places).items():
+        # A place of zeros is no defect: it is the actuator in the middle.
+        if reason.startswith(COPY):
             raise MatrixError(
-                "positions: found a number that is not finite for actuator "
-                f"{np.flatnonzero(~np.isfinite(turned).all(axis=1))[0]}, expected x and y in metres"
+                f"positions: found actuator {number} where {reason.removeprefix(COPY)} is, "
+                "expected a place of its own for each"
             )
-    places, words = orient_matrix(given, longer, 2, "positions", "(n_actuators, 2)")
-    notes += words
-    copies = find_defects(places)
-    twice = {number: kind for number, kind in copies.items() if kind.startswith(COPY)}
-    if twice:
-        raise MatrixError(
-            f"positions: found actuator {min(twice)} where {twice[min(twice)].removeprefix(COPY)} "
-            "is, expected a place of its own for each"
-        )
+    # On a line every rotation about it fits: a registration cannot be measured.
     if np.linalg.matrix_rank(places - places.mean(axis=0), tol=1e-6 * np.ptp(places)) < 2:
         raise MatrixError(
             f"positions: found {len(places)} actuators on one line, expected their places in the "
@@ -115,13 +107,12 @@ def _read_positions(given: Array, notes: list[str]) -> Mirror:
 
 def _read_shapes(given: Array, diameter_m: float, *, is_basis: bool, notes: list[str]) -> Mirror:
     cube = cube_of(given, notes)
-    pitch = {"modes_pitch_m": diameter_m / cube.shape[1]}
-    name = "mode_shapes" if is_basis else "influence_functions"
-    key = "modes" if is_basis else name
+    # Not "modes": that name in matrix.h5 is of the basis index of each column.
+    key, name = ("modes", "mode_shapes") if is_basis else ("influence_functions",) * 2
     return Mirror(
         n_modes=len(cube),
         n_actuators=len(cube),
-        table={key: Dataset(name), **pitch},
+        table={key: Dataset(name), "modes_pitch_m": diameter_m / cube.shape[1]},
         arrays={name: cube},
         per_mode=(name,),
         defects=find_defects(cube),
@@ -130,26 +121,18 @@ def _read_shapes(given: Array, diameter_m: float, *, is_basis: bool, notes: list
 
 def combine(mirror: Mirror, strokes: Array, notes: list[str]) -> None:
     """Make the mirror's modes combinations of its actuators, without unusable ones."""
-    n_actuators = mirror.n_actuators
-    found = np.asarray(strokes)
-    if found.ndim == 2 and found.shape[0] != n_actuators and found.shape[1] != n_actuators:
-        raise MatrixError(
-            f"mode_to_actuator: found shape {found.shape}, expected (n_actuators, n_modes) = "
-            f"({n_actuators}, any)"
-        )
-    broken = ~np.isfinite(found) if found.dtype.kind == "f" else np.zeros(found.shape, bool)
-    commands, words = orient_matrix(
-        np.where(broken, 0, found), n_actuators, None, "mode_to_actuator", "(n_actuators, n_modes)"
-    )
-    notes += words
-    commands = np.array(commands, dtype=np.float64)
-    commands[broken if commands.shape == broken.shape and not words else broken.T] = np.nan
+    n_actuators, shape = mirror.n_actuators, "(n_actuators, n_modes)"
+    # One unusable mode must not make the others unusable: it is left out later, with its number.
+    commands = orient_matrix(
+        strokes, n_actuators, None, "mode_to_actuator", shape, notes, broken_entries=True
+    ).astype(np.float64)
     if commands.shape[1] > n_actuators:
         raise MatrixError(
             f"mode_to_actuator: found {commands.shape[1]} modes of {n_actuators} actuators, "
             "expected no more modes than actuators"
         )
     if mirror.defects:
+        # A mode is a sum over all actuators, so these are left out of every mode, not as modes.
         notes += explain_defects(mirror.defects, "influence function")
         kept = np.array([k for k in range(n_actuators) if k not in mirror.defects])
         for name in mirror.per_mode:

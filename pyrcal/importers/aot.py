@@ -25,6 +25,23 @@ _HEADER_BYTES = 20 * 2880
 """Number of leading bytes that must contain the version."""
 
 
+def import_aotpy() -> Any:  # noqa: ANN401 - aotpy has no types
+    """Return the module of the standard.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is not installed.
+    """
+    try:
+        import aotpy
+    except ImportError as error:
+        raise ConfigurationError(
+            "AOT files need aotpy, which is not installed: pip install 'pyrcal[aot]'"
+        ) from error
+    return aotpy
+
+
 def read_system(path: Path) -> Any:  # noqa: ANN401 - aotpy has no types
     """Return aotpy's system of a file.
 
@@ -35,23 +52,21 @@ def read_system(path: Path) -> Any:  # noqa: ANN401 - aotpy has no types
     MatrixError
         If it is no AOT file.
     """
-    try:
-        import aotpy
-    except ImportError as error:
-        raise ConfigurationError(
-            f"{path}: AOT files need aotpy: pip install 'pyrcal[aot]'"
-        ) from error
+    aotpy = import_aotpy()
     _check(path)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # aotpy warns of whatever a file leaves empty
+            # aotpy warns of whatever a file leaves empty.
+            warnings.simplefilter("ignore")
             system = aotpy.AOSystem.read_from_file(path)
-    except Exception as error:  # aotpy does not export its own class
+    # aotpy does not export the class of its errors.
+    except Exception as error:
         raise MatrixError(f"{path}: found {error}, expected an AOT file") from error
     for part in (*system.wavefront_sensors, *system.wavefront_correctors, *system.loops):
         for name, value in vars(part).items():
             if isinstance(value, aotpy.Image) and value.data is None:
-                setattr(part, name, None)  # an image without data says as little as none
+                # An image without data says as little as none.
+                setattr(part, name, None)
     return system
 
 
@@ -70,7 +85,8 @@ def _check(path: Path) -> None:
         raise MatrixError(f"{path}: found no FITS, expected an AOT file")
     if b"AOT-VERS" not in begins:
         raise MatrixError(f"{path}: found FITS without AOT-VERS, expected an AOT file")
-    with opened(path):  # refuses a damaged file
+    # Opening refuses a damaged file.
+    with opened(path):
         pass
 
 
@@ -123,6 +139,7 @@ def from_aot(
             f"which has {mirror.n_valid_actuators} actuators; give --positions FILE, x and y in "
             "metres"
         )
+    # What the file says is preferred to what was given: it cannot be mistyped.
     telescope = system.main_telescope
     diameter_m = telescope.enclosing_diameter or reported.diameter_m
     dated = registrations_between(mirror, sensor, diameter_m / max(places.shape), str(path))
@@ -149,33 +166,21 @@ def from_aot(
 
 def _choose_loop(path: Path, system: Any, wanted: str | None) -> Any:  # noqa: ANN401
     """Return the requested loop, or the only one with an interaction matrix."""
-    measured = [one for one in system.loops if getattr(one, "interaction_matrix", None) is not None]
-    if wanted is None:
-        if len(measured) == 1:
-            return measured[0]
-        listed = _format_loops(system)
-        what = "no loop" if not measured else f"{len(measured)} loops"
+    loops = list(enumerate(system.loops, start=1))
+    listed = "; ".join(f"{k} {one.uid} ({_describe_loop(one)})" for k, one in loops) or "none"
+    if wanted is not None:
+        # The first one only: the uid of one loop may be the number of another.
+        loops = [(k, one) for k, one in loops if wanted in {str(k), one.uid}][:1]
+        if not loops:
+            raise MatrixError(f"{path}: --loop: found {wanted}, expected one of {listed}")
+    measured = [one for _, one in loops if getattr(one, "interaction_matrix", None) is not None]
+    if len(measured) != 1:
+        what = f"{len(measured)} loops" if measured else "no loop"
         raise MatrixError(
             f"{path}: found {what} with an interaction matrix, expected one: choose with --loop: "
             f"{listed}"
         )
-    listed = _format_loops(system)
-    for number, one in enumerate(system.loops, start=1):
-        if wanted in {str(number), one.uid}:
-            if one not in measured:
-                raise MatrixError(
-                    f"{path}: loop {one.uid}: found no interaction matrix, expected one: {listed}"
-                )
-            return one
-    raise MatrixError(f"{path}: --loop: found {wanted}, expected one of {listed}")
-
-
-def _format_loops(system: Any) -> str:  # noqa: ANN401
-    """Return the loops of a file, each with its number."""
-    loops = (
-        f"{k} {one.uid} ({_describe_loop(one)})" for k, one in enumerate(system.loops, start=1)
-    )
-    return "; ".join(loops) or "none"
+    return measured[0]
 
 
 def _describe_loop(loop: Any) -> str:  # noqa: ANN401
@@ -201,6 +206,7 @@ def registrations_between(
     """
     if mirror.transformation_matrix is None:
         return None
+    # α is the mirror on the sensor: a sensor that is moved as well would be counted twice.
     own = sensor.transformation_matrix
     if own is not None and not np.allclose(
         np.moveaxis(np.reshape(own.data, (3, 3, -1)), -1, 0), np.eye(3), rtol=0.0, atol=1e-6
@@ -225,6 +231,7 @@ def _mirror(
         found["positions"] = np.array([[at.x, at.y] for at in mirror.actuator_coordinates])
     if loop.modes_to_commands is not None:
         strokes = np.asarray(loop.modes_to_commands.data)
+        # The standard defines the matrix for actuators; some files have one for modes.
         if strokes.ndim == 2 and n_columns == len(strokes) != strokes.shape[1]:
             notes.append("the matrix is of actuators, as the standard has it: modes are left out")
         else:
@@ -263,7 +270,8 @@ def places_of(places: Array, where: str) -> Array:
     listed = places[places >= 0].ravel()
     n_valid = len(listed)
     if n_valid and listed.min() == 1:
-        listed = listed - 1  # some writers count from 1
+        # Some writers count from 1.
+        listed = listed - 1
     if places.ndim != 2 or not np.array_equal(np.sort(listed), np.arange(n_valid)):
         raise MatrixError(
             f"{where}: subaperture_mask: expected -1 or the place of each valid subaperture, 0 to "

@@ -11,14 +11,13 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from pyrcal.fitting.recorded import file_sha256
 from pyrcal.importers.files import Reported, from_arrays
 from pyrcal.importers.imported import Array, Imported
-from pyrcal.importers.layouts import check_binary
+from pyrcal.importers.layouts import check_binary, plane_of
 from service.errors import MatrixError
 from service.files.container import opened
 
@@ -59,11 +58,11 @@ RESPONSES = (
 """Kinds of responses in order of preference."""
 
 PICTURES = {
-    "valid": r"wfsmask",
-    "actuators": r"dmmask|dmmaskctrl",
-    "light": r"wfsref",
+    "valid": (r"wfsmask", "mask of valid subapertures or lit pixels"),
+    "actuators": (r"dmmask|dmmaskctrl", "mask of actuators"),
+    "light": (r"wfsref", "mean frame"),
 }
-"""Patterns of other files that are used, by role."""
+"""Patterns and purposes of other files that are used, by role."""
 
 NOT_USED = {
     r"dmmask-?extr": "its actuators are extrapolated, not controlled",
@@ -180,29 +179,35 @@ def from_cacao(folder: Path, reported: Reported, response: str | None = None) ->
     matrix, kind = _response(found, response)
     arrays: dict[str, Array] = {"matrix": matrix}
     for role in ("valid", "light"):
-        path = found.one(PICTURES[role], role)
-        if path is not None:
-            values = _plane(found.read(path, _PURPOSES[role]))
-            if role == "valid":
-                check_binary(values, str(path))
-            arrays[role] = values
+        picture = _picture(found, role)
+        if picture is not None:
+            arrays[role] = picture
     notes: list[str] = []
-    modes = None if kind.modes is None else _modes(found, kind)
+    modes = None if kind.modes is None else _modes(found, kind.modes, kind.words)
     arrays |= _mirror(found, matrix, modes, reported.diameter_m, notes)
     sensor = reported.sensor or _sensor(found.variables, notes)
-    processed = found.variables.get("WFSSTREAM_PROCESSED")
     if "light" in arrays and arrays["light"].shape != matrix.shape[1:]:
         notes.append(f"wfsref has shape {arrays['light'].shape}, the response another: ignored")
         del arrays["light"]
-    elif processed == "ON":
-        arrays.pop("light", None)  # these are reference slopes, not an image of the light
+    elif found.variables.get("WFSSTREAM_PROCESSED") == "ON":
+        # These are reference slopes, not an image of the light.
+        arrays.pop("light", None)
     numbers = arrays.pop("numbers", None)
     reported = replace(reported, sensor=sensor)
     imported = from_arrays(f"cacao, {folder}", arrays, reported, numbers)
     return replace(imported, inventory=(*found.taken, *found.ignored())).with_notes(*notes)
 
 
-_PURPOSES = {"valid": "mask of valid subapertures or lit pixels", "light": "mean frame"}
+def _picture(found: _Folder, role: str) -> Array | None:
+    """Return an image ``(ny, nx)`` of the folder; None if there is none."""
+    pattern, purpose = PICTURES[role]
+    path = found.one(pattern, f"the {purpose}")
+    if path is None:
+        return None
+    values = plane_of(found.read(path, purpose))
+    if role != "light":
+        check_binary(values, str(path))
+    return values
 
 
 def _survey(folder: Path) -> _Folder:
@@ -271,18 +276,19 @@ def _cube(found: _Folder, path: Path, kind: _Kind) -> Array:
     return values
 
 
-def _modes(found: _Folder, kind: _Kind) -> Array:
-    path = found.one(str(kind.modes), f"the modes of {kind.words}")
+def _modes(found: _Folder, pattern: str, words: str) -> Array:
+    path = found.one(pattern, f"the {words}")
     if path is None:
-        raise MatrixError(f"{found.root}: found no {kind.modes}, expected the modes poked")
-    return found.read(path, f"{kind.words} on the mirror")
+        raise MatrixError(f"{found.root}: found no {pattern}, expected the modes poked")
+    return found.read(path, f"{words} on the mirror")
 
 
 def _mirror(
     found: _Folder, matrix: Array, modes: Array | None, diameter_m: float, notes: list[str]
 ) -> dict[str, Array]:
     """Return positions ``(n_actuators, 2)`` and, of modes, ``mode_to_actuator``; the mask's."""
-    mask = _mask(found)
+    picture = _picture(found, "actuators")
+    mask = None if picture is None else picture > 0
     shape = _grid(found, matrix, modes, mask)
     if shape is not None:
         return _on_grid(found, shape, matrix, modes, mask, diameter_m, notes)
@@ -307,20 +313,10 @@ def _mirror(
     )
 
 
-def _mask(found: _Folder) -> Array | None:
-    path = found.one(PICTURES["actuators"], "the mask of actuators")
-    if path is None:
-        return None
-    mask = _plane(found.read(path, "mask of actuators"))
-    check_binary(mask, str(path))
-    return mask > 0
-
-
 def _grid(
     found: _Folder, matrix: Array, modes: Array | None, mask: Array | None
 ) -> tuple[int, int] | None:
     """Return rows and columns of the mirror's grid; None if its actuators are a list."""
-    n_actuators = len(matrix) if modes is None else None
     if modes is not None:
         if modes.ndim != 3:
             raise MatrixError(f"{found.root}: found modes {modes.shape}, expected (n, ny, nx)")
@@ -331,12 +327,15 @@ def _grid(
                 "expected (n_modes, ny, nx) and (ny, nx)"
             )
         return None if min(rows, columns) == 1 else (rows, columns)
-    if mask is not None and mask.size == n_actuators and min(mask.shape) > 1:
-        return int(mask.shape[0]), int(mask.shape[1])
-    sizes = _numbers(found.variables, "DMxsize"), _numbers(found.variables, "DMysize")
-    if found.variables.get("DMSPATIAL") == "1" and None not in sizes:
-        columns, rows = int(sizes[0] or 0), int(sizes[1] or 0)
-        if rows * columns == n_actuators and min(rows, columns) > 1:
+    # A response of single actuators has no picture of the mirror: its mask, or its stated size, is
+    # taken where it has as many points as there are pokes.
+    shapes = [] if mask is None else [mask.shape]
+    if found.variables.get("DMSPATIAL") == "1":
+        shapes.append(
+            tuple(int(_number(found.variables, key) or 0) for key in ("DMysize", "DMxsize"))
+        )
+    for rows, columns in shapes:
+        if rows * columns == len(matrix) and min(rows, columns) > 1:
             return rows, columns
     return None
 
@@ -352,9 +351,10 @@ def _on_grid(
 ) -> dict[str, Array]:
     inside = np.ones(shape, dtype=bool) if mask is None else np.asarray(mask)
     row, column = np.nonzero(inside)
+    # α is relative to the middle of the grid unless the file states the beam's own.
     # Without a stated radius the outermost actuators are at the edge of the pupil.
-    radius = _numbers(found.variables, "DM_beam_rad") or (max(shape) - 1) / 2.0
-    stated_centres = (_numbers(found.variables, f"DM_beam_{axis}cent") for axis in "xy")
+    radius = _number(found.variables, "DM_beam_rad") or (max(shape) - 1) / 2.0
+    stated_centres = (_number(found.variables, f"DM_beam_{axis}cent") for axis in "xy")
     grid = ((n - 1) / 2.0 for n in reversed(shape))
     middle = [own if at is None else at for at, own in zip(stated_centres, grid, strict=True)]
     pitch_m = diameter_m / 2.0 / radius
@@ -378,35 +378,37 @@ def _on_grid(
 
 def _positions(found: _Folder, n_actuators: int) -> Array | None:
     """Return x and y of each actuator as the text file lists them; None without a file."""
-    paths = [path for path in found.texts if POSITIONS.search(path.name)]
-    for path in paths:
-        try:
-            table = np.loadtxt(path, ndmin=2)
-        except ValueError as error:
-            raise MatrixError(f"{path}: found {error}, expected number, x, y in a row") from error
-        if table.shape == (n_actuators, 3) and np.isfinite(table).all():
-            # Sorted by number: the rows of the file need not be in the order of the columns.
-            order = np.argsort(table[:, 0])
-            if not np.array_equal(table[order, 0], np.arange(n_actuators) + table[:, 0].min()):
-                raise MatrixError(f"{path}: expected each actuator's number once, in column 1")
-            found.taken.append(f"took {found.name(path)}: positions of {n_actuators} actuators")
-            return np.asarray(table[order, 1:])
+    path = next((path for path in found.texts if POSITIONS.search(path.name)), None)
+    if path is None:
+        return None
+    try:
+        table = np.loadtxt(path, ndmin=2)
+    except ValueError as error:
+        raise MatrixError(f"{path}: found {error}, expected number, x, y in a row") from error
+    if table.shape != (n_actuators, 3) or not np.isfinite(table).all():
         raise MatrixError(
             f"{path}: found shape {table.shape}, expected number, x, y of {n_actuators} actuators"
         )
-    return None
+    # Sorted by number: the rows of the file need not be in the order of the columns.
+    table = table[np.argsort(table[:, 0])]
+    # Some files count actuators from 0, others from 1.
+    if not np.array_equal(table[:, 0], np.arange(n_actuators) + table[0, 0]):
+        raise MatrixError(f"{path}: expected each actuator's number once, in column 1")
+    found.taken.append(f"took {found.name(path)}: positions of {n_actuators} actuators")
+    return np.asarray(table[:, 1:])
 
 
 _MAX_NUMBER = 1e5
 """Actuators across a mirror; a larger number is a slip."""
 
 
-def _numbers(variables: Mapping[str, str], key: str) -> float | None:
+def _number(variables: Mapping[str, str], key: str) -> float | None:
     """Return a number above 0 of cacaovars; None if there is none, or it cannot be."""
-    words: Sequence[str] = variables.get(key, "").split()
+    # A line may go on after its value.
+    words = variables.get(key, "").split()[:1]
     try:
-        number = float(words[0])
-    except (IndexError, ValueError):
+        number = float("".join(words))
+    except ValueError:
         return None
     return number if 0.0 < number <= _MAX_NUMBER else None
 
@@ -418,7 +420,3 @@ def _sensor(variables: Mapping[str, str], notes: list[str]) -> str:
     because = f"as its stream {stream} is named" if kind != "pyramid" else "give --sensor if not"
     notes.append(f"the sensor is taken as a {kind}, {because}")
     return kind
-
-
-def _plane(values: Any) -> Array:  # noqa: ANN401 - NumPy's own
-    return np.asarray(values[0] if values.ndim == 3 and len(values) == 1 else values)

@@ -13,15 +13,9 @@ from typing import Any
 import numpy as np
 
 from pyrcal.importers.actuators import Mirror, combine
-from pyrcal.importers.files import (
-    UNITS_M,
-    Signals,
-    read_frames,
-    read_slopes,
-    usable_modes,
-)
-from pyrcal.importers.frames import Frames, describe_images, round_centres
-from pyrcal.importers.imported import UNKNOWN, Array, Dataset, Imported
+from pyrcal.importers.files import apply_unit, read_frames, read_slopes, usable_modes
+from pyrcal.importers.frames import Frames, describe_images, describe_windows
+from pyrcal.importers.imported import Array, Dataset, Imported, Signals
 from service.errors import MatrixError
 from service.files.toml import read_toml
 from service.instrument import instrument_path, load_instrument
@@ -76,27 +70,24 @@ def from_described(
     mirror = _mirror(instrument, tables["mirror"], path.parent, arrays, notes)
     signals = _signals(source, instrument, tables["wfs"], arrays, mirror, notes)
     modes = usable_modes(signals, mirror, columns, notes)
-    table = {**mirror.table}
-    if unit is None:
-        table["stroke"] = UNKNOWN
-        notes.append("the unit of the commands is unknown: only shapes are compared")
-    else:
-        signals.arrays["interaction_matrix"] = signals.arrays["interaction_matrix"] / UNITS_M[unit]
-    wfs = {**tables["wfs"], **signals.table}
-    slopes = {**tables.get("slopes", {})}
-    if wfs.get("input") == "frames":
-        # both follow from the positions of the images on the frames
-        wfs.pop("pupil_separation_subap", None)
+    apply_unit(unit, signals, mirror, notes)
+    changed = {name: dict(table) for name, table in tables.items()}
+    changed["mirror"] = mirror.table
+    changed["wfs"] |= signals.table
+    slopes = changed.setdefault("slopes", {})
+    if changed["wfs"].get("input") == "frames":
+        # Both follow from the positions of the images on the frames.
+        changed["wfs"].pop("pupil_separation_subap", None)
         slopes.pop("order", None)
     slopes.setdefault("orientation", "auto")
-    kept = {key: table for key, table in tables.items() if key not in {"wfs", "mirror", "slopes"}}
-    if "modes" in kept and "mode_to_actuator" in mirror.arrays:
-        kept["modes"] = {k: v for k, v in kept["modes"].items() if k != "n_modes"}
-    if kept.get("loop", {}).get("n_controlled", 0) > mirror.n_modes:
-        kept["loop"] = {k: v for k, v in kept["loop"].items() if k != "n_controlled"}
+    # The file's numbers of modes are those of its own basis.
+    if "mode_to_actuator" in mirror.arrays:
+        changed.get("modes", {}).pop("n_modes", None)
+    if changed.get("loop", {}).get("n_controlled", 0) > mirror.n_modes:
+        del changed["loop"]["n_controlled"]
     return Imported(
         source=source,
-        tables={**kept, "wfs": wfs, "mirror": table, "slopes": slopes},
+        tables=changed,
         arrays={**signals.arrays, **modes, **mirror.arrays},
         centres_found="pupil_centres_px" in signals.table,
         notes=tuple(notes),
@@ -111,6 +102,7 @@ def _mirror(
     notes: list[str],
 ) -> Mirror:
     """Return the mirror of the file, with the modes of the arrays where there are some."""
+    # The new file is in another folder, so paths relative to the old one must not stay.
     absolute = {
         key: str(folder.resolve() / value)
         for key, value in table.items()
@@ -152,6 +144,7 @@ def _signals(
         signals = read_slopes(source, arrays, mirror.n_modes, notes)
         n, found = instrument.wfs.n_subapertures, signals.table["n_subapertures"]
         if found != n:
+            # Another width would be another sensor, with other slopes.
             raise MatrixError(
                 f"{source}: valid: found a mask that spans {found} subapertures, expected {n} as "
                 "wfs.n_subapertures says"
@@ -162,16 +155,13 @@ def _signals(
     if instrument.frames is not None:
         notes += _check_centres(wfs, frames.light, frames.light_name)
     else:
-        table = _windows(source, instrument, frames, notes)
-    return Signals(
-        table=table,
-        arrays={"interaction_matrix": frames.cube, "flux_frame": frames.light},
-        obscuration_ratio=0.0,
-        columns=0,
-    )
+        # Frames can be fitted although the RTC of this instrument computes slopes from them.
+        table = _locate_windows(source, instrument, frames, notes)
+    arrays_found = {"interaction_matrix": frames.cube, "flux_frame": frames.light}
+    return Signals(table=table, arrays=arrays_found, columns=0)
 
 
-def _windows(
+def _locate_windows(
     source: str, instrument: Instrument, frames: Frames, notes: list[str]
 ) -> dict[str, Any]:
     """Return keys of ``[wfs]`` that make frames of an instrument whose RTC sends slopes."""
@@ -184,12 +174,7 @@ def _windows(
             f"pixels, expected a multiple of wfs.pupil_diameter_subap = {width:g}"
         )
     notes.append(describe_images(frames, images))
-    return {
-        "input": "frames",
-        "pixels_per_subaperture": pixels,
-        "pupil_centres_px": round_centres(images),
-        "pupil_diameter_subap": round(images.diameter_px / pixels, 3),
-    }
+    return describe_windows(images, pixels)
 
 
 def _check_centres(wfs: Mapping[str, Any], light: Array, name: str) -> list[str]:
@@ -200,7 +185,9 @@ def _check_centres(wfs: Mapping[str, Any], light: Array, name: str) -> list[str]
     try:
         found = find_pupil_images(light, name).centres_px
     except MatrixError:
+        # The file's centres are enough: the light need not show them.
         return []
+    # Each is compared with the nearest one, because the file may list them in another order.
     apart = np.hypot(*np.moveaxis(found[:, None] - np.asarray(centres, float), -1, 0))
     away = float(apart.min(axis=1).max()) / wfs.get("pixels_per_subaperture", 1)
     if away <= OFF_CENTRE_SUBAP:

@@ -7,6 +7,7 @@ pyRTC are such arrays; since its version 2.0 they have a record of their role.
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,14 +20,8 @@ from pyrcal.fitting.pupil_width import compute_responses, measure_pupil
 from pyrcal.importers.actuators import Mirror, read_mirror
 from pyrcal.importers.apertures import centre_grid, find_lit
 from pyrcal.importers.frames import Frames, describe_frames, frames_of
-from pyrcal.importers.imported import (
-    UNKNOWN,
-    Array,
-    Dataset,
-    Imported,
-    matrix_of,
-)
-from pyrcal.importers.layouts import ROLES, maps_of, mask_of
+from pyrcal.importers.imported import UNKNOWN, Array, Dataset, Imported, Signals, matrix_of
+from pyrcal.importers.layouts import ROLES, maps_of, mask_of, plane_of
 from service.errors import ConfigurationError, MatrixError
 from service.model.aperture import measure_aperture
 from service.model.defects import explain_defects, find_defects
@@ -119,38 +114,6 @@ class Reported:
         return self.sensor or "pyramid"
 
 
-@dataclass(slots=True, kw_only=True, eq=False)
-class Signals:
-    """The sensor's part of an import."""
-
-    table: dict[str, Any]
-    """Keys of ``[wfs]`` except the optical parameters."""
-
-    arrays: dict[str, Array]
-    """The matrix and the mask."""
-
-    obscuration_ratio: float
-    """Obscuration ratio measured on the mask or the light."""
-
-    columns: int
-    """Axis of the matrix that enumerates the modes."""
-
-    @property
-    def n_columns(self) -> int:
-        """Number of columns of the matrix."""
-        return int(self.arrays["interaction_matrix"].shape[self.columns])
-
-    @property
-    def by_column(self) -> Array:
-        """Matrix with the modes along the first axis."""
-        return np.moveaxis(self.arrays["interaction_matrix"], self.columns, 0)
-
-    def keep(self, columns: Array) -> None:
-        """Remove all but these columns."""
-        kept = np.moveaxis(self.by_column[columns], 0, self.columns)
-        self.arrays["interaction_matrix"] = kept
-
-
 def from_arrays(
     source: str,
     arrays: Mapping[str, Array],
@@ -178,19 +141,11 @@ def from_arrays(
     if frames is None:
         signals = read_slopes(source, arrays, mirror.n_modes, notes)
     else:
-        table, kept, ratio = describe_frames(
-            frames, mirror.n_actuators, reported.pixels_per_subaperture, source, notes
-        )
-        signals = Signals(table=table, arrays=kept, obscuration_ratio=ratio, columns=0)
+        pixels = reported.pixels_per_subaperture
+        signals = describe_frames(frames, mirror.n_actuators, pixels, source, notes)
     turbulence = _make_own_modes(source, signals, mirror, reported)
     modes = usable_modes(signals, mirror, reported.columns, notes, column_numbers)
-    if reported.unit is None:
-        mirror.table["stroke"] = UNKNOWN
-        notes.append("the unit of the commands is unknown: only shapes are compared")
-    else:
-        signals.arrays["interaction_matrix"] = (
-            signals.arrays["interaction_matrix"] / UNITS_M[reported.unit]
-        )
+    apply_unit(reported.unit, signals, mirror, notes)
     sensor = _sensor(reported, signals, notes)
     obscuration = reported.obscuration_ratio
     if obscuration is None:
@@ -211,7 +166,7 @@ def from_arrays(
             "mirror": mirror.table,
             **turbulence,
             "slopes": {
-                # slopes that pyrcal computes from frames have its own order
+                # Slopes that pyrcal computes from frames have its own order.
                 **({} if frames else {"order": reported.order}),
                 "orientation": "auto",
             },
@@ -220,6 +175,16 @@ def from_arrays(
         centres_found=frames is not None,
         notes=(*notes, *(f"{key} is unknown" for key, v in sensor.items() if v == UNKNOWN)),
     )
+
+
+def apply_unit(unit: str | None, signals: Signals, mirror: Mirror, notes: list[str]) -> None:
+    """Make the response one per metre of OPD, or mark the strokes as unknown."""
+    if unit is None:
+        mirror.table["stroke"] = UNKNOWN
+        notes.append("the unit of the commands is unknown: only shapes are compared")
+    else:
+        # Not in place: the matrix may be that of the caller.
+        signals.arrays["interaction_matrix"] = signals.arrays["interaction_matrix"] / UNITS_M[unit]
 
 
 def _make_own_modes(
@@ -258,16 +223,14 @@ def read_frames(source: str, arrays: Mapping[str, Array], kind: str) -> Frames |
     matrix = np.asarray(arrays["matrix"])
     light, valid = arrays.get("light"), arrays.get("valid")
     if matrix.ndim == 3:
-        try:
+        # Maps of slopes have three axes, too: what fits their layout is not taken as frames.
+        with contextlib.suppress(MatrixError):
             maps_of(matrix, None if valid is None else min(np.shape(valid)), [])
-        except MatrixError:
-            pass
-        else:
             return None
     frames = frames_of(
         matrix,
-        None if light is None else _plane(light),
-        None if valid is None else _plane(valid),
+        None if light is None else plane_of(light),
+        None if valid is None else plane_of(valid),
     )
     if frames is not None and kind != "pyramid":
         raise MatrixError(
@@ -275,12 +238,6 @@ def read_frames(source: str, arrays: Mapping[str, Array], kind: str) -> Frames |
             "only slopes are read"
         )
     return frames
-
-
-def _plane(values: Array) -> Array:
-    """Return an image, also if a FITS file has it as a cube with a single plane."""
-    found = np.asarray(values)
-    return found[0] if found.ndim == 3 and len(found) == 1 else found
 
 
 def read_slopes(
@@ -294,18 +251,6 @@ def read_slopes(
         If there is no mask and the matrix is no cube of maps, or a shape fits no layout.
     """
     given, found = arrays.get("valid"), np.asarray(arrays["matrix"])
-    if given is None and found.ndim == 2:
-        side = round(found.shape[0] ** 0.5)
-        frames = (
-            f"; {found.shape[0]} = {side} x {side} values look like camera frames: give the mean "
-            "frame (light=FILE) or the mask of lit pixels (valid=FILE)"
-            if side**2 == found.shape[0]
-            else ""
-        )
-        raise MatrixError(
-            f"{source}: found no valid; expected an array named {' or '.join(ROLES['valid'])}, or "
-            f"a file of its own{frames}"
-        )
     valid = None if given is None else mask_of(given, notes)
     if found.ndim > 2:
         maps = maps_of(found, None if valid is None else len(valid), notes)
@@ -313,11 +258,23 @@ def read_slopes(
             valid = find_lit(maps, notes)
         found = maps[:, valid].reshape(-1, maps.shape[-1])
     if valid is None:
-        raise MatrixError(f"{source}: found no valid subapertures, expected a mask (n, n)")
+        rows = found.shape[0] if found.ndim else 0
+        side = round(rows**0.5)
+        frames = (
+            f"; {rows} = {side} x {side} values look like camera frames: give the mean frame "
+            "(light=FILE) or the mask of lit pixels (valid=FILE)"
+            if side**2 == rows
+            else ""
+        )
+        raise MatrixError(
+            f"{source}: found no valid; expected an array named {' or '.join(ROLES['valid'])}, or "
+            f"a file of its own{frames}"
+        )
     n_rows = 2 * int(valid.sum())
-    found, valid = _remove_dead_rows(found, valid, n_rows, notes)
-    matrix, turned = _orient_matrix(found, 2 * int(valid.sum()), _columns(found, valid, n_modes))
-    notes += turned
+    n_columns = _count_columns(found, n_rows, n_modes)
+    # NaN are allowed: a dead subaperture or a failed poke is left out below, with its number.
+    matrix = matrix_of(found, n_rows, n_columns, notes=notes, broken_entries=True)
+    matrix, valid = _remove_dead_rows(matrix, valid, notes)
     grid = centre_grid(valid)
     if grid.shape != valid.shape or np.any(grid != valid):
         notes.append(
@@ -341,36 +298,15 @@ def read_slopes(
     )
 
 
-def _orient_matrix(found: Array, n_rows: int, n_columns: int) -> tuple[Array, tuple[str, ...]]:
-    """Return a matrix ``(n_slopes, n_modes)``; NaN in columns are kept."""
-    if found.dtype.kind != "f" or found.ndim != 2:
-        return matrix_of(found, n_rows, n_columns)
-    unknown = ~np.isfinite(found)
-    matrix, turned = matrix_of(np.where(unknown, 0.0, found), n_rows, n_columns)
-    if unknown.any():
-        matrix = np.array(matrix)
-        matrix[
-            unknown if matrix.shape == unknown.shape and found.shape[0] == n_rows else unknown.T
-        ] = np.nan
-    return matrix, turned
-
-
 def _remove_dead_rows(
-    found: Array, valid: NDArray[np.bool_], n_rows: int, notes: list[str]
+    matrix: Array, valid: NDArray[np.bool_], notes: list[str]
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Return matrix and mask without subapertures that are NaN or 0 for all modes."""
-    if found.ndim != 2 or found.dtype.kind not in "iuf" or n_rows not in found.shape:
-        return found, valid
-    turned = found.shape[0] != n_rows
-    slopes = found.T if turned else found
-    planes = slopes.reshape(2, len(slopes) // 2, slopes.shape[1])
-    with np.errstate(invalid="ignore"):
-        silent = ~np.isfinite(planes) | (planes == 0.0)
-    dead = silent.all(axis=2).any(axis=0)
-    usable = np.isfinite(planes).any(axis=2).any(axis=0)
-    dead |= ~usable
+    planes = matrix.reshape(2, len(matrix) // 2, matrix.shape[1])
+    dead = (~np.isfinite(planes) | (planes == 0.0)).all(axis=2).any(axis=0)
+    # Where all are dead there is no response at all: the columns are refused with their numbers.
     if not dead.any() or dead.all():
-        return found, valid
+        return matrix, valid
     places = np.argwhere(valid)[dead]
     listed = ", ".join(f"({row}, {column})" for row, column in places[:12])
     more = f" and {len(places) - 12} more" if len(places) > 12 else ""
@@ -380,13 +316,12 @@ def _remove_dead_rows(
     )
     kept = valid.copy()
     kept[tuple(places.T)] = False
-    remaining = planes[:, ~dead].reshape(-1, slopes.shape[1])
-    return (remaining.T if turned else remaining), kept
+    return planes[:, ~dead].reshape(-1, matrix.shape[1]), kept
 
 
-def _columns(matrix: Array, valid: NDArray[np.bool_], n_modes: int) -> int:
+def _count_columns(matrix: Array, n_rows: int, n_modes: int) -> int:
     """Return the expected number of columns: all modes, or fewer if the matrix has fewer."""
-    others = [n for n in matrix.shape if n != 2 * int(valid.sum())]
+    others = [n for n in matrix.shape if n != n_rows]
     return others[0] if len(others) == 1 and others[0] < n_modes else n_modes
 
 
@@ -425,6 +360,8 @@ def usable_modes(
     notes += explain_defects(dead, "column", numbers)
     notes += explain_defects(shapes, "actuator" if mirror.is_zonal else "mode")
     unusable = set(shapes)
+    # A mode that was not measured can be controlled all the same. A single actuator whose poke
+    # failed is taken as broken, and left out of the mirror.
     if mirror.is_zonal and mirror.per_mode:
         unusable |= {int(indices[k]) for k in dead}
     kept = np.array([n for n in range(n_modes) if n not in unusable], dtype=np.intp)
@@ -442,6 +379,7 @@ def usable_modes(
         arrays[name] = kept if numbers is None else np.asarray(numbers)[kept]
         mirror.keep(kept)
     position = {int(n): k for k, n in enumerate(kept)}
+    # Counted anew, because unusable ones are removed from the basis as well.
     left = np.array([position[int(indices[k])] for k in measured])
     if not np.array_equal(left, np.arange(len(kept))):
         arrays["modes"] = left

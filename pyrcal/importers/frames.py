@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.importers.imported import Array, Dataset
+from pyrcal.importers.imported import Array, Dataset, Signals
 from pyrcal.importers.layouts import is_listed_twice
 from service.errors import MatrixError
 from service.model.pupil_images import PupilImages, find_pupil_images
@@ -58,40 +58,39 @@ def frames_of(matrix: Array, light: Array | None, valid: Array | None) -> Frames
     """
     light_map = light if light is not None else valid
     name = "the mean frame" if light is not None else "the mask of lit pixels"
+    if light_map is not None and light_map.ndim == 2:
+        cube = _cube_of(matrix, light_map, valid)
+        light_map = np.asarray(light_map, np.float64)
+        return None if cube is None else Frames(cube=cube, light=light_map, light_name=name)
+    if matrix.ndim != 3:
+        return None
+    # Only lit pixels respond, so the response itself shows where the pupil images are.
+    cube = np.moveaxis(matrix, -1, 0) if matrix.shape[0] == matrix.shape[1] else matrix
+    strength = np.sqrt(np.mean(np.square(np.nan_to_num(cube, copy=True)), axis=0, dtype=float))
+    return Frames(cube=cube, light=strength, light_name="the strength of the response")
+
+
+def _cube_of(matrix: Array, light_map: Array, valid: Array | None) -> Array | None:
+    """Return a response as frames of the shape of the light; None if its shape is another."""
     if matrix.ndim == 3:
-        return _of_cube(matrix, light_map, name)
-    if matrix.ndim != 2 or light_map is None or light_map.ndim != 2:
+        if matrix.shape[1:] == light_map.shape:
+            return matrix
+        return np.moveaxis(matrix, -1, 0) if matrix.shape[:2] == light_map.shape else None
+    if matrix.ndim != 2:
         return None
     if light_map.size in matrix.shape:
         flat = matrix if matrix.shape[0] == light_map.size else matrix.T
-        return Frames(
-            cube=np.ascontiguousarray(flat.T).reshape(-1, *light_map.shape),
-            light=np.asarray(light_map, dtype=np.float64),
-            light_name=name,
-        )
+        return np.ascontiguousarray(flat.T).reshape(-1, *light_map.shape)
     if valid is None or not np.isin(valid, (0, 1)).all():
         return None
     lit = valid.astype(bool)
+    # A mask that lists its subapertures twice is one for Sx and Sy: the rows are slopes.
     if lit.sum() not in matrix.shape or is_listed_twice(lit):
         return None
     flat = matrix if matrix.shape[0] == lit.sum() else matrix.T
     cube = np.zeros((flat.shape[1], *lit.shape), dtype=matrix.dtype)
     cube[:, lit] = flat.T
-    return Frames(cube=cube, light=np.asarray(light_map, dtype=np.float64), light_name=name)
-
-
-def _of_cube(matrix: Array, light_map: Array | None, name: str) -> Frames | None:
-    if light_map is not None and light_map.ndim == 2:
-        if matrix.shape[1:] == light_map.shape:
-            cube = matrix
-        elif matrix.shape[:2] == light_map.shape:
-            cube = np.moveaxis(matrix, -1, 0)
-        else:
-            return None
-        return Frames(cube=cube, light=np.asarray(light_map, np.float64), light_name=name)
-    cube = np.moveaxis(matrix, -1, 0) if matrix.shape[0] == matrix.shape[1] else matrix
-    strength = np.sqrt(np.mean(np.square(np.nan_to_num(cube, copy=True)), axis=0, dtype=float))
-    return Frames(cube=cube, light=strength, light_name="the strength of the response")
+    return cube
 
 
 def describe_frames(
@@ -100,8 +99,8 @@ def describe_frames(
     pixels_per_subaperture: int | None,
     where: str,
     notes: list[str],
-) -> tuple[dict[str, Any], dict[str, Array], float]:
-    """Return keys of ``[wfs]``, arrays, and the obscuration ratio of the images.
+) -> Signals:
+    """Return the sensor's part of an import, with what the images in the light show.
 
     Raises
     ------
@@ -114,20 +113,20 @@ def describe_frames(
     notes.append(describe_images(frames, images))
     notes.append(f"{pixels} x {pixels} pixels are one subaperture; --pixels-per-subap changes that")
     valid = _valid(frames.light, images, n, pixels)
-    table = {
-        "n_subapertures": n,
-        "pupil_diameter_subap": round(images.diameter_px / pixels, 3),
-        "input": "frames",
-        "pixels_per_subaperture": pixels,
-        "pupil_centres_px": round_centres(images),
-        "valid_subapertures": Dataset("valid_subapertures"),
-    }
-    arrays = {
-        "interaction_matrix": frames.cube,
-        "flux_frame": frames.light,
-        "valid_subapertures": valid.astype(np.uint8),
-    }
-    return table, arrays, images.obscuration_ratio
+    return Signals(
+        table={
+            "n_subapertures": n,
+            **describe_windows(images, pixels),
+            "valid_subapertures": Dataset("valid_subapertures"),
+        },
+        arrays={
+            "interaction_matrix": frames.cube,
+            "flux_frame": frames.light,
+            "valid_subapertures": valid.astype(np.uint8),
+        },
+        obscuration_ratio=images.obscuration_ratio,
+        columns=0,
+    )
 
 
 def describe_images(frames: Frames, images: PupilImages) -> str:
@@ -140,12 +139,18 @@ def describe_images(frames: Frames, images: PupilImages) -> str:
     )
 
 
-def round_centres(images: PupilImages) -> list[list[float]]:
-    """Return the centres in the notation of an instrument file."""
-    return [[round(float(value), 3) for value in at] for at in images.centres_px]
+def describe_windows(images: PupilImages, pixels: int) -> dict[str, Any]:
+    """Return the keys of ``[wfs]`` that say where the subapertures are on the frames."""
+    return {
+        "pupil_diameter_subap": round(images.diameter_px / pixels, 3),
+        "input": "frames",
+        "pixels_per_subaperture": pixels,
+        "pupil_centres_px": np.round(images.centres_px, 3).tolist(),
+    }
 
 
 def _choose_binning(images: PupilImages, n_actuators: int) -> int:
+    # The actuators across a round mirror of so many.
     across = math.sqrt(4.0 * n_actuators / math.pi)
     return max(1, int(images.diameter_px / (SUBAPERTURES_PER_ACTUATOR * across)))
 

@@ -41,6 +41,37 @@ class Dataset(str):
     __slots__ = ()
 
 
+@dataclass(slots=True, kw_only=True, eq=False)
+class Signals:
+    """The sensor's part of an import."""
+
+    table: dict[str, Any]
+    """Keys of ``[wfs]`` except the optical parameters."""
+
+    arrays: dict[str, Array]
+    """The matrix, and the mask or the light."""
+
+    obscuration_ratio: float = 0.0
+    """Obscuration ratio measured on the mask or the light."""
+
+    columns: int
+    """Axis of the matrix that enumerates the modes."""
+
+    @property
+    def n_columns(self) -> int:
+        """Number of columns of the matrix."""
+        return int(self.arrays[DATASET].shape[self.columns])
+
+    @property
+    def by_column(self) -> Array:
+        """Matrix with the modes along the first axis."""
+        return np.moveaxis(self.arrays[DATASET], self.columns, 0)
+
+    def keep(self, columns: Array) -> None:
+        """Remove all but these columns."""
+        self.arrays[DATASET] = np.moveaxis(self.by_column[columns], 0, self.columns)
+
+
 class Saved(NamedTuple):
     """Paths of a saved import."""
 
@@ -185,9 +216,16 @@ def _toml(value: object) -> str:
 
 
 def orient_matrix(
-    values: Array, rows: int, columns: int | None, what: str, of: str
-) -> tuple[Array, tuple[str, ...]]:
-    """Return a matrix as ``(rows, columns)``, and a note if it was transposed.
+    values: Array,
+    rows: int,
+    columns: int | None,
+    what: str,
+    of: str,
+    notes: list[str],
+    *,
+    broken_entries: bool = False,
+) -> Array:
+    """Return a matrix as ``(rows, columns)``.
 
     Parameters
     ----------
@@ -199,6 +237,10 @@ def orient_matrix(
         Name of the matrix, for messages.
     of
         Description of the shape, like ``(n_slopes, n_modes)``.
+    notes
+        List to which a note is appended if it was transposed, or could have been.
+    broken_entries
+        True if numbers that are not finite are allowed.
 
     Raises
     ------
@@ -206,17 +248,26 @@ def orient_matrix(
         If it has neither shape, or contains a number that is not finite.
     """
     found = np.asarray(values)
-    if found.ndim != 2 or found.dtype.kind not in "iuf" or not np.isfinite(found).all():
+    if found.ndim != 2 or found.dtype.kind not in "iuf":
         raise MatrixError(
             f"{what}: found shape {found.shape} of {found.dtype}, expected finite numbers {of}"
         )
+    broken = np.argwhere(~np.isfinite(found))
+    if len(broken) and not broken_entries:
+        row, column = broken[0]
+        raise MatrixError(
+            f"{what}: found {found[row, column]} in row {row}, column {column}, expected finite "
+            f"numbers {of}"
+        )
     n_rows, n_columns = found.shape
     if n_rows == rows and columns in {None, n_columns}:
-        square = n_rows == n_columns
-        unsure = f"{what} is square, {n_rows} by {n_rows}: taken as {of}"
-        return found, (unsure,) if square else ()
+        # Nothing in a square matrix shows which of its axes is which.
+        if n_rows == n_columns:
+            notes.append(f"{what} is square, {n_rows} by {n_rows}: taken as {of}")
+        return found
     if n_columns == rows and columns in {None, n_rows}:
-        return found.T, (f"{what} was listed the other way round: turned to {of}",)
+        notes.append(f"{what} was listed the other way round: turned to {of}")
+        return found.T
     wanted = f"({rows}, {'any' if columns is None else columns})"
     raise MatrixError(f"{what}: found shape {found.shape}, expected {of} = {wanted}")
 

@@ -24,10 +24,13 @@ ROLES = {
     ),
     "light": ("flux_frame", "light", "wfsref", "reference_frame", "referenceIntensity"),
     "modes": ("modes", "influence_functions", "cube", "ifunc", "mode_shapes"),
-    "mode_to_actuator": ("mode_to_actuator", "M2C", "m2c"),
+    "mode_to_actuator": ("mode_to_actuator", "M2C"),
     "positions": ("positions", "xy_m", "coordinates"),
 }
 """Names of arrays by role, in a file with several arrays."""
+
+_ROLE_OF_NAME = {name.lower(): role for role, names in ROLES.items() for name in names}
+"""Roles by name, in lower case: FITS has capitals only."""
 
 
 def mask_of(values: Array, notes: list[str]) -> NDArray[np.bool_]:
@@ -53,6 +56,12 @@ def mask_of(values: Array, notes: list[str]) -> NDArray[np.bool_]:
     return mask.astype(bool)
 
 
+def plane_of(values: Array) -> Array:
+    """Return an image, also if a FITS file has it as a cube with a single plane."""
+    found = np.asarray(values)
+    return found[0] if found.ndim == 3 and len(found) == 1 else found
+
+
 def is_listed_twice(mask: Array) -> bool:
     """Return True if a mask contains the same subapertures twice, for x and for y."""
     if mask.ndim != 2 or max(mask.shape) != 2 * min(mask.shape):
@@ -72,6 +81,7 @@ def check_binary(mask: Array, what: str) -> None:
     other = np.unique(mask[~np.isin(mask, (0, 1))])
     if other.size:
         quoted = " and ".join(f"{value:g}" for value in other[:2])
+        # FITS stores unsigned bytes less 128: a reader that ignores BZERO leaves -128 and -127.
         hint = ": was BZERO applied?" if np.any(other == -128) else ""
         raise MatrixError(f"{what}: found values {quoted}, expected a mask of 0 and 1{hint}")
 
@@ -87,6 +97,7 @@ def maps_of(values: Array, n: int | None, notes: list[str]) -> Array:
     MatrixError
         If they fit no layout, or several.
     """
+    # All layouts are tried: a shape that fits two of them must not be taken for the first.
     ways: dict[str, Array] = {}
     for first in (True, False):
         modes_last = np.moveaxis(values, 0, -1) if first else values
@@ -121,6 +132,7 @@ def cube_of(values: Array, notes: list[str]) -> NDArray[np.float32]:
         raise MatrixError(
             f"modes: found shape {cube.shape} of {cube.dtype}, expected numbers (n_modes, n, n)"
         )
+    # Modes are rendered on square maps: the two equal axes are the map's, unless all three are.
     first, _, last = cube.shape
     if first == last or (first != cube.shape[1] and cube.shape[1] != last):
         raise MatrixError(
@@ -136,22 +148,17 @@ def cube_of(values: Array, notes: list[str]) -> NDArray[np.float32]:
 def by_role(arrays: Mapping[str, Array], where: str) -> dict[str, Array]:
     """Return the arrays of a file by role, recognised by name in any letter case.
 
-    FITS has capitals only.
-
     Raises
     ------
     MatrixError
         If two have names of the same role.
     """
-    found: dict[str, Array] = {}
-    for role, names in ROLES.items():
-        there = [one for name in names for one in arrays if one.lower() == name.lower()]
-        there = list(dict.fromkeys(there))  # two of the names differ in letter case only
-        if len(there) > 1:
-            raise MatrixError(f"{where}: found {' and '.join(there)}, expected one {role}")
-        if there:
-            found[role] = arrays[there[0]]
-    return found
+    names: dict[str, str] = {}
+    for name in arrays:
+        role = _ROLE_OF_NAME.get(name.lower())
+        if role is not None and names.setdefault(role, name) != name:
+            raise MatrixError(f"{where}: found {names[role]} and {name}, expected one {role}")
+    return {role: arrays[name] for role, name in names.items()}
 
 
 def role_of_name(name: str) -> str | None:
@@ -159,9 +166,7 @@ def role_of_name(name: str) -> str | None:
 
     Numbers may follow the name, as in ``int_mat_1_5_10``.
     """
-    plain = _NUMBERED.sub("", name).lower()
-    known = (role for role, names in ROLES.items() if plain in {n.lower() for n in names})
-    return next(known, None)
+    return _ROLE_OF_NAME.get(_NUMBERED.sub("", name).lower())
 
 
 def numbers_of_name(name: str) -> list[int]:

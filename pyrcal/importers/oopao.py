@@ -13,81 +13,105 @@ names is accepted as well. OOPAO's geometry was read from version 1.0.0 and is t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.importers.imported import Array, Dataset, Imported, matrix_of, orient_matrix
+from pyrcal.importers.registration import decompose
 from service.errors import ConfigurationError
 from service.model.misregistration import Misregistration, rotation
 
 PYRAMID, LENSLETS = "pyramid", "shackHartmann"
 
-SAVED = {
-    "tel": ("D", "resolution", "pupil", "pupilReflectivity"),
-    "ngs": ("wavelength",),
-    "dm": (
-        *("modes", "altitude", "initial_coordinates", "nActAlongDiameter", "mechCoupling"),
-        *("sign", "flip_", "flip_lr", "validAct"),
-    ),
-    "dm.misReg": (
-        *("rotationAngle", "shiftX", "shiftY", "anamorphosisAngle"),
-        *("radialScaling", "tangentialScaling"),
-    ),
-    "wfs": (
-        *("tag", "nSubap", "modulation", "n_pix_separation", "binning", "postProcessing"),
-        *("validI4Q", "valid_subapertures", "pixel_scale", "n_pix_subap", "threshold_cog"),
-        "is_geometric",
-    ),
-}
-"""Attributes that are read from each object; missing ones do not apply to that object."""
-
-_OPTIONAL = {
-    *("pupilReflectivity", "altitude", "sign", "flip_", "flip_lr", "is_geometric", "validAct"),
-}
-
-_OF_SENSOR = {
-    **dict.fromkeys(
-        ("modulation", "n_pix_separation", "binning", "postProcessing", "validI4Q"), (PYRAMID,)
-    ),
-    **dict.fromkeys(
-        ("valid_subapertures", "pixel_scale", "n_pix_subap", "threshold_cog"), (LENSLETS,)
-    ),
-}
-"""Attributes of ``wfs`` that only one kind of sensor has."""
-
-_WORDS = {"tag", "postProcessing"}
-_ARRAYS = {
-    **dict.fromkeys(("pupil", "validI4Q", "valid_subapertures"), (2,)),
-    "pupilReflectivity": (0, 2),
-    "modes": (2, 3),
-    "initial_coordinates": (2,),
-    "validAct": (1, 2),
-}
-"""Attributes that are arrays, with the allowed numbers of axes."""
-
-_COUNTS = {
-    **dict.fromkeys(("nSubap", "n_pix_subap", "binning"), 1),
-    **dict.fromkeys(("resolution", "nActAlongDiameter"), 2),
-}
-"""Attributes that are counts, with their smallest values."""
-
-_AXES = 2
-"""Number of coordinates of a point."""
-
-_POSITIVE = {"D", "wavelength", "mechCoupling", "pixel_scale"}
-
 _MAX_NUMBER = 1e6
 """Largest allowed value of any attribute, in its own unit."""
 
+
+class _Rule(NamedTuple):
+    """Requirement on a saved attribute."""
+
+    expected: str
+    fits: Callable[[Array], bool]
+    single: bool = True
+    """True for a number or a word, False for an array."""
+
+    sensor: str | None = None
+    """The only kind of sensor that has it; None for all."""
+
+    needed: bool = True
+
+
+def _number(expected: str, least: float) -> _Rule:
+    def fits(values: Array) -> bool:
+        is_number = values.size == 1 and values.dtype.kind in "iufb"
+        return is_number and bool(least <= values.item() <= _MAX_NUMBER)
+
+    return _Rule(expected, fits)
+
+
+def _count(least: int) -> _Rule:
+    return _number(f"a number of at least {least}", least)
+
+
+def _array(*axes: int) -> _Rule:
+    def fits(values: Array) -> bool:
+        return values.dtype.kind in "iufb" and values.ndim in axes and values.size > 0
+
+    return _Rule(f"numbers with {' or '.join(map(str, axes))} axes", fits, single=False)
+
+
+_ANY = _number("a finite number", -_MAX_NUMBER)
+_POSITIVE = _number("a number above 0", np.finfo(float).tiny)
+_OPTIONAL = _ANY._replace(needed=False)
+_WORD = _Rule("a word", lambda values: values.size == 1 and isinstance(values.item(), str))
+
+SAVED = {
+    "tel": {
+        "D": _POSITIVE,
+        "resolution": _count(2),
+        "pupil": _array(2),
+        "pupilReflectivity": _array(0, 2)._replace(needed=False),
+    },
+    "ngs": {"wavelength": _POSITIVE},
+    "dm": {
+        "modes": _array(2, 3),
+        "altitude": _OPTIONAL,
+        "initial_coordinates": _array(2),
+        "nActAlongDiameter": _count(2),
+        "mechCoupling": _POSITIVE,
+        **dict.fromkeys(("sign", "flip_", "flip_lr"), _OPTIONAL),
+        "validAct": _array(1, 2)._replace(needed=False),
+    },
+    "dm.misReg": dict.fromkeys(
+        (
+            *("rotationAngle", "shiftX", "shiftY", "anamorphosisAngle"),
+            *("radialScaling", "tangentialScaling"),
+        ),
+        _ANY,
+    ),
+    "wfs": {
+        "tag": _WORD,
+        "nSubap": _count(1),
+        "modulation": _ANY._replace(sensor=PYRAMID),
+        "n_pix_separation": _ANY._replace(sensor=PYRAMID),
+        "binning": _count(1)._replace(sensor=PYRAMID),
+        "postProcessing": _WORD._replace(sensor=PYRAMID),
+        "validI4Q": _array(2)._replace(sensor=PYRAMID),
+        "valid_subapertures": _array(2)._replace(sensor=LENSLETS),
+        "pixel_scale": _POSITIVE._replace(sensor=LENSLETS),
+        "n_pix_subap": _count(1)._replace(sensor=LENSLETS),
+        "threshold_cog": _ANY._replace(sensor=LENSLETS),
+        "is_geometric": _OPTIONAL,
+    },
+}
+"""Attributes that are read from each object, and what they must be."""
+
 _MAX_SHAPE_DEVIATION = 1e-3
 """Largest accepted deviation of an influence function from its Gaussian, relative to its height."""
-
-_MAX_ROUNDING = 1e-9
-"""Stretches below this are rounding errors."""
 
 _SAMPLED_ACTUATORS = 24
 """Number of influence functions that are compared with the Gaussian."""
@@ -123,6 +147,7 @@ def from_oopao(
     """
     notes: list[str] = []
     if getattr(dm, "altitude", None) is not None:
+        # A conjugated mirror has another registration for every star.
         raise ConfigurationError(
             f"dm.altitude: found {dm.altitude} m, expected None: a mirror in the pupil"
         )
@@ -138,17 +163,15 @@ def from_oopao(
         mirror["basis"] = "zonal"
         n_modes = n_actuators
     else:
-        strokes, turned = orient_matrix(
-            _numpy(M2C), n_actuators, None, "M2C", "(n_actuators, n_modes)"
-        )
-        notes += turned
+        shape = "(n_actuators, n_modes)"
+        strokes = orient_matrix(_numpy(M2C), n_actuators, None, "M2C", shape, notes)
         n_modes = strokes.shape[1]
         mirror["mode_to_actuator"] = Dataset("mode_to_actuator")
         arrays["mode_to_actuator"] = strokes
     if calib is not None:
-        matrix, turned = matrix_of(_numpy(getattr(calib, "D", calib)), 2 * valid.sum(), n_modes)
-        notes += turned
-        arrays["interaction_matrix"] = matrix
+        arrays["interaction_matrix"] = matrix_of(
+            _numpy(getattr(calib, "D", calib)), 2 * valid.sum(), n_modes, notes=notes
+        )
     arrays |= {"valid_subapertures": valid.astype(np.uint8), "pupil": pupil}
     return Imported(
         source="OOPAO",
@@ -187,12 +210,6 @@ def _wavelength_m(tel: Any, wfs: Any, ngs: Any) -> float:  # noqa: ANN401
     return float(source.wavelength)
 
 
-def _pupil(tel: Any) -> NDArray[np.float32]:  # noqa: ANN401
-    """Return the share of light of every point: OOPAO's reflectivity is of the intensity."""
-    reflectivity = _numpy(getattr(tel, "pupilReflectivity", 1.0))
-    return np.asarray(_numpy(tel.pupil) * np.sqrt(reflectivity), dtype=np.float32)
-
-
 def _lit_pupil(
     tel: Any,  # noqa: ANN401
     sensor: dict[str, Any],
@@ -202,7 +219,9 @@ def _lit_pupil(
 
     A padded telescope has an array that is wider than its light, and ``tel.D`` is the array's.
     """
-    pupil = _pupil(tel)
+    # OOPAO's reflectivity is that of the intensity, the model's pupil is an amplitude.
+    reflectivity = _numpy(getattr(tel, "pupilReflectivity", 1.0))
+    pupil = np.asarray(_numpy(tel.pupil) * np.sqrt(reflectivity), dtype=np.float32)
     side = len(pupil)
     lit = np.argwhere(pupil > 0.0)
     if pupil.ndim != 2 or side != pupil.shape[1] or not len(lit):
@@ -216,7 +235,8 @@ def _lit_pupil(
     diameter_m = float(tel.D) * share
     sensor["pupil_diameter_subap"] = sensor["n_subapertures"] * share
     if "modulation_lambda_over_d" in sensor:
-        sensor["modulation_lambda_over_d"] *= share  # it is counted in wavelengths over tel.D
+        # It is counted in wavelengths over tel.D, which is the array's width.
+        sensor["modulation_lambda_over_d"] *= share
     notes.append(
         f"tel.D = {float(tel.D):g} m is that of a padded array: a dark rim of {rim} points is cut, "
         f"so that the pupil is {diameter_m:.4g} m wide, {sensor['pupil_diameter_subap']:.4g} of "
@@ -447,29 +467,23 @@ def _describe_registration(moved: Any, tel: Any, n_subapertures: int) -> tuple[s
     if np.allclose(_linear(moved), np.eye(2)) and not moved.shiftX and not moved.shiftY:
         return ()
     alpha = registration_of(moved, tel, n_subapertures)
-    # a fit has 1 sigma of 0.001 subapertures: two decimals would look like a disagreement
+    # A fit has 1 sigma of 0.001 subapertures: two decimals would look like a disagreement.
     x, y, turned, size = (round(value, 4) + 0.0 for value in alpha.to_boundary().values())
-    stretched = np.abs(alpha.stretches).max() > _MAX_ROUNDING
-    text = f", stretched by {alpha.stretches[0]:+.4f}, {alpha.stretches[1]:+.4f}"
+    stretched = ""
+    if alpha.anamorphosis is not None:
+        stretched = ", stretched by {:+.4f}, {:+.4f}".format(*alpha.anamorphosis)
     return (
         "α is relative to OOPAO's mirror without its misReg, which is "
         f"α = ({x:+.4f}, {y:+.4f} subap, {turned:+.4f} deg, {size:.4f})"
-        f"{text if stretched else ''}",
+        f"{stretched}",
     )
 
 
 def registration_of(moved: Any, tel: Any, n_subapertures: int) -> Misregistration:  # noqa: ANN401
     """Return the registration that OOPAO's ``MisRegistration`` is."""
-    linear, per_subaperture = _linear(moved), _steps(tel) * n_subapertures / float(tel.D)
-    turn = float(np.arctan2(linear[1, 0] - linear[0, 1], np.trace(linear)))
-    stretch = linear @ rotation(turn).T
-    size = float(np.trace(stretch)) / 2
-    return Misregistration(
-        shift_x_subap=-float(moved.shiftX) * per_subaperture,
-        shift_y_subap=-float(moved.shiftY) * per_subaperture,
-        rotation_rad=turn,
-        magnification=size,
-    ).with_anamorphosis(stretch[0] / size - [1.0, 0.0])
+    # OOPAO moves the mirror by minus the shift.
+    shift_m = -np.array([float(moved.shiftX), float(moved.shiftY)])
+    return decompose(_linear(moved), shift_m * _steps(tel) * n_subapertures / float(tel.D))
 
 
 def to_oopao(alpha: Misregistration, tel: Any, wfs: Any) -> dict[str, float]:  # noqa: ANN401
@@ -505,11 +519,20 @@ def from_saved(arrays: Mapping[str, Array], where: str) -> Imported:
     objects = {name: SimpleNamespace() for name in SAVED}
     for name, values in arrays.items():
         owner, _, attribute = name.rpartition(".")
-        if owner in objects:
-            setattr(
-                objects[owner], attribute, _check_attribute(f"{where}: {name}", attribute, values)
-            )
-    missing = [f"{owner}.{name}" for owner, name in _list_missing(objects)]
+        rule = SAVED.get(owner, {}).get(attribute)
+        if rule is None:
+            continue
+        if not rule.fits(values):
+            found = values if values.size == 1 else f"{values.dtype} of shape {values.shape}"
+            raise ConfigurationError(f"{where}: {name}: found {found}, expected {rule.expected}")
+        setattr(objects[owner], attribute, values.item() if rule.single else values)
+    kind = getattr(objects["wfs"], "tag", PYRAMID)
+    missing = [
+        f"{owner}.{attribute}"
+        for owner, rules in SAVED.items()
+        for attribute, rule in rules.items()
+        if rule.needed and rule.sensor in {None, kind} and not hasattr(objects[owner], attribute)
+    ]
     if missing:
         raise ConfigurationError(
             f"{where}: found no {', '.join(missing)}; expected it with the others"
@@ -523,7 +546,7 @@ def from_saved(arrays: Mapping[str, Array], where: str) -> Imported:
                 "tel.resolution says"
             )
     places = np.shape(objects["dm"].initial_coordinates)
-    if places[1] != _AXES:
+    if places[1] != 2:
         raise ConfigurationError(
             f"{where}: dm.initial_coordinates: found shape {places}, expected (n_actuators, 2)"
         )
@@ -536,57 +559,3 @@ def from_saved(arrays: Mapping[str, Array], where: str) -> Imported:
         arrays.get("M2C"),
         objects["ngs"],
     )
-
-
-def _check_attribute(where: str, attribute: str, values: Array) -> object:
-    """Return an attribute as OOPAO has it: a number, a word, or an array.
-
-    Raises
-    ------
-    ConfigurationError
-        If it is of another kind, has other axes, or is a number that cannot be.
-    """
-    if attribute in _WORDS:
-        word = values.item() if values.size == 1 else values
-        if not isinstance(word, str):
-            raise ConfigurationError(f"{where}: found {word!r}, expected a word")
-        return word
-    if attribute in _ARRAYS:
-        axes = _ARRAYS[attribute]
-        if values.dtype.kind not in "iufb" or values.ndim not in axes or not values.size:
-            expected = " or ".join(str(n) for n in axes)
-            raise ConfigurationError(
-                f"{where}: found {values.dtype} of shape {values.shape}, expected numbers with "
-                f"{expected} axes"
-            )
-        return values
-    number = values.item() if values.size == 1 and values.dtype.kind in "iufb" else np.nan
-    low = (
-        float(_COUNTS.get(attribute, 0))
-        if attribute in _COUNTS
-        else 0.0
-        if attribute in _POSITIVE
-        else -_MAX_NUMBER
-    )
-    if not low <= float(number) <= _MAX_NUMBER or (attribute in _POSITIVE and number == 0.0):
-        found = values if values.size == 1 else f"shape {values.shape}"
-        raise ConfigurationError(
-            f"{where}: found {found}, expected {_describe_expected(attribute)}"
-        )
-    return number
-
-
-def _describe_expected(attribute: str) -> str:
-    if attribute in _COUNTS:
-        return f"a number of at least {_COUNTS[attribute]}"
-    return "a number above 0" if attribute in _POSITIVE else "a finite number"
-
-
-def _list_missing(objects: Mapping[str, SimpleNamespace]) -> Iterator[tuple[str, str]]:
-    """Yield what every import needs of each object and was not saved."""
-    kind = getattr(objects["wfs"], "tag", PYRAMID)
-    for owner, names in SAVED.items():
-        for name in names:
-            needed = name not in _OPTIONAL and kind in _OF_SENSOR.get(name, (kind,))
-            if needed and not hasattr(objects[owner], name):
-                yield owner, name

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import argparse
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from pyrcal.importers import oopao
 from pyrcal.importers.aot import from_aot
 from pyrcal.importers.cacao import from_cacao
 from pyrcal.importers.described import from_described
 from pyrcal.importers.files import RECORD, Reported, calibration_of, from_arrays
 from pyrcal.importers.imported import Array, Imported
 from pyrcal.importers.layouts import by_role, numbers_of_name, role_of_name
+from pyrcal.importers.oopao import from_saved
 from pyrcal.importers.saved import read_npz
 from pyrcal.importers.specula import UNIT, from_specula
 from service.errors import ConfigurationError, MatrixError
@@ -25,13 +25,27 @@ from service.instrument import load_instrument
 from service.model.aperture import check_mask
 
 
-def _oopao(options: argparse.Namespace) -> Imported:
-    return oopao.from_saved(read_npz(options.file), str(options.file))
+def import_files(options: argparse.Namespace) -> Imported:
+    """Return what the files of the source that was named describe.
 
-
-def _specula(options: argparse.Namespace) -> Imported:
-    reported, source = _make_reported(options), options.source
-    return from_specula([path for _, path in options.files], reported, source)
+    Raises
+    ------
+    PyrcalError
+        If something that was given cannot be used.
+    """
+    match options.source:
+        case "oopao":
+            return from_saved(read_npz(options.file), str(options.file))
+        case "specula" | "synim":
+            paths = [path for _, path in options.files]
+            return from_specula(paths, _make_reported(options), options.source)
+        case "cacao":
+            return from_cacao(options.folder, _make_reported(options), options.response)
+        case "aot":
+            places = None if options.positions is None else _positions(options.positions)
+            return from_aot(options.file, _make_reported(options), options.loop, places)
+        case _:
+            return _arrays(options)
 
 
 def _arrays(options: argparse.Namespace) -> Imported:
@@ -76,13 +90,12 @@ def _by_role(role: str | None, path: Path, source: str) -> dict[str, Array]:
         return {role: _only(arrays, str(path))}
     if source == "pyrtc":
         return dict([calibration_of(arrays, str(path))])
-    found = by_role(arrays, str(path))
     if len(arrays) == 1:
-        # the array of a NumPy file has no name, so the file's own is taken
+        # The array of a NumPy file has no name, so the file's own is taken.
         named = _role_of(path)
         if named is not None:
             return {named: next(iter(arrays.values()))}
-    return found
+    return by_role(arrays, str(path))
 
 
 def _modes_of_name(path: Path, matrix: Array, inventory: list[str]) -> Array | None:
@@ -114,17 +127,6 @@ def _only(arrays: Mapping[str, Array], where: str) -> Array:
     if len(values) != 1:
         raise MatrixError(f"{where}: found {', '.join(arrays)}, expected one array")
     return values[0]
-
-
-def _cacao(options: argparse.Namespace) -> Imported:
-    return from_cacao(options.folder, _make_reported(options), options.response)
-
-
-def _aot(options: argparse.Namespace) -> Imported:
-    positions = None
-    if options.positions is not None:
-        positions = _positions(options.positions)
-    return from_aot(options.file, _make_reported(options), options.loop, positions)
 
 
 def _positions(path: Path) -> Array:
@@ -165,17 +167,6 @@ def _make_reported(options: argparse.Namespace) -> Reported:
 _ARRAY_FILES = (".npy", ".fits", ".fits.gz", ".fits.fz", ".npz", ".h5")
 """Suffixes of files that are read from a folder."""
 
-IMPORTERS: Mapping[str, Callable[[argparse.Namespace], Imported]] = {
-    "oopao": _oopao,
-    "specula": _specula,
-    "synim": _specula,
-    "cacao": _cacao,
-    "pyrtc": _arrays,
-    "aot": _aot,
-    "files": _arrays,
-}
-"""Importers by their name on the command line."""
-
 
 def main(options: argparse.Namespace) -> int:
     """Import, write both files, and print the notes.
@@ -185,7 +176,7 @@ def main(options: argparse.Namespace) -> int:
     PyrcalError
         If something that was given cannot be used.
     """
-    imported = IMPORTERS[options.source](options)
+    imported = import_files(options)
     saved = imported.save(options.output)
     for line in imported.inventory:
         print(line)

@@ -8,7 +8,7 @@ rotation. One with reflection is the same with ``parity = -1``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -115,6 +115,7 @@ def registrations_of(image: Any, subaperture_m: float, where: str) -> Registrati
             f"{where}: found the last row {each[0, 2].tolist()}, expected 0 0 1: transposed, or of "
             "row vectors?"
         )
+    # A mirror that is seen from behind stays so: one parity holds at all times.
     signs = np.sign(np.linalg.det(each[:, :2, :2]))
     if not (np.all(signs == 1.0) or np.all(signs == -1.0)):
         raise MatrixError(
@@ -131,30 +132,38 @@ def registrations_of(image: Any, subaperture_m: float, where: str) -> Registrati
 def _alpha(
     matrix: NDArray[np.float64], parity: int, subaperture_m: float, where: str
 ) -> Misregistration:
-    """Return the α of one matrix ``(3, 3)``: a symmetric stretch times a rotation."""
-    linear = matrix[:2, :2] * [1.0, parity]
-    turn = np.arctan2(linear[1, 0] - linear[0, 1], linear[0, 0] + linear[1, 1])
-    size = np.hypot(linear[1, 0] - linear[0, 1], linear[0, 0] + linear[1, 1]) / 2.0
-    stretch = linear @ rotation(-turn) / size
-    along, askew = (stretch[0, 0] - stretch[1, 1]) / 2.0, (stretch[0, 1] + stretch[1, 0]) / 2.0
-    if np.hypot(along, askew) > LARGEST_STRETCH:
+    """Return the α of one matrix ``(3, 3)``."""
+    # The reflection of y is in the parity of the mirror, not in α.
+    alpha = decompose(matrix[:2, :2] * [1.0, parity], matrix[:2, 2] / subaperture_m)
+    stretch = np.hypot(*alpha.stretches)
+    if stretch > LARGEST_STRETCH:
         raise MatrixError(
-            f"{where}: found an image stretched by {np.hypot(along, askew):.2f}, expected at most "
+            f"{where}: found an image stretched by {stretch:.2f}, expected at most "
             f"{LARGEST_STRETCH}"
         )
-    shift_x, shift_y = matrix[:2, 2] / subaperture_m
-    stretched = max(abs(along), abs(askew)) > NO_STRETCH
-    return Misregistration(
-        shift_x_subap=float(shift_x),
-        shift_y_subap=float(shift_y),
-        rotation_rad=float(turn),
-        magnification=float(size),
-        anamorphosis=(float(along), float(askew)) if stretched else None,
+    return alpha
+
+
+def decompose(linear: NDArray[np.float64], shift_subap: NDArray[np.float64]) -> Misregistration:
+    """Return the α of an image ``(2, 2)`` of the mirror: a symmetric stretch times a rotation."""
+    turn = float(np.arctan2(linear[1, 0] - linear[0, 1], np.trace(linear)))
+    stretch = linear @ rotation(-turn)
+    size = float(np.trace(stretch)) / 2.0
+    alpha = Misregistration(
+        shift_x_subap=float(shift_subap[0]),
+        shift_y_subap=float(shift_subap[1]),
+        rotation_rad=turn,
+        magnification=size,
+    ).with_anamorphosis(stretch[0] / size - [1.0, 0.0])
+    # A rounding error must not turn an unstretched image into one with an anamorphosis of its own.
+    return (
+        alpha if np.abs(alpha.stretches).max() > NO_STRETCH else replace(alpha, anamorphosis=None)
     )
 
 
 def _times(time: Any, n: int, where: str) -> Sequence[int | None]:  # noqa: ANN401 - aotpy's own
     """Return UTC nanoseconds; times written from nanoseconds are restored to the same double."""
+    # A Fraction, because seconds times 1e9 would be rounded to a multiple of 256 ns.
     stamps = [] if time is None else list(time.timestamps)
     if not stamps:
         return [None] * n

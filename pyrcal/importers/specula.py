@@ -53,22 +53,23 @@ def from_specula(paths: Sequence[Path], reported: Reported, source: str = "SPECU
                 places = read_subapertures(container)
                 kind = "shack-hartmann" if "np_sub" in container.facts else "pyramid"
                 continue
-            role, values, turned = _role_of(container)
+            role, values = _role_of(container, notes)
             if role in found:
                 raise MatrixError(f"{path}: found a second {role}, expected one")
             found[role] = values
-            notes += turned
             interleaved |= bool(container.facts.get("intrlvd", False))
     if places is None or "matrix" not in found:
         missing = "PupData or SubapData" if places is None else "Intmat"
         raise MatrixError(f"{source}: found no {missing}, expected one among the files")
-    matrix, turned = orient_matrix(
-        found["matrix"], 2 * len(places.rows), None, "Intmat", "(n_slopes, n_modes)"
+    # Older files are transposed: only the number of subapertures says which axis is which.
+    matrix = orient_matrix(
+        found["matrix"], 2 * len(places.rows), None, "Intmat", "(n_slopes, n_modes)", notes
     )
-    notes += turned
-    components = matrix.reshape(-1, 2, matrix.shape[1]) if interleaved else None
+    n_modes = matrix.shape[1]
     both = (
-        np.moveaxis(components, 1, 0) if components is not None else np.stack(np.split(matrix, 2))
+        np.moveaxis(matrix.reshape(-1, 2, n_modes), 1, 0)
+        if interleaved
+        else matrix.reshape(2, -1, n_modes)
     )
     found["matrix"] = both[:, places.by_rows].reshape(matrix.shape)
     found["valid"] = places.mask
@@ -77,7 +78,7 @@ def from_specula(paths: Sequence[Path], reported: Reported, source: str = "SPECU
             f"{source}: found the subapertures of a {kind}, expected those of a {reported.sensor}, "
             "as --sensor says"
         )
-    # SPECULA's pyramid counts x along the rows of its mask
+    # SPECULA's pyramid counts x along the rows of its mask.
     order = "yx" if kind == "pyramid" else "xy"
     if kind != "pyramid" and reported.unit is not None:
         notes.append(LENSLETS)
@@ -88,23 +89,24 @@ def from_specula(paths: Sequence[Path], reported: Reported, source: str = "SPECU
     return imported.with_notes(*notes)
 
 
-def _role_of(container: Container) -> tuple[str, Array, tuple[str, ...]]:
-    """Return the role of a file's array, its numbers, and notes."""
+def _role_of(container: Container, notes: list[str]) -> tuple[str, Array]:
+    """Return the role of a file's array, and its numbers."""
     matrix, functions = container.find("INTMAT"), container.find("INFLUENCE_FUNCTION")
     if matrix is not None:
-        return "matrix", matrix.numbers(), ()
+        return "matrix", matrix.numbers()
     if functions is not None:
-        return "modes", *_cube(container, functions.numbers())
+        return "modes", _cube(container, functions.numbers(), notes)
+    # An M2C has no name of its own in the file.
     arrays = [stored for stored in container.arrays.values() if len(stored.shape) == 2]
     if len(arrays) != 1:
         raise MatrixError(
             f"{container.path}: found {container.listing()}, expected SPECULA's Intmat, PupData, "
             "SubapData, IFunc or M2C"
         )
-    return "mode_to_actuator", arrays[0].numbers(), ()
+    return "mode_to_actuator", arrays[0].numbers()
 
 
-def _cube(container: Container, functions: Array) -> tuple[Array, tuple[str, ...]]:
+def _cube(container: Container, functions: Array, notes: list[str]) -> Array:
     """Return an ``IFunc`` as maps with NaN outside its mask: it holds only the points inside."""
     stored = container.find("MASK_INF_FUNC")
     if stored is None:
@@ -112,9 +114,8 @@ def _cube(container: Container, functions: Array) -> tuple[Array, tuple[str, ...
             f"{container.path}: found INFLUENCE_FUNCTION without MASK_INF_FUNC, expected both"
         )
     inside = stored.numbers() > 0.0
-    values, turned = orient_matrix(
-        functions, int(inside.sum()), None, "INFLUENCE_FUNCTION", "(n_points, n_functions)"
-    )
+    shape = "(n_points, n_functions)"
+    values = orient_matrix(functions, int(inside.sum()), None, "INFLUENCE_FUNCTION", shape, notes)
     cube = np.full((values.shape[1], *inside.shape), np.nan, dtype=np.float32)
     cube[:, inside] = values.T
-    return cube, turned
+    return cube

@@ -7,7 +7,7 @@ import json
 import textwrap
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -133,18 +133,15 @@ def _compute_matrix(instrument: Instrument, known: Implied) -> Implied:
     )
     matrix = model.interaction_matrix(instrument.start)
     seconds = time.perf_counter() - begun
-    # an underdetermined matrix has no condition that a reconstructor could use
-    inversion = None
-    if known.n_modes <= known.n_slopes:
-        inversion = invert(matrix, known.n_modes, max_condition=MAX_CONDITION)
-    return Implied(
-        n_valid=known.n_valid,
-        n_slopes=known.n_slopes,
-        n_modes=known.n_modes,
-        expected_gb=known.expected_gb,
+    # An underdetermined matrix has no condition that a reconstructor could use.
+    if known.n_modes > known.n_slopes:
+        return replace(known, seconds=seconds)
+    inversion = invert(matrix, known.n_modes, max_condition=MAX_CONDITION)
+    return replace(
+        known,
         seconds=seconds,
-        condition_number=None if inversion is None else inversion.condition_number,
-        n_weak=0 if inversion is None else inversion.n_truncated,
+        condition_number=inversion.condition_number,
+        n_weak=inversion.n_truncated,
     )
 
 
@@ -160,8 +157,8 @@ def describe_properties(instrument: Instrument, found: Implied) -> tuple[str, ..
         f"matrix      {megabytes:.2g} MB; a fit takes {found.expected_gb:.2g} GB at most",
     ]
     if found.seconds is None:
-        lines.append("condition   not computed: --memory-gb allows more")
-    elif found.condition_number is None:
+        return (*lines, "condition   not computed: --memory-gb allows more")
+    if found.condition_number is None:
         lines.append("condition   none: there are more modes than slopes, so not all can be seen")
     else:
         lines.append(
@@ -169,9 +166,7 @@ def describe_properties(instrument: Instrument, found: Implied) -> tuple[str, ..
             f"{found.n_weak} of them are too weak for a reconstructor of condition "
             f"{MAX_CONDITION:g}"
         )
-    if found.seconds is not None:
-        lines.append(f"time        {span(found.seconds)} for modes and matrix")
-    return tuple(lines)
+    return (*lines, f"time        {span(found.seconds)} for modes and matrix")
 
 
 _POINTS = 6

@@ -7,7 +7,6 @@ import inspect
 import textwrap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, is_dataclass
-from itertools import pairwise
 from typing import Any, get_args, get_type_hints
 
 from service.files.toml import Table
@@ -136,18 +135,13 @@ def described(kind: type) -> dict[str, str]:
     tree = ast.parse(textwrap.dedent(inspect.getsource(kind)))
     (body,) = (node.body for node in tree.body if isinstance(node, ast.ClassDef))
     texts: dict[str, str] = {}
-    for statement, after in pairwise([*body, ast.Pass()]):
-        match statement, after:
-            case (
-                ast.Assign(targets=[ast.Name(id=name)]) | ast.AnnAssign(target=ast.Name(id=name)),
-                ast.Expr(value=ast.Constant(value=str(text))),
-            ):
-                texts[name] = " ".join(text.split())
-            case (
-                ast.Assign(targets=[ast.Name(id=name)]) | ast.AnnAssign(target=ast.Name(id=name)),
-                _,
-            ):
+    name = ""
+    for statement in body:
+        match statement:
+            case ast.Assign(targets=[ast.Name(id=name)]) | ast.AnnAssign(target=ast.Name(id=name)):
                 texts[name] = ""
+            case ast.Expr(value=ast.Constant(value=str(text))) if name:
+                texts[name], name = " ".join(text.split()), ""
             case _:
-                pass
+                name = ""
     return texts

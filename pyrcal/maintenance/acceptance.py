@@ -6,7 +6,7 @@ docs/operate/commissioning.md explains the limits.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Final
@@ -134,63 +134,73 @@ class Commissioning:
 
 def judge(data: Commissioning) -> tuple[Criterion, ...]:
     """Return all criteria in the order of the report."""
-    parts = (
-        *(_judge_rtc, _judge_fit, _judge_tracking),
-        *(_judge_matrices, _judge_alarms, _judge_wavefront),
+    parts = {
+        "RTC": _judge_rtc,
+        "Fit": _judge_fit,
+        "Tracking": _judge_tracking,
+        "Matrices": _judge_matrices,
+        "Alarms": _judge_alarms,
+        "Wavefront": _judge_wavefront,
+    }
+    outcomes = {True: Outcome.PASS, False: Outcome.FAIL, None: Outcome.MISSING}
+    return tuple(
+        Criterion(
+            group=group,
+            name=name,
+            outcome=outcomes[passed],
+            found=found,
+            limit=limit,
+            remedy=remedy,
+        )
+        for group, part in parts.items()
+        for name, passed, found, limit, remedy in part(data)
     )
-    return tuple(one for part in parts for one in part(data))
 
 
-def _line(
-    group: str, name: str, passed: bool | None, found: str, limit: str, remedy: str
-) -> Criterion:
-    """Return a criterion; ``passed`` is None if there is nothing to judge."""
-    outcome = {True: Outcome.PASS, False: Outcome.FAIL, None: Outcome.MISSING}[passed]
-    return Criterion(
-        group=group, name=name, outcome=outcome, found=found, limit=limit, remedy=remedy
-    )
+_Lines = Iterator[tuple[str, bool | None, str, str, str]]
+"""Name of each criterion, whether it is passed (None if there is nothing to judge), what was found,
+limit, and advice."""
 
 
-def _judge_rtc(data: Commissioning) -> Iterator[Criterion]:
+def _count(names: Collection[str]) -> str:
+    """Return how many there are, and which."""
+    # Each name once: an alarm may have begun and ended many times.
+    return f"{len(names)}: {', '.join(dict.fromkeys(names))}" if names else "0"
+
+
+def _judge_rtc(data: Commissioning) -> _Lines:
+    wrong_name, passed_name = "checks that found a violation", "required checks passed"
+    n_required = f"{len(REQUIRED_CHECKS)}"
     remedy = "correct the RTC: pyrcal check-rtc names the requirements of each check"
     if data.checks is None:
-        text = "no result was given"
-        yield _line("RTC", "checks that found a violation", None, text, "0", remedy)
-        yield _line("RTC", "required checks passed", None, text, f"{len(REQUIRED_CHECKS)}", remedy)
+        yield wrong_name, None, "no result was given", "0", remedy
+        yield passed_name, None, "no result was given", n_required, remedy
         return
     outcomes = {one["check"]: one["outcome"] for one in data.checks}
     wrong = [name for name, outcome in outcomes.items() if outcome == "wrong"]
-    yield _line(
-        "RTC",
-        "checks that found a violation",
-        not wrong,
-        f"{len(wrong)}{': ' if wrong else ''}{', '.join(wrong)}",
-        "0",
-        remedy,
-    )
+    yield wrong_name, not wrong, _count(wrong), "0", remedy
+    # "seen" is unusual, but the contract allows it.
     open_ones = [name for name in REQUIRED_CHECKS if outcomes.get(name) not in {"ok", "seen"}]
-    yield _line(
-        "RTC",
-        "required checks passed",
+    n_passed = f"{len(REQUIRED_CHECKS) - len(open_ones)} of {n_required}"
+    yield (
+        passed_name,
         not open_ones,
-        f"{len(REQUIRED_CHECKS) - len(open_ones)} of {len(REQUIRED_CHECKS)}"
-        + (f"; not: {', '.join(open_ones)}" if open_ones else ""),
-        f"{len(REQUIRED_CHECKS)}",
+        f"{n_passed}; not: {', '.join(open_ones)}" if open_ones else n_passed,
+        n_required,
         "run pyrcal check-rtc --yes --open-loop --json in closed loop",
     )
 
 
-def _judge_fit(data: Commissioning) -> Iterator[Criterion]:
+def _judge_fit(data: Commissioning) -> _Lines:
     names = ("registration determined", "σ of the registration", "stable modes")
     limits = ("yes", _sigma_text(_stale_sigma(data)), f"{_n_wanted(data)} modes")
     if data.fit is None or data.fit["registration"] is None:
         reason = "no fit was given" if data.fit is None else "the fit has no registration"
         for name, limit in zip(names, limits, strict=True):
-            yield _line("Fit", name, None, reason, limit, "measure and fit a matrix")
+            yield name, None, reason, limit, "measure and fit a matrix"
         return
     registration, control = data.fit["registration"], data.fit["reconstructor"]
-    yield _line(
-        "Fit",
+    yield (
         names[0],
         bool(registration["determined"]),
         str(data.fit["verdict"]),
@@ -198,8 +208,7 @@ def _judge_fit(data: Commissioning) -> Iterator[Criterion]:
         "follow the fit's recommendation: instrument file, order of slopes, more averages",
     )
     sigma = np.array([data.fit["sigma"][name] for name in PARAMETERS]) / BOUNDARY_SCALE
-    yield _line(
-        "Fit",
+    yield (
         names[1],
         bool((sigma <= _stale_sigma(data)).all()),
         _sigma_text(sigma),
@@ -207,11 +216,11 @@ def _judge_fit(data: Commissioning) -> Iterator[Criterion]:
         "more averages or more modes",
     )
     if control is None:
-        yield _line("Fit", names[2], None, "the fit has no closed loop", limits[2], "give --gain")
+        yield names[2], None, "the fit has no closed loop", limits[2], "give --gain"
         return
+    # A matrix may have been measured for fewer modes than the service is to control.
     wanted = min(_n_wanted(data), int(control["n_modes"]))
-    yield _line(
-        "Fit",
+    yield (
         names[2],
         int(control["stable_modes"]) >= wanted,
         f"{control['stable_modes']} of {control['n_modes']} at gain {control['gain']:g}",
@@ -236,10 +245,10 @@ def _sigma_text(sigma: NDArray[np.float64]) -> str:
     return f"{shifts} subap, {rotation:.3g} deg, {100 * magnification:.2g} %"
 
 
-def _judge_tracking(data: Commissioning) -> Iterator[Criterion]:
+def _judge_tracking(data: Commissioning) -> _Lines:
+    # Estimates from ordinary telemetry have a bias that a dither does not have: not judged here.
     windows = [one for one in data.estimates if one.entered and one.source is not Source.PASSIVE]
-    yield _line(
-        "Tracking",
+    yield (
         "dithered windows in α",
         len(windows) >= MIN_WINDOWS,
         f"{len(windows)}",
@@ -253,8 +262,7 @@ def _judge_tracking(data: Commissioning) -> Iterator[Criterion]:
     )
     enough = len(windows) >= MIN_WINDOWS
     median = np.median([one.filtered_sigma for one in windows], axis=0) if windows else target
-    yield _line(
-        "Tracking",
+    yield (
         "median σ of α after a window",
         bool((median <= target).all()) if enough else None,
         _sigma_text(median) if enough else "too few windows",
@@ -262,20 +270,19 @@ def _judge_tracking(data: Commissioning) -> Iterator[Criterion]:
         "a brighter star, or a larger [dither] budget_m",
     )
     inside = float(np.mean([one.innovation <= ELLIPSE_95 for one in windows])) if windows else 0.0
-    yield _line(
-        "Tracking",
+    yield (
         "windows inside their 95 % ellipse",
         inside >= MIN_COVERAGE if enough else None,
         f"{100 * inside:.0f} % of {len(windows)}" if enough else "too few windows",
         f"at least {100 * MIN_COVERAGE:.0f} %",
         "σ is too small, or the mirror moves: set [tracking] drift_*, look for vibrations",
     )
+    # Samples before α was first known say nothing on whether the dither keeps it fresh.
     known = [one.sigma for one in data.samples if one.sigma is not None]
     stale = np.hypot(_stale_sigma(data), policy.image_floor)
     fresh = [bool((sigma <= stale).all()) for sigma in known]
     share = float(np.mean(fresh)) if fresh else 0.0
-    yield _line(
-        "Tracking",
+    yield (
         "time with a usable α, since it was known",
         share >= MIN_FRESH_SHARE if fresh else None,
         f"{100 * share:.0f} % of {len(fresh)} samples" if fresh else "no sample has α",
@@ -284,10 +291,9 @@ def _judge_tracking(data: Commissioning) -> Iterator[Criterion]:
     )
 
 
-def _judge_matrices(data: Commissioning) -> Iterator[Criterion]:
+def _judge_matrices(data: Commissioning) -> _Lines:
     n_applied = len(data.swaps_ns)
-    yield _line(
-        "Matrices",
+    yield (
         "applied by the RTC",
         n_applied >= 1,
         f"{n_applied}",
@@ -297,29 +303,27 @@ def _judge_matrices(data: Commissioning) -> Iterator[Criterion]:
     bad = [
         one.id for one in data.matrices if one.state in {MatrixState.REJECTED, MatrixState.FAILED}
     ]
-    yield _line(
-        "Matrices",
+    yield (
         "rejected or failed",
         not bad,
-        f"{len(bad)}{': ' if bad else ''}{', '.join(bad)}",
+        _count(bad),
         "0",
         "see the reason of each (pyrcal archive show ID) and the RTC's log",
     )
     verdicts = [state for _, state, _ in data.probations]
     n_passed = verdicts.count("passed")
     n_back = sum(state in _WORSE for state in verdicts)
-    yield _line(
-        "Matrices",
+    yield (
         "probations passed; taken back or worse",
         n_passed >= 1 and not n_back if verdicts else None,
         f"{n_passed} passed, {n_back} worse" if verdicts else "no probation ended",
         "at least 1 passed, 0 worse",
         "find out why: α, the gains, the RTC's own matrix (alarm probation)",
     )
+    # The last one: margins of matrices that were replaced do not matter any more.
     margins = [one.margin for one in data.samples if one.margin is not None]
     worst = margins[-1] if margins else None
-    yield _line(
-        "Matrices",
+    yield (
         "largest pole radius over its bound, at the end",
         None if worst is None else worst <= 1.0,
         "not judged" if worst is None else f"{worst:.3f}",
@@ -332,14 +336,14 @@ _WORSE: Final = frozenset({"rolling-back", "watched", "rolled-back", "kept", "op
 """States of a probation whose matrix made the loop worse."""
 
 
-def _judge_alarms(data: Commissioning) -> Iterator[Criterion]:
+def _judge_alarms(data: Commissioning) -> _Lines:
+    # At least a second, so that an archive of a moment is judged and not divided by zero.
     span_s = max((data.last_ns - data.first_ns) * 1e-9, 1.0)
     critical = [name for name, *_ in data.alarms if _severity(name) is Severity.CRITICAL]
-    yield _line(
-        "Alarms",
+    yield (
         "critical",
         not critical,
-        f"{len(critical)}{': ' if critical else ''}{', '.join(dict.fromkeys(critical))}",
+        _count(critical),
         "0",
         "the runbook; cut a deliberate test off with --since and --until",
     )
@@ -349,8 +353,7 @@ def _judge_alarms(data: Commissioning) -> Iterator[Criterion]:
         if _severity(name) is Severity.SERIOUS
     ]
     share = min(1.0, _union_ns(serious) * 1e-9 / span_s)
-    yield _line(
-        "Alarms",
+    yield (
         "time with a serious alarm",
         share <= MAX_SERIOUS_SHARE,
         f"{100 * share:.1f} %, {len(serious)} alarms",
@@ -368,6 +371,7 @@ def _alarm_intervals(marks: Iterable[Mark], last_ns: int) -> Iterator[tuple[str,
     begun: dict[str, int] = {}
     for mark in marks:
         if mark.kind is MarkKind.ALARM:
+            # The first line counts: an alarm that lasts may be reported again.
             begun.setdefault(mark.name, mark.t_ns_utc)
         elif mark.kind is MarkKind.OVER and mark.name in begun:
             yield mark.name, begun.pop(mark.name), mark.t_ns_utc
@@ -380,6 +384,7 @@ def _alarm_intervals(marks: Iterable[Mark], last_ns: int) -> Iterator[tuple[str,
 
 def _union_ns(intervals: Sequence[tuple[int, int]]) -> int:
     """Return the time that is covered by at least one of the intervals."""
+    # Alarms overlap: two at the same time are not twice the time.
     total, until = 0, 0
     for begin_ns, end_ns in sorted(intervals):
         total += max(0, end_ns - max(begin_ns, until))
@@ -387,12 +392,12 @@ def _union_ns(intervals: Sequence[tuple[int, int]]) -> int:
     return total
 
 
-def _judge_wavefront(data: Commissioning) -> Iterator[Criterion]:
+def _judge_wavefront(data: Commissioning) -> _Lines:
     before, after = compare_residuals(data)
     enough = min(len(before), len(after)) >= MIN_SAMPLES
+    # Medians, because a few bad seconds of seeing must not decide.
     ratio = float(np.median(after) / np.median(before)) if enough else 0.0
-    yield _line(
-        "Wavefront",
+    yield (
         "residual per controlled mode, after the swaps over before",
         ratio <= MAX_RESIDUAL_RATIO if enough else None,
         f"{ratio:.2f} ({1e9 * np.median(before):.2f} to {1e9 * np.median(after):.2f} nm RMS)"
@@ -407,6 +412,7 @@ def compare_residuals(data: Commissioning) -> tuple[list[float], list[float]]:
     """Return residuals per mode before the first and after the last swap, metres RMS."""
     if not data.swaps_ns:
         return [], []
+    # Close to the swaps only, because seeing and star change during a night.
     reach_ns = round(COMPARED_S * 1e9)
     first_ns, last_ns = data.swaps_ns[0], data.swaps_ns[-1]
     per_mode = residuals_per_mode(data)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.importers.aot import import_aotpy
 from pyrcal.importers.registration import Dated
 from service.errors import ConfigurationError, WireError
 from service.files.recording import RecordedKind, Recording
@@ -43,6 +44,11 @@ class Excerpt:
 
     n_damaged: int = 0
     """Number of messages that break the contract and are left out."""
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames."""
+        return sum(batch.header.n for batch in self.batches)
 
     @property
     def first_ns_utc(self) -> int:
@@ -78,6 +84,7 @@ def excerpt(path: Path, first_s: float, seconds: float) -> Excerpt:
         for message in recording.messages():
             if message.time_s > first_s + seconds:
                 break
+            # Status and matrices from before the excerpt are kept: they hold during it.
             try:
                 if message.kind is RecordedKind.STATUS:
                     found.status = decode(Status, message.payload)
@@ -93,6 +100,7 @@ def excerpt(path: Path, first_s: float, seconds: float) -> Excerpt:
         raise ConfigurationError(
             f"{path}: found no frames from {first_s:g} s on for {seconds:g} s, expected some"
         )
+    # Another session counts its frames from 0 again: one loop of the standard cannot hold both.
     session = found.batches[0].header.session
     found.batches = [batch for batch in found.batches if batch.header.session == session]
     return found
@@ -126,12 +134,7 @@ def write_aot(
     ModelError
         If the telemetry is not of this instrument.
     """
-    try:
-        import aotpy
-    except ImportError as error:
-        raise ConfigurationError(
-            "AOT files need aotpy, which is not installed: pip install 'pyrcal[aot]'"
-        ) from error
+    aotpy = import_aotpy()
     if path.exists():
         raise ConfigurationError(f"{path}: exists already; expected a new file")
     system = _system(aotpy, instrument, tuple(estimates))
@@ -139,7 +142,7 @@ def write_aot(
         _add_telemetry(aotpy, system, instrument, taken)
     try:
         with warnings.catch_warnings():
-            # missing fields stay empty: without telemetry there is no loop to describe
+            # Missing fields stay empty: without telemetry there is no loop to describe
             warnings.filterwarnings("ignore", message=".*contains no data")
             system.write_to_file(path, "fits")
     except OSError as error:
@@ -154,6 +157,7 @@ def _system(aotpy: Any, instrument: Instrument, estimates: tuple[Dated, ...]) ->
     )
     source = aotpy.NaturalGuideStar(uid="source")
     valid = valid_subapertures(instrument)
+    # The standard's mask lists each subaperture's place among the slopes, -1 where there is none.
     places = np.full(valid.shape, -1, dtype=np.int32)
     places[valid] = np.arange(valid.sum())
     aot_class, own = kind_of(instrument).aot(instrument.slopes)
@@ -172,6 +176,7 @@ def _system(aotpy: Any, instrument: Instrument, estimates: tuple[Dated, ...]) ->
         transformation_matrix=_over_time(aotpy, instrument, estimates),
     )
     if isinstance(instrument.mirror, Mirror):
+        # α acts on positions as they are drawn, with the mirror seen from its front.
         drawn = instrument.mirror.positions_m * [1.0, instrument.mirror.y_sign]
         corrector.n_valid_actuators = len(drawn)
         corrector.actuator_coordinates = [aotpy.Coordinates(x, y) for x, y in drawn.tolist()]
@@ -197,10 +202,9 @@ def _over_time(aotpy: Any, instrument: Instrument, estimates: tuple[Dated, ...])
 
 def affine(alpha: Misregistration, subaperture_m: float) -> NDArray[np.float64]:
     """Return ``(3, 3)``, from ``(x, y, 1)`` on the mirror to the sensor, metres in the pupil."""
-    shift_m = np.array([alpha.shift_x_subap, alpha.shift_y_subap]) * subaperture_m
     matrix = np.eye(3)
     matrix[:2, :2] = alpha.image
-    matrix[:2, 2] = shift_m
+    matrix[:2, 2] = alpha.vector[:2] * subaperture_m
     return matrix
 
 
@@ -219,6 +223,7 @@ def _add_telemetry(aotpy: Any, system: Any, instrument: Instrument, taken: Excer
         for t in (t_ns[0], t_ns[-1])
     )
     status = taken.status
+    # A loop has one reconstructor in the standard: frames of another one are another loop.
     for cm_id in dict.fromkeys(ids.tolist()):
         those, matrix = ids == cm_id, taken.matrices.get(cm_id)
         time = _time(aotpy, f"frames of {cm_id}", t_ns[those], seqs[those])

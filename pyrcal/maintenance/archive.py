@@ -36,13 +36,12 @@ def main(options: argparse.Namespace) -> int:
     ArchiveError, ConfigurationError, UnknownIdError
         If it cannot be done.
     """
-    given = {} if options.data_dir is None else {"service.data_dir": options.data_dir}
-    settings = load_settings(options.config, os.environ, given)
+    settings = read_settings(options)
     if options.action == "aot":
         return _aot(options, settings)
     if options.action == "prune":
         return _prune(settings, dry_run=options.dry_run, as_json=options.json)
-    with _open_archive(settings) as archive:
+    with open_archive(settings) as archive:
         every = items(archive, _list_saved_matrices(archive))
         if options.action == "list":
             return _list(every, as_json=options.json)
@@ -51,10 +50,17 @@ def main(options: argparse.Namespace) -> int:
         return _verify(archive, every, as_json=options.json)
 
 
+def read_settings(options: argparse.Namespace) -> Settings:
+    """Return the settings of the service whose files the archive options name."""
+    given = {} if options.data_dir is None else {"service.data_dir": options.data_dir}
+    return load_settings(options.config, os.environ, given)
+
+
 @contextmanager
-def _open_archive(settings: Settings) -> Iterator[Archive]:
+def open_archive(settings: Settings) -> Iterator[Archive]:
     """Open the archive to read, whether a service runs or not."""
-    with Archive(settings.service.data_dir) as archive:
+    # With the site's noon, because it decides which night a measurement belongs to.
+    with Archive(settings.service.data_dir, settings.archive.noon_utc_h) as archive:
         archive.look()
         yield archive
 
@@ -108,6 +114,7 @@ def _show(archive: Archive, every: tuple[Item, ...], product_id: str, *, as_json
 
 def _verify(archive: Archive, every: tuple[Item, ...], *, as_json: bool) -> int:
     wrong = []
+    # One at a time with progress: reading every matrix of a full archive takes minutes.
     for k, damage in enumerate(verify(archive, every), start=1):
         show_progress(f"{k} of {len(every)}")
         if damage is not None:
@@ -137,16 +144,17 @@ def _prune(settings: Settings, *, dry_run: bool, as_json: bool) -> int:
 
     A running service does this itself and holds the lock.
     """
-    retention, archive = retention_policy(settings), Archive(settings.service.data_dir)
-    with archive:
-        archive.look()  # reject a folder without an archive before anything is written
-        # Opening takes the lock: a dry run must work while a service runs.
+    retention = retention_policy(settings)
+    # Opened to read first, which rejects a folder without an archive before anything is written.
+    with open_archive(settings) as archive:
+        # Opening to write takes the lock: a dry run must work while a service runs.
         if not dry_run:
             archive.close()
             archive.open()
         going = tuple(due(items(archive, _list_saved_matrices(archive)), retention, time.time_ns()))
         gone = []
         for item, why in going:
+            # None if somebody has pinned it since the list was made: it stays.
             entry = None if dry_run else remove(archive, item, why)
             if entry is not None:
                 archive.record((), (replace(entry, who="pyrcal archive prune"),))
@@ -163,6 +171,7 @@ def _prune(settings: Settings, *, dry_run: bool, as_json: bool) -> int:
 
 def _aot(options: argparse.Namespace, settings: Settings) -> int:
     """Write the measurements of a night, or those around a recording, as AOT FITS."""
+    # Imported here, because the other commands of the archive must not wait for it.
     from pyrcal.importers.registration import Dated
     from pyrcal.maintenance.aot import excerpt, write_aot
     from service.instrument import load_instrument
@@ -174,7 +183,7 @@ def _aot(options: argparse.Namespace, settings: Settings) -> int:
     if options.recording is not None:
         taken = excerpt(options.recording, options.skip, options.seconds)
         span = (taken.first_ns_utc - ALPHA_MARGIN_NS, taken.last_ns_utc + ALPHA_MARGIN_NS)
-    with _open_archive(settings) as archive:
+    with open_archive(settings) as archive:
         if options.night is not None:
             nights = archive.nights.between(*span)
             night = next((night for night in nights if night.date == options.night), None)
@@ -184,12 +193,9 @@ def _aot(options: argparse.Namespace, settings: Settings) -> int:
         entries = archive.nights.estimates(*span, MAX_DOWNSAMPLED)
     estimates = [Dated(t_ns_utc=e.t_ns_utc, alpha=e.filtered) for e in entries if e.entered]
     write_aot(options.output, instrument, estimates, taken)
-    n_frames = 0 if taken is None else sum(batch.header.n for batch in taken.batches)
-    n_damaged = 0 if taken is None else taken.n_damaged
-    say(
-        f"{options.output}: {len(estimates)} estimates of α, {n_frames} frames"
-        + (f"; {n_damaged} damaged messages left out" if n_damaged else "")
-    )
+    n_frames, n_damaged = (0, 0) if taken is None else (taken.n_frames, taken.n_damaged)
+    damaged = f"; {n_damaged} damaged messages left out" if n_damaged else ""
+    say(f"{options.output}: {len(estimates)} estimates of α, {n_frames} frames{damaged}")
     return DONE
 
 

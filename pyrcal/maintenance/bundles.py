@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.maintenance.archive import open_archive, read_settings
 from service.archive import Archive
 from service.archive.serialisation import NOT_UNDERSTOOD, from_json, to_json
-from service.config import Settings, load_settings
+from service.config import Settings
 from service.errors import ArchiveError, ConfigurationError, UnknownIdError, say, shown
 from service.files.bundle import RECONSTRUCTOR, Bundle, read_bundle, write_bundle
 from service.files.container import NUMPY_DAMAGE
@@ -42,8 +42,7 @@ def main(options: argparse.Namespace) -> int:
         found = _summary(options.bundle, read_bundle(options.bundle), as_json=options.json)
         print(shown(found, keep="\n"))
         return 0
-    given = {} if options.data_dir is None else {"service.data_dir": options.data_dir}
-    settings = load_settings(options.config, os.environ, given)
+    settings = read_settings(options)
     instrument = load_instrument(options.instrument or settings.service.instrument)
     bundle = _bundle_of(options, settings, instrument)
     write_bundle(options.output, bundle)
@@ -55,10 +54,10 @@ def _bundle_of(options: argparse.Namespace, settings: Settings, instrument: Inst
     archived = Path(options.source)
     if archived.suffix == ".h5" and archived.is_file():
         return _read_product(options, instrument, archived, _record_in(archived))
-    with Archive(settings.service.data_dir) as archive:
-        archive.look()
+    with open_archive(settings) as archive:
         record = _record(archive, options.source)
-        archive.reconstructors.matrix(record.id)  # refuses one that is damaged
+        # Reading it refuses one that is damaged.
+        archive.reconstructors.matrix(record.id)
         path = archive.reconstructors.path_of(record.id)
         return _read_product(options, instrument, path, record)
 
@@ -74,6 +73,7 @@ def _read_product(
             key: value.item() if isinstance(value, np.generic) else value
             for key, value in file["provenance"].attrs.items()
         }
+    # The basis in the bundle is made from this instrument file, so it must be the right one.
     made_for = provenance.get("instrument")
     if made_for not in {None, instrument.name}:
         raise ConfigurationError(
@@ -120,6 +120,7 @@ _COMPANION_ARRAYS = {
 
 def _record(archive: Archive, name: str) -> ReconstructorRecord:
     records = archive.reconstructors.records()
+    # Records are in the order in which they were made: the newest one of a name counts.
     matching = (
         [one for one in records if one.state is MatrixState.APPLIED]
         if name == IN_USE
@@ -136,6 +137,7 @@ def _interaction_matrix(
     instrument: Instrument,
     basis: Any,  # noqa: ANN401 - any basis
 ) -> NDArray[np.float32]:
+    # A matrix that was read from the RTC at its start has no known registration.
     if record.alpha is None:
         raise ArchiveError(f"{record.id}: is the RTC's own; its registration is unknown")
     model = RtcInteractionModel(instrument, basis)

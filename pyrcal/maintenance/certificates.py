@@ -69,6 +69,7 @@ def _make(folder: Path, hosts: tuple[str, ...], port: int, days: float) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         authority = _authority(folder)
+        # A key in the folder is kept, as the authority is: programs that run use both.
         if not (folder / SECRET).exists():
             _write_secret(folder / SECRET, secrets.token_hex(32).encode() + b"\n")
         for role in LinkRole:
@@ -108,6 +109,7 @@ def _make_certificate(
     """Return a certificate of a role; only the service's accepts connections."""
     key = ec.generate_private_key(ec.SECP256R1())
     serves = role is LinkRole.SERVICE
+    # Every role presents its certificate to the router, which the service is.
     usages = [Usage.CLIENT_AUTH, *([Usage.SERVER_AUTH] if serves else [])]
     builder = (
         _builder(str(role), authority.certificate.subject, key, days)
@@ -154,6 +156,7 @@ def _write(folder: Path, stem: str, signed: Signed) -> None:
 
 def _write_secret(path: Path, data: bytes) -> None:
     """Write a file that other users can never read, not even while it is being written."""
+    # Made anew, because a mode applies to new files only.
     path.unlink(missing_ok=True)
     path.touch(mode=0o600)
     path.write_bytes(data)
@@ -164,9 +167,12 @@ def _write_settings(folder: Path, role: LinkRole, host: str, port: int) -> None:
     own, key = folder / f"{role}.pem", folder / f"{role}-key.pem"
     ca, endpoint = folder / "ca.pem", f"tls/{host}:{port}"
     others = [str(folder / f"{other}.pem") for other in LinkRole if other is not role]
+    # The service warns before the certificates of the others end, too.
     watched = f"watched = {json.dumps(others)}\n" if role is LinkRole.SERVICE else ""
+    # A comment, because with it neither side accepts the other's messages until both have the key.
     signing = f"\n# [zenoh.signing]\n# key_file = {json.dumps(str(folder / SECRET))}\n"
     if role is LinkRole.VIEWER:
+        # A viewer must not be able to sign commands.
         signing = ""
     how = "listen" if role is LinkRole.SERVICE else "connect"
     (folder / f"{role}.toml").write_text(
@@ -175,6 +181,7 @@ def _write_settings(folder: Path, role: LinkRole, host: str, port: int) -> None:
         f"key = {json.dumps(str(key))}\n{watched}{signing}",
         encoding="utf-8",
     )
+    # The service is the router: no other program takes its place.
     if role is LinkRole.SERVICE:
         return
     tls = {"root_ca_certificate": str(ca), "enable_mtls": True, "verify_name_on_connect": True}

@@ -8,18 +8,17 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
 from pyrcal.maintenance.acceptance import Commissioning, Outcome, judge
+from pyrcal.maintenance.archive import open_archive, read_settings
 from pyrcal.maintenance.commission_page import write_page
 from service.archive import Archive
 from service.archive.index import Range
 from service.archive.nights import FOREVER_NS, MAX_DOWNSAMPLED
-from service.config import load_settings
 from service.errors import ConfigurationError, UnknownIdError, say
 from service.files.documents import json_text
 from service.files.whole import open_hdf5
@@ -58,17 +57,16 @@ def main(options: argparse.Namespace) -> int:
 
 def read_commissioning(options: argparse.Namespace) -> Commissioning:
     """Read the archive and the results that the options name."""
-    given = {} if options.data_dir is None else {"service.data_dir": options.data_dir}
-    settings = load_settings(options.config, os.environ, given)
+    settings = read_settings(options)
     instrument = load_instrument(options.instrument or settings.service.instrument)
-    folder = Path(settings.service.data_dir)
-    with Archive(folder, settings.archive.noon_utc_h) as archive:
-        archive.look()
+    with open_archive(settings) as archive:
         _check_instrument(archive, instrument.name)
         first_ns, last_ns = _choose_time(archive, options)
         estimates = archive.nights.estimates(first_ns, last_ns, MAX_DOWNSAMPLED)
         samples = archive.nights.samples(first_ns, last_ns, MAX_SAMPLES)
         marks = archive.nights.marks(first_ns, last_ns, MAX_DOWNSAMPLED)
+        # What was recorded, and not the night, is the judged time: a share of it must not count
+        # hours in which no service ran.
         times_ns = [one.t_ns_utc for each in (estimates, samples, marks) for one in each]
         if not estimates:
             raise UnknownIdError("nothing was measured between --since and --until")
@@ -86,6 +84,7 @@ def read_commissioning(options: argparse.Namespace) -> Commissioning:
             matrices=tuple(
                 one
                 for one in archive.reconstructors.records()
+                # The matrix in use may be of an earlier night.
                 if first_ns <= one.created_ns_utc <= last_ns or one.state is MatrixState.APPLIED
             ),
             probations=tuple(
@@ -96,7 +95,7 @@ def read_commissioning(options: argparse.Namespace) -> Commissioning:
             checks=None if options.check_rtc is None else _read_checks(options.check_rtc),
             fit=None if options.fit is None else _read_fit(options.fit),
             origins={
-                "archive": str(folder),
+                "archive": str(archive.directory),
                 "check-rtc": str(options.check_rtc or "not given"),
                 "fit": str(options.fit or "not given"),
             },
@@ -123,6 +122,7 @@ def _choose_time(archive: Archive, options: argparse.Namespace) -> tuple[int, in
     nights = archive.nights.between(0, FOREVER_NS)
     if options.night is not None:
         nights = tuple(night for night in nights if night.date == options.night)
+    # A night with events alone, as of a service that only waited, cannot be judged.
     nights = tuple(night for night in nights if night.n_estimates)
     if not nights:
         which = options.night or "no night"

@@ -121,7 +121,7 @@ def _criteria_table(criteria: Sequence[Criterion]) -> str:
             one.name,
             one.found,
             one.limit,
-            _Html(f'<span class="{one.outcome}">{one.outcome}</span>'),
+            _mark(one.outcome, one.outcome),
             "" if one.outcome is Outcome.PASS else one.remedy,
         )
         for one in criteria
@@ -133,10 +133,8 @@ def _instrument_rows(data: Commissioning) -> Iterable[tuple[str, str]]:
     instrument = data.instrument
     yield "Instrument", instrument.name
     yield "Telescope", f"{instrument.diameter_m:g} m, obscuration {instrument.obscuration_ratio:g}"
-    yield (
-        "Sensor",
-        f"{instrument.wfs.kind}, {instrument.wfs.n_subapertures} subapertures across",
-    )
+    sensor = instrument.wfs
+    yield "Sensor", f"{sensor.kind}, {sensor.n_subapertures} subapertures across"
     yield "Modes wanted", f"{data.settings.control.n_modes_target}"
     yield "Mode of the service at the start", data.settings.service.mode
     for what, where in data.origins.items():
@@ -151,10 +149,7 @@ def _checks(data: Commissioning) -> str:
         (
             str(one["check"]),
             ", ".join(map(str, one.get("requirements", ()))),
-            _Html(
-                f'<span class="{classes.get(one["outcome"], "note")}">'
-                f"{escape(str(one['outcome']))}</span>"
-            ),
+            _mark(str(one["outcome"]), classes.get(one["outcome"], "note")),
             str(one["found"]),
         )
         for one in data.checks
@@ -206,16 +201,14 @@ def _matrices(data: Commissioning) -> str:
 def _alarms(data: Commissioning) -> str:
     if not data.alarms:
         return "<p>None.</p>"
-    rows = (
-        (
-            name,
-            str(ALARMS[name].severity) if name in ALARMS else "a rule of the settings",
-            _time(begin_ns),
-            f"{(end_ns - begin_ns) * 1e-9:.0f} s",
-            "" if name not in ALARMS else ALARMS[name].means,
+    rows = []
+    for name, begin_ns, end_ns in data.alarms:
+        # An alarm that is not in the table is a rule of the observatory's own settings.
+        known = ALARMS.get(name)
+        severity, means = (
+            ("a rule of the settings", "") if known is None else (known.severity, known.means)
         )
-        for name, begin_ns, end_ns in data.alarms
-    )
+        rows.append((name, severity, _time(begin_ns), f"{(end_ns - begin_ns) * 1e-9:.0f} s", means))
     return _figure(_draw_alarms(data), "Alarms over time, by severity.") + _table(
         ("Alarm", "Severity", "Began (UTC)", "Lasted", "Meaning"), rows
     )
@@ -252,15 +245,9 @@ def _draw_alpha(data: Commissioning) -> Figure:
         ):
             mine = [one for one in data.estimates if one.source is source]
             if mine:
-                axis.plot(
-                    _minutes(data, [one.t_ns_utc for one in mine]),
-                    [one.measured.vector[k] * BOUNDARY_SCALE[k] for one in mine],
-                    ls="",
-                    marker="+",
-                    ms=6,
-                    color=colour,
-                    label=name,
-                )
+                times = _minutes(data, [one.t_ns_utc for one in mine])
+                values = [one.measured.vector[k] * BOUNDARY_SCALE[k] for one in mine]
+                axis.plot(times, values, "+", ms=6, color=colour, label=name)
         if data.fit is not None:
             axis.axhline(data.fit[PARAMETERS[k]], color=_GREEN, lw=1.0, ls=":", label="fit")
         axis.set_ylabel(label)
@@ -271,42 +258,32 @@ def _draw_alpha(data: Commissioning) -> Figure:
 
 def _draw_wavefront(data: Commissioning) -> Figure:
     figure, (residual, margin) = _draw(2, 4.6)
-    per_mode = residuals_per_mode(data)
-    residual.plot(
-        _minutes(data, [t_ns for t_ns, _ in per_mode]),
-        [1e9 * value_m for _, value_m in per_mode],
-        color=_BLUE,
-        marker=".",
-        lw=1.4,
-    )
+    judged = [(one.t_ns_utc, one.margin) for one in data.samples if one.margin is not None]
+    residuals_nm = [(t_ns, 1e9 * value_m) for t_ns, value_m in residuals_per_mode(data)]
+    for axis, points in ((residual, residuals_nm), (margin, judged)):
+        _mark_swaps(axis, data)
+        times = _minutes(data, [t_ns for t_ns, _ in points])
+        axis.plot(times, [value for _, value in points], color=_BLUE, marker=".", lw=1.4)
+    # The two medians that the criterion compares, over the time between which it looks for them.
     before, after = compare_residuals(data)
     limits = [data.swaps_ns[0], data.swaps_ns[-1]] if data.swaps_ns else []
-    for values, times in (
+    for values, ends_ns in (
         (before, (data.first_ns, *limits[:1])),
         (after, (*limits[1:], data.last_ns)),
     ):
-        if values and len(times) == 2:
+        if values and len(ends_ns) == 2:
             median_nm = 1e9 * float(np.median(values))
-            residual.plot(_minutes(data, times), [median_nm] * 2, color=_GREEN, lw=1.2, ls="--")
+            residual.plot(_minutes(data, ends_ns), [median_nm] * 2, color=_GREEN, lw=1.2, ls="--")
     residual.set_ylabel("nm RMS per mode")
     residual.set_ylim(bottom=0.0)
-    judged = [(one.t_ns_utc, one.margin) for one in data.samples if one.margin is not None]
-    margin.plot(
-        _minutes(data, [t_ns for t_ns, _ in judged]),
-        [ratio for _, ratio in judged],
-        color=_BLUE,
-        marker=".",
-        lw=1.4,
-    )
     margin.axhline(1.0, color=_RED, lw=1.0)
     margin.set(ylabel="pole radius / bound", xlabel="minutes")
-    for axis in (residual, margin):
-        _mark_swaps(axis, data)
     return figure
 
 
 def _draw_gains(fit: dict[str, Any]) -> Figure:
     figure, (axis,) = _draw(1, 2.4)
+    # A mode without a gain leaves a gap in the line.
     gains = [np.nan if one is None else one for one in fit["gains"]]
     axis.plot(gains, color=_BLUE, marker=".", ms=3, lw=0.8)
     axis.axhline(1.0, color=_GREY, lw=0.8)
@@ -321,6 +298,7 @@ def _draw_alarms(data: Commissioning) -> Figure:
     for name, begin_ns, end_ns in data.alarms:
         severity = str(ALARMS[name].severity) if name in ALARMS else "warning"
         begin, end = _minutes(data, (begin_ns, end_ns))
+        # A bar of no length would not be drawn.
         axis.barh(names.index(name), max(end - begin, 0.02), left=begin, color=colours[severity])
     axis.set_yticks(range(len(names)), names)
     axis.invert_yaxis()
@@ -344,6 +322,11 @@ class _Html(str):
     """Text that is HTML already."""
 
     __slots__ = ()
+
+
+def _mark(text: str, kind: str) -> _Html:
+    """Return a word in the colour of its class."""
+    return _Html(f'<span class="{kind}">{escape(text)}</span>')
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

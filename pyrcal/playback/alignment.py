@@ -56,6 +56,7 @@ def measure_delay(slopes: Array, commands: Array, delay_frames: float) -> int | 
     delay_frames
         Stated delay, frames; delays within ``MAX_APART_FRAMES`` of it are tried.
     """
+    # The delay does not change during a night, so the first seconds are enough.
     n = min(len(slopes), MAX_FRAMES)
     if n < MIN_FRAMES:
         return None
@@ -70,6 +71,7 @@ def measure_delay(slopes: Array, commands: Array, delay_frames: float) -> int | 
     shares = np.array([_predict_share(seen, changes, int(delay)) for delay in delays])
     strengths = np.where(shares > MIN_PREDICTED_SHARE, shares, 0.0).sum(axis=1)
     best = int(np.argmax(strengths))
+    # Neighbours are left out of the comparison: turbulence is alike from one frame to the next.
     others = np.delete(strengths, slice(max(best - 1, 0), best + 2))
     if (
         np.sum(shares[best] > MIN_PREDICTED_SHARE) < MIN_MODES
@@ -84,6 +86,7 @@ def _components(slopes: Array, n_most: int) -> Array:
     centred = slopes - slopes.mean(axis=0)
     if centred.shape[1] <= min(n_most, MAX_COMPONENTS):
         return np.asarray(centred)
+    # From some of the frames: the covariance of all slopes would be far larger than needed.
     some = centred[: 5 * MAX_COMPONENTS]
     _, along = np.linalg.eigh(some @ some.T)
     strongest = along[:, -min(n_most, MAX_COMPONENTS) :]
@@ -100,6 +103,7 @@ def _predict_share(seen: Array, changes: Array, delay: int) -> Array:
     causes, effects = seen[first - delay : last - delay], changes[first - 1 : last - 1]
     half = len(causes) // 2
     normal = causes[:half].T @ causes[:half]
+    # A small ridge, because slopes of modes that are not excited are nearly dependent.
     normal += 1e-6 * np.trace(normal) / len(normal) * np.eye(len(normal))
     weights = np.linalg.solve(normal, causes[:half].T @ effects[:half])
     left = np.sum((effects[half:] - causes[half:] @ weights) ** 2, axis=0)

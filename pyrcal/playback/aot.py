@@ -62,7 +62,6 @@ def read_telemetry(path: Path, instrument: Instrument) -> AotTelemetry:
         If it is no AOT file, or not of this instrument: what was found and expected.
     """
     system = read_system(path)
-    loops = [one for one in system.loops if _commands(one) is not None]
     sensors = [one for one in system.wavefront_sensors if _belongs_to(one, instrument)]
     if not sensors:
         listed = ", ".join(
@@ -74,15 +73,17 @@ def read_telemetry(path: Path, instrument: Instrument) -> AotTelemetry:
             f"{path}: found the sensors {listed or 'none'}, expected one whose mask is "
             f"that of {instrument.name}: {expected} valid subapertures"
         )
-    loops = [
+    playable = [
         one
-        for one in loops
+        for one in system.loops
         if any(one.input_sensor is sensor for sensor in sensors)
         and one.input_sensor.measurements is not None
+        and _commands(one) is not None
     ]
-    loops.sort(key=lambda one: -len(_commands(one).data))
-    sensor = loops[0].input_sensor if loops else sensors[0]
-    mirror = loops[0].commanded_corrector if loops else _only_mirror(path, system)
+    # pyrcal writes a loop for each reconstructor in use: the one in use longest has most frames.
+    loop = max(playable, key=lambda one: len(_commands(one).data), default=None)
+    sensor = sensors[0] if loop is None else loop.input_sensor
+    mirror = _only_mirror(path, system) if loop is None else loop.commanded_corrector
     dated = registrations_between(mirror, sensor, instrument.subaperture_m, str(path))
     night = AotTelemetry(registrations=() if dated is None else dated.over_time)
     if len(system.wavefront_sensors) > 1:
@@ -90,11 +91,10 @@ def read_telemetry(path: Path, instrument: Instrument) -> AotTelemetry:
             f"of {len(system.wavefront_sensors)} sensors {sensor.uid} is taken, whose mask is the "
             "instrument's"
         )
-    if loops:
-        night.arrays = _Reader(path=path, instrument=instrument, notes=night.notes).arrays(
-            loops[0], sensor
-        )
-        if rest := [loop.uid for loop in system.loops if loop is not loops[0]]:
+    if loop is not None:
+        reader = _Reader(path=path, instrument=instrument, notes=night.notes)
+        night.arrays = reader.arrays(loop, sensor)
+        if rest := [one.uid for one in system.loops if one is not loop]:
             night.notes.append(f"one loop is played; left out: {', '.join(rest)}")
     return night
 
@@ -139,12 +139,14 @@ class _Reader:
     def arrays(self, loop: Any, sensor: Any) -> dict[str, Array]:  # noqa: ANN401
         """Return the frames of a loop; slopes are those that its commands are of."""
         image, commands = sensor.measurements, _commands(loop)
+        # pyrcal's slopes have no unit: those in pixels or radians have another scale.
         if image.unit not in {None, ""}:
             raise self._refusal(
                 f"measurements: found the unit {image.unit}, expected slopes without one"
             )
         if not loop.framerate:
             raise self._refusal(f"loop {loop.uid}: found no framerate, expected frames a second")
+        # Files of pyrcal are in the axes of conventions.md, all others in the RTC's.
         own = is_own(image)
         listed = self._list_positions(sensor, own=own)
         slopes = self._order_as_rtc(np.asarray(image.data), listed, own=own)
@@ -235,6 +237,7 @@ class _Reader:
         beats = (np.array(stamps) - first) * rate_hz
         numbers = np.round(beats)
         off = float(np.max(np.abs(beats - numbers)))
+        # Written with not, so that NaN is refused too.
         if not off <= MAX_TIME_OFFSET or np.any(np.diff(numbers) <= 0):
             raise self._refusal(
                 f"found times that are {off:.2g} of a frame off the loop's {rate_hz:g} Hz, or "
@@ -259,6 +262,7 @@ class _Reader:
                 f"found {found} and no modal_coefficients, expected modal_coefficients, or an "
                 "instrument file with the mode_to_actuator of these actuators"
             )
+        # By least squares, and checked: commands outside the modes' span would be lost silently.
         modal = strokes_m @ np.linalg.pinv(to_actuators).T
         left = np.linalg.norm(strokes_m - modal @ to_actuators.T) / np.linalg.norm(strokes_m)
         if not left <= MAX_UNMODELLED_SHARE:

@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 
 from pyrcal.importers.saved import read_npz
 from pyrcal.playback.alignment import MAX_FRAMES, measure_delay
+from pyrcal.rtc.identity import Identity, Reconstructor
 from service.errors import ConfigurationError, say
 from service.files import FileKind, kind_of
 from service.files.recording import Message, RecordedKind
@@ -44,17 +45,13 @@ from service.model.instrument import Instrument
 from service.tracking.policy import SECOND_NS
 from service.wire import (
     BATCH_LIMIT,
-    CHUNK_LIMIT,
     FRAMES_PER_BATCH,
     DitherKind,
     DitherRequest,
     DitherStatus,
     FrameHeader,
     Loop,
-    Manifest,
-    MatrixLayout,
     Status,
-    checksum,
     encode,
     encode_frames,
 )
@@ -149,11 +146,13 @@ class Arrays:
         last_status, unusable = -1, np.zeros(0, np.intp)
         for start, stop in _batches(seq, _frames_at_once(n_slopes + 2 * n_modes)):
             rows = self._rows(start, stop, n_modes)
-            usable = np.all(np.abs(rows) <= MAX_NUMBER, axis=1)  # False for NaN, too
+            # A comparison with NaN is false, so it is left out as well.
+            usable = np.all(np.abs(rows) <= MAX_NUMBER, axis=1)
             unusable = np.concatenate([unusable, start + np.flatnonzero(~usable)])
             for first, last in _runs(usable):
                 numbers = seq[[start + first, start + last - 1]]
                 since = numbers - seq[0]
+                # By frames and not by time: a status comes before the first frame after a gap.
                 if since[0] // every != last_status:
                     last_status = since[0] // every
                     yield _status_message(status, int(numbers[0]), int(since[0]))
@@ -236,7 +235,8 @@ class Arrays:
 
     def _rows(self, first: int, last: int, n_modes: int) -> NDArray[np.float32]:
         """Return some frames in wire format; modes missing from the file are zero."""
-        with np.errstate(over="ignore"):  # infinite in single precision: left out as such
+        # What overflows single precision becomes infinite, and is left out as such.
+        with np.errstate(over="ignore"):
             parts = [np.asarray(self.found["slopes"][first:last], np.float32)]
             for name in ("commands_m", "dither_m"):
                 if self._has(name):
@@ -301,6 +301,7 @@ class Arrays:
         indices = f"indices of columns of commands_m, counted from 0 to {n_given - 1}"
         fits = (modes >= 0) & (modes < n_given) & (modes == np.round(modes))
         self._check_each("dither_modes", modes, fits, indices)
+        # A sine of a mode that does not move would be fitted to noise.
         if self._has("dither_m"):
             moving = np.any(self.found["dither_m"][:_N_CHECKED_FRAMES], axis=0)
             still = "modes that dither_m moves (indices are counted from 0)"
@@ -329,15 +330,7 @@ class Arrays:
         if n_controlled > n_modes:
             raise self._refusal("reconstructor", f"{n_controlled} rows", f"at most {n_modes}")
         values = np.asarray(self.found["reconstructor"][()], float)
-        usable = np.abs(values) <= MAX_NUMBER  # False for NaN, too
-        if not usable.all():
-            row, column = (int(place) for place in np.argwhere(~usable)[0])
-            n_rows = int(np.sum(~usable.all(axis=1)))
-            found = (
-                f"{values[row, column]:g} in row {row}, column {column} ({n_rows} of "
-                f"{n_controlled} rows hold such numbers)"
-            )
-            raise self._refusal("reconstructor", found, _FINITE)
+        self._check_each("reconstructor", values, np.abs(values) <= MAX_NUMBER, _FINITE)
         return np.ascontiguousarray(values, "<f4")
 
     def _sequence(self, n_frames: int) -> NDArray[np.int64]:
@@ -399,7 +392,7 @@ class Arrays:
     def _check_each(
         self, name: str, values: NDArray[Any], fits: NDArray[np.bool_], expected: str
     ) -> None:
-        """Refuse values of which one does not fit, with its row.
+        """Refuse values of which one does not fit, with its place.
 
         Raises
         ------
@@ -407,9 +400,13 @@ class Arrays:
             Naming the first.
         """
         if not fits.all():
-            row = int(np.argmin(fits))
-            shown = f"{values[row]:.17g}" if values.dtype.kind == "f" else str(values[row])
-            raise self._refusal(name, f"{shown} in row {row}", expected)
+            place = tuple(np.argwhere(~fits)[0].tolist())
+            # All digits of a double, because neighbours of 2^53 differ in the last one.
+            shown = f"{values[place]:.17g}" if values.dtype.kind == "f" else str(values[place])
+            where = ", ".join(
+                f"{axis} {k}" for axis, k in zip(("row", "column"), place, strict=False)
+            )
+            raise self._refusal(name, f"{shown} in {where}", expected)
 
     def _number(self, name: str, default: float | None, limit: float) -> float:
         given = self.facts.get(name, self.found.get(name, default))
@@ -428,26 +425,9 @@ class Arrays:
 
 
 def _matrix_message(matrix: NDArray[np.float32], status: Status) -> Message:
-    data = matrix.tobytes()
-    layout = MatrixLayout(
-        shape=(matrix.shape[0], matrix.shape[1]),
-        n_chunks=-(-len(data) // CHUNK_LIMIT),
-        chunk_bytes=CHUNK_LIMIT,
-        sha256=checksum(matrix),
-    )
-    manifest = Manifest(
-        id=MATRIX_ID,
-        layout=layout,
-        alpha=None,
-        sigma=None,
-        im_id=None,
-        parent=None,
-        basis_id=status.basis_id,
-        config_id=status.config_id,
-        system=SESSION,
-        created_ns=status.t_ns,
-    )
-    return Message(0.0, RecordedKind.MATRIX, data, encode(manifest))
+    identity = Identity(system=SESSION, basis_id=status.basis_id, config_id=status.config_id)
+    manifest = Reconstructor.own(MATRIX_ID, matrix, identity, created_ns=status.t_ns).manifest
+    return Message(0.0, RecordedKind.MATRIX, matrix.tobytes(), encode(manifest))
 
 
 def _status_message(status: Status, seq: int, since: int) -> Message:

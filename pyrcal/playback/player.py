@@ -7,7 +7,7 @@ the α of a moment later.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Concatenate, Final, ParamSpec, TypeVar
@@ -106,12 +106,12 @@ class Track:
     @property
     def alpha(self) -> NDArray[np.float64]:
         """``(n, 4)`` filtered α after each measurement, in the units of ``PARAMETERS``."""
-        return _at_boundary([entry.filtered.vector for entry in self.entries])
+        return to_boundary([entry.filtered.vector for entry in self.entries])
 
     @property
     def sigma(self) -> NDArray[np.float64]:
         """``(n, 4)`` 1 σ of ``alpha``, model error included."""
-        return _at_boundary([entry.filtered_sigma for entry in self.entries])
+        return to_boundary([entry.filtered_sigma for entry in self.entries])
 
     def plot(self, title: str = "") -> Figure:
         """Return α over time as a figure, as ``pyrcal track --plot`` draws it.
@@ -121,13 +121,15 @@ class Track:
         ConfigurationError
             If matplotlib, the extra ``plots``, is not installed.
         """
-        report = import_module("pyrcal.playback.report")  # imported late: it imports this module
+        # Imported late, because it imports this module.
+        report = import_module("pyrcal.playback.report")
         figure: Figure = report.draw(self, title)
         return figure
 
 
-def _at_boundary(vectors: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+def to_boundary(vectors: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
     """Return vectors in numeric units as rows in the units of ``PARAMETERS``."""
+    # Reshaped, because no vector at all must give (0, 4) as well.
     return np.asarray(np.array(vectors).reshape(-1, len(PARAMETERS)) * BOUNDARY_SCALE)
 
 
@@ -148,9 +150,11 @@ class Player:
         ModelError
             If the instrument can be fitted offline but not controlled with, or is too large.
         """
+        # The loop of a recording cannot be opened, so nothing is acquired from nothing.
         policy = replace(policy_of(settings, instrument), acquires=False)
         state = TrackerState(
             system=system,
+            # A matrix that would be made has no RTC to go to.
             operator=OperatorState(mode=Mode.HOLD),
             loop=LoopState(basis_id=instrument.basis_id, config_id=instrument.config_id),
         )
@@ -178,10 +182,10 @@ class Player:
             await self._age()
             progress(self._now_s)
         rest_s = self._now_s - self._summed_s
-        # lets the intake give up on missing frames and release the blocks behind them
+        # Lets the intake give up on missing frames and release the blocks behind them.
         self._now_s += 1.0
         await self._look()
-        # a short rest has a large uncertainty and would only add noise to the list
+        # A short rest has a large uncertainty and would only add noise to the list.
         if rest_s > PASSIVE_INTERVAL_S / 2 or not self.track.passive:
             await self._sum_up()
         self.track.state = self._engine.state
@@ -201,12 +205,14 @@ class Player:
                 case RecordedKind.MATRIX:
                     self._keep(message)
                 case RecordedKind.LIVELINESS | RecordedKind.ACKNOWLEDGEMENT:
-                    pass  # of the recorded service, not this one; the statuses show their effect
+                    # Of the recorded service, not this one; the statuses show their effect.
+                    pass
         except WireError as error:
             self._intake.malformed(message.kind.name.lower(), error)
 
     def _set_clock(self, message: Message) -> None:
         """Set the service's clock to the RTC's, from its first status on."""
+        # Once, because a step of the RTC's clock during a night must not move the service's.
         if not self._began_ns:
             now_ns = decode(Status, message.payload).t_ns
             self._began_ns = now_ns - round(message.time_s * SECOND_NS)
@@ -221,6 +227,7 @@ class Player:
 
     async def _look(self) -> None:
         """Process frames, then the events after them, like the service."""
+        # Until nothing follows: an event can release frames that waited for it.
         while True:
             blocks = self._intake.drain(before_events=True)
             self._engine.feed(blocks)
@@ -229,6 +236,7 @@ class Player:
             await self._fit_windows()
             events = self._intake.events()
             for event in events:
+                # Measured matrices need the service's archive; a fit reads them from their files.
                 if not isinstance(event, MeasuredMatrix):
                     self._engine.receive(event)
             await self._read_matrix()
@@ -259,7 +267,8 @@ class Player:
             self._random = (
                 window if self._random is None else join_random_windows(self._random, window)
             )
-        except ModelError:  # another dither began: only the last one's matrix is kept
+        except ModelError:
+            # Another dither began: only the last one's matrix is kept.
             self._random = window
 
     async def _read_matrix(self) -> None:
@@ -302,10 +311,12 @@ class Player:
         passive = after.alpha.passive
         if passive is not None and passive is not before.alpha.passive:
             self.track.passive.append(passive)
+        # A refused dither is an answer of this program's, which the telemetry does not show.
         mine = [line for line in new_lines(before, after) if NOT_CARRIED_OUT not in line.text]
         self.track.lines += mine
-        seen = {id(entry) for entry in before.alpha.history}
-        self.track.entries += [e for e in after.alpha.history if id(e) not in seen]
+        # Not by their number: the history is limited, and drops its oldest entries.
+        seen = set(before.alpha.history)
+        self.track.entries += [entry for entry in after.alpha.history if entry not in seen]
 
     def fit(self, window: EndedWindow) -> None:
         """Queue a window for fitting."""

@@ -49,15 +49,20 @@ def read_session(path: Path, instrument: Instrument) -> dict[str, Array]:
     streams = _streams(folder)
     slopes, answered = _stream(folder, streams, SLOPES)
     strokes, by = _stream(folder, streams, COMMANDS)
-    facts = _facts(folder)
+    facts = read_npz(folder / FACTS) if (folder / FACTS).exists() else {}
     delay = np.asarray(facts.get("delay_frames", DELAY_FRAMES))
     if delay.size != 1 or delay.dtype.kind not in "iuf" or not 1.0 <= delay.item() <= 20.0:
         raise ConfigurationError(
             f"{folder / FACTS}: delay_frames: found {delay.tolist()}, expected 1 to 20"
         )
-    sent_m, known = _average_commands(
-        _convert_to_modes(strokes, instrument, folder), by, answered, float(delay.item())
-    )
+    # pyRTC sends its modes, as M2C has them.
+    n_modes = instrument.modes.n_modes
+    if strokes.shape[1] > n_modes:
+        raise ConfigurationError(
+            f"{folder}: {COMMANDS}: found {strokes.shape[1]} numbers a frame, expected at most the "
+            f"{n_modes} modes of {instrument.name}"
+        )
+    sent_m, known = _average_commands(strokes.astype(np.float64), by, answered, float(delay.item()))
     if not known.any():
         raise ConfigurationError(
             f"{folder}: found signals of exposures {answered[0]} to {answered[-1]} and commands "
@@ -112,11 +117,13 @@ def _stream(
             f"{folder}: {record['name']}: found {frames.dtype} of shape {frames.shape} with ids of "
             f"shape {ids.shape}, expected numbers (n_frames, ...) with (n_frames,)"
         )
+    # The recorder may see a frame twice, or late: each exposure is taken once, in their order.
     ids, first = np.unique(ids.astype(np.int64), return_index=True)
     return np.asarray(frames[first], np.float32).reshape(len(ids), -1), ids
 
 
 def _load_array(folder: Path, record: Mapping[str, Any], key: str) -> Array:
+    # The session may come from somebody else: it must not name files outside its folder.
     path = (folder / str(record.get(key))).resolve()
     if not path.is_relative_to(folder.resolve()):
         raise ConfigurationError(f"{folder / MANIFEST}: {key}: found {path}, expected a file in it")
@@ -124,22 +131,6 @@ def _load_array(folder: Path, record: Mapping[str, Any], key: str) -> Array:
         return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
     except NUMPY_DAMAGE as error:
         raise ConfigurationError(f"{path}: cannot be read: {error}") from error
-
-
-def _facts(folder: Path) -> dict[str, Array]:
-    path = folder / FACTS
-    return read_npz(path) if path.exists() else {}
-
-
-def _convert_to_modes(strokes: Array, instrument: Instrument, folder: Path) -> Array:
-    """Return the commands ``(n_frames, n_modes)``: pyRTC sends its modes, as M2C has them."""
-    n_modes = instrument.modes.n_modes
-    if strokes.shape[1] > n_modes:
-        raise ConfigurationError(
-            f"{folder}: {COMMANDS}: found {strokes.shape[1]} numbers a frame, expected at most the "
-            f"{n_modes} modes of {instrument.name}"
-        )
-    return strokes.astype(np.float64)
 
 
 def _average_commands(
@@ -154,6 +145,7 @@ def _average_commands(
     total = np.zeros((len(exposures), commands_m.shape[1]))
     known = np.ones(len(exposures), bool)
     for behind, share in ((whole - 1, whole - delay), (whole, 1.0 - (whole - delay))):
+        # With a whole number of frames no exposure sees two commands.
         if share > 0.0:
             places = np.searchsorted(answers, exposures - behind).clip(max=len(answers) - 1)
             known &= answers[places] == exposures - behind

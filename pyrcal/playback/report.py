@@ -12,11 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.fitting.figures import check_plots
-from pyrcal.playback.player import Track
+from pyrcal.playback.player import Track, to_boundary
 from pyrcal.terminal import table as aligned
 from service.errors import ConfigurationError
 from service.files.container import put_array
-from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, wrap_angle
+from service.model.misregistration import (
+    BOUNDARY_SCALE,
+    COVARIANCE_SCALE,
+    PARAMETERS,
+    at_boundary,
+    wrap_angle,
+)
 from service.tracking import alarms
 from service.tracking.policy import SECOND_NS
 from service.tracking.registration import HistoryEntry, Source
@@ -93,6 +99,7 @@ def _file_rows(track: Track, found: Array | None) -> list[Sequence[str]]:
         (f"the file's own, last of {len(track.stated)}", *_cells(last * BOUNDARY_SCALE))
     ]
     if found is not None:
+        # Both are angles of any turn, so the difference is brought to less than half a turn.
         apart = found - last
         apart[2] = wrap_angle(apart[2])
         rows.append(("found less the file's own", *_cells(apart * BOUNDARY_SCALE)))
@@ -133,12 +140,13 @@ def _scatter(entries: Sequence[HistoryEntry]) -> list[str]:
 
 def _list_problems(track: Track) -> list[str]:
     """Return alarms that last, then what else the tracker warned of, the most frequent first."""
-    # responses of another frame look like responses of the opposite sign
+    # Responses of another frame look like responses of the opposite sign.
     led_to = _OF_MISALIGNED if track.misaligned else frozenset()
     lines = [f"note: {track.misaligned}"] if track.misaligned else []
     lines += [
         f"alarm {alarm.name}: {alarm.text}"
         for alarm in track.state.alarms.active
+        # What misaligned streams lead to is not listed beside its cause.
         if alarm.name not in led_to
     ]
     names: Counter[str] = Counter()
@@ -166,14 +174,14 @@ def document(track: Track, source: Path) -> dict[str, Any]:
         "alpha": None if registration is None else registration.alpha.to_boundary(),
         "covariance": None
         if registration is None
-        else (registration.covariance * np.outer(BOUNDARY_SCALE, BOUNDARY_SCALE)).tolist(),
+        else (registration.covariance * COVARIANCE_SCALE).tolist(),
         "entries": [_entry(entry) for entry in track.entries],
         "passive": [
             {
                 "t_ns_utc": one.t_ns_utc,
                 "estimator": one.estimator,
                 "alpha": one.alpha.to_boundary(),
-                "sigma": _name_values(one.sigma) if np.isfinite(one.sigma).all() else None,
+                "sigma": at_boundary(one.sigma) if np.isfinite(one.sigma).all() else None,
                 "text": one.text,
             }
             for one in track.passive
@@ -194,18 +202,14 @@ def document(track: Track, source: Path) -> dict[str, Any]:
     }
 
 
-def _name_values(values: Array) -> dict[str, float]:
-    return dict(zip(PARAMETERS, (values * BOUNDARY_SCALE).tolist(), strict=True))
-
-
 def _entry(entry: HistoryEntry) -> dict[str, Any]:
     return {
         "t_ns_utc": entry.t_ns_utc,
         "source": entry.source.value,
         "measured": entry.measured.to_boundary(),
-        "measured_sigma": _name_values(entry.measured_sigma),
+        "measured_sigma": at_boundary(entry.measured_sigma),
         "filtered": entry.filtered.to_boundary(),
-        "filtered_sigma": _name_values(entry.filtered_sigma),
+        "filtered_sigma": at_boundary(entry.filtered_sigma),
         "innovation": entry.innovation,
         "misfit": entry.misfit if np.isfinite(entry.misfit) else None,
         "entered": entry.entered,
@@ -221,31 +225,21 @@ def fill(file: h5py.File, track: Track, source: Path) -> None:
     for name, values, what in (
         ("t_ns_utc", np.array([e.t_ns_utc for e in entries], np.int64), "(n,) end of telemetry"),
         ("source", np.array([e.source.value for e in entries], _TEXT), "(n,) estimator"),
-        ("measured", _boundary([e.measured.vector for e in entries]), "(n, 4) by itself"),
-        ("measured_sigma", _boundary([e.measured_sigma for e in entries]), "(n, 4) of the data"),
-        ("filtered", _boundary([e.filtered.vector for e in entries]), "(n, 4) α after it"),
-        (
-            "filtered_sigma",
-            _boundary([e.filtered_sigma for e in entries]),
-            "(n, 4) 1 sigma of it, the model's error included",
-        ),
+        ("measured", to_boundary([e.measured.vector for e in entries]), "(n, 4) by itself"),
+        ("measured_sigma", to_boundary([e.measured_sigma for e in entries]), "(n, 4) of the data"),
+        ("filtered", track.alpha, "(n, 4) α after it"),
+        ("filtered_sigma", track.sigma, "(n, 4) 1 sigma of it, the model's error included"),
         ("entered", np.array([e.entered for e in entries], bool), "(n,) whether it was accepted"),
         ("misfit", np.array([e.misfit for e in entries]), "(n,) residual power over noise"),
         ("passive/t_ns_utc", np.array([p.t_ns_utc for p in passive], np.int64), "(m,) ends"),
-        ("passive/alpha", _boundary([p.alpha.vector for p in passive]), "(m, 4) its bias in it"),
-        ("passive/sigma", _boundary([p.sigma for p in passive]), "(m, 4) 1 sigma of that"),
+        ("passive/alpha", to_boundary([p.alpha.vector for p in passive]), "(m, 4) its bias in it"),
+        ("passive/sigma", to_boundary([p.sigma for p in passive]), "(m, 4) 1 sigma of that"),
     ):
         put_array(file, name, values, what)
     if track.noisy is not None:
         put_array(file, "interaction_matrix", track.noisy.matrix, "noisy, slope per metre of OPD")
         put_array(file, "noise", np.median(track.noisy.noise, axis=0), "(n_modes,) 1 sigma")
         put_array(file, "modes", np.array(track.noisy.modes), "(n_modes,) basis indices")
-
-
-def _boundary(vectors: Sequence[Array]) -> Array:
-    """Return vectors in numeric units as rows in the units of the parameters."""
-    rows: Array = np.array(vectors).reshape(-1, len(PARAMETERS)) * BOUNDARY_SCALE
-    return rows
 
 
 def plot(track: Track, title: str, path: Path) -> None:
@@ -290,24 +284,23 @@ def _draw(axes: Axes, track: Track, k: int) -> None:
     def seconds(ends_ns: Sequence[int]) -> Array:
         return (np.array(ends_ns) - track.first_ns_utc) / SECOND_NS
 
-    passive = _boundary([one.alpha.vector for one in track.passive])[:, k]
+    passive = to_boundary([one.alpha.vector for one in track.passive])[:, k]
     ends = seconds([one.t_ns_utc for one in track.passive])
     axes.plot(ends, passive, "x", color="0.6", label="ordinary telemetry, its bias in it")
     for source, colour in _COLOURS.items():
         chosen = [entry for entry in track.entries if entry.source is source]
         if chosen:
             ends = seconds([entry.t_ns_utc for entry in chosen])
-            values = _boundary([entry.measured.vector for entry in chosen])[:, k]
-            sigma = _boundary([entry.measured_sigma for entry in chosen])[:, k]
+            values = to_boundary([entry.measured.vector for entry in chosen])[:, k]
+            sigma = to_boundary([entry.measured_sigma for entry in chosen])[:, k]
             axes.errorbar(ends, values, sigma, fmt=".", color=colour, label=source.value)
-            margin = 3.0 * _boundary([entry.filtered_sigma for entry in chosen])[:, k].max()
+            # The range is that of the last source: outliers of the others may be cut off.
+            margin = 3.0 * to_boundary([entry.filtered_sigma for entry in chosen])[:, k].max()
             axes.set_ylim(values.min() - margin, values.max() + margin)
     if track.entries:
-        ends = seconds([entry.t_ns_utc for entry in track.entries])
-        filtered = _boundary([entry.filtered.vector for entry in track.entries])[:, k]
-        width = _boundary([entry.filtered_sigma for entry in track.entries])[:, k]
-        axes.plot(ends, filtered, color="tab:red", linewidth=1.0, label="filtered")
+        filtered, width = track.alpha[:, k], track.sigma[:, k]
+        axes.plot(track.t, filtered, color="tab:red", linewidth=1.0, label="filtered")
         low, high = filtered - width, filtered + width
-        axes.fill_between(ends, low, high, color="tab:red", alpha=0.15, linewidth=0)
+        axes.fill_between(track.t, low, high, color="tab:red", alpha=0.15, linewidth=0)
     axes.set_ylabel(f"{PARAMETERS[k]}\n{UNITS[k]}".strip())
     axes.grid(alpha=0.3)

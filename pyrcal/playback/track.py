@@ -41,8 +41,10 @@ def main(options: argparse.Namespace) -> int:
     PyrcalError
         If something that was given cannot be used.
     """
+    # Before the telemetry is played, which may take minutes.
     if options.plot is not None:
         check_plots()
+    # Standard output is for the result.
     structlog.configure(logger_factory=structlog.PrintLoggerFactory(sys.stderr))
     settings = load_settings(options.config, os.environ)
     instrument = load_instrument(options.instrument)
@@ -76,6 +78,7 @@ def track(
     if not isinstance(instrument, Instrument):
         instrument = load_instrument(instrument)
     settings = settings or load_settings(None, {})
+    # One thread, as in the service: sums of several threads differ in their last digits.
     with threadpool_limits(1):
         if _is_recording(path):
             with Recording(path) as recording:
@@ -93,7 +96,8 @@ def _is_recording(path: Path) -> bool:
     try:
         with open_growing_hdf5(path) as file:
             return str(file.attrs.get("format")) == FORMAT
-    except (OSError, RuntimeError, KeyError):  # read as arrays it is refused with the reason
+    except (OSError, RuntimeError, KeyError):
+        # Read as arrays it is refused with the reason.
         return False
 
 
@@ -101,7 +105,8 @@ def _is_fits(path: Path) -> bool:
     try:
         with path.open("rb") as file:
             return file.read(6) == b"SIMPLE"
-    except OSError:  # read as arrays it is refused with the reason
+    except OSError:
+        # Read as arrays it is refused with the reason.
         return False
 
 

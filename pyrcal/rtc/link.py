@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Protocol
 
 import numpy as np
 import structlog
@@ -15,13 +14,7 @@ from numpy.typing import NDArray
 
 from pyrcal.rtc.matrices import Matrices
 from pyrcal.rtc.replies import Computer, Replies
-from pyrcal.rtc.session import (
-    Lifeline,
-    Token,
-    frames_publisher,
-    open_session,
-    status_publisher,
-)
+from pyrcal.rtc.session import Token, frames_publisher, open_session, status_publisher
 from service.config.link_tables import Router
 from service.wire import FrameHeader, Keys, Role, Status, encode, encode_frames
 from service.wire.signing import Signatures
@@ -32,13 +25,8 @@ STATUS_PERIOD_S = 0.2
 """Period in which an RTC publishes its status."""
 
 
-class MatricesFactory(Protocol):
-    """Constructor of :class:`Matrices` or of a subclass with its other arguments bound."""
-
-    def __call__(
-        self, session: zenoh.Session, keys: Keys, computer: Computer, *, signatures: Signatures
-    ) -> Matrices:
-        """Return the exchange of matrices in this session."""
+_MAX_TIME_WITHOUT_ROUTER_S = 5.0
+"""A session without a router is closed after this time. zenoh itself reconnects within 1.6 s."""
 
 
 class RtcLink:
@@ -59,7 +47,7 @@ class RtcLink:
         self._signatures = signatures
         self._frames = frames_publisher(session, keys, batches_per_s)
         self._status = status_publisher(session, keys)
-        self._lifeline = Lifeline(time.monotonic())
+        self._routed_s = time.monotonic()
         self._matrices = matrices
         self.token = token
         """Liveliness token; a program may withdraw it while it has nothing to send."""
@@ -96,9 +84,20 @@ class RtcLink:
 
     def is_lost(self) -> bool:
         """Return True if the connection must be closed and opened again."""
-        if not self._lifeline.cut(self._session, time.monotonic()):
+        # After both ends were suspended for longer than the lease, a zenoh client may connect twice
+        # at the same time. One connection stays open and unused, and the router accepts no second
+        # one of the same session (MAX_LINKS). The token is then visible, but nothing that the
+        # session publishes arrives. Only a new session resolves this (eclipse-zenoh/zenoh#1886).
+        now_s = time.monotonic()
+        if self._session.info.routers_zid():
+            self._routed_s = now_s
+        if now_s - self._routed_s <= _MAX_TIME_WITHOUT_ROUTER_S:
             return False
-        _log.warning("link.cut-off", text=self._lifeline.text)
+        _log.warning(
+            "link.cut-off",
+            text=f"no router for {_MAX_TIME_WITHOUT_ROUTER_S:.0f} s: closing the session to open a "
+            "new one",
+        )
         return True
 
 
@@ -117,7 +116,8 @@ class RtcConnection:
     batches_per_s
         Messages with frames per second; sets how many of them are kept for the service to request.
     matrices
-        Subclass of :class:`Matrices`, for programs that change the exchange of matrices.
+        :class:`Matrices`, or a subclass with its other arguments bound, for programs that change
+        the exchange of matrices.
     on_token
         Called when the liveliness token is declared (True) or withdrawn (False).
 
@@ -135,7 +135,7 @@ class RtcConnection:
         router: Router,
         *,
         batches_per_s: float,
-        matrices: MatricesFactory = Matrices,
+        matrices: Callable[..., Matrices] = Matrices,
         on_token: Callable[[bool], None] | None = None,
     ) -> None:
         self._computer = computer

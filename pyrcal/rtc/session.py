@@ -19,9 +19,6 @@ _log = structlog.get_logger("rtc")
 _RETRY_S = 0.2
 """Pause between two attempts to reach the service's router."""
 
-_MAX_TIME_WITHOUT_ROUTER_S = 5.0
-"""A session without a router is closed after this time. zenoh itself reconnects within 1.6 s."""
-
 _OPEN_TIMEOUT_MS = 1000
 _LEASE_MS = 2000
 _WAIT_BEFORE_DROP_US = 20_000
@@ -110,29 +107,6 @@ def status_publisher(session: zenoh.Session, keys: Keys) -> zenoh.Publisher:
         encoding=Encodings.STATUS,
         congestion_control=zenoh.CongestionControl.DROP,
     )
-
-
-class Lifeline:
-    """Detects that a session has lost its router for good.
-
-    After both ends were suspended for longer than the lease, a zenoh client may connect twice at
-    the same time. One connection stays open and unused, and the router accepts no second one of
-    the same session (``MAX_LINKS``). The token is then visible, but nothing that the session
-    publishes arrives. Only a new session resolves this (eclipse-zenoh/zenoh#1886).
-    """
-
-    text = (
-        f"no router for {_MAX_TIME_WITHOUT_ROUTER_S:.0f} s: closing the session to open a new one"
-    )
-
-    def __init__(self, now_s: float) -> None:
-        self._seen_s = now_s
-
-    def cut(self, session: zenoh.Session, now_s: float) -> bool:
-        """Return True if the session has had no router for so long that it must be closed."""
-        if session.info.routers_zid():
-            self._seen_s = now_s
-        return now_s - self._seen_s > _MAX_TIME_WITHOUT_ROUTER_S
 
 
 class Token:

@@ -21,11 +21,6 @@ def test_the_conventions_need_no_import_of_their_own():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_names_of_the_documents_are_the_same_things():
-    assert pyrcal.InversionOptions is pyrcal.Recipe
-    assert pyrcal.array_backend is pyrcal.arrays_of
-
-
 @pytest.mark.parametrize("module", ["pyrcal", "pyrcal.client.rest", "pyrcal.fitting"])
 def test_what_is_imported_brings_no_mathematics(module):
     code = f"import sys, {module}; sys.exit('numpy' in sys.modules or 'pydantic' in sys.modules)"
@@ -36,7 +31,6 @@ SIGNATURES = {
     "dither_sigma": "near, modes, amplitude_m, n_frames, slope_noise",
     "fit_file": "instrument, path, options, dataset, threads, memory_gb, basis, progress",
     "array_backend": "library",
-    "arrays_of": "library",
     "fit": "instrument, matrix, modes, noise, flux_frame, double_pass, options, threads",
     "from_oopao": "tel, dm, wfs, calib, M2C, ngs",
     "interaction_matrix": "instrument, alpha",

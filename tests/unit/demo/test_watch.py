@@ -2,9 +2,9 @@ import json
 import re
 import time
 
-import httpx
 import pytest
 
+from pyrcal.client.rest import Fetched, UnreachableError
 from pyrcal.demo.children import Child
 from pyrcal.demo.truth import TruthFile
 from pyrcal.demo.watch import (
@@ -84,9 +84,6 @@ class Scene:
         self.path = tmp_path / "truth.jsonl"
         monkeypatch.setattr(time, "monotonic", lambda: self.now_s)
         monkeypatch.setattr(time, "sleep", self.sleep)
-        self.client = httpx.Client(
-            transport=httpx.MockTransport(self.answer), base_url="http://service"
-        )
 
     def sleep(self, seconds):
         self.now_s += seconds
@@ -101,31 +98,32 @@ class Scene:
     def right(self):
         return self.now_s >= self.right_at_s
 
-    def answer(self, request):
+    def get(self, path):
         if not self.answers:
-            raise httpx.ConnectError("no service", request=request)
-        if request.url.path == "/v1/events":
+            raise UnreachableError("no service")
+        if path == "/v1/events":
             log = [{"name": "window.refused", "text": "the loop is open"}]
-            return httpx.Response(200, json={"alarms": [], "log": log})
+            return Fetched({"alarms": [], "log": log}, "")
         records = shelf() if self.right else shelf()[:1]
-        if request.url.path == "/v1/reconstructors":
-            return httpx.Response(200, json={"reconstructors": records})
+        if path == "/v1/reconstructors":
+            return Fetched({"reconstructors": records}, "")
         state = service_state(self.alarms)
         if self.now_s < self.ready_at_s:
             state["waiting_for"] = [waiting("model", "worker", "the model is being prepared")]
-        state["rtc"], state["in_use"], state["margin"] = {"n_controlled": 400}, "initial", None
+        state["rtc"] = {"n_controlled": 400, "frame_rate_hz": 1000.0}
+        state["in_use"], state["margin"] = "initial", None
         state["link"] = {"frames_received": round(1000 * self.now_s), "frames_lost": 0}
         if not self.right:
             state["registration"] = None
             state |= {"windows_accepted": 0, "windows_refused": 3}
         else:
             state["registration"]["age_s"] = 0.5
-        return httpx.Response(200, json=state)
+        return Fetched(state, "")
 
     def watch(self, seconds=60.0, *, whole=False, large=False, started=()):
         promise = Promise(seconds=seconds, whole=whole, real_time=True, large=large)
         truth = TruthFile(self.path)
-        return TelemetryObserver(self.client, truth, list(started), promise, self.lines.append)
+        return TelemetryObserver(self, truth, list(started), promise, self.lines.append)
 
 
 @pytest.fixture

@@ -181,7 +181,7 @@ def test_arrays_are_known_by_their_names(tmp_path):
     assert main([*words, "--output", str(folder)]) == 0
     with pyrcal.fitting.recorded.opened(folder / "matrix.h5") as file:
         np.testing.assert_allclose(file.find("interaction_matrix").read(), MATRIX * 1e6)
-    with pytest.raises(MatrixError, match="found im and D, expected one matrix"):
+    with pytest.raises(MatrixError, match="found D and im, expected one matrix"):
         by_role({"D": MATRIX, "im": MATRIX}, "it")
 
 

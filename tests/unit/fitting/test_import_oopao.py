@@ -176,9 +176,10 @@ def test_oopao_scales_along_its_angle_then_turns():
 
 
 def test_a_square_matrix_is_taken_as_it_is_and_it_is_said():
-    values, (note,) = orient_matrix(np.arange(9.0).reshape(3, 3), 3, 3, "M2C", "(a, b)")
+    notes: list[str] = []
+    values = orient_matrix(np.arange(9.0).reshape(3, 3), 3, 3, "M2C", "(a, b)", notes)
     assert values[0, 1] == 1.0
-    assert "M2C is square" in note
+    assert "M2C is square" in notes[0]
 
 
 def test_python_objects_and_what_is_no_npz_are_refused(tmp_path):

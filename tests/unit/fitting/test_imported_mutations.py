@@ -49,10 +49,14 @@ def by_aot(files, matrix, monkeypatch, _):
         pass
 
     loop = image(
+        uid="loop",
         interaction_matrix=image(data=matrix),
         modes_to_commands=image(data=given["mode_to_actuator"]),
         input_sensor=Pyramid(
-            subaperture_mask=image(data=places), wavelength=750e-9, transformation_matrix=None
+            uid="sensor",
+            subaperture_mask=image(data=places),
+            wavelength=750e-9,
+            transformation_matrix=None,
         ),
         commanded_corrector=image(
             influence_function=None,

@@ -250,7 +250,6 @@ def _jump(
         scatter=registration.scatter,
         jumped=True,
     )
-    validity.store_registration(context, registration)
     # Ordinary telemetry summed until now mixes both registrations.
     validity.void_until(context, first.t_ns_utc, BOTH_SIDES, Purpose.PASSIVE)
     # A window that was held was not counted when it came; one that had entered was.

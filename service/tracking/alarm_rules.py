@@ -99,10 +99,10 @@ def _loop_open(context: StepContext) -> str | None:
 
 def _other_numbers(context: StepContext) -> str | None:
     mismatched = context.matrices.mismatched_id
-    record = None if mismatched is None else context.state.reconstructor(mismatched)
-    if record is None or record.state is not MatrixState.FAILED:
-        return None if mismatched is None else context.alarm_text(alarms.OTHER_SUM)
-    return record.reason
+    record = context.state.reconstructor(mismatched)
+    if record is not None and record.state is MatrixState.FAILED:
+        return record.reason
+    return None if mismatched is None else context.alarm_text(alarms.OTHER_SUM)
 
 
 def _margin(context: StepContext) -> str | None:

@@ -86,8 +86,7 @@ def wanted_step(
     done = np.zeros(4) if state.alpha.offload is None else state.alpha.offload.total
     # The travel limits the sum of all moves, not a single one.
     step = np.clip(done + step, -limits.travel, limits.travel) - done
-    used = state.reconstructor(state.matrices.in_use) if state.matrices.in_use else None
-    made_for = start if used is None or used.alpha is None else used.alpha.vector
+    made_for = start if state.used is None or state.used.alpha is None else state.used.alpha.vector
     before, after = (np.abs(_apart(at, made_for)) for at in (alpha, alpha + step))
     allowed = np.maximum(before, MAX_STEPS_BEHIND * limits.max_step)
     idle = (np.abs(off) <= limits.near) | (after > allowed) | (limits.travel == 0.0)

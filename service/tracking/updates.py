@@ -137,7 +137,7 @@ def _choose_update(context: StepContext, rtc: Status) -> None:
     first_ns = max(
         _next_attempt_ns(state, rtc, context.policy), state.matrices.no_making_before_ns_utc
     )
-    in_use = state.reconstructor(state.matrices.in_use) if state.matrices.in_use else None
+    in_use = state.used
     if _is_busy(context) or now_ns < first_ns or in_use is None:
         return
     why, n_now = update_reason(state, in_use, context.policy, now_ns), rtc.n_controlled
@@ -161,8 +161,7 @@ def explain_hindrance(context: StepContext, rtc: Status) -> str:
     Empty while nothing does, and while it is a matter of a few windows. What the operator has
     ordered, and alarms that forbid all decisions, are said elsewhere.
     """
-    state, registration = context.state, context.registration
-    in_use = state.reconstructor(state.matrices.in_use) if state.matrices.in_use else None
+    state, registration, in_use = context.state, context.registration, context.state.used
     busy = state.operations.acquisition.under_way or state.on_probation
     if state.operator.mode is Mode.HOLD or in_use is None or not rtc.in_loop or busy:
         return ""

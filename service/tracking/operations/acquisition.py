@@ -135,11 +135,8 @@ def _own_loop_lost(context: StepContext) -> str | None:
     On as many modes it would not hold the next time, unless the mirror turns out to be elsewhere
     (``update_policy.is_beyond_verdict``). The RTC's own matrix says nothing of that.
     """
-    state = context.state
-    record = (
-        state.reconstructor(state.matrices.in_use) if state.matrices.in_use is not None else None
-    )
-    if record is None or record.alpha is None:
+    used = context.state.used
+    if used is None or used.alpha is None:
         return None
     alarm = context.blocking_alarm(Interlock.HOLD)
     return None if alarm is None else alarm.name
@@ -216,7 +213,7 @@ def _take_in(context: StepContext, event: Event) -> None:
 def _closed_stage(context: StepContext, rtc: Status) -> None:
     """Make, send, close; then let ordinary windows sharpen α and go on to more modes."""
     acquisition = context.acquisition
-    record = context.state.reconstructor(acquisition.matrix) if acquisition.matrix else None
+    record = context.state.reconstructor(acquisition.matrix)
     if record is not None and record.state in _LOST_STATES:
         stages.restart_acquisition(context, f"{record.id} was not applied: {record.reason}")
     elif acquisition.stage is AcquisitionStage.WIDENING:

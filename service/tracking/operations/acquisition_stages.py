@@ -459,7 +459,7 @@ def _lift_limit_of_jump(context: StepContext) -> None:
     at: the loss says nothing of how many modes hold at this one.
     """
     acquisition = context.acquisition
-    record = context.state.reconstructor(acquisition.lost_with) if acquisition.lost_with else None
+    record = context.state.reconstructor(acquisition.lost_with)
     if record is None or acquisition.found is None:
         return
     if not is_beyond_verdict(context.state, record):

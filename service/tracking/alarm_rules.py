@@ -30,7 +30,7 @@ from service.tracking import commands as cmd
 from service.tracking.alarms import ALARMS, RULE_PREFIX, AlarmDefinition, Severity
 from service.tracking.dither_request import MAX_STOP_DELAY_S
 from service.tracking.operation_records import AcquisitionStage
-from service.tracking.operations.acquisition_stages import has_missed_enough
+from service.tracking.operations.acquisition import has_missed_enough
 from service.tracking.operations.probation import explain_opening
 from service.tracking.policy import SECOND_NS, Rule
 from service.tracking.products import MatrixState

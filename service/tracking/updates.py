@@ -11,8 +11,13 @@ from service.tracking.mode_proof import awaits_proof, n_proven_modes
 from service.tracking.operations.running import running_ramp
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.reconstructors import request_applied, request_matrix, request_verdict
-from service.tracking.sending import check_return, check_sendable
+from service.tracking.reconstructors import (
+    check_return,
+    check_sendable,
+    request_applied,
+    request_matrix,
+    request_verdict,
+)
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.update_policy import (

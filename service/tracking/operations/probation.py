@@ -32,11 +32,11 @@ from service.tracking.alarms import (
 )
 from service.tracking.events import Event
 from service.tracking.operation_records import CommandState, Probation, ProbationState
-from service.tracking.operations.acquisition_stages import may_acquire
+from service.tracking.operations.acquisition import may_acquire
 from service.tracking.operator import enter_hold, leave_hold, set_loop
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.sending import check_sendable
+from service.tracking.reconstructors import check_sendable
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
 

@@ -548,7 +548,7 @@ def _operations() -> dict[str, set[str]]:
             for seen in _matched_types(node)
         }
         for path in sorted((ROOT / "service" / "tracking" / "operations").glob("*.py"))
-        if path.stem not in {"__init__", "running", "acquisition_stages"}
+        if path.stem not in {"__init__", "running"}
     }
 
 

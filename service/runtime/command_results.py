@@ -18,7 +18,7 @@ from service.tracking.dither_request import total_m
 from service.tracking.events import Effect, Event
 from service.tracking.operation_records import CommandState, MeasureState
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.sending import check_sendable
+from service.tracking.reconstructors import check_sendable
 from service.tracking.state import TrackerState
 
 SILENT = "sent, the RTC has not answered yet"

@@ -36,9 +36,9 @@ from service.tracking import alarms, products
 from service.tracking import events as ev
 from service.tracking.events import Event
 from service.tracking.operation_records import MeasurementRecord, MeasureState, NoisyFinding
-from service.tracking.passive_processing import fit_begins_at
 from service.tracking.pointing_law import start_of_fit
 from service.tracking.state import Level, TrackerState
+from service.tracking.window_processing import fit_begins_at
 from service.wire import checksum
 
 MatrixOf = Callable[[str], NDArray[np.float32]]

@@ -26,7 +26,7 @@ from service.tracking.operation_records import AcquisitionStage
 from service.tracking.operations.running import operating
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.sending import check_return, explain_unread_matrix
+from service.tracking.reconstructors import check_return, explain_unread_matrix
 from service.tracking.state import Mode, TrackerState
 from service.tracking.update_policy import MIN_PROPOSAL_LIFETIME_S, is_outdated
 from service.wire import TEXT_LIMIT, AlarmMessage, StateMessage

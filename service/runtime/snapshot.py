@@ -18,8 +18,8 @@ from service.tracking.commands import GainGroup
 from service.tracking.interlocks import Permission, permissions
 from service.tracking.operations.running import Operating, operating
 from service.tracking.policy import Policy
+from service.tracking.reconstructors import check_return
 from service.tracking.registration import PassiveBias, Registration
-from service.tracking.sending import check_return
 from service.tracking.state import LogEntry, TrackerState
 from service.wire import Status
 

@@ -30,7 +30,7 @@ from service.tracking import commands as cmd
 from service.tracking.alarms import ALARMS, RULE_PREFIX, AlarmDefinition, Severity
 from service.tracking.dither_request import MAX_STOP_DELAY_S
 from service.tracking.operation_records import AcquisitionStage
-from service.tracking.operations.acquisition_stages import has_missed_enough
+from service.tracking.operations.acquisition import has_missed_enough
 from service.tracking.operations.probation import explain_opening
 from service.tracking.policy import SECOND_NS, Rule
 from service.tracking.products import MatrixState
@@ -99,10 +99,10 @@ def _loop_open(context: StepContext) -> str | None:
 
 def _other_numbers(context: StepContext) -> str | None:
     mismatched = context.matrices.mismatched_id
-    record = None if mismatched is None else context.state.reconstructor(mismatched)
-    if record is None or record.state is not MatrixState.FAILED:
-        return None if mismatched is None else context.alarm_text(alarms.OTHER_SUM)
-    return record.reason
+    record = context.state.reconstructor(mismatched)
+    if record is not None and record.state is MatrixState.FAILED:
+        return record.reason
+    return None if mismatched is None else context.alarm_text(alarms.OTHER_SUM)
 
 
 def _margin(context: StepContext) -> str | None:

@@ -16,9 +16,9 @@ from service.estimation.random_dither import RandomEstimate
 from service.tracking import alarms, dither_plan, mode_proof
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.dither_modes import N_LINES
 from service.tracking.dither_plan import WantedDither
 from service.tracking.dither_request import (
+    N_LINES,
     NOISY_DITHER,
     OWN_DITHER,
     Dither,

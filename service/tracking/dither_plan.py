@@ -18,12 +18,6 @@ from service.estimation.loop import explain_open_loop
 from service.estimation.windows import DITHER_SETTLING_S
 from service.tracking import mode_proof
 from service.tracking.alarms import Interlock
-from service.tracking.dither_modes import (
-    check_free_modes,
-    choose_modes,
-    controlled,
-    expected_amplification,
-)
 from service.tracking.dither_request import (
     DITHER_MARGIN_S,
     OUR_DITHERS,
@@ -32,7 +26,11 @@ from service.tracking.dither_request import (
     DitherParameters,
     DitherPhase,
     DitherPlan,
+    check_free_modes,
+    choose_modes,
     clear_lines,
+    controlled,
+    expected_amplification,
     is_own_sine,
     is_proving,
     n_lines,

@@ -18,12 +18,11 @@ from service.tracking.alarms import ALARMS, RULE_PREFIX
 from service.tracking.commands import Command
 from service.tracking.events import kebab
 from service.tracking.operation_records import AcquisitionStage
-from service.tracking.operations.acquisition_stages import check_acquisition
+from service.tracking.operations.acquisition import check_acquisition
 from service.tracking.operations.running import OperationKind, RunningOperation, running_operations
 from service.tracking.policy import Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.reconstructors import require_record
-from service.tracking.sending import beyond_judging, check_approved
+from service.tracking.reconstructors import beyond_judging, check_approved, require_record
 from service.tracking.state import Mode, TrackerState
 from service.tracking.update_policy import is_left_behind
 

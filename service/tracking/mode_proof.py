@@ -20,8 +20,13 @@ from service.estimation.own_matrix import N_NEIGHBOURS, UNEVEN_RATIO
 from service.estimation.random_dither import RandomEstimate
 from service.tracking import alarms
 from service.tracking import events as ev
-from service.tracking.dither_modes import N_LINES, PROVING_LINE_RANGE, choose_modes
-from service.tracking.dither_request import VIBRATION_CLEARANCES_HZ, step_of
+from service.tracking.dither_request import (
+    N_LINES,
+    PROVING_LINE_RANGE,
+    VIBRATION_CLEARANCES_HZ,
+    choose_modes,
+    step_of,
+)
 from service.tracking.mode_limits import (
     MAX_LISTED_MODES,
     ModeAnswer,

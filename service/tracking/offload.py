@@ -86,8 +86,7 @@ def wanted_step(
     done = np.zeros(4) if state.alpha.offload is None else state.alpha.offload.total
     # The travel limits the sum of all moves, not a single one.
     step = np.clip(done + step, -limits.travel, limits.travel) - done
-    used = state.reconstructor(state.matrices.in_use) if state.matrices.in_use else None
-    made_for = start if used is None or used.alpha is None else used.alpha.vector
+    made_for = start if state.used is None or state.used.alpha is None else state.used.alpha.vector
     before, after = (np.abs(_apart(at, made_for)) for at in (alpha, alpha + step))
     allowed = np.maximum(before, MAX_STEPS_BEHIND * limits.max_step)
     idle = (np.abs(off) <= limits.near) | (after > allowed) | (limits.travel == 0.0)
@@ -102,7 +101,8 @@ def on_answer(context: StepContext, request: OffloadRequest, reply: Reply) -> No
     if not reply.accepted:
         # The image has not moved: the telemetry since the request is a measurement after all.
         make_valid(context, Purpose.MEASURE, MOVING)
-        _end(context, offload, OffloadState.REFUSED, reply.reason)
+        refused = replace(offload, state=OffloadState.REFUSED, text=reply.reason)
+        context.alpha = replace(context.alpha, offload=refused)
         context.warn("offload.refused", f"{offload.id}: {reply.reason}")
         return
     lasts_s = limits.settle_s
@@ -110,12 +110,8 @@ def on_answer(context: StepContext, request: OffloadRequest, reply: Reply) -> No
         until_s = (reply.start_seq - rtc.seq) / rtc.frame_rate_hz
         # The frame may be in the past already, and a wrong one must not void telemetry for hours.
         lasts_s = min(max(until_s, 0.0), MAX_MOVE_DURATION_S)
-    spread = OFFLOAD_ERROR_SIGMA * np.abs(offload.step) + _cross_talk(offload.step, limits)
-    still_ns = _clock_ns(context, lasts_s)
-    done = replace(offload, total=offload.total + offload.step, n_moves=offload.n_moves + 1)
-    void_until(context, still_ns, MOVING)
-    _end(context, done, OffloadState.MOVED, "")
-    validity.shift_estimate(context, offload.step, spread, still_ns)
+    moved = replace(offload, state=OffloadState.MOVED, text="", n_moves=offload.n_moves + 1)
+    _expect(context, moved, limits, _clock_ns(context, lasts_s))
     context.log("offload.moved", f"{offload.id}: α is expected {step_text(offload.step)} away")
 
 
@@ -125,12 +121,25 @@ def on_failure(context: StepContext, name: str, text: str) -> None:
     if offload is None or limits is None or offload.id != name:
         return
     still_ns = max(end_of(context.state, MOVING), _clock_ns(context, limits.settle_s))
-    void_until(context, still_ns, MOVING)
-    _end(context, offload, OffloadState.FAILED, text)
-    # The move was made or not: α is left where it was, and the whole step is its uncertainty.
-    spread = np.abs(offload.step) + _cross_talk(offload.step, limits)
-    validity.shift_estimate(context, np.zeros(4), spread, still_ns)
+    failed = replace(offload, state=OffloadState.FAILED, text=text)
+    _expect(context, failed, limits, still_ns)
     context.warn("offload.failed", f"{offload.id}: {text}; whether it was made must be measured")
+
+
+def _expect(context: StepContext, offload: Offload, limits: Offloading, still_ns: int) -> None:
+    """Store a move that was, or may have been, made, and expect α where it leads."""
+    known = offload.state is OffloadState.MOVED
+    # Without a reply α is left where it was, and the whole step is its uncertainty.
+    step, error_sigma = (offload.step, OFFLOAD_ERROR_SIGMA) if known else (np.zeros(4), 1.0)
+    # An axis that is never moved may have a largest step of 0.
+    share = np.abs(offload.step) / np.maximum(limits.max_step, 1e-12)
+    cross_talk = CROSS_TALK_SIGMA * share.max() * limits.max_step
+    void_until(context, still_ns, MOVING)
+    # The travel of the device is limited, whether or not its reply has arrived.
+    done = replace(offload, total=offload.total + offload.step)
+    context.alpha = replace(context.alpha, offload=done)
+    spread = error_sigma * np.abs(offload.step) + cross_talk
+    validity.shift_estimate(context, step, spread, still_ns)
 
 
 def restore_offload(context: StepContext, offload: Offload) -> None:
@@ -188,17 +197,6 @@ def _clock_ns(context: StepContext, after_s: float) -> int:
         # The RTC's clock has run on since its last status.
         else context.rtc.t_ns + round((MAX_STATUS_AGE_S + after_s) * SECOND_NS)
     )
-
-
-def _end(context: StepContext, offload: Offload, state: OffloadState, text: str) -> None:
-    context.alpha = replace(context.alpha, offload=replace(offload, state=state, text=text))
-
-
-def _cross_talk(step: Array, limits: Offloading) -> Array:
-    """Return ``(4,)`` 1 σ of what a step may do to the axes that it does not mean."""
-    # An axis that is never moved may have a largest step of 0.
-    share = np.abs(step) / np.maximum(limits.max_step, 1e-12)
-    return np.asarray(CROSS_TALK_SIGMA * share.max() * limits.max_step)
 
 
 def _apart(alpha: Array, other: Array) -> Array:

@@ -157,6 +157,11 @@ class Acquisition:
     """Id of the order or event that has begun it; empty: the service before this one did."""
 
     @property
+    def n_modes_before(self) -> int:
+        """Number of modes controlled before the acquisition, to which it returns."""
+        return self.n_modes if self.found is None else self.found.n_controlled
+
+    @property
     def uses_wide_capture(self) -> bool:
         """Return True if windows are open-loop windows, from which a distant α can be found."""
         return self.stage in {AcquisitionStage.COARSE, AcquisitionStage.CONFIRMING}

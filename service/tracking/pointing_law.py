@@ -18,7 +18,7 @@ from service.model.misregistration import Misregistration, step_text, wrap_angle
 from service.model.pointing_law import ANGLES, PointingLaw, Reported
 from service.tracking import events as ev
 from service.tracking.events import Event
-from service.tracking.operations.acquisition_stages import set_acquisition
+from service.tracking.operations.acquisition import set_acquisition
 from service.tracking.policy import SECOND_NS
 from service.tracking.registration import LawLeap, LawState, Purpose, Registration, moved
 from service.tracking.state import TrackerState

@@ -440,7 +440,8 @@ class Offload:
     """``(4,)`` by how much α was to change, numeric units."""
 
     total: Array
-    """``(4,)`` of all demands that were carried out, numeric units; outlives the service."""
+    """``(4,)`` of all demands that were, or may have been, carried out, numeric units; outlives
+    the service."""
 
     asked_ns_utc: int
     n_moves: int = 0

@@ -9,8 +9,11 @@ from service.tracking import dither, mode_proof, offload
 from service.tracking.alarm_records import restore_records
 from service.tracking.alarm_rules import derive_alarms
 from service.tracking.alarms import NOT_RESTORED, Interlock
-from service.tracking.operations.acquisition import acquisition_to_save, restore_acquisition
-from service.tracking.operations.acquisition_stages import abort_acquisition
+from service.tracking.operations.acquisition import (
+    abort_acquisition,
+    acquisition_to_save,
+    restore_acquisition,
+)
 from service.tracking.operations.measurement import give_up
 from service.tracking.operations.running import running_ramp
 from service.tracking.operator import change_mode

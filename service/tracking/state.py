@@ -340,9 +340,14 @@ class TrackerState:
     log: tuple[LogEntry, ...] = ()
     """Oldest first, bounded."""
 
-    def reconstructor(self, matrix_id: str) -> ReconstructorRecord | None:
+    def reconstructor(self, matrix_id: str | None) -> ReconstructorRecord | None:
         """Return the record of this id, or None."""
         return next((r for r in reversed(self.matrices.reconstructors) if r.id == matrix_id), None)
+
+    @property
+    def used(self) -> ReconstructorRecord | None:
+        """Record of the matrix that the RTC multiplies with; None if unknown."""
+        return self.reconstructor(self.matrices.in_use)
 
     def failure(self, cause: str) -> str:
         """Return the reason why an order or event had no result; empty if it had one."""

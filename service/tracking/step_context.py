@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
+from typing import Any, Generic, TypeVar
 
 from service.errors import CommandError
 from service.estimation.loop import NO_RTC
@@ -66,10 +67,29 @@ that are tried again."""
 LOOKED_BACK = 30
 """So many lines back the beginning of a burst is looked for."""
 
+RecordT = TypeVar("RecordT")
+
 _NUMBERS = re.compile(r"[-+]?[0-9][0-9.e+-]*")
 
 _VALUE = re.compile(r"(?<![\w.-])[-+]?[0-9]+(?:\.[0-9]+)?(?:e[-+]?[0-9]+)?(?![\w-])")
 """A number that is no part of a name or of a date."""
+
+
+class _Record(Generic[RecordT]):
+    """A record of the state as an attribute of the context; assigning replaces it."""
+
+    __slots__ = ("_name",)
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, context: StepContext, owner: type) -> RecordT:
+        record: RecordT = getattr(context.state, self._name)
+        return record
+
+    def __set__(self, context: StepContext, record: RecordT) -> None:
+        changes: dict[str, Any] = {self._name: record}
+        context.state = replace(context.state, **changes)
 
 
 class StepContext:
@@ -93,77 +113,14 @@ class StepContext:
 
         self.effects: list[Effect] = []
 
-    @property
-    def operator(self) -> OperatorState:
-        """Record ``operator`` of the state; assigning replaces it."""
-        return self.state.operator
-
-    @operator.setter
-    def operator(self, operator: OperatorState) -> None:
-        self.state = replace(self.state, operator=operator)
-
-    @property
-    def alpha(self) -> AlphaState:
-        """Record ``alpha`` of the state; assigning replaces it."""
-        return self.state.alpha
-
-    @alpha.setter
-    def alpha(self, alpha: AlphaState) -> None:
-        self.state = replace(self.state, alpha=alpha)
-
-    @property
-    def windows(self) -> WindowCounts:
-        """Record ``windows`` of the state; assigning replaces it."""
-        return self.state.windows
-
-    @windows.setter
-    def windows(self, windows: WindowCounts) -> None:
-        self.state = replace(self.state, windows=windows)
-
-    @property
-    def matrices(self) -> MatrixStates:
-        """Record ``matrices`` of the state; assigning replaces it."""
-        return self.state.matrices
-
-    @matrices.setter
-    def matrices(self, matrices: MatrixStates) -> None:
-        self.state = replace(self.state, matrices=matrices)
-
-    @property
-    def operations(self) -> Operations:
-        """Record ``operations`` of the state; assigning replaces it."""
-        return self.state.operations
-
-    @operations.setter
-    def operations(self, operations: Operations) -> None:
-        self.state = replace(self.state, operations=operations)
-
-    @property
-    def dithers(self) -> DitherState:
-        """Record ``dithers`` of the state; assigning replaces it."""
-        return self.state.dithers
-
-    @dithers.setter
-    def dithers(self, dithers: DitherState) -> None:
-        self.state = replace(self.state, dithers=dithers)
-
-    @property
-    def loop(self) -> LoopState:
-        """Record ``loop`` of the state; assigning replaces it."""
-        return self.state.loop
-
-    @loop.setter
-    def loop(self, loop: LoopState) -> None:
-        self.state = replace(self.state, loop=loop)
-
-    @property
-    def alarms(self) -> AlarmStates:
-        """Record ``alarms`` of the state; assigning replaces it."""
-        return self.state.alarms
-
-    @alarms.setter
-    def alarms(self, alarms: AlarmStates) -> None:
-        self.state = replace(self.state, alarms=alarms)
+    operator = _Record[OperatorState]()
+    alpha = _Record[AlphaState]()
+    windows = _Record[WindowCounts]()
+    matrices = _Record[MatrixStates]()
+    operations = _Record[Operations]()
+    dithers = _Record[DitherState]()
+    loop = _Record[LoopState]()
+    alarms = _Record[AlarmStates]()
 
     @property
     def registration(self) -> Registration | None:

@@ -11,8 +11,13 @@ from service.tracking.mode_proof import awaits_proof, n_proven_modes
 from service.tracking.operations.running import running_ramp
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.reconstructors import request_applied, request_matrix, request_verdict
-from service.tracking.sending import check_return, check_sendable
+from service.tracking.reconstructors import (
+    check_return,
+    check_sendable,
+    request_applied,
+    request_matrix,
+    request_verdict,
+)
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.update_policy import (
@@ -137,7 +142,7 @@ def _choose_update(context: StepContext, rtc: Status) -> None:
     first_ns = max(
         _next_attempt_ns(state, rtc, context.policy), state.matrices.no_making_before_ns_utc
     )
-    in_use = state.reconstructor(state.matrices.in_use) if state.matrices.in_use else None
+    in_use = state.used
     if _is_busy(context) or now_ns < first_ns or in_use is None:
         return
     why, n_now = update_reason(state, in_use, context.policy, now_ns), rtc.n_controlled
@@ -161,8 +166,7 @@ def explain_hindrance(context: StepContext, rtc: Status) -> str:
     Empty while nothing does, and while it is a matter of a few windows. What the operator has
     ordered, and alarms that forbid all decisions, are said elsewhere.
     """
-    state, registration = context.state, context.registration
-    in_use = state.reconstructor(state.matrices.in_use) if state.matrices.in_use else None
+    state, registration, in_use = context.state, context.registration, context.state.used
     busy = state.operations.acquisition.under_way or state.on_probation
     if state.operator.mode is Mode.HOLD or in_use is None or not rtc.in_loop or busy:
         return ""

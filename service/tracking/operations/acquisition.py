@@ -15,41 +15,128 @@ leaves the decision to the operator. It never closes a loop.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
+import numpy as np
+
+from service.control.dither import (
+    COARSE_BAND,
+    FINE_BAND,
+    FIRST_LOOP_MODES,
+    MIN_LINES,
+    Band,
+    spread_lines,
+    spread_modes,
+)
 from service.control.gate import MAX_SLIP_SAFE_LEAK
+from service.estimation.loop import NO_RTC
 from service.estimation.windows import RefusalKind
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking import reconstructors, update_policy
-from service.tracking.alarms import Interlock
-from service.tracking.dither import allow_dither, choose_dither, stop_running_dither
+from service.tracking import validity
+from service.tracking.alarms import LOST, Interlock, alarm_blocks, blocking_alarm
+from service.tracking.dither import (
+    allow_dither,
+    choose_dither,
+    request_dither,
+    request_stop,
+    stop_running_dither,
+)
+from service.tracking.dither_request import ACQUIRING_DITHER, Dither
 from service.tracking.events import Event
-from service.tracking.operation_records import Acquisition, AcquisitionStage, Interruption
-from service.tracking.operations import acquisition_stages as stages
+from service.tracking.operation_records import (
+    Acquisition,
+    AcquisitionStage,
+    Interruption,
+    LoopFound,
+    ProbationState,
+)
 from service.tracking.operations.noisy_measurement import fail_noisy_measurement
 from service.tracking.operations.running import running_ramp
-from service.tracking.policy import SECOND_NS
+from service.tracking.operator import set_loop
+from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.sending import check_sendable
-from service.tracking.state import Mode, TrackerState
+from service.tracking.reconstructors import (
+    change_state,
+    check_sendable,
+    forget_verdict,
+    request_matrix,
+    send_with,
+)
+from service.tracking.registration import Registration
+from service.tracking.state import Level, Mode, TrackerState
 from service.tracking.step_context import StepContext, present
-from service.wire import DitherRequest, LoopRequest, Reply, Status
+from service.tracking.update_policy import (
+    fewer_modes_than,
+    forget_limit,
+    half_of_modes,
+    has_moved,
+    is_beyond_verdict,
+    limit_modes,
+    verdict_doubtful_reason,
+)
+from service.wire import DitherKind, DitherRequest, LoopRequest, Reply, Status
 
 MIN_FINAL_WINDOWS = 2
 """Ordinary windows that must agree with the last reconstructor in the loop."""
 
-NO_RTC = (
+NO_RTC_LEFT = (
     "no RTC is present; once there is one, the acquisition restarts or reports why not; the loop "
     "may be open"
 )
-
-_LASTING_STAGES = (AcquisitionStage.FAILED, AcquisitionStage.INTERRUPTED)
-"""Stages that remain until an operator, or windows, end them."""
 
 MAX_STAGE_DURATION_S = 180.0
 """Longest time in one stage: a simulated RTC may be ten times slower than its timestamps."""
 
 _LOST_STATES = (MatrixState.REJECTED, MatrixState.FAILED)
+
+
+FAR_WINDOW_S = 2.0
+"""Telemetry in one estimate with the loop open, seconds."""
+
+FAR_DITHER_DURATION_S = 6.0
+"""Duration of a dither, seconds: two windows and the time until they are fitted; short, so that it
+ends soon after a crashed service."""
+
+CLOSING_GAIN = 0.3
+"""Gain of every mode if the loop was open at the start: its status does not contain the gains."""
+
+MAX_DIVERGENCE_S = 2.0
+"""Duration of an alarm of a diverging loop after which the service opens the loop itself. A lost
+loop is opened at once, unless the service is rolling back to the previous matrix, which takes less
+than this."""
+
+MISSES_BEFORE_ACQUISITION = 3
+"""Consecutive windows without a registration after which the service acquires by itself."""
+
+MISSES_WHILE_TRACKING = 10
+"""Consecutive windows without a registration, while α is known, after which the service acquires:
+bad telemetry alone opens no loop."""
+
+MAX_ATTEMPTS = 3
+"""Largest number of times that one acquisition opens the loop."""
+
+HELD_OFF_TEXT = (
+    "; none starts by itself until windows agree in a closed loop, the mode is set again, or an "
+    "operator orders one"
+)
+"""End of the text of an acquisition that an operator ended."""
+
+_MEASURED_STAGES = (
+    AcquisitionStage.PARTIAL,
+    AcquisitionStage.WIDENING,
+    AcquisitionStage.INTERRUPTED,
+)
+"""Stages in which α, if it is known, was measured by this acquisition."""
+
+MAX_ESTIMATE_DIFFERENCE = 23.5
+"""χ² of the difference of two estimates (4 degrees of freedom) that one in 10^4 exceeds."""
+
+MAX_STAGE_MISSES = 4
+"""Failed windows of a stage after which the loop is opened again."""
+
+STOP_STATUS_DELAY_S = 2.0
+"""Longest time until the status shows the end of a dither that was stopped."""
 
 
 def acquire_on_command(context: StepContext, _: cmd.Acquire) -> None:
@@ -60,7 +147,7 @@ def acquire_on_command(context: StepContext, _: cmd.Acquire) -> None:
 
 def abort_on_command(context: StepContext, _: cmd.AbortAcquisition) -> None:
     """End an acquisition by order."""
-    stages.abort_acquisition(context, "by the operator", held_off=True)
+    abort_acquisition(context, "by the operator", held_off=True)
 
 
 def advance(context: StepContext, event: Event) -> None:
@@ -71,15 +158,15 @@ def advance(context: StepContext, event: Event) -> None:
     elif not acquisition.under_way:
         if context.windows.accepted > context.before.windows.accepted:
             # An accepted window ends the sequence of misses.
-            stages.set_acquisition(context, replace(acquisition, misses=0))
+            set_acquisition(context, replace(acquisition, misses=0))
         _forget_when_over(context, event)
-        why = stages.explain_acquisition(context.state, context.policy, context.now_ns)
+        why = explain_acquisition(context.state, context.policy, context.now_ns)
         if why is not None and context.rtc and running_ramp(context.state, context.now_ns) is None:
             _begin(context, context.rtc, why, commanded=False)
     elif isinstance(event, ev.RtcVanished):
         # the state before still knows in which session that was
-        stages.set_acquisition(context, _interrupt(context.before, "the RTC vanished"))
-        _note_interrupted(context, NO_RTC)
+        set_acquisition(context, _interrupt(context.before, "the RTC vanished"))
+        _note_interrupted(context, NO_RTC_LEFT)
     else:
         with context.because_of("" if isinstance(event, cmd.Instruction) else acquisition.cause):
             _advance(context, event)
@@ -95,51 +182,63 @@ def acquisition_to_save(state: TrackerState) -> Acquisition | None:
     if acquisition.under_way:
         return _interrupt(state, "the service ended")
     aborted = acquisition.stage is AcquisitionStage.ABORTED and state.alpha.registration is None
-    lasts = acquisition.stage in _LASTING_STAGES or acquisition.held_off
-    return _saved_part(acquisition) if aborted or lasts else None
+    # Stages that remain until an operator, or windows, end them.
+    lasts = acquisition.stage in {AcquisitionStage.FAILED, AcquisitionStage.INTERRUPTED}
+    return _saved_part(acquisition) if aborted or lasts or acquisition.held_off else None
 
 
 def restore_acquisition(context: StepContext, left: Acquisition) -> None:
     """Take over the acquisition that the service before this one has left."""
-    stages.set_acquisition(context, left)
+    set_acquisition(context, left)
     if left.stage not in {AcquisitionStage.FAILED, AcquisitionStage.ABORTED}:
-        _note_interrupted(context, NO_RTC)
+        _note_interrupted(context, NO_RTC_LEFT)
 
 
 def _begin(context: StepContext, rtc: Status, why: str, *, commanded: bool) -> None:
+    """Begin one: nothing is known of α any more."""
     stop_running_dither(context)
     # Its telemetry would contain the opening of the loop.
     fail_noisy_measurement(context, "an acquisition has begun")
-    lost = _own_loop_lost(context)
-    stages.begin_acquisition(context, rtc, why=why, commanded=commanded)
+    lost, left = _own_loop_lost(context), acquisition_left_open(context.state, rtc)
+    found = left.found if left is not None else None
+    found = found or _loop_found(context.state, rtc, context.policy)
+    # The loop was unstable with this number of modes although its matrix fitted α, so the same
+    # number would fail again (``_own_loop_lost``).
+    most = None if lost is None else half_of_modes(rtc.n_controlled)
+    first = min(found.n_controlled, FIRST_LOOP_MODES)
+    begun = Acquisition(
+        stage=AcquisitionStage.OPENING,
+        text=f"opening the loop: {why}",
+        started_ns_utc=context.now_ns,
+        since_ns_utc=context.now_ns,
+        commanded=commanded,
+        attempt=1,
+        found=found,
+        n_modes=first if most is None else min(first, most),
+        max_modes=most,
+        lost_with=None if lost is None else context.before.matrices.in_use,
+        sent=left is not None and left.sent,
+        cause=context.cause,
+    )
+    set_acquisition(context, begun)
+    # A window that began before the loop is opened would mix two loops.
+    validity.invalidate_telemetry(context, "the acquisition had not begun")
+    validity.forget_registration(context)
+    forget_verdict(context)
     context.log("acquisition.begun", why)
-    if lost is not None:
-        # The loop was unstable with this number of modes although its matrix fitted α, so the same
-        # number would fail again (``_own_loop_lost``).
-        most = update_policy.half_of_modes(rtc.n_controlled)
-        first = min(context.acquisition.n_modes, most)
-        limited = replace(
-            context.acquisition,
-            max_modes=most,
-            n_modes=first,
-            lost_with=context.before.matrices.in_use,
-        )
-        stages.set_acquisition(context, limited)
-        update_policy.limit_modes(context, most, f"{lost} with {rtc.n_controlled} modes")
-    stages.wide_capture_stage(context, rtc)
+    if most is not None:
+        limit_modes(context, most, f"{lost} with {rtc.n_controlled} modes")
+    _wide_capture_stage(context, rtc)
 
 
 def _own_loop_lost(context: StepContext) -> str | None:
     """Return the alarm of a loop that did not hold on a matrix made for where the mirror is.
 
     On as many modes it would not hold the next time, unless the mirror turns out to be elsewhere
-    (``update_policy.is_beyond_verdict``). The RTC's own matrix says nothing of that.
+    (``is_beyond_verdict``). The RTC's own matrix says nothing of that.
     """
-    state = context.state
-    record = (
-        state.reconstructor(state.matrices.in_use) if state.matrices.in_use is not None else None
-    )
-    if record is None or record.alpha is None:
+    used = context.state.used
+    if used is None or used.alpha is None:
         return None
     alarm = context.blocking_alarm(Interlock.HOLD)
     return None if alarm is None else alarm.name
@@ -156,7 +255,7 @@ def _advance(context: StepContext, event: Event) -> None:
     if context.acquisition.stage in {AcquisitionStage.PARTIAL, AcquisitionStage.WIDENING}:
         _closed_stage(context, context.rtc)
     else:
-        stages.wide_capture_stage(context, context.rtc)
+        _wide_capture_stage(context, context.rtc)
 
 
 def _end_by_event(context: StepContext, event: Event) -> bool:
@@ -165,19 +264,19 @@ def _end_by_event(context: StepContext, event: Event) -> bool:
     late = context.now_ns - acquisition.since_ns_utc > MAX_STAGE_DURATION_S * SECOND_NS
     match event:
         case cmd.StopDither():
-            stages.abort_acquisition(context, "because the dither was stopped")
+            abort_acquisition(context, "because the dither was stopped")
         case cmd.SetMode(mode=mode) if mode is not Mode.AUTO and not acquisition.commanded:
-            stages.abort_acquisition(context, f"because the mode is {mode}")
+            abort_acquisition(context, f"because the mode is {mode}")
         # Opening the loop begins a session of its own. In a later stage the loop was changed from
         # outside.
         case ev.SessionStarted() if acquisition.stage is not AcquisitionStage.OPENING:
-            stages.restart_acquisition(context, "the RTC began a new session")
+            _restart_acquisition(context, "the RTC began a new session")
         case ev.DitherMeasured(id=loud, text=text) if loud == state.dithers.policy.loud_id and text:
-            stages.fail_acquisition(context, text)
+            _fail_acquisition(context, text)
         case ev.DitherUnusable(text=text):
-            stages.fail_acquisition(context, f"its dither cannot be read: {text}")
+            _fail_acquisition(context, f"its dither cannot be read: {text}")
         case ev.Tick() if late:
-            stages.restart_acquisition(
+            _restart_acquisition(
                 context, f"{acquisition.text}: not done in {MAX_STAGE_DURATION_S:.0f} s"
             )
         case _:
@@ -191,9 +290,9 @@ def _end_by_answer(context: StepContext, event: Event) -> bool:
         case ev.Answered(
             request=LoopRequest(id=acquisition.command), reply=Reply(accepted=False, reason=reason)
         ):
-            stages.fail_acquisition(context, f"the RTC will not change its loop: {reason}")
+            _fail_acquisition(context, f"the RTC will not change its loop: {reason}")
         case ev.JobFailed(effect=ev.Ask(request=LoopRequest(id=acquisition.command)), text=text):
-            stages.restart_acquisition(context, text)
+            _restart_acquisition(context, text)
         case _:
             return False
     return True
@@ -202,11 +301,11 @@ def _end_by_answer(context: StepContext, event: Event) -> bool:
 def _take_in(context: StepContext, event: Event) -> None:
     match event:
         case ev.WideCaptureFitted():
-            stages.on_wide_capture(context, event)
+            _on_wide_capture(context, event)
         case ev.WindowLost(refused=refused) if refused.kind is RefusalKind.NOT_FOUND:
-            stages.on_missed(context, refused.reason)
+            _on_missed(context, refused.reason)
         case ev.Answered(request=DitherRequest(), reply=Reply(accepted=False, reason=reason)):
-            stages.on_missed(context, f"the RTC refused the dither: {reason}")
+            _on_missed(context, f"the RTC refused the dither: {reason}")
         case ev.MatrixMade():
             _on_made(context, event)
         case _:
@@ -216,9 +315,9 @@ def _take_in(context: StepContext, event: Event) -> None:
 def _closed_stage(context: StepContext, rtc: Status) -> None:
     """Make, send, close; then let ordinary windows sharpen α and go on to more modes."""
     acquisition = context.acquisition
-    record = context.state.reconstructor(acquisition.matrix) if acquisition.matrix else None
+    record = context.state.reconstructor(acquisition.matrix)
     if record is not None and record.state in _LOST_STATES:
-        stages.restart_acquisition(context, f"{record.id} was not applied: {record.reason}")
+        _restart_acquisition(context, f"{record.id} was not applied: {record.reason}")
     elif acquisition.stage is AcquisitionStage.WIDENING:
         _widen(context, rtc, record)
     elif record is None:
@@ -229,12 +328,12 @@ def _closed_stage(context: StepContext, rtc: Status) -> None:
         return
     elif rtc.loop == "open":
         if acquisition.command is None:
-            stages.request_loop(context, cmd.SetLoop(loop="closed"))
+            _request_loop(context, cmd.SetLoop(loop="closed"))
     else:
         n_windows = context.windows.accepted
-        stages.set_acquisition(context, replace(acquisition, applied=record.id, windows=n_windows))
+        set_acquisition(context, replace(acquisition, applied=record.id, windows=n_windows))
         text = f"closed on {record.n_modes} modes: sharpening the registration"
-        stages.enter_stage(context, AcquisitionStage.WIDENING, text)
+        _enter_stage(context, AcquisitionStage.WIDENING, text)
 
 
 def _on_made(context: StepContext, made: ev.MatrixMade) -> None:
@@ -247,28 +346,24 @@ def _on_made(context: StepContext, made: ev.MatrixMade) -> None:
         return
     found = acquisition.found
     if rtc is None or found is None:
-        stages.restart_acquisition(context, f"{record.id} cannot be sent: no RTC is there")
+        _restart_acquisition(context, f"{record.id} cannot be sent: no RTC is there")
         return
-    gains = stages.gains_for(found, record.n_modes, rtc.n_modes)
-    stale = update_policy.verdict_doubtful_reason(
-        context.state, record.judged, gains[: record.n_modes]
-    )
+    gains = _gains_for(found, record.n_modes, rtc.n_modes)
+    stale = verdict_doubtful_reason(context.state, record.judged, gains[: record.n_modes])
     if stale is not None:
-        reconstructors.change_state(
-            context, record.id, MatrixState.DISCARDED, f"while it was made, {stale}"
-        )
+        change_state(context, record.id, MatrixState.DISCARDED, f"while it was made, {stale}")
         context.log("reconstructor.discarded", f"{record.id}: {stale}")
         return
     reason = check_sendable(context.state, record)
     if reason is not None:
-        stages.restart_acquisition(context, f"{record.id} cannot be sent: {reason}")
+        _restart_acquisition(context, f"{record.id} cannot be sent: {reason}")
         return
-    reconstructors.send_with(context, record.id, gains)
+    send_with(context, record.id, gains)
     most = acquisition.max_modes
     if acquisition.stage is AcquisitionStage.WIDENING and record.n_modes < (made.asked_modes or 0):
         most = record.n_modes
     sent = replace(acquisition, matrix=record.id, n_modes=record.n_modes, sent=True, command=None)
-    stages.set_acquisition(context, replace(sent, max_modes=most))
+    set_acquisition(context, replace(sent, max_modes=most))
 
 
 def _on_refused(context: StepContext, record: ReconstructorRecord) -> None:
@@ -276,28 +371,28 @@ def _on_refused(context: StepContext, record: ReconstructorRecord) -> None:
     acquisition, gate, rtc = context.acquisition, record.gate, context.rtc
     slippery = gate is not None and gate.edge_motion_m is not None
     if acquisition.stage is AcquisitionStage.WIDENING:
-        stages.set_acquisition(context, replace(acquisition, max_modes=acquisition.n_modes))
+        set_acquisition(context, replace(acquisition, max_modes=acquisition.n_modes))
     # With this leak a slipped segment at the edge recovers within a tenth of a second
     # (docs/results/reliability.md).
     elif slippery and rtc is not None and rtc.leak > MAX_SLIP_SAFE_LEAK:
         text = f"a leak of {MAX_SLIP_SAFE_LEAK} is to keep the outer ring in place"
         context.log("acquisition.leak", text)
-        stages.request_loop(context, cmd.SetLoop(leak=MAX_SLIP_SAFE_LEAK))
+        _request_loop(context, cmd.SetLoop(leak=MAX_SLIP_SAFE_LEAK))
     else:
         reason = gate.reason if gate is not None else record.reason
-        stages.fail_acquisition(context, f"no number of modes passes the gate: {reason}")
+        _fail_acquisition(context, f"no number of modes passes the gate: {reason}")
 
 
 def _widen(context: StepContext, rtc: Status, record: ReconstructorRecord | None) -> None:
     acquisition, registration = context.acquisition, context.registration
     slipped = context.blocking_alarm(Interlock.HOLD)
     if slipped is not None:
-        stages.restart_acquisition(
+        _restart_acquisition(
             context, f"{slipped.name} with {acquisition.n_modes} modes", slipped=True
         )
         return
     if rtc.loop == "open":
-        stages.restart_acquisition(context, "the loop was opened from outside")
+        _restart_acquisition(context, "the loop was opened from outside")
         return
     doubted = registration is not None and bool(registration.doubt)
     waiting = doubted or context.matrices.making_since_ns_utc is not None
@@ -305,10 +400,11 @@ def _widen(context: StepContext, rtc: Status, record: ReconstructorRecord | None
         if record.applied_frame_seq is not None and acquisition.applied != record.id:
             n_windows = context.windows.accepted
             acquisition = replace(acquisition, applied=record.id, windows=n_windows)
-            stages.set_acquisition(context, acquisition)
-        seen, goal = context.windows.accepted - acquisition.windows, _goal(acquisition)
+            set_acquisition(context, acquisition)
+        seen = context.windows.accepted - acquisition.windows
+        goal = min(acquisition.n_modes_before, acquisition.max_modes or rtc.n_modes)
         if seen >= 1 and (
-            record.n_modes < goal or update_policy.has_moved(context.state, record, context.policy)
+            record.n_modes < goal or has_moved(context.state, record, context.policy)
         ):
             _make(context, goal, rtc, at_least=record.n_modes)
             return
@@ -327,26 +423,19 @@ def _make(context: StepContext, n_modes: int, rtc: Status, *, at_least: int = 0)
         effect = ev.MakeMatrix(
             n_modes=n_modes,
             why=f"acquisition: {n_modes} modes",
-            gains=stages.gains_for(found, n_modes, rtc.n_modes),
-            fewer=tuple(
-                fewer for fewer in update_policy.fewer_modes_than(n_modes) if fewer > at_least
-            ),
+            gains=_gains_for(found, n_modes, rtc.n_modes),
+            fewer=tuple(fewer for fewer in fewer_modes_than(n_modes) if fewer > at_least),
         )
-        reconstructors.request_matrix(context, effect)
-
-
-def _goal(acquisition: Acquisition) -> int:
-    goal = acquisition.n_modes if acquisition.found is None else acquisition.found.n_controlled
-    return goal if acquisition.max_modes is None else min(goal, acquisition.max_modes)
+        request_matrix(context, effect)
 
 
 def _finish(context: StepContext, record: ReconstructorRecord) -> None:
     acquisition = context.acquisition
-    goal = acquisition.found.n_controlled if acquisition.found is not None else record.n_modes
+    goal = acquisition.n_modes_before
     took_s = (context.now_ns - acquisition.started_ns_utc) / SECOND_NS
     of_goal = "" if record.n_modes >= goal else f" of {goal}"
     text = f"tracking after {took_s:.0f} s, {record.n_modes}{of_goal} modes controlled"
-    stages.enter_stage(context, AcquisitionStage.TRACKING, text)
+    _enter_stage(context, AcquisitionStage.TRACKING, text)
 
 
 def _forget_when_over(context: StepContext, event: Event) -> None:
@@ -365,7 +454,7 @@ def _forget_when_over(context: StepContext, event: Event) -> None:
         text = f"{MIN_FINAL_WINDOWS} windows agree in the closed loop: none is needed any more"
     else:
         return
-    stages.set_acquisition(context, Acquisition(text=text, since_ns_utc=context.now_ns))
+    set_acquisition(context, Acquisition(text=text, since_ns_utc=context.now_ns))
     context.log("acquisition.idle", text)
 
 
@@ -408,13 +497,13 @@ def _resume_interrupted(context: StepContext) -> None:
         _note_interrupted(context, f"it does not restart by itself: {why_not}", do)
         return
     cause = _cause(context.acquisition)
-    stages.set_acquisition(context, replace(context.acquisition, interruption=None))
-    stages.restart_acquisition(context, cause)
+    set_acquisition(context, replace(context.acquisition, interruption=None))
+    _restart_acquisition(context, cause)
 
 
 def _check_automatic_resumption(context: StepContext, rtc: Status) -> str | None:
     state = context.state
-    if stages.acquisition_left_open(state, rtc) is None:
+    if acquisition_left_open(state, rtc) is None:
         return "the RTC has begun another session since, and who left its loop open is not known"
     if state.operator.mode is not Mode.AUTO:
         return f"the mode is {state.operator.mode}"
@@ -422,7 +511,7 @@ def _check_automatic_resumption(context: StepContext, rtc: Status) -> str | None
         return "the settings forbid that"
     if state.dithers.stopped:
         return "the dither was stopped"
-    return stages.check_acquisition(state, context.policy)
+    return check_acquisition(state, context.policy)
 
 
 def _note_interrupted(context: StepContext, what: str, do: str = "") -> None:
@@ -431,7 +520,7 @@ def _note_interrupted(context: StepContext, what: str, do: str = "") -> None:
     acquisition, stage = context.acquisition, AcquisitionStage.INTERRUPTED
     if (acquisition.stage, acquisition.text) == (stage, text):
         return
-    stages.set_acquisition(
+    set_acquisition(
         context, replace(acquisition, stage=stage, text=text, since_ns_utc=context.now_ns)
     )
     context.warn("acquisition.interrupted", what)
@@ -443,7 +532,7 @@ def _note_closed(context: StepContext, rtc: Status) -> None:
     if rtc.cm_id is not None and rtc.cm_id == context.acquisition.matrix:
         judged = "which had passed the gate: the registration is followed from there"
     text = f"{_cause_text(context.acquisition)}; the loop is closed on {matrix}, {judged}"
-    stages.enter_stage(context, AcquisitionStage.ABORTED, text)
+    _enter_stage(context, AcquisitionStage.ABORTED, text)
 
 
 def _cause_text(acquisition: Acquisition) -> str:
@@ -455,3 +544,389 @@ def _cause_text(acquisition: Acquisition) -> str:
 def _cause(acquisition: Acquisition) -> str:
     left = acquisition.interruption
     return "it was cut off" if left is None else left.cause
+
+
+def band_of(stage: AcquisitionStage) -> Band:
+    """Return the band of modes that is dithered in a stage with the loop open."""
+    return COARSE_BAND if stage is AcquisitionStage.COARSE else FINE_BAND
+
+
+def wide_capture_dither(
+    stage: AcquisitionStage, rtc: Status, policy: Policy, now_ns: int
+) -> Dither | str:
+    """Return the dither of a stage with the loop open, or why there is none.
+
+    It is strong: an open loop leaves the pyramid little response, and nothing is observed
+    meanwhile that could be spoilt.
+    """
+    modes, lines = _wide_capture_modes(stage, rtc)
+    reason = _check_mode_number(modes, rtc)
+    if reason is not None:
+        return reason
+    request = DitherRequest(
+        id=f"{ACQUIRING_DITHER}{now_ns}",
+        kind=DitherKind.SINE,
+        modes=modes,
+        amplitude_m=(min(policy.acquisition_amplitude_m, rtc.max_dither_m),) * len(modes),
+        frequency_hz=lines[: len(modes)],
+        duration_s=FAR_DITHER_DURATION_S,
+    )
+    return Dither(request=request, asked_ns_utc=now_ns, window_s=FAR_WINDOW_S)
+
+
+def _wide_capture_modes(
+    stage: AcquisitionStage, rtc: Status
+) -> tuple[tuple[int, ...], tuple[float, ...]]:
+    """Return the modes dithered in a stage with the loop open, and lines for them, Hz."""
+    # With the loop open a dithered line is a measured column of D, so any mode of the basis can be
+    # used.
+    lines = _lines(rtc.frame_rate_hz, rtc.max_dither_modes)
+    return spread_modes(band_of(stage), rtc.n_modes, len(lines)) if lines else (), lines
+
+
+@lru_cache(maxsize=4)
+def _lines(frame_rate_hz: float, n_lines: int) -> tuple[float, ...]:
+    """Return the lines of an RTC; whether there are enough is asked with every state shown."""
+    return spread_lines(frame_rate_hz, FAR_WINDOW_S, n_lines)
+
+
+def _check_mode_number(modes: tuple[int, ...], rtc: Status) -> str | None:
+    if len(modes) >= MIN_LINES:
+        return None
+    return (
+        f"found room for {len(modes)} dithered modes; expected at least {MIN_LINES}: the "
+        f"RTC plays {rtc.max_dither_modes} at once, at {rtc.frame_rate_hz:g} Hz, and its basis "
+        f"has {rtc.n_modes}"
+    )
+
+
+def _loop_found(state: TrackerState, rtc: Status, policy: Policy) -> LoopFound:
+    """Return the loop as it is, and as it shall be closed again."""
+    closed = rtc.loop != "open"
+    out_of_hand = blocking_alarm(state.alarms.active, Interlock.HOLD) is not None
+    goal = rtc.n_controlled or policy.wanted_modes(rtc)
+    # The status of an open loop does not contain the gains with which it was closed.
+    gains = rtc.gains if closed else (CLOSING_GAIN,) * goal
+    return LoopFound(
+        closed=closed,
+        gains=gains,
+        n_controlled=goal,
+        leak=rtc.leak,
+        held=closed and not out_of_hand,
+    )
+
+
+def acquisition_left_open(state: TrackerState, rtc: Status) -> Acquisition | None:
+    """Return the interrupted acquisition, if the loop is as it left it.
+
+    Opening a loop begins a session: the same session means that the loop was not closed in between.
+    """
+    left = state.operations.acquisition.interruption
+    if left is None or left.session != rtc.session or rtc.loop != "open":
+        return None
+    return state.operations.acquisition
+
+
+def _gains_for(found: LoopFound, n_modes: int, of_basis: int) -> tuple[float, ...]:
+    """Return the gains ``(of_basis,)`` with which so many modes are closed."""
+    return (*found.gains[:n_modes], *(0.0,) * (of_basis - n_modes))
+
+
+def may_acquire(state: TrackerState, policy: Policy) -> bool:
+    """Return whether the service may acquire by itself in mode auto, if it has a reason to."""
+    rtc, acquisition = state.loop.rtc, state.operations.acquisition
+    if not policy.acquires or rtc is None or rtc.loop == "open":
+        return False
+    if not policy.dither_enabled or state.dithers.stopped or state.measuring is not None:
+        return False
+    failed = acquisition.stage is AcquisitionStage.FAILED
+    blocked = blocking_alarm(state.alarms.active, Interlock.SEND_NEW) is not None
+    return not (failed or acquisition.held_off or blocked)
+
+
+def explain_acquisition(state: TrackerState, policy: Policy, now_ns: int) -> str | None:
+    """Return why the service should acquire by itself, or None."""
+    if state.operator.mode is not Mode.AUTO or not may_acquire(state, policy):
+        return None
+    trial = state.operations.probation
+    if trial is not None and trial.state is ProbationState.ACQUIRING:
+        return f"the loop is lost with {trial.id} and with {trial.before}"
+    for alarm in state.alarms.active:
+        lasted_ns = now_ns - alarm.since_ns_utc
+        # During a rollback the loop is given the time in which the previous matrix can recover it.
+        waits_s = 0.0 if alarm.name == LOST and not _goes_back(state) else MAX_DIVERGENCE_S
+        if alarm_blocks(alarm, Interlock.HOLD) and lasted_ns >= waits_s * SECOND_NS:
+            return f"{alarm.name} for {lasted_ns / SECOND_NS:.0f} s"
+    # Bad telemetry alone also refuses windows. Only a loop that has stopped correcting is opened
+    # for it.
+    if has_missed_enough(state) and not state.loop.holds:
+        return f"{state.operations.acquisition.misses} windows in a row found no registration"
+    return None
+
+
+def _goes_back(state: TrackerState) -> bool:
+    """Return whether the matrix before is on its way to the RTC, or has just come there."""
+    trial = state.operations.probation
+    return trial is not None and trial.state in {
+        ProbationState.ROLLING_BACK,
+        ProbationState.WATCHED,
+    }
+
+
+def has_missed_enough(state: TrackerState) -> bool:
+    """Return whether so many windows in a row found no registration that it is no chance."""
+    is_known = state.alpha.registration is not None and state.alpha.registration.usable
+    return state.operations.acquisition.misses >= (
+        MISSES_WHILE_TRACKING if is_known else MISSES_BEFORE_ACQUISITION
+    )
+
+
+def count_miss(context: StepContext, kind: RefusalKind) -> None:
+    """Count a refused window, if α was out of its reach and no acquisition is under way."""
+    if not context.acquisition.under_way and kind is RefusalKind.OUT_OF_REACH:
+        set_acquisition(
+            context, replace(context.acquisition, misses=context.acquisition.misses + 1)
+        )
+
+
+def check_acquisition(state: TrackerState, policy: Policy) -> str | None:
+    """Return why no acquisition can begin now, or None."""
+    if state.loop.rtc is None:
+        return NO_RTC
+    if not policy.dither_enabled:
+        return "the settings forbid any dither"
+    alarm = blocking_alarm(state.alarms.active, Interlock.SEND_NEW)
+    if alarm is not None:
+        return f"{alarm.name}: {alarm.text}"
+    modes, _ = _wide_capture_modes(AcquisitionStage.COARSE, state.loop.rtc)
+    return _check_mode_number(modes, state.loop.rtc)
+
+
+def set_acquisition(context: StepContext, acquisition: Acquisition) -> None:
+    """Note how far it has come."""
+    context.operations = replace(context.operations, acquisition=acquisition)
+
+
+def _enter_stage(context: StepContext, stage: AcquisitionStage, text: str) -> None:
+    """Begin a stage."""
+    set_acquisition(
+        context,
+        replace(
+            context.acquisition,
+            stage=stage,
+            text=text,
+            since_ns_utc=context.now_ns,
+            misses=0,
+            command=None,
+        ),
+    )
+    level = Level.WARNING if stage is AcquisitionStage.FAILED else Level.INFO
+    context.log(f"acquisition.{stage}", text, level)
+
+
+def _request_loop(context: StepContext, command: cmd.SetLoop) -> None:
+    """Ask the RTC to change its loop, and remember having asked."""
+    set_loop(context, command)
+    asked = context.loop.command
+    set_acquisition(
+        context, replace(context.acquisition, command=None if asked is None else asked.id)
+    )
+
+
+def _restart_acquisition(context: StepContext, reason: str, *, slipped: bool = False) -> None:
+    """Restart with the loop opened again, at once, a few times; then give up.
+
+    A loop that has slipped is closed on half as many modes next time.
+    """
+    acquisition = context.acquisition
+    if acquisition.attempt >= MAX_ATTEMPTS:
+        _fail_acquisition(context, f"{reason}, after {acquisition.attempt} attempts")
+        return
+    most = acquisition.max_modes
+    lost_with = acquisition.lost_with
+    if slipped:
+        # Fewer modes tolerate a larger misregistration.
+        most, lost_with = half_of_modes(acquisition.n_modes), None
+        limit_modes(context, most, reason)
+    validity.invalidate_telemetry(context, "the acquisition had not restarted")
+    stop_running_dither(context)
+    validity.forget_registration(context)
+    set_acquisition(
+        context,
+        replace(
+            acquisition,
+            attempt=acquisition.attempt + 1,
+            alpha=None,
+            covariance=None,
+            matrix=None,
+            max_modes=most,
+            lost_with=lost_with,
+            n_modes=min(acquisition.n_modes, most or acquisition.n_modes_before),
+        ),
+    )
+    _enter_stage(context, AcquisitionStage.OPENING, f"opening the loop again: {reason}")
+    if context.rtc is not None and context.rtc.loop != "open":
+        _request_loop(context, cmd.SetLoop(loop="open"))
+
+
+def _fail_acquisition(context: StepContext, reason: str) -> None:
+    """Give up: the loop stays as it is, but one that is out of hand is opened."""
+    closed = context.rtc is not None and context.rtc.loop != "open"
+    out_of_hand = context.blocking_alarm(Interlock.HOLD) is not None
+    stop_running_dither(context)
+    validity.forget_registration(context)
+    set_acquisition(context, replace(context.acquisition, windows=context.windows.accepted))
+    if closed and out_of_hand:
+        _request_loop(context, cmd.SetLoop(loop="open"))
+    text = (
+        f"no registration was acquired: {reason}; see the log, then acquire again, or close the "
+        "loop on a matrix of your own"
+    )
+    _enter_stage(context, AcquisitionStage.FAILED, text)
+
+
+def abort_acquisition(context: StepContext, why: str, *, held_off: bool = False) -> None:
+    """End it at once: the loop as it was found, if it held then and nothing was sent; else as is.
+
+    As is means open, or closed on a reconstructor that has passed the gate. ``held_off``: none
+    begins by itself for now, though what made this one begin may last.
+    """
+    stop_running_dither(context)
+    # In the other stages a second set of modes has not confirmed α.
+    if context.acquisition.stage not in _MEASURED_STAGES:
+        validity.forget_registration(context)
+    left, found = "left as it is", _to_give_back(context.state)
+    if found is not None:
+        left = "closed as it was found"
+        _request_loop(context, cmd.SetLoop(loop="closed", leak=found.leak))
+    text = f"ended {why}; the loop is {left}{HELD_OFF_TEXT if held_off else ''}"
+    over = replace(context.acquisition, held_off=held_off, windows=context.windows.accepted)
+    set_acquisition(context, over)
+    _enter_stage(context, AcquisitionStage.ABORTED, text)
+
+
+def _wide_capture_stage(context: StepContext, rtc: Status) -> None:
+    """Open the loop, then keep the dither of the stage running."""
+    acquisition = context.acquisition
+    if acquisition.stage is AcquisitionStage.OPENING:
+        if rtc.loop != "open":
+            if acquisition.command is None:
+                _request_loop(context, cmd.SetLoop(loop="open"))
+            return
+        text = "looking for the registration with the loop open, on smooth modes"
+        _enter_stage(context, AcquisitionStage.COARSE, text)
+    elif rtc.loop != "open":
+        _restart_acquisition(context, "the loop was closed from outside")
+        return
+    _keep_dithering(context, rtc)
+
+
+def _on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
+    """Take over where a window puts the mirror, or hold it against where another one did."""
+    rtc, before, estimate = context.rtc, context.acquisition, event.found.estimate
+    span = validity.telemetry_span(event.began_ns_utc, estimate.t_ns_utc)
+    if validity.explain_void(context.state, span) is not None:
+        return
+    if rtc is None or not before.uses_wide_capture or estimate.session != rtc.session:
+        return
+    if not _is_of_stage(context, rtc, estimate.modes):
+        return
+    covariance = estimate.covariance + np.diag(band_of(before.stage).floor ** 2)
+    set_acquisition(context, replace(before, alpha=estimate.alpha, covariance=covariance))
+    x, y, rotation, magnification = np.sqrt(np.diag(covariance))
+    place = (
+        f"{estimate.alpha} +- {x:.3f}, {y:.3f} subap, {np.rad2deg(rotation):.2f} deg, "
+        f"{magnification:.3f} (1 sigma)"
+    )
+    if before.stage is AcquisitionStage.COARSE or before.alpha is None or before.covariance is None:
+        stop_running_dither(context)
+        _enter_stage(context, AcquisitionStage.CONFIRMING, f"{place}: other modes must confirm it")
+        return
+    difference = estimate.alpha.vector - before.alpha.vector
+    chi2 = float(difference @ np.linalg.solve(covariance + before.covariance, difference))
+    # Two sets of modes must agree before α is used (docs/decisions/0019-acquisition.md).
+    if chi2 > MAX_ESTIMATE_DIFFERENCE:
+        set_acquisition(context, before)
+        reason = (
+            f"two sets of modes disagree: {before.alpha} and {estimate.alpha}, "
+            f"chi2 {chi2:.0f}, expected at most {MAX_ESTIMATE_DIFFERENCE}"
+        )
+        _restart_acquisition(context, reason)
+        return
+    registration = Registration(
+        alpha=estimate.alpha,
+        covariance=covariance,
+        floor=context.policy.floor,
+        image_floor=context.policy.image_floor,
+        t_ns_utc=estimate.t_ns_utc,
+        arrived_ns_utc=context.now_ns,
+        n_windows=1,
+        basis_id=context.loop.basis_id,
+        config_id=context.loop.config_id,
+        nominal=context.alpha.law.nominal,
+    )
+    validity.store_registration(context, registration)
+    _lift_limit_of_jump(context)
+    stop_running_dither(context)
+    _enter_stage(context, AcquisitionStage.PARTIAL, f"{place}: closing the loop")
+
+
+def _lift_limit_of_jump(context: StepContext) -> None:
+    """Allow all modes again where the loop was lost because the mirror had jumped.
+
+    The matrix that lost it was made for another registration, beyond what the gate had judged it
+    at: the loss says nothing of how many modes hold at this one.
+    """
+    acquisition = context.acquisition
+    record = context.state.reconstructor(acquisition.lost_with)
+    if record is None or not is_beyond_verdict(context.state, record):
+        return
+    n_modes = acquisition.n_modes_before
+    first = min(n_modes, FIRST_LOOP_MODES)
+    set_acquisition(context, replace(acquisition, max_modes=None, n_modes=first, lost_with=None))
+    forget_limit(context)
+    context.log("modes.limit-lifted", f"the mirror has moved since {record.id}: {n_modes} modes")
+
+
+def _on_missed(context: StepContext, reason: str) -> None:
+    """Count a window without a result; after a few, restart."""
+    misses = context.acquisition.misses + 1
+    if misses >= MAX_STAGE_MISSES:
+        _restart_acquisition(context, reason)
+    else:
+        set_acquisition(context, replace(context.acquisition, misses=misses))
+
+
+def _keep_dithering(context: StepContext, rtc: Status) -> None:
+    """Ask for the dither of the stage once no other one runs."""
+    if context.dither is not None or context.now_ns < context.dithers.no_dither_before_ns_utc:
+        return
+    if rtc.dither_id is not None:
+        stopping = rtc.dither_id == context.dither_policy.stopped_id
+        since_s = (context.now_ns - context.acquisition.since_ns_utc) / SECOND_NS
+        if not (stopping and since_s < STOP_STATUS_DELAY_S):
+            context.put_off(dither_s=STOP_STATUS_DELAY_S)
+            request_stop(context)
+        return
+    dither = wide_capture_dither(context.acquisition.stage, rtc, context.policy, context.now_ns)
+    if isinstance(dither, str):
+        _fail_acquisition(context, dither)
+    else:
+        request_dither(context, dither)
+
+
+def _to_give_back(state: TrackerState) -> LoopFound | None:
+    """Return the loop as it was found, if it held then and its matrix is still in the RTC."""
+    acquisition, rtc = state.operations.acquisition, state.loop.rtc
+    found = acquisition.found
+    if rtc is None or found is None or acquisition.sent or not (found.closed and found.held):
+        return None
+    if acquisition.interruption is not None and acquisition_left_open(state, rtc) is None:
+        return None
+    return found
+
+
+def _is_of_stage(context: StepContext, rtc: Status, modes: tuple[int, ...]) -> bool:
+    """Return whether these are the modes of the present stage."""
+    dither = wide_capture_dither(context.acquisition.stage, rtc, context.policy, 0)
+    return not isinstance(dither, str) and dither.request.modes == modes

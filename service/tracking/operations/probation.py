@@ -32,11 +32,11 @@ from service.tracking.alarms import (
 )
 from service.tracking.events import Event
 from service.tracking.operation_records import CommandState, Probation, ProbationState
-from service.tracking.operations.acquisition_stages import may_acquire
+from service.tracking.operations.acquisition import may_acquire
 from service.tracking.operator import enter_hold, leave_hold, set_loop
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.sending import check_sendable
+from service.tracking.reconstructors import check_sendable
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
 
@@ -195,7 +195,7 @@ def _begin_rollback(
 
 def _on_swap(context: StepContext, before: str | None, in_use: str | None) -> None:
     trial = context.operations.probation
-    record = None if in_use is None else context.state.reconstructor(in_use)
+    record = context.state.reconstructor(in_use)
     if (
         trial is not None
         and trial.state in _ROLLBACK_STATES
@@ -418,7 +418,7 @@ def _explain_failed_rollback(context: StepContext, trial: Probation, event: Even
     """Return why the matrix before does not come into use again; empty: it is on its way."""
     if isinstance(event, ev.JobFailed) and isinstance(event.effect, ev.RepublishMatrix):
         return event.text
-    sent = None if trial.rollback is None else context.state.reconstructor(trial.rollback)
+    sent = context.state.reconstructor(trial.rollback)
     if sent is None:
         late = context.now_ns > trial.until_ns_utc + REPUBLICATION_TIMEOUT_S * SECOND_NS
         return "its copy did not come" if late else ""

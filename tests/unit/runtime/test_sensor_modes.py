@@ -19,8 +19,8 @@ from service.runtime.estimates import fitted, read_own_matrix
 from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
 from service.tracking.products import MatrixState
+from service.tracking.reconstructors import check_sendable
 from service.tracking.resume import resumed, saved_of
-from service.tracking.sending import check_sendable
 from service.tracking.state import LoopState, Mode, TrackerState
 from sim_rtc.options import parse_options
 from tests.unit.runtime.small import COMPUTE

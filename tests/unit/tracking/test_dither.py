@@ -17,19 +17,22 @@ from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.alarms import OVER_BUDGET
 from service.tracking.dither import FIRST_DITHER_RETRY_S, MAX_DITHER_RETRY_S
-from service.tracking.dither_modes import (
-    LINE_RANGE,
-    choose_modes,
-    controlled,
-    expected_amplification,
-)
 from service.tracking.dither_plan import (
     FAINT_WINDOW_S,
     MAX_DITHER_DURATION_S,
     MIN_WINDOWS_FOR_PAUSE,
     budget_m,
 )
-from service.tracking.dither_request import DitherParameters, DitherPhase, clear_lines, total_m
+from service.tracking.dither_request import (
+    LINE_RANGE,
+    DitherParameters,
+    DitherPhase,
+    choose_modes,
+    clear_lines,
+    controlled,
+    expected_amplification,
+    total_m,
+)
 from service.tracking.state import Level, Mode
 from service.wire import DitherRequest, DitherStop
 from tests.states import changed

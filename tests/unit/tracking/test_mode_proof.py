@@ -11,7 +11,7 @@ from service.estimation.windows import WindowRefused
 from service.tracking import alarms
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.dither_modes import PROVING_LINE_RANGE
+from service.tracking.dither_request import PROVING_LINE_RANGE
 from service.tracking.mode_limits import MAX_COMPARED_WINDOWS, ModeProof, ModeRatio, compare
 from service.tracking.mode_proof import (
     MAX_PROOF_TRIES,

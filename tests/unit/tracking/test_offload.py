@@ -165,6 +165,25 @@ def test_the_reach_of_the_device_is_never_left():
     assert len(story.asked(OffloadRequest)) == 1
 
 
+@pytest.mark.parametrize("stops", [False, True])
+def test_a_move_without_a_reply_counts_for_the_reach_for_it_may_have_been_made(tmp_path, stops):
+    short = replace(LIMITS, travel=np.array([0.04, 0.03, 0.0, 0.0]) / BOUNDARY_SCALE)
+    story = a_story(policy=replace(MOVES, offloading=short))
+    (asked,) = story.asked(OffloadRequest)
+    if stops:
+        story = restarted(story, tmp_path)
+        story.meet(cm_id="cm-1")
+    else:
+        story.tell(ev.JobFailed(effect=ev.Ask(request=asked), text="nobody answered"))
+    np.testing.assert_allclose(
+        story.state.alpha.offload.total * BOUNDARY_SCALE, [-0.04, 0.03, 0.0, 0.0]
+    )
+    n_asked = len(story.asked(OffloadRequest))
+    story.wait(60.0)
+    story.see(ALPHA, n_windows=20)
+    assert len(story.asked(OffloadRequest)) == n_asked
+
+
 def restarted(story, tmp_path):
     """The service five seconds later: what it knows went through the file on the disk."""
     file = TrackingFile(tmp_path / "tracking.json")

@@ -10,9 +10,9 @@ from service.estimation.loop import loop_numbers
 from service.model.misregistration import Misregistration
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.passive_processing import fit_begins_at
 from service.tracking.registration import Source, Validity
 from service.tracking.state import Mode, TrackerState
+from service.tracking.window_processing import fit_begins_at
 from tests.states import changed
 from tests.unit.tracking.situations import (
     ALPHA,

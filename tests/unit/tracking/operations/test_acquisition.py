@@ -13,10 +13,10 @@ from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither_request import lock_in_plan
 from service.tracking.operation_records import AcquisitionStage
-from service.tracking.operations.acquisition import MAX_STAGE_DURATION_S
-from service.tracking.operations.acquisition_stages import (
+from service.tracking.operations.acquisition import (
     MAX_ATTEMPTS,
     MAX_DIVERGENCE_S,
+    MAX_STAGE_DURATION_S,
     MAX_STAGE_MISSES,
     MISSES_BEFORE_ACQUISITION,
     MISSES_WHILE_TRACKING,

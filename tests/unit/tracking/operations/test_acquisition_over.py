@@ -6,8 +6,7 @@ from service.estimation.windows import RefusalKind
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.operation_records import AcquisitionStage
-from service.tracking.operations.acquisition import MIN_FINAL_WINDOWS
-from service.tracking.operations.acquisition_stages import MISSES_WHILE_TRACKING
+from service.tracking.operations.acquisition import MIN_FINAL_WINDOWS, MISSES_WHILE_TRACKING
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import Loop, LoopRequest

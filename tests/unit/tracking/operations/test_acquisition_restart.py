@@ -7,7 +7,7 @@ import pytest
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.operation_records import AcquisitionStage
-from service.tracking.operations.acquisition_stages import MAX_ATTEMPTS
+from service.tracking.operations.acquisition import MAX_ATTEMPTS
 from service.tracking.products import MatrixState
 from service.tracking.resume import resumed, saved_of
 from service.tracking.state import Mode

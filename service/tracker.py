@@ -144,6 +144,8 @@ def _on_condition(context: StepContext, event: ev.ConditionChanged) -> None:
     elif event.name == alarms.MIRROR_SILENT:
         dither.stop_unanswered(context, event.text)
     else:
+        if event.name == alarms.WORKER_LOST:
+            mode_proof.forget_responses(context)
         context.raise_alarm(event.name, event.text)
 
 

@@ -88,6 +88,12 @@ class LeftOver:
     slopes: NDArray[np.float32]
     """``(n_slopes, n)`` slope per metre."""
 
+    def is_large(self, model: NDArray[np.floating]) -> bool:
+        """Return True if the model ``(n_slopes, n_modes)`` explains most of these modes poorly."""
+        size = np.linalg.norm(model[:, self.columns], axis=0)
+        share = np.linalg.norm(self.slopes, axis=0) / np.maximum(size, np.finfo(np.float32).tiny)
+        return bool(len(share)) and float(np.median(share)) >= MAX_UNWEIGHTED_MISFIT
+
     def add_to(self, linearisation: Linearisation) -> Linearisation:
         """Return a linearisation whose matrix has it: the response as it was measured."""
         matrix = linearisation.matrix.copy()
@@ -168,10 +174,11 @@ class OwnMatrix:
     def uneven(self) -> str:
         """Text on modes whose response differs from their neighbours'; empty without any."""
         recognised = np.flatnonzero(self.modes >= 0)
-        size = np.abs(self.response[recognised])
+        gain, misfit = np.abs(self.response[recognised]), self.misfit[recognised]
+        explained = 1.0 / (1.0 + misfit**2)
         ratio = {
-            int(self.columns[mode]): float(
-                size[k] / np.median(size[find_neighbours(recognised, k)])
+            int(self.columns[mode]): compare_strength(
+                gain, explained, k, find_neighbours(recognised, k)
             )
             for k, mode in enumerate(recognised)
             if len(recognised) > 1
@@ -238,6 +245,30 @@ class OwnMatrix:
 def find_neighbours(modes: NDArray[np.intp], k: int) -> NDArray[np.intp]:
     """Return the indices of the ``N_NEIGHBOURS`` modes nearest in number to ``modes[k]``."""
     return np.argsort(np.abs(modes - modes[k]), kind="stable")[1 : N_NEIGHBOURS + 1]
+
+
+def compare_strength(
+    gain: NDArray[np.floating], explained: NDArray[np.floating], k: int, beside: NDArray[np.intp]
+) -> float:
+    """Return the strength of the response of mode ``k`` over the median of modes ``beside`` it.
+
+    Where the model explains a mode's response only in part, the gain is the projection on the
+    model, and too small: the norm of the response is ``gain / sqrt(explained)``. But noise raises
+    the norm, so that of both ratios the one nearer to 1 is returned.
+
+    Parameters
+    ----------
+    gain
+        ``(n,)`` response over the model's.
+    explained
+        ``(n,)`` share of the power of each response that the model explains.
+    k, beside
+        Indices of the mode and of its neighbours.
+    """
+    ratios = [
+        float(size[k] / np.median(size[beside])) for size in (gain, gain / np.sqrt(explained))
+    ]
+    return min(ratios, key=lambda ratio: abs(np.log(max(ratio, np.finfo(float).tiny))))
 
 
 def recognise_modes(

@@ -8,7 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.own_matrix import N_NEIGHBOURS, UNEVEN_RATIO, find_neighbours
+from service.estimation.own_matrix import (
+    N_NEIGHBOURS,
+    UNEVEN_RATIO,
+    compare_strength,
+    find_neighbours,
+)
 
 HEALTHY_RATIO = 1.3
 """A mode whose response differs from that of its neighbours by ``UNEVEN_RATIO`` or its inverse is
@@ -23,6 +28,10 @@ CERTAINTY_SIGMA = 3.0
 
 MAX_NEIGHBOUR_DISTANCE = 2 * N_NEIGHBOURS
 """Modes away that one of them may be: others have another optical gain."""
+
+MIN_EXPLAINED_SHARE = 0.3
+"""Least share of a response that counts as explained when strengths are compared: noise makes it
+uncertain, and it may come out as zero."""
 
 MAX_COMPARED_WINDOWS = 3
 """Number of windows that compare a mode before it is accepted without a certain result."""
@@ -108,13 +117,19 @@ class ModeRatio:
 
 
 def compare(
-    modes: NDArray[np.intp], gains: NDArray[np.float64], sigma: NDArray[np.float64]
+    modes: NDArray[np.intp],
+    gains: NDArray[np.float64],
+    sigma: NDArray[np.float64],
+    unexplained: NDArray[np.float64] | None = None,
 ) -> dict[int, ModeRatio]:
     """Compare the response of each mode in one window with those of its neighbours in the basis.
 
     Optical gains change slowly with the mode number. A window with fewer than ``N_NEIGHBOURS``
-    other modes is not compared.
+    other modes is not compared. ``unexplained`` is the share of the power of each mode's response
+    that the model does not explain; None: nothing.
     """
+    left = np.zeros(len(modes)) if unexplained is None else unexplained
+    explained = np.maximum(1.0 - left, MIN_EXPLAINED_SHARE)
     found: dict[int, ModeRatio] = {}
     if len(modes) <= N_NEIGHBOURS:
         return found
@@ -124,9 +139,8 @@ def compare(
         # A ratio to neighbours that do not respond, or that are far away in the basis, means
         # nothing.
         if usual > 0.0 and abs(modes[beside[-1]] - mode) <= MAX_NEIGHBOUR_DISTANCE:
-            found[mode] = ModeRatio(
-                mode=mode, ratio=float(gains[k]) / usual, sigma=float(sigma[k]) / usual
-            )
+            ratio = compare_strength(gains, explained, k, beside)
+            found[mode] = ModeRatio(mode=mode, ratio=ratio, sigma=float(sigma[k]) / usual)
     return found
 
 

@@ -271,7 +271,8 @@ def learn_modes(context: StepContext, estimate: LockInEstimate | RandomEstimate)
     # Two windows must agree before a mode is excluded.
     sure = bad & (proof.suspected | proof.contrary)
     compared = _without(
-        compare(modes, gains, estimate.gain_sigma), bad | _controlled(context.state)
+        compare(modes, gains, estimate.gain_sigma, estimate.unexplained),
+        bad | _controlled(context.state),
     )
     uneven, doubtful = _judge_ratios(proof, compared, bad)
     doubted = frozenset(one.mode for one in doubtful)
@@ -368,7 +369,7 @@ def proof_to_keep(state: TrackerState) -> ModeProof | None:
     Modes of the matrix in use are not kept as suspected, because after a restart the service does
     not know that matrix at first.
     """
-    proof, proven = state.matrices.mode_proof, proven_modes(state)
+    proof, proven = _without_responses(state.matrices.mode_proof), proven_modes(state)
     kept = replace(
         proof,
         contrary=shunned_modes(state),
@@ -378,6 +379,21 @@ def proof_to_keep(state: TrackerState) -> ModeProof | None:
         n_tries=0,
     )
     return None if kept == ModeProof() else kept
+
+
+def forget_responses(context: StepContext) -> None:
+    """Have modes dithered again after the worker was lost, if the gate needs their response."""
+    proof = _without_responses(context.matrices.mode_proof)
+    context.matrices = replace(context.matrices, mode_proof=proof)
+
+
+def _without_responses(proof: ModeProof) -> ModeProof:
+    """Return the results without the measured responses, which end with the worker.
+
+    Where the model explains the RTC's own matrix well, sign and size of a mode are enough. Where
+    it does not, the gate needs the measured response of each mode that is newly controlled.
+    """
+    return replace(proof, proven=frozenset()) if proof.own_weights else proof
 
 
 def restore_proof(context: StepContext, proof: ModeProof, session: str) -> None:

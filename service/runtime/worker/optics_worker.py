@@ -23,6 +23,7 @@ from service.control.loop import ControlLoop
 from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
 from service.estimation import passive
 from service.estimation.description import Description
+from service.estimation.dithered_response import DitheredResponse
 from service.estimation.estimate import DitheredEstimate, PassiveEstimate
 from service.estimation.lockin import LockInEstimate, Spectra, fit_window
 from service.estimation.openloop import (
@@ -115,6 +116,8 @@ class OpticsWorker:
     def _equip(self, instrument: Instrument) -> None:
         """Make the models of an instrument, all but its modes."""
         basis, compute = self._basis, self._compute
+        # Residuals of the models before.
+        self._dithered = DitheredResponse()
 
         def model(sampling: int, nodes: int, at_work: WorkingPoint | None) -> RtcInteractionModel:
             return RtcInteractionModel(
@@ -205,7 +208,18 @@ class OpticsWorker:
         Where the linearisation at hand is too far away, the coarse model leads to within reach of
         one new, fine linearisation. A working point that does not give the optical gains that were
         measured is followed first. Slopes of another instrument are refused: what they look like.
+        The residual of every accepted fit is kept for the gate.
         """
+        outcome = self._fit_recognised(spectra, loop, start)
+        if isinstance(outcome, LockInEstimate):
+            response = self._as_own_matrix(outcome.alpha).matrix_at(outcome.alpha)
+            self._dithered.add(spectra, outcome, response)
+        return outcome
+
+    def _fit_recognised(
+        self, spectra: Spectra, loop: ClosedLoop, start: Misregistration | None
+    ) -> LockInEstimate | WindowRefused:
+        """Return the fit of a window, or why its slopes are another instrument's."""
         begun = start or self._start
         outcome = self._fit_spectra(spectra, loop, begun)
         if isinstance(outcome, LockInEstimate):
@@ -498,11 +512,22 @@ class OpticsWorker:
         """Return whether a reconstructor would hold the loop within α ± 3σ."""
         alpha, noise = conditions.alpha, self._model.instrument.slopes.kind.noise
         loop = replace(conditions.loop, outer=outer_of(self._model), noise=noise)
-        at_work = self._sensor.at_unit_gain(alpha)
-        if self._left_over is not None:
-            at_work = self._left_over.add_to(at_work)
+        own, at_work = self._left_over, self._as_own_matrix(alpha)
+        dithered = self._dithered.left_over(
+            () if own is None else own.columns.tolist(),
+            # A model that is poor where it was measured is taken for poor in all modes: what noise
+            # may hide counts as the model's error then.
+            noisy=own is not None and own.is_large(at_work.matrix),
+        )
+        if dithered is not None:
+            at_work = dithered.add_to(at_work)
         covariance, bound = conditions.covariance, conditions.bound
         return judge(reconstructor, at_work, alpha, covariance, loop, bound=bound)
+
+    def _as_own_matrix(self, alpha: Misregistration) -> Linearisation:
+        """Return the response at unit gain, with the residual of the RTC's own matrix."""
+        at_work = self._sensor.at_unit_gain(alpha)
+        return at_work if self._left_over is None else self._left_over.add_to(at_work)
 
     @waits(at_most_s=10.0)
     def margin(

@@ -250,3 +250,33 @@ def test_what_is_left_over_makes_the_measured_response_of_the_models_own():
     np.testing.assert_array_equal(there.matrix[:, N_CONTROLLED:], near.matrix[:, N_CONTROLLED:])
     none = LeftOver(columns=np.arange(0), slopes=np.zeros((len(own[0]), 0), np.float32))
     np.testing.assert_array_equal(none.add_to(near).matrix, near.matrix)
+
+
+def test_a_residual_is_large_where_the_model_explains_most_of_the_modes_poorly():
+    near = model(2).linearise(Misregistration())
+    columns = np.arange(10)
+    share = np.where(columns < 6, 0.1, 0.01)
+    poor = LeftOver(columns=columns, slopes=near.matrix[:, columns] * share)
+    assert poor.is_large(near.matrix)
+    assert not LeftOver(columns=columns, slopes=0.5 * poor.slopes).is_large(near.matrix)
+    assert not LeftOver(columns=columns[:0], slopes=poor.slopes[:, :0]).is_large(near.matrix)
+
+
+def test_the_strength_of_a_mode_is_its_norm_where_the_model_does_not_explain_its_shape():
+    """Half of the projection, but 0.8 of the norm: the shape differs and not the scale."""
+    _, response = true_response("as a night leaves it")
+    rng = np.random.default_rng(6)
+    strange = rng.standard_normal(len(response))
+    shape = response[:, 10] / np.linalg.norm(response[:, 10])
+    strange -= shape * (shape @ strange)
+
+    def twist(matrix):
+        changed = matrix.copy()
+        size = np.linalg.norm(matrix[:, 10])
+        changed[:, 10] = size * (0.55 * shape + 0.55 * strange / np.linalg.norm(strange))
+        return changed
+
+    found = told_by(twist)
+    assert found.response[10] == pytest.approx(0.55, abs=0.05)
+    assert found.uneven == ""
+    assert "mode 10 0.5" in told_by(times(0.55, 10)).uneven

@@ -5,6 +5,8 @@ import pytest
 
 from pyrcal_studies.campaign.observatory import OwnHands
 from service.errors import UnknownIdError
+from service.estimation.frames import FrameBlock
+from service.estimation.lockin import LockIn, LockInPlan
 from service.model.misregistration import Misregistration
 from service.runtime.estimates import read_own_matrix
 from service.runtime.worker import OpticsWorker
@@ -132,3 +134,81 @@ async def test_after_a_restart_the_rtcs_own_matrix_is_read_and_not_the_one_made_
         raise UnknownIdError(name)
 
     assert (await read(lost)).misfit < 0.02
+
+
+N_MORE = 79
+"""Modes of a matrix that controls more than the RTC's own; beyond, the edge would slip."""
+
+
+def a_window_of_free_modes(response):
+    """Two seconds of an open loop whose modes 45 to 89 are dithered together."""
+    rng, time = np.random.default_rng(2), np.arange(2000) / 1000.0
+    modes = tuple(range(N_CONTROLLED, 90))
+    lines = tuple(160.0 + 6.0 * k for k in range(len(modes)))
+    dither = np.zeros((len(time), 90), np.float32)
+    for mode, line in zip(modes, lines, strict=True):
+        dither[:, mode] = 1e-9 * np.sqrt(2) * np.sin(2 * np.pi * line * time)
+    noise = 1e-3 * rng.standard_normal((len(time), len(response)))
+    block = FrameBlock(
+        session="s1",
+        first_seq=0,
+        t0_ns_utc=0,
+        dt_ns=1_000_000,
+        slopes=(dither @ response.T + noise).astype(np.float32),
+        commands_m=dither,
+        dither_m=dither,
+        cm_id="initial",
+    )
+    plan = LockInPlan(
+        modes=modes,
+        frequencies_hz=lines,
+        amplitude_m=(1e-9,) * len(modes),
+        frame_rate_hz=1000.0,
+        n_frames=len(time),
+        first_seq=0,
+    )
+    _, (window,) = LockIn(plan=plan).accumulate(block)
+    return window
+
+
+def test_a_loop_is_judged_with_the_dithered_response_of_modes_that_the_rtc_does_not_control(bench):
+    """The model's error of the modes above those of the RTC's own matrix makes the loop unstable.
+
+    The error of pairs of modes exchanges them in part: each responds as the other, too, with
+    opposite signs, so that the eigenvalues of g R D are about 0.4 (1 ± 1.3 i).
+    """
+    start = Misregistration()
+    model = bench.response(start).astype(float)
+    first, second = np.arange(N_CONTROLLED, 89, 2), np.arange(N_CONTROLLED + 1, 90, 2)
+    truth = model.copy()
+    # Of random sense, because a rotation of the mirror exchanges all pairs in one sense.
+    ratio = 1.3 * np.random.default_rng(3).choice([-1.0, 1.0], len(first))
+    truth[:, first] += ratio * model[:, second]
+    truth[:, second] -= ratio * model[:, first]
+    own = np.linalg.pinv(truth[:, :N_CONTROLLED]).astype(np.float32)
+    found, _ = bench.recognise(own, None, None)
+    assert found.known.all()
+    more = conditions(start, np.diag(SIGMA**2), loop_settings(N_MORE), 0.95)
+    inverse = np.linalg.pinv(model[:, :N_MORE]).astype(np.float32)
+    assert bench.judge(inverse, more).accepted
+    bench.fit(a_window_of_free_modes(truth), open_loop(own), start)
+    verdict = bench.judge(inverse, more)
+    poles = loop_settings(N_MORE).pole_radius(np.linalg.eigvals(0.4 * inverse @ truth[:, :N_MORE]))
+    assert poles.max() > 1.0
+    assert verdict.worst_pole_radius >= poles.max()
+    assert not verdict.accepted
+    # a matrix of the RTC's own modes alone is judged as before
+    fewer = conditions(start, np.diag(SIGMA**2), loop_settings(), 0.95)
+    assert bench.judge(inverse[:N_CONTROLLED], fewer).accepted
+
+
+def test_a_window_of_a_right_model_changes_no_verdict(bench):
+    start = Misregistration()
+    truth = bench.response(start).astype(float)
+    own = np.linalg.pinv(truth[:, :N_CONTROLLED]).astype(np.float32)
+    bench.recognise(own, None, None)
+    more = conditions(start, np.diag(SIGMA**2), loop_settings(N_MORE), 0.95)
+    inverse = np.linalg.pinv(truth[:, :N_MORE]).astype(np.float32)
+    before = bench.judge(inverse, more).worst_pole_radius
+    bench.fit(a_window_of_free_modes(truth), open_loop(own), start)
+    assert bench.judge(inverse, more).worst_pole_radius == pytest.approx(before, abs=0.02)

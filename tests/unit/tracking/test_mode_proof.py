@@ -298,6 +298,19 @@ def test_a_mode_of_twice_or_half_the_strength_is_named_by_two_windows_and_contro
     assert alarms.MODES_UNEVEN not in world.alarms
 
 
+def test_a_mode_whose_shape_the_model_does_not_explain_is_not_uneven():
+    """Its gain is the projection of its response: 0.36 / sqrt(1 - 0.4) is 0.46."""
+    modes = np.arange(12)
+    gains, sigma = np.where(modes == 5, 0.36, 0.6), np.full(12, 0.01)
+    unexplained = np.where(modes == 5, 0.4, 0.0)
+    assert compare(modes, gains, sigma)[5].ratio == pytest.approx(0.6)
+    found = compare(modes, gains, sigma, unexplained)
+    assert found[5].ratio == pytest.approx(0.775, abs=0.001)
+    assert not found[5].stands_out
+    # noise that makes a strong mode stronger accuses nobody
+    assert compare(modes, np.full(12, 0.6), sigma, unexplained)[5].ratio == pytest.approx(1.0)
+
+
 def test_optical_gains_that_change_along_the_basis_are_not_uneven():
     world = Shown().pass_(8.0)
     for _ in range(3):
@@ -346,6 +359,25 @@ def test_what_modes_have_shown_outlives_the_service():
     assert "(-0.60 times the model)" in text
     assert "mode 415 answers" in world.state.alarm(alarms.MODES_UNEVEN).text
     assert world.state.matrices.mode_limit.n_modes == 421
+
+
+@pytest.mark.parametrize("lost", ["restart", "worker"])
+def test_modes_are_dithered_again_where_the_gate_has_lost_their_response(lost):
+    """The model is poor: sign and size of a mode are not enough."""
+    lose = {"restart": killed, "worker": lost_worker}[lost]
+    world = Shown().pass_(8.0)
+    told(world, [0.6] * 12)
+    before = world.state.matrices.mode_proof.proven
+    assert before
+    assert lose(world).state.matrices.mode_proof.proven == before
+    proof = replace(world.state.matrices.mode_proof, own_weights=(1.0,) * N_MODES)
+    world.state = changed(world.state, mode_proof=proof)
+    assert not lose(world).state.matrices.mode_proof.proven
+
+
+def lost_worker(world):
+    world.tell(ev.ConditionChanged(name=alarms.WORKER_LOST, text="the worker died"))
+    return world
 
 
 def test_of_another_session_nothing_is_taken_over():

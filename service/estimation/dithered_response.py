@@ -1,0 +1,104 @@
+"""Measured response of dithered modes: what the model does not explain of it.
+
+The RTC's own matrix shows the model's error in the modes that it controls. Of all other modes only
+a dither shows it, and a loop that begins to control them may be unstable because of it. The slopes
+at a mode's line, over its command, are its measured response. The model's part is in phase with
+the command and is subtracted; noise has any phase. So the component out of phase is noise alone,
+as strong and as correlated over slopes and modes as the noise of the component in phase, and shows
+how much of the latter is significant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.estimation.lockin import LockInEstimate, Spectra
+from service.estimation.own_matrix import LeftOver
+
+Array = NDArray[Any]
+
+MIN_GAIN_SIGMA = 4.0
+"""A mode whose gain is not above this many σ has no response whose shape could be compared."""
+
+MEMORY_RATIO = 0.95
+"""Weight of earlier windows after each window of the same mode: twenty windows are averaged, so
+that the residual follows a response that changes over the night."""
+
+_TINY = float(np.finfo(np.float32).tiny)
+
+
+class DitheredResponse:
+    """Residual of the model in the response of dithered modes, averaged over their windows."""
+
+    def __init__(self) -> None:
+        self._means: dict[int, tuple[Array, float]] = {}
+        self._significant: dict[int, Array] = {}
+        self._session: str | None = None
+
+    def add(self, spectra: Spectra, estimate: LockInEstimate, response: Array) -> None:
+        """Add a window, without the optical gain of each mode: the gate gets it from the tracker.
+
+        ``response`` is ``(n_slopes, n_modes)`` without this residual, at unit gain.
+        """
+        if estimate.session != self._session:
+            # An RTC that was restarted may have other modes.
+            self._means, self._significant, self._session = {}, {}, estimate.session
+        gains, sigma = estimate.optical_gain, estimate.gain_sigma
+        if sigma is None:
+            return
+        lines = np.flatnonzero(gains.real > MIN_GAIN_SIGMA * sigma)
+        if not len(lines):
+            return
+        modes = np.array(spectra.plan.modes)[lines]
+        commands = spectra.commands[lines, 0]
+        own = commands[np.arange(len(lines)), modes]
+        # The commands of all modes: the loop answers a dither with every mode that it controls,
+        # and those have a residual as well.
+        seen = commands.real @ response.T + 1j * (commands.imag @ response.T)
+        known = sorted(self._significant)
+        if known:
+            others = np.where(np.equal.outer(modes, known), 0.0, commands[:, known])
+            seen += others @ np.array([self._significant[mode] for mode in known])
+        left = (spectra.slopes[lines, 0] / gains[lines, None] - seen) / own[:, None]
+        for mode, one in zip(modes.tolist(), left, strict=True):
+            self._add_to_mean(mode, one)
+        self._find_significant(modes.tolist())
+
+    def _add_to_mean(self, mode: int, left: Array) -> None:
+        weight = 1.0 / max(float(np.mean(left.imag**2)), _TINY)
+        mean, total = self._means.get(mode, (np.zeros_like(left), 0.0))
+        total = MEMORY_RATIO * total + weight
+        self._means[mode] = mean + (left - mean) * (weight / total), total
+
+    def _find_significant(self, modes: list[int]) -> None:
+        """Keep of these modes' residuals the patterns that stand out of the noise.
+
+        The model's error is smooth over modes and slopes, so that few patterns have most of it,
+        while noise is spread over all: a single mode may be measured poorly, and the error of the
+        combination of modes that makes a loop unstable is still known.
+        """
+        mean = np.array([self._means[mode][0] for mode in modes])
+        sigma = np.sqrt(np.mean(mean.imag**2, axis=1, keepdims=True))
+        sigma = np.maximum(sigma, _TINY)
+        noise = float(np.linalg.norm(mean.imag / sigma, ord=2))
+        by_mode, size, by_slope = np.linalg.svd(mean.real / sigma, full_matrices=False)
+        # No margin: a pattern of noise that passes raises a pole radius by 0.02 at most, and an
+        # error that is missed may hide an unstable loop.
+        size[size < noise] = 0.0
+        left = sigma * ((by_mode * size) @ by_slope)
+        self._significant.update(zip(modes, left.astype(np.float32), strict=True))
+
+    def left_over(self, known: Collection[int] = (), *, noisy: bool = False) -> LeftOver | None:
+        """Return the residual of dithered modes other than ``known`` ones; None: of no mode.
+
+        Only what is significant, or with its noise if ``noisy``.
+        """
+        modes = sorted(self._significant.keys() - set(known))
+        if not modes:
+            return None
+        every = [self._means[mode][0].real if noisy else self._significant[mode] for mode in modes]
+        return LeftOver(columns=np.array(modes), slopes=np.array(every, np.float32).T)

@@ -184,11 +184,12 @@ class Normals:
         self, inside: NDArray[np.bool_], held: Array, pull: Array
     ) -> tuple[Array, Array]:
         """Return the step of selected parts ``(n_parts,)`` and its 1 σ by leaving out clusters."""
-        _, cluster = np.unique(self.clusters[inside], return_inverse=True)
-        n_clusters = int(cluster.max()) + 1
-        normals = np.zeros((n_clusters, *self.normals.shape[1:]))
-        np.add.at(normals, cluster, self.normals[inside])
-        scores = np.array([np.bincount(cluster, row) for row in self.scores[:, inside]])
+        parts = np.flatnonzero(inside)
+        order = parts[np.argsort(self.clusters[parts], kind="stable")]
+        _, first = np.unique(self.clusters[order], return_index=True)
+        n_clusters = len(first)
+        normals = np.add.reduceat(self.normals[order], first, axis=0)
+        scores = np.add.reduceat(self.scores[:, order], first, axis=1)
         every, scored = normals.sum(axis=0) + held, scores.sum(axis=1) - pull
         # All fits with one cluster left out are solved at once.
         left = np.linalg.solve(every - normals, (scored[:, None] - scores).T[:, :, None])[:, :4, 0]

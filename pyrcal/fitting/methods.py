@@ -206,9 +206,6 @@ class Settled:
     nuisances: Nuisances
     """Nuisances relative to these models."""
 
-    on_fine_grid: bool = True
-    """True if the fine model determined the solution."""
-
     @property
     def prior(self) -> Array:
         """``(4 + n_nuisances,)`` effective weight of the prior of each unknown, 1 / σ²."""
@@ -238,14 +235,14 @@ def settle(
     fit is repeated if their set has changed.
     """
     seen = _remove_unknown_rows(models, target, start)
-    solution = refine(models, seen, start, nuisances, decides=models.cheap)
-    settled = Settled(
-        solution=solution, target=seen, models=models, nuisances=nuisances, on_fine_grid=False
+    # where little is left over, the cheap grid's own error would displace pupil images
+    solution = refine(
+        models, seen, start, nuisances, decides=models.cheap, fine_below=SEARCH_RESIDUAL
     )
-    if settled.share < SEARCH_RESIDUAL:
-        # so little is left over that the cheap grid's own error would displace pupil images
+    settled = Settled(solution=solution, target=seen, models=models, nuisances=nuisances)
+    if not solution.on_fine_grid and settled.share < SEARCH_RESIDUAL:
         solution = refine(models, seen, solution.alpha, nuisances, near=solution)
-        settled = replace(settled, solution=solution, on_fine_grid=True)
+        settled = replace(settled, solution=solution)
     settled = _with_nearest_instrument(settled)
     models, nuisances = settled.models, settled.nuisances
     # ``approaching``: iterate on the coarse grid, which is cheaper, until that has converged
@@ -257,7 +254,7 @@ def settle(
         before = left
         there, near = _remove_unknown_rows(models, target, settled.solution.alpha), None
         if models is settled.models and np.array_equal(there.rows, settled.target.rows):
-            if settled.on_fine_grid:
+            if settled.solution.on_fine_grid:
                 break
             # Nothing changed on the coarse grid: the derivatives still hold for the fine one.
             approaching, near = False, settled.solution
@@ -271,13 +268,12 @@ def settle(
             target=there,
             models=models,
             nuisances=nuisances,
-            on_fine_grid=not approaching,
         )
         taken = settled if images is None and near is None else taken
-    if settled.on_fine_grid:
+    if settled.solution.on_fine_grid:
         return settled
     solution = refine(models, settled.target, settled.solution.alpha, nuisances)
-    return replace(settled, solution=solution, on_fine_grid=True)
+    return replace(settled, solution=solution)
 
 
 def reuse_image_derivatives(
@@ -315,9 +311,7 @@ def _with_nearest_instrument(settled: Settled) -> Settled:
         if models is not settled.models:
             start = settled.solution.alpha
             solution = refine(models, settled.target, start, nuisances, decides=models.cheap)
-            settled = replace(
-                settled, solution=solution, models=models, nuisances=nuisances, on_fine_grid=False
-            )
+            settled = replace(settled, solution=solution, models=models, nuisances=nuisances)
     return settled
 
 

@@ -129,6 +129,8 @@ class FitModels:
             mapper=self.mapper,
             kept_bytes=0.0 if once else KEPT_BYTES,
         )
+        if known is not None:
+            model.share_modes(known)
         if not once:
             self.made[sampling] = model
         return model
@@ -221,20 +223,20 @@ class FitModels:
         return replace(self, instrument=replace(self.instrument, wfs=wfs))
 
     def optics_derivatives(
-        self, alpha: Misregistration, optics: Sequence[Optic]
+        self, alpha: Misregistration, optics: Sequence[Optic], cheap_matrix: NDArray[Any] | None
     ) -> list[NDArray[Any]]:
         """Return the derivatives of D by optical quantities, ``(n_slopes, n_modes)`` each.
 
-        They are computed on the coarse grid.
+        They are computed on the coarse grid. ``cheap_matrix`` is D on it; None if it is not known.
         """
         found = []
         for optic in optics:
             if optic is Optic.WIDTH:
                 found.append(self.cheap.width_derivative(alpha))
                 continue
+            own = self.cheap.interaction_matrix(alpha) if cheap_matrix is None else cheap_matrix
             other = self.with_optic(optic, SENSOR_STEP).model(COARSE_SAMPLING, once=True)
-            stepped = other.interaction_matrix(alpha)
-            found.append((stepped - self.cheap.interaction_matrix(alpha)) / SENSOR_STEP)
+            found.append((other.interaction_matrix(alpha) - own) / SENSOR_STEP)
             self.counter.n += 1
         self.counter.n += len(found)
         return found

@@ -206,7 +206,9 @@ class FitSubset:
         """Return D of an instrument, ``(n_slopes, n_few)``."""
         own = tried.basis is self.models.basis
         basis = self.model.basis if own else tried.basis.subset(self.modes)
-        return self._at_solution(tried.model(COARSE_SAMPLING, basis, once=True))
+        model = tried.model(COARSE_SAMPLING, basis, once=True)
+        model.share_modes(self.model)
+        return self._at_solution(model)
 
     def left(self, matrix: Array, *more: Array) -> float:
         """Return χ² at the best unknowns, including those of further derivatives."""

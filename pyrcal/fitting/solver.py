@@ -57,13 +57,16 @@ LONGEST_STRETCH = 0.03
 SETTLED_STRETCH = 1e-5
 """Step of a stretch below which the fit has converged: 1.5e-4 subapertures at the edge of 30."""
 
-LINEAR_STEP = np.array([5e-3, 5e-3, np.deg2rad(0.02), 4e-4])
-"""Step below which the coarse model is extrapolated with its derivatives, 0.005 subapertures at the
-edge of 30 (numeric units). The fine model is always computed: extrapolated as well, it moved a
-result that is known to 0.001 subapertures by 0.2 sigma."""
+LINEAR_STEP = np.array([0.02, 0.02, np.deg2rad(0.1), 4e-3])
+"""Step below which the coarse model is extrapolated with its derivatives (numeric units). The
+error, some percent of the step, is that of a start for the fine grid."""
 
-LINEAR_STRETCH = 4e-4
-"""The same limit for a stretch."""
+FINE_LINEAR_STEP = np.array([5e-4, 5e-4, np.deg2rad(2e-3), 2e-4])
+"""The same limit for the fine model, whose last step is then extrapolated. Derivatives of the
+coarse model are wrong by 1 %: the error is less than a twentieth of the smallest sigma of a fit."""
+
+LINEAR_STRETCH, FINE_LINEAR_STRETCH = 4e-3, 2e-4
+"""The same limits for a stretch."""
 
 STRETCH_FLOOR = 1e-4
 """Smallest 1 σ of an anamorphosis; the same floor as the magnification's: both are image scales."""
@@ -195,23 +198,24 @@ class Nuisances:
         models: FitModels,
         alpha: Misregistration,
         matrix: NDArray[Any],
+        cheap_matrix: NDArray[Any] | None = None,
+        of_stretches: Sequence[Array] | Array = (),
         of_images: Sequence[Array] | Array = (),
     ) -> Array:
         """Return the derivatives of D by each nuisance except the gain map.
 
-        Shape ``(n_nuisances - n_maps, n_slopes, n_modes)``. ``of_images`` are those by the image
-        displacements, one for each pattern.
+        Shape ``(n_nuisances - n_maps, n_slopes, n_modes)``. ``matrix`` is D, ``cheap_matrix``
+        that of the coarse grid or None if it is not known. ``of_stretches`` are the derivatives by
+        the stretches, if they are unknown, ``of_images`` those by the image displacements, one for
+        each pattern.
         """
-        model = models.cheap
-        kind = model.instrument.slopes.kind
+        kind = models.instrument.slopes.kind
         along_x, along_y = slopes_of(matrix, kind)
         # A small rotation of the axes adds (-Sy, Sx) times the angle to (Sx, Sy).
-        found = [signals_of_slopes(np.stack([-along_y, along_x]), kind)]
-        if self.anamorphosis:
-            models.counter.n += 2
-            found += list(model.stretch_derivatives(alpha))
-        found += models.optics_derivatives(alpha, [optic for optic, _ in self.optics])
-        return np.array([*found, *of_images])
+        turned = signals_of_slopes(np.stack([-along_y, along_x]), kind)
+        which = [optic for optic, _ in self.optics]
+        optics = models.optics_derivatives(alpha, which, cheap_matrix)
+        return np.array([turned, *of_stretches, *optics, *of_images])
 
     def combine_images(self, apart: Array, of_alpha: Array) -> Array:
         """Return the change with each pattern, of the changes ``(8, ...)`` with each image."""
@@ -298,7 +302,7 @@ def nuisances_of(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Solution:
-    """Minimum of the fit on the fine grid."""
+    """Minimum of the fit on one of the grids."""
 
     alpha: Misregistration
     """Registration. Its anamorphosis keeps its start value if it is not fitted."""
@@ -329,6 +333,9 @@ class Solution:
 
     converged: bool
 
+    on_fine_grid: bool = True
+    """True if the fine model determined the solution."""
+
     @property
     def vector(self) -> Array:
         """``(4,)`` of α, numeric units."""
@@ -345,6 +352,7 @@ def refine(
     near: Solution | None = None,
     of_images: Array | None = None,
     decides: InteractionModel | None = None,
+    fine_below: float = 0.0,
 ) -> Solution:
     """Return the minimum on the fine grid, with derivatives frozen on a coarser one.
 
@@ -363,39 +371,56 @@ def refine(
         Derivatives by the image displacements only, of a nearby solution; None to compute them.
     decides
         Model of the residual that is minimised; None for the fine one.
+    fine_below
+        RMS residual share of the signal below which the fine model decides instead of the coarse
+        one, after a step within which the model is linear.
     """
     vector, values = start.vector, nuisances.begin(start)
     decides = models.fine if decides is None else decides
     matrix = models.matrix(decides, start)
     near_alpha = start if near is None else near.near_alpha
     rates = (
-        _compute_derivatives(models, start, matrix, nuisances, of_images)
+        _compute_derivatives(
+            models,
+            start,
+            matrix,
+            nuisances,
+            of_images,
+            on_coarse_grid=decides is models.cheap,
+        )
         if near is None
         else near.near
     )
     seen, every = _project_columns(columns, matrix, rates, values, nuisances)
     regions = nuisances.regions[columns.rows]
     counts = dispersion(seen, regions)
-    moving, settled, linear, converged = np.arange(4), SETTLED_STEP, LINEAR_STEP, False
+    moving, settled, converged = np.arange(4), SETTLED_STEP, False
+    coarse_linear, fine_linear = LINEAR_STEP, FINE_LINEAR_STEP
     if nuisances.anamorphosis:
         moving = np.append(moving, 4 + np.arange(STRETCHES.start, STRETCHES.stop))
         settled = np.append(settled, [SETTLED_STRETCH] * 2)
-        linear = np.append(linear, [LINEAR_STRETCH] * 2)
+        coarse_linear = np.append(coarse_linear, [LINEAR_STRETCH] * 2)
+        fine_linear = np.append(fine_linear, [FINE_LINEAR_STRETCH] * 2)
+    step = _limit_step(seen, values, nuisances, counts)
     for _ in range(max_steps):
-        step = _limit_step(seen, values, nuisances, counts)
         # The last point inside the limits is kept, and the fit counts as not converged.
         if not within_limits(vector + step[:4]):
             break
         vector, values = vector + step[:4], values + step[4:]
-        if decides is models.cheap and np.all(np.abs(step[moving]) < linear):
-            # the error, some percent of the step, is that of a start for the fine grid
+        on_coarse_grid = decides is models.cheap
+        linear = bool(
+            np.all(np.abs(step[moving]) < (coarse_linear if on_coarse_grid else fine_linear))
+        )
+        if on_coarse_grid and linear and _expected_share(seen, columns) < fine_below:
+            decides, linear = models.fine, False
+        if linear:
             matrix = matrix + sum(step[k].astype(rates.dtype) * rates[k] for k in moving)
         else:
             matrix = models.matrix(decides, nuisances.at(start, vector, values))
         seen, every = _project_columns(columns, matrix, rates, values, nuisances)
         counts = dispersion(seen, regions)
-        next_step = _limit_step(seen, values, nuisances, counts)
-        if np.all(np.abs(next_step[moving]) < settled):
+        step = _limit_step(seen, values, nuisances, counts)
+        if np.all(np.abs(step[moving]) < settled):
             converged = True
             break
     return Solution(
@@ -409,7 +434,14 @@ def refine(
         projection=seen,
         dispersion=counts,
         converged=converged,
+        on_fine_grid=decides is not models.cheap,
     )
+
+
+def _expected_share(seen: Projection, columns: Columns) -> float:
+    """Return the RMS share of the signal that the next step leaves over, to first order."""
+    power = np.sum(columns.matrix[columns.rows] ** 2, axis=0)
+    return float(np.sqrt(max(seen.chi_at_best, 0.0) / (power @ columns.weights)))
 
 
 def _compute_derivatives(
@@ -418,21 +450,31 @@ def _compute_derivatives(
     matrix: NDArray[Any],
     nuisances: Nuisances,
     of_images: Array | None,
+    *,
+    on_coarse_grid: bool,
 ) -> Array:
-    """Return the derivatives by α and each nuisance except the gain map, ``Solution.near``."""
-    model = models.cheap
-    models.counter.n += 4
+    """Return the derivatives by α and each nuisance except the gain map, ``Solution.near``.
+
+    ``on_coarse_grid``: ``matrix`` is D of the coarse model.
+    """
+    model, stretched = models.cheap, nuisances.anamorphosis
+    models.counter.n += 6 if stretched else 4
     if of_images is not None or not len(nuisances.images):
-        of_alpha = model.derivatives(alpha)
+        moved = model.derivatives(alpha, with_stretches=stretched)
     else:
         models.counter.n += 2
         apart = model.image_derivatives(alpha)
-        of_alpha = model.derivatives(alpha, apart)
-        of_images = nuisances.combine_images(apart, of_alpha)
+        moved = model.derivatives(alpha, apart, with_stretches=stretched)
+        of_images = nuisances.combine_images(apart, moved)
     of_nuisances = nuisances.derivatives(
-        models, alpha, matrix, () if of_images is None else of_images
+        models,
+        alpha,
+        matrix,
+        matrix if on_coarse_grid else None,
+        moved[4:],
+        () if of_images is None else of_images,
     )
-    return np.concatenate([of_alpha, of_nuisances])
+    return np.concatenate([moved[:4], of_nuisances])
 
 
 def _project_columns(

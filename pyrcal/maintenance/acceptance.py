@@ -193,7 +193,7 @@ def _judge_rtc(data: Commissioning) -> _Lines:
 
 def _judge_fit(data: Commissioning) -> _Lines:
     names = ("registration determined", "σ of the registration", "stable modes")
-    limits = ("yes", _sigma_text(_stale_sigma(data)), f"{_n_wanted(data)} modes")
+    limits = ("yes", _sigma_text(_largest_fit_sigma(data)), f"{_n_wanted(data)} modes")
     if data.fit is None or data.fit["registration"] is None:
         reason = "no fit was given" if data.fit is None else "the fit has no registration"
         for name, limit in zip(names, limits, strict=True):
@@ -210,7 +210,7 @@ def _judge_fit(data: Commissioning) -> _Lines:
     sigma = np.array([data.fit["sigma"][name] for name in PARAMETERS]) / BOUNDARY_SCALE
     yield (
         names[1],
-        bool((sigma <= _stale_sigma(data)).all()),
+        bool((sigma <= _largest_fit_sigma(data)).all()),
         _sigma_text(sigma),
         limits[1],
         "more averages or more modes",
@@ -229,8 +229,8 @@ def _judge_fit(data: Commissioning) -> _Lines:
     )
 
 
-def _stale_sigma(data: Commissioning) -> NDArray[np.float64]:
-    """Return 1 σ of α ``(4,)`` from which on it is stale, the model error included."""
+def _largest_fit_sigma(data: Commissioning) -> NDArray[np.float64]:
+    """Return 1 σ ``(4,)`` from which on α is stale, with the model error that a fit includes."""
     return np.hypot(data.policy.stale_sigma, data.policy.floor)
 
 
@@ -257,9 +257,8 @@ def _judge_tracking(data: Commissioning) -> _Lines:
     )
     # The precision that the service itself requires of α; its σ includes the model error.
     policy = data.policy
-    target = np.sqrt(
-        (policy.tolerance * policy.dither_sigma) ** 2 + policy.floor**2 + policy.image_floor**2
-    )
+    floor = np.hypot(policy.floor, policy.image_floor)  # both are in every σ of the service
+    target = np.hypot(policy.tolerance * policy.dither_sigma, floor)
     enough = len(windows) >= MIN_WINDOWS
     median = np.median([one.filtered_sigma for one in windows], axis=0) if windows else target
     yield (
@@ -279,7 +278,7 @@ def _judge_tracking(data: Commissioning) -> _Lines:
     )
     # Samples before α was first known say nothing on whether the dither keeps it fresh.
     known = [one.sigma for one in data.samples if one.sigma is not None]
-    stale = np.hypot(_stale_sigma(data), policy.image_floor)
+    stale = np.hypot(policy.stale_sigma, floor)
     fresh = [bool((sigma <= stale).all()) for sigma in known]
     share = float(np.mean(fresh)) if fresh else 0.0
     yield (

@@ -78,8 +78,7 @@ class Columns:
         """
         matrix = np.asarray(model[self.rows], dtype=np.float64)
         measured = self.matrix[self.rows]
-        # a mode that a far registration moves off the pupil changes no slope: its gain is 0
-        power = np.maximum(np.sum(matrix**2, axis=0), np.finfo(float).tiny)
+        power = _power(matrix)
         gains = np.sum(matrix * measured, axis=0) / power
         if not self.signed:
             gains = np.maximum(gains, 0.0)
@@ -109,9 +108,17 @@ class Columns:
         matrix = np.asarray(model[self.rows], dtype=np.float64)
         measured = self.matrix[self.rows]
         along = np.sum(matrix * measured, axis=0)
-        explained = np.maximum(along, 0.0) ** 2 / np.sum(matrix**2, axis=0)
+        explained = np.maximum(along, 0.0) ** 2 / _power(matrix)
         total = np.sum(measured**2, axis=0)
         return float((total - explained) @ self.weights / (total @ self.weights))
+
+
+def _power(matrix: Array) -> Array:
+    """Return the sum of squares of each column, never 0.
+
+    A mode that a far registration moves off the pupil changes no slope: its gain is 0 then.
+    """
+    return np.asarray(np.maximum(np.sum(matrix**2, axis=0), np.finfo(float).tiny))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -8,7 +8,7 @@ between the two.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, Generic, Self, TypeVar
@@ -202,6 +202,14 @@ class InteractionModel:
             single = self._dtype is np.float32
             self._combination = (local.in_single if single else local).coefficients
 
+    def share_modes(self, other: InteractionModel) -> None:
+        """Take over the modes that another model has rendered, if both have the same points.
+
+        A model of another sensor behind the same pupil needs no rendering then.
+        """
+        if self.basis is other.basis and np.array_equal(self.pupil.points, other.pupil.points):
+            self._modes = other._modes
+
     def forget(self) -> None:
         """Give back the memory of the last response and the last rendered modes."""
         self._response, self._modes = _Last(), _Last()
@@ -225,20 +233,28 @@ class InteractionModel:
         """
         return self._as_listed(self.measure_signals(alpha, self._render_modes(alpha)))
 
-    def derivatives(self, alpha: Misregistration, of_images: Array | None = None) -> Array:
+    def derivatives(
+        self,
+        alpha: Misregistration,
+        of_images: Array | None = None,
+        *,
+        with_stretches: bool = False,
+    ) -> Array:
         """Return dD/dα ``(4, n_slopes, n_modes)``: per subaperture, radian, magnification.
 
         ``of_images`` are those by each pupil image if they are known, see ``image_derivatives``:
         with the mirror as stop a shift moves all images, so that their sums are its derivatives.
+        ``with_stretches`` appends those of ``stretch_derivatives``, which cost less together.
         """
+        more = self._stretch_ways(alpha) if with_stretches else []
         if self.instrument.stop is Stop.TELESCOPE:
-            rates = self._measure_shapes(alpha, self._rates_of_modes(alpha))
+            rates = self._measure_shapes(alpha, self._rates_of_modes(alpha, more))
         elif of_images is not None and len(of_images):
-            rates = self._measure_shapes(alpha, self._rates_of_modes(alpha))
+            rates = self._measure_shapes(alpha, self._rates_of_modes(alpha, more))
             by_axis = of_images.reshape(_AXES, -1, *of_images.shape[1:]).sum(axis=1)
             return np.stack([*by_axis, *(self._as_listed(rate) for rate in rates)])
         else:
-            _, *rates = self._with_rates(alpha)
+            _, *rates = self._with_rates(alpha, more)
         return np.stack([self._as_listed(rate) for rate in rates])
 
     def mirror_shift_derivatives(self, alpha: Misregistration) -> Array:
@@ -253,11 +269,7 @@ class InteractionModel:
         Per unit of stretch along x, and as much shrinking along y; the second along 45 deg and
         135 deg.
         """
-        turn = rotation(alpha.rotation_rad)
-        stretches = self.instrument.with_anamorphosis(alpha).stretches
-        back = np.linalg.inv(stretch_matrix(stretches)) @ turn
-        along, askew = -turn.T * [1.0, -1.0] @ back, -turn.T[:, ::-1] @ back
-        moved = [self._move_modes(alpha, partial(_stretch_rate, by=by)) for by in (along, askew)]
+        moved = [self._move_modes(alpha, way) for way in self._stretch_ways(alpha)]
         rates = self._measure_shapes(alpha, moved)
         return np.stack([self._as_listed(rate) for rate in rates])
 
@@ -366,22 +378,24 @@ class InteractionModel:
         """Return rows ``(n_slopes, ...)`` in the order and signs that this model's caller uses."""
         return rows
 
-    def _with_rates(self, alpha: Misregistration) -> list[Array]:
-        """Return D and its four derivatives."""
-        rendered, rates = self._render_modes(alpha), self._rates_of_modes(alpha)
+    def _with_rates(self, alpha: Misregistration, more: Sequence[Way] = ()) -> list[Array]:
+        """Return D and its four derivatives, then those along ``more`` ways of the mirror."""
+        rendered, rates = self._render_modes(alpha), self._rates_of_modes(alpha, more)
         if self.instrument.stop is Stop.TELESCOPE:
             return self._measure_shapes(alpha, [rendered, *rates])
         turned = self._measure_shapes(alpha, rates)
         return [*self._at(self._image_shift(alpha)).with_shift_rates(rendered), *turned]
 
-    def _rates_of_modes(self, alpha: Misregistration) -> list[Shapes]:
+    def _rates_of_modes(self, alpha: Misregistration, more: Sequence[Way] = ()) -> list[Shapes]:
         """Return how the modes change at the pupil's points with each parameter that moves them.
 
-        With the mirror as stop a shift does not: it moves the pupil's images.
+        With the mirror as stop a shift does not: it moves the pupil's images. The changes along
+        ``more`` ways are appended.
         """
         ways: list[Way] = [_rotation_rate, partial(_scale_rate, magnification=alpha.magnification)]
         if self.instrument.stop is Stop.TELESCOPE:
             ways[:0] = self._shift_ways(alpha)
+        ways += more
         # With more ways than axes the gradient along both axes is cheaper than a rendering for each
         # way.
         if len(ways) > _AXES and isinstance(self._render_modes(alpha), np.ndarray):
@@ -394,6 +408,14 @@ class InteractionModel:
         # -x.
         steps = -self.instrument.with_anamorphosis(alpha).on_mirror(np.eye(_AXES))
         return [partial(_shift_rate, step=step) for step in steps]
+
+    def _stretch_ways(self, alpha: Misregistration) -> list[Way]:
+        """Return the ways of the mirror's points with each anamorphosis of its image."""
+        turn = rotation(alpha.rotation_rad)
+        stretches = self.instrument.with_anamorphosis(alpha).stretches
+        back = np.linalg.inv(stretch_matrix(stretches)) @ turn
+        along, askew = -turn.T * [1.0, -1.0] @ back, -turn.T[:, ::-1] @ back
+        return [partial(_stretch_rate, by=by) for by in (along, askew)]
 
     def _along(self, alpha: Misregistration, ways: list[Way]) -> list[Shapes]:
         """Return the rates of modes that are arrays along several ways, from their gradient."""

@@ -48,3 +48,10 @@ def test_other_weights_are_not_answered_with_what_was_found_for_these(projected)
     np.testing.assert_allclose(twice.normal, 2.0 * first[0])
     np.testing.assert_allclose(twice.scores, 2.0 * first[1])
     np.testing.assert_allclose(twice.best_step, first[2])
+
+
+def test_a_column_to_which_the_model_does_not_respond_explains_nothing():
+    columns = Columns(matrix=np.eye(4, 2), weights=np.ones(2), rows=np.ones(4, dtype=bool))
+    model = np.eye(4, 2) * [1.0, 0.0]
+    assert columns.misfit(model) == 0.5
+    assert columns.project(model, np.zeros((1, 4, 2))).gains.tolist() == [1.0, 0.0]

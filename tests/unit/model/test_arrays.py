@@ -55,6 +55,13 @@ def test_the_standard_alone_is_enough_for_every_kind_of_signal(order, normalisat
     assert_alike(STRICT, order=order, normalisation=normalisation, local=False)
 
 
+def test_few_shapes_are_computed_by_the_chosen_library_too():
+    """What is cheaper for few shapes is written for NumPy alone."""
+    assert model(NUMPY, local=False).sensor.optics.are_few(1)
+    assert model(pickle.loads(pickle.dumps(NUMPY)), local=False).sensor.optics.are_few(1)
+    assert not model(STRICT, local=False).sensor.optics.are_few(1)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("local", [True, False])
 def test_torch_finds_what_numpy_finds(local):

@@ -101,6 +101,32 @@ def test_derivatives_by_a_stretch_are_exact(stop, axis):
 
 
 @pytest.mark.parametrize("stop", Stop)
+def test_all_derivatives_together_are_those_one_by_one(stop):
+    model = small_model(stop, double=True)
+    together = model.derivatives(STRETCHED, with_stretches=True)
+    assert relative(together[:4], model.derivatives(STRETCHED)) < 1e-9
+    assert relative(together[4:], model.stretch_derivatives(STRETCHED)) < 1e-9
+
+
+def test_rendered_modes_are_shared_by_models_of_the_same_pupil_only():
+    about, basis = small_model(Stop.MIRROR).instrument, small_basis()
+    model = InteractionModel(about, basis)
+    expected = model.interaction_matrix(SOMEWHERE)
+    same = InteractionModel(
+        replace(about, wfs=replace(about.wfs, modulation_lambda_over_d=5.0)), basis
+    )
+    wider = InteractionModel(replace(about, obscuration_ratio=0.5), basis)
+    for other, is_shared in ((same, True), (wider, False)):
+        alone = other.interaction_matrix(SOMEWHERE)
+        other.forget()
+        other.share_modes(model)
+        assert (other._modes is model._modes) is is_shared
+        np.testing.assert_array_equal(other.interaction_matrix(SOMEWHERE), alone)
+    model.forget()
+    np.testing.assert_array_equal(model.interaction_matrix(SOMEWHERE), expected)
+
+
+@pytest.mark.parametrize("stop", Stop)
 @pytest.mark.parametrize("axis", [0, 1, 2, 3])
 def test_the_other_derivatives_are_of_the_stretched_image(stop, axis):
     if stop is Stop.MIRROR and axis < 2:

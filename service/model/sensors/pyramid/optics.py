@@ -501,7 +501,12 @@ class PyramidOptics:
         return partial(self._fold, lit=lit, scale=scale, shapes=known)
 
     def are_few(self, n_shapes: int) -> bool:
-        """Return True if so few shapes cost less than the gradient at every point of a row."""
+        """Return True if so few shapes cost less than the gradient at every point of a row.
+
+        Another array library computes the gradient whatever it costs: few shapes use NumPy only.
+        """
+        if self.arrays != NUMPY:
+            return False
         n_lines = self.recipe.kind.n_planes * self.wfs.n_subapertures
         n_points = len(self.pupil.coordinates)
         return n_shapes * (n_points + n_lines) < n_points * n_lines

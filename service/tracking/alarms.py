@@ -108,8 +108,11 @@ class Severity(StrEnum):
 
     def above(self, other: Severity | None) -> bool:
         """Return whether it matters more than another; None: than nothing."""
-        order = list(Severity)
-        return other is None or order.index(self) > order.index(other)
+        return other is None or SEVERITIES.index(self) > SEVERITIES.index(other)
+
+
+SEVERITIES: Final = tuple(Severity)
+"""Lowest first."""
 
 
 class Responsible(StrEnum):

@@ -67,7 +67,7 @@ that are tried again."""
 LOOKED_BACK = 30
 """So many lines back the beginning of a burst is looked for."""
 
-RecordT = TypeVar("RecordT")
+PartT = TypeVar("PartT")
 
 _NUMBERS = re.compile(r"[-+]?[0-9][0-9.e+-]*")
 
@@ -75,21 +75,21 @@ _VALUE = re.compile(r"(?<![\w.-])[-+]?[0-9]+(?:\.[0-9]+)?(?:e[-+]?[0-9]+)?(?![\w
 """A number that is no part of a name or of a date."""
 
 
-class _Record(Generic[RecordT]):
-    """A record of the state as an attribute of the context; assigning replaces it."""
+class _Part(Generic[PartT]):
+    """A part of the state, or of one of its records; assigning replaces it."""
 
-    __slots__ = ("_name",)
+    __slots__ = ("_name", "_record")
 
-    def __set_name__(self, owner: type, name: str) -> None:
-        self._name = name
+    def __init__(self, name: str, record: str = "state") -> None:
+        self._name, self._record = name, record
 
-    def __get__(self, context: StepContext, owner: type) -> RecordT:
-        record: RecordT = getattr(context.state, self._name)
-        return record
+    def __get__(self, context: StepContext, owner: type) -> PartT:
+        part: PartT = getattr(getattr(context, self._record), self._name)
+        return part
 
-    def __set__(self, context: StepContext, record: RecordT) -> None:
-        changes: dict[str, Any] = {self._name: record}
-        context.state = replace(context.state, **changes)
+    def __set__(self, context: StepContext, part: PartT) -> None:
+        changes: dict[str, Any] = {self._name: part}
+        setattr(context, self._record, replace(getattr(context, self._record), **changes))
 
 
 class StepContext:
@@ -113,29 +113,22 @@ class StepContext:
 
         self.effects: list[Effect] = []
 
-    operator = _Record[OperatorState]()
-    alpha = _Record[AlphaState]()
-    windows = _Record[WindowCounts]()
-    matrices = _Record[MatrixStates]()
-    operations = _Record[Operations]()
-    dithers = _Record[DitherState]()
-    loop = _Record[LoopState]()
-    alarms = _Record[AlarmStates]()
+    operator = _Part[OperatorState]("operator")
+    alpha = _Part[AlphaState]("alpha")
+    windows = _Part[WindowCounts]("windows")
+    matrices = _Part[MatrixStates]("matrices")
+    operations = _Part[Operations]("operations")
+    dithers = _Part[DitherState]("dithers")
+    loop = _Part[LoopState]("loop")
+    alarms = _Part[AlarmStates]("alarms")
+    acquisition = _Part[Acquisition]("acquisition", "operations")
+    dither = _Part[Dither | None]("dither", "dithers")
+    dither_policy = _Part[DitherPolicyState]("policy", "dithers")
 
     @property
     def registration(self) -> Registration | None:
         """The registration; None: unknown."""
         return self.state.alpha.registration
-
-    @property
-    def dither(self) -> Dither | None:
-        """Return the dither that is requested or running, or None."""
-        return self.state.dithers.dither
-
-    @property
-    def dither_policy(self) -> DitherPolicyState:
-        """The state of the dither policy."""
-        return self.state.dithers.policy
 
     @property
     def nominal(self) -> Misregistration:
@@ -148,11 +141,6 @@ class StepContext:
         return (
             self.state.alpha.law.nominal or self.state.alpha.own_matrix_alpha or self.policy.start
         )
-
-    @property
-    def acquisition(self) -> Acquisition:
-        """The state of the acquisition."""
-        return self.state.operations.acquisition
 
     @property
     def rtc(self) -> Status | None:

@@ -15,7 +15,6 @@ from service.tracking import commands as cmd
 from service.tracking.alarms import (
     ALARMS,
     RULE_PREFIX,
-    SEVERITIES,
     Alarm,
     AlarmRecord,
     AlarmState,
@@ -71,7 +70,7 @@ def muted_records(state: TrackerState) -> tuple[AlarmRecord, ...]:
 def worst_severity(state: TrackerState) -> Severity | None:
     """Return the most severe of what lasts, or went unseen; None: there is nothing."""
     found = (record.worst for record in state.alarms.records if record.worst is not None)
-    return max(found, key=SEVERITIES.index, default=None)
+    return max(found, key=lambda worst: worst.rank, default=None)
 
 
 def acknowledge(context: StepContext, command: cmd.AcknowledgeAlarm) -> None:

@@ -106,13 +106,14 @@ class Severity(StrEnum):
     CRITICAL = auto()
     """The loop is in danger, or its telemetry cannot be used."""
 
+    @property
+    def rank(self) -> int:
+        """Place in the order, 0 for the lowest."""
+        return list(Severity).index(self)
+
     def above(self, other: Severity | None) -> bool:
         """Return whether it matters more than another; None: than nothing."""
-        return other is None or SEVERITIES.index(self) > SEVERITIES.index(other)
-
-
-SEVERITIES: Final = tuple(Severity)
-"""Lowest first."""
+        return other is None or self.rank > other.rank
 
 
 class Responsible(StrEnum):

@@ -28,7 +28,7 @@ from service.tracking import (
     window_processing,
 )
 from service.tracking import commands as cmd
-from service.tracking.alarms import ALARMS, RULE_PREFIX, AlarmDefinition, Severity
+from service.tracking.alarms import RULE_PREFIX, AlarmDefinition
 from service.tracking.dither_request import MAX_STOP_DELAY_S
 from service.tracking.operation_records import AcquisitionStage
 from service.tracking.operations.acquisition import has_missed_enough
@@ -73,7 +73,7 @@ def _definition(context: StepContext, name: str) -> AlarmDefinition | None:
     """Return what an alarm is where that is not as the table has it, else None."""
     margin = context.matrices.margin
     if name == alarms.SHORT_MARGIN and margin is not None and margin.unstable:
-        return replace(ALARMS[name], severity=Severity.CRITICAL)
+        return alarms.as_critical(name)
     return None
 
 

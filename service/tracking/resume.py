@@ -124,11 +124,8 @@ def restored(records: tuple[ReconstructorRecord, ...]) -> tuple[ReconstructorRec
 
 def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
     """Return the part of a state that is saved; None if nothing is known yet, nor ordered."""
-    registration, acquisition, orders = (
-        state.alpha.registration,
-        acquisition_to_save(state),
-        orders_of(state),
-    )
+    registration, rtc = state.alpha.registration, state.loop.rtc
+    acquisition, orders = acquisition_to_save(state), orders_of(state)
     if registration is not None:
         registration = replace(
             registration,
@@ -142,7 +139,7 @@ def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
     return Saved(
         system=state.system,
         saved_ns_utc=now_ns,
-        session=state.loop.rtc.session if state.loop.rtc is not None else None,
+        session=None if rtc is None else rtc.session,
         in_use=state.matrices.in_use,
         pointing=state.alpha.pointing,
         registration=registration,
@@ -215,7 +212,8 @@ def _take_over_alpha(context: StepContext, saved: Saved, now_ns: int) -> None:
     if registration is not None:
         # The clock may have been set back meanwhile.
         away_s = max(now_ns - registration.arrived_ns_utc, 0) / SECOND_NS
-        validity.restore_registration(context, registration)
+        restored_now = replace(registration, n_windows=0, restored_ns_utc=now_ns)
+        validity.store_registration(context, restored_now)
         text = f"α of {away_s:.0f} s ago; {saved.in_use or 'no known matrix'} was in use then"
         context.log("registration.restored", text)
         validity.age_registration(context)

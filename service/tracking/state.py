@@ -395,16 +395,12 @@ class TrackerState:
     @property
     def measuring(self) -> MeasurementRecord | None:
         """The measurement by the RTC that is under way, or None."""
-        return self._under_way(noisy=False)
+        return next((r for r in reversed(self.by_rtc) if r.under_way), None)
 
     @property
     def noisy_measurement(self) -> MeasurementRecord | None:
         """The noisy interaction matrix under way, or None."""
-        return self._under_way(noisy=True)
-
-    def _under_way(self, *, noisy: bool) -> MeasurementRecord | None:
-        going_on = (r for r in reversed(self.operations.measurements) if r.under_way)
-        return next((r for r in going_on if (r.pattern is None) is noisy), None)
+        return next((r for r in reversed(self.noisy) if r.under_way), None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,11 +13,9 @@ from service.errors import CommandError
 from service.estimation.loop import NO_RTC
 from service.model.misregistration import Misregistration
 from service.tracking.alarms import (
-    ALARMS,
     Alarm,
     AlarmDefinition,
     Interlock,
-    Severity,
     blocking_alarm,
 )
 from service.tracking.dither_request import Dither, DitherPolicyState
@@ -178,13 +176,13 @@ class StepContext:
     def put_off(self, *, dither_s: float = 0.0, make_s: float = 0.0) -> None:
         """Ask for no dither, make no reconstructor for so long; 0: that one is not put off."""
         dither_ns, make_ns = (
-            self.now_ns + round(put_off_s * SECOND_NS) if put_off_s else 0
-            for put_off_s in (dither_s, make_s)
+            self.now_ns + round(s * SECOND_NS) if s else 0 for s in (dither_s, make_s)
         )
         # A pause that was asked for before is never shortened.
-        dither_ns = max(self.dithers.no_dither_before_ns_utc, dither_ns)
-        make_ns = max(self.matrices.no_making_before_ns_utc, make_ns)
-        self._put_off_until(dither_ns, make_ns)
+        self._put_off_until(
+            max(self.dithers.no_dither_before_ns_utc, dither_ns),
+            max(self.matrices.no_making_before_ns_utc, make_ns),
+        )
 
     def retry_all(self) -> None:
         """Put nothing off any more."""
@@ -205,16 +203,11 @@ class StepContext:
         """Add a warning to the log."""
         self.log(name, text, Level.WARNING)
 
-    def raise_alarm(
-        self, name: str, text: str, own: AlarmDefinition | None = None, *, critical: bool = False
-    ) -> None:
+    def raise_alarm(self, name: str, text: str, own: AlarmDefinition | None = None) -> None:
         """Raise an alarm; one already raised keeps its beginning.
 
-        ``own``: what is to be known of it, where no table has it. ``critical``: it is worse now
-        than the table says.
+        ``own``: what is to be known of it, where it is not as the table has it.
         """
-        if critical:
-            own = replace(ALARMS[name], severity=Severity.CRITICAL)
         before = self.state.alarm(name)
         t_ns = 0 if self.rtc is None else self.rtc.t_ns
         first = before or Alarm(name=name, since_ns_utc=self.now_ns, text=text, t_ns_utc=t_ns)

@@ -162,7 +162,9 @@ def _gain_reason(
     if since is None:
         return None
     step, covariance = since
-    found, raised = last.expected, _threshold_ratio(in_use, now_ns)
+    found, since_s = last.expected, (now_ns - in_use.created_ns_utc) / SECOND_NS
+    # Soon after an update another one must win more.
+    raised = 1.0 + max(0.0, 1.0 - since_s / THRESHOLD_DECAY_S)
     # Noise of α alone would show a loss, which no new matrix recovers.
     win_m = found.loss_m - estimate_noise_loss_m(found.loss_m, step, covariance)
     if win_m > policy.update_gain_m * raised:
@@ -182,12 +184,6 @@ def _margin_lost(last: Assessment) -> float:
     # has nothing that could have been lost.
     whole = 1.0 - last.expected.fresh_pole_radius
     return (1.0 - (1.0 - last.expected.pole_radius) / whole) if whole > 0.0 else 0.0
-
-
-def _threshold_ratio(in_use: ReconstructorRecord, now_ns: int) -> float:
-    """Return by how much the thresholds are raised so soon after an update."""
-    since_s = (now_ns - in_use.created_ns_utc) / SECOND_NS
-    return 1.0 + max(0.0, 1.0 - since_s / THRESHOLD_DECAY_S)
 
 
 def _step_since(

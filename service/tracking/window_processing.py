@@ -333,11 +333,10 @@ def _is_excused(context: StepContext) -> bool:
 
 def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
     """Update α by the passive estimate and its bias, or mark α as doubtful."""
-    reason = _check_passive_estimate(context.state, event) or _find_later_telemetry(
-        context.state, event
-    )
+    reason = _check_passive_estimate(context.state, event)
     if reason is not None:
-        _note_unavailable(context, f"the passive estimate was not used: {reason}")
+        text = f"the passive estimate was not used: {reason}"
+        context.alpha = replace(context.alpha, passive_unavailable_reason=text)
         return
     registration, estimate = context.registration, event.estimate
     if registration is None:
@@ -394,11 +393,7 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
 
 def on_passive_unavailable(context: StepContext, event: ev.PassiveUnavailable) -> None:
     """Store why there is no passive estimate."""
-    _note_unavailable(context, event.text)
-
-
-def _note_unavailable(context: StepContext, why: str) -> None:
-    context.alpha = replace(context.alpha, passive_unavailable_reason=why)
+    context.alpha = replace(context.alpha, passive_unavailable_reason=event.text)
 
 
 def fit_begins_at(state: TrackerState) -> Misregistration | None:
@@ -413,24 +408,17 @@ def fit_begins_at(state: TrackerState) -> Misregistration | None:
 
 def _check_passive_estimate(state: TrackerState, event: ev.PassiveFitted) -> str | None:
     """Return why a passive estimate says nothing of the telescope as it is, or None."""
-    of_loop = loop_numbers(state.loop.rtc)
+    of_loop, registration = loop_numbers(state.loop.rtc), state.alpha.registration
     # The bias belongs to the loop in which it was measured.
     if event.loop and of_loop and not same_numbers(event.loop, of_loop):
         return "the loop has changed since"
-    return filtering.check_measurable(
-        state, validity.telemetry_span(event.began_ns_utc, event.t_ns_utc)
-    )
-
-
-def _find_later_telemetry(state: TrackerState, event: ev.PassiveFitted) -> str | None:
-    """Return the later telemetry that supersedes a delayed estimate, in words, or None."""
-    registration = state.alpha.registration
-    if registration is None or not registration.window_began_ns_utc:
-        return None
-    since = validity.telemetry_span(
-        registration.window_began_ns_utc, registration.window_began_ns_utc
-    )
-    if validity.precedes(state, since, event.t_ns_utc):
+    span = validity.telemetry_span(event.began_ns_utc, event.t_ns_utc)
+    reason = filtering.check_measurable(state, span)
+    if reason is not None or registration is None or not registration.window_began_ns_utc:
+        return reason
+    # Later telemetry supersedes a delayed estimate.
+    window = validity.telemetry_span(0, registration.window_began_ns_utc)
+    if validity.precedes(state, window, event.t_ns_utc):
         return None
     return "a dithered window taken since has been fitted before it"
 
@@ -472,23 +460,16 @@ def _biases_after_look(
     previous: PreviousEstimate | None = None,
 ) -> tuple[PassiveBias, ...]:
     """Return the biases after a passive estimate; ``previous``: what the filter saw it from."""
-    name, loop = event.estimate.bias.name, _loop(state, registration, event)
+    name, loop = event.estimate.bias.name, loop_numbers(state.loop.rtc)
+    before = registration.bias(event.estimate.bias)
+    if state.loop.rtc is None and before is not None:
+        loop = before.loop
     return tuple(
         replace(bias, looked_ns_utc=event.t_ns_utc, loop=loop, previous_estimate=previous)
         if bias.block.name == name
         else bias
         for bias in filtering.biases_of(joint)
     )
-
-
-def _loop(
-    state: TrackerState, registration: Registration, event: ev.PassiveFitted
-) -> tuple[float, ...]:
-    """Return the loop the telemetry is of; while no RTC is there, that of the last estimate."""
-    if state.loop.rtc is not None:
-        return loop_numbers(state.loop.rtc)
-    bias = registration.bias(event.estimate.bias)
-    return () if bias is None else bias.loop
 
 
 def _check_single_registration(
@@ -525,16 +506,14 @@ def _ask_for_window(
         "dithered window must decide which"
     )
     registration = context.registration or registration
-    was_doubted, void = (
-        bool(registration.doubt),
-        bool(registration.doubt) and registration.doubt_voids,
-    )
+    was_doubted = bool(registration.doubt)
     why_none = None if context.rtc is None else check_dither_allowed(context, context.rtc)
     # In another wind the bias is another one.
     gone = kalman.forget(prior, event.estimate.bias, event.estimate.bias_excess)
     after = _registration_after_passive(context, registration, gone, event)
     biases = _biases_after_look(context.state, registration, gone, event)
-    doubted = replace(after, biases=biases, doubt=text, doubt_voids=void)
+    voids = was_doubted and registration.doubt_voids
+    doubted = replace(after, biases=biases, doubt=text, doubt_voids=voids)
     validity.store_registration(context, doubted)
     validity.cast_doubt(context, event.t_ns_utc)
     context.warn("registration.passive-jump", f"{text} (innovation {far:.0f}, expected 4)")

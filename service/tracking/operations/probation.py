@@ -29,6 +29,7 @@ from service.tracking.alarms import (
     Alarm,
     Interlock,
     alarm_blocks,
+    as_critical,
 )
 from service.tracking.events import Event
 from service.tracking.operation_records import CommandState, Probation, ProbationState
@@ -291,7 +292,7 @@ def _end_watch(
     _end(context, trial, ProbationState.ROLLED_BACK, trial.text)
     do = ". Open the loop" if lost else ""
     text = f"{trial.id} {trial.text}. The mode is hold until an operator sets another{do}"
-    context.raise_alarm(PROBATION, text, critical=lost)
+    context.raise_alarm(PROBATION, text, as_critical(PROBATION) if lost else None)
 
 
 def _may_resume(context: StepContext, trial: Probation, *, lost: bool) -> bool:
@@ -456,7 +457,8 @@ def _keep_worse(context: StepContext, trial: Probation, why: str) -> None:
         return
     _end(context, trial, ProbationState.KEPT, text)
     do = "open the loop if it suffers, or roll back by hand"
-    context.raise_alarm(PROBATION, f"{trial.id} {text}; {do}", critical=lost)
+    own = as_critical(PROBATION) if lost else None
+    context.raise_alarm(PROBATION, f"{trial.id} {text}; {do}", own)
 
 
 def _end(context: StepContext, trial: Probation, state: ProbationState, text: str) -> None:

@@ -129,7 +129,7 @@ def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
     if registration is not None:
         registration = replace(
             registration,
-            biases=without_previous(registration.biases),
+            bias=without_previous(registration.bias),
             # The window that would confirm or refute the jump belongs to the run that ends.
             suspected_jump=None,
             previous_estimate=None,

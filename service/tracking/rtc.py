@@ -61,12 +61,11 @@ def on_status(context: StepContext, rtc: Status) -> None:
     if before is not None and not same_loop(before, rtc):
         # the margin is not what it was
         reconstructors.forget_when_judged(context)
-    numbers = loop_numbers(rtc)
-    if registration is not None and any(
-        bias.looked_ns_utc and not same_numbers(bias.loop, numbers) for bias in registration.biases
-    ):
-        # they were learnt in another loop, in whichever session
-        validity.store_registration(context, replace(registration, biases=()))
+    bias = None if registration is None else registration.bias
+    elsewhere = bias is not None and not same_numbers(bias.loop, loop_numbers(rtc))
+    if registration is not None and bias is not None and bias.looked_ns_utc and elsewhere:
+        # it was learnt in another loop, in whichever session
+        validity.store_registration(context, replace(registration, bias=None))
     context.loop = replace(
         context.loop,
         rtc=rtc,

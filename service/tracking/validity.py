@@ -123,7 +123,7 @@ def shift_estimate(context: StepContext, step: Array, spread: Array, still_ns_ut
             previous_estimate=None,
             suspected_jump=None,
             # The passive bias is of the loop and the wind: it does not move with the image.
-            biases=without_previous(registration.biases),
+            bias=without_previous(registration.bias),
         ),
     )
     void_until(context, still_ns_utc, MOVING, Purpose.PASSIVE)
@@ -156,7 +156,7 @@ def in_subapertures(registration: Registration, scale: Array, config_id: str) ->
         grown=registration.grown * scale**2,
         optical_gain=None,
         optical_gains=(),
-        biases=(),
+        bias=None,
         previous_estimate=None,
         suspected_jump=None,
         config_id=config_id,

@@ -132,7 +132,7 @@ def test_a_change_of_mode_keeps_alpha_before_any_window_of_the_new_one(night):
         assert np.sqrt(np.diag(kept.covariance)) == pytest.approx(
             np.sqrt(np.diag(known.covariance)) * scale
         )
-        assert (kept.n_windows, kept.biases, kept.optical_gains) == (0, (), ())
+        assert (kept.n_windows, kept.bias, kept.optical_gains) == (0, None, ())
 
 
 def test_the_change_is_told_in_one_line(night):

@@ -19,6 +19,7 @@ from service.estimation.windows import DITHER_SETTLING_S
 from service.tracking import mode_proof
 from service.tracking.alarms import Interlock
 from service.tracking.dither_request import (
+    DEFAULT_DURATION_S,
     DITHER_MARGIN_S,
     OUR_DITHERS,
     OWN_DITHER,
@@ -213,7 +214,7 @@ def operator_parameters(context: StepContext, rtc: Status) -> DitherParameters:
     """Return what an operator's dither is like where the operator does not say."""
     policy, plan = context.policy, context.dither_policy.plan
     window_s = policy.window_s if plan is None else plan.window_s
-    lasting_s = policy.dither_duration_s - DITHER_SETTLING_S - DITHER_MARGIN_S
+    lasting_s = DEFAULT_DURATION_S - DITHER_SETTLING_S - DITHER_MARGIN_S
     return _parameters(context, quiet_budget_m(rtc, policy), window_s, lasting_s)
 
 

@@ -18,11 +18,11 @@ from service.tracking import events as ev
 from service.tracking import validity
 from service.tracking.alarms import Interlock
 from service.tracking.operations.running import running_ramp
-from service.tracking.policy import SECOND_NS, Offloading, Policy
+from service.tracking.policy import SECOND_NS, Offloading
 from service.tracking.registration import Offload, OffloadState, Purpose, Registration, Validity
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
-from service.tracking.update_policy import is_settled
+from service.tracking.update_policy import REFUSED_INTERVAL_S, is_settled
 from service.tracking.validity import MOVING, end_of, make_valid, void_until
 from service.wire import OffloadRequest, Reply, Status
 
@@ -179,14 +179,12 @@ def _may_move(
         return False
     if state.noisy_measurement is not None or running_ramp(state, context.now_ns) is not None:
         return False
-    return last is None or context.now_ns >= last.asked_ns_utc + _rest_ns(last, context.policy)
-
-
-def _rest_ns(last: Offload, policy: Policy) -> int:
-    """Return the pause after a demand; a demand without a reply is awaited."""
-    if last.state is OffloadState.MOVED:
-        return round(policy.minimum_interval_s * SECOND_NS)
-    return round(policy.refused_interval_s * SECOND_NS)
+    if last is None:
+        return True
+    # A demand without a reply is awaited.
+    moved = last.state is OffloadState.MOVED
+    pause_s = context.policy.minimum_interval_s if moved else REFUSED_INTERVAL_S
+    return context.now_ns >= last.asked_ns_utc + round(pause_s * SECOND_NS)
 
 
 def _clock_ns(context: StepContext, after_s: float) -> int:

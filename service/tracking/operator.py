@@ -108,7 +108,7 @@ def _plan_dither(context: StepContext, rtc: Status, command: cmd.StartDither) ->
             modes=command.modes or ModeSet.CONTROLLED,
             total_m=command.total_amplitude_m
             or min(dither_request.DEFAULT_RANDOM_RMS_M, policy.dither_budget_m),
-            duration_s=command.duration_s or policy.dither_duration_s,
+            duration_s=command.duration_s or dither_request.DEFAULT_DURATION_S,
         )
     dither = dither_request.plan_dither(
         rtc,

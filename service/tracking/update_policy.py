@@ -26,6 +26,9 @@ VERDICT_MARGIN = np.array([0.05, 0.05, np.deg2rad(0.05), 0.005])
 0.1 deg), and 0.5 % of magnification: a verdict still holds this far beyond α ± 3σ (numeric
 units)."""
 
+REFUSED_INTERVAL_S = 30.0
+"""Least time to the next request after one was refused, rejected or not acknowledged."""
+
 THRESHOLD_DECAY_S = 60.0
 """Time over which the thresholds, doubled by an update, return to their own values."""
 

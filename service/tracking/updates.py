@@ -297,7 +297,7 @@ def _next_attempt_ns(state: TrackerState, rtc: Status, policy: Policy) -> int:
         and not update_policy.is_outdated(state, last)
         and last.n_modes <= rtc.n_controlled
     )
-    wait_s = policy.refused_interval_s if again else policy.minimum_interval_s
+    wait_s = update_policy.REFUSED_INTERVAL_S if again else policy.minimum_interval_s
     return last.created_ns_utc + int(wait_s * SECOND_NS)
 
 

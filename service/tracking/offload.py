@@ -47,12 +47,9 @@ Array = NDArray[np.float64]
 def request_offload(context: StepContext) -> None:
     """Ask for a move where α is known well enough and too far from the nominal registration."""
     limits, registration, rtc = context.policy.offloading, context.registration, context.rtc
-    if (
-        limits is None
-        or registration is None
-        or rtc is None
-        or not _may_move(context, registration, rtc, limits)
-    ):
+    if limits is None or registration is None or rtc is None:
+        return
+    if not _may_move(context, registration, rtc, limits):
         return
     step = wanted_step(context.state, registration, context.nominal.vector, limits)
     if not step.any():
@@ -161,10 +158,7 @@ def _may_move(
     state, last = context.state, context.alpha.offload
     if state.operator.mode is not Mode.AUTO or state.on_probation or not rtc.in_loop:
         return False
-    if any(
-        context.blocking_alarm(interlock)
-        for interlock in (Interlock.ASK, Interlock.DECIDE, Interlock.SEND_NEW)
-    ):
+    if any(map(context.blocking_alarm, (Interlock.ASK, Interlock.DECIDE, Interlock.SEND_NEW))):
         return False
     sure = (
         is_settled(registration)
@@ -173,9 +167,7 @@ def _may_move(
     )
     if not sure or np.any(np.sqrt(np.diag(registration.covariance)) > limits.near):
         return False
-    if state.matrices.making_since_ns_utc is not None or any(
-        r.on_its_way for r in state.matrices.reconstructors
-    ):
+    if state.matrices.making_since_ns_utc is not None or state.sent is not None:
         return False
     if state.noisy_measurement is not None or running_ramp(state, context.now_ns) is not None:
         return False
@@ -189,12 +181,10 @@ def _may_move(
 
 def _clock_ns(context: StepContext, after_s: float) -> int:
     """Return the RTC's clock so long after now, at the latest; 0: unknown."""
-    return (
-        0
-        if context.rtc is None
-        # The RTC's clock has run on since its last status.
-        else context.rtc.t_ns + round((MAX_STATUS_AGE_S + after_s) * SECOND_NS)
-    )
+    if context.rtc is None:
+        return 0
+    # The RTC's clock has run on since its last status.
+    return context.rtc.t_ns + round((MAX_STATUS_AGE_S + after_s) * SECOND_NS)
 
 
 def _apart(alpha: Array, other: Array) -> Array:

@@ -553,12 +553,12 @@ def _explain_missing_verdict(record: ReconstructorRecord) -> str:
 
 
 def _warn_of_unreadable_commit(context: StepContext, event: Acknowledgement) -> None:
-    on_way = next((r.id for r in context.matrices.reconstructors if r.on_its_way), None)
+    sent = context.state.sent
     text = f"the RTC rejected a commit that it could not read: {event.reason or 'no reason given'}"
-    if on_way is None:
+    if sent is None:
         text += ". This service has sent none: another program sends commits to the RTC"
     else:
-        text += f". {on_way} is on its way: if the RTC does not apply it, this may be why"
+        text += f". {sent.id} is on its way: if the RTC does not apply it, this may be why"
     context.warn("acknowledgement.unreadable-commit", text)
 
 

@@ -349,6 +349,11 @@ class TrackerState:
         """Record of the matrix that the RTC multiplies with; None if unknown."""
         return self.reconstructor(self.matrices.in_use)
 
+    @property
+    def sent(self) -> ReconstructorRecord | None:
+        """Record of a matrix that is on its way to the RTC; None if there is none."""
+        return next((r for r in self.matrices.reconstructors if r.on_its_way), None)
+
     def failure(self, cause: str) -> str:
         """Return the reason why an order or event had no result; empty if it had one."""
         failures = reversed(self.operator.failures)

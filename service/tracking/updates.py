@@ -35,6 +35,10 @@ MAX_REFUSED_WINDOWS = 2
 MIN_JUDGE_INTERVAL_S = 2.0
 """Least time between two looks when the last one holds no longer."""
 
+_FAILED_STATES = frozenset(
+    {MatrixState.REFUSED, MatrixState.REJECTED, MatrixState.FAILED, MatrixState.DISCARDED}
+)
+
 
 def fetch_in_use(context: StepContext) -> None:
     """Ask for the matrix in use until it was had once in this session."""
@@ -84,32 +88,25 @@ def _find_unjudged(context: StepContext) -> str | None:
     Nothing is sent on such an answer: what is made, approved, copied or asked of the loop is judged
     there and then.
     """
-    state, registration = context.state, context.registration
-    if (
-        registration is None
-        or state.matrices.in_use is None
-        or not update_policy.is_settled(registration)
-    ):
+    matrices, registration = context.matrices, context.registration
+    if registration is None or not update_policy.is_settled(registration):
         return None
-    making = state.matrices.making_since_ns_utc is not None
-    return (
-        None
-        if making or not _judgement_due(state, state.matrices.in_use, context.now_ns)
-        else state.matrices.in_use
-    )
+    if matrices.making_since_ns_utc is not None or not _is_judgement_due(context):
+        return None
+    return matrices.in_use
 
 
-def _judgement_due(state: TrackerState, in_use: str, now_ns: int) -> bool:
-    if state.matrices.judged_ns_utc is None:
+def _is_judgement_due(context: StepContext) -> bool:
+    matrices, record = context.matrices, context.state.used
+    if matrices.judged_ns_utc is None:
         return True
-    waited_s = (now_ns - state.matrices.judged_ns_utc) / SECOND_NS
-    record = state.reconstructor(in_use)
-    if state.matrices.margin is None or record is None or record.judged is None:
+    waited_s = (context.now_ns - matrices.judged_ns_utc) / SECOND_NS
+    if matrices.margin is None or record is None or record.judged is None:
         return waited_s > REFUSED_JUDGE_INTERVAL_S
     # A smaller σ may let a rejected matrix pass soon.
-    every_s = JUDGE_INTERVAL_S if state.matrices.margin.accepted else REFUSED_JUDGE_INTERVAL_S
+    every_s = JUDGE_INTERVAL_S if matrices.margin.accepted else REFUSED_JUDGE_INTERVAL_S
     return waited_s > every_s or (
-        waited_s > MIN_JUDGE_INTERVAL_S and update_policy.assessment_is_old(state, record)
+        waited_s > MIN_JUDGE_INTERVAL_S and update_policy.assessment_is_old(context.state, record)
     )
 
 
@@ -283,24 +280,14 @@ def _next_attempt_ns(state: TrackerState, rtc: Status, policy: Policy) -> int:
 
     One refused for another α, or for more modes than are controlled, holds back no other.
     """
-    own = [
-        r
-        for r in state.matrices.reconstructors
-        if r.parent is not None and not _is_overtaken(state, r)
-    ]
-    if not own:
-        return 0
-    last = own[-1]
-    failed = (MatrixState.REFUSED, MatrixState.REJECTED, MatrixState.FAILED, MatrixState.DISCARDED)
-    again = (
-        last.state in failed
-        and not update_policy.is_outdated(state, last)
-        and last.n_modes <= rtc.n_controlled
-    )
-    wait_s = update_policy.REFUSED_INTERVAL_S if again else policy.minimum_interval_s
-    return last.created_ns_utc + int(wait_s * SECOND_NS)
-
-
-def _is_overtaken(state: TrackerState, record: ReconstructorRecord) -> bool:
-    """Return whether a reconstructor was never sent, and α is elsewhere by now."""
-    return record.state is MatrixState.DISCARDED and update_policy.is_outdated(state, record)
+    newest = (r for r in reversed(state.matrices.reconstructors) if r.parent is not None)
+    for last in newest:
+        overtaken = update_policy.is_outdated(state, last)
+        # One that was never sent, while α is elsewhere by now.
+        if last.state is MatrixState.DISCARDED and overtaken:
+            continue
+        failed = last.state in _FAILED_STATES
+        again = failed and not overtaken and last.n_modes <= rtc.n_controlled
+        wait_s = update_policy.REFUSED_INTERVAL_S if again else policy.minimum_interval_s
+        return last.created_ns_utc + int(wait_s * SECOND_NS)
+    return 0

@@ -640,10 +640,13 @@ def explain_acquisition(state: TrackerState, policy: Policy, now_ns: int) -> str
     trial = state.operations.probation
     if trial is not None and trial.state is ProbationState.ACQUIRING:
         return f"the loop is lost with {trial.id} and with {trial.before}"
+    # The matrix before is on its way to the RTC, or has just come there.
+    returns = {ProbationState.ROLLING_BACK, ProbationState.WATCHED}
+    goes_back = trial is not None and trial.state in returns
     for alarm in state.alarms.active:
         lasted_ns = now_ns - alarm.since_ns_utc
         # During a rollback the loop is given the time in which the previous matrix can recover it.
-        waits_s = 0.0 if alarm.name == LOST and not _goes_back(state) else MAX_DIVERGENCE_S
+        waits_s = 0.0 if alarm.name == LOST and not goes_back else MAX_DIVERGENCE_S
         if alarm_blocks(alarm, Interlock.HOLD) and lasted_ns >= waits_s * SECOND_NS:
             return f"{alarm.name} for {lasted_ns / SECOND_NS:.0f} s"
     # Bad telemetry alone also refuses windows. Only a loop that has stopped correcting is opened
@@ -651,15 +654,6 @@ def explain_acquisition(state: TrackerState, policy: Policy, now_ns: int) -> str
     if has_missed_enough(state) and not state.loop.holds:
         return f"{state.operations.acquisition.misses} windows in a row found no registration"
     return None
-
-
-def _goes_back(state: TrackerState) -> bool:
-    """Return whether the matrix before is on its way to the RTC, or has just come there."""
-    trial = state.operations.probation
-    return trial is not None and trial.state in {
-        ProbationState.ROLLING_BACK,
-        ProbationState.WATCHED,
-    }
 
 
 def has_missed_enough(state: TrackerState) -> bool:
@@ -810,8 +804,9 @@ def _on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
         return
     if rtc is None or not before.uses_wide_capture or estimate.session != rtc.session:
         return
-    if not _is_of_stage(context, rtc, estimate.modes):
-        return
+    dither = wide_capture_dither(before.stage, rtc, context.policy, 0)
+    if isinstance(dither, str) or dither.request.modes != estimate.modes:
+        return  # a window of another stage
     covariance = estimate.covariance + np.diag(band_of(before.stage).floor ** 2)
     context.acquisition = replace(before, alpha=estimate.alpha, covariance=covariance)
     x, y, rotation, magnification = np.sqrt(np.diag(covariance))
@@ -905,9 +900,3 @@ def _to_give_back(state: TrackerState) -> LoopFound | None:
     if acquisition.interruption is not None and acquisition_left_open(state, rtc) is None:
         return None
     return found
-
-
-def _is_of_stage(context: StepContext, rtc: Status, modes: tuple[int, ...]) -> bool:
-    """Return whether these are the modes of the present stage."""
-    dither = wide_capture_dither(context.acquisition.stage, rtc, context.policy, 0)
-    return not isinstance(dither, str) and dither.request.modes == modes

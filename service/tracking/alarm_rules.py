@@ -126,11 +126,8 @@ def _not_found(context: StepContext) -> str | None:
         return context.alarm_text(alarms.NOT_FOUND)
     proof = context.matrices.mode_proof
     if proof.own_response_ratio is not None and not proof.strange:
-        left = (
-            ""
-            if proof.own_misfit_ratio is None
-            else f" ({proof.own_misfit_ratio:.0%} left unexplained)"
-        )
+        misfit = proof.own_misfit_ratio
+        left = "" if misfit is None else f" ({misfit:.0%} left unexplained)"
         return (
             f"No window gives a registration: {context.windows.refused_because}. Order and signs "
             "of modes and slopes are not the cause: the model recognises the modes of the RTC's "

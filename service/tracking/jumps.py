@@ -192,11 +192,8 @@ def previous_window(registration: Registration) -> TimedEstimate | None:
     """Return the window before the present one: held, or the last that entered."""
     if registration.suspected_jump is not None:
         return registration.suspected_jump
-    return (
-        None
-        if registration.previous_estimate is None
-        else registration.previous_estimate.next_window
-    )
+    previous = registration.previous_estimate
+    return None if previous is None else previous.next_window
 
 
 def jump_lasts(

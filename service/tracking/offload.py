@@ -160,11 +160,7 @@ def _may_move(
         return False
     if any(map(context.blocking_alarm, (Interlock.ASK, Interlock.DECIDE, Interlock.SEND_NEW))):
         return False
-    sure = (
-        is_settled(registration)
-        and not registration.doubt
-        and registration.validity.level is Validity.FRESH
-    )
+    sure = is_settled(registration) and registration.validity.level is Validity.FRESH
     if not sure or np.any(np.sqrt(np.diag(registration.covariance)) > limits.near):
         return False
     if state.matrices.making_since_ns_utc is not None or state.sent is not None:

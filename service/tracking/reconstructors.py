@@ -96,10 +96,7 @@ def may_follow(state: TrackerState) -> bool:
     rtc, registration = state.loop.rtc, state.alpha.registration
     if state.operator.mode is not Mode.AUTO or state.on_probation or rtc is None or not rtc.in_loop:
         return False
-    if (
-        blocking_alarm(state.alarms.active, Interlock.DECIDE) is not None
-        or check_return(state) is not None
-    ):
+    if blocking_alarm(state.alarms.active, Interlock.DECIDE) or check_return(state) is not None:
         return False
     return registration is not None and update_policy.is_settled(registration)
 
@@ -265,11 +262,10 @@ def on_matrix(context: StepContext, made: ev.MatrixMade) -> None:
         context.log("reconstructor.discarded", text)
         return
     held = check_sendable(context.state, record) or beyond_judging(context.state, record)
-    no_return = (
-        # In auto no matrix is sent without a way back from it: probation must be able to send the
-        # previous one.
-        None if wanted or context.operator.mode is not Mode.AUTO else check_return(context.state)
-    )
+    # In auto no matrix is sent without a way back from it: probation must be able to send the
+    # previous one.
+    unasked = context.operator.mode is Mode.AUTO and not wanted
+    no_return = check_return(context.state) if unasked else None
     if not held and no_return is not None:
         context.log("reconstructor.kept-back", f"{record.id} is proposed and not sent: {no_return}")
     elif not held and made.anyway:
@@ -472,10 +468,7 @@ def on_margin(context: StepContext, event: ev.MarginJudged) -> None:
         return
     used = event.id == context.matrices.in_use
     gains = () if context.rtc is None else context.rtc.gains[: record.n_modes]
-    if (
-        judged is not None
-        and update_policy.verdict_doubtful_reason(context.state, judged, gains) is not None
-    ):
+    if judged and update_policy.verdict_doubtful_reason(context.state, judged, gains) is not None:
         if used:
             forget_when_judged(context)
         return

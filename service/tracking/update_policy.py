@@ -141,11 +141,9 @@ def assessment_is_old(state: TrackerState, in_use: ReconstructorRecord) -> bool:
     gains = () if state.loop.rtc is None else state.loop.rtc.gains[: in_use.n_modes]
     if verdict_invalid_reason(state, in_use.judged, gains) is not None:
         return True
-    if (
-        registration is None
-        or last is None
-        or _step_since(in_use, registration.alpha, registration) is None
-    ):
+    if registration is None or last is None:
+        return False
+    if _step_since(in_use, registration.alpha, registration) is None:
         return False
     noise = np.sqrt(np.diag(registration.covariance))
     return bool(
@@ -223,10 +221,7 @@ def _has_jumped(
 
     What a new one wins does not matter: what has jumped once may jump again.
     """
-    since = (
-        registration.jumped_ns_utc is not None
-        and registration.jumped_ns_utc > in_use.created_ns_utc
-    )
+    since = (registration.jumped_ns_utc or 0) > in_use.created_ns_utc
     return since and is_outdated(state, in_use)
 
 

@@ -64,11 +64,8 @@ def decide_updates(context: StepContext) -> None:
     rtc = context.rtc
     if rtc is None or context.blocking_alarm(Interlock.ASK) is not None:
         return
-    idle = (
-        context.blocking_alarm(Interlock.DECIDE) is not None
-        or running_ramp(context.state, context.now_ns) is not None
-    )
-    if idle:
+    ramp = running_ramp(context.state, context.now_ns)
+    if ramp is not None or context.blocking_alarm(Interlock.DECIDE) is not None:
         stop_unwanted(context, rtc)
         return
     choose_dither(context, rtc)
@@ -113,14 +110,10 @@ def _is_judgement_due(context: StepContext) -> bool:
 def _choose_update(context: StepContext, rtc: Status) -> None:
     """Compute a reconstructor when it is worthwhile, or could command more modes."""
     state, registration, now_ns = context.state, context.registration, context.now_ns
-    if (
-        state.operator.mode is Mode.HOLD
-        or state.on_probation
-        or registration is None
-        or not update_policy.is_settled(registration)
-    ):
+    if registration is None or not update_policy.is_settled(registration) or not rtc.in_loop:
         return
-    if not rtc.in_loop or state.matrices.making_since_ns_utc is not None:
+    making = state.matrices.making_since_ns_utc is not None
+    if state.operator.mode is Mode.HOLD or state.on_probation or making:
         return
     if context.blocking_alarm(Interlock.SEND_NEW) is not None:
         return
@@ -130,10 +123,8 @@ def _choose_update(context: StepContext, rtc: Status) -> None:
     in_use = state.used
     if _is_busy(context) or now_ns < first_ns or in_use is None:
         return
-    why, n_now = (
-        update_policy.update_reason(state, in_use, context.policy, now_ns),
-        rtc.n_controlled,
-    )
+    n_now = rtc.n_controlled
+    why = update_policy.update_reason(state, in_use, context.policy, now_ns)
     n_safe = n_proven_modes(state, rtc.n_modes)
     # No new matrix may control modes whose response has not been verified.
     if n_safe < n_now:
@@ -181,12 +172,10 @@ def explain_hindrance(context: StepContext, rtc: Status) -> str:
 
 def _is_wanted(context: StepContext, rtc: Status, in_use: ReconstructorRecord) -> bool:
     """Return whether a reconstructor would be made if nothing kept the service from it."""
-    if context.policy.wanted_modes(rtc) > rtc.n_controlled:
+    state, policy = context.state, context.policy
+    if policy.wanted_modes(rtc) > rtc.n_controlled:
         return True
-    return (
-        update_policy.update_reason(context.state, in_use, context.policy, context.now_ns)
-        is not None
-    )
+    return update_policy.update_reason(state, in_use, policy, context.now_ns) is not None
 
 
 def _explain_modes(context: StepContext, rtc: Status) -> str:
@@ -204,13 +193,11 @@ def _explain_modes(context: StepContext, rtc: Status) -> str:
             f"{rtc.n_controlled - 1} is 0, and modes that are added get it. Give it a gain."
         )
     limit = state.matrices.mode_limit
+    if limit is None:
+        return ""
     return (
-        ""
-        if limit is None
-        else (
-            f"No more than {limit.n_modes} of {n_wanted} modes are controlled for now: "
-            f"{limit.reason}. Lower [control] n_modes_target to stop further attempts."
-        )
+        f"No more than {limit.n_modes} of {n_wanted} modes are controlled for now: "
+        f"{limit.reason}. Lower [control] n_modes_target to stop further attempts."
     )
 
 
@@ -268,11 +255,10 @@ def _is_left_to_operator(context: StepContext, record: ReconstructorRecord) -> b
     if not update_policy.is_outdated(state, record):
         return True
     age_s = (context.now_ns - record.created_ns_utc) / SECOND_NS
-    usable = (
-        not update_policy.is_left_behind(state, record, context.policy)
-        and reconstructors.check_sendable(state, record) is None
-    )
-    return usable and age_s < update_policy.MIN_PROPOSAL_LIFETIME_S
+    if update_policy.is_left_behind(state, record, context.policy):
+        return False
+    new = age_s < update_policy.MIN_PROPOSAL_LIFETIME_S
+    return new and reconstructors.check_sendable(state, record) is None
 
 
 def _next_attempt_ns(state: TrackerState, rtc: Status, policy: Policy) -> int:

@@ -30,7 +30,7 @@ from service.tracking import events as ev
 from service.tracking.alarm_rules import derive_alarms
 from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
-from service.tracking.operation_records import CommandState
+from service.tracking.operation_records import CommandState, MeasureState
 from service.tracking.operations import acquisition, measurement, noisy_measurement, probation
 from service.tracking.policy import Policy
 from service.tracking.state import TrackerState
@@ -120,7 +120,9 @@ def _advance(context: StepContext, event: Event) -> None:
     if context.acquisition.under_way:
         return
     noisy_measurement.advance(context, event)
-    if not noisy_measurement.awaits_its_dither(context.state):
+    noisy = context.state.noisy_measurement
+    # Another dither has to end before its own: until then the service begins none.
+    if noisy is None or noisy.state is not MeasureState.WAITING:
         decide_updates(context)
         offload.request_offload(context)
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ArchiveError, ModelError, StorageError
+from service.estimation.estimate import BIAS_FLOOR, BIAS_OVER_SCATTER, BIAS_WANDER
 from service.files.durable import replace_file
 from service.model.misregistration import BOUNDARY_SCALE, COVARIANCE_SCALE
 from service.tracking.filtering import joint_of
@@ -115,6 +116,14 @@ VERSION = 1
 _NOT_KEPT = ("grown", "validity", "suspected_jump", "previous_estimate", "restored_ns_utc")
 """Fields of the registration and its bias that the next service computes again."""
 
+_BIAS_BLOCK = {
+    "name": "passive",
+    "floor": BIAS_FLOOR.tolist(),
+    "over_scatter": BIAS_OVER_SCATTER.tolist(),
+    "wander": BIAS_WANDER.tolist(),
+}
+"""Head of the bias in the file, which could hold those of several estimators."""
+
 _ACQUISITION_KEPT = (
     "stage",
     "text",
@@ -198,6 +207,8 @@ def _kept(saved: Saved) -> dict[str, Any]:
     if known is not None:
         alpha = known["alpha"]
         known["alpha"] = [*(alpha[name] for name in _NUMERIC), *(alpha["anamorphosis"] or ())]
+        bias = known.pop("bias")
+        known["biases"] = [] if bias is None else [{"block": _BIAS_BLOCK, **bias}]
         for record in (known, *known["biases"]):
             for name in _NOT_KEPT:
                 record.pop(name, None)
@@ -215,6 +226,8 @@ def _convert_saved(values: dict[str, Any]) -> Saved:
         known["alpha"] = dict(zip(_NUMERIC, four, strict=True)) | {
             "anamorphosis": stretches or None
         }
+        biases = (each for each in known.pop("biases", ()) if each.pop("block") == _BIAS_BLOCK)
+        known["bias"] = next(biases, None)
     saved = msgspec.convert(
         values, Saved, dec_hook=lambda _kind, value: np.array(value, dtype=np.float64)
     )
@@ -253,11 +266,11 @@ def _check(registration: Registration) -> None:
     if stretches is not None:
         arrays += [(stretches.covariance, (2, 2)), (stretches.shared, (2, 4))]
         n = 6
-    for k, bias in enumerate(registration.biases):
-        arrays += [(bias.offset, (4,)), (bias.covariance, (4, 4)), (bias.shared, (4, n + 4 * k))]
+    bias = registration.bias
+    if bias is not None:
+        arrays += [(bias.offset, (4,)), (bias.covariance, (4, 4)), (bias.shared, (4, n))]
         arrays += [(bias.excess, (4,)), (np.array(bias.loop), (len(bias.loop),))]
         arrays += [(np.array(bias.scatter), ())]
-        arrays += [(np.array(shape), (4,)) for shape in bias.block.shapes]
     _check_shapes(arrays)
     covariance = joint_of(registration).covariance
     power = np.linalg.eigvalsh(covariance)

@@ -187,7 +187,7 @@ def _residual_variance(
     radius = model.loop.pole_radius(eigenvalues).max()
     rejected = 1.0 / (1.0 + model.integrator[:, None] * eigenvalues)
     passed = model.integrator[:, None] * rejected
-    basis = _UncoupledModes() if vectors is None else _CoupledModes(vectors)
+    basis = _Eigenmodes(vectors)
     scale, total = np.sqrt(model.variance_m2), 0.0
     for k, shape in enumerate(model.shapes):
         own, other = model.group[:n] == k, n + np.flatnonzero(model.group[n:] == k)
@@ -209,30 +209,23 @@ def _square_root(covariance: Array) -> Array:
     return np.asarray(vectors * np.sqrt(np.maximum(power, 0.0)))
 
 
-class _UncoupledModes:
-    """Variance in a loop whose eigenvectors are its modes."""
+class _Eigenmodes:
+    """Eigenvectors V ``(n, n)`` of a loop, which are mixtures of its modes; None for the modes."""
 
-    def variance(self, driving: Array, response: NDArray[Any], weights: Array) -> float:
-        """Return the variance of ``[response] driving x`` for x of unit variance.
-
-        ``driving`` is ``(n, n_inputs)``, ``response`` ``(n_frequencies, n)``; ``weights`` is the
-        power of x at each frequency.
-        """
-        return float(np.sum(driving**2, axis=1) @ (weights @ np.abs(response) ** 2))
-
-
-class _CoupledModes:
-    """Variance in a loop whose eigenvectors V ``(n, n)`` are mixtures of its modes."""
-
-    def __init__(self, vectors: NDArray[Any]) -> None:
-        self._inverse = np.linalg.inv(vectors)
-        self._metric = vectors.conj().T @ vectors
+    def __init__(self, vectors: NDArray[Any] | None) -> None:
+        self._coupled = vectors is not None
+        if vectors is not None:
+            self._inverse = np.linalg.inv(vectors)
+            self._metric = vectors.conj().T @ vectors
 
     def variance(self, driving: Array, response: NDArray[Any], weights: Array) -> float:
         """Return the variance of ``V [response] V^-1 driving x`` for x of unit variance.
 
-        Arguments are those of :meth:`_UncoupledModes.variance`.
+        ``driving`` is ``(n, n_inputs)``, ``response`` ``(n_frequencies, n)``; ``weights`` is the
+        power of x at each frequency.
         """
+        if not self._coupled:
+            return float(np.sum(driving**2, axis=1) @ (weights @ np.abs(response) ** 2))
         driven = self._inverse @ driving
         mean = (response.T * weights) @ response.conj()
         return float(np.vdot(self._metric, (driven @ driven.conj().T) * mean).real)

@@ -221,10 +221,8 @@ def gain_table(measured: Sequence[ModeGain], n_modes: int) -> GainTable:
     everywhere = np.arange(n_modes)
     # An optical gain is at most 1, so a clearly larger median can only be double pass.
     passes = 2.0 if len(found) and np.median(found) > MAX_SINGLE_PASS_GAIN else 1.0
-    expected, covariance = (
-        _reference_log_gain(everywhere) + np.log(passes),
-        _prior_covariance(everywhere, modes),
-    )
+    expected = _reference_log_gain(everywhere) + np.log(passes)
+    covariance = _prior_covariance(everywhere, modes)
     variance = np.diag(_prior_covariance(everywhere, everywhere)).copy()
     # Conditioning of the Gaussian process on the measured modes, in the logarithm of the gain,
     # where a stronger residual is a multiple of the same shape.

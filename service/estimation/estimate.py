@@ -22,44 +22,21 @@ smooth across the pupil and pulls at α more than noise of the same power. From 
 diffractive telescope, two truths and two models (docs/results/tracking.md)."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BiasBlock:
-    """Possible constant bias of an estimate from ordinary telemetry.
+BIAS_FLOOR = np.array([0.10, 0.10, np.deg2rad(0.05), 0.001])
+"""1 σ of the bias of a passive estimate that none may go below without a dither, numeric units.
 
-    A block of the filter's state. Units: subapertures for the shifts, radians for the rotation, a
-    ratio for the magnification.
-    """
-
-    name: str
-    floor: tuple[float, ...]
-    """1 σ that no estimate of this kind may go below without a dither."""
-
-    over_scatter: tuple[float, ...]
-    """Multiples of its own scatter that the bias may have beyond that."""
-
-    wander: tuple[float, ...]
-    """Multiples of its own scatter by which the bias may change."""
-
-    @property
-    def shapes(self) -> tuple[tuple[float, ...], ...]:
-        """All its numbers, four of each."""
-        return self.floor, self.over_scatter, self.wander
-
-
-PASSIVE_BIAS = BiasBlock(
-    name="passive",
-    floor=(0.10, 0.10, float(np.deg2rad(0.05)), 0.001),
-    over_scatter=(10.0, 10.0, 2.0, 0.0),
-    wander=(0.0, 0.0, 2.0, 4.0),
-)
-"""The wind's, and the model's own error.
-
-Where the loop's own noise hardly shows (a bright star in 25 m/s) the scatter grows, and the bias
-with it: a quarter of a subaperture was seen at a scatter of 0.014. On 12 subapertures a bright star
-turns it, too: by up to 1 deg at a scatter of 0.4, in OOPAO's loops. Where 60 modes look through bad
-seeing the magnification is 2 to 5 times its scatter too large, every time, and on a bright star the
-rotation up to 2.5 times off.
+It is the wind's, and the model's own error. Where the loop's own noise hardly shows (a bright star
+in 25 m/s) the scatter grows, and the bias with it: a quarter of a subaperture was seen at a scatter
+of 0.014. On 12 subapertures a bright star turns it, too: by up to 1 deg at a scatter of 0.4, in
+OOPAO's loops. Where 60 modes look through bad seeing the magnification is 2 to 5 times its scatter
+too large, every time, and on a bright star the rotation up to 2.5 times off.
 """
+
+BIAS_OVER_SCATTER = np.array([10.0, 10.0, 2.0, 0.0])
+"""Multiples of its own scatter that the bias of an estimate may have beyond that."""
+
+BIAS_WANDER = np.array([0.0, 0.0, 2.0, 4.0])
+"""Multiples of its own scatter by which the bias may change from one estimate to the next."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -87,20 +64,17 @@ class PassiveEstimate(Estimate):
     telemetry.
     """
 
-    bias: BiasBlock = PASSIVE_BIAS
-    """Kind of its bias."""
-
     @property
     def bias_excess(self) -> NDArray[np.float64]:
         """Return ``(4,)`` variance of the bias beyond its floor, as the scatter indicates it."""
-        return np.asarray(np.diag(self.covariance) * np.square(self.bias.over_scatter))
+        return np.asarray(np.diag(self.covariance) * np.square(BIAS_OVER_SCATTER))
 
     @property
     @override
     def sigma(self) -> NDArray[np.float64]:
         """``(4,)`` 1 σ in numeric units where nothing is known of the bias."""
         return np.asarray(
-            np.sqrt(np.diag(self.covariance) + np.square(self.bias.floor) + self.bias_excess)
+            np.sqrt(np.diag(self.covariance) + np.square(BIAS_FLOOR) + self.bias_excess)
         )
 
 

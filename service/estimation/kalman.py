@@ -1,4 +1,4 @@
-"""One Kalman filter for α and the biases of passive estimates.
+"""One Kalman filter for α and the bias of the passive estimate.
 
 Under frozen flow the passive estimate measures ``α + b``: an estimate scatters by 0.3 to 0.5 % of a
 subaperture and is biased by up to 9 % on the diffractive telescope, 24 % on the linear plant
@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.estimate import PASSIVE_BIAS, BiasBlock
+from service.estimation.estimate import BIAS_FLOOR
 
 Array = NDArray[np.float64]
 
@@ -41,10 +41,7 @@ SCATTER_LEARNING = 0.05
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Bias:
-    """State of the bias of one kind of passive estimate, besides mean and covariance."""
-
-    block: BiasBlock = PASSIVE_BIAS
-    """Which bias it is."""
+    """State of the bias of the passive estimate, besides mean and covariance."""
 
     excess: Array = field(default_factory=lambda: np.zeros(4))
     """``(4,)`` variance of the bias beyond its floor that estimates have indicated, and that is in
@@ -56,10 +53,10 @@ class Bias:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Joint:
-    """The random walk of α, and N biases that forget themselves."""
+    """The random walk of α, and a bias that forgets itself."""
 
     mean: Array
-    """``(n_alpha + 4 N,)`` α in numeric units, then the bias of each passive estimate."""
+    """``(n_alpha,)`` α in numeric units, then the four of the bias where there is one."""
 
     covariance: Array
     """Covariance of all parameters."""
@@ -67,7 +64,8 @@ class Joint:
     n_alpha: int = 4
     """Numbers of α: 6 with its anamorphosis."""
 
-    biases: tuple[Bias, ...] = ()
+    bias: Bias | None = None
+    """None if there was no passive estimate yet: the bias is none of the parameters then."""
 
     @property
     def alpha(self) -> Array:
@@ -84,33 +82,23 @@ class Joint:
         """``(4, 4)`` of the registration alone."""
         return self.covariance[:4, :4]
 
-    def place(self, block: BiasBlock) -> slice:
-        """Return where a bias is among the states; behind them all where nothing is known of it."""
-        names = [bias.block.name for bias in self.biases]
-        k = names.index(block.name) if block.name in names else len(names)
-        return slice(self.n_alpha + 4 * k, self.n_alpha + 4 * k + 4)
+    @property
+    def place(self) -> slice:
+        """Place of the bias among the parameters."""
+        return slice(self.n_alpha, self.n_alpha + 4)
 
-    def bias_of(self, block: BiasBlock) -> Bias:
-        """Return what is known of a bias."""
-        known = (bias for bias in self.biases if bias.block.name == block.name)
-        return next(known, Bias(block=block))
-
-    def bias(self, block: BiasBlock) -> Array:
+    @property
+    def offset(self) -> Array:
         """``(4,)`` what a passive estimate reads more than α."""
-        return self.mean[self.place(block)]
+        return self.mean[self.place]
 
-    def observation_rows(self, block: BiasBlock | None) -> Array:
-        """Return the four rows a look sees, α and its bias; None: all of α, as a window does."""
-        if block is None:
+    def observation_rows(self, *, passive: bool = True) -> Array:
+        """Return the four rows a passive estimate sees, α and its bias, or all of α of a window."""
+        if not passive:
             return np.eye(self.n_alpha, len(self.mean))
         sees = np.eye(4, len(self.mean))
-        sees[:, self.place(block)] = np.eye(4)
+        sees[:, self.place] = np.eye(4)
         return sees
-
-    def with_bias(self, bias: Bias) -> Joint:
-        """Return the estimate with what is known of a bias replaced."""
-        others = (bias if one.block.name == bias.block.name else one for one in self.biases)
-        return replace(self, biases=tuple(others))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -125,7 +113,7 @@ class Drift:
 
 
 def begin_joint(measured: Array, covariance: Array) -> Joint:
-    """Return the estimate after a first dithered measurement: nothing is known of any bias."""
+    """Return the estimate after a first dithered measurement: nothing is known of the bias."""
     return Joint(mean=measured, covariance=covariance, n_alpha=len(measured))
 
 
@@ -133,7 +121,7 @@ def with_stretches(joint: Joint, nominal: Array) -> Joint:
     """Return the estimate with an anamorphosis as it is expected, where it has none yet."""
     if joint.n_alpha > 4:
         return joint
-    # Inserted between α and the biases; nothing correlates with them yet.
+    # Inserted between α and the bias; nothing correlates with them yet.
     at, expected = [4, 4], np.square(STRETCH_SIGMA) * np.eye(2)
     covariance = np.insert(np.insert(joint.covariance, at, 0.0, axis=0), at, 0.0, axis=1)
     covariance[4:6, 4:6] = expected
@@ -149,38 +137,34 @@ def expect_stretches(joint: Joint, nominal: Array) -> Joint:
     return _update(joint, sees, nominal, np.square(STRETCH_SIGMA) * np.eye(2))
 
 
-def forget(joint: Joint, block: BiasBlock, excess: Array | None = None) -> Joint:
-    """Reset a bias to unknown; α is unchanged.
+def forget(joint: Joint, excess: Array | None = None) -> Joint:
+    """Reset the bias to unknown; α is unchanged.
 
     ``excess`` ``(4,)`` is the variance of the bias beyond its floor, indicated by the present
     estimate if there is one.
     """
     excess = np.zeros(4) if excess is None else excess
-    place, n_states, biases = joint.place(block), len(joint.mean), joint.biases
-    n_more = place.stop - n_states if place.stop > n_states else 0
+    n_more, place = 4 if joint.bias is None else 0, joint.place
     covariance = np.pad(joint.covariance, (0, n_more))
     # Correlations with α go as well: they were learnt with the bias.
     covariance[place] = covariance[:, place] = 0.0
-    covariance[place, place] = np.diag(np.square(block.floor) + excess)
+    covariance[place, place] = np.diag(np.square(BIAS_FLOOR) + excess)
     mean = np.pad(joint.mean, (0, n_more))
     mean[place] = 0.0
-    if n_more:
-        biases = (*biases, Bias(block=block))
-    fresh = replace(joint.bias_of(block), excess=excess)
-    return replace(joint, mean=mean, covariance=covariance, biases=biases).with_bias(fresh)
+    bias = replace(joint.bias or Bias(), excess=excess)
+    return replace(joint, mean=mean, covariance=covariance, bias=bias)
 
 
-def allow_scatter(joint: Joint, block: BiasBlock, excess: Array) -> Joint:
-    """Increase the covariance of a bias by the excess scatter.
+def allow_scatter(joint: Joint, excess: Array) -> Joint:
+    """Increase the covariance of the bias by the excess scatter.
 
     Only the excess beyond earlier values is added: a steady wind adds it once, and what was learnt
     about the bias is kept.
     """
-    known, place, covariance = joint.bias_of(block), joint.place(block), joint.covariance.copy()
+    known, covariance = joint.bias or Bias(), joint.covariance.copy()
     more = np.maximum(excess - known.excess, 0.0)
-    covariance[place, place] += np.diag(more)
-    told = replace(known, excess=known.excess + more)
-    return replace(joint, covariance=covariance).with_bias(told)
+    covariance[joint.place, joint.place] += np.diag(more)
+    return replace(joint, covariance=covariance, bias=replace(known, excess=known.excess + more))
 
 
 def predict_state(
@@ -197,37 +181,35 @@ def predict_state(
     growth[4 : joint.n_alpha] = STRETCH_RATE**2 * elapsed
     if flexure is not None:
         growth[:4] += flexure**2
-    for bias in joint.biases:
+    bias = joint.bias
+    if bias is not None:
         # A first-order process: what has faded of the variance returns as the floor, so that the
         # variance of an unobserved bias tends to the floor and does not vanish.
-        growth[joint.place(bias.block)] = np.square(bias.block.floor) * (1.0 - fading**2)
+        growth[joint.place] = np.square(BIAS_FLOOR) * (1.0 - fading**2)
+        # what fades of the excess the next look that tells of it brings back
+        bias = replace(bias, excess=fading**2 * bias.excess)
     covariance = joint.covariance * np.outer(keep, keep) + np.diag(growth)
-    # what fades of the excess the next look that tells of it brings back
-    biases = tuple(replace(bias, excess=fading**2 * bias.excess) for bias in joint.biases)
-    return replace(joint, mean=keep * joint.mean, covariance=covariance, biases=biases)
+    return replace(joint, mean=keep * joint.mean, covariance=covariance, bias=bias)
 
 
-def innovation(
-    prior: Joint, measured: Array, noise: Array, block: BiasBlock | None = None
-) -> float:
+def innovation(prior: Joint, measured: Array, noise: Array, *, passive: bool = False) -> float:
     """Return the squared, normalised innovation of a measurement; its expectation is 4.
 
-    With a bias, of a passive estimate; without, of a dithered window.
+    It is that of a dithered window, or of a passive estimate.
     """
-    sees = prior.observation_rows(block)[: len(measured)]
+    sees = prior.observation_rows(passive=passive)[: len(measured)]
     difference = measured - sees @ prior.mean
     total = sees @ prior.covariance @ sees.T + noise
     return float(difference @ np.linalg.solve(total, difference))
 
 
-def correct_state(
-    prior: Joint, measured: Array, noise: Array, block: BiasBlock | None = None
-) -> Joint:
+def correct_state(prior: Joint, measured: Array, noise: Array, *, passive: bool = False) -> Joint:
     """Fold in a measurement ``(4,)`` with the covariance ``(4, 4)`` of its own scatter.
 
     A window's may be ``(6,)``: with its anamorphosis, where that is followed.
     """
-    return _update(prior, prior.observation_rows(block)[: len(measured)], measured, noise)
+    sees = prior.observation_rows(passive=passive)[: len(measured)]
+    return _update(prior, sees, measured, noise)
 
 
 def _update(prior: Joint, sees: Array, measured: Array, noise: Array) -> Joint:
@@ -244,13 +226,13 @@ def _update(prior: Joint, sees: Array, measured: Array, noise: Array) -> Joint:
     )
 
 
-def update_scatter(joint: Joint, block: BiasBlock, innovation: float) -> Joint:
+def update_scatter(joint: Joint, innovation: float) -> Joint:
     """Return the estimate after an innovation, 4 expected, with ``scatter`` learnt from it.
 
     In fast wind the bias swings from look to look, and looks scatter by more than they say.
     """
-    known = joint.bias_of(block)
-    return joint.with_bias(replace(known, scatter=learnt(known.scatter, innovation)))
+    known = joint.bias or Bias()
+    return replace(joint, bias=replace(known, scatter=learnt(known.scatter, innovation)))
 
 
 def learnt(scatter: float, innovation: float) -> float:

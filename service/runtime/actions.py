@@ -249,7 +249,7 @@ class Actions:
         matrix = await asyncio.to_thread(self.matrix, effect.id)
         judged = present_conditions(state, effect.gains)
         verdict = await self._verdict(matrix, effect.gains, state)
-        return ev.ProposalJudged(id=effect.id, verdict=verdict, judged=judged)
+        return ev.ProposalJudged(id=effect.id, verdict=verdict, judged=judged, wanted=effect.wanted)
 
     async def _margin(self, effect: ev.JudgeMatrix, state: TrackerState) -> Event | None:
         if effect.id in self._judging:

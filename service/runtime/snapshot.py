@@ -19,7 +19,7 @@ from service.tracking.interlocks import Permission, permissions
 from service.tracking.operations.running import Operating, operating
 from service.tracking.policy import Policy
 from service.tracking.reconstructors import check_return
-from service.tracking.registration import PassiveBias, Registration
+from service.tracking.registration import Registration
 from service.tracking.state import LogEntry, TrackerState
 from service.wire import Status
 
@@ -237,22 +237,14 @@ class Alpha:
     @property
     def passive_bias(self) -> NDArray[np.float64] | None:
         """Bias of the passive estimate, as far as learnt; null: unknown."""
-        bias = self._bias
+        bias = self.registration.bias
         return None if bias is None else bias.offset
 
     @property
     def passive_bias_sigma(self) -> NDArray[np.float64] | None:
         """1 σ of it."""
-        bias = self._bias
+        bias = self.registration.bias
         return None if bias is None else np.sqrt(np.diag(bias.covariance))
-
-    @property
-    def _bias(self) -> PassiveBias | None:
-        """Bias of the estimate that is shown; None if it was made by another estimator since."""
-        biases, shown = self.registration.biases, self.snapshot.tracker.alpha.passive
-        if shown is None:
-            return biases[0] if biases else None
-        return next((bias for bias in biases if bias.block.name == shown.estimator), None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

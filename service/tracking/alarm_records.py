@@ -51,10 +51,7 @@ def update_records(context: StepContext, *, timely: bool, ordered: bool) -> None
 
 def record_of(state: TrackerState, alarm: Alarm) -> AlarmRecord:
     """Return what is kept of an alarm that lasts."""
-    known = next(
-        (record for record in state.alarms.records if record.name == alarm.name),
-        AlarmRecord(name=alarm.name),
-    )
+    known = _find(state, alarm.name) or AlarmRecord(name=alarm.name)
     return replace(_with_alarm(known, alarm), text=alarm.text)
 
 
@@ -72,11 +69,8 @@ def muted_records(state: TrackerState) -> tuple[AlarmRecord, ...]:
 
 def worst_severity(state: TrackerState) -> Severity | None:
     """Return the most severe of what lasts, or went unseen; None: there is nothing."""
-    found: Severity | None = None
-    for record in state.alarms.records:
-        if record.worst is not None and record.worst.above(found):
-            found = record.worst
-    return found
+    found = (record.worst for record in state.alarms.records if record.worst is not None)
+    return max(found, key=lambda worst: worst.rank, default=None)
 
 
 def acknowledge(context: StepContext, command: cmd.AcknowledgeAlarm) -> None:
@@ -89,13 +83,12 @@ def acknowledge(context: StepContext, command: cmd.AcknowledgeAlarm) -> None:
     UnknownIdError
         If no alarm has this name.
     """
-    notes, record = _with_record(context, command.name)
+    record = _record_named(context, command.name)
     seen, worst_yet = command.severity, record.worst
     if seen is not None and worst_yet is not None and worst_yet.above(seen):
         raise CommandError(f"{record.name} has been {worst_yet}, and {seen} was seen: look again")
     acknowledged = replace(record, acknowledged=_operator_note(context, command))
-    notes[record.name] = acknowledged if record.over_ns_utc is None else _blank(record)
-    _store(context, notes)
+    _put(context, acknowledged if record.over_ns_utc is None else _blank(record))
     context.log("alarm.acknowledged", f"{record.name} {command.signed}")
 
 
@@ -107,12 +100,10 @@ def mute(context: StepContext, command: cmd.MuteAlarm) -> None:
     UnknownIdError
         If no alarm has this name.
     """
-    notes, record = _with_record(context, command.name)
+    record = _record_named(context, command.name)
     until_ns = context.now_ns + round(command.for_s * SECOND_NS)
-    notes[record.name] = replace(
-        record, muted=replace(_operator_note(context, command), until_ns_utc=until_ns)
-    )
-    _store(context, notes)
+    muted = replace(_operator_note(context, command), until_ns_utc=until_ns)
+    _put(context, replace(record, muted=muted))
     context.log("alarm.muted", f"{record.name} for {command.for_s:.0f} s {command.signed}")
 
 
@@ -124,22 +115,19 @@ def unmute(context: StepContext, command: cmd.UnmuteAlarm) -> None:
     UnknownIdError
         If no alarm has this name.
     """
-    notes, record = _with_record(context, command.name)
-    notes[record.name] = replace(record, muted=None)
-    _store(context, notes)
+    record = _record_named(context, command.name)
+    _put(context, replace(record, muted=None))
     context.log("alarm.unmuted", f"{record.name} {command.signed}")
 
 
 def restore_records(context: StepContext, orders: Orders) -> None:
     """Know what was known before a restart; what lasted then has yet to be raised again."""
     over_ns = context.now_ns
-    context.alarms = replace(
-        context.alarms,
-        records=tuple(
-            replace(record, over_ns_utc=record.over_ns_utc or over_ns) if record.worst else record
-            for record in orders.seen
-        ),
+    records = tuple(
+        replace(record, over_ns_utc=record.over_ns_utc or over_ns) if record.worst else record
+        for record in orders.seen
     )
+    context.alarms = replace(context.alarms, records=records)
 
 
 def _with_alarm(record: AlarmRecord, alarm: Alarm) -> AlarmRecord:
@@ -189,13 +177,22 @@ def _without_old_mute(record: AlarmRecord, now_ns: int) -> AlarmRecord:
     return record if until_ns is None or now_ns < until_ns else replace(record, muted=None)
 
 
-def _with_record(context: StepContext, name: str) -> tuple[dict[str, AlarmRecord], AlarmRecord]:
-    """Return all notes by name, and one of them, or a new one."""
-    notes = {record.name: record for record in context.alarms.records}
+def _record_named(context: StepContext, name: str) -> AlarmRecord:
+    """Return what is kept of an alarm, or a new record."""
     own = {f"{RULE_PREFIX}{rule.name}" for rule in context.policy.rules}
-    if name not in notes and name not in ALARMS and name not in own:
+    known = _find(context.state, name)
+    if known is None and name not in ALARMS and name not in own:
         raise UnknownIdError(f"unknown alarm {name}")
-    return notes, notes.get(name, AlarmRecord(name=name))
+    return known or AlarmRecord(name=name)
+
+
+def _find(state: TrackerState, name: str) -> AlarmRecord | None:
+    return next((record for record in state.alarms.records if record.name == name), None)
+
+
+def _put(context: StepContext, record: AlarmRecord) -> None:
+    """Keep a record in the place of the one of its name."""
+    _store(context, {each.name: each for each in (*context.alarms.records, record)})
 
 
 def _store(context: StepContext, notes: dict[str, AlarmRecord]) -> None:

@@ -13,6 +13,7 @@ import operator
 from collections.abc import Callable
 from dataclasses import replace
 from difflib import get_close_matches
+from functools import partial
 from typing import Any, Final
 
 from service.errors import CommandError, UnknownIdError
@@ -27,7 +28,7 @@ from service.tracking import (
     window_processing,
 )
 from service.tracking import commands as cmd
-from service.tracking.alarms import ALARMS, RULE_PREFIX, AlarmDefinition, Severity
+from service.tracking.alarms import RULE_PREFIX, AlarmDefinition
 from service.tracking.dither_request import MAX_STOP_DELAY_S
 from service.tracking.operation_records import AcquisitionStage
 from service.tracking.operations.acquisition import has_missed_enough
@@ -72,7 +73,7 @@ def _definition(context: StepContext, name: str) -> AlarmDefinition | None:
     """Return what an alarm is where that is not as the table has it, else None."""
     margin = context.matrices.margin
     if name == alarms.SHORT_MARGIN and margin is not None and margin.unstable:
-        return replace(ALARMS[name], severity=Severity.CRITICAL)
+        return alarms.as_critical(name)
     return None
 
 
@@ -125,11 +126,8 @@ def _not_found(context: StepContext) -> str | None:
         return context.alarm_text(alarms.NOT_FOUND)
     proof = context.matrices.mode_proof
     if proof.own_response_ratio is not None and not proof.strange:
-        left = (
-            ""
-            if proof.own_misfit_ratio is None
-            else f" ({proof.own_misfit_ratio:.0%} left unexplained)"
-        )
+        misfit = proof.own_misfit_ratio
+        left = "" if misfit is None else f" ({misfit:.0%} left unexplained)"
         return (
             f"No window gives a registration: {context.windows.refused_because}. Order and signs "
             "of modes and slopes are not the cause: the model recognises the modes of the RTC's "
@@ -169,10 +167,6 @@ def _jump_suspected(context: StepContext) -> str | None:
     return registration.doubt if jump is None else jump.text
 
 
-def _law_not_followed(context: StepContext) -> str | None:
-    return context.alpha.law.problem or None
-
-
 RULES: Final[dict[str, Callable[[StepContext], str | None]]] = {
     "stopped": _stopped,
     alarms.LOOP_OPEN: _loop_open,
@@ -185,7 +179,7 @@ RULES: Final[dict[str, Callable[[StepContext], str | None]]] = {
     alarms.MODES_CONTRARY: mode_proof.contrary_text,
     alarms.MODES_UNEVEN: mode_proof.explain_uneven,
     alarms.SUSPECTED: _jump_suspected,
-    "pointing-law": _law_not_followed,
+    "pointing-law": lambda context: context.alpha.law.problem or None,
     alarms.STALE: validity.stale_text,
     # the last: windows may be refused for what another alarm says
     alarms.WINDOWS_REFUSED: window_processing.explain_refusals,
@@ -196,23 +190,11 @@ An alarm name that no other code uses is written here only, without a constant i
 with hysteresis asks whether its alarm is already active: alarms are part of the state."""
 
 
-def _no_rtc(context: StepContext) -> bool:
-    return context.rtc is None
-
-
-def _no_dither_plays(context: StepContext) -> bool:
-    return context.dither is None or context.dither.start_seq is None
-
-
 def _not_used_since(context: StepContext) -> bool:
     """Return whether the reconstructor that was sent last has never been in use."""
     newest_first = reversed(context.matrices.reconstructors)
     sent = max(newest_first, key=lambda record: record.published_ns_utc or 0, default=None)
     return sent is None or not sent.was_used
-
-
-def _in_doubt(context: StepContext) -> bool:
-    return context.registration is not None and bool(context.registration.doubt)
 
 
 def _is_not_as_asked(context: StepContext) -> bool:
@@ -236,26 +218,20 @@ def _is_given_up(context: StepContext) -> bool:
     return unwanted and context.dither_policy.unwanted_id is None
 
 
-def _is_repeated(name: str) -> Callable[[StepContext], bool]:
-    def repeated(context: StepContext) -> bool:
-        alarm = context.state.alarm(name)
-        return (
-            alarm is not None
-            and context.now_ns - alarm.seen_ns_utc <= LINK_ALARM_TIMEOUT_S * SECOND_NS
-        )
-
-    return repeated
+def _is_repeated(name: str, context: StepContext) -> bool:
+    alarm, timeout_ns = context.state.alarm(name), LINK_ALARM_TIMEOUT_S * SECOND_NS
+    return alarm is not None and context.now_ns - alarm.seen_ns_utc <= timeout_ns
 
 
 LASTING: Final[dict[str, Callable[[StepContext], bool]]] = {
-    alarms.VANISHED: _no_rtc,
-    alarms.SECOND_RTC: _is_repeated(alarms.SECOND_RTC),
-    alarms.OTHER_BASIS: _is_repeated(alarms.OTHER_BASIS),
-    alarms.NO_DITHER: _no_dither_plays,
+    alarms.VANISHED: lambda context: context.rtc is None,
+    alarms.SECOND_RTC: partial(_is_repeated, alarms.SECOND_RTC),
+    alarms.OTHER_BASIS: partial(_is_repeated, alarms.OTHER_BASIS),
+    alarms.NO_DITHER: lambda context: context.dither is None or context.dither.start_seq is None,
     alarms.NOT_AS_ASKED: _is_not_as_asked,
     alarms.OVER_BUDGET: _is_over_budget,
     alarms.NOT_ACKNOWLEDGED: _not_used_since,
-    alarms.DISAGREES: _in_doubt,
+    alarms.DISAGREES: lambda context: bool(context.registration and context.registration.doubt),
     alarms.NOT_RESTORED: lambda context: context.registration is None,
 }
 """Conditions under which an alarm raised by an event stays active; all others are ended by an
@@ -273,16 +249,10 @@ _COMPARE: Final[dict[str, Callable[[Any, Any], bool]]] = {
 FIELDS: Final[dict[str, Callable[[TrackerState], cmd.Value | None]]] = {
     "state.mode": lambda state: state.operator.mode.value,
     "state.loop": lambda state: None if state.loop.rtc is None else state.loop.rtc.loop.value,
-    "state.n_controlled": lambda state: (
-        None if state.loop.rtc is None else state.loop.rtc.n_controlled
-    ),
-    "state.magnitude": lambda state: None if state.loop.rtc is None else state.loop.rtc.magnitude,
-    "state.elevation_deg": lambda state: (
-        None if state.alpha.pointing is None else state.alpha.pointing.elevation_deg
-    ),
-    "state.azimuth_deg": lambda state: (
-        None if state.alpha.pointing is None else state.alpha.pointing.azimuth_deg
-    ),
+    "state.n_controlled": lambda state: getattr(state.loop.rtc, "n_controlled", None),
+    "state.magnitude": lambda state: getattr(state.loop.rtc, "magnitude", None),
+    "state.elevation_deg": lambda state: getattr(state.alpha.pointing, "elevation_deg", None),
+    "state.azimuth_deg": lambda state: getattr(state.alpha.pointing, "azimuth_deg", None),
 }
 """Fields of the state that a condition may use; None where the value is unknown."""
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum, auto
 from importlib.resources import files
 from typing import Final
@@ -106,10 +106,14 @@ class Severity(StrEnum):
     CRITICAL = auto()
     """The loop is in danger, or its telemetry cannot be used."""
 
+    @property
+    def rank(self) -> int:
+        """Place in the order, 0 for the lowest."""
+        return list(Severity).index(self)
+
     def above(self, other: Severity | None) -> bool:
         """Return whether it matters more than another; None: than nothing."""
-        order = list(Severity)
-        return other is None or order.index(self) > order.index(other)
+        return other is None or self.rank > other.rank
 
 
 class Responsible(StrEnum):
@@ -249,6 +253,11 @@ def _read() -> dict[str, AlarmDefinition]:
 
 ALARMS: Final = _read()
 """Definitions by name, from alarms.toml."""
+
+
+def as_critical(name: str) -> AlarmDefinition:
+    """Return the definition of an alarm that is worse now than the table says."""
+    return replace(ALARMS[name], severity=Severity.CRITICAL)
 
 
 def blocking_alarm(alarms: Iterable[Alarm], interlock: Interlock) -> Alarm | None:

@@ -18,7 +18,7 @@ from service.files import MAX_MODES
 from service.tracking.alarms import Severity
 from service.tracking.products import ModeSet
 from service.tracking.state import Mode
-from service.wire import DitherKind, Pattern, Pointing
+from service.wire import DitherKind, Pattern
 
 MAX_SINES = 64
 MAX_GROUPS = 1000
@@ -265,11 +265,6 @@ class SetPointing(Instruction):
 
     azimuth_deg: Annotated[float, Ge(-720.0), Le(720.0)]
     """From north over east, degrees; only differences count."""
-
-    @property
-    def pointing(self) -> Pointing:
-        """The direction."""
-        return Pointing(elevation_deg=self.elevation_deg, azimuth_deg=self.azimuth_deg)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,25 +13,11 @@ import numpy as np
 from service.control.dither import compute_precision_ratio, update_mean_ratio
 from service.estimation.lockin import LockInEstimate
 from service.estimation.random_dither import RandomEstimate
-from service.tracking import alarms, dither_plan, mode_proof
+from service.tracking import alarms, dither_plan, dither_request, mode_proof
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither_plan import WantedDither
-from service.tracking.dither_request import (
-    N_LINES,
-    NOISY_DITHER,
-    OWN_DITHER,
-    Dither,
-    DitherPhase,
-    DitherPolicyState,
-    Precision,
-    check_dither_usable,
-    is_own_sine,
-    is_proving,
-    on_vibrations,
-    plan_dither,
-    total_m,
-)
+from service.tracking.dither_request import Dither, DitherPhase, Precision
 from service.tracking.policy import SECOND_NS
 from service.tracking.state import Level, TrackerState
 from service.tracking.step_context import StepContext
@@ -72,7 +58,7 @@ def choose_dither(context: StepContext, rtc: Status) -> None:
     _update_cost(context, rtc)
     stop_unwanted(context, rtc)
     dither = context.dither
-    if dither is not None and not is_own_sine(dither.request):
+    if dither is not None and not dither_request.is_own_sine(dither.request):
         _set_phase(context, DitherPhase.OPERATOR, f"{dither.id} runs")
         return
     forbidden = dither_plan.check_dither_allowed(context, rtc)
@@ -81,14 +67,11 @@ def choose_dither(context: StepContext, rtc: Status) -> None:
         return
     mode_proof.give_up_unseen(context, rtc)
     wanted, plan = dither_plan.choose_next(context, rtc)
-    _set_policy(
-        context,
-        replace(
-            context.dither_policy,
-            plan=plan,
-            next_ns_utc=wanted.next_ns_utc if wanted.next_ns_utc > context.now_ns else None,
-            avoided_hz=wanted.parameters.avoid_hz,
-        ),
+    context.dither_policy = replace(
+        context.dither_policy,
+        plan=plan,
+        next_ns_utc=wanted.next_ns_utc if wanted.next_ns_utc > context.now_ns else None,
+        avoided_hz=wanted.parameters.avoid_hz,
     )
     _set_phase(context, wanted.phase, wanted.reason)
     if dither is not None:
@@ -100,7 +83,7 @@ def choose_dither(context: StepContext, rtc: Status) -> None:
 
 def request_dither(context: StepContext, dither: Dither) -> None:
     """Ask for a dither and follow it."""
-    _set_dither(context, replace(dither, cause=context.cause))
+    context.dither = replace(dither, cause=context.cause)
     context.ask(ev.Ask(request=dither.request))
 
 
@@ -114,7 +97,7 @@ def request_stop(context: StepContext) -> None:
 
 def forget_dither(context: StepContext) -> None:
     """Follow no dither any more."""
-    _set_dither(context, None)
+    context.dither = None
 
 
 def stop_running_dither(context: StepContext) -> None:
@@ -123,7 +106,7 @@ def stop_running_dither(context: StepContext) -> None:
     running = dither.id if dither is not None else rtc and rtc.dither_id
     if running:
         _note_stop(context, running)
-        _set_dither(context, None)
+        context.dither = None
         request_stop(context)
 
 
@@ -143,7 +126,7 @@ def stop_by_operator(context: StepContext, _: cmd.StopDither) -> None:
 
 def stop_unfollowed(context: StepContext) -> None:
     """Ask the RTC to end a dither that is not needed and not followed."""
-    _set_policy(context, replace(context.dither_policy, stop_asked_ns_utc=context.now_ns))
+    context.dither_policy = replace(context.dither_policy, stop_asked_ns_utc=context.now_ns)
     request_stop(context)
 
 
@@ -152,14 +135,14 @@ def on_answer(context: StepContext, request: DitherRequest, reply: Reply) -> Non
     if context.dither is None or context.dither.id != request.id:
         return
     if reply.accepted:
-        _set_dither(
-            context, replace(context.dither, start_seq=reply.start_seq, asked_ns_utc=context.now_ns)
+        context.dither = replace(
+            context.dither, start_seq=reply.start_seq, asked_ns_utc=context.now_ns
         )
         text = f"{request.id} starts at frame {reply.start_seq}"
         context.log("dither.started", text, _level(request))
         return
     context.put_off(dither_s=10.0)
-    _set_dither(context, None)
+    context.dither = None
     text = f"the RTC refused the dither: {reply.reason}"
     context.raise_alarm(alarms.NO_DITHER, text)
     context.fail(text)
@@ -191,8 +174,8 @@ def follow_status(context: StepContext, rtc: Status) -> None:
     asked_to_stop = dither.id == context.dither_policy.stopped_id
     # a status a second old may be the first to show the end
     if asked_to_stop or played_s >= dither.request.duration_s - MISSING_DITHER_ALARM_S:
-        _set_policy(context, replace(context.dither_policy, ended_ns_utc=context.now_ns))
-        _set_dither(context, None)
+        context.dither_policy = replace(context.dither_policy, ended_ns_utc=context.now_ns)
+        context.dither = None
         context.clear_alarm(alarms.DITHER_LOST)
         context.log("dither.ended", f"{dither.id} has ended", _level(dither.request))
         return
@@ -233,7 +216,7 @@ def learn_precision(context: StepContext, estimate: LockInEstimate | RandomEstim
     accepted = context.windows.accepted > context.before.windows.accepted
     if isinstance(estimate, RandomEstimate) or not accepted or rtc is None:
         return
-    if len(estimate.modes) > N_LINES:
+    if len(estimate.modes) > dither_request.N_LINES:
         return  # not the modes that tell most of α
     if estimate.dither_m > 0.0:
         ratio = compute_precision_ratio(
@@ -242,7 +225,7 @@ def learn_precision(context: StepContext, estimate: LockInEstimate | RandomEstim
         n_windows = 0 if before is None else before.n_windows
         mean = update_mean_ratio(None if before is None else before.ratio, n_windows, ratio)
         precision = Precision(ratio=mean, n_windows=n_windows + 1)
-        _set_policy(context, replace(context.dither_policy, precision=precision))
+        context.dither_policy = replace(context.dither_policy, precision=precision)
 
 
 def check_measured_dither(context: StepContext, event: ev.DitherMeasured) -> str | None:
@@ -252,11 +235,11 @@ def check_measured_dither(context: StepContext, event: ev.DitherMeasured) -> str
     """
     rtc, dither = context.rtc, context.dither
     if not event.text:
-        _set_policy(context, replace(context.dither_policy, loud_text="", amiss_id=None))
+        context.dither_policy = replace(context.dither_policy, loud_text="", amiss_id=None)
         return None
     if rtc is None or dither is None or dither.id != event.id:
         return None
-    _set_policy(context, replace(context.dither_policy, amiss_id=event.id, amiss_m=event.found_m))
+    context.dither_policy = replace(context.dither_policy, amiss_id=event.id, amiss_m=event.found_m)
     most_m = dither_plan.budget_m(rtc, context.policy)
     # An operator may have allowed more than the budget.
     if event.found_m > MAX_MEASURED_AMPLITUDE_RATIO * max(event.asked_m, most_m):
@@ -268,7 +251,7 @@ def check_measured_dither(context: StepContext, event: ev.DitherMeasured) -> str
 def stop_too_strong(context: StepContext, dither_id: str, loud: str) -> None:
     """Stop a dither that the frames show to be too strong."""
     _note_unwanted(context, dither_id)
-    _set_policy(context, replace(context.dither_policy, loud_id=dither_id, loud_text=loud))
+    context.dither_policy = replace(context.dither_policy, loud_id=dither_id, loud_text=loud)
     _raise_over_budget(context, dither_id, loud)
     stop_unfollowed(context)
 
@@ -306,15 +289,7 @@ def stop_unwanted(context: StepContext, rtc: Status) -> None:
 def forget_unwanted(context: StepContext) -> None:
     """Note that no unwanted dither plays."""
     if context.dither_policy.unwanted_id is not None:
-        _set_policy(context, replace(context.dither_policy, unwanted_id=None))
-
-
-def _set_dither(context: StepContext, dither: Dither | None) -> None:
-    context.dithers = replace(context.dithers, dither=dither)
-
-
-def _set_policy(context: StepContext, policy: DitherPolicyState) -> None:
-    context.dithers = replace(context.dithers, policy=policy)
+        context.dither_policy = replace(context.dither_policy, unwanted_id=None)
 
 
 def _begin(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
@@ -325,7 +300,9 @@ def _begin(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
         return
     if context.now_ns < context.dithers.no_dither_before_ns_utc:
         return
-    if rtc.dither_id is not None and rtc.dither_id.startswith((OWN_DITHER, NOISY_DITHER)):
+    if rtc.dither_id is not None and rtc.dither_id.startswith(
+        (dither_request.OWN_DITHER, dither_request.NOISY_DITHER)
+    ):
         # left behind by this service: its window of another length, or to stop
         context.put_off(dither_s=2.0)
         stop_running_dither(context)
@@ -334,8 +311,10 @@ def _begin(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
 
 
 def _ask(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
-    dither = plan_dither(rtc, context.policy, context.now_ns, choice=wanted.parameters)
-    reason = check_dither_usable(dither, rtc, context.policy)
+    dither = dither_request.plan_dither(
+        rtc, context.policy, context.now_ns, choice=wanted.parameters
+    )
+    reason = dither_request.check_dither_usable(dither, rtc, context.policy)
     if reason is not None:
         text = (
             f"no usable dither: {reason}; a dither of random signs needs no lines, and α can be "
@@ -344,22 +323,19 @@ def _ask(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
         context.put_off(dither_s=60.0)
         context.raise_alarm(alarms.NO_DITHER, text)
         return
-    shaken = on_vibrations(dither, wanted.parameters.avoid_hz)
+    shaken = dither_request.on_vibrations(dither, wanted.parameters.avoid_hz)
     if shaken and dither.frequency_hz != context.dither_policy.lines_hz:
         text = f"lines at {shaken} Hz are on vibrations: there is no room, or the settings fix them"
         context.warn("dither.on-vibrations", text)
     if wanted.phase is DitherPhase.PROVE:
         mode_proof.note_shown(context, wanted.parameters.modes)
-    _set_policy(
-        context,
-        replace(
-            context.dither_policy,
-            lines_hz=wanted.parameters.last_hz if wanted.parameters.modes else dither.frequency_hz,
-            # The count that accepted windows reach once all of this dither have arrived.
-            results_due=context.windows.accepted + wanted.parameters.n_windows,
-            ended_ns_utc=None,
-            next_ns_utc=None,
-        ),
+    context.dither_policy = replace(
+        context.dither_policy,
+        lines_hz=wanted.parameters.last_hz if wanted.parameters.modes else dither.frequency_hz,
+        # The count that accepted windows reach once all of this dither have arrived.
+        results_due=context.windows.accepted + wanted.parameters.n_windows,
+        ended_ns_utc=None,
+        next_ns_utc=None,
     )
     request_dither(context, dither)
 
@@ -379,12 +355,14 @@ def _end_when_done(context: StepContext, rtc: Status, dither: Dither, wanted: Wa
     weak = (
         wanted.phase is DitherPhase.ACQUIRE
         # Only a dither with less than half of the wanted amplitude is worth a restart.
-        and 2.0 * total_m(dither.request) < wanted.parameters.total_m
+        and 2.0 * dither_request.total_m(dither.request) < wanted.parameters.total_m
     )
     moved = dither_plan.check_dithered_modes(dither, rtc, context.policy, wanted.parameters.shunned)
     # weak lines are worth another dither where what is known was restored, and is to be confirmed
     confirms = registration is not None and bool(wanted.parameters.modes)
-    if (confirms or wanted.phase is DitherPhase.PROVE) and not is_proving(dither.request):
+    if (confirms or wanted.phase is DitherPhase.PROVE) and not dither_request.is_proving(
+        dither.request
+    ):
         moved = wanted.reason
     if done or weak or moved:
         # the next one must not overtake the command to stop
@@ -401,8 +379,9 @@ def _adopt(context: StepContext, rtc: Status) -> bool:
         return False
     running, begun_seq, dithering = rtc.dither.request, rtc.dither.start_seq, context.dither_policy
     over = (
-        is_own_sine(running)
-        and total_m(running) > dither_plan.AMPLITUDE_ROUNDING_RATIO * dithering.budget_m
+        dither_request.is_own_sine(running)
+        and dither_request.total_m(running)
+        > dither_plan.AMPLITUDE_ROUNDING_RATIO * dithering.budget_m
     )
     asked_to_stop = running.id == dithering.stopped_id
     # a recorded night stops nothing: what it goes on playing is read all the same
@@ -413,8 +392,8 @@ def _adopt(context: StepContext, rtc: Status) -> bool:
         dither = Dither(
             request=running, start_seq=begun_seq, asked_ns_utc=context.now_ns, window_s=window_s
         )
-        if check_dither_usable(dither, rtc, context.policy) is None:
-            _set_dither(context, dither)
+        if dither_request.check_dither_usable(dither, rtc, context.policy) is None:
+            context.dither = dither
             context.log("dither.adopted", f"{running.id} runs since frame {begun_seq}")
             return True
     return False
@@ -422,7 +401,7 @@ def _adopt(context: StepContext, rtc: Status) -> bool:
 
 def _level(request: DitherRequest) -> Level:
     """Return the log level of a dither: the service's own come and go all night."""
-    return Level.DEBUG if request.id.startswith(OWN_DITHER) else Level.INFO
+    return Level.DEBUG if request.id.startswith(dither_request.OWN_DITHER) else Level.INFO
 
 
 def _update_cost(context: StepContext, rtc: Status) -> None:
@@ -431,7 +410,7 @@ def _update_cost(context: StepContext, rtc: Status) -> None:
     followed = dither is not None and dither.start_seq is not None
     # what nobody has asked for costs as much
     playing = dither if followed else rtc.dither
-    power = 0.0 if playing is None else total_m(playing.request) ** 2
+    power = 0.0 if playing is None else dither_request.total_m(playing.request) ** 2
     since_ns = context.now_ns if dithering.seen_ns_utc is None else dithering.seen_ns_utc
     # 1 - exp(-t/T), accurate for short steps. A clock that was set back adds nothing.
     share = -np.expm1(-max(context.now_ns - since_ns, 0) / (COST_AVERAGING_TIME_S * SECOND_NS))
@@ -439,15 +418,12 @@ def _update_cost(context: StepContext, rtc: Status) -> None:
     windows_ns = 0 if registration is None else registration.window_ns_utc
     if registration is not None and windows_ns and registration.arrived_ns_utc > windows_ns:
         passive_ns = registration.arrived_ns_utc
-    _set_policy(
-        context,
-        replace(
-            dithering,
-            budget_m=dither_plan.budget_m(rtc, context.policy),
-            mean_square_m2=float(dithering.mean_square_m2 * (1.0 - share) + power * share),
-            seen_ns_utc=context.now_ns,
-            passive_ns_utc=passive_ns,
-        ),
+    context.dither_policy = replace(
+        dithering,
+        budget_m=dither_plan.budget_m(rtc, context.policy),
+        mean_square_m2=float(dithering.mean_square_m2 * (1.0 - share) + power * share),
+        seen_ns_utc=context.now_ns,
+        passive_ns_utc=passive_ns,
     )
 
 
@@ -455,8 +431,8 @@ def _set_phase(context: StepContext, phase: DitherPhase, reason: str) -> None:
     none_follows = phase in {DitherPhase.OFF, DitherPhase.OPERATOR}
     # A phase in which the service starts no dither must not announce one.
     next_ns = None if none_follows else context.dither_policy.next_ns_utc
-    _set_policy(
-        context, replace(context.dither_policy, phase=phase, reason=reason, next_ns_utc=next_ns)
+    context.dither_policy = replace(
+        context.dither_policy, phase=phase, reason=reason, next_ns_utc=next_ns
     )
 
 
@@ -469,23 +445,23 @@ def _take_over_played(context: StepContext, asked: Dither, shown: DitherStatus) 
     if running == asked:
         return
     plays, wanted = running.request, asked.request
-    if total_m(plays) > dither_plan.AMPLITUDE_ROUNDING_RATIO * max(
-        total_m(wanted), context.dither_policy.budget_m
+    if dither_request.total_m(plays) > dither_plan.AMPLITUDE_ROUNDING_RATIO * max(
+        dither_request.total_m(wanted), context.dither_policy.budget_m
     ):
-        _set_policy(context, replace(context.dither_policy, loud_id=running.id, loud_text=""))
+        context.dither_policy = replace(context.dither_policy, loud_id=running.id, loud_text="")
     text = (
         f"{asked.id}: the RTC plays modes {plays.modes}, {running.frequency_hz} Hz, "
         f"{plays.amplitude_m} m from frame {running.start_seq}; requested were modes "
         f"{wanted.modes}, {asked.frequency_hz} Hz, {wanted.amplitude_m} m from {asked.start_seq}"
     )
-    _set_dither(context, running)
+    context.dither = running
     context.warn("dither.other", text)
 
 
 def _note_lost(context: StepContext, dither: Dither, text: str) -> None:
     context.raise_alarm(alarms.DITHER_LOST, text)
     context.warn("dither.lost", text)
-    _set_dither(context, None)
+    context.dither = None
     context.dithers = replace(context.dithers, lost=dither.id, losses=context.dithers.losses + 1)
 
 
@@ -496,14 +472,11 @@ def _patience_s(state: TrackerState) -> float:
 def _note_stop(context: StepContext, dither_id: str) -> None:
     """Note that the RTC is asked to stop a dither, and since when."""
     if context.dither_policy.stopped_id != dither_id:
-        _set_policy(
-            context,
-            replace(
-                context.dither_policy,
-                stopped_id=dither_id,
-                ended_ns_utc=None,
-                stopped_ns_utc=context.now_ns,
-            ),
+        context.dither_policy = replace(
+            context.dither_policy,
+            stopped_id=dither_id,
+            ended_ns_utc=None,
+            stopped_ns_utc=context.now_ns,
         )
 
 
@@ -511,8 +484,8 @@ def _note_unwanted(context: StepContext, running: str) -> None:
     """Note that a dither must go, and follow it no more."""
     _note_stop(context, running)
     if context.dither is not None and context.dither.id == running:
-        _set_dither(context, None)
-    _set_policy(context, replace(context.dither_policy, unwanted_id=running))
+        context.dither = None
+    context.dither_policy = replace(context.dither_policy, unwanted_id=running)
 
 
 def _raise_over_budget(context: StepContext, running: str, loud: str) -> None:
@@ -520,5 +493,5 @@ def _raise_over_budget(context: StepContext, running: str, loud: str) -> None:
         f"{loud}: the RTC was ordered to stop {running}, and another is tried after "
         f"{FAILED_DITHER_PAUSE_S:.0f} s; check the dither of the RTC, or stop the dither"
     )
-    _set_policy(context, replace(context.dither_policy, loud_ns_utc=context.now_ns))
+    context.dither_policy = replace(context.dither_policy, loud_ns_utc=context.now_ns)
     context.raise_alarm(alarms.OVER_BUDGET, text)

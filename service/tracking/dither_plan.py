@@ -19,6 +19,7 @@ from service.estimation.windows import DITHER_SETTLING_S
 from service.tracking import mode_proof
 from service.tracking.alarms import Interlock
 from service.tracking.dither_request import (
+    DEFAULT_DURATION_S,
     DITHER_MARGIN_S,
     OUR_DITHERS,
     OWN_DITHER,
@@ -136,7 +137,9 @@ def choose_next(context: StepContext, rtc: Status) -> tuple[WantedDither, Dither
         return _to_show(context, rtc, shown, window_s), plan
     fixed = policy.dither_amplitude_m is not None
     total_m = requirement.budget_m if fixed else plan.total_m
-    choice = _parameters(context, total_m, window_s, max(requirement.window_s, _duration_s(phase)))
+    longest_s = MAX_DITHER_DURATION_S - DITHER_SETTLING_S - DITHER_MARGIN_S
+    lasting_s = requirement.window_s if phase is DitherPhase.SPARSE else longest_s
+    choice = _parameters(context, total_m, window_s, max(requirement.window_s, lasting_s))
     # An acquisition watches its matrices itself (``mode_proof.check_proven``).
     if phase is DitherPhase.ACQUIRE and not context.acquisition.under_way:
         choice = _with_others(context, rtc, choice)
@@ -211,7 +214,7 @@ def operator_parameters(context: StepContext, rtc: Status) -> DitherParameters:
     """Return what an operator's dither is like where the operator does not say."""
     policy, plan = context.policy, context.dither_policy.plan
     window_s = policy.window_s if plan is None else plan.window_s
-    lasting_s = policy.dither_duration_s - DITHER_SETTLING_S - DITHER_MARGIN_S
+    lasting_s = DEFAULT_DURATION_S - DITHER_SETTLING_S - DITHER_MARGIN_S
     return _parameters(context, quiet_budget_m(rtc, policy), window_s, lasting_s)
 
 
@@ -330,15 +333,6 @@ def _requirement(
     return replace(requirement, window_s=window_s)
 
 
-def _duration_s(phase: DitherPhase) -> float:
-    """Return how long a request is to be read at least, seconds."""
-    return (
-        0.0
-        if phase is DitherPhase.SPARSE
-        else MAX_DITHER_DURATION_S - DITHER_SETTLING_S - DITHER_MARGIN_S
-    )
-
-
 def _walk_rate(context: StepContext) -> NDArray[np.float64]:
     """Return ``(4,)`` variance that α gains in a second: the drift, or the flexure of a slew."""
     registration, base = context.registration, context.policy.drift_rate**2
@@ -354,12 +348,8 @@ def _next_window(
     context: StepContext, requirement: DitherRequirement
 ) -> tuple[DitherPhase, str, int]:
     """Return how to dither, why, and when the next window is due."""
-    state, registration, policy, now_ns = (
-        context.state,
-        context.registration,
-        context.policy,
-        context.now_ns,
-    )
+    state, policy, now_ns = context.state, context.policy, context.now_ns
+    registration = context.registration
     if registration is None:
         return DitherPhase.ACQUIRE, "α is not known", now_ns
     if state.alpha.dither_due_since_ns_utc is not None:
@@ -405,11 +395,8 @@ def _pace_without_passive(
         return DitherPhase.FOLLOW, text, registration.arrived_ns_utc
     # Bounded, because a slow drift allows any pause; the longest one is applied below.
     due_ns = registration.arrived_ns_utc + round(min(pause_s, 1e6) * SECOND_NS)
-    return (
-        DitherPhase.SPARSE,
-        "α cannot have walked far since the last window",
-        min(due_ns, longest_ns),
-    )
+    text = "α cannot have walked far since the last window"
+    return DitherPhase.SPARSE, text, min(due_ns, longest_ns)
 
 
 def _steady_amplitude(
@@ -422,11 +409,8 @@ def _steady_amplitude(
     if before is None or not settled or before.total_m > requirement.budget_m:
         return found.total_m
     ratio = found.total_m / before.total_m
-    return (
-        before.total_m
-        if 1.0 / AMPLITUDE_HYSTERESIS_RATIO <= ratio <= AMPLITUDE_HYSTERESIS_RATIO
-        else found.total_m
-    )
+    near = 1.0 / AMPLITUDE_HYSTERESIS_RATIO <= ratio <= AMPLITUDE_HYSTERESIS_RATIO
+    return before.total_m if near else found.total_m
 
 
 def check_dither_allowed(context: StepContext, rtc: Status) -> str | None:

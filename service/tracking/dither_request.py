@@ -384,6 +384,9 @@ def step_of(rtc: Status, window_s: float) -> float:
     return rtc.frame_rate_hz / max(round(window_s * rtc.frame_rate_hz), 1)
 
 
+DEFAULT_DURATION_S = 120.0
+"""Duration of a dither that an operator requests without stating one."""
+
 DEFAULT_RANDOM_RMS_M = 5e-9
 """Default RMS of all modes together, metres OPD, within the budget."""
 

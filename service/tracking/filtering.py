@@ -215,18 +215,19 @@ def joint_of(registration: Registration) -> Joint:
     if known is not None:
         mean = np.concatenate([joint.mean, registration.alpha.stretches])
         every = [[joint.covariance, known.shared.T], [known.shared, known.covariance]]
-        # The anamorphosis comes directly after the four of α, before any bias: ``stretches_of`` and
-        # ``biases_of`` read the state in this order.
+        # The anamorphosis comes directly after the four of α, before the bias: ``stretches_of`` and
+        # ``bias_of`` read the state in this order.
         joint = begin_joint(mean, np.block(every))
-    for bias in registration.biases:
-        covariance = [[joint.covariance, bias.shared.T], [bias.shared, bias.covariance]]
-        joint = Joint(
-            mean=np.concatenate([joint.mean, bias.offset]),
-            covariance=np.block(covariance),
-            n_alpha=joint.n_alpha,
-            biases=(*joint.biases, bias),
-        )
-    return joint
+    bias = registration.bias
+    if bias is None:
+        return joint
+    covariance = [[joint.covariance, bias.shared.T], [bias.shared, bias.covariance]]
+    return Joint(
+        mean=np.concatenate([joint.mean, bias.offset]),
+        covariance=np.block(covariance),
+        n_alpha=joint.n_alpha,
+        bias=bias,
+    )
 
 
 def alpha_of(joint: Joint, before: Misregistration) -> Misregistration:
@@ -242,16 +243,15 @@ def stretches_of(joint: Joint) -> KnownStretches | None:
     return KnownStretches(covariance=joint.covariance[4:6, 4:6], shared=joint.covariance[4:6, :4])
 
 
-def biases_of(joint: Joint) -> tuple[PassiveBias, ...]:
-    """Return what the filter knows of the biases; when and in which loop is as it was before."""
-    found = []
-    for bias in joint.biases:
-        if not isinstance(bias, PassiveBias):  # the filter has just begun with it
-            bias = PassiveBias(block=bias.block, excess=bias.excess, scatter=bias.scatter)
-        place = joint.place(bias.block)
-        shared, own = joint.covariance[place, : place.start], joint.covariance[place, place]
-        found.append(replace(bias, offset=joint.mean[place], covariance=own, shared=shared))
-    return tuple(found)
+def bias_of(joint: Joint) -> PassiveBias | None:
+    """Return what the filter knows of the bias; when and in which loop is as it was before."""
+    bias, place = joint.bias, joint.place
+    if bias is None:
+        return None
+    if not isinstance(bias, PassiveBias):  # the filter has just begun with it
+        bias = PassiveBias(excess=bias.excess, scatter=bias.scatter)
+    shared, own = joint.covariance[place, : place.start], joint.covariance[place, place]
+    return replace(bias, offset=joint.offset, covariance=own, shared=shared)
 
 
 def add_history(context: StepContext, entry: HistoryEntry) -> None:
@@ -276,7 +276,7 @@ def accept(
     joint, when, previous = update.joint, measured.when, context.registration
     doubted = _still_doubted(context.state, update, when)
     anew = update.jumped or (previous is not None and previous.suspected_jump is not None)
-    biases = biases_of(joint)
+    bias = bias_of(joint)
     registration = Registration(
         alpha=alpha_of(joint, measured.alpha),
         covariance=joint.alpha_covariance,
@@ -292,7 +292,7 @@ def accept(
         optical_gain=measured.optical_gain,
         optical_gains=measured.optical_gains,
         # What was known before a jump is of another registration.
-        biases=without_previous(biases) if anew else biases,
+        bias=without_previous(bias) if anew else bias,
         previous_estimate=None if anew else _previous_estimate(previous, update, measured),
         jumped_ns_utc=_jumped_ns_utc(previous, update, context.now_ns),
         doubt=previous.doubt if previous is not None and doubted else "",

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, get_args
 
 from service.errors import CommandError, UnknownIdError
@@ -42,9 +43,6 @@ class Moment:
 
     state: TrackerState
     policy: Policy
-    now_ns: int
-    """The service's clock, nanoseconds."""
-
     running: tuple[RunningOperation, ...]
     """Running operations, the exclusive one first."""
 
@@ -108,12 +106,13 @@ def permitted(state: TrackerState, order: Order, policy: Policy, now_ns: int) ->
     UnknownIdError
         If a command names what does not exist.
     """
-    return _decide(_moment(state, policy, now_ns), order)
+    running = running_operations(state, now_ns)
+    return _decide(Moment(state=state, policy=policy, running=running), order)
 
 
 def permissions(state: TrackerState, policy: Policy, now_ns: int) -> Mapping[str, Permission]:
     """Return the same of every order, by its name."""
-    moment = _moment(state, policy, now_ns)
+    moment = Moment(state=state, policy=policy, running=running_operations(state, now_ns))
     return {name: _decide(moment, order) for name, order in ORDERS.items()}
 
 
@@ -130,11 +129,6 @@ def require(state: TrackerState, command: Command, policy: Policy, now_ns: int) 
     permission = permitted(state, command, policy, now_ns)
     if not permission.allowed:
         raise CommandError(permission.reason)
-
-
-def _moment(state: TrackerState, policy: Policy, now_ns: int) -> Moment:
-    running = running_operations(state, now_ns)
-    return Moment(state=state, policy=policy, now_ns=now_ns, running=running)
 
 
 def _decide(moment: Moment, order: Order) -> Permission:
@@ -163,23 +157,11 @@ def _needs_rtc(moment: Moment, _: str = "") -> str | None:
     return f"{NO_RTC}: start it first" if moment.state.loop.rtc is None else None
 
 
-def _needs_loop(moment: Moment, why: str) -> str | None:
+def _needs_loop(moment: Moment, _: str, *, why: str) -> str | None:
     """Return why something cannot be done that needs the loop closed."""
     rtc = moment.state.loop.rtc
     opened = rtc is not None and rtc.loop == "open"
     return f"the loop is open: close it first, {why}" if opened else _needs_rtc(moment)
-
-
-def _start_dither(moment: Moment, _: str) -> str | None:
-    return _needs_loop(moment, "a dither is read in the closed loop")
-
-
-def _measure_noisy(moment: Moment, _: str) -> str | None:
-    return _needs_loop(moment, "a noisy matrix is measured in the closed loop")
-
-
-def _ramp(moment: Moment, _: str) -> str | None:
-    return _needs_loop(moment, "gains are tried on its residual")
 
 
 def _compensate(moment: Moment) -> str | None:
@@ -192,10 +174,6 @@ def _compensate(moment: Moment) -> str | None:
         "is read back, or publish one"
     )
     return unknown if moment.state.matrices.in_use is None else None
-
-
-def _acquire(moment: Moment, _: str) -> str | None:
-    return _needs_rtc(moment) or check_acquisition(moment.state, moment.policy)
 
 
 def _abort(moment: Moment, _: str) -> str | None:
@@ -312,19 +290,19 @@ def _is_known(alarm: str) -> bool:
 
 INTERLOCKS: Final[dict[type, Callable[[Moment, str], str | None]]] = {
     cmd.Resume: _resume,
-    cmd.Acquire: _acquire,
+    cmd.Acquire: lambda now, _: _needs_rtc(now) or check_acquisition(now.state, now.policy),
     cmd.AbortAcquisition: _abort,
     cmd.Refit: _refit,
-    cmd.StartDither: _start_dither,
+    cmd.StartDither: partial(_needs_loop, why="a dither is read in the closed loop"),
     cmd.Approve: _approve,
     cmd.Reject: _reject,
     cmd.Publish: _publish,
     cmd.Rollback: _rollback,
     cmd.Measure: _needs_rtc,
-    cmd.MeasureNoisy: _measure_noisy,
+    cmd.MeasureNoisy: partial(_needs_loop, why="a noisy matrix is measured in the closed loop"),
     cmd.GiveUp: _give_up,
     cmd.SetLoop: _needs_rtc,
-    cmd.Ramp: _ramp,
+    cmd.Ramp: partial(_needs_loop, why="gains are tried on its residual"),
     cmd.AcknowledgeAlarm: _acknowledge,
     cmd.UnmuteAlarm: _unmute,
 }

@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.estimate import BiasBlock
+from service.estimation.estimate import BIAS_FLOOR, BIAS_WANDER
 from service.estimation.kalman import JUMP_THRESHOLD, Joint
 from service.model.misregistration import Misregistration
 from service.tracking.policy import SECOND_NS, Policy
@@ -192,11 +192,8 @@ def previous_window(registration: Registration) -> TimedEstimate | None:
     """Return the window before the present one: held, or the last that entered."""
     if registration.suspected_jump is not None:
         return registration.suspected_jump
-    return (
-        None
-        if registration.previous_estimate is None
-        else registration.previous_estimate.next_window
-    )
+    previous = registration.previous_estimate
+    return None if previous is None else previous.next_window
 
 
 def jump_lasts(
@@ -229,24 +226,19 @@ def is_after_jump(
 
 
 def passive_innovation(
-    registration: Registration,
-    joint: Joint,
-    block: BiasBlock,
-    window: PointedEstimate,
-    policy: Policy,
+    registration: Registration, joint: Joint, window: PointedEstimate, policy: Policy
 ) -> float:
-    """Return the innovation of a passive estimate; ``joint`` is at ``known``'s time."""
-    bias = registration.bias(block)
-    before = None if bias is None else bias.previous_estimate
-    found, off = [], np.square(block.wander) * np.diag(window.covariance)
-    for earlier in (sum_of(registration, joint, block), before):
+    """Return the innovation of a passive estimate; ``joint`` is at the registration's time."""
+    before = None if registration.bias is None else registration.bias.previous_estimate
+    found, off = [], np.square(BIAS_WANDER) * np.diag(window.covariance)
+    for earlier in (sum_of(registration, joint), before):
         if earlier is not None:
             elapsed_s = max(window.t_ns_utc - earlier.t_ns_utc, 0) / SECOND_NS
             # 1 - exp(-2t/T): the variance of a bias with memory T that has been forgotten. Twice
             # the rate, because it is a variance.
             fading = -np.expm1(-2.0 * elapsed_s / policy.bias_memory_s)
             # The bias fades with its memory, so an old comparison must allow for a new bias.
-            forgot = np.square(block.floor) * fading + off
+            forgot = np.square(BIAS_FLOOR) * fading + off
             found.append(_innovation_from(earlier, window, policy, forgot).mahalanobis_squared)
     # The larger of the two, because a change within one estimate shows fully only in comparison
     # with the state before it.
@@ -263,9 +255,9 @@ def to_previous_estimate(registration: Registration) -> PreviousEstimate:
     )
 
 
-def sum_of(registration: Registration, joint: Joint, block: BiasBlock) -> PreviousEstimate:
+def sum_of(registration: Registration, joint: Joint) -> PreviousEstimate:
     """Return the expected passive estimate: α and its bias together."""
-    sees = joint.observation_rows(block)
+    sees = joint.observation_rows()
     return PreviousEstimate(
         alpha=Misregistration.from_vector(sees @ joint.mean),
         covariance=sees @ joint.covariance @ sees.T,

@@ -18,11 +18,11 @@ from service.tracking import events as ev
 from service.tracking import validity
 from service.tracking.alarms import Interlock
 from service.tracking.operations.running import running_ramp
-from service.tracking.policy import SECOND_NS, Offloading, Policy
+from service.tracking.policy import SECOND_NS, Offloading
 from service.tracking.registration import Offload, OffloadState, Purpose, Registration, Validity
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
-from service.tracking.update_policy import is_settled
+from service.tracking.update_policy import REFUSED_INTERVAL_S, is_settled
 from service.tracking.validity import MOVING, end_of, make_valid, void_until
 from service.wire import OffloadRequest, Reply, Status
 
@@ -47,12 +47,9 @@ Array = NDArray[np.float64]
 def request_offload(context: StepContext) -> None:
     """Ask for a move where α is known well enough and too far from the nominal registration."""
     limits, registration, rtc = context.policy.offloading, context.registration, context.rtc
-    if (
-        limits is None
-        or registration is None
-        or rtc is None
-        or not _may_move(context, registration, rtc, limits)
-    ):
+    if limits is None or registration is None or rtc is None:
+        return
+    if not _may_move(context, registration, rtc, limits):
         return
     step = wanted_step(context.state, registration, context.nominal.vector, limits)
     if not step.any():
@@ -161,42 +158,29 @@ def _may_move(
     state, last = context.state, context.alpha.offload
     if state.operator.mode is not Mode.AUTO or state.on_probation or not rtc.in_loop:
         return False
-    if any(
-        context.blocking_alarm(interlock)
-        for interlock in (Interlock.ASK, Interlock.DECIDE, Interlock.SEND_NEW)
-    ):
+    if any(map(context.blocking_alarm, (Interlock.ASK, Interlock.DECIDE, Interlock.SEND_NEW))):
         return False
-    sure = (
-        is_settled(registration)
-        and not registration.doubt
-        and registration.validity.level is Validity.FRESH
-    )
+    sure = is_settled(registration) and registration.validity.level is Validity.FRESH
     if not sure or np.any(np.sqrt(np.diag(registration.covariance)) > limits.near):
         return False
-    if state.matrices.making_since_ns_utc is not None or any(
-        r.on_its_way for r in state.matrices.reconstructors
-    ):
+    if state.matrices.making_since_ns_utc is not None or state.sent is not None:
         return False
     if state.noisy_measurement is not None or running_ramp(state, context.now_ns) is not None:
         return False
-    return last is None or context.now_ns >= last.asked_ns_utc + _rest_ns(last, context.policy)
-
-
-def _rest_ns(last: Offload, policy: Policy) -> int:
-    """Return the pause after a demand; a demand without a reply is awaited."""
-    if last.state is OffloadState.MOVED:
-        return round(policy.minimum_interval_s * SECOND_NS)
-    return round(policy.refused_interval_s * SECOND_NS)
+    if last is None:
+        return True
+    # A demand without a reply is awaited.
+    moved = last.state is OffloadState.MOVED
+    pause_s = context.policy.minimum_interval_s if moved else REFUSED_INTERVAL_S
+    return context.now_ns >= last.asked_ns_utc + round(pause_s * SECOND_NS)
 
 
 def _clock_ns(context: StepContext, after_s: float) -> int:
     """Return the RTC's clock so long after now, at the latest; 0: unknown."""
-    return (
-        0
-        if context.rtc is None
-        # The RTC's clock has run on since its last status.
-        else context.rtc.t_ns + round((MAX_STATUS_AGE_S + after_s) * SECOND_NS)
-    )
+    if context.rtc is None:
+        return 0
+    # The RTC's clock has run on since its last status.
+    return context.rtc.t_ns + round((MAX_STATUS_AGE_S + after_s) * SECOND_NS)
 
 
 def _apart(alpha: Array, other: Array) -> Array:

@@ -8,39 +8,27 @@ from service.control.gains import gain_table
 from service.errors import CommandError
 from service.estimation.loop import extend_gains
 from service.tracking import commands as cmd
+from service.tracking import dither_request, reconstructors
 from service.tracking import events as ev
-from service.tracking import reconstructors
 from service.tracking.alarms import PROBATION
 from service.tracking.commands import GainGroup, ModeGroup
 from service.tracking.dither import allow_dither, request_dither
 from service.tracking.dither_plan import operator_parameters
-from service.tracking.dither_request import (
-    DEFAULT_RANDOM_RMS_M,
-    OPERATOR_DITHER,
-    Dither,
-    check_dither_usable,
-    check_modes,
-    cost_of,
-    plan_dither,
-    plan_random,
-    total_m,
-)
+from service.tracking.dither_request import Dither
 from service.tracking.operation_records import CommandState, LoopCommand
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ModeSet
 from service.tracking.state import Level, Mode
 from service.tracking.step_context import StepContext, present
 from service.tracking.validity import note_pointing
-from service.wire import DitherKind, Loop, LoopRequest, RampRequest, Status
+from service.wire import DitherKind, Loop, LoopRequest, Pointing, RampRequest, Status
 
 
 def set_mode(context: StepContext, command: cmd.SetMode) -> None:
     """Set the mode; remember that of the settings."""
-    mode = command.mode
-    of_settings = context.operator.settings_mode or context.operator.mode
-    change_mode(context, mode, None if mode is of_settings else of_settings)
+    change_mode(context, command.mode)
     context.clear_alarm(PROBATION)
-    context.log("mode", f"mode is {mode}")
+    context.log("mode", f"mode is {command.mode}")
 
 
 def approve(context: StepContext, command: cmd.Approve) -> None:
@@ -93,8 +81,8 @@ def start_dither(context: StepContext, command: cmd.StartDither) -> None:
     """
     rtc = present(context.rtc)
     dither = _plan_dither(context, rtc, command)
-    total, over_budget = total_m(dither.request), command.over_budget
-    cost = cost_of(total, context.policy, over_budget=over_budget)
+    total, over_budget = dither_request.total_m(dither.request), command.over_budget
+    cost = dither_request.cost_of(total, context.policy, over_budget=over_budget)
     allow_dither(context)
     modes = dither.request.modes
     which = f"modes {modes}" if len(modes) < 10 else f"{len(modes)} modes"
@@ -112,16 +100,17 @@ def _plan_dither(context: StepContext, rtc: Status, command: cmd.StartDither) ->
     """
     policy, now_ns = context.policy, context.now_ns
     if command.kind is DitherKind.BINARY or isinstance(command.modes, ModeSet):
-        return plan_random(
+        return dither_request.plan_random(
             rtc,
             policy,
             now_ns,
-            dither_id=f"{OPERATOR_DITHER}{now_ns}",
+            dither_id=f"{dither_request.OPERATOR_DITHER}{now_ns}",
             modes=command.modes or ModeSet.CONTROLLED,
-            total_m=command.total_amplitude_m or min(DEFAULT_RANDOM_RMS_M, policy.dither_budget_m),
-            duration_s=command.duration_s or policy.dither_duration_s,
+            total_m=command.total_amplitude_m
+            or min(dither_request.DEFAULT_RANDOM_RMS_M, policy.dither_budget_m),
+            duration_s=command.duration_s or dither_request.DEFAULT_DURATION_S,
         )
-    dither = plan_dither(
+    dither = dither_request.plan_dither(
         rtc,
         policy,
         now_ns,
@@ -131,8 +120,8 @@ def _plan_dither(context: StepContext, rtc: Status, command: cmd.StartDither) ->
         frequency_hz=command.frequency_hz,
         duration_s=command.duration_s,
     )
-    check_modes(dither.request.modes, rtc)
-    reason = check_dither_usable(dither, rtc, policy)
+    dither_request.check_modes(dither.request.modes, rtc)
+    reason = dither_request.check_dither_usable(dither, rtc, policy)
     if reason is not None:
         raise CommandError(reason)
     return dither
@@ -148,26 +137,27 @@ def _republish(context: StepContext, source: str, why: str, *, anyway: bool = Fa
 
 def set_pointing(context: StepContext, command: cmd.SetPointing) -> None:
     """Store the pointing that the observatory reports."""
-    note_pointing(context, command.pointing)
+    pointing = Pointing(elevation_deg=command.elevation_deg, azimuth_deg=command.azimuth_deg)
+    note_pointing(context, pointing)
 
 
 def enter_hold(context: StepContext, why: str) -> None:
     """Do nothing unasked until an operator sets another mode."""
-    of_settings = context.operator.settings_mode or context.operator.mode
-    change_mode(context, Mode.HOLD, None if of_settings is Mode.HOLD else of_settings)
+    change_mode(context, Mode.HOLD)
     context.log("mode", f"hold: {why}")
 
 
 def leave_hold(context: StepContext, why: str) -> None:
     """Go on in mode auto after :func:`enter_hold`."""
-    of_settings = context.operator.settings_mode
-    change_mode(context, Mode.AUTO, None if of_settings is Mode.AUTO else of_settings)
+    change_mode(context, Mode.AUTO)
     context.warn("mode", f"auto: {why}")
 
 
-def change_mode(context: StepContext, mode: Mode, of_settings: Mode | None) -> None:
-    """Go on in a mode; ``of_settings`` is that of the settings, None: the same."""
-    context.operator = replace(context.operator, mode=mode, settings_mode=of_settings)
+def change_mode(context: StepContext, mode: Mode) -> None:
+    """Go on in a mode, and remember that of the settings if it is another one."""
+    of_settings = context.operator.settings_mode or context.operator.mode
+    other = None if mode is of_settings else of_settings
+    context.operator = replace(context.operator, mode=mode, settings_mode=other)
 
 
 RAMP_GROUPS = ((0, 1), (2, 99), (100, None))
@@ -197,7 +187,11 @@ def set_loop(context: StepContext, command: cmd.SetLoop) -> None:
     n_controlled = command.n_controlled
     if n_controlled is not None and not 1 <= n_controlled <= rtc.n_modes:
         raise CommandError(f"found {n_controlled} modes; expected 1 to {rtc.n_modes}")
-    gains = _gains_of(command, context, rtc, n_controlled or rtc.n_controlled)
+    gains, n_modes = None, n_controlled or rtc.n_controlled
+    if command.effective_gain is not None:
+        gains = _compensate(context, rtc, command.effective_gain, n_modes)
+    elif command.gains is not None:
+        gains = _gains(rtc, command.gains, n_modes)
     if command.loop is not None:
         context.loop = replace(context.loop, close_since_ns_utc=None)
     _ask_loop(
@@ -277,15 +271,6 @@ def close_again(context: StepContext) -> None:
     if not closed and not recent:
         request = LoopRequest(id=f"loop-{context.now_ns}", loop=Loop.CLOSED)
         _ask_loop(context, request, "close again after a measurement given up")
-
-
-def _gains_of(
-    command: cmd.Gains, context: StepContext, rtc: Status, n_modes: int
-) -> tuple[float, ...] | None:
-    """Return a gain for each mode of the basis as requested; None if they are unchanged."""
-    if command.effective_gain is not None:
-        return _compensate(context, rtc, command.effective_gain, n_modes)
-    return None if command.gains is None else _gains(rtc, command.gains, n_modes)
 
 
 def _gains(rtc: Status, groups: tuple[GainGroup, ...], n_modes: int) -> tuple[float, ...]:

@@ -17,19 +17,13 @@ from service.errors import ModelError
 from service.model.misregistration import Misregistration, step_text, wrap_angle
 from service.model.pointing_law import ANGLES, PointingLaw, Reported
 from service.tracking import events as ev
+from service.tracking import validity
 from service.tracking.events import Event
-from service.tracking.operations.acquisition import set_acquisition
+from service.tracking.operations.acquisition import carry_alpha
 from service.tracking.policy import SECOND_NS
 from service.tracking.registration import LawLeap, LawState, Purpose, Registration, moved
 from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext
-from service.tracking.validity import (
-    age_registration,
-    cast_doubt,
-    request_window,
-    store_registration,
-    void_until,
-)
 
 Array = NDArray[np.float64]
 
@@ -281,11 +275,11 @@ def _hold(context: StepContext, before: Misregistration, now: Misregistration) -
     registration, t_ns = context.registration, 0 if context.rtc is None else context.rtc.t_ns
     if registration is not None:
         doubted = replace(registration, doubt=because, doubt_voids=True, suspected_jump=None)
-        store_registration(context, doubted)
-        cast_doubt(context, t_ns)
-        request_window(context, because)
-        age_registration(context)
-    void_until(context, t_ns, because, Purpose.MEASURE)
+        validity.store_registration(context, doubted)
+        validity.cast_doubt(context, t_ns)
+        validity.request_window(context, because)
+        validity.age_registration(context)
+    validity.void_until(context, t_ns, because, Purpose.MEASURE)
     context.warn(
         "law.leapt", f"{because}: α follows the law from now on, until a window confirms it"
     )
@@ -293,17 +287,15 @@ def _hold(context: StepContext, before: Misregistration, now: Misregistration) -
 
 def _carry(context: StepContext, now: Misregistration) -> None:
     """Take this for nominal, and move what is known of α as far as it has moved."""
-    registration, acquisition = context.registration, context.acquisition
-    before = context.alpha.law.nominal
+    registration, before = context.registration, context.alpha.law.nominal
     if registration is not None and registration.nominal != now:
         # A registration that was not related to the law yet has not moved with it: it only gets a
         # place.
         if registration.nominal is not None:
             registration = moved(registration, difference(registration.nominal, now))
-        store_registration(context, replace(registration, nominal=now))
-    if acquisition.alpha is not None and before is not None and before != now:
-        found = acquisition.alpha.add_step(difference(before, now))
-        set_acquisition(context, replace(acquisition, alpha=found))
+        validity.store_registration(context, replace(registration, nominal=now))
+    if before is not None and before != now:
+        carry_alpha(context, difference(before, now))
     state = LawState(
         nominal=now,
         worked_out_ns_utc=context.now_ns,

@@ -110,9 +110,6 @@ class Policy:
     dither_frequencies_hz: tuple[float, ...] | None
     """None: spread over 0.2-0.35 of the frame rate."""
 
-    dither_duration_s: float = 120.0
-    """Duration of a dither that an operator requests without stating one."""
-
     window_s: float
     """Shortest window of dithered telemetry."""
 
@@ -183,9 +180,6 @@ class Policy:
 
     law: PointingLaw | None = None
     """Registration as a function of the pointing; None if it is constant."""
-
-    refused_interval_s: float = 30.0
-    """The same after one was refused, rejected or not acknowledged."""
 
     def wanted_modes(self, rtc: Status) -> int:
         """Return how many modes are to be controlled once the registration is known."""

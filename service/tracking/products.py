@@ -130,14 +130,9 @@ class ReconstructorRecord:
     """Id of the order or event that has made it, or sent it since."""
 
     @property
-    def is_rtcs(self) -> bool:
-        """Return True if its numbers are the RTC's own matrix."""
-        return self.alpha is None
-
-    @property
     def origin(self) -> str:
         """Maker of its numbers: the RTC, or the service."""
-        if not self.is_rtcs:
+        if self.alpha is not None:
             return "the service's"
         return "the RTC's own" + ("" if self.parent is None else f", {self.parent} sent again")
 

@@ -8,7 +8,7 @@ from service.errors import CommandError, UnknownIdError
 from service.estimation.loop import NO_RTC, extend_gains, select_gains
 from service.tracking import alarms, update_policy
 from service.tracking import events as ev
-from service.tracking.alarms import Alarm, Interlock, alarm_blocks, blocking_alarm
+from service.tracking.alarms import Interlock, alarm_blocks, blocking_alarm
 from service.tracking.mode_proof import check_proven
 from service.tracking.products import Assessment, MatrixState, ReconstructorRecord
 from service.tracking.state import Level, Mode, TrackerState
@@ -45,10 +45,10 @@ def check_sendable(
             now = "invalid" if registration.doubt_voids else "in question"
             return f"α is {now} ({registration.doubt})"
     interlock = Interlock.SEND_KNOWN if was_used else Interlock.SEND_NEW
-    before = state.alarms.active if swapped_ns_utc is None else _not_of_swap(state, swapped_ns_utc)
-    alarm = next((alarm for alarm in before if alarm_blocks(alarm, interlock)), None)
-    if alarm is not None:
-        return alarm.text
+    for alarm in state.alarms.active:
+        of_swap = swapped_ns_utc is not None and alarm.since_ns_utc >= swapped_ns_utc
+        if alarm_blocks(alarm, interlock) and not (of_swap and alarm.name in _OF_A_SWAP):
+            return alarm.text
     unread = explain_unread_matrix(state, state.loop.rtc.cm_id)
     return unread if unread or was_used else check_proven(state, record)
 
@@ -80,15 +80,6 @@ def check_return(state: TrackerState) -> str | None:
     )
 
 
-def _not_of_swap(state: TrackerState, swapped_ns_utc: int) -> tuple[Alarm, ...]:
-    """Return the alarms that a matrix applied then cannot have caused."""
-    return tuple(
-        alarm
-        for alarm in state.alarms.active
-        if alarm.name not in _OF_A_SWAP or alarm.since_ns_utc < swapped_ns_utc
-    )
-
-
 def explain_unread_matrix(state: TrackerState, matrix_id: str | None) -> str | None:
     """Return why the numbers of this matrix of the RTC's are unknown, or None."""
     if matrix_id is None or matrix_id in state.matrices.verified_ids:
@@ -105,10 +96,7 @@ def may_follow(state: TrackerState) -> bool:
     rtc, registration = state.loop.rtc, state.alpha.registration
     if state.operator.mode is not Mode.AUTO or state.on_probation or rtc is None or not rtc.in_loop:
         return False
-    if (
-        blocking_alarm(state.alarms.active, Interlock.DECIDE) is not None
-        or check_return(state) is not None
-    ):
+    if blocking_alarm(state.alarms.active, Interlock.DECIDE) or check_return(state) is not None:
         return False
     return registration is not None and update_policy.is_settled(registration)
 
@@ -183,9 +171,8 @@ def mark_applied(context: StepContext, matrix_id: str) -> None:
         if other.id != matrix_id and other.state is MatrixState.APPLIED:
             change_state(context, other.id, MatrixState.SUPERSEDED, f"{matrix_id} is in use")
     replace_record(context, replace(record, state=MatrixState.APPLIED))
-    forget_verdict(context)
     context.matrices = replace(
-        context.matrices, in_use=matrix_id, assessment=None, judged_ns_utc=None
+        context.matrices, in_use=matrix_id, margin=None, assessment=None, judged_ns_utc=None
     )
 
 
@@ -275,11 +262,10 @@ def on_matrix(context: StepContext, made: ev.MatrixMade) -> None:
         context.log("reconstructor.discarded", text)
         return
     held = check_sendable(context.state, record) or beyond_judging(context.state, record)
-    no_return = (
-        # In auto no matrix is sent without a way back from it: probation must be able to send the
-        # previous one.
-        None if wanted or context.operator.mode is not Mode.AUTO else check_return(context.state)
-    )
+    # In auto no matrix is sent without a way back from it: probation must be able to send the
+    # previous one.
+    unasked = context.operator.mode is Mode.AUTO and not wanted
+    no_return = check_return(context.state) if unasked else None
     if not held and no_return is not None:
         context.log("reconstructor.kept-back", f"{record.id} is proposed and not sent: {no_return}")
     elif not held and made.anyway:
@@ -291,9 +277,7 @@ def on_matrix(context: StepContext, made: ev.MatrixMade) -> None:
 def propose(context: StepContext, record: ReconstructorRecord) -> None:
     """Keep a new reconstructor in place of any proposal."""
     note_none_made(context)
-    for older in context.matrices.reconstructors:
-        if older.state is MatrixState.PROPOSED:
-            change_state(context, older.id, MatrixState.DISCARDED, f"{record.id} replaces it")
+    discard_proposals(context, f"{record.id} replaces it")
     store_reconstructor(context, replace(record, cause=context.cause))
     verdict = record.gate.reason if record.gate is not None else record.reason
     if record.state is MatrixState.REFUSED:
@@ -357,8 +341,13 @@ def on_proposal_judged(context: StepContext, event: ev.ProposalJudged) -> None:
     context.fail(text)
 
 
-def send(context: StepContext, matrix_id: str, swapped_ns_utc: int | None = None) -> None:
-    """Mark a reconstructor as published and request to send it, with the gains in force.
+def send(
+    context: StepContext,
+    matrix_id: str,
+    swapped_ns_utc: int | None = None,
+    gains: tuple[float, ...] | None = None,
+) -> None:
+    """Mark a reconstructor as published and request to send it, with gains or those in force.
 
     ``swapped_ns_utc`` requests a rollback behind the swap of that time, see :func:`check_sendable`.
 
@@ -368,37 +357,18 @@ def send(context: StepContext, matrix_id: str, swapped_ns_utc: int | None = None
         If no RTC is there, it may be the wrong one, or the gate's latest verdict is no.
     """
     record, rtc = _sendable(context, matrix_id, swapped_ns_utc)
-    same = record.n_modes == rtc.n_controlled
     # Gains travel with the matrix only where the number of modes changes: the RTC keeps its own.
-    _send(context, record, None if same else extend_gains(rtc, record.n_modes))
-
-
-def send_with(context: StepContext, matrix_id: str, gains: tuple[float, ...] | None) -> None:
-    """Do the same with these gains.
-
-    Raises
-    ------
-    CommandError
-        As above.
-    """
-    record, _ = _sendable(context, matrix_id)
-    _send(context, record, gains)
-
-
-def _send(
-    context: StepContext, record: ReconstructorRecord, gains: tuple[float, ...] | None
-) -> None:
+    if gains is None and record.n_modes != rtc.n_controlled:
+        gains = extend_gains(rtc, record.n_modes)
     unjudged = _explain_missing_verdict(record)
-    replace_record(
-        context,
-        replace(
-            record,
-            state=MatrixState.PUBLISHED,
-            published_ns_utc=context.now_ns,
-            reason=unjudged,
-            cause=context.cause,
-        ),
+    sent = replace(
+        record,
+        state=MatrixState.PUBLISHED,
+        published_ns_utc=context.now_ns,
+        reason=unjudged,
+        cause=context.cause,
     )
+    replace_record(context, sent)
     text = f"{record.id} sent to the RTC{'; ' if unjudged else ''}{unjudged}"
     context.log("reconstructor.published", text, Level.WARNING if unjudged else Level.INFO)
     context.ask(ev.SendMatrix(id=record.id, n_modes=record.n_modes, gains=gains))
@@ -498,10 +468,7 @@ def on_margin(context: StepContext, event: ev.MarginJudged) -> None:
         return
     used = event.id == context.matrices.in_use
     gains = () if context.rtc is None else context.rtc.gains[: record.n_modes]
-    if (
-        judged is not None
-        and update_policy.verdict_doubtful_reason(context.state, judged, gains) is not None
-    ):
+    if judged and update_policy.verdict_doubtful_reason(context.state, judged, gains) is not None:
         if used:
             forget_when_judged(context)
         return
@@ -579,12 +546,12 @@ def _explain_missing_verdict(record: ReconstructorRecord) -> str:
 
 
 def _warn_of_unreadable_commit(context: StepContext, event: Acknowledgement) -> None:
-    on_way = next((r.id for r in context.matrices.reconstructors if r.on_its_way), None)
+    sent = context.state.sent
     text = f"the RTC rejected a commit that it could not read: {event.reason or 'no reason given'}"
-    if on_way is None:
+    if sent is None:
         text += ". This service has sent none: another program sends commits to the RTC"
     else:
-        text += f". {on_way} is on its way: if the RTC does not apply it, this may be why"
+        text += f". {sent.id} is on its way: if the RTC does not apply it, this may be why"
     context.warn("acknowledgement.unreadable-commit", text)
 
 

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.control.gains import ModeGain
-from service.estimation.estimate import PASSIVE_BIAS, BiasBlock
 from service.estimation.kalman import Bias
 from service.model.misregistration import Determination, Misregistration
 from service.wire import Pointing
@@ -129,8 +128,8 @@ class PassiveBias(Bias):
     """``(4, 4)`` of it."""
 
     shared: Array = field(default_factory=lambda: np.zeros((4, 4)))
-    """``(4, n + 4 k)`` covariance of it (rows) with the ``n`` numbers of α, 6 with its
-    anamorphosis, and the ``k`` biases before it (columns)."""
+    """``(4, n)`` covariance of it (rows) with the ``n`` numbers of α, 6 with its anamorphosis
+    (columns)."""
 
     looked_ns_utc: int = 0
     """End of the telemetry of the last passive estimate, the RTC's clock; 0: there was none."""
@@ -142,9 +141,9 @@ class PassiveBias(Bias):
     """α and bias together before that one; None: it was the first, or has been doubted."""
 
 
-def without_previous(biases: tuple[PassiveBias, ...]) -> tuple[PassiveBias, ...]:
-    """Return the biases without what was known before their last updates: it is out of date."""
-    return tuple(replace(bias, previous_estimate=None) for bias in biases)
+def without_previous(bias: PassiveBias | None) -> PassiveBias | None:
+    """Return the bias without what was known before its last update: it is out of date."""
+    return bias and replace(bias, previous_estimate=None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -225,8 +224,8 @@ class Registration:
     optical_gains: tuple[ModeGain, ...] = ()
     """Optical gain of every mode that was dithered, in mode order, bounded in number."""
 
-    biases: tuple[PassiveBias, ...] = ()
-    """Biases of the passive estimates that have contributed, in the filter's order."""
+    bias: PassiveBias | None = None
+    """Bias of the passive estimate; None if none has contributed."""
 
     pointing: Pointing | None = None
     """Pointing of the telescope at ``t_ns_utc``; None if unknown."""
@@ -269,10 +268,6 @@ class Registration:
 
     stretches: KnownStretches | None = None
     """Accuracy of its anamorphosis; None if anamorphosis is not tracked."""
-
-    def bias(self, block: BiasBlock) -> PassiveBias | None:
-        """Return what is known of a bias; None: nothing is."""
-        return next((bias for bias in self.biases if bias.block.name == block.name), None)
 
     @property
     def total_covariance(self) -> Array:
@@ -386,15 +381,15 @@ class LawState:
 
 def moved(registration: Registration, step: Array) -> Registration:
     """Return what is known of α with all of it a step ``(4,)`` further, numeric units."""
+    bias = registration.bias
+    if bias is not None:
+        bias = replace(bias, previous_estimate=_previous_moved(bias.previous_estimate, step))
     return replace(
         registration,
         alpha=registration.alpha.add_step(step),
         previous_estimate=_previous_moved(registration.previous_estimate, step),
         suspected_jump=_moved(registration.suspected_jump, step),
-        biases=tuple(
-            replace(bias, previous_estimate=_previous_moved(bias.previous_estimate, step))
-            for bias in registration.biases
-        ),
+        bias=bias,
     )
 
 
@@ -473,6 +468,5 @@ class PassiveState:
     bias: Array = field(default_factory=lambda: np.zeros(4))
     """``(4,)`` what is known of its bias, numeric units; 0: nothing."""
 
-    estimator: str = PASSIVE_BIAS.name
-    """Name of the estimate's bias, which identifies it. The most recent of several estimates is
-    shown."""
+    estimator: str = "passive"
+    """Name of the estimator."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.tracking import commands as cmd
-from service.tracking import dither, mode_proof, offload
+from service.tracking import dither, mode_proof, offload, validity
 from service.tracking.alarm_records import restore_records
 from service.tracking.alarm_rules import derive_alarms
 from service.tracking.alarms import NOT_RESTORED, Interlock
@@ -23,13 +23,6 @@ from service.tracking.reconstructors import prune
 from service.tracking.registration import without_previous
 from service.tracking.state import Orders, Saved, TrackerState
 from service.tracking.step_context import StepContext
-from service.tracking.validity import (
-    age_registration,
-    forget_registration,
-    in_subapertures,
-    restore_intervals,
-    restore_registration,
-)
 
 MAX_CLOCK_DIFFERENCE_S = 60.0
 """A state from further in the future than this was saved under another clock."""
@@ -110,7 +103,7 @@ def obey_orders(context: StepContext, orders: Orders) -> None:
             f"mode is {ordered}, as an operator set it before the restart, and not {of_settings} "
             "as the settings say; set the mode to change it"
         )
-        change_mode(context, ordered, of_settings)
+        change_mode(context, ordered)
     context.warn("mode", text)
 
 
@@ -131,15 +124,12 @@ def restored(records: tuple[ReconstructorRecord, ...]) -> tuple[ReconstructorRec
 
 def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
     """Return the part of a state that is saved; None if nothing is known yet, nor ordered."""
-    registration, acquisition, orders = (
-        state.alpha.registration,
-        acquisition_to_save(state),
-        orders_of(state),
-    )
+    registration, rtc = state.alpha.registration, state.loop.rtc
+    acquisition, orders = acquisition_to_save(state), orders_of(state)
     if registration is not None:
         registration = replace(
             registration,
-            biases=without_previous(registration.biases),
+            bias=without_previous(registration.bias),
             # The window that would confirm or refute the jump belongs to the run that ends.
             suspected_jump=None,
             previous_estimate=None,
@@ -149,7 +139,7 @@ def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
     return Saved(
         system=state.system,
         saved_ns_utc=now_ns,
-        session=state.loop.rtc.session if state.loop.rtc is not None else None,
+        session=None if rtc is None else rtc.session,
         in_use=state.matrices.in_use,
         pointing=state.alpha.pointing,
         registration=registration,
@@ -184,7 +174,7 @@ def resumed(state: TrackerState, saved: Saved, policy: Policy, now_ns: int) -> T
         context.operator = replace(context.operator, stopped_because=stopped)
         restore_records(context, saved.orders)
     if saved.system == state.system:
-        restore_intervals(context, saved.void_intervals)
+        validity.restore_intervals(context, saved.void_intervals)
     _take_over_alpha(context, saved, now_ns)
     if saved.offload is not None and saved.system == state.system:
         offload.restore_offload(context, saved.offload)
@@ -201,7 +191,9 @@ def _in_present_mode(context: StepContext, saved: Saved) -> Saved:
     if scale is None:
         return saved
     # Modes were verified as another mode of the sensor sees them.
-    return replace(saved, registration=in_subapertures(registration, scale, now), mode_proof=None)
+    return replace(
+        saved, registration=validity.in_subapertures(registration, scale, now), mode_proof=None
+    )
 
 
 def _take_over_alpha(context: StepContext, saved: Saved, now_ns: int) -> None:
@@ -212,7 +204,7 @@ def _take_over_alpha(context: StepContext, saved: Saved, now_ns: int) -> None:
         context.warn("registration.not-restored", text)
         if saved.registration is not None:
             context.raise_alarm(NOT_RESTORED, text)
-        forget_registration(context)
+        validity.forget_registration(context)
         return
     if saved.acquisition is not None:
         restore_acquisition(context, saved.acquisition)
@@ -220,10 +212,11 @@ def _take_over_alpha(context: StepContext, saved: Saved, now_ns: int) -> None:
     if registration is not None:
         # The clock may have been set back meanwhile.
         away_s = max(now_ns - registration.arrived_ns_utc, 0) / SECOND_NS
-        restore_registration(context, registration)
+        restored_now = replace(registration, n_windows=0, restored_ns_utc=now_ns)
+        validity.store_registration(context, restored_now)
         text = f"α of {away_s:.0f} s ago; {saved.in_use or 'no known matrix'} was in use then"
         context.log("registration.restored", text)
-        age_registration(context)
+        validity.age_registration(context)
     if saved.mode_proof is not None and saved.session is not None:
         mode_proof.restore_proof(context, saved.mode_proof, saved.session)
 

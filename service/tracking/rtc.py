@@ -38,9 +38,8 @@ def on_tick(context: StepContext) -> None:
         sent_ns = record.published_ns_utc or context.now_ns
         if record.on_its_way and context.now_ns - sent_ns > ACKNOWLEDGEMENT_TIMEOUT_S * SECOND_NS:
             text = (
-                f"{record.id} was not applied within {ACKNOWLEDGEMENT_TIMEOUT_S:.0f} s; "
-                "the RTC keeps "
-                "the old one: see the RTC's log, then publish again"
+                f"{record.id} was not applied within {ACKNOWLEDGEMENT_TIMEOUT_S:.0f} s; the RTC "
+                "keeps the old one: see the RTC's log, then publish again"
             )
             reconstructors.change_state(context, record.id, MatrixState.FAILED, text)
             with context.because_of(record.cause):
@@ -62,11 +61,11 @@ def on_status(context: StepContext, rtc: Status) -> None:
     if before is not None and not same_loop(before, rtc):
         # the margin is not what it was
         reconstructors.forget_when_judged(context)
-    biases = () if registration is None else registration.biases
-    numbers = loop_numbers(rtc)
-    if any(bias.looked_ns_utc and not same_numbers(bias.loop, numbers) for bias in biases):
-        # they were learnt in another loop, in whichever session
-        validity.forget_biases(context)
+    bias = None if registration is None else registration.bias
+    elsewhere = bias is not None and not same_numbers(bias.loop, loop_numbers(rtc))
+    if registration is not None and bias is not None and bias.looked_ns_utc and elsewhere:
+        # it was learnt in another loop, in whichever session
+        validity.store_registration(context, replace(registration, bias=None))
     context.loop = replace(
         context.loop,
         rtc=rtc,
@@ -108,17 +107,14 @@ def _log_partial_loop(context: StepContext, before: Status | None, rtc: Status) 
 
 def _drop_other_basis(context: StepContext) -> None:
     """Drop an α that was restored from a night with another basis or configuration."""
-    registration, state = context.registration, context.state
+    registration, loop = context.registration, context.loop
     if registration is None or registration.basis_id is None or registration.config_id is None:
         return
-    if (registration.basis_id, registration.config_id) != (
-        state.loop.basis_id,
-        state.loop.config_id,
-    ):
+    if (registration.basis_id, registration.config_id) != (loop.basis_id, loop.config_id):
         validity.forget_registration(context)
         text = (
             f"α was measured with {registration.basis_id}, {registration.config_id}; the RTC has "
-            f"{state.loop.basis_id}, {state.loop.config_id}"
+            f"{loop.basis_id}, {loop.config_id}"
         )
         context.log("registration.void", text)
 
@@ -132,10 +128,12 @@ def _enter_sensor_mode(context: StepContext, config_id: str) -> None:
     context.loop = replace(context.loop, config_id=config_id)
     pointing_law.begin_law(context)
     kept, scale = "", context.policy.alpha_scale(before, config_id)
-    if scale is not None:
-        validity.change_subapertures(context, scale, config_id)
-        if context.registration is not None:
-            kept = f"; α is kept, {context.registration.alpha} in its subapertures"
+    if scale is not None and context.registration is not None:
+        # α is kept, because the mirror has not moved; windows of this mode must confirm it.
+        scaled = validity.in_subapertures(context.registration, scale, config_id)
+        validity.store_registration(context, replace(scaled, n_windows=0))
+        validity.age_registration(context)
+        kept = f"; α is kept, {scaled.alpha} in its subapertures"
     context.log("sensor.mode", f"the sensor's mode is {config_id}, it was {before}{kept}")
 
 
@@ -184,8 +182,7 @@ def on_services(context: StepContext, event: ev.ServicesMet) -> None:
         does = "drives the RTC" if event.drives else "stands by"
         text = (
             f"more than one service of system {context.state.system}: besides this one, which "
-            f"{does}, "
-            f"{who}: end all but one"
+            f"{does}, {who}: end all but one"
         )
         context.raise_alarm(alarms.SECOND_SERVICE, text)
     if not event.drives:

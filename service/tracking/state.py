@@ -349,6 +349,11 @@ class TrackerState:
         """Record of the matrix that the RTC multiplies with; None if unknown."""
         return self.reconstructor(self.matrices.in_use)
 
+    @property
+    def sent(self) -> ReconstructorRecord | None:
+        """Record of a matrix that is on its way to the RTC; None if there is none."""
+        return next((r for r in self.matrices.reconstructors if r.on_its_way), None)
+
     def failure(self, cause: str) -> str:
         """Return the reason why an order or event had no result; empty if it had one."""
         failures = reversed(self.operator.failures)
@@ -395,16 +400,12 @@ class TrackerState:
     @property
     def measuring(self) -> MeasurementRecord | None:
         """The measurement by the RTC that is under way, or None."""
-        return self._under_way(noisy=False)
+        return next((r for r in reversed(self.by_rtc) if r.under_way), None)
 
     @property
     def noisy_measurement(self) -> MeasurementRecord | None:
         """The noisy interaction matrix under way, or None."""
-        return self._under_way(noisy=True)
-
-    def _under_way(self, *, noisy: bool) -> MeasurementRecord | None:
-        going_on = (r for r in reversed(self.operations.measurements) if r.under_way)
-        return next((r for r in going_on if (r.pattern is None) is noisy), None)
+        return next((r for r in reversed(self.noisy) if r.under_way), None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,11 +13,9 @@ from service.errors import CommandError
 from service.estimation.loop import NO_RTC
 from service.model.misregistration import Misregistration
 from service.tracking.alarms import (
-    ALARMS,
     Alarm,
     AlarmDefinition,
     Interlock,
-    Severity,
     blocking_alarm,
 )
 from service.tracking.dither_request import Dither, DitherPolicyState
@@ -67,7 +65,7 @@ that are tried again."""
 LOOKED_BACK = 30
 """So many lines back the beginning of a burst is looked for."""
 
-RecordT = TypeVar("RecordT")
+PartT = TypeVar("PartT")
 
 _NUMBERS = re.compile(r"[-+]?[0-9][0-9.e+-]*")
 
@@ -75,21 +73,21 @@ _VALUE = re.compile(r"(?<![\w.-])[-+]?[0-9]+(?:\.[0-9]+)?(?:e[-+]?[0-9]+)?(?![\w
 """A number that is no part of a name or of a date."""
 
 
-class _Record(Generic[RecordT]):
-    """A record of the state as an attribute of the context; assigning replaces it."""
+class _Part(Generic[PartT]):
+    """A part of the state, or of one of its records; assigning replaces it."""
 
-    __slots__ = ("_name",)
+    __slots__ = ("_name", "_record")
 
-    def __set_name__(self, owner: type, name: str) -> None:
-        self._name = name
+    def __init__(self, name: str, record: str = "state") -> None:
+        self._name, self._record = name, record
 
-    def __get__(self, context: StepContext, owner: type) -> RecordT:
-        record: RecordT = getattr(context.state, self._name)
-        return record
+    def __get__(self, context: StepContext, owner: type) -> PartT:
+        part: PartT = getattr(getattr(context, self._record), self._name)
+        return part
 
-    def __set__(self, context: StepContext, record: RecordT) -> None:
-        changes: dict[str, Any] = {self._name: record}
-        context.state = replace(context.state, **changes)
+    def __set__(self, context: StepContext, part: PartT) -> None:
+        changes: dict[str, Any] = {self._name: part}
+        setattr(context, self._record, replace(getattr(context, self._record), **changes))
 
 
 class StepContext:
@@ -113,29 +111,22 @@ class StepContext:
 
         self.effects: list[Effect] = []
 
-    operator = _Record[OperatorState]()
-    alpha = _Record[AlphaState]()
-    windows = _Record[WindowCounts]()
-    matrices = _Record[MatrixStates]()
-    operations = _Record[Operations]()
-    dithers = _Record[DitherState]()
-    loop = _Record[LoopState]()
-    alarms = _Record[AlarmStates]()
+    operator = _Part[OperatorState]("operator")
+    alpha = _Part[AlphaState]("alpha")
+    windows = _Part[WindowCounts]("windows")
+    matrices = _Part[MatrixStates]("matrices")
+    operations = _Part[Operations]("operations")
+    dithers = _Part[DitherState]("dithers")
+    loop = _Part[LoopState]("loop")
+    alarms = _Part[AlarmStates]("alarms")
+    acquisition = _Part[Acquisition]("acquisition", "operations")
+    dither = _Part[Dither | None]("dither", "dithers")
+    dither_policy = _Part[DitherPolicyState]("policy", "dithers")
 
     @property
     def registration(self) -> Registration | None:
         """The registration; None: unknown."""
         return self.state.alpha.registration
-
-    @property
-    def dither(self) -> Dither | None:
-        """Return the dither that is requested or running, or None."""
-        return self.state.dithers.dither
-
-    @property
-    def dither_policy(self) -> DitherPolicyState:
-        """The state of the dither policy."""
-        return self.state.dithers.policy
 
     @property
     def nominal(self) -> Misregistration:
@@ -148,11 +139,6 @@ class StepContext:
         return (
             self.state.alpha.law.nominal or self.state.alpha.own_matrix_alpha or self.policy.start
         )
-
-    @property
-    def acquisition(self) -> Acquisition:
-        """The state of the acquisition."""
-        return self.state.operations.acquisition
 
     @property
     def rtc(self) -> Status | None:
@@ -190,13 +176,13 @@ class StepContext:
     def put_off(self, *, dither_s: float = 0.0, make_s: float = 0.0) -> None:
         """Ask for no dither, make no reconstructor for so long; 0: that one is not put off."""
         dither_ns, make_ns = (
-            self.now_ns + round(put_off_s * SECOND_NS) if put_off_s else 0
-            for put_off_s in (dither_s, make_s)
+            self.now_ns + round(s * SECOND_NS) if s else 0 for s in (dither_s, make_s)
         )
         # A pause that was asked for before is never shortened.
-        dither_ns = max(self.dithers.no_dither_before_ns_utc, dither_ns)
-        make_ns = max(self.matrices.no_making_before_ns_utc, make_ns)
-        self._put_off_until(dither_ns, make_ns)
+        self._put_off_until(
+            max(self.dithers.no_dither_before_ns_utc, dither_ns),
+            max(self.matrices.no_making_before_ns_utc, make_ns),
+        )
 
     def retry_all(self) -> None:
         """Put nothing off any more."""
@@ -217,16 +203,11 @@ class StepContext:
         """Add a warning to the log."""
         self.log(name, text, Level.WARNING)
 
-    def raise_alarm(
-        self, name: str, text: str, own: AlarmDefinition | None = None, *, critical: bool = False
-    ) -> None:
+    def raise_alarm(self, name: str, text: str, own: AlarmDefinition | None = None) -> None:
         """Raise an alarm; one already raised keeps its beginning.
 
-        ``own``: what is to be known of it, where no table has it. ``critical``: it is worse now
-        than the table says.
+        ``own``: what is to be known of it, where it is not as the table has it.
         """
-        if critical:
-            own = replace(ALARMS[name], severity=Severity.CRITICAL)
         before = self.state.alarm(name)
         t_ns = 0 if self.rtc is None else self.rtc.t_ns
         first = before or Alarm(name=name, since_ns_utc=self.now_ns, text=text, t_ns_utc=t_ns)

@@ -26,6 +26,9 @@ VERDICT_MARGIN = np.array([0.05, 0.05, np.deg2rad(0.05), 0.005])
 0.1 deg), and 0.5 % of magnification: a verdict still holds this far beyond α ± 3σ (numeric
 units)."""
 
+REFUSED_INTERVAL_S = 30.0
+"""Least time to the next request after one was refused, rejected or not acknowledged."""
+
 THRESHOLD_DECAY_S = 60.0
 """Time over which the thresholds, doubled by an update, return to their own values."""
 
@@ -138,11 +141,9 @@ def assessment_is_old(state: TrackerState, in_use: ReconstructorRecord) -> bool:
     gains = () if state.loop.rtc is None else state.loop.rtc.gains[: in_use.n_modes]
     if verdict_invalid_reason(state, in_use.judged, gains) is not None:
         return True
-    if (
-        registration is None
-        or last is None
-        or _step_since(in_use, registration.alpha, registration) is None
-    ):
+    if registration is None or last is None:
+        return False
+    if _step_since(in_use, registration.alpha, registration) is None:
         return False
     noise = np.sqrt(np.diag(registration.covariance))
     return bool(
@@ -162,7 +163,9 @@ def _gain_reason(
     if since is None:
         return None
     step, covariance = since
-    found, raised = last.expected, _threshold_ratio(in_use, now_ns)
+    found, since_s = last.expected, (now_ns - in_use.created_ns_utc) / SECOND_NS
+    # Soon after an update another one must win more.
+    raised = 1.0 + max(0.0, 1.0 - since_s / THRESHOLD_DECAY_S)
     # Noise of α alone would show a loss, which no new matrix recovers.
     win_m = found.loss_m - estimate_noise_loss_m(found.loss_m, step, covariance)
     if win_m > policy.update_gain_m * raised:
@@ -182,12 +185,6 @@ def _margin_lost(last: Assessment) -> float:
     # has nothing that could have been lost.
     whole = 1.0 - last.expected.fresh_pole_radius
     return (1.0 - (1.0 - last.expected.pole_radius) / whole) if whole > 0.0 else 0.0
-
-
-def _threshold_ratio(in_use: ReconstructorRecord, now_ns: int) -> float:
-    """Return by how much the thresholds are raised so soon after an update."""
-    since_s = (now_ns - in_use.created_ns_utc) / SECOND_NS
-    return 1.0 + max(0.0, 1.0 - since_s / THRESHOLD_DECAY_S)
 
 
 def _step_since(
@@ -224,10 +221,7 @@ def _has_jumped(
 
     What a new one wins does not matter: what has jumped once may jump again.
     """
-    since = (
-        registration.jumped_ns_utc is not None
-        and registration.jumped_ns_utc > in_use.created_ns_utc
-    )
+    since = (registration.jumped_ns_utc or 0) > in_use.created_ns_utc
     return since and is_outdated(state, in_use)
 
 

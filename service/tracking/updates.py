@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from service.tracking import reconstructors, update_policy
 from service.tracking.alarms import Interlock
 from service.tracking.dither import choose_dither, stop_unwanted
 from service.tracking.events import MakeMatrix
@@ -11,25 +12,8 @@ from service.tracking.mode_proof import awaits_proof, n_proven_modes
 from service.tracking.operations.running import running_ramp
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.reconstructors import (
-    check_return,
-    check_sendable,
-    request_applied,
-    request_matrix,
-    request_verdict,
-)
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
-from service.tracking.update_policy import (
-    MIN_PROPOSAL_LIFETIME_S,
-    assessment_is_old,
-    fewer_modes_than,
-    is_left_behind,
-    is_outdated,
-    is_settled,
-    more_modes_to_try,
-    update_reason,
-)
 from service.wire import Status
 
 FIRST_MATRIX_INTERVAL_S = 3.0
@@ -51,6 +35,10 @@ MAX_REFUSED_WINDOWS = 2
 MIN_JUDGE_INTERVAL_S = 2.0
 """Least time between two looks when the last one holds no longer."""
 
+_FAILED_STATES = frozenset(
+    {MatrixState.REFUSED, MatrixState.REJECTED, MatrixState.FAILED, MatrixState.DISCARDED}
+)
+
 
 def fetch_in_use(context: StepContext) -> None:
     """Ask for the matrix in use until it was had once in this session."""
@@ -68,7 +56,7 @@ def fetch_in_use(context: StepContext) -> None:
     # An RTC that could not show its matrix, or shows other numbers, is asked less often.
     every_s = FIRST_MATRIX_INTERVAL_S if anew else MATRIX_REQUEST_INTERVAL_S
     if context.now_ns - state.matrices.applied_asked_ns_utc >= every_s * SECOND_NS:
-        request_applied(context, rtc)
+        reconstructors.request_applied(context, rtc)
 
 
 def decide_updates(context: StepContext) -> None:
@@ -76,11 +64,8 @@ def decide_updates(context: StepContext) -> None:
     rtc = context.rtc
     if rtc is None or context.blocking_alarm(Interlock.ASK) is not None:
         return
-    idle = (
-        context.blocking_alarm(Interlock.DECIDE) is not None
-        or running_ramp(context.state, context.now_ns) is not None
-    )
-    if idle:
+    ramp = running_ramp(context.state, context.now_ns)
+    if ramp is not None or context.blocking_alarm(Interlock.DECIDE) is not None:
         stop_unwanted(context, rtc)
         return
     choose_dither(context, rtc)
@@ -91,7 +76,7 @@ def decide_updates(context: StepContext) -> None:
     # asked for first: after a jump the loop waits for it, and nobody for the old one's margin
     _choose_update(context, rtc)
     if unjudged is not None:
-        request_verdict(context, unjudged)
+        reconstructors.request_verdict(context, unjudged)
 
 
 def _find_unjudged(context: StepContext) -> str | None:
@@ -100,42 +85,35 @@ def _find_unjudged(context: StepContext) -> str | None:
     Nothing is sent on such an answer: what is made, approved, copied or asked of the loop is judged
     there and then.
     """
-    state, registration = context.state, context.registration
-    if registration is None or state.matrices.in_use is None or not is_settled(registration):
+    matrices, registration = context.matrices, context.registration
+    if registration is None or not update_policy.is_settled(registration):
         return None
-    making = state.matrices.making_since_ns_utc is not None
-    return (
-        None
-        if making or not _judgement_due(state, state.matrices.in_use, context.now_ns)
-        else state.matrices.in_use
-    )
+    if matrices.making_since_ns_utc is not None or not _is_judgement_due(context):
+        return None
+    return matrices.in_use
 
 
-def _judgement_due(state: TrackerState, in_use: str, now_ns: int) -> bool:
-    if state.matrices.judged_ns_utc is None:
+def _is_judgement_due(context: StepContext) -> bool:
+    matrices, record = context.matrices, context.state.used
+    if matrices.judged_ns_utc is None:
         return True
-    waited_s = (now_ns - state.matrices.judged_ns_utc) / SECOND_NS
-    record = state.reconstructor(in_use)
-    if state.matrices.margin is None or record is None or record.judged is None:
+    waited_s = (context.now_ns - matrices.judged_ns_utc) / SECOND_NS
+    if matrices.margin is None or record is None or record.judged is None:
         return waited_s > REFUSED_JUDGE_INTERVAL_S
     # A smaller σ may let a rejected matrix pass soon.
-    every_s = JUDGE_INTERVAL_S if state.matrices.margin.accepted else REFUSED_JUDGE_INTERVAL_S
+    every_s = JUDGE_INTERVAL_S if matrices.margin.accepted else REFUSED_JUDGE_INTERVAL_S
     return waited_s > every_s or (
-        waited_s > MIN_JUDGE_INTERVAL_S and assessment_is_old(state, record)
+        waited_s > MIN_JUDGE_INTERVAL_S and update_policy.assessment_is_old(context.state, record)
     )
 
 
 def _choose_update(context: StepContext, rtc: Status) -> None:
     """Compute a reconstructor when it is worthwhile, or could command more modes."""
     state, registration, now_ns = context.state, context.registration, context.now_ns
-    if (
-        state.operator.mode is Mode.HOLD
-        or state.on_probation
-        or registration is None
-        or not is_settled(registration)
-    ):
+    if registration is None or not update_policy.is_settled(registration) or not rtc.in_loop:
         return
-    if not rtc.in_loop or state.matrices.making_since_ns_utc is not None:
+    making = state.matrices.making_since_ns_utc is not None
+    if state.operator.mode is Mode.HOLD or state.on_probation or making:
         return
     if context.blocking_alarm(Interlock.SEND_NEW) is not None:
         return
@@ -145,19 +123,26 @@ def _choose_update(context: StepContext, rtc: Status) -> None:
     in_use = state.used
     if _is_busy(context) or now_ns < first_ns or in_use is None:
         return
-    why, n_now = update_reason(state, in_use, context.policy, now_ns), rtc.n_controlled
+    n_now = rtc.n_controlled
+    why = update_policy.update_reason(state, in_use, context.policy, now_ns)
     n_safe = n_proven_modes(state, rtc.n_modes)
     # No new matrix may control modes whose response has not been verified.
     if n_safe < n_now:
         return
     if why is not None:
-        request_matrix(context, MakeMatrix(n_modes=n_now, why=why, fewer=fewer_modes_than(n_now)))
+        reconstructors.request_matrix(
+            context, MakeMatrix(n_modes=n_now, why=why, fewer=update_policy.fewer_modes_than(n_now))
+        )
         return
     # More modes are tried only when the matrix in use needs no replacement.
-    more = tuple(n for n in more_modes_to_try(state, rtc, context.policy, now_ns) if n <= n_safe)
+    more = tuple(
+        n
+        for n in update_policy.more_modes_to_try(state, rtc, context.policy, now_ns)
+        if n <= n_safe
+    )
     if more and not awaits_proof(context, rtc):
         why = f"{n_now} of {more[0]} modes controlled"
-        request_matrix(context, MakeMatrix(n_modes=more[0], why=why, fewer=more[1:]))
+        reconstructors.request_matrix(context, MakeMatrix(n_modes=more[0], why=why, fewer=more[1:]))
 
 
 def explain_hindrance(context: StepContext, rtc: Status) -> str:
@@ -187,15 +172,16 @@ def explain_hindrance(context: StepContext, rtc: Status) -> str:
 
 def _is_wanted(context: StepContext, rtc: Status, in_use: ReconstructorRecord) -> bool:
     """Return whether a reconstructor would be made if nothing kept the service from it."""
-    if context.policy.wanted_modes(rtc) > rtc.n_controlled:
+    state, policy = context.state, context.policy
+    if policy.wanted_modes(rtc) > rtc.n_controlled:
         return True
-    return update_reason(context.state, in_use, context.policy, context.now_ns) is not None
+    return update_policy.update_reason(state, in_use, policy, context.now_ns) is not None
 
 
 def _explain_modes(context: StepContext, rtc: Status) -> str:
     """Return what keeps more modes, or those of the loop, from being controlled by a new one."""
     state, n_wanted = context.state, context.policy.wanted_modes(rtc)
-    more = more_modes_to_try(state, rtc, context.policy, context.now_ns)
+    more = update_policy.more_modes_to_try(state, rtc, context.policy, context.now_ns)
     n_safe = n_proven_modes(state, max(n_wanted, rtc.n_controlled))
     if n_safe < max(rtc.n_controlled, *more, 0):
         return _explain_unproven(context, rtc, n_safe)
@@ -207,13 +193,11 @@ def _explain_modes(context: StepContext, rtc: Status) -> str:
             f"{rtc.n_controlled - 1} is 0, and modes that are added get it. Give it a gain."
         )
     limit = state.matrices.mode_limit
+    if limit is None:
+        return ""
     return (
-        ""
-        if limit is None
-        else (
-            f"No more than {limit.n_modes} of {n_wanted} modes are controlled for now: "
-            f"{limit.reason}. Lower [control] n_modes_target to stop further attempts."
-        )
+        f"No more than {limit.n_modes} of {n_wanted} modes are controlled for now: "
+        f"{limit.reason}. Lower [control] n_modes_target to stop further attempts."
     )
 
 
@@ -257,7 +241,7 @@ def _is_busy(context: StepContext) -> bool:
     no matrix to return to.
     """
     state = context.state
-    awaited = state.operator.mode is not Mode.AUTO or check_return(state) is not None
+    awaited = state.operator.mode is not Mode.AUTO or reconstructors.check_return(state) is not None
     return any(
         r.on_its_way
         or (r.state is MatrixState.PROPOSED and awaited and _is_left_to_operator(context, r))
@@ -268,13 +252,13 @@ def _is_busy(context: StepContext) -> bool:
 def _is_left_to_operator(context: StepContext, record: ReconstructorRecord) -> bool:
     """Return whether a proposal is left for an operator to decide on: it fits α, or is new."""
     state = context.state
-    if not is_outdated(state, record):
+    if not update_policy.is_outdated(state, record):
         return True
     age_s = (context.now_ns - record.created_ns_utc) / SECOND_NS
-    usable = (
-        not is_left_behind(state, record, context.policy) and check_sendable(state, record) is None
-    )
-    return usable and age_s < MIN_PROPOSAL_LIFETIME_S
+    if update_policy.is_left_behind(state, record, context.policy):
+        return False
+    new = age_s < update_policy.MIN_PROPOSAL_LIFETIME_S
+    return new and reconstructors.check_sendable(state, record) is None
 
 
 def _next_attempt_ns(state: TrackerState, rtc: Status, policy: Policy) -> int:
@@ -282,22 +266,14 @@ def _next_attempt_ns(state: TrackerState, rtc: Status, policy: Policy) -> int:
 
     One refused for another α, or for more modes than are controlled, holds back no other.
     """
-    own = [
-        r
-        for r in state.matrices.reconstructors
-        if r.parent is not None and not _is_overtaken(state, r)
-    ]
-    if not own:
-        return 0
-    last = own[-1]
-    failed = (MatrixState.REFUSED, MatrixState.REJECTED, MatrixState.FAILED, MatrixState.DISCARDED)
-    again = (
-        last.state in failed and not is_outdated(state, last) and last.n_modes <= rtc.n_controlled
-    )
-    wait_s = policy.refused_interval_s if again else policy.minimum_interval_s
-    return last.created_ns_utc + int(wait_s * SECOND_NS)
-
-
-def _is_overtaken(state: TrackerState, record: ReconstructorRecord) -> bool:
-    """Return whether a reconstructor was never sent, and α is elsewhere by now."""
-    return record.state is MatrixState.DISCARDED and is_outdated(state, record)
+    newest = (r for r in reversed(state.matrices.reconstructors) if r.parent is not None)
+    for last in newest:
+        overtaken = update_policy.is_outdated(state, last)
+        # One that was never sent, while α is elsewhere by now.
+        if last.state is MatrixState.DISCARDED and overtaken:
+            continue
+        failed = last.state in _FAILED_STATES
+        again = failed and not overtaken and last.n_modes <= rtc.n_controlled
+        wait_s = update_policy.REFUSED_INTERVAL_S if again else policy.minimum_interval_s
+        return last.created_ns_utc + int(wait_s * SECOND_NS)
+    return 0

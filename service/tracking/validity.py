@@ -123,7 +123,7 @@ def shift_estimate(context: StepContext, step: Array, spread: Array, still_ns_ut
             previous_estimate=None,
             suspected_jump=None,
             # The passive bias is of the loop and the wind: it does not move with the image.
-            biases=without_previous(registration.biases),
+            bias=without_previous(registration.bias),
         ),
     )
     void_until(context, still_ns_utc, MOVING, Purpose.PASSIVE)
@@ -138,29 +138,12 @@ def forget_registration(context: StepContext) -> None:
     store_registration(context, None)
 
 
-def forget_biases(context: StepContext) -> None:
-    """Forget how far the passive estimate is off."""
-    if context.registration is not None:
-        store_registration(context, replace(context.registration, biases=()))
-
-
-def change_subapertures(context: StepContext, scale: Array, config_id: str) -> None:
-    """Keep α over a change of the sensor's mode; windows must confirm it.
+def in_subapertures(registration: Registration, scale: Array, config_id: str) -> Registration:
+    """Return what is known of α in the subapertures of another mode of the sensor.
 
     ``scale`` ``(4,)`` multiplies its numbers. What was learnt of gains and biases was of the mode
     before.
     """
-    registration = context.registration
-    if registration is not None:
-        scaled = in_subapertures(registration, scale, config_id)
-        # α is kept, because the mirror has not moved; it needs windows of this sensor mode to be
-        # trusted.
-        store_registration(context, replace(scaled, n_windows=0))
-        age_registration(context)
-
-
-def in_subapertures(registration: Registration, scale: Array, config_id: str) -> Registration:
-    """Return what is known of α in the subapertures of another mode of the sensor."""
     known = registration.stretches
     return replace(
         registration,
@@ -173,7 +156,7 @@ def in_subapertures(registration: Registration, scale: Array, config_id: str) ->
         grown=registration.grown * scale**2,
         optical_gain=None,
         optical_gains=(),
-        biases=(),
+        bias=None,
         previous_estimate=None,
         suspected_jump=None,
         config_id=config_id,
@@ -185,11 +168,6 @@ def require_new_windows(context: StepContext) -> None:
     """Require new windows to confirm the estimate."""
     if context.registration is not None:
         store_registration(context, replace(context.registration, n_windows=0))
-
-
-def restore_registration(context: StepContext, registration: Registration) -> None:
-    """Take over what was known before a restart of the service."""
-    store_registration(context, replace(registration, n_windows=0, restored_ns_utc=context.now_ns))
 
 
 def age_registration(context: StepContext) -> None:
@@ -214,15 +192,9 @@ def age_registration(context: StepContext) -> None:
 def request_window(context: StepContext, reason: str) -> None:
     """Request a dithered window; a request that is pending keeps its start."""
     if context.alpha.dither_due_since_ns_utc is None:
-        due = replace(
-            context.state,
-            alpha=replace(
-                context.alpha,
-                dither_due_since_ns_utc=context.now_ns,
-                dither_due_reason=reason,
-            ),
+        context.alpha = replace(
+            context.alpha, dither_due_since_ns_utc=context.now_ns, dither_due_reason=reason
         )
-        context.state = due
         context.log("dither.due", reason)
 
 
@@ -256,10 +228,8 @@ def elapsed_s(state: TrackerState, registration: Registration, now_ns: int) -> f
 
 
 def _validity_of(context: StepContext, registration: Registration) -> ValidityState:
-    policy, reason = (
-        context.policy,
-        _explain_invalidity(context.state, registration, context.policy),
-    )
+    policy = context.policy
+    reason = _explain_invalidity(context.state, registration, policy)
     if reason is not None:
         return ValidityState(level=Validity.INVALID, reason=reason)
     sigma, before = sigma_beyond_floor(registration), context.before.alpha.registration

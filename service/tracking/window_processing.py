@@ -43,6 +43,7 @@ from service.tracking.registration import (
     Source,
     SuspectedJump,
     TimedEstimate,
+    without_previous,
 )
 from service.tracking.state import Level, TrackerState
 from service.tracking.step_context import StepContext, same_but_for_numbers
@@ -333,72 +334,65 @@ def _is_excused(context: StepContext) -> bool:
 
 def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
     """Update α by the passive estimate and its bias, or mark α as doubtful."""
-    reason = _check_passive_estimate(context.state, event) or _find_later_telemetry(
-        context.state, event
-    )
+    reason = _check_passive_estimate(context.state, event)
     if reason is not None:
-        _note_unavailable(context, f"the passive estimate was not used: {reason}")
+        text = f"the passive estimate was not used: {reason}"
+        context.alpha = replace(context.alpha, passive_unavailable_reason=text)
         return
     registration, estimate = context.registration, event.estimate
     if registration is None:
         _show_passive_alone(context, event)
         return
-    block = estimate.bias
     registration = _with_first_bias(registration, estimate)
     forward = filtering.predict(context, registration, event.t_ns_utc)
-    prior = kalman.allow_scatter(forward, block, estimate.bias_excess)
+    prior = kalman.allow_scatter(forward, estimate.bias_excess)
     mixed = _check_single_registration(context.state, registration, event)
     if mixed is not None:
-        biases = _biases_after_look(
-            context.state, registration, filtering.joint_of(registration), event
-        )
-        validity.store_registration(context, replace(registration, biases=biases))
+        joint = filtering.joint_of(registration)
+        bias = _bias_after_look(context.state, registration, joint, event)
+        validity.store_registration(context, replace(registration, bias=bias))
         sigma = _passive_sigma(estimate, prior)
-        _show_passive(context, event, sigma, prior.bias(block), f"not used: {mixed}")
+        _show_passive(context, event, sigma, prior.offset, f"not used: {mixed}")
         return
     measured = estimate.alpha.vector
     window = PointedEstimate(
         alpha=estimate.alpha,
-        covariance=prior.bias_of(block).scatter * estimate.covariance,
+        covariance=(prior.bias or kalman.Bias()).scatter * estimate.covariance,
         t_ns_utc=event.t_ns_utc,
         pointing=validity.pointing_at(context.state, event.t_ns_utc),
     )
     far = jumps.passive_innovation(
-        registration, filtering.joint_of(registration), block, window, context.policy
+        registration, filtering.joint_of(registration), window, context.policy
     )
     # A passive estimate never moves α far by itself: wind and a moved mirror look alike in it
     # (docs/decisions/0020-filter-and-passive-estimate.md).
     if far > jumps.MAX_PASSIVE_INNOVATION:
         _ask_for_window(context, registration, event, prior, far)
         return
-    joint = kalman.correct_state(prior, measured, estimate.covariance, block)
-    joint = kalman.update_scatter(joint, block, far)
+    joint = kalman.correct_state(prior, measured, estimate.covariance, passive=True)
+    joint = kalman.update_scatter(joint, far)
     registration = _registration_after_passive(context, registration, joint, event)
     validity.store_registration(context, registration)
     validity.age_registration(context)
     sigma = _passive_sigma(estimate, prior)
     entry = HistoryEntry(
         t_ns_utc=event.t_ns_utc,
-        measured=Misregistration.from_vector(measured - joint.bias(block)),
+        measured=Misregistration.from_vector(measured - joint.offset),
         measured_sigma=sigma,
         filtered=registration.alpha,
         filtered_sigma=registration.shown_sigma,
-        innovation=kalman.innovation(prior, measured, estimate.covariance, block),
+        innovation=kalman.innovation(prior, measured, estimate.covariance, passive=True),
         misfit=estimate.misfit,
         source=Source.PASSIVE,
     )
     filtering.add_history(context, entry)
     text = "agrees with α and with what is known of its own bias"
-    _show_passive(context, event, sigma, joint.bias(block), text)
+    _show_passive(context, event, sigma, joint.offset, text)
 
 
 def on_passive_unavailable(context: StepContext, event: ev.PassiveUnavailable) -> None:
     """Store why there is no passive estimate."""
-    _note_unavailable(context, event.text)
-
-
-def _note_unavailable(context: StepContext, why: str) -> None:
-    context.alpha = replace(context.alpha, passive_unavailable_reason=why)
+    context.alpha = replace(context.alpha, passive_unavailable_reason=event.text)
 
 
 def fit_begins_at(state: TrackerState) -> Misregistration | None:
@@ -413,24 +407,17 @@ def fit_begins_at(state: TrackerState) -> Misregistration | None:
 
 def _check_passive_estimate(state: TrackerState, event: ev.PassiveFitted) -> str | None:
     """Return why a passive estimate says nothing of the telescope as it is, or None."""
-    of_loop = loop_numbers(state.loop.rtc)
+    of_loop, registration = loop_numbers(state.loop.rtc), state.alpha.registration
     # The bias belongs to the loop in which it was measured.
     if event.loop and of_loop and not same_numbers(event.loop, of_loop):
         return "the loop has changed since"
-    return filtering.check_measurable(
-        state, validity.telemetry_span(event.began_ns_utc, event.t_ns_utc)
-    )
-
-
-def _find_later_telemetry(state: TrackerState, event: ev.PassiveFitted) -> str | None:
-    """Return the later telemetry that supersedes a delayed estimate, in words, or None."""
-    registration = state.alpha.registration
-    if registration is None or not registration.window_began_ns_utc:
-        return None
-    since = validity.telemetry_span(
-        registration.window_began_ns_utc, registration.window_began_ns_utc
-    )
-    if validity.precedes(state, since, event.t_ns_utc):
+    span = validity.telemetry_span(event.began_ns_utc, event.t_ns_utc)
+    reason = filtering.check_measurable(state, span)
+    if reason is not None or registration is None or not registration.window_began_ns_utc:
+        return reason
+    # Later telemetry supersedes a delayed estimate.
+    window = validity.telemetry_span(0, registration.window_began_ns_utc)
+    if validity.precedes(state, window, event.t_ns_utc):
         return None
     return "a dithered window taken since has been fitted before it"
 
@@ -457,38 +444,26 @@ def _with_first_bias(registration: Registration, estimate: PassiveEstimate) -> R
     A later estimate that says more is allowed for by the filter alone: a jump of the mirror is then
     found with less patience.
     """
-    bias = registration.bias(estimate.bias)
-    if bias is not None and bias.looked_ns_utc:
+    if registration.bias is not None and registration.bias.looked_ns_utc:
         return registration
-    joint = kalman.forget(filtering.joint_of(registration), estimate.bias, estimate.bias_excess)
-    return replace(registration, biases=filtering.biases_of(joint))
+    joint = kalman.forget(filtering.joint_of(registration), estimate.bias_excess)
+    return replace(registration, bias=filtering.bias_of(joint))
 
 
-def _biases_after_look(
+def _bias_after_look(
     state: TrackerState,
     registration: Registration,
     joint: Joint,
     event: ev.PassiveFitted,
     previous: PreviousEstimate | None = None,
-) -> tuple[PassiveBias, ...]:
-    """Return the biases after a passive estimate; ``previous``: what the filter saw it from."""
-    name, loop = event.estimate.bias.name, _loop(state, registration, event)
-    return tuple(
-        replace(bias, looked_ns_utc=event.t_ns_utc, loop=loop, previous_estimate=previous)
-        if bias.block.name == name
-        else bias
-        for bias in filtering.biases_of(joint)
+) -> PassiveBias | None:
+    """Return the bias after a passive estimate; ``previous``: what the filter saw it from."""
+    loop, before, bias = loop_numbers(state.loop.rtc), registration.bias, filtering.bias_of(joint)
+    if state.loop.rtc is None and before is not None:
+        loop = before.loop
+    return bias and replace(
+        bias, looked_ns_utc=event.t_ns_utc, loop=loop, previous_estimate=previous
     )
-
-
-def _loop(
-    state: TrackerState, registration: Registration, event: ev.PassiveFitted
-) -> tuple[float, ...]:
-    """Return the loop the telemetry is of; while no RTC is there, that of the last estimate."""
-    if state.loop.rtc is not None:
-        return loop_numbers(state.loop.rtc)
-    bias = registration.bias(event.estimate.bias)
-    return () if bias is None else bias.loop
 
 
 def _check_single_registration(
@@ -500,7 +475,7 @@ def _check_single_registration(
     """
     if registration.suspected_jump is not None:
         return BOTH_SIDES
-    bias = registration.bias(event.estimate.bias)
+    bias = registration.bias
     # Passive estimates share no telemetry, so this one began after the last one ended.
     began_ns = 0 if bias is None else bias.looked_ns_utc
     span = TelemetrySpan(began_ns_utc=began_ns, ended_ns_utc=event.t_ns_utc)
@@ -525,16 +500,14 @@ def _ask_for_window(
         "dithered window must decide which"
     )
     registration = context.registration or registration
-    was_doubted, void = (
-        bool(registration.doubt),
-        bool(registration.doubt) and registration.doubt_voids,
-    )
+    was_doubted = bool(registration.doubt)
     why_none = None if context.rtc is None else check_dither_allowed(context, context.rtc)
     # In another wind the bias is another one.
-    gone = kalman.forget(prior, event.estimate.bias, event.estimate.bias_excess)
+    gone = kalman.forget(prior, event.estimate.bias_excess)
     after = _registration_after_passive(context, registration, gone, event)
-    biases = _biases_after_look(context.state, registration, gone, event)
-    doubted = replace(after, biases=biases, doubt=text, doubt_voids=void)
+    voids = was_doubted and registration.doubt_voids
+    bias = without_previous(after.bias)
+    doubted = replace(after, bias=bias, doubt=text, doubt_voids=voids)
     validity.store_registration(context, doubted)
     validity.cast_doubt(context, event.t_ns_utc)
     context.warn("registration.passive-jump", f"{text} (innovation {far:.0f}, expected 4)")
@@ -551,9 +524,9 @@ def _registration_after_passive(
     context: StepContext, registration: Registration, joint: Joint, event: ev.PassiveFitted
 ) -> Registration:
     """Return the registration as the filter has it after a passive estimate."""
-    block, was = event.estimate.bias, None
-    if registration.bias(block) is not None:
-        was = jumps.sum_of(registration, filtering.joint_of(registration), block)
+    was = None
+    if registration.bias is not None:
+        was = jumps.sum_of(registration, filtering.joint_of(registration))
     return replace(
         registration,
         alpha=filtering.alpha_of(joint, registration.alpha),
@@ -562,15 +535,14 @@ def _registration_after_passive(
         # A passive fit may end after that of a window with newer telemetry.
         t_ns_utc=max(event.t_ns_utc, registration.t_ns_utc),
         arrived_ns_utc=context.now_ns,
-        biases=_biases_after_look(context.state, registration, joint, event, was),
+        bias=_bias_after_look(context.state, registration, joint, event, was),
         pointing=validity.pointing_at(context.state, event.t_ns_utc),
     )
 
 
 def _passive_sigma(estimate: PassiveEstimate, prior: Joint) -> Array:
     """Return ``(4,)`` 1 σ of the estimate as a reading of α: its scatter, and that of its bias."""
-    place = prior.place(estimate.bias)
-    return np.sqrt(np.diag(estimate.covariance) + np.diag(prior.covariance)[place])
+    return np.sqrt(np.diag(estimate.covariance) + np.diag(prior.covariance)[prior.place])
 
 
 def _show_passive(
@@ -590,6 +562,5 @@ def _show_passive(
         consistent=consistent,
         text=text,
         bias=bias,
-        estimator=event.estimate.bias.name,
     )
     context.alpha = replace(context.alpha, passive=watchdog, passive_unavailable_reason="")

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.estimation import kalman, lockin
-from service.estimation.estimate import PASSIVE_BIAS
 from service.estimation.health import LoopHealth, observe
 from tests.numerics import block_of, part, sines
 
@@ -74,11 +73,11 @@ def test_the_filters_covariance_stays_symmetric_and_positive(mean, prior, measur
     """Joseph's form, whatever arrives, dithered and passive in turn; 1e-9 of its largest axis is
     rounding."""
     drift = kalman.Drift(alpha_rate=np.full(4, 1e-3))
-    found = kalman.forget(kalman.begin_joint(mean, prior), PASSIVE_BIAS)
+    found = kalman.forget(kalman.begin_joint(mean, prior))
     for measured, noise in measurements:
         found = kalman.predict_state(found, drift, 1.0)
         found = kalman.correct_state(
-            kalman.correct_state(found, measured, noise), measured, noise, PASSIVE_BIAS
+            kalman.correct_state(found, measured, noise), measured, noise, passive=True
         )
     np.testing.assert_array_equal(found.covariance, found.covariance.T)
     power = np.linalg.eigvalsh(found.covariance)

@@ -26,7 +26,6 @@ from service.errors import (
     StorageError,
     UnknownIdError,
 )
-from service.estimation.estimate import PASSIVE_BIAS
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import PARAMETERS, Misregistration
 from service.runtime.command_results import Refits
@@ -369,13 +368,11 @@ async def test_alpha_says_what_it_is_worth_and_since_when_it_was_not_dithered(cl
         window_ns_utc=70 * SECOND,
         validity=ValidityState(level=Validity.AGEING, reason="σ grows", until_ns_utc=120 * SECOND),
         optical_gains=(ModeGain(mode=501, gain=0.6, sigma=0.01, scatter=0.03, t_ns_utc=1),),
-        biases=(
-            PassiveBias(
-                offset=np.array([0.05, 0.0, np.deg2rad(0.01), 0.0]),
-                covariance=np.diag(SIGMA**2),
-                shared=np.zeros((4, 4)),
-                looked_ns_utc=1,
-            ),
+        bias=PassiveBias(
+            offset=np.array([0.05, 0.0, np.deg2rad(0.01), 0.0]),
+            covariance=np.diag(SIGMA**2),
+            shared=np.zeros((4, 4)),
+            looked_ns_utc=1,
         ),
         pointing=Pointing(elevation_deg=61.0, azimuth_deg=120.0),
         restored_ns_utc=60 * SECOND,
@@ -401,23 +398,6 @@ async def test_alpha_says_what_it_is_worth_and_since_when_it_was_not_dithered(cl
     assert body["passive_bias"]["rotation_deg"] == pytest.approx(0.01)
     assert body["passive_bias_sigma"]["shift_x_subap"] == pytest.approx(SIGMA[0])
     assert body["pointing"] == {"elevation_deg": 61.0, "azimuth_deg": 120.0}
-
-
-async def test_alpha_has_the_bias_of_the_estimate_that_is_shown(client, service):
-    """One learnt while the passive estimate was made of something else is no bias of this one."""
-    of_slopes = PassiveBias(
-        offset=np.full(4, 0.05), covariance=np.diag(SIGMA**2), shared=np.zeros((4, 4))
-    )
-    registration = replace(STATE.alpha.registration, biases=(of_slopes,))
-    by_commands = replace(STATE.alpha.passive, estimator="commands")
-    service.change(registration=registration, passive=by_commands)
-    assert (await body_of(client, "/v1/alpha"))["passive_bias"] is None
-    of_commands = replace(
-        of_slopes, block=replace(PASSIVE_BIAS, name="commands"), offset=np.full(4, 0.03)
-    )
-    service.change(registration=replace(registration, biases=(of_slopes, of_commands)))
-    bias = (await body_of(client, "/v1/alpha"))["passive_bias"]
-    assert bias["shift_x_subap"] == pytest.approx(0.03)
 
 
 async def test_alpha_of_which_little_is_known_says_null(client):

@@ -18,6 +18,7 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from service.control.dither import (
     COARSE_BAND,
@@ -33,7 +34,7 @@ from service.estimation.loop import NO_RTC
 from service.estimation.windows import RefusalKind
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking import validity
+from service.tracking import reconstructors, update_policy, validity
 from service.tracking.alarms import LOST, Interlock, alarm_blocks, blocking_alarm
 from service.tracking.dither import (
     allow_dither,
@@ -56,25 +57,9 @@ from service.tracking.operations.running import running_ramp
 from service.tracking.operator import set_loop
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.reconstructors import (
-    change_state,
-    check_sendable,
-    forget_verdict,
-    request_matrix,
-    send_with,
-)
 from service.tracking.registration import Registration
 from service.tracking.state import Level, Mode, TrackerState
 from service.tracking.step_context import StepContext, present
-from service.tracking.update_policy import (
-    fewer_modes_than,
-    forget_limit,
-    half_of_modes,
-    has_moved,
-    is_beyond_verdict,
-    limit_modes,
-    verdict_doubtful_reason,
-)
 from service.wire import DitherKind, DitherRequest, LoopRequest, Reply, Status
 
 MIN_FINAL_WINDOWS = 2
@@ -158,14 +143,14 @@ def advance(context: StepContext, event: Event) -> None:
     elif not acquisition.under_way:
         if context.windows.accepted > context.before.windows.accepted:
             # An accepted window ends the sequence of misses.
-            set_acquisition(context, replace(acquisition, misses=0))
+            context.acquisition = replace(acquisition, misses=0)
         _forget_when_over(context, event)
         why = explain_acquisition(context.state, context.policy, context.now_ns)
         if why is not None and context.rtc and running_ramp(context.state, context.now_ns) is None:
             _begin(context, context.rtc, why, commanded=False)
     elif isinstance(event, ev.RtcVanished):
         # the state before still knows in which session that was
-        set_acquisition(context, _interrupt(context.before, "the RTC vanished"))
+        context.acquisition = _interrupt(context.before, "the RTC vanished")
         _note_interrupted(context, NO_RTC_LEFT)
     else:
         with context.because_of("" if isinstance(event, cmd.Instruction) else acquisition.cause):
@@ -189,7 +174,7 @@ def acquisition_to_save(state: TrackerState) -> Acquisition | None:
 
 def restore_acquisition(context: StepContext, left: Acquisition) -> None:
     """Take over the acquisition that the service before this one has left."""
-    set_acquisition(context, left)
+    context.acquisition = left
     if left.stage not in {AcquisitionStage.FAILED, AcquisitionStage.ABORTED}:
         _note_interrupted(context, NO_RTC_LEFT)
 
@@ -204,7 +189,7 @@ def _begin(context: StepContext, rtc: Status, why: str, *, commanded: bool) -> N
     found = found or _loop_found(context.state, rtc, context.policy)
     # The loop was unstable with this number of modes although its matrix fitted α, so the same
     # number would fail again (``_own_loop_lost``).
-    most = None if lost is None else half_of_modes(rtc.n_controlled)
+    most = None if lost is None else update_policy.half_of_modes(rtc.n_controlled)
     first = min(found.n_controlled, FIRST_LOOP_MODES)
     begun = Acquisition(
         stage=AcquisitionStage.OPENING,
@@ -220,14 +205,14 @@ def _begin(context: StepContext, rtc: Status, why: str, *, commanded: bool) -> N
         sent=left is not None and left.sent,
         cause=context.cause,
     )
-    set_acquisition(context, begun)
+    context.acquisition = begun
     # A window that began before the loop is opened would mix two loops.
     validity.invalidate_telemetry(context, "the acquisition had not begun")
     validity.forget_registration(context)
-    forget_verdict(context)
+    reconstructors.forget_verdict(context)
     context.log("acquisition.begun", why)
     if most is not None:
-        limit_modes(context, most, f"{lost} with {rtc.n_controlled} modes")
+        update_policy.limit_modes(context, most, f"{lost} with {rtc.n_controlled} modes")
     _wide_capture_stage(context, rtc)
 
 
@@ -331,7 +316,7 @@ def _closed_stage(context: StepContext, rtc: Status) -> None:
             _request_loop(context, cmd.SetLoop(loop="closed"))
     else:
         n_windows = context.windows.accepted
-        set_acquisition(context, replace(acquisition, applied=record.id, windows=n_windows))
+        context.acquisition = replace(acquisition, applied=record.id, windows=n_windows)
         text = f"closed on {record.n_modes} modes: sharpening the registration"
         _enter_stage(context, AcquisitionStage.WIDENING, text)
 
@@ -349,21 +334,25 @@ def _on_made(context: StepContext, made: ev.MatrixMade) -> None:
         _restart_acquisition(context, f"{record.id} cannot be sent: no RTC is there")
         return
     gains = _gains_for(found, record.n_modes, rtc.n_modes)
-    stale = verdict_doubtful_reason(context.state, record.judged, gains[: record.n_modes])
+    stale = update_policy.verdict_doubtful_reason(
+        context.state, record.judged, gains[: record.n_modes]
+    )
     if stale is not None:
-        change_state(context, record.id, MatrixState.DISCARDED, f"while it was made, {stale}")
+        reconstructors.change_state(
+            context, record.id, MatrixState.DISCARDED, f"while it was made, {stale}"
+        )
         context.log("reconstructor.discarded", f"{record.id}: {stale}")
         return
-    reason = check_sendable(context.state, record)
+    reason = reconstructors.check_sendable(context.state, record)
     if reason is not None:
         _restart_acquisition(context, f"{record.id} cannot be sent: {reason}")
         return
-    send_with(context, record.id, gains)
+    reconstructors.send(context, record.id, gains=gains)
     most = acquisition.max_modes
     if acquisition.stage is AcquisitionStage.WIDENING and record.n_modes < (made.asked_modes or 0):
         most = record.n_modes
     sent = replace(acquisition, matrix=record.id, n_modes=record.n_modes, sent=True, command=None)
-    set_acquisition(context, replace(sent, max_modes=most))
+    context.acquisition = replace(sent, max_modes=most)
 
 
 def _on_refused(context: StepContext, record: ReconstructorRecord) -> None:
@@ -371,7 +360,7 @@ def _on_refused(context: StepContext, record: ReconstructorRecord) -> None:
     acquisition, gate, rtc = context.acquisition, record.gate, context.rtc
     slippery = gate is not None and gate.edge_motion_m is not None
     if acquisition.stage is AcquisitionStage.WIDENING:
-        set_acquisition(context, replace(acquisition, max_modes=acquisition.n_modes))
+        context.acquisition = replace(acquisition, max_modes=acquisition.n_modes)
     # With this leak a slipped segment at the edge recovers within a tenth of a second
     # (docs/results/reliability.md).
     elif slippery and rtc is not None and rtc.leak > MAX_SLIP_SAFE_LEAK:
@@ -400,11 +389,11 @@ def _widen(context: StepContext, rtc: Status, record: ReconstructorRecord | None
         if record.applied_frame_seq is not None and acquisition.applied != record.id:
             n_windows = context.windows.accepted
             acquisition = replace(acquisition, applied=record.id, windows=n_windows)
-            set_acquisition(context, acquisition)
+            context.acquisition = acquisition
         seen = context.windows.accepted - acquisition.windows
         goal = min(acquisition.n_modes_before, acquisition.max_modes or rtc.n_modes)
         if seen >= 1 and (
-            record.n_modes < goal or has_moved(context.state, record, context.policy)
+            record.n_modes < goal or update_policy.has_moved(context.state, record, context.policy)
         ):
             _make(context, goal, rtc, at_least=record.n_modes)
             return
@@ -424,9 +413,11 @@ def _make(context: StepContext, n_modes: int, rtc: Status, *, at_least: int = 0)
             n_modes=n_modes,
             why=f"acquisition: {n_modes} modes",
             gains=_gains_for(found, n_modes, rtc.n_modes),
-            fewer=tuple(fewer for fewer in fewer_modes_than(n_modes) if fewer > at_least),
+            fewer=tuple(
+                fewer for fewer in update_policy.fewer_modes_than(n_modes) if fewer > at_least
+            ),
         )
-        request_matrix(context, effect)
+        reconstructors.request_matrix(context, effect)
 
 
 def _finish(context: StepContext, record: ReconstructorRecord) -> None:
@@ -454,7 +445,7 @@ def _forget_when_over(context: StepContext, event: Event) -> None:
         text = f"{MIN_FINAL_WINDOWS} windows agree in the closed loop: none is needed any more"
     else:
         return
-    set_acquisition(context, Acquisition(text=text, since_ns_utc=context.now_ns))
+    context.acquisition = Acquisition(text=text, since_ns_utc=context.now_ns)
     context.log("acquisition.idle", text)
 
 
@@ -497,7 +488,7 @@ def _resume_interrupted(context: StepContext) -> None:
         _note_interrupted(context, f"it does not restart by itself: {why_not}", do)
         return
     cause = _cause(context.acquisition)
-    set_acquisition(context, replace(context.acquisition, interruption=None))
+    context.acquisition = replace(context.acquisition, interruption=None)
     _restart_acquisition(context, cause)
 
 
@@ -520,9 +511,7 @@ def _note_interrupted(context: StepContext, what: str, do: str = "") -> None:
     acquisition, stage = context.acquisition, AcquisitionStage.INTERRUPTED
     if (acquisition.stage, acquisition.text) == (stage, text):
         return
-    set_acquisition(
-        context, replace(acquisition, stage=stage, text=text, since_ns_utc=context.now_ns)
-    )
+    context.acquisition = replace(acquisition, stage=stage, text=text, since_ns_utc=context.now_ns)
     context.warn("acquisition.interrupted", what)
 
 
@@ -651,10 +640,13 @@ def explain_acquisition(state: TrackerState, policy: Policy, now_ns: int) -> str
     trial = state.operations.probation
     if trial is not None and trial.state is ProbationState.ACQUIRING:
         return f"the loop is lost with {trial.id} and with {trial.before}"
+    # The matrix before is on its way to the RTC, or has just come there.
+    returns = {ProbationState.ROLLING_BACK, ProbationState.WATCHED}
+    goes_back = trial is not None and trial.state in returns
     for alarm in state.alarms.active:
         lasted_ns = now_ns - alarm.since_ns_utc
         # During a rollback the loop is given the time in which the previous matrix can recover it.
-        waits_s = 0.0 if alarm.name == LOST and not _goes_back(state) else MAX_DIVERGENCE_S
+        waits_s = 0.0 if alarm.name == LOST and not goes_back else MAX_DIVERGENCE_S
         if alarm_blocks(alarm, Interlock.HOLD) and lasted_ns >= waits_s * SECOND_NS:
             return f"{alarm.name} for {lasted_ns / SECOND_NS:.0f} s"
     # Bad telemetry alone also refuses windows. Only a loop that has stopped correcting is opened
@@ -662,15 +654,6 @@ def explain_acquisition(state: TrackerState, policy: Policy, now_ns: int) -> str
     if has_missed_enough(state) and not state.loop.holds:
         return f"{state.operations.acquisition.misses} windows in a row found no registration"
     return None
-
-
-def _goes_back(state: TrackerState) -> bool:
-    """Return whether the matrix before is on its way to the RTC, or has just come there."""
-    trial = state.operations.probation
-    return trial is not None and trial.state in {
-        ProbationState.ROLLING_BACK,
-        ProbationState.WATCHED,
-    }
 
 
 def has_missed_enough(state: TrackerState) -> bool:
@@ -684,9 +667,7 @@ def has_missed_enough(state: TrackerState) -> bool:
 def count_miss(context: StepContext, kind: RefusalKind) -> None:
     """Count a refused window, if α was out of its reach and no acquisition is under way."""
     if not context.acquisition.under_way and kind is RefusalKind.OUT_OF_REACH:
-        set_acquisition(
-            context, replace(context.acquisition, misses=context.acquisition.misses + 1)
-        )
+        context.acquisition = replace(context.acquisition, misses=context.acquisition.misses + 1)
 
 
 def check_acquisition(state: TrackerState, policy: Policy) -> str | None:
@@ -702,23 +683,22 @@ def check_acquisition(state: TrackerState, policy: Policy) -> str | None:
     return _check_mode_number(modes, state.loop.rtc)
 
 
-def set_acquisition(context: StepContext, acquisition: Acquisition) -> None:
-    """Note how far it has come."""
-    context.operations = replace(context.operations, acquisition=acquisition)
+def carry_alpha(context: StepContext, step: NDArray[np.float64]) -> None:
+    """Shift the α that was found, because the pointing law has moved by a step ``(4,)``."""
+    found = context.acquisition.alpha
+    if found is not None:
+        context.acquisition = replace(context.acquisition, alpha=found.add_step(step))
 
 
 def _enter_stage(context: StepContext, stage: AcquisitionStage, text: str) -> None:
     """Begin a stage."""
-    set_acquisition(
-        context,
-        replace(
-            context.acquisition,
-            stage=stage,
-            text=text,
-            since_ns_utc=context.now_ns,
-            misses=0,
-            command=None,
-        ),
+    context.acquisition = replace(
+        context.acquisition,
+        stage=stage,
+        text=text,
+        since_ns_utc=context.now_ns,
+        misses=0,
+        command=None,
     )
     level = Level.WARNING if stage is AcquisitionStage.FAILED else Level.INFO
     context.log(f"acquisition.{stage}", text, level)
@@ -728,9 +708,7 @@ def _request_loop(context: StepContext, command: cmd.SetLoop) -> None:
     """Ask the RTC to change its loop, and remember having asked."""
     set_loop(context, command)
     asked = context.loop.command
-    set_acquisition(
-        context, replace(context.acquisition, command=None if asked is None else asked.id)
-    )
+    context.acquisition = replace(context.acquisition, command=None if asked is None else asked.id)
 
 
 def _restart_acquisition(context: StepContext, reason: str, *, slipped: bool = False) -> None:
@@ -746,23 +724,20 @@ def _restart_acquisition(context: StepContext, reason: str, *, slipped: bool = F
     lost_with = acquisition.lost_with
     if slipped:
         # Fewer modes tolerate a larger misregistration.
-        most, lost_with = half_of_modes(acquisition.n_modes), None
-        limit_modes(context, most, reason)
+        most, lost_with = update_policy.half_of_modes(acquisition.n_modes), None
+        update_policy.limit_modes(context, most, reason)
     validity.invalidate_telemetry(context, "the acquisition had not restarted")
     stop_running_dither(context)
     validity.forget_registration(context)
-    set_acquisition(
-        context,
-        replace(
-            acquisition,
-            attempt=acquisition.attempt + 1,
-            alpha=None,
-            covariance=None,
-            matrix=None,
-            max_modes=most,
-            lost_with=lost_with,
-            n_modes=min(acquisition.n_modes, most or acquisition.n_modes_before),
-        ),
+    context.acquisition = replace(
+        acquisition,
+        attempt=acquisition.attempt + 1,
+        alpha=None,
+        covariance=None,
+        matrix=None,
+        max_modes=most,
+        lost_with=lost_with,
+        n_modes=min(acquisition.n_modes, most or acquisition.n_modes_before),
     )
     _enter_stage(context, AcquisitionStage.OPENING, f"opening the loop again: {reason}")
     if context.rtc is not None and context.rtc.loop != "open":
@@ -775,7 +750,7 @@ def _fail_acquisition(context: StepContext, reason: str) -> None:
     out_of_hand = context.blocking_alarm(Interlock.HOLD) is not None
     stop_running_dither(context)
     validity.forget_registration(context)
-    set_acquisition(context, replace(context.acquisition, windows=context.windows.accepted))
+    context.acquisition = replace(context.acquisition, windows=context.windows.accepted)
     if closed and out_of_hand:
         _request_loop(context, cmd.SetLoop(loop="open"))
     text = (
@@ -801,7 +776,7 @@ def abort_acquisition(context: StepContext, why: str, *, held_off: bool = False)
         _request_loop(context, cmd.SetLoop(loop="closed", leak=found.leak))
     text = f"ended {why}; the loop is {left}{HELD_OFF_TEXT if held_off else ''}"
     over = replace(context.acquisition, held_off=held_off, windows=context.windows.accepted)
-    set_acquisition(context, over)
+    context.acquisition = over
     _enter_stage(context, AcquisitionStage.ABORTED, text)
 
 
@@ -829,10 +804,11 @@ def _on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
         return
     if rtc is None or not before.uses_wide_capture or estimate.session != rtc.session:
         return
-    if not _is_of_stage(context, rtc, estimate.modes):
-        return
+    dither = wide_capture_dither(before.stage, rtc, context.policy, 0)
+    if isinstance(dither, str) or dither.request.modes != estimate.modes:
+        return  # a window of another stage
     covariance = estimate.covariance + np.diag(band_of(before.stage).floor ** 2)
-    set_acquisition(context, replace(before, alpha=estimate.alpha, covariance=covariance))
+    context.acquisition = replace(before, alpha=estimate.alpha, covariance=covariance)
     x, y, rotation, magnification = np.sqrt(np.diag(covariance))
     place = (
         f"{estimate.alpha} +- {x:.3f}, {y:.3f} subap, {np.rad2deg(rotation):.2f} deg, "
@@ -846,7 +822,7 @@ def _on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
     chi2 = float(difference @ np.linalg.solve(covariance + before.covariance, difference))
     # Two sets of modes must agree before α is used (docs/decisions/0019-acquisition.md).
     if chi2 > MAX_ESTIMATE_DIFFERENCE:
-        set_acquisition(context, before)
+        context.acquisition = before
         reason = (
             f"two sets of modes disagree: {before.alpha} and {estimate.alpha}, "
             f"chi2 {chi2:.0f}, expected at most {MAX_ESTIMATE_DIFFERENCE}"
@@ -879,12 +855,12 @@ def _lift_limit_of_jump(context: StepContext) -> None:
     """
     acquisition = context.acquisition
     record = context.state.reconstructor(acquisition.lost_with)
-    if record is None or not is_beyond_verdict(context.state, record):
+    if record is None or not update_policy.is_beyond_verdict(context.state, record):
         return
     n_modes = acquisition.n_modes_before
     first = min(n_modes, FIRST_LOOP_MODES)
-    set_acquisition(context, replace(acquisition, max_modes=None, n_modes=first, lost_with=None))
-    forget_limit(context)
+    context.acquisition = replace(acquisition, max_modes=None, n_modes=first, lost_with=None)
+    update_policy.forget_limit(context)
     context.log("modes.limit-lifted", f"the mirror has moved since {record.id}: {n_modes} modes")
 
 
@@ -894,7 +870,7 @@ def _on_missed(context: StepContext, reason: str) -> None:
     if misses >= MAX_STAGE_MISSES:
         _restart_acquisition(context, reason)
     else:
-        set_acquisition(context, replace(context.acquisition, misses=misses))
+        context.acquisition = replace(context.acquisition, misses=misses)
 
 
 def _keep_dithering(context: StepContext, rtc: Status) -> None:
@@ -924,9 +900,3 @@ def _to_give_back(state: TrackerState) -> LoopFound | None:
     if acquisition.interruption is not None and acquisition_left_open(state, rtc) is None:
         return None
     return found
-
-
-def _is_of_stage(context: StepContext, rtc: Status, modes: tuple[int, ...]) -> bool:
-    """Return whether these are the modes of the present stage."""
-    dither = wide_capture_dither(context.acquisition.stage, rtc, context.policy, 0)
-    return not isinstance(dither, str) and dither.request.modes == modes

@@ -16,7 +16,6 @@ from service.tracking.events import Event
 from service.tracking.operation_records import MeasurementRecord, MeasureState
 from service.tracking.operations.measurement import fail_measurement, store_measurement
 from service.tracking.policy import SECOND_NS
-from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext, present
 from service.wire import DitherRequest, Reply, Status
 
@@ -113,12 +112,6 @@ def fail_noisy_measurement(context: StepContext, why: str) -> None:
     record = context.state.noisy_measurement
     if record is not None:
         fail_measurement(context, record, why)
-
-
-def awaits_its_dither(state: TrackerState) -> bool:
-    """Return whether another dither has to end first: until then the service begins none."""
-    record = state.noisy_measurement
-    return record is not None and record.state is MeasureState.WAITING
 
 
 def _begin_noisy(context: StepContext, record: MeasurementRecord, rtc: Status) -> None:

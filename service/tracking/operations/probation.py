@@ -28,7 +28,7 @@ from service.tracking.alarms import (
     WRONG_LOOP,
     Alarm,
     Interlock,
-    alarm_blocks,
+    as_critical,
 )
 from service.tracking.events import Event
 from service.tracking.operation_records import CommandState, Probation, ProbationState
@@ -102,7 +102,8 @@ def _go_on(context: StepContext, trial: Probation, event: Event) -> None:
         case ProbationState.RUNNING | ProbationState.OVERDUE:
             _await_verdict(context, trial)
         case ProbationState.ROLLING_BACK:
-            _await_republished(context, trial, event)
+            if why := _explain_failed_rollback(context, trial, event):
+                _keep_worse(context, trial, why)
         case ProbationState.WATCHED:
             _watch(context, trial)
         case ProbationState.OPENING:
@@ -239,12 +240,6 @@ def _await_verdict(context: StepContext, trial: Probation) -> None:
         _set(context, replace(trial, state=ProbationState.OVERDUE, text="telemetry is late"))
 
 
-def _await_republished(context: StepContext, trial: Probation, event: Event) -> None:
-    why = _explain_failed_rollback(context, trial, event)
-    if why:
-        _keep_worse(context, trial, why)
-
-
 def _begin_watch(context: StepContext, trial: Probation, in_use: str) -> None:
     """Check whether the loop recovers, now that the matrix before is in use again."""
     text = f"{trial.worse}. The service went back to {trial.before}, as {in_use}"
@@ -266,7 +261,7 @@ def _begin_watch(context: StepContext, trial: Probation, in_use: str) -> None:
 def _watch(context: StepContext, trial: Probation) -> None:
     """End the check of the loop with the matrix before: lost, opened, or undecided."""
     waited_s = (context.now_ns - trial.since_ns_utc) / SECOND_NS
-    lost = next((a for a in context.alarms.active if alarm_blocks(a, Interlock.HOLD)), None)
+    lost = context.blocking_alarm(Interlock.HOLD)
     if context.rtc is None or not context.rtc.in_loop:
         why = "the RTC is gone" if context.rtc is None else explain_open_loop(context.rtc)
         _end_watch(context, trial, why, lost=False)
@@ -291,7 +286,7 @@ def _end_watch(
     _end(context, trial, ProbationState.ROLLED_BACK, trial.text)
     do = ". Open the loop" if lost else ""
     text = f"{trial.id} {trial.text}. The mode is hold until an operator sets another{do}"
-    context.raise_alarm(PROBATION, text, critical=lost)
+    context.raise_alarm(PROBATION, text, as_critical(PROBATION) if lost else None)
 
 
 def _may_resume(context: StepContext, trial: Probation, *, lost: bool) -> bool:
@@ -439,9 +434,8 @@ def _check_rollback(context: StepContext, trial: Probation) -> str | None:
         return "the RTC has not shown its numbers in this session"
     if trial.loop is None or not same_but_for_modes(trial.loop, rtc):
         return "the loop has been changed since"
-    on_way = next((r.id for r in state.matrices.reconstructors if r.on_its_way), None)
-    if on_way is not None:
-        return f"{on_way} is on its way to the RTC"
+    if state.sent is not None:
+        return f"{state.sent.id} is on its way to the RTC"
     return check_sendable(state, record, trial.since_ns_utc)
 
 
@@ -456,7 +450,8 @@ def _keep_worse(context: StepContext, trial: Probation, why: str) -> None:
         return
     _end(context, trial, ProbationState.KEPT, text)
     do = "open the loop if it suffers, or roll back by hand"
-    context.raise_alarm(PROBATION, f"{trial.id} {text}; {do}", critical=lost)
+    own = as_critical(PROBATION) if lost else None
+    context.raise_alarm(PROBATION, f"{trial.id} {text}; {do}", own)
 
 
 def _end(context: StepContext, trial: Probation, state: ProbationState, text: str) -> None:

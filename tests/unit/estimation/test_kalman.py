@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.estimation.estimate import PASSIVE_BIAS, BiasBlock
+from service.estimation.estimate import BIAS_FLOOR, BIAS_OVER_SCATTER
 from service.estimation.kalman import (
     JUMP_THRESHOLD,
     Drift,
@@ -28,17 +28,13 @@ SCATTER = np.diag(np.array([0.003, 0.003, np.deg2rad(0.01), 0.0003]) ** 2)
 DRIFT = Drift(alpha_rate=np.array([0.05, 0.05, np.deg2rad(0.05), 0.0005]) / np.sqrt(3600.0))
 STILL = Drift(alpha_rate=np.zeros(4), bias_memory_s=np.inf)
 NOWHERE = np.array([0.0, 0.0, 0.0, 1.0])
-BIAS_FLOOR, BIAS_OVER_SCATTER = np.array(PASSIVE_BIAS.floor), np.array(PASSIVE_BIAS.over_scatter)
 SIGMA = np.array([0.015, 0.015, np.deg2rad(0.01), 0.0005])
 """A window's 1 σ: 1.5 % of a subaperture."""
 
 
-def begun(measured: np.ndarray, covariance: np.ndarray, *blocks: BiasBlock) -> Joint:
-    """The filter after a window, nothing known of these biases: the passive estimate's, if none."""
-    joint = begin_joint(measured, covariance)
-    for block in blocks or (PASSIVE_BIAS,):
-        joint = forget(joint, block)
-    return joint
+def begun(measured: np.ndarray, covariance: np.ndarray) -> Joint:
+    """The filter after a window, nothing known of the bias."""
+    return forget(begin_joint(measured, covariance))
 
 
 def away(*step: float) -> np.ndarray:
@@ -121,7 +117,7 @@ class TestBias:
         """Prior of α: 1 subaperture. A bias does not average out, of no parameter."""
         joint = begun(NOWHERE, np.diag([1.0, 1.0, 0.01, 0.01]))
         for _ in range(50):
-            joint = correct_state(joint, NOWHERE, SCATTER, PASSIVE_BIAS)
+            joint = correct_state(joint, NOWHERE, SCATTER, passive=True)
         assert np.all(np.sqrt(np.diag(joint.alpha_covariance)) > 0.99 * BIAS_FLOOR)
 
     def test_the_bias_is_the_difference_of_the_two_readings(self):
@@ -129,17 +125,17 @@ class TestBias:
         joint = begun(NOWHERE, DITHERED)
         for _ in range(400):
             joint = correct_state(joint, NOWHERE, DITHERED)
-            joint = correct_state(joint, away(0.06, -0.03, 3e-4, 0.0), SCATTER, PASSIVE_BIAS)
-        np.testing.assert_allclose(joint.bias(PASSIVE_BIAS), [0.06, -0.03, 3e-4, 0.0], atol=1e-3)
+            joint = correct_state(joint, away(0.06, -0.03, 3e-4, 0.0), SCATTER, passive=True)
+        np.testing.assert_allclose(joint.offset, [0.06, -0.03, 3e-4, 0.0], atol=1e-3)
         np.testing.assert_allclose(joint.alpha, NOWHERE, atol=1e-3)
 
     def test_once_the_bias_is_learnt_a_passive_reading_moves_the_registration(self):
         joint = begun(NOWHERE, DITHERED)
         for _ in range(100):
             joint = correct_state(joint, NOWHERE, DITHERED)
-            joint = correct_state(joint, away(0.06, 0, 0, 0), SCATTER, PASSIVE_BIAS)
+            joint = correct_state(joint, away(0.06, 0, 0, 0), SCATTER, passive=True)
         later = predict_state(joint, Drift(alpha_rate=np.full(4, 0.01), bias_memory_s=np.inf), 1.0)
-        found = correct_state(later, away(0.08, 0, 0, 0), SCATTER, PASSIVE_BIAS)
+        found = correct_state(later, away(0.08, 0, 0, 0), SCATTER, passive=True)
         assert found.alpha[0] == pytest.approx(0.02, abs=0.003)
         assert np.sqrt(found.covariance[0, 0]) < 0.005
 
@@ -147,9 +143,9 @@ class TestBias:
         joint = begun(NOWHERE, DITHERED)
         for _ in range(20):
             joint = correct_state(joint, NOWHERE, DITHERED)
-            joint = correct_state(joint, NOWHERE, SCATTER, PASSIVE_BIAS)
-        assert innovation(joint, away(0.12, 0, 0, 0), SCATTER, PASSIVE_BIAS) > JUMP_THRESHOLD
-        gone = forget(joint, PASSIVE_BIAS)
+            joint = correct_state(joint, NOWHERE, SCATTER, passive=True)
+        assert innovation(joint, away(0.12, 0, 0, 0), SCATTER, passive=True) > JUMP_THRESHOLD
+        gone = forget(joint)
         np.testing.assert_array_equal(gone.alpha, joint.alpha)
         np.testing.assert_array_equal(gone.alpha_covariance, joint.alpha_covariance)
         np.testing.assert_array_equal(gone.covariance[4:, 4:], np.diag(BIAS_FLOOR**2))
@@ -158,16 +154,16 @@ class TestBias:
         joint = begun(NOWHERE, DITHERED)
         for _ in range(50):
             joint = correct_state(joint, NOWHERE, DITHERED)
-            joint = correct_state(joint, away(0.05, 0, 0, 0), SCATTER, PASSIVE_BIAS)
+            joint = correct_state(joint, away(0.05, 0, 0, 0), SCATTER, passive=True)
         moved = correct_state(widen_after_jump(joint, DITHERED), away(0.1, 0, 0, 0), DITHERED)
         assert moved.alpha[0] == pytest.approx(0.1, abs=0.005)
-        assert moved.bias(PASSIVE_BIAS)[0] == pytest.approx(0.05, abs=0.01)
+        assert moved.offset[0] == pytest.approx(0.05, abs=0.01)
 
     def test_what_was_learnt_of_the_bias_fades_to_knowing_nothing(self):
         joint = begun(NOWHERE, DITHERED)
         learnt = replace(joint, mean=joint.mean + np.array([0, 0, 0, 0, 0.05, 0, 0, 0]))
         later = predict_state(learnt, DRIFT, 20 * DRIFT.bias_memory_s)
-        np.testing.assert_allclose(later.bias(PASSIVE_BIAS), 0.0, atol=1e-9)
+        np.testing.assert_allclose(later.offset, 0.0, atol=1e-9)
         np.testing.assert_allclose(np.sqrt(np.diag(later.covariance)[4:]), BIAS_FLOOR)
 
 
@@ -177,7 +173,7 @@ class TestExcess:
     def test_where_nothing_is_learnt_a_reading_is_worth_what_the_estimate_says(self):
         """10 % and, at a scatter of 1.4 %, 14 % more of it: together with the scatter 17.3 %."""
         excess = np.array([0.14, 0.14, 0.0, 0.0]) ** 2
-        found = allow_scatter(begun(NOWHERE, DITHERED), PASSIVE_BIAS, excess)
+        found = allow_scatter(begun(NOWHERE, DITHERED), excess)
         np.testing.assert_allclose(np.diag(found.covariance)[4:], BIAS_FLOOR**2 + excess)
         np.testing.assert_array_equal(found.alpha_covariance, DITHERED)
 
@@ -188,95 +184,44 @@ class TestExcess:
         for _ in range(50):
             joint = correct_state(joint, NOWHERE, DITHERED)
             joint = correct_state(
-                allow_scatter(joint, PASSIVE_BIAS, excess),
+                allow_scatter(joint, excess),
                 away(0.15, 0, 0, 0),
                 SCATTER,
-                PASSIVE_BIAS,
+                passive=True,
             )
-        again = allow_scatter(joint, PASSIVE_BIAS, excess)
+        again = allow_scatter(joint, excess)
         np.testing.assert_array_equal(again.covariance, joint.covariance)
         assert np.sqrt(again.covariance[4, 4]) < 0.002
-        assert again.bias(PASSIVE_BIAS)[0] == pytest.approx(0.15, abs=0.005)
+        assert again.offset[0] == pytest.approx(0.15, abs=0.005)
 
     def test_a_look_that_tells_of_more_moves_a_known_registration_less(self):
         """The bias may have changed with the wind: 1 % of a subaperture of drift, a step of 6 %."""
         joint = begun(NOWHERE, DITHERED)
         for _ in range(50):
             joint = correct_state(joint, NOWHERE, DITHERED)
-            joint = correct_state(joint, NOWHERE, SCATTER, PASSIVE_BIAS)
+            joint = correct_state(joint, NOWHERE, SCATTER, passive=True)
         joint = predict_state(joint, Drift(alpha_rate=np.full(4, 0.01), bias_memory_s=np.inf), 1.0)
-        calm = correct_state(joint, away(0.06, 0, 0, 0), SCATTER, PASSIVE_BIAS)
-        windy = allow_scatter(joint, PASSIVE_BIAS, np.array([0.12, 0.12, 0.0, 0.0]) ** 2)
-        stormy = correct_state(windy, away(0.06, 0, 0, 0), 16 * SCATTER, PASSIVE_BIAS)
+        calm = correct_state(joint, away(0.06, 0, 0, 0), SCATTER, passive=True)
+        windy = allow_scatter(joint, np.array([0.12, 0.12, 0.0, 0.0]) ** 2)
+        stormy = correct_state(windy, away(0.06, 0, 0, 0), 16 * SCATTER, passive=True)
         assert calm.alpha[0] > 0.04
         assert stormy.alpha[0] < 0.001
-        assert stormy.bias(PASSIVE_BIAS)[0] > 0.05
+        assert stormy.offset[0] > 0.05
 
     def test_what_is_forgotten_is_as_uncertain_as_the_look_that_made_it_be(self):
         excess = np.array([0.05, 0.0, 0.0, 0.0])
-        much = allow_scatter(begun(NOWHERE, DITHERED), PASSIVE_BIAS, 3.0 * excess)
-        gone = forget(much, PASSIVE_BIAS, excess)
+        much = allow_scatter(begun(NOWHERE, DITHERED), 3.0 * excess)
+        gone = forget(much, excess)
         np.testing.assert_allclose(np.diag(gone.covariance)[4:], BIAS_FLOOR**2 + excess)
-        np.testing.assert_array_equal(gone.bias_of(PASSIVE_BIAS).excess, excess)
+        np.testing.assert_array_equal(gone.bias.excess, excess)
 
     def test_a_wind_that_lasts_keeps_it_while_the_filter_fades_it(self):
         """For days: one hour of memory, a look every minute."""
         excess = np.array([0.2, 0.2, 0.0, 0.0]) ** 2
-        joint = allow_scatter(begun(NOWHERE, DITHERED), PASSIVE_BIAS, excess)
+        joint = allow_scatter(begun(NOWHERE, DITHERED), excess)
         for _ in range(3000):
-            joint = allow_scatter(predict_state(joint, DRIFT, 60.0), PASSIVE_BIAS, excess)
+            joint = allow_scatter(predict_state(joint, DRIFT, 60.0), excess)
         np.testing.assert_allclose(np.diag(joint.covariance)[4:], BIAS_FLOOR**2 + excess)
-
-
-OTHER = BiasBlock(
-    name="other",
-    floor=(0.05, 0.05, 0.002, 0.002),
-    over_scatter=(0.0,) * 4,
-    wander=(0.0,) * 4,
-)
-
-
-class TestSeveralBiases:
-    """Two kinds of passive estimate, each with a block of its own."""
-
-    def test_each_is_learnt_by_itself(self):
-        joint = begun(NOWHERE, DITHERED, PASSIVE_BIAS, OTHER)
-        for _ in range(400):
-            joint = correct_state(joint, NOWHERE, DITHERED)
-            joint = correct_state(joint, away(0.06, 0, 0, 0), SCATTER, PASSIVE_BIAS)
-            joint = correct_state(joint, away(-0.04, 0, 0, 0), SCATTER, OTHER)
-        assert joint.bias(PASSIVE_BIAS)[0] == pytest.approx(0.06, abs=1e-3)
-        assert joint.bias(OTHER)[0] == pytest.approx(-0.04, abs=1e-3)
-        np.testing.assert_allclose(joint.alpha, NOWHERE, atol=1e-3)
-
-    def test_together_they_say_what_two_independent_readings_do(self):
-        """Precisions add up: 10 % and 5 % of a subaperture make 4.5 %."""
-        joint = begun(NOWHERE, np.diag([1e4] * 4), PASSIVE_BIAS, OTHER)
-        for block in (PASSIVE_BIAS, OTHER):
-            joint = correct_state(joint, NOWHERE, 1e-12 * np.eye(4), block)
-        expected = (0.10**-2 + 0.05**-2) ** -0.5
-        assert np.sqrt(joint.covariance[0, 0]) == pytest.approx(expected, rel=1e-4)
-
-    def test_one_that_says_nothing_changes_nothing(self):
-        one, two = begun(NOWHERE, DITHERED), begun(NOWHERE, DITHERED, OTHER, PASSIVE_BIAS)
-        for _ in range(20):
-            one, two = (predict_state(joint, DRIFT, 10.0) for joint in (one, two))
-            one, two = (correct_state(joint, NOWHERE, DITHERED) for joint in (one, two))
-            read = away(0.06, 0, 0, 0)
-            one, two = (correct_state(joint, read, SCATTER, PASSIVE_BIAS) for joint in (one, two))
-        np.testing.assert_allclose(two.alpha, one.alpha, rtol=1e-12)
-        np.testing.assert_allclose(two.alpha_covariance, one.alpha_covariance, rtol=1e-9)
-        np.testing.assert_allclose(two.bias(PASSIVE_BIAS), one.bias(PASSIVE_BIAS), atol=1e-15)
-
-    def test_what_is_forgotten_of_one_leaves_the_other(self):
-        joint = begun(NOWHERE, DITHERED, PASSIVE_BIAS, OTHER)
-        for block in (PASSIVE_BIAS, OTHER):
-            joint = correct_state(joint, away(0.06, 0, 0, 0), SCATTER, block)
-        gone = forget(joint, PASSIVE_BIAS)
-        np.testing.assert_array_equal(gone.bias(PASSIVE_BIAS), 0.0)
-        np.testing.assert_array_equal(gone.bias(OTHER), joint.bias(OTHER))
-        place = joint.place(OTHER)
-        np.testing.assert_array_equal(gone.covariance[place, place], joint.covariance[place, place])
 
 
 CALM = np.array([0.003, 0.003, np.deg2rad(0.01), 3e-4])
@@ -307,9 +252,7 @@ def windy_night(seed: int, scatters: tuple[np.ndarray, np.ndarray]) -> np.ndarra
             read = true + np.sqrt(np.diag(DITHERED)) * rng.normal(size=4)
             joint = correct_state(joint, read, DITHERED)
         read = true + bias + scatter * rng.normal(size=4)
-        joint = correct_state(
-            allow_scatter(joint, PASSIVE_BIAS, excess), read, np.diag(scatter**2), PASSIVE_BIAS
-        )
+        joint = correct_state(allow_scatter(joint, excess), read, np.diag(scatter**2), passive=True)
         error, covariance = joint.alpha - true, joint.alpha_covariance
         square = error @ np.linalg.solve(covariance, error)
         found.append([*error / np.sqrt(np.diag(covariance)), square])
@@ -348,7 +291,7 @@ def night(seed: int, dither_every_s: float) -> tuple[np.ndarray, np.ndarray]:
             joint = fresh if joint is None else correct_state(joint, read, DITHERED)
         assert joint is not None
         read = true + bias + np.sqrt(np.diag(SCATTER)) * rng.normal(size=4)
-        joint = correct_state(joint, read, SCATTER, PASSIVE_BIAS)
+        joint = correct_state(joint, read, SCATTER, passive=True)
         if t > 600.0:
             error = joint.alpha - true
             errors.append(error)
@@ -390,7 +333,7 @@ class TestAnamorphosis:
         np.testing.assert_array_equal(found.stretches, [0.01, 0.0])
         np.testing.assert_array_equal(found.covariance[4:6, 4:6], 4e-4 * np.eye(2))
         np.testing.assert_array_equal(found.alpha_covariance, before.alpha_covariance)
-        np.testing.assert_array_equal(found.bias(PASSIVE_BIAS), before.bias(PASSIVE_BIAS))
+        np.testing.assert_array_equal(found.offset, before.offset)
         assert np.count_nonzero(found.covariance[4:6, :4]) == 0
 
     def test_a_window_that_does_not_tell_it_tells_the_four(self):

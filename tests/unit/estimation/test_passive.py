@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.estimation.estimate import PASSIVE_BIAS, PassiveEstimate
+from service.estimation.estimate import BIAS_FLOOR, PassiveEstimate
 from service.estimation.frames import FrameBlock
 from service.estimation.passive import (
     MIN_FRAMES_PER_MODE,
@@ -189,7 +189,7 @@ def test_a_sensor_that_is_not_the_modelled_one_shows_in_the_misfit():
 def test_sigma_is_never_below_the_bias_that_no_dither_has_taught():
     """10 % of a subaperture, more where the scatter says that the signal is weak."""
     found = fit(fed(night()), small_linearisation())
-    assert np.all(found.sigma > PASSIVE_BIAS.floor)
+    assert np.all(found.sigma > BIAS_FLOOR)
     strong, weak = (replace(found, covariance=np.eye(4) * s**2) for s in (1e-4, 0.014))
     np.testing.assert_allclose(strong.sigma[:2], 0.10, rtol=1e-3)
     np.testing.assert_allclose(weak.sigma[:2], np.hypot(0.10, 0.14), rtol=0.01)
@@ -200,7 +200,7 @@ def test_noise_widens_sigma_beyond_the_floor():
     block = quiet_block(700)
     noise = 30.0 * np.random.default_rng(4).normal(size=block.slopes.shape)
     found = fit(fed(block_of(block.slopes + noise, block.commands_m, None)), small_linearisation())
-    assert np.all(found.sigma > 2 * np.array(PASSIVE_BIAS.floor))
+    assert np.all(found.sigma > 2 * BIAS_FLOOR)
 
 
 def test_too_few_frames_give_no_estimate_rather_than_a_poor_one():

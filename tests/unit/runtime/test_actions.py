@@ -190,6 +190,14 @@ async def test_the_margin_is_judged_at_the_registration_of_now(actions):
     assert not event.verdict.accepted
 
 
+@pytest.mark.parametrize("wanted", [True, False])
+async def test_the_verdict_on_a_proposal_says_whether_an_operator_wants_it_sent(actions, wanted):
+    found, state = await made(actions)
+    gains = RTC.gains[:N_CONTROLLED]
+    event = await actions.perform(ev.JudgeProposal(id=found.id, gains=gains, wanted=wanted), state)
+    assert (event.id, event.verdict.accepted, event.wanted) == (found.id, True, wanted)
+
+
 async def test_the_rtcs_own_matrix_is_fetched_and_archived_once(actions, archive):
     for _ in range(2):
         event = await actions.perform(ev.FetchMatrix(id="initial"), STATE)

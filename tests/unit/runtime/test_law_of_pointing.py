@@ -97,7 +97,7 @@ def test_the_reconstructor_follows_and_nothing_is_the_matter_at_the_end(night):
     state, true = night.parts[-1]
     assert (error_in_sigma(state, true) < 5.0).all()
     used = state.reconstructor(state.matrices.in_use)
-    assert not used.is_rtcs
+    assert used.alpha is not None
     assert np.rad2deg(abs(used.alpha.rotation_rad - true.rotation_rad)) < 1.0
     assert {alarm.name for alarm in state.alarms.active} == set()
     assert "registration.jump-suspected" not in [entry.name for entry in state.log]

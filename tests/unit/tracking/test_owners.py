@@ -19,6 +19,13 @@ PARTS = {
     for part in fields(getattr(BLANK, record))
 }
 PACKAGE = Path(tracking.__file__).parent
+ATTRIBUTES = {
+    "acquisition": "operations.acquisition",
+    "dither": "dithers.dither",
+    "dither_policy": "dithers.policy",
+}
+"""Parts that have a name of their own in the context."""
+
 STATES = ("context", "context.state", "self", "self.state", "state")
 
 
@@ -32,6 +39,8 @@ def written(tree):
             case ast.Call(ast.Name("replace"), [of, *_], keywords) if ast.unparse(of) in STATES:
                 # the context replaces a record that it is given as a whole
                 yield from (keyword.arg or "" for keyword in keywords)
+            case ast.Assign([ast.Attribute(ast.Name("context"), name)]) if name in ATTRIBUTES:
+                yield ATTRIBUTES[name]
             case _:
                 continue
 
@@ -44,6 +53,7 @@ def written(tree):
         ("replace(state.windows, run=run + 1)", 1),
         ("replace(self.state.alarms, active=())", 1),
         ("replace(state, log=())", 1),
+        ("context.dither_policy = replace(context.dither_policy, phase=phase)", 1),
         ("replace(record, state=done)", 0),
         ("state.alpha.history", 0),
     ],

@@ -6,12 +6,12 @@ import pytest
 from service.errors import CommandError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.dither_request import DEFAULT_DURATION_S
 from service.tracking.products import MatrixState
 from service.tracking.state import Level, Mode
 from service.wire import DitherRequest
 from tests.states import changed
 from tests.unit.tracking.situations import (
-    POLICY,
     Story,
     dither_answered,
     estimate,
@@ -264,7 +264,7 @@ class TestDither:
         first = story.state.dithers.dither.id
         story.tell(rtc(dither=story.state.dithers.dither), after_s=5)
         assert story.state.dithers.dither.id == first
-        story.tell(rtc(), after_s=POLICY.dither_duration_s - 5)
+        story.tell(rtc(), after_s=DEFAULT_DURATION_S - 5)
         assert "dither.ended" in story.logged
         assert story.alarms == {"windows-refused"}, "for two minutes no window has come"
         assert story.state.dithers.dither.id != first

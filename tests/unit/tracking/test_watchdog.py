@@ -154,7 +154,7 @@ def test_a_bias_that_was_learnt_is_not_excused_by_a_look_that_scatters_more(stor
 
 def test_the_bias_is_learnt_between_windows_and_shown(story):
     known = learnt(story).state.alpha.registration
-    assert known.biases[0].offset[0] == pytest.approx(0.06, abs=0.004)
+    assert known.bias.offset[0] == pytest.approx(0.06, abs=0.004)
     assert story.state.alpha.passive.bias[0] == pytest.approx(0.06, abs=0.004)
     assert story.state.alpha.passive.sigma[0] < 0.02
     assert known.alpha.shift_x_subap == pytest.approx(ALPHA.shift_x_subap, abs=0.003)
@@ -172,7 +172,7 @@ def test_looks_that_scatter_more_than_they_say_are_no_jumps(story):
         watch(story, Misregistration.from_vector(drawn), after_s=5.0, scatter=said)
         doubts += disagrees(story)
     assert doubts <= 1
-    assert story.state.alpha.registration.biases[0].scatter == pytest.approx(1.96, rel=0.4)
+    assert story.state.alpha.registration.bias.scatter == pytest.approx(1.96, rel=0.4)
     watch(story, moved(shift_x_subap=0.3), after_s=5.0, scatter=said)
     assert disagrees(story)
 
@@ -217,7 +217,7 @@ class TestBark:
     def test_alpha_stays_valid_the_bias_is_forgotten_and_nothing_is_made_meanwhile(self, barking):
         known = barking.state.alpha.registration
         assert known.alpha == self.before.alpha
-        np.testing.assert_array_equal(known.biases[0].offset, 0.0)
+        np.testing.assert_array_equal(known.bias.offset, 0.0)
         assert known.validity.level is Validity.FRESH
         assert not of_kind(barking.wait(30), ev.MakeMatrix)
         assert not of_kind(barking.make("cm-1"), ev.SendMatrix)
@@ -294,15 +294,15 @@ def test_it_is_of_the_time_of_its_telemetry_not_of_when_the_worker_was_done(stor
     end_ns = story.state.alpha.registration.t_ns_utc + 4 * SECOND
     story.tell(ev.PassiveFitted(estimate=watched(ALPHA), t_ns_utc=end_ns), after_s=60.0)
     assert story.state.alpha.registration.t_ns_utc == end_ns
-    assert story.state.alpha.registration.biases[0].looked_ns_utc == end_ns
+    assert story.state.alpha.registration.bias.looked_ns_utc == end_ns
 
 
 def test_a_registration_without_a_bias_knows_nothing_of_it(story):
     story.state = changed(
-        story.state, registration=replace(story.state.alpha.registration, biases=())
+        story.state, registration=replace(story.state.alpha.registration, bias=None)
     )
     watch(story, moved(shift_x_subap=0.08))
-    assert story.state.alpha.registration.biases[0].offset[0] > 0.05
+    assert story.state.alpha.registration.bias.offset[0] > 0.05
 
 
 @pytest.mark.parametrize(
@@ -311,9 +311,9 @@ def test_a_registration_without_a_bias_knows_nothing_of_it(story):
 def test_another_loop_has_another_bias(story, changes):
     learnt(story)
     story.tell(rtc(t_ns=story.now_ns))
-    assert story.state.alpha.registration.biases != ()
+    assert story.state.alpha.registration.bias is not None
     story.tell(rtc(t_ns=story.now_ns, **changes))
-    assert story.state.alpha.registration.biases == ()
+    assert story.state.alpha.registration.bias is None
     assert story.state.alpha.registration.usable
 
 
@@ -322,7 +322,7 @@ def test_so_it_has_when_the_rtc_was_restarted_in_between(story, n_controlled, ke
     learnt(story)
     story.tell(ev.SessionStarted(session="s2"))
     story.tell(rtc(n_controlled, session="s2"))
-    assert (story.state.alpha.registration.biases != ()) is kept
+    assert (story.state.alpha.registration.bias is not None) is kept
 
 
 @pytest.mark.parametrize(("n_controlled", "kept"), [(400, True), (300, False)])
@@ -332,7 +332,7 @@ def test_so_it_has_when_the_service_was(story, n_controlled, kept):
     after = Story(Mode.AUTO, state=left)
     after.now_ns = story.now_ns
     after.meet(n_controlled=n_controlled)
-    assert (after.state.alpha.registration.biases != ()) is kept
+    assert (after.state.alpha.registration.bias is not None) is kept
 
 
 def test_a_look_that_was_under_way_when_the_loop_changed_is_not_used(story):
@@ -343,7 +343,7 @@ def test_a_look_that_was_under_way_when_the_loop_changed_is_not_used(story):
     known = story.state.alpha.registration
     story.tell(look, after_s=1.0)
     assert story.state.alpha.registration.alpha == known.alpha
-    assert story.state.alpha.registration.biases == ()
+    assert story.state.alpha.registration.bias is None
     assert "the loop has changed" in story.state.alpha.passive_unavailable_reason
 
 
@@ -362,17 +362,17 @@ def test_a_look_at_a_loop_out_of_hand_moves_nothing(story, alarm):
 
 
 def test_a_bias_of_which_nothing_was_learnt_is_of_no_loop(story):
-    before = story.state.alpha.registration.biases
+    before = story.state.alpha.registration.bias
     story.tell(rtc(300, t_ns=story.now_ns))
-    assert story.state.alpha.registration.biases is before
+    assert story.state.alpha.registration.bias is before
 
 
 def test_gains_that_follow_the_seeing_by_a_percent_unteach_no_bias(story):
     learnt(story)
-    before = story.state.alpha.registration.biases
+    before = story.state.alpha.registration.bias
     gains = (0.4 * 1.01,) * 400 + (0.0,) * 194
     story.tell(rtc(t_ns=story.now_ns, gains=gains))
-    assert story.state.alpha.registration.biases is before
+    assert story.state.alpha.registration.bias is before
     late = ev.PassiveFitted(
         estimate=watched(moved(shift_x_subap=0.06)),
         t_ns_utc=story.now_ns + 4 * SECOND,

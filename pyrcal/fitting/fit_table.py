@@ -13,6 +13,7 @@ from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.methods import ScanStep
 from pyrcal.fitting.report import FitReport, orientation_words, verdict_line
 from service.errors import shown
+from service.model.defects import list_ranges
 from service.model.misregistration import BOUNDARY_SCALE
 
 _ROWS = (
@@ -93,7 +94,7 @@ def _basis_lines(report: FitReport) -> Iterator[str]:
     fit = report.fit
     yield f"{'residual':20s}{100.0 * fit.residual_fraction:.2f} % of the measured slopes"
     yield from _residual_lines(fit)
-    yield f"{'modes used':20s}{len(fit.modes)} ({_format_ranges(fit)})"
+    yield f"{'modes used':20s}{len(fit.modes)} ({list_ranges(fit.modes, _MAX_LISTED)})"
     for sentence in fit.left_out:
         yield f"{'left out':20s}{sentence}"
     yield f"{'gains':20s}{_format_gains(fit)}"
@@ -212,16 +213,6 @@ def paper_lines(steps: tuple[ScanStep, ...]) -> Iterator[str]:
             f"{number:4d}  {scan.parameter:15s}{scan.samples.min():11.4f}"
             f"{scan.samples.max():11.4f}{scan.step:9.4f}{scan.minimum:11.4f}"
         )
-
-
-def _format_ranges(fit: Fit) -> str:
-    """Return the modes as ranges, ends included."""
-    modes = np.sort(fit.modes)
-    runs = np.split(modes, np.flatnonzero(np.diff(modes) > 1) + 1)
-    words = [
-        f"{run[0]}" if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs[:_MAX_LISTED]
-    ]
-    return ", ".join(words) + (", ..." if len(runs) > _MAX_LISTED else "")
 
 
 def _format_gains(fit: Fit) -> str:

@@ -21,6 +21,7 @@ from service.estimation.estimator import Change, FrameContext, LoopContext, Mark
 from service.estimation.frames import FrameBlock
 from service.estimation.loop import last_seq
 from service.estimation.windows import ExpectedDither
+from service.model.defects import list_ranges
 
 Array = NDArray[Any]
 
@@ -352,10 +353,8 @@ def _strays(stray: Array, wanted_m: float) -> list[str]:
     if together <= MAX_STRAY_SHARE * wanted_m:
         return []
     worst = np.argsort(stray)[::-1]
-    worst = worst[stray[worst] > 0.0]
-    named = ", ".join(str(mode) for mode in sorted(worst[:_MAX_LISTED_MODES].tolist()))
-    more = ", ..." if len(worst) > _MAX_LISTED_MODES else ""
-    return [f"modes that were not requested ({named}{more}) carry {1e9 * together:.3g} nm"]
+    named = list_ranges(worst[stray[worst] > 0.0][:_MAX_LISTED_MODES])
+    return [f"modes that were not requested carry {1e9 * together:.3g} nm, above all {named}"]
 
 
 def _find_hidden_modes(

@@ -48,6 +48,7 @@ from service.estimation.estimator import (
 from service.estimation.frames import FrameBlock
 from service.estimation.probation import MIN_HISTORY_S, MIN_PART_FRAMES, PART_S
 from service.estimation.residual import N_LOST_PARTS, RUNAWAY_POWER_RATIO, runs_away
+from service.model.defects import list_ranges
 from service.model.kinds import SignalKind
 from service.model.misregistration import unit_like
 from service.model.slopes import TO_SLOPES
@@ -477,13 +478,13 @@ class PlayedCommands(Streaming):
         if not self.unplayed:
             return (None,)
         ratio, _ = max(self.beyond, key=lambda part: part[0])
-        actuators = sorted(set().union(*(part[1] for part in self.beyond)))
-        some = ", ".join(map(str, actuators[:4])) + (", ..." if len(actuators) > 4 else "")
+        actuators = np.array(sorted(set().union(*(part[1] for part in self.beyond))))
         return (
-            f"commands and slopes part: {len(actuators)} actuators ({some}) are commanded up to "
-            f"{ratio:.0f} times what turbulence needs, and the slopes do not show it. The mirror "
-            "clips commands that the telemetry reports as asked, or the sensor saturates: report "
-            "the commands that the mirror plays, offload, lower the gain or control fewer modes",
+            f"commands and slopes part: {len(actuators)} actuators ({list_ranges(actuators, 4)}) "
+            f"are commanded up to {ratio:.0f} times what turbulence needs, and the slopes do not "
+            "show it. The mirror clips commands that the telemetry reports as asked, or the sensor "
+            "saturates: report the commands that the mirror plays, offload, lower the gain or "
+            "control fewer modes",
         )
 
 

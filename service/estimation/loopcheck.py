@@ -13,7 +13,6 @@ not change although it should is at a limit. ``control_law`` checks a few modes 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from service.estimation.estimator import Change, FrameContext, LoopContext, Mark
 from service.estimation.frames import FrameBlock, join_frames
 from service.estimation.loop import last_seq
 from service.estimation.windows import ClosedLoop, Telemetry
+from service.model.defects import list_ranges
 
 Array = NDArray[Any]
 
@@ -212,10 +212,10 @@ class CommandResidual:
         worst = int(off[np.argmin(shares)])
         return (
             f"commands are off the loop equation: {len(off)} of {len(self.share)} modes "
-            f"({_spans(off)}) take {np.median(shares):.2f} of the commanded steps (median; least "
-            f"mode {worst}: {self.share[worst]:.2f}) and stay where they are in up to "
-            f"{self.held[off].max():.0%} of the frames: the mirror is saturated, or the RTC's "
-            f"gains, its delay or its reconstructor are not those it names ({self.cm_id})"
+            f"({list_ranges(off, _SPANS_NAMED)}) take {np.median(shares):.2f} of the commanded "
+            f"steps (median; least mode {worst}: {self.share[worst]:.2f}) and stay where they are "
+            f"in up to {self.held[off].max():.0%} of the frames: the mirror is saturated, or "
+            f"the RTC's gains, its delay or its reconstructor are not those it names ({self.cm_id})"
         )
 
 
@@ -421,13 +421,3 @@ def _multiply_waiting(check: LoopCheck, loop: ClosedLoop) -> LoopCheck:
     while sum(len(b.seq) for b in kept) > KEPT_SAMPLES:
         kept = kept[1:]
     return replace(check, waiting=(), batches=kept)
-
-
-def _spans(modes: Array) -> str:
-    """Return modes as ranges: 0-5, 9, ..."""
-    runs = [list(run) for _, run in groupby(enumerate(modes), key=lambda pair: pair[1] - pair[0])]
-    spans = [
-        str(run[0][1]) if len(run) == 1 else f"{run[0][1]}-{run[-1][1]}"
-        for run in runs[:_SPANS_NAMED]
-    ]
-    return ", ".join(spans) + (", ..." if len(runs) > _SPANS_NAMED else "")

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from service.errors import ModelError
 from service.estimation.reference import Reference, Target, target_of
 from service.estimation.solver import vertex
+from service.model.defects import list_ranges
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.kinds import SlopeOrder
@@ -373,11 +374,9 @@ def low_order_of(model: InteractionModel) -> LowOrder:
     response = np.linalg.norm(matrix, axis=0)
     unseen = np.flatnonzero(response <= UNSEEN_RESPONSE_RATIO * response.max())
     if len(unseen):
-        named = ", ".join(str(mode) for mode in unseen[:_MAX_LISTED_MODES])
-        more = ", ..." if len(unseen) > _MAX_LISTED_MODES else ""
         raise ModelError(
             f"{model.instrument.name}: found {len(unseen)} of {len(response)} modes that move "
-            f"nothing the sensor sees (columns {named}{more}); "
+            f"nothing the sensor sees (columns {list_ranges(unseen, _MAX_LISTED_MODES)}); "
             "expected actuators or tables in metres over the pupil (--modes leaves some out)"
         )
     root = np.where(model.basis.known(points)[:, None], root, 0.0)

@@ -78,3 +78,11 @@ def explain_defects(
         elif entries:
             notes.append(f"{what}s {text} are {kind}: left out")
     return notes
+
+
+def list_ranges(numbers: NDArray[np.integer], n_listed: int = _LISTED) -> str:
+    """Return numbers as ranges, ends included: ``0 to 5, 9, ...`` where there are more."""
+    numbers = np.sort(numbers)
+    runs = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
+    words = [f"{run[0]}" if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs[:n_listed]]
+    return ", ".join(words) + (", ..." if len(runs) > n_listed else "")

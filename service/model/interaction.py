@@ -8,7 +8,8 @@ between the two.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+import operator
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, Generic, Self, TypeVar
@@ -21,9 +22,9 @@ from typing_extensions import override
 from service.model.arrays import NUMPY, Arrays
 from service.model.instrument import Instrument
 from service.model.kinds import Stop
-from service.model.local import Drawing, LocalShapes, Patch, Shapes, beside, tiles_of
+from service.model.local import LocalShapes, MadeElsewhere, Patch, Shapes, beside, tiles_of
 from service.model.misregistration import Misregistration, rotation, stretch_matrix
-from service.model.modes import Basis, local_of
+from service.model.modes import Basis, LocalBasis, local_of
 from service.model.pupil import Illumination, instrument_pupil
 from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import (
@@ -197,10 +198,7 @@ class InteractionModel:
             and len(self.pupil.points) * len(local.coefficients) > _MAX_DENSE_PRODUCT
         )
         self._tiles = tiles_of(self.pupil) if by_tiles else ()
-        self._combination: Array | None = None
-        if local is not None and by_tiles:
-            single = self._dtype is np.float32
-            self._combination = (local.in_single if single else local).coefficients
+        self._local: LocalBasis | None = local if by_tiles else None
 
     def share_modes(self, other: InteractionModel) -> None:
         """Take over the modes that another model has rendered, if both have the same points.
@@ -255,13 +253,12 @@ class InteractionModel:
             return np.stack([*by_axis, *(self._as_listed(rate) for rate in rates)])
         else:
             _, *rates = self._with_rates(alpha, more)
-        return np.stack([self._as_listed(rate) for rate in rates])
+        return self._all_listed(rates)
 
     def mirror_shift_derivatives(self, alpha: Misregistration) -> Array:
         """Return how D changes with a shift of the mirror, the pupil unmoved, ``(2, ...)``."""
         moved = [self._move_modes(alpha, way) for way in self._shift_ways(alpha)]
-        rates = self._measure_shapes(alpha, moved)
-        return np.stack([self._as_listed(rate) for rate in rates])
+        return self._all_listed(self._measure_shapes(alpha, moved))
 
     def stretch_derivatives(self, alpha: Misregistration) -> Array:
         """Return how D changes with an anamorphosis of the mirror's image, ``(2, ...)``.
@@ -270,8 +267,7 @@ class InteractionModel:
         135 deg.
         """
         moved = [self._move_modes(alpha, way) for way in self._stretch_ways(alpha)]
-        rates = self._measure_shapes(alpha, moved)
-        return np.stack([self._as_listed(rate) for rate in rates])
+        return self._all_listed(self._measure_shapes(alpha, moved))
 
     def image_derivatives(self, alpha: Misregistration) -> Array:
         """Return how D changes when one of the sensor's pupil images alone moves on its pixels.
@@ -282,8 +278,7 @@ class InteractionModel:
         response = self._at(self._image_shift(alpha))
         if not isinstance(response, SeveralImages):
             return np.empty((0, self.n_slopes, self.basis.n_modes))
-        rates = response.image_rates(self._render_modes(alpha))
-        return np.stack([self._as_listed(rate) for rate in rates])
+        return self._all_listed(response.image_rates(self._render_modes(alpha)))
 
     def width_derivative(self, alpha: Misregistration) -> Array:
         """Return how D changes with the logarithm of the influence functions' width.
@@ -303,16 +298,16 @@ class InteractionModel:
             if self._anamorphosis
             else None,
             matrix=np.ascontiguousarray(self._as_listed(matrix), np.float32),
-            derivatives=np.stack([self._as_listed(rate) for rate in rates]).astype(
-                np.float32, copy=False
-            ),
+            derivatives=self._all_listed(rates).astype(np.float32, copy=False),
             noise_shape=self.noise_shape,
         )
 
     @cached_property
     def noise_shape(self) -> NDArray[np.float64] | None:
         """``(n_slopes,)`` σ of each slope over their RMS, of the same light; None: all alike."""
-        return kind_of(self.instrument).noise_shape(self.instrument)
+        shape = kind_of(self.instrument).noise_shape(self.instrument)
+        # abs, because the RTC's order of slopes may turn signs, and a σ has none.
+        return None if shape is None else np.abs(self._sort_rows(shape))
 
     def slope_noise(self, noise: float) -> NDArray[np.float64]:
         """Return σ of every signal ``(n_slopes,)`` where that of a slope is ``noise``, RMS."""
@@ -340,7 +335,9 @@ class InteractionModel:
         seen = np.column_stack([x, y]) - centre - self._image_shift(alpha)
         distance, _ = scipy.spatial.cKDTree(self.pupil.points[unknown]).query(seen, p=np.inf)
         # Half a subaperture from its centre to its edge; p = inf, because subapertures are square.
-        return np.tile(distance <= 0.5 + UNKNOWN_REACH_SUBAP, self.n_slopes // len(x))
+        marks = np.tile(distance <= 0.5 + UNKNOWN_REACH_SUBAP, self.n_slopes // len(x))
+        # As numbers, because an RTC's signs are multiplied into the rows.
+        return np.asarray(self._sort_rows(marks.astype(np.float32)) != 0.0)
 
     def _at(self, shift: tuple[float, float]) -> Response:
         """Return the sensor's response with the image at ``shift``; derivatives use it again."""
@@ -374,9 +371,17 @@ class InteractionModel:
         stretches = self.instrument.with_anamorphosis(alpha).stretches
         return self._modes.get((*moved, *stretches), lambda: self._move_modes(alpha, None))
 
-    def _as_listed(self, rows: Array) -> Array:
+    def _sort_rows(self, rows: Array) -> Array:
         """Return rows ``(n_slopes, ...)`` in the order and signs that this model's caller uses."""
         return rows
+
+    def _as_listed(self, matrix: Array) -> Array:
+        """Return a matrix in that order, its columns as the modes answer."""
+        return self._sort_rows(matrix)
+
+    def _all_listed(self, matrices: Iterable[Array]) -> Array:
+        """Return several matrices so, in one array."""
+        return np.stack([self._as_listed(matrix) for matrix in matrices])
 
     def _with_rates(self, alpha: Misregistration, more: Sequence[Way] = ()) -> list[Array]:
         """Return D and its four derivatives, then those along ``more`` ways of the mirror."""
@@ -436,18 +441,16 @@ class InteractionModel:
 
     def _move_modes(self, alpha: Misregistration, way: Way | None) -> Shapes:
         """Return the modes where α puts them or, with a way, their rates along it."""
-        if self._tiles:
-            return self._by_tiles(alpha, way)
+        if self._local is not None:
+            return self._by_tiles(self._local, alpha, way)
         points = self._mirror_points(alpha)
         if way is None:
             return self._by_rows(self.basis.render, points)
         both = np.hstack([points, way(points)])
         return self._by_rows(lambda p: self.basis.render_slope(p[:, :2], p[:, 2:]), both)
 
-    def _by_tiles(self, alpha: Misregistration, way: Way | None) -> Shapes:
-        basis = local_of(self.basis)
-        if basis is None:
-            raise TypeError(f"found {type(self.basis).__name__}; only functions of actuators end")
+    def _by_tiles(self, basis: LocalBasis, alpha: Misregistration, way: Way | None) -> Shapes:
+        kept = basis.in_single if self._dtype is np.float32 else basis
 
         def patch(number: int) -> Patch:
             tile = self._tiles[number]
@@ -459,11 +462,11 @@ class InteractionModel:
             patches=tuple(self._map(patch, range(len(self._tiles)))),
             n_points=int(self.pupil.lit.sum()),
             n_functions=len(basis.coefficients),
-            combination=self._combination,
-            drawing=Drawing(
-                parts=(self._again, basis.in_single if self._dtype is np.float32 else basis),
-                prepare=_made_again,
-                draw=partial(_drawn, alpha=alpha, way=way),
+            combination=kept.coefficients,
+            elsewhere=MadeElsewhere(
+                parts=(self._again, kept),
+                prepare=operator.call,
+                make=partial(_moved_modes, alpha=alpha, way=way),
             ),
         )
         return shapes if shapes.is_cheaper else shapes.array()
@@ -478,11 +481,7 @@ class InteractionModel:
         )
 
 
-def _made_again(model_of: Callable[[Basis], InteractionModel], basis: Basis) -> InteractionModel:
-    return model_of(basis)
-
-
-def _drawn(model: InteractionModel, *, alpha: Misregistration, way: Way | None) -> Shapes:
+def _moved_modes(model: InteractionModel, *, alpha: Misregistration, way: Way | None) -> Shapes:
     return model._move_modes(alpha, way)  # noqa: SLF001 - its own, in another process
 
 
@@ -536,27 +535,13 @@ class RtcInteractionModel(InteractionModel):
         """Slopes per unit command relative to the nominal mode, ``(n_modes,)``; None if nominal."""
 
     @override
-    def _as_listed(self, rows: Array) -> Array:
-        """Return rows as the RTC lists slopes, columns as its modes answer."""
-        listed = self._sort_rows(rows)
+    def _as_listed(self, matrix: Array) -> Array:
+        listed = self._sort_rows(matrix)
         if self._mode_response is None:
             return listed
         return np.asarray(listed * self._mode_response.astype(listed.dtype))
 
     @override
-    def unknown_rows(self, alpha: Misregistration) -> NDArray[np.bool_]:
-        """Return which of the RTC's slopes are near unknown surface, ``(n_slopes,)``."""
-        # As numbers, because signs are multiplied into the rows.
-        marks = self._sort_rows(super().unknown_rows(alpha).astype(np.float32))
-        return np.asarray(marks != 0.0)
-
-    @override
-    @cached_property
-    def noise_shape(self) -> NDArray[np.float64] | None:
-        shape = kind_of(self.instrument).noise_shape(self.instrument)
-        # abs, because the order of slopes may turn signs, and a σ has none.
-        return None if shape is None else np.abs(self._sort_rows(shape))
-
     def _sort_rows(self, rows: Array) -> Array:
         recipe = self.instrument.slopes
         mask = rtc_mask(self.valid, recipe.assumed_orientation)

@@ -53,23 +53,18 @@ class Patch:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Drawing:
-    """Recipe of local shapes: the modes and a few kilobytes, for another process."""
+class MadeElsewhere:
+    """How another process makes something, from what can be pickled: a few kilobytes and parts."""
 
     parts: tuple[object, ...]
-    """Parts that all shapes of a model share: its settings and its modes."""
+    """Parts that all matrices of a model share: instrument, modes. They are sent to a cluster once.
+    """
 
     prepare: Callable[..., Any]
-    """Makes the model of its parts."""
+    """Makes a model of the parts, which is kept for the next matrix, too."""
 
-    draw: Callable[[Any], Shapes]
-    """Makes the shapes of the model."""
-
-    @classmethod
-    def beside(cls, drawings: Sequence[Drawing]) -> Drawing:
-        """Return the recipe of several sets of shapes of one model, placed side by side."""
-        draw = partial(_drawn_beside, draws=tuple(one.draw for one in drawings))
-        return replace(drawings[0], draw=draw)
+    make: Callable[[Any], Any]
+    """Makes the thing itself of the model."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -92,8 +87,8 @@ class LocalShapes:
     """Number of sets of functions with the same combination, placed side by side, such as heights
     and rates. Function j of layer k has the index ``k n_functions + j``."""
 
-    drawing: Drawing | None = None
-    """From what somebody else can make them; None: he cannot."""
+    elsewhere: MadeElsewhere | None = None
+    """How another process makes them; None if it cannot."""
 
     # Makes numpy hand ``array @ shapes`` to __rmatmul__ instead of making an array of objects.
     __array_ufunc__: ClassVar[None] = None
@@ -190,13 +185,15 @@ def beside(shapes: Sequence[Shapes]) -> Shapes:
         )
         for layers in zip(*(one.patches for one in local), strict=True)
     ]
-    drawings = [one.drawing for one in local if one.drawing is not None]
-    drawing = Drawing.beside(drawings) if len(drawings) == len(local) else None
-    return replace(local[0], patches=patches, n_layers=len(local), drawing=drawing)
+    recipes, there = [one.elsewhere for one in local if one.elsewhere is not None], None
+    if len(recipes) == len(local):
+        each = tuple(recipe.make for recipe in recipes)
+        there = replace(recipes[0], make=partial(_made_beside, each=each))
+    return replace(local[0], patches=patches, n_layers=len(local), elsewhere=there)
 
 
-def _drawn_beside(model: object, *, draws: Sequence[Callable[[Any], Shapes]]) -> Shapes:
-    return beside([draw(model) for draw in draws])
+def _made_beside(model: object, *, each: Sequence[Callable[[Any], Shapes]]) -> Shapes:
+    return beside([make(model) for make in each])
 
 
 def tiles_of(pupil: PupilGrid) -> tuple[Tile, ...]:

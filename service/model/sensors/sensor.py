@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.arrays import NUMPY, Arrays
-from service.model.local import Shapes
+from service.model.local import MadeElsewhere, Shapes
 from service.model.pupil import Illumination
 
 Array = NDArray[Any]
@@ -37,24 +37,9 @@ class RowTask(ABC):
         """Return what there is of a row."""
 
     @property
-    def elsewhere(self) -> RowsElsewhere | None:
-        """From what another process makes the same; None: it gets megabytes of arrays."""
+    def elsewhere(self) -> MadeElsewhere | None:
+        """How another process makes the same; None: it gets megabytes of arrays."""
         return None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RowsElsewhere:
-    """A function of rows as what it is made from; all can be pickled."""
-
-    parts: tuple[object, ...]
-    """Parts that all matrices of a model share: instrument, modes. They are sent to a cluster once.
-    """
-
-    prepare: Callable[..., Any]
-    """Makes of the parts what is kept for the next matrix, too."""
-
-    make: Callable[[Any], RowTask]
-    """Makes of that the function: a kilobyte."""
 
 
 class WorkingPoint:

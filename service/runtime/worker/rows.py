@@ -20,7 +20,8 @@ from functools import partial
 from typing import Any
 
 from service.errors import ClusterError
-from service.model.sensors.sensor import Array, RowsElsewhere, RowTask
+from service.model.local import MadeElsewhere
+from service.model.sensors.sensor import Array, RowTask
 from service.runtime.cluster import Cluster
 
 MIN_REMOTE_ROW_S = 0.2
@@ -173,7 +174,7 @@ class RemoteRows:
     """Pickled instrument and modes, which identify the model."""
 
     @classmethod
-    def of(cls, rows: RowsElsewhere) -> RemoteRows:
+    def of(cls, rows: MadeElsewhere) -> RemoteRows:
         """Return what is sent of a function of rows: all but its parts."""
         return cls(described=pickle.dumps((rows.prepare, rows.make)))
 

@@ -170,7 +170,7 @@ def test_gains_other_than_the_status_says_are_named_with_their_modes():
     found = verdict(closed_loop(gains=gains))
     assert np.flatnonzero(found.disobeys).tolist() == [3, 4, 5, 9]
     np.testing.assert_allclose(found.share[[3, 4, 5]], 0.25, atol=1e-3)
-    assert "4 of 16 modes (3-5, 9)" in found.text
+    assert "4 of 16 modes (3 to 5, 9)" in found.text
     assert "least mode 9: 0.00" in found.text
 
 

@@ -89,7 +89,7 @@ def test_a_tenth_more_or_a_third_less_is_a_mirror_that_clips_and_no_news():
 
 def test_other_modes_are_named():
     (found,) = played(lambda s, n: columns(s, n, modes=(0, 1, 2, 3)))
-    assert "(0, 1, 2, 3) carry 8 nm" in found.text
+    assert "carry 8 nm, above all 0 to 3" in found.text
     assert "mode 8 carries 0 nm instead of 4 nm" in found.text
 
 

@@ -7,10 +7,12 @@ import pytest
 
 from pyrcal.fitting.light_rotation import Arms, LightRotation, find_rotation
 from service.errors import ModelError
-from service.model.sensors.pyramid.light import measure_illumination, relative_light
+from service.model.sensors.pyramid.light import PyramidLight
 from service.model.sensors.sensor import CannotTell, PupilPosition
 from tests.unit.estimation.lamps import beam, counts_of, flao, gaussian
 from tests.unit.model.sensors.test_pyramid_light_illumination import at
+
+LIGHT = PyramidLight(instrument=flao())
 
 SHIFT = (-0.4, 0.3)
 HERE = at(*SHIFT)
@@ -48,7 +50,7 @@ def shaded(angles, turn_deg: float, width: float = WIDTH_SUBAP):
 
 
 def seen_through(light):
-    return relative_light(counts_of(flao(), SHIFT, light), flao(), HERE)
+    return LIGHT.relative(counts_of(flao(), SHIFT, light), HERE)
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, -11.0, 24.7])
@@ -78,7 +80,7 @@ def test_arms_unevenly_spread_tell_it_over_a_full_turn(turn_deg):
 
 @pytest.mark.parametrize("turn_deg", [-30.0, 65.0])
 def test_uneven_light_tells_it_against_a_map_of_another_day(turn_deg):
-    before = measure_illumination(counts_of(flao(), light=beam(gaussian)), flao(), at())
+    before = LIGHT.illumination(counts_of(flao(), light=beam(gaussian)), at())
     light, known = seen_through(turned(gaussian, turn_deg))
     found = find_rotation(light, known, HERE, before)
     assert isinstance(found, LightRotation), found

@@ -117,84 +117,112 @@ class PyramidLight:
         return np.ascontiguousarray(sides).reshape(4, n, n)
 
     def find_pupil(self, counts: NDArray[Any]) -> PupilPosition | CannotTell:
-        """Return the position of the pupil images."""
-        return find_pupil(counts, self.instrument)
+        """Return the position of the pupil images in the mean counts ``(4, n, n)``.
+
+        The axes are those of conventions.md, the images in row-major order of their place on the
+        detector.
+
+        Raises
+        ------
+        ModelError
+            If the counts are not four images of the instrument's size.
+        """
+        images, _ = repair_pixels(counts, self.instrument)
+        light = float(images.mean())
+        if not light > 0.0:
+            return CannotTell(reason=f"no light: the mean count is {light:g}; open the shutter")
+        images = images / light
+        optics = build_even_optics(self.instrument)
+        try:
+            start = _first_guess(images, build_even_optics(self.instrument, 1))
+            position, steps, formal, residual = _settle_position(images, optics, start)
+        except np.linalg.LinAlgError:
+            return CannotTell(reason="the light has no edge the position could be read from")
+        if residual > _MAX_RESIDUAL:
+            return CannotTell(
+                reason=f"the light is not that of the instrument's pupil: {residual:.0%} of it "
+                f"remain unexplained, expected at most {_MAX_RESIDUAL:.0%}; check the mask, the "
+                "pupil diameter and the obscuration"
+            )
+        # The four images are four independent measurements of one position.
+        scatter = steps.std(axis=0, ddof=1) / np.sqrt(len(steps))
+        sigma = np.sqrt(scatter**2 + (formal**2).mean(axis=0) / len(steps) + _FLOOR_SUBAP**2)
+        if not np.all(sigma < _LARGEST_SIGMA_SUBAP):
+            return CannotTell(
+                reason=f"the four images disagree by {scatter.max() * 2:.1f} subapertures; "
+                "check that each is cut out of the frame at its own place"
+            )
+        return PupilPosition(at=_pair(position), sigma=_pair(sigma))
 
     def find_image_offsets(self, counts: NDArray[Any]) -> ImageOffsets | CannotTell:
-        """Return the displacement of each pupil image from its place on the pixel grid."""
-        return find_image_offsets(counts, self.instrument)
+        """Return the displacement of each pupil image in the mean counts ``(4, n, n)``.
+
+        Displacements stated in the instrument file are not used. Axes and order are those of
+        ``find_pupil``. A displacement common to all four images is a shift and is not included.
+
+        Raises
+        ------
+        ModelError
+            If the counts are not four images of the instrument's size.
+        """
+        wfs = replace(pyramid_in(self.instrument), image_offsets_subap=None)
+        on_grid = replace(self.instrument, wfs=wfs)
+        pupil = PyramidLight(instrument=on_grid).find_pupil(counts)
+        if isinstance(pupil, CannotTell):
+            return pupil
+        found = _locate_images(counts, on_grid, np.tile(pupil.at, (4, 1)), _FLUX_SAMPLING)
+        if isinstance(found, CannotTell):
+            return found
+        places, formal, _ = found
+        sigma = np.hypot(formal, _OFFSET_FLOOR_SUBAP)
+        return ImageOffsets(subap=places - places.mean(axis=0), sigma_subap=sigma)
 
     def illumination(self, counts: NDArray[Any], position: PupilPosition) -> Illumination:
-        """Return how evenly the beam is lit."""
-        return measure_illumination(counts, self.instrument, position)
+        """Return how evenly the beam is lit, from the mean counts ``(4, n, n)``.
+
+        Each image is divided by that of an even beam at the same place, diffraction included; the
+        median of the four is robust to bad pixels and, to first order, to static aberrations, which
+        move light from one image to another. Its mean over the pupil is 1. Diffraction scatters
+        light from the bright part of the beam into the dark one, so the map is corrected once by
+        the images that its own light would make. More corrections would amplify what the
+        aberrations left.
+
+        Raises
+        ------
+        ModelError
+            If the counts are not four images of the instrument's size, or dark.
+        """
+        images, _ = repair_pixels(counts, self.instrument)
+        if not images.mean() > 0.0:
+            raise ModelError("illumination: found no light; expected the mean counts of the images")
+        optics = build_even_optics(self.instrument)
+        even = compute_even_images(optics, position.at)
+        lit = _lit_part(even)
+        share = _excess(images, even, lit)
+        beam = _beam(_fill_outside(share, lit), position)
+        if not beam.intensity.any():
+            return beam
+        shown = compute_even_images(replace(optics, pupil=optics.pupil.lit_by(beam)), position.at)
+        return _beam(_fill_outside(share * _excess(images, shown, lit), lit), position)
 
     def relative(
         self, counts: NDArray[Any], position: PupilPosition
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """Return the light over that of an even beam, and where it is known."""
-        return relative_light(counts, self.instrument, position)
+        """Return the light relative to an even beam, ``(n, n)`` on the sensor, and the known part.
 
+        The map is not smoothed: sharp structure in it, such as a spider's shadow, determines the
+        rotation.
 
-def find_pupil(counts: NDArray[Any], instrument: Instrument) -> PupilPosition | CannotTell:
-    """Return the position of the pupil images in the mean counts ``(4, n, n)``.
-
-    The axes are those of conventions.md, the images in row-major order of their place on the
-    detector.
-
-    Raises
-    ------
-    ModelError
-        If the counts are not four images of the instrument's size.
-    """
-    images, _ = repair_pixels(counts, instrument)
-    light = float(images.mean())
-    if not light > 0.0:
-        return CannotTell(reason=f"no light: the mean count is {light:g}; open the shutter")
-    images = images / light
-    optics = build_even_optics(instrument)
-    try:
-        start = _first_guess(images, build_even_optics(instrument, 1))
-        position, steps, formal, residual = _settle_position(images, optics, start)
-    except np.linalg.LinAlgError:
-        return CannotTell(reason="the light has no edge the position could be read from")
-    if residual > _MAX_RESIDUAL:
-        return CannotTell(
-            reason=f"the light is not that of the instrument's pupil: {residual:.0%} of it remain "
-            f"unexplained, expected at most {_MAX_RESIDUAL:.0%}; check the mask, the pupil "
-            "diameter and the obscuration"
-        )
-    # The four images are four independent measurements of one position.
-    scatter = steps.std(axis=0, ddof=1) / np.sqrt(len(steps))
-    sigma = np.sqrt(scatter**2 + (formal**2).mean(axis=0) / len(steps) + _FLOOR_SUBAP**2)
-    if not np.all(sigma < _LARGEST_SIGMA_SUBAP):
-        return CannotTell(
-            reason=f"the four images disagree by {scatter.max() * 2:.1f} subapertures; "
-            "check that each is cut out of the frame at its own place"
-        )
-    return PupilPosition(at=_pair(position), sigma=_pair(sigma))
-
-
-def find_image_offsets(counts: NDArray[Any], instrument: Instrument) -> ImageOffsets | CannotTell:
-    """Return the displacement of each pupil image in the mean counts ``(4, n, n)``.
-
-    Displacements stated in the instrument file are not used. Axes and order are those of
-    ``find_pupil``. A displacement common to all four images is a shift and is not included.
-
-    Raises
-    ------
-    ModelError
-        If the counts are not four images of the instrument's size.
-    """
-    on_grid = replace(instrument, wfs=replace(pyramid_in(instrument), image_offsets_subap=None))
-    pupil = find_pupil(counts, on_grid)
-    if isinstance(pupil, CannotTell):
-        return pupil
-    found = _locate_images(counts, on_grid, np.tile(pupil.at, (4, 1)), _FLUX_SAMPLING)
-    if isinstance(found, CannotTell):
-        return found
-    places, formal, _ = found
-    sigma = np.hypot(formal, _OFFSET_FLOOR_SUBAP)
-    return ImageOffsets(subap=places - places.mean(axis=0), sigma_subap=sigma)
+        Raises
+        ------
+        ModelError
+            If the counts are not four images of the instrument's size.
+        """
+        images, _ = repair_pixels(counts, self.instrument)
+        even = compute_even_images(build_even_optics(self.instrument), position.at)
+        lit = _lit_part(even)
+        share = images.sum(axis=0) / np.where(lit, even.sum(axis=0), 1.0)
+        return np.where(lit, share / share[lit].mean(), 1.0), lit
 
 
 def image_places(counts: NDArray[Any], instrument: Instrument) -> Array | CannotTell:
@@ -401,56 +429,6 @@ _RIDGE = 1e-3
 _SPREAD_SUBAP = 1.0
 _MARGIN = 4
 """Subapertures around the sensor's grid: the pupil may have moved when the map is used."""
-
-
-def measure_illumination(
-    counts: NDArray[Any], instrument: Instrument, position: PupilPosition
-) -> Illumination:
-    """Return how evenly the beam is lit, from the mean counts ``(4, n, n)``.
-
-    Each image is divided by that of an even beam at the same place, diffraction included; the
-    median of the four is robust to bad pixels and, to first order, to static aberrations, which
-    move light from one image to another. Its mean over the pupil is 1. Diffraction scatters light
-    from the bright part of the beam into the dark one, so the map is corrected once by the images
-    that its own light would make. More corrections would amplify what the aberrations left.
-
-    Raises
-    ------
-    ModelError
-        If the counts are not four images of the instrument's size, or dark.
-    """
-    images, _ = repair_pixels(counts, instrument)
-    if not images.mean() > 0.0:
-        raise ModelError("illumination: found no light; expected the mean counts of the images")
-    optics = build_even_optics(instrument)
-    even = compute_even_images(optics, position.at)
-    lit = _lit_part(even)
-    share = _excess(images, even, lit)
-    beam = _beam(_fill_outside(share, lit), position)
-    if not beam.intensity.any():
-        return beam
-    shown = compute_even_images(replace(optics, pupil=optics.pupil.lit_by(beam)), position.at)
-    return _beam(_fill_outside(share * _excess(images, shown, lit), lit), position)
-
-
-def relative_light(
-    counts: NDArray[Any], instrument: Instrument, position: PupilPosition
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the light relative to an even beam, ``(n, n)`` on the sensor, and the known part.
-
-    The map is not smoothed: sharp structure in it, such as a spider's shadow, determines the
-    rotation.
-
-    Raises
-    ------
-    ModelError
-        If the counts are not four images of the instrument's size.
-    """
-    images, _ = repair_pixels(counts, instrument)
-    even = compute_even_images(build_even_optics(instrument), position.at)
-    lit = _lit_part(even)
-    share = images.sum(axis=0) / np.where(lit, even.sum(axis=0), 1.0)
-    return np.where(lit, share / share[lit].mean(), 1.0), lit
 
 
 def _lit_part(even: Array) -> NDArray[np.bool_]:

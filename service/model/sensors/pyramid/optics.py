@@ -20,13 +20,13 @@ from typing_extensions import override
 from service.errors import ModelError
 from service.model.arrays import NUMPY, Arrays, Foreign
 from service.model.kinds import Normalisation, SignalKind
-from service.model.local import LocalShapes, Shapes
+from service.model.local import LocalShapes, MadeElsewhere, Shapes
 from service.model.pupil import PupilGrid, gauss_legendre
 from service.model.sensors.pyramid.description import Pyramid
 from service.model.sensors.pyramid.few import FewShapes
 from service.model.sensors.pyramid.tiles import TiledResponse
 from service.model.sensors.pyramid.working_point import Halo
-from service.model.sensors.sensor import Mapper, RowsElsewhere, RowTask
+from service.model.sensors.sensor import Mapper, RowTask
 from service.model.slopes import PLAIN, SlopeRecipe
 
 Array = NDArray[Any]
@@ -615,19 +615,13 @@ class RowResponse(RowTask):
 
     @property
     @override
-    def elsewhere(self) -> RowsElsewhere | None:
-        """From what another process makes the same, where shapes can be drawn there."""
-        drawing = self.shapes.drawing if isinstance(self.shapes, LocalShapes) else None
-        if drawing is None:
+    def elsewhere(self) -> MadeElsewhere | None:
+        """How another process makes the same, if it can make the shapes."""
+        shapes = self.shapes.elsewhere if isinstance(self.shapes, LocalShapes) else None
+        if shapes is None:
             return None
-        make = partial(
-            _of_model,
-            draw=drawing.draw,
-            shift=self.shift,
-            nodes_y=self.nodes_y,
-            nodes_x=self.nodes_x,
-        )
-        return RowsElsewhere(parts=drawing.parts, prepare=drawing.prepare, make=make)
+        where = {"shift": self.shift, "nodes_y": self.nodes_y, "nodes_x": self.nodes_x}
+        return replace(shapes, make=partial(_of_model, shapes_of=shapes.make, **where))
 
     @override
     def __getstate__(self) -> dict[str, object]:
@@ -635,10 +629,10 @@ class RowResponse(RowTask):
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
-def _of_model(model: Any, *, draw: Callable[[Any], Shapes], **where: Any) -> RowResponse:  # noqa: ANN401 - a model of its own
-    """Return rows of a model's pyramid, of the shapes that can be drawn of it."""
+def _of_model(model: Any, *, shapes_of: Callable[[Any], Shapes], **where: Any) -> RowResponse:  # noqa: ANN401 - a model of its own
+    """Return rows of a model's pyramid, of the shapes that can be made of it."""
     optics = model.sensor.optics
-    return RowResponse(optics=optics, valid=model.valid, shapes=draw(model), **where)
+    return RowResponse(optics=optics, valid=model.valid, shapes=shapes_of(model), **where)
 
 
 def enough_modulation_points(wfs: Pyramid) -> int:

@@ -19,7 +19,7 @@ from service.model.misregistration import Misregistration
 from service.model.pupil import instrument_pupil
 from service.model.sensors.model import SensorModel
 from service.model.sensors.pyramid.description import Pyramid
-from service.model.sensors.pyramid.light import find_pupil, repair_pixels
+from service.model.sensors.pyramid.light import PyramidLight, repair_pixels
 from service.model.sensors.pyramid.model import PyramidModel
 from service.model.sensors.pyramid.optics import Nodes, PyramidOptics, enough_modulation_points
 from service.model.sensors.pyramid.signals import pixel_places
@@ -36,6 +36,8 @@ from tests.unit.estimation.lamps import (
     small,
     with_diameter,
 )
+
+LIGHT = PyramidLight(instrument=flao())
 
 N_MANY = 30
 """Shapes of a sensor of 20 subapertures for which the gradient at every point is computed."""
@@ -142,7 +144,7 @@ def test_single_precision_is_good_to_a_few_parts_in_a_million():
 
 
 def found_in(counts, instrument=None) -> PupilPosition:
-    found = find_pupil(counts, instrument or flao())
+    found = PyramidLight(instrument=instrument or flao()).find_pupil(counts)
     assert isinstance(found, PupilPosition), found
     return found
 
@@ -189,30 +191,30 @@ def test_images_that_disagree_widen_the_uncertainty():
 
 
 def test_darkness_tells_nothing():
-    found = find_pupil(np.zeros((4, 30, 30)), flao())
+    found = LIGHT.find_pupil(np.zeros((4, 30, 30)))
     assert isinstance(found, CannotTell)
     assert "no light" in found.reason
 
 
 def test_frames_of_nan_tell_nothing():
-    assert isinstance(find_pupil(np.full((4, 30, 30), np.nan), flao()), CannotTell)
+    assert isinstance(LIGHT.find_pupil(np.full((4, 30, 30), np.nan)), CannotTell)
 
 
 def test_another_instruments_pupil_is_not_taken_for_this_ones():
     counts = counts_of(with_diameter(flao(), 18.0))
-    found = find_pupil(counts, flao())
+    found = LIGHT.find_pupil(counts)
     assert isinstance(found, CannotTell)
     assert "unexplained" in found.reason
 
 
 def test_light_without_a_pupil_tells_nothing():
     noise = np.random.default_rng(3).exponential(100.0, size=(30, 30))
-    assert isinstance(find_pupil(np.tile(noise, (4, 1, 1)), flao()), CannotTell)
+    assert isinstance(LIGHT.find_pupil(np.tile(noise, (4, 1, 1))), CannotTell)
 
 
 def test_counts_of_another_size_are_refused():
     with pytest.raises(ModelError, match=r"found counts \(4, 12, 12\); expected \(4, 30, 30\)"):
-        find_pupil(np.ones((4, 12, 12)), flao())
+        LIGHT.find_pupil(np.ones((4, 12, 12)))
 
 
 # --- the sensor

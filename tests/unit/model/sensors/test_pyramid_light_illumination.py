@@ -8,10 +8,12 @@ import pytest
 from service.errors import ModelError
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
-from service.model.sensors.pyramid.light import find_pupil, measure_illumination, relative_light
+from service.model.sensors.pyramid.light import PyramidLight
 from service.model.sensors.sensor import PupilPosition
 from tests.numerics import small_basis
 from tests.unit.estimation.lamps import beam, counts_of, flao, fringes, gaussian, small
+
+LIGHT = PyramidLight(instrument=flao())
 
 
 def at(x: float = 0.0, y: float = 0.0) -> PupilPosition:
@@ -31,7 +33,7 @@ def inside(illumination, function, radius: float = 13.0):
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (-0.92, 0.35)])
 def test_a_fibres_beam_is_found_whatever_the_images_have_moved(shift):
     """0.012: scattered light hides little of its unevenness of 16 % after one correction."""
-    found = measure_illumination(counts_of(flao(), shift, beam(gaussian)), flao(), at(*shift))
+    found = LIGHT.illumination(counts_of(flao(), shift, beam(gaussian)), at(*shift))
     measured, true = inside(found, gaussian)
     assert np.std(true) > 0.1
     assert np.std(measured - true) < 0.012
@@ -44,28 +46,28 @@ def test_a_beam_that_fades_to_a_third_is_known_at_its_rim():
         return 1.0 - 0.7 * (x**2 + y**2) / 15.0**2 + 0.1 * x / 15.0
 
     light = beam(lambda x, y: np.maximum(fading(x, y), 0.05))
-    found = measure_illumination(counts_of(flao(), light=light), flao(), at())
+    found = LIGHT.illumination(counts_of(flao(), light=light), at())
     measured, true = inside(found, fading, radius=15.0)
     assert np.std(measured - true) < 0.15 * np.std(true)
 
 
 def test_an_even_beam_is_found_even():
     """0.01: ripples of a pupil sampled more finely than the map's own."""
-    found = measure_illumination(counts_of(flao()), flao(), at())
+    found = LIGHT.illumination(counts_of(flao()), at())
     measured, _ = inside(found, lambda x, y: np.ones_like(x + y))
     assert np.std(measured) < 0.01
 
 
 def test_bad_pixels_leave_no_trace():
     counts = counts_of(flao(), light=beam(gaussian))
-    clean = measure_illumination(counts, flao(), at())
+    clean = LIGHT.illumination(counts, at())
     counts[1, 10, 10], counts[2, 16, 20] = 0.0, 1e5
-    damaged = measure_illumination(counts, flao(), at())
+    damaged = LIGHT.illumination(counts, at())
     np.testing.assert_allclose(damaged.intensity, clean.intensity, atol=0.02)
 
 
 def test_the_light_goes_on_smoothly_beyond_the_outline():
-    found = measure_illumination(counts_of(flao(), light=beam(gaussian)), flao(), at())
+    found = LIGHT.illumination(counts_of(flao(), light=beam(gaussian)), at())
     steps = np.abs(np.diff(found.intensity, axis=0))
     assert found.intensity.min() > 0.2
     assert steps.max() < 0.15
@@ -76,9 +78,9 @@ def test_the_matrix_of_an_uneven_beam_is_nearer_with_the_light_that_was_measured
     light, shift = beam(fringes, size=60), (0.3, -0.2)
     alpha = Misregistration(shift_x_subap=shift[0], shift_y_subap=shift[1])
     counts = counts_of(small(), shift, light)
-    position = find_pupil(counts, small())
+    position = PyramidLight(instrument=small()).find_pupil(counts)
     assert isinstance(position, PupilPosition)
-    measured = measure_illumination(counts, small(), position)
+    measured = PyramidLight(instrument=small()).illumination(counts, position)
 
     def matrix(illumination):
         model = InteractionModel(small(), small_basis(), illumination=illumination)
@@ -93,7 +95,7 @@ def test_the_matrix_of_an_uneven_beam_is_nearer_with_the_light_that_was_measured
 
 
 def test_where_the_light_is_not_known_is_said():
-    light, known = relative_light(counts_of(flao()), flao(), at())
+    light, known = LIGHT.relative(counts_of(flao()), at())
     n = np.arange(30) - 14.5
     radius = np.hypot(n[:, None], n)
     assert not known[radius > 15.6].any()
@@ -103,9 +105,9 @@ def test_where_the_light_is_not_known_is_said():
 
 def test_darkness_lights_nothing():
     with pytest.raises(ModelError, match="no light"):
-        measure_illumination(np.zeros((4, 30, 30)), flao(), at())
+        LIGHT.illumination(np.zeros((4, 30, 30)), at())
 
 
 def test_counts_of_another_size_are_refused():
     with pytest.raises(ModelError, match=r"expected \(4, 30, 30\)"):
-        relative_light(np.zeros((4, 3, 3)), flao(), at())
+        LIGHT.relative(np.zeros((4, 3, 3)), at())

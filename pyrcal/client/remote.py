@@ -94,7 +94,7 @@ class Request(NamedTuple):
 
 
 def _reads(
-    name: str, purpose: str, path: str, *every: Words, by: str = "reading", example: str
+    name: str, purpose: str, path: str, *every: Words, by: str = "reading", example: str = ""
 ) -> Request:
     return Request(name, purpose, by, f"GET {path}", every, example=example)
 
@@ -164,10 +164,10 @@ GROUPS = {
 """Purposes of the commands that are groups of others."""
 
 REQUESTS = (
-    _reads("status", "show the state of the service on one screen", "/v1/state", example=""),
-    _reads("watch", "show state and log live, until Ctrl-C", "/v1/stream", by="watch", example=""),
+    _reads("status", "show the state of the service on one screen", "/v1/state"),
+    _reads("watch", "show state and log live, until Ctrl-C", "/v1/stream", by="watch"),
     _reads("alpha", "show the registration with 1 sigma", "/v1/alpha", example="--json"),
-    _reads("alarms list", "list the alarms, and what to do about each", "/v1/state", example=""),
+    _reads("alarms list", "list the alarms, and what to do about each", "/v1/state"),
     _orders(
         "alarms ack",
         "acknowledge an alarm; it stays until its cause is gone",
@@ -183,11 +183,7 @@ REQUESTS = (
         example="margin 3600 --why 'seen, lowering the gain'",
     ),
     _orders(
-        "alarms unmute",
-        "show a muted alarm again",
-        _ALARM,
-        operation="unmute",
-        example="margin",
+        "alarms unmute", "show a muted alarm again", _ALARM, operation="unmute", example="margin"
     ),
     _reads(
         "audit",
@@ -229,12 +225,9 @@ REQUESTS = (
         then="pyrcal resume ends the stop",
         example="--why 'dome closing'",
     ),
-    _orders("resume", "end the stop; mode and dither are then as before", example=""),
+    _orders("resume", "end the stop; mode and dither are then as before"),
     _reads(
-        "reconstructors list",
-        "list the reconstructors; * marks the one in use",
-        RECONSTRUCTORS,
-        example="",
+        "reconstructors list", "list the reconstructors; * marks the one in use", RECONSTRUCTORS
     ),
     _reads(
         "reconstructors show",
@@ -300,7 +293,6 @@ REQUESTS = (
         operation="loop",
         always={"loop": "closed"},
         asks="close the loop",
-        example="",
     ),
     _orders(
         "loop acquire",
@@ -313,11 +305,7 @@ REQUESTS = (
         example="--why 'mirror was exchanged'",
     ),
     _orders(
-        "loop abort",
-        "end the acquisition",
-        operation="acquisition",
-        always={"action": "abort"},
-        example="",
+        "loop abort", "end the acquisition", operation="acquisition", always={"action": "abort"}
     ),
     _orders(
         "dither start",
@@ -332,13 +320,7 @@ REQUESTS = (
         always={"action": "start"},
         example="--modes 3,5 --frequency-hz 90,110 --amplitude-m 5e-9",
     ),
-    _orders(
-        "dither stop",
-        "stop the dither",
-        operation="dither",
-        always={"action": "stop"},
-        example="",
-    ),
+    _orders("dither stop", "stop the dither", operation="dither", always={"action": "stop"}),
     _orders(
         "measure matrix",
         "have the RTC measure an interaction matrix; all patterns but sine open the loop",
@@ -363,12 +345,7 @@ REQUESTS = (
         operation="give_up",
         example="im-1",
     ),
-    _reads(
-        "recordings list",
-        "list the recordings, oldest first",
-        "/v1/recordings",
-        example="",
-    ),
+    _reads("recordings list", "list the recordings, oldest first", "/v1/recordings"),
     _records(
         "recordings start",
         "record telemetry from now on, byte for byte; default one minute",

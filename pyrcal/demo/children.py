@@ -42,6 +42,7 @@ class Child:
 
     def signal(self, number: signal.Signals) -> None:
         """Send a signal to the process itself; it ends the processes that it started."""
+        # The number of a process that has ended may belong to another one.
         if self.process.poll() is None:
             self.process.send_signal(number)
 

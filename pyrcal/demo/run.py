@@ -89,6 +89,7 @@ def run_demo(options: argparse.Namespace) -> int:
     """
     service_words, sim_words = _make_commands(options)
     _check(options, sim_words)
+    # Only now, because the folder of an earlier demo is deleted.
     _prepare_directory(options.dir)
     if _is_measured(options):
         write_live_instrument(options.instrument, options.dir / LIVE_INSTRUMENT)
@@ -236,6 +237,8 @@ def _choose_ratio(options: argparse.Namespace) -> float:
         return MEASURED_RATIO
     if not _is_far(options) or _measure_load(options) is not None:
         return 1.0
+    # An end that is not worse is enough above: near the nominal registration there is little to
+    # win, and a telescope in slow motion has few seconds.
     if options.instrument == DEFAULT_INSTRUMENT:
         return FLAO_RATIO
     few = _n_modes(options) <= FEW_MODES or _find_small_diameter_m(options) is not None
@@ -289,6 +292,7 @@ def _prepare_directory(directory: Path) -> None:
         If it holds something else, or is no directory.
     """
     try:
+        # The log of an earlier demo shows that a folder is the demo's own.
         if directory.exists() and any(directory.iterdir()) and not (directory / LOG).exists():
             raise ConfigurationError(f"--dir {directory}: holds other files; name a new directory")
         shutil.rmtree(directory, ignore_errors=True)
@@ -317,6 +321,7 @@ def _make_commands(options: argparse.Namespace) -> tuple[list[str], list[str]]:
     for name in FORWARDED:
         value = getattr(options, name)
         if value is not None:
+            # In one word, because a value may begin with a minus.
             simulator.append(f"--{name}={value}")
     for name in REPEATED:
         simulator += [f"--{name}={value}" for value in getattr(options, name) or ()]

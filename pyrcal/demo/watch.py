@@ -101,6 +101,8 @@ class Stopwatch:
     @property
     def spent_s(self) -> float:
         """Seconds that count; the clock continues if the simulator stops."""
+        # Telemetry, because a slow machine shall get as much of it as a fast one. Idle time: a
+        # simulator that stopped must not keep the demo alive.
         return min(self.wall_s, self.telemetry_s + self._idle_s)
 
     @property
@@ -204,6 +206,7 @@ class TelemetryObserver:
         """Return the final figures, with the reason from the service's log if they failed."""
         self._truth.read()
         report = self.report()
+        # The service is asked for its log only where a reason is needed.
         return report if report.good else self.report(self._last_refusal())
 
     def _last_refusal(self) -> str | None:
@@ -223,6 +226,7 @@ class TelemetryObserver:
             # A process that has ended will never be ready.
             if self._endings():
                 return False
+            # Both are needed: a large simulator is ready minutes after the service, or before it.
             if last is not None and self._state is not None and MODEL not in waits(self._state):
                 self._ready_s = waited_s
                 self._frames_grown_s = time.monotonic()
@@ -238,6 +242,8 @@ class TelemetryObserver:
     def _is_over(self) -> bool:
         clock, promise = self._stopwatch, self._promise
         if clock is None or promise.seconds is None:
+            # Only the service's end ends it then: the truth file is followed across a restart of
+            # the simulator.
             return any(child.name == "service" for child in self._children if child.ended)
         # The outcome must last, because an update just before may still turn out bad.
         right_s = 0.0 if self._right_since_s is None else clock.spent_s - self._right_since_s
@@ -336,6 +342,7 @@ def live_line(seconds: float, state: View | None, truth: Line | None) -> str:
     if state is None:
         return f"{seconds:7.1f}  the service is starting"
     link, known = state["link"], state["registration"]
+    # As wide as the four numbers, so that all columns stay below their headings.
     registration = " not known yet".ljust(66)
     age = "    -"
     if known is not None:

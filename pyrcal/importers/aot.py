@@ -267,6 +267,7 @@ def places_of(places: Array, where: str) -> Array:
     MatrixError
         If they are not each of 0 to ``n_valid - 1`` once.
     """
+    # In the order of the mask's rows, which is that of pyrcal's slopes.
     listed = places[places >= 0].ravel()
     n_valid = len(listed)
     if n_valid and listed.min() == 1:

@@ -120,6 +120,7 @@ class _Folder:
 
     def _distinct(self, paths: Sequence[Path]) -> list[Path]:
         """Return the files without links to and copies of the others: ``conf`` has many."""
+        # Links first: they need no checksum, for which whole files are read.
         real = {path.resolve(): path for path in paths}
         if len(real) < 2:
             return list(real.values())
@@ -192,6 +193,7 @@ def from_cacao(folder: Path, reported: Reported, response: str | None = None) ->
     elif found.variables.get("WFSSTREAM_PROCESSED") == "ON":
         # These are reference slopes, not an image of the light.
         arrays.pop("light", None)
+    # Pokes outside the mask are left out; messages and matrix.h5 count as the files do.
     numbers = arrays.pop("numbers", None)
     reported = replace(reported, sensor=sensor)
     imported = from_arrays(f"cacao, {folder}", arrays, reported, numbers)
@@ -215,7 +217,9 @@ def _survey(folder: Path) -> _Folder:
         raise MatrixError(f"{folder}: found no folder, expected one of cacao's")
     files: dict[Path, str] = {}
     texts: list[Path] = []
+    # Sorted, so that the same files are taken on every machine.
     for number, path in enumerate(sorted(folder.rglob("*"))):
+        # A wrong folder, such as a home, would be searched for minutes.
         if number > MAX_FILES:
             raise MatrixError(
                 f"{folder}: found more than {MAX_FILES} files, expected a conf folder"
@@ -248,6 +252,7 @@ def _response(found: _Folder, requested: str | None) -> tuple[Array, _Kind]:
         kinds = [
             kind for kind in RESPONSES if re.fullmatch(rf"(?:.*[._-])?(?:{kind.response})", name)
         ]
+        # The name says what the columns are, so one of no known kind cannot be used.
         path = found.one(re.escape(name), "the response")
         if path is None or not kinds:
             names = ", ".join(sorted(set(found.files.values()))) or "no FITS file"

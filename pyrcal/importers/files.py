@@ -46,6 +46,7 @@ def calibration_of(arrays: Mapping[str, Array], where: str) -> tuple[str, Array]
         raise MatrixError(
             f"{where}: found no record of pyRTC 2 ({RECORD}), expected one, or ROLE=FILE"
         ) from error
+    # A newer format may mean something else by the same names.
     if version > FORMAT or kind not in KINDS:
         raise MatrixError(
             f"{where}: found {kind} of format {version}, expected {' or '.join(KINDS)} of format "
@@ -136,6 +137,7 @@ def from_arrays(
             f"{source}: found no matrix; expected an array named {' or '.join(ROLES['matrix'])}, "
             "or a file of its own"
         )
+    # First, because the number of modes shows which axis of the matrix is theirs.
     mirror = read_mirror(source, arrays, reported.diameter_m, notes)
     frames = read_frames(source, arrays, reported.kind)
     if frames is None:
@@ -420,6 +422,7 @@ def _sensor(reported: Reported, signals: Signals, notes: list[str]) -> dict[str,
         table["modulation_lambda_over_d"] = UNKNOWN if modulation is None else modulation
     elif reported.centroid is not None:
         table["centroid"] = reported.centroid
+    # A stated diameter is not questioned.
     if reported.pupil_diameter_subap is not None:
         return {**table, "pupil_diameter_subap": reported.pupil_diameter_subap}
     if table.get("input") != "frames":

@@ -430,6 +430,7 @@ def _is_gaussian(
     """Return True if the influence functions are the Gaussians given by the attributes."""
     if getattr(dm, "sign", 1) != 1:
         return False
+    # A sample is enough, because all are drawn by one formula.
     some = np.unique(np.linspace(0, len(places) - 1, _SAMPLED_ACTUATORS).astype(int))
     drawn = _compute_gaussians(dm, places[some].astype(float), len(functions), diameter_m)
     return bool(np.abs(drawn - functions[:, some].T).max() <= _MAX_SHAPE_DEVIATION)
@@ -492,6 +493,7 @@ def to_oopao(alpha: Misregistration, tel: Any, wfs: Any) -> dict[str, float]:  #
     subaperture_m = float(tel.D) / n_subapertures / _steps(tel)
     # OOPAO applies the stretch first, then the rotation
     stretch = rotation(alpha.rotation_rad).T @ alpha.image
+    # eigh sorts by size: the larger scale is called radial, and the angle is that of its axis.
     (tangential, radial), axes = np.linalg.eigh((stretch + stretch.T) / 2)
     return {
         "rotationAngle": float(np.rad2deg(alpha.rotation_rad)),

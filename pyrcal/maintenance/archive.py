@@ -96,6 +96,7 @@ def _show(archive: Archive, every: tuple[Item, ...], product_id: str, *, as_json
         )
     store = next(store for store in archive.stores if store.noun == item.kind)
     record = next((record for record in store.records() if record.id == product_id), None)
+    # The numbers are read as well, because the index does not know of damage.
     damage = next(verify(archive, [item]))
     document: dict[str, Any] = {
         **asdict(item),

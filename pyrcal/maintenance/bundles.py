@@ -68,6 +68,7 @@ def _read_product(
     """Return an archived product, the requested companion products, and its basis."""
     with open_hdf5(path) as file:
         names = {RECONSTRUCTOR: RECONSTRUCTOR, **_COMPANION_ARRAYS}
+        # Gains and covariance are not of every product: the RTC's own matrix has none.
         arrays = {name: np.asarray(file[at][()]) for name, at in names.items() if at in file}
         provenance = {
             key: value.item() if isinstance(value, np.generic) else value
@@ -80,6 +81,7 @@ def _read_product(
             f"{record.id}: was made for {made_for}; found the instrument {instrument.name}: give "
             "its own with --instrument"
         )
+    # The archive has no basis: it follows from the instrument, whose checksum is in the bundle.
     basis = cached_basis(instrument)
     if isinstance(basis, ModalBasis):
         arrays["mode_to_actuator"] = np.asarray(basis.mode_to_actuator)
@@ -104,6 +106,7 @@ def _record_in(path: Path) -> ReconstructorRecord:
             stated, found = file.attrs["sha256"], checksum(np.asarray(file[RECONSTRUCTOR][()]))
     except NOT_UNDERSTOOD as error:
         raise ArchiveError(f"{path}: no archived reconstructor: {error}") from error
+    # The file may have left the archive, whose reading would have compared them.
     if found != stated:
         raise ArchiveError(f"{path}: damaged: found checksum {found}, expected {stated}")
     return record

@@ -108,6 +108,7 @@ def _make_certificate(
 ) -> Signed:
     """Return a certificate of a role; only the service's accepts connections."""
     key = ec.generate_private_key(ec.SECP256R1())
+    # Names of a host matter where somebody connects to it: only at the service.
     serves = role is LinkRole.SERVICE
     # Every role presents its certificate to the router, which the service is.
     usages = [Usage.CLIENT_AUTH, *([Usage.SERVER_AUTH] if serves else [])]

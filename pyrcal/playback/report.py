@@ -133,6 +133,7 @@ def _scatter(entries: Sequence[HistoryEntry]) -> list[str]:
     if len(entered) < MIN_WINDOWS:
         return ["too few"] * len(PARAMETERS)
     measured = np.array([entry.measured.vector for entry in entered])
+    # The difference of two windows has twice the variance of one.
     scatter = np.sqrt(np.mean(np.diff(measured, axis=0) ** 2, axis=0) / 2.0)
     stated_sigma = np.sqrt(np.mean([entry.measured_sigma**2 for entry in entered], axis=0))
     return [f"{ratio:.2f}" for ratio in scatter / stated_sigma]
@@ -151,6 +152,7 @@ def _list_problems(track: Track) -> list[str]:
     ]
     names: Counter[str] = Counter()
     texts: dict[str, str] = {}
+    # One line for each kind: the last text is the most recent one.
     for entry in track.lines:
         if entry.level in {Level.WARNING, Level.ALARM} and entry.name not in led_to:
             names[entry.name] += 1

@@ -100,8 +100,11 @@ def _reads(
 
 
 def _orders(name: str, purpose: str, *every: Words, operation: str = "", **more: Any) -> Request:  # noqa: ANN401
-    """Return the command of an order in the service's table, by default the one of its name."""
-    order = ORDERS[operation or name]
+    """Return the command of an order in the service's table.
+
+    By default that is the order of its last word, or of its first one, which is the group's.
+    """
+    order = ORDERS[operation or next(word for word in reversed(name.split()) if word in ORDERS)]
     kind = order["command"]
     if not isinstance(kind, str):
         kind = kind[more.get("always", {}).get("action", "start")]
@@ -179,12 +182,9 @@ REQUESTS = (
         "alarms mute",
         "hide an alarm for a time; what it forbids stays forbidden",
         *(_ALARM, words("for_s SECONDS", "up to 43200 (twelve hours)", type=float)),
-        operation="mute",
         example="margin 3600 --why 'seen, lowering the gain'",
     ),
-    _orders(
-        "alarms unmute", "show a muted alarm again", _ALARM, operation="unmute", example="margin"
-    ),
+    _orders("alarms unmute", "show a muted alarm again", _ALARM, example="margin"),
     _reads(
         "audit",
         "list who ordered what, why, and the outcome",
@@ -247,7 +247,6 @@ REQUESTS = (
         "reconstructors approve",
         "send the proposed reconstructor to the RTC",
         *(_CANDIDATE, _NO_WAIT),
-        operation="approve",
         asks="send it to the RTC",
         example="--why 'margin restored'",
     ),
@@ -255,7 +254,6 @@ REQUESTS = (
         "reconstructors reject",
         "discard the proposed reconstructor",
         _CANDIDATE,
-        operation="reject",
         needs_why=True,
         example="--why 'alpha is not plausible'",
     ),
@@ -263,7 +261,6 @@ REQUESTS = (
         "reconstructors publish",
         "send a reconstructor again that was in use or proposed before",
         *(_ID, _NO_WAIT),
-        operation="publish",
         asks="send it to the RTC again",
         example="previous",
     ),
@@ -272,7 +269,6 @@ REQUESTS = (
         "send the previous reconstructor again; the mode becomes hold",
         words("--anyway", "even if the stability check refuses it", default=None),
         _NO_WAIT,
-        operation="rollback",
         asks="go back to the previous reconstructor; the mode becomes hold",
         needs_why=True,
         then="pyrcal mode propose, or auto, ends mode hold",
@@ -281,7 +277,6 @@ REQUESTS = (
     _orders(
         "loop open",
         "have the RTC open the loop",
-        operation="loop",
         always={"loop": "open"},
         permitted="open_loop",
         asks="open the loop; the image is lost",
@@ -290,7 +285,6 @@ REQUESTS = (
     _orders(
         "loop close",
         "have the RTC close the loop",
-        operation="loop",
         always={"loop": "closed"},
         asks="close the loop",
     ),
@@ -316,10 +310,10 @@ REQUESTS = (
             choices=("sine", "binary"),
         ),
         *(_MODES, _EACH, _LINES, _TOTAL, _LASTS, _OVER),
-        operation="dither",
         always={"action": "start"},
         example="--modes 3,5 --frequency-hz 90,110 --amplitude-m 5e-9",
     ),
+    # Named, because "stop" is an order of its own.
     _orders("dither stop", "stop the dither", operation="dither", always={"action": "stop"}),
     _orders(
         "measure matrix",
@@ -327,7 +321,6 @@ REQUESTS = (
         words("--pattern NAME", "push-pull-modal, hadamard, sine, ..."),
         words("--n-average N", "pushes and pulls of each mode", type=int),
         *(_MODES, _EACH, _LINES, _LASTS, _NO_WAIT),
-        operation="measure",
         asks="have the RTC measure; all patterns but sine open the loop",
         example="--pattern sine --modes controlled",
     ),

@@ -181,6 +181,7 @@ def _reasons(state: View | None, circumstances: Circumstances) -> Iterator[str]:
         return
     if circumstances.silent_s > MAX_SILENCE_S:
         yield f"the simulator has made nothing for {circumstances.silent_s:.0f} s"
+    # A service that does not answer says nothing of frames.
     if circumstances.unanswered_s <= MAX_SILENCE_S:
         yield from _explain_missing_frames(state, circumstances.frameless_s)
     for alarm in state["alarms"]:
@@ -292,7 +293,8 @@ def _judge(report: Report, circumstances: Circumstances) -> None:
                 f"{swap['frames_skipped']} frames skipped at the swap to {swap['cm_id']}"
             )
     # A slow machine is given more time instead.
-    report.failures += [f"alarm {text}" for text in report.alarms if not _is_slowness(text)]
+    slowness = f"{WORKER_BEHIND}: "
+    report.failures += [f"alarm {text}" for text in report.alarms if not text.startswith(slowness)]
 
 
 def _failures(report: Report, circumstances: Circumstances) -> list[str]:
@@ -349,11 +351,6 @@ def _estimate_failures(report: Report, across_subap: float) -> list[str]:
         if abs(report.error_in_sigma[name]) > MAX_ERROR_IN_SIGMA:
             failures.append(f"{name} is off by {report.error_in_sigma[name]:+.1f} sigma")
     return failures
-
-
-def _is_slowness(alarm: str) -> bool:
-    """Return True if an alarm only reports a slow machine, which is not a failure."""
-    return alarm.startswith(f"{WORKER_BEHIND}: ")
 
 
 def _has_recovered(start: float | None, first: float | None) -> bool:

@@ -8,7 +8,6 @@ import shutil
 import socket
 import subprocess
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +17,7 @@ from pyrcal.demo.children import interrupt_on_end, run_children
 from pyrcal.demo.report import table
 from pyrcal.demo.truth import TruthFile
 from pyrcal.demo.watch import REQUEST_TIMEOUT_S, USUAL_RATE_HZ, Promise, TelemetryObserver
+from pyrcal.fitting.figures import check_plots
 from service.errors import ConfigurationError, shown
 from service.instrument.schema import (
     AboutTable,
@@ -257,8 +257,8 @@ def _check(options: argparse.Namespace, sim_words: list[str]) -> None:
     for name, file in (("--json", options.json), ("--plot", options.plot)):
         if file is not None and (file.is_dir() or not file.absolute().parent.is_dir()):
             raise ConfigurationError(f"{name} {file}: expected a file in a folder that exists")
-    if options.plot is not None and find_spec("matplotlib") is None:
-        raise ConfigurationError("--plot: found no matplotlib; expected the extra 'plots'")
+    if options.plot is not None:
+        check_plots()
     if options.port == options.zenoh_port:
         raise ConfigurationError(f"--port and --zenoh-port: both {options.port}, expected two")
     # Tried now, because the service would report an occupied port only after its start.

@@ -144,7 +144,8 @@ class Arrays:
             yield _matrix_message(matrix, status)
         every = max(1, round(STATUS_S * status.frame_rate_hz))
         last_status, unusable = -1, np.zeros(0, np.intp)
-        for start, stop in _batches(seq, _frames_at_once(n_slopes + 2 * n_modes)):
+        n_at_once = max(1, min(FRAMES_PER_BATCH, BATCH_LIMIT // (4 * (n_slopes + 2 * n_modes))))
+        for start, stop in _batches(seq, n_at_once):
             rows = self._rows(start, stop, n_modes)
             # A comparison with NaN is false, so it is left out as well.
             usable = np.all(np.abs(rows) <= MAX_NUMBER, axis=1)
@@ -435,10 +436,6 @@ def _status_message(status: Status, seq: int, since: int) -> Message:
     seconds = since / status.frame_rate_hz
     later_status = replace(status, seq=seq, t_ns=status.t_ns + round(seconds * SECOND_NS))
     return Message(seconds, RecordedKind.STATUS, encode(later_status))
-
-
-def _frames_at_once(n_columns: int) -> int:
-    return max(1, min(FRAMES_PER_BATCH, BATCH_LIMIT // (4 * n_columns)))
 
 
 def _runs(usable: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:

@@ -193,14 +193,11 @@ class Matrices(Background):
         if refusal:
             _log.info("reconstructor.not-taken", id=manifest.id, reason=refusal)
             return
-        if self._is_in_use(manifest):
+        active = self._computer.reconstructor.manifest
+        if (active.id, active.layout.sha256) == (manifest.id, manifest.layout.sha256):
             return
         self._execute(self._staging.commit(manifest, time.monotonic()))
         self._fetch(manifest.id, tuple(range(manifest.layout.n_chunks)))
-
-    def _is_in_use(self, manifest: Manifest) -> bool:
-        active = self._computer.reconstructor.manifest
-        return (active.id, active.layout.sha256) == (manifest.id, manifest.layout.sha256)
 
     def _fetch(self, matrix_id: str, chunks: tuple[int, ...]) -> None:
         for index in chunks:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pyrcal.fitting.figures import check_plots, map_to_sensor, mirror_outline
+from pyrcal.fitting.figures import check_plots, map_to_sensor, mirror_outline, save_figure
 from pyrcal.instruments.schema_texts import KeyText, TableText, tables_of
 from pyrcal.terminal import print_lines, span
 from service.control.reconstructor import MAX_CONDITION, invert
@@ -213,10 +213,7 @@ def write_drawing(instrument: Instrument, path: Path) -> None:
         ylim=(-reach, reach),
         aspect="equal",
     )
-    try:
-        figure.savefig(path, dpi=110)
-    except (OSError, ValueError) as error:
-        raise ConfigurationError(f"cannot write {path}: {error}") from error
+    save_figure(figure, path)
 
 
 USABLE, WRONG = 0, 1

@@ -16,7 +16,7 @@ from service.archive.serialisation import NOT_UNDERSTOOD, from_json, to_json
 from service.config import Settings
 from service.errors import ArchiveError, ConfigurationError, UnknownIdError, say, shown
 from service.files.bundle import RECONSTRUCTOR, Bundle, read_bundle, write_bundle
-from service.files.container import NUMPY_DAMAGE
+from service.files.container import opened
 from service.files.disk_cache import cached_basis
 from service.files.documents import json_text
 from service.files.whole import open_hdf5
@@ -148,10 +148,9 @@ def _interaction_matrix(
 
 
 def _reference(path: Path, n_slopes: int) -> NDArray[np.float32]:
-    try:
-        found = np.load(path, allow_pickle=False)
-    except NUMPY_DAMAGE as error:
-        raise ConfigurationError(f"--reference {path}: {error}") from error
+    with opened(path) as container:
+        # A NumPy file has one array, without a name.
+        found = next(iter(container.arrays.values())).numbers()
     if found.shape != (n_slopes,):
         raise ConfigurationError(
             f"--reference {path}: found shape {found.shape}, expected ({n_slopes},)"

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from pyrcal.fitting.figures import check_plots
 from pyrcal.playback.player import Track, to_boundary
 from pyrcal.terminal import table as aligned
-from service.errors import ConfigurationError
 from service.files.container import put_array
 from service.model.misregistration import (
     BOUNDARY_SCALE,
@@ -242,20 +241,6 @@ def fill(file: h5py.File, track: Track, source: Path) -> None:
         put_array(file, "interaction_matrix", track.noisy.matrix, "noisy, slope per metre of OPD")
         put_array(file, "noise", np.median(track.noisy.noise, axis=0), "(n_modes,) 1 sigma")
         put_array(file, "modes", np.array(track.noisy.modes), "(n_modes,) basis indices")
-
-
-def plot(track: Track, title: str, path: Path) -> None:
-    """Draw α over time, every estimator's and the filtered one.
-
-    Raises
-    ------
-    ConfigurationError
-        If the file cannot be written.
-    """
-    try:
-        draw(track, title).savefig(path, dpi=110)
-    except (OSError, ValueError) as error:
-        raise ConfigurationError(f"--plot: cannot write {path}: {error}") from error
 
 
 def draw(track: Track, title: str) -> Figure:

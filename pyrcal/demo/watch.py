@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pyrcal.client.rest import RefusedError, Service, UnreachableError
 from pyrcal.demo.children import Child
 from pyrcal.demo.report import (
+    MAX_SILENCE_S,
     MODEL,
     REAL_TIME,
     TOLERANCE_ACROSS_SUBAP,
@@ -49,10 +50,6 @@ USUAL_RATE_HZ = 1000.0
 HOLD_S = 5.0
 """Time for which all criteria must be met before the demo ends by itself, seconds."""
 
-SILENCE_S = 5.0
-"""Time without new truth or frames after which they count as stopped, seconds: the clock then
-continues without them."""
-
 MAX_STRETCH = 6.0
 """Longest duration over the requested one on a machine that does not keep real time."""
 
@@ -89,7 +86,7 @@ class Stopwatch:
             self.telemetry_s += min(max(step_s, 0.0), now_s - self._grown_s + _TRUTH_PERIOD_S)
             self._grown_s = now_s
         self._alive_s = max(self._grown_s, frames_grown_s or 0.0)
-        if now_s - self._alive_s > SILENCE_S:
+        if now_s - self._alive_s > MAX_SILENCE_S:
             self._idle_s += now_s - self._now_s
         self._now_s, self._telemetry_ns = now_s, telemetry_ns
 
@@ -113,7 +110,7 @@ class Stopwatch:
     @property
     def pace(self) -> float | None:
         """Seconds of telemetry per second; None if it is too early."""
-        return self.telemetry_s / self.wall_s if self.wall_s > SILENCE_S else None
+        return self.telemetry_s / self.wall_s if self.wall_s > MAX_SILENCE_S else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -100,16 +100,16 @@ def open_arrays(path: Path) -> Iterator[Arrays]:
         try:
             if zipfile.is_zipfile(path):
                 found: dict[str, Any] = dict(read_npz(path, max_bytes=None))
-                facts: Mapping[str, Any] = {}
             elif kind_of(path) is FileKind.HDF5:
                 file = stack.enter_context(open_hdf5(path))
-                found = {k: v for k, v in file.items() if isinstance(v, h5py.Dataset)}
-                facts = file.attrs
+                # Numbers may be attributes; an attribute does not take the place of an array.
+                found = {name: np.asarray(value) for name, value in file.attrs.items()}
+                found |= {k: v for k, v in file.items() if isinstance(v, h5py.Dataset)}
             else:
                 raise ConfigurationError(f"{path}: expected telemetry in HDF5 or .npz")
         except (OSError, RuntimeError, ValueError, KeyError) as error:
             raise ConfigurationError(f"{path}: damaged: {error}") from error
-        yield Arrays(path=path, found=found, facts=facts)
+        yield Arrays(path=path, found=found)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -118,7 +118,7 @@ class Arrays:
 
     path: Path
     found: Mapping[str, Any]
-    facts: Mapping[str, Any]
+    """Arrays and numbers by name, as they are in the file."""
 
     def messages(self, instrument: Instrument) -> Iterator[Message]:
         """Yield it as an RTC would have sent it: matrix, statuses, frames.
@@ -410,7 +410,7 @@ class Arrays:
             raise self._refusal(name, f"{shown} in {where}", expected)
 
     def _number(self, name: str, default: float | None, limit: float) -> float:
-        given = self.facts.get(name, self.found.get(name, default))
+        given = self.found.get(name, default)
         if given is None:
             raise self._refusal(name, "no such number", "it as an attribute or an array of one")
         try:

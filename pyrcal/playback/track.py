@@ -87,7 +87,7 @@ def track(
         if _is_fits(path):
             return _play_aot(path, instrument, settings)
         if is_session(path):
-            session = Arrays(path=path, found=read_session(path, instrument), facts={})
+            session = Arrays(path=path, found=read_session(path, instrument))
             return _play_arrays(session, instrument, settings)
         with open_arrays(path) as arrays:
             return _play_arrays(arrays, instrument, settings)
@@ -121,7 +121,7 @@ def _play_aot(path: Path, instrument: Instrument, settings: Settings) -> Track:
         )
     for note in aot.notes:
         say(f"note: {path}: {note}")
-    found = _play_arrays(Arrays(path=path, found=aot.arrays, facts={}), instrument, settings)
+    found = _play_arrays(Arrays(path=path, found=aot.arrays), instrument, settings)
     return replace(found, stated=aot.registrations)
 
 

@@ -73,6 +73,7 @@ class Service:
             self._port = parts.port
         except ValueError:
             parts, self._port = urlsplit(""), None
+        # Anything else would end in an error of the HTTP library, which does not name the option.
         usable = url.isascii() and url.isprintable() and " " not in url and not parts.query
         if not (usable and parts.scheme in {"http", "https"} and parts.hostname):
             raise ConfigurationError(

@@ -93,6 +93,7 @@ class Matrices(Background):
         self._enqueue(self._report)
 
     def _on_chunk(self, sample: zenoh.Sample) -> None:
+        # Refused before it is copied.
         if len(sample.payload) > CHUNK_LIMIT:
             return
         key, data = str(sample.key_expr), sample.payload.to_bytes()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -217,13 +218,12 @@ def _survey(folder: Path) -> _Folder:
         raise MatrixError(f"{folder}: found no folder, expected one of cacao's")
     files: dict[Path, str] = {}
     texts: list[Path] = []
+    # Not all are listed: a wrong folder, such as a home, would be searched for minutes.
+    paths = list(islice(folder.rglob("*"), MAX_FILES + 1))
+    if len(paths) > MAX_FILES:
+        raise MatrixError(f"{folder}: found more than {MAX_FILES} files, expected a conf folder")
     # Sorted, so that the same files are taken on every machine.
-    for number, path in enumerate(sorted(folder.rglob("*"))):
-        # A wrong folder, such as a home, would be searched for minutes.
-        if number > MAX_FILES:
-            raise MatrixError(
-                f"{folder}: found more than {MAX_FILES} files, expected a conf folder"
-            )
+    for path in sorted(paths):
         if len(path.relative_to(folder).parts) > MAX_DEPTH or not path.is_file():
             continue
         if _SUFFIX.search(path.name):
@@ -232,13 +232,13 @@ def _survey(folder: Path) -> _Folder:
             texts.append(path)
     variables: dict[str, str] = {}
     found = _Folder(root=folder, files=files, texts=texts, variables=variables)
-    scripts = [path for path in texts if path.name.lower().startswith("cacaovars")]
-    for path in scripts[:1]:
+    script = next((path for path in texts if path.name.lower().startswith("cacaovars")), None)
+    if script is not None:
         # Limited, because any file of this name is read.
-        text = path.read_text(encoding="utf-8", errors="replace")[:1_000_000]
+        text = script.read_text(encoding="utf-8", errors="replace")[:1_000_000]
         variables.update((key, value.strip()) for key, value in _VARIABLES.findall(text))
         found.taken.append(
-            f"took {found.name(path)}: loop {variables.get('LOOPNAME', '(no name)')}, mirror "
+            f"took {found.name(script)}: loop {variables.get('LOOPNAME', '(no name)')}, mirror "
             f"{variables.get('DMxsize', '?')} x {variables.get('DMysize', '?')}, sensor stream "
             f"{variables.get('WFSSTREAM', '?')}"
         )

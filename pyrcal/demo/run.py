@@ -205,7 +205,6 @@ def _make_promise(options: argparse.Namespace) -> Promise:
     return Promise(
         seconds=options.seconds,
         whole=any(getattr(options, name) for name in ("jump", "drift", "fault")),
-        real_time=options.plant != "diffractive" and not large,
         wanted_ratio=_choose_ratio(options, telescope),
         across_subap=telescope.across_subap,
         measured_plant=_is_measured(options),

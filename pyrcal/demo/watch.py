@@ -123,9 +123,6 @@ class Promise:
     whole: bool
     """True if the demo must last all the seconds, because of events at given times."""
 
-    real_time: bool
-    """True if the simulator keeps real time on an ordinary machine."""
-
     large: bool = False
     """True for thousands of modes: preparation takes minutes."""
 
@@ -298,7 +295,7 @@ class TelemetryObserver:
         clock, promise = self._stopwatch, self._promise
         pace = None if clock is None else clock.pace
         for line in (
-            slow_line(pace, real_time=promise.real_time, behind=self._behind),
+            slow_line(pace, behind=self._behind),
             rate_line(self._state, promise.requested_rate_hz),
         ):
             if line is not None:
@@ -375,13 +372,12 @@ def rate_line(state: View | None, asked_hz: float = USUAL_RATE_HZ) -> str | None
     return f"         simulated at {held_hz:g} Hz of {asked_hz:g}: what this machine holds"
 
 
-def slow_line(pace: float | None, *, real_time: bool, behind: bool) -> str | None:
+def slow_line(pace: float | None, *, behind: bool) -> str | None:
     """Return a line if the demo takes longer than requested, else None."""
     if pace is not None and pace < REAL_TIME:
-        who = "this machine is slow: the simulator" if real_time else "the simulated telescope"
-        return f"         {who} runs at {pace:.1f} of real time; this takes longer"
+        return f"         the simulator runs at {pace:.1f} of real time; this takes longer"
     if behind:
-        return "         this machine is slow: the service's worker is behind; this takes longer"
+        return "         the service's worker is behind; this takes longer"
     return None
 
 

@@ -1,4 +1,4 @@
-"""Print what a running service knows."""
+"""Print the state and the records of a running service."""
 
 from __future__ import annotations
 

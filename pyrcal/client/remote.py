@@ -127,7 +127,7 @@ def _records(name: str, purpose: str, call: str, *every: Words, **more: Any) -> 
 
 
 def _numbers(kind: type[int] | type[float]) -> Any:  # noqa: ANN401 - argparse's own
-    """Return a reader of ``3,5,9``, or of a word that the service knows."""
+    """Return a reader of ``3,5,9``, or of a word of the service's."""
 
     def read(text: str) -> object:
         try:

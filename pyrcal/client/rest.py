@@ -233,7 +233,7 @@ class _LostError(UnreachableError):
 
 
 def _cut(sock: socket.socket, late: threading.Event) -> None:
-    """End a connection, whether or not somebody waits for it."""
+    """End a connection, even if a thread waits for it."""
     late.set()
     try:
         # shutdown() wakes a thread that waits in recv(); close() does not.

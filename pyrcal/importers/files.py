@@ -381,7 +381,7 @@ def usable_modes(
         arrays[name] = kept if numbers is None else np.asarray(numbers)[kept]
         mirror.keep(kept)
     position = {int(n): k for k, n in enumerate(kept)}
-    # Counted anew, because unusable ones are removed from the basis as well.
+    # Counted again, because unusable ones are removed from the basis as well.
     left = np.array([position[int(indices[k])] for k in measured])
     if not np.array_equal(left, np.arange(len(kept))):
         arrays["modes"] = left

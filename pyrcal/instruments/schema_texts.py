@@ -72,8 +72,8 @@ def tables_of(whole: type[Table]) -> Iterator[TableText]:
 
 def _inside(record: object, key: str) -> object:
     """Return the record of a table within another, which may be left out; None: no dataclass."""
-    told = get_type_hints(record)[key] if is_dataclass(record) else None
-    return next((one for one in get_args(told) if is_dataclass(one)), None)
+    hint = get_type_hints(record)[key] if is_dataclass(record) else None
+    return next((one for one in get_args(hint) if is_dataclass(one)), None)
 
 
 def _table(header: str, kind: Schema, record: object, kinds: Mapping[str, Schema]) -> TableText:
@@ -98,7 +98,7 @@ def _table(header: str, kind: Schema, record: object, kinds: Mapping[str, Schema
 
 def _field_texts(record: type) -> dict[str, str]:
     """Return the docstring under each field of a record, inherited ones included."""
-    # Of all bases, the record's own last, because it may describe a field anew.
+    # Of all bases, the record's own last, because it may describe a field in its own words.
     bases = [described(base) for base in reversed(record.__mro__[:-1])]
     return {key: text for texts in bases for key, text in texts.items() if text}
 

@@ -155,7 +155,7 @@ def _prune(settings: Settings, *, dry_run: bool, as_json: bool) -> int:
         going = tuple(due(items(archive, _list_saved_matrices(archive)), retention, time.time_ns()))
         gone = []
         for item, why in going:
-            # None if somebody has pinned it since the list was made: it stays.
+            # None if it was pinned after the list was made: it stays.
             entry = None if dry_run else remove(archive, item, why)
             if entry is not None:
                 archive.record((), (replace(entry, who="pyrcal archive prune"),))

@@ -106,7 +106,7 @@ def _file_rows(track: Track, found: Array | None) -> list[Sequence[str]]:
 
 
 def _explain_failure(track: Track) -> str:
-    """Return why nothing could be made of the telemetry, as far as anybody knows."""
+    """Return the most likely reason for which the telemetry gave no α."""
     if not track.n_frames:
         return "no frame could be used"
     if track.misaligned:

@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from pyrcal.fitting.pupil_width import compute_responses, measure_pupil
 from pyrcal.importers.actuators import Mirror, read_mirror
-from pyrcal.importers.apertures import centre_grid, find_lit
 from pyrcal.importers.frames import Frames, describe_frames, frames_of
 from pyrcal.importers.imported import UNKNOWN, Array, Dataset, Imported, Signals, matrix_of
-from pyrcal.importers.layouts import ROLES, maps_of, mask_of, plane_of
+from pyrcal.importers.layouts import ROLES, centre_grid, find_lit, maps_of, mask_of, plane_of
 from service.errors import ConfigurationError, MatrixError
 from service.model.aperture import measure_aperture
 from service.model.defects import explain_defects, find_defects

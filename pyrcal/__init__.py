@@ -16,7 +16,7 @@ from service.errors import (
 )
 
 if TYPE_CHECKING:
-    # "as" the same name tells type checkers that a name is offered.
+    # "as" the same name marks a name as public for type checkers.
     from pyrcal.client.rest import Service as Service
     from pyrcal.fitting.design import dither_sigma as dither_sigma
     from pyrcal.fitting.design import interaction_matrix as interaction_matrix

@@ -67,7 +67,7 @@ class RuleCheck:
     deviation: float
     """Measured deviation, in the unit given in the text."""
 
-    limit: float
+    limit: float = 0.0
     """Largest deviation that keeps the rule."""
 
     text: str
@@ -137,7 +137,6 @@ def _basis(instrument: Instrument) -> Iterator[RuleCheck]:
         rule=MODES,
         # In powers of ten: a basis in another unit is outside by three or more.
         deviation=float(max(np.log10(low / peak), np.log10(peak / high), 0.0)) if peak else np.inf,
-        limit=0.0,
         text=f"peak of a mode: {peak:.3g} m per unit command; expected metres of OPD",
     )
 
@@ -151,7 +150,6 @@ def _matrix(instrument: Instrument, matrix: Array, columns: Array | None) -> Ite
     shape = RuleCheck(
         rule=MATRIX,
         deviation=abs(matrix.shape[0] - n_slopes) if matrix.ndim == 2 else np.inf,
-        limit=0.0,
         text=f"shape {matrix.shape}; expected ({n_slopes} slopes, n_modes)",
     )
     yield shape
@@ -168,7 +166,7 @@ def _matrix(instrument: Instrument, matrix: Array, columns: Array | None) -> Ite
         with threadpool_limits(1):
             fit = fit_matrix(free, reference)
     except (MatrixError, ModelError) as error:
-        yield RuleCheck(rule=MATRIX, deviation=np.inf, limit=0.0, text=str(error))
+        yield RuleCheck(rule=MATRIX, deviation=np.inf, text=str(error))
         return
     yield from _axes(instrument, fit)
     yield from _gains(instrument, fit)
@@ -188,7 +186,6 @@ def _axes(instrument: Instrument, fit: Fit) -> Iterator[RuleCheck]:
     yield RuleCheck(
         rule=ORDER,
         deviation=float(fit.order is not instrument.slopes.order),
-        limit=0.0,
         text=f"order {fit.order}; stated {instrument.slopes.order}",
     )
     if stated is not None:
@@ -196,14 +193,12 @@ def _axes(instrument: Instrument, fit: Fit) -> Iterator[RuleCheck]:
         yield RuleCheck(
             rule=AXES,
             deviation=float(flips),
-            limit=0.0,
             text=f"axes {found}; stated {stated}",
         )
         signs = abs(stated.sign_x - found.sign_x) + abs(stated.sign_y - found.sign_y)
         yield RuleCheck(
             rule=SIGN,
             deviation=signs / 2,
-            limit=0.0,
             text=f"signs {found.sign_x}, {found.sign_y} of Sx and Sy; stated {stated.sign_x}, "
             f"{stated.sign_y}",
         )
@@ -249,7 +244,6 @@ def _columns(fit: Fit) -> Iterator[RuleCheck]:
     yield RuleCheck(
         rule=MODES,
         deviation=float(MIN_LIKENESS - alike[worst]),
-        limit=0.0,
         text=f"column of mode {fit.modes[worst]} correlates by {alike[worst]:.2f} with that mode; "
         "expected the modes of the basis in their order and signs",
     )

@@ -56,11 +56,13 @@ def run_command(service: Service, _request: Request, options: argparse.Namespace
         what = "an id" if "{id}" in path else "no id"
         raise ConfigurationError(f"export {options.what}: expected {what}")
     words = [options.what, *([options.id] if options.id else [])]
+    # An id comes from the service: it must not lead into another folder.
     plain = "".join(c if c.isalnum() or c in "-._" else "_" for c in "-".join(words))
     target = options.output or Path(f"{plain}.{_ENDINGS.get(form, form)}")
     part = target.with_name(f"{target.name}.part")
     path = path.replace("{id}", quote(options.id or "", safe=""))
     query = collect_arguments(options, ("since", "until"))
+    # Nothing is overwritten: a matrix under an old name would be taken for another one.
     if target.exists():
         raise ConfigurationError(f"{target}: found a file, expected a new name (--output)")
     if not target.absolute().parent.is_dir():
@@ -134,6 +136,7 @@ def _flat(entry: Document, before: str = "") -> Document:
     """Return a document as flat keys: a nested field is named after both."""
     found: Document = {}
     for name, value in entry.items():
+        # A table has no nested fields.
         inside = isinstance(value, dict)
         found |= _flat(value, f"{before}{name}.") if inside else {f"{before}{name}": value}
     return found

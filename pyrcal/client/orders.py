@@ -51,7 +51,7 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
         Errors of the service.
     """
     headers = {}
-    # Only if somebody will be asked: a script learns the refusal from the order itself.
+    # Only if the user will be asked: a script learns the refusal from the order itself.
     if (request.needs_why and not options.why) or (request.asks and not options.yes):
         _refuse_early(service, request)
     if request.decides_on:
@@ -69,12 +69,14 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
     if request.method == "POST":
         # Lets the order be sent again if its answer is lost.
         headers["Idempotency-Key"] = str(uuid.uuid4())
+    # An empty name is a name, too: who orders may choose to give none.
     who = login() if options.who is None else options.who
     given = collect_arguments(options, request.body)
     body = {**given, **request.always, "reason": why, "by": who}
     answer = service.order(request.method, path_of(request.path, options), body, headers).document
     with understood(service):
         text = str(answer["text"])
+        # What is followed is what the order has begun, and not its subject.
         options.id = answer.get("id", getattr(options, "id", None))
     follows = request.follows and not options.no_wait
     if not options.json:
@@ -139,6 +141,7 @@ def _progress(service: Service, request: Request, options: argparse.Namespace) -
 
 def _prompt_user(request: Request, question: str, option: str) -> str:
     """Ask at the terminal and return the answer."""
+    # A script must not wait for an answer that never comes.
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         raise ConfigurationError(
             f"{request.name}: found no {option} and no terminal to ask at; expected {option}"
@@ -196,6 +199,7 @@ def _step(document: Document, lasted_s: float) -> Step:
         return Step(text, work["under_way"], work["stage"] == "tracking")
     state = document["state"]
     why = f": {document['reason']}" if document["reason"] else ""
+    # A matrix may wait for the RTC longer than a person waits at a terminal.
     too_long = state in _PENDING_STATES and lasted_s > MAX_SWAP_WAIT_S
     text = f"{document['id']} is {state}{why}"
     return Step(

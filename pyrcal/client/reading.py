@@ -1,4 +1,4 @@
-"""Print what a running service knows."""
+"""Print the state and the records of a running service."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
     lines = SCREENS[request.name]
     with understood(service):
         text_lines = [] if options.json else list(lines(document))
+        # Only status is a question whose answer can be bad.
         well = request.name != "status" or (document["ready"] and not document["alarms"])
+    # Read before it is printed: what is not understood must not be printed in part.
     if options.json:
         print_document(document)
     print_lines(text_lines)

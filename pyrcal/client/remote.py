@@ -94,14 +94,17 @@ class Request(NamedTuple):
 
 
 def _reads(
-    name: str, purpose: str, path: str, *every: Words, by: str = "reading", example: str
+    name: str, purpose: str, path: str, *every: Words, by: str = "reading", example: str = ""
 ) -> Request:
     return Request(name, purpose, by, f"GET {path}", every, example=example)
 
 
 def _orders(name: str, purpose: str, *every: Words, operation: str = "", **more: Any) -> Request:  # noqa: ANN401
-    """Return the command of an order in the service's table, by default the one of its name."""
-    order = ORDERS[operation or name]
+    """Return the command of an order in the service's table.
+
+    By default that is the order of its last word, or of its first one, which is the group's.
+    """
+    order = ORDERS[operation or next(word for word in reversed(name.split()) if word in ORDERS)]
     kind = order["command"]
     if not isinstance(kind, str):
         kind = kind[more.get("always", {}).get("action", "start")]
@@ -124,7 +127,7 @@ def _records(name: str, purpose: str, call: str, *every: Words, **more: Any) -> 
 
 
 def _numbers(kind: type[int] | type[float]) -> Any:  # noqa: ANN401 - argparse's own
-    """Return a reader of ``3,5,9``, or of a word that the service knows."""
+    """Return a reader of ``3,5,9``, or of a word of the service's."""
 
     def read(text: str) -> object:
         try:
@@ -164,10 +167,10 @@ GROUPS = {
 """Purposes of the commands that are groups of others."""
 
 REQUESTS = (
-    _reads("status", "show the state of the service on one screen", "/v1/state", example=""),
-    _reads("watch", "show state and log live, until Ctrl-C", "/v1/stream", by="watch", example=""),
+    _reads("status", "show the state of the service on one screen", "/v1/state"),
+    _reads("watch", "show state and log live, until Ctrl-C", "/v1/stream", by="watch"),
     _reads("alpha", "show the registration with 1 sigma", "/v1/alpha", example="--json"),
-    _reads("alarms list", "list the alarms, and what to do about each", "/v1/state", example=""),
+    _reads("alarms list", "list the alarms, and what to do about each", "/v1/state"),
     _orders(
         "alarms ack",
         "acknowledge an alarm; it stays until its cause is gone",
@@ -179,16 +182,9 @@ REQUESTS = (
         "alarms mute",
         "hide an alarm for a time; what it forbids stays forbidden",
         *(_ALARM, words("for_s SECONDS", "up to 43200 (twelve hours)", type=float)),
-        operation="mute",
         example="margin 3600 --why 'seen, lowering the gain'",
     ),
-    _orders(
-        "alarms unmute",
-        "show a muted alarm again",
-        _ALARM,
-        operation="unmute",
-        example="margin",
-    ),
+    _orders("alarms unmute", "show a muted alarm again", _ALARM, example="margin"),
     _reads(
         "audit",
         "list who ordered what, why, and the outcome",
@@ -229,12 +225,9 @@ REQUESTS = (
         then="pyrcal resume ends the stop",
         example="--why 'dome closing'",
     ),
-    _orders("resume", "end the stop; mode and dither are then as before", example=""),
+    _orders("resume", "end the stop; mode and dither are then as before"),
     _reads(
-        "reconstructors list",
-        "list the reconstructors; * marks the one in use",
-        RECONSTRUCTORS,
-        example="",
+        "reconstructors list", "list the reconstructors; * marks the one in use", RECONSTRUCTORS
     ),
     _reads(
         "reconstructors show",
@@ -254,7 +247,6 @@ REQUESTS = (
         "reconstructors approve",
         "send the proposed reconstructor to the RTC",
         *(_CANDIDATE, _NO_WAIT),
-        operation="approve",
         asks="send it to the RTC",
         example="--why 'margin restored'",
     ),
@@ -262,7 +254,6 @@ REQUESTS = (
         "reconstructors reject",
         "discard the proposed reconstructor",
         _CANDIDATE,
-        operation="reject",
         needs_why=True,
         example="--why 'alpha is not plausible'",
     ),
@@ -270,7 +261,6 @@ REQUESTS = (
         "reconstructors publish",
         "send a reconstructor again that was in use or proposed before",
         *(_ID, _NO_WAIT),
-        operation="publish",
         asks="send it to the RTC again",
         example="previous",
     ),
@@ -279,7 +269,6 @@ REQUESTS = (
         "send the previous reconstructor again; the mode becomes hold",
         words("--anyway", "even if the stability check refuses it", default=None),
         _NO_WAIT,
-        operation="rollback",
         asks="go back to the previous reconstructor; the mode becomes hold",
         needs_why=True,
         then="pyrcal mode propose, or auto, ends mode hold",
@@ -288,7 +277,6 @@ REQUESTS = (
     _orders(
         "loop open",
         "have the RTC open the loop",
-        operation="loop",
         always={"loop": "open"},
         permitted="open_loop",
         asks="open the loop; the image is lost",
@@ -297,10 +285,8 @@ REQUESTS = (
     _orders(
         "loop close",
         "have the RTC close the loop",
-        operation="loop",
         always={"loop": "closed"},
         asks="close the loop",
-        example="",
     ),
     _orders(
         "loop acquire",
@@ -313,11 +299,7 @@ REQUESTS = (
         example="--why 'mirror was exchanged'",
     ),
     _orders(
-        "loop abort",
-        "end the acquisition",
-        operation="acquisition",
-        always={"action": "abort"},
-        example="",
+        "loop abort", "end the acquisition", operation="acquisition", always={"action": "abort"}
     ),
     _orders(
         "dither start",
@@ -328,24 +310,17 @@ REQUESTS = (
             choices=("sine", "binary"),
         ),
         *(_MODES, _EACH, _LINES, _TOTAL, _LASTS, _OVER),
-        operation="dither",
         always={"action": "start"},
         example="--modes 3,5 --frequency-hz 90,110 --amplitude-m 5e-9",
     ),
-    _orders(
-        "dither stop",
-        "stop the dither",
-        operation="dither",
-        always={"action": "stop"},
-        example="",
-    ),
+    # Named, because "stop" is an order of its own.
+    _orders("dither stop", "stop the dither", operation="dither", always={"action": "stop"}),
     _orders(
         "measure matrix",
         "have the RTC measure an interaction matrix; all patterns but sine open the loop",
         words("--pattern NAME", "push-pull-modal, hadamard, sine, ..."),
         words("--n-average N", "pushes and pulls of each mode", type=int),
         *(_MODES, _EACH, _LINES, _LASTS, _NO_WAIT),
-        operation="measure",
         asks="have the RTC measure; all patterns but sine open the loop",
         example="--pattern sine --modes controlled",
     ),
@@ -363,12 +338,7 @@ REQUESTS = (
         operation="give_up",
         example="im-1",
     ),
-    _reads(
-        "recordings list",
-        "list the recordings, oldest first",
-        "/v1/recordings",
-        example="",
-    ),
+    _reads("recordings list", "list the recordings, oldest first", "/v1/recordings"),
     _records(
         "recordings start",
         "record telemetry from now on, byte for byte; default one minute",

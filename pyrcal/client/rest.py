@@ -73,6 +73,7 @@ class Service:
             self._port = parts.port
         except ValueError:
             parts, self._port = urlsplit(""), None
+        # Anything else would end in an error of the HTTP library, which does not name the option.
         usable = url.isascii() and url.isprintable() and " " not in url and not parts.query
         if not (usable and parts.scheme in {"http", "https"} and parts.hostname):
             raise ConfigurationError(
@@ -232,7 +233,7 @@ class _LostError(UnreachableError):
 
 
 def _cut(sock: socket.socket, late: threading.Event) -> None:
-    """End a connection, whether or not somebody waits for it."""
+    """End a connection, even if a thread waits for it."""
     late.set()
     try:
         # shutdown() wakes a thread that waits in recv(); close() does not.

@@ -52,6 +52,7 @@ def _mode_text(mode: str) -> str:
 
 def worst_first(state: Document) -> list[Document]:
     """Return the alarms that are not muted: the most severe first, unacknowledged before others."""
+    # A muted alarm is listed elsewhere, with who muted it.
     shown = [alarm for alarm in state["alarms"] if alarm["muted"] is None]
     return sorted(
         shown, key=lambda one: (-_SEVERITIES.index(one["severity"]), one["alarm_state"] != "active")
@@ -164,6 +165,7 @@ def _refusal_lines(state: Document) -> list[str]:
     for name, permission in state["permitted"].items():
         if not permission["allowed"]:
             orders.setdefault(permission["reason"], []).append(name.replace("_", " "))
+    # One or two orders are always refused, such as to close a loop that is closed.
     several = (item for item in orders.items() if len(item[1]) > FEW)
     return [_line("Not possible", f"{', '.join(names)}: {reason}") for reason, names in several]
 

@@ -85,6 +85,7 @@ def events(service: Service, path: str, latest: Latest) -> Iterator[Event]:
     """Yield the name and the data of each event; ``lost`` with the reason where the stream ends."""
     ever = False
     while True:
+        # The service continues after this line, or says with a reset that it cannot.
         headers = {"Last-Event-ID": latest.last} if latest.last else {}
         try:
             with service.open_response(
@@ -103,6 +104,7 @@ def events(service: Service, path: str, latest: Latest) -> Iterator[Event]:
                     yield name, data
             latest.lost = "the service has ended the stream"
         except (RefusedError, UnreachableError) as error:
+            # A service that has never answered is an error; one that restarts is waited for.
             if not ever:
                 raise
             latest.lost = str(error)
@@ -123,6 +125,7 @@ def _read(service: Service, response: HTTPResponse, latest: Latest) -> Iterator[
     fields: dict[str, str] = {}
     while raw := response.readline(_MAX_LINE_BYTES):
         name, _, value = raw.decode(errors="replace").rstrip("\r\n").partition(":")
+        # An empty line ends an event.
         if name or value:
             fields[name] = value.removeprefix(" ")
             continue

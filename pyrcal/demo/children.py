@@ -40,16 +40,6 @@ class Child:
         how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
         return f"the {self.name} {how}: {last}"
 
-    def signal(self, number: signal.Signals) -> None:
-        """Send a signal to the process itself; it ends the processes that it started."""
-        if self.process.poll() is None:
-            self.process.send_signal(number)
-
-    def kill_all(self) -> None:
-        """Kill the process and its children: they share its process group."""
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(self.process.pid, signal.SIGKILL)
-
 
 @contextmanager
 def run_children(directory: Path, commands: Mapping[str, Sequence[str]]) -> Iterator[list[Child]]:
@@ -66,7 +56,7 @@ def run_children(directory: Path, commands: Mapping[str, Sequence[str]]) -> Iter
 def _start_child(name: str, words: Sequence[str], directory: Path) -> Child:
     path = directory / f"{name}.log"
     with path.open("wb") as log:
-        # A session of its own: Ctrl-C in the terminal does not reach it, and kill_all ends its
+        # A session of its own: Ctrl-C in the terminal does not reach it, and SIGKILL ends its
         # group.
         process = subprocess.Popen(
             [sys.executable, *words], stdout=log, stderr=subprocess.STDOUT, start_new_session=True
@@ -79,13 +69,14 @@ def _end_children(started: list[Child]) -> None:
     with _handle_ending(signal.SIG_IGN):
         # All are signalled before any is awaited, so that they share one period of grace.
         for child in started:
-            child.signal(signal.SIGINT)
+            child.process.send_signal(signal.SIGINT)
         until_s = time.monotonic() + GRACE_S
         while time.monotonic() < until_s and any(c.process.poll() is None for c in started):
             time.sleep(_POLL_S)
         # Those that ended in time too: their own children may still run.
         for child in started:
-            child.kill_all()
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(child.process.pid, signal.SIGKILL)
             child.process.wait()
 
 

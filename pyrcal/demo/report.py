@@ -181,6 +181,7 @@ def _reasons(state: View | None, circumstances: Circumstances) -> Iterator[str]:
         return
     if circumstances.silent_s > MAX_SILENCE_S:
         yield f"the simulator has made nothing for {circumstances.silent_s:.0f} s"
+    # A service that does not answer says nothing of frames.
     if circumstances.unanswered_s <= MAX_SILENCE_S:
         yield from _explain_missing_frames(state, circumstances.frameless_s)
     for alarm in state["alarms"]:
@@ -286,11 +287,14 @@ def _judge(report: Report, circumstances: Circumstances) -> None:
     judge = _failures_on_measured_plant if circumstances.measured_plant else _failures
     report.failures += judge(report, circumstances)
     for swap in report.swaps:
+        # The RTC swaps between two frames: a skipped one is a fault.
         if swap["frames_skipped"]:
             report.failures.append(
                 f"{swap['frames_skipped']} frames skipped at the swap to {swap['cm_id']}"
             )
-    report.failures += [f"alarm {text}" for text in report.alarms if not _is_slowness(text)]
+    # A slow machine is given more time instead.
+    slowness = f"{WORKER_BEHIND}: "
+    report.failures += [f"alarm {text}" for text in report.alarms if not text.startswith(slowness)]
 
 
 def _failures(report: Report, circumstances: Circumstances) -> list[str]:
@@ -349,11 +353,6 @@ def _estimate_failures(report: Report, across_subap: float) -> list[str]:
     return failures
 
 
-def _is_slowness(alarm: str) -> bool:
-    """Return True if an alarm only reports a slow machine, which is not a failure."""
-    return alarm.startswith(f"{WORKER_BEHIND}: ")
-
-
 def _has_recovered(start: float | None, first: float | None) -> bool:
     """Return True if an update improves the margin.
 
@@ -407,16 +406,10 @@ def _before_and_after(report: Report) -> list[str]:
         return []
     return [
         "",
-        "wavefront error         before  "
-        f"{_bar(before_nm, before_nm)} {before_nm:4.0f} nm   Strehl ratio at 1.65 um "
-        f"{strehl_ratio(before_nm):.2f}",
-        f"                         after  {_bar(after_nm, before_nm)} {after_nm:4.0f} nm   "
-        f"{'':24}{strehl_ratio(after_nm):.2f}   {before_nm / after_nm:.2f} times less",
+        f"wavefront error {before_nm:.0f} nm before, {after_nm:.0f} nm after: "
+        f"{before_nm / after_nm:.2f} times less; Strehl ratio at 1.65 um "
+        f"{strehl_ratio(before_nm):.2f} before, {strehl_ratio(after_nm):.2f} after",
     ]
-
-
-def _bar(value_nm: float, whole_nm: float) -> str:
-    return ("#" * round(30.0 * min(value_nm / whole_nm, 1.0))).ljust(30)
 
 
 def strehl_ratio(error_nm: float, wavelength_nm: float = 1650.0) -> float:
@@ -426,6 +419,7 @@ def strehl_ratio(error_nm: float, wavelength_nm: float = 1650.0) -> float:
 
 def _row(report: Report, name: str) -> str:
     true = report.true_alpha
+    # A measured plant has no truth, and an estimate is shown all the same.
     if true is None and report.estimated_alpha is not None and report.sigma is not None:
         return f"  not known {report.estimated_alpha[name]:+14.5f} {report.sigma[name]:9.5f}"
     if true is None:

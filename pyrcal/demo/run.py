@@ -8,9 +8,8 @@ import shutil
 import socket
 import subprocess
 import sys
-from importlib.util import find_spec
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 from pyrcal.client.rest import Service
 from pyrcal.demo.arguments import FORWARDED, REPEATED
@@ -18,13 +17,9 @@ from pyrcal.demo.children import interrupt_on_end, run_children
 from pyrcal.demo.report import table
 from pyrcal.demo.truth import TruthFile
 from pyrcal.demo.watch import REQUEST_TIMEOUT_S, USUAL_RATE_HZ, Promise, TelemetryObserver
+from pyrcal.fitting.figures import check_plots
 from service.errors import ConfigurationError, shown
-from service.instrument.schema import (
-    AboutTable,
-    InstrumentFile,
-    SlopesTable,
-    read_instrument_file,
-)
+from service.instrument.schema import AboutTable, SlopesTable, read_instrument_file
 from service.model.kinds import KarhunenLoeve, LoopFacts
 from sim_rtc.rehearsal import write_live_instrument
 
@@ -89,6 +84,7 @@ def run_demo(options: argparse.Namespace) -> int:
     """
     service_words, sim_words = _make_commands(options)
     _check(options, sim_words)
+    # Only now, because the folder of an earlier demo is deleted.
     _prepare_directory(options.dir)
     if _is_measured(options):
         write_live_instrument(options.instrument, options.dir / LIVE_INSTRUMENT)
@@ -97,9 +93,9 @@ def run_demo(options: argparse.Namespace) -> int:
     _say(f"service    pyrcal {' '.join(service_words)}")
     _say(f"simulator  pyrcal sim {' '.join(sim_words)}")
     _say(f"REST       {url}/v1/state   logs and truth: {options.dir}\n")
-    large = _measure_load(options)
-    if large is not None:
-        _say(TOO_LARGE_TEXT.format(gflop_s=large.gflop_s, rate_hz=large.rate_hz))
+    telescope = _Telescope.read(options.instrument)
+    if _is_large(options, telescope):
+        _say(TOO_LARGE_TEXT.format(gflop_s=telescope.gflop_s, rate_hz=telescope.rate_hz))
     if _is_far(options):
         _say(_choose_introduction(options))
     commands = {
@@ -149,96 +145,84 @@ def _choose_introduction(options: argparse.Namespace) -> str:
     return FAR_TEXT.format(start=FLAO_START if is_flao else OTHER_START)
 
 
-def _find_small_diameter_m(options: argparse.Namespace) -> float | None:
-    """Return the diameter of a small telescope, metres; None for a larger one."""
-    if _is_measured(options):
-        return None
-    instrument_file = read_instrument_file(options.instrument)
-    diameter_m = float(instrument_file.section(AboutTable).said.diameter_m)
-    return diameter_m if diameter_m < SMALL_DIAMETER_M else None
+class _Telescope(NamedTuple):
+    """What a demo depends on in an instrument file."""
+
+    diameter_m: float
+    across_subap: float
+    """Subapertures across the pupil."""
+
+    n_modes: int
+    rate_hz: float
+    """Frame rate; 0 if the file states none."""
+
+    gflop_s: float
+    """Speed that the simulator's products of slopes and modes need, GFLOP/s: each frame is
+    multiplied by R and by D."""
+
+    @classmethod
+    def read(cls, name_or_path: str) -> Self:
+        """Read an instrument file."""
+        file = read_instrument_file(name_or_path)
+        across_subap = float(file.section(file.kind.table).said.pupil_diameter)
+        n_planes = file.section(SlopesTable).said.kind.n_planes
+        n_modes = int(file.section(KarhunenLoeve).said.n_modes)
+        rate_hz = file.section(LoopFacts).said.frame_rate_hz or 0.0
+        return cls(
+            diameter_m=float(file.section(AboutTable).said.diameter_m),
+            across_subap=across_subap,
+            n_modes=n_modes,
+            rate_hz=rate_hz,
+            gflop_s=4e-9 * rate_hz * n_planes * math.pi / 4 * across_subap**2 * n_modes,
+        )
 
 
-def _make_small_options(options: argparse.Namespace) -> list[str]:
+def _is_small(options: argparse.Namespace, telescope: _Telescope) -> bool:
+    """Return True for a telescope with the light and the loop of a small one."""
+    return telescope.diameter_m < SMALL_DIAMETER_M and not _is_measured(options)
+
+
+def _is_large(options: argparse.Namespace, telescope: _Telescope) -> bool:
+    """Return True if no ordinary machine simulates the linear plant in real time."""
+    # The diffractive plant is slow on any machine: it has no load that could be held.
+    return telescope.gflop_s > HELD_GFLOP_S and options.plant != "diffractive"
+
+
+def _make_small_options(options: argparse.Namespace, telescope: _Telescope) -> list[str]:
     """Return the simulator's options for the star and the loop of a small telescope."""
-    diameter_m = _find_small_diameter_m(options)
-    if diameter_m is None:
-        return []
     words = []
     if options.mag is None:
-        words.append(f"--mag={USUAL_MAGNITUDE + 5 * math.log10(diameter_m / USUAL_DIAMETER_M):.2f}")
+        brighter = 5 * math.log10(telescope.diameter_m / USUAL_DIAMETER_M)
+        words.append(f"--mag={USUAL_MAGNITUDE + brighter:.2f}")
     if _is_far(options):
-        words.append(f"--n-controlled={max(_n_modes(options) // 3, 2)}")
+        words.append(f"--n-controlled={max(telescope.n_modes // 3, 2)}")
     return words
 
 
-def _n_modes(options: argparse.Namespace) -> int:
-    instrument_file = read_instrument_file(options.instrument)
-    return int(instrument_file.section(KarhunenLoeve).said.n_modes)
-
-
-class _Large(NamedTuple):
-    """Size of a linear plant that no ordinary machine simulates in real time."""
-
-    rate_hz: float
-    """Frame rate."""
-
-    gflop_s: float
-    """Speed that the products of slopes and modes need, GFLOP/s."""
-
-
-def _measure_load(options: argparse.Namespace) -> _Large | None:
-    """Return the required speed if a machine cannot keep real time; None if it can.
-
-    Each frame is multiplied by R and by D. An instrument file without a frame rate counts as small.
-    """
-    if options.plant == "diffractive":
-        return None
-    # The diffractive plant is slow on any machine: it has no load that could be held.
-    instrument_file = read_instrument_file(options.instrument)
-    rate_hz = instrument_file.section(LoopFacts).said.frame_rate_hz
-    if rate_hz is None:
-        return None
-    gflop_s = (
-        4e-9
-        * rate_hz
-        * _n_slopes(instrument_file)
-        * instrument_file.section(KarhunenLoeve).said.n_modes
-    )
-    return _Large(rate_hz, gflop_s) if gflop_s > HELD_GFLOP_S else None
-
-
-def _n_slopes(instrument_file: InstrumentFile) -> float:
-    """Return the approximate number of slopes of a file's sensor."""
-    kind = instrument_file.section(SlopesTable).said.kind
-    return float(kind.n_planes * math.pi / 4 * _across_subap(instrument_file) ** 2)
-
-
-def _across_subap(instrument_file: InstrumentFile) -> float:
-    return float(instrument_file.section(instrument_file.kind.table).said.pupil_diameter)
-
-
 def _make_promise(options: argparse.Namespace) -> Promise:
-    large = _measure_load(options)
+    telescope = _Telescope.read(options.instrument)
+    large = _is_large(options, telescope)
     return Promise(
         seconds=options.seconds,
         whole=any(getattr(options, name) for name in ("jump", "drift", "fault")),
-        real_time=options.plant != "diffractive" and large is None,
-        wanted_ratio=_choose_ratio(options),
-        across_subap=_across_subap(read_instrument_file(options.instrument)),
+        wanted_ratio=_choose_ratio(options, telescope),
+        across_subap=telescope.across_subap,
         measured_plant=_is_measured(options),
-        large=large is not None,
-        requested_rate_hz=USUAL_RATE_HZ if large is None else large.rate_hz,
+        large=large,
+        requested_rate_hz=telescope.rate_hz if large else USUAL_RATE_HZ,
     )
 
 
-def _choose_ratio(options: argparse.Namespace) -> float:
+def _choose_ratio(options: argparse.Namespace, telescope: _Telescope) -> float:
     if _is_measured(options):
         return MEASURED_RATIO
-    if not _is_far(options) or _measure_load(options) is not None:
+    # Near the nominal registration there is little to win, and a telescope in slow motion has few
+    # seconds: an end that is not worse is enough.
+    if not _is_far(options) or _is_large(options, telescope):
         return 1.0
     if options.instrument == DEFAULT_INSTRUMENT:
         return FLAO_RATIO
-    few = _n_modes(options) <= FEW_MODES or _find_small_diameter_m(options) is not None
+    few = telescope.n_modes <= FEW_MODES or _is_small(options, telescope)
     return FEW_RATIO if few else OTHER_RATIO
 
 
@@ -254,8 +238,8 @@ def _check(options: argparse.Namespace, sim_words: list[str]) -> None:
     for name, file in (("--json", options.json), ("--plot", options.plot)):
         if file is not None and (file.is_dir() or not file.absolute().parent.is_dir()):
             raise ConfigurationError(f"{name} {file}: expected a file in a folder that exists")
-    if options.plot is not None and find_spec("matplotlib") is None:
-        raise ConfigurationError("--plot: found no matplotlib; expected the extra 'plots'")
+    if options.plot is not None:
+        check_plots()
     if options.port == options.zenoh_port:
         raise ConfigurationError(f"--port and --zenoh-port: both {options.port}, expected two")
     # Tried now, because the service would report an occupied port only after its start.
@@ -289,6 +273,7 @@ def _prepare_directory(directory: Path) -> None:
         If it holds something else, or is no directory.
     """
     try:
+        # The log of an earlier demo shows that a folder is the demo's own.
         if directory.exists() and any(directory.iterdir()) and not (directory / LOG).exists():
             raise ConfigurationError(f"--dir {directory}: holds other files; name a new directory")
         shutil.rmtree(directory, ignore_errors=True)
@@ -308,15 +293,17 @@ def _make_commands(options: argparse.Namespace) -> tuple[list[str], list[str]]:
     # FLAO keeps real time on an ordinary machine; others run at the rate that this one sustains.
     if options.instrument != DEFAULT_INSTRUMENT:
         simulator.append("--held-rate")
-    large = _measure_load(options)
-    if large is not None:
-        simulator.append(f"--rate={large.rate_hz:g}")
+    telescope = _Telescope.read(options.instrument)
+    if _is_large(options, telescope):
+        simulator.append(f"--rate={telescope.rate_hz:g}")
     if _is_far(options):
         simulator.append("--far")
-    simulator += _make_small_options(options)
+    if _is_small(options, telescope):
+        simulator += _make_small_options(options, telescope)
     for name in FORWARDED:
         value = getattr(options, name)
         if value is not None:
+            # In one word, because a value may begin with a minus.
             simulator.append(f"--{name}={value}")
     for name in REPEATED:
         simulator += [f"--{name}={value}" for value in getattr(options, name) or ()]

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pyrcal.client.rest import RefusedError, Service, UnreachableError
 from pyrcal.demo.children import Child
 from pyrcal.demo.report import (
+    MAX_SILENCE_S,
     MODEL,
     REAL_TIME,
     TOLERANCE_ACROSS_SUBAP,
@@ -49,10 +50,6 @@ USUAL_RATE_HZ = 1000.0
 HOLD_S = 5.0
 """Time for which all criteria must be met before the demo ends by itself, seconds."""
 
-SILENCE_S = 5.0
-"""Time without new truth or frames after which they count as stopped, seconds: the clock then
-continues without them."""
-
 MAX_STRETCH = 6.0
 """Longest duration over the requested one on a machine that does not keep real time."""
 
@@ -89,7 +86,7 @@ class Stopwatch:
             self.telemetry_s += min(max(step_s, 0.0), now_s - self._grown_s + _TRUTH_PERIOD_S)
             self._grown_s = now_s
         self._alive_s = max(self._grown_s, frames_grown_s or 0.0)
-        if now_s - self._alive_s > SILENCE_S:
+        if now_s - self._alive_s > MAX_SILENCE_S:
             self._idle_s += now_s - self._now_s
         self._now_s, self._telemetry_ns = now_s, telemetry_ns
 
@@ -101,6 +98,8 @@ class Stopwatch:
     @property
     def spent_s(self) -> float:
         """Seconds that count; the clock continues if the simulator stops."""
+        # Telemetry, because a slow machine shall get as much of it as a fast one. Idle time: a
+        # simulator that stopped must not keep the demo alive.
         return min(self.wall_s, self.telemetry_s + self._idle_s)
 
     @property
@@ -111,7 +110,7 @@ class Stopwatch:
     @property
     def pace(self) -> float | None:
         """Seconds of telemetry per second; None if it is too early."""
-        return self.telemetry_s / self.wall_s if self.wall_s > SILENCE_S else None
+        return self.telemetry_s / self.wall_s if self.wall_s > MAX_SILENCE_S else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,9 +122,6 @@ class Promise:
 
     whole: bool
     """True if the demo must last all the seconds, because of events at given times."""
-
-    real_time: bool
-    """True if the simulator keeps real time on an ordinary machine."""
 
     large: bool = False
     """True for thousands of modes: preparation takes minutes."""
@@ -204,6 +200,7 @@ class TelemetryObserver:
         """Return the final figures, with the reason from the service's log if they failed."""
         self._truth.read()
         report = self.report()
+        # The service is asked for its log only where a reason is needed.
         return report if report.good else self.report(self._last_refusal())
 
     def _last_refusal(self) -> str | None:
@@ -223,6 +220,7 @@ class TelemetryObserver:
             # A process that has ended will never be ready.
             if self._endings():
                 return False
+            # Both are needed: a large simulator is ready minutes after the service, or before it.
             if last is not None and self._state is not None and MODEL not in waits(self._state):
                 self._ready_s = waited_s
                 self._frames_grown_s = time.monotonic()
@@ -238,6 +236,8 @@ class TelemetryObserver:
     def _is_over(self) -> bool:
         clock, promise = self._stopwatch, self._promise
         if clock is None or promise.seconds is None:
+            # Only the service's end ends it then: the truth file is followed across a restart of
+            # the simulator.
             return any(child.name == "service" for child in self._children if child.ended)
         # The outcome must last, because an update just before may still turn out bad.
         right_s = 0.0 if self._right_since_s is None else clock.spent_s - self._right_since_s
@@ -295,7 +295,7 @@ class TelemetryObserver:
         clock, promise = self._stopwatch, self._promise
         pace = None if clock is None else clock.pace
         for line in (
-            slow_line(pace, real_time=promise.real_time, behind=self._behind),
+            slow_line(pace, behind=self._behind),
             rate_line(self._state, promise.requested_rate_hz),
         ):
             if line is not None:
@@ -336,6 +336,7 @@ def live_line(seconds: float, state: View | None, truth: Line | None) -> str:
     if state is None:
         return f"{seconds:7.1f}  the service is starting"
     link, known = state["link"], state["registration"]
+    # As wide as the four numbers, so that all columns stay below their headings.
     registration = " not known yet".ljust(66)
     age = "    -"
     if known is not None:
@@ -371,13 +372,12 @@ def rate_line(state: View | None, asked_hz: float = USUAL_RATE_HZ) -> str | None
     return f"         simulated at {held_hz:g} Hz of {asked_hz:g}: what this machine holds"
 
 
-def slow_line(pace: float | None, *, real_time: bool, behind: bool) -> str | None:
+def slow_line(pace: float | None, *, behind: bool) -> str | None:
     """Return a line if the demo takes longer than requested, else None."""
     if pace is not None and pace < REAL_TIME:
-        who = "this machine is slow: the simulator" if real_time else "the simulated telescope"
-        return f"         {who} runs at {pace:.1f} of real time; this takes longer"
+        return f"         the simulator runs at {pace:.1f} of real time; this takes longer"
     if behind:
-        return "         this machine is slow: the service's worker is behind; this takes longer"
+        return "         the service's worker is behind; this takes longer"
     return None
 
 

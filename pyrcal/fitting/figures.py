@@ -66,8 +66,19 @@ def write_sheet(report: FitReport, instrument: Instrument, path: Path) -> None:
     check_plots()
     fit = report.fit
     heading = f"{report.instrument}: {report.reference}"
+    save_figure(draw_sheet(fit, heading, instrument), path)
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as an image of the kind the file's name says.
+
+    Raises
+    ------
+    ConfigurationError
+        If the file cannot be written, or its kind is not known.
+    """
     try:
-        draw_sheet(fit, heading, instrument).savefig(path, dpi=110)
+        figure.savefig(path, dpi=110)
     except (OSError, ValueError) as error:
         raise ConfigurationError(f"--plot: cannot write {path}: {error}") from error
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pyrcal.fitting.figures import save_figure
 from pyrcal.fitting.system_report import SystemReport
-from service.errors import ConfigurationError
 from service.model.instrument import Mirror
 from service.model.misregistration import PARAMETERS
 
@@ -43,10 +43,7 @@ def write_system_sheet(report: SystemReport, path: Path) -> None:
         pulls(panels[n_panels - 1], report)
     for empty in panels[n_panels:]:
         empty.set_axis_off()
-    try:
-        figure.savefig(path, dpi=110)
-    except (OSError, ValueError) as error:
-        raise ConfigurationError(f"--plot: cannot write {path}: {error}") from error
+    save_figure(figure, path)
 
 
 def footprints(axes: Axes, report: SystemReport, number: int) -> None:

@@ -44,6 +44,7 @@ class Mirror:
         """Remove all but these modes of the basis."""
         for name in self.per_mode:
             values = self.arrays[name]
+            # Of all these arrays only this one has a column, not a row, for each mode.
             along_columns = name == "mode_to_actuator"
             self.arrays[name] = values[:, modes] if along_columns else values[modes]
         self.n_modes = len(modes)

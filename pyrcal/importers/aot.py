@@ -8,13 +8,12 @@ from __future__ import annotations
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from pyrcal.importers.files import Reported, from_arrays
 from pyrcal.importers.imported import Array, Imported
-from pyrcal.importers.registration import Registrations, registrations_of
+from pyrcal.importers.registration import Aot, Registrations, registrations_of
 from service.errors import ConfigurationError, MatrixError
 from service.files.container import opened
 
@@ -25,7 +24,7 @@ _HEADER_BYTES = 20 * 2880
 """Number of leading bytes that must contain the version."""
 
 
-def import_aotpy() -> Any:  # noqa: ANN401 - aotpy has no types
+def import_aotpy() -> Aot:
     """Return the module of the standard.
 
     Raises
@@ -42,7 +41,7 @@ def import_aotpy() -> Any:  # noqa: ANN401 - aotpy has no types
     return aotpy
 
 
-def read_system(path: Path) -> Any:  # noqa: ANN401 - aotpy has no types
+def read_system(path: Path) -> Aot:
     """Return aotpy's system of a file.
 
     Raises
@@ -164,7 +163,7 @@ def from_aot(
     ).with_notes(dated.text)
 
 
-def _choose_loop(path: Path, system: Any, wanted: str | None) -> Any:  # noqa: ANN401
+def _choose_loop(path: Path, system: Aot, wanted: str | None) -> Aot:
     """Return the requested loop, or the only one with an interaction matrix."""
     loops = list(enumerate(system.loops, start=1))
     listed = "; ".join(f"{k} {one.uid} ({_describe_loop(one)})" for k, one in loops) or "none"
@@ -183,7 +182,7 @@ def _choose_loop(path: Path, system: Any, wanted: str | None) -> Any:  # noqa: A
     return measured[0]
 
 
-def _describe_loop(loop: Any) -> str:  # noqa: ANN401
+def _describe_loop(loop: Aot) -> str:
     """Return the contents of a loop as text."""
     matrix = getattr(loop, "interaction_matrix", None)
     sensor = loop.input_sensor
@@ -192,10 +191,7 @@ def _describe_loop(loop: Any) -> str:  # noqa: ANN401
 
 
 def registrations_between(
-    mirror: Any,  # noqa: ANN401 - aotpy's own classes
-    sensor: Any,  # noqa: ANN401
-    subaperture_m: float,
-    where: str,
+    mirror: Aot, sensor: Aot, subaperture_m: float, where: str
 ) -> Registrations | None:
     """Return α of a mirror on a sensor over time; None if the file has none.
 
@@ -218,12 +214,7 @@ def registrations_between(
     return registrations_of(mirror.transformation_matrix, subaperture_m, where)
 
 
-def _mirror(
-    mirror: Any,  # noqa: ANN401 - aotpy's own classes
-    loop: Any,  # noqa: ANN401
-    n_columns: int,
-    notes: list[str],
-) -> dict[str, Array]:
+def _mirror(mirror: Aot, loop: Aot, n_columns: int, notes: list[str]) -> dict[str, Array]:
     found: dict[str, Array] = {}
     if mirror.influence_function is not None:
         found["modes"] = np.asarray(mirror.influence_function.data)
@@ -239,7 +230,7 @@ def _mirror(
     return found
 
 
-def _by_rows(values: Any, places: Array, where: str) -> Array:  # noqa: ANN401 - aotpy has no types
+def _by_rows(values: Aot, places: Array, where: str) -> Array:
     """Return AOT's matrix in two dimensions, all x first, subapertures row by row.
 
     The standard defines ``(n_valid, 2, n)``; ``(2, n_valid, n)`` and two-dimensional ones are
@@ -267,6 +258,7 @@ def places_of(places: Array, where: str) -> Array:
     MatrixError
         If they are not each of 0 to ``n_valid - 1`` once.
     """
+    # In the order of the mask's rows, which is that of pyrcal's slopes.
     listed = places[places >= 0].ravel()
     n_valid = len(listed)
     if n_valid and listed.min() == 1:

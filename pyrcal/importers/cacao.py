@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -120,6 +121,7 @@ class _Folder:
 
     def _distinct(self, paths: Sequence[Path]) -> list[Path]:
         """Return the files without links to and copies of the others: ``conf`` has many."""
+        # Links first: they need no checksum, for which whole files are read.
         real = {path.resolve(): path for path in paths}
         if len(real) < 2:
             return list(real.values())
@@ -192,6 +194,7 @@ def from_cacao(folder: Path, reported: Reported, response: str | None = None) ->
     elif found.variables.get("WFSSTREAM_PROCESSED") == "ON":
         # These are reference slopes, not an image of the light.
         arrays.pop("light", None)
+    # Pokes outside the mask are left out; messages and matrix.h5 count as the files do.
     numbers = arrays.pop("numbers", None)
     reported = replace(reported, sensor=sensor)
     imported = from_arrays(f"cacao, {folder}", arrays, reported, numbers)
@@ -215,11 +218,12 @@ def _survey(folder: Path) -> _Folder:
         raise MatrixError(f"{folder}: found no folder, expected one of cacao's")
     files: dict[Path, str] = {}
     texts: list[Path] = []
-    for number, path in enumerate(sorted(folder.rglob("*"))):
-        if number > MAX_FILES:
-            raise MatrixError(
-                f"{folder}: found more than {MAX_FILES} files, expected a conf folder"
-            )
+    # Not all are listed: a wrong folder, such as a home, would be searched for minutes.
+    paths = list(islice(folder.rglob("*"), MAX_FILES + 1))
+    if len(paths) > MAX_FILES:
+        raise MatrixError(f"{folder}: found more than {MAX_FILES} files, expected a conf folder")
+    # Sorted, so that the same files are taken on every machine.
+    for path in sorted(paths):
         if len(path.relative_to(folder).parts) > MAX_DEPTH or not path.is_file():
             continue
         if _SUFFIX.search(path.name):
@@ -228,13 +232,13 @@ def _survey(folder: Path) -> _Folder:
             texts.append(path)
     variables: dict[str, str] = {}
     found = _Folder(root=folder, files=files, texts=texts, variables=variables)
-    scripts = [path for path in texts if path.name.lower().startswith("cacaovars")]
-    for path in scripts[:1]:
+    script = next((path for path in texts if path.name.lower().startswith("cacaovars")), None)
+    if script is not None:
         # Limited, because any file of this name is read.
-        text = path.read_text(encoding="utf-8", errors="replace")[:1_000_000]
+        text = script.read_text(encoding="utf-8", errors="replace")[:1_000_000]
         variables.update((key, value.strip()) for key, value in _VARIABLES.findall(text))
         found.taken.append(
-            f"took {found.name(path)}: loop {variables.get('LOOPNAME', '(no name)')}, mirror "
+            f"took {found.name(script)}: loop {variables.get('LOOPNAME', '(no name)')}, mirror "
             f"{variables.get('DMxsize', '?')} x {variables.get('DMysize', '?')}, sensor stream "
             f"{variables.get('WFSSTREAM', '?')}"
         )
@@ -248,6 +252,7 @@ def _response(found: _Folder, requested: str | None) -> tuple[Array, _Kind]:
         kinds = [
             kind for kind in RESPONSES if re.fullmatch(rf"(?:.*[._-])?(?:{kind.response})", name)
         ]
+        # The name says what the columns are, so one of no known kind cannot be used.
         path = found.one(re.escape(name), "the response")
         if path is None or not kinds:
             names = ", ".join(sorted(set(found.files.values()))) or "no FITS file"

@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from pyrcal.fitting.pupil_width import compute_responses, measure_pupil
 from pyrcal.importers.actuators import Mirror, read_mirror
-from pyrcal.importers.apertures import centre_grid, find_lit
 from pyrcal.importers.frames import Frames, describe_frames, frames_of
 from pyrcal.importers.imported import UNKNOWN, Array, Dataset, Imported, Signals, matrix_of
-from pyrcal.importers.layouts import ROLES, maps_of, mask_of, plane_of
+from pyrcal.importers.layouts import ROLES, centre_grid, find_lit, maps_of, mask_of, plane_of
 from service.errors import ConfigurationError, MatrixError
 from service.model.aperture import measure_aperture
 from service.model.defects import explain_defects, find_defects
@@ -46,6 +45,7 @@ def calibration_of(arrays: Mapping[str, Array], where: str) -> tuple[str, Array]
         raise MatrixError(
             f"{where}: found no record of pyRTC 2 ({RECORD}), expected one, or ROLE=FILE"
         ) from error
+    # A newer format may mean something else by the same names.
     if version > FORMAT or kind not in KINDS:
         raise MatrixError(
             f"{where}: found {kind} of format {version}, expected {' or '.join(KINDS)} of format "
@@ -136,6 +136,7 @@ def from_arrays(
             f"{source}: found no matrix; expected an array named {' or '.join(ROLES['matrix'])}, "
             "or a file of its own"
         )
+    # First, because the number of modes shows which axis of the matrix is theirs.
     mirror = read_mirror(source, arrays, reported.diameter_m, notes)
     frames = read_frames(source, arrays, reported.kind)
     if frames is None:
@@ -379,7 +380,7 @@ def usable_modes(
         arrays[name] = kept if numbers is None else np.asarray(numbers)[kept]
         mirror.keep(kept)
     position = {int(n): k for k, n in enumerate(kept)}
-    # Counted anew, because unusable ones are removed from the basis as well.
+    # Counted again, because unusable ones are removed from the basis as well.
     left = np.array([position[int(indices[k])] for k in measured])
     if not np.array_equal(left, np.arange(len(kept))):
         arrays["modes"] = left
@@ -420,6 +421,7 @@ def _sensor(reported: Reported, signals: Signals, notes: list[str]) -> dict[str,
         table["modulation_lambda_over_d"] = UNKNOWN if modulation is None else modulation
     elif reported.centroid is not None:
         table["centroid"] = reported.centroid
+    # A stated diameter is not questioned.
     if reported.pupil_diameter_subap is not None:
         return {**table, "pupil_diameter_subap": reported.pupil_diameter_subap}
     if table.get("input") != "frames":

@@ -169,12 +169,15 @@ def _valid(light: Array, images: PupilImages, n: int, pixels: int) -> NDArray[np
     offsets = np.arange(n * pixels) - (n * pixels - 1) / 2.0
     total = np.zeros((n, n))
     for row, column in images.centres_px:
+        # Windows that are rounded to pixels may reach beyond the frame by one.
         rows = np.clip(np.rint(row + offsets).astype(int), 0, light.shape[0] - 1)
         columns = np.clip(np.rint(column + offsets).astype(int), 0, light.shape[1] - 1)
         total += light[np.ix_(rows, columns)].reshape(n, pixels, n, pixels).mean(axis=(1, 3))
+    # The background of the camera must not count as light.
     total -= np.percentile(total, 1)
     places = (np.arange(n) - (n - 1) / 2.0) * pixels
     radius = np.hypot(*np.meshgrid(places, places))
+    # Away from both edges, where subapertures are lit in part.
     inside = (radius < 0.45 * images.diameter_px) & (radius > 0.55 * images.hole_px)
     valid = total > LIT_SHARE * float(np.median(total[inside]))
     if not valid.any():

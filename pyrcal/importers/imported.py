@@ -124,6 +124,7 @@ class Imported:
         place = Path(folder)
         saved = Saved(place / INSTRUMENT_FILE, place / ARRAYS_FILE)
         try:
+            # Folders that are made here are removed again if nothing can be written.
             made = [one for one in (place, *place.parents) if not one.exists()]
             place.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -150,8 +151,9 @@ class Imported:
                         refined = self._with_refined_centres(instrument)
                         draft.instrument.write_text(refined.instrument_text(), encoding="utf-8")
                 except ConfigurationError as error:
-                    # the message must not name the temporary folder, which is deleted by then
+                    # The message must not name the temporary folder, which is deleted by then.
                     raise ConfigurationError(str(error).replace(name, str(place))) from error
+                # The arrays first: an instrument file without the arrays it names would be refused.
                 draft.matrix.replace(place / ARRAYS_FILE)
                 draft.instrument.replace(place / INSTRUMENT_FILE)
         except OSError as error:
@@ -181,7 +183,8 @@ class Imported:
         """Return it with the centres that a fit would use for ``pupil_centres_px = "auto"``."""
         centres = kind_of(instrument).image_centres(instrument, self.arrays[FLUX_FRAME])
         if centres is None:
-            return self  # the light is narrower than the file's pupil: keep the fitted circles
+            # The light is narrower than the file's pupil: the fitted circles are kept.
+            return self
         wfs = {**self.tables["wfs"], "pupil_centres_px": np.round(centres, 3).tolist()}
         return replace(self, tables={**self.tables, "wfs": wfs})
 

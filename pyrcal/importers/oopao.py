@@ -25,6 +25,12 @@ from pyrcal.importers.registration import decompose
 from service.errors import ConfigurationError
 from service.model.misregistration import Misregistration, rotation
 
+_Sensor = tuple[dict[str, Any], NDArray[np.bool_], dict[str, Any]]
+"""``[wfs]``, its valid subapertures, and ``[slopes]``."""
+
+Oopao = Any
+"""An object of OOPAO's own classes, which are known by their attributes."""
+
 PYRAMID, LENSLETS = "pyramid", "shackHartmann"
 
 _MAX_NUMBER = 1e6
@@ -118,12 +124,12 @@ _SAMPLED_ACTUATORS = 24
 
 
 def from_oopao(
-    tel: Any,  # noqa: ANN401 - OOPAO's own classes, known by their attributes
-    dm: Any,  # noqa: ANN401
-    wfs: Any,  # noqa: ANN401
-    calib: Any = None,  # noqa: ANN401
+    tel: Oopao,
+    dm: Oopao,
+    wfs: Oopao,
+    calib: Oopao = None,
     M2C: Array | None = None,  # noqa: N803 - OOPAO's own name
-    ngs: Any = None,  # noqa: ANN401
+    ngs: Oopao = None,
 ) -> Imported:
     """Return OOPAO's telescope, mirror, sensor and calibration as pyrcal's instrument and matrix.
 
@@ -196,12 +202,12 @@ def from_oopao(
     )
 
 
-def _numpy(values: Any) -> Array:  # noqa: ANN401 - of NumPy or CuPy
+def _numpy(values: Oopao) -> Array:
     """Return an array of this machine's memory."""
     return np.asarray(values.get() if hasattr(values, "get") else values)
 
 
-def _wavelength_m(tel: Any, wfs: Any, ngs: Any) -> float:  # noqa: ANN401
+def _wavelength_m(tel: Oopao, wfs: Oopao, ngs: Oopao) -> float:
     source = ngs or getattr(wfs, "src", None) or getattr(tel, "src", None)
     if source is None or not hasattr(source, "wavelength"):
         raise ConfigurationError(
@@ -211,9 +217,7 @@ def _wavelength_m(tel: Any, wfs: Any, ngs: Any) -> float:  # noqa: ANN401
 
 
 def _lit_pupil(
-    tel: Any,  # noqa: ANN401
-    sensor: dict[str, Any],
-    notes: list[str],
+    tel: Oopao, sensor: dict[str, Any], notes: list[str]
 ) -> tuple[NDArray[np.float32], float]:
     """Return the pupil without a dark rim, and its diameter; ``sensor`` is changed to match.
 
@@ -245,7 +249,7 @@ def _lit_pupil(
     return pupil[rim : side - rim, rim : side - rim], diameter_m
 
 
-def _steps(tel: Any) -> float:  # noqa: ANN401
+def _steps(tel: Oopao) -> float:
     """Return a length of a pupil that is n samples wide over one of OOPAO's."""
     return (int(tel.resolution) - 1) / int(tel.resolution)
 
@@ -253,11 +257,7 @@ def _steps(tel: Any) -> float:  # noqa: ANN401
 # --- the sensor
 
 
-def _sensor(
-    tel: Any,  # noqa: ANN401
-    wfs: Any,  # noqa: ANN401
-    notes: list[str],
-) -> tuple[dict[str, Any], NDArray[np.bool_], dict[str, Any]]:
+def _sensor(tel: Oopao, wfs: Oopao, notes: list[str]) -> _Sensor:
     """Return ``[wfs]``, its valid subapertures, and ``[slopes]``."""
     kind = getattr(wfs, "tag", type(wfs).__name__)
     if kind == PYRAMID:
@@ -267,11 +267,7 @@ def _sensor(
     raise ConfigurationError(f"wfs.tag: found {kind!r}, expected {PYRAMID!r} or {LENSLETS!r}")
 
 
-def _pyramid(
-    tel: Any,  # noqa: ANN401
-    wfs: Any,  # noqa: ANN401
-    notes: list[str],
-) -> tuple[dict[str, Any], NDArray[np.bool_], dict[str, Any]]:
+def _pyramid(tel: Oopao, wfs: Oopao, notes: list[str]) -> _Sensor:
     if not wfs.postProcessing.startswith("slopesMaps"):
         raise ConfigurationError(
             f"wfs.postProcessing: found {wfs.postProcessing!r}, expected 'slopesMaps' or another "
@@ -296,10 +292,7 @@ def _pyramid(
     return sensor, valid, {"order": "xy", "orientation": "auto", "normalisation": "global"}
 
 
-def _lenslets(
-    wfs: Any,  # noqa: ANN401
-    notes: list[str],
-) -> tuple[dict[str, Any], NDArray[np.bool_], dict[str, Any]]:
+def _lenslets(wfs: Oopao, notes: list[str]) -> _Sensor:
     threshold = float(wfs.threshold_cog)
     centroid: dict[str, Any] = {"centroid": "cog"}
     if getattr(wfs, "is_geometric", False):
@@ -321,7 +314,7 @@ def _lenslets(
 # --- the mirror
 
 
-def _functions(tel: Any, dm: Any) -> Array:  # noqa: ANN401
+def _functions(tel: Oopao, dm: Oopao) -> Array:
     """Return influence functions ``(tel.resolution ** 2, n_actuators)``.
 
     OOPAO's ``InfluenceFunctions`` has them as a cube ``influence_function_2D``.
@@ -346,10 +339,7 @@ def _functions(tel: Any, dm: Any) -> Array:  # noqa: ANN401
 
 
 def _mirror(
-    tel: Any,  # noqa: ANN401
-    dm: Any,  # noqa: ANN401
-    functions: Array,
-    notes: list[str],
+    tel: Oopao, dm: Oopao, functions: Array, notes: list[str]
 ) -> tuple[dict[str, Any], dict[str, Array]]:
     """Return ``[mirror]`` and its arrays: drawn where it is OOPAO's Gaussian one, else a cube."""
     side = int(tel.resolution)
@@ -368,7 +358,7 @@ def _mirror(
     return table, {"influence_functions": cube}
 
 
-def _places(dm: Any, n_functions: int, notes: list[str]) -> Array | None:  # noqa: ANN401
+def _places(dm: Oopao, n_functions: int, notes: list[str]) -> Array | None:
     """Return where the actuators of the functions are drawn; None if that is not known.
 
     With a scalar ``actuator_selection`` OOPAO drops functions, and leaves the coordinates as they
@@ -398,11 +388,7 @@ def _places(dm: Any, n_functions: int, notes: list[str]) -> Array | None:  # noq
     return None
 
 
-def _gaussian(
-    tel: Any,  # noqa: ANN401
-    dm: Any,  # noqa: ANN401
-    places: Array,
-) -> tuple[dict[str, Any], dict[str, Array]]:
+def _gaussian(tel: Oopao, dm: Oopao, places: Array) -> tuple[dict[str, Any], dict[str, Array]]:
     """Return ``[mirror]`` of OOPAO's own Gaussian mirror at its position without misReg."""
     places = places.astype(float) * _steps(tel) * _flip_signs(dm)
     table = {
@@ -415,27 +401,23 @@ def _gaussian(
     return table, {"positions": places}
 
 
-def _flip_signs(dm: Any) -> NDArray[np.float64]:  # noqa: ANN401
+def _flip_signs(dm: Oopao) -> NDArray[np.float64]:
     """Return the sign of x and y from the flips of OOPAO's influence functions."""
     x, y = (-1.0, -1.0) if getattr(dm, "flip_", False) else (1.0, 1.0)
     return np.array([-x if getattr(dm, "flip_lr", False) else x, y])
 
 
-def _is_gaussian(
-    dm: Any,  # noqa: ANN401
-    places: Array,
-    functions: Array,
-    diameter_m: float,
-) -> bool:
+def _is_gaussian(dm: Oopao, places: Array, functions: Array, diameter_m: float) -> bool:
     """Return True if the influence functions are the Gaussians given by the attributes."""
     if getattr(dm, "sign", 1) != 1:
         return False
+    # A sample is enough, because all are drawn by one formula.
     some = np.unique(np.linspace(0, len(places) - 1, _SAMPLED_ACTUATORS).astype(int))
     drawn = _compute_gaussians(dm, places[some].astype(float), len(functions), diameter_m)
     return bool(np.abs(drawn - functions[:, some].T).max() <= _MAX_SHAPE_DEVIATION)
 
 
-def _compute_gaussians(dm: Any, places_m: Array, n_points: int, diameter_m: float) -> Array:  # noqa: ANN401
+def _compute_gaussians(dm: Oopao, places_m: Array, n_points: int, diameter_m: float) -> Array:
     """Return OOPAO's Gaussians ``(n, n_points)`` of actuators that its misReg moves."""
     moved = dm.misReg
     linear = _linear(moved)
@@ -453,7 +435,7 @@ def _compute_gaussians(dm: Any, places_m: Array, n_points: int, diameter_m: floa
 # --- its misregistration
 
 
-def _linear(moved: Any) -> NDArray[np.float64]:  # noqa: ANN401
+def _linear(moved: Oopao) -> NDArray[np.float64]:
     """Return what a ``MisRegistration`` does to coordinates, ``(2, 2)``, before its shift."""
     axes = rotation(np.deg2rad(float(moved.anamorphosisAngle)))
     radial, tangential = 1.0 + float(moved.radialScaling), 1.0 + float(moved.tangentialScaling)
@@ -462,7 +444,7 @@ def _linear(moved: Any) -> NDArray[np.float64]:  # noqa: ANN401
     return np.asarray(rotation(np.deg2rad(float(moved.rotationAngle))) @ stretch)
 
 
-def _describe_registration(moved: Any, tel: Any, n_subapertures: int) -> tuple[str, ...]:  # noqa: ANN401
+def _describe_registration(moved: Oopao, tel: Oopao, n_subapertures: int) -> tuple[str, ...]:
     """Return the registration that a mirror has been given, as a note; nothing where none."""
     if np.allclose(_linear(moved), np.eye(2)) and not moved.shiftX and not moved.shiftY:
         return ()
@@ -479,19 +461,20 @@ def _describe_registration(moved: Any, tel: Any, n_subapertures: int) -> tuple[s
     )
 
 
-def registration_of(moved: Any, tel: Any, n_subapertures: int) -> Misregistration:  # noqa: ANN401
+def registration_of(moved: Oopao, tel: Oopao, n_subapertures: int) -> Misregistration:
     """Return the registration that OOPAO's ``MisRegistration`` is."""
     # OOPAO moves the mirror by minus the shift.
     shift_m = -np.array([float(moved.shiftX), float(moved.shiftY)])
     return decompose(_linear(moved), shift_m * _steps(tel) * n_subapertures / float(tel.D))
 
 
-def to_oopao(alpha: Misregistration, tel: Any, wfs: Any) -> dict[str, float]:  # noqa: ANN401
+def to_oopao(alpha: Misregistration, tel: Oopao, wfs: Oopao) -> dict[str, float]:
     """Return a registration as OOPAO's ``MisRegistration`` takes it: metres, degrees, fractions."""
     n_subapertures = int(wfs.nSubap) / int(getattr(wfs, "binning", 1))
     subaperture_m = float(tel.D) / n_subapertures / _steps(tel)
     # OOPAO applies the stretch first, then the rotation
     stretch = rotation(alpha.rotation_rad).T @ alpha.image
+    # eigh sorts by size: the larger scale is called radial, and the angle is that of its axis.
     (tangential, radial), axes = np.linalg.eigh((stretch + stretch.T) / 2)
     return {
         "rotationAngle": float(np.rad2deg(alpha.rotation_rad)),

@@ -56,6 +56,7 @@ def _arrays(options: argparse.Namespace) -> Imported:
         arrays = _by_role(role, path, options.source)
         if not arrays:
             inventory.append(f"ignored {path}: no name of a role, see docs/howto/importing.md")
+        # Modes of the command line are preferred to those in a file's name.
         if "matrix" in arrays and options.modes is None:
             options.modes = _modes_of_name(path, arrays["matrix"], inventory)
         twice = found.keys() & arrays.keys()

@@ -18,6 +18,9 @@ from numpy.typing import NDArray
 from service.errors import MatrixError
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration, rotation
 
+Aot = Any
+"""An object of aotpy, which has no types."""
+
 LARGEST_STRETCH = 0.2
 """Largest anamorphosis that an instrument file accepts."""
 
@@ -82,7 +85,7 @@ class Registrations:
         return f"the file's own alpha: {times}{last}{stretch}{behind}; a fit starts at its rotation"
 
 
-def registrations_of(image: Any, subaperture_m: float, where: str) -> Registrations:  # noqa: ANN401
+def registrations_of(image: Aot, subaperture_m: float, where: str) -> Registrations:
     """Return α over time from aotpy's image of the matrices.
 
     Parameters
@@ -161,7 +164,7 @@ def decompose(linear: NDArray[np.float64], shift_subap: NDArray[np.float64]) -> 
     )
 
 
-def _times(time: Any, n: int, where: str) -> Sequence[int | None]:  # noqa: ANN401 - aotpy's own
+def _times(time: Aot, n: int, where: str) -> Sequence[int | None]:
     """Return UTC nanoseconds; times written from nanoseconds are restored to the same double."""
     # A Fraction, because seconds times 1e9 would be rounded to a multiple of 256 ns.
     stamps = [] if time is None else list(time.timestamps)

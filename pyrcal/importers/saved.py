@@ -24,6 +24,7 @@ def read_npz(path: Path, *, max_bytes: int | None = MAX_BYTES) -> dict[str, Arra
     """
     try:
         with zipfile.ZipFile(path) as packed:
+            # Sizes are in the archive's directory, so nothing is unpacked to learn them.
             n_bytes = sum(member.file_size for member in packed.infolist())
         if max_bytes is not None and n_bytes > max_bytes:
             raise MatrixError(

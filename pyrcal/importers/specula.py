@@ -50,6 +50,7 @@ def from_specula(paths: Sequence[Path], reported: Reported, source: str = "SPECU
     for path in paths:
         with opened(path) as container:
             if "fsizex" in container.facts or "np_sub" in container.facts:
+                # Only PupData has FSIZEX, only SubapData NP_SUB.
                 places = read_subapertures(container)
                 kind = "shack-hartmann" if "np_sub" in container.facts else "pyramid"
                 continue

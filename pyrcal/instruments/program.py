@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pyrcal.fitting.figures import check_plots, map_to_sensor, mirror_outline
+from pyrcal.fitting.figures import check_plots, map_to_sensor, mirror_outline, save_figure
 from pyrcal.instruments.schema_texts import KeyText, TableText, tables_of
 from pyrcal.terminal import print_lines, span
 from service.control.reconstructor import MAX_CONDITION, invert
@@ -58,6 +58,8 @@ def make_template(kind: SensorKind) -> str:
 
 def _table(table: TableText, examples: Mapping[str, object]) -> Iterator[str]:
     """Yield a table; an optional nested table is commented out."""
+    # A nested table is optional: as a comment it does not make the template an instrument
+    # with such a part.
     inner = "." in table.header
     yield from _comment(table.about)
     yield f"{'#' if inner else ''}{table.header}"
@@ -123,6 +125,7 @@ def derive_properties(instrument: Instrument, most_gb: float) -> Implied:
         n_modes=instrument.modes.n_modes,
         expected_gb=work_of(instrument, sensor, pupil).memory_bytes / GB,
     )
+    # The size of an ELT's matrix is reported instead of being tried.
     return known if known.expected_gb > most_gb else _compute_matrix(instrument, known)
 
 
@@ -204,6 +207,7 @@ def write_drawing(instrument: Instrument, path: Path) -> None:
     points, style = mirror_outline(instrument)
     here = map_to_sensor(points, instrument.start)
     axes.plot(here[:, 0], here[:, 1], style, color=_MIRROR, markersize=5.0, linewidth=1.0)
+    # The mirror may be larger than the pupil, and must be seen whole.
     reach = 1.05 * max(half, float(np.abs(here).max()))
     axes.set(
         title=f"{instrument.name}: pupil (grey), valid subapertures (blue), mirror (red)",
@@ -213,10 +217,7 @@ def write_drawing(instrument: Instrument, path: Path) -> None:
         ylim=(-reach, reach),
         aspect="equal",
     )
-    try:
-        figure.savefig(path, dpi=110)
-    except (OSError, ValueError) as error:
-        raise ConfigurationError(f"cannot write {path}: {error}") from error
+    save_figure(figure, path)
 
 
 USABLE, WRONG = 0, 1
@@ -243,6 +244,7 @@ def main(options: argparse.Namespace) -> int:
 
 def _new(options: argparse.Namespace) -> int:
     try:
+        # Mode x: a file that was edited is not overwritten.
         with options.file.open("x", encoding="utf-8") as file:
             file.write(make_template(KINDS[options.kind]))
     except OSError as error:

@@ -62,6 +62,7 @@ def tables_of(whole: type[Table]) -> Iterator[TableText]:
                 (each, _) = get_args(get_type_hints(record)[key])
                 table = kinds[inner.rpartition("/")[2]]
                 yield _table(f"[[{section}.{key}]]", table, each, kinds)
+            # A table within a table may be optional, which JSON schemas say with anyOf.
             for of_key in (field, *field.get("anyOf", ())):
                 table = kinds.get(of_key.get("$ref", "").rpartition("/")[2], {})
                 if _text(table).startswith(f"`[{section}.{key}]"):
@@ -71,8 +72,8 @@ def tables_of(whole: type[Table]) -> Iterator[TableText]:
 
 def _inside(record: object, key: str) -> object:
     """Return the record of a table within another, which may be left out; None: no dataclass."""
-    told = get_type_hints(record)[key] if is_dataclass(record) else None
-    return next((one for one in get_args(told) if is_dataclass(one)), None)
+    hint = get_type_hints(record)[key] if is_dataclass(record) else None
+    return next((one for one in get_args(hint) if is_dataclass(one)), None)
 
 
 def _table(header: str, kind: Schema, record: object, kinds: Mapping[str, Schema]) -> TableText:
@@ -97,6 +98,7 @@ def _table(header: str, kind: Schema, record: object, kinds: Mapping[str, Schema
 
 def _field_texts(record: type) -> dict[str, str]:
     """Return the docstring under each field of a record, inherited ones included."""
+    # Of all bases, the record's own last, because it may describe a field in its own words.
     bases = [described(base) for base in reversed(record.__mro__[:-1])]
     return {key: text for texts in bases for key, text in texts.items() if text}
 
@@ -132,6 +134,7 @@ def _text(field: Schema) -> str:
 
 def described(kind: type) -> dict[str, str]:
     """Return the names in the body of a class with the text that follows each in its source."""
+    # From the source, because Python keeps no docstring of a field.
     tree = ast.parse(textwrap.dedent(inspect.getsource(kind)))
     (body,) = (node.body for node in tree.body if isinstance(node, ast.ClassDef))
     texts: dict[str, str] = {}

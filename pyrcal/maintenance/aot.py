@@ -10,13 +10,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.importers.aot import import_aotpy
-from pyrcal.importers.registration import Dated
+from pyrcal.importers.registration import Aot, Dated
 from service.errors import ConfigurationError, WireError
 from service.files.recording import RecordedKind, Recording
 from service.model.instrument import Instrument, Mirror
@@ -149,7 +148,7 @@ def write_aot(
         raise ConfigurationError(f"{path}: cannot be written: {error}") from error
 
 
-def _system(aotpy: Any, instrument: Instrument, estimates: tuple[Dated, ...]) -> Any:  # noqa: ANN401
+def _system(aotpy: Aot, instrument: Instrument, estimates: tuple[Dated, ...]) -> Aot:
     telescope = aotpy.MainTelescope(
         uid="telescope",
         enclosing_diameter=instrument.diameter_m,
@@ -190,7 +189,7 @@ def _system(aotpy: Any, instrument: Instrument, estimates: tuple[Dated, ...]) ->
     )
 
 
-def _over_time(aotpy: Any, instrument: Instrument, estimates: tuple[Dated, ...]) -> Any:  # noqa: ANN401
+def _over_time(aotpy: Aot, instrument: Instrument, estimates: tuple[Dated, ...]) -> Aot:
     """Return α over time; None if there is no estimate."""
     if not estimates:
         return None
@@ -208,7 +207,7 @@ def affine(alpha: Misregistration, subaperture_m: float) -> NDArray[np.float64]:
     return matrix
 
 
-def _add_telemetry(aotpy: Any, system: Any, instrument: Instrument, taken: Excerpt) -> None:  # noqa: ANN401
+def _add_telemetry(aotpy: Aot, system: Aot, instrument: Instrument, taken: Excerpt) -> None:
     headers = [batch.header for batch in taken.batches]
     rows = [np.arange(header.n) for header in headers]
     seqs = np.concatenate([h.seq0 + row for h, row in zip(headers, rows, strict=True)])
@@ -247,13 +246,13 @@ def _add_telemetry(aotpy: Any, system: Any, instrument: Instrument, taken: Excer
         )
 
 
-def is_own(measurements: Any) -> bool:  # noqa: ANN401
+def is_own(measurements: Aot) -> bool:
     """Return True if measurements in an AOT file were written by pyrcal, in its axes."""
     time = measurements.time
     return time is not None and str(time.uid).casefold() == f"time of {FRAMES}"
 
 
-def _time(aotpy: Any, name: str, t_ns: NDArray[np.int64], seqs: NDArray[np.int64]) -> Any:  # noqa: ANN401
+def _time(aotpy: Aot, name: str, t_ns: NDArray[np.int64], seqs: NDArray[np.int64]) -> Aot:
     seconds = (t_ns / SECOND_NS).tolist()
     return aotpy.Time(uid=f"time of {name}", timestamps=seconds, frame_numbers=seqs.tolist())
 

@@ -96,6 +96,7 @@ def _show(archive: Archive, every: tuple[Item, ...], product_id: str, *, as_json
         )
     store = next(store for store in archive.stores if store.noun == item.kind)
     record = next((record for record in store.records() if record.id == product_id), None)
+    # The numbers are read as well, because the index does not know of damage.
     damage = next(verify(archive, [item]))
     document: dict[str, Any] = {
         **asdict(item),
@@ -154,7 +155,7 @@ def _prune(settings: Settings, *, dry_run: bool, as_json: bool) -> int:
         going = tuple(due(items(archive, _list_saved_matrices(archive)), retention, time.time_ns()))
         gone = []
         for item, why in going:
-            # None if somebody has pinned it since the list was made: it stays.
+            # None if it was pinned after the list was made: it stays.
             entry = None if dry_run else remove(archive, item, why)
             if entry is not None:
                 archive.record((), (replace(entry, who="pyrcal archive prune"),))

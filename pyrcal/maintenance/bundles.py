@@ -16,7 +16,7 @@ from service.archive.serialisation import NOT_UNDERSTOOD, from_json, to_json
 from service.config import Settings
 from service.errors import ArchiveError, ConfigurationError, UnknownIdError, say, shown
 from service.files.bundle import RECONSTRUCTOR, Bundle, read_bundle, write_bundle
-from service.files.container import NUMPY_DAMAGE
+from service.files.container import opened
 from service.files.disk_cache import cached_basis
 from service.files.documents import json_text
 from service.files.whole import open_hdf5
@@ -68,6 +68,7 @@ def _read_product(
     """Return an archived product, the requested companion products, and its basis."""
     with open_hdf5(path) as file:
         names = {RECONSTRUCTOR: RECONSTRUCTOR, **_COMPANION_ARRAYS}
+        # Gains and covariance are not of every product: the RTC's own matrix has none.
         arrays = {name: np.asarray(file[at][()]) for name, at in names.items() if at in file}
         provenance = {
             key: value.item() if isinstance(value, np.generic) else value
@@ -80,6 +81,7 @@ def _read_product(
             f"{record.id}: was made for {made_for}; found the instrument {instrument.name}: give "
             "its own with --instrument"
         )
+    # The archive has no basis: it follows from the instrument, whose checksum is in the bundle.
     basis = cached_basis(instrument)
     if isinstance(basis, ModalBasis):
         arrays["mode_to_actuator"] = np.asarray(basis.mode_to_actuator)
@@ -104,6 +106,7 @@ def _record_in(path: Path) -> ReconstructorRecord:
             stated, found = file.attrs["sha256"], checksum(np.asarray(file[RECONSTRUCTOR][()]))
     except NOT_UNDERSTOOD as error:
         raise ArchiveError(f"{path}: no archived reconstructor: {error}") from error
+    # The file may have left the archive, whose reading would have compared them.
     if found != stated:
         raise ArchiveError(f"{path}: damaged: found checksum {found}, expected {stated}")
     return record
@@ -145,10 +148,9 @@ def _interaction_matrix(
 
 
 def _reference(path: Path, n_slopes: int) -> NDArray[np.float32]:
-    try:
-        found = np.load(path, allow_pickle=False)
-    except NUMPY_DAMAGE as error:
-        raise ConfigurationError(f"--reference {path}: {error}") from error
+    with opened(path) as container:
+        # A NumPy file has one array, without a name.
+        found = next(iter(container.arrays.values())).numbers()
     if found.shape != (n_slopes,):
         raise ConfigurationError(
             f"--reference {path}: found shape {found.shape}, expected ({n_slopes},)"

@@ -108,6 +108,7 @@ def _make_certificate(
 ) -> Signed:
     """Return a certificate of a role; only the service's accepts connections."""
     key = ec.generate_private_key(ec.SECP256R1())
+    # Names of a host matter where clients connect to it: only at the service.
     serves = role is LinkRole.SERVICE
     # Every role presents its certificate to the router, which the service is.
     usages = [Usage.CLIENT_AUTH, *([Usage.SERVER_AUTH] if serves else [])]
@@ -156,7 +157,7 @@ def _write(folder: Path, stem: str, signed: Signed) -> None:
 
 def _write_secret(path: Path, data: bytes) -> None:
     """Write a file that other users can never read, not even while it is being written."""
-    # Made anew, because a mode applies to new files only.
+    # Removed first, because a mode applies to new files only.
     path.unlink(missing_ok=True)
     path.touch(mode=0o600)
     path.write_bytes(data)

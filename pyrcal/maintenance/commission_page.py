@@ -148,6 +148,7 @@ def _checks(data: Commissioning) -> str:
     rows = (
         (
             str(one["check"]),
+            # The file may come from a check-rtc of another version.
             ", ".join(map(str, one.get("requirements", ()))),
             _mark(str(one["outcome"]), classes.get(one["outcome"], "note")),
             str(one["found"]),
@@ -180,6 +181,7 @@ def _fit(data: Commissioning) -> str:
 
 
 def _matrices(data: Commissioning) -> str:
+    # The last state of a probation counts, in the order of the audit trail.
     verdicts: dict[str, str] = {}
     for _, state, text in data.probations:
         name, _, words = text.partition(": ")
@@ -209,9 +211,7 @@ def _alarms(data: Commissioning) -> str:
             ("a rule of the settings", "") if known is None else (known.severity, known.means)
         )
         rows.append((name, severity, _time(begin_ns), f"{(end_ns - begin_ns) * 1e-9:.0f} s", means))
-    return _figure(_draw_alarms(data), "Alarms over time, by severity.") + _table(
-        ("Alarm", "Severity", "Began (UTC)", "Lasted", "Meaning"), rows
-    )
+    return _table(("Alarm", "Severity", "Began (UTC)", "Lasted", "Meaning"), rows)
 
 
 # --- figures
@@ -288,21 +288,6 @@ def _draw_gains(fit: dict[str, Any]) -> Figure:
     axis.plot(gains, color=_BLUE, marker=".", ms=3, lw=0.8)
     axis.axhline(1.0, color=_GREY, lw=0.8)
     axis.set(xlabel="fitted mode", ylabel="gain")
-    return figure
-
-
-def _draw_alarms(data: Commissioning) -> Figure:
-    names = list(dict.fromkeys(name for name, *_ in data.alarms))
-    figure, (axis,) = _draw(1, 1.0 + 0.28 * len(names))
-    colours = {"critical": _RED, "serious": _AMBER, "warning": _GREY}
-    for name, begin_ns, end_ns in data.alarms:
-        severity = str(ALARMS[name].severity) if name in ALARMS else "warning"
-        begin, end = _minutes(data, (begin_ns, end_ns))
-        # A bar of no length would not be drawn.
-        axis.barh(names.index(name), max(end - begin, 0.02), left=begin, color=colours[severity])
-    axis.set_yticks(range(len(names)), names)
-    axis.invert_yaxis()
-    axis.set(xlabel="minutes", xlim=_minutes(data, (data.first_ns, data.last_ns)))
     return figure
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.importers.aot import places_of, read_system, registrations_between
-from pyrcal.importers.registration import SECOND_NS, Dated
+from pyrcal.importers.registration import SECOND_NS, Aot, Dated
 from pyrcal.maintenance.aot import is_own
 from service.errors import MatrixError
 from service.model.instrument import Instrument, Mirror
@@ -99,13 +99,13 @@ def read_telemetry(path: Path, instrument: Instrument) -> AotTelemetry:
     return night
 
 
-def _n_valid(sensor: Any) -> int:  # noqa: ANN401 - aotpy has no types
+def _n_valid(sensor: Aot) -> int:
     """Return how many subapertures the mask of a sensor lists; 0 without a mask."""
     mask = getattr(sensor, "subaperture_mask", None)
     return 0 if mask is None else int((np.asarray(mask.data) >= 0).sum())
 
 
-def _belongs_to(sensor: Any, instrument: Instrument) -> bool:  # noqa: ANN401
+def _belongs_to(sensor: Aot, instrument: Instrument) -> bool:
     """Return True if a sensor may be the instrument's; one without a mask is rejected later."""
     mask = getattr(sensor, "subaperture_mask", None)
     if mask is None:
@@ -115,7 +115,7 @@ def _belongs_to(sensor: Any, instrument: Instrument) -> bool:  # noqa: ANN401
     return any(places.shape == one.shape and np.array_equal(places, one) for one in masks)
 
 
-def _only_mirror(path: Path, system: Any) -> Any:  # noqa: ANN401
+def _only_mirror(path: Path, system: Aot) -> Aot:
     if len(system.wavefront_correctors) != 1:
         raise MatrixError(
             f"{path}: found {len(system.wavefront_correctors)} mirrors and no loop with commands, "
@@ -124,7 +124,7 @@ def _only_mirror(path: Path, system: Any) -> Any:  # noqa: ANN401
     return system.wavefront_correctors[0]
 
 
-def _commands(loop: Any) -> Any:  # noqa: ANN401 - aotpy has no types
+def _commands(loop: Aot) -> Aot:
     """Return the image of a loop's commands, modal if available; None if it has none."""
     modal = getattr(loop, "modal_coefficients", None)
     return loop.commands if modal is None else modal
@@ -136,7 +136,7 @@ class _Reader:
     instrument: Instrument
     notes: list[str]
 
-    def arrays(self, loop: Any, sensor: Any) -> dict[str, Array]:  # noqa: ANN401
+    def arrays(self, loop: Aot, sensor: Aot) -> dict[str, Array]:
         """Return the frames of a loop; slopes are those that its commands are of."""
         image, commands = sensor.measurements, _commands(loop)
         # pyrcal's slopes have no unit: those in pixels or radians have another scale.
@@ -176,7 +176,7 @@ class _Reader:
 
     # --- signals
 
-    def _list_positions(self, sensor: Any, *, own: bool) -> Array:  # noqa: ANN401
+    def _list_positions(self, sensor: Aot, *, own: bool) -> Array:
         """Return the position of each of the instrument's subapertures in the file, row by row."""
         if sensor.subaperture_mask is None:
             raise self._refusal("found no subaperture_mask, expected one")
@@ -213,7 +213,7 @@ class _Reader:
 
     # --- frames
 
-    def _frames(self, image: Any, commands: Any, rate_hz: float) -> tuple[list[int], list[int]]:  # noqa: ANN401
+    def _frames(self, image: Aot, commands: Aot, rate_hz: float) -> tuple[list[int], list[int]]:
         """Return the numbers of the frames of signals and commands."""
         n_numbers = [len(_numbers(one)) for one in (image, commands)]
         if n_numbers == [len(image.data), len(commands.data)]:
@@ -247,7 +247,7 @@ class _Reader:
 
     # --- commands
 
-    def _compute_modal_commands(self, loop: Any) -> Array:  # noqa: ANN401
+    def _compute_modal_commands(self, loop: Aot) -> Array:
         """Return the commands ``(n, n_modes)`` of the instrument's modes, metres."""
         if loop.modal_coefficients is not None:
             return self._convert_to_metres(loop.modal_coefficients)
@@ -273,7 +273,7 @@ class _Reader:
         self.notes.append("commands of actuators: turned into modes by mode_to_actuator")
         return np.asarray(modal)
 
-    def _filter(self, loop: Any) -> dict[str, Array]:  # noqa: ANN401
+    def _filter(self, loop: Aot) -> dict[str, Array]:
         """Return gains and leak, where the loop's time filter is an integrator."""
         if loop.time_filter_num is None or loop.time_filter_den is None:
             return {}
@@ -288,7 +288,7 @@ class _Reader:
         self.notes.append("the time filter is no integrator with one leak: gains are taken as 0.5")
         return {}
 
-    def _convert_to_metres(self, image: Any) -> Array:  # noqa: ANN401
+    def _convert_to_metres(self, image: Aot) -> Array:
         if image.unit not in UNITS_M:
             raise self._refusal(
                 f"{image.name}: found the unit {image.unit}, expected one of m, um, nm"
@@ -300,7 +300,7 @@ class _Reader:
         return MatrixError(f"{self.path}: {what}")
 
 
-def _numbers(image: Any) -> list[int]:  # noqa: ANN401
+def _numbers(image: Aot) -> list[int]:
     """Return the numbers of the frames that an image is of, -1 where one is missing.
 
     Empty if it has none.
@@ -309,7 +309,7 @@ def _numbers(image: Any) -> list[int]:  # noqa: ANN401
     return [-1 if number is None else int(number) for number in given]
 
 
-def _stamps(image: Any) -> list[float]:  # noqa: ANN401
+def _stamps(image: Aot) -> list[float]:
     """Return the times of an image in seconds, NaN if one is missing; empty if it has none."""
     given = [] if image.time is None else image.time.timestamps
     return [math.nan if stamp is None else float(stamp) for stamp in given]

@@ -100,16 +100,16 @@ def open_arrays(path: Path) -> Iterator[Arrays]:
         try:
             if zipfile.is_zipfile(path):
                 found: dict[str, Any] = dict(read_npz(path, max_bytes=None))
-                facts: Mapping[str, Any] = {}
             elif kind_of(path) is FileKind.HDF5:
                 file = stack.enter_context(open_hdf5(path))
-                found = {k: v for k, v in file.items() if isinstance(v, h5py.Dataset)}
-                facts = file.attrs
+                # Numbers may be attributes; an attribute does not take the place of an array.
+                found = {name: np.asarray(value) for name, value in file.attrs.items()}
+                found |= {k: v for k, v in file.items() if isinstance(v, h5py.Dataset)}
             else:
                 raise ConfigurationError(f"{path}: expected telemetry in HDF5 or .npz")
         except (OSError, RuntimeError, ValueError, KeyError) as error:
             raise ConfigurationError(f"{path}: damaged: {error}") from error
-        yield Arrays(path=path, found=found, facts=facts)
+        yield Arrays(path=path, found=found)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -118,7 +118,7 @@ class Arrays:
 
     path: Path
     found: Mapping[str, Any]
-    facts: Mapping[str, Any]
+    """Arrays and numbers by name, as they are in the file."""
 
     def messages(self, instrument: Instrument) -> Iterator[Message]:
         """Yield it as an RTC would have sent it: matrix, statuses, frames.
@@ -144,7 +144,8 @@ class Arrays:
             yield _matrix_message(matrix, status)
         every = max(1, round(STATUS_S * status.frame_rate_hz))
         last_status, unusable = -1, np.zeros(0, np.intp)
-        for start, stop in _batches(seq, _frames_at_once(n_slopes + 2 * n_modes)):
+        n_at_once = max(1, min(FRAMES_PER_BATCH, BATCH_LIMIT // (4 * (n_slopes + 2 * n_modes))))
+        for start, stop in _batches(seq, n_at_once):
             rows = self._rows(start, stop, n_modes)
             # A comparison with NaN is false, so it is left out as well.
             usable = np.all(np.abs(rows) <= MAX_NUMBER, axis=1)
@@ -409,7 +410,7 @@ class Arrays:
             raise self._refusal(name, f"{shown} in {where}", expected)
 
     def _number(self, name: str, default: float | None, limit: float) -> float:
-        given = self.facts.get(name, self.found.get(name, default))
+        given = self.found.get(name, default)
         if given is None:
             raise self._refusal(name, "no such number", "it as an attribute or an array of one")
         try:
@@ -435,10 +436,6 @@ def _status_message(status: Status, seq: int, since: int) -> Message:
     seconds = since / status.frame_rate_hz
     later_status = replace(status, seq=seq, t_ns=status.t_ns + round(seconds * SECOND_NS))
     return Message(seconds, RecordedKind.STATUS, encode(later_status))
-
-
-def _frames_at_once(n_columns: int) -> int:
-    return max(1, min(FRAMES_PER_BATCH, BATCH_LIMIT // (4 * n_columns)))
 
 
 def _runs(usable: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:

@@ -123,7 +123,7 @@ def _stream(
 
 
 def _load_array(folder: Path, record: Mapping[str, Any], key: str) -> Array:
-    # The session may come from somebody else: it must not name files outside its folder.
+    # The session may come from another machine: it must not name files outside its folder.
     path = (folder / str(record.get(key))).resolve()
     if not path.is_relative_to(folder.resolve()):
         raise ConfigurationError(f"{folder / MANIFEST}: {key}: found {path}, expected a file in it")

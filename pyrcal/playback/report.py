@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from pyrcal.fitting.figures import check_plots
 from pyrcal.playback.player import Track, to_boundary
 from pyrcal.terminal import table as aligned
-from service.errors import ConfigurationError
 from service.files.container import put_array
 from service.model.misregistration import (
     BOUNDARY_SCALE,
@@ -107,7 +106,7 @@ def _file_rows(track: Track, found: Array | None) -> list[Sequence[str]]:
 
 
 def _explain_failure(track: Track) -> str:
-    """Return why nothing could be made of the telemetry, as far as anybody knows."""
+    """Return the most likely reason for which the telemetry gave no α."""
     if not track.n_frames:
         return "no frame could be used"
     if track.misaligned:
@@ -133,6 +132,7 @@ def _scatter(entries: Sequence[HistoryEntry]) -> list[str]:
     if len(entered) < MIN_WINDOWS:
         return ["too few"] * len(PARAMETERS)
     measured = np.array([entry.measured.vector for entry in entered])
+    # The difference of two windows has twice the variance of one.
     scatter = np.sqrt(np.mean(np.diff(measured, axis=0) ** 2, axis=0) / 2.0)
     stated_sigma = np.sqrt(np.mean([entry.measured_sigma**2 for entry in entered], axis=0))
     return [f"{ratio:.2f}" for ratio in scatter / stated_sigma]
@@ -151,6 +151,7 @@ def _list_problems(track: Track) -> list[str]:
     ]
     names: Counter[str] = Counter()
     texts: dict[str, str] = {}
+    # One line for each kind: the last text is the most recent one.
     for entry in track.lines:
         if entry.level in {Level.WARNING, Level.ALARM} and entry.name not in led_to:
             names[entry.name] += 1
@@ -240,20 +241,6 @@ def fill(file: h5py.File, track: Track, source: Path) -> None:
         put_array(file, "interaction_matrix", track.noisy.matrix, "noisy, slope per metre of OPD")
         put_array(file, "noise", np.median(track.noisy.noise, axis=0), "(n_modes,) 1 sigma")
         put_array(file, "modes", np.array(track.noisy.modes), "(n_modes,) basis indices")
-
-
-def plot(track: Track, title: str, path: Path) -> None:
-    """Draw α over time, every estimator's and the filtered one.
-
-    Raises
-    ------
-    ConfigurationError
-        If the file cannot be written.
-    """
-    try:
-        draw(track, title).savefig(path, dpi=110)
-    except (OSError, ValueError) as error:
-        raise ConfigurationError(f"--plot: cannot write {path}: {error}") from error
 
 
 def draw(track: Track, title: str) -> Figure:

@@ -14,12 +14,12 @@ from pathlib import Path
 import structlog
 from threadpoolctl import threadpool_limits
 
-from pyrcal.fitting.figures import check_plots
+from pyrcal.fitting.figures import check_plots, save_figure
 from pyrcal.playback.aot import read_telemetry
 from pyrcal.playback.arrays import Arrays, open_arrays
 from pyrcal.playback.player import Player, Track
 from pyrcal.playback.pyrtc import is_session, read_session
-from pyrcal.playback.report import document, fill, plot, table
+from pyrcal.playback.report import document, draw, fill, table
 from pyrcal.terminal import show_progress
 from service.config import load_settings
 from service.config.settings import Settings
@@ -56,7 +56,8 @@ def main(options: argparse.Namespace) -> int:
     if options.output is not None:
         write_whole(options.output, partial(fill, track=found, source=options.telemetry))
     if options.plot is not None:
-        plot(found, f"{instrument.name}: {options.telemetry.name}", options.plot)
+        figure = draw(found, f"{instrument.name}: {options.telemetry.name}")
+        save_figure(figure, options.plot)
     return NOTHING_FOUND if found.state.alpha.registration is None else FOUND
 
 
@@ -86,7 +87,7 @@ def track(
         if _is_fits(path):
             return _play_aot(path, instrument, settings)
         if is_session(path):
-            session = Arrays(path=path, found=read_session(path, instrument), facts={})
+            session = Arrays(path=path, found=read_session(path, instrument))
             return _play_arrays(session, instrument, settings)
         with open_arrays(path) as arrays:
             return _play_arrays(arrays, instrument, settings)
@@ -120,7 +121,7 @@ def _play_aot(path: Path, instrument: Instrument, settings: Settings) -> Track:
         )
     for note in aot.notes:
         say(f"note: {path}: {note}")
-    found = _play_arrays(Arrays(path=path, found=aot.arrays, facts={}), instrument, settings)
+    found = _play_arrays(Arrays(path=path, found=aot.arrays), instrument, settings)
     return replace(found, stated=aot.registrations)
 
 

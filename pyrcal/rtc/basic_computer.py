@@ -288,6 +288,7 @@ class BasicComputer:
             self.gains = np.array(request.gains)
         if request.leak is not None:
             self.leak = request.leak
+        # The number changes with the next matrix: the one in use has its own rows.
         self._n_next = request.n_controlled or self._n_next
         if request.loop is Loop.OPEN and self.closed:
             # Zeroing the integrator begins a new session by the contract. A dither and a

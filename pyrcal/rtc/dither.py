@@ -63,6 +63,7 @@ class Dither:
         ``(n_frames, n_modes)``, metres of OPD; None if none of these frames has a dither.
         """
         seq = np.arange(seq0, seq0 + n_frames) - self._delay_frames
+        # A batch may begin before the dither and end after it.
         playing = (seq >= self.start_seq) & (seq < self.stop_seq)
         if not playing.any():
             return None

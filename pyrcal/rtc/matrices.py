@@ -93,6 +93,7 @@ class Matrices(Background):
         self._enqueue(self._report)
 
     def _on_chunk(self, sample: zenoh.Sample) -> None:
+        # Refused before it is copied.
         if len(sample.payload) > CHUNK_LIMIT:
             return
         key, data = str(sample.key_expr), sample.payload.to_bytes()
@@ -193,14 +194,11 @@ class Matrices(Background):
         if refusal:
             _log.info("reconstructor.not-taken", id=manifest.id, reason=refusal)
             return
-        if self._is_in_use(manifest):
+        active = self._computer.reconstructor.manifest
+        if (active.id, active.layout.sha256) == (manifest.id, manifest.layout.sha256):
             return
         self._execute(self._staging.commit(manifest, time.monotonic()))
         self._fetch(manifest.id, tuple(range(manifest.layout.n_chunks)))
-
-    def _is_in_use(self, manifest: Manifest) -> bool:
-        active = self._computer.reconstructor.manifest
-        return (active.id, active.layout.sha256) == (manifest.id, manifest.layout.sha256)
 
     def _fetch(self, matrix_id: str, chunks: tuple[int, ...]) -> None:
         for index in chunks:

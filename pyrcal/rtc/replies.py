@@ -8,6 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -121,17 +122,14 @@ def answer_commands(
 ) -> None:
     """Declare one queryable for each kind of command, answered by ``reply``."""
 
-    def answering(kind: CommandKind) -> Callable[[zenoh.Query], None]:
-        def answer(query: zenoh.Query) -> None:
-            with query:
-                data = b"" if query.payload is None else query.payload.to_bytes()
-                reply_bytes = signatures.sign(keys.command(kind), encode(reply(kind, data)))
-                query.reply(keys.command(kind), reply_bytes, encoding=Encodings.REPLY)
-
-        return answer
+    def answer(kind: CommandKind, query: zenoh.Query) -> None:
+        with query:
+            data = b"" if query.payload is None else query.payload.to_bytes()
+            reply_bytes = signatures.sign(keys.command(kind), encode(reply(kind, data)))
+            query.reply(keys.command(kind), reply_bytes, encoding=Encodings.REPLY)
 
     for kind in CommandKind:
-        session.declare_queryable(keys.command(kind), answering(kind))
+        session.declare_queryable(keys.command(kind), partial(answer, kind))
 
 
 def answer_applied(

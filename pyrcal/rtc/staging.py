@@ -155,6 +155,7 @@ class Staging:
         if matrix_id not in self._collected:
             parts = ChunkAssembler(self._limit_bytes)
             self._collected[matrix_id] = _Collection(parts=parts)
+            # Chunks may come without a commit ever: their memory is bounded.
             if len(self._collected) > _MAX_COLLECTED_MATRICES:
                 self._collected.popitem(last=False)
         return self._collected[matrix_id]

@@ -80,6 +80,7 @@ def _compute_frames(
     model = RtcInteractionModel(instrument, modal_basis(instrument))
     matrix = np.asarray(model.interaction_matrix(ALPHA))
     matrix = matrix if columns is None else matrix[:, list(columns)]
+    # A fixed seed: the tutorials print the numbers of these files.
     noise = np.random.default_rng(3).normal(size=matrix.shape)
     matrix = matrix + 0.1 * np.linalg.norm(matrix, axis=0) * noise / np.linalg.norm(noise, axis=0)
     valid, lit = model.valid, np.zeros((n_pixels, n_pixels), dtype=bool)
@@ -110,12 +111,14 @@ def _write_papyrus(folder: Path) -> None:
 
 def _write_cacao(folder: Path) -> None:
     """Write a ``conf`` folder: response of a mirror of 12 x 12 actuators on 64 x 64 pixels."""
+    # An instrument is read from a file only.
     with NamedTemporaryFile("w", suffix=".toml") as file:
         file.write(CACAO)
         file.flush()
         instrument = load_instrument(file.name)
     positions = instrument.analytic_mirror.positions_m
     frames, lit = _compute_frames(instrument, None, ((17, 17), (17, 47), (47, 17), (47, 47)), 64, 1)
+    # cacao lists actuators row by row over the whole grid.
     at = np.rint(positions / instrument.analytic_mirror.pitch_m + 5.5).astype(int)
     cube, mask = np.zeros((144, 64, 64), np.float32), np.zeros((12, 12), np.float32)
     cube[at[:, 1] * 12 + at[:, 0]] = frames

@@ -1,4 +1,5 @@
 import json
+import re
 from dataclasses import replace
 
 import pytest
@@ -104,14 +105,9 @@ def test_a_night_that_went_well_is_good(truth):
 def test_before_and_after_stand_side_by_side(truth):
     report = make_report(service_state(), shelf(), truth, WELL)
     assert report.wavefront_ratio == pytest.approx(120.0 / 105.0)
-    before, after = [line for line in table(report).splitlines() if "####" in line]
-    assert before.count("#") == 30
-    assert after.count("#") == 26
+    (line,) = [line for line in table(report).splitlines() if "Strehl" in line]
     # Marechal: exp(-(2 pi 120/1650)^2), exp(-(2 pi 105/1650)^2)
-    assert "120 nm" in before
-    assert before.endswith("0.81")
-    assert "105 nm" in after
-    assert after.endswith("0.85   1.14 times less")
+    assert re.findall(r"[\d.]+", line) == ["120", "105", "1.14", "1.65", "0.81", "0.85"]
 
 
 def test_a_night_that_won_less_than_was_promised_fails(truth):

@@ -121,7 +121,7 @@ class Scene:
         return Fetched(state, "")
 
     def watch(self, seconds=60.0, *, whole=False, large=False, started=()):
-        promise = Promise(seconds=seconds, whole=whole, real_time=True, large=large)
+        promise = Promise(seconds=seconds, whole=whole, large=large)
         truth = TruthFile(self.path)
         return TelemetryObserver(self, truth, list(started), promise, self.lines.append)
 
@@ -293,13 +293,11 @@ def test_alarms_and_what_is_waited_for_are_seen():
     assert "the service is starting" in live_line(1.0, None, None)
 
 
-def test_a_slow_machine_is_said_to_be_slow_and_a_slow_telescope_is_not_its_fault():
-    assert slow_line(0.97, real_time=True, behind=False) is None
-    assert slow_line(None, real_time=True, behind=False) is None
-    slow = slow_line(0.61, real_time=True, behind=False)
-    assert "this machine is slow: the simulator runs at 0.6 of real time" in slow
-    assert "this machine" not in slow_line(0.2, real_time=False, behind=False)
-    assert "worker is behind" in slow_line(1.0, real_time=True, behind=True)
+def test_a_simulator_or_a_worker_that_is_slow_is_said_to_be_slow():
+    assert slow_line(0.97, behind=False) is None
+    assert slow_line(None, behind=False) is None
+    assert "the simulator runs at 0.6 of real time" in slow_line(0.61, behind=False)
+    assert "worker is behind" in slow_line(1.0, behind=True)
 
 
 def test_while_it_prepares_the_demo_says_what_it_waits_for():

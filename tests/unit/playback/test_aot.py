@@ -225,7 +225,7 @@ def test_a_part_of_negative_size_is_refused(small, tmp_path):
 
 
 def played(arrays, about):
-    return list(Arrays(path=Path("hand.fits"), found=arrays, facts={}).messages(about))
+    return list(Arrays(path=Path("hand.fits"), found=arrays).messages(about))
 
 
 def test_commands_of_more_frames_than_signals_without_any_number_are_refused(small, tmp_path):

@@ -120,7 +120,7 @@ def test_what_the_loop_says_beside_it_is_checked_as_any_telemetry(tmp_path, fact
     folder = session_in(
         tmp_path / "s", signals=counted(ids, N_SLOPES), commands=counted(ids, N_MODES), facts=facts
     )
-    arrays = Arrays(path=folder, found=read_session(folder, SMALL), facts={})
+    arrays = Arrays(path=folder, found=read_session(folder, SMALL))
     with pytest.raises(ConfigurationError, match=match):
         list(arrays.messages(SMALL))
 

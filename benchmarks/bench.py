@@ -346,9 +346,9 @@ def play(n_rounds: int, peers: Sequence[PeerProcess]) -> tuple[Rounds, dict[str,
         for peer in peers:
             answer, seen[peer.peer] = peer.ask(do="push", modes=MODES)
             rounds.peer_s.setdefault(peer.peer, []).append(float(np.median(answer["seconds"])))
-        rounds.frame_ms.setdefault("pyrcal", []).append(plant.measure(1).step_ms)
-        oopao = plant.measure_oopao(str(environment("oopao")), 4)
-        rounds.frame_ms.setdefault("oopao", []).append(oopao.step_ms)
+        rounds.frame_ms.setdefault("pyrcal", []).append(plant.measure(1))
+        oopao_ms = plant.measure_oopao(str(environment("oopao")))
+        rounds.frame_ms.setdefault("oopao", []).append(oopao_ms)
         print(f"round {k + 1} of {n_rounds} done", file=sys.stderr, flush=True)
     return rounds, seen
 

@@ -22,9 +22,8 @@ from pathlib import Path
 import httpx
 import numpy as np
 
-from benchmarks.rest import PAGES
 from benchmarks.soak import Row
-from benchmarks.standing import Sample, Standing, standing
+from benchmarks.standing import PAGES, Sample, Standing, standing
 from pyrcal_studies.sections import write_section
 
 ANSWER_MS = 50.0

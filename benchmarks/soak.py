@@ -28,8 +28,7 @@ import httpx
 import numpy as np
 from scipy import stats
 
-from benchmarks.rest import PAGES
-from benchmarks.standing import Sample, Standing, standing
+from benchmarks.standing import PAGES, Sample, Standing, standing
 from pyrcal_studies.campaign.rows import RowFile
 from pyrcal_studies.sections import write_section
 from service.instrument import load_instrument

@@ -26,6 +26,18 @@ START_TIMEOUT_S = 240.0
 
 ANSWER_TIMEOUT_S = 60.0
 
+PAGES = (
+    "/v1/state",
+    "/v1/alpha",
+    "/v1/reconstructors",
+    "/v1/alpha/history?limit=200",
+    "/v1/events?limit=200",
+    "/v1/alarms",
+    "/v1/audit?limit=50",
+    "/metrics",
+)
+"""What clients ask for, one after the other."""
+
 _TICKS = os.sysconf("SC_CLK_TCK")
 
 

@@ -8,7 +8,6 @@ slower for all. Writes the section ``bench`` of docs/results/speed.md and its pl
 
 from __future__ import annotations
 
-import argparse
 import json
 import multiprocessing
 import os
@@ -55,7 +54,7 @@ from pyrcal_studies.peers import (
     write_reference,
 )
 from pyrcal_studies.peers_pushpull import Array, Measured, read_product, write_job
-from pyrcal_studies.sections import RESULTS, write_section
+from pyrcal_studies.shared import RESULTS, study_parser, write_section
 from service.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
@@ -510,7 +509,7 @@ def facts(rounds: Rounds, peers: Sequence[PeerProcess]) -> list[str]:
 
 def main() -> int:
     """Measure, then write the section and the plot."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.bench")
+    parser = study_parser("benchmarks.bench", __doc__)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--page", type=Path, default=PAGE, help="page with a section 'bench'")
     given = parser.parse_args()

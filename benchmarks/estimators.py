@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from pyrcal_studies.shared import study_parser
 from service.estimation import loopcheck, passive
 from service.estimation.description import Actuators, Description, edge_watch
 from service.estimation.frames import FrameBlock
@@ -90,7 +91,7 @@ def main() -> None:
 
 
 def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.estimators")
+    parser = study_parser("benchmarks.estimators", __doc__)
     parser.add_argument("--block", type=int, default=30, help="frames per block (default: 30)")
     parser.add_argument("--frames", type=int, default=3000, help="per repeat (default: 3000)")
     parser.add_argument("--repeats", type=int, default=5, help="the fastest counts (default: 5)")

@@ -12,7 +12,6 @@ import argparse
 import json
 import multiprocessing
 import os
-import socket
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -25,6 +24,7 @@ import zenoh
 import zenoh.ext
 from threadpoolctl import threadpool_limits
 
+from pyrcal_studies.shared import free_port, study_parser
 from service.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
@@ -195,7 +195,7 @@ def main() -> None:
 
 def measure(arguments: argparse.Namespace) -> Result:
     """Return what one run of sender, link and worker gave."""
-    listen = f"tcp/127.0.0.1:{_free_port()}"
+    listen = f"tcp/127.0.0.1:{free_port()}"
     endpoint = Endpoint(system=SYSTEM, listen=(listen,))
     sending = Sending(
         endpoint=listen,
@@ -253,12 +253,6 @@ def _wait_until_positive(counter: Synchronized[int]) -> None:
         time.sleep(0.1)
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def _report(result: Result) -> str:
     return (
         f"{result.frames_sent} frames of {result.bytes_per_frame} bytes sent at "
@@ -274,8 +268,7 @@ def _report(result: Result) -> str:
 
 
 def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.ingest", description=__doc__)
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser = study_parser("benchmarks.ingest", __doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--rate", type=float, default=1000.0, help="frames per second")
     parser.add_argument("--batch", type=int, default=1, help="frames per message, 1 to 50")

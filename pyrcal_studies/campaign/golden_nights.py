@@ -8,7 +8,6 @@ what the tracker makes of them is written anew: the first difference of each nig
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -44,6 +43,7 @@ from pyrcal_studies.campaign.observatory import (
     latencies_of,
     true_radius,
 )
+from pyrcal_studies.shared import study_parser
 from service.config import load_settings
 from service.control.reconstructor import Recipe, reconstruct
 from service.errors import LinkError, PyrcalError
@@ -1184,7 +1184,11 @@ NIGHTS = (*TRACKING, *ACQUIRING, *COMMANDED, *MEASURING, *FAULTS)
 
 def main() -> int:
     """Record the nights that are asked for."""
-    given = _parser().parse_args()
+    parser = study_parser("pyrcal_studies.campaign.golden_nights", __doc__)
+    parser.add_argument("--folder", type=Path, default=FOLDER)
+    parser.add_argument("--retell", action="store_true", help="keep the events")
+    parser.add_argument("--only", default="", metavar="NAME,NAME", help="default: all nights")
+    given = parser.parse_args()
     names = given.only.split(",") if given.only else [plan.name for plan in NIGHTS]
     with threadpool_limits(1):
         for plan in NIGHTS:
@@ -1214,17 +1218,6 @@ def _retell(folder: Path, name: str) -> None:
     night = read(path)
     sys.stdout.write(f"{name}: {replayed(night, instrument) or 'as it was'}\n")
     written(retold(night, instrument), path)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m pyrcal_studies.campaign.golden_nights",
-        description="Records the golden nights, what the tracker is compared with.",
-    )
-    parser.add_argument("--folder", type=Path, default=FOLDER)
-    parser.add_argument("--retell", action="store_true", help="keep the events")
-    parser.add_argument("--only", default="", metavar="NAME,NAME", help="default: all nights")
-    return parser
 
 
 if __name__ == "__main__":

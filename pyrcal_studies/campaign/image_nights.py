@@ -11,11 +11,9 @@ var/image_nights.jsonl``; nights that are there already are not run again.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +29,15 @@ from pyrcal_studies.campaign.observatory import (
     Observatory,
     true_response,
 )
-from pyrcal_studies.campaign.rows import Row, RowFile, heading, line, range_of
+from pyrcal_studies.campaign.rows import (
+    Row,
+    campaign_parser,
+    complete,
+    heading,
+    line,
+    range_of,
+    tell,
+)
 from service.config import load_settings
 from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
@@ -174,22 +180,18 @@ def _numbers(values: NDArray[np.float64], digits: int) -> str:
 
 def main() -> int:
     """Run what is missing, then print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser = campaign_parser("image_nights", __doc__)
     parser.add_argument("--seeds", type=range_of, default=range(1, 17), metavar="FIRST:END")
     parser.add_argument("--rms", type=float, nargs="+", default=[0.1])
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--output", type=Path, default=Path("var/image_nights.jsonl"))
     given = parser.parse_args()
+    nights = [
+        ImageNight(seed=seed, rms_px=rms, seconds=given.seconds)
+        for rms in given.rms
+        for seed in given.seeds
+    ]
     with threadpool_limits(1):
-        file = RowFile(given.output)
-        nights = [
-            ImageNight(seed=seed, rms_px=rms, seconds=given.seconds)
-            for rms in given.rms
-            for seed in given.seeds
-        ]
-        for night in file.missing(nights):
-            file.add(play(night))
-    print(table(file.rows))
+        tell(table(complete(play, nights, given)), given.table, parser.prog)
     return 0
 
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal_studies.shared import study_parser
 from service.errors import ClusterError, say
 from service.runtime.cluster import Cluster
 
@@ -90,8 +91,7 @@ def played(
 
 def campaign_parser(name: str, text: str | None) -> argparse.ArgumentParser:
     """Return the parser of a campaign; ``text`` is its module's docstring."""
-    program = f"python -m pyrcal_studies.campaign{name and '.'}{name}"
-    parser = argparse.ArgumentParser(prog=program, description=(text or "").partition("\n\n")[0])
+    parser = study_parser(f"pyrcal_studies.campaign{name and '.'}{name}", text)
     usual = Path(f"var/{name or 'campaign'}.jsonl")
     parser.add_argument("--output", type=Path, default=usual, help=f"rows, resumed ({usual})")
     parser.add_argument("--table", type=Path, metavar="FILE.md", help="of all rows")

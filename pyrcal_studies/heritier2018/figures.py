@@ -5,7 +5,6 @@ Values that the paper prints are drawn in. Every picture stays below 100 kB.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +17,7 @@ from pyrcal_studies.heritier2018.loops import FIELD, OVERSAMPLING, strehl, wavef
 from pyrcal_studies.heritier2018.plan import Budget, Variant
 from pyrcal_studies.heritier2018.registration import fitted_alpha
 from pyrcal_studies.heritier2018.store import Store
+from pyrcal_studies.shared import save_picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,9 +38,7 @@ def smoothed(variance_nm2: Array) -> tuple[NDArray[np.intp], Array]:
     return np.arange(1, high + 1), values
 
 
-MAX_BYTES = 95_000
 _DPI = 85
-_COLOURS = (256, 96, 48)
 
 SYNTHETIC, MEASURED, TURBULENCE, PAPER = "#0757ae", "#b3261e", "0.55", "#1a7f37"
 
@@ -418,19 +416,4 @@ def write_all(budget: Budget, store: Store, folder: Path) -> None:
     """Write every picture into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     for number, draw in DRAWN.items():
-        (folder / file_name(number)).write_bytes(png(draw(budget, store)))
-
-
-def png(figure: Figure) -> bytes:
-    """Return a picture with as many colours as ``MAX_BYTES`` allow."""
-    from PIL import Image
-
-    drawn = io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=_DPI)
-    picture = Image.open(drawn).convert("RGB")
-    for colours in _COLOURS:
-        data = io.BytesIO()
-        picture.quantize(colours, dither=Image.Dither.NONE).save(data, format="png", optimize=True)
-        if data.tell() <= MAX_BYTES:
-            break
-    return data.getvalue()
+        save_picture(draw(budget, store), folder / file_name(number), _DPI)

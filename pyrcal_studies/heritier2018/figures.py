@@ -18,6 +18,7 @@ from pyrcal_studies.heritier2018.plan import Budget, Variant
 from pyrcal_studies.heritier2018.registration import fitted_alpha
 from pyrcal_studies.heritier2018.store import Store
 from pyrcal_studies.shared import save_picture
+from service.model.slopes import as_maps
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -254,7 +255,7 @@ def slope_maps(budget: Budget, store: Store) -> Figure:
         share = np.linalg.norm(measured - synthetic) / np.linalg.norm(measured)
         for axes, slopes in zip(trio, (synthetic, measured, measured - synthetic), strict=True):
             axes.imshow(
-                results.slope_maps(slopes, record["valid"]) / limit,
+                as_maps(slopes, record["valid"]) / limit,
                 origin="lower",
                 cmap="RdBu_r",
                 vmin=-1,
@@ -284,7 +285,7 @@ def variance_maps(budget: Budget, store: Store) -> Figure:
         figure.subplots(len(shown), 1, squeeze=False)[:, 0], shown, strict=True
     ):
         image = axes.imshow(
-            results.slope_maps(values, valid),
+            as_maps(values, valid),
             origin="lower",
             cmap="viridis",
             vmin=0.0,

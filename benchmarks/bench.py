@@ -8,7 +8,6 @@ slower for all. Writes the section ``bench`` of docs/results/speed.md and its pl
 
 from __future__ import annotations
 
-import argparse
 import json
 import multiprocessing
 import os
@@ -55,7 +54,7 @@ from pyrcal_studies.peers import (
     write_reference,
 )
 from pyrcal_studies.peers_pushpull import Array, Measured, read_product, write_job
-from pyrcal_studies.sections import RESULTS, write_section
+from pyrcal_studies.shared import RESULTS, study_parser, write_section
 from service.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
@@ -346,9 +345,9 @@ def play(n_rounds: int, peers: Sequence[PeerProcess]) -> tuple[Rounds, dict[str,
         for peer in peers:
             answer, seen[peer.peer] = peer.ask(do="push", modes=MODES)
             rounds.peer_s.setdefault(peer.peer, []).append(float(np.median(answer["seconds"])))
-        rounds.frame_ms.setdefault("pyrcal", []).append(plant.measure(1).step_ms)
-        oopao = plant.measure_oopao(str(environment("oopao")), 4)
-        rounds.frame_ms.setdefault("oopao", []).append(oopao.step_ms)
+        rounds.frame_ms.setdefault("pyrcal", []).append(plant.measure(1))
+        oopao_ms = plant.measure_oopao(str(environment("oopao")))
+        rounds.frame_ms.setdefault("oopao", []).append(oopao_ms)
         print(f"round {k + 1} of {n_rounds} done", file=sys.stderr, flush=True)
     return rounds, seen
 
@@ -510,7 +509,7 @@ def facts(rounds: Rounds, peers: Sequence[PeerProcess]) -> list[str]:
 
 def main() -> int:
     """Measure, then write the section and the plot."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.bench")
+    parser = study_parser("benchmarks.bench", __doc__)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--page", type=Path, default=PAGE, help="page with a section 'bench'")
     given = parser.parse_args()

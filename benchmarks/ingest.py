@@ -1,6 +1,6 @@
 """Telemetry into the service while it computes: what is lost, and how late it comes.
 
-``python -m benchmarks.ingest [--seconds 60] [--batch 1] [--secured HOW] [--json FILE]``
+``python -m benchmarks.ingest [--seconds 60] [--batch 1] [--json FILE]``
 
 Three processes, as in the field: a sender that puts full-size frames at the frame rate, the
 service's own link, and a nice'd worker that linearises the optical model without pause.
@@ -12,10 +12,6 @@ import argparse
 import json
 import multiprocessing
 import os
-import socket
-import subprocess
-import sys
-import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -28,14 +24,13 @@ import zenoh
 import zenoh.ext
 from threadpoolctl import threadpool_limits
 
-from service.config.link_tables import Router, link_security, read_link_tables, router_of
+from pyrcal_studies.shared import free_port, study_parser
 from service.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
 from service.rtc_bridge import Bridge, Endpoint
-from service.wire import FrameHeader, Keys, Role, encode_frames
-from service.wire.signing import Signatures
+from service.wire import FrameHeader, Keys, encode_frames
 
 CACHE_S = 5.0
 HEARTBEAT_MS = 200
@@ -53,8 +48,7 @@ class Sending:
     seconds: float
     n_slopes: int
     n_modes: int
-    router: Router
-    """What is shown and signed on a secured link."""
+    endpoint: str
 
     @property
     def bytes_per_frame(self) -> int:
@@ -66,13 +60,13 @@ def send_frames(
     sending: Sending, n_sent: Synchronized[int], processor_ns: Synchronized[int]
 ) -> None:
     """Put frames at the frame rate from a real zenoh client; the timestamp is the time of put."""
-    key, signatures = Keys(sending.system).frames, Signatures(sending.router.secret, Role.RTC)
+    key = Keys(sending.system).frames
     n = sending.frames_per_message
     rows = np.random.default_rng(0).standard_normal(
         (n, sending.bytes_per_frame // 4), dtype=np.float32
     )
     n_messages = round(sending.seconds * sending.frame_rate_hz / n)
-    with zenoh.open(_client(sending.router)) as session:
+    with zenoh.open(_client(sending.endpoint)) as session:
         publisher = zenoh.ext.declare_advanced_publisher(
             session,
             key,
@@ -85,8 +79,7 @@ def send_frames(
         start, began_ns = time.perf_counter(), time.process_time_ns()
         for message in range(n_messages):
             payload, attachment = encode_frames(_header(sending, message * n), rows)
-            signed = signatures.sign(key, attachment, payload)
-            publisher.put(payload, attachment=signed)
+            publisher.put(payload, attachment=attachment)
             n_sent.value += n
             behind = time.perf_counter() - start - (message + 1) * n / sending.frame_rate_hz
             time.sleep(max(0.0, -behind))
@@ -122,17 +115,16 @@ def _header(sending: Sending, seq0: int) -> FrameHeader:
     )
 
 
-def _client(router: Router) -> zenoh.Config:
+def _client(endpoint: str) -> zenoh.Config:
     config = zenoh.Config()
     settings: dict[str, object] = {
         "mode": "client",
-        "connect/endpoints": [router.endpoint],
+        "connect/endpoints": [endpoint],
         "scouting/multicast/enabled": False,
         "timestamping/enabled": True,
         "transport/shared_memory/enabled": False,
         "transport/link/tx/queue/size/data": QUEUE_MESSAGES,
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": WAIT_BEFORE_DROP_US,
-        **router.security,
     }
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
@@ -140,8 +132,6 @@ def _client(router: Router) -> zenoh.Config:
 
 
 SYSTEM = "benchmark"
-
-SIGNING = '[zenoh.signing]\nkey_file = "%s/signing.key"\n'
 
 START_TIMEOUT_S = 60.0
 """For the worker to build its basis and finish a first linearisation."""
@@ -167,9 +157,6 @@ class Result:
 
     latency_p99_s: float
     latency_max_s: float
-    secured: str
-    """How: nothing, certificates and access, signatures, both."""
-
     link_processor_s: float
     """Processor time of the service's link, all of its threads."""
 
@@ -208,36 +195,10 @@ def main() -> None:
 
 def measure(arguments: argparse.Namespace) -> Result:
     """Return what one run of sender, link and worker gave."""
-    with tempfile.TemporaryDirectory() as folder:
-        endpoint, router = _both_ends(Path(folder), arguments.secured)
-        return _measured(arguments, endpoint, router)
-
-
-def _both_ends(folder: Path, secured: str) -> tuple[Endpoint, Router]:
-    """Return the service's end and the RTC's, with certificates and secret of their own."""
-    port = _free_port()
-    if secured == "nothing":
-        listen = f"tcp/127.0.0.1:{port}"
-        return Endpoint(system=SYSTEM, listen=(listen,)), Router(endpoint=listen, security={})
-    make = ["certificates", "new", str(folder), "--zenoh-port", str(port)]
-    subprocess.run([sys.executable, "-m", "pyrcal", *make], check=True, capture_output=True)
-    for name in ("service", "rtc"):
-        path = folder / f"{name}.toml"
-        text = path.read_text(encoding="utf-8")
-        if secured == "signatures":
-            text = text.partition("[zenoh.tls]")[0].replace("tls/", "tcp/") + SIGNING % folder
-        elif secured == "both":
-            text = text.replace("# ", "")
-        path.write_text(text, encoding="utf-8")
-    zenoh = read_link_tables(folder / "service.toml")
-    security = link_security(zenoh, SYSTEM)
-    endpoint = Endpoint(system=SYSTEM, listen=zenoh.listen, security=security)
-    return endpoint, router_of(folder / "rtc.toml", None)
-
-
-def _measured(arguments: argparse.Namespace, endpoint: Endpoint, router: Router) -> Result:
+    listen = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = Endpoint(system=SYSTEM, listen=(listen,))
     sending = Sending(
-        router=router,
+        endpoint=listen,
         system=SYSTEM,
         frame_rate_hz=arguments.rate,
         frames_per_message=arguments.batch,
@@ -278,7 +239,6 @@ def _measured(arguments: argparse.Namespace, endpoint: Endpoint, router: Router)
         latency_p50_s=p50,
         latency_p99_s=p99,
         latency_max_s=highest,
-        secured=arguments.secured,
         link_processor_s=1e-9 * link_ns,
         sender_processor_s=1e-9 * sender_ns.value,
         cpus=os.cpu_count(),
@@ -293,12 +253,6 @@ def _wait_until_positive(counter: Synchronized[int]) -> None:
         time.sleep(0.1)
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def _report(result: Result) -> str:
     return (
         f"{result.frames_sent} frames of {result.bytes_per_frame} bytes sent at "
@@ -308,21 +262,18 @@ def _report(result: Result) -> str:
         f"while {result.fits_computed} linearisations were computed\n"
         f"put to consumer: p50 {1e3 * result.latency_p50_s:.2f} ms, "
         f"p99 {1e3 * result.latency_p99_s:.2f} ms, max {1e3 * result.latency_max_s:.1f} ms\n"
-        f"processor time, secured by {result.secured}: link {result.link_processor_s:.2f} s, "
+        f"processor time: link {result.link_processor_s:.2f} s, "
         f"sender {result.sender_processor_s:.2f} s in {result.seconds:g} s"
     )
 
 
 def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.ingest", description=__doc__)
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser = study_parser("benchmarks.ingest", __doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--rate", type=float, default=1000.0, help="frames per second")
     parser.add_argument("--batch", type=int, default=1, help="frames per message, 1 to 50")
     parser.add_argument("--n-slopes", type=int, default=1408)
     parser.add_argument("--n-modes", type=int, default=594)
-    ways = ("nothing", "certificates", "signatures", "both")
-    parser.add_argument("--secured", choices=ways, default="nothing", help="the link, by what")
     parser.add_argument("--json", type=Path, metavar="FILE")
     return parser.parse_args()
 

@@ -8,7 +8,6 @@ after the other, and another client orders a stop every two seconds.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import itertools
 import os
@@ -22,10 +21,9 @@ from pathlib import Path
 import httpx
 import numpy as np
 
-from benchmarks.rest import PAGES
 from benchmarks.soak import Row
-from benchmarks.standing import Sample, Standing, standing
-from pyrcal_studies.sections import write_section
+from benchmarks.standing import PAGES, Sample, Standing, standing
+from pyrcal_studies.shared import study_parser, write_section
 
 ANSWER_MS = 50.0
 """Of the 99th percentile."""
@@ -197,7 +195,7 @@ def phase(found: Standing, seconds: float) -> Phase:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run, write section and plot; return 1 where a figure is not reached."""
-    parser = argparse.ArgumentParser(prog="make load")
+    parser = study_parser("benchmarks.load", __doc__)
     parser.add_argument("--seconds", type=float, default=60.0, help="duration of the run")
     parser.add_argument("--folder", type=Path, default=Path("var/load"), help="is emptied first")
     parser.add_argument("--page", type=Path, help="page with a section 'load'")

@@ -10,7 +10,6 @@ there is to see.
 
 from __future__ import annotations
 
-import argparse
 import io
 import multiprocessing
 import os
@@ -28,10 +27,9 @@ import httpx
 import numpy as np
 from scipy import stats
 
-from benchmarks.rest import PAGES
-from benchmarks.standing import Sample, Standing, standing
+from benchmarks.standing import PAGES, Sample, Standing, standing
 from pyrcal_studies.campaign.rows import RowFile
-from pyrcal_studies.sections import write_section
+from pyrcal_studies.shared import study_parser, write_section
 from service.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
@@ -269,7 +267,7 @@ def _watch(found: Standing, minutes: float, path: Path) -> Iterator[Sample]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run, write section and plot; return 1 where a figure is not reached."""
-    parser = argparse.ArgumentParser(prog="make soak")
+    parser = study_parser("benchmarks.soak", __doc__)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--folder", type=Path, default=Path("var/soak"), help="is emptied first")
     parser.add_argument("--page", type=Path, help="page with a section 'soak'")

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-import socket
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,11 +19,24 @@ from typing import Any
 import httpx
 
 from pyrcal.demo.children import Child, interrupt_on_end, run_children
+from pyrcal_studies.shared import free_port
 
 START_TIMEOUT_S = 240.0
 """For the optics of a first start, and a first matrix, on a machine that has other work."""
 
 ANSWER_TIMEOUT_S = 60.0
+
+PAGES = (
+    "/v1/state",
+    "/v1/alpha",
+    "/v1/reconstructors",
+    "/v1/alpha/history?limit=200",
+    "/v1/events?limit=200",
+    "/v1/alarms",
+    "/v1/audit?limit=50",
+    "/metrics",
+)
+"""What clients ask for, one after the other."""
 
 _TICKS = os.sysconf("SC_CLK_TCK")
 
@@ -140,7 +152,7 @@ def standing(folder: Path, *simulator: str) -> Iterator[Standing]:
     """Run service and RTC while the ``with`` block lasts; ``folder`` is emptied first."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    port, endpoint = _free_port(), f"tcp/127.0.0.1:{_free_port()}"
+    port, endpoint = free_port(), f"tcp/127.0.0.1:{free_port()}"
     data = folder / "data"
     run = ["-m", "pyrcal", "run", "--mode", "auto", "--listen", endpoint, "--port", str(port)]
     sim = ["-m", "pyrcal", "sim", "--connect", endpoint, "--quiet", "--seed", "5", *simulator]
@@ -185,9 +197,3 @@ def _descendants(pid: int) -> Iterator[int]:
             for child in map(int, thread.read_text(encoding="ascii").split()):
                 yield child
                 yield from _descendants(child)
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

@@ -9,7 +9,6 @@ Run: ``python -m pyrcal_studies.benches --data PATH --wrong``.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tempfile
@@ -31,6 +30,7 @@ from pyrcal.fitting.fitted import Fit, Registration
 from pyrcal.fitting.matrix import FitOptions
 from pyrcal_studies.campaign.rows import RowFile
 from pyrcal_studies.peers import ROOT
+from pyrcal_studies.shared import save_picture, study_parser
 from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.model.slopes import as_maps, side_by_side
@@ -319,11 +319,7 @@ def draw(fit: Fit, path: Path) -> None:
     left.set(title="left over: Sx | Sy, % of the measured RMS", xticks=[], yticks=[])
     figure.colorbar(image, ax=left, shrink=0.7)
     _draw_sets(right, fit)
-    figure.savefig(path, dpi=80)
-    from PIL import Image  # matplotlib brings it
-
-    with Image.open(path) as picture:  # 128 colours, a quarter of the size
-        picture.convert("RGB").quantize(128).save(path, optimize=True)
+    save_picture(figure, path)
 
 
 def _draw_sets(axes: Any, fit: Fit) -> None:  # noqa: ANN401 - matplotlib's, imported when drawn
@@ -511,7 +507,7 @@ def _over_sigma(one: dict[str, Any]) -> float:
 
 def main() -> int:
     """Fit, draw, and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser = study_parser("pyrcal_studies.benches", __doc__)
     parser.add_argument("--data", type=Path, required=True, help="folder of papyrus/ and ao188/")
     parser.add_argument("--wrong", action="store_true", help="fit with wrong values as well")
     given = parser.parse_args()

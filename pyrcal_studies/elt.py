@@ -9,7 +9,6 @@ in the folder. It takes five minutes of processor time and 3.3 GB.
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing
 import platform
 import resource
@@ -25,6 +24,7 @@ import scipy
 from threadpoolctl import threadpool_limits
 
 from benchmarks import estimators
+from pyrcal_studies.shared import study_parser
 from service.control.gate import judge
 from service.control.loop import ControlLoop
 from service.control.reconstructor import invert
@@ -273,7 +273,7 @@ def _gflops() -> float:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(prog="python -m pyrcal_studies.elt")
+    parser = study_parser("pyrcal_studies.elt", __doc__)
     parser.add_argument("--only", nargs="+", choices=STEPS, default=list(STEPS))
     parser.add_argument("--folder", help="keep what steps leave for one another here")
     given = parser.parse_args()

@@ -9,7 +9,6 @@ next window of telemetry is taken in, and what must never be.
 
 from __future__ import annotations
 
-import argparse
 import os
 import re
 import signal
@@ -28,6 +27,7 @@ from typing import Any
 import httpx
 
 from pyrcal_studies.live import WITHIN_S, Telescope
+from pyrcal_studies.shared import study_parser
 from sim_rtc.faults import FaultKind
 
 NAMED_S = 3.0
@@ -36,7 +36,7 @@ NAMED_S = 3.0
 Doing = Callable[[Telescope], Iterator[None]]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Fault:
     """One fault: what begins it, how long it lasts, and what is expected."""
 
@@ -63,22 +63,17 @@ def _rtc_killed(at: Telescope) -> Iterator[None]:
     at.start_rtc()
 
 
-def _rtc_frozen(at: Telescope) -> Iterator[None]:
-    send_signal(at.rtc, signal.SIGSTOP)
-    yield
-    send_signal(at.rtc, signal.SIGCONT)
-
-
 def _service_killed(at: Telescope) -> Iterator[None]:
     at.kill()
     yield
     at.start()
 
 
-def _service_frozen(at: Telescope) -> Iterator[None]:
-    send_signal(at.service, signal.SIGSTOP)
+def _frozen(at: Telescope, *, what: str) -> Iterator[None]:
+    """Stop ``rtc`` or ``service`` without ending it."""
+    send_signal(getattr(at, what), signal.SIGSTOP)
     yield
-    send_signal(at.service, signal.SIGCONT)
+    send_signal(getattr(at, what), signal.SIGCONT)
 
 
 def _worker_killed(at: Telescope) -> Iterator[None]:
@@ -103,22 +98,19 @@ def _link_cut(at: Telescope) -> Iterator[None]:
     at.cable.plugged.set()
 
 
-def _link_half_open(at: Telescope) -> Iterator[None]:
-    at.cable.held = True
+def _link(at: Telescope, *, name: str, value: object) -> Iterator[None]:
+    """Change a property of the cable."""
+    before = getattr(at.cable, name)
+    setattr(at.cable, name, value)
     yield
-    at.cable.held = False
+    setattr(at.cable, name, before)
 
 
-def _link_delayed(at: Telescope) -> Iterator[None]:
-    at.cable.delay_s = 0.3
+def _machine(at: Telescope, **like: float) -> Iterator[None]:
+    """Change the clock or the disk of the machine that the service runs on."""
+    at.machine.be(**like)
     yield
-    at.cable.delay_s = 0.0
-
-
-def _link_throttled(at: Telescope) -> Iterator[None]:
-    at.cable.bytes_per_s = 100_000.0
-    yield
-    at.cable.bytes_per_s = None
+    at.machine.be()
 
 
 def _disk_refuses(at: Telescope) -> Iterator[None]:
@@ -135,13 +127,6 @@ def _simulated(_: Telescope) -> Iterator[None]:
     yield
 
 
-def _disk_slow(at: Telescope) -> Iterator[None]:
-    """Each file that is flushed to the disk takes two seconds."""
-    at.machine.be(flush_s=2.0)
-    yield
-    at.machine.be()
-
-
 def _disk_flipped(at: Telescope, *, files: str = "*") -> Iterator[None]:
     """While the service is not there, one bit flips in each of these files of its archive."""
     at.kill()
@@ -152,19 +137,6 @@ def _disk_flipped(at: Telescope, *, files: str = "*") -> Iterator[None]:
             path.write_bytes(data)
     yield
     at.start()
-
-
-def _clock_ahead(at: Telescope) -> Iterator[None]:
-    """Somebody sets the machine's clock an hour ahead, and back."""
-    at.machine.be(ahead_s=3600.0)
-    yield
-    at.machine.be()
-
-
-def _clock_behind(at: Telescope) -> Iterator[None]:
-    at.machine.be(ahead_s=-3600.0)
-    yield
-    at.machine.be()
 
 
 def _memory_short(at: Telescope) -> Iterator[None]:
@@ -243,84 +215,48 @@ OF_FRAMES = tuple(
     for k, (kind, arguments) in enumerate(SCHEDULE.items())
 )
 
+
+def _harmless(name: str, seconds: float, does: Doing) -> Fault:
+    """Return a fault that costs windows at most, and that ``--quick`` leaves out."""
+    return Fault(name, seconds, does, named_within_s=None, quick=False)
+
+
 FAULTS = (
-    Fault(name="RTC killed, 5 s", stops_telemetry=True, seconds=5.0, does=_rtc_killed),
-    Fault(name="RTC frozen, 10 s", stops_telemetry=True, seconds=10.0, does=_rtc_frozen),
-    Fault(name="service killed", seconds=0.0, does=_service_killed, named_within_s=None),
-    Fault(name="service frozen, 10 s", seconds=10.0, does=_service_frozen, named_within_s=None),
-    Fault(name="worker killed", seconds=1.0, does=_worker_killed, named_within_s=None),
+    Fault("RTC killed, 5 s", 5.0, _rtc_killed, stops_telemetry=True),
+    Fault("RTC frozen, 10 s", 10.0, partial(_frozen, what="rtc"), stops_telemetry=True),
+    Fault("service killed", 0.0, _service_killed, named_within_s=None),
+    Fault("service frozen, 10 s", 10.0, partial(_frozen, what="service"), named_within_s=None),
+    Fault("worker killed", 1.0, _worker_killed, named_within_s=None),
+    Fault("worker frozen, 30 s", 30.0, _worker_frozen, named_within_s=6.0, quick=False),
+    Fault("link cut, 30 s", 30.0, _link_cut, stops_telemetry=True, quick=False),
     Fault(
-        name="worker frozen, 30 s",
-        seconds=30.0,
-        does=_worker_frozen,
-        named_within_s=6.0,
+        "link half open, 10 s",
+        10.0,
+        partial(_link, name="held", value=True),
+        stops_telemetry=True,
+    ),
+    _harmless("link delayed by 0.3 s, 10 s", 10.0, partial(_link, name="delay_s", value=0.3)),
+    Fault(
+        "link throttled to 100 kB/s, 10 s",
+        10.0,
+        partial(_link, name="bytes_per_s", value=100_000.0),
+    ),
+    Fault("disk refuses every write, 15 s", 15.0, _disk_refuses, named_within_s=6.0),
+    _harmless("each flush to the disk takes 2 s, 15 s", 15.0, partial(_machine, flush_s=2.0)),
+    _harmless(
+        "a bit flipped in each matrix of the archive", 0.0, partial(_disk_flipped, files="*.h5")
+    ),
+    _harmless("a bit flipped in each file of the archive", 0.0, _disk_flipped),
+    Fault("the service's clock an hour ahead, 12 s", 12.0, partial(_machine, ahead_s=3600.0)),
+    Fault(
+        "the service's clock an hour behind, 12 s",
+        12.0,
+        partial(_machine, ahead_s=-3600.0),
         quick=False,
     ),
-    Fault(name="link cut, 30 s", stops_telemetry=True, seconds=30.0, does=_link_cut, quick=False),
-    Fault(name="link half open, 10 s", stops_telemetry=True, seconds=10.0, does=_link_half_open),
-    Fault(
-        name="link delayed by 0.3 s, 10 s",
-        seconds=10.0,
-        does=_link_delayed,
-        named_within_s=None,
-        quick=False,
-    ),
-    Fault(name="link throttled to 100 kB/s, 10 s", seconds=10.0, does=_link_throttled),
-    Fault(
-        name="disk refuses every write, 15 s", seconds=15.0, does=_disk_refuses, named_within_s=6.0
-    ),
-    Fault(
-        name="each flush to the disk takes 2 s, 15 s",
-        seconds=15.0,
-        does=_disk_slow,
-        named_within_s=None,
-        quick=False,
-    ),
-    Fault(
-        name="a bit flipped in each matrix of the archive",
-        seconds=0.0,
-        does=partial(_disk_flipped, files="*.h5"),
-        named_within_s=None,
-        quick=False,
-    ),
-    Fault(
-        name="a bit flipped in each file of the archive",
-        seconds=0.0,
-        does=_disk_flipped,
-        named_within_s=None,
-        quick=False,
-    ),
-    Fault(
-        name="the service's clock an hour ahead, 12 s",
-        seconds=12.0,
-        does=_clock_ahead,
-    ),
-    Fault(
-        name="the service's clock an hour behind, 12 s",
-        seconds=12.0,
-        does=_clock_behind,
-        quick=False,
-    ),
-    Fault(
-        name="20 MB of memory left, 15 s",
-        seconds=15.0,
-        does=_memory_short,
-        named_within_s=None,
-        quick=False,
-    ),
-    Fault(
-        name="second service, 15 s",
-        seconds=15.0,
-        does=_second_service,
-        named_within_s=None,
-        quick=False,
-    ),
-    Fault(
-        name="20 stream clients that never read, 10 s",
-        seconds=10.0,
-        does=_dead_clients,
-        named_within_s=None,
-    ),
+    _harmless("20 MB of memory left, 15 s", 15.0, _memory_short),
+    _harmless("second service, 15 s", 15.0, _second_service),
+    Fault("20 stream clients that never read, 10 s", 10.0, _dead_clients, named_within_s=None),
 )
 
 
@@ -523,7 +459,7 @@ def report(outcomes: list[Outcome]) -> str:
 
 def main() -> int:
     """Run what is asked for; the exit status is 1 if anything was broken."""
-    parser = argparse.ArgumentParser(prog="python -m pyrcal_studies.faults")
+    parser = study_parser("pyrcal_studies.faults", __doc__)
     parser.add_argument("--only", metavar="NAME", help="those whose name has this in it")
     parser.add_argument("--quick", action="store_true", help="those that take seconds")
     parser.add_argument("--directory", type=Path, help="data folder and logs, kept afterwards")

@@ -7,7 +7,6 @@ the tutorials are in ``pyrcal_studies/tutorial_figures.py``.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -22,10 +21,10 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import FancyBboxPatch, Rectangle
 from numpy.typing import NDArray
-from PIL import Image
 
 import pyrcal
 from pyrcal_studies import small_loop, tutorial_figures
+from pyrcal_studies.shared import save_picture, study_parser
 from service.control.gate import judge
 from service.control.loop import ControlLoop, pole_radius
 from service.instrument import packaged_instrument
@@ -669,14 +668,12 @@ FIGURES: dict[str, Callable[[], Figure]] = {
 
 def main() -> int:
     """Draw the figures named, or all."""
-    parser = argparse.ArgumentParser(prog="python -m pyrcal_studies.figures", description=__doc__)
+    parser = study_parser("pyrcal_studies.figures", __doc__)
     parser.add_argument("names", nargs="*", choices=[[], *FIGURES], metavar="NAME")
     mpl.rcParams.update({"font.size": 9.0, "figure.facecolor": "white"})
     for name in parser.parse_args().names or FIGURES:
         path = DOCS / f"{name}.png"
-        FIGURES[name]().savefig(path, dpi=100)
-        with Image.open(path) as image:  # 128 colours are enough, and a third of the size
-            image.convert("RGB").quantize(128).save(path, optimize=True)
+        save_picture(FIGURES[name](), path, dpi=100)
         print(path, path.stat().st_size)
     return 0
 

@@ -10,7 +10,6 @@ var/fit_realistic.jsonl``.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -24,6 +23,7 @@ from threadpoolctl import threadpool_limits
 
 from pyrcal.fitting.matrix import FitOptions, fit_matrix
 from pyrcal_studies.campaign.rows import RowFile
+from pyrcal_studies.shared import study_parser
 from service.estimation.reference import Reference
 from service.instrument import load_instrument
 from service.model.instrument import Instrument
@@ -137,7 +137,7 @@ def table(truth: str, found: list[dict[str, Any]]) -> str:
 
 def main() -> int:
     """Run what is left of the campaign and print its table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser = study_parser("pyrcal_studies.fit_coverage", __doc__)
     parser.add_argument("--truth", choices=sorted(SETS), default="ideal")
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--out", type=Path, required=True, help="results, a line of JSON each")

@@ -9,7 +9,6 @@ of OOPAO at so many registrations drawn at random, on 20 by 20 lenslets, and how
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import tempfile
@@ -24,7 +23,8 @@ from numpy.typing import NDArray
 
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.matrix import fit_matrix
-from pyrcal_studies.peers import KEPT, ROOT, environment
+from pyrcal_studies.peers import KEPT, ROOT, environment, variables
+from pyrcal_studies.shared import study_parser
 from service.estimation.reference import Reference
 from service.instrument import load_instrument
 from service.model.instrument import Instrument
@@ -193,7 +193,7 @@ def measured(case: Case) -> tuple[Array, Array]:
         subprocess.run(
             [str(environment(case.peer)), *module],
             cwd=ROOT,
-            env={**os.environ, "MPLBACKEND": "Agg"},
+            env=variables(),
             stdout=subprocess.DEVNULL,
             check=True,
         )
@@ -241,43 +241,31 @@ def drawn(n_cases: int) -> list[Case]:
 
 def coverage(n_cases: int) -> None:
     """Print each error over its σ, and what all of them say together."""
-    print("| case | x | y | rotation | magnification | a0 | a45 | chi |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    all_errors, all_sigma = [], []
+    print("| case | x | y | rotation | magnification |\n| --- | --- | --- | --- | --- |")
+    errors, sigmas = [], []
     for case in drawn(n_cases):
         found = fitted(case)
-        stretches = np.zeros(2) if found.anamorphosis_sigma is None else found.alpha.stretches
-        sigma_2 = np.ones(2) if found.anamorphosis_sigma is None else found.anamorphosis_sigma
-        error = np.concatenate([found.alpha.vector - case.alpha.vector, stretches])
-        sigma = np.concatenate([found.sigma, sigma_2])
-        chi = error[:4] @ np.linalg.solve(found.covariance, error[:4])
-        print(
-            f"| {case.truth} | "
-            + " | ".join(f"{v:+.2f}" for v in error / sigma)
-            + f" | {chi:.1f} |",
-            flush=True,
-        )
-        all_errors.append(error)
-        all_sigma.append(sigma)
-    scale = np.array([*BOUNDARY_SCALE, 1.0, 1.0])
-    errors, sigma = np.array(all_errors) * scale, np.array(all_sigma) * scale
-    rms, typical = np.sqrt(np.mean(errors**2, axis=0)), np.sqrt(np.mean(sigma**2, axis=0))
-    inside = np.mean(np.abs(errors) < 1.96 * sigma, axis=0)
+        errors.append((found.alpha.vector - case.alpha.vector) * BOUNDARY_SCALE)
+        sigmas.append(np.asarray(found.sigma) * BOUNDARY_SCALE)
+        ratios = " | ".join(f"{ratio:+.2f}" for ratio in errors[-1] / sigmas[-1])
+        print(f"| {case.truth} | {ratios} |", flush=True)
+    rms, typical = (np.sqrt(np.mean(np.square(values), axis=0)) for values in (errors, sigmas))
     for name, values in (
         ("RMS error", rms),
-        ("mean error", errors.mean(axis=0)),
-        ("largest error", np.abs(errors).max(axis=0)),
         ("σ", typical),
         ("σ / RMS error", typical / rms),
-        ("inside 1.96 σ", inside),
+        ("inside 1.96 σ", np.mean(np.abs(errors) < 1.96 * np.array(sigmas), axis=0)),
     ):
         print(f"{name}: " + ", ".join(f"{value:.2g}" for value in values))
 
 
 def main() -> int:
     """Measure, fit, print the table."""
-    if sys.argv[1:2] == ["--cases"]:
-        coverage(int(sys.argv[2]))
+    parser = study_parser("pyrcal_studies.lenslets", __doc__)
+    parser.add_argument("--cases", type=int, metavar="N", help="registrations drawn at random")
+    given = parser.parse_args()
+    if given.cases:
+        coverage(given.cases)
         return 0
     print("| peer | α | threshold | x, subap | y | rotation, deg | magnification | left over | s |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")

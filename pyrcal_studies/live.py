@@ -19,6 +19,7 @@ import httpx
 from pyrcal.demo.truth import TruthFile
 from pyrcal_studies.campaign.observatory import SETTINGS, SMALL
 from pyrcal_studies.machine import Machine
+from pyrcal_studies.shared import free_port
 
 
 class Cable:
@@ -102,7 +103,7 @@ class Telescope:
 
     def __init__(self, directory: Path, seed: int) -> None:
         self.directory = directory
-        self.port, self.zenoh_port = _free_port(), _free_port()
+        self.port, self.zenoh_port = free_port(), free_port()
         self.cable = Cable(self.zenoh_port)
         self.client = httpx.Client(base_url=f"http://127.0.0.1:{self.port}", timeout=10.0)
         self.truth = TruthFile(directory / "truth.jsonl")
@@ -141,7 +142,7 @@ class Telescope:
         return self._process(
             "second",
             *("service", "run", "--config", str(self.settings), "--instrument", SMALL),
-            *("--connect", f"tcp/127.0.0.1:{self.zenoh_port}", "--port", str(_free_port())),
+            *("--connect", f"tcp/127.0.0.1:{self.zenoh_port}", "--port", str(free_port())),
             *("--data-dir", str(self.directory / "second"), "--mode", "auto"),
         )
 
@@ -232,11 +233,6 @@ def tracks(state: dict[str, Any]) -> bool:
     known, rtc = state["registration"], state["rtc"]
     received = state["ready"] and rtc is not None and state["link"]["frames_received"] > 0
     return bool(received and known is not None and known["restored_ns_utc"] is not None)
-
-
-def _free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return int(server.getsockname()[1])
 
 
 def _toml() -> str:

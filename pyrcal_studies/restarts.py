@@ -12,7 +12,6 @@ truth file, says which matrix closes the loop.
 
 from __future__ import annotations
 
-import argparse
 import io
 import statistics
 import sys
@@ -29,6 +28,7 @@ import numpy as np
 
 from pyrcal_studies.campaign.rows import RowFile
 from pyrcal_studies.live import WITHIN_S, Telescope, tracks
+from pyrcal_studies.shared import study_parser
 
 ASKED_S = 5.0
 """From the start of the process until it tracks again."""
@@ -242,7 +242,7 @@ def summary(rounds: list[Round]) -> str:
 
 def main() -> int:
     """Run what is asked for; the exit status is 1 if anything was broken."""
-    parser = argparse.ArgumentParser(prog="python -m pyrcal_studies.restarts")
+    parser = study_parser("pyrcal_studies.restarts", __doc__)
     parser.add_argument("--rounds", type=int, default=200, metavar="N")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--directory", type=Path, help="data folder and logs, kept afterwards")

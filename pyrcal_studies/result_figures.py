@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pyrcal_studies.sections import RESULTS
+from pyrcal_studies.shared import RESULTS, save_picture
 
 NUMBER = re.compile(r"[+-]?\d+(?:\.\d+)?")
 BLUE = "#4477aa"
@@ -87,7 +87,7 @@ def write_figures(folder: Path) -> None:
     ):
         figure = Figure(figsize=(8.0, height), layout="constrained")
         draw(figure.subplots())
-        figure.savefig(folder / f"{name}.png", dpi=80)
+        save_picture(figure, folder / f"{name}.png")
 
 
 def main() -> int:

@@ -1,10 +1,9 @@
 """Takes the pictures of docs/start and of the operating pages with a demo and a headless browser.
 
 Run: ``python -m pyrcal_studies.screenshots``, then look at ``docs/start/*.png``: three minutes.
-A slow machine needs the jump later than after 90 s: ``python -m pyrcal_studies.screenshots 200``.
-``python -m pyrcal_studies.screenshots operate`` takes ``docs/operate/pictures/*.png``: the page in
-tracking, a fit, a night, and a critical alarm: two minutes; ``... report REPORT.html`` a report of
-``pyrcal commission``, such as the one of tests/system/test_commission.py.
+``--operate`` takes ``docs/operate/pictures/*.png`` instead: the page in tracking, a fit, a night,
+and a critical alarm: two minutes. ``--report FILE.html`` takes the picture of a report of ``pyrcal
+commission``, such as the one of tests/system/test_commission.py.
 It needs Debian's chromium and chromium-driver, selenium and Pillow.
 """
 
@@ -12,18 +11,20 @@ from __future__ import annotations
 
 import io
 import shutil
-import socket
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import httpx
 from PIL import Image
 from selenium import webdriver
+
+from pyrcal_studies.shared import free_port, study_parser
 
 ROOT = Path(__file__).parents[1]
 PICTURES = ROOT / "docs" / "start"
@@ -45,23 +46,30 @@ PATIENCE_S = 400.0
 
 def main() -> int:
     """Take the pictures; return the exit status."""
-    if sys.argv[1:2] == ["report"]:
-        show_report(Path(sys.argv[2]))
+    parser = study_parser("pyrcal_studies.screenshots", __doc__)
+    parser.add_argument("--operate", action="store_true", help="those of the operating pages")
+    parser.add_argument("--report", type=Path, metavar="FILE.html", help="of pyrcal commission")
+    parser.add_argument(
+        "--jump-at", type=float, default=90.0, metavar="S", help="later on a slow machine (90)"
+    )
+    given = parser.parse_args()
+    if given.report:
+        with browser() as driver:
+            driver.get(given.report.absolute().as_uri())
+            picture(driver, "commissioning", OPERATE)
         return 0
-    operates = sys.argv[1:2] == ["operate"]
-    (OPERATE if operates else PICTURES).mkdir(exist_ok=True)
+    (OPERATE if given.operate else PICTURES).mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         port, zenoh_port = free_port(), free_port()
         words = ["--port", str(port), "--zenoh-port", str(zenoh_port), "--dir", f"{folder}/demo"]
-        at_s = sys.argv[1] if len(sys.argv) > 1 else "90"
         words += (
             ["--instrument", str(SMALL), "--near", "--fault", f"frozen@{ALARM_AT_S}:60"]
-            if operates
-            else ["--jump", f"{at_s}:{JUMP}"]
+            if given.operate
+            else ["--jump", f"{given.jump_at}:{JUMP}"]
         )
         demo = subprocess.Popen([sys.executable, "-m", "pyrcal.demo", *words])
         try:
-            (walk_operating if operates else walk)(f"http://127.0.0.1:{port}")
+            (walk_operating if given.operate else walk)(f"http://127.0.0.1:{port}")
         finally:
             demo.terminate()
             demo.wait(20.0)
@@ -72,8 +80,7 @@ def walk_operating(url: str) -> None:
     """Take the pictures of the operating pages."""
     client = httpx.Client(base_url=url, timeout=20.0)
     wait(lambda: state(client).get("registration"), "the first estimate")
-    driver = browser()
-    try:
+    with browser() as driver:
         driver.get(url)
         wait(lambda: own_matrix(client), "a matrix of the service in use")
         time.sleep(20.0)  # a chart of a few windows
@@ -95,18 +102,6 @@ def walk_operating(url: str) -> None:
         wait(lambda: "slopes-stand" in alarms(client), "the alarm")
         time.sleep(2.0)
         picture(driver, "alarm", OPERATE, height_px=460)
-    finally:
-        driver.quit()
-
-
-def show_report(report: Path) -> None:
-    """Take the picture of a report of ``pyrcal commission``."""
-    driver = browser()
-    try:
-        driver.get(report.absolute().as_uri())
-        picture(driver, "commissioning", OPERATE)
-    finally:
-        driver.quit()
 
 
 def press(driver: webdriver.Chrome, key: str) -> None:
@@ -128,8 +123,7 @@ def walk(url: str) -> None:
     """Do what the tutorial says, and keep what is seen."""
     client = httpx.Client(base_url=url, timeout=20.0)
     wait(lambda: state(client).get("registration"), "the first estimate")
-    driver = browser()
-    try:
+    with browser() as driver:
         driver.get(url)
         wait(lambda: own_matrix(client, 500), "500 modes in use")
         time.sleep(12.0)  # a chart of a few windows
@@ -150,12 +144,11 @@ def walk(url: str) -> None:
         driver.find_element("css selector", "#order [value=send]").click()
         answer = "document.querySelector('#answer').innerText.includes('applied at frame')"
         wait(lambda: driver.execute_script(f"return {answer}"), "it is applied")
-    finally:
-        driver.quit()
 
 
-def browser() -> webdriver.Chrome:
-    """Return a headless browser, in the dark."""
+@contextmanager
+def browser() -> Iterator[webdriver.Chrome]:
+    """Yield a headless browser."""
     options = webdriver.ChromeOptions()
     options.binary_location = shutil.which("chromium") or shutil.which("chromium-browser") or ""
     for word in ("headless=new", "no-sandbox", "disable-dev-shm-usage", "disable-gpu"):
@@ -163,7 +156,10 @@ def browser() -> webdriver.Chrome:
     driver = webdriver.Chrome(options, webdriver.ChromeService(shutil.which("chromedriver")))
     size = {"width": SIZE[0], "height": SIZE[1], "deviceScaleFactor": 1, "mobile": False}
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-    return driver
+    try:
+        yield driver
+    finally:
+        driver.quit()
 
 
 def picture(
@@ -217,13 +213,6 @@ def wait(condition: Callable[[], object], what: str) -> None:
         if time.monotonic() > until_s:
             raise TimeoutError(f"not within {PATIENCE_S:.0f} s: {what}")
         time.sleep(0.5)
-
-
-def free_port() -> int:
-    """Return a TCP port that nobody uses now."""
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        port: int = listener.getsockname()[1]
-    return port
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Several sensors and mirrors: MORFEO's geometry, found again; SynIM as an outside judge.
 
-``python -m pyrcal_studies.systems [geometry] [matrices] [noise]``, by default all three.
+Run: ``python -m pyrcal_studies.systems [geometry] [matrices] [noise]``, by default all three.
 
 Six laser stars on a ring of 45 arcseconds and mirrors at 600, 6500 and 17500 m are those of
 SynIM's own tutorial (docs/tutorials/registration_morfeo_tutorial.rst). Sensors of 16 x 16
@@ -11,7 +11,6 @@ asked in an environment of its own, made at the first call under ``var/peers``.
 from __future__ import annotations
 
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -29,6 +28,7 @@ from pyrcal.fitting.system_file import load_system
 from pyrcal.fitting.system_fit import fit_system
 from pyrcal.fitting.system_report import SystemReport
 from pyrcal_studies.peers import environment, variables
+from pyrcal_studies.shared import study_parser
 from service.estimation.reference import Reference
 from service.model.instrument import Instrument
 from service.model.interaction import RtcInteractionModel
@@ -347,7 +347,9 @@ STEPS: dict[str, Callable[[], Iterator[str]]] = {
 
 def main() -> None:
     """Print what each step finds."""
-    for name in sys.argv[1:] or STEPS:
+    parser = study_parser("pyrcal_studies.systems", __doc__)
+    parser.add_argument("steps", nargs="*", choices=[[], *STEPS], metavar="STEP")
+    for name in parser.parse_args().steps or STEPS:
         print(f"--- {name}", flush=True)
         for line in STEPS[name]():
             print(line, flush=True)

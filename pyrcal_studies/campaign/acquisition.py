@@ -10,25 +10,30 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
-from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pyrcal_studies.campaign.observatory import Observatory, bench_of
-from pyrcal_studies.campaign.rows import UNITS, Row, RowFile, heading, line, range_of, tell
+from pyrcal_studies.campaign.rows import (
+    UNITS,
+    Row,
+    campaign_parser,
+    complete,
+    grouped,
+    heading,
+    line,
+    range_of,
+    tell,
+)
 from pyrcal_studies.campaign.system_nights import GAINS
 from service.config import load_settings
-from service.estimation.openloop import WideCaptureEstimate
 from service.model.misregistration import BOUNDARY_SCALE
 from service.runtime.policy import policy_of
-from service.tracking.events import WideCaptureFitted
 from service.tracking.operation_records import AcquisitionStage
 from service.tracking.state import Mode
 
@@ -86,7 +91,6 @@ class Start:
 
 def play(start: Start) -> Row:
     """Run one start until it tracks, fails, or its time is over."""
-    begun = time.monotonic()
     with threadpool_limits(1):
         settings = load_settings(None, {}, {"control.n_modes_target": start.n_controlled})
         bench = bench_of(start.instrument, start.sampling)
@@ -106,22 +110,16 @@ def play(start: Start) -> Row:
         "n_modes": night.dome.moments[-1].n_controlled,
         "closed": night.dome.moments[-1].closed,
         "wavefront_nm": _wavefront_nm(night),
-        "true": (night.dome.alpha.vector * BOUNDARY_SCALE).tolist(),
         "error": None,
         "sigma": None,
         "log": [entry.text for entry in night.state.log if entry.name.startswith("acquisition")],
     }
-    row["far"] = [
-        _far(event.found, night)
-        for _, event in night.events
-        if isinstance(event, WideCaptureFitted)
-    ]
     if registration is not None:
         error = registration.alpha.vector - night.dome.alpha.vector
         row["error"] = (error * BOUNDARY_SCALE).tolist()
         row["sigma"] = (registration.sigma * BOUNDARY_SCALE).tolist()
     row["radii"] = [swap.radius for swap in night.swaps]
-    return asdict(start) | row | {"took_s": time.monotonic() - begun}
+    return asdict(start) | row
 
 
 def _wavefront_nm(night: Observatory) -> float:
@@ -138,41 +136,9 @@ def _ended(night: Observatory, over_s: float | None) -> bool:
     return not tracking or night.time_s >= over_s + _HOLDS_S
 
 
-def _far(found: WideCaptureEstimate, night: Observatory) -> Row:
-    """Return how far off a window with the loop open was, and what it saw."""
-    error = found.estimate.alpha.vector - night.dome.alpha.vector
-    gains = np.abs(found.estimate.optical_gain)
-    return {
-        "modes": [min(found.estimate.modes), max(found.estimate.modes)],
-        "error": (error * BOUNDARY_SCALE).tolist(),
-        "unexplained": found.unexplained,
-        "gains": [float(gains.min()), float(gains.max())],
-        "n_starts": found.n_starts,
-    }
-
-
 def main() -> int:
     """Run what is missing, then print the table."""
-    given = _parser().parse_args()
-    file = RowFile(given.output)
-    for start in file.missing(_starts(given)):
-        row = play(start)
-        file.add(row)
-        sys.stderr.write(f"{start.seed}: {row['text']}\n")
-    text = table(file.rows)
-    tell(text, given.table, "python -m pyrcal_studies.campaign.acquisition")
-    return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m pyrcal_studies.campaign.acquisition",
-        description="Lets the service find registrations from nothing, and counts how it ended.",
-    )
-    parser.add_argument(
-        "--output", type=Path, default=Path("acquisition.jsonl"), help="rows, resumed"
-    )
-    parser.add_argument("--table", type=Path, metavar="FILE.md")
+    parser = campaign_parser("acquisition", __doc__)
     parser.add_argument("--instrument", default="flao-lbt", metavar="NAME|FILE")
     parser.add_argument("--plant", choices=("linear", "diffractive"), default="linear")
     parser.add_argument("--truth", default="ideal", metavar="NAME")
@@ -181,10 +147,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--gain", type=float, help="default: 0.4 linear, 0.6 diffractive")
     parser.add_argument("--n-controlled", type=int, default=400)
     parser.add_argument("--within", type=float, default=90.0, metavar="S")
-    parser.add_argument(
-        "--sampling", type=int, default=3, help="of the service's model (default: %(default)s)"
-    )
-    return parser
+    parser.add_argument("--sampling", type=int, default=3, help="of the service's model (3)")
+    given = parser.parse_args()
+    tell(table(complete(play, _starts(given), given)), given.table, parser.prog)
+    return 0
 
 
 def _starts(given: argparse.Namespace) -> Iterator[Start]:
@@ -217,12 +183,7 @@ _HEADER = heading(
 
 def table(rows: list[Row]) -> str:
     """Return the table, one line for each kind of start."""
-    groups: dict[tuple[Any, ...], list[Row]] = defaultdict(list)
-    for row in rows:
-        name = Path(row["instrument"]).stem
-        key = (name, row["plant"], row["truth"], row["magnitude"], row["gain"], row["n_controlled"])
-        groups[key].append(row)
-    return _HEADER + "".join(_line(key, group) for key, group in sorted(groups.items()))
+    return _HEADER + "".join(map(_line, grouped(rows, Start, "seed")))
 
 
 def wrong(row: Row) -> bool:
@@ -233,32 +194,27 @@ def wrong(row: Row) -> bool:
     return bool(np.any(error > WRONG) or np.any(error > WRONG_SIGMA * np.array(row["sigma"])))
 
 
-def _line(key: tuple[Any, ...], rows: list[Row]) -> str:
-    name, plant, truth, magnitude, gain, n_controlled = key
+def _line(rows: list[Row]) -> str:
+    about = Start(**{field.name: rows[0].get(field.name, field.default) for field in fields(Start)})
     tracking = [row for row in rows if row["stage"] == "tracking"]
     failed = [row for row in rows if row["stage"] == "failed"]
     times = [row["time_s"] for row in tracking]
     spent = f"{np.median(times):.0f}, {max(times):.0f}" if times else "-"
     again = sum(row["attempts"] > 1 for row in rows)
-    unstable = sum(radius is not None and radius >= 1.0 for row in rows for radius in _sent(row))
+    unstable = sum(radius is not None and radius >= 1.0 for row in rows for radius in row["radii"])
     errors = np.array([row["error"] for row in tracking if row["error"] is not None])
     rms = "-"
     if len(errors):
         x, y, rotation, magnification = np.sqrt(np.mean(errors**2, axis=0)) * UNITS
         rms = f"{x:.2f} {y:.2f} {rotation:.1f} {magnification:.3f}"
     return line(
-        f"{name}, {plant}, {truth}, mag {magnitude:g}, {n_controlled} modes g {gain:g}",
+        f"{Path(about.instrument).stem}, {about.plant}, {about.truth}, mag {about.magnitude:g}, "
+        f"{about.n_controlled} modes g {about.gain:g}",
         len(rows),
         f"{len(tracking)} ({len(tracking) / len(rows):.0%})",
         *(spent, again, len(failed), len(rows) - len(tracking) - len(failed)),
         *(sum(map(wrong, rows)), unstable, rms),
     )
-
-
-def _sent(row: Row) -> list[float | None]:
-    """Return the true pole radii of the matrices the service has sent."""
-    radii: list[float | None] = row["radii"]
-    return radii
 
 
 if __name__ == "__main__":

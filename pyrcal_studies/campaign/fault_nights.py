@@ -10,14 +10,13 @@ been without it.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,18 +27,33 @@ from typing_extensions import override
 from pyrcal_studies.campaign.observatory import (
     SETTINGS,
     SMALL,
-    Dome,
-    KeptNight,
     Moment,
+    Observatory,
     OwnHands,
     ShortLink,
     bench_of,
     latencies_of,
 )
-from pyrcal_studies.campaign.rows import Row, RowFile, heading, line, range_of, tell
+from pyrcal_studies.campaign.rows import (
+    Row,
+    campaign_parser,
+    complete,
+    heading,
+    line,
+    range_of,
+    tell,
+)
+from service.archive import Archive
 from service.config import load_settings
 from service.errors import LinkError, PyrcalError
 from service.estimation.frames import FrameBlock
+from service.runtime.archiving import (
+    SAVE_INTERVAL_S,
+    is_unsaved,
+    is_urgent,
+    leave,
+    restore_tracking,
+)
 from service.runtime.losses import silence
 from service.runtime.policy import policy_of
 from service.tracking import commands as cmd
@@ -48,7 +62,8 @@ from service.tracking.dither_request import DitherPhase
 from service.tracking.operations.running import OperationKind, running_operations
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState
-from service.tracking.state import Mode
+from service.tracking.resume import restored
+from service.tracking.state import MatrixStates, Mode, OperatorState, TrackerState
 from service.wire import Acknowledgement, Command, Manifest, Reply
 
 STEP_S = 0.25
@@ -88,6 +103,16 @@ _OWNERS = {
 _SEED = 20261126
 
 
+DOWN_S = 3.0
+"""From the end of a service until the next one listens."""
+
+
+def _opened(folder: Path) -> Archive:
+    archive = Archive(folder)
+    archive.open()
+    return archive
+
+
 class CutLink(ShortLink):
     """The way to the RTC and back, which may be cut; ``watch`` is told of all that is sent."""
 
@@ -116,13 +141,21 @@ class CutLink(ShortLink):
         return await super().fetch_applied()
 
 
-class FaultNight(KeptNight):
-    """A night of faults; what does not hold is in ``broken``."""
+class FaultNight(Observatory):
+    """A night of faults; what does not hold is in ``broken``.
+
+    The service keeps its state in ``folder``; after a kill another service continues from there.
+    """
 
     _link: CutLink
 
     def __init__(self, words: Sequence[str], folder: Path, seed: int, *, listening: bool) -> None:
         settings = {**SETTINGS, "dither.enabled": not listening}
+        self._policy = policy_of(load_settings(None, {}, settings))
+        self._mode = Mode.HOLD if listening else Mode.AUTO
+        self._folder, self._archive = folder, _opened(folder)
+        self._saved: TrackerState | None = None
+        self._saved_s = 0.0
         self.broken: list[str] = []
         self.listening = listening
         self.clock_ns = 0
@@ -142,16 +175,64 @@ class FaultNight(KeptNight):
         """Taken in, of all services."""
 
         super().__init__(
-            policy_of(load_settings(None, {}, settings)),
-            Mode.HOLD if listening else Mode.AUTO,
+            words,
+            self._policy,
+            self._mode,
             bench_of(words[0].removeprefix("--instrument=")),
-            folder,
             latencies=latencies_of(),
-            dome=Dome(words),
+            with_poles=False,
             link=CutLink,
+            archive=self._archive,
         )
         self._link.watch = self._sent
         self._looked_s = 0.0
+
+    def kill(self) -> None:
+        """End the service as ``kill -9`` does; another takes up what is on the disk.
+
+        What was on its way to the RTC arrives; telescope and RTC go on.
+        """
+        self._arrive()
+        self._agenda.clear()
+        self._idle_worker()
+        self._archive.close()
+        begun_s = self.time_s + DOWN_S
+        while self.time_s < begun_s:
+            self.dome.play()
+            for _ in self._link.swapped():
+                self._note_swap()
+        self._archive = self._shelf = _opened(self._folder)
+        self._actions = self._new_actions()
+        state = TrackerState(
+            system=self.state.system,
+            operator=OperatorState(mode=self._mode),
+            matrices=MatrixStates(reconstructors=restored(self._archive.reconstructors.records())),
+        )
+        self._engine.state = restore_tracking(self._archive, state, self._policy, self.now_ns())
+        self._engine.begin_anew()
+        self._begin()
+
+    def close(self) -> None:
+        """Close the archive."""
+        self._archive.close()
+
+    @override
+    def stepped(self, before: TrackerState, event: ev.Event) -> None:
+        """Keep what the tracker heard, and write what the service would."""
+        super().stepped(before, event)
+        records = self.state.matrices.reconstructors
+        if records is not before.matrices.reconstructors:
+            old = {record.id: record for record in before.matrices.reconstructors}
+            news = tuple(record for record in records if old.get(record.id) is not record)
+            self._archive.record(news, (), ())
+
+    def save(self) -> None:
+        """Write what the next service needs as seldom as the service does."""
+        state = self.state
+        before, due = self._saved, self.time_s >= self._saved_s + SAVE_INTERVAL_S
+        if before is None or ((due or is_urgent(before, state)) and is_unsaved(before, state)):
+            leave(self._archive, state, self.now_ns())
+            self._saved, self._saved_s = state, self.time_s
 
     @override
     def now_ns(self) -> int:
@@ -260,7 +341,7 @@ class FaultNight(KeptNight):
                 self._wrong(f"{name} cannot be read after a kill: {error}")
         if self.told is not None and self.state.operator.mode is not self.told:
             self._wrong(f"mode {self.state.operator.mode} after a kill, ordered was {self.told}")
-        if self._folder is not None and any(self._folder.rglob("*.part")):
+        if any(self._folder.rglob("*.part")):
             self._wrong("half a file is left after a kill")
 
     def play(self, deeds: Sequence[Deed], seconds: float) -> None:
@@ -441,15 +522,16 @@ def _by_second(moments: Sequence[Moment]) -> dict[int, float]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Night:
-    """What is played: instrument, plant, frame rate, and how long."""
+    """One night; two that are equal give the same row."""
 
+    seed: int = 0
     instrument: str = SMALL
     plant: str = "linear"
     rate_hz: float = 1000.0
     seconds: float = 600.0
 
 
-def _words(rng: np.random.Generator, seed: int, what: Night) -> list[str]:
+def _words(rng: np.random.Generator, what: Night) -> list[str]:
     x, y = rng.uniform(-0.1, 0.1, 2)
     words = [
         f"--instrument={what.instrument}",
@@ -457,7 +539,7 @@ def _words(rng: np.random.Generator, seed: int, what: Night) -> list[str]:
         f"--rate={what.rate_hz:g}",
         f"--wind={WIND_M * what.rate_hz:g},35",
         "--n-controlled=45",
-        f"--seed={seed}",
+        f"--seed={what.seed}",
         "--mag=7",
         f"--alpha={x:.3f},{y:.3f},{rng.uniform(-0.3, 0.3):.3f},1.002",
     ]
@@ -467,30 +549,24 @@ def _words(rng: np.random.Generator, seed: int, what: Night) -> list[str]:
     return words
 
 
-def night_of(seed: int, what: Night, *, listening: bool) -> FaultNight:
-    """Play one night; its archive is gone afterwards."""
-    rng = np.random.default_rng([_SEED, seed])
-    words = _words(rng, seed, what)
-    deeds = deeds_of(rng, what.seconds)
-    with threadpool_limits(1), tempfile.TemporaryDirectory(prefix="fault-night-") as folder:
-        night = FaultNight(words, Path(folder), seed, listening=listening)
-        night.play(deeds, what.seconds)
-        night.close()
-    return night
-
-
-def play(seed: int, what: Night) -> Row:
+def play(what: Night) -> Row:
     """Play one night, and the same with a service that only listens."""
     begun = time.process_time()
-    night = night_of(seed, what, listening=False)
-    alone = night_of(seed, what, listening=True)
-    deeds = deeds_of(_after_words(seed, what), what.seconds)
+    rng = np.random.default_rng([_SEED, what.seed])
+    words = _words(rng, what)
+    deeds = deeds_of(rng, what.seconds)
+
+    def night_of(*, listening: bool) -> FaultNight:
+        """Play the night; its archive is gone afterwards."""
+        with threadpool_limits(1), tempfile.TemporaryDirectory(prefix="fault-night-") as folder:
+            night = FaultNight(words, Path(folder), what.seed, listening=listening)
+            night.play(deeds, what.seconds)
+            night.close()
+        return night
+
+    night, alone = night_of(listening=False), night_of(listening=True)
     moments = night.dome.moments
-    return {
-        "seed": seed,
-        "plant": what.plant,
-        "rate_hz": what.rate_hz,
-        "seconds": what.seconds,
+    return asdict(what) | {
         "deeds": [(round(deed.time_s, 2), deed.name) for deed in deeds],
         "broken": night.broken,
         "worse": worse(moments, alone.dome.moments),
@@ -499,12 +575,6 @@ def play(seed: int, what: Night) -> Row:
         "median_nm": [_median(moments), _median(alone.dome.moments)],
         "cpu_s": time.process_time() - begun,
     }
-
-
-def _after_words(seed: int, what: Night) -> np.random.Generator:
-    rng = np.random.default_rng([_SEED, seed])
-    _words(rng, seed, what)
-    return rng
 
 
 def _runs(block: FrameBlock, arrives: np.ndarray) -> Iterator[FrameBlock]:
@@ -529,15 +599,8 @@ def _median(moments: Sequence[Moment]) -> float:
 def table(rows: Sequence[Row]) -> str:
     """Return the campaign as a Markdown table, and every night that went wrong."""
     text = heading(
-        *(
-            "plant",
-            "frames a second",
-            "nights",
-            "simulated hours",
-            "faults and orders",
-            "windows",
-            "matrices sent",
-        ),
+        *("plant", "frames a second", "nights", "simulated hours", "faults and orders"),
+        *("windows", "matrices sent"),
         *("rules broken", f"worse by {HARM - 1:.0%} for {HARM_S:g} s"),
     )
     kinds = sorted({(row["plant"], row["rate_hz"]) for row in rows})
@@ -556,35 +619,26 @@ def table(rows: Sequence[Row]) -> str:
 
 def main() -> int:
     """Play what is missing, then print the table; 1 if anything was broken."""
-    given = _parser().parse_args()
-    file = RowFile(given.output)
-    what = Night(
-        instrument=given.instrument,
-        plant=given.plant,
-        rate_hz=given.rate,
-        seconds=given.seconds,
-    )
-    done = {(row["seed"], row["plant"], row["rate_hz"], row["seconds"]) for row in file.rows}
-    for seed in given.seeds:
-        if (seed, what.plant, what.rate_hz, what.seconds) not in done:
-            file.add(play(seed, what))
-    tell(table(file.rows), given.table, "python -m pyrcal_studies.campaign.fault_nights")
-    return int(any(row["broken"] or row["worse"] for row in file.rows))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m pyrcal_studies.campaign.fault_nights",
-        description="Plays random sequences of faults in simulated time.",
-    )
-    parser.add_argument("--output", type=Path, default=Path("faults.jsonl"), help="rows, resumed")
-    parser.add_argument("--table", type=Path, metavar="FILE.md")
+    parser = campaign_parser("fault_nights", __doc__)
     parser.add_argument("--instrument", default=SMALL, metavar="NAME|FILE")
     parser.add_argument("--plant", choices=("linear", "diffractive"), default="linear")
     parser.add_argument("--rate", type=float, default=1000.0, metavar="HZ", help="of frames")
     parser.add_argument("--seeds", type=range_of, default=range(4), metavar="FIRST:END")
     parser.add_argument("--seconds", type=float, default=600.0, help="of each night")
-    return parser
+    given = parser.parse_args()
+    nights = [
+        Night(
+            seed=seed,
+            instrument=given.instrument,
+            plant=given.plant,
+            rate_hz=given.rate,
+            seconds=given.seconds,
+        )
+        for seed in given.seeds
+    ]
+    rows = complete(play, nights, given)
+    tell(table(rows), given.table, parser.prog)
+    return int(any(row["broken"] or row["worse"] for row in rows))
 
 
 if __name__ == "__main__":

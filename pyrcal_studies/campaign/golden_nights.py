@@ -8,17 +8,20 @@ what the tracker makes of them is written anew: the first difference of each nig
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 from typing_extensions import override
 
+from pyrcal.rtc.identity import Reconstructor
 from pyrcal_studies.campaign.golden import (
     FOLDER,
     INSTRUMENT,
@@ -33,16 +36,20 @@ from pyrcal_studies.campaign.golden import (
 from pyrcal_studies.campaign.observatory import SETTINGS as SMALL_SETTINGS
 from pyrcal_studies.campaign.observatory import (
     SMALL,
+    Dome,
     Observatory,
     OwnHands,
+    ShortLink,
     latencies_of,
     true_radius,
 )
-from pyrcal_studies.campaign.strange_rtc import Mischief, StrangeDome, StrangeLink
+from pyrcal_studies.shared import study_parser
 from service.config import load_settings
 from service.control.reconstructor import Recipe, reconstruct
 from service.errors import LinkError, PyrcalError
+from service.estimation.frames import FrameBlock
 from service.instrument import load_instrument
+from service.model.pupil import valid_subapertures
 from service.runtime.policy import policy_of
 from service.runtime.worker import Compute, OpticsWorker
 from service.tracking import commands as cmd
@@ -60,12 +67,16 @@ from service.wire import (
     DitherRequest,
     Loop,
     LoopRequest,
+    Manifest,
     MeasureRequest,
     Pattern,
     RampRequest,
     Reply,
+    Status,
+    layout_of,
 )
 from service.wire import Command as Order
+from sim_rtc.computer.activities import MAX_DITHER_AMPLITUDE_M
 
 WORDS = (
     f"--instrument={SMALL}",
@@ -110,8 +121,105 @@ class Plan:
     """What happens and after how many seconds, in its order."""
 
 
-class GoldenDome(StrangeDome):
-    """A telescope whose RTC may refuse or ignore what it is asked, or not be reached."""
+STRONG = 20.0
+"""A dither is so much stronger than was asked for, as far as the mirror goes."""
+
+TRUE_LEAK, TOLD_LEAK = 0.90, 0.99
+
+
+class Mischief(StrEnum):
+    """One way of not keeping to the contract, or to the truth."""
+
+    SIGN = "sign"
+    """Slopes, and so the matrices, of the other sign."""
+
+    FLIP_X = "flip-x"
+    NANOMETRES = "nanometres"
+    """Commands, and so the matrices, in nanometres."""
+
+    LEAK = "leak"
+    """0.99 is reported, 0.90 is true."""
+
+    DELAY = "delay"
+    """A frame less is reported than there is."""
+
+    GAIN = "gain"
+    """Half the gain is reported."""
+
+    SEEING_GAINS = "seeing-gains"
+    """Gains that move by 1 % with every status: nothing wrong with that."""
+
+    STRONG_DITHER = "strong-dither"
+    OTHER_SHA = "other-sha"
+    """What is acknowledged is not what was sent."""
+
+    NO_ACK = "no-ack"
+    NO_STATUS = "no-status"
+    NO_CM_ID = "no-cm-id"
+
+
+DIALECTS = frozenset({Mischief.SIGN, Mischief.FLIP_X, Mischief.NANOMETRES})
+"""Those of telemetry and matrices: an RTC changes them only when it starts anew."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Dialect:
+    """How slopes and commands are listed on the wire."""
+
+    index: NDArray[np.intp]
+    """``(n_slopes,)``: the place on the wire ``k`` shows slope ``index[k]``."""
+
+    sign: NDArray[np.float32]
+    """``(n_slopes,)`` of each place on the wire."""
+
+    unit: float
+    """Commands on the wire over commands in metres."""
+
+    def shown(self, matrix: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return a reconstructor as the RTC would show it."""
+        matrix = matrix[:, self.index] * self.sign * np.float32(self.unit)
+        return np.ascontiguousarray(matrix, dtype=np.float32)
+
+    def meant(self, matrix: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return what the loop does with a reconstructor it is sent: the inverse of ``shown``."""
+        inner = np.empty_like(matrix)
+        inner[:, self.index] = matrix * self.sign / np.float32(self.unit)
+        return inner
+
+    def spoken(self, block: FrameBlock) -> FrameBlock:
+        """Return telemetry as it is sent."""
+        unit, dither = np.float32(self.unit), block.dither_m
+        return replace(
+            block,
+            slopes=block.slopes[:, self.index] * self.sign,
+            commands_m=block.commands_m * unit,
+            dither_m=None if dither is None else dither * unit,
+        )
+
+
+def dialect_of(mischief: Mischief | None, mask: NDArray[np.bool_]) -> Dialect:
+    """Return the dialect of an RTC; ``mask`` ``(n, n)`` [y, x] are its valid subapertures."""
+    n_valid = int(mask.sum())
+    number = np.full(mask.shape, -1)
+    number[mask] = np.arange(n_valid)
+    signs = (1.0, 1.0)
+    if mischief is Mischief.SIGN:
+        signs = (-1.0, -1.0)
+    elif mischief is Mischief.FLIP_X:
+        number, signs = number[:, ::-1], (-1.0, 1.0)
+    order = number[number >= 0]
+    return Dialect(
+        index=np.concatenate([order, order + n_valid]),
+        sign=np.repeat(np.array(signs, dtype=np.float32), n_valid),
+        unit=1e9 if mischief is Mischief.NANOMETRES else 1.0,
+    )
+
+
+class GoldenDome(Dome):
+    """A telescope whose RTC refuses or ignores requests, or differs from what it reports.
+
+    Nothing here knows how the service finds out.
+    """
 
     def __init__(self, words: Sequence[str]) -> None:
         super().__init__(words)
@@ -124,21 +232,89 @@ class GoldenDome(StrangeDome):
         self.unreachable = False
         """No answer comes from it."""
 
+        self.mischief: set[Mischief] = set()
+        self._asked: dict[str, DitherRequest] = {}
+        self._n_reported = 0
+        self.speak(None)
+
+    def speak(self, mischief: Mischief | None) -> None:
+        """Take up a dialect, None the right one, as an RTC does that is set up anew."""
+        self.dialect = dialect_of(mischief, valid_subapertures(self.instrument))
+        self.mischief -= DIALECTS
+        self.mischief |= {mischief} if mischief else set()
+
+    def begin(self, mischief: Mischief) -> None:
+        """Get up to something that needs no new session."""
+        self.mischief.add(mischief)
+        if mischief is Mischief.LEAK:
+            self._leak(TRUE_LEAK)
+
+    def end(self, mischief: Mischief) -> None:
+        """Behave again."""
+        self.mischief.discard(mischief)
+        if mischief is Mischief.LEAK:
+            self._leak(TOLD_LEAK)
+
+    def _leak(self, leak: float) -> None:
+        self.computer.execute(LoopRequest(id=f"strange-{self.frame}", leak=leak))
+
+    @override
+    def play(self) -> list[FrameBlock]:
+        """Let one block of frames pass and return what is sent of it."""
+        return [self.dialect.spoken(block) for block in super().play()]
+
     @override
     def order(self, command: Order) -> Reply:
         """Tell the RTC something and return its answer."""
         if isinstance(command, self.refused):
             reason = "busy: it is told to refuse"
             return Reply(id=command.id, accepted=False, reason=reason, start_seq=None)
-        if self.deaf and isinstance(command, DitherRequest):
-            return Reply(id=command.id, accepted=True, reason="", start_seq=self.frame + 50)
+        if isinstance(command, DitherRequest):
+            if self.deaf:
+                return Reply(id=command.id, accepted=True, reason="", start_seq=self.frame + 50)
+            if Mischief.STRONG_DITHER in self.mischief:
+                self._asked[command.id] = command
+                strong = [min(STRONG * a, MAX_DITHER_AMPLITUDE_M) for a in command.amplitude_m]
+                command = replace(command, amplitude_m=tuple(strong))
         return super().order(command)
 
+    @override
+    def stage(self, reconstructor: Reconstructor) -> None:
+        """Hand the loop a matrix, as it understands it."""
+        super().stage(replace(reconstructor, matrix=self.dialect.meant(reconstructor.matrix)))
 
-class GoldenLink(StrangeLink):
-    """The way to it, which may be cut."""
+    def applied(self) -> tuple[Manifest, NDArray[np.float32]]:
+        """Return the matrix in use as the RTC shows it."""
+        active = self.computer.reconstructor
+        matrix = self.dialect.shown(active.matrix)
+        layout = layout_of(matrix, active.manifest.layout.chunk_bytes)
+        return replace(active.manifest, layout=layout), matrix
 
-    _strange: GoldenDome
+    @override
+    def status(self) -> Status:
+        """Return what the RTC says of itself, true or not."""
+        status = super().status()
+        self._n_reported += 1
+        dither = status.dither
+        if dither is not None and dither.request.id in self._asked:
+            asked = self._asked[dither.request.id]
+            status = replace(status, dither=replace(dither, request=asked))
+        if Mischief.LEAK in self.mischief:
+            status = replace(status, leak=TOLD_LEAK)
+        if Mischief.DELAY in self.mischief:
+            status = replace(status, delay_frames=status.delay_frames - 1.0)
+        if Mischief.NO_CM_ID in self.mischief:
+            status = replace(status, cm_id=None)
+        factor = 0.5 if Mischief.GAIN in self.mischief else 1.0
+        if Mischief.SEEING_GAINS in self.mischief:
+            factor *= 1.0 + 0.01 * (self._n_reported % 2)
+        return replace(status, gains=tuple(factor * gain for gain in status.gains))
+
+
+class GoldenLink(ShortLink):
+    """The way to it, which may be cut; what is acknowledged need not be what was sent."""
+
+    _dome: GoldenDome
 
     @override
     async def command(self, command: Order) -> Reply:
@@ -149,9 +325,19 @@ class GoldenLink(StrangeLink):
         LinkError
             If none comes.
         """
-        if self._strange.unreachable:
+        if self._dome.unreachable:
             raise LinkError("the RTC did not answer within 2 s")
         return await super().command(command)
+
+    @override
+    async def fetch_applied(self) -> tuple[Manifest, NDArray[np.float32]]:
+        """Return the matrix the RTC uses, as it shows it."""
+        return self._dome.applied()
+
+    @override
+    def _told(self, acknowledgement: Acknowledgement) -> Acknowledgement:
+        other = Mischief.OTHER_SHA in self._dome.mischief
+        return replace(acknowledgement, sha256="0" * 64) if other else acknowledgement
 
 
 class GoldenNight(Observatory):
@@ -998,7 +1184,11 @@ NIGHTS = (*TRACKING, *ACQUIRING, *COMMANDED, *MEASURING, *FAULTS)
 
 def main() -> int:
     """Record the nights that are asked for."""
-    given = _parser().parse_args()
+    parser = study_parser("pyrcal_studies.campaign.golden_nights", __doc__)
+    parser.add_argument("--folder", type=Path, default=FOLDER)
+    parser.add_argument("--retell", action="store_true", help="keep the events")
+    parser.add_argument("--only", default="", metavar="NAME,NAME", help="default: all nights")
+    given = parser.parse_args()
     names = given.only.split(",") if given.only else [plan.name for plan in NIGHTS]
     with threadpool_limits(1):
         for plan in NIGHTS:
@@ -1028,17 +1218,6 @@ def _retell(folder: Path, name: str) -> None:
     night = read(path)
     sys.stdout.write(f"{name}: {replayed(night, instrument) or 'as it was'}\n")
     written(retold(night, instrument), path)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m pyrcal_studies.campaign.golden_nights",
-        description="Records the golden nights, what the tracker is compared with.",
-    )
-    parser.add_argument("--folder", type=Path, default=FOLDER)
-    parser.add_argument("--retell", action="store_true", help="keep the events")
-    parser.add_argument("--only", default="", metavar="NAME,NAME", help="default: all nights")
-    return parser
 
 
 if __name__ == "__main__":

@@ -1,33 +1,50 @@
-"""One simulated night: a telescope, a star, the lock-in, and the error of each of its windows."""
+"""Windows of a dither on many simulated telescopes, and the error of each.
+
+Run: ``python -m pyrcal_studies.campaign --magnitudes 7,10,12.5 --seeds 0:10 --output
+var/campaign.jsonl``; nights that are there already are not run again. A night is a telescope, a
+star, a dither and the service's lock-in, without its tracker. The table has bias, scatter,
+coverage, refusals and wavefront error.
+"""
 
 from __future__ import annotations
 
-import hashlib
+import argparse
 import itertools
 import os
-import pickle
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from service.estimation.frames import FrameBlock
+from pyrcal_studies.campaign.observatory import Dome
+from pyrcal_studies.campaign.rows import (
+    UNITS,
+    Row,
+    add_workers,
+    campaign_parser,
+    complete,
+    floats,
+    four,
+    grouped,
+    heading,
+    line,
+    range_of,
+    tell,
+    words,
+)
+from service.config import load_settings
+from service.estimation.estimate import model_error
 from service.estimation.lockin import LockIn, LockInEstimate, LockInPlan, Spectra
 from service.estimation.windows import ClosedLoop, WindowRefused
 from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.runtime.policy import floor_of
 from service.runtime.worker import Compute, OpticsWorker, Sampling
 from service.wire import DitherKind, DitherRequest
-from sim_rtc.assembly import Telescope, build_telescope
-from sim_rtc.computer.feed import Ahead
-from sim_rtc.computer.real_time_computer import RealTimeComputer
-from sim_rtc.computer.telemetry import Batch
-from sim_rtc.options import parse_options
-from sim_rtc.truth import WavefrontError
 
 LINE_FRACTIONS = (0.211, 0.239, 0.283, 0.331)
 """Of the frame rate: what the service dithers at by itself."""
@@ -50,9 +67,6 @@ class Night:
 
     magnitude: float = 10.0
     wind_m_s: float = 12.0
-    profile: str | None = None
-    """Named layers instead of one wind."""
-
     seed: int = 0
     gain: float = 0.6
     n_controlled: int = 400
@@ -88,10 +102,7 @@ class Night:
             "seed": self.seed,
             "gain": self.gain,
         }
-        if self.profile is None:
-            options["wind"] = f"{self.wind_m_s},{(37 + 61 * self.seed) % 360:g}"
-        else:
-            options["profile"] = self.profile
+        options["wind"] = f"{self.wind_m_s},{(37 + 61 * self.seed) % 360:g}"
         options["n-controlled"] = self.n_controlled
         if self.instrument != "flao-lbt":
             options["instrument"] = self.instrument
@@ -102,115 +113,59 @@ class Night:
         return [f"--{name}={value}" for name, value in options.items()]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Seen:
-    """One window of a night's telemetry, and the truth behind it."""
-
-    window: Window
-    loop: ClosedLoop
-    true: Misregistration
-    errors_nm: tuple[float, ...]
-    """Wavefront error of its batches, RMS."""
-
-
-def play(night: Night, keep: Path | None = None) -> list[dict[str, Any]]:
-    """Run one night and return a row for each of its windows.
-
-    With ``keep`` the sums of its telemetry are put there, and a night that is there already is
-    not simulated again: only looked at, perhaps with another model.
-    """
+def play(night: Night) -> list[Row]:
+    """Run one night and return a row for each of its windows."""
     with threadpool_limits(1):
-        rows, known = [], Misregistration()
         # of this night alone: it follows the seeing, and rows must not depend on other nights
         bench = OpticsWorker(
             load_instrument(night.instrument),
             Compute(threads=1, sampling=Sampling(working_point_modes=night.working_point_modes)),
         )
-        for k, seen in enumerate(_kept(night, keep)):
+        dome = Dome(night.words, block_batches=BLOCK_BATCHES)
+        dome.play()
+        sums = LockIn(plan=start_dither(night, dome))
+        loop, known, rows = loop_of(dome), Misregistration(), list[Row]()
+        for window, wavefront_nm in itertools.islice(windows(dome, sums), night.n_windows):
             outcome: Outcome
-            if isinstance(seen.window, WindowRefused):
-                outcome = seen.window
+            if isinstance(window, WindowRefused):
+                outcome = window
             else:
-                outcome = bench.fit(seen.window, seen.loop, known)
+                outcome = bench.fit(window, loop, known)
             if not isinstance(outcome, WindowRefused):
                 known = outcome.alpha
-            alpha = (seen.true.vector * BOUNDARY_SCALE).tolist()
-            rows.append(asdict(night) | _row(outcome, seen) | {"window": k, "alpha": alpha})
+            about = {"window": len(rows), "alpha": (dome.alpha.vector * BOUNDARY_SCALE).tolist()}
+            about["wavefront_nm"] = wavefront_nm
+            rows.append(asdict(night) | about | _row(outcome, dome.alpha))
         return rows
 
 
-def kept_in(night: Night, folder: Path) -> Path:
-    """Return the file of a night's sums: the model it is looked at with plays no part."""
-    words = repr(replace(night, working_point_modes=None))
-    return folder / f"{hashlib.sha256(words.encode()).hexdigest()[:16]}.pickle"
+def windows(dome: Dome, sums: LockIn) -> Iterator[tuple[Window, float | None]]:
+    """Yield the windows of a dither without end, each with the RMS wavefront error during it."""
+    waited, errors_nm = 0, list[float]()
+    while True:
+        for block in dome.play():
+            sums, ended = sums.accumulate(block)
+            for window in ended:
+                yield window, _rms(errors_nm)
+                errors_nm.clear()
+            waited = 0 if ended or sums.window is not None else waited + block.n_frames
+        if sums.window is not None:
+            errors_nm.append(dome.moments[-1].wavefront_nm)
+        if waited > 2 * sums.plan.n_frames:
+            yield WindowRefused(reason="no frame carried a dither", t_ns_utc=0), None
+            waited = sums.plan.n_frames
 
 
-def _kept(night: Night, keep: Path | None) -> Iterator[Seen]:
-    if keep is None:
-        yield from _simulated_windows(night)
-        return
-    path = kept_in(night, keep)
-    if not path.exists():
-        keep.mkdir(parents=True, exist_ok=True)
-        unfinished = path.with_suffix(f".{os.getpid()}")
-        unfinished.write_bytes(pickle.dumps(list(_simulated_windows(night)), protocol=5))
-        unfinished.rename(path)
-    yield from pickle.loads(path.read_bytes())
+def _rms(values: list[float]) -> float | None:
+    return float(np.sqrt(np.mean(np.square(values)))) if values else None
 
 
-def _simulated_windows(night: Night) -> Iterator[Seen]:
-    options = parse_options(night.words)
-    telescope = build_telescope(options, load_instrument(night.instrument))
-    true, error = telescope.optics.start().alpha, WavefrontError(telescope.weights)
-    with Ahead(telescope.feed.blocks()) as ahead:
-        computer = telescope.computer(iter(ahead))
-        computer.prepare()
-        plan = start_dither(night, computer, options.frame_rate_hz)
-        arriving = Arriving(telescope=telescope, computer=computer, error=error)
-        for window in itertools.islice(arriving.windows(plan), night.n_windows):
-            seen = tuple(arriving.errors_nm)
-            yield Seen(window=window, loop=loop_of(telescope), true=true, errors_nm=seen)
-            arriving.errors_nm.clear()
-
-
-@dataclass(slots=True, kw_only=True)
-class Arriving:
-    """Frames of one telescope on their way to the lock-in."""
-
-    telescope: Telescope
-    computer: RealTimeComputer
-    error: WavefrontError
-    errors_nm: list[float] = field(default_factory=list)
-    """Wavefront error of the batches of the window under way, RMS."""
-
-    def windows(self, plan: LockInPlan) -> Iterator[Window]:
-        """Yield the windows of this plan, without end."""
-        sums = LockIn(plan=plan)
-        waited = 0
-        for blocks in self._blocks(plan.first_seq):
-            for block in blocks:
-                sums, ended = sums.accumulate(block)
-                yield from ended
-                waited = 0 if ended or sums.window is not None else waited + block.n_frames
-            if waited > 2 * plan.n_frames:
-                yield WindowRefused(reason="no frame carried a dither", t_ns_utc=0)
-                waited = plan.n_frames
-
-    def _blocks(self, first_seq: int) -> Iterator[list[FrameBlock]]:
-        """Yield what arrives, some batches at a time; their wavefront error is noted."""
-        while True:
-            batches = [self.computer.next_batch() for _ in range(BLOCK_BATCHES)]
-            if batches[0].seq0 >= first_seq:
-                self.errors_nm += self.error.rms_nm(batches)
-            yield blocks_of(batches, self.telescope)
-
-
-def start_dither(night: Night, computer: RealTimeComputer, rate_hz: float) -> LockInPlan:
-    """Close the loop for a moment, ask for the dither, and return how it is to be read."""
-    computer.next_batch()
+def start_dither(night: Night, dome: Dome) -> LockInPlan:
+    """Ask for the dither, and return how it is to be read."""
+    rate_hz = dome.rate_hz
     amplitude_m = (night.amplitude_nm * 1e-9,) * len(night.dithered)
     lines = tuple(round(f * rate_hz * night.window_s) / night.window_s for f in LINE_FRACTIONS)
-    reply = computer.execute(
+    reply = dome.order(
         DitherRequest(
             id="campaign",
             kind=DitherKind.SINE,
@@ -233,37 +188,13 @@ def start_dither(night: Night, computer: RealTimeComputer, rate_hz: float) -> Lo
     )
 
 
-def blocks_of(batches: list[Batch], telescope: Telescope) -> list[FrameBlock]:
-    """Return batches as the link delivers them: joined while nothing changes."""
-    dt_ns = round(1e9 / telescope.settings.frame_rate_hz)
-    kept = [(b.session, b.cm_id, b.dither_m is None) for b in batches]
-    edges = [0, *(k for k in range(1, len(kept)) if kept[k] != kept[k - 1]), len(kept)]
-    blocks = []
-    for start, stop in itertools.pairwise(edges):
-        part = batches[start:stop]
-        dithers = [b.dither_m for b in part if b.dither_m is not None]
-        blocks.append(
-            FrameBlock(
-                session=part[0].session,
-                first_seq=part[0].seq0,
-                t0_ns_utc=part[0].seq0 * dt_ns,
-                dt_ns=dt_ns,
-                slopes=np.concatenate([b.slopes for b in part]),
-                commands_m=np.concatenate([b.commands_m for b in part]),
-                dither_m=np.concatenate(dithers) if dithers else None,
-                cm_id=part[0].cm_id,
-            )
-        )
-    return blocks
-
-
-def loop_of(telescope: Telescope) -> ClosedLoop:
+def loop_of(dome: Dome) -> ClosedLoop:
     """Return the loop as it starts."""
-    settings = telescope.settings
+    settings, matrix = dome.telescope.settings, dome.telescope.reconstructor.matrix
     gains = np.array(settings.gains)
-    gains[len(telescope.reconstructor.matrix) :] = 0.0
+    gains[len(matrix) :] = 0.0
     return ClosedLoop(
-        reconstructor=telescope.reconstructor.matrix,
+        reconstructor=matrix,
         gains=gains,
         leak=settings.leak,
         delay_frames=settings.delay_frames,
@@ -271,20 +202,165 @@ def loop_of(telescope: Telescope) -> ClosedLoop:
     )
 
 
-def _row(outcome: Outcome, seen: Seen) -> dict[str, Any]:
-    row: dict[str, Any] = {
-        "wavefront_nm": float(np.sqrt(np.mean(np.square(seen.errors_nm))))
-        if seen.errors_nm
-        else None
-    }
+def _row(outcome: Outcome, true: Misregistration) -> Row:
     if isinstance(outcome, WindowRefused):
-        return row | {"refused": outcome.reason}
-    difference = outcome.alpha.vector - seen.true.vector
-    covariance, gains = outcome.covariance, np.abs(outcome.optical_gain)
-    return row | {
+        return {"refused": outcome.reason}
+    difference = outcome.alpha.vector - true.vector
+    return {
         "refused": None,
         "error": (difference * BOUNDARY_SCALE).tolist(),
-        "covariance": (covariance * np.outer(BOUNDARY_SCALE, BOUNDARY_SCALE)).tolist(),
-        "optical_gain": float(gains.mean()),
+        "covariance": (outcome.covariance * np.outer(BOUNDARY_SCALE, BOUNDARY_SCALE)).tolist(),
         "misfit": outcome.misfit,
     }
+
+
+HEADER = heading(
+    *("night", "windows (refused)", "bias x, y % / mdeg / %", "scatter", "scatter/σ", "chi2/4"),
+    *("inside 95 %", "error RMS", "wavefront nm"),
+)
+
+
+def table(rows: list[Row], floor: Array, *, pooled: bool = False) -> str:
+    """Return the campaign as a Markdown table; ``floor`` ``(4,)`` in boundary units.
+
+    ``pooled``: one line for all winds.
+    """
+    groups = grouped(rows, Night, "seed", "n_windows", *(["wind_m_s"] if pooled else []))
+    return HEADER + "".join(_line(group, floor, pooled=pooled) for group in groups)
+
+
+def _line(rows: list[Row], floor: Array, *, pooled: bool) -> str:
+    good = [row for row in rows if row["refused"] is None]
+    wavefront = np.array([row["wavefront_nm"] for row in rows if row["wavefront_nm"] is not None])
+    name = _name(rows[0], "many winds" if pooled else f"{rows[0]['wind_m_s']:g} m/s")
+    counted = f"{len(rows)} ({len(rows) - len(good)})"
+    error_nm = f"{np.sqrt(np.mean(wavefront**2)):.1f}" if wavefront.size else "-"
+    if not good:
+        return line(name, counted, *"------", error_nm)
+    errors = np.array([row["error"] for row in good])
+    covariances = np.array([row["covariance"] for row in good])
+    seeds = np.array([row["seed"] for row in good])
+    sigma = np.sqrt(np.mean(np.diagonal(covariances, axis1=1, axis2=2), axis=0))
+    scatter = _within(errors, seeds)
+    squares = distances(errors, covariances + model_errors(good), floor)
+    inside = np.mean(squares < scipy.stats.chi2.ppf(0.95, 4))
+    return line(
+        *(name, counted),
+        four(errors.mean(axis=0) * UNITS),
+        four(scatter * UNITS),
+        four(scatter / sigma),
+        f"{squares.mean() / 4:.2f}",
+        f"{inside:.0%}",
+        four(np.sqrt(np.mean(errors**2, axis=0)) * UNITS),
+        error_nm,
+    )
+
+
+def model_errors(rows: list[Row]) -> Array:
+    """Return ``(n, 4, 4)`` what the misfit of each window adds, which the service adds as well."""
+    return np.array([np.diag(model_error(row["covariance"], row["misfit"]) ** 2) for row in rows])
+
+
+def distances(errors: Array, covariances: Array, floor: Array) -> Array:
+    """Return ``(n,)`` normalised squared errors, floor included: four degrees of freedom."""
+    total = covariances + np.diag(floor**2)
+    return np.array([e @ np.linalg.solve(c, e) for e, c in zip(errors, total, strict=True)])
+
+
+def _within(errors: Array, seeds: NDArray[np.int_]) -> Array:
+    """Return the RMS scatter about each telescope's own mean, ``(4,)``."""
+    squares, freedom = np.zeros(4), 0
+    for seed in np.unique(seeds):
+        own = errors[seeds == seed]
+        squares += np.sum((own - own.mean(axis=0)) ** 2, axis=0)
+        freedom += len(own) - 1
+    return np.asarray(np.sqrt(squares / freedom)) if freedom else np.full(4, np.nan)
+
+
+def _name(key: Row, wind: str) -> str:
+    words = [
+        f"{key['plant']} {key['truth']}, mag {key['magnitude']:g}, {wind}",
+        f"{key['n_controlled']} modes g {key['gain']:g}",
+        f"4 x {key['amplitude_nm']:g} nm, {key['window_s']:g} s",
+    ]
+    if key["working_point_modes"]:
+        words.append("working point")
+    if key["modes"]:
+        words.append("modes " + " ".join(str(mode) for mode in key["modes"]))
+    if key["instrument"] != "flao-lbt":
+        words.insert(0, Path(key["instrument"]).stem)
+    if key["rate_hz"]:
+        words.append(f"{key['rate_hz']:g} Hz")
+    if key["camera"] != "ccd":
+        words.append(key["camera"])
+    return ", ".join(words)
+
+
+def main() -> int:
+    """Run what is missing, then print the table."""
+    parser = _parser()
+    given = parser.parse_args()
+    rows = complete(play, _nights(given), given)
+    environment = {}
+    if given.working_point_modes is not None:
+        environment["PYRCAL_COMPUTE__WORKING_POINT_MODES"] = str(given.working_point_modes)
+    floor = floor_of(load_settings(None, environment), load_instrument(given.instrument))
+    text = table(rows, floor, pooled=given.winds_in_turn is not None)
+    tell(text, given.table, parser.prog)
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = campaign_parser("", __doc__)
+    parser.add_argument("--seeds", type=range_of, default=range(2), metavar="FIRST:END")
+    parser.add_argument("--magnitudes", type=floats, default=(10.0,), metavar="R,R...")
+    parser.add_argument("--winds", type=floats, default=(12.0,), metavar="M_S,M_S...")
+    parser.add_argument(
+        "--winds-in-turn",
+        type=floats,
+        metavar="M_S,M_S...",
+        help="one for each seed, over and over, and one line of the table for all",
+    )
+    parser.add_argument("--truths", type=words, default=("ideal",), metavar="NAME,NAME...")
+    parser.add_argument("--plant", choices=("linear", "diffractive"), default="diffractive")
+    parser.add_argument("--gain", type=float, default=0.6)
+    parser.add_argument("--n-controlled", type=int, default=400)
+    parser.add_argument("--amplitude-nm", type=float, default=5.0, help="RMS of each of four modes")
+    parser.add_argument("--window-s", type=float, default=5.0)
+    parser.add_argument("--windows", type=int, default=4, help="of each night")
+    parser.add_argument("--working-point-modes", type=int)
+    parser.add_argument("--modes", type=_modes, metavar="MODE,MODE...", help="that are dithered")
+    parser.add_argument("--camera", choices=("ccd", "emccd"), default="ccd")
+    parser.add_argument("--instrument", default="flao-lbt", metavar="NAME|FILE")
+    parser.add_argument("--rate", type=float, metavar="HZ", help="frames per second")
+    add_workers(parser, os.cpu_count() or 1)
+    return parser
+
+
+def _nights(given: argparse.Namespace) -> Iterator[Night]:
+    """Yield every night of the grid."""
+    grid = itertools.product(given.seeds, given.truths, given.magnitudes, given.winds)
+    turns = given.winds_in_turn
+    for seed, truth, magnitude, wind in grid:
+        wind_m_s = wind if turns is None else turns[seed % len(turns)]
+        yield Night(
+            plant=given.plant,
+            truth=truth,
+            magnitude=magnitude,
+            wind_m_s=wind_m_s,
+            seed=seed,
+            gain=given.gain,
+            n_controlled=given.n_controlled,
+            amplitude_nm=given.amplitude_nm,
+            window_s=given.window_s,
+            n_windows=given.windows,
+            working_point_modes=given.working_point_modes,
+            modes=given.modes,
+            camera=given.camera,
+            instrument=given.instrument,
+            rate_hz=given.rate,
+        )
+
+
+def _modes(text: str) -> tuple[int, ...]:
+    return tuple(int(word) for word in text.split(","))

@@ -5,10 +5,9 @@ the wire. Only what waits is replaced: an agenda says when each thing is over, b
 so a night takes as long as it computes and is the same every time.
 
 ``Dome`` is the telescope with its RTC, ``ShortLink``, ``OwnHands`` and ``Shelf`` replace the link,
-the worker process and the archive, ``Observatory`` is the service at the dome, and ``KeptNight``
-one that keeps its state on a disk, may be killed and continues from it. ``published`` judges the
-matrices of a night by the telescope alone: the wavefront after each swap, and the poles of the
-loop with the telescope's own response, which the service has not seen.
+the worker process and the archive, and ``Observatory`` is the service at the dome. ``published``
+judges the matrices of a night by the telescope alone: the wavefront after each swap, and the poles
+of the loop with the telescope's own response, which the service has not seen.
 """
 
 from __future__ import annotations
@@ -16,14 +15,11 @@ from __future__ import annotations
 import asyncio
 import heapq
 import itertools
-import time
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cache, partial
-from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
@@ -32,7 +28,6 @@ from typing_extensions import override
 
 from pyrcal.rtc import staging
 from pyrcal.rtc.identity import Reconstructor
-from service.archive import Archive
 from service.archive.products import NoisyNumbers
 from service.archive.store import Provenance
 from service.control.gate import GateVerdict
@@ -47,13 +42,6 @@ from service.instrument import load_instrument
 from service.model.misregistration import Misregistration
 from service.model.slopes import SlopeRecipe
 from service.runtime.actions import Actions, Publishing, present_conditions
-from service.runtime.archiving import (
-    SAVE_INTERVAL_S,
-    is_unsaved,
-    is_urgent,
-    leave,
-    restore_tracking,
-)
 from service.runtime.engine import Engine
 from service.runtime.estimates import PendingWindow, fit_passive, fitted, read_own_matrix
 from service.runtime.ports import StorePort
@@ -66,8 +54,7 @@ from service.tracking.events import Effect, Event
 from service.tracking.operation_records import MeasurementRecord
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.resume import restored
-from service.tracking.state import LoopState, MatrixStates, Mode, OperatorState, TrackerState
+from service.tracking.state import LoopState, Mode, OperatorState, TrackerState
 from service.wire import (
     CHUNK_LIMIT,
     Acknowledgement,
@@ -368,9 +355,6 @@ class OwnHands:
     def __init__(self, workbench: OpticsWorker) -> None:
         self.first: Callable[[], Done[None]] | None = None
         self.found_slopes: SlopeRecipe | None = None
-        self.cpu_s: defaultdict[str, float] = defaultdict(float)
-        """Processor time of the jobs, seconds, by name."""
-
         self.broken = ""
         """Why no job can be done; empty: all can."""
 
@@ -380,7 +364,6 @@ class OwnHands:
         self, job: Callable[Concatenate[OpticsWorker, P], R], *args: P.args, **kwargs: P.kwargs
     ) -> R:
         """Run a method of the workbench now; what goes wrong is said as the worker would."""
-        before_s = time.process_time()
         if self.broken:
             raise WorkerError(self.broken)
         try:
@@ -389,8 +372,6 @@ class OwnHands:
             raise
         except Exception as error:
             raise WorkerError(f"{job.__name__} failed in the worker: {error!r}") from error
-        finally:
-            self.cpu_s[job.__name__] += time.process_time() - before_s
 
 
 class Kept:
@@ -501,9 +482,6 @@ class Publication:
     after_nm: float
     """The same during the last second of the watch; NaN: there is none."""
 
-    n_clipped: int
-    """Commands that met a limit of the mirror during the watch, beyond those before it."""
-
     outcome: Outcome
 
 
@@ -518,21 +496,15 @@ def published(swap: Swap, moments: Sequence[Moment], until_s: float) -> Publicat
     after = [m for m in moments if swap.time_s < m.time_s <= end_s]
     late = [m for m in after if m.time_s > end_s - 1.0]
     before_nm, after_nm = _rms_nm(before), _rms_nm(late)
-    n_clipped = sum(m.n_clipped for m in after) if not any(m.n_clipped for m in before) else 0
+    clipped = any(m.n_clipped for m in after) and not any(m.n_clipped for m in before)
     quiet_nm = min((m.wavefront_nm for m in moments if m.time_s > 1.0), default=np.nan)
     grown = after_nm > GROWTH * max(before_nm, quiet_nm)
     outcome = Outcome.HELD
-    if grown or n_clipped or (swap.radius or 0.0) >= 1.0:
+    if grown or clipped or (swap.radius or 0.0) >= 1.0:
         outcome = Outcome.DIVERGED
     elif end_s - swap.time_s < LEAST_S:
         outcome = Outcome.UNTESTED
-    return Publication(
-        swap=swap,
-        before_nm=before_nm,
-        after_nm=after_nm,
-        n_clipped=n_clipped,
-        outcome=outcome,
-    )
+    return Publication(swap=swap, before_nm=before_nm, after_nm=after_nm, outcome=outcome)
 
 
 def true_radius(
@@ -636,7 +608,6 @@ class Observatory:
         workbench: OpticsWorker,
         *,
         latencies: Latencies | None = None,
-        pole_radius_bound: float = 0.95,
         with_poles: bool = True,
         dome: Dome | None = None,
         link: Callable[[Any], ShortLink] = ShortLink,
@@ -668,7 +639,7 @@ class Observatory:
         self._workers = OwnHands(workbench)
         self._shelf: StorePort = archive or Shelf()
         self._publishing = Publishing(
-            system=system, chunk_bytes=CHUNK_LIMIT, pole_radius_bound=pole_radius_bound
+            system=system, chunk_bytes=CHUNK_LIMIT, pole_radius_bound=0.95
         )
         self._actions = self._new_actions()
         self._n_restarts = 0
@@ -687,11 +658,6 @@ class Observatory:
     def time_s(self) -> float:
         """Seconds since the night began."""
         return self.dome.time_s
-
-    @property
-    def worker_cpu_s(self) -> dict[str, float]:
-        """Processor time the worker's jobs have taken, seconds, by name."""
-        return dict(self._workers.cpu_s)
 
     def advance(self, seconds: float) -> None:
         """Let so much time pass.
@@ -1007,107 +973,6 @@ class Observatory:
 
 def _nothing() -> None:
     pass
-
-
-DOWN_S = 3.0
-"""From the end of a service until the next one listens."""
-
-
-class KeptNight(Observatory):
-    """With a ``folder`` the service can be killed and begun again."""
-
-    def __init__(
-        self,
-        policy: Policy,
-        mode: Mode,
-        bench: OpticsWorker,
-        folder: Path | None,
-        *,
-        latencies: Latencies,
-        dome: Dome,
-        link: Callable[[Any], ShortLink],
-    ) -> None:
-        self._policy, self._mode, self._folder = policy, mode, folder
-        self._archive = None if folder is None else _opened(folder)
-        self._saved: TrackerState | None = None
-        self._saved_s = 0.0
-        super().__init__(
-            (),
-            policy,
-            mode,
-            bench,
-            latencies=latencies,
-            with_poles=False,
-            dome=dome,
-            link=link,
-            archive=self._archive,
-        )
-
-    def kill(self) -> None:
-        """End the service as ``kill -9`` does; another takes up what is on the disk.
-
-        What was on its way to the RTC arrives; telescope and RTC go on.
-
-        Raises
-        ------
-        ValueError
-            If the night has no folder to begin again from.
-        """
-        if self._archive is None or self._folder is None:
-            raise ValueError("kill: found a night without a folder; expected one that has")
-        self._arrive()
-        self._agenda.clear()
-        self._idle_worker()
-        self._archive.close()
-        begun_s = self.time_s + DOWN_S
-        while self.time_s < begun_s:
-            self.dome.play()
-            for _ in self._link.swapped():
-                self._note_swap()
-        self._archive = self._shelf = _opened(self._folder)
-        self._actions = self._new_actions()
-        state = TrackerState(
-            system=self.state.system,
-            operator=OperatorState(mode=self._mode),
-            matrices=MatrixStates(reconstructors=restored(self._archive.reconstructors.records())),
-        )
-        self._engine.state = restore_tracking(self._archive, state, self._policy, self.now_ns())
-        self._engine.begin_anew()
-        self._begin()
-
-    def close(self) -> None:
-        """Close the archive."""
-        if self._archive is not None:
-            self._archive.close()
-
-    @override
-    def stepped(self, before: TrackerState, event: Event) -> None:
-        """Keep what the tracker heard, and write what the service would."""
-        super().stepped(before, event)
-        after = self.state
-        if (
-            self._archive is not None
-            and after.matrices.reconstructors is not before.matrices.reconstructors
-        ):
-            old = {record.id: record for record in before.matrices.reconstructors}
-            news = tuple(r for r in after.matrices.reconstructors if old.get(r.id) is not r)
-            self._archive.record(news, (), ())
-
-    def save(self) -> None:
-        """Write what the next service needs as seldom as the service does."""
-        archive, state = self._archive, self.state
-        before, due = self._saved, self.time_s >= self._saved_s + SAVE_INTERVAL_S
-        if archive is None:
-            return
-        if before is None or ((due or is_urgent(before, state)) and is_unsaved(before, state)):
-            leave(archive, state, self.now_ns())
-            self._saved, self._saved_s = state, self.time_s
-
-
-def _opened(folder: Path) -> Archive:
-    archive = Archive(folder)
-    archive.open()
-    return archive
 
 
 SMALL = "tests/system/small.toml"

@@ -6,6 +6,7 @@ import argparse
 import json
 import multiprocessing
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import fields
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal_studies.shared import study_parser
 from service.errors import ClusterError, say
 from service.runtime.cluster import Cluster
 
@@ -87,6 +89,31 @@ def played(
             yield finished.result()
 
 
+def campaign_parser(name: str, text: str | None) -> argparse.ArgumentParser:
+    """Return the parser of a campaign; ``text`` is its module's docstring."""
+    parser = study_parser(f"pyrcal_studies.campaign{name and '.'}{name}", text)
+    usual = Path(f"var/{name or 'campaign'}.jsonl")
+    parser.add_argument("--output", type=Path, default=usual, help=f"rows, resumed ({usual})")
+    parser.add_argument("--table", type=Path, metavar="FILE.md", help="of all rows")
+    return parser
+
+
+def complete(
+    play: Callable[[Plan], Row | list[Row]], plans: Iterable[Plan], given: argparse.Namespace
+) -> list[Row]:
+    """Play what is not in ``--output`` yet, and return all rows of it."""
+    file = RowFile(given.output)
+    missing = file.missing(plans)
+    started = time.monotonic()
+    workers, cluster = getattr(given, "workers", 1), getattr(given, "cluster", None)
+    for k, found in enumerate(played(play, missing, workers, cluster), start=1):
+        file.add(*(found if isinstance(found, list) else [found]))
+        left_s = (time.monotonic() - started) / k * (len(missing) - k)
+        sys.stderr.write(f"\r{k} of {len(missing)}, {left_s / 60:.0f} min left   ")
+    sys.stderr.write("\n")
+    return file.rows
+
+
 def add_workers(parser: argparse.ArgumentParser, usual: int) -> None:
     """Add the options that say where nights are played."""
     parser.add_argument("--workers", type=int, default=usual, help="processes here")
@@ -95,6 +122,15 @@ def add_workers(parser: argparse.ArgumentParser, usual: int) -> None:
         metavar="tcp://HOST:PORT",
         help="a running Dask scheduler, whose workers play them (extra 'cluster')",
     )
+
+
+def grouped(rows: Iterable[Row], plan: type[DataclassInstance], *but: str) -> list[list[Row]]:
+    """Return rows in groups that agree in all fields of their record, those of ``but`` apart."""
+    names = [field.name for field in fields(plan) if field.name not in but]
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(json.dumps([row.get(name) for name in names]), []).append(row)
+    return list(groups.values())
 
 
 def heading(*columns: str) -> str:

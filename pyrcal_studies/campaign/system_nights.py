@@ -10,12 +10,9 @@ import argparse
 import itertools
 import json
 import sys
-import time
-from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from enum import StrEnum
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,13 +30,14 @@ from pyrcal_studies.campaign.observatory import (
 from pyrcal_studies.campaign.rows import (
     UNITS,
     Row,
-    RowFile,
     add_workers,
+    campaign_parser,
+    complete,
     floats,
     four,
+    grouped,
     heading,
     line,
-    played,
     range_of,
     tell,
     words,
@@ -57,9 +55,6 @@ from service.wire import DitherRequest
 
 LATER_S = 10.0
 """A jump comes up to so much later, at random: in a window, or in the pause between two."""
-
-SWING_S = 2.0
-"""Of seeing that takes the optical gain with it: from one extreme to the other."""
 
 
 class Case(StrEnum):
@@ -80,17 +75,8 @@ class Case(StrEnum):
     BUDGET = "budget"
     """Nothing: what does the dither cost? Played again without it."""
 
-    SEEING = "seeing"
-    """Seeing that grows from 0.8 to 1.3 arcsec and falls again, within minutes."""
-
-    GAIN = "gain"
-    """Seeing that swings by 15 % every two seconds, and the optical gain with it."""
-
     LOST = "lost"
     """A jump of 0.3 subapertures and 1 deg, which no loop of many modes survives."""
-
-    RESTART = "restart"
-    """The RTC begins again with the matrix of the start, in the middle of a drift."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,11 +112,6 @@ class Plan:
         return tuple(np.round(due_s + later_s, 2).tolist())
 
     @property
-    def restart_s(self) -> float | None:
-        """When the RTC begins again."""
-        return self.period_s if self.case is Case.RESTART else None
-
-    @property
     def words(self) -> list[str]:
         """The simulator's command line."""
         options = {
@@ -155,7 +136,7 @@ class Plan:
             f"--jump={time_s}:{steps[k % 2]}" for k, time_s in enumerate(self.jump_times_s, first)
         ]
         match self.case:
-            case Case.DRIFT | Case.RESTART:
+            case Case.DRIFT:
                 return [drift]
             case Case.JUMP | Case.JUMP_ROTATION:
                 return jumps
@@ -163,12 +144,6 @@ class Plan:
                 return [f"--jump={self.period_s}:0.3,0,1,0"]
             case Case.BUSY:
                 return [drift, *jumps]
-            case Case.SEEING:
-                third = self.seconds / 3.0
-                return ["--seeing=0.8", f"--seeing-at={third}:1.3", f"--seeing-at={2 * third}:0.9"]
-            case Case.GAIN:
-                times = np.arange(SWING_S, self.seconds, SWING_S)
-                return [f"--seeing-at={t}:{0.85 if k % 2 else 1.15}" for k, t in enumerate(times)]
             case Case.BUDGET:
                 return []
 
@@ -194,26 +169,22 @@ Array = NDArray[np.float64]
 def row_of(night: Observatory, jump_times_s: tuple[float, ...]) -> Row:
     """Return the row; errors in boundary units (subapertures, degrees, ratio)."""
     publications = night.publications()
-    own_s = min((p.swap.time_s for p in publications if _own(p)), default=None)
+    own_s = min((p.swap.time_s for p in publications if p.swap.made_for), default=None)
     good_s = first_good_s(night)
     begin_s = STEADY_S + max(own_s or 0.0, good_s or 0.0)
     steady = [m for m in night.dome.moments if m.time_s >= begin_s]
-    errors, sigma = tracking_errors(night, begin_s, jump_times_s)
+    errors = tracking_errors(night, begin_s, jump_times_s)
     return {
         "good_alpha_s": good_s,
         "own_matrix_s": own_s,
         "modes_reached": night.dome.moments[-1].n_controlled,
         "steady_from_s": begin_s,
-        "tracking_rms": _rms(errors),
-        "tracking_sigma": _rms(sigma),
-        "tracking_inside_2_sigma": np.mean(np.abs(errors) <= 2.0 * sigma, axis=0).tolist()
-        if len(errors)
-        else None,
+        "tracking_rms": np.sqrt(np.mean(errors**2, axis=0)).tolist() if len(errors) else None,
         "jumps": [jump_row(night, publications, t) for t in jump_times_s],
         "wavefront_nm": wavefront_rms_nm(steady),
         "dither_nm": float(np.sqrt(np.mean([m.dither_nm**2 for m in steady]))) if steady else None,
         "windows": [night.state.windows.accepted, night.state.windows.refused],
-        "published": [publication_row(p) for p in publications],
+        "published": [(p.swap.time_s, p.outcome.value) for p in publications],
         "refused": sum(r.state is MatrixState.REFUSED for r in night.state.matrices.reconstructors),
         "unstable": sum(p.outcome is Outcome.DIVERGED for p in publications),
         "log": [
@@ -261,21 +232,20 @@ def first_good_s(night: Observatory) -> float | None:
 
 def tracking_errors(
     night: Observatory, begin_s: float, jump_times_s: tuple[float, ...] = ()
-) -> tuple[Array, Array]:
-    """Return ``(n, 4)`` errors of what the service held to be true, and their 1 σ, block by block.
+) -> Array:
+    """Return ``(n, 4)`` errors of what the service held to be true, block by block.
 
     Against where the mirror is at that moment: the age of the estimate is part of the error. What
     comes within ``AFTER_JUMP_S`` of a jump is left out.
     """
     found = [
-        (glance.alpha - moment.alpha.vector, glance.sigma)
+        glance.alpha - moment.alpha.vector
         for moment, glance in zip(night.dome.moments, night.glances, strict=True)
         if glance.alpha is not None
         and glance.time_s >= begin_s
         and not any(0.0 <= glance.time_s - t < AFTER_JUMP_S for t in jump_times_s)
     ]
-    errors, sigma = (np.array([pair[k] for pair in found]).reshape(-1, 4) for k in range(2))
-    return errors * BOUNDARY_SCALE, sigma * BOUNDARY_SCALE
+    return np.asarray(np.reshape(found, (-1, 4)) * BOUNDARY_SCALE)
 
 
 def jump_row(night: Observatory, publications: list[Publication], time_s: float) -> Row:
@@ -295,30 +265,11 @@ def jump_row(night: Observatory, publications: list[Publication], time_s: float)
     }
 
 
-def publication_row(publication: Publication) -> Row:
-    """Return one published matrix as JSON can hold it."""
-    swap = publication.swap
-    return {
-        "id": swap.id,
-        "at_s": swap.time_s,
-        "n_modes": swap.n_modes,
-        "gate_radius": None if swap.gate is None else swap.gate.worst_pole_radius,
-        "true_radius": swap.radius,
-        "before_nm": publication.before_nm,
-        "after_nm": publication.after_nm,
-        "outcome": publication.outcome.value,
-    }
-
-
 def wavefront_rms_nm(moments: list[Moment]) -> float | None:
     """Return the RMS over these moments, or None where there is none."""
     if not moments:
         return None
     return float(np.sqrt(np.mean([m.wavefront_nm**2 for m in moments])))
-
-
-def _own(publication: Publication) -> bool:
-    return publication.swap.made_for is not None
 
 
 def _corrects(publication: Publication) -> bool:
@@ -329,16 +280,6 @@ def _corrects(publication: Publication) -> bool:
     return bool(np.all(np.abs(error) <= CORRECTED))
 
 
-def _rms(errors: Array) -> list[float] | None:
-    return np.sqrt(np.mean(errors**2, axis=0)).tolist() if len(errors) else None
-
-
-GROUPED_BY = (
-    "case", "plant", "truth", "magnitude", "gain", "n_controlled", "seconds", "period_s",
-    "instrument", "settings",
-)  # fmt: skip
-"""Nights that differ in nothing but the seed make one line."""
-
 HEADER = heading(
     *("nights", "good α after s", "own matrix after s", "tracking RMS x, y % / mdeg / %"),
     *("flagged after s", "corrected after s", "wavefront nm", "dither nm", "cost nm"),
@@ -348,10 +289,8 @@ HEADER = heading(
 
 def table(rows: list[Row]) -> str:
     """Return the nights as a Markdown table, the worst of each group in brackets."""
-    groups: dict[str, list[Row]] = defaultdict(list)
-    for row in rows:
-        groups[str([row[name] for name in GROUPED_BY])].append(row)
-    return HEADER + "".join(line_of(_name(group[0]), group) for group in groups.values())
+    groups = grouped(rows, Plan, "seed")
+    return HEADER + "".join(line_of(_name(group[0]), group) for group in groups)
 
 
 def line_of(name: str, rows: list[Row]) -> str:
@@ -426,17 +365,9 @@ GAINS = {"linear": 0.4, "diffractive": 0.6}
 
 def main() -> int:
     """Run what is missing, then print the table."""
-    given = _parser().parse_args()
-    file = RowFile(given.output)
-    plans = file.missing(_plans(given))
-    started = time.monotonic()
-    for k, row in enumerate(played(play, plans, given.workers, given.cluster), start=1):
-        file.add(row)
-        spent_min = (time.monotonic() - started) / 60.0
-        sys.stderr.write(f"\r{k} of {len(plans)} nights in {spent_min:.0f} min   ")
-    sys.stderr.write("\n")
-    text = table(file.rows)
-    tell(text, given.table, "python -m pyrcal_studies.campaign.system_nights")
+    parser = _parser()
+    given = parser.parse_args()
+    tell(table(complete(play, _plans(given), given)), given.table, parser.prog)
     return 0
 
 
@@ -452,18 +383,14 @@ def play(plan: Plan) -> Row:
                 sampling=Sampling(working_point_modes=settings.compute.working_point_modes),
             ),
         )
-        begun = time.monotonic()
         night = Observatory(plan.words, policy_of(settings), Mode.AUTO, bench)
-        if plan.restart_s is not None:
-            night.advance(plan.restart_s)
-            night.restart_rtc()
-        night.advance(plan.seconds - night.time_s)
+        night.advance(plan.seconds)
         row = row_of(night, plan.jump_times_s)
         if plan.case is Case.LOST:
             row |= recovery_of(night, plan.period_s)
         if plan.case is Case.BUDGET:
             row["twin_nm"] = _without_dither_nm(night, plan, row["steady_from_s"])
-    return asdict(plan) | row | {"took_s": time.monotonic() - begun}
+    return asdict(plan) | row
 
 
 def _settings(plan: Plan) -> dict[str, object]:
@@ -483,12 +410,7 @@ def _without_dither_nm(night: Observatory, plan: Plan, begin_s: float) -> float 
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m pyrcal_studies.campaign.system_nights",
-        description="Runs nights of the whole service and compares what it did with the truth.",
-    )
-    parser.add_argument("--output", type=Path, default=Path("system.jsonl"), help="rows, resumed")
-    parser.add_argument("--table", type=Path, metavar="FILE.md")
+    parser = campaign_parser("system_nights", __doc__)
     parser.add_argument(
         "--cases", type=words, default=("drift",), metavar="NAME,NAME...", help=", ".join(Case)
     )

@@ -5,7 +5,6 @@ Values that the paper prints are drawn in. Every picture stays below 100 kB.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +17,8 @@ from pyrcal_studies.heritier2018.loops import FIELD, OVERSAMPLING, strehl, wavef
 from pyrcal_studies.heritier2018.plan import Budget, Variant
 from pyrcal_studies.heritier2018.registration import fitted_alpha
 from pyrcal_studies.heritier2018.store import Store
+from pyrcal_studies.shared import save_picture
+from service.model.slopes import as_maps
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,9 +39,7 @@ def smoothed(variance_nm2: Array) -> tuple[NDArray[np.intp], Array]:
     return np.arange(1, high + 1), values
 
 
-MAX_BYTES = 95_000
 _DPI = 85
-_COLOURS = (256, 96, 48)
 
 SYNTHETIC, MEASURED, TURBULENCE, PAPER = "#0757ae", "#b3261e", "0.55", "#1a7f37"
 
@@ -256,7 +255,7 @@ def slope_maps(budget: Budget, store: Store) -> Figure:
         share = np.linalg.norm(measured - synthetic) / np.linalg.norm(measured)
         for axes, slopes in zip(trio, (synthetic, measured, measured - synthetic), strict=True):
             axes.imshow(
-                results.slope_maps(slopes, record["valid"]) / limit,
+                as_maps(slopes, record["valid"]) / limit,
                 origin="lower",
                 cmap="RdBu_r",
                 vmin=-1,
@@ -286,7 +285,7 @@ def variance_maps(budget: Budget, store: Store) -> Figure:
         figure.subplots(len(shown), 1, squeeze=False)[:, 0], shown, strict=True
     ):
         image = axes.imshow(
-            results.slope_maps(values, valid),
+            as_maps(values, valid),
             origin="lower",
             cmap="viridis",
             vmin=0.0,
@@ -418,19 +417,4 @@ def write_all(budget: Budget, store: Store, folder: Path) -> None:
     """Write every picture into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     for number, draw in DRAWN.items():
-        (folder / file_name(number)).write_bytes(png(draw(budget, store)))
-
-
-def png(figure: Figure) -> bytes:
-    """Return a picture with as many colours as ``MAX_BYTES`` allow."""
-    from PIL import Image
-
-    drawn = io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=_DPI)
-    picture = Image.open(drawn).convert("RGB")
-    for colours in _COLOURS:
-        data = io.BytesIO()
-        picture.quantize(colours, dither=Image.Dither.NONE).save(data, format="png", optimize=True)
-        if data.tell() <= MAX_BYTES:
-            break
-    return data.getvalue()
+        save_picture(draw(budget, store), folder / file_name(number), _DPI)

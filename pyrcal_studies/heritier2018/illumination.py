@@ -15,10 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal_studies.heritier2018 import telescope
-from pyrcal_studies.heritier2018.reconstructors import (
-    inverse_record,
-    synthetic_matrix,
-)
+from pyrcal_studies.heritier2018.reconstructors import synthetic_matrix
 from pyrcal_studies.heritier2018.registration import FitRun, fitted_alpha
 from pyrcal_studies.heritier2018.store import Record, Store, Task
 from service.control.reconstructor import invert
@@ -107,7 +104,7 @@ class ChangedReconstructor:
         return (self.fit,)
 
     def compute(self, store: Store) -> Record:
-        """Return ``matrix`` ``(n_modes, n_slopes)`` and its condition number."""
+        """Return ``matrix`` ``(n_modes, n_slopes)``."""
         rng = np.random.default_rng(_NOISE_SEED)
         alpha, instrument = fitted_alpha(store.read(self.fit)), telescope.instrument()
         if self.change.displaced_images:
@@ -119,4 +116,4 @@ class ChangedReconstructor:
         matrix = matrix * np.tile(kept, 2)[:, None]
         scatter = self.change.noise * np.sqrt(np.mean(matrix**2, axis=0))
         matrix = matrix + scatter * rng.standard_normal(matrix.shape)
-        return inverse_record(invert(matrix, self.n_modes))
+        return {"matrix": invert(matrix, self.n_modes).matrix}

@@ -77,11 +77,6 @@ def strehl(image: NDArray[Any]) -> float:
     return float(image.max())
 
 
-def marechal(wavefront_error_nm: float) -> float:
-    """Return the Strehl ratio that goes with a wavefront error, by Maréchal's approximation."""
-    return float(np.exp(-((2e-9 * np.pi / H_BAND_M * wavefront_error_nm) ** 2)))
-
-
 Array32 = NDArray[np.float32]
 
 N_PARTS = 3
@@ -120,9 +115,6 @@ class LoopRun:
     settling_frames: int = 200
     """From rest until it has settled."""
 
-    played_modes: int | None = None
-    """By day: modes of the played turbulence; None: all the mirror can make."""
-
     @property
     def needs(self) -> tuple[Task, ...]:
         """The reconstructor, its gains, the fit that says where the mirror lies."""
@@ -156,9 +148,7 @@ class LoopRun:
             middle = others[0] if others else tip_tilt
             rest = others[-1] if others else tip_tilt
             gains = np.array(by_group((tip_tilt, middle, rest), len(matrix)))
-        closed = ClosedLoop(
-            self.occasion, alpha, matrix, self.n_frames_run, played_modes=self.played_modes
-        )
+        closed = ClosedLoop(self.occasion, alpha, matrix, self.n_frames_run)
         residual, positions, n_clipped = [], [], 0
         for row in range(0, self.n_frames_run, BATCH_FRAMES):
             result = closed.batch(row, gains)
@@ -186,8 +176,7 @@ def statistics(
 
     ``error_nm`` ``(n,)`` at each snapshot; ``modal_nm2`` and ``incoming_nm2`` ``(n_modes,)``
     variance in the telescope's own modes where they truly lie, made orthonormal in their order;
-    ``total_nm2`` and ``incoming_total_nm2``, over all there is. Both of what is left are also
-    there by parts of the run: ``modal_by_part_nm2`` ``(N_PARTS, n_modes)``, ``total_by_part_nm2``.
+    ``total_nm2`` over all that is left, ``total_by_part_nm2`` ``(N_PARTS,)`` by parts of the run.
     """
     projection = orthonormal(seen.opd_per_command, weights)
     left, came = (_piston_free(opd_m, weights) for opd_m in (residual_m, incoming_m))
@@ -197,9 +186,7 @@ def statistics(
         "error_nm": np.sqrt(squared) * 1e9,
         "total_nm2": np.array(squared.mean() * 1e18),
         "modal_nm2": modal.mean(axis=0) * 1e18,
-        "modal_by_part_nm2": np.array([modal[part].mean(axis=0) for part in parts]) * 1e18,
         "total_by_part_nm2": np.array([squared[part].mean() for part in parts]) * 1e18,
-        "incoming_total_nm2": np.array(np.mean(came**2 @ weights) * 1e18),
         "incoming_nm2": np.mean((came @ projection) ** 2, axis=0) * 1e18,
     }
 
@@ -259,15 +246,9 @@ class ClosedLoop:
         alpha: Misregistration,
         matrix: Array32,
         n_frames: int,
-        *,
-        played_modes: int | None = None,
     ) -> None:
-        """Take the truth, and how many modes the played turbulence has (None: all there are)."""
         self.optics = telescope.optics(occasion, alpha)
         phases, played = telescope.incoming(occasion, n_frames)
-        if played is not None and played_modes is not None:
-            played = played.copy()
-            played[:, played_modes:] = 0.0
         self.block = PhaseBlock(
             first_frame=0,
             optics=self.optics,

@@ -48,14 +48,7 @@ def plain(tex: str) -> str:
 QUOTES = {
     "actuators": Quote(text="composed of 663 valid actuators", where="3.1", values=(663,)),
     "modes": Quote(text="the 594 modes on the ASM", where="3.1", values=(594,)),
-    "subapertures": Quote(
-        text="30 by 30 subapertures (1 pixel per subaperture) and 36 pixels separating each pupil "
-        "image centres",
-        where="3.1",
-        values=(30, 36),
-    ),
     "wavelength": Quote(text="operates at 750 nm", where="3.1", values=(750,)),
-    "modulation": Quote(text="Tip/Tilt modulation", where="3.1", values=(3,)),
     "double_pass": Quote(text="the WFS signals are normalised with a factor 2", where="3.1"),
     "eigenvalues": Quote(
         text="the distribution of eigen values is flatter and the knee of the curve occurs for a "
@@ -68,29 +61,11 @@ QUOTES = {
     "slopes_rms": Quote(
         text="Both WFS have the same sensitivity to the KL modes.", where="figure 4"
     ),
-    "border": Quote(
-        text="a rotation of 1° corresponds to a shift of around 25% of a subaperture on the border "
-        "of the pupil",
-        where="3.2",
-        values=(1, 25),
-    ),
     "drop": Quote(
         text="the first mis-registration value after the drop of performance when controlling 594 "
         "modes ( 0.8° for the rotation and 40% for the shift)",
         where="3.2",
         values=(0.8, 40),
-    ),
-    "high_modes": Quote(
-        text="the high order modes are the most impacted by the mis-registrations and get "
-        "amplified "
-        "even to higher values than the incoming turbulence",
-        where="3.2",
-    ),
-    "rule": Quote(
-        text="less than 10% of a subaperture for the shifts and less than 0.1° for the rotation "
-        "which corresponds to a shift of 2.5% on the border of the pupil",
-        where="3.2",
-        values=(10, 0.1, 2.5),
     ),
     "magnification": Quote(
         text="the impact of a magnification becomes significant when controlling a high number of "
@@ -99,22 +74,6 @@ QUOTES = {
     ),
     "rough": Quote(
         text="(+/- 1 subaperture shift and +/- 2° of rotation)", where="4", values=(1, 2)
-    ),
-    "third": Quote(
-        text="Applying a third estimation does not change the value of the estimated parameters",
-        where="4.3",
-    ),
-    "quadratic": Quote(text="showing a quadratic behaviour around each optimal value", where="4.3"),
-    "gains": Quote(
-        text="As a last step, we also tuned the modal gains of the pyramid model",
-        where="4.3",
-    ),
-    "maps": Quote(text="shows only negligible differences", where="4.4"),
-    "features": Quote(
-        text="some parts of the pupils gathered less signals than others, the bottom left part, "
-        "the "
-        "central obscuration and behind the spiders of the retro-reflector",
-        where="figure 10",
     ),
     "simulator": Quote(
         text="a residual variance of 128 nm in the synthetic case and 147 nm using the "
@@ -128,77 +87,14 @@ QUOTES = {
         "interaction matrix",
         where="4.4",
     ),
-    "best": Quote(
-        text="For each parameter, the optimal value provides the best AO performance", where="4.4"
-    ),
-    "same": Quote(
-        text="We also retrieve the same sensitivity to the mis-registrations as in the synthetic "
-        "case",
-        where="4.4",
-    ),
-    "conditions": Quote(
-        text="a star of magnitude 7 is simulated using an external fibre and a retro-reflector. A "
-        "disturbance signal is then applied on the ASM to simulate a turbulence with a seeing of "
-        '1" in the visible',
-        where="5",
-        values=(7, 1),
-    ),
-    "groups": Quote(
-        text="for the Tip/Tilt, the following modes up to 100 and for the remaining modes up to "
-        "400",
-        where="5",
-        values=(100, 400),
-    ),
-    "ramp": Quote(
-        text="applying a ramp of gain values and select the one minimizing the RMSE of the "
-        "residual "
-        "slopes",
-        where="5",
-    ),
-    "no_tuning": Quote(
-        text="used the corresponding values for our synthetic interaction matrix with no further "
-        "tuning",
-        where="5",
-    ),
-    "positions": Quote(
-        text="These are computed from the DM positions which include the correction for the "
-        "vibrations of the telescope.",
-        where="5",
-    ),
     "not_considered": Quote(
         text="These modes should then not be considered for the performance comparison.", where="5"
-    ),
-    "better": Quote(
-        text="the pseudo-synthetic interaction matrix provided a slightly better correction than "
-        "the experimental one",
-        where="5",
-    ),
-    "more": Quote(
-        text="to correct up to 500 modes and get stable closed-loop with high order correction",
-        where="5",
-        values=(500,),
     ),
     "patterns": Quote(
         text="using system modes or Hadamard patterns to maximize the signal provides a consistent "
         "gain in calibration time",
         where="2.1",
     ),
-    "flux": Quote(text="could be done using flux considerations", where="4"),
-    "number": Quote(
-        text="There is a need to study the number and type of signals required", where="6"
-    ),
-    "noise": Quote(
-        text="the impact of the noise on the parameters estimation will also have to be "
-        "investigated",
-        where="6",
-    ),
-    "tracking": Quote(
-        text="especially the tracking of these parameters during the operation, if possible "
-        "without "
-        "injecting any perturbation",
-        where="6",
-    ),
-    "elt": Quote(text="with respectively 4356 and 4702 actuators", where="1", values=(4356, 4702)),
 }
 
 START = Quote(

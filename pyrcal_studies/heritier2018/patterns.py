@@ -91,7 +91,6 @@ class PatternRun:
             "n_frames": np.array(n_frames),
             "pattern_rms_m": np.array(rms_m),
             "relative_error": np.array(np.linalg.norm(error) / np.linalg.norm(exact)),
-            "error_by_mode": np.linalg.norm(error, axis=0) / np.linalg.norm(exact, axis=0),
             "sigma": sets.std(axis=0, ddof=1) / np.sqrt(N_SETS),
         }
 

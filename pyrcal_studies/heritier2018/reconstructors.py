@@ -14,7 +14,7 @@ from pyrcal_studies.heritier2018.registration import FitRun, Found, fitted_alpha
 from pyrcal_studies.heritier2018.store import Record, Store, Task
 from pyrcal_studies.heritier2018.telescope import Occasion
 from service.control.gains import CalibrationGains
-from service.control.reconstructor import Inversion, invert
+from service.control.reconstructor import invert
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
@@ -51,10 +51,10 @@ class ModelReconstructor:
         return (self.alpha.fit,) if isinstance(self.alpha, Found) else ()
 
     def compute(self, store: Store) -> Record:
-        """Return ``matrix`` ``(n_modes, n_slopes)`` and its condition number."""
+        """Return ``matrix`` ``(n_modes, n_slopes)``."""
         alpha = resolved(self.alpha, store)
         matrix = synthetic_matrix(alpha) * self.occasion.passes
-        return inverse_record(invert(matrix, self.n_modes))
+        return {"matrix": invert(matrix, self.n_modes).matrix}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,8 +79,8 @@ class MeasuredReconstructor:
         return self.measurement.n_modes
 
     def compute(self, store: Store) -> Record:
-        """Return ``matrix`` ``(n_modes, n_slopes)`` and its condition number."""
-        return inverse_record(invert(self.measurement.matrix(store), self.n_modes))
+        """Return ``matrix`` ``(n_modes, n_slopes)``."""
+        return {"matrix": invert(self.measurement.matrix(store), self.n_modes).matrix}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,12 +103,12 @@ class FittedReconstructor:
         return (self.fit,)
 
     def compute(self, store: Store) -> Record:
-        """Return ``matrix`` ``(n_modes, n_slopes)`` and its condition number."""
+        """Return ``matrix`` ``(n_modes, n_slopes)``."""
         fit = store.read(self.fit)
         matrix = synthetic_matrix(fitted_alpha(fit))
         if self.tuned:
             matrix = calibration_gains(fit, matrix.shape[1]).tuned(matrix)
-        return inverse_record(invert(self.passes * matrix, self.n_modes))
+        return {"matrix": invert(self.passes * matrix, self.n_modes).matrix}
 
 
 def calibration_gains(fit: Record, n_basis: int) -> CalibrationGains:
@@ -125,12 +125,3 @@ def synthetic_matrix(
     """
     model = InteractionModel(instrument or telescope.instrument(), telescope.basis())
     return np.asarray(model.interaction_matrix(alpha), dtype=np.float64)
-
-
-def inverse_record(inversion: Inversion) -> Record:
-    """Return a reconstructor, its condition number and how much was truncated."""
-    return {
-        "matrix": inversion.matrix,
-        "condition_number": np.array(inversion.condition_number),
-        "n_truncated": np.array(inversion.n_truncated),
-    }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -49,34 +48,28 @@ class FitRun:
         return np.arange(0, self.source.n_modes, self.modes_every)
 
     def compute(self, store: Store) -> Record:
-        """Return the fit as arrays; one that gives up is a record of its reason."""
+        """Return the fit as arrays; α of one that gives up is NaN."""
         options = FitOptions(
             method=self.method, start=self.start, orientation=Orientation(), modes=self.modes
         )
         reference = self.source.reference(store)
         instrument, basis = telescope.instrument(), telescope.basis()
-        started = time.process_time()
         try:
             fit = fit_matrix(instrument, reference, options, basis=basis)
-        except PyrcalError as error:
-            return _gave_up(str(error), time.process_time() - started)
-        return flattened(fit, time.process_time() - started)
+        except PyrcalError:
+            return {"alpha": np.full(4, np.nan), "n_evaluations": np.array(0)}
+        return flattened(fit)
 
 
-def flattened(fit: Fit, seconds: float) -> Record:
+def flattened(fit: Fit) -> Record:
     """Return a fit as arrays."""
     record: dict[str, NDArray[Any]] = {
         "alpha": fit.alpha.vector * BOUNDARY_SCALE,
-        "sigma": np.sqrt(np.diag(fit.covariance)) * BOUNDARY_SCALE,
         "gains": fit.gains,
         "modes": fit.modes,
         "residual_fraction": np.array(fit.residual_fraction),
         "residual_by_mode": fit.residual_by_mode,
-        "condition_number": np.array(fit.condition_number),
-        "accepted": np.array(fit.accepted),
-        "verdict": np.array(fit.verdict),
         "n_evaluations": np.array(fit.n_evaluations),
-        "seconds": np.array(seconds),
         "synthetic": fit.synthetic.astype(np.float32),
         "measured": fit.measured.astype(np.float32),
         "valid": fit.valid,
@@ -90,17 +83,6 @@ def flattened(fit: Fit, seconds: float) -> Record:
         record[f"chi_{k}"] = step.chi
         record[f"coefficients_{k}"] = step.coefficients
     return record
-
-
-def _gave_up(reason: str, seconds: float) -> Record:
-    return {
-        "alpha": np.full(4, np.nan),
-        "sigma": np.full(4, np.nan),
-        "accepted": np.array(False),
-        "verdict": np.array(reason),
-        "n_evaluations": np.array(0),
-        "seconds": np.array(seconds),
-    }
 
 
 def fitted_alpha(record: Mapping[str, NDArray[Any]]) -> Misregistration:

@@ -367,13 +367,6 @@ def normalised_variance(matrix: NDArray[np.floating]) -> Array:
     return np.asarray(np.mean(scaled**2, axis=1))
 
 
-def slope_maps(slopes: NDArray[np.floating], valid: NDArray[np.bool_]) -> Array:
-    """Return the map of x slopes beside that of y slopes ``(n, 2 n)``, NaN outside the mask."""
-    maps = np.full((2, *valid.shape), np.nan)
-    maps[:, valid] = slopes.reshape(2, -1)
-    return np.hstack(list(maps))
-
-
 # --- loops
 
 

@@ -8,6 +8,7 @@ import pytest
 from pyrcal_studies.campaign import fault_nights
 from pyrcal_studies.campaign.fault_nights import (
     AT_ONCE,
+    DOWN_S,
     LASTING,
     FaultNight,
     Night,
@@ -93,7 +94,7 @@ def test_an_order_that_a_kill_loses_is_told(night, monkeypatch):
 
 @pytest.mark.long
 def test_ten_faults_and_orders_in_a_hundred_seconds_break_no_rule():
-    row = fault_nights.play(0, Night(instrument=str(INSTRUMENT), seconds=100.0))
+    row = fault_nights.play(Night(seed=0, instrument=str(INSTRUMENT), seconds=100.0))
     assert row["broken"] == []
     assert row["worse"] == []
     assert row["n_windows"] > 10
@@ -112,3 +113,21 @@ def test_a_matrix_that_was_under_way_when_the_frames_stopped_is_not_sent(night):
     night.play((), 26.0)
     assert night.state.alarm("no-frames") is None
     assert night.broken == []
+
+
+def test_a_service_that_is_killed_begins_again_from_what_it_has_written(night):
+    night.play((), 7.0)
+    known = night.state.alpha.registration.alpha
+    night.kill()
+    assert night.time_s == pytest.approx(7.0 + DOWN_S)
+    assert np.abs(night.state.alpha.registration.alpha.vector - known.vector).max() < 0.01
+    night.play((), night.time_s + 2.0)
+    assert night.state.matrices.in_use == night.dome.computer.reconstructor.manifest.id
+
+
+def test_what_was_on_its_way_when_the_service_was_killed_arrives(night):
+    while not any(r.on_its_way for r in night.state.matrices.reconstructors):
+        night.advance(0.05)
+    sent = next(r.id for r in night.state.matrices.reconstructors if r.on_its_way)
+    night.kill()
+    assert night.dome.computer.reconstructor.manifest.id == sent

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from pyrcal_studies.result_figures import read_table, write_figures
-from pyrcal_studies.sections import RESULTS, write_section
+from pyrcal_studies.shared import RESULTS, write_section
 
 
 def test_a_section_is_replaced_and_the_rest_stays(tmp_path):

@@ -54,7 +54,7 @@ def test_a_registered_loop_leaves_a_fraction_of_the_modes_it_controls(tmp_path: 
 
 def test_a_quarter_turn_of_the_mirror_is_worse_than_no_loop(tmp_path: Path) -> None:
     record = closed(tmp_path, Misregistration(rotation_rad=np.pi / 2))
-    assert record["total_nm2"] > record["incoming_total_nm2"]
+    assert record["total_nm2"] > record["incoming_nm2"].sum()
 
 
 def test_a_residual_is_taken_over_what_is_asked_for() -> None:
@@ -73,9 +73,7 @@ def test_a_residual_is_taken_over_what_is_asked_for() -> None:
     assert shown == pytest.approx(np.sqrt(8 * 4.0))
 
 
-def played_by_day(
-    tmp_path: Path, played_modes: int | None = None, *, vibrations: bool = False
-) -> Record:
+def played_by_day(tmp_path: Path, *, vibrations: bool = False) -> Record:
     day = replace(NIGHT, daytime=True, vibrations=vibrations)
     model = ModelReconstructor(occasion=day, alpha=Misregistration(), n_modes=30)
     task = LoopRun(
@@ -84,18 +82,8 @@ def played_by_day(
         reconstructor=model,
         gain=0.6,
         n_frames=50,
-        played_modes=played_modes,
     )
     return done(tmp_path, task)
-
-
-def test_turbulence_in_other_modes_leaks_into_the_controlled_ones(tmp_path: Path) -> None:
-    everything, of_30 = (played_by_day(tmp_path, n) for n in (None, 30))
-    assert of_30["incoming_nm2"][30:].sum() < 1e-3 * everything["incoming_nm2"][30:].sum()
-    leaked, left = (
-        wavefront_error_nm(record, over=Over.CONTROLLED) for record in (everything, of_30)
-    )
-    assert leaked > 1.5 * left
 
 
 def test_in_a_still_dome_the_mirrors_positions_are_the_residual(tmp_path: Path) -> None:

@@ -41,15 +41,6 @@ def test_the_knee_is_where_the_spectrum_bends():
     assert results.knee(flat_then_steep) in {60, 61}
 
 
-def test_maps_put_x_slopes_beside_y_slopes_and_leave_the_dark_empty():
-    valid = np.array([[True, False], [True, True]])
-    maps = results.slope_maps(np.arange(6.0), valid)
-    assert maps.shape == (2, 4)
-    assert np.isnan(maps[0, [1, 3]]).all()
-    assert maps[:, :2][valid].tolist() == [0.0, 1.0, 2.0]
-    assert maps[:, 2:][valid].tolist() == [3.0, 4.0, 5.0]
-
-
 def test_the_optimum_is_that_of_the_variances():
     cost = {value: float(np.sqrt(100.0 + (value - 0.5) ** 2)) for value in (-2.0, 0.0, 1.0, 3.0)}
     assert results.optimum(cost) == pytest.approx(0.5)

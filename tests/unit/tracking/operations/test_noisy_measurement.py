@@ -87,7 +87,6 @@ def test_a_dither_that_does_not_make_way_ends_the_wait(dithering):
     status(dithering, dither=own)
     dithering.wait(DITHER_END_TIMEOUT_S + 2.0)
     assert state_of(dithering) is MeasureState.FAILED
-    assert "did not end within" in dithering.state.measurement("noisy-1").reason
 
 
 def test_it_runs_from_when_the_rtc_has_accepted(story):

@@ -41,10 +41,6 @@ def judge(story, *, accepted=True, **changes):
     return story.tell(event, after_s=1.0)
 
 
-def test_a_proposal_judged_for_this_loop_and_alpha_is_sent_at_once(waiting):
-    assert of_kind(waiting.tell(cmd.Approve(id="cm-1")), ev.SendMatrix)
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

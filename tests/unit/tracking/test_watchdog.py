@@ -313,21 +313,18 @@ def test_another_loop_has_another_bias(story, changes):
 
 
 @pytest.mark.parametrize(("n_controlled", "kept"), [(400, True), (300, False)])
-def test_so_it_has_when_the_rtc_was_restarted_in_between(story, n_controlled, kept):
+@pytest.mark.parametrize("restarted", ["the RTC", "the service"])
+def test_so_it_has_when_the_rtc_or_the_service_was_restarted(story, restarted, n_controlled, kept):
     learnt(story)
-    story.tell(ev.SessionStarted(session="s2"))
-    story.tell(rtc(n_controlled, session="s2"))
+    if restarted == "the RTC":
+        story.tell(ev.SessionStarted(session="s2"))
+        story.tell(rtc(n_controlled, session="s2"))
+    else:
+        known, now_ns = story.state.alpha.registration, story.now_ns
+        story = Story(Mode.AUTO, state=changed(TrackerState(system="flao"), registration=known))
+        story.now_ns = now_ns
+        story.meet(n_controlled=n_controlled)
     assert (story.state.alpha.registration.biases != ()) is kept
-
-
-@pytest.mark.parametrize(("n_controlled", "kept"), [(400, True), (300, False)])
-def test_so_it_has_when_the_service_was(story, n_controlled, kept):
-    learnt(story)
-    left = changed(TrackerState(system="flao"), registration=story.state.alpha.registration)
-    after = Story(Mode.AUTO, state=left)
-    after.now_ns = story.now_ns
-    after.meet(n_controlled=n_controlled)
-    assert (after.state.alpha.registration.biases != ()) is kept
 
 
 def test_a_look_that_was_under_way_when_the_loop_changed_is_not_used(story):

@@ -284,45 +284,6 @@ class TestGap:
         one, other = again.state.operations.acquisition, opened.state.operations.acquisition
         assert (one.stage, one.attempt, one.found) == (other.stage, other.attempt, other.found)
 
-    def test_what_the_gap_left_playing_is_stopped_before_another_dither_is_asked_for(self, opened):
-        left, n_before = opened.state.dithers.dither.id, len(opened.asked(DitherRequest))
-        opened.tell(ev.RtcVanished())
-        opened.still_open(dither_id=left)
-        assert opened.asked(DitherStop)
-        assert len(opened.asked(DitherRequest)) == n_before
-        opened.still_open()
-        assert len(opened.asked(DitherRequest)) == n_before + 1
-
-    def test_in_another_mode_it_waits_and_says_what_to_do(self):
-        story = Acquiring(Mode.PROPOSE)
-        story.tell(cmd.Acquire())
-        story.open()
-        story.tell(ev.RtcVanished())
-        story.still_open()
-        story.wait(60)
-        assert story.stage is AcquisitionStage.INTERRUPTED
-        assert "acquisition" in story.alarms
-
-    def test_in_another_session_nobody_touches_the_loop(self, opened):
-        n_asked = len(opened.asked(LoopRequest)), len(opened.asked(DitherRequest))
-        opened.tell(ev.RtcVanished())
-        opened.tell(ev.SessionStarted(session="s9"))
-        opened.status(session="s9", **OPEN)
-        opened.wait(60)
-        assert opened.stage is AcquisitionStage.INTERRUPTED
-        assert (len(opened.asked(LoopRequest)), len(opened.asked(DitherRequest))) == n_asked
-
-    def test_a_loop_closed_on_the_matrix_that_was_judged_is_followed_from_there(self):
-        story = Acquiring().to_widening()
-        matrix, n_asked = story.state.matrices.in_use, len(story.asked(LoopRequest))
-        story.tell(ev.RtcVanished())
-        story.status(gains=(0.4,) * 150 + (0.0,) * 444, n_controlled=150, cm_id=matrix)
-        assert story.stage is AcquisitionStage.ABORTED
-        assert f"closed on {matrix}, which had passed the gate" in story.text
-        assert "acquisition" not in story.alarms
-        assert story.state.alpha.registration is not None
-        assert len(story.asked(LoopRequest)) == n_asked
-
     def test_a_link_that_fails_again_and_again_ends_it(self, opened):
         for _ in range(MAX_ATTEMPTS):
             assert opened.stage is AcquisitionStage.COARSE
@@ -338,13 +299,3 @@ class TestGap:
         again.find()
         again.still_open()
         assert again.stage is AcquisitionStage.COARSE
-
-    def test_who_aborts_after_it_gets_a_healthy_loop_back_as_it_was(self):
-        story = Acquiring(Mode.PROPOSE)
-        story.tell(cmd.Acquire())
-        story.open()
-        story.tell(ev.RtcVanished())
-        story.still_open()
-        story.tell(cmd.AbortAcquisition())
-        last = story.asked(LoopRequest)[-1]
-        assert (last.loop, last.leak) == (Loop.CLOSED, 0.999)

@@ -607,7 +607,6 @@ def test_a_busy_port_is_one_clear_line(bridge, endpoint):
         Bridge(endpoint).open()
     text = str(refusal.value)
     assert endpoint.listen[0] in text
-    assert "already in use" in text
     assert "\n" not in text
 
 

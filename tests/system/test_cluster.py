@@ -103,9 +103,8 @@ def test_nights_without_any_worker_left_are_played_here_and_rows_are_resumed(tmp
         running = campaign(path, "--cluster", dask.address)
         wait_for(lambda: n_rows(path), 60, "no row of the cluster's")
         dask.workers[0].kill()
-        status, told = ended(running)
+        status, _ = ended(running)
         assert status == 0
-        assert "the cluster has had no worker for" in told
         assert rows_of(path) == played_here
         path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
         refused = ended(campaign(path, "--cluster", dask.address))

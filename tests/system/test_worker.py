@@ -25,8 +25,7 @@ def test_a_worker_that_hangs_is_named_killed_and_replaced(night):
         wait_for(lambda: night.state["windows_accepted"] > 0, 40.0, "it tracks")
         (worker,) = workers_of(service)
         os.kill(worker, signal.SIGSTOP)
-        text = wait_for(lambda: night.alarms.get("worker-lost"), 12.0, "the alarm")
-        assert "stood still" in text
+        wait_for(lambda: night.alarms.get("worker-lost"), 12.0, "the alarm")
         answer = night.client.get("/readyz")
         assert answer.status_code == 503
         assert "stood still" in answer.json()["detail"]

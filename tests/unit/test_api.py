@@ -30,27 +30,38 @@ from service.link.statistics import LinkStatistics
 from service.model.misregistration import PARAMETERS, Misregistration
 from service.runtime.command_results import Refits
 from service.runtime.snapshot import Snapshot
-from service.tracking.alarms import Alarm
+from service.tracking.alarms import Alarm, Severity
 from service.tracking.commands import (
+    AbortAcquisition,
+    AcknowledgeAlarm,
+    Acquire,
     Approve,
+    GainGroup,
+    ModeGroup,
+    MuteAlarm,
     Publish,
+    Ramp,
     Refit,
     Reject,
     Rollback,
+    SetLoop,
     SetMode,
     SetPointing,
     StartDither,
     StopDither,
+    UnmuteAlarm,
 )
 from service.tracking.dither_request import Dither, DitherPhase, DitherPlan, DitherPolicyState
 from service.tracking.events import MakeMatrix
 from service.tracking.operation_records import (
+    Acquisition,
+    AcquisitionStage,
     CommandState,
     LoopCommand,
     MeasurementRecord,
     MeasureState,
 )
-from service.tracking.products import MatrixState, ReconstructorRecord
+from service.tracking.products import MatrixState, ModeSet, ReconstructorRecord
 from service.tracking.registration import (
     HistoryEntry,
     PassiveBias,
@@ -62,6 +73,7 @@ from service.tracking.registration import (
     ValidityState,
 )
 from service.tracking.state import Level, LogEntry, Mode, TrackerState
+from service.web.views import to_json
 from service.wire import DitherKind, DitherRequest, DitherStatus, Loop, Pattern, Pointing, Status
 from tests.states import changed, tracker_state
 from tests.unit.tracking.situations import POLICY
@@ -252,15 +264,19 @@ class FakeService:
             raise UnknownIdError(f"reconstructor {matrix_id}: no such matrix in the archive")
         return MATRIX
 
+    @property
+    def tracker(self):
+        return self.now.tracker
+
     def change(self, **changes):
         self.now = replace(self.now, tracker=changed(self.now.tracker, **changes))
 
 
 def a_snapshot(tracker=STATE, **changes):
     """Return what a service of 60 s knows, with changes."""
-    given = {"link": LINK, "ready": True, "ready_reason": "telemetry flows"} | changes
-    given = {"now_ns": 100 * SECOND, "started_ns": 40 * SECOND} | given
-    return Snapshot(policy=POLICY, tracker=tracker, **given)
+    given = {"link": LINK, "ready": True, "ready_reason": "telemetry flows", "policy": POLICY}
+    given |= {"now_ns": 100 * SECOND, "started_ns": 40 * SECOND} | changes
+    return Snapshot(tracker=tracker, **given)
 
 
 @pytest.fixture
@@ -353,6 +369,14 @@ async def test_the_state_says_why_ordinary_telemetry_says_nothing(client, servic
     assert (await body_of(client, "/v1/state"))[
         "passive_unavailable_reason"
     ] == silent.alpha.passive_unavailable_reason
+
+
+def test_an_acquisition_is_shown_with_its_stage_and_what_it_found_in_degrees():
+    under_way = Acquisition(stage=AcquisitionStage.CONFIRMING, text="looking", attempt=1)
+    shown = to_json(replace(under_way, alpha=ALPHA))
+    assert (shown["stage"], shown["under_way"], shown["n_attempts"]) == ("confirming", True, 1)
+    assert shown["alpha"]["rotation_deg"] == pytest.approx(0.3)
+    assert to_json(Acquisition())["alpha"] is None
 
 
 async def test_a_reading_that_cannot_tell_has_no_sigma(client, service):
@@ -532,6 +556,11 @@ async def test_a_damaged_matrix_is_a_problem_that_says_so(client, service):
 
 # --- commands
 
+BINARY = {"action": "start", "kind": "binary"}
+SINE = {"pattern": "sine", "frequency_hz": [60.0]}
+TWICE = [{"first": 0, "last": 2, "gain": 0.1}, {"first": 2, "last": 3, "gain": 0}]
+UNSEEN = AcknowledgeAlarm(name="margin", by="Ada")
+
 
 @pytest.mark.parametrize(
     ("method", "path", "body", "command"),
@@ -571,6 +600,48 @@ async def test_a_damaged_matrix_is_a_problem_that_says_so(client, service):
         ("POST", "/v1/reconstructors/cm-1/publish", {}, Publish(id="cm-1")),
         ("POST", "/v1/rollback", None, Rollback()),
         ("PUT", "/v1/mode", {"mode": "auto"}, SetMode(mode=Mode.AUTO)),
+        ("POST", "/v1/acquisition", {"action": "start"}, Acquire()),
+        ("POST", "/v1/acquisition", {"action": "abort"}, AbortAcquisition()),
+        ("POST", "/v1/loop", {"loop": "open"}, SetLoop(loop="open")),
+        ("POST", "/v1/loop", {"loop": "closed", "leak": 0.9}, SetLoop(loop="closed", leak=0.9)),
+        ("POST", "/v1/loop", {"n_controlled": 300}, SetLoop(n_controlled=300)),
+        ("POST", "/v1/loop", {"effective_gain": 0.3}, SetLoop(effective_gain=0.3)),
+        (
+            "POST",
+            "/v1/loop",
+            {"gains": [{"first": 0, "last": 1, "gain": 0.4}, {"first": 2, "last": 9, "gain": 0}]},
+            SetLoop(
+                gains=(GainGroup(first=0, last=1, gain=0.4), GainGroup(first=2, last=9, gain=0.0))
+            ),
+        ),
+        ("POST", "/v1/loop/ramp", None, Ramp()),
+        (
+            "POST",
+            "/v1/loop/ramp",
+            {"groups": [{"first": 0, "last": 1}], "gains": [0.2, 0.5], "step_s": 0.5},
+            Ramp(groups=(ModeGroup(first=0, last=1),), gains=(0.2, 0.5), step_s=0.5),
+        ),
+        (
+            "POST",
+            "/v1/dither",
+            BINARY | {"modes": "all", "total_amplitude_m": 5e-9},
+            StartDither(kind=DitherKind.BINARY, modes=ModeSet.ALL, total_amplitude_m=5e-9),
+        ),
+        (
+            "POST",
+            "/v1/dither",
+            BINARY | {"modes": list(range(400))},
+            StartDither(kind=DitherKind.BINARY, modes=tuple(range(400))),
+        ),
+        ("POST", "/v1/alarms/margin/acknowledge", {"by": "Ada"}, UNSEEN),
+        (
+            "POST",
+            "/v1/alarms/margin/acknowledge",
+            {"severity": "serious"},
+            replace(UNSEEN, by="", severity=Severity.SERIOUS),
+        ),
+        ("POST", "/v1/alarms/margin/mute", {"for_s": 60.0}, MuteAlarm(name="margin", for_s=60.0)),
+        ("POST", "/v1/alarms/margin/unmute", {}, UnmuteAlarm(name="margin")),
         (
             "PUT",
             "/v1/pointing",
@@ -623,6 +694,66 @@ async def test_a_command_is_handed_on_and_answered_202(
         ("POST", "/v1/reconstructors/cm-1/reject", {"why": ""}, ["body.why: unknown"]),
         ("POST", "/v1/rollback", {"to": "cm-0"}, ["body.to: unknown"]),
         ("PUT", "/v1/mode", {"mode": "manual"}, ["'auto', 'propose' or 'hold'"]),
+        ("POST", "/v1/acquisition", {}, ["body.action: missing"]),
+        ("POST", "/v1/acquisition", {"action": "go"}, ["'start', 'abort'"]),
+        ("POST", "/v1/acquisition", {"action": "start", "modes": [1]}, ["modes: unknown"]),
+        ("POST", "/v1/loop", {}, ["at least one of loop, gains, leak, n_controlled"]),
+        ("POST", "/v1/loop", {"loop": "partial"}, ["loop: found 'partial'"]),
+        ("POST", "/v1/loop", {"leak": 1.5}, ["leak"]),
+        ("POST", "/v1/loop", {"n_controlled": 0}, ["n_controlled"]),
+        ("POST", "/v1/loop", {"gains": []}, ["gains"]),
+        ("POST", "/v1/loop", {"gains": [{"first": 3, "last": 2, "gain": 0.1}]}, ["first <= last"]),
+        ("POST", "/v1/loop", {"gains": [{"first": 0, "last": 2, "gain": -0.1}]}, ["gain"]),
+        ("POST", "/v1/loop", {"gains": TWICE}, ["no mode in two groups: mode 2 is"]),
+        ("POST", "/v1/loop", {"effective_gain": 0.3, "gains": TWICE[:1]}, ["not both"]),
+        ("POST", "/v1/loop", {"speed": 3}, ["speed: unknown"]),
+        ("POST", "/v1/loop/ramp", {"gains": [0.0]}, ["gains.0"]),
+        (
+            "POST",
+            "/v1/loop/ramp",
+            {"groups": [{"first": 0, "last": 1}] * 2},
+            ["no mode in two groups"],
+        ),
+        ("POST", "/v1/loop/ramp", {"step_s": 61.0}, ["step_s"]),
+        ("POST", "/v1/dither", {"action": "start", "kind": "noise"}, ["kind: found 'noise'"]),
+        ("POST", "/v1/dither", BINARY | {"amplitude_m": 1e-9}, ["no amplitude_m and no frequ"]),
+        ("POST", "/v1/dither", BINARY | {"frequency_hz": [250.0]}, ["no amplitude_m and no fre"]),
+        ("POST", "/v1/dither", {"action": "start", "modes": "all"}, ["at most 64 modes with"]),
+        ("POST", "/v1/dither", {"action": "start", "modes": list(range(65))}, ["at most 64"]),
+        ("POST", "/v1/dither", {"action": "start", "modes": [3, 3]}, ["without any of them tw"]),
+        (
+            "POST",
+            "/v1/dither",
+            {"action": "start", "total_amplitude_m": 1e-9},
+            ["no total_amplitude_m with sine"],
+        ),
+        ("POST", "/v1/alarms/margin/mute", {}, ["for_s"]),
+        ("POST", "/v1/alarms/margin/mute", {"for_s": 0}, ["for_s"]),
+        ("POST", "/v1/alarms/margin/mute", {"for_s": 43_201}, ["for_s"]),
+        ("POST", "/v1/alarms/margin/mute", {"for_s": "an hour"}, ["for_s"]),
+        ("POST", "/v1/measurements", {"pattern": "poke"}, ["pattern: found 'poke'"]),
+        ("POST", "/v1/measurements", {"modes": []}, ["modes"]),
+        ("POST", "/v1/measurements", {"modes": [-1]}, ["modes.0"]),
+        ("POST", "/v1/measurements", {"modes": [1, 1]}, ["modes without any of them twice"]),
+        ("POST", "/v1/measurements", {"amplitude_m": 0.0}, ["amplitude_m"]),
+        ("POST", "/v1/measurements", {"n_average": 0}, ["n_average"]),
+        ("POST", "/v1/measurements", SINE | {"n_average": 3}, ["no n_average with a sine"]),
+        ("POST", "/v1/measurements", {"duration_s": 3.0}, ["no frequency_hz and no duration_s"]),
+        ("POST", "/v1/measurements", SINE | {"modes": [1, 2]}, ["1 given for 2"]),
+        ("POST", "/v1/measurements", SINE, ["1 given for 0"]),
+        ("POST", "/v1/measurements", {"averages": 3}, ["averages: unknown"]),
+        (
+            "POST",
+            "/v1/noisy-matrix",
+            {"modes": "every"},
+            ["modes: found 'every', expected a valid array or 'controlled' or 'all'"],
+        ),
+        ("POST", "/v1/noisy-matrix", {"modes": []}, ["modes: found []"]),
+        ("POST", "/v1/noisy-matrix", {"modes": [1, 1]}, ["expected modes without any of them"]),
+        ("POST", "/v1/noisy-matrix", {"modes": [-1]}, ["modes.0: found -1"]),
+        ("POST", "/v1/noisy-matrix", {"total_amplitude_m": 0.0}, ["total_amplitude_m"]),
+        ("POST", "/v1/noisy-matrix", {"duration_s": 4000.0}, ["duration_s"]),
+        ("POST", "/v1/noisy-matrix", {"amplitude_m": 1e-9}, ["amplitude_m: unknown"]),
         ("PUT", "/v1/mode", {}, ["body.mode: missing"]),
     ],
 )

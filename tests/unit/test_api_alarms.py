@@ -2,10 +2,7 @@
 
 from dataclasses import replace
 
-import pytest
-
 from service.tracking.alarms import ALARMS, Alarm, AlarmRecord, OperatorNote, Severity
-from service.tracking.commands import AcknowledgeAlarm, MuteAlarm, UnmuteAlarm
 from service.tracking.operations.running import ServiceState
 from tests.unit.test_api import (  # noqa: F401
     SECOND,
@@ -48,34 +45,3 @@ async def test_alarms_are_those_that_last_went_unseen_or_are_muted(client, servi
     assert [found[name,] for name in counted] == [1, 1, 1, 0]
     assert found["alarms_shown", "warning"] == 1
     assert found["service_state", state["operating"]["service_state"]] == 1
-
-
-@pytest.mark.parametrize(
-    ("path", "body", "expected"),
-    [
-        ("margin/acknowledge", {"by": "Ada"}, AcknowledgeAlarm(name="margin", by="Ada")),
-        (
-            "margin/acknowledge",
-            {"severity": "serious"},
-            AcknowledgeAlarm(name="margin", severity=Severity.SERIOUS),
-        ),
-        ("margin/mute", {"for_s": 60.0}, MuteAlarm(name="margin", for_s=60.0)),
-        ("margin/unmute", {}, UnmuteAlarm(name="margin")),
-    ],
-)
-async def test_what_operators_do_about_an_alarm_is_an_order(
-    client,
-    service,  # noqa: F811
-    path,
-    body,
-    expected,
-):
-    answer = await client.post(f"/v1/alarms/{path}", json=body)
-    assert answer.status_code == 202
-    assert service.commands == [expected]
-
-
-@pytest.mark.parametrize("body", [{}, {"for_s": 0}, {"for_s": 43_201}, {"for_s": "an hour"}])
-async def test_a_mute_is_for_a_time_and_not_for_ever(client, service, body):  # noqa: F811
-    assert (await client.post("/v1/alarms/margin/mute", json=body)).status_code == 422
-    assert service.commands == []

@@ -5,10 +5,9 @@ from dataclasses import replace
 import pytest
 
 from service.control.gains import ModeGain
-from service.tracking.commands import SetLoop
-from tests.states import changed, tracker_state
-from tests.unit.obedient import Obedient
+from tests.states import tracker_state
 from tests.unit.runtime.handmade import REGISTRATION
+from tests.unit.test_api import FakeService, a_snapshot
 from tests.unit.tracking.situations import START_NS, record, rtc
 
 MEASURED = (
@@ -19,14 +18,12 @@ MEASURED = (
 
 @pytest.fixture
 def service():
-    return Obedient(
-        tracker_state(
-            system="flao",
-            rtc=rtc(),
-            registration=replace(REGISTRATION, optical_gains=MEASURED),
-            reconstructors=(record("cm-1", optical_gains=MEASURED[:1]), record("cm-2")),
-        )
+    state = tracker_state(
+        rtc=rtc(),
+        registration=replace(REGISTRATION, optical_gains=MEASURED),
+        reconstructors=(record("cm-1", optical_gains=MEASURED[:1]), record("cm-2")),
     )
+    return FakeService(a_snapshot(state, now_ns=0))
 
 
 async def test_the_present_table_is_of_every_mode_of_the_basis(client):
@@ -53,19 +50,6 @@ async def test_where_nothing_was_measured_the_table_says_so(client):
 
 async def test_a_table_of_nothing_is_a_problem(client, service):
     assert (await client.get("/v1/reconstructors/cm-9/gains")).status_code == 404
-    service.tracker = changed(service.tracker, rtc=None)
+    service.change(rtc=None)
     answer = await client.get("/v1/gains")
     assert (answer.status_code, "no RTC is there" in answer.text) == (409, True)
-
-
-async def test_gains_by_the_table_are_asked_for_by_their_effect(client, service):
-    answer = await client.post("/v1/loop", json={"effective_gain": 0.3})
-    assert answer.status_code == 202
-    assert service.commands == [SetLoop(effective_gain=0.3)]
-
-
-async def test_gains_of_both_kinds_at_once_are_refused(client):
-    body = {"effective_gain": 0.3, "gains": [{"first": 0, "last": 1, "gain": 0.2}]}
-    answer = await client.post("/v1/loop", json=body)
-    assert answer.status_code == 422
-    assert "not both" in answer.text

@@ -1,4 +1,4 @@
-"""Measured interaction matrices over real HTTP messages, with a hand-written service behind."""
+"""Measured interaction matrices, and noisy ones, over real HTTP messages."""
 
 import hashlib
 import io
@@ -8,15 +8,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from service.errors import CommandError, LinkError, UnknownIdError
-from service.tracking.commands import GiveUp, Measure
-from service.tracking.operation_records import MeasurementRecord, MeasureState
+from service.errors import UnknownIdError
+from service.model.misregistration import Misregistration
+from service.tracking.commands import GiveUp, Measure, MeasureNoisy
+from service.tracking.operation_records import MeasurementRecord, MeasureState, NoisyFinding
+from service.tracking.products import ModeSet
+from service.web.views import NOISY_MEASUREMENT, to_json
 from service.wire import Pattern
 from tests.states import tracker_state
-from tests.unit.obedient import Obedient
+from tests.unit.test_api import FakeService, a_snapshot
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(4, 3)
 FILE = b"\x89HDF the product"
+NOW_NS, NOW = 1_763_696_400_250_000_000, "20251121T034000.250000"
 STORED = MeasurementRecord(
     id="im-1",
     state=MeasureState.STORED,
@@ -43,126 +47,143 @@ RUNNING = replace(
     double_pass=None,
     sha256="",
 )
+NOISY = MeasurementRecord(
+    id="noisy-1",
+    state=MeasureState.STORED,
+    pattern=None,
+    modes=(0, 7, 3),
+    amplitude_m=(5e-9 / 3**0.5,) * 3,
+    duration_s=30.0,
+    window_s=5.0,
+    seed=77,
+    asked_ns_utc=900,
+    basis_id="kl",
+    config_id="b1",
+    finding=NoisyFinding(
+        n_slopes=4,
+        n_frames=29_994,
+        n_missing=6,
+        snr=1.4,
+        alpha=Misregistration(shift_x_subap=0.1, rotation_rad=np.deg2rad(0.2)),
+        covariance=np.diag([0.01, 0.01, np.deg2rad(0.02), 0.001]) ** 2,
+        optical_gain=0.6,
+        misfit=1.01,
+        cm_id="cm-1",
+        session="s-1",
+        created_ns_utc=1_000,
+        sha256="0" * 64,
+    ),
+)
+NOISY_RUNNING = replace(NOISY, id="noisy-2", state=MeasureState.RUNNING, finding=None)
 
 
 class FakeMatrices:
-    """The archive's measured matrices."""
+    """The archive's matrices of one kind; numbers of a noisy one leave with their noise alone."""
 
-    def __init__(self, folder):
-        self.path = folder / "product.h5"
+    def __init__(self, folder, name):
+        self.name, self.path = name, folder / f"{name}.h5"
         self.path.write_bytes(FILE)
 
-    def matrix(self, measurement_id):
-        if measurement_id != "im-1":
-            raise UnknownIdError(f"measurement {measurement_id}: no such matrix in the archive")
+    def matrix(self, name):
+        assert not self.name.startswith("noisy"), name
+        self.file(name)
         return MATRIX
 
-    def file(self, measurement_id):
-        self.matrix(measurement_id)
+    def file(self, name):
+        if name != self.name:
+            raise UnknownIdError(f"measurement {name}: no such matrix in the archive")
         return self.path
 
 
 @pytest.fixture
 def service(tmp_path):
-    return Obedient(
-        tracker_state(system="flao-lbt", measurements=(STORED, RUNNING)),
-        now_ns=1_763_696_400_250_000_000,
-        archive=SimpleNamespace(measured=FakeMatrices(tmp_path)),
-    )
-
-
-async def test_a_bare_request_measures_push_pull_modal(client, service):
-    response = await client.post("/v1/measurements")
-    assert response.status_code == 202, response.text
-    body = response.json()
-    assert body["id"] == "im-20251121T034000.250000"
-    assert body["links"]["measurement"] == f"/v1/measurements/{body['id']}"
-    assert service.commands == [Measure(id=body["id"], pattern=Pattern.PUSH_PULL_MODAL)]
-
-
-async def test_every_choice_reaches_the_command(client, service):
-    body = {
-        "pattern": "sine",
-        "modes": [3, 9],
-        "amplitude_m": 5e-9,
-        "frequency_hz": [60.0, 80.0],
-        "duration_s": 12.0,
+    shelves = {
+        "measured": FakeMatrices(tmp_path, "im-1"),
+        "noisy": FakeMatrices(tmp_path, "noisy-1"),
     }
-    response = await client.post("/v1/measurements", json=body)
+    records = (STORED, RUNNING, NOISY, NOISY_RUNNING)
+    known = a_snapshot(tracker_state(measurements=records), now_ns=NOW_NS)
+    return FakeService(known, archive=SimpleNamespace(**shelves))
+
+
+@pytest.mark.parametrize(
+    ("path", "link", "body", "command"),
+    [
+        ("measurements", "measurement", None, Measure(id=f"im-{NOW}", pattern="push-pull-modal")),
+        (
+            "measurements",
+            "measurement",
+            {
+                "pattern": "sine",
+                "modes": [3, 9],
+                "amplitude_m": 5e-9,
+                "frequency_hz": [60.0, 80.0],
+                "duration_s": 12.0,
+            },
+            Measure(
+                id=f"im-{NOW}",
+                pattern=Pattern.SINE,
+                modes=(3, 9),
+                amplitude_m=5e-9,
+                frequency_hz=(60.0, 80.0),
+                duration_s=12.0,
+            ),
+        ),
+        ("noisy-matrix", "matrix", None, MeasureNoisy(id=f"noisy-{NOW}")),
+        (
+            "noisy-matrix",
+            "matrix",
+            {"modes": "all", "total_amplitude_m": 2e-9, "duration_s": 60, "over_budget": True},
+            MeasureNoisy(
+                id=f"noisy-{NOW}",
+                modes=ModeSet.ALL,
+                total_amplitude_m=2e-9,
+                duration_s=60.0,
+                over_budget=True,
+            ),
+        ),
+        (
+            "noisy-matrix",
+            "matrix",
+            {"modes": [3, 9]},
+            MeasureNoisy(id=f"noisy-{NOW}", modes=(3, 9)),
+        ),
+    ],
+)
+async def test_every_choice_reaches_the_command(client, service, path, link, body, command):
+    response = await client.post(f"/v1/{path}", json=body)
     assert response.status_code == 202, response.text
-    (command,) = service.commands
-    assert command == Measure(
-        id=response.json()["id"],
-        pattern=Pattern.SINE,
-        modes=(3, 9),
-        amplitude_m=5e-9,
-        frequency_hz=(60.0, 80.0),
-        duration_s=12.0,
-    )
+    answer = response.json()
+    assert (answer["id"], answer["links"][link]) == (command.id, f"/v1/{path}/{command.id}")
+    assert service.commands == [command]
 
 
 @pytest.mark.parametrize(
-    ("body", "words"),
+    ("path", "link"),
     [
-        ({"pattern": "poke"}, "pattern: found 'poke'"),
-        ({"modes": []}, "modes"),
-        ({"modes": [-1]}, "modes.0"),
-        ({"modes": [1, 1]}, "modes without any of them twice"),
-        ({"amplitude_m": 0.0}, "amplitude_m"),
-        ({"n_average": 0}, "n_average"),
-        ({"pattern": "sine", "n_average": 3}, "no n_average with a sine"),
-        ({"duration_s": 3.0}, "no frequency_hz and no duration_s with push-pull-modal"),
-        ({"pattern": "sine", "modes": [1, 2], "frequency_hz": [60.0]}, "1 given for 2"),
-        ({"pattern": "sine", "frequency_hz": [60.0]}, "1 given for 0"),
-        ({"averages": 3}, "averages: unknown"),
+        ("measurements/im-2", "measurement"),
+        ("measurements/noisy-2", ""),
+        ("noisy-matrix/noisy-2", ""),
     ],
 )
-async def test_a_request_that_cannot_be_meant_is_refused(client, service, body, words):
-    response = await client.post("/v1/measurements", json=body)
-    assert response.status_code == 422, response.text
-    assert response.headers["content-type"] == "application/problem+json"
-    assert words in response.json()["detail"]
-    assert service.commands == []
-
-
-@pytest.mark.parametrize(
-    ("refusal", "status"),
-    [
-        (CommandError("the RTC refused: busy: dither d-1 is on until frame 9"), 409),
-        (LinkError("no answer from the RTC"), 504),
-    ],
-)
-async def test_a_refusal_arrives_in_its_own_words(client, service, refusal, status):
-    service.refusal = refusal
-    response = await client.post("/v1/measurements", json={})
-    assert response.status_code == status
-    assert response.json()["detail"] == str(refusal)
-
-
-async def test_a_measurement_can_be_given_up(client, service):
-    response = await client.delete("/v1/measurements/im-2")
+async def test_one_can_be_given_up(client, service, path, link):
+    response = await client.delete(f"/v1/{path}")
     assert response.status_code == 202, response.text
-    assert response.json()["links"]["measurement"] == "/v1/measurements/im-2"
-    assert service.commands == [GiveUp(id="im-2")]
+    assert not link or response.json()["links"][link] == f"/v1/{path}"
+    assert service.commands == [GiveUp(id=path.partition("/")[2])]
 
 
 @pytest.mark.parametrize(
-    ("refusal", "status"),
+    ("path", "name", "ids"),
     [
-        (UnknownIdError("unknown measurement im-2"), 404),
-        (CommandError("im-2 is stored: there is nothing to give up"), 409),
+        ("measurements", "measurements", ["im-1", "im-2"]),
+        ("noisy-matrix", "noisy_matrices", ["noisy-1", "noisy-2"]),
     ],
 )
-async def test_what_cannot_be_given_up_is_told(client, service, refusal, status):
-    service.refusal = refusal
-    response = await client.delete("/v1/measurements/im-2")
-    assert (response.status_code, response.json()["detail"]) == (status, str(refusal))
-
-
-async def test_measurements_are_listed_oldest_first(client):
-    body = (await client.get("/v1/measurements")).json()
-    assert [m["id"] for m in body["measurements"]] == ["im-1", "im-2"]
-    assert [m["state"] for m in body["measurements"]] == ["stored", "running"]
+async def test_they_are_listed_oldest_first(client, path, name, ids):
+    listed = (await client.get(f"/v1/{path}")).json()[name]
+    assert [one["id"] for one in listed] == ids
+    assert [one["state"] for one in listed] == ["stored", "running"]
 
 
 async def test_a_measurement_tells_how_it_was_made(client):
@@ -174,11 +195,41 @@ async def test_a_measurement_tells_how_it_was_made(client):
     assert body["sha256"] == STORED.sha256
 
 
-@pytest.mark.parametrize("path", ["im-9", "im-9/matrix", "im-9/matrix?format=hdf5"])
-async def test_an_unknown_measurement_is_not_found(client, path):
-    response = await client.get(f"/v1/measurements/{path}")
+async def test_a_noisy_matrix_tells_how_it_was_made_and_what_it_says(client):
+    body = (await client.get("/v1/noisy-matrix/noisy-1")).json()
+    assert (body["n_modes"], body["modes"], body["seed"]) == (3, [0, 7, 3], 77)
+    assert body["amplitude_m"] == pytest.approx(5e-9 / np.sqrt(3))
+    found = body["finding"]
+    assert found["alpha"]["rotation_deg"] == pytest.approx(0.2)
+    assert found["sigma"]["rotation_deg"] == pytest.approx(0.02)
+    assert (found["snr"], found["misfit"]) == (1.4, 1.01)
+    assert (found["n_frames"], found["n_missing"]) == (29_994, 6)
+    as_measured = (await client.get("/v1/measurements/noisy-2")).json()
+    assert (as_measured["id"], as_measured["pattern"]) == ("noisy-2", None)
+    assert as_measured["amplitude_m"] == pytest.approx([5e-9 / np.sqrt(3)] * 3)
+
+
+async def test_one_under_way_has_found_nothing_yet(client, service):
+    body = (await client.get("/v1/noisy-matrix/noisy-2")).json()
+    assert (body["state"], body["finding"]) == ("running", None)
+    state = to_json(service.tracker.noisy_measurement, NOISY_MEASUREMENT)
+    assert (state["id"], state["state"], state["duration_s"]) == ("noisy-2", "running", 30.0)
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "measurements/im-9",
+        "measurements/im-9/matrix",
+        "measurements/im-9/matrix?format=hdf5",
+        "noisy-matrix/noisy-9",
+        "noisy-matrix/noisy-9/file",
+    ],
+)
+async def test_an_unknown_one_is_not_found(client, path):
+    response = await client.get(f"/v1/{path}")
     assert response.status_code == 404
-    assert "im-9" in response.json()["detail"]
+    assert path.split("/")[1] in response.json()["detail"]
 
 
 async def test_the_matrix_leaves_as_a_numpy_file(client):
@@ -187,20 +238,25 @@ async def test_the_matrix_leaves_as_a_numpy_file(client):
     assert response.headers["content-disposition"] == 'attachment; filename="im-1.npy"'
     found = np.load(io.BytesIO(response.content), allow_pickle=False)
     np.testing.assert_array_equal(found, MATRIX)
+    raw = await client.get("/v1/measurements/im-1/matrix", params={"format": "raw"})
+    assert hashlib.sha256(raw.content).hexdigest() == STORED.sha256
+    other = await client.get("/v1/measurements/im-1/matrix", params={"format": "csv"})
+    assert other.status_code == 422
 
 
-async def test_the_raw_matrix_has_the_announced_checksum(client):
-    response = await client.get("/v1/measurements/im-1/matrix", params={"format": "raw"})
-    assert hashlib.sha256(response.content).hexdigest() == STORED.sha256
-
-
-async def test_the_product_leaves_as_it_lies_in_the_archive(client):
-    response = await client.get("/v1/measurements/im-1/matrix", params={"format": "hdf5"})
+@pytest.mark.parametrize(
+    "path", ["measurements/im-1/matrix?format=hdf5", "noisy-matrix/noisy-1/file"]
+)
+async def test_the_product_leaves_as_it_lies_in_the_archive(client, path):
+    response = await client.get(f"/v1/{path}")
     assert response.content == FILE
     assert response.headers["content-type"] == "application/x-hdf5"
-    assert response.headers["content-disposition"] == 'attachment; filename="im-1.h5"'
+    name = path.split("/")[1]
+    assert response.headers["content-disposition"] == f'attachment; filename="{name}.h5"'
 
 
-async def test_another_format_is_refused(client):
-    response = await client.get("/v1/measurements/im-1/matrix", params={"format": "csv"})
-    assert response.status_code == 422
+@pytest.mark.parametrize("action", ["approve", "publish", "reject"])
+async def test_no_route_publishes_a_noisy_matrix(client, service, action):
+    response = await client.post(f"/v1/noisy-matrix/noisy-1/{action}")
+    assert response.status_code in {404, 405}
+    assert service.commands == []

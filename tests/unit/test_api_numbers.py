@@ -14,7 +14,7 @@ from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.state import TrackerState
 from service.wire import checksum
 from tests.states import tracker_state
-from tests.unit.obedient import Obedient
+from tests.unit.test_api import FakeService, a_snapshot
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(3, 4) / 7
 
@@ -33,7 +33,7 @@ RECORDS = (
 )
 
 
-class FakeService(Obedient):
+class Archived(FakeService):
     """Has the matrices of a real archive."""
 
     def matrix(self, matrix_id):
@@ -48,7 +48,7 @@ def service(tmp_path):
         for one in RECORDS:
             archive.reconstructors.store(one, MATRIX, None, {})
         state = tracker_state(system="flao-lbt", reconstructors=RECORDS, in_use="cm-3")
-        yield FakeService(state, archive=archive)
+        yield Archived(a_snapshot(state), archive=archive)
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ async def test_a_reconstructor_is_found_by_what_it_is(client, service, alias, na
     ],
 )
 async def test_one_that_there_is_not_is_said_to_be_none(client, service, alias, words):
-    service.tracker = TrackerState(system="flao-lbt")
+    service.now = a_snapshot(TrackerState(system="flao-lbt"))
     for answer in (
         await client.get(f"/v1/reconstructors/{alias}"),
         await client.post(f"/v1/reconstructors/{alias}/approve"),

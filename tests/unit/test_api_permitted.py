@@ -7,7 +7,7 @@ from service.api import create_app
 from service.tracker import step
 from service.tracking.commands import Refit
 from service.tracking.interlocks import ORDERS
-from tests.unit.obedient import Obedient
+from tests.unit.test_api import FakeService, a_snapshot
 from tests.unit.tracking.moments import MOMENTS, meant
 
 REQUESTS = {
@@ -37,11 +37,11 @@ REQUESTS = {
 }
 
 
-class AtOneMoment(Obedient):
+class AtOneMoment(FakeService):
     """Asks the tracker what becomes of an order, and stays as it is."""
 
     async def submit(self, command, caller, order_id=""):
-        step(self.tracker, command, self.policy, self.now_ns)
+        step(self.tracker, command, self.now.policy, self.now.now_ns)
         if isinstance(command, Refit):
             return await super().submit(command, caller, order_id)
         return "done"
@@ -50,7 +50,8 @@ class AtOneMoment(Obedient):
 @pytest.mark.parametrize("moment", MOMENTS, ids=lambda moment: moment.__name__)
 async def test_the_state_tells_what_a_request_would_be_answered(moment):
     story = moment()
-    service = AtOneMoment(story.state, story.now_ns, policy=story.policy)
+    now = a_snapshot(story.state, now_ns=story.now_ns, policy=story.policy)
+    service = AtOneMoment(now)
     transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
     async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
         state = (await client.get("/v1/state")).json()

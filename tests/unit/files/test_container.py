@@ -198,7 +198,6 @@ def test_a_small_file_that_claims_a_large_array_is_refused_before_it_is_read(tmp
             )
     assert path.stat().st_size < 100_000
     text = refused(path, "D")
-    assert "bytes in the file" in text
     assert "GB in memory" in text or "MB in memory" in text
 
 

@@ -206,7 +206,6 @@ def test_one_that_may_not_leaves_the_loop_open_and_asks_nothing_of_the_rtc(inter
     night.advance(3.0)
     assert not night.dome.moments[-1].closed
     assert len(night.dome.orders) == n_orders
-    assert "the mode is propose" in night.state.operations.acquisition.text
 
 
 def test_one_whose_loop_had_just_been_closed_goes_on_from_there(interrupted):

@@ -255,7 +255,6 @@ class TestCommandsOffTheLoop:
         streams = with_matrix(streams, "initial", self.R)
         streams, windows, off = self.play(streams, self.telemetry(30, stroke_m=5e-10))
         assert [type(w) for w in windows] == [WindowRefused] * 5
-        assert "off the loop equation" in windows[0].reason
         assert off.index(True) * 0.2 < 2.0
         assert "4 of 4 modes (0-3)" in streams[LoopCheck].residual.text
 
@@ -400,7 +399,6 @@ def test_or_until_so_few_modes_are_controlled_that_nobody_can_tell(slipped):
     many = with_rtc(few, replace(MANY, seq=3000))
     for first_seq in range(3000, 4000, 10):
         many, _ = process_block(many, driven(first_seq, 2e-6))
-    assert "an outer actuator" in dict(told(many))["edge-slip"]
 
 
 def test_but_not_because_a_few_modes_less_are_controlled(slipped):

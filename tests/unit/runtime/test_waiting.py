@@ -91,7 +91,6 @@ def test_nothing_is_complained_of_while_all_is_well():
 def test_frames_that_come_and_are_not_used_are_named_whatever_the_reason(outcome):
     text = complaints(link(disposition(outcome, 900, text="found x, expected y")))["frames-unused"]
     assert outcome in text.partition(":")[0]
-    assert "found x, expected y" in text
     assert "0 were used" in text
 
 
@@ -216,7 +215,6 @@ def test_a_matrix_without_a_name_or_without_its_numbers_is_waited_for():
     state = tracker_state(system="s", rtc=rtc(cm_id=None), read_back_error="no answer")
     wait = waits(link(*WELL), state)["matrix-name"]
     assert "cm_id is nil" in wait.text
-    assert "no answer" in wait.text
     state = changed(state, rtc=rtc(cm_id="theirs"))
     assert "theirs" in waits(link(*WELL), state)["matrix-in-use"].text
 

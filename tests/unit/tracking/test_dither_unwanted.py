@@ -173,7 +173,6 @@ class TestTooStrong:
         playing(story, loud)
         assert not of_kind(silent(story, round(FAILED_DITHER_PAUSE_S) - 2), DitherRequest)
         assert OVER_BUDGET in story.alarms
-        assert "too strong" in story.state.dithers.policy.reason
         assert of_kind(silent(story, 4), DitherRequest)
         accept(story, story.state.dithers.dither)
         assert OVER_BUDGET in story.alarms
@@ -243,7 +242,6 @@ def test_settings_that_forbid_it_do_not_tolerate_what_an_earlier_service_has_lef
     story = Story(policy=replace(POLICY, dither_enabled=False)).meet()
     asked = of_kind(playing(story, dither, 20), DitherStop)
     assert len(asked) == pytest.approx(20 / STOP_REQUEST_INTERVAL_S, abs=1)
-    assert "the settings forbid" in next(a.text for a in story.state.alarms.active)
 
 
 class TestByTheFrames:
@@ -312,7 +310,6 @@ class TestByTheFrames:
         accept(story, dither)
         self.measured(story, dither, 5.0)
         assert story.state.operations.acquisition.stage is AcquisitionStage.FAILED
-        assert "the frames hold much" in story.state.operations.acquisition.text
 
     def test_a_noisy_matrix_ends_and_says_why(self, story):
         story.tell(cmd.StopDither())
@@ -324,4 +321,3 @@ class TestByTheFrames:
         self.measured(story, dither, 5.0)
         (noisy,) = story.state.noisy
         assert noisy.state is MeasureState.FAILED
-        assert "too strong" in noisy.reason

@@ -369,7 +369,7 @@ def test_a_window_weaker_than_what_is_asked_of_alpha_says_nothing_of_the_model(s
     np.testing.assert_array_equal(story.state.alpha.registration.floor, story.policy.floor)
 
 
-def test_each_window_leaves_its_own_estimate_in_the_history(story):
+def test_each_window_leaves_its_own_estimate_in_the_history_which_is_bounded(story):
     story.see()
     story.see(moved(shift_x_subap=0.004))
     first, second = story.state.alpha.history
@@ -377,12 +377,7 @@ def test_each_window_leaves_its_own_estimate_in_the_history(story):
     assert second.measured.shift_x_subap == pytest.approx(0.124)
     assert 0.12 < second.filtered.shift_x_subap < 0.124
     assert 0.0 < second.innovation < 4.0
-
-
-def test_the_history_is_bounded(story):
-    story.see()
-    full = story.state.alpha.history * HISTORY_LENGTH
-    story.state = changed(story.state, history=full)
+    story.state = changed(story.state, history=(first,) * HISTORY_LENGTH)
     story.see(moved(shift_x_subap=0.001))
     assert len(story.state.alpha.history) == HISTORY_LENGTH
     assert story.state.alpha.history[-1].measured.shift_x_subap == pytest.approx(0.121)
@@ -444,18 +439,14 @@ def test_windows_far_from_their_start_that_agree_are_used_while_alpha_is_unknown
     assert story.state.alpha.far_windows == ()
 
 
-@pytest.mark.parametrize("share", [0.6, None])
-def test_far_windows_that_the_model_does_not_explain_are_never_used(story, share):
+@pytest.mark.parametrize(("share", "apart"), [(0.6, 0.0), (None, 0.0), (0.1, 0.1)])
+def test_far_windows_that_the_model_does_not_explain_or_that_disagree_are_never_used(
+    story, share, apart
+):
     """Modes in another order lead every window to the same wrong place."""
     unexplained = None if share is None else np.full(4, share)
-    story.see(FAR, n_windows=8, unexplained=unexplained)
-    assert story.state.alpha.registration is None
-
-
-def test_far_windows_that_disagree_are_never_used(story):
     for k in range(8):
-        far = moved(FAR, shift_x_subap=0.1 * (k % 2))
-        story.see(far, unexplained=np.full(4, 0.1))
+        story.see(moved(FAR, shift_x_subap=apart * (k % 2)), unexplained=unexplained)
     assert story.state.alpha.registration is None
 
 
@@ -522,7 +513,6 @@ def test_a_window_in_flight_when_the_commands_go_off_the_loop_is_not_good():
     story.tell(ev.ConditionChanged(name="commands-off-loop", text="saturated"))
     story.see()
     assert story.state.alpha.registration is None
-    assert "off the loop equation" in story.state.log[-1].text
     story.tell(ev.ConditionChanged(name="commands-off-loop", text="again", over=True))
     story.see()
     assert story.state.alpha.registration is not None

@@ -8,9 +8,33 @@ import pytest
 from service.errors import CommandError, UnknownIdError
 from service.tracker import step
 from service.tracking import commands as cmd
+from service.tracking import events as ev
 from service.tracking.interlocks import ORDERS, Permission, permissions, permitted
-from tests.unit.tracking.moments import MOMENTS, in_use, meant, proposed, refused_since
-from tests.unit.tracking.operations.test_running import COMMANDS, ramping
+from service.tracking.products import MatrixState, ModeSet
+from tests.unit.tracking.moments import (
+    MOMENTS,
+    in_use,
+    meant,
+    met,
+    nobody_there,
+    opened,
+    proposed,
+    refused_since,
+    small,
+    without_dither,
+)
+from tests.unit.tracking.operations.test_running import (
+    COMMANDS,
+    acquiring,
+    gathering,
+    idle,
+    making,
+    measuring,
+    operators_dither,
+    others_dither,
+    ramping,
+    sending,
+)
 
 NAMED = [name for name in ORDERS if name != "set_value"]
 
@@ -106,6 +130,168 @@ def test_a_refusal_says_what_is_missing(moment, order, words):
     assert permission_for(moment, ORDERS[order]) == Permission(allowed=False, reason=words)
 
 
+def vanished():
+    """The RTC has vanished; a reconstructor is proposed and another has been in use."""
+    story = in_use()
+    story.make("cm-2")
+    story.tell(ev.RtcVanished())
+    return story
+
+
+def refused_by_the_gate():
+    """The gate has refused the last reconstructor."""
+    story = in_use()
+    story.make("cm-2", MatrixState.REFUSED)
+    return story
+
+
+def measured():
+    """A measurement is over."""
+    return measuring().pass_(10.0)
+
+
+def gathered():
+    """A noisy matrix is stored, and nothing runs."""
+    return gathering().pass_(40.0)
+
+
+def gains(first, last, **changes):
+    return cmd.SetLoop(gains=(cmd.GainGroup(first=first, last=last, gain=0.3),), **changes)
+
+
+def dither(*frequency_hz, first=3):
+    modes = tuple(range(first, first + len(frequency_hz)))
+    return cmd.StartDither(modes=modes, frequency_hz=frequency_hz)
+
+
+MEASURE, NOISY = cmd.Measure(id="im-9"), cmd.MeasureNoisy(id="noisy-9")
+REFUSED = {
+    nobody_there: {
+        "no RTC is there": [cmd.Acquire(), MEASURE, cmd.Refit(), cmd.SetLoop(leak=0.9), cmd.Ramp()],
+        "no RTC is there: start it first": [cmd.StartDither()],
+    },
+    vanished: {
+        "no RTC is there": [cmd.Acquire(), cmd.Rollback(), cmd.Publish(id="cm-1")],
+        "cannot be sent: no RTC is there": [cmd.Approve(id="cm-2")],
+    },
+    met: {
+        "α is not known yet; start a dither": [cmd.Refit()],
+        r"dither-\d+ is running; stop it first": [cmd.StartDither(), MEASURE],
+        "no earlier reconstructor has been in use": [cmd.Rollback()],
+    },
+    opened: {
+        "the loop is open: close it": [cmd.StartDither(), cmd.Ramp(), NOISY],
+        "found gains for 2 modes; expected all 400": [gains(0, 1)],
+    },
+    small: {"at least 3": [cmd.Acquire()]},
+    without_dither: {"forbid": [cmd.Acquire()]},
+    in_use: {
+        "found 595 modes; expected 1 to 594": [
+            cmd.Refit(n_modes=595),
+            cmd.SetLoop(n_controlled=595),
+        ],
+        "found modes 390 to 400; expected .* 0 to 399": [gains(390, 400)],
+        "found modes 100 to 400; expected .* 0 to 399": [
+            cmd.Ramp(groups=(cmd.ModeGroup(first=100, last=400),))
+        ],
+        "unknown reconstructor cm-9": [kind(id="cm-9") for kind in (cmd.Approve, cmd.Publish)],
+        "unknown measurement im-1": [cmd.GiveUp(id="im-1")],
+    },
+    proposed: {
+        "initial is applied, not proposed": [cmd.Approve(id="initial"), cmd.Reject(id="initial")],
+        "unknown reconstructor cm-9": [cmd.Reject(id="cm-9")],
+    },
+    refused_by_the_gate: {
+        "cm-2 is refused, not proposed": [cmd.Approve(id="cm-2"), cmd.Reject(id="cm-2")]
+    },
+    idle: {
+        "found mode 594; expected 0 to 593": [cmd.Measure(id="im-1", modes=(0, 594))],
+        "found mode 600": [cmd.MeasureNoisy(id="noisy-9", modes=(600,))],
+        "594": [dither(250.0, first=594)],
+        "room for the side bins": [dither(5.0), dither(495.0)],
+        "closer than 4 bins": [dither(200.0, 200.5)],
+        "11 nm RMS in all, budget 8 nm": [
+            cmd.MeasureNoisy(id="noisy-9", total_amplitude_m=11e-9, duration_s=60.0)
+        ],
+        "400 modes need windows of 3.2 s": [
+            cmd.MeasureNoisy(id="noisy-9", modes=ModeSet.CONTROLLED, duration_s=2.0)
+        ],
+        "no acquisition is under way": [cmd.AbortAcquisition()],
+    },
+    making: {"being computed; wait": [cmd.Refit(), cmd.Publish(id="cm-1"), MEASURE]},
+    sending: {"is on its way": [MEASURE]},
+    acquiring: {
+        "acquisition": [cmd.Refit(), cmd.SetLoop(loop="closed"), cmd.StartDither(), NOISY],
+        "under way": [cmd.Acquire()],
+    },
+    measuring: {
+        "im-1 is being measured; wait for it": [
+            cmd.Acquire(),
+            cmd.SetLoop(loop="open"),
+            cmd.SetLoop(loop="closed"),
+            cmd.Ramp(),
+            cmd.Refit(),
+            cmd.StartDither(),
+            cmd.Approve(id="x"),
+            cmd.Publish(id="x"),
+            cmd.Rollback(),
+            MEASURE,
+        ]
+    },
+    measured: {
+        "ids are never reused": [cmd.Measure(id="im-1")],
+        "im-1 is stored: there is nothing to give up": [cmd.GiveUp(id="im-1")],
+    },
+    gathering: {
+        "noisy-1": [
+            cmd.Acquire(),
+            cmd.SetLoop(loop="open"),
+            cmd.Ramp(),
+            cmd.StartDither(),
+            MEASURE,
+            NOISY,
+        ]
+    },
+    gathered: {
+        "never reused": [cmd.MeasureNoisy(id="noisy-1")],
+        "noisy-1 is stored": [cmd.GiveUp(id="noisy-1")],
+        "unknown reconstructor noisy-1": [
+            kind(id="noisy-1") for kind in (cmd.Approve, cmd.Publish, cmd.Reject)
+        ],
+    },
+    ramping: {
+        "open the loop to end it": [
+            cmd.Acquire(),
+            gains(0, 399),
+            cmd.Ramp(),
+            cmd.StartDither(),
+            MEASURE,
+            NOISY,
+        ]
+    },
+    operators_dither: {"is running; stop it first": [NOISY, cmd.StartDither()]},
+    others_dither: {"of-another-program is running; stop it first": [NOISY, cmd.StartDither()]},
+}
+"""What is refused in each moment, with the reason that names what is in the way."""
+
+
+@pytest.mark.parametrize(
+    ("moment", "words", "command"),
+    [
+        (moment, words, command)
+        for moment, reasons in REFUSED.items()
+        for words, commands in reasons.items()
+        for command in commands
+    ],
+    ids=lambda value: getattr(value, "__name__", type(value).__name__),
+)
+def test_a_command_that_cannot_be_carried_out_is_refused_by_what_is_in_the_way(
+    moment, words, command
+):
+    state, now_ns, policy = at(moment)
+    with pytest.raises((CommandError, UnknownIdError), match=words):
+        step(state, command, policy, now_ns)
+
+
 def test_a_gain_ramp_lets_the_loop_be_opened_and_nothing_else_changed():
     assert permission_for(ramping, ORDERS["open_loop"]).allowed
-    assert "open the loop to end it" in permission_for(ramping, ORDERS["set_loop"]).reason

@@ -2,14 +2,14 @@ from dataclasses import replace
 
 import pytest
 
-from service.errors import CommandError, UnknownIdError
+from service.errors import CommandError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Level, Mode
 from service.wire import DitherRequest
 from tests.states import changed
-from tests.unit.tracking.situations import Story, moved, of_kind, record, rtc, stopping
+from tests.unit.tracking.situations import Story, moved, of_kind, record, stopping
 
 
 @pytest.fixture
@@ -53,25 +53,6 @@ class TestApproval:
         story.tell(cmd.Reject(id="cm-1"))
         assert story.state.reconstructor("cm-1").reason == "by the operator"
 
-    @pytest.mark.parametrize("command", [cmd.Approve, cmd.Reject])
-    def test_only_a_proposal_can_be_decided_on(self, story, command):
-        refused(story, command(id="initial"), "initial is applied, not proposed")
-        refused(story, command(id="cm-9"), "unknown reconstructor cm-9", UnknownIdError)
-
-    @pytest.mark.parametrize("command", [cmd.Approve, cmd.Reject])
-    def test_what_the_gate_refused_cannot_be_approved(self, story, command):
-        story.make("cm-2", MatrixState.REFUSED)
-        refused(story, command(id="cm-2"), "cm-2 is refused, not proposed")
-
-    def test_nothing_is_sent_while_no_rtc_is_there(self, story):
-        story.tell(ev.RtcVanished())
-        refused(story, cmd.Approve(id="cm-1"), "cannot be sent: no RTC is there")
-
-    @pytest.mark.parametrize("name", ["second-rtc", "basis-mismatch", "instrument-mismatch"])
-    def test_nothing_is_sent_to_an_rtc_that_may_be_the_wrong_one(self, story, name):
-        story.tell(ev.ConditionChanged(name=name, text="two of them"))
-        refused(story, cmd.Approve(id="cm-1"), "cm-1 cannot be sent: two of them")
-
 
 class TestRefit:
     def test_it_computes_for_as_many_modes_as_are_controlled(self, story):
@@ -84,18 +65,6 @@ class TestRefit:
         story.tell(cmd.Refit())
         story.make("cm-2")
         assert story.matrix_state("cm-2") is MatrixState.PROPOSED
-
-    def test_more_modes_than_the_basis_has_are_refused(self, story):
-        refused(story, cmd.Refit(n_modes=595), "found 595 modes; expected 1 to 594")
-
-    def test_one_at_a_time(self, story):
-        story.tell(cmd.Refit())
-        refused(story, cmd.Refit(), "being computed; wait")
-
-    def test_it_needs_a_registration_and_an_rtc(self):
-        story = Story()
-        refused(story, cmd.Refit(), "no RTC is there")
-        refused(story.meet(), cmd.Refit(), "α is not known yet; start a dither")
 
 
 class TestGoingBack:
@@ -155,9 +124,6 @@ class TestGoingBack:
         assert copied.source == "initial"
         assert story.state.operator.mode is Mode.HOLD
 
-    def test_but_no_unknown_one(self, story):
-        refused(story, cmd.Publish(id="cm-9"), "unknown reconstructor cm-9", UnknownIdError)
-
     def test_while_the_gate_cannot_judge_only_what_has_been_in_use_is_sent(self, story):
         story.make("cm-3", MatrixState.REFUSED)
         story.state = changed(story.state, registration=None)
@@ -186,23 +152,11 @@ class TestGoingBack:
         story.acknowledge("cm-3")
         assert story.state.reconstructor("cm-3").reason == ""
 
-    def test_there_must_be_something_to_go_back_to(self):
-        refused(Story().meet(), cmd.Rollback(), "no earlier reconstructor has been in use")
-
     def test_it_need_not_wait_for_a_computation_under_way(self, story):
         story.tell(cmd.Refit())
         story.tell(cmd.Rollback())
         assert not of_kind(story.make("cm-3"), ev.SendMatrix), "mode is hold by now"
         assert of_kind(story.make("cm-4", wanted=True, parent="cm-1"), ev.SendMatrix)
-
-    def test_to_publish_one_again_waits_for_it(self, story):
-        story.tell(cmd.Refit())
-        refused(story, cmd.Publish(id="cm-1"), "being computed; wait")
-
-    @pytest.mark.parametrize("command", [cmd.Rollback(), cmd.Publish(id="cm-1")])
-    def test_it_needs_an_rtc(self, story, command):
-        story.tell(ev.RtcVanished())
-        refused(story, command, "no RTC is there")
 
 
 class TestDither:
@@ -232,34 +186,3 @@ class TestDither:
         assert dither.amplitude_m == (2e-9, 2e-9)
         assert dither.frequency_hz == (220.0, 260.0)
         assert dither.duration_s == 10.0
-
-    def test_one_at_a_time(self):
-        story = Story().meet()
-        refused(story, cmd.StartDither(), "is running; stop it first")
-
-    def test_it_needs_a_closed_loop(self):
-        refused(Story(), cmd.StartDither(), "no RTC is there: start it first")
-        refused(Story().meet(loop="open"), cmd.StartDither(), "the loop is open: close it")
-
-    @pytest.mark.parametrize(
-        ("command", "match"),
-        [
-            (cmd.StartDither(modes=(3,), frequency_hz=(5.0,)), "room for the side bins"),
-            (cmd.StartDither(modes=(3,), frequency_hz=(495.0,)), "room for the side bins"),
-            (cmd.StartDither(modes=(3, 4), frequency_hz=(200.0, 200.5)), "closer than 4 bins"),
-        ],
-    )
-    def test_lines_that_cannot_be_told_apart_are_refused(self, command, match):
-        story = Story().meet()
-        story.tell(cmd.StopDither())
-        refused(story, command, match)
-
-    def test_modes_the_basis_does_not_have_are_refused(self):
-        story = Story().meet()
-        story.tell(cmd.StopDither())
-        refused(story, cmd.StartDither(modes=(594,), frequency_hz=(250.0,)), "594")
-
-
-def test_a_status_of_500_modes_makes_refit_compute_500(story):
-    story.tell(rtc(500))
-    assert story.tell(cmd.Refit())[0].n_modes == 500

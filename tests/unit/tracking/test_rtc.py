@@ -14,7 +14,6 @@ from tests.states import changed
 from tests.unit.tracking.situations import (
     Story,
     dither_answered,
-    estimate,
     of_kind,
     rtc,
     stopping,
@@ -92,36 +91,20 @@ def test_a_status_tells_which_matrix_is_in_use_even_when_its_acknowledgement_was
     assert story.matrix_state("initial") is MatrixState.SUPERSEDED
 
 
-def test_a_status_that_shows_a_reconstructor_in_use_ends_the_alarm_that_it_was_not_applied(story):
-    story.make("cm-1", wanted=True)
-    story.wait(5)
-    assert story.matrix_state("cm-1") is MatrixState.FAILED
-    assert "no-acknowledgement" in story.alarms
-    story.tell(rtc())
-    assert "no-acknowledgement" in story.alarms
-    story.tell(rtc(cm_id="cm-1"))
-    assert story.matrix_state("cm-1") is MatrixState.APPLIED
-    assert "no-acknowledgement" not in story.alarms
-    assert "in use after all" in story.state.reconstructor("cm-1").reason
-    assert story.logged[-2:] == ["reconstructor.applied", "no-acknowledgement"]
-
-
-def test_so_does_one_that_shows_the_next_in_use(story):
-    story.make("cm-1", wanted=True)
-    story.wait(5)
-    story.make("cm-2", wanted=True)
-    assert "no-acknowledgement" in story.alarms
-    story.tell(rtc(cm_id="cm-2"))
-    assert "no-acknowledgement" not in story.alarms
-    assert story.matrix_state("cm-1") is MatrixState.FAILED
-
-
-def test_but_not_one_that_shows_an_old_one(story):
+@pytest.mark.parametrize("shown", ["cm-1", "cm-2", "cm-0"])
+def test_a_status_with_that_or_a_later_matrix_ends_the_alarm_that_it_was_not_applied(story, shown):
     story.use("cm-0")
     story.make("cm-1", wanted=True)
     story.wait(5)
-    story.tell(rtc(cm_id="initial"))
+    assert story.matrix_state("cm-1") is MatrixState.FAILED
+    if shown == "cm-2":
+        story.make("cm-2", wanted=True)
+    story.tell(rtc(cm_id="cm-0"))
     assert "no-acknowledgement" in story.alarms
+    story.tell(rtc(cm_id=shown))
+    assert ("no-acknowledgement" in story.alarms) is (shown == "cm-0")
+    in_use = MatrixState.APPLIED if shown == "cm-1" else MatrixState.FAILED
+    assert story.matrix_state("cm-1") is in_use
 
 
 def test_a_vanished_rtc_is_an_alarm_that_ends_with_its_next_status(story):
@@ -163,13 +146,6 @@ def test_a_restarted_rtc_has_lost_what_was_sent_to_it(story):
     assert story.matrix_state("cm-1") is MatrixState.FAILED
     assert story.matrix_state("cm-2") is MatrixState.FAILED
     assert story.state.reconstructor("cm-1").reason == "the RTC restarted"
-
-
-def test_a_window_of_the_session_before_is_not_used(story):
-    story.tell(ev.SessionStarted(session="s2"))
-    story.tell(rtc(session="s2"))
-    story.tell(ev.WindowFitted(estimate=estimate(session="s1")))
-    assert story.state.alpha.registration.n_windows == 0
 
 
 def test_a_missing_acknowledgement_fails_the_reconstructor_after_three_seconds(story):
@@ -278,14 +254,6 @@ class TestDither:
 
 class TestFailures:
     """A job that failed is forgotten, so that it can be asked again."""
-
-    def test_a_matrix_that_could_not_be_made_is_asked_for_again(self):
-        story = Story().meet()
-        (effect,) = of_kind(story.see(n_windows=2), ev.MakeMatrix)
-        story.tell(ev.JobFailed(effect=effect, text="the worker process died"))
-        assert story.state.matrices.making_since_ns_utc is None
-        assert of_kind(story.wait(6), ev.MakeMatrix)
-        assert story.state.log[-1].level is Level.WARNING
 
     def test_a_matrix_that_could_not_be_sent_has_failed(self, story):
         (effect,) = story.make("cm-1", wanted=True)

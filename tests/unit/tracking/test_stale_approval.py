@@ -8,7 +8,6 @@ import pytest
 from service.errors import CommandError
 from service.tracker import step
 from service.tracking import commands as cmd
-from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.registration import Registration
 from tests.states import tracker_state
@@ -43,12 +42,6 @@ def proposed(alpha):
         registration=registration,
         mode_proof=ALL_SHOWN,
     )
-
-
-def test_a_proposal_for_the_present_registration_is_sent():
-    state, effects = step(proposed(ALPHA), cmd.Approve(id="cm-1"), POLICY, START_NS)
-    assert state.reconstructor("cm-1").state is MatrixState.PUBLISHED
-    assert any(isinstance(effect, ev.SendMatrix) for effect in effects)
 
 
 def test_a_proposal_for_a_registration_left_behind_is_refused_and_still_there():

@@ -57,8 +57,6 @@ def test_nothing_is_asked_of_the_rtc_any_more_but_that_dithers_end(activity):
     stopped(world).pass_(120.0)
     assert [one for one in world.effects if not harmless(one)] == []
     assert world.playing is None or world.playing.request.id == "of-another-program"
-    assert "by Ada (someone is on the platform)" in alarm(world).text
-    assert "until the stop is released" in alarm(world).text
 
 
 def test_a_dither_ends_at_once():
@@ -94,7 +92,6 @@ def test_measurements_are_given_up():
 
 def test_a_gain_ramp_is_the_rtcs_and_named():
     world = stopped(ramping())
-    assert "is the RTC's and ends by itself" in alarm(world).text
     assert world.pass_(30.0).loop == "closed"
 
 

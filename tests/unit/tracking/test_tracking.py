@@ -83,7 +83,6 @@ class TestSuspicion:
         assert not of_kind(effects, ev.SendMatrix)
         assert of_kind(effects, ev.MakeMatrix)
         assert story.matrix_state("cm-1") is MatrixState.DISCARDED
-        assert "jumped while it was made" in story.state.reconstructor("cm-1").reason
         assert of_kind(story.make("cm-2"), ev.SendMatrix)
 
     def test_a_dither_is_due_until_a_window_has_decided(self, story):

@@ -153,7 +153,6 @@ class TestTime:
         story.state = changed(story.state, dither=None, no_dither_before_ns_utc=2**63)
         story.wait(5)
         assert "estimate-stale" not in story.alarms
-        assert "stability gate" in story.state.alpha.dither_due_reason
 
     def test_the_alarm_and_the_validity_say_the_same_at_every_moment(self, story):
         """It had come and gone with every window, four times in six seconds, while α was fresh."""

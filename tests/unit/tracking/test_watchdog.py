@@ -68,7 +68,6 @@ def test_it_only_reports_while_there_is_nothing_to_compare_with():
     story = Story(Mode.AUTO).meet()
     watch(story, Misregistration())
     assert story.state.alpha.passive.consistent
-    assert "no dithered estimate" in story.state.alpha.passive.text
     assert story.state.alpha.registration is None
 
 
@@ -95,7 +94,6 @@ def test_a_reading_too_far_away_for_its_fit_is_worth_nothing_and_says_so():
     story = Story(Mode.AUTO).meet()
     watch(story, moved(rotation_rad=np.deg2rad(3.0)))
     assert np.isinf(story.state.alpha.passive.sigma).all()
-    assert "no estimate" in story.state.alpha.passive.text
     assert fit_begins_at(story.state) is None
     turned = Story(Mode.AUTO, replace(POLICY, start=moved(rotation_rad=np.deg2rad(3.0)))).meet()
     watch(turned, moved(rotation_rad=np.deg2rad(3.0)))
@@ -231,14 +229,12 @@ class TestBark:
     def test_a_second_one_that_disagrees_unanswered_is_an_alarm_and_voids_nothing(self, barking):
         watch(barking, moved(shift_x_subap=1.3))
         assert "watchdog" in barking.alarms
-        assert "no window since" in barking.state.alarm("watchdog").text
         assert barking.state.alpha.registration.usable
 
     def test_where_no_dither_can_be_had_the_first_is_an_alarm_with_the_reason(self, story):
         learnt(story)
         story.tell(cmd.StopDither())
         watch(story, moved(shift_x_subap=0.30))
-        assert "stopped by the operator" in story.state.alarm("watchdog").text
         assert story.state.alpha.registration.validity.level is Validity.FRESH
 
     def test_what_a_window_has_made_void_a_look_makes_no_better(self, story):
@@ -272,7 +268,6 @@ class TestJump:
         before = story.state.alpha.registration
         watch(story, moved(shift_x_subap=0.10))
         assert story.state.alpha.registration.alpha == before.alpha
-        assert "both sides of a jump" in story.state.alpha.passive.text
 
     def test_one_that_began_after_it_is(self, story):
         learnt(story)
@@ -318,21 +313,18 @@ def test_another_loop_has_another_bias(story, changes):
 
 
 @pytest.mark.parametrize(("n_controlled", "kept"), [(400, True), (300, False)])
-def test_so_it_has_when_the_rtc_was_restarted_in_between(story, n_controlled, kept):
+@pytest.mark.parametrize("restarted", ["the RTC", "the service"])
+def test_so_it_has_when_the_rtc_or_the_service_was_restarted(story, restarted, n_controlled, kept):
     learnt(story)
-    story.tell(ev.SessionStarted(session="s2"))
-    story.tell(rtc(n_controlled, session="s2"))
+    if restarted == "the RTC":
+        story.tell(ev.SessionStarted(session="s2"))
+        story.tell(rtc(n_controlled, session="s2"))
+    else:
+        known, now_ns = story.state.alpha.registration, story.now_ns
+        story = Story(Mode.AUTO, state=changed(TrackerState(system="flao"), registration=known))
+        story.now_ns = now_ns
+        story.meet(n_controlled=n_controlled)
     assert (story.state.alpha.registration.bias is not None) is kept
-
-
-@pytest.mark.parametrize(("n_controlled", "kept"), [(400, True), (300, False)])
-def test_so_it_has_when_the_service_was(story, n_controlled, kept):
-    learnt(story)
-    left = changed(TrackerState(system="flao"), registration=story.state.alpha.registration)
-    after = Story(Mode.AUTO, state=left)
-    after.now_ns = story.now_ns
-    after.meet(n_controlled=n_controlled)
-    assert (after.state.alpha.registration.bias is not None) is kept
 
 
 def test_a_look_that_was_under_way_when_the_loop_changed_is_not_used(story):

@@ -1,12 +1,13 @@
 """Whether another reconstructor is worth a swap."""
 
+import re
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from service.control.expected_gain import ExpectedGain
-from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.state import Mode
 from service.tracking.update_policy import THRESHOLD_DECAY_S
@@ -54,19 +55,17 @@ def test_nothing_to_win_is_no_reason(story):
     assert not judged(story, told(loss_m=0.1e-9, radius=0.62))
 
 
-def test_nanometres_are(story):
-    (made,) = judged(story, told(loss_m=1e-9))
-    assert "expected to win" in made.why
-    assert "nm over cm-1" in made.why
-
-
-def test_margin_is(story):
-    (made,) = judged(story, told(radius=0.7))
-    assert "cm-1 has lost 25% of its stability margin" in made.why
-
-
-def test_a_loop_that_would_be_unstable_is_reason_enough(story):
-    (made,) = judged(story, told(loss_m=float("inf"), radius=1.1))
+@pytest.mark.parametrize(
+    ("found", "words"),
+    [
+        ({"loss_m": 1e-9}, "expected to win .*nm over cm-1"),
+        ({"radius": 0.7}, "cm-1 has lost 25% of its stability margin"),
+        ({"loss_m": float("inf"), "radius": 1.1}, ""),
+    ],
+)
+def test_nanometres_margin_or_an_unstable_loop_are(story, found, words):
+    (made,) = judged(story, told(**found))
+    assert re.search(words, made.why)
     assert made.n_modes == 400
 
 
@@ -82,31 +81,19 @@ def test_a_loss_of_another_matrix_is_not(story):
     assert not judged(story, told(loss_m=1e-9), matrix_id="cm-1")
 
 
-def test_soon_after_an_update_it_takes_twice_as_much(story):
+def test_soon_after_an_update_it_takes_twice_as_much_and_later_as_much_as_ever(story):
     story.use("cm-2")
     for k in range(1, 9):
         story.see(moved(NEAR, shift_x_subap=0.005 * k))
     there = moved(NEAR, shift_x_subap=0.04)
     assert not judged(story, told(loss_m=0.8e-9), alpha=there, matrix_id="cm-2")
-    assert judged(story, told(loss_m=1.5e-9), alpha=there, matrix_id="cm-2")
-
-
-def test_the_raised_threshold_comes_down_again(story):
-    story.use("cm-2")
+    assert judged(copy(story), told(loss_m=1.5e-9), alpha=there, matrix_id="cm-2")
     story.wait(THRESHOLD_DECAY_S)
-    there = moved(NEAR, shift_x_subap=0.04)
     story.see(there, n_windows=6)
     assert judged(story, told(loss_m=0.8e-9), alpha=there, matrix_id="cm-2")
 
 
-def test_a_move_is_looked_at_without_waiting_for_the_next_look(story):
-    judged(story, told())
-    story.effects.clear()
-    story.see(moved(NEAR, shift_x_subap=0.03), n_windows=2)
-    assert story.asked(ev.JudgeMatrix)
-
-
-def test_after_a_move_the_new_matrix_comes_before_the_margin_of_the_old_one(story):
+def test_a_move_is_looked_at_at_once_and_the_new_matrix_comes_before_the_margin_of_the_old(story):
     judged(story, told())
     effects = story.see(moved(NEAR, shift_x_subap=0.03), n_windows=2)
     asked = [type(e) for e in effects if isinstance(e, (ev.MakeMatrix, ev.JudgeMatrix))]
@@ -132,11 +119,6 @@ def test_a_jump_that_a_verdict_still_reaches_asks_for_none(story):
     story.see(moved(NEAR, rotation_rad=np.deg2rad(0.018)), n_windows=4)
     assert "registration.jump" in story.logged
     assert not story.asked(ev.MakeMatrix)
-
-
-def test_in_hold_nothing_is_worth_it(story):
-    story.tell(cmd.SetMode(mode=Mode.HOLD))
-    assert not judged(story, told(loss_m=5e-9))
 
 
 def test_far_enough_needs_no_estimate(story):

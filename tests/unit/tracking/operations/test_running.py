@@ -9,7 +9,7 @@ import pytest
 from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.operation_records import AcquisitionStage, MeasureState
+from service.tracking.operation_records import MeasureState
 from service.tracking.operations.running import running_operations
 from service.tracking.products import MatrixState, ModeSet
 from service.tracking.state import Mode
@@ -268,17 +268,6 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("activity", "what", "command"),
-    [(activity, what, command) for activity, what, commands in REFUSED for command in commands],
-    ids=lambda value: getattr(value, "__name__", type(value).__name__),
-)
-def test_what_would_strand_it_is_refused_by_its_name(activity, what, command):
-    world = activity()
-    with pytest.raises(CommandError, match=what):
-        world.tell(command)
-
-
 def test_a_gain_ramp_ends_when_the_loop_is_opened():
     world = ramping()
     world.tell(cmd.SetLoop(loop="open"))
@@ -325,15 +314,3 @@ def test_a_ramp_nobody_answers_for_keeps_nothing_back_for_ever():
     assert running_operations(story.state, story.now_ns)
     story.wait(60.0)
     assert not [one for one in running_operations(story.state, story.now_ns) if "ramp" in one.text]
-
-
-def test_an_acquisition_after_all_this_leads_to_tracking():
-    world = acquiring()
-    world.pass_(120.0)
-    assert world.state.operations.acquisition.stage is AcquisitionStage.TRACKING
-    assert not strands(world)
-
-
-def test_a_measurement_ends_stored():
-    world = measuring().pass_(10.0)
-    assert [r.state for r in world.state.operations.measurements] == [MeasureState.STORED]

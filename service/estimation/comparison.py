@@ -5,7 +5,7 @@ Numbers are from docs/results/reliability.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import reduce
 from typing import NamedTuple
@@ -168,11 +168,6 @@ class Part:
 
     peak: float = 0.0
     """Largest sum of squares of one frame's slopes."""
-
-    def without_samples(self) -> Part:
-        """Return the sums without the slopes that another matrix could read."""
-        residual = self.residual
-        return self if residual is None else replace(self, residual=replace(residual, kept=()))
 
     def plus(self, other: Part) -> Part:
         """Return the sums over both."""
@@ -406,11 +401,8 @@ class _Look:
             value, limit = float(newest.min()), diverged
         else:
             # however noisy the loop was: no healthy one is worse by a factor of several for so long
-            limit = (
-                min(limit, float(np.log(EARLY_POWER_RATIO)))
-                if self.decides
-                else float(np.log(EARLY_POWER_RATIO))
-            )
+            early = float(np.log(EARLY_POWER_RATIO))
+            limit = min(limit, early) if self.decides else early
         # Half, because the logarithms are of powers and the finding states RMS.
         rms = float(np.exp(0.5 * max(value, -40.0)))
         return _Ground(value > limit, words.format(rms), rms, float(np.exp(0.5 * limit)))

@@ -142,7 +142,10 @@ class IdentifiedLaw:
 
 def follow(law: ControlLawCheck, block: FrameBlock, loop: ClosedLoop) -> ControlLawCheck:
     """Return the law after one more block, as far as it is of this loop."""
-    if block.first_seq < law.from_seq or _has_time(law, block):
+    # Frames that will be forgotten before the next verdict on their matrix need not be kept.
+    needed_seq = law.judged_seq + VERDICT_INTERVAL_FRAMES - KEPT_FRAMES
+    needless = block.next_seq <= needed_seq and block.cm_id == law.cm_id
+    if block.first_seq < law.from_seq or needless:
         return law
     if law.cm_id != block.cm_id or not len(law.seq):
         # the first frames of a matrix follow from slopes that another one multiplied
@@ -160,12 +163,6 @@ def follow(law: ControlLawCheck, block: FrameBlock, loop: ClosedLoop) -> Control
         commands_m=np.concatenate([law.commands_m, own])[-KEPT_FRAMES:],
         seen_m=np.concatenate([law.seen_m, seen])[-KEPT_FRAMES:],
     )
-
-
-def _has_time(law: ControlLawCheck, block: FrameBlock) -> bool:
-    """Return whether these frames will be forgotten before the next verdict on their matrix."""
-    first_seq = law.judged_seq + VERDICT_INTERVAL_FRAMES - KEPT_FRAMES
-    return block.next_seq <= first_seq and block.cm_id == law.cm_id
 
 
 def judge_frames(

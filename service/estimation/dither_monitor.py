@@ -245,19 +245,13 @@ def _add_slopes(monitor: DitherMonitor, slopes: Array, first_seq: int) -> Dither
     seq = first_seq - asked.first_seq + np.arange(len(slopes))
     turns = np.outer(bins_hz / asked.frame_rate_hz, seq)
     summed = np.concatenate(cosines_and_sines(turns)) @ slopes
-    return replace(
-        monitor,
-        slopes=monitor.slopes + summed,
-        n_repeated=monitor.n_repeated + _count_repeated(slopes),
-    )
-
-
-def _count_repeated(slopes: Array) -> int:
-    """Return how many frames have the very slopes of the frame before."""
     first = slopes[:, :_N_COMPARED_SLOPES]
-    # Only frames whose first slopes are the same are compared completely.
+    # Only frames whose first slopes are those of the frame before are compared completely.
     again = 1 + np.flatnonzero((first[1:] == first[:-1]).all(axis=1))
-    return int(np.count_nonzero((slopes[again] == slopes[again - 1]).all(axis=1)))
+    n_repeated = int(np.count_nonzero((slopes[again] == slopes[again - 1]).all(axis=1)))
+    return replace(
+        monitor, slopes=monitor.slopes + summed, n_repeated=monitor.n_repeated + n_repeated
+    )
 
 
 def _powers(monitor: DitherMonitor) -> tuple[float, float, float]:
@@ -331,19 +325,19 @@ def _outside_tolerance(
     asked: ExpectedDither, carried: Array, wanted: Array, reported_m: Array
 ) -> list[str]:
     """Return requested modes with a wrong amplitude or frequency."""
-    ratio, said = carried / wanted, []
-    for k in np.flatnonzero((ratio > MAX_AMPLITUDE_RATIO) | (ratio < MIN_AMPLITUDE_RATIO))[
-        :_MAX_LISTED_MODES
-    ]:
-        found = f"mode {asked.modes[k]} carries {1e9 * carried[k]:.3g} nm"
-        said.append(f"{found} instead of {1e9 * wanted[k]:.3g} nm")
-    if not asked.frequency_hz:
-        return said
-    for k in np.flatnonzero(
-        (ratio >= MIN_AMPLITUDE_RATIO) & (reported_m < MIN_AMPLITUDE_RATIO * carried)
-    )[:_MAX_LISTED_MODES]:
-        line = f"{asked.frequency_hz[k]:g} Hz"
-        said.append(f"mode {asked.modes[k]} moves at another frequency than {line}")
+    ratio = carried / wanted
+    wrong = (ratio > MAX_AMPLITUDE_RATIO) | (ratio < MIN_AMPLITUDE_RATIO)
+    said = [
+        f"mode {asked.modes[k]} carries {1e9 * carried[k]:.3g} nm "
+        f"instead of {1e9 * wanted[k]:.3g} nm"
+        for k in np.flatnonzero(wrong)[:_MAX_LISTED_MODES]
+    ]
+    if asked.frequency_hz:
+        elsewhere = (ratio >= MIN_AMPLITUDE_RATIO) & (reported_m < MIN_AMPLITUDE_RATIO * carried)
+        said += [
+            f"mode {asked.modes[k]} moves at another frequency than {asked.frequency_hz[k]:g} Hz"
+            for k in np.flatnonzero(elsewhere)[:_MAX_LISTED_MODES]
+        ]
     return said
 
 

@@ -208,9 +208,11 @@ class LoopHealth(Streaming):
     @override
     def conditions(self) -> tuple[str | None, ...]:
         """Texts of the alarms for commands in another unit and for a diverging or lost loop."""
+        unit = unit_like(max(self.ratio, 1.0), 2.1)
+        likely = f"look like {unit}" if unit else "are in another unit, or decoded wrongly"
         absurd = (
-            f"commands are {self.ratio:.3g} times what turbulence asks: {self.unit}; nothing is "
-            "measured, made or sent until the RTC sends metres"
+            f"commands are {self.ratio:.3g} times what turbulence asks: they {likely}, metres of "
+            "OPD are expected; nothing is measured, made or sent until the RTC sends metres"
         )
         beyond = (
             f"{self.ratio:.0f} times what turbulence asks of them"
@@ -230,14 +232,6 @@ class LoopHealth(Streaming):
             diverging if self.diverging else None,
             lost if self.lost else None,
         )
-
-    @property
-    def unit(self) -> str:
-        """The likely unit of absurd commands."""
-        unit = unit_like(max(self.ratio, 1.0), 2.1)
-        if not unit:
-            return "they are in another unit than metres of OPD, or decoded wrongly"
-        return f"they look like {unit}, metres of OPD are expected"
 
 
 def observe(
@@ -274,7 +268,10 @@ def observe(
     # Hysteresis: a ratio near the limit must not switch the alarm on and off.
     limit = CALM_RATIO if health.diverging else DIVERGING_RATIO
     diverging = not absurd and (ratio > limit or upper_power.ratio is not None)
-    beyond_s = _beyond_s(health, levels, block.dt_ns * 1e-9)
+    # For how long every frame has been beyond, at the end of the block.
+    below = np.flatnonzero(levels <= LOST_RATIO)
+    n_beyond = len(levels) - 1 - int(below[-1]) if len(below) else len(levels)
+    beyond_s = (0.0 if len(below) else health.beyond_s) + n_beyond * block.dt_ns * 1e-9
     lost = diverging and (health.lost or beyond_s >= LOST_S)
     return LoopHealth(
         ratio=ratio,
@@ -284,14 +281,6 @@ def observe(
         beyond_s=beyond_s,
         lost=lost,
     )
-
-
-def _beyond_s(health: LoopHealth, levels: NDArray[np.float64], dt_s: float) -> float:
-    """Return for how long every frame has been beyond ``LOST_RATIO``, at the end of the block."""
-    below = np.flatnonzero(levels <= LOST_RATIO)
-    if len(below):
-        return (len(levels) - 1 - int(below[-1])) * dt_s
-    return health.beyond_s + len(levels) * dt_s
 
 
 def _absurd(health: LoopHealth, levels: NDArray[np.float64]) -> bool:
@@ -377,16 +366,12 @@ def observe_edge(health: EdgeHealth, block: FrameBlock, watch: EdgeWatch) -> Edg
     inner = np.einsum("km,km->k", moved @ watch.inner, moved)
     each = zip(moved, inner, n_frames * (block.dt_ns * 1e-9), strict=True)
     for command, mean_square, lasted_s in each:
-        health = _update_health(health, watch, command, float(mean_square), float(lasted_s))
+        health = _after_command(health, watch, command, float(mean_square), float(lasted_s))
     return health
 
 
-def _update_health(
-    health: EdgeHealth,
-    watch: EdgeWatch,
-    command: NDArray[np.float32],
-    inner: float,
-    lasted_s: float,
+def _after_command(
+    health: EdgeHealth, watch: EdgeWatch, command: Array, inner: float, lasted_s: float
 ) -> EdgeHealth:
     """Return the health after a command that lasted for ``lasted_s``.
 

@@ -10,6 +10,7 @@ enters.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -265,10 +266,14 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
     coupling = loop.reconstructor @ matrix
     slopes = spectra.slopes[:, 0]
     seen = _images(linearisation, spectra.commands[:, 0])
-    known = _apply(matrix, _instrument(spectra, coupling, loop, np.ones(len(slopes))))
+    # The commands that the dither of each line alone causes, for gains of the sensor.
+    respond = partial(
+        compute_total_commands, spectra.dither, coupling, loop, spectra.plan.frequencies_hz
+    )
+    known = _apply(matrix, respond(np.ones(len(slopes))))
     # First guess of the gains: <D Z, S> / <D Z, D C>.
     gains = np.sum(known.conj() * slopes, axis=1) / np.sum(known.conj() * seen[:, 0], axis=1)
-    known = _images(linearisation, _instrument(spectra, coupling, loop, gains))
+    known = _images(linearisation, respond(gains))
     # An instrumental variable may have any weight; the inverse variance gives the smallest σ.
     if linearisation.noise_shape is not None:
         known /= linearisation.noise_shape**2
@@ -287,6 +292,8 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
     # Rounding leaves the product slightly asymmetric.
     every = (every + every.T) / 2
     turns = 2 * np.pi * np.array(spectra.plan.frequencies_hz) / loop.frame_rate_hz
+    size = np.abs(window.dither).max(axis=1)
+    rms_m = size * np.sqrt(2.0) / (0.5 * spectra.plan.n_frames)  # see ``LockIn.close``
     return LockInEstimate(
         alpha=linearisation.add_step(step),
         covariance=every[:4, :4],
@@ -303,9 +310,9 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
         session=spectra.session,
         modes=spectra.plan.modes,
         gain_sigma=_modulus_sigma(gains, every[n:, n:]),
-        weak=_weak(window),
+        weak=tuple(np.array(spectra.plan.modes)[size < WEAK_LINE_RATIO * size.max()].tolist()),
         answers_as=_answers_as(window, every_mode),
-        dither_m=_total_dither_m(window),
+        dither_m=float(np.sqrt(np.sum(rms_m**2))),
         window_s=spectra.window_s,
     )
 
@@ -326,13 +333,6 @@ def _select_moved_modes(
     moved = np.flatnonzero(moves)
     few = replace(spectra, commands=spectra.commands[:, :, moved], dither=spectra.dither[:, moved])
     return few, linearisation.of_modes(moved)
-
-
-def _instrument(spectra: Spectra, coupling: Array, loop: ClosedLoop, gains: Array) -> Array:
-    """Return the commands ``(n_lines, n_modes)`` that the dither of each line alone causes."""
-    return compute_total_commands(
-        spectra.dither, coupling, loop, spectra.plan.frequencies_hz, gains
-    )
 
 
 def compute_total_commands(
@@ -430,19 +430,6 @@ def _answers_as(spectra: Spectra, matrix: Array) -> tuple[int, ...]:
             best[line] = own[line]
     clear = size[lines, best] > OTHER_MODE_POWER_RATIO * size[lines, own]
     return tuple(np.where(clear, best, own).tolist())
-
-
-def _weak(spectra: Spectra) -> tuple[int, ...]:
-    """Return the modes whose dither is far weaker than that of the strongest."""
-    size = np.abs(spectra.dither).max(axis=1)
-    return tuple(np.array(spectra.plan.modes)[size < WEAK_LINE_RATIO * size.max()].tolist())
-
-
-def _total_dither_m(spectra: Spectra) -> float:
-    """Return the RMS of all lines together, from the dither columns of the window."""
-    # RMS of each line: see ``LockIn.close`` for the factors.
-    amplitudes = np.abs(spectra.dither).max(axis=1) * np.sqrt(2.0) / (0.5 * spectra.plan.n_frames)
-    return float(np.sqrt(np.sum(amplitudes**2)))
 
 
 def _regressors(images: Array, gain: complex, step: Array) -> Array:

@@ -279,54 +279,15 @@ def last_samples(check: LoopCheck, before_seq: int) -> tuple[int, int] | None:
     return (int(seq[0]), int(seq[-1])) if len(seq) == MIN_SAMPLES else None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Products:
-    """Sums of products over the samples, enough to judge every mode."""
-
-    n_samples: int
-    asked: Array
-    """``(_TAPS, _TAPS, n_modes)`` products of the required steps of one frame and another, metres².
-    """
-
-    common: Array
-    """``(_TAPS, n_modes)`` products of required and actual steps."""
-
-    taken: Array
-    """``(n_modes,)`` steps taken."""
-
-    @classmethod
-    def of(cls, asked: Array, taken: Array) -> _Products:
-        """Return them of ``(_TAPS, n_samples, n_modes)`` and ``(n_samples, n_modes)``."""
-        return cls(
-            n_samples=len(taken),
-            asked=np.einsum("ikm,jkm->ijm", asked, asked),
-            common=np.einsum("ikm,km->im", asked, taken),
-            taken=np.einsum("km,km->m", taken, taken),
-        )
-
-    def only(self, modes: Array) -> _Products:
-        """Return them of some modes alone."""
-        return _Products(
-            n_samples=self.n_samples,
-            asked=self.asked[:, :, modes],
-            common=self.common[:, modes],
-            taken=self.taken[modes],
-        )
-
-    def power(self, weights: Array) -> Array:
-        """Return ``(n_modes,)`` power of the required steps for frames with these weights."""
-        return np.asarray(np.einsum("i,j,ijm->m", weights, weights, self.asked))
-
-
 def _judge(asked: Array, taken: Array, held: Array, loop: ClosedLoop) -> CommandResidual:
-    products = _Products.of(asked, taken)
-    weights = _lag(products, loop)
-    obeys = np.abs(_shares(products, weights)[0] - 1.0) < STEP_TOLERANCE
+    """Judge steps that were asked for ``(_TAPS, n_samples, n_modes)``, and taken."""
+    weights = _lag(asked, taken, loop)
+    obeys = np.abs(_shares(asked, taken, weights)[0] - 1.0) < STEP_TOLERANCE
     if obeys.any():
         # those that do not must not decide how late the others are
-        weights = _lag(products.only(obeys), loop)
-    share, error = _shares(products, weights)
-    asked_for = products.power(weights) > products.n_samples * _STILL_M**2
+        weights = _lag(asked[:, :, obeys], taken[:, obeys], loop)
+    share, error, power = _shares(asked, taken, weights)
+    asked_for = power > len(taken) * _STILL_M**2
     off = (np.abs(share - 1.0) > STEP_TOLERANCE + SIGNIFICANCE_SIGMA * error) | (
         held > MAX_CONSTANT_SHARE
     )
@@ -344,16 +305,21 @@ def _judge(asked: Array, taken: Array, held: Array, loop: ClosedLoop) -> Command
     )
 
 
-def _shares(products: _Products, weights: Array) -> tuple[Array, Array]:
-    """Return ``(n_controlled,)`` regressions of what was taken on what was asked, and 1 σ."""
+def _shares(asked: Array, taken: Array, weights: Array) -> tuple[Array, Array, Array]:
+    """Return regressions of what was taken on what was asked, 1 σ, and the power that was asked.
+
+    ``(n_controlled,)`` each, for frames with these ``weights``.
+    """
+    steps = np.tensordot(weights, asked, axes=1)
+    power = np.einsum("km,km->m", steps, steps)
     # No division by zero for a mode that rests.
-    power = products.power(weights) + _STILL_M**2
-    common = weights @ products.common
-    left = np.maximum(products.taken - common**2 / power, 0.0)
-    return common / power, np.sqrt(left / power / (products.n_samples - 1))
+    share = np.einsum("km,km->m", steps, taken) / (power + _STILL_M**2)
+    left = np.einsum("km,km->m", taken, taken) - share**2 * (power + _STILL_M**2)
+    variance = np.maximum(left, 0.0) / (power + _STILL_M**2) / (len(taken) - 1)
+    return share, np.sqrt(variance), power
 
 
-def _lag(products: _Products, loop: ClosedLoop) -> Array:
+def _lag(asked: Array, taken: Array, loop: ClosedLoop) -> Array:
     """Return ``(_TAPS,)`` weights of the frames, with sum 1: the delay of the modes.
 
     Fitted with equal weight for all modes. If the result is no delay, the delay in the status is
@@ -362,10 +328,10 @@ def _lag(products: _Products, loop: ClosedLoop) -> Array:
     late = loop.delay_frames - int(loop.delay_frames)
     # Each mode's own power, so that all modes have the same weight whatever their amplitudes; the
     # second term avoids a division by zero for modes that rest.
-    scale = np.trace(products.asked) + products.n_samples * _STILL_M**2
-    fitted = np.linalg.lstsq(
-        (products.asked / scale).sum(axis=2), (products.common / scale).sum(axis=1)
-    )[0]
+    scale = np.sqrt(np.einsum("ikm,ikm->m", asked, asked) + len(taken) * _STILL_M**2)
+    asked, taken = asked / scale, taken / scale
+    normal = np.einsum("ikm,jkm->ij", asked, asked)
+    fitted = np.linalg.lstsq(normal, np.einsum("ikm,km->i", asked, taken))[0]
     if fitted.sum() > STEP_TOLERANCE and (fitted > -0.1 * fitted.sum()).all():
         return np.asarray(fitted / fitted.sum())
     # A delay of n and a fraction splits each step between two frames in that proportion.

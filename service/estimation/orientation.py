@@ -171,9 +171,8 @@ def find_orientation(
     """
     stated = instrument.slopes
     settings = [stated] if stated.orientation is not None else list(_settings(stated))
-    turned = _Turned.of(_any_way_round(instrument, basis, mapper), mapper, about)
-    poses = _poses(turned, instrument, reference, settings)
-    return _judge_classes(poses, instrument.mirror.nominal_rotation_rad, turned.lowest)
+    poses, lowest = poses_of(instrument, reference, basis, settings, mapper=mapper, about=about)
+    return _judge_classes(poses, instrument.mirror.nominal_rotation_rad, lowest)
 
 
 def poses_of(
@@ -184,25 +183,20 @@ def poses_of(
     *,
     mapper: Mapper = map,
     about: Misregistration = NOMINAL,
-) -> list[Pose]:
+) -> tuple[list[Pose], LowOrder]:
     """Return how well each of these orders and orientations explains the lowest orders."""
     turned = _Turned.of(_any_way_round(instrument, basis, mapper), mapper, about)
-    return _poses(turned, instrument, reference, settings)
-
-
-def _poses(
-    turned: _Turned, instrument: Instrument, reference: Reference, settings: Sequence[SlopeRecipe]
-) -> list[Pose]:
     low = replace(
         reference,
         matrix=turned.lowest.combine_columns(reference.matrix),
         modes=None,
         noise=None,
     )
-    return [
+    poses = [
         turned.pose(target_of(low, replace(instrument, slopes=slopes)), slopes)
         for slopes in settings
     ]
+    return poses, turned.lowest
 
 
 def _any_way_round(instrument: Instrument, basis: Basis, mapper: Mapper) -> InteractionModel:

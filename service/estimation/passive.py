@@ -257,11 +257,6 @@ class Passive(Streaming):
         return max(sum(block.n_frames for block in self.waiting) - _FILTER_SPAN_FRAMES, 0)
 
     @property
-    def end_ns_utc(self) -> int:
-        """End of exposure of the last frame; 0: none has come."""
-        return 0 if self.tail is None else self.tail.next_t_ns - self.tail.dt_ns
-
-    @property
     def why_unusable(self) -> str | None:
         """Return why this loop's telemetry says nothing, or None."""
         if self.delay_frames >= N_TAPS:
@@ -358,14 +353,16 @@ def accumulate(state: Passive, block: FrameBlock) -> Passive:
     if state.why_unusable is not None or block.first_seq < state.from_seq:
         return state
     n_columns, block = block.commands_m.shape[1], _with_dither_beside(state, block)
-    if state.tail is not None and not _follows(block, state.tail):
+    tail = state.tail
+    n_moved = block.commands_m.shape[1]
+    if tail is not None and not (block.follows(tail) and n_moved == tail.commands_m.shape[1]):
         state = replace(_end_run(state), tail=None)
     before = () if state.tail is None else (state.tail,)
     n_others = len(_others(state, *before, block))
     if state.n_waiting and n_others != state.n_others:
         # a dither begins or ends: what it is taken out of must hold it from end to end
         state = _end_run(state)
-    if block.commands_m.shape[1] == n_columns:  # a dither of the loop's modes is no noise
+    if n_moved == n_columns:  # a dither of the loop's modes is no noise
         state = _keep_sample(state, *before, block)
     tail = block if block.n_frames >= _FILTER_SPAN_FRAMES else join_frames((*before, block))
     waiting = (*(state.waiting or before), block)
@@ -392,11 +389,6 @@ def _of(commands: Array, modes: NDArray[np.intp]) -> Array:
     """Return the last axis of these modes: of the first ones, as usual, without a copy."""
     n = len(modes)
     return commands[..., :n] if n and modes[-1] == n - 1 else commands[..., modes]
-
-
-def _follows(block: FrameBlock, tail: FrameBlock) -> bool:
-    """Return whether frames go on where others end, and have as many columns."""
-    return block.follows(tail) and block.commands_m.shape[1] == tail.commands_m.shape[1]
 
 
 def _end_run(state: Passive) -> Passive:
@@ -538,10 +530,8 @@ def _project_instruments(matrix: Array, some: NDArray[np.intp], carried: Array) 
     own = _of(matrix, some)
     if not len(carried):
         return own
-    if matrix.ndim == 3:
-        return np.stack([_project_instruments(one, some, carried) for one in matrix])
     n_modes = len(some) + len(carried)
-    others = np.delete(matrix[:, :n_modes], some, axis=1)
+    others = np.delete(matrix[..., :n_modes], some, axis=-1)
     return np.asarray(own + others @ carried.astype(matrix.dtype))
 
 
@@ -568,7 +558,12 @@ def fit_matrix(
     # ``least`` for each column that moves.
     freedom = (len(left) - 1) * (weights @ noise) - 4 * least
     variance = float(np.sum(left**2, axis=0) @ weights / freedom)
-    scores = _patterns(left, noise).T @ (seen.jacobian * weights)
+    # What is left of every column as patterns P of the slopes' errors, S = P P^T. Their trace is
+    # the number of slopes: errors without correlation would make the unit matrix.
+    moving = noise > 0.0
+    patterns = left[:, moving] / np.sqrt(noise[moving])
+    patterns = patterns * np.sqrt(len(left) / np.sum(patterns**2))
+    scores = patterns.T @ (seen.jacobian * weights)
     spread = (scores @ found.shape).reshape(4, -1) @ scores.reshape(4, -1).T
     covariance = variance * normal @ spread @ normal
     return PassiveEstimate(
@@ -580,16 +575,6 @@ def fit_matrix(
         misfit=variance,
         step=step,
     )
-
-
-def _patterns(left: Array, noise: Array) -> Array:
-    """Return what is left of every mode's column as patterns P of the slopes' errors: S = P P^T.
-
-    Their trace is the number of slopes: errors without correlation would make the unit matrix.
-    """
-    moving = noise > 0.0
-    patterns = left[:, moving] / np.sqrt(noise[moving])
-    return np.asarray(patterns * np.sqrt(len(left) / np.sum(patterns**2)))
 
 
 def _slope_variance(state: Passive, matrix: Array) -> float:

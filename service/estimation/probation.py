@@ -367,7 +367,9 @@ def _add_sums(state: Comparison, part: Part, block: FrameBlock) -> Comparison:
         # Samples of slopes are kept for recent parts only, from which the new matrix reads the
         # residual; older ones would take memory for nothing.
         old = parts[-n_recent - 1]
-        parts = (*parts[: -n_recent - 1], old.without_samples(), *parts[-n_recent:])
+        if old.residual is not None:
+            old = replace(old, residual=replace(old.residual, kept=()))
+        parts = (*parts[: -n_recent - 1], old, *parts[-n_recent:])
     return replace(state, parts=parts)
 
 

@@ -18,7 +18,7 @@ from typing_extensions import override
 from service.errors import ModelError
 from service.estimation.estimate import DitheredEstimate
 from service.estimation.frames import FrameBlock
-from service.estimation.solver import Columns, Projection
+from service.estimation.solver import Columns
 from service.estimation.windows import (
     RefusalKind,
     Telemetry,
@@ -307,7 +307,8 @@ def fit_random(window: Correlated, linearisation: Linearisation) -> RandomEstima
     """
     noisy, sums = noisy_matrix(window), window.sums
     columns = list(noisy.modes)
-    power = 1.0 / np.diag(np.linalg.inv(sums.dither_power.sum(axis=0)))
+    parted = np.linalg.inv(sums.dither_power.sum(axis=0))
+    power = 1.0 / np.diag(parted)
     noise = np.sqrt(_noise_variance(sums))[:, None]
     # in units of the slopes' noise a mode's weight is the power of its dither
     matrix = linearisation.matrix[:, columns] / noise
@@ -330,8 +331,16 @@ def fit_random(window: Correlated, linearisation: Linearisation) -> RandomEstima
     inverse = np.linalg.inv(normal)
     parts = [seen.residual]
     if window.plan.n_batches > 1:
-        parts = _residuals_of_batches(sums, seen.gains * response, noise)
-    spread = _scatter(_scores(parts, seen), normal)
+        # Each batch's part of the residual of the whole window.
+        of_batches = zip(sums.response, sums.dither_power, strict=True)
+        explained = seen.gains * response
+        parts = [(answer / noise - explained @ sent) @ parted for answer, sent in of_batches]
+    # Independent parts of the score, of the batches or of the modes.
+    scores = seen.scores.T
+    if len(parts) > 1:
+        weighted = seen.jacobian * seen.weights
+        scores = np.array([np.einsum("jsm,sm->j", weighted, part) for part in parts])
+    spread = _scatter(scores, normal)
     every = inverse @ spread @ inverse.T
     return RandomEstimate(
         alpha=linearisation.add_step(step),
@@ -371,22 +380,17 @@ def _answers(
     late = later * np.sqrt(norm) / louder
     # A negative share is the loop's own reply, and no lag.
     lag = max(later / (at_once + later), 0.0) if at_once + later > 0.0 else 0.0
-    return min(lag, 1.0), _check_responses(seen, late)
-
-
-def _check_responses(seen: float, late: float) -> Why | None:
-    """Return why there is nothing to fit, from the significance of both answers, in σ."""
+    lag = min(lag, 1.0)
     if seen > RESPONSE_SIGMA:
-        return None
+        return lag, None
     if late > RESPONSE_SIGMA:
-        return RefusalKind.MISALIGNED, (
-            f"columns misaligned: the slopes answer the dither one frame late ({late:.0f} sigma, "
-            f"{seen:.0f} in the same row)"
+        return lag, (
+            RefusalKind.MISALIGNED,
+            "columns misaligned: the slopes answer the dither one frame late "
+            f"({late:.0f} sigma, {seen:.0f} in the same row)",
         )
-    return RefusalKind.OTHER, (
-        f"the dither is not seen in the slopes ({seen:.1f} sigma): raise its amplitude or the "
-        "window's length"
-    )
+    text = f"the dither is not seen in the slopes ({seen:.1f} sigma): raise its amplitude"
+    return lag, (RefusalKind.OTHER, f"{text} or the window's length")
 
 
 def _noise_variance(sums: Correlations) -> Array:
@@ -402,23 +406,6 @@ def _noise_variance(sums: Correlations) -> Array:
     # One response per dithered mode has been fitted to each slope.
     variance = np.where(left > 0.0, left, left.mean()) / max(sums.n_pairs - len(power), 1)
     return np.asarray(variance)
-
-
-def _residuals_of_batches(sums: Correlations, explained: Array, noise: Array) -> list[Array]:
-    """Return each batch's part of the whole window's residual, ``(n_slopes, n_dithered)``."""
-    total = np.linalg.inv(sums.dither_power.sum(axis=0))
-    return [
-        (response / noise - explained @ power) @ total
-        for response, power in zip(sums.response, sums.dither_power, strict=True)
-    ]
-
-
-def _scores(parts: list[Array], seen: Projection) -> Array:
-    """Return independent parts of the score, ``(n, 4)``: of the batches, or of the modes."""
-    if len(parts) == 1:
-        return seen.scores.T
-    weighted = seen.jacobian * seen.weights
-    return np.array([np.einsum("jsm,sm->j", weighted, part) for part in parts])
 
 
 def _scatter(scores: Array, normal: Array) -> Array:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,15 +96,9 @@ class Residual:
         own = None
         if self.own is not None and other.own is not None and len(self.own) == len(other.own):
             own = self.own + other.own
-        return Residual(
-            n_seen=self.n_seen + other.n_seen,
-            seen=self.seen + other.seen,
-            n_moved=self.n_moved + other.n_moved,
-            moved=self.moved + other.moved,
-            commanded=self.commanded + other.commanded,
-            own=own,
-            kept=self.kept + other.kept,
-        )
+        names = ("n_seen", "seen", "n_moved", "moved", "commanded", "kept")
+        sums = {name: getattr(self, name) + getattr(other, name) for name in names}
+        return replace(self, **sums, own=own)
 
     def read_by(self, matrix: NDArray[np.float32] | None) -> Residual:
         """Return the sums with ``own`` as this matrix reads the samples that were kept."""
@@ -188,9 +183,10 @@ class ResidualLevel:
         known = tuple(group for group in groups if group.n_moved)
         recent = known[-n_recent:]
         by_power = sorted(recent, key=lambda group: float(group.seen.sum()) / group.n_seen)
-        total = total_of(tuple(by_power[: max(round(CALM_SHARE * len(recent)), 1)]))
-        if total is None:
+        if not by_power:
             return None
+        calm = by_power[: max(round(CALM_SHARE * len(recent)), 1)]
+        total = reduce(lambda sums, group: group.plus(sums), calm)
         modes, plain = np.arange(len(total.seen)), replace(total, own=None)
         # those with another number of modes were read by another matrix
         logs = [log_ratio(plain, one, modes) for one in known if len(one.seen) == len(total.seen)]
@@ -251,14 +247,6 @@ def stride_frames(dt_ns: int) -> int:
 def log_ratio(before: Residual, after: Residual, modes: NDArray[np.intp]) -> float:
     """Return the logarithm of ``ratio``, finite."""
     return float(np.log(max(ratio(before, after, modes), 1e-30)))
-
-
-def total_of(parts: tuple[Residual, ...]) -> Residual | None:
-    """Return the sums over parts; None: there is none."""
-    total = None
-    for part in parts:
-        total = part.plus(total)
-    return total
 
 
 def ratio(before: Residual, after: Residual, modes: NDArray[np.intp]) -> float:

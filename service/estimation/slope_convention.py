@@ -104,7 +104,7 @@ def identify_from_reconstructor(
     ratio = float(np.median(sizes / np.linalg.norm(response[:, lower], axis=0)))
     unit = _unit_of_matrix(ratio, instrument)
     try:
-        poses = poses_of(
+        poses, _ = poses_of(
             instrument,
             Reference(matrix=measured, modes=used),
             basis.subset(used),

@@ -27,7 +27,7 @@ from service.model.instrument import (
     TabulatedModes,
 )
 from service.model.kinds import KarhunenLoeve, LoopFacts
-from service.model.sensors.kind import SensorKind, SensorTable
+from service.model.sensors.kind import SensorKind
 from service.model.slopes import Orientation, SlopeRecipe
 
 _LIT_FRACTION = 0.5
@@ -186,7 +186,7 @@ def _made(parts: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
 
 
 def _in_first_mode(
-    instrument: Instrument, file: schema.Section[SensorTable], kind: SensorKind
+    instrument: Instrument, file: schema.Section[Any], kind: SensorKind
 ) -> Instrument:
     """Return the instrument with the modes of its sensor, in the first of them."""
     with schema.refused_at(file.path, file.name):
@@ -320,7 +320,7 @@ def _loop(file: schema.Section[LoopFacts], n_modes: int) -> LoopFacts | None:
     return table
 
 
-def _sensor(file: schema.Section[SensorTable], kind: SensorKind, pupil: Pupil) -> SensorDescription:
+def _sensor(file: schema.Section[Any], kind: SensorKind, pupil: Pupil) -> SensorDescription:
     with schema.refused_at(file.path, file.name):
         sensor = kind.model.read_sensor(file.said, file.given, pupil.subaperture_m)
     if file.said.valid_subapertures == "auto":

@@ -84,27 +84,17 @@ def _convert_term(value: object) -> Term:
 
 
 _INPUT = float | str | dict[str, Any]
-_Shift = Annotated[
-    Term | None,
-    PlainValidator(
-        partial(_term, north_step=NORTH_STEP_SUBAP),
-        json_schema_input_type=_INPUT,
-    ),
-]
-_Rotation = Annotated[
-    Term | None,
-    PlainValidator(
-        partial(_term, north_step=NORTH_STEP_DEG, turn=360.0),
-        json_schema_input_type=_INPUT,
-    ),
-]
-_Magnification = Annotated[
-    Term | None,
-    PlainValidator(
-        partial(_term, north_step=NORTH_STEP_MAGNIFICATION),
-        json_schema_input_type=_INPUT,
-    ),
-]
+
+
+def _term_of(north_step: float, turn: float = 0.0) -> PlainValidator:
+    """Return how a term is read; see ``_term`` for the numbers."""
+    read = partial(_term, north_step=north_step, turn=turn)
+    return PlainValidator(read, json_schema_input_type=_INPUT)
+
+
+_Shift = Annotated[Term | None, _term_of(NORTH_STEP_SUBAP)]
+_Rotation = Annotated[Term | None, _term_of(NORTH_STEP_DEG, turn=360.0)]
+_Magnification = Annotated[Term | None, _term_of(NORTH_STEP_MAGNIFICATION)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

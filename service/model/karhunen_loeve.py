@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.model.instrument import Instrument
-from service.model.local import LocalShapes, Patch, tiles_of
+from service.model.local import LocalShapes, shapes_on
 from service.model.pupil import PupilGrid, instrument_pupil
 from service.model.sensors.sensor import by_rows
 from service.model.surface import Gaussian, Surface
@@ -115,12 +115,7 @@ def _local(surface: Surface, pupil: PupilGrid) -> LocalShapes | None:
     n_points, n_functions = int(pupil.lit.sum()), len(surface.positions)
     if not isinstance(surface, Gaussian) or 8.0 * n_points * n_functions < WHOLE_BYTES:
         return None
-    patches = []
-    for tile in tiles_of(pupil):
-        near = surface.near(tile.points)
-        heights = surface.only(near).basis(tile.points)
-        patches.append(Patch(tile=tile, functions=near, weights=heights))
-    return LocalShapes(patches=patches, n_points=n_points, n_functions=n_functions)
+    return shapes_on(pupil, n_functions, surface.patch)
 
 
 def _parity_sectors(positions_m: Array) -> list[Any]:

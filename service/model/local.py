@@ -219,3 +219,15 @@ def tiles_of(pupil: PupilGrid) -> tuple[Tile, ...]:
                 )
             )
     return tuple(found)
+
+
+def shapes_on(
+    pupil: PupilGrid, n_functions: int, patch: Callable[[Array], tuple[Indices, Array]]
+) -> LocalShapes:
+    """Return functions on a pupil; ``patch`` gives those that reach some points, and heights."""
+    patches = []
+    for tile in tiles_of(pupil):
+        near, heights = patch(tile.points)
+        patches.append(Patch(tile=tile, functions=near, weights=heights))
+    n_points = int(pupil.lit.sum())
+    return LocalShapes(patches=patches, n_points=n_points, n_functions=n_functions)

@@ -17,7 +17,7 @@ from typing_extensions import override
 
 from service.errors import ModelError
 from service.model.instrument import Instrument, LocalFunctions, TabulatedModes
-from service.model.local import LocalShapes, Patch, tiles_of
+from service.model.local import shapes_on
 from service.model.pupil import instrument_pupil
 from service.model.tabulated import TabulatedBasis, continuation, margin_of, pad_mask
 from service.model.turbulence import SAMPLING, local_statistics, predict_variance
@@ -42,7 +42,9 @@ class LocalTable(TabulatedBasis):
     @override
     def variance_m2(self) -> Array:
         strokes = np.asarray(self.coefficients, np.float64)
-        gram, covariance = local_statistics(self.instrument, self._on_pupil())
+        pupil = instrument_pupil(self.instrument, SAMPLING)
+        functions = shapes_on(pupil, self.functions.shape[1], self.patch)
+        gram, covariance = local_statistics(self.instrument, functions)
         return predict_variance(strokes.T @ gram @ strokes, strokes.T @ covariance @ strokes)
 
     @cached_property
@@ -65,15 +67,6 @@ class LocalTable(TabulatedBasis):
     @override
     def _combine_splines(self, splines: Any) -> Array:
         return np.asarray((splines @ self.functions) @ self.coefficients)
-
-    def _on_pupil(self) -> LocalShapes:
-        pupil = instrument_pupil(self.instrument, SAMPLING)
-        patches = []
-        for tile in tiles_of(pupil):
-            near, heights = self.patch(tile.points)
-            patches.append(Patch(tile=tile, functions=near, weights=heights))
-        n_functions = self.functions.shape[1]
-        return LocalShapes(patches=patches, n_points=int(pupil.lit.sum()), n_functions=n_functions)
 
 
 def local_table(instrument: Instrument, table: TabulatedModes) -> LocalTable:

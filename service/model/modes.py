@@ -13,7 +13,7 @@ from typing_extensions import override
 
 from service.errors import ModelError
 from service.model.far_field import PlateSum
-from service.model.instrument import Instrument, Mirror, TabulatedModes
+from service.model.instrument import Instrument, TabulatedModes
 from service.model.karhunen_loeve import compute_modes, surface_statistics
 from service.model.kinds import BasisKind
 from service.model.local_table import LocalTable, local_table
@@ -116,11 +116,7 @@ class ModalBasis:
         if not isinstance(self.surface, Gaussian):
             raise ModelError("modes: found functions that reach everywhere; expected local ones")
         side = np.array([1.0, self.y_sign])
-        near = self.surface.near(points * side)
-        some = self.surface.only(near)
-        if direction is None:
-            return near, some.basis(points * side)
-        return near, some.slope(points * side, direction * side)
+        return self.surface.patch(points * side, None if direction is None else direction * side)
 
     def of_surface(self, surface: Surface) -> ModalBasis:
         """Return the same strokes of other influence functions."""
@@ -158,6 +154,8 @@ class ModalBasis:
 
 
 Basis = ModalBasis | TabulatedBasis
+"""Shapes of the mirror that can be evaluated wherever a registration puts them."""
+
 LocalBasis = ModalBasis | LocalTable
 """Made of functions that may end near their actuators."""
 
@@ -165,9 +163,6 @@ LocalBasis = ModalBasis | LocalTable
 def local_of(basis: Basis) -> LocalBasis | None:
     """Return a basis whose functions end near their actuators; None: they do not."""
     return basis if isinstance(basis, LocalBasis) and basis.is_local else None
-
-
-"""Shapes of the mirror that can be evaluated wherever a registration puts them."""
 
 
 def modal_basis(instrument: Instrument) -> Basis:
@@ -210,17 +205,11 @@ def analytic_basis(instrument: Instrument) -> ModalBasis:
         If the mirror has fewer modes than requested, or is a table of shapes.
     """
     mirror = instrument.analytic_mirror
-    if mirror.mode_to_actuator is not None:
-        return _build_given_basis(instrument, mirror, mirror.mode_to_actuator)
-    match mirror.basis:
-        case BasisKind.ZONAL:
-            return _build_given_basis(instrument, mirror, np.eye(len(mirror.positions_m)))
-        case BasisKind.KARHUNEN_LOEVE:
+    strokes = mirror.mode_to_actuator
+    if strokes is None:
+        if mirror.basis is BasisKind.KARHUNEN_LOEVE:
             return karhunen_loeve_basis(instrument)
-
-
-def _build_given_basis(instrument: Instrument, mirror: Mirror, strokes: Array) -> ModalBasis:
-    """Return the modes with these actuator strokes ``(n_actuators, n_modes)``, as they are."""
+        strokes = np.eye(len(mirror.positions_m))
     surface = mirror_surface(mirror, instrument.subaperture_m)
     gram, covariance = surface_statistics(instrument, surface)
     return ModalBasis(

@@ -141,9 +141,7 @@ def _disc(light: Array) -> tuple[float, float, float, float] | None:
 def _edges(light: Array, centre: Array, radius: float, typical: float) -> Array:
     """Return the outermost points ``(n, 2)`` of each ray at which the light falls to half."""
     distances = np.arange(0.0, 1.5 * radius + 2.0, _RAY_STEP_PX)
-    angles = 2.0 * np.pi * np.arange(_N_RAYS) / _N_RAYS
-    directions = np.column_stack([np.sin(angles), np.cos(angles)])
-    rays = _along(light, centre, directions, distances)
+    directions, rays = _rays(light, centre, distances)
     inside = (distances > 0.6 * radius) & (distances < 0.95 * radius)
     edges = []
     for direction, ray in zip(directions, rays, strict=True):
@@ -159,9 +157,12 @@ def _edges(light: Array, centre: Array, radius: float, typical: float) -> Array:
     return np.array(edges).reshape(-1, 2)
 
 
-def _along(light: Array, centre: Array, directions: Array, distances: Array) -> Array:
+def _rays(light: Array, centre: Array, distances: Array) -> tuple[Array, Array]:
+    """Return directions ``(n_rays, 2)`` around a centre, and the light along each of them."""
+    angles = 2.0 * np.pi * np.arange(_N_RAYS) / _N_RAYS
+    directions = np.column_stack([np.sin(angles), np.cos(angles)])
     points = centre[:, None, None] + directions.T[:, :, None] * distances
-    return np.asarray(scipy.ndimage.map_coordinates(light, points, order=1, cval=0.0))
+    return directions, scipy.ndimage.map_coordinates(light, points, order=1, cval=0.0)
 
 
 def _circle(edges: Array) -> tuple[Array, float] | None:
@@ -185,10 +186,8 @@ def _circle(edges: Array) -> tuple[Array, float] | None:
 def _hole_radius(light: Array, centre: Array, radius: float) -> float:
     """Return the radius at which the light around the centre rises to half; 0 without a hole."""
     distances = np.arange(0.0, 0.8 * radius, _RAY_STEP_PX)
-    angles = 2.0 * np.pi * np.arange(_N_RAYS) / _N_RAYS
-    directions = np.column_stack([np.sin(angles), np.cos(angles)])
     # The median over all rays ignores the arms of a spider.
-    profile = np.median(_along(light, centre, directions, distances), axis=0)
+    profile = np.median(_rays(light, centre, distances)[1], axis=0)
     plateau = float(np.median(profile[distances > 0.5 * radius]))
     dark = profile < _HALF * plateau
     if not dark[: max(int(_SMALLEST_PX / 2.0 / _RAY_STEP_PX), 1)].all():

@@ -97,9 +97,16 @@ class Gaussian:
         reached = (dx**2 + dy**2).min(axis=0, initial=np.inf) <= reach**2
         return np.asarray(candidates[reached])
 
-    def only(self, functions: NDArray[np.intp]) -> Gaussian:
-        """Return the surface that these functions alone make."""
-        return replace(self, positions=self.positions[functions])
+    def patch(
+        self, points: Array, direction: Array | None = None
+    ) -> tuple[NDArray[np.intp], Array]:
+        """Return which functions reach some points close together, and their heights there.
+
+        ``(n_near,)`` and ``(n_points, n_near)``; with a ``direction`` their rates along it.
+        """
+        near = self.near(points)
+        some = replace(self, positions=self.positions[near])
+        return near, some.basis(points) if direction is None else some.slope(points, direction)
 
     def coefficients(self, strokes: Array) -> Array:
         """Each actuator is its own basis function."""

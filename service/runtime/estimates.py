@@ -192,7 +192,7 @@ async def fit_passive(
         return []
     found = ev.PassiveFitted(
         estimate=estimate,
-        t_ns_utc=sums.end_ns_utc,
+        t_ns_utc=sums.tail.next_t_ns - sums.tail.dt_ns,
         began_ns_utc=sums.since_ns_utc,
         loop=loop_numbers(state.loop.rtc),
     )

@@ -7,27 +7,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 if TYPE_CHECKING:
     from service.model.kinds import SignalKind
     from service.model.sensors.model import SensorModel
-
-
-class SensorTable(Protocol):
-    """The part of ``[wfs]`` that every kind has: a dataclass that pydantic can read."""
-
-    @property
-    def n_subapertures(self) -> int:
-        """Subapertures across the sensor grid."""
-
-    @property
-    def pupil_diameter(self) -> float:
-        """Diameter of the pupil image, in subapertures."""
-
-    @property
-    def valid_subapertures(self) -> str:
-        """A mask ``path:/dataset``, or "auto": by ``flux_threshold``, which no mask allows."""
 
 
 class SensorKind(ABC):
@@ -37,7 +21,11 @@ class SensorKind(ABC):
     """``wfs.kind`` of an instrument file."""
 
     table: ClassVar[type[Any]]
-    """Type of the ``[wfs]`` table, a ``SensorTable``."""
+    """Type of the ``[wfs]`` table: a dataclass that pydantic can read.
+
+    Every kind has ``n_subapertures``, ``pupil_diameter`` (subapertures) and ``valid_subapertures``:
+    a mask ``path:/dataset``, or "auto", by ``flux_threshold``, which no mask allows.
+    """
 
     unknown: ClassVar[Mapping[str, float | None]] = {}
     """Keys that may be "unknown", with the value assumed until a measured matrix determines it;

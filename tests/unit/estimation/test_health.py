@@ -229,7 +229,7 @@ def test_commands_that_no_mirror_plays_are_in_another_unit_and_no_divergence(uni
     health = after(LoopHealth(), unit)
     assert health.absurd
     assert not health.diverging
-    assert name in health.unit
+    assert name in health.conditions[0]
 
 
 def test_a_loop_in_another_unit_that_has_just_closed_begins_at_zero():

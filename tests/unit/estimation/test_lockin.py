@@ -495,10 +495,9 @@ def test_the_sigma_of_the_gains_is_the_scatter_that_is_seen(found):
 def test_the_command_as_its_own_instrument_is_biased(monkeypatch):
     """What the instrument is for: the command carries turbulence and noise of its own."""
     right = errors(FAINT, faint_estimates())
-    monkeypatch.setattr(
-        lockin, "_instrument", lambda spectra, *_: spectra.commands[:, 0].astype(complex)
-    )
-    wrong = errors(FAINT, settled(FAINT, faint_windows()))
+    windows = [replace(window, dither=window.commands[:, 0]) for window in faint_windows()]
+    monkeypatch.setattr(lockin, "compute_total_commands", lambda dither, *_: dither.astype(complex))
+    wrong = errors(FAINT, settled(FAINT, windows))
     assert np.abs(in_sigma_of_the_mean(wrong)).max() > 5.0
     assert np.abs(wrong.mean(axis=0))[0] > 3 * np.abs(right.mean(axis=0))[0]
 

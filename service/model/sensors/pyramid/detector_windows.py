@@ -7,7 +7,6 @@ spline through it: what falls on neighbouring subapertures is then neither lost 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -183,30 +182,30 @@ def locate_images(
     light = flux_frame.astype(np.float64)
     if windows.centres_px is not None:
         moving = instrument.stop is Stop.MIRROR  # the images move with the mirror
-        remarks = () if moving else tuple(_beside_the_light(instrument, windows, light))
-        return instrument, remarks
+        expected = by_quadrant(windows.centres_px).reshape(4, 2)
+        return instrument, () if moving else _beside_the_light(instrument, windows, expected, light)
     centres = frame_windows(instrument, light).centres_px.reshape(4, 2)
     found = _format_centres(centres)
     remark = f"shifts count from the pupil images as found: pupil_centres_px = [{found}]"
     return replace(instrument, frames=replace(windows, centres_px=centres)), (remark,)
 
 
-def _beside_the_light(instrument: Instrument, windows: FrameWindows, light: Array) -> Iterator[str]:
-    """Yield a remark if the centres in the file differ from the pupil images of the flux frame."""
-    if windows.centres_px is None:
-        return
+def _beside_the_light(
+    instrument: Instrument, windows: FrameWindows, expected: Array, light: Array
+) -> tuple[str, ...]:
+    """Return a remark if the centres of the file differ from the pupil images of the flux frame."""
     pixels = windows.pixels_per_subaperture
     try:
         found = found_centres(light, instrument.wfs.pupil_diameter * pixels).reshape(4, 2)
     except ModelError:
-        return
-    expected = by_quadrant(windows.centres_px).reshape(4, 2)
+        return ()
     away = float(np.hypot(*(found - expected).T).max()) / pixels
-    if away > _REMARK_DISTANCE_SUBAP:
-        yield (
-            f"wfs.pupil_centres_px are up to {away:.2f} subapertures from the pupil images of "
-            f"the flux frame, which are centred at [{_format_centres(found)}]: correct the key"
-        )
+    if away <= _REMARK_DISTANCE_SUBAP:
+        return ()
+    return (
+        f"wfs.pupil_centres_px are up to {away:.2f} subapertures from the pupil images of "
+        f"the flux frame, which are centred at [{_format_centres(found)}]: correct the key",
+    )
 
 
 def _format_centres(centres: Array) -> str:

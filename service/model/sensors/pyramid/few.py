@@ -8,7 +8,6 @@ at rest, then the product of both. Each is a product of matrices that stay in th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,53 +21,45 @@ _SOURCES_TOGETHER = 10
 """Pairs of source points that one thread computes."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FewShapes:
-    """Shapes, and the roof operators of one image."""
+def respond_to_few(
+    amplitude: Array,
+    shapes: Array,
+    modulated: tuple[Array, Array],
+    weights: tuple[Array, Array],
+    mapper: Mapper,
+) -> tuple[Array, Array]:
+    """Return the light of all sources ``(n, n)`` and its change ``(n, n, n_shapes)``, of one image.
 
-    amplitude: Array
-    """``(N, N)`` of the pupil, real."""
+    Parameters
+    ----------
+    amplitude
+        ``(N, N)`` of the pupil, real.
+    shapes
+        ``(N, N n_shapes)`` factor of each shape in the gradient, 0 at points that are not lit.
+    modulated
+        Roof operators times the sources' phasors: along y ``(n_sources, n, n_nodes_y, N)``, along x
+        ``(n, n_sources, n_nodes_x, N)``; the two sources of a pair count as nodes along x.
+    weights
+        ``(n_nodes_y,)`` and ``(n_nodes_x,)`` of the quadrature.
+    mapper
+        Spreads the sources over threads.
+    """
+    (modulated_y, modulated_x), (weights_y, weights_x) = modulated, weights
+    n_sources, n, n_y, n_u = modulated_y.shape
+    n_x, dtype, n_shapes = modulated_x.shape[2], amplitude.dtype, shapes.shape[1] // n_u
 
-    shapes: Array
-    """``(N, N n_shapes)`` factor of each shape in the gradient, 0 at points that are not lit."""
-
-    modulated_y: Array
-    """``(n_sources, n, n_nodes_y, N)`` roof operator times the source's phasors."""
-
-    modulated_x: Array
-    """``(n, n_sources, n_nodes_x, N)``; the two sources of a pair count as nodes."""
-
-    weights_y: Array
-    """``(n_nodes_y,)`` of the quadrature."""
-
-    weights_x: Array
-    """``(n_nodes_x,)``."""
-
-    @property
-    def n_shapes(self) -> int:
-        """Number of shapes."""
-        return int(self.shapes.shape[1] // len(self.amplitude))
-
-    def respond(self, mapper: Mapper) -> tuple[Array, Array]:
-        """Return the light of all sources ``(n, n)`` and its change ``(n, n, n_shapes)``."""
-        parts = mapper(self._respond_from, range(0, len(self.modulated_y), _SOURCES_TOGETHER))
-        light, change = (np.sum(each, axis=0) for each in zip(*parts, strict=True))
-        return light, change
-
-    def _respond_from(self, first: int) -> tuple[Array, Array]:
+    def respond_from(first: int) -> tuple[Array, Array]:
         """Return light and change of the sources that are computed together with the first."""
-        n_sources, n, n_y, n_u = self.modulated_y.shape
-        n_x, dtype, n_shapes = self.modulated_x.shape[2], self.amplitude.dtype, self.n_shapes
         light = np.zeros((n * n_x, n * n_y))
         change = np.zeros((n, n, n_shapes), dtype)
-        field = np.empty((n * n_y, n_u), self.modulated_y.dtype)
+        field = np.empty((n * n_y, n_u), modulated_y.dtype)
         at_rest = np.empty((n, n_x, 2, 2, n * n_y), dtype)
         along_x = np.empty((n, 2 * n * n_y, n_u), dtype)
-        weights_y = np.tile(self.weights_y, n)[:, None].astype(dtype)
-        weights_x = self.weights_x[:, None].astype(dtype)
+        counts_y = np.tile(weights_y, n)[:, None].astype(dtype)
+        counts_x = weights_x[:, None].astype(dtype)
         for source in range(first, min(first + _SOURCES_TOGETHER, n_sources)):
-            y, x = self.modulated_y[source].reshape(-1, n_u), self.modulated_x[:, source]
-            field.real, field.imag = y.real @ self.amplitude, y.imag @ self.amplitude
+            y, x = modulated_y[source].reshape(-1, n_u), modulated_x[:, source]
+            field.real, field.imag = y.real @ amplitude, y.imag @ amplitude
             seen = x.reshape(-1, n_u) @ field.T
             light += seen.real**2 + seen.imag**2
             # Im{conj(seen) x y} = Im{conj(seen) x} Re y + Re{conj(seen) x} Im y
@@ -76,14 +67,18 @@ class FewShapes:
             np.negative(seen.imag, out=at_rest[:, :, 0, 0])
             at_rest[:, :, 0, 1] = at_rest[:, :, 1, 0] = seen.real
             at_rest[:, :, 1, 1] = seen.imag
-            parts_x = np.stack([x.real * weights_x, x.imag * weights_x], axis=2)
+            parts_x = np.stack([x.real * counts_x, x.imag * counts_x], axis=2)
             pairs = at_rest.reshape(n, 2 * n_x, -1).swapaxes(1, 2)
             np.matmul(pairs, parts_x.reshape(n, 2 * n_x, n_u), out=along_x)
             for part, by_line in zip((y.real, y.imag), np.split(along_x, 2, axis=1), strict=True):
-                over_y = (part * weights_y) @ self.shapes
+                over_y = (part * counts_y) @ shapes
                 change += np.matmul(
                     by_line.reshape(n, n, -1).swapaxes(0, 1),
                     over_y.reshape(n, -1, n_shapes),
                 )
         light = light.reshape(n, n_x, n, n_y)
-        return np.einsum("jbia,a,b->ij", light, self.weights_y, self.weights_x), change
+        return np.einsum("jbia,a,b->ij", light, weights_y, weights_x), change
+
+    parts = mapper(respond_from, range(0, n_sources, _SOURCES_TOGETHER))
+    light, change = (np.sum(each, axis=0) for each in zip(*parts, strict=True))
+    return light, change

@@ -358,14 +358,14 @@ def _departures(
 
     Displacements and σ are ``(4, 2)`` each.
     """
-    even = compute_even_images(optics, _pair(position))
+
+    def shown_at(place: Array) -> Array:
+        return compute_even_images(optics, _pair(place))
+
+    even, probes = shown_at(position), _PROBE_SUBAP * np.eye(2)
     rates = [
-        (
-            compute_even_images(optics, _pair(position + probe))
-            - compute_even_images(optics, _pair(position - probe))
-        )
-        / (2 * _PROBE_SUBAP)
-        for probe in _PROBE_SUBAP * np.eye(2)
+        (shown_at(position + probe) - shown_at(position - probe)) / (2 * _PROBE_SUBAP)
+        for probe in probes
     ]
     surface = _polynomials(images.shape[1], _ORDER)
     found = [

@@ -23,7 +23,7 @@ from service.model.kinds import Normalisation, SignalKind
 from service.model.local import LocalShapes, MadeElsewhere, Shapes
 from service.model.pupil import PupilGrid, gauss_legendre
 from service.model.sensors.pyramid.description import Pyramid
-from service.model.sensors.pyramid.few import FewShapes
+from service.model.sensors.pyramid.few import respond_to_few
 from service.model.sensors.pyramid.tiles import TiledResponse
 from service.model.sensors.pyramid.working_point import Halo
 from service.model.sensors.sensor import Mapper, RowTask
@@ -175,10 +175,14 @@ class PyramidOptics:
             gradient[:, begin:end] = lines[:n_signals].reshape(len(gradient), -1, n_out)
             # Copied, because a view would keep the whole row in memory.
             light.append(lines[n_signals:].copy())
+        if self.recipe.normalisation is Normalisation.LOCAL:
+            flux = np.concatenate(light)
+        else:
+            flux = np.asarray(np.sum(light, axis=(0, 1)) / int(valid.sum()))
         return LightGradient(
             images=images,
             gradient=gradient.reshape(-1, n_out),
-            flux_gradient=self._flux_gradient(light, int(valid.sum())),
+            flux_gradient=flux,
             recipe=self.recipe,
         )
 
@@ -204,28 +208,24 @@ class PyramidOptics:
             roof_y = self._roof(shift[1] + grid.y, nodes[0], grid.sides_y)
             roof_x = self._roof(shift[0] + grid.x, nodes[1], grid.sides_x)
             modulated_y, modulated_x = self._modulate_roof(roof_y, roof_x)
-            few = FewShapes(
-                amplitude=self.pupil.amplitude.astype(self.dtype),
-                shapes=on_grid.reshape(n_u, -1),
-                modulated_y=modulated_y[:, :, 0],
-                modulated_x=modulated_x.reshape(n, len(modulated_y), -1, n_u),
-                weights_y=roof_y.weights,
-                weights_x=np.tile(roof_x.weights, 2),
+            light, change = respond_to_few(
+                self.pupil.amplitude.astype(self.dtype),
+                on_grid.reshape(n_u, -1),
+                (modulated_y[:, :, 0], modulated_x.reshape(n, len(modulated_y), -1, n_u)),
+                (roof_y.weights, np.tile(roof_x.weights, 2)),
+                mapper,
             )
-            light, change = few.respond(mapper)
             place = grid.sides_y.start, grid.sides_x.start
             images[place[0], :, place[1]] = light / self._all_light
             changes[place] = change
         lines = changes[:, :, valid].reshape(4, -1, n_shapes)
-        whole = _Grid(sides_y=slice(0, 2), sides_x=slice(0, 2))
-        planes: Array = self._plane_signs(whole).reshape(-1, 4).astype(self.dtype)
+        planes: Array = self._plane_signs(_ALL_IMAGES).reshape(-1, 4).astype(self.dtype)
         signals = (planes @ lines.reshape(4, -1)).reshape(-1, *lines.shape[1:])
         n_planes = self.recipe.kind.n_planes
-        match self.recipe.normalisation:
-            case Normalisation.GLOBAL:
-                flux = lines.sum(axis=(0, 1)) / lines.shape[1]
-            case Normalisation.LOCAL:
-                flux = signals[n_planes]
+        if self.recipe.normalisation is Normalisation.LOCAL:
+            flux = signals[n_planes]
+        else:
+            flux = lines.sum(axis=(0, 1)) / lines.shape[1]
         return LightGradient(
             images=images,
             gradient=signals[:n_planes].reshape(-1, n_shapes),
@@ -233,20 +233,26 @@ class PyramidOptics:
             recipe=self.recipe,
         )
 
+    @property
+    def _apart(self) -> bool:
+        """True if each image is computed by itself, and the signals are combined of them."""
+        # pixels that differ in many places of the sum are cheaper image by image
+        return self.recipe.kind is SignalKind.INTENSITY
+
     def prepare(self, of_row: RowResponse) -> PreparedRows:
         """Return what all rows of subapertures share."""
         images = np.empty((2, self.wfs.n_subapertures, 2, self.wfs.n_subapertures))
         parts: list[PreparedGrid] = []
-        # pixels that differ in many places of the sum are cheaper image by image
-        apart = self.recipe.kind is SignalKind.INTENSITY
-        for grid in _SINGLE_IMAGES if apart and self.offsets is None else self._grids:
+        for grid in _SINGLE_IMAGES if self._apart and self.offsets is None else self._grids:
             roof_y = self._roof(of_row.shift[1] + grid.y, of_row.nodes_y, grid.sides_y)
             roof_x = self._roof(of_row.shift[0] + grid.x, of_row.nodes_x, grid.sides_x)
             modulated_y, modulated_x = self._modulate_roof(roof_y, roof_x)
             fields_at_rest = self._fields(modulated_y, modulated_x)
             images[grid.sides_y, :, grid.sides_x] = self._images(fields_at_rest, roof_y, roof_x)
-            shares_y = bool(parts) and parts[-1].grid.has_same_y(grid)
-            planes = np.ones((1, 1, 1)) if apart else self._plane_signs(grid)
+            last = parts[-1].grid if parts else None
+            # The images of one side along y have the same factors along y.
+            shares_y = last is not None and (last.sides_y, last.y) == (grid.sides_y, grid.y)
+            planes = np.ones((1, 1, 1)) if self._apart else self._plane_signs(grid)
             parts.append(
                 PreparedGrid(
                     grid=grid,
@@ -258,13 +264,12 @@ class PyramidOptics:
                     signs=self._signs(len(roof_y.weights), len(roof_x.weights), planes),
                 )
             )
-        return PreparedRows(
-            images=images, parts=tuple(parts), finish=self._finish(of_row.shapes), apart=apart
-        )
+        finish = self._finish(of_row.shapes)
+        return PreparedRows(images=images, parts=tuple(parts), finish=finish)
 
     def lines(self, row: int, columns: Array, rows: PreparedRows) -> Array:
         """Return the lines of subapertures in these columns of a row, ``(n_lines, n_shapes)``."""
-        if rows.apart:
+        if self._apart:
             return self._combine_images(self._image_lines(row, columns, rows))
         factors = [self._row_factors(row, columns, part) for part in rows.parts]
         if len(factors) == 1:
@@ -288,8 +293,7 @@ class PyramidOptics:
 
     def _combine_images(self, lines: Array) -> Array:
         """Return the lines of the signals, and of what normalises them, of those of the images."""
-        whole = _Grid(sides_y=slice(0, 2), sides_x=slice(0, 2))
-        planes = self._plane_signs(whole).reshape(-1, 4).astype(lines.dtype)
+        planes = self._plane_signs(_ALL_IMAGES).reshape(-1, 4).astype(lines.dtype)
         signals = np.tensordot(planes, lines, axes=1).reshape(-1, lines.shape[2])
         if self.recipe.normalisation is Normalisation.LOCAL:
             return signals
@@ -312,27 +316,15 @@ class PyramidOptics:
         return images
 
     @property
-    def n_grids(self) -> int:
-        """Regular grids that the detector points of the four images form."""
-        return len(self._grids)
-
-    @property
     def _grids(self) -> tuple[_Grid, ...]:
         """The four images together, or one by one if they are displaced differently."""
         if self.offsets is None:
-            return (_Grid(sides_y=slice(0, 2), sides_x=slice(0, 2)),)
+            return (_ALL_IMAGES,)
         return tuple(
             _Grid(sides_y=slice(y, y + 1), sides_x=slice(x, x + 1), x=float(at[0]), y=float(at[1]))
             for y, row in enumerate(self.offsets)
             for x, at in enumerate(row)
         )
-
-    def _flux_gradient(self, by_row: list[Array], n_valid: int) -> Array:
-        match self.recipe.normalisation:
-            case Normalisation.GLOBAL:
-                return np.asarray(np.sum(by_row, axis=(0, 1)) / n_valid)
-            case Normalisation.LOCAL:
-                return np.concatenate(by_row)
 
     @property
     def _complex(self) -> type[np.complex64] | type[np.complex128]:
@@ -476,7 +468,8 @@ class PyramidOptics:
         right = xp.reshape(right, (n_columns, n_source, -1, n_u))
         lines = xp.matmul(there(left), right)
         along_x = [xp.reshape(lines, (n_planes * n_columns, -1, n_u))]
-        if self.recipe.normalisation is Normalisation.GLOBAL and not rows.is_single:
+        # A part of one plane gives the lines of one image, not of signals.
+        if self.recipe.normalisation is Normalisation.GLOBAL and n_planes > 1:
             along_x.append(self._flux_factor(lines, along_y, rows.grid))
         return there(along_y.reshape(-1, n_u).T), along_x
 
@@ -495,10 +488,18 @@ class PyramidOptics:
         """Return what makes of a row's factors its gradient, or its response to shapes."""
         if isinstance(shapes, LocalShapes):
             return TiledResponse(shapes, self._scale, self.arrays)
-        there = self.arrays.there
+        xp, there = self.arrays.xp, self.arrays.there
         lit, scale = there(np.flatnonzero(self.pupil.lit)), there(self._scale[self.pupil.lit])
         known = None if shapes is None else there(shapes)
-        return partial(self._fold, lit=lit, scale=scale, shapes=known)
+
+        def fold(along_y: Foreign, along_x: list[Foreign]) -> Foreign:
+            products = (xp.matmul(along_y, part) for part in along_x)
+            flat = [xp.reshape(product, (product.shape[0], -1)) for product in products]
+            gradient = xp.concat([xp.take(lines, lit, axis=1) for lines in flat], axis=0)
+            gradient *= scale
+            return gradient if known is None else xp.matmul(gradient, known)
+
+        return fold
 
     def are_few(self, n_shapes: int) -> bool:
         """Return True if so few shapes cost less than the gradient at every point of a row.
@@ -516,23 +517,6 @@ class PyramidOptics:
         """``(N, N)`` what a product of factors is multiplied by."""
         return (-2.0 * self.pupil.amplitude).astype(self.dtype)
 
-    def _fold(
-        self,
-        along_y: Foreign,
-        along_x: list[Foreign],
-        *,
-        lit: Foreign,
-        scale: Foreign,
-        shapes: Foreign | None,
-    ) -> Foreign:
-        """Return the gradient of every line ``(n_lines, n_points)``, or its product with shapes."""
-        xp = self.arrays.xp
-        products = (xp.matmul(along_y, part) for part in along_x)
-        flat = [xp.reshape(product, (product.shape[0], -1)) for product in products]
-        gradient = xp.concat([xp.take(lines, lit, axis=1) for lines in flat], axis=0)
-        gradient *= scale
-        return gradient if shapes is None else xp.matmul(gradient, shapes)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Grid:
@@ -545,10 +529,8 @@ class _Grid:
 
     y: float = 0.0
 
-    def has_same_y(self, other: _Grid) -> bool:
-        """Return True if the factors along y are those of another grid."""
-        return self.sides_y == other.sides_y and self.y == other.y
 
+_ALL_IMAGES = _Grid(sides_y=slice(0, 2), sides_x=slice(0, 2))
 
 _SINGLE_IMAGES = tuple(
     _Grid(sides_y=slice(y, y + 1), sides_x=slice(x, x + 1)) for y in range(2) for x in range(2)
@@ -571,11 +553,6 @@ class PreparedGrid:
     signs: Array
     """Factor of a field in every plane of signals."""
 
-    @property
-    def is_single(self) -> bool:
-        """True if it gives the lines of one image, not of signals."""
-        return len(self.signs) == 1
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PreparedRows:
@@ -587,9 +564,6 @@ class PreparedRows:
 
     finish: Callable[[Foreign, list[Foreign]], Foreign]
     """Function that turns a row's factors into its gradient, or into its response to shapes."""
-
-    apart: bool
-    """True if each image is computed by itself, and the signals are combined of them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

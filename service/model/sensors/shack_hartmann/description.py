@@ -36,7 +36,10 @@ class ShackHartmann(ShackHartmannNumbers):
     @property
     def leaves_out_partly_lit(self) -> bool:
         """True if fits leave out the subapertures that the pupil's edge cuts."""
-        return (self.partly_lit or _usual(self.centroid)) is PartlyLit.LEAVE_OUT
+        if self.partly_lit is not None:
+            return self.partly_lit is PartlyLit.LEAVE_OUT
+        # A threshold, or no pixels at all, is nonlinear where the edge cuts a lenslet.
+        return self.centroid in {Centroid.THRESHOLD, Centroid.GRADIENT}
 
     def pixel_lambda_over_d(self, subaperture_m: float) -> float:
         """Return the width of a pixel in units of λ/d, d the width of a subaperture."""
@@ -131,8 +134,3 @@ def point_variances(sensor: ShackHartmann, subaperture_m: float) -> tuple[float,
         half = min(half, 1.0)
     across = 2.0 * half / pixel
     return half / math.pi**2, across**2 * (2.0 * half) ** 2 / 12.0
-
-
-def _usual(centroid: Centroid) -> PartlyLit:
-    cut_widely = centroid in (Centroid.THRESHOLD, Centroid.GRADIENT)
-    return PartlyLit.LEAVE_OUT if cut_widely else PartlyLit.USE

@@ -56,6 +56,7 @@ def local_functions(
         found.append(part[row, column])
         places.append((row + rows.start) * known.shape[1] + column + columns.start)
     ends = np.concatenate([[0], np.cumsum([len(one) for one in places])]).astype(np.intp)
+    # Functions that cover much of the pupil are cheaper as whole tables.
     if ends[-1] > _MAX_MEAN_COVERAGE * len(heights) * known.sum():
         return None
     local = LocalFunctions(
@@ -84,6 +85,7 @@ def modes_of_crops(
     """
     shape = _table_of(file, crops)
     n_modes = len(crops) if strokes is None else strokes.shape[1]
+    # Refused before the memory is taken.
     n_bytes = n_modes * shape[0] * shape[1] * crops.dtype.itemsize
     if n_bytes > MAX_BYTES:
         file.refuse(
@@ -138,6 +140,7 @@ def _origins(
     where, origins = file.where("influence_origin"), file.array("influence_origin")
     if origins.shape != (len(crops), 2):
         refuse(where, f"shape {origins.shape}", f"({len(crops)}, 2): row and column for each")
+    # Between two points of the table a crop would have to be interpolated.
     if not np.array_equal(origins, np.rint(origins)):
         refuse(where, "rows or columns that are no whole numbers", "points of the table")
     outside = np.any((origins >= shape) | (origins + crops.shape[1:] <= 0), axis=1)

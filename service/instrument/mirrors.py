@@ -109,6 +109,7 @@ def own_modes(mirror: Mirror | TabulatedModes) -> int | None:
 
 def _check_keys(file: MirrorSection) -> None:
     table, given = file.said, file.given
+    # One source of the surface: two would contradict each other.
     kinds = [kind for kind in _KINDS if getattr(table, kind) is not None]
     if len(kinds) != 1:
         expected = f"one of {', '.join(_KINDS)}"
@@ -180,6 +181,7 @@ def _about_segments(file: MirrorSection, mirror: Mirror) -> tuple[str, ...]:
 
 def _check_width(file: MirrorSection, positions_m: NDArray[np.float64], pupil: Pupil) -> None:
     """Refuse actuators that cannot be in metres of the pupil plane."""
+    # A file in millimetres or in subapertures is off by powers of ten.
     width = float(np.ptp(positions_m, axis=0).max()) / pupil.diameter_m
     if 1.0 / _LARGEST_TABLE < width < _LARGEST_TABLE:
         return
@@ -212,6 +214,7 @@ def _check_layout_keys(file: MirrorSection) -> None:
 
 def _segments(file: MirrorSection, positions_m: NDArray[np.float64]) -> tuple[float, ...]:
     """Return where the gaps between segments are, in order; refuse a segment without actuators."""
+    # Ascending, because the segment of a point is found by bisection.
     gaps_deg = tuple(sorted(angle % 360.0 for angle in file.said.segments_deg))
     if not gaps_deg:
         return ()
@@ -426,6 +429,7 @@ def _read_table(file: MirrorSection, pupil: Pupil) -> tuple[TabulatedModes, tupl
         file.refuse(key, f"shape {cube.shape}", "(n, ny, nx), one table for each")
     of_functions = key == "influence_functions"
     strokes, of_strokes = _strokes(file, len(cube)) if of_functions else (None, ())
+    # Kept beside the modes: whether crops were cut too close is judged before they are combined.
     crops, broken = _without_defects(file, key, cube)
     cube, local = crops, None
     whole = None if file.said.influence_origin is not None else known_samples(cube)
@@ -464,6 +468,7 @@ def _without_defects(
     surface unknown for all of them), if it is zero, or if it equals an earlier one. Equal crops are
     not copies, because they have different positions.
     """
+    # Outside the pupil all functions are undefined: only more than that is a fault.
     unknown = np.mean(~np.isfinite(cube), axis=(1, 2))
     broken = unknown > np.median(unknown) + _BROKEN_SHARE
     defects = {int(number): NOT_FINITE for number in np.flatnonzero(broken)}
@@ -516,6 +521,7 @@ def _check_table(
             f"{pitch_m:g} m, a table of {width:.3g} pupil diameters",
             f"at most {_LARGEST_TABLE:g}: is it in metres of the pupil plane?",
         )
+    # Slopes near unknown surface are left out of fits: with less than half nothing is left to fit.
     covered = known.sum() * pitch_m**2 / (np.pi / 4 * pupil.diameter_m**2)
     if covered < 0.5:
         file.refuse(

@@ -73,6 +73,7 @@ def _read_pupil_map(file: Section[AboutTable], subaperture_m: float) -> PupilMap
         refuse(where, f"shape {lit.shape}", "(ny, nx), a map of the pupil")
     if not np.isfinite(lit).all() or lit.min() < 0.0 or lit.max() > 1.0:
         refuse(where, "values that are not 0 to 1", "the share of each point that is lit")
+    # Extent of the light: a map in another unit or off its centre shows there.
     rows, columns = (np.flatnonzero((lit > _LIT_FRACTION).any(axis=axis)) for axis in (1, 0))
     if not rows.size:
         refuse(where, "no lit point", f"a pupil of {diameter_m:g} m")
@@ -175,6 +176,7 @@ def _made(parts: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
     """
     made: dict[str, Any] = {}
     refused: dict[str, ConfigurationError] = {}
+    # Every part is tried, so that one run shows all mistakes of a file.
     for name, make in parts.items():
         try:
             made[name] = make()
@@ -219,6 +221,7 @@ def _complete_mode(
         If it controls more modes than there are, or its mask is missing or not its own.
     """
     loop = instrument.loop or LoopFacts()
+    # What a mode does not say of its loop is as in [loop].
     n_controlled = mode.loop.n_controlled or loop.n_controlled
     rate_hz = mode.loop.frame_rate_hz or loop.frame_rate_hz
     if (n_controlled or 0) > instrument.modes.n_modes:
@@ -272,6 +275,7 @@ def _modes(file: schema.Section[KarhunenLoeve], mirror: Mirror | TabulatedModes)
     if own is not None:
         if "n_modes" in file.given:
             refuse(where, f"it together with an own basis of {own} modes", "it for KL modes only")
+        # The user's own basis has its number of modes; only the turbulence is read here.
         return replace(table, n_modes=own)
     n_max = len(mirror.positions_m) - 1 if isinstance(mirror, Mirror) else 0
     if "n_modes" not in file.given:
@@ -323,6 +327,7 @@ def _loop(file: schema.Section[LoopFacts], n_modes: int) -> LoopFacts | None:
 def _sensor(file: schema.Section[Any], kind: SensorKind, pupil: Pupil) -> SensorDescription:
     with schema.refused_at(file.path, file.name):
         sensor = kind.model.read_sensor(file.said, file.given, pupil.subaperture_m)
+    # The mask of the RTC decides if there is one: its slopes are listed by it.
     if file.said.valid_subapertures == "auto":
         return sensor
     file.refuse_useless(["flux_threshold"], "together with a mask file (wfs.valid_subapertures)")

@@ -355,6 +355,7 @@ def read_instrument_file(name_or_path: str | Path) -> InstrumentFile:
     _check_one_sensor(written, kind, path)
     taken = unknown_values(kind)
     unknown = frozenset(key for key in taken if _value(written, key) == "unknown")
+    # The schema knows numbers only: a value that is called unknown begins at its default.
     tables = dict(written)
     for key in unknown:
         table, name = key.split(".")
@@ -396,6 +397,8 @@ def _check_one_sensor(written: Mapping[str, Any], kind: SensorKind, path: Path) 
         )
     if not isinstance(wfs, dict):
         return  # refused with the other tables
+    # A key of another kind is a file for two sensors, or a forgotten kind: both get their own
+    # words.
     known = {name: {field.name for field in fields(one.table)} for name, one in KINDS.items()}
     for key in sorted(set(wfs) - known[kind.name]):
         others = [f'"{name}"' for name, keys in known.items() if key in keys]

@@ -64,6 +64,7 @@ class Aperture:
 
 def measure_aperture(valid: NDArray[np.bool_]) -> Aperture:
     """Return the pupil that a mask ``(n, n)`` shows."""
+    # Without its holes, so that dead subapertures do not narrow the pupil.
     filled = scipy.ndimage.binary_fill_holes(valid)
     labels, _ = scipy.ndimage.label(filled & ~valid, np.ones((3, 3)))
     middle = (np.array(valid.shape) - 1) / 2.0
@@ -101,6 +102,7 @@ def check_mask(
         return None
     mask, pupil = measure_aperture(own), measure_aperture(lit)
     by_mirror = instrument.stop is Stop.MIRROR
+    # With the mirror as stop the pupil is where α puts it; without α its place is not compared.
     moved = shift_subap if by_mirror else instrument.pupil_shift_subap or (0.0, 0.0)
     wide = abs(mask.diameter_subap - pupil.diameter_subap) > MAX_WIDTH_DIFFERENCE_SUBAP
     # lengths alone are compared: which way the grid lies may be unknown

@@ -91,6 +91,7 @@ class PlateSum:
 
     def _add_terms(self, tile: _Tile, far: Array, near: Array) -> Array:
         """Return the sum of the terms of all far plates, and of near ones and the plane."""
+        # The last three functions are the plane 1, x, y, which no series contains.
         used = np.concatenate([tile.near, np.arange(-3, 0)])
         return np.asarray(far @ tile.series + near @ self.coefficients[used])
 
@@ -110,6 +111,8 @@ class PlateSum:
         b = _complex(self.surface.positions) - middle
         far = np.abs(b) >= FAR_DISTANCE_RATIO * TILE_SUBAP / np.sqrt(2.0)
         plates = _series(b[far])
+        # All far actuators at once: a mode is then one polynomial in this tile, whatever their
+        # number.
         series = np.concatenate([plates.real, plates.imag]) @ self.coefficients[: len(b)][far]
         return _Tile(middle=middle, near=np.flatnonzero(~far), series=series)
 
@@ -121,6 +124,7 @@ def _series(b: Complex) -> Complex:
     ``w̄ w^k`` is that of ``w̄w w^(k-1)``, of ``w̄`` itself that of w.
     """
     k = np.arange(1, SERIES_DEGREE + 2)
+    # The Taylor series of log(w - b) about the middle of the tile.
     g = np.concatenate(
         [np.log(np.abs(b))[None], -1.0 / (k[:, None] * _powers(b, SERIES_DEGREE + 1)[1:])]
     )

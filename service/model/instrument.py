@@ -260,6 +260,7 @@ class Instrument(Telescope):
         """Area of the pupil that light comes through."""
         if self.pupil is not None:
             return float(self.pupil.lit.sum()) * self.pupil.pitch_m**2
+        # From the obscuration to the rim: what lies before the obscuration hides nothing.
         arm_m = self.diameter_m / 2 * (1 - self.obscuration_ratio)
         arms_m2 = len(self.spiders_deg) * (self.spiders_m or 0.0) * arm_m
         return np.pi / 4 * self.diameter_m**2 * (1 - self.obscuration_ratio**2) - arms_m2
@@ -267,6 +268,7 @@ class Instrument(Telescope):
     @property
     def binning(self) -> int:
         """Number of the finest subapertures, along each axis, that are binned to one."""
+        # Without modes the subapertures are the finest there are.
         now = (mode.binning for mode in self.sensor_modes if mode.config_id == self.config_id)
         return next(now, 1)
 
@@ -368,6 +370,7 @@ def instrument_sha256(instrument: Instrument) -> str:
 
     Two files that describe the same instrument, one with the defaults spelt out, are the same.
     """
+    # Records of the archive refer to an instrument by this digest.
     digest = hashlib.sha256()
     # Remarks contain paths, which do not change the instrument.
     _add(digest, replace(instrument, remarks=()))

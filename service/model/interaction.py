@@ -275,6 +275,7 @@ class InteractionModel:
         ``(8, n_slopes, n_modes)`` per subaperture: the images at -x -y, +x -y, -x +y, +x +y along
         x, then along y. The mirror moves with its image. Empty for a sensor with one image.
         """
+        # A sensor with one image has no images to be displaced against each other.
         response = self._at(self._image_shift(alpha))
         if not isinstance(response, SeveralImages):
             return np.empty((0, self.n_slopes, self.basis.n_modes))
@@ -416,6 +417,8 @@ class InteractionModel:
 
     def _stretch_ways(self, alpha: Misregistration) -> list[Way]:
         """Return the ways of the mirror's points with each anamorphosis of its image."""
+        # The stretch acts last on the way to the sensor, so first on the way back: S⁻¹ is
+        # differentiated.
         turn = rotation(alpha.rotation_rad)
         stretches = self.instrument.with_anamorphosis(alpha).stretches
         back = np.linalg.inv(stretch_matrix(stretches)) @ turn
@@ -424,6 +427,7 @@ class InteractionModel:
 
     def _along(self, alpha: Misregistration, ways: list[Way]) -> list[Shapes]:
         """Return the rates of modes that are arrays along several ways, from their gradient."""
+        # Two renderings give the gradient, of which every way is a combination point by point.
         steps = [partial(_shift_rate, step=step) for step in np.eye(_AXES)]
         along_x, along_y = (self._move_modes(alpha, step) for step in steps)
         points = self._mirror_points(alpha)

@@ -76,6 +76,7 @@ def _left_out(instrument: Instrument, surface: Surface) -> Array:
     the height of segments relative to one another, least of all behind the arms of a spider, so
     these differential pistons are excluded from every fit and inversion.
     """
+    # Only Gaussian functions can end at a gap.
     if not isinstance(surface, Gaussian) or not surface.segments_deg:
         return np.empty((0, len(surface.positions)))
     radius = instrument.wfs.pupil_diameter / 2
@@ -128,6 +129,7 @@ def _parity_sectors(positions_m: Array) -> list[Any]:
     if distance.max() > 1e-6 * np.ptp(positions_m) or len(set(image)) != n:
         return [scipy.sparse.eye_array(n, format="csc")]
     on_axis = np.flatnonzero(image == np.arange(n))
+    # One actuator of each pair stands for both.
     first = np.flatnonzero(image > np.arange(n))
     # Actuators on the axis keep their place among the pairs. This order decides the basis, which
     # must not change.
@@ -189,6 +191,7 @@ def _sort_even_first(found: list[tuple[float, int, Array]]) -> list[tuple[float,
 
 def _unit_rms(strokes: Array, gram: Array) -> Array:
     """Orthonormalise the modes over the pupil, in order: their ``gram`` there becomes one."""
+    # In order: the first modes keep their shape, the last ones take the corrections.
     upper = scipy.linalg.cholesky(gram)
     return np.asarray(scipy.linalg.solve_triangular(upper, strokes.T, trans="T").T)
 

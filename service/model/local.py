@@ -108,6 +108,8 @@ class LocalShapes:
     @property
     def is_cheaper(self) -> bool:
         """True if products with it take fewer operations than with an array of the shapes."""
+        # Rows of a sensor times functions near each point, then times the modes; or times whole
+        # modes.
         by_tiles = self.n_points * self.n_near + self.n_functions * self.shape[1]
         return by_tiles < self.n_points * self.shape[1]
 
@@ -132,6 +134,7 @@ class LocalShapes:
             )
             for patch in self.patches
         ]
+        # Parts of a function in several tiles have different rows: no entry is given twice.
         values, rows, columns = (np.concatenate(part) for part in zip(*parts, strict=True))
         shape = (self.n_points, self.n_all_functions)
         return scipy.sparse.csr_array((values, (rows, columns)), shape=shape)
@@ -200,12 +203,14 @@ def tiles_of(pupil: PupilGrid) -> tuple[Tile, ...]:
     """Return the tiles of a pupil that see any light, row after row."""
     lit, side = pupil.lit, TILE_SUBAP * pupil.sampling
     end = len(lit)
+    # Index of each lit point in the list of all lit points.
     place = np.cumsum(lit).reshape(lit.shape) - 1
     found = []
     for row in range(0, end, side):
         for column in range(0, end, side):
             part = (slice(row, min(row + side, end)), slice(column, min(column + side, end)))
             inside = np.flatnonzero(lit[part])
+            # Tiles in the corners of the grid and in the obscuration see nothing.
             if len(inside) == 0:
                 continue
             y, x = np.meshgrid(*(pupil.coordinates[one] for one in part), indexing="ij")

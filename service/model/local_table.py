@@ -61,6 +61,7 @@ class LocalTable(TabulatedBasis):
         along it. What they weigh in each mode are the ``coefficients``.
         """
         found = self._splines_at(points, direction) @ self.functions
+        # A sparse product keeps only functions whose splines reach one of the points.
         near = np.unique(found.indices)
         return near.astype(np.intp), np.asarray(found[:, near].toarray())
 
@@ -85,6 +86,7 @@ def local_table(instrument: Instrument, table: TabulatedModes) -> LocalTable:
     samples = _continue_samples(
         _place_samples(local, table.known.shape, margin, known.shape), known
     )
+    # Without strokes each function is a mode.
     strokes = np.eye(local.n_functions) if local.strokes is None else local.strokes
     return LocalTable(
         instrument=instrument,
@@ -105,6 +107,7 @@ def _place_samples(
     """Return the functions' samples on the table with its margin, ``(ny * nx, n)``, by columns."""
     row, column = np.divmod(local.places, shape[1])
     row, column = row + margin[0], column + margin[1]
+    # A negative margin cuts the table: samples beyond what any registration reaches are dropped.
     inside = (row >= 0) & (row < grown[0]) & (column >= 0) & (column < grown[1])
     function = np.repeat(np.arange(local.n_functions), np.diff(local.ends))
     places = (row * grown[1] + column)[inside]

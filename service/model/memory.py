@@ -39,6 +39,7 @@ def work_of(
     n_functions = _n_functions(instrument)
     by_tiles = n_points * near + float(n_functions * n_modes)
     product = 2.0 * sensor.n_signals * min(by_tiles, n_points * n_modes)
+    # Without a kept gradient all shapes are measured at once, and have to exist at once.
     together = 1 if sensor.keeps_gradient else n_matrices
     if by_tiles < n_points * n_modes:
         shapes = 4.0 * n_functions * n_modes + 12.0 * together * n_points * near

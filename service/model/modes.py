@@ -56,6 +56,7 @@ class ModalBasis:
 
     def render(self, points: Array) -> Array:
         """Return the modes ``(n_points, n_modes)`` at mirror ``points`` ``(n_points, 2)``."""
+        # A mirror seen from behind is drawn in its own coordinates.
         at = points * [1.0, self.y_sign]
         if self.plates is not None:
             return self.plates.heights(at)
@@ -92,6 +93,7 @@ class ModalBasis:
     @cached_property
     def in_single(self) -> ModalBasis:
         """The same modes as products take them, in float32."""
+        # Gaussian functions only, whose coefficients are the strokes: thin plates need float64.
         strokes: NDArray[Any] = self.coefficients.astype(np.float32)
         return replace(self, mode_to_actuator=strokes, coefficients=strokes)
 
@@ -148,6 +150,7 @@ class ModalBasis:
             coefficients=combine(self.coefficients),
             variance_m2=variance_m2,
         )
+        # The series of a tile are linear in the modes: combining them spares the plates.
         if self.plates is not None and other.plates is not None:
             other.plates.take_tiles(self.plates, combine)
         return other
@@ -173,6 +176,7 @@ def modal_basis(instrument: Instrument) -> Basis:
     ModelError
         If the mirror has fewer modes than requested, or its table is too coarse.
     """
+    # Computed with the finest subapertures, so that all sensor modes have the same basis.
     finest = instrument.finest
     mirror = finest.mirror
     if isinstance(mirror, TabulatedModes):
@@ -210,6 +214,7 @@ def analytic_basis(instrument: Instrument) -> ModalBasis:
         if mirror.basis is BasisKind.KARHUNEN_LOEVE:
             return karhunen_loeve_basis(instrument)
         strokes = np.eye(len(mirror.positions_m))
+    # The statistics serve the expected variance alone: the modes are the user's own.
     surface = mirror_surface(mirror, instrument.subaperture_m)
     gram, covariance = surface_statistics(instrument, surface)
     return ModalBasis(

@@ -186,6 +186,7 @@ def _shares(
 ) -> NDArray[np.float64]:
     """Return which share of each cell ``(n, m)`` each of ``m`` points of a map covers, one axis."""
     points = (np.arange(m) - (m - 1) / 2) * step
+    # Overlap of two intervals: a cell of the grid and a point of the map.
     half, wide = 0.5 / sampling, step / 2
     high = np.minimum(coordinates[:, None] + half, points + wide)
     low = np.maximum(coordinates[:, None] - half, points - wide)
@@ -257,6 +258,7 @@ def fully_lit_subapertures(instrument: Instrument) -> NDArray[np.bool_]:
 @lru_cache(maxsize=8)
 def _light_per_subaperture(outline: _Outline) -> NDArray[np.float64]:
     """Return the share of each subaperture ``(n, n)`` that the pupil lights."""
+    # Of eight by eight cells each, whose lit shares are known to 1e-4.
     n, fine = outline.n_subapertures, _drawn(outline, 8).amplitude
     # The grid of the pupil may be larger than that of the sensor; both have the same centre.
     margin = (len(fine) - 8 * n) // 2

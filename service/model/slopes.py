@@ -132,6 +132,7 @@ def to_conventions(
     ModelError
         If there are not two slopes for every valid subaperture.
     """
+    # A gather with signs; its inverse below is the scatter.
     index, sign = _list_signals(values, recipe, mask)
     return np.asarray(values[index] * _as_column(sign, values))
 

@@ -248,6 +248,7 @@ def fill_table(cube: Table, known: Mask, margin: tuple[int, int]) -> Table:
     """
     shapes = _resize(np.where(known, cube, cube.dtype.type(0)), margin)
     samples = np.ascontiguousarray(shapes.reshape(len(shapes), -1).T)
+    # A spline across an edge to zero would be wrong inside of it.
     target, weights = continuation(pad_mask(known, margin))
     samples[target] = weights.astype(samples.dtype) @ samples
     return samples
@@ -264,6 +265,7 @@ def continuation(known: Mask) -> tuple[NDArray[np.intp], scipy.sparse.csr_array]
     nearest = scipy.ndimage.distance_transform_edt(
         ~known, return_distances=False, return_indices=True
     )
+    # Each unknown sample is mirrored at the known one nearest to it.
     place = np.argwhere(~known)
     edge = nearest[:, ~known].T
     mirrored = 2 * edge - place

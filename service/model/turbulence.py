@@ -88,6 +88,7 @@ def local_statistics(instrument: Instrument, functions: LocalShapes) -> tuple[Ar
     spread, places = Spread(instrument, pupil), np.flatnonzero(pupil.lit)
     heights = functions.sparse().tocsc()
     covariance = np.empty((functions.n_functions, functions.n_functions))
+    # A block at a time: whole functions of an ELT take tens of gigabytes.
     for start in range(0, functions.n_functions, _BLOCK):
         columns = range(start, min(start + _BLOCK, functions.n_functions))
         block = np.zeros((len(columns), functions.n_points))
@@ -153,5 +154,6 @@ def predict_variance(gram: Array, covariance: Array) -> Array:
     Of statistics of the pupil. The shapes need be neither orthogonal nor independent: the fit is
     the shortest.
     """
+    # Modes may depend on one another: their Gram matrix is then singular.
     inverse = scipy.linalg.pinvh(gram)
     return np.asarray(np.einsum("ij,jk,ki->i", inverse, covariance, inverse, optimize=True))

@@ -55,6 +55,8 @@ def pyramid_of(table: PyramidTable, given: frozenset[str]) -> Pyramid:
         One line that begins with the key: the images overlap, or are not where the keys place them.
     """
     diameter, separation = table.pupil_diameter, _separation(table, given)
+    # Images that overlap on the detector add their light: no normalised difference of them is a
+    # slope.
     if separation < diameter:
         raise ModelError(
             f"pupil_separation_subap: found {separation:g}, expected at least the pupil's "
@@ -62,6 +64,7 @@ def pyramid_of(table: PyramidTable, given: frozenset[str]) -> Pyramid:
         )
     optics = {field.name: getattr(table, field.name) for field in fields(PyramidNumbers)}
     pixels = table.pixels_per_subaperture
+    # The file has detector pixels, because windows are cut there; the optics need subapertures.
     offsets: tuple[tuple[float, float], ...] | None = None
     if table.image_offsets_px is not None:
         offsets = tuple((x / pixels, y / pixels) for x, y in table.image_offsets_px)
@@ -108,6 +111,8 @@ def bin_pyramid(sensor: Pyramid, binning: int) -> Pyramid:
 
 def _in_mode(sensor: Pyramid, mode: PyramidMode, where: str) -> SensorMode:
     n, binning = sensor.n_subapertures, mode.binning
+    # A binned grid that does not fill the finest one may have a column more or less: only the RTC
+    # knows.
     if mode.n_subapertures is None and n % binning:
         raise ModelError(
             f"{where}.binning: found {binning} of {n} subapertures, which it does not divide; "
@@ -115,6 +120,7 @@ def _in_mode(sensor: Pyramid, mode: PyramidMode, where: str) -> SensorMode:
         )
     across = mode.n_subapertures or n // binning
     diameter = sensor.pupil_diameter / binning
+    # A grid a little narrower than the image cuts its rim only; one of twice its width is a slip.
     if not diameter - 1.0 < across < 2.0 * diameter:
         raise ModelError(
             f"{where}.n_subapertures: found {across} across a pupil image of {diameter:.1f}, "
@@ -161,6 +167,7 @@ def orient_offsets(
     Side along y, side along x, (x, y). A sign of -1 exchanges the images' roles and leaves each at
     its place, as with pixels. ``back``: from conventions.md to the RTC's axes.
     """
+    # A flip reverses the places of the images and the direction of their displacements.
     flips = np.array([orientation.flip_x, orientation.flip_y])
     signs = np.array([orientation.sign_x, orientation.sign_y]) * (-1) ** flips
 
@@ -209,6 +216,7 @@ def by_quadrant(centres_px: NDArray[np.float64]) -> NDArray[np.float64]:
     ModelError
         If the four quadrants around their mean do not contain one each.
     """
+    # By quadrant, so that a file may list the centres in any order.
     side = (centres_px > centres_px.mean(axis=0)).astype(int)
     place = 2 * side[:, 0] + side[:, 1]
     if sorted(place) != [0, 1, 2, 3]:
@@ -224,6 +232,7 @@ def _separation(table: PyramidTable, given: frozenset[str]) -> float:
     if table.pupil_centres_px is None or table.input == "slopes":
         return stated
     centres = _centres(table)
+    # Both rows and both columns: faces of a real pyramid differ by some 0.1 %.
     sides = (centres[1, :, 0] - centres[0, :, 0], centres[:, 1, 1] - centres[:, 0, 1])
     measured = float(np.mean(sides)) / table.pixels_per_subaperture
     if "pupil_separation_subap" not in given:

@@ -42,17 +42,8 @@ _REMARK_DISTANCE_SUBAP = 0.25
 """Distance of the centres of the file from the light that is mentioned."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Window:
-    """One pupil image: which pixels it is made of, and how."""
-
-    rows: slice
-    columns: slice
-    along_y: Array
-    """``(n, n_rows)`` share of every pixel row in every subaperture row."""
-
-    along_x: Array
-    """``(n, n_columns)``."""
+_Axis = tuple[slice, Array]
+"""Pixels of a window along an axis; their shares in every subaperture ``(n, n_pixels)``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -65,8 +56,8 @@ class Windows:
     shape: tuple[int, int]
     """Shape of a frame: rows, columns."""
 
-    windows: tuple[_Window, ...]
-    """At -y -x, -y +x, +y -x, +y +x."""
+    windows: tuple[tuple[_Axis, _Axis], ...]
+    """Along y and x, at -y -x, -y +x, +y -x, +y +x."""
 
     def cut(self, frames: NDArray[np.floating]) -> Array:
         """Return the images ``(..., 2, n, 2, n)`` of ``frames`` ``(..., rows, columns)``.
@@ -81,8 +72,8 @@ class Windows:
         if frames.shape[-2:] != self.shape:
             raise ModelError(f"frames: found {frames.shape[-2:]} pixels, expected {self.shape}")
         images = [
-            window.along_y @ frames[..., window.rows, window.columns] @ window.along_x.T
-            for window in self.windows
+            along_y @ frames[..., rows, columns] @ along_x.T
+            for (rows, along_y), (columns, along_x) in self.windows
         ]
         upper, lower = (np.stack(pair, axis=-2) for pair in (images[:2], images[2:]))
         return np.stack([upper, lower], axis=-4)
@@ -132,6 +123,7 @@ def _refine_centres(instrument: Instrument, flux_frame: Array, pixels: int) -> A
     places = image_places(images.transpose(0, 2, 1, 3).reshape(4, n, n), instrument)
     if isinstance(places, CannotTell):
         return centres
+    # Far from the circles the model has taken uneven light for a displacement.
     found = whole + pixels * places[:, ::-1].reshape(2, 2, 2)  # (x, y) to (row, column)
     return found if np.abs(found - centres).max() < _MAX_EDGE_DISTANCE_SUBAP * pixels else centres
 
@@ -156,12 +148,12 @@ def image_centres(instrument: Instrument, flux_frame: NDArray[np.floating]) -> A
 def _windows_at(instrument: Instrument, centres: Array, flux_frame: Array, pixels: int) -> Windows:
     n = instrument.wfs.n_subapertures
     shape = (flux_frame.shape[0], flux_frame.shape[1])
-    windows = []
-    for row, column in centres.reshape(4, 2):
-        rows, along_y = _axis(row, n, pixels, shape[0], "rows")
-        columns, along_x = _axis(column, n, pixels, shape[1], "columns")
-        windows.append(_Window(rows=rows, columns=columns, along_y=along_y, along_x=along_x))
-    return Windows(centres_px=centres, shape=shape, windows=tuple(windows))
+    # Each image has its own window: faces displace them independently.
+    windows = tuple(
+        (_axis(row, n, pixels, shape[0], "rows"), _axis(column, n, pixels, shape[1], "columns"))
+        for row, column in centres.reshape(4, 2)
+    )
+    return Windows(centres_px=centres, shape=shape, windows=windows)
 
 
 def locate_images(
@@ -272,6 +264,7 @@ def slopes_per_unit(
     """
     signals, flux = signals_of(rest, valid, recipe)
     changes, flux_changes = signals_of(images, valid, recipe)
+    # A dark subaperture would divide by zero.
     if flux.min() <= 0.0:
         raise ModelError(
             f"flux frame: found {flux.min():g} counts in a valid subaperture, expected light in all"
@@ -302,7 +295,7 @@ def found_centres(flux_frame: Array, diameter_px: float) -> Array:
     return images.centres_px.reshape(2, 2, 2)
 
 
-def _axis(centre_px: float, n: int, pixels: int, length: int, name: str) -> tuple[slice, Array]:
+def _axis(centre_px: float, n: int, pixels: int, length: int, name: str) -> _Axis:
     """Return which pixels of an axis a window needs, and their shares ``(n, n_pixels)``."""
     edges = centre_px + 0.5 + (np.arange(n + 1) - n / 2) * pixels
     if edges[0] < -1e-9 or edges[-1] > length + 1e-9:
@@ -312,6 +305,7 @@ def _axis(centre_px: float, n: int, pixels: int, length: int, name: str) -> tupl
         )
     first = max(int(np.floor(edges[0])) - _SPLINE_MARGIN_PX, 0)
     last = min(int(np.ceil(edges[-1])) + _SPLINE_MARGIN_PX, length)
+    # The running sum of each pixel: its spline between two edges is the light in between.
     running = np.tri(last - first + 1, last - first, -1)
     spline = scipy.interpolate.make_interp_spline(np.arange(first, last + 1), running, k=5)
     return slice(first, last), np.diff(spline(np.clip(edges, first, last)), axis=0)

@@ -132,6 +132,7 @@ class PyramidLight:
         if not light > 0.0:
             return CannotTell(reason=f"no light: the mean count is {light:g}; open the shutter")
         images = images / light
+        # One point per subaperture is enough for the coarse grid of first positions.
         optics = build_even_optics(self.instrument)
         try:
             start = _first_guess(images, build_even_optics(self.instrument, 1))
@@ -338,6 +339,7 @@ def _settle_position(
 
 def _first_guess(images: Array, optics: PyramidOptics) -> Array:
     """Return the best of a coarse grid of positions."""
+    # The four images together, because static aberrations move light from one to another.
     total = images.sum(axis=0).ravel()
     surface = _polynomials(images.shape[1], 1)
 
@@ -390,6 +392,7 @@ def _departure(
         columns = np.column_stack([lit, rates[0] * light, rates[1] * light])
         solution, covariance = _weigh(columns, image, weights)
         left = image - columns @ solution
+        # From the median, so that a spider or a dead pixel does not widen its own tolerance.
         scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
         weights = np.minimum(1.0, _HUBER_SIGMA * scale / np.maximum(np.abs(left), 1e-12))
         light = surface @ solution[: surface.shape[1]]
@@ -433,6 +436,7 @@ _MARGIN = 4
 
 def _lit_part(even: Array) -> NDArray[np.bool_]:
     """Return the pixels ``(n, n)`` that an even beam lights, from its images ``(4, n, n)``."""
+    # The 75th percentile is that of full subapertures: those of the rim have less.
     light = even.sum(axis=0)
     return np.asarray(light > _LIT_SHARE * np.percentile(light, 75.0))
 
@@ -452,6 +456,7 @@ def _fill_outside(share: Array, lit: NDArray[np.bool_]) -> Array:
     subaperture beyond the rim, which the edge of the pupil may cross. Further outside, the map is a
     weighted mean of these, whose weights widen until everything is reached.
     """
+    # With a margin, so that a beam that has moved is known there, too.
     measured = np.pad(lit, _MARGIN)
     known = scipy.ndimage.binary_dilation(measured)
     smooth = _smooth_by_planes(np.pad(np.where(lit, share, 0.0), _MARGIN), measured, known)
@@ -473,6 +478,7 @@ def _smooth_by_planes(
     weights = measured.astype(np.float64)
     normal = np.array([[_moment(weights, a, b) for b in _PLANE] for a in _PLANE])
     right = np.array([_moment(values, a, (0, 0)) for a in _PLANE])
+    # Relative to the weight around the place; the level itself is not held.
     ridge = normal[0, 0][known][:, None, None] * np.diag([0.0, _RIDGE, _RIDGE])
     planes = normal[:, :, known].transpose(2, 0, 1) + ridge
     level = np.linalg.solve(planes, right[:, known].T[:, :, None])[:, 0, 0]

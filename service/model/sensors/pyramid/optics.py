@@ -199,6 +199,7 @@ class PyramidOptics:
         ``nodes`` are those along y and x.
         """
         n, n_u, n_shapes = self.wfs.n_subapertures, len(self.pupil.coordinates), shapes.shape[1]
+        # On the whole grid, where points without light have no part in any product.
         on_grid = np.zeros((n_u, n_u, n_shapes), self.dtype)
         on_grid[self.pupil.lit] = shapes * self._scale[self.pupil.lit][:, None]
         images = np.empty((2, n, 2, n))
@@ -333,6 +334,7 @@ class PyramidOptics:
     def _roof(self, shift: float, nodes: Nodes, sides: slice) -> _Roof:
         """Return the roof operator along one axis, at the nodes of every subaperture."""
         n, half = self.wfs.n_subapertures, self.wfs.image_separation_subap / 2
+        # Points of the detector along an axis, those of the images on either side of the middle.
         centres = np.arange(n) - (n - 1) / 2
         x = _SIDES[sides, None, None] * half + centres[:, None] + nodes.offsets - shift
         distance = x[..., None] - self.pupil.coordinates
@@ -398,6 +400,7 @@ class PyramidOptics:
         fields = np.empty((n, n, n_source, math.prod(at_y), math.prod(at_x)), self._complex)
         for source, left in enumerate(modulated_y):
             right = modulated_x[:, source].reshape(-1, n_u)
+            # Along y, then along x: the roof operator is separable.
             seen = (left.reshape(-1, n_u) @ amplitude) @ right.T
             fields[:, :, source] = seen.reshape(n, fields.shape[-2], n, -1).swapaxes(1, 2)
         return fields.reshape(n, n, n_source, *at_y, *at_x)
@@ -407,6 +410,7 @@ class PyramidOptics:
         # In double precision, because a halo has hundreds of source points to sum over.
         power = np.square(parts).sum(axis=2, dtype=np.float64)
         power = power.reshape(*fields.shape[:2], *fields.shape[3:], 2)
+        # Sum over nodes (a, b), pair (p) and real and imaginary part (c).
         images = np.einsum("ijyaxpbc,a,b->yixj", power, roof_y.weights, roof_x.weights)
         return np.asarray(images / self._all_light)
 
@@ -462,6 +466,8 @@ class PyramidOptics:
         else:
             here = rows.fields[row, columns]
             right = xp.take(rows.factors_x, there(columns), axis=0)
+        # Complex numbers as pairs: the imaginary part of a product is a real product of twice the
+        # length.
         left = (here[None, :, :, None] * rows.signs).view(self.dtype)
         n_planes, n_columns, n_source = left.shape[:3]
         left = left.reshape(n_planes, n_columns, n_source, along_y[0].size // n_u, -1)
@@ -490,6 +496,7 @@ class PyramidOptics:
             return TiledResponse(shapes, self._scale, self.arrays)
         xp, there = self.arrays.xp, self.arrays.there
         lit, scale = there(np.flatnonzero(self.pupil.lit)), there(self._scale[self.pupil.lit])
+        # Sent to the device once, before the rows.
         known = None if shapes is None else there(shapes)
 
         def fold(along_y: Foreign, along_x: list[Foreign]) -> Foreign:

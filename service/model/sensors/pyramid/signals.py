@@ -172,6 +172,7 @@ class PyramidResponse:
         at_rest, rates = self._to(shapes), []
         for edges in ({"nodes_x": Nodes.edges()}, {"nodes_y": Nodes.edges()}):
             moving = replace(self, sensor=images)._to(shapes, **edges)  # noqa: SLF001 - its own kind
+            # Images as planes, of which each in turn is the only one that moves.
             by_image = moving.gradient.reshape(2, 2, -1, moving.gradient.shape[1])
             for side_y, side_x in np.ndindex(2, 2):
                 light = np.zeros_like(moving.images)
@@ -267,6 +268,7 @@ def signals_of(images: Array, valid: NDArray[np.bool_], recipe: SlopeRecipe) -> 
     The signals are ``(..., n_slopes)``: x, then y differences, or the images. The flux is
     ``(..., 1)``, the mean per valid subaperture, or ``(..., n_slopes)``, each one's own.
     """
+    # Sums of the two images on one side.
     by_x, by_y = images.sum(axis=-4), images.sum(axis=-2)
     flux = by_y.sum(axis=-3)[..., valid]
     if recipe.kind is SignalKind.INTENSITY:

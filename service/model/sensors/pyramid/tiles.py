@@ -86,12 +86,14 @@ class TiledResponse:
     def __init__(self, shapes: LocalShapes, scale: Array, arrays: Arrays) -> None:
         """Prepare strips of the shapes; ``scale`` ``(N, N)`` multiplies a product of factors."""
         self._arrays = arrays
+        # Tiles of a strip share the product along y.
         by_strip: dict[int, list[Patch]] = {}
         for patch in shapes.patches:
             by_strip.setdefault(patch.tile.rows.start, []).append(patch)
         self._strips = [_strip_of(patches, scale, arrays) for patches in by_strip.values()]
         every = np.concatenate([strip.sum.functions for strip in self._strips])
         self._sum = _Sum.over(every, arrays)
+        # Functions that reach no lit point have no row: they read the zeros behind the last one.
         places = np.full(shapes.n_all_functions, len(self._sum.functions))  # of a row of zeros
         places[self._sum.functions] = np.arange(len(self._sum.functions))
         self._layers = [arrays.there(layer) for layer in np.split(places, shapes.n_layers)]
@@ -114,6 +116,7 @@ def _strip_of(patches: Sequence[Patch], scale: Array, arrays: Arrays) -> _Strip:
     tiles = []
     for patch in patches:
         tile = patch.tile
+        # Multiplied into the heights once, instead of into each row's product.
         at_points = scale[tile.rows, tile.columns].reshape(-1, 1)
         heights = np.ascontiguousarray((patch.weights * at_points).T)
         tiles.append((tile.columns, arrays.there(heights)))

@@ -84,6 +84,7 @@ def working_point(
     covariance = (
         scipy.special.j0(np.outer(distance, frequency)) @ (power * frequency * step) / (2 * np.pi)
     )
+    # exp(-D/2) with D = 2 (variance - covariance).
     coherence = np.exp(covariance - variance)
     far = float(np.exp(-variance))
     wfs = pyramid_in(instrument)
@@ -122,6 +123,7 @@ def _rings(tilt: Array, brightness: Array, core: float) -> Halo:
     light = np.concatenate([[0.0], np.cumsum((brightness[1:] + brightness[:-1]) / 2)])
     light *= tilt[1] - tilt[0]
     n_rings = len(POINTS)
+    # Rings of equal light need the fewest points where the halo is faint.
     middle = (np.arange(n_rings) + 0.5) / n_rings * light[-1]
     return Halo(
         core_weight=core,

@@ -58,6 +58,7 @@ def shack_hartmann_of(table: ShackHartmannTable) -> ShackHartmann:
         partly lit subapertures; mean gradients of a laser's spots.
     """
     thresholded = table.centroid is Centroid.THRESHOLD
+    # There is no usual value, and a wrong one would bias α.
     if thresholded and table.threshold is None:
         raise ModelError(
             'threshold: found none, expected a share of the brightest pixel with centroid = "'
@@ -129,6 +130,7 @@ def point_variances(sensor: ShackHartmann, subaperture_m: float) -> tuple[float,
     alone: w = 1.
     """
     pixel = sensor.pixel_lambda_over_d(subaperture_m)
+    # Wings of a spot fall as 1/u², so that its variance grows with the width of the field.
     half = sensor.pixels_per_subaperture * pixel / 2
     if sensor.centroid is not Centroid.CENTRE_OF_GRAVITY:
         half = min(half, 1.0)

@@ -71,6 +71,7 @@ class ElongatedSpots(Spots):
     @override
     @cached_property
     def nodes(self) -> tuple[Array, Array]:
+        # Light from beyond the field is blurred into it: nodes must resolve its fringes, too.
         width = self.n_pixels * self.pixel + 2.0 * self._beyond
         places, weights = gauss_legendre(int(np.ceil(width)) + SPARE_NODES)
         return places / 2, weights / 2
@@ -142,6 +143,7 @@ class ElongatedSpots(Spots):
     @override
     def images(self, amplitude: Array) -> Array:
         light = np.abs(self._transform_amplitude(amplitude)) ** 2
+        # A blur is a product of spectra.
         spectrum = self._star * (self._spectrum @ light @ self._spectrum.T)
         return np.asarray((self._to_pixels @ spectrum @ self._to_pixels.T).real)
 
@@ -152,6 +154,7 @@ class ElongatedSpots(Spots):
         ``(2, n_lenslets)`` each, along x and y, in (λ/d)², over the square of the photons yet.
         """
         full = self.images(np.ones((1, *[len(self.nodes[0])] * 2)))
+        # Where a photon falls: its place times what the pixel counts is the centroid it makes.
         share = full / full.sum(axis=(1, 2), keepdims=True)
         counts = self.weights_of(full)
         x = self.pixel * self._places

@@ -102,6 +102,7 @@ class ShackHartmannSensor:
     @cached_property
     def extend_wavefronts(self) -> Any:  # noqa: ANN401 - scipy has no types
         """``(n_grid, n_points)``: from wavefronts where it is lit to that grid; sparse."""
+        # Nodes of a lenslet at the edge read points that see no light: a wavefront is needed there.
         lit = np.pad(self.pupil.lit, _MARGIN_POINTS)
         near = scipy.ndimage.binary_dilation(lit, np.ones((2 * _MARGIN_POINTS + 1,) * 2)) & ~lit
         inside, beyond = np.argwhere(lit), np.argwhere(near)
@@ -123,6 +124,7 @@ class ShackHartmannSensor:
 
     def work(self, n_shapes: int) -> Work:
         """Return what K, which is sparse, and its product with so many shapes take."""
+        # A lenslet reads its own points and two more on either side.
         entries = float(self.n_signals * (self.pupil.sampling + 4) ** 2)
         n_nodes = len(self.spots.nodes[0])
         spots = 16.0 * self.n_signals * n_nodes**2
@@ -213,6 +215,7 @@ class ShackHartmannResponse:
         Of a full lenslet, wings beyond its field counted, it is 1.
         """
         instrument, n = self.sensor.instrument, len(self.sensor.valid)
+        # Light is asked for on all pixels, those of invalid subapertures included.
         every = np.ones((n, n), np.bool_)
         spots = spots_of(shack_hartmann_in(instrument), instrument.subaperture_m, every)
         light = spots.images(self._amplitudes[0].reshape(n * n, *self._amplitudes[0].shape[2:]))
@@ -273,6 +276,7 @@ class ShackHartmannResponse:
     @cached_property
     def _pulls(self) -> tuple[tuple[Array, Array], Array, tuple[Array, Array, Array]]:
         """Return pulls along x and y, the light that counts, amplitudes and their rates."""
+        # Rates are those of the light's grid, so that the derivative by the shift is exact.
         spots = self.sensor.spots
         amplitude, *rates = (each[self.sensor.valid] for each in self._amplitudes)
         full = np.ones((1, *amplitude.shape[1:]))

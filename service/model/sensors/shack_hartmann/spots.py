@@ -84,6 +84,7 @@ class Spots:
 
         ``(..., n_angles, n_angles)`` each, including the quadrature weight.
         """
+        # What counts is decided by a fully lit lenslet: thresholds follow the brightest pixel.
         full = self.images(np.ones((1, *[len(self.nodes[0])] * 2)))
         counts = self._spread(self.weights_of(full))
         x = self.pixel * np.repeat(self._places, self._angles[0].shape[1])
@@ -91,6 +92,7 @@ class Spots:
 
     def weights_of(self, full: Array) -> Array:
         """Return how much each pixel counts, of spots ``(n, n_pixels, n_pixels)`` in full light."""
+        # Relative to the brightest pixel, as the threshold is.
         light = full / full.max(axis=(1, 2), keepdims=True)
         match self.centroid:
             case Centroid.CENTRE_OF_GRAVITY | Centroid.GRADIENT:
@@ -111,6 +113,7 @@ class Spots:
     def images(self, amplitude: Array) -> Array:
         """Return the light on the pixels ``(n_lenslets, n_pixels, n_pixels)`` [y, x]."""
         light = np.abs(self._transform_amplitude(amplitude)) ** 2 * self._area
+        # Several angles belong to a pixel: their light is summed.
         n, inside = self.n_pixels, self._angles[0].shape[1]
         return np.asarray(light.reshape(-1, n, inside, n, inside).sum(axis=(2, 4)))
 
@@ -155,6 +158,7 @@ class Spots:
         found = []
         for axis, pull in enumerate(self.pull(full, full)):
             along = nodes[:, None] if axis else nodes
+            # The answer to a tilt that the model has, per λ/d of motion.
             linear = 2 * np.pi * (pull * along).sum(axis=(1, 2)) / self.light(full, full)
             seen = [self._centroids(full * np.exp(2j * np.pi * far * along), axis) for far in aside]
             fitted = aside @ np.array(seen) / (aside @ aside)

@@ -53,6 +53,7 @@ def spots_of(wfs: ShackHartmann, width_m: float, lenslets: NDArray[np.bool_]) ->
     line_m = width_m * (np.arange(len(lenslets)) - (len(lenslets) - 1) / 2)
     places_m = np.stack(np.meshgrid(line_m, line_m), axis=-1)
     blur = blur_of(wfs.laser, places_m, wfs.wavelength_m / width_m)
+    # Of all lenslets, so that each has the same grid of angles whichever are asked for.
     widest = float(np.sqrt(np.linalg.eigvalsh(blur).max()))
     return ElongatedSpots(**pixels, blur=blur[lenslets], widest=widest)
 
@@ -83,10 +84,12 @@ def check_star(wfs: ShackHartmann, width_m: float) -> None:
         _check_laser(wfs.laser, wfs, width_m)
     if wfs.threshold is None:
         return
+    # Spots of a point are alike; of a laser's, a coarse grid of lenslets is checked.
     some = np.zeros((n, n), np.bool_)
     each = 1 if wfs.laser is None else max(1, n // _N_CHECKED_SPOTS)
     some[::each, ::each] = True
     moved = spots_of(wfs, width_m, some).straightness(_SPOT_MOTION_LAMBDA_OVER_D)
+    # Farthest from 1 as a ratio: half as much is as wrong as twice as much.
     worst = float(moved[np.argmax(np.abs(np.log(np.maximum(moved, 1e-3))))])
     low, high = LINEARITY_RANGE
     if not low < worst < high:
@@ -106,6 +109,7 @@ def _check_laser(laser: LaserStar, wfs: ShackHartmann, width_m: float) -> None:
             f"{_MIN_SPOT_LAMBDA_OVER_D:g} λ/d or more: "
             f"{_MIN_SPOT_LAMBDA_OVER_D * lambda_over_d:.2g} of a subaperture of {width_m:.3g} m"
         )
+    # The lenslet farthest from the launcher has the longest spot.
     corner = width_m * wfs.n_subapertures / 2 * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
     long = math.degrees(np.linalg.norm(elongation_rad(laser, corner), axis=1).max()) * 3600.0
     field = wfs.pixels_per_subaperture * wfs.pixel_lambda_over_d(width_m) * lambda_over_d

@@ -35,8 +35,7 @@ def work_of(
     """
     n_points, n_modes = float(pupil.lit.sum()), instrument.modes.n_modes
     kept, making = _of_modes(instrument)
-    near = _near(instrument)
-    n_functions = _n_functions(instrument)
+    n_functions, near = _functions(instrument)
     by_tiles = n_points * near + float(n_functions * n_modes)
     product = 2.0 * sensor.n_signals * min(by_tiles, n_points * n_modes)
     # Without a kept gradient all shapes are measured at once, and have to exist at once.
@@ -54,21 +53,15 @@ def work_of(
     )
 
 
-def _n_functions(instrument: Instrument) -> int:
-    mirror = instrument.mirror
-    if isinstance(mirror, Mirror):
-        return len(mirror.positions_m)
-    return instrument.modes.n_modes if mirror.local is None else mirror.local.n_functions
-
-
 def _of_modes(instrument: Instrument) -> tuple[float, float]:
     """Return bytes of the modes as they are kept, and while they are made."""
     mirror = instrument.mirror
     if not isinstance(mirror, Mirror):
         if mirror.cube is not None:
             return 2.0 * mirror.cube.nbytes, 3.0 * mirror.cube.nbytes
-        kept = 12.0 * _n_functions(instrument) * instrument.modes.n_modes
-        return kept, kept + _STATISTICS_COPIES * 8.0 * _n_functions(instrument) ** 2
+        n_functions, _ = _functions(instrument)
+        kept = 12.0 * n_functions * instrument.modes.n_modes
+        return kept, kept + _STATISTICS_COPIES * 8.0 * n_functions**2
     n_actuators = float(len(mirror.positions_m))
     surface = mirror_surface(mirror, instrument.subaperture_m)
     local = isinstance(surface, Gaussian)
@@ -87,22 +80,23 @@ def _of_modes(instrument: Instrument) -> tuple[float, float]:
     return kept, kept + 8.0 * (n_points * tables + 3.0 * n_actuators**2)
 
 
-def _near(instrument: Instrument) -> float:
-    """Return how many functions reach a tile of the pupil, about."""
+def _functions(instrument: Instrument) -> tuple[int, float]:
+    """Return how many functions the modes are made of, and how many reach a tile, about."""
     mirror = instrument.mirror
-    if not isinstance(mirror, Mirror):
-        if mirror.local is None:
-            return float(instrument.modes.n_modes)
+    if isinstance(mirror, Mirror):
+        surface = mirror_surface(mirror, instrument.subaperture_m)
+        n_functions = len(mirror.positions_m)
+        near = float(n_functions)
+        if isinstance(surface, Gaussian):
+            near = _area_within(surface.reach) / surface.pitch**2
+    elif mirror.local is None:
+        n_functions, near = instrument.modes.n_modes, float(instrument.modes.n_modes)
+    else:
         step = mirror.pitch_m / instrument.subaperture_m
         n_functions, n_samples = mirror.local.n_functions, len(mirror.local.heights)
         reach = step * (float(np.sqrt(n_samples / n_functions / np.pi)) + 4.0)
-        each = np.pi / 4 * instrument.wfs.pupil_diameter**2 / n_functions
-        return float(min(n_functions, _area_within(reach) / each))
-    surface = mirror_surface(mirror, instrument.subaperture_m)
-    n_actuators = float(len(mirror.positions_m))
-    if not isinstance(surface, Gaussian):
-        return n_actuators
-    return float(min(n_actuators, _area_within(surface.reach) / surface.pitch**2))
+        near = _area_within(reach) / (np.pi / 4 * instrument.wfs.pupil_diameter**2 / n_functions)
+    return n_functions, float(min(n_functions, near))
 
 
 def _area_within(reach: float) -> float:

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from service.errors import ModelError
 from service.model.instrument import Instrument, SensorMode
-from service.model.kinds import Normalisation
+from service.model.kinds import LoopFacts, Normalisation
 from service.model.pupil import PupilGrid
 from service.model.sensors.model import SensorModel, Term
 from service.model.sensors.pyramid import description, detector_windows, signals, working_point
-from service.model.sensors.pyramid.description import FrameWindows, Pyramid, pyramid_in
+from service.model.sensors.pyramid.description import FrameWindows, Pyramid, by_quadrant, pyramid_in
 from service.model.sensors.pyramid.light import PyramidLight
-from service.model.sensors.pyramid.table import IMAGE_KEY, PyramidTable
+from service.model.sensors.pyramid.table import IMAGE_KEY, PyramidMode, PyramidNumbers, PyramidTable
 from service.model.sensors.pyramid.working_point import Halo
 from service.model.sensors.sensor import Fineness, WorkingPoint
 from service.model.slopes import SlopeRecipe
@@ -57,6 +58,10 @@ axis. Of 12 and 24 subapertures, modulated by 0 and 3 λ/D, low and high modes: 
 EDGE_ERROR_RATIO = 0.03
 """The same of rotation and magnification, at the pupil's edge: 0.001 to 0.032."""
 
+_SEPARATION_TOLERANCE = 0.1
+
+_FRAME_KEYS = ("pupil_centres_px", "pixels_per_subaperture")
+
 _WEAK_LAMBDA_OVER_D = 1.5
 """Modulation up to which the star's own width counts as much."""
 
@@ -72,15 +77,79 @@ class PyramidModel(SensorModel):
     def read_sensor(
         self, table: PyramidTable, given: frozenset[str], subaperture_m: float
     ) -> Pyramid:
-        return description.pyramid_of(table, given)
+        diameter, separation = table.pupil_diameter, _separation(table, given)
+        # Images that overlap on the detector add their light: no normalised difference of them is a
+        # slope.
+        if separation < diameter:
+            raise ModelError(
+                f"pupil_separation_subap: found {separation:g}, expected at least the pupil's "
+                f"diameter, {diameter:g} subapertures: the images would overlap"
+            )
+        optics = {field.name: getattr(table, field.name) for field in fields(PyramidNumbers)}
+        pixels = table.pixels_per_subaperture
+        # The file has detector pixels, because windows are cut there; the optics need subapertures.
+        offsets: tuple[tuple[float, float], ...] | None = None
+        if table.image_offsets_px is not None:
+            offsets = tuple((x / pixels, y / pixels) for x, y in table.image_offsets_px)
+        return Pyramid(
+            **optics | {"pupil_separation_subap": separation},
+            image_offsets_subap=offsets,
+        )
 
     @override
     def in_modes(self, table: PyramidTable, sensor: Pyramid) -> tuple[tuple[SensorMode, str], ...]:
-        return description.modes_of(table, sensor)
+        if table.mode and table.input == "frames":
+            raise ModelError('mode: belongs to input = "slopes", found input = "frames"')
+        names = [mode.config_id for mode in table.mode]
+        for k, mode in enumerate(table.mode):
+            if mode.config_id in names[:k]:
+                raise ModelError(
+                    f"mode[{k}].config_id: found {mode.config_id!r} again, expected a name of "
+                    "its own"
+                )
+        return tuple(
+            (self._in_mode(sensor, mode, f"mode[{k}]"), mode.valid_subapertures)
+            for k, mode in enumerate(table.mode)
+        )
+
+    def _in_mode(self, sensor: Pyramid, mode: PyramidMode, where: str) -> SensorMode:
+        n, binning = sensor.n_subapertures, mode.binning
+        # A binned grid that does not fill the finest one may have a column more or less: only the
+        # RTC knows.
+        if mode.n_subapertures is None and n % binning:
+            raise ModelError(
+                f"{where}.binning: found {binning} of {n} subapertures, which it does not divide; "
+                f"expected n_subapertures as well, that of the binned grid: about {n / binning:.1f}"
+            )
+        across = mode.n_subapertures or n // binning
+        diameter = sensor.pupil_diameter / binning
+        # A grid a little narrower than the image cuts its rim only; one of twice its width is a
+        # slip.
+        if not diameter - 1.0 < across < 2.0 * diameter:
+            raise ModelError(
+                f"{where}.n_subapertures: found {across} across a pupil image of {diameter:.1f}, "
+                "expected as many as the image is wide, or a few more"
+            )
+        modulation = mode.modulation_lambda_over_d
+        wfs = replace(
+            self.bin_sensor(sensor, binning),
+            n_subapertures=across,
+            modulation_lambda_over_d=(
+                sensor.modulation_lambda_over_d if modulation is None else modulation
+            ),
+        )
+        loop = LoopFacts(frame_rate_hz=mode.frame_rate_hz, n_controlled=mode.n_controlled)
+        return SensorMode(config_id=mode.config_id, binning=binning, wfs=wfs, loop=loop)
 
     @override
     def frames(self, table: PyramidTable, given: frozenset[str]) -> FrameWindows | None:
-        return description.frames_of(table, given)
+        if table.input == "slopes":
+            for key in _FRAME_KEYS:
+                if key in given and getattr(table, key) != 1:
+                    raise ModelError(f'{key}: belongs to input = "frames", found input = "slopes"')
+            return None
+        centres = None if table.pupil_centres_px is None else _centres(table).reshape(4, 2)
+        return FrameWindows(centres_px=centres, pixels_per_subaperture=table.pixels_per_subaperture)
 
     @override
     def signals_of_frames(
@@ -105,7 +174,15 @@ class PyramidModel(SensorModel):
 
     @override
     def bin_sensor(self, sensor: Pyramid, binning: int) -> Pyramid:
-        return description.bin_pyramid(sensor, binning)
+        return replace(
+            sensor,
+            n_subapertures=sensor.n_subapertures // binning,
+            pupil_separation_subap=sensor.image_separation_subap / binning,
+            pupil_diameter_subap=sensor.pupil_diameter / binning,
+            image_offsets_subap=None
+            if sensor.image_offsets_subap is None
+            else tuple((x / binning, y / binning) for x, y in sensor.image_offsets_subap),
+        )
 
     @override
     def noise_terms(self, instrument: Instrument) -> tuple[Term, Term]:
@@ -226,3 +303,29 @@ def _pixels(instrument: Instrument) -> int:
     """Return the detector pixels along a side of a subaperture."""
     frames = instrument.frames
     return frames.pixels_per_subaperture if isinstance(frames, FrameWindows) else 1
+
+
+def _separation(table: PyramidTable, given: frozenset[str]) -> float:
+    """Return the distance of the images: as given, or from their positions on the frames."""
+    stated = table.image_separation_subap
+    if table.pupil_centres_px is None or table.input == "slopes":
+        return stated
+    centres = _centres(table)
+    # Both rows and both columns: faces of a real pyramid differ by some 0.1 %.
+    sides = (centres[1, :, 0] - centres[0, :, 0], centres[:, 1, 1] - centres[:, 0, 1])
+    measured = float(np.mean(sides)) / table.pixels_per_subaperture
+    if "pupil_separation_subap" not in given:
+        return measured
+    if abs(measured / stated - 1.0) > _SEPARATION_TOLERANCE:
+        raise ModelError(
+            f"pupil_separation_subap: found {stated:g}, expected about {measured:.1f}, the "
+            "distance of wfs.pupil_centres_px"
+        )
+    return stated
+
+
+def _centres(table: PyramidTable) -> NDArray[np.float64]:
+    try:
+        return by_quadrant(np.array(table.pupil_centres_px))
+    except ModelError as error:
+        raise ModelError(f"pupil_centres_px: {error}") from error

@@ -1,9 +1,9 @@
-"""A Shack-Hartmann as an instrument has it, made of its file's table or refused."""
+"""A Shack-Hartmann as an instrument has it."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -15,7 +15,6 @@ from service.model.sensors.shack_hartmann.table import (
     Centroid,
     PartlyLit,
     ShackHartmannNumbers,
-    ShackHartmannTable,
 )
 
 FIELDS_LAMBDA_OVER_D = (1.5, 60.0)
@@ -46,42 +45,6 @@ class ShackHartmann(ShackHartmannNumbers):
         if self.pixel_scale_arcsec is None:
             return 1.0
         return math.radians(self.pixel_scale_arcsec / 3600.0) * subaperture_m / self.wavelength_m
-
-
-def shack_hartmann_of(table: ShackHartmannTable) -> ShackHartmann:
-    """Return the sensor of a table, its mask apart.
-
-    Raises
-    ------
-    ModelError
-        One line that begins with the key: a threshold that is missing, has no meaning, or meets
-        partly lit subapertures; mean gradients of a laser's spots.
-    """
-    thresholded = table.centroid is Centroid.THRESHOLD
-    # There is no usual value, and a wrong one would bias α.
-    if thresholded and table.threshold is None:
-        raise ModelError(
-            'threshold: found none, expected a share of the brightest pixel with centroid = "'
-            f'{table.centroid}"'
-        )
-    if not thresholded and table.threshold is not None:
-        raise ModelError(
-            f'threshold: found {table.threshold:g} with centroid = "{table.centroid}", expected '
-            'centroid = "threshold" or no threshold'
-        )
-    if table.centroid is Centroid.GRADIENT and table.laser is not None:
-        raise ModelError(
-            'centroid: found "gradient" with a laser star, expected "cog", "weighted" or '
-            '"threshold": a mean gradient does not model elongated spots'
-        )
-    if thresholded and table.partly_lit is PartlyLit.USE:
-        raise ModelError(
-            f'partly_lit: found "use" with a threshold of {table.threshold:g}, expected "leave '
-            'out": a threshold removes more of a spot that the pupil edge widens'
-        )
-    return ShackHartmann(
-        **{field.name: getattr(table, field.name) for field in fields(ShackHartmannNumbers)}
-    )
 
 
 def check_field(sensor: ShackHartmann, subaperture_m: float) -> None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from service.errors import ModelError
 from service.model.instrument import Instrument, SensorDescription
 from service.model.pupil import PupilGrid, fully_lit_subapertures, valid_subapertures
 from service.model.sensors.model import LeftOut, SensorModel, Term
@@ -17,11 +18,15 @@ from service.model.sensors.shack_hartmann.description import (
     check_field,
     pixel_places,
     shack_hartmann_in,
-    shack_hartmann_of,
 )
 from service.model.sensors.shack_hartmann.optics import ShackHartmannSensor
 from service.model.sensors.shack_hartmann.stars import centroid_variances, check_star
-from service.model.sensors.shack_hartmann.table import Centroid, ShackHartmannTable
+from service.model.sensors.shack_hartmann.table import (
+    Centroid,
+    PartlyLit,
+    ShackHartmannNumbers,
+    ShackHartmannTable,
+)
 from service.model.slopes import SlopeRecipe
 
 
@@ -37,7 +42,31 @@ class ShackHartmannModel(SensorModel):
     def read_sensor(
         self, table: ShackHartmannTable, given: frozenset[str], subaperture_m: float
     ) -> ShackHartmann:
-        sensor = shack_hartmann_of(table)
+        thresholded = table.centroid is Centroid.THRESHOLD
+        # There is no usual value, and a wrong one would bias α.
+        if thresholded and table.threshold is None:
+            raise ModelError(
+                'threshold: found none, expected a share of the brightest pixel with centroid = "'
+                f'{table.centroid}"'
+            )
+        if not thresholded and table.threshold is not None:
+            raise ModelError(
+                f'threshold: found {table.threshold:g} with centroid = "{table.centroid}", '
+                'expected centroid = "threshold" or no threshold'
+            )
+        if table.centroid is Centroid.GRADIENT and table.laser is not None:
+            raise ModelError(
+                'centroid: found "gradient" with a laser star, expected "cog", "weighted" or '
+                '"threshold": a mean gradient does not model elongated spots'
+            )
+        if thresholded and table.partly_lit is PartlyLit.USE:
+            raise ModelError(
+                f'partly_lit: found "use" with a threshold of {table.threshold:g}, expected "leave '
+                'out": a threshold removes more of a spot that the pupil edge widens'
+            )
+        sensor = ShackHartmann(
+            **{field.name: getattr(table, field.name) for field in fields(ShackHartmannNumbers)}
+        )
         check_field(sensor, subaperture_m)
         check_star(sensor, subaperture_m)
         return sensor

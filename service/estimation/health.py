@@ -719,7 +719,24 @@ class Standstill(Streaming):
     @override
     def update(self, frames: FrameContext) -> Standstill:
         """Return it after one more block."""
-        return self.follow(frames.block)
+        block, state = frames.block, self
+        # By frame number: which frames are compared does not depend on how they are cut into
+        # blocks.
+        for row in range(
+            -block.first_seq % STANDSTILL_STRIDE_FRAMES, block.n_frames, STANDSTILL_STRIDE_FRAMES
+        ):
+            slopes, t_ns = block.slopes[row], block.t0_ns_utc + row * block.dt_ns
+            if state.session == block.session and np.array_equal(slopes, state.slopes):
+                state = replace(state, lasts_s=(t_ns - state.since_ns_utc) * 1e-9)
+                continue
+            state = Standstill(
+                session=block.session,
+                # Copied: a view would keep the whole block in memory.
+                slopes=slopes.copy(),
+                first_seq=block.first_seq + row,
+                since_ns_utc=t_ns,
+            )
+        return state
 
     @property
     @override
@@ -741,27 +758,6 @@ class Standstill(Streaming):
             "measurement; open the loop, then check the camera and its link"
         )
         return (text,)
-
-    def follow(self, block: FrameBlock) -> Standstill:
-        """Return it after one more block."""
-        state = self
-        # By frame number: which frames are compared does not depend on how they are cut into
-        # blocks.
-        for row in range(
-            -block.first_seq % STANDSTILL_STRIDE_FRAMES, block.n_frames, STANDSTILL_STRIDE_FRAMES
-        ):
-            slopes, t_ns = block.slopes[row], block.t0_ns_utc + row * block.dt_ns
-            if state.session == block.session and np.array_equal(slopes, state.slopes):
-                state = replace(state, lasts_s=(t_ns - state.since_ns_utc) * 1e-9)
-                continue
-            state = Standstill(
-                session=block.session,
-                # Copied: a view would keep the whole block in memory.
-                slopes=slopes.copy(),
-                first_seq=block.first_seq + row,
-                since_ns_utc=t_ns,
-            )
-        return state
 
 
 def _around(power: Array, n: int) -> Array:

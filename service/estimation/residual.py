@@ -312,19 +312,14 @@ class Rejection(Streaming):
     @override
     def update(self, frames: FrameContext) -> Rejection:
         """Return it after one more block."""
-        rtc, in_loop = frames.rtc, frames.loop.in_loop
-        return self.follow(frames.block, in_loop, np.array(rtc.gains)[in_loop], rtc.leak)
-
-    def follow(
-        self, block: FrameBlock, in_loop: NDArray[np.intp], gains: Array, leak: float
-    ) -> Rejection:
-        """Return it after one more block of a loop of these modes with these gains."""
+        block, rtc, in_loop = frames.block, frames.rtc, frames.loop.in_loop
         own = block.without_dither().commands_m[:, in_loop].astype(float)
         if len(own) < 2:
             return self
         # The loop law solved for R s: the residual follows from the commands alone, whatever matrix
         # is in use. The delay only shifts it in time.
-        residual = np.square((leak * own[:-1] - own[1:]) / gains).sum(axis=0)
+        gains = np.array(rtc.gains)[in_loop]
+        residual = np.square((rtc.leak * own[:-1] - own[1:]) / gains).sum(axis=0)
         commanded, lasts_s = np.square(own[1:]).sum(axis=0), block.n_frames * block.dt_ns * 1e-9
         if self.residual is None or self.commanded is None or len(self.residual) != len(residual):
             return Rejection(lasts_s=lasts_s, residual=residual, commanded=commanded)

@@ -1,6 +1,7 @@
 """A camera that stands is noticed by its slopes, zero or frozen."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ def noise(n_frames):
 def after(slopes, state=None):
     state = state or Standstill()
     for block in blocks(slopes):
-        state = state.follow(block)
+        state = state.update(SimpleNamespace(block=block))
     return state
 
 
@@ -64,4 +65,4 @@ def test_frames_sent_twice_are_no_camera_that_stands():
 def test_another_session_begins_anew():
     state = after(np.zeros((800, N_SLOPES)))
     (block,) = blocks(np.zeros((BLOCK, N_SLOPES)), first_seq=800)
-    assert not state.follow(replace(block, session="t")).marks
+    assert not state.update(SimpleNamespace(block=replace(block, session="t"))).marks

@@ -1,5 +1,7 @@
 """Whether a loop holds well is seen in its own commands."""
 
+from types import SimpleNamespace
+
 import numpy as np
 
 from service.estimation.frames import FrameBlock
@@ -28,7 +30,9 @@ def followed(response, seconds=2.0):
             dither_m=None,
             cm_id="a",
         )
-        state = state.follow(block, np.arange(N_MODES), np.full(N_MODES, GAIN), 0.99)
+        rtc = SimpleNamespace(gains=np.full(N_MODES, GAIN), leak=0.99)
+        loop = SimpleNamespace(in_loop=np.arange(N_MODES))
+        state = state.update(SimpleNamespace(block=block, rtc=rtc, loop=loop))
     return state
 
 

@@ -61,7 +61,7 @@ class DemodulationBank:
         cuts = [place, *range(place // length * length + length, end, length), end]
         segments = [first // length for first in cuts[:-1]]
         shaped = [_shaped_lines(self, index) for index in segments]
-        bins = np.hstack([_segment(self, index).bins for index in segments])
+        bins = np.hstack([_segment(self, index)[1] for index in segments])
         n_columns, by_shape = columns.shape[1], sums.transpose(2, 1, 0, 3)
         for start in range(0, n_columns, _COLUMNS_AT_ONCE):
             some = slice(start, min(start + _COLUMNS_AT_ONCE, n_columns))
@@ -97,29 +97,20 @@ class DemodulationBank:
         return np.asarray((_lines(self, frames) * _hann(self.n_frames, frames)) @ columns)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Segment:
-    """The lines in a segment, and the matrix that leads from smooth shapes to bins."""
-
-    lines: Array
-    """``(2 * n_lines, length)`` both parts of each line."""
-
-    bins: Array
-    """``(n_shapes, n_smooth)`` the combinations: of 1, the cosines, then the sines."""
-
-
 @lru_cache(maxsize=48)
-def _segment(bank: DemodulationBank, index: int) -> _Segment:
-    """Return the lines and the bins of one segment, which are the same in every window."""
+def _segment(bank: DemodulationBank, index: int) -> tuple[Array, Array]:
+    """Return lines and bins of one segment, which are the same in every window.
+
+    ``(2 * n_lines, length)`` both parts of each line, and ``(n_shapes, n_smooth)`` the matrix that
+    leads from smooth shapes to bins: of 1, the cosines, then the sines.
+    """
     smooth = _smooth(bank.frame_rate_hz, bank.n_frames)
     length = smooth.shape[1]
     frames = index * length + np.arange(length)
     turns = np.outer(_OFFSETS_HZ / bank.frame_rate_hz, frames)
     turning = np.vstack([np.ones(length), *cosines_and_sines(turns)])
-    return _Segment(
-        lines=_lines(bank, frames),
-        bins=np.asarray((turning * _hann(bank.n_frames, frames)) @ smooth.T, np.float32),
-    )
+    bins = np.asarray((turning * _hann(bank.n_frames, frames)) @ smooth.T, np.float32)
+    return _lines(bank, frames), bins
 
 
 @lru_cache(maxsize=4)
@@ -128,7 +119,7 @@ def _shaped_lines(bank: DemodulationBank, index: int) -> Array:
 
     Only those in use are kept: with a hundred lines a segment has 1.4 MB, a window twenty segments.
     """
-    smooth, lines = _smooth(bank.frame_rate_hz, bank.n_frames), _segment(bank, index).lines
+    smooth, (lines, _) = _smooth(bank.frame_rate_hz, bank.n_frames), _segment(bank, index)
     return np.asarray((smooth[:, None] * lines).reshape(-1, smooth.shape[1]))
 
 

@@ -52,14 +52,10 @@ class Aperture:
     def words(self) -> str:
         """Diameter, hole and centre, in words."""
         x, y = self.centre
-        at = f", centred {x:+.2f}, {y:+.2f} from the middle of the grid" if self.is_off else ""
+        is_off = float(np.hypot(x, y)) > OFF_CENTRE_SUBAP
+        at = f", centred {x:+.2f}, {y:+.2f} from the middle of the grid" if is_off else ""
         hole = f", a central hole of {self.hole_subap:.1f}" if self.hole_subap else ", no hole"
         return f"{self.diameter_subap:.1f} subapertures across{hole}{at}"
-
-    @property
-    def is_off(self) -> bool:
-        """True if the pupil is not centred on the grid."""
-        return float(np.hypot(*self.centre)) > OFF_CENTRE_SUBAP
 
 
 def measure_aperture(valid: NDArray[np.bool_]) -> Aperture:

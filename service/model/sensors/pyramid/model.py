@@ -12,11 +12,12 @@ from typing_extensions import override
 from service.errors import ModelError
 from service.model.instrument import Instrument, SensorMode
 from service.model.kinds import LoopFacts, Normalisation
-from service.model.pupil import PupilGrid
+from service.model.pupil import PupilGrid, valid_subapertures
 from service.model.sensors.model import SensorModel, Term
 from service.model.sensors.pyramid import description, detector_windows, signals, working_point
 from service.model.sensors.pyramid.description import FrameWindows, Pyramid, by_quadrant, pyramid_in
 from service.model.sensors.pyramid.light import PyramidLight
+from service.model.sensors.pyramid.optics import PyramidOptics, enough_modulation_points
 from service.model.sensors.pyramid.table import IMAGE_KEY, PyramidMode, PyramidNumbers, PyramidTable
 from service.model.sensors.pyramid.working_point import Halo
 from service.model.sensors.sensor import Fineness, WorkingPoint
@@ -201,7 +202,26 @@ class PyramidModel(SensorModel):
         fineness: Fineness,
         working_point: WorkingPoint | None = None,
     ) -> signals.PyramidSensor:
-        return signals.pyramid_sensor(instrument, pupil, fineness, working_point)
+        wfs = pyramid_in(instrument)
+        if not isinstance(working_point, Halo | None):
+            raise ModelError(f"pyramid: found {working_point!r}, expected a halo")
+        optics = PyramidOptics(
+            wfs=wfs,
+            pupil=pupil,
+            n_nodes=fineness.n_nodes,
+            n_modulation=max(fineness.n_source_points, enough_modulation_points(wfs)),
+            dtype=fineness.dtype,
+            halo=working_point,
+            recipe=instrument.slopes,
+            arrays=fineness.arrays,
+            offsets=description.image_offsets(instrument),
+        )
+        return signals.PyramidSensor(
+            optics=optics,
+            valid=valid_subapertures(instrument),
+            mapper=fineness.mapper,
+            kept_bytes=fineness.kept_bytes,
+        )
 
     @override
     def working_point(

@@ -9,61 +9,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import ModelError
-from service.model.instrument import Instrument
 from service.model.kinds import Normalisation, SignalKind, SlopeOrder
 from service.model.local import Shapes
-from service.model.pupil import PupilGrid, valid_subapertures
-from service.model.sensors.pyramid.description import image_offsets, pyramid_in
 from service.model.sensors.pyramid.optics import (
     LightGradient,
     Nodes,
     PyramidOptics,
-    enough_modulation_points,
 )
-from service.model.sensors.pyramid.working_point import Halo
-from service.model.sensors.sensor import KEPT_BYTES, Fineness, Mapper, Work, WorkingPoint, by_rows
+from service.model.sensors.sensor import KEPT_BYTES, Mapper, Work, by_rows
 from service.model.slopes import PLAIN, TO_SLOPES, SlopeRecipe
 
 Array = NDArray[Any]
 
 _ROWS = 512
 """Signals that are normalised at once."""
-
-
-def pyramid_sensor(
-    instrument: Instrument,
-    pupil: PupilGrid,
-    fineness: Fineness,
-    working_point: WorkingPoint | None = None,
-) -> PyramidSensor:
-    """Return the pyramid of an instrument on this pupil, by default for a flat wavefront.
-
-    Raises
-    ------
-    ModelError
-        If the instrument's sensor is another, or the working point another sensor's.
-    """
-    wfs = pyramid_in(instrument)
-    if not isinstance(working_point, Halo | None):
-        raise ModelError(f"pyramid: found {working_point!r}, expected a halo")
-    optics = PyramidOptics(
-        wfs=wfs,
-        pupil=pupil,
-        n_nodes=fineness.n_nodes,
-        n_modulation=max(fineness.n_source_points, enough_modulation_points(wfs)),
-        dtype=fineness.dtype,
-        halo=working_point,
-        recipe=instrument.slopes,
-        arrays=fineness.arrays,
-        offsets=image_offsets(instrument),
-    )
-    return PyramidSensor(
-        optics=optics,
-        valid=valid_subapertures(instrument),
-        mapper=fineness.mapper,
-        kept_bytes=fineness.kept_bytes,
-    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

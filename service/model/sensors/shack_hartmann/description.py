@@ -9,17 +9,12 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import ModelError
 from service.model.instrument import Instrument, sensor_of_kind
 from service.model.sensors.shack_hartmann.table import (
     Centroid,
     PartlyLit,
     ShackHartmannNumbers,
 )
-
-FIELDS_LAMBDA_OVER_D = (1.5, 60.0)
-"""Width of a subaperture's field: a narrower one cuts the spot itself, a wider one is a slip of the
-unit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -45,23 +40,6 @@ class ShackHartmann(ShackHartmannNumbers):
         if self.pixel_scale_arcsec is None:
             return 1.0
         return math.radians(self.pixel_scale_arcsec / 3600.0) * subaperture_m / self.wavelength_m
-
-
-def check_field(sensor: ShackHartmann, subaperture_m: float) -> None:
-    """Refuse pixels on which no spot can be.
-
-    Raises
-    ------
-    ModelError
-        One line that begins with the key.
-    """
-    width = sensor.pixels_per_subaperture * sensor.pixel_lambda_over_d(subaperture_m)
-    low, high = FIELDS_LAMBDA_OVER_D
-    if not low <= width <= high:
-        raise ModelError(
-            f"pixel_scale_arcsec: found a field of {width:.3g} λ/d across a subaperture of "
-            f"{subaperture_m:.3g} m, expected {low:g} to {high:g}"
-        )
 
 
 def shack_hartmann_in(instrument: Instrument) -> ShackHartmann:

@@ -15,7 +15,6 @@ from service.model.sensors.model import LeftOut, SensorModel, Term
 from service.model.sensors.sensor import Fineness, WorkingPoint
 from service.model.sensors.shack_hartmann.description import (
     ShackHartmann,
-    check_field,
     pixel_places,
     shack_hartmann_in,
 )
@@ -28,6 +27,10 @@ from service.model.sensors.shack_hartmann.table import (
     ShackHartmannTable,
 )
 from service.model.slopes import SlopeRecipe
+
+FIELDS_LAMBDA_OVER_D = (1.5, 60.0)
+"""Width of a subaperture's field: a narrower one cuts the spot itself, a wider one is a slip of the
+unit."""
 
 
 class ShackHartmannModel(SensorModel):
@@ -67,7 +70,13 @@ class ShackHartmannModel(SensorModel):
         sensor = ShackHartmann(
             **{field.name: getattr(table, field.name) for field in fields(ShackHartmannNumbers)}
         )
-        check_field(sensor, subaperture_m)
+        width = sensor.pixels_per_subaperture * sensor.pixel_lambda_over_d(subaperture_m)
+        low, high = FIELDS_LAMBDA_OVER_D
+        if not low <= width <= high:
+            raise ModelError(
+                f"pixel_scale_arcsec: found a field of {width:.3g} λ/d across a subaperture of "
+                f"{subaperture_m:.3g} m, expected {low:g} to {high:g}"
+            )
         check_star(sensor, subaperture_m)
         return sensor
 

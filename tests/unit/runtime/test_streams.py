@@ -256,7 +256,7 @@ class TestCommandsOffTheLoop:
         streams, windows, off = self.play(streams, self.telemetry(30, stroke_m=5e-10))
         assert [type(w) for w in windows] == [WindowRefused] * 5
         assert off.index(True) * 0.2 < 2.0
-        assert "4 of 4 modes (0-3)" in streams[LoopCheck].residual.text
+        assert "4 of 4 modes (0 to 3)" in streams[LoopCheck].residual.text
 
     @pytest.mark.parametrize("from_frame", [2300, 2700, 3100, 3500, 3900, 4300])
     def test_whenever_it_begins_to_saturate_that_is_named_in_time(self, streams, from_frame):

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.importers.imported import Array, Dataset, Imported, matrix_of, orient_matrix
+from pyrcal.importers.imported import Array, Imported, in_arrays_file, matrix_of, orient_matrix
 from pyrcal.importers.registration import decompose
 from service.errors import ConfigurationError
 from service.model.misregistration import Misregistration, rotation
@@ -172,7 +172,7 @@ def from_oopao(
         shape = "(n_actuators, n_modes)"
         strokes = orient_matrix(_numpy(M2C), n_actuators, None, "M2C", shape, notes)
         n_modes = strokes.shape[1]
-        mirror["mode_to_actuator"] = Dataset("mode_to_actuator")
+        mirror["mode_to_actuator"] = in_arrays_file("mode_to_actuator")
         arrays["mode_to_actuator"] = strokes
     if calib is not None:
         arrays["interaction_matrix"] = matrix_of(
@@ -185,14 +185,14 @@ def from_oopao(
             "instrument": {
                 "name": "oopao",
                 "diameter_m": diameter_m,
-                "pupil": Dataset("pupil"),
+                "pupil": in_arrays_file("pupil"),
                 "stop": "telescope",
                 "double_pass": False,
             },
             "wfs": {
                 **sensor,
                 "wavelength_m": wavelength_m,
-                "valid_subapertures": Dataset("valid_subapertures"),
+                "valid_subapertures": in_arrays_file("valid_subapertures"),
             },
             "mirror": mirror,
             "slopes": slopes,
@@ -352,7 +352,7 @@ def _mirror(
     )
     cube = np.ascontiguousarray(functions.T.reshape(-1, side, side), dtype=np.float32)
     table = {
-        "influence_functions": Dataset("influence_functions"),
+        "influence_functions": in_arrays_file("influence_functions"),
         "modes_pitch_m": float(tel.D) / side,
     }
     return table, {"influence_functions": cube}
@@ -393,7 +393,7 @@ def _gaussian(tel: Oopao, dm: Oopao, places: Array) -> tuple[dict[str, Any], dic
     places = places.astype(float) * _steps(tel) * _flip_signs(dm)
     table = {
         "layout": "positions",
-        "positions": Dataset("positions"),
+        "positions": in_arrays_file("positions"),
         "pitch_m": float(tel.D) / float(dm.nActAlongDiameter) * _steps(tel),
         "influence": "gaussian",
         "coupling": float(dm.mechCoupling),

@@ -224,14 +224,21 @@ def _lit_pupil(
     A padded telescope has an array that is wider than its light, and ``tel.D`` is the array's.
     """
     # OOPAO's reflectivity is that of the intensity, the model's pupil is an amplitude.
-    reflectivity = _numpy(getattr(tel, "pupilReflectivity", 1.0))
-    pupil = np.asarray(_numpy(tel.pupil) * np.sqrt(reflectivity), dtype=np.float32)
-    side = len(pupil)
+    mask, reflectivity = _numpy(tel.pupil), _numpy(getattr(tel, "pupilReflectivity", 1.0))
+    side = int(tel.resolution)
+    for name, values, shapes in (
+        ("pupil", mask, {(side, side)}),
+        ("pupilReflectivity", reflectivity, {(), (side, side)}),
+    ):
+        if values.shape not in shapes:
+            raise ConfigurationError(
+                f"tel.{name}: found shape {values.shape}, expected ({side}, {side}) as "
+                "tel.resolution says"
+            )
+    pupil = np.asarray(mask * np.sqrt(reflectivity), dtype=np.float32)
     lit = np.argwhere(pupil > 0.0)
-    if pupil.ndim != 2 or side != pupil.shape[1] or not len(lit):
-        raise ConfigurationError(
-            f"tel.pupil: found shape {pupil.shape}, expected light on a square (n, n)"
-        )
+    if not len(lit):
+        raise ConfigurationError("tel.pupil: found no light, expected some")
     rim = int(min(lit.min(), side - 1 - lit.max()))
     if not rim:
         return pupil, float(tel.D)
@@ -368,6 +375,10 @@ def _places(dm: Oopao, n_functions: int, notes: list[str]) -> Array | None:
     if places is None:
         return None
     places = _numpy(places)
+    if places.ndim != 2 or places.shape[1] != 2:
+        raise ConfigurationError(
+            f"dm.initial_coordinates: found shape {places.shape}, expected (n_actuators, 2)"
+        )
     if len(places) == n_functions:
         return places
     kept = getattr(dm, "validAct", None)
@@ -519,19 +530,6 @@ def from_saved(arrays: Mapping[str, Array], where: str) -> Imported:
     if missing:
         raise ConfigurationError(
             f"{where}: found no {', '.join(missing)}; expected it with the others"
-        )
-    side = int(objects["tel"].resolution)
-    for name in ("pupil", "pupilReflectivity"):
-        shape = np.shape(getattr(objects["tel"], name, ()))
-        if shape not in {(), (side, side)}:
-            raise ConfigurationError(
-                f"{where}: tel.{name}: found shape {shape}, expected ({side}, {side}) as "
-                "tel.resolution says"
-            )
-    places = np.shape(objects["dm"].initial_coordinates)
-    if places[1] != 2:
-        raise ConfigurationError(
-            f"{where}: dm.initial_coordinates: found shape {places}, expected (n_actuators, 2)"
         )
     objects["dm"].misReg = objects["dm.misReg"]
     return from_oopao(

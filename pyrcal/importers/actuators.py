@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pyrcal.importers.imported import UNKNOWN, Array, Dataset, orient_matrix
+from pyrcal.importers.imported import UNKNOWN, Array, in_arrays_file, orient_matrix
 from pyrcal.importers.layouts import cube_of
 from service.errors import MatrixError
 from service.model.defects import COPY, explain_defects, find_defects
@@ -97,7 +97,7 @@ def _read_positions(given: Array, notes: list[str]) -> Mirror:
         table={
             "basis": "zonal",
             "layout": "positions",
-            "positions": Dataset("positions"),
+            "positions": in_arrays_file("positions"),
             "influence": "gaussian",
             "coupling": UNKNOWN,
         },
@@ -113,7 +113,7 @@ def _read_shapes(given: Array, diameter_m: float, *, is_basis: bool, notes: list
     return Mirror(
         n_modes=len(cube),
         n_actuators=len(cube),
-        table={key: Dataset(name), "modes_pitch_m": diameter_m / cube.shape[1]},
+        table={key: in_arrays_file(name), "modes_pitch_m": diameter_m / cube.shape[1]},
         arrays={name: cube},
         per_mode=(name,),
         defects=find_defects(cube),
@@ -140,7 +140,7 @@ def combine(mirror: Mirror, strokes: Array, notes: list[str]) -> None:
             mirror.arrays[name] = mirror.arrays[name][kept]
         commands = commands[kept]
     mirror.table.pop("basis", None)
-    mirror.table["mode_to_actuator"] = Dataset("mode_to_actuator")
+    mirror.table["mode_to_actuator"] = in_arrays_file("mode_to_actuator")
     mirror.arrays["mode_to_actuator"] = commands
     mirror.per_mode = ("mode_to_actuator",)
     mirror.n_modes = commands.shape[1]

@@ -15,7 +15,7 @@ import numpy as np
 from pyrcal.importers.actuators import Mirror, combine
 from pyrcal.importers.files import apply_unit, read_frames, read_slopes, usable_modes
 from pyrcal.importers.frames import Frames, describe_images, describe_windows
-from pyrcal.importers.imported import Array, Dataset, Imported, Signals
+from pyrcal.importers.imported import Array, Imported, Signals, in_arrays_file
 from service.errors import MatrixError
 from service.files.toml import read_toml
 from service.instrument import instrument_path, load_instrument
@@ -149,7 +149,7 @@ def _signals(
                 f"{source}: valid: found a mask that spans {found} subapertures, expected {n} as "
                 "wfs.n_subapertures says"
             )
-        signals.table = {"valid_subapertures": Dataset("valid_subapertures")}
+        signals.table = {"valid_subapertures": in_arrays_file("valid_subapertures")}
         return signals
     table: dict[str, Any] = {}
     if instrument.frames is not None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pyrcal.fitting.pupil_width import compute_responses, measure_pupil
 from pyrcal.importers.actuators import Mirror, read_mirror
 from pyrcal.importers.frames import Frames, describe_frames, frames_of
-from pyrcal.importers.imported import UNKNOWN, Array, Dataset, Imported, Signals, matrix_of
+from pyrcal.importers.imported import UNKNOWN, Array, Imported, Signals, in_arrays_file, matrix_of
 from pyrcal.importers.layouts import ROLES, centre_grid, find_lit, maps_of, mask_of, plane_of
 from service.errors import ConfigurationError, MatrixError
 from service.model.aperture import measure_aperture
@@ -290,7 +290,7 @@ def read_slopes(
     return Signals(
         table={
             "n_subapertures": len(grid),
-            "valid_subapertures": Dataset("valid_subapertures"),
+            "valid_subapertures": in_arrays_file("valid_subapertures"),
             **width,
         },
         arrays={"interaction_matrix": matrix, "valid_subapertures": grid.astype(np.uint8)},

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.importers.imported import Array, Dataset, Signals
+from pyrcal.importers.imported import Array, Signals, in_arrays_file
 from pyrcal.importers.layouts import is_listed_twice
 from service.errors import MatrixError
 from service.model.pupil_images import PupilImages, find_pupil_images
@@ -117,7 +117,7 @@ def describe_frames(
         table={
             "n_subapertures": n,
             **describe_windows(images, pixels),
-            "valid_subapertures": Dataset("valid_subapertures"),
+            "valid_subapertures": in_arrays_file("valid_subapertures"),
         },
         arrays={
             "interaction_matrix": frames.cube,

@@ -35,10 +35,9 @@ UNKNOWN = "unknown"
 """Value in an instrument file for a number that is not known."""
 
 
-class Dataset(str):
-    """The name of an array that a key of the instrument file refers to."""
-
-    __slots__ = ()
+def in_arrays_file(name: str) -> str:
+    """Return the value of a key of the instrument file that refers to an array."""
+    return f"{ARRAYS_FILE}:/{name}"
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -207,8 +206,6 @@ class Imported:
 
 def _toml(value: object) -> str:
     """Return a value in TOML notation."""
-    if isinstance(value, Dataset):
-        return json.dumps(f"{ARRAYS_FILE}:/{value}")
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{key} = {_toml(each)}" for key, each in value.items()) + " }"
     if isinstance(value, list | tuple):

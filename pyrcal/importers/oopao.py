@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.importers.imported import Array, Dataset, Imported, matrix_of, orient_matrix
+from pyrcal.importers.imported import Array, Imported, in_arrays_file, matrix_of, orient_matrix
 from pyrcal.importers.registration import decompose
 from service.errors import ConfigurationError
 from service.model.misregistration import Misregistration, rotation
@@ -172,7 +172,7 @@ def from_oopao(
         shape = "(n_actuators, n_modes)"
         strokes = orient_matrix(_numpy(M2C), n_actuators, None, "M2C", shape, notes)
         n_modes = strokes.shape[1]
-        mirror["mode_to_actuator"] = Dataset("mode_to_actuator")
+        mirror["mode_to_actuator"] = in_arrays_file("mode_to_actuator")
         arrays["mode_to_actuator"] = strokes
     if calib is not None:
         arrays["interaction_matrix"] = matrix_of(
@@ -185,14 +185,14 @@ def from_oopao(
             "instrument": {
                 "name": "oopao",
                 "diameter_m": diameter_m,
-                "pupil": Dataset("pupil"),
+                "pupil": in_arrays_file("pupil"),
                 "stop": "telescope",
                 "double_pass": False,
             },
             "wfs": {
                 **sensor,
                 "wavelength_m": wavelength_m,
-                "valid_subapertures": Dataset("valid_subapertures"),
+                "valid_subapertures": in_arrays_file("valid_subapertures"),
             },
             "mirror": mirror,
             "slopes": slopes,
@@ -224,14 +224,21 @@ def _lit_pupil(
     A padded telescope has an array that is wider than its light, and ``tel.D`` is the array's.
     """
     # OOPAO's reflectivity is that of the intensity, the model's pupil is an amplitude.
-    reflectivity = _numpy(getattr(tel, "pupilReflectivity", 1.0))
-    pupil = np.asarray(_numpy(tel.pupil) * np.sqrt(reflectivity), dtype=np.float32)
-    side = len(pupil)
+    mask, reflectivity = _numpy(tel.pupil), _numpy(getattr(tel, "pupilReflectivity", 1.0))
+    side = int(tel.resolution)
+    for name, values, shapes in (
+        ("pupil", mask, {(side, side)}),
+        ("pupilReflectivity", reflectivity, {(), (side, side)}),
+    ):
+        if values.shape not in shapes:
+            raise ConfigurationError(
+                f"tel.{name}: found shape {values.shape}, expected ({side}, {side}) as "
+                "tel.resolution says"
+            )
+    pupil = np.asarray(mask * np.sqrt(reflectivity), dtype=np.float32)
     lit = np.argwhere(pupil > 0.0)
-    if pupil.ndim != 2 or side != pupil.shape[1] or not len(lit):
-        raise ConfigurationError(
-            f"tel.pupil: found shape {pupil.shape}, expected light on a square (n, n)"
-        )
+    if not len(lit):
+        raise ConfigurationError("tel.pupil: found no light, expected some")
     rim = int(min(lit.min(), side - 1 - lit.max()))
     if not rim:
         return pupil, float(tel.D)
@@ -352,7 +359,7 @@ def _mirror(
     )
     cube = np.ascontiguousarray(functions.T.reshape(-1, side, side), dtype=np.float32)
     table = {
-        "influence_functions": Dataset("influence_functions"),
+        "influence_functions": in_arrays_file("influence_functions"),
         "modes_pitch_m": float(tel.D) / side,
     }
     return table, {"influence_functions": cube}
@@ -368,6 +375,10 @@ def _places(dm: Oopao, n_functions: int, notes: list[str]) -> Array | None:
     if places is None:
         return None
     places = _numpy(places)
+    if places.ndim != 2 or places.shape[1] != 2:
+        raise ConfigurationError(
+            f"dm.initial_coordinates: found shape {places.shape}, expected (n_actuators, 2)"
+        )
     if len(places) == n_functions:
         return places
     kept = getattr(dm, "validAct", None)
@@ -393,7 +404,7 @@ def _gaussian(tel: Oopao, dm: Oopao, places: Array) -> tuple[dict[str, Any], dic
     places = places.astype(float) * _steps(tel) * _flip_signs(dm)
     table = {
         "layout": "positions",
-        "positions": Dataset("positions"),
+        "positions": in_arrays_file("positions"),
         "pitch_m": float(tel.D) / float(dm.nActAlongDiameter) * _steps(tel),
         "influence": "gaussian",
         "coupling": float(dm.mechCoupling),
@@ -519,19 +530,6 @@ def from_saved(arrays: Mapping[str, Array], where: str) -> Imported:
     if missing:
         raise ConfigurationError(
             f"{where}: found no {', '.join(missing)}; expected it with the others"
-        )
-    side = int(objects["tel"].resolution)
-    for name in ("pupil", "pupilReflectivity"):
-        shape = np.shape(getattr(objects["tel"], name, ()))
-        if shape not in {(), (side, side)}:
-            raise ConfigurationError(
-                f"{where}: tel.{name}: found shape {shape}, expected ({side}, {side}) as "
-                "tel.resolution says"
-            )
-    places = np.shape(objects["dm"].initial_coordinates)
-    if places[1] != 2:
-        raise ConfigurationError(
-            f"{where}: dm.initial_coordinates: found shape {places}, expected (n_actuators, 2)"
         )
     objects["dm"].misReg = objects["dm.misReg"]
     return from_oopao(

@@ -1,4 +1,4 @@
-"""Hold a matrix and a basis against the numbered rules of docs/reference/conventions.md.
+"""Hold a matrix, a basis or a stream against the numbered rules of docs/reference/conventions.md.
 
 Each finding has the number of its rule, what was measured and what is allowed. What an instrument
 file leaves open (``orientation = "auto"``, ``stroke = "unknown"``) breaks no rule.
@@ -30,7 +30,8 @@ from service.model.slopes import FLIPS
 
 Array = NDArray[Any]
 
-AXES, ROTATION, MODES, ORDER, SIGN, MATRIX, PASSES = 1, 2, 9, 10, 11, 13, 15
+AXES, ROTATION, OPD, MODES, ORDER = 1, 2, 8, 9, 10
+SIGN, MATRIX, LAW, PASSES, TIME = 11, 13, 14, 15, 17
 """Rules that can be measured."""
 
 MAX_ROTATION_DEG = 20.0
@@ -56,6 +57,18 @@ MAX_RESIDUAL = 0.2
 HEIGHTS_M = (0.05, 50.0)
 """Plausible range of a mode's peak over the pupil, metres per unit command."""
 
+COMMANDS_M = (1e-11, 1e-4)
+"""Plausible range of the RMS of commands, metres."""
+
+MAX_SLOPE = 3.0
+"""Largest plausible RMS of slopes, which are dimensionless."""
+
+YEARS_NS = (946_684_800_000_000_000, 4_102_444_800_000_000_000)
+"""Plausible range of times: 2000 to 2100, nanoseconds since 1970."""
+
+MAX_LAW_RESIDUAL = 0.5
+"""Largest RMS of command steps that the control law does not explain, relative to all steps."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RuleCheck:
@@ -77,6 +90,27 @@ class RuleCheck:
     def kept(self) -> bool:
         """True if the rule is kept."""
         return self.deviation <= self.limit
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Stream:
+    """Telemetry of a closed loop."""
+
+    t_ns_utc: Array
+    """``(n_frames,)`` nanoseconds."""
+
+    slopes: Array
+    """``(n_frames, n_slopes)`` as the RTC lists them."""
+
+    commands: Array
+    """``(n_frames, n_modes)`` metres OPD, as they were on the mirror during the frame."""
+
+    reconstructor: Array
+    """``(n_modes, n_slopes)`` metres per slope."""
+
+    frame_rate_hz: float
+    delay_frames: int = 1
+    """Frames from an exposure to its correction."""
 
 
 def main(options: argparse.Namespace) -> int:
@@ -101,6 +135,7 @@ def check(
     matrix: Array | None = None,
     *,
     columns: Array | None = None,
+    stream: Stream | None = None,
 ) -> tuple[RuleCheck, ...]:
     """Return every rule that could be measured; broken ones have ``kept`` False.
 
@@ -112,10 +147,14 @@ def check(
         ``(n_slopes, n_modes)`` as its file has it.
     columns
         Basis index of each column; None: the first ones.
+    stream
+        Telemetry of its loop.
     """
     findings = [*_basis(instrument)]
     if matrix is not None:
         findings += _matrix(instrument, np.asarray(matrix), columns)
+    if stream is not None:
+        findings += _stream(instrument, stream)
     return tuple(findings)
 
 
@@ -132,13 +171,21 @@ def _basis(instrument: Instrument) -> Iterator[RuleCheck]:
     shapes = lowest.render(pupil.points)
     mean = pupil.weights @ shapes
     peak = float(np.median(np.abs(shapes - mean).max(axis=0)))
-    low, high = HEIGHTS_M
+    decades = _decades_outside(peak, HEIGHTS_M)
     yield RuleCheck(
         rule=MODES,
         # In powers of ten: a basis in another unit is outside by three or more.
-        deviation=float(max(np.log10(low / peak), np.log10(peak / high), 0.0)) if peak else np.inf,
+        deviation=decades,
         text=f"peak of a mode: {peak:.3g} m per unit command; expected metres of OPD",
     )
+
+
+def _decades_outside(value: float, limits: tuple[float, float]) -> float:
+    """Return the powers of ten by which a number is outside a range; 0 within it."""
+    if not np.isfinite(value) or value <= 0.0:
+        return np.inf
+    low, high = limits
+    return float(max(np.log10(low / value), np.log10(value / high), 0.0))
 
 
 # --- a matrix
@@ -160,7 +207,6 @@ def _matrix(instrument: Instrument, matrix: Array, columns: Array | None) -> Ite
         modes=np.arange(matrix.shape[1]) if columns is None else np.asarray(columns),
         double_pass=instrument.double_pass,
     )
-    # The fit finds axes and signs by itself: they are compared with the stated ones below.
     free = replace(instrument, slopes=replace(instrument.slopes, orientation=None))
     try:
         with threadpool_limits(1):
@@ -218,8 +264,10 @@ def _gains(instrument: Instrument, fit: Fit) -> Iterator[RuleCheck]:
     if not instrument.mirror.stroke_known or "wfs.wavelength_m" in instrument.unknown:
         return
     median = float(np.median(fit.gains))
-    # A factor of two is a wrong number of passes, or surface instead of OPD.
-    twice = abs(abs(np.log2(max(median, 1e-300))) - 1.0) < _A_PASS
+    factor = abs(
+        np.log2(max(median, 1e-300))
+    )  # in powers of two: a wrong number of passes, or surface instead of OPD
+    twice = abs(factor - 1.0) < _A_PASS
     yield RuleCheck(
         rule=PASSES if twice else MATRIX,
         deviation=abs(median - 1.0),
@@ -252,3 +300,84 @@ def _columns(fit: Fit) -> Iterator[RuleCheck]:
 def _unit(columns: Array) -> Array:
     values = np.nan_to_num(np.asarray(columns, dtype=np.float64))
     return np.asarray(values / np.linalg.norm(values, axis=0))
+
+
+# --- a stream
+
+
+def _stream(instrument: Instrument, stream: Stream) -> Iterator[RuleCheck]:
+    n_frames, n_modes = len(stream.t_ns_utc), len(stream.reconstructor)
+    n_slopes = stream.reconstructor.shape[1]
+    expected = instrument.slopes.kind.n_planes * int(rtc_valid_subapertures(instrument).sum())
+    shapes = (stream.slopes.shape, stream.commands.shape, n_slopes)
+    right = ((n_frames, n_slopes), (n_frames, n_modes), expected)
+    yield RuleCheck(
+        rule=MATRIX,
+        deviation=float(shapes != right),
+        limit=0.0,
+        text=f"slopes, commands, slopes of R: {shapes}; expected {right}",
+    )
+    yield from _times(stream)
+    if shapes != right:
+        return
+    size = float(np.sqrt(np.mean(np.square(stream.commands))))
+    yield RuleCheck(
+        rule=OPD,
+        deviation=_decades_outside(size, COMMANDS_M),
+        limit=0.0,
+        text=f"commands of {size:.3g} RMS; expected metres of OPD",
+    )
+    light = float(np.sqrt(np.mean(np.square(stream.slopes))))
+    yield RuleCheck(
+        rule=ORDER,
+        deviation=light,
+        limit=MAX_SLOPE,
+        text=f"slopes of {light:.3g} RMS; expected dimensionless ones",
+    )
+    yield from _law(stream)
+
+
+def _times(stream: Stream) -> Iterator[RuleCheck]:
+    times = np.asarray(stream.t_ns_utc)
+    first, last = (float(t) for t in (times[0], times[-1]))
+    in_range = times.dtype.kind in "iu" and YEARS_NS[0] < first <= last < YEARS_NS[1]
+    yield RuleCheck(
+        rule=TIME,
+        deviation=float(not in_range),
+        limit=0.0,
+        text=f"times {first:.6g} to {last:.6g} of {times.dtype}; expected integer nanoseconds",
+    )
+    steps = np.diff(times.astype(np.float64)) * stream.frame_rate_hz * 1e-9
+    late = float(abs(np.median(steps) - 1.0))
+    yield RuleCheck(
+        rule=TIME,
+        deviation=late if (steps > 0.0).all() else np.inf,
+        limit=0.2,
+        text=f"a frame takes {np.median(steps):.3g} of what the rate says; expected 1, and times "
+        "that rise",
+    )
+
+
+def _law(stream: Stream) -> Iterator[RuleCheck]:
+    """Yield the check of ``c[k+d] - c[k+d-1] = -gain R s[k]`` with one gain above 0."""
+    d = stream.delay_frames
+    steps = np.diff(stream.commands, axis=0)[d - 1 :]
+    requested = -(stream.slopes @ stream.reconstructor.T)[: len(steps)]
+    steps = steps[: len(requested)]
+    power = float(np.sum(requested * requested))
+    gain = float(np.sum(requested * steps)) / power if power else 0.0
+    left = steps - gain * requested
+    size = float(np.sqrt(np.mean(np.square(steps))))
+    share = float(np.sqrt(np.mean(np.square(left)))) / size if size else np.inf
+    yield RuleCheck(
+        rule=LAW,
+        deviation=max(-gain, 0.0) if gain <= 0.0 else 0.0,
+        limit=0.0,
+        text=f"commands step by {gain:+.3g} times -R s; expected a gain above 0: R = +pinv(D)",
+    )
+    yield RuleCheck(
+        rule=LAW,
+        deviation=share,
+        limit=MAX_LAW_RESIDUAL,
+        text=f"{share:.2f} of the commands' steps are not -gain R s of {d} frames before",
+    )

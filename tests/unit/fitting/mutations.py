@@ -1,10 +1,11 @@
-"""Good files, and ways to get them wrong, each with the rule that it breaks."""
+"""Good files, and forty ways to get them wrong, each with the rule that it breaks."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 
+from pyrcal.conventions import Stream
 from service.instrument import load_instrument
 from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import Misregistration
@@ -46,12 +47,15 @@ order = "xy"
 orientation = { swap_xy = false, flip_x = false, flip_y = false, sign = 1 }
 """
 
+DELAY, RATE_HZ, GAIN, N_FRAMES = 2, 1000.0, 0.4, 200
+
 
 @dataclass(frozen=True)
 class Good:
     instrument: object
     matrix: np.ndarray
     valid: np.ndarray
+    stream: Stream
 
 
 @cache
@@ -63,7 +67,33 @@ def good(folder):
     matrix = np.asarray(model.interaction_matrix(ALPHA), dtype=np.float64)
     rng = np.random.default_rng(1)
     matrix += 0.01 * matrix.std() * rng.normal(size=matrix.shape)
-    return Good(instrument, matrix, rtc_valid_subapertures(instrument))
+    return Good(instrument, matrix, rtc_valid_subapertures(instrument), _stream(matrix, rng))
+
+
+def _stream(matrix, rng):
+    """A loop on drifting turbulence: c[k+d] = c[k+d-1] - gain R s[k]."""
+    reconstructor = np.linalg.pinv(matrix)
+    n_modes = matrix.shape[1]
+    sky = np.cumsum(rng.normal(size=(N_FRAMES, n_modes)), axis=0) * 5e-9
+    commands = np.zeros((N_FRAMES, n_modes))
+    slopes = np.zeros((N_FRAMES, len(matrix)))
+    for k in range(N_FRAMES):
+        if k >= 1:
+            seen = reconstructor @ slopes[k - DELAY] if k >= DELAY else 0.0
+            commands[k] = commands[k - 1] - GAIN * seen
+        slopes[k] = matrix @ (sky[k] + commands[k])
+    t_ns = 1_790_000_000_000_000_000 + np.arange(N_FRAMES, dtype=np.int64) * 1_000_000
+    return Stream(
+        t_ns_utc=t_ns,
+        slopes=slopes,
+        commands=commands,
+        reconstructor=reconstructor,
+        frame_rate_hz=RATE_HZ,
+        delay_frames=DELAY,
+    )
+
+
+# --- of a matrix
 
 
 def _maps(good):
@@ -158,4 +188,36 @@ MATRICES = {
         by_matrix(lambda m: np.column_stack([m[:, -1], m[:, :-1]])),
         (9, 13),
     ),
+}
+
+
+# --- of a stream
+
+
+def stream_with(**changes):
+    return lambda good: replace(
+        good.stream,
+        **{name: change(getattr(good.stream, name)) for name, change in changes.items()},
+    )
+
+
+STREAMS = {
+    "R with the other sign": (stream_with(reconstructor=lambda r: -r), 14),
+    "R transposed": (stream_with(reconstructor=lambda r: r.T), 13),
+    "commands of the other sign": (stream_with(commands=lambda c: -c), 14),
+    "another delay": (stream_with(delay_frames=lambda d: d + 4), 14),
+    "commands in nanometres": (
+        stream_with(commands=lambda c: c * 1e9, reconstructor=lambda r: r * 1e9),
+        8,
+    ),
+    "frames last": (stream_with(slopes=lambda s: s.T), 13),
+    "times in microseconds": (stream_with(t_ns_utc=lambda t: t // 1000), 17),
+    "times in seconds": (stream_with(t_ns_utc=lambda t: t * 1e-9), 17),
+    "times backwards": (stream_with(t_ns_utc=lambda t: t[::-1]), 17),
+    "times that stop": (stream_with(t_ns_utc=lambda t: np.r_[t[:-1], t[-2]]), 17),
+    "slopes in milliarcseconds": (
+        stream_with(slopes=lambda s: s * 206_265e3, reconstructor=lambda r: r / 206_265e3),
+        10,
+    ),
+    "another rate": (stream_with(frame_rate_hz=lambda f: 2 * f), 17),
 }

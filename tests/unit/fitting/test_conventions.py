@@ -1,5 +1,5 @@
-"""A matrix and modes against the numbered rules: what is good keeps them all, and each of the
-mutations breaks the rule that it is about.
+"""A matrix, modes and a stream against the numbered rules: what is good keeps them all, and each of
+more than forty mutations breaks the rule that it is about.
 """
 
 import re
@@ -16,13 +16,14 @@ from pyrcal.importers.oopao import from_saved
 from pyrcal.importers.saved import read_npz
 from service.instrument import load_instrument
 from service.model.modes import modal_basis
-from tests.unit.fitting.mutations import GOOD_FILE, MATRICES, good
+from tests.unit.fitting.mutations import GOOD_FILE, MATRICES, STREAMS, good
 from tests.unit.test_house import ROOT
 
 DATA = ROOT / "pyrcal" / "samples" / "data"
 RULES = {
-    *(conventions.AXES, conventions.ROTATION, conventions.MODES, conventions.ORDER),
-    *(conventions.SIGN, conventions.MATRIX, conventions.PASSES),
+    *(conventions.AXES, conventions.ROTATION, conventions.OPD, conventions.MODES),
+    *(conventions.ORDER, conventions.SIGN, conventions.MATRIX, conventions.LAW),
+    *(conventions.PASSES, conventions.TIME),
 }
 
 
@@ -40,9 +41,13 @@ def named(rules):
 
 
 def test_what_is_good_keeps_every_rule_that_can_be_measured(files):
-    findings = check(files.instrument, files.matrix)
+    findings = check(files.instrument, files.matrix, stream=files.stream)
     assert broken(findings) == set()
     assert {one.rule for one in findings} == RULES - {conventions.PASSES}
+
+
+def test_there_are_forty_mutations():
+    assert len(MATRICES) + len(STREAMS) >= 40
 
 
 @pytest.mark.parametrize(
@@ -53,6 +58,12 @@ def test_what_is_good_keeps_every_rule_that_can_be_measured(files):
 def test_a_mutated_matrix_breaks_its_rule(name, files):
     mutate, rules = MATRICES[name]
     assert broken(check(files.instrument, mutate(files))) & named(rules)
+
+
+@pytest.mark.parametrize("name", STREAMS)
+def test_a_mutated_stream_breaks_its_rule_and_no_other(name, files):
+    mutate, rules = STREAMS[name]
+    assert broken(check(files.instrument, stream=mutate(files))) == named(rules)
 
 
 @pytest.mark.parametrize("factor", [1e9, 1e6, 1e-3])
@@ -97,11 +108,14 @@ def test_the_rules_have_the_numbers_of_the_page():
     for rule, word in (
         (conventions.AXES, "reference frame"),
         (conventions.ROTATION, "Rotation"),
+        (conventions.OPD, "optical path difference"),
         (conventions.MODES, "Modes"),
         (conventions.ORDER, "Slopes"),
         (conventions.SIGN, "positive mean Sx"),
         (conventions.MATRIX, "Interaction matrix"),
+        (conventions.LAW, "Closed loop"),
         (conventions.PASSES, "Double pass"),
+        (conventions.TIME, "Time"),
     ):
         assert word in texts[str(rule)]
     assert [*map(int, texts)] == list(range(1, len(texts) + 1))

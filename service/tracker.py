@@ -204,7 +204,7 @@ def _on_answer(context: StepContext, answered: ev.Answered) -> None:
 
 
 def _on_failure(context: StepContext, failed: ev.JobFailed) -> None:
-    """Pass the failure of an effect to its requester."""
+    """Pass the failure of an effect to its requester, which may ask again later."""
     match failed.effect:
         case ev.Ask(request=MeasureRequest(id=name)):
             measurement.fail_measurement(context, context.state.measurement(name), failed.text)

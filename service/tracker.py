@@ -31,7 +31,7 @@ from service.tracking.alarm_rules import derive_alarms
 from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
 from service.tracking.operation_records import CommandState, MeasureState
-from service.tracking.operations import acquisition, measurement, noisy_measurement, probation
+from service.tracking.operations import acquisition, measurement, probation
 from service.tracking.policy import Policy
 from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext
@@ -119,7 +119,7 @@ def _advance(context: StepContext, event: Event) -> None:
     # Updates follow α, which an acquisition is about to determine.
     if context.acquisition.under_way:
         return
-    noisy_measurement.advance(context, event)
+    measurement.advance_noisy(context, event)
     noisy = context.state.noisy_measurement
     # Another dither has to end before its own: until then the service begins none.
     if noisy is None or noisy.state is not MeasureState.WAITING:
@@ -175,9 +175,7 @@ def _on_dither_measured(context: StepContext, event: ev.DitherMeasured) -> None:
     """Stop a dither measured stronger than requested."""
     reason = dither.check_measured_dither(context, event)
     if reason is not None:
-        noisy_measurement.fail_noisy_measurement(
-            context, f"its dither was too strong: {event.text}"
-        )
+        measurement.fail_noisy_measurement(context, f"its dither was too strong: {event.text}")
         dither.stop_too_strong(context, event.id, reason)
 
 
@@ -258,7 +256,7 @@ REACTIONS: Final[dict[type, Callable[[StepContext, Any], object]]] = {
     cmd.StopDither: dither.stop_by_operator,
     cmd.Measure: measurement.measure,
     cmd.GiveUp: measurement.give_up_on_command,
-    cmd.MeasureNoisy: noisy_measurement.measure_noisy,
+    cmd.MeasureNoisy: measurement.measure_noisy,
     cmd.AcknowledgeAlarm: alarm_records.acknowledge,
     cmd.MuteAlarm: alarm_records.mute,
     cmd.UnmuteAlarm: alarm_records.unmute,

@@ -52,7 +52,7 @@ from service.tracking.operation_records import (
     LoopFound,
     ProbationState,
 )
-from service.tracking.operations.noisy_measurement import fail_noisy_measurement
+from service.tracking.operations.measurement import fail_noisy_measurement
 from service.tracking.operations.running import running_ramp
 from service.tracking.operator import set_loop
 from service.tracking.policy import SECOND_NS, Policy

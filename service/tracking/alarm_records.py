@@ -35,6 +35,7 @@ def update_records(context: StepContext, *, timely: bool, ordered: bool) -> None
     ``timely``: the time has gone on. ``ordered``: an operator has given a command, and what it ends
     has been seen.
     """
+    # The same tuple: no alarm has begun, ended or changed. Mutes and graces end by time alone.
     if context.alarms.active is context.before.alarms.active and not timely:
         return
     notes = {record.name: record for record in context.alarms.records}

@@ -47,6 +47,7 @@ def derive_alarms(context: StepContext) -> None:
     raised = {alarm.name for alarm in context.alarms.active}
     for name, rule in RULES.items():
         text = rule(context)
+        # Nearly all rules are silent at every event, and were before.
         if text is not None or name in raised:
             _update(context, name, text, _definition(context, name))
     for alarm in context.alarms.active:

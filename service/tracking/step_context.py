@@ -156,6 +156,7 @@ class StepContext:
         An acknowledgement, a status or a tick does not contain its cause.
         """
         own, self.cause = self.cause, cause or self.cause
+        # Not in ``finally``: an exception ends the step, and with it the context.
         yield
         self.cause = own
 
@@ -214,6 +215,7 @@ class StepContext:
         others = tuple(alarm for alarm in self.state.alarms.active if alarm.name != name)
         raised = replace(first, text=text, seen_ns_utc=self.now_ns, own=own)
         self.alarms = replace(self.alarms, active=(*others, raised))
+        # One that goes on changes its text many times a minute: only its beginning is logged.
         if before is None:
             self.log(name, text, Level.ALARM)
 

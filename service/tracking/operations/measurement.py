@@ -149,6 +149,7 @@ def _update(context: StepContext, record: MeasurementRecord) -> None:
         given_up = before.state is MeasureState.GIVEN_UP
         if given_up or (record.under_way and not before.under_way):
             return
+        # The manifest of a matrix does not repeat what the service has asked for.
         record = replace(
             record,
             frequency_hz=before.frequency_hz,
@@ -212,12 +213,14 @@ def _plan_measurement(context: StepContext, command: cmd.Measure, rtc: Status) -
     sine = command.pattern is Pattern.SINE
     modes = command.modes or tuple(range(rtc.n_controlled))
     if sine and command.modes is None:
+        # Every so many modes, rounded up: the tones span the basis, and are never too many.
         modes = modes[:: -(-len(modes) // N_TONES)]
     tone_m = context.policy.dither_amplitude_m or TONE_RMS_M
     stroke_m = command.amplitude_m or (tone_m if sine else PUSH_PULL_RMS_M)
     duration_s = (command.duration_s or DEFAULT_TONES_DURATION_S) if sine else None
     lines = command.frequency_hz
     if duration_s is not None and lines is None:
+        # Whole periods in the duration, so that the lines do not leak into one another.
         band_hz = np.linspace(*TONE_BAND, len(modes)) * rtc.frame_rate_hz
         lines = tuple((np.round(band_hz * duration_s) / duration_s).tolist())
     return MeasurementRecord(

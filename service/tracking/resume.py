@@ -41,7 +41,7 @@ def stop_everything(context: StepContext, command: cmd.StopEverything) -> None:
     closed again when all is released: the RTC is busy until then. A gain ramp is the RTC's, and
     ends by itself; only opening the loop would end it sooner.
     """
-    # The first order is remembered; ordered again, nothing is left to stop but what has begun since.
+    # The first order is remembered; a second one only ends what has begun since.
     if not context.operator.stopped_because:
         ramp = running_ramp(context.state, context.now_ns)
         left = "" if ramp is None else f"; {ramp.id} is the RTC's and ends by itself"

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final
 
+from service import wire
 from service.tracking import (
     alarm_records,
     alarm_rules,
@@ -37,16 +38,6 @@ from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.update_policy import note_declined
 from service.tracking.updates import decide_updates, fetch_in_use
-from service.wire import (
-    Acknowledgement,
-    DitherRequest,
-    DitherStop,
-    LoopRequest,
-    MeasureRequest,
-    OffloadRequest,
-    RampRequest,
-    Status,
-)
 
 __all__ = ["Command", "Event", "Policy", "step"]
 
@@ -188,15 +179,15 @@ def _on_answer(context: StepContext, answered: ev.Answered) -> None:
     """Pass the RTC's reply to the requester."""
     reply = answered.reply
     match answered.request:
-        case DitherRequest() as request:
+        case wire.DitherRequest() as request:
             dither.on_answer(context, request, reply)
-        case DitherStop():
+        case wire.DitherStop():
             dither.on_stop_answer(context, reply)
-        case MeasureRequest() as request:
+        case wire.MeasureRequest() as request:
             measurement.on_answer(context, request, reply)
-        case OffloadRequest() as request:
+        case wire.OffloadRequest() as request:
             offload.on_answer(context, request, reply)
-        case LoopRequest() | RampRequest() as request:
+        case wire.LoopRequest() | wire.RampRequest() as request:
             outcome = CommandState.ACCEPTED if reply.accepted else CommandState.REFUSED
             operator.on_loop_answer(context, request.id, outcome, reply.reason)
 
@@ -204,13 +195,13 @@ def _on_answer(context: StepContext, answered: ev.Answered) -> None:
 def _on_failure(context: StepContext, failed: ev.JobFailed) -> None:
     """Pass the failure of an effect to its requester, which may ask again later."""
     match failed.effect:
-        case ev.Ask(request=MeasureRequest(id=name)):
+        case ev.Ask(request=wire.MeasureRequest(id=name)):
             measurement.fail_measurement(context, context.state.measurement(name), failed.text)
-        case ev.Ask(request=OffloadRequest(id=name)):
+        case ev.Ask(request=wire.OffloadRequest(id=name)):
             offload.on_failure(context, name, failed.text)
         case ev.FinishNoisy(record=noisy):
             measurement.fail_measurement(context, noisy, failed.text)
-        case ev.Ask(request=LoopRequest(id=name) | RampRequest(id=name)):
+        case ev.Ask(request=wire.LoopRequest(id=name) | wire.RampRequest(id=name)):
             operator.on_loop_answer(context, name, CommandState.FAILED, failed.text)
         case effect:
             rtc.on_failure(context, effect, failed.text)
@@ -218,7 +209,7 @@ def _on_failure(context: StepContext, failed: ev.JobFailed) -> None:
 
 REACTIONS: Final[dict[type, Callable[[StepContext, Any], object]]] = {
     ev.Tick: _on_tick,
-    Status: rtc.on_status,
+    wire.Status: rtc.on_status,
     ev.SessionStarted: rtc.on_new_session,
     ev.RtcVanished: rtc.on_vanished,
     ev.ServicesMet: rtc.on_services,
@@ -233,7 +224,7 @@ REACTIONS: Final[dict[type, Callable[[StepContext, Any], object]]] = {
     ev.ModesRecognised: mode_proof.note_recognised,
     ev.MarginJudged: reconstructors.on_margin,
     ev.ProposalJudged: reconstructors.on_proposal_judged,
-    Acknowledgement: reconstructors.on_acknowledgement,
+    wire.Acknowledgement: reconstructors.on_acknowledgement,
     ev.MatrixMeasured: measurement.on_measured,
     ev.Answered: _on_answer,
     ev.DitherSilent: dither.on_silence,

@@ -17,19 +17,10 @@ from dataclasses import replace
 from service.estimation.comparison import Verdict
 from service.estimation.loop import explain_open_loop, same_but_for_modes
 from service.estimation.probation import MAX_PROBATION_S
+from service.tracking import alarms, mode_proof, reconstructors, validity
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking import mode_proof, reconstructors, validity
-from service.tracking.alarms import (
-    DIVERGING,
-    LOOP_OPENED,
-    OFF_LOOP,
-    PROBATION,
-    WRONG_LOOP,
-    Alarm,
-    Interlock,
-    as_critical,
-)
+from service.tracking.alarms import Alarm, Interlock
 from service.tracking.events import Event
 from service.tracking.operation_records import CommandState, Probation, ProbationState
 from service.tracking.operations.acquisition import may_acquire
@@ -63,7 +54,7 @@ OPEN_REQUEST_INTERVAL_S = 2.0
 
 MAY_HAVE_JUMPED = "the mirror may have jumped at the time of a swap"
 
-_CONCLUSIVE_ALARMS = (WRONG_LOOP, OFF_LOOP, DIVERGING)
+_CONCLUSIVE_ALARMS = (alarms.WRONG_LOOP, alarms.OFF_LOOP, alarms.DIVERGING)
 """Alarms that say by themselves that the RTC plays another matrix, or one that does not hold."""
 
 _FINAL_STATES = frozenset(
@@ -92,7 +83,7 @@ def advance(context: StepContext, event: Event) -> None:
     alarm = _alarm_of_swap(context, trial)
     if alarm is not None:
         # Commands that contradict the law of the loop are the RTC's fault and not the mirror's.
-        _begin_rollback(context, trial, alarm.text, resumes=alarm.name == DIVERGING)
+        _begin_rollback(context, trial, alarm.text, resumes=alarm.name == alarms.DIVERGING)
     else:
         _go_on(context, trial, event)
 
@@ -132,7 +123,7 @@ def on_compared(context: StepContext, event: ev.Compared) -> None:
         _end(context, trial, ProbationState.NOT_JUDGED, found.text)
     elif found.verdict is Verdict.AS_GOOD:
         _end(context, trial, ProbationState.PASSED, found.text)
-        context.clear_alarm(PROBATION)
+        context.clear_alarm(alarms.PROBATION)
         passed = context.state.reconstructor(trial.id)
         if passed is not None:
             mode_proof.note_passed(context, passed)
@@ -186,7 +177,7 @@ def _begin_rollback(
         return
     text = f"{trial.worse}. The service goes back to {trial.before}"
     _set(context, replace(trial, state=ProbationState.ROLLING_BACK, text=text))
-    context.raise_alarm(PROBATION, f"{trial.id} {text}")
+    context.raise_alarm(alarms.PROBATION, f"{trial.id} {text}")
     why = f"the service goes back to {trial.before}: {trial.id} made the loop worse"
     # Not judged: the loop ran with this matrix, and α may be what is wrong.
     reconstructors.request_matrix(
@@ -254,7 +245,7 @@ def _begin_watch(context: StepContext, trial: Probation, in_use: str) -> None:
     )
     _end(context, watched, ProbationState.WATCHED, text)
     context.raise_alarm(
-        PROBATION, f"{trial.id} {text}. The mode is hold until an operator sets another"
+        alarms.PROBATION, f"{trial.id} {text}. The mode is hold until an operator sets another"
     )
 
 
@@ -286,7 +277,9 @@ def _end_watch(
     _end(context, trial, ProbationState.ROLLED_BACK, trial.text)
     do = ". Open the loop" if lost else ""
     text = f"{trial.id} {trial.text}. The mode is hold until an operator sets another{do}"
-    context.raise_alarm(PROBATION, text, as_critical(PROBATION) if lost else None)
+    context.raise_alarm(
+        alarms.PROBATION, text, alarms.as_critical(alarms.PROBATION) if lost else None
+    )
 
 
 def _may_resume(context: StepContext, trial: Probation, *, lost: bool) -> bool:
@@ -306,7 +299,7 @@ def _resume(context: StepContext, trial: Probation, *, lost: bool) -> None:
         context, trial.id, MatrixState.FAILED, "rolled back, but it was not the cause"
     )
     _end(context, replace(trial, resumed_ns_utc=context.now_ns), state, trial.text)
-    context.clear_alarm(PROBATION)
+    context.clear_alarm(alarms.PROBATION)
     leave_hold(
         context,
         f"the loop is no better with {trial.before}, so {trial.id} was not the cause. The mirror "
@@ -350,7 +343,7 @@ def explain_opening(context: StepContext) -> str | None:
     trial, asked = context.operations.probation, context.loop.command
     if trial is None or trial.state not in {ProbationState.OPENING, ProbationState.OPENED}:
         return None
-    raised, does = context.alarm_text(LOOP_OPENED), "The RTC is asked to open the loop"
+    raised, does = context.alarm_text(alarms.LOOP_OPENED), "The RTC is asked to open the loop"
     if trial.state is ProbationState.OPENED:
         does = "The loop was asked to open, and is open"
     elif asked is not None and asked.state in {CommandState.REFUSED, CommandState.FAILED}:
@@ -450,8 +443,8 @@ def _keep_worse(context: StepContext, trial: Probation, why: str) -> None:
         return
     _end(context, trial, ProbationState.KEPT, text)
     do = "open the loop if it suffers, or roll back by hand"
-    own = as_critical(PROBATION) if lost else None
-    context.raise_alarm(PROBATION, f"{trial.id} {text}; {do}", own)
+    own = alarms.as_critical(alarms.PROBATION) if lost else None
+    context.raise_alarm(alarms.PROBATION, f"{trial.id} {text}; {do}", own)
 
 
 def _end(context: StepContext, trial: Probation, state: ProbationState, text: str) -> None:

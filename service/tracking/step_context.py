@@ -20,7 +20,7 @@ from service.tracking.alarms import (
 )
 from service.tracking.dither_request import Dither, DitherPolicyState
 from service.tracking.events import Effect
-from service.tracking.operation_records import Acquisition
+from service.tracking.operation_records import Acquisition, Probation
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Registration
 from service.tracking.state import (
@@ -120,6 +120,7 @@ class StepContext:
     loop = _Part[LoopState]("loop")
     alarms = _Part[AlarmStates]("alarms")
     acquisition = _Part[Acquisition]("acquisition", "operations")
+    probation = _Part[Probation | None]("probation", "operations")
     dither = _Part[Dither | None]("dither", "dithers")
     dither_policy = _Part[DitherPolicyState]("policy", "dithers")
 

@@ -77,7 +77,7 @@ def advance(context: StepContext, event: Event) -> None:
     if context.matrices.in_use != context.before.matrices.in_use:
         _on_swap(context, context.before.matrices.in_use, context.matrices.in_use)
         return
-    trial = context.operations.probation
+    trial = context.probation
     if trial is None:
         return
     alarm = _alarm_of_swap(context, trial)
@@ -102,7 +102,7 @@ def _go_on(context: StepContext, trial: Probation, event: Event) -> None:
         case ProbationState.ACQUIRING:
             _await_acquisition(context, trial, event)
         case ProbationState.OPENED if context.rtc is not None and context.rtc.in_loop:
-            _set(context, replace(trial, state=ProbationState.ROLLED_BACK))
+            context.probation = replace(trial, state=ProbationState.ROLLED_BACK)
 
 
 def on_compared(context: StepContext, event: ev.Compared) -> None:
@@ -110,7 +110,7 @@ def on_compared(context: StepContext, event: ev.Compared) -> None:
 
     What was said of other matrices than the two on record is not meant.
     """
-    trial, found = context.operations.probation, event.finding
+    trial, found = context.probation, event.finding
     if trial is None or not trial.awaits(found.before, found.after):
         return
     # The comparison now concerns the previous matrix, which is in use again.
@@ -149,7 +149,7 @@ def is_way_back(state: TrackerState, made: ev.MatrixMade) -> bool:
 
 def send_way_back(context: StepContext, made: ev.MatrixMade) -> None:
     """Send the matrix before under its new id, unless something forbids it by now."""
-    trial = context.operations.probation
+    trial = context.probation
     reconstructors.propose(context, made.record)
     if trial is None:
         return
@@ -158,7 +158,7 @@ def send_way_back(context: StepContext, made: ev.MatrixMade) -> None:
         _keep_worse(context, trial, why)
         return
     reconstructors.send(context, made.record.id, trial.since_ns_utc)
-    _set(context, replace(trial, rollback=made.record.id))
+    context.probation = replace(trial, rollback=made.record.id)
 
 
 def _begin_rollback(
@@ -176,7 +176,7 @@ def _begin_rollback(
         _keep_worse(context, trial, why)
         return
     text = f"{trial.worse}. The service goes back to {trial.before}"
-    _set(context, replace(trial, state=ProbationState.ROLLING_BACK, text=text))
+    context.probation = replace(trial, state=ProbationState.ROLLING_BACK, text=text)
     context.raise_alarm(alarms.PROBATION, f"{trial.id} {text}")
     why = f"the service goes back to {trial.before}: {trial.id} made the loop worse"
     # Not judged: the loop ran with this matrix, and α may be what is wrong.
@@ -186,7 +186,7 @@ def _begin_rollback(
 
 
 def _on_swap(context: StepContext, before: str | None, in_use: str | None) -> None:
-    trial = context.operations.probation
+    trial = context.probation
     record = context.state.reconstructor(in_use)
     if (
         trial is not None
@@ -199,36 +199,33 @@ def _on_swap(context: StepContext, before: str | None, in_use: str | None) -> No
     if record is None or before is None:
         if trial is not None and trial.judges is not None:
             why = "the RTC's matrix is unknown"
-            _set(context, replace(trial, state=ProbationState.NOT_JUDGED, text=why))
+            context.probation = replace(trial, state=ProbationState.NOT_JUDGED, text=why)
         return
     why = _explain_missing_probation(context, record, trial)
     # The reference is the last matrix that was good, not the one that made the loop worse.
     worse = trial is not None and trial.id == before and trial.state in _WORSE_STATES
     asked = context.policy.opens_lost_loop
-    _set(
-        context,
-        Probation(
-            id=record.id,
-            before=before,
-            reference=trial.reference if trial is not None and worse else before,
-            state=ProbationState.NOT_JUDGED if why else ProbationState.RUNNING,
-            text=why or f"compared with {before}",
-            since_ns_utc=context.now_ns,
-            until_ns_utc=context.now_ns + round(MAX_PROBATION_S * SECOND_NS),
-            # A rollback requires the loop to be as it was before the swap.
-            loop=context.before.loop.rtc,
-            opens=context.before.operator.mode is Mode.AUTO if asked is None else asked,
-            resumed_ns_utc=None if trial is None else trial.resumed_ns_utc,
-        ),
+    context.probation = Probation(
+        id=record.id,
+        before=before,
+        reference=trial.reference if trial is not None and worse else before,
+        state=ProbationState.NOT_JUDGED if why else ProbationState.RUNNING,
+        text=why or f"compared with {before}",
+        since_ns_utc=context.now_ns,
+        until_ns_utc=context.now_ns + round(MAX_PROBATION_S * SECOND_NS),
+        # A rollback requires the loop to be as it was before the swap.
+        loop=context.before.loop.rtc,
+        opens=context.before.operator.mode is Mode.AUTO if asked is None else asked,
+        resumed_ns_utc=None if trial is None else trial.resumed_ns_utc,
     )
 
 
 def _await_verdict(context: StepContext, trial: Probation) -> None:
     why = _check_comparable(context)
     if why:
-        _set(context, replace(trial, state=ProbationState.NOT_JUDGED, text=why))
+        context.probation = replace(trial, state=ProbationState.NOT_JUDGED, text=why)
     elif trial.under_way and context.now_ns > trial.until_ns_utc + MAX_VERDICT_DELAY_S * SECOND_NS:
-        _set(context, replace(trial, state=ProbationState.OVERDUE, text="telemetry is late"))
+        context.probation = replace(trial, state=ProbationState.OVERDUE, text="telemetry is late")
 
 
 def _begin_watch(context: StepContext, trial: Probation, in_use: str) -> None:
@@ -253,9 +250,8 @@ def _watch(context: StepContext, trial: Probation) -> None:
     """End the check of the loop with the matrix before: lost, opened, or undecided."""
     waited_s = (context.now_ns - trial.since_ns_utc) / SECOND_NS
     lost = context.blocking_alarm(Interlock.HOLD)
-    if context.rtc is None or not context.rtc.in_loop:
-        why = "the RTC is gone" if context.rtc is None else explain_open_loop(context.rtc)
-        _end_watch(context, trial, why, lost=False)
+    if gone := _check_loop(context):
+        _end_watch(context, trial, gone, lost=False)
     # The detector of divergence averages over half a second, so that it still shows the rejected
     # matrix.
     elif lost is not None and waited_s > MAX_CALMING_S:
@@ -322,9 +318,9 @@ def _await_opening(context: StepContext, trial: Probation, event: Event) -> None
     rtc, asked = context.rtc, context.loop.command
     # An operator who sets the mode has taken over.
     if isinstance(event, cmd.SetMode):
-        _set(context, replace(trial, state=ProbationState.KEPT))
+        context.probation = replace(trial, state=ProbationState.KEPT)
     elif rtc is not None and not rtc.in_loop:
-        _set(context, replace(trial, state=ProbationState.OPENED))
+        context.probation = replace(trial, state=ProbationState.OPENED)
     elif rtc is not None and asked is not None and not context.operator.stopped_because:
         waited_ns = context.now_ns - asked.asked_ns_utc
         if waited_ns > OPEN_REQUEST_INTERVAL_S * SECOND_NS:
@@ -335,12 +331,12 @@ def _await_acquisition(context: StepContext, trial: Probation, event: Event) -> 
     """Note that the acquisition has begun, or that the operator or the RTC has taken over."""
     closed = context.rtc is not None and context.rtc.in_loop
     if context.acquisition.under_way or not closed or isinstance(event, cmd.SetMode):
-        _set(context, replace(trial, state=ProbationState.NOT_CONFIRMED))
+        context.probation = replace(trial, state=ProbationState.NOT_CONFIRMED)
 
 
 def explain_opening(context: StepContext) -> str | None:
     """Return that the loop was lost and is asked to open, and whether it did; None: it is not."""
-    trial, asked = context.operations.probation, context.loop.command
+    trial, asked = context.probation, context.loop.command
     if trial is None or trial.state not in {ProbationState.OPENING, ProbationState.OPENED}:
         return None
     raised, does = context.alarm_text(alarms.LOOP_OPENED), "The RTC is asked to open the loop"
@@ -385,13 +381,17 @@ def _explain_missing_probation(
 
 def _check_comparable(context: StepContext) -> str:
     """Return why telemetry cannot be compared now; empty: it can."""
+    acquiring = context.acquisition.under_way
+    return _check_loop(context) or (
+        "an acquisition watches its matrices itself" if acquiring else ""
+    )
+
+
+def _check_loop(context: StepContext) -> str:
+    """Return why no loop is closed; empty: one is."""
     if context.rtc is None:
         return "the RTC is gone"
-    if not context.rtc.in_loop:
-        return explain_open_loop(context.rtc)
-    if context.acquisition.under_way:
-        return "an acquisition watches its matrices itself"
-    return ""
+    return "" if context.rtc.in_loop else explain_open_loop(context.rtc)
 
 
 def _check_jump(context: StepContext, trial: Probation) -> str:
@@ -448,9 +448,5 @@ def _keep_worse(context: StepContext, trial: Probation, why: str) -> None:
 
 
 def _end(context: StepContext, trial: Probation, state: ProbationState, text: str) -> None:
-    _set(context, replace(trial, state=state, text=text))
+    context.probation = replace(trial, state=state, text=text)
     context.log(f"probation.{state}", f"{trial.id}: {text}")
-
-
-def _set(context: StepContext, trial: Probation) -> None:
-    context.operations = replace(context.operations, probation=trial)

@@ -793,8 +793,8 @@ def _wide_capture_stage(context: StepContext, rtc: Status) -> None:
 def _on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
     """Take over where a window puts the mirror, or hold it against where another one did."""
     rtc, before, estimate = context.rtc, context.acquisition, event.found.estimate
-    span = validity.telemetry_span(event.began_ns_utc, estimate.t_ns_utc)
-    if validity.explain_void(context.state, span) is not None:
+    began_ns = event.began_ns_utc or estimate.t_ns_utc
+    if validity.explain_void(context.state, began_ns) is not None:
         return
     if rtc is None or not before.uses_wide_capture or estimate.session != rtc.session:
         return

@@ -78,8 +78,12 @@ class _Part(Generic[PartT]):
 
     __slots__ = ("_name", "_record")
 
-    def __init__(self, name: str, record: str = "state") -> None:
-        self._name, self._record = name, record
+    def __init__(self, record: str = "state", name: str = "") -> None:
+        self._record, self._name = record, name
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        # A part has the name of the attribute unless another one is given.
+        self._name = self._name or name
 
     def __get__(self, context: StepContext, owner: type) -> PartT:
         part: PartT = getattr(getattr(context, self._record), self._name)
@@ -111,18 +115,18 @@ class StepContext:
 
         self.effects: list[Effect] = []
 
-    operator = _Part[OperatorState]("operator")
-    alpha = _Part[AlphaState]("alpha")
-    windows = _Part[WindowCounts]("windows")
-    matrices = _Part[MatrixStates]("matrices")
-    operations = _Part[Operations]("operations")
-    dithers = _Part[DitherState]("dithers")
-    loop = _Part[LoopState]("loop")
-    alarms = _Part[AlarmStates]("alarms")
-    acquisition = _Part[Acquisition]("acquisition", "operations")
-    probation = _Part[Probation | None]("probation", "operations")
-    dither = _Part[Dither | None]("dither", "dithers")
-    dither_policy = _Part[DitherPolicyState]("policy", "dithers")
+    operator = _Part[OperatorState]()
+    alpha = _Part[AlphaState]()
+    windows = _Part[WindowCounts]()
+    matrices = _Part[MatrixStates]()
+    operations = _Part[Operations]()
+    dithers = _Part[DitherState]()
+    loop = _Part[LoopState]()
+    alarms = _Part[AlarmStates]()
+    acquisition = _Part[Acquisition]("operations")
+    probation = _Part[Probation | None]("operations")
+    dither = _Part[Dither | None]("dithers")
+    dither_policy = _Part[DitherPolicyState]("dithers", "policy")
 
     @property
     def registration(self) -> Registration | None:

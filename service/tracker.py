@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final
 
+from service import wire
 from service.tracking import (
     alarm_records,
     alarm_rules,
@@ -31,22 +32,12 @@ from service.tracking.alarm_rules import derive_alarms
 from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
 from service.tracking.operation_records import CommandState, MeasureState
-from service.tracking.operations import acquisition, measurement, noisy_measurement, probation
+from service.tracking.operations import acquisition, measurement, probation
 from service.tracking.policy import Policy
 from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.update_policy import note_declined
 from service.tracking.updates import decide_updates, fetch_in_use
-from service.wire import (
-    Acknowledgement,
-    DitherRequest,
-    DitherStop,
-    LoopRequest,
-    MeasureRequest,
-    OffloadRequest,
-    RampRequest,
-    Status,
-)
 
 __all__ = ["Command", "Event", "Policy", "step"]
 
@@ -119,7 +110,7 @@ def _advance(context: StepContext, event: Event) -> None:
     # Updates follow α, which an acquisition is about to determine.
     if context.acquisition.under_way:
         return
-    noisy_measurement.advance(context, event)
+    measurement.advance_noisy(context, event)
     noisy = context.state.noisy_measurement
     # Another dither has to end before its own: until then the service begins none.
     if noisy is None or noisy.state is not MeasureState.WAITING:
@@ -175,9 +166,7 @@ def _on_dither_measured(context: StepContext, event: ev.DitherMeasured) -> None:
     """Stop a dither measured stronger than requested."""
     reason = dither.check_measured_dither(context, event)
     if reason is not None:
-        noisy_measurement.fail_noisy_measurement(
-            context, f"its dither was too strong: {event.text}"
-        )
+        measurement.fail_noisy_measurement(context, f"its dither was too strong: {event.text}")
         dither.stop_too_strong(context, event.id, reason)
 
 
@@ -190,29 +179,29 @@ def _on_answer(context: StepContext, answered: ev.Answered) -> None:
     """Pass the RTC's reply to the requester."""
     reply = answered.reply
     match answered.request:
-        case DitherRequest() as request:
+        case wire.DitherRequest() as request:
             dither.on_answer(context, request, reply)
-        case DitherStop():
+        case wire.DitherStop():
             dither.on_stop_answer(context, reply)
-        case MeasureRequest() as request:
+        case wire.MeasureRequest() as request:
             measurement.on_answer(context, request, reply)
-        case OffloadRequest() as request:
+        case wire.OffloadRequest() as request:
             offload.on_answer(context, request, reply)
-        case LoopRequest() | RampRequest() as request:
+        case wire.LoopRequest() | wire.RampRequest() as request:
             outcome = CommandState.ACCEPTED if reply.accepted else CommandState.REFUSED
             operator.on_loop_answer(context, request.id, outcome, reply.reason)
 
 
 def _on_failure(context: StepContext, failed: ev.JobFailed) -> None:
-    """Pass the failure of an effect to its requester."""
+    """Pass the failure of an effect to its requester, which may ask again later."""
     match failed.effect:
-        case ev.Ask(request=MeasureRequest(id=name)):
+        case ev.Ask(request=wire.MeasureRequest(id=name)):
             measurement.fail_measurement(context, context.state.measurement(name), failed.text)
-        case ev.Ask(request=OffloadRequest(id=name)):
+        case ev.Ask(request=wire.OffloadRequest(id=name)):
             offload.on_failure(context, name, failed.text)
         case ev.FinishNoisy(record=noisy):
             measurement.fail_measurement(context, noisy, failed.text)
-        case ev.Ask(request=LoopRequest(id=name) | RampRequest(id=name)):
+        case ev.Ask(request=wire.LoopRequest(id=name) | wire.RampRequest(id=name)):
             operator.on_loop_answer(context, name, CommandState.FAILED, failed.text)
         case effect:
             rtc.on_failure(context, effect, failed.text)
@@ -220,7 +209,7 @@ def _on_failure(context: StepContext, failed: ev.JobFailed) -> None:
 
 REACTIONS: Final[dict[type, Callable[[StepContext, Any], object]]] = {
     ev.Tick: _on_tick,
-    Status: rtc.on_status,
+    wire.Status: rtc.on_status,
     ev.SessionStarted: rtc.on_new_session,
     ev.RtcVanished: rtc.on_vanished,
     ev.ServicesMet: rtc.on_services,
@@ -235,7 +224,7 @@ REACTIONS: Final[dict[type, Callable[[StepContext, Any], object]]] = {
     ev.ModesRecognised: mode_proof.note_recognised,
     ev.MarginJudged: reconstructors.on_margin,
     ev.ProposalJudged: reconstructors.on_proposal_judged,
-    Acknowledgement: reconstructors.on_acknowledgement,
+    wire.Acknowledgement: reconstructors.on_acknowledgement,
     ev.MatrixMeasured: measurement.on_measured,
     ev.Answered: _on_answer,
     ev.DitherSilent: dither.on_silence,
@@ -258,7 +247,7 @@ REACTIONS: Final[dict[type, Callable[[StepContext, Any], object]]] = {
     cmd.StopDither: dither.stop_by_operator,
     cmd.Measure: measurement.measure,
     cmd.GiveUp: measurement.give_up_on_command,
-    cmd.MeasureNoisy: noisy_measurement.measure_noisy,
+    cmd.MeasureNoisy: measurement.measure_noisy,
     cmd.AcknowledgeAlarm: alarm_records.acknowledge,
     cmd.MuteAlarm: alarm_records.mute,
     cmd.UnmuteAlarm: alarm_records.unmute,

@@ -11,16 +11,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.errors import CommandError, UnknownIdError
+from service.tracking import alarms
 from service.tracking import commands as cmd
-from service.tracking.alarms import (
-    ALARMS,
-    RULE_PREFIX,
-    Alarm,
-    AlarmRecord,
-    AlarmState,
-    OperatorNote,
-    Severity,
-)
+from service.tracking.alarms import Alarm, AlarmRecord, AlarmState, OperatorNote, Severity
 from service.tracking.policy import SECOND_NS
 from service.tracking.state import Orders, TrackerState
 from service.tracking.step_context import StepContext
@@ -35,6 +28,7 @@ def update_records(context: StepContext, *, timely: bool, ordered: bool) -> None
     ``timely``: the time has gone on. ``ordered``: an operator has given a command, and what it ends
     has been seen.
     """
+    # The same tuple: no alarm has begun, ended or changed. Mutes and graces end by time alone.
     if context.alarms.active is context.before.alarms.active and not timely:
         return
     notes = {record.name: record for record in context.alarms.records}
@@ -179,9 +173,9 @@ def _without_old_mute(record: AlarmRecord, now_ns: int) -> AlarmRecord:
 
 def _record_named(context: StepContext, name: str) -> AlarmRecord:
     """Return what is kept of an alarm, or a new record."""
-    own = {f"{RULE_PREFIX}{rule.name}" for rule in context.policy.rules}
+    own = {f"{alarms.RULE_PREFIX}{rule.name}" for rule in context.policy.rules}
     known = _find(context.state, name)
-    if known is None and name not in ALARMS and name not in own:
+    if known is None and name not in alarms.ALARMS and name not in own:
         raise UnknownIdError(f"unknown alarm {name}")
     return known or AlarmRecord(name=name)
 

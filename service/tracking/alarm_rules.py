@@ -12,12 +12,12 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable
 from dataclasses import replace
-from difflib import get_close_matches
 from functools import partial
 from typing import Any, Final
 
 from service.errors import CommandError, UnknownIdError
 from service.estimation.loop import explain_open_loop
+from service.files.toml import nearest
 from service.model.pointing_law import ANGLES
 from service.tracking import (
     alarms,
@@ -47,6 +47,7 @@ def derive_alarms(context: StepContext) -> None:
     raised = {alarm.name for alarm in context.alarms.active}
     for name, rule in RULES.items():
         text = rule(context)
+        # Nearly all rules are silent at every event, and were before.
         if text is not None or name in raised:
             _update(context, name, text, _definition(context, name))
     for alarm in context.alarms.active:
@@ -288,9 +289,7 @@ def set_value(context: StepContext, command: cmd.SetValue) -> None:
     """
     asked = _values_asked_for(context)
     if command.name not in asked:
-        near = get_close_matches(command.name, asked, n=1)
-        names = ", ".join(sorted(asked)) or "none"
-        hint = f", did you mean {near[0]}?" if near else f"; expected: {names}"
+        hint = nearest(command.name, asked)
         raise UnknownIdError(f"value {command.name}: no rule uses it{hint}")
     kind, because = asked[command.name]
     if kind_of(command.value) != kind:

@@ -21,20 +21,20 @@ from service.tracking.alarms import Interlock
 from service.tracking.dither_request import (
     DEFAULT_DURATION_S,
     DITHER_MARGIN_S,
+    N_LINES,
     OUR_DITHERS,
     OWN_DITHER,
     Dither,
     DitherParameters,
     DitherPhase,
     DitherPlan,
-    check_free_modes,
     choose_modes,
     clear_lines,
     controlled,
     expected_amplification,
+    has_free_modes,
     is_own_sine,
     is_proving,
-    n_lines,
     step_of,
     total_m,
 )
@@ -266,7 +266,7 @@ def precision(state: TrackerState, rtc: Status) -> NDArray[np.float64]:
 
 def budget_m(rtc: Status, policy: Policy) -> float:
     """Return the largest RMS of all lines together that policy, settings and RTC allow, metres."""
-    n = n_lines(rtc, policy)
+    n = min(len(policy.dither_modes or range(N_LINES)), rtc.max_dither_modes)
     # Both limits are of one mode; the total of n equal modes is the root of n times larger.
     largest = min(rtc.max_dither_m, policy.dither_amplitude_m or np.inf)
     return float(min(policy.dither_budget_m, largest * np.sqrt(max(n, 1))))
@@ -297,9 +297,12 @@ def check_dithered_modes(
         return (
             f"mode {min(odd)} has not answered as the instrument file says: others are used for α"
         )
-    elsewhere = check_free_modes(dither.request, rtc, policy)
-    if elsewhere or not controlled(dither.request.modes, rtc):
-        return elsewhere
+    inside = controlled(dither.request.modes, rtc)
+    if not inside:
+        return ""
+    if has_free_modes(rtc, policy, n_inside=len(inside)):
+        named = ", ".join(str(mode) for mode in inside)
+        return f"the loop controls modes {named} now: others are free"
     if total_m(dither.request) <= AMPLITUDE_HYSTERESIS_RATIO * quiet_budget_m(rtc, policy):
         return ""
     return "the loop controls its modes now and amplifies it: a weaker one is requested"

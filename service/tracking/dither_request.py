@@ -95,19 +95,10 @@ def expected_amplification(rtc: Status, policy: Policy, chosen: tuple[int, ...] 
     return max(float(np.sqrt(np.mean(found**2, axis=-1)).max()), 1.0)
 
 
-def check_free_modes(request: DitherRequest, rtc: Status, policy: Policy) -> str:
-    """Return why a dither of the service should move to modes that are still free, or "".
-
-    More modes may be controlled now than when it was requested.
-    """
-    inside = controlled(request.modes, rtc)
-    if not inside:
-        return ""
+def has_free_modes(rtc: Status, policy: Policy, *, n_inside: int) -> bool:
+    """Return whether the service has other modes to dither, fewer of which the loop controls."""
     fixed = _without_choice(rtc, policy)
-    if fixed is not None and len(controlled(fixed, rtc)) >= len(inside):
-        return ""
-    named = ", ".join(str(mode) for mode in inside)
-    return f"the loop controls modes {named} now: others are free"
+    return fixed is None or len(controlled(fixed, rtc)) < n_inside
 
 
 def _without_choice(
@@ -372,11 +363,6 @@ def on_vibrations(dither: Dither, avoid_hz: tuple[float, ...]) -> tuple[float, .
     # A line that was placed at exactly the clearance is clear.
     near = VIBRATION_CLEARANCES_HZ[-1] - 1e-6
     return tuple(f for f in dither.frequency_hz if any(abs(f - v) < near for v in avoid_hz))
-
-
-def n_lines(rtc: Status, policy: Policy) -> int:
-    """Return how many modes the service dithers by itself."""
-    return min(len(policy.dither_modes or range(N_LINES)), rtc.max_dither_modes)
 
 
 def step_of(rtc: Status, window_s: float) -> float:

@@ -34,7 +34,6 @@ from service.tracking.registration import (
 )
 from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext
-from service.tracking.validity import TelemetrySpan
 
 MODES_KEPT = 64
 """More than any dither plays at once: of those measured longest ago the rest is forgotten."""
@@ -164,11 +163,6 @@ class WindowEstimate(PointedEstimate):
         """Covariance of these numbers."""
         return self.covariance if self.with_stretches is None else self.with_stretches
 
-    @property
-    def when(self) -> TelemetrySpan:
-        """The telemetry it is of."""
-        return TelemetrySpan(began_ns_utc=self.began_ns_utc, ended_ns_utc=self.t_ns_utc)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FilterUpdate:
@@ -273,8 +267,8 @@ def accept(
     context: StepContext, update: FilterUpdate, measured: WindowEstimate, *, n_accepted: int = 1
 ) -> None:
     """Take what the filter says after a window for what is known; it may be the second accepted."""
-    joint, when, previous = update.joint, measured.when, context.registration
-    doubted = _still_doubted(context.state, update, when)
+    joint, previous = update.joint, context.registration
+    doubted = _still_doubted(context.state, update, measured)
     anew = update.jumped or (previous is not None and previous.suspected_jump is not None)
     bias = bias_of(joint)
     registration = Registration(
@@ -283,12 +277,12 @@ def accept(
         stretches=stretches_of(joint),
         floor=measured.floor,
         image_floor=context.policy.image_floor,
-        t_ns_utc=when.ended_ns_utc,
+        t_ns_utc=measured.t_ns_utc,
         arrived_ns_utc=context.now_ns,
         n_windows=update.n_windows,
         scatter=update.scatter,
         window_ns_utc=context.now_ns,
-        window_began_ns_utc=when.began_ns_utc,
+        window_began_ns_utc=measured.began_ns_utc,
         optical_gain=measured.optical_gain,
         optical_gains=measured.optical_gains,
         # What was known before a jump is of another registration.
@@ -298,7 +292,7 @@ def accept(
         doubt=previous.doubt if previous is not None and doubted else "",
         doubt_voids=previous is None or previous.doubt_voids,
         pointing=measured.pointing,
-        window_pointing=validity.pointing_at(context.state, when.began_ns_utc),
+        window_pointing=validity.pointing_at(context.state, measured.began_ns_utc),
         restored_ns_utc=previous.restored_ns_utc if previous is not None else None,
         basis_id=context.loop.basis_id,
         config_id=context.loop.config_id,
@@ -314,7 +308,7 @@ def accept(
     validity.age_registration(context)
 
 
-def _still_doubted(state: TrackerState, update: FilterUpdate, when: TelemetrySpan) -> bool:
+def _still_doubted(state: TrackerState, update: FilterUpdate, measured: WindowEstimate) -> bool:
     """Return True if α stays in doubt because the window began before the doubt.
 
     A window that confirms the registration after a jump need not have begun since: it agrees with
@@ -323,10 +317,9 @@ def _still_doubted(state: TrackerState, update: FilterUpdate, when: TelemetrySpa
     registration = state.alpha.registration
     if registration is None or not registration.doubt:
         return False
-    if update.jumped:
-        # A jump is confirmed by two windows that agree, even if the first began before the doubt.
-        when = replace(when, began_ns_utc=when.ended_ns_utc)
-    return validity.explain_void(state, when, Purpose.SETTLE) is not None
+    # A jump is confirmed by two windows that agree, even if the first began before the doubt.
+    since_ns = measured.t_ns_utc if update.jumped else measured.began_ns_utc
+    return validity.explain_void(state, since_ns, Purpose.SETTLE) is not None
 
 
 def _jumped_ns_utc(
@@ -412,13 +405,11 @@ def strong_gains(estimate: DitheredEstimate) -> Array:
     return gains if len(modes) != len(estimate.strong) else gains[estimate.strong]
 
 
-def check_window(
-    context: StepContext, estimate: DitheredEstimate, when: TelemetrySpan
-) -> Why | None:
+def check_window(context: StepContext, estimate: DitheredEstimate, began_ns_utc: int) -> Why | None:
     """Return why a window's estimate must not be used, or None."""
     if context.rtc is None or estimate.session != context.rtc.session:
         return RefusalKind.VOID, OTHER_SESSION
-    reason = check_measurable(context.state, when)
+    reason = check_measurable(context.state, began_ns_utc)
     if reason is not None:
         return RefusalKind.VOID, reason
     odd = mode_proof.check_information(context, estimate)
@@ -475,10 +466,10 @@ def _far_windows_agree(context: StepContext, estimate: DitheredEstimate) -> bool
     return len(together) >= N_FAR_WINDOWS
 
 
-def check_measurable(state: TrackerState, when: TelemetrySpan) -> str | None:
-    """Return why telemetry taken then, or any that comes now, measures nothing; None: it does."""
+def check_measurable(state: TrackerState, began_ns_utc: int) -> str | None:
+    """Return why telemetry that began then, or any that comes now, measures nothing, or None."""
     alarm = blocking_alarm(state.alarms.active, Interlock.MEASURE)
     if alarm is None:
-        because = validity.explain_void(state, when)
+        because = validity.explain_void(state, began_ns_utc)
         return because and f"{because} when it was taken: its telemetry is no measurement"
     return f"{alarm.definition.because}: its telemetry is no measurement"

@@ -135,6 +135,7 @@ def _decide(moment: Moment, order: Order) -> Permission:
     kind = order if isinstance(order, type) else type(order)
     opens = isinstance(order, cmd.SetLoop) and order.loop == "open"
     for running in moment.running:
+        # An RTC ends a gain ramp when its loop is opened, and knows no other way.
         ends_it = opens and running.kind is OperationKind.RAMPING
         if kind not in ALLOWS[running.kind] and not ends_it:
             return Permission(allowed=False, reason=running.text)

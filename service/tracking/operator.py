@@ -83,6 +83,7 @@ def start_dither(context: StepContext, command: cmd.StartDither) -> None:
     dither = _plan_dither(context, rtc, command)
     total, over_budget = dither_request.total_m(dither.request), command.over_budget
     cost = dither_request.cost_of(total, context.policy, over_budget=over_budget)
+    # Whoever orders a dither wants those of the service again, too.
     allow_dither(context)
     modes = dither.request.modes
     which = f"modes {modes}" if len(modes) < 10 else f"{len(modes)} modes"
@@ -193,6 +194,7 @@ def set_loop(context: StepContext, command: cmd.SetLoop) -> None:
     elif command.gains is not None:
         gains = _gains(rtc, command.gains, n_modes)
     if command.loop is not None:
+        # The order counts: the loop is not closed again after a measurement that was given up.
         context.loop = replace(context.loop, close_since_ns_utc=None)
     _ask_loop(
         context,
@@ -220,6 +222,7 @@ def ramp(context: StepContext, command: cmd.Ramp) -> None:
     groups = command.groups or _paper_groups(rtc.n_controlled)
     ranges = _ranges(groups, rtc.n_controlled)
     gains = command.gains or RAMP_GAINS
+    # The wire counts frames: a slow RTC takes longer, and so the clock begins with its answer.
     n_frames = max(1, round((command.step_s or RAMP_STEP_S) * rtc.frame_rate_hz))
     lasts_s = len(ranges) * len(gains) * n_frames / rtc.frame_rate_hz
     spans = ", ".join(f"{first} to {last}" for first, last in ranges)

@@ -41,6 +41,7 @@ def stop_everything(context: StepContext, command: cmd.StopEverything) -> None:
     closed again when all is released: the RTC is busy until then. A gain ramp is the RTC's, and
     ends by itself; only opening the loop would end it sooner.
     """
+    # The first order is remembered; a second one only ends what has begun since.
     if not context.operator.stopped_because:
         ramp = running_ramp(context.state, context.now_ns)
         left = "" if ramp is None else f"; {ramp.id} is the RTC's and ends by itself"
@@ -51,6 +52,7 @@ def stop_everything(context: StepContext, command: cmd.StopEverything) -> None:
     for record in (context.state.measuring, context.state.noisy_measurement):
         if record is not None:
             give_up(context, record.id)
+    # On standby another service drives the RTC, and stops its own dither.
     if context.rtc is None or context.blocking_alarm(Interlock.ASK) is not None:
         dither.forget_dither(context)
     else:

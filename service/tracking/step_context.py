@@ -20,7 +20,7 @@ from service.tracking.alarms import (
 )
 from service.tracking.dither_request import Dither, DitherPolicyState
 from service.tracking.events import Effect
-from service.tracking.operation_records import Acquisition
+from service.tracking.operation_records import Acquisition, Probation
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Registration
 from service.tracking.state import (
@@ -78,8 +78,12 @@ class _Part(Generic[PartT]):
 
     __slots__ = ("_name", "_record")
 
-    def __init__(self, name: str, record: str = "state") -> None:
-        self._name, self._record = name, record
+    def __init__(self, record: str = "state", name: str = "") -> None:
+        self._record, self._name = record, name
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        # A part has the name of the attribute unless another one is given.
+        self._name = self._name or name
 
     def __get__(self, context: StepContext, owner: type) -> PartT:
         part: PartT = getattr(getattr(context, self._record), self._name)
@@ -111,17 +115,18 @@ class StepContext:
 
         self.effects: list[Effect] = []
 
-    operator = _Part[OperatorState]("operator")
-    alpha = _Part[AlphaState]("alpha")
-    windows = _Part[WindowCounts]("windows")
-    matrices = _Part[MatrixStates]("matrices")
-    operations = _Part[Operations]("operations")
-    dithers = _Part[DitherState]("dithers")
-    loop = _Part[LoopState]("loop")
-    alarms = _Part[AlarmStates]("alarms")
-    acquisition = _Part[Acquisition]("acquisition", "operations")
-    dither = _Part[Dither | None]("dither", "dithers")
-    dither_policy = _Part[DitherPolicyState]("policy", "dithers")
+    operator = _Part[OperatorState]()
+    alpha = _Part[AlphaState]()
+    windows = _Part[WindowCounts]()
+    matrices = _Part[MatrixStates]()
+    operations = _Part[Operations]()
+    dithers = _Part[DitherState]()
+    loop = _Part[LoopState]()
+    alarms = _Part[AlarmStates]()
+    acquisition = _Part[Acquisition]("operations")
+    probation = _Part[Probation | None]("operations")
+    dither = _Part[Dither | None]("dithers")
+    dither_policy = _Part[DitherPolicyState]("dithers", "policy")
 
     @property
     def registration(self) -> Registration | None:
@@ -156,6 +161,7 @@ class StepContext:
         An acknowledgement, a status or a tick does not contain its cause.
         """
         own, self.cause = self.cause, cause or self.cause
+        # Not in ``finally``: an exception ends the step, and with it the context.
         yield
         self.cause = own
 
@@ -214,6 +220,7 @@ class StepContext:
         others = tuple(alarm for alarm in self.state.alarms.active if alarm.name != name)
         raised = replace(first, text=text, seen_ns_utc=self.now_ns, own=own)
         self.alarms = replace(self.alarms, active=(*others, raised))
+        # One that goes on changes its text many times a minute: only its beginning is logged.
         if before is None:
             self.log(name, text, Level.ALARM)
 

@@ -10,7 +10,7 @@ detector is fast.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -334,37 +334,27 @@ def _unit(pointing: Pointing) -> NDArray[np.float64]:
     return np.array([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TelemetrySpan:
-    """A stretch of telemetry, by the RTC's clock."""
+def precedes(state: TrackerState, began_ns_utc: int, since_ns_utc: int) -> bool:
+    """Return True if telemetry began before a time, so that it contains earlier states.
 
-    began_ns_utc: int
-    ended_ns_utc: int
-
-
-def telemetry_span(began_ns_utc: int, ended_ns_utc: int) -> TelemetrySpan:
-    """Return the interval that ended then; a start of 0 means unknown and short."""
-    return TelemetrySpan(began_ns_utc=began_ns_utc or ended_ns_utc, ended_ns_utc=ended_ns_utc)
-
-
-def precedes(state: TrackerState, span: TelemetrySpan, since_ns_utc: int) -> bool:
-    """Return True if telemetry began before a time, so that it contains earlier states."""
+    Both are times of the RTC's clock.
+    """
     rtc = state.loop.rtc
     # A time so far in the future is of before the RTC's clock was set back: it voids nothing.
     if rtc is not None and since_ns_utc - rtc.t_ns > CLOCK_SET_BACK_S * SECOND_NS:
         return False
-    return span.began_ns_utc < since_ns_utc - _ROUNDING_NS
+    return began_ns_utc < since_ns_utc - _ROUNDING_NS
 
 
 def explain_void(
-    state: TrackerState, span: TelemetrySpan, purpose: Purpose = Purpose.MEASURE
+    state: TrackerState, began_ns_utc: int, purpose: Purpose = Purpose.MEASURE
 ) -> str | None:
-    """Return why telemetry taken then is void for a purpose, whatever is the matter now, or None.
+    """Return why telemetry that began then is void for a purpose, or None.
 
     What is the matter now is asked of the alarms.
     """
     of_purpose = (each for each in state.alpha.void_intervals if each.purpose is purpose)
-    covers = (each for each in of_purpose if precedes(state, span, each.until_ns_utc))
+    covers = (each for each in of_purpose if precedes(state, began_ns_utc, each.until_ns_utc))
     return next((each.because for each in covers), None)
 
 
@@ -432,10 +422,10 @@ def end_alarm(context: StepContext, name: str, t_ns_utc: int = 0) -> None:
         invalidate_telemetry(context, alarm.definition.because, t_ns_utc)
 
 
-def is_since_alarm(state: TrackerState, name: str, span: TelemetrySpan) -> bool:
-    """Return whether telemetry was taken since this alarm was raised, or there is no such alarm."""
+def is_since_alarm(state: TrackerState, name: str, began_ns_utc: int) -> bool:
+    """Return whether telemetry began since this alarm was raised, or there is no such alarm."""
     alarm = state.alarm(name)
-    return alarm is None or not precedes(state, span, alarm.t_ns_utc)
+    return alarm is None or not precedes(state, began_ns_utc, alarm.t_ns_utc)
 
 
 def _store_intervals(context: StepContext, intervals: Iterable[VoidInterval]) -> None:

@@ -47,7 +47,7 @@ from service.tracking.registration import (
 )
 from service.tracking.state import Level, TrackerState
 from service.tracking.step_context import StepContext, same_but_for_numbers
-from service.tracking.validity import BOTH_SIDES, TelemetrySpan
+from service.tracking.validity import BOTH_SIDES
 
 Array = NDArray[Any]
 
@@ -67,11 +67,10 @@ HARMLESS_REFUSALS = (RefusalKind.CUT_SHORT, RefusalKind.VOID)
 def on_window(context: StepContext, event: ev.WindowFitted) -> None:
     """Fold one window's estimate into the registration, or refuse it with its reason."""
     estimate = event.estimate
-    when = validity.telemetry_span(event.began_ns_utc, estimate.t_ns_utc)
-    why = filtering.check_window(context, estimate, when)
-    smeared = pointing_law.check_pointing_motion(
-        context.state, when.began_ns_utc, when.ended_ns_utc
-    )
+    # A window whose beginning is not known counts as short.
+    began_ns = event.began_ns_utc or estimate.t_ns_utc
+    why = filtering.check_window(context, estimate, began_ns)
+    smeared = pointing_law.check_pointing_motion(context.state, began_ns, estimate.t_ns_utc)
     # Last, so that it replaces any other reason: what a smeared window says proves no fault.
     if smeared is not None:
         why = RefusalKind.VOID, smeared
@@ -81,11 +80,11 @@ def on_window(context: StepContext, event: ev.WindowFitted) -> None:
         return
     # ``run`` counts accepted windows in a row as positive and refused ones as negative.
     context.windows = replace(context.windows, run=max(context.windows.run, 0) + 1)
-    if validity.is_since_alarm(context.state, alarms.DITHER_LOST, when):
+    if validity.is_since_alarm(context.state, alarms.DITHER_LOST, began_ns):
         note_found(context)
     random = isinstance(estimate, RandomEstimate)
     for name in (alarms.MISALIGNED, *(() if random else (alarms.WRONG_ANSWER,))):
-        if validity.is_since_alarm(context.state, name, when):
+        if validity.is_since_alarm(context.state, name, began_ns):
             context.clear_alarm(name)
     registration = context.registration
     modes, gains, gain_sigma = filtering.gains_of(estimate)
@@ -94,7 +93,7 @@ def on_window(context: StepContext, event: ev.WindowFitted) -> None:
         covariance=estimate.covariance,
         t_ns_utc=estimate.t_ns_utc,
         pointing=validity.pointing_at(context.state, estimate.t_ns_utc),
-        began_ns_utc=when.began_ns_utc,
+        began_ns_utc=began_ns,
         source=Source.RANDOM if random else Source.LOCK_IN,
         optical_gain=float(filtering.strong_gains(estimate).mean()),
         optical_gains=filtering.update_gains(
@@ -156,7 +155,7 @@ def process_window(context: StepContext, measured: WindowEstimate) -> None:
             _suspect_jump(context, registration, measured, both, first)
         return
     far = jumps.window_innovation(registration, measured, context.policy)
-    too_early = validity.explain_void(context.state, measured.when, Purpose.SETTLE)
+    too_early = validity.explain_void(context.state, measured.began_ns_utc, Purpose.SETTLE)
     # A window that began before the doubt and agrees with the old α cannot end the doubt. If it
     # disagrees, it counts.
     if too_early is not None and not far.is_outlier:
@@ -411,13 +410,11 @@ def _check_passive_estimate(state: TrackerState, event: ev.PassiveFitted) -> str
     # The bias belongs to the loop in which it was measured.
     if event.loop and of_loop and not same_numbers(event.loop, of_loop):
         return "the loop has changed since"
-    span = validity.telemetry_span(event.began_ns_utc, event.t_ns_utc)
-    reason = filtering.check_measurable(state, span)
+    reason = filtering.check_measurable(state, event.began_ns_utc or event.t_ns_utc)
     if reason is not None or registration is None or not registration.window_began_ns_utc:
         return reason
     # Later telemetry supersedes a delayed estimate.
-    window = validity.telemetry_span(0, registration.window_began_ns_utc)
-    if validity.precedes(state, window, event.t_ns_utc):
+    if validity.precedes(state, registration.window_began_ns_utc, event.t_ns_utc):
         return None
     return "a dithered window taken since has been fitted before it"
 
@@ -478,8 +475,7 @@ def _check_single_registration(
     bias = registration.bias
     # Passive estimates share no telemetry, so this one began after the last one ended.
     began_ns = 0 if bias is None else bias.looked_ns_utc
-    span = TelemetrySpan(began_ns_utc=began_ns, ended_ns_utc=event.t_ns_utc)
-    return validity.explain_void(state, span, Purpose.PASSIVE)
+    return validity.explain_void(state, began_ns, Purpose.PASSIVE)
 
 
 def _ask_for_window(

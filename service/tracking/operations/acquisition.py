@@ -52,7 +52,7 @@ from service.tracking.operation_records import (
     LoopFound,
     ProbationState,
 )
-from service.tracking.operations.noisy_measurement import fail_noisy_measurement
+from service.tracking.operations.measurement import fail_noisy_measurement
 from service.tracking.operations.running import running_ramp
 from service.tracking.operator import set_loop
 from service.tracking.policy import SECOND_NS, Policy
@@ -69,6 +69,9 @@ NO_RTC_LEFT = (
     "no RTC is present; once there is one, the acquisition restarts or reports why not; the loop "
     "may be open"
 )
+
+CUT_OFF = Interruption(doing="unknown", session=None, cause="it was cut off")
+"""Interruption of which nothing is known."""
 
 MAX_STAGE_DURATION_S = 180.0
 """Longest time in one stage: a simulated RTC may be ten times slower than its timestamps."""
@@ -232,8 +235,7 @@ def _own_loop_lost(context: StepContext) -> str | None:
 def _advance(context: StepContext, event: Event) -> None:
     """Take one that is under way further."""
     n_effects = len(context.effects)
-    if not _end_by_event(context, event):
-        _take_in(context, event)
+    _end_by_event(context, event)
     acted = len(context.effects) > n_effects
     if acted or not context.acquisition.under_way or context.rtc is None:
         return
@@ -243,8 +245,8 @@ def _advance(context: StepContext, event: Event) -> None:
         _wide_capture_stage(context, context.rtc)
 
 
-def _end_by_event(context: StepContext, event: Event) -> bool:
-    """End or restart an acquisition that cannot go on after the event; return True if it did so."""
+def _end_by_event(context: StepContext, event: Event) -> None:
+    """End or restart an acquisition that cannot go on after the event, else make use of it."""
     acquisition, state = context.acquisition, context.state
     late = context.now_ns - acquisition.since_ns_utc > MAX_STAGE_DURATION_S * SECOND_NS
     match event:
@@ -265,11 +267,10 @@ def _end_by_event(context: StepContext, event: Event) -> bool:
                 context, f"{acquisition.text}: not done in {MAX_STAGE_DURATION_S:.0f} s"
             )
         case _:
-            return _end_by_answer(context, event)
-    return True
+            _end_by_answer(context, event)
 
 
-def _end_by_answer(context: StepContext, event: Event) -> bool:
+def _end_by_answer(context: StepContext, event: Event) -> None:
     acquisition = context.acquisition
     match event:
         case ev.Answered(
@@ -279,8 +280,7 @@ def _end_by_answer(context: StepContext, event: Event) -> bool:
         case ev.JobFailed(effect=ev.Ask(request=LoopRequest(id=acquisition.command)), text=text):
             _restart_acquisition(context, text)
         case _:
-            return False
-    return True
+            _take_in(context, event)
 
 
 def _take_in(context: StepContext, event: Event) -> None:
@@ -487,7 +487,7 @@ def _resume_interrupted(context: StepContext) -> None:
         )
         _note_interrupted(context, f"it does not restart by itself: {why_not}", do)
         return
-    cause = _cause(context.acquisition)
+    cause = (context.acquisition.interruption or CUT_OFF).cause
     context.acquisition = replace(context.acquisition, interruption=None)
     _restart_acquisition(context, cause)
 
@@ -525,14 +525,8 @@ def _note_closed(context: StepContext, rtc: Status) -> None:
 
 
 def _cause_text(acquisition: Acquisition) -> str:
-    left = acquisition.interruption
-    doing = "unknown" if left is None else left.doing
-    return f"{_cause(acquisition)} during an acquisition ({doing})"
-
-
-def _cause(acquisition: Acquisition) -> str:
-    left = acquisition.interruption
-    return "it was cut off" if left is None else left.cause
+    left = acquisition.interruption or CUT_OFF
+    return f"{left.cause} during an acquisition ({left.doing})"
 
 
 def band_of(stage: AcquisitionStage) -> Band:
@@ -799,8 +793,8 @@ def _wide_capture_stage(context: StepContext, rtc: Status) -> None:
 def _on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
     """Take over where a window puts the mirror, or hold it against where another one did."""
     rtc, before, estimate = context.rtc, context.acquisition, event.found.estimate
-    span = validity.telemetry_span(event.began_ns_utc, estimate.t_ns_utc)
-    if validity.explain_void(context.state, span) is not None:
+    began_ns = event.began_ns_utc or estimate.t_ns_utc
+    if validity.explain_void(context.state, began_ns) is not None:
         return
     if rtc is None or not before.uses_wide_capture or estimate.session != rtc.session:
         return

@@ -1,4 +1,7 @@
-"""Measurements of interaction matrices by the RTC."""
+"""Interaction matrices measured by the RTC, and noisy ones measured on sky by random signs.
+
+The sums of a noisy one are kept where the telemetry comes in; here is only how far each is.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,14 @@ import numpy as np
 from service.errors import CommandError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.dither import stop_running_dither
-from service.tracking.dither_request import check_modes
+from service.tracking.dither import request_dither, stop_running_dither
+from service.tracking.dither_request import DEFAULT_RANDOM_RMS_M, check_modes, cost_of, plan_random
 from service.tracking.events import Event
 from service.tracking.operation_records import MeasurementRecord, MeasureState
 from service.tracking.operator import begin_closing
-from service.tracking.policy import SECOND_NS, Policy
+from service.tracking.policy import SECOND_NS
 from service.tracking.step_context import StepContext, present
-from service.wire import MatrixStrokes, MeasureRequest, Pattern, Reply, Status
+from service.wire import DitherRequest, MatrixStrokes, MeasureRequest, Pattern, Reply, Status
 
 MEASUREMENTS_KEPT = 300
 
@@ -45,6 +48,16 @@ MAX_MEASUREMENT_S = 3600.0
 MEASURING = "an interaction matrix is being measured: these frames are no ordinary telemetry"
 
 
+DEFAULT_NOISY_DURATION_S = 30.0
+"""On a bright star an element of a noisy matrix is then as large as its noise."""
+
+DITHER_END_TIMEOUT_S = 15.0
+"""Time for the service's own dither to vanish from the RTC's status."""
+
+FIT_TIMEOUT_S = 120.0
+"""Time for the fit and the archive."""
+
+
 def measure(context: StepContext, command: cmd.Measure) -> None:
     """Request a measured interaction matrix.
 
@@ -54,20 +67,19 @@ def measure(context: StepContext, command: cmd.Measure) -> None:
         If it names a mode that the basis does not have, or an id that was used before.
     """
     rtc = present(context.rtc)
-    if context.state.measurement(command.id) is not None:
-        raise CommandError(f"{command.id} was measured before; ids are never reused")
-    record = replace(
-        _plan_measurement(command, rtc, context.policy, context.now_ns), cause=context.cause
-    )
+    _require_new(context, command.id)
+    record = _plan_measurement(context, command, rtc)
     check_modes(record.modes, rtc)
     store_measurement(context, record)
     context.log("measurement.asked", f"{record.id}: {record.pattern} of {len(record.modes)} modes")
     strokes = {field.name: getattr(record, field.name) for field in fields(MatrixStrokes)}
-    context.ask(
-        ev.Ask(
-            request=MeasureRequest(pattern=command.pattern, n_average=record.n_average, **strokes)
-        )
-    )
+    request = MeasureRequest(pattern=command.pattern, n_average=record.n_average, **strokes)
+    context.ask(ev.Ask(request=request))
+
+
+def _require_new(context: StepContext, measurement_id: str) -> None:
+    if context.state.measurement(measurement_id) is not None:
+        raise CommandError(f"{measurement_id} was measured before; ids are never reused")
 
 
 def give_up_on_command(context: StepContext, command: cmd.GiveUp) -> None:
@@ -137,6 +149,7 @@ def _update(context: StepContext, record: MeasurementRecord) -> None:
         given_up = before.state is MeasureState.GIVEN_UP
         if given_up or (record.under_way and not before.under_way):
             return
+        # The manifest of a matrix does not repeat what the service has asked for.
         record = replace(
             record,
             frequency_hz=before.frequency_hz,
@@ -196,18 +209,18 @@ def _give_up_overdue(context: StepContext, record: MeasurementRecord, *, closed:
             store_measurement(context, replace(record, overdue_since_ns_utc=since_ns))
 
 
-def _plan_measurement(
-    command: cmd.Measure, rtc: Status, policy: Policy, now_ns: int
-) -> MeasurementRecord:
+def _plan_measurement(context: StepContext, command: cmd.Measure, rtc: Status) -> MeasurementRecord:
     sine = command.pattern is Pattern.SINE
     modes = command.modes or tuple(range(rtc.n_controlled))
     if sine and command.modes is None:
+        # Every so many modes, rounded up: the tones span the basis, and are never too many.
         modes = modes[:: -(-len(modes) // N_TONES)]
-    tone_m = policy.dither_amplitude_m or TONE_RMS_M
+    tone_m = context.policy.dither_amplitude_m or TONE_RMS_M
     stroke_m = command.amplitude_m or (tone_m if sine else PUSH_PULL_RMS_M)
     duration_s = (command.duration_s or DEFAULT_TONES_DURATION_S) if sine else None
     lines = command.frequency_hz
     if duration_s is not None and lines is None:
+        # Whole periods in the duration, so that the lines do not leak into one another.
         band_hz = np.linspace(*TONE_BAND, len(modes)) * rtc.frame_rate_hz
         lines = tuple((np.round(band_hz * duration_s) / duration_s).tolist())
     return MeasurementRecord(
@@ -219,8 +232,9 @@ def _plan_measurement(
         n_average=None if sine else command.n_average or N_AVERAGE,
         frequency_hz=lines,
         duration_s=duration_s,
-        asked_ns_utc=now_ns,
+        asked_ns_utc=context.now_ns,
         closed_before=rtc.loop != "open",
+        cause=context.cause,
     )
 
 
@@ -230,3 +244,132 @@ def store_measurement(context: StepContext, record: MeasurementRecord) -> None:
     context.operations = replace(
         context.operations, measurements=(*others, record)[-MEASUREMENTS_KEPT:]
     )
+
+
+def measure_noisy(context: StepContext, command: cmd.MeasureNoisy) -> None:
+    """Measure a noisy interaction matrix after the running dither.
+
+    Raises
+    ------
+    CommandError
+        If it costs more than the budget, or names an id that was used before.
+    """
+    rtc = present(context.rtc)
+    _require_new(context, command.id)
+    duration_s = command.duration_s or DEFAULT_NOISY_DURATION_S
+    total = command.total_amplitude_m or min(DEFAULT_RANDOM_RMS_M, context.policy.dither_budget_m)
+    cost_of(total, context.policy, over_budget=command.over_budget)
+    dither = plan_random(
+        rtc,
+        context.policy,
+        context.now_ns,
+        dither_id=command.id,
+        modes=command.modes,
+        total_m=total,
+        duration_s=duration_s,
+    )
+    record = MeasurementRecord(
+        id=command.id,
+        state=MeasureState.WAITING,
+        pattern=None,
+        modes=dither.request.modes,
+        amplitude_m=dither.request.amplitude_m,
+        duration_s=duration_s,
+        window_s=dither.window_s,
+        seed=dither.request.seed,
+        asked_ns_utc=context.now_ns,
+        basis_id=rtc.basis_id,
+        config_id=rtc.config_id,
+        cause=context.cause,
+    )
+    store_measurement(context, record)
+    text = (
+        f"{record.id}: {len(record.modes)} modes, {1e9 * record.total_m:.3g} nm RMS in all, "
+        f"{duration_s:g} s"
+    )
+    context.log("noisy-matrix.asked", text)
+    stop_running_dither(context)
+
+
+def advance_noisy(context: StepContext, event: Event) -> None:
+    """Go on with the one under way, if there is one."""
+    record = context.state.noisy_measurement
+    if record is not None:
+        with context.because_of(record.cause):
+            _go_on(context, record, event)
+
+
+def _go_on(context: StepContext, record: MeasurementRecord, event: Event) -> None:
+    """Start its dither, note that it plays, or that it is over."""
+    rtc = context.rtc
+    waited_s = (context.now_ns - (record.asked_ns_utc or 0)) / SECOND_NS
+    match record.state:
+        case MeasureState.WAITING if isinstance(event, cmd.StopDither):
+            fail_noisy_measurement(context, "the operator stopped the dither")
+        case MeasureState.WAITING:
+            if rtc is not None and rtc.loop != "open" and rtc.dither_id is None:
+                _begin_noisy(context, record, rtc)
+            elif waited_s > DITHER_END_TIMEOUT_S:
+                fail_noisy_measurement(
+                    context, f"the dither that ran did not end within {DITHER_END_TIMEOUT_S:.0f} s"
+                )
+        case MeasureState.ASKED | MeasureState.RUNNING:
+            _follow_playing(context, record, event)
+        case _:
+            # a simulated RTC may be ten times slower than its timestamps
+            if waited_s >= 10.0 * (
+                (record.duration_s or 0.0) + DITHER_END_TIMEOUT_S + FIT_TIMEOUT_S
+            ):
+                fail_noisy_measurement(context, "the worker did not answer")
+
+
+def fail_noisy_measurement(context: StepContext, why: str) -> None:
+    """End the one under way, if there is one, without a matrix."""
+    record = context.state.noisy_measurement
+    if record is not None:
+        fail_measurement(context, record, why)
+
+
+def _begin_noisy(context: StepContext, record: MeasurementRecord, rtc: Status) -> None:
+    try:
+        dither = plan_random(
+            rtc,
+            context.policy,
+            context.now_ns,
+            dither_id=record.id,
+            modes=record.modes,
+            total_m=record.total_m,
+            duration_s=record.duration_s or DEFAULT_NOISY_DURATION_S,
+        )
+    except CommandError as error:  # the RTC is another than when it was asked for
+        fail_measurement(context, record, str(error))
+        return
+    window_s, seed = dither.window_s, dither.request.seed
+    store_measurement(
+        context, replace(record, state=MeasureState.ASKED, window_s=window_s, seed=seed)
+    )
+    request_dither(context, dither)
+
+
+def _follow_playing(context: StepContext, record: MeasurementRecord, event: Event) -> None:
+    match event:
+        case ev.Answered(
+            request=DitherRequest(id=record.id), reply=Reply(accepted=False, reason=reason)
+        ):
+            fail_measurement(context, record, f"the RTC refused the dither: {reason}")
+            return
+        case ev.JobFailed(effect=ev.Ask(request=DitherRequest(id=record.id)), text=text):
+            fail_measurement(context, record, text)
+            return
+        case _:
+            pass
+    dither, asked = context.dither, record.state is MeasureState.ASKED
+    if dither is not None and dither.id == record.id:
+        if asked and dither.start_seq is not None:
+            store_measurement(context, replace(record, state=MeasureState.RUNNING))
+    elif asked:
+        fail_measurement(context, record, "its dither never began")
+    else:
+        record = replace(record, state=MeasureState.FINISHING)
+        store_measurement(context, record)
+        context.ask(ev.FinishNoisy(record=record))

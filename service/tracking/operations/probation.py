@@ -17,19 +17,10 @@ from dataclasses import replace
 from service.estimation.comparison import Verdict
 from service.estimation.loop import explain_open_loop, same_but_for_modes
 from service.estimation.probation import MAX_PROBATION_S
+from service.tracking import alarms, mode_proof, reconstructors, validity
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking import mode_proof, reconstructors, validity
-from service.tracking.alarms import (
-    DIVERGING,
-    LOOP_OPENED,
-    OFF_LOOP,
-    PROBATION,
-    WRONG_LOOP,
-    Alarm,
-    Interlock,
-    as_critical,
-)
+from service.tracking.alarms import Alarm, Interlock
 from service.tracking.events import Event
 from service.tracking.operation_records import CommandState, Probation, ProbationState
 from service.tracking.operations.acquisition import may_acquire
@@ -63,7 +54,7 @@ OPEN_REQUEST_INTERVAL_S = 2.0
 
 MAY_HAVE_JUMPED = "the mirror may have jumped at the time of a swap"
 
-_CONCLUSIVE_ALARMS = (WRONG_LOOP, OFF_LOOP, DIVERGING)
+_CONCLUSIVE_ALARMS = (alarms.WRONG_LOOP, alarms.OFF_LOOP, alarms.DIVERGING)
 """Alarms that say by themselves that the RTC plays another matrix, or one that does not hold."""
 
 _FINAL_STATES = frozenset(
@@ -86,13 +77,13 @@ def advance(context: StepContext, event: Event) -> None:
     if context.matrices.in_use != context.before.matrices.in_use:
         _on_swap(context, context.before.matrices.in_use, context.matrices.in_use)
         return
-    trial = context.operations.probation
+    trial = context.probation
     if trial is None:
         return
     alarm = _alarm_of_swap(context, trial)
     if alarm is not None:
         # Commands that contradict the law of the loop are the RTC's fault and not the mirror's.
-        _begin_rollback(context, trial, alarm.text, resumes=alarm.name == DIVERGING)
+        _begin_rollback(context, trial, alarm.text, resumes=alarm.name == alarms.DIVERGING)
     else:
         _go_on(context, trial, event)
 
@@ -111,7 +102,7 @@ def _go_on(context: StepContext, trial: Probation, event: Event) -> None:
         case ProbationState.ACQUIRING:
             _await_acquisition(context, trial, event)
         case ProbationState.OPENED if context.rtc is not None and context.rtc.in_loop:
-            _set(context, replace(trial, state=ProbationState.ROLLED_BACK))
+            context.probation = replace(trial, state=ProbationState.ROLLED_BACK)
 
 
 def on_compared(context: StepContext, event: ev.Compared) -> None:
@@ -119,7 +110,7 @@ def on_compared(context: StepContext, event: ev.Compared) -> None:
 
     What was said of other matrices than the two on record is not meant.
     """
-    trial, found = context.operations.probation, event.finding
+    trial, found = context.probation, event.finding
     if trial is None or not trial.awaits(found.before, found.after):
         return
     # The comparison now concerns the previous matrix, which is in use again.
@@ -132,7 +123,7 @@ def on_compared(context: StepContext, event: ev.Compared) -> None:
         _end(context, trial, ProbationState.NOT_JUDGED, found.text)
     elif found.verdict is Verdict.AS_GOOD:
         _end(context, trial, ProbationState.PASSED, found.text)
-        context.clear_alarm(PROBATION)
+        context.clear_alarm(alarms.PROBATION)
         passed = context.state.reconstructor(trial.id)
         if passed is not None:
             mode_proof.note_passed(context, passed)
@@ -158,7 +149,7 @@ def is_way_back(state: TrackerState, made: ev.MatrixMade) -> bool:
 
 def send_way_back(context: StepContext, made: ev.MatrixMade) -> None:
     """Send the matrix before under its new id, unless something forbids it by now."""
-    trial = context.operations.probation
+    trial = context.probation
     reconstructors.propose(context, made.record)
     if trial is None:
         return
@@ -167,7 +158,7 @@ def send_way_back(context: StepContext, made: ev.MatrixMade) -> None:
         _keep_worse(context, trial, why)
         return
     reconstructors.send(context, made.record.id, trial.since_ns_utc)
-    _set(context, replace(trial, rollback=made.record.id))
+    context.probation = replace(trial, rollback=made.record.id)
 
 
 def _begin_rollback(
@@ -185,8 +176,8 @@ def _begin_rollback(
         _keep_worse(context, trial, why)
         return
     text = f"{trial.worse}. The service goes back to {trial.before}"
-    _set(context, replace(trial, state=ProbationState.ROLLING_BACK, text=text))
-    context.raise_alarm(PROBATION, f"{trial.id} {text}")
+    context.probation = replace(trial, state=ProbationState.ROLLING_BACK, text=text)
+    context.raise_alarm(alarms.PROBATION, f"{trial.id} {text}")
     why = f"the service goes back to {trial.before}: {trial.id} made the loop worse"
     # Not judged: the loop ran with this matrix, and α may be what is wrong.
     reconstructors.request_matrix(
@@ -195,7 +186,7 @@ def _begin_rollback(
 
 
 def _on_swap(context: StepContext, before: str | None, in_use: str | None) -> None:
-    trial = context.operations.probation
+    trial = context.probation
     record = context.state.reconstructor(in_use)
     if (
         trial is not None
@@ -208,36 +199,33 @@ def _on_swap(context: StepContext, before: str | None, in_use: str | None) -> No
     if record is None or before is None:
         if trial is not None and trial.judges is not None:
             why = "the RTC's matrix is unknown"
-            _set(context, replace(trial, state=ProbationState.NOT_JUDGED, text=why))
+            context.probation = replace(trial, state=ProbationState.NOT_JUDGED, text=why)
         return
     why = _explain_missing_probation(context, record, trial)
     # The reference is the last matrix that was good, not the one that made the loop worse.
     worse = trial is not None and trial.id == before and trial.state in _WORSE_STATES
     asked = context.policy.opens_lost_loop
-    _set(
-        context,
-        Probation(
-            id=record.id,
-            before=before,
-            reference=trial.reference if trial is not None and worse else before,
-            state=ProbationState.NOT_JUDGED if why else ProbationState.RUNNING,
-            text=why or f"compared with {before}",
-            since_ns_utc=context.now_ns,
-            until_ns_utc=context.now_ns + round(MAX_PROBATION_S * SECOND_NS),
-            # A rollback requires the loop to be as it was before the swap.
-            loop=context.before.loop.rtc,
-            opens=context.before.operator.mode is Mode.AUTO if asked is None else asked,
-            resumed_ns_utc=None if trial is None else trial.resumed_ns_utc,
-        ),
+    context.probation = Probation(
+        id=record.id,
+        before=before,
+        reference=trial.reference if trial is not None and worse else before,
+        state=ProbationState.NOT_JUDGED if why else ProbationState.RUNNING,
+        text=why or f"compared with {before}",
+        since_ns_utc=context.now_ns,
+        until_ns_utc=context.now_ns + round(MAX_PROBATION_S * SECOND_NS),
+        # A rollback requires the loop to be as it was before the swap.
+        loop=context.before.loop.rtc,
+        opens=context.before.operator.mode is Mode.AUTO if asked is None else asked,
+        resumed_ns_utc=None if trial is None else trial.resumed_ns_utc,
     )
 
 
 def _await_verdict(context: StepContext, trial: Probation) -> None:
     why = _check_comparable(context)
     if why:
-        _set(context, replace(trial, state=ProbationState.NOT_JUDGED, text=why))
+        context.probation = replace(trial, state=ProbationState.NOT_JUDGED, text=why)
     elif trial.under_way and context.now_ns > trial.until_ns_utc + MAX_VERDICT_DELAY_S * SECOND_NS:
-        _set(context, replace(trial, state=ProbationState.OVERDUE, text="telemetry is late"))
+        context.probation = replace(trial, state=ProbationState.OVERDUE, text="telemetry is late")
 
 
 def _begin_watch(context: StepContext, trial: Probation, in_use: str) -> None:
@@ -254,7 +242,7 @@ def _begin_watch(context: StepContext, trial: Probation, in_use: str) -> None:
     )
     _end(context, watched, ProbationState.WATCHED, text)
     context.raise_alarm(
-        PROBATION, f"{trial.id} {text}. The mode is hold until an operator sets another"
+        alarms.PROBATION, f"{trial.id} {text}. The mode is hold until an operator sets another"
     )
 
 
@@ -262,9 +250,8 @@ def _watch(context: StepContext, trial: Probation) -> None:
     """End the check of the loop with the matrix before: lost, opened, or undecided."""
     waited_s = (context.now_ns - trial.since_ns_utc) / SECOND_NS
     lost = context.blocking_alarm(Interlock.HOLD)
-    if context.rtc is None or not context.rtc.in_loop:
-        why = "the RTC is gone" if context.rtc is None else explain_open_loop(context.rtc)
-        _end_watch(context, trial, why, lost=False)
+    if gone := _check_loop(context):
+        _end_watch(context, trial, gone, lost=False)
     # The detector of divergence averages over half a second, so that it still shows the rejected
     # matrix.
     elif lost is not None and waited_s > MAX_CALMING_S:
@@ -286,7 +273,9 @@ def _end_watch(
     _end(context, trial, ProbationState.ROLLED_BACK, trial.text)
     do = ". Open the loop" if lost else ""
     text = f"{trial.id} {trial.text}. The mode is hold until an operator sets another{do}"
-    context.raise_alarm(PROBATION, text, as_critical(PROBATION) if lost else None)
+    context.raise_alarm(
+        alarms.PROBATION, text, alarms.as_critical(alarms.PROBATION) if lost else None
+    )
 
 
 def _may_resume(context: StepContext, trial: Probation, *, lost: bool) -> bool:
@@ -306,7 +295,7 @@ def _resume(context: StepContext, trial: Probation, *, lost: bool) -> None:
         context, trial.id, MatrixState.FAILED, "rolled back, but it was not the cause"
     )
     _end(context, replace(trial, resumed_ns_utc=context.now_ns), state, trial.text)
-    context.clear_alarm(PROBATION)
+    context.clear_alarm(alarms.PROBATION)
     leave_hold(
         context,
         f"the loop is no better with {trial.before}, so {trial.id} was not the cause. The mirror "
@@ -329,9 +318,9 @@ def _await_opening(context: StepContext, trial: Probation, event: Event) -> None
     rtc, asked = context.rtc, context.loop.command
     # An operator who sets the mode has taken over.
     if isinstance(event, cmd.SetMode):
-        _set(context, replace(trial, state=ProbationState.KEPT))
+        context.probation = replace(trial, state=ProbationState.KEPT)
     elif rtc is not None and not rtc.in_loop:
-        _set(context, replace(trial, state=ProbationState.OPENED))
+        context.probation = replace(trial, state=ProbationState.OPENED)
     elif rtc is not None and asked is not None and not context.operator.stopped_because:
         waited_ns = context.now_ns - asked.asked_ns_utc
         if waited_ns > OPEN_REQUEST_INTERVAL_S * SECOND_NS:
@@ -342,15 +331,15 @@ def _await_acquisition(context: StepContext, trial: Probation, event: Event) -> 
     """Note that the acquisition has begun, or that the operator or the RTC has taken over."""
     closed = context.rtc is not None and context.rtc.in_loop
     if context.acquisition.under_way or not closed or isinstance(event, cmd.SetMode):
-        _set(context, replace(trial, state=ProbationState.NOT_CONFIRMED))
+        context.probation = replace(trial, state=ProbationState.NOT_CONFIRMED)
 
 
 def explain_opening(context: StepContext) -> str | None:
     """Return that the loop was lost and is asked to open, and whether it did; None: it is not."""
-    trial, asked = context.operations.probation, context.loop.command
+    trial, asked = context.probation, context.loop.command
     if trial is None or trial.state not in {ProbationState.OPENING, ProbationState.OPENED}:
         return None
-    raised, does = context.alarm_text(LOOP_OPENED), "The RTC is asked to open the loop"
+    raised, does = context.alarm_text(alarms.LOOP_OPENED), "The RTC is asked to open the loop"
     if trial.state is ProbationState.OPENED:
         does = "The loop was asked to open, and is open"
     elif asked is not None and asked.state in {CommandState.REFUSED, CommandState.FAILED}:
@@ -392,13 +381,17 @@ def _explain_missing_probation(
 
 def _check_comparable(context: StepContext) -> str:
     """Return why telemetry cannot be compared now; empty: it can."""
+    acquiring = context.acquisition.under_way
+    return _check_loop(context) or (
+        "an acquisition watches its matrices itself" if acquiring else ""
+    )
+
+
+def _check_loop(context: StepContext) -> str:
+    """Return why no loop is closed; empty: one is."""
     if context.rtc is None:
         return "the RTC is gone"
-    if not context.rtc.in_loop:
-        return explain_open_loop(context.rtc)
-    if context.acquisition.under_way:
-        return "an acquisition watches its matrices itself"
-    return ""
+    return "" if context.rtc.in_loop else explain_open_loop(context.rtc)
 
 
 def _check_jump(context: StepContext, trial: Probation) -> str:
@@ -450,14 +443,10 @@ def _keep_worse(context: StepContext, trial: Probation, why: str) -> None:
         return
     _end(context, trial, ProbationState.KEPT, text)
     do = "open the loop if it suffers, or roll back by hand"
-    own = as_critical(PROBATION) if lost else None
-    context.raise_alarm(PROBATION, f"{trial.id} {text}; {do}", own)
+    own = alarms.as_critical(alarms.PROBATION) if lost else None
+    context.raise_alarm(alarms.PROBATION, f"{trial.id} {text}; {do}", own)
 
 
 def _end(context: StepContext, trial: Probation, state: ProbationState, text: str) -> None:
-    _set(context, replace(trial, state=state, text=text))
+    context.probation = replace(trial, state=state, text=text)
     context.log(f"probation.{state}", f"{trial.id}: {text}")
-
-
-def _set(context: StepContext, trial: Probation) -> None:
-    context.operations = replace(context.operations, probation=trial)

@@ -52,6 +52,7 @@ def running_operations(state: TrackerState, now_ns: int) -> tuple[RunningOperati
 
 def running_ramp(state: TrackerState, now_ns: int) -> LoopCommand | None:
     """Return the gain ramp that the RTC is busy with, or None: opening the loop ends one."""
+    # No status says that a ramp runs: only the RTC's answer and the clock do.
     asked, rtc = state.loop.command, state.loop.rtc
     if asked is None or not asked.lasts_s or rtc is None or rtc.loop == "open":
         return None
@@ -89,6 +90,8 @@ def _exclusive(state: TrackerState, now_ns: int) -> Iterator[RunningOperation]:
 
 def _dither(state: TrackerState, now_ns: int) -> Iterator[RunningOperation]:
     """Yield the dither that plays, unless it was ordered to stop."""
+    # A status may be a second old, and still show a dither that was just asked to stop. One of the
+    # service's own that nobody follows is about to be stopped: nobody has to wait for it.
     followed = None if state.dithers.dither is None else state.dithers.dither.id
     stopping = now_ns - state.dithers.policy.stop_asked_ns_utc < MAX_STOP_DELAY_S * SECOND_NS
     seen = None if state.loop.rtc is None or stopping else state.loop.rtc.dither_id
@@ -185,6 +188,7 @@ def operating(state: TrackerState, hindered: str, now_ns: int) -> Operating:
     now_ns
         The service's clock, nanoseconds.
     """
+    # The loop in danger comes first, then what keeps the service from its work, then what it does.
     occupation, doing = _current_operation(state, now_ns)
     operation, because = ServiceState.OPERATIONAL, doing
     critical, serious = (_first(state, grade) for grade in (Severity.CRITICAL, Severity.SERIOUS))

@@ -22,6 +22,7 @@ PACKAGE = Path(tracking.__file__).parent
 ATTRIBUTES = {
     "acquisition": "operations.acquisition",
     "dither": "dithers.dither",
+    "probation": "operations.probation",
     "dither_policy": "dithers.policy",
 }
 """Parts that have a name of their own in the context."""

@@ -14,7 +14,6 @@ from service.tracking.state import Mode, TrackerState
 from service.tracking.validity import (
     INTERVALS_KEPT,
     MAX_TELEMETRY_AGE_S,
-    TelemetrySpan,
     explain_void,
     invalidate_telemetry,
     make_valid,
@@ -294,10 +293,9 @@ def test_nothing_is_due_while_nothing_is_known():
     assert not story.alarms
 
 
-def at(began_s, lasts_s=2.0):
-    """Telemetry that began so long after the RTC's last status."""
-    began_ns = START_NS + round(began_s * SECOND)
-    return TelemetrySpan(began_ns_utc=began_ns, ended_ns_utc=began_ns + round(lasts_s * SECOND))
+def at(began_s):
+    """The beginning of telemetry, so long after the RTC's last status."""
+    return START_NS + round(began_s * SECOND)
 
 
 def void(state, until_s, because, **kwargs):

@@ -8,7 +8,7 @@ import pytest
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.operation_records import MeasureState
-from service.tracking.operations.noisy_measurement import DITHER_END_TIMEOUT_S
+from service.tracking.operations.measurement import DITHER_END_TIMEOUT_S
 from service.tracking.products import ModeSet
 from service.wire import DitherKind, DitherRequest, DitherStop
 from tests.unit.tracking.situations import (

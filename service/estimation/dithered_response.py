@@ -10,7 +10,7 @@ how much of the latter is significant.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -97,16 +97,26 @@ class DitheredResponse:
             if size.any():
                 self._significant[mode] = one
 
-    def left_over(self, known: Collection[int] = (), *, noisy: bool = False) -> LeftOver | None:
-        """Return the residual of dithered modes other than ``known`` ones; None: of no mode.
+    def left_over(self, known: Collection[int] = ()) -> LeftOver | None:
+        """Return the significant residual of modes other than ``known`` ones; None: of no mode."""
+        return _of_modes(self._significant, known)
 
-        Only what is significant, or with its noise if ``noisy``.
+    def with_noise(self, known: Collection[int] = ()) -> tuple[LeftOver, ...]:
+        """Return the residual of modes other than ``known`` ones as it may be within its noise.
+
+        It is the mean of the windows, and the mean with one realisation of its noise added and
+        subtracted; empty if no mode was dithered.
         """
-        residuals = self._significant
-        if noisy:
-            residuals = {mode: mean.real for mode, (mean, _) in self._means.items()}
-        modes = sorted(residuals.keys() - set(known))
-        if not modes:
-            return None
-        slopes = np.array([residuals[mode] for mode in modes], np.float32)
-        return LeftOver(columns=np.array(modes), slopes=slopes.T)
+        every = [
+            _of_modes({m: one.real + sign * one.imag for m, (one, _) in self._means.items()}, known)
+            for sign in (0.0, 1.0, -1.0)
+        ]
+        return tuple(one for one in every if one is not None)
+
+
+def _of_modes(residuals: Mapping[int, Array], known: Collection[int]) -> LeftOver | None:
+    modes = sorted(residuals.keys() - set(known))
+    if not modes:
+        return None
+    slopes = np.array([residuals[mode] for mode in modes], np.float32)
+    return LeftOver(columns=np.array(modes), slopes=slopes.T)

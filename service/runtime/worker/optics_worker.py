@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import TypeVar
 
@@ -512,17 +513,29 @@ class OpticsWorker:
         """Return whether a reconstructor would hold the loop within α ± 3σ."""
         alpha, noise = conditions.alpha, self._model.instrument.slopes.kind.noise
         loop = replace(conditions.loop, outer=outer_of(self._model), noise=noise)
+        found: list[GateVerdict] = []
+        for response in self._possible_responses(alpha):
+            covariance, bound = conditions.covariance, conditions.bound
+            found.append(judge(reconstructor, response, alpha, covariance, loop, bound=bound))
+            if not found[-1].accepted:
+                return found[-1]
+        return max(found, key=lambda verdict: verdict.worst_pole_radius)
+
+    def _possible_responses(self, alpha: Misregistration) -> Iterator[Linearisation]:
+        """Yield the responses at unit gain that agree with what was measured of modes."""
         own, at_work = self._left_over, self._as_own_matrix(alpha)
-        dithered = self._dithered.left_over(
-            () if own is None else own.columns.tolist(),
-            # A model that is poor where it was measured is taken for poor in all modes: what noise
-            # may hide counts as the model's error then.
-            noisy=own is not None and own.is_large(at_work.matrix),
-        )
-        if dithered is not None:
-            at_work = dithered.add_to(at_work)
-        covariance, bound = conditions.covariance, conditions.bound
-        return judge(reconstructor, at_work, alpha, covariance, loop, bound=bound)
+        known = () if own is None else own.columns.tolist()
+        # A model that is poor where the RTC's own matrix shows it is taken for poor in all modes:
+        # what noise may hide in their measured response counts as the model's error.
+        if own is not None and own.is_large(at_work.matrix):
+            every = self._dithered.with_noise(known)
+        else:
+            significant = self._dithered.left_over(known)
+            every = () if significant is None else (significant,)
+        for left in every:
+            yield left.add_to(at_work)
+        if not every:
+            yield at_work
 
     def _as_own_matrix(self, alpha: Misregistration) -> Linearisation:
         """Return the response at unit gain, with the residual of the RTC's own matrix."""

@@ -212,9 +212,11 @@ class OpticsWorker:
         The residual of every accepted fit is kept for the gate.
         """
         outcome = self._fit_recognised(spectra, loop, start)
-        if isinstance(outcome, LockInEstimate):
-            response = self._as_own_matrix(outcome.alpha).matrix_at(outcome.alpha)
-            self._dithered.add(spectra, outcome, response)
+        # Not a new linearisation about the estimate: the fit has done without it.
+        near = self._sensor.at_hand
+        if isinstance(outcome, LockInEstimate) and near is not None:
+            at_work = self._with_own_residual(self._sensor.to_unit_gain(near))
+            self._dithered.add(spectra, outcome, at_work.matrix_at(outcome.alpha))
         return outcome
 
     def _fit_recognised(
@@ -523,7 +525,7 @@ class OpticsWorker:
 
     def _possible_responses(self, alpha: Misregistration) -> Iterator[Linearisation]:
         """Yield the responses at unit gain that agree with what was measured of modes."""
-        own, at_work = self._left_over, self._as_own_matrix(alpha)
+        own, at_work = self._left_over, self._with_own_residual(self._sensor.at_unit_gain(alpha))
         known = () if own is None else own.columns.tolist()
         # A model that is poor where the RTC's own matrix shows it is taken for poor in all modes:
         # what noise may hide in their measured response counts as the model's error.
@@ -537,10 +539,9 @@ class OpticsWorker:
         if not every:
             yield at_work
 
-    def _as_own_matrix(self, alpha: Misregistration) -> Linearisation:
-        """Return the response at unit gain, with the residual of the RTC's own matrix."""
-        at_work = self._sensor.at_unit_gain(alpha)
-        return at_work if self._left_over is None else self._left_over.add_to(at_work)
+    def _with_own_residual(self, linearisation: Linearisation) -> Linearisation:
+        """Return a linearisation at unit gain with the residual of the RTC's own matrix."""
+        return linearisation if self._left_over is None else self._left_over.add_to(linearisation)
 
     @waits(at_most_s=10.0)
     def margin(

@@ -10,7 +10,7 @@ how much of the latter is significant.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,8 @@ class DitheredResponse:
 
     def __init__(self) -> None:
         self._means: dict[int, tuple[Array, float]] = {}
+        # Only modes with a residual: of a good model hardly any has one, and of an ELT all together
+        # would take as much memory as D.
         self._significant: dict[int, Array] = {}
         self._session: str | None = None
 
@@ -65,14 +67,14 @@ class DitheredResponse:
             seen += others @ np.array([self._significant[mode] for mode in known])
         left = (spectra.slopes[lines, 0] / gains[lines, None] - seen) / own[:, None]
         for mode, one in zip(modes.tolist(), left, strict=True):
-            self._add_to_mean(mode, one)
+            self._add_to_mean(mode, one.astype(np.complex64))
         self._find_significant(modes.tolist())
 
     def _add_to_mean(self, mode: int, left: Array) -> None:
         weight = 1.0 / max(float(np.mean(left.imag**2)), _TINY)
         mean, total = self._means.get(mode, (np.zeros_like(left), 0.0))
         total = MEMORY_RATIO * total + weight
-        self._means[mode] = mean + (left - mean) * (weight / total), total
+        self._means[mode] = mean + (left - mean) * np.float32(weight / total), total
 
     def _find_significant(self, modes: list[int]) -> None:
         """Keep of these modes' residuals the patterns that stand out of the noise.
@@ -89,16 +91,32 @@ class DitheredResponse:
         # No margin: a pattern of noise that passes raises a pole radius by 0.02 at most, and an
         # error that is missed may hide an unstable loop.
         size[size < noise] = 0.0
-        left = sigma * ((by_mode * size) @ by_slope)
-        self._significant.update(zip(modes, left.astype(np.float32), strict=True))
+        left = (sigma * ((by_mode * size) @ by_slope)).astype(np.float32)
+        for mode, one in zip(modes, left, strict=True):
+            self._significant.pop(mode, None)
+            if size.any():
+                self._significant[mode] = one
 
-    def left_over(self, known: Collection[int] = (), *, noisy: bool = False) -> LeftOver | None:
-        """Return the residual of dithered modes other than ``known`` ones; None: of no mode.
+    def left_over(self, known: Collection[int] = ()) -> LeftOver | None:
+        """Return the significant residual of modes other than ``known`` ones; None: of no mode."""
+        return _of_modes(self._significant, known)
 
-        Only what is significant, or with its noise if ``noisy``.
+    def with_noise(self, known: Collection[int] = ()) -> tuple[LeftOver, ...]:
+        """Return the residual of modes other than ``known`` ones as it may be within its noise.
+
+        It is the mean of the windows, and the mean with one realisation of its noise added and
+        subtracted; empty if no mode was dithered.
         """
-        modes = sorted(self._significant.keys() - set(known))
-        if not modes:
-            return None
-        every = [self._means[mode][0].real if noisy else self._significant[mode] for mode in modes]
-        return LeftOver(columns=np.array(modes), slopes=np.array(every, np.float32).T)
+        every = [
+            _of_modes({m: one.real + sign * one.imag for m, (one, _) in self._means.items()}, known)
+            for sign in (0.0, 1.0, -1.0)
+        ]
+        return tuple(one for one in every if one is not None)
+
+
+def _of_modes(residuals: Mapping[int, Array], known: Collection[int]) -> LeftOver | None:
+    modes = sorted(residuals.keys() - set(known))
+    if not modes:
+        return None
+    slopes = np.array([residuals[mode] for mode in modes], np.float32)
+    return LeftOver(columns=np.array(modes), slopes=slopes.T)

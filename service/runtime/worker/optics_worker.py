@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import TypeVar
 
@@ -211,9 +212,11 @@ class OpticsWorker:
         The residual of every accepted fit is kept for the gate.
         """
         outcome = self._fit_recognised(spectra, loop, start)
-        if isinstance(outcome, LockInEstimate):
-            response = self._as_own_matrix(outcome.alpha).matrix_at(outcome.alpha)
-            self._dithered.add(spectra, outcome, response)
+        # Not a new linearisation about the estimate: the fit has done without it.
+        near = self._sensor.at_hand
+        if isinstance(outcome, LockInEstimate) and near is not None:
+            at_work = self._with_own_residual(self._sensor.to_unit_gain(near))
+            self._dithered.add(spectra, outcome, at_work.matrix_at(outcome.alpha))
         return outcome
 
     def _fit_recognised(
@@ -512,22 +515,33 @@ class OpticsWorker:
         """Return whether a reconstructor would hold the loop within α ± 3σ."""
         alpha, noise = conditions.alpha, self._model.instrument.slopes.kind.noise
         loop = replace(conditions.loop, outer=outer_of(self._model), noise=noise)
-        own, at_work = self._left_over, self._as_own_matrix(alpha)
-        dithered = self._dithered.left_over(
-            () if own is None else own.columns.tolist(),
-            # A model that is poor where it was measured is taken for poor in all modes: what noise
-            # may hide counts as the model's error then.
-            noisy=own is not None and own.is_large(at_work.matrix),
-        )
-        if dithered is not None:
-            at_work = dithered.add_to(at_work)
-        covariance, bound = conditions.covariance, conditions.bound
-        return judge(reconstructor, at_work, alpha, covariance, loop, bound=bound)
+        found: list[GateVerdict] = []
+        for response in self._possible_responses(alpha):
+            covariance, bound = conditions.covariance, conditions.bound
+            found.append(judge(reconstructor, response, alpha, covariance, loop, bound=bound))
+            if not found[-1].accepted:
+                return found[-1]
+        return max(found, key=lambda verdict: verdict.worst_pole_radius)
 
-    def _as_own_matrix(self, alpha: Misregistration) -> Linearisation:
-        """Return the response at unit gain, with the residual of the RTC's own matrix."""
-        at_work = self._sensor.at_unit_gain(alpha)
-        return at_work if self._left_over is None else self._left_over.add_to(at_work)
+    def _possible_responses(self, alpha: Misregistration) -> Iterator[Linearisation]:
+        """Yield the responses at unit gain that agree with what was measured of modes."""
+        own, at_work = self._left_over, self._with_own_residual(self._sensor.at_unit_gain(alpha))
+        known = () if own is None else own.columns.tolist()
+        # A model that is poor where the RTC's own matrix shows it is taken for poor in all modes:
+        # what noise may hide in their measured response counts as the model's error.
+        if own is not None and own.is_large(at_work.matrix):
+            every = self._dithered.with_noise(known)
+        else:
+            significant = self._dithered.left_over(known)
+            every = () if significant is None else (significant,)
+        for left in every:
+            yield left.add_to(at_work)
+        if not every:
+            yield at_work
+
+    def _with_own_residual(self, linearisation: Linearisation) -> Linearisation:
+        """Return a linearisation at unit gain with the residual of the RTC's own matrix."""
+        return linearisation if self._left_over is None else self._left_over.add_to(linearisation)
 
     @waits(at_most_s=10.0)
     def margin(

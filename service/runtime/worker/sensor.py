@@ -87,6 +87,11 @@ class SensorAtWork:
         """Variance of the residual over that expected at the instrument's r0."""
         return 0.0 if self.is_flat else self._strength
 
+    @property
+    def at_hand(self) -> Linearisation | None:
+        """The last linearisation; None if there is none since the working point has changed."""
+        return self._linearisation
+
     def near(self, alpha: Misregistration) -> Linearisation:
         """Return the linearisation at hand if it is close enough, else a new one."""
         kept = self._linearisation
@@ -129,7 +134,10 @@ class SensorAtWork:
 
         An optical gain multiplies it; what the working point does to the shape of a mode stays.
         """
-        near = self.near(alpha)
+        return self.to_unit_gain(self.near(alpha))
+
+    def to_unit_gain(self, near: Linearisation) -> Linearisation:
+        """Return the linearisation at hand, each mode as strong as for a flat wavefront."""
         if self.is_flat:
             return near
         ratio = self.ratio().astype(np.float32)

@@ -140,7 +140,7 @@ N_MORE = 79
 """Modes of a matrix that controls more than the RTC's own; beyond, the edge would slip."""
 
 
-def a_window_of_free_modes(response):
+def a_window_of_free_modes(response, noise=1e-3):
     """Two seconds of an open loop whose modes 45 to 89 are dithered together."""
     rng, time = np.random.default_rng(2), np.arange(2000) / 1000.0
     modes = tuple(range(N_CONTROLLED, 90))
@@ -148,13 +148,13 @@ def a_window_of_free_modes(response):
     dither = np.zeros((len(time), 90), np.float32)
     for mode, line in zip(modes, lines, strict=True):
         dither[:, mode] = 1e-9 * np.sqrt(2) * np.sin(2 * np.pi * line * time)
-    noise = 1e-3 * rng.standard_normal((len(time), len(response)))
+    scatter = noise * rng.standard_normal((len(time), len(response)))
     block = FrameBlock(
         session="s1",
         first_seq=0,
         t0_ns_utc=0,
         dt_ns=1_000_000,
-        slopes=(dither @ response.T + noise).astype(np.float32),
+        slopes=(dither @ response.T + scatter).astype(np.float32),
         commands_m=dither,
         dither_m=dither,
         cm_id="initial",
@@ -212,3 +212,20 @@ def test_a_window_of_a_right_model_changes_no_verdict(bench):
     before = bench.judge(inverse, more).worst_pole_radius
     bench.fit(a_window_of_free_modes(truth), open_loop(own), start)
     assert bench.judge(inverse, more).worst_pole_radius == pytest.approx(before, abs=0.02)
+
+
+@pytest.mark.parametrize(("error", "counts"), [(0.02, False), (0.3, True)])
+def test_where_the_model_is_poor_the_noise_of_a_dither_counts_as_its_error(bench, error, counts):
+    start, rng = Misregistration(), np.random.default_rng(4)
+    truth = bench.response(start).astype(float)
+    part = rng.standard_normal((len(truth), N_CONTROLLED))
+    part *= error * np.linalg.norm(truth[:, :N_CONTROLLED], axis=0) / np.linalg.norm(part, axis=0)
+    truth[:, :N_CONTROLLED] += part
+    bench.recognise(np.linalg.pinv(truth[:, :N_CONTROLLED]).astype(np.float32), None, None)
+    more = conditions(start, np.diag(SIGMA**2), loop_settings(N_MORE), 0.95)
+    inverse = np.linalg.pinv(bench.response(start)[:, :N_MORE]).astype(np.float32)
+    before = bench.judge(inverse, more).worst_pole_radius
+    own = np.zeros((0, len(truth)), np.float32)
+    bench.fit(a_window_of_free_modes(truth, noise=0.1), open_loop(own), start)
+    raised = bench.judge(inverse, more).worst_pole_radius - before
+    assert raised > 0.1 if counts else raised < 0.02

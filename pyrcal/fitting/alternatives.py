@@ -44,6 +44,11 @@ MIN_OFFSET_EXPLAINED = 0.01
 EXCLUSION_SIGMA = 3.0
 """Number of σ by which an alternative must be worse to be excluded."""
 
+EXCLUSION_RATIO = 10.0
+"""χ² over that of the fit above which an alternative is excluded whatever its scatter. Misfit that
+is concentrated in a few modes or at one side scatters as much as it grows: Gaussian influence
+functions left 94 times the χ² of a matrix of HCIPy, and with 2.9 σ they made σ ten times wider."""
+
 NOTABLE_GAIN_RATIO = 0.02
 """Smallest reported ratio of the gains of Sx and Sy, less 1."""
 
@@ -298,7 +303,7 @@ def _describe_pupil(
 
 def is_open(lead: Lead) -> bool:
     """Return True if an alternative is not excluded: it is not significantly worse."""
-    return lead.significance > -EXCLUSION_SIGMA
+    return lead.share < EXCLUSION_RATIO and lead.significance > -EXCLUSION_SIGMA
 
 
 def _try_off_centre(few: FitSubset) -> Iterator[Alternative]:

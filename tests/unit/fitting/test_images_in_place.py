@@ -11,6 +11,7 @@ import pyrcal.fitting.alternatives as alternatives
 from pyrcal.fitting.instrument_checks import fit_file_values
 from pyrcal.fitting.methods import settle_at
 from pyrcal.fitting.models import FitModels
+from pyrcal.fitting.pupil_checks import Lead
 from pyrcal.fitting.solver import image_patterns, nuisances_of
 from pyrcal_studies.benches import coarse_bench, fit_bench, some_columns
 from service.estimation.reference import Reference, target_of
@@ -24,6 +25,15 @@ def in_place(found):
 
 def test_images_that_are_displaced_as_pyramids_have_them_are_no_alternative():
     assert in_place(fit(matrix(ELSEWHERE))) == []
+
+
+@pytest.mark.parametrize(
+    ("share", "sigma", "is_open"),
+    [(0.9, 0.1, True), (2.0, 0.5, True), (2.0, 0.3, False), (9.0, 4.0, True), (94.0, 32.0, False)],
+)
+def test_an_alternative_that_leaves_many_times_as_much_is_excluded(share, sigma, is_open):
+    """The last one is a matrix of HCIPy with Gaussian influence functions."""
+    assert alternatives.is_open(Lead(share=share, sigma=sigma)) is is_open
 
 
 def test_images_displaced_beyond_belief_are_tried_in_their_places(monkeypatch):

@@ -207,7 +207,8 @@ def test_quarter_turns_of_the_sensors_axes_are_no_error():
         (Question.ALL, 0.0019, 0.019, False, False),
         (Question.FEW, 0.0049, 0.019, True, True),
         (Question.WRONG_STOP, 0.03, 0.1, False, True),
-        (Question.WRONG_STOP, 0.0, 0.01, True, False),
+        (Question.WRONG_STOP, 0.0049, 0.1, True, True),
+        (Question.WRONG_STOP, 0.0051, 0.01, True, False),
     ],
 )
 def test_an_answer_is_as_asked_when_near_accepted_and_small_in_residual(
@@ -223,6 +224,7 @@ def test_an_answer_is_as_asked_when_near_accepted_and_small_in_residual(
         verdict="as told",
         orientation={},
         seconds=1.0,
+        right_error=np.array([0.002, -0.002, 0.004, 0.0002]),
     )
     assert answer.as_asked is as_asked
 
@@ -244,11 +246,16 @@ def test_the_answers_of_the_last_run_are_judged_again_from_what_was_said(tmp_pat
         "orientation": {},
         "seconds": 3.0,
     }
-    (tmp_path / KEPT_ANSWERS).write_text(json.dumps(said) + "\n")
-    (answer,) = kept_answers(case, tmp_path)
+    all_modes = {**said, "question": "all modes", "shift_x_subap": 0.9005}
+    wrong = {**said, "question": "wrong stop", "shift_x_subap": 1.201}
+    lines = [json.dumps(one) for one in (all_modes, said, wrong)]
+    (tmp_path / KEPT_ANSWERS).write_text("\n".join(lines) + "\n")
+    _, answer, other = kept_answers(case, tmp_path)
     np.testing.assert_allclose(answer.error, [0.001, 0.0, 0.0, 0.0], atol=1e-12)
     assert answer.question is Question.FEW
     assert answer.as_asked
+    assert other.change_sigma == pytest.approx(3.005)
+    assert not other.as_asked
 
 
 def test_the_page_tells_the_refusal_of_a_wrong_stop_and_what_was_missed():
@@ -269,7 +276,7 @@ def test_the_page_tells_the_refusal_of_a_wrong_stop_and_what_was_missed():
     )
     text = page([(case, _measured())], [right, wrong])
     assert "| +0.210, +0.000 | +0.0000 | +0.0000 | 0.100 | 1.23% | **no** |" in text
-    assert '| stop = "x" |' in text
+    assert '| 0.0 | stop = "x" | yes |' in text
     assert "As asked: 1 of 2." in text
 
 

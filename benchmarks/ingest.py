@@ -161,7 +161,6 @@ class Result:
     """Processor time of the service's link, all of its threads."""
 
     sender_processor_s: float
-    cpus: int | None
 
 
 class Consumer:
@@ -241,7 +240,6 @@ def measure(arguments: argparse.Namespace) -> Result:
         latency_max_s=highest,
         link_processor_s=1e-9 * link_ns,
         sender_processor_s=1e-9 * sender_ns.value,
-        cpus=os.cpu_count(),
     )
 
 

@@ -23,7 +23,6 @@ from service.model.pointing_law import ANGLES
 from service.model.pupil import rtc_valid_subapertures
 from service.model.sensors.registry import kind_of
 from service.model.slopes import Orientation
-from service.model.surface import mirror_surface
 from sim_rtc.computer.feed import BATCH_FRAMES, Block, Feed, OpenLoopFeed, PhaseFeed, Source
 from sim_rtc.computer.gains import by_group
 from sim_rtc.computer.real_time_computer import RealTimeComputer
@@ -33,7 +32,7 @@ from sim_rtc.held_rate import DITHERED_FROM_HZ, frame_s, held_rate_hz, slow_moti
 from sim_rtc.options import Options
 from sim_rtc.rehearsal import with_modes
 from sim_rtc.telescope.atmosphere import build_layers, compute_fried_parameter_m
-from sim_rtc.telescope.detector import Detector, PixelDetector, bin_pixels
+from sim_rtc.telescope.detector import Detector, PixelDetector
 from sim_rtc.telescope.diffractive import DiffractivePlant
 from sim_rtc.telescope.imperfections import Imperfections
 from sim_rtc.telescope.influence import read_influence
@@ -136,17 +135,6 @@ def _law_of(options: Options, instrument: Instrument) -> Callable[[float], Misre
     return nominal
 
 
-def _bin_instrument(
-    options: Options, basis: Basis, instrument: Instrument
-) -> tuple[Basis, Instrument]:
-    """Return modes and instrument in the subapertures that a preset bins."""
-    if options.binning == 1 or not isinstance(basis, ModalBasis):
-        return basis, instrument
-    coarse = bin_pixels(instrument, options.binning)
-    surface = mirror_surface(coarse.analytic_mirror, coarse.subaperture_m)
-    return basis.of_surface(surface), coarse
-
-
 def at_held_rate(options: Options, instrument: Instrument) -> Options:
     """Return the options with the highest frame rate that this machine sustains, at most theirs.
 
@@ -210,7 +198,7 @@ def build_telescope(
     instrument = _select_mode(options, instrument)
     # A stream for each part: a different plant does not change the sky of the same seed.
     plant_rng, sky_rng, noise_rng, alpha_rng = np.random.default_rng(options.seed).spawn(4)
-    basis, instrument = _bin_instrument(options, _modes(options, instrument), instrument)
+    basis = _modes(options, instrument)
     n_modes = basis.n_modes
     n_controlled = options.n_controlled(n_modes, most_of(instrument))
     law = _law_of(options, instrument)
@@ -356,7 +344,7 @@ def build_plant(
     rng: np.random.Generator,
     start: Misregistration | None = None,
 ) -> Plant:
-    """Return the plant of these options, for an instrument that is binned already.
+    """Return the plant of these options.
 
     ``start`` is the registration at which the matrix of a measured plant was taken; None: the
     nominal one.
@@ -364,9 +352,8 @@ def build_plant(
     Raises
     ------
     ConfigurationError
-        If pixels are to be binned on a plant that cannot, or actuators to fail that the mirror does
-        not have, or the influence functions are not of this mirror, or the file of a measured
-        matrix cannot be used.
+        If actuators are to fail that the mirror does not have, or the influence functions are not
+        of this mirror, or the file of a measured matrix cannot be used.
     """
     if options.matrix is not None:
         measured = read_measured_matrix(options.matrix, instrument, basis, dataset=options.dataset)
@@ -390,12 +377,7 @@ def build_plant(
         "influence": None if cube is None else read_influence(cube, instrument, pitch_m),
     }
     if options.plant == "diffractive":
-        binning = options.binning * instrument.binning
-        return DiffractivePlant(instrument, basis, binning=binning, **made)
-    if options.binning > 1:
-        raise ConfigurationError(
-            "--preset: a binned sensor needs --plant diffractive; found --plant linear"
-        )
+        return DiffractivePlant(instrument, basis, binning=instrument.binning, **made)
     return LinearPlant(instrument, basis, **made)
 
 

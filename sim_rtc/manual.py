@@ -11,7 +11,6 @@ from typing_extensions import override
 
 from service.parser import OneLineParser
 from sim_rtc.faults import manual as fault_manual
-from sim_rtc.telescope.detector import FLAO_PRESETS
 
 _USAGE = "pyrcal sim [options]"
 
@@ -21,12 +20,6 @@ at the frame rate, sends telemetry and accepts all commands of docs/rtc.md. The 
 is not sent.
 """
 
-_PRESETS = "\n".join(
-    f"    to R = {preset.faintest:4.1f}: {preset.frame_rate_hz:5.0f} Hz, binning {preset.binning}, "
-    f"{preset.n_controlled} modes"
-    for preset in FLAO_PRESETS
-)
-
 _EPILOG = f"""\
 plants
   linear       one matrix, in real time at 1 kHz; the optical gain is a given function of the mode.
@@ -34,11 +27,6 @@ plants
                the residual wavefront, slopes from noisy pixels. Influence functions and pupil grid
                differ from those of the service. 150 to 200 frames a second of FLAO on one core;
                timestamps follow loop time.
-
-presets
-  --preset flao chooses by magnitude:
-{_PRESETS}
-  A larger residual lowers the optical gain: use --gain 1 or more with a faint star.
 
 registration
   X,Y in subapertures, rotation in degrees from +x towards +y, magnification as a ratio. A jump
@@ -123,8 +111,6 @@ examples
       replay of that recording, twice as fast
   pyrcal sim --plant diffractive --influence p45.h5:/influence --dead-actuators 14,222
       measured influence functions, two dead actuators
-  pyrcal sim --plant diffractive --snapshot loop.png
-      a picture of pupil images, slopes and residual wavefront as the loop closes
 
 exit status
   0 ended as requested (time is up, SIGINT, SIGTERM); 2 wrong option.

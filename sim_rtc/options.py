@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import Field, asdict, dataclass, fields, replace
+from dataclasses import Field, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from sim_rtc import manual
 from sim_rtc.arguments import as_they_are, count, option, several, within
 from sim_rtc.faults import Fault, read_fault
 from sim_rtc.telescope.atmosphere import PROFILES, Layer
-from sim_rtc.telescope.detector import Camera, preset_for
+from sim_rtc.telescope.detector import Camera
 from sim_rtc.telescope.imperfections import SETS, Imperfections
 from sim_rtc.telescope.mirror import MirrorFaults, MirrorLimits
 from sim_rtc.telescope.registration import Drift, Flexure, Jump, Walk
@@ -372,12 +372,6 @@ class Options:
         within(1.0, 4.0),
         default=1.0,
     )
-    preset: str | None = option(
-        "--preset",
-        "frame rate, binning and modes that FLAO would choose for this magnitude; overrides "
-        "--rate and --n-controlled; binning needs the diffractive plant",
-        choices=["flao"],
-    )
     given_connect: str | None = option(
         "--connect ENDPOINT",
         f"zenoh endpoint of the service (default: {DEFAULT_ENDPOINT}); may come up later",
@@ -398,12 +392,6 @@ class Options:
         "loop time over wall-clock time, 0: as fast as it goes (default: 1; diffractive: 0)",
         within(0.0, 100.0),
     )
-    snapshot: Path | None = option(
-        "--snapshot FILE",
-        "close the loop for 300 frames without a service, write a contact sheet of pupil "
-        "images, slopes and residual wavefront, and end (needs the extra 'plots')",
-        Path,
-    )
     quiet: bool = option("--quiet", "say only what is wrong", action="store_true")
     faults: tuple[Fault, ...] = option(
         "--fault KIND@T[:ARGS]",
@@ -416,8 +404,6 @@ class Options:
         "--record FILE", "write all that is sent to this new HDF5 file", Path
     )
     replay: Path | None = option("--replay FILE", "play a recording instead of a telescope", Path)
-    binning: int = 1
-    """Detector pixels per side of a subaperture, in pixels of the finest one: the preset's."""
 
     @property
     def _by_day(self) -> bool:
@@ -574,13 +560,13 @@ class Options:
             read_noise_electrons=self.read_noise_electrons, excess_noise=self.excess_noise
         )
 
-    def complete(self) -> Options:
-        """Return the options with those that a preset chooses.
+    def check(self) -> None:
+        """Check that the options are possible together.
 
         Raises
         ------
         ConfigurationError
-            If they are not possible together: one line that names the option.
+            If they are not: one line that names the option.
         """
         if self.replay is not None and (self.record is not None or self.faults):
             raise ConfigurationError(
@@ -591,16 +577,9 @@ class Options:
         self._check_measured()
         if self.influence_pitch_m is not None and self.influence_cube is None:
             raise ConfigurationError("--influence-pitch: found alone; expected --influence as well")
-        chosen = self
-        if self.preset is not None:
-            preset = asdict(preset_for(self.magnitude))
-            del preset["faintest"]
-            preset["given_n_controlled"] = preset.pop("n_controlled")
-            chosen = replace(self, **preset)
         for name, value in vars(Options).items():
             if isinstance(value, property):
-                getattr(chosen, name)
-        return chosen
+                getattr(self, name)
 
     def _check_measured(self) -> None:
         """Refuse options that do not fit together with a measured plant, or without one."""
@@ -623,7 +602,6 @@ class Options:
             "--influence": self.influence_cube,
             "--dead-actuators": self.dead_actuators,
             "--stuck-actuators": self.stuck_actuators,
-            "--preset": self.preset,
         }
         _refuse_given(unusable, "a measured plant is as it was measured; expected another --plant")
         moving = {
@@ -668,17 +646,19 @@ def _option_fields() -> list[Field[Any]]:
 
 def parse_options(given: Sequence[str] | None = None) -> Options:
     """Return the options; an impossible one ends the program with one line and status 2."""
-    parser, options = sim_parser(), _option_fields()
+    parser, known = sim_parser(), _option_fields()
     found = parser.read(sys.argv[1:] if given is None else given)
-    for one in options:
+    for one in known:
         if one.metadata["argparse"].get("action") == "append":
             found[one.name] = tuple(found[one.name] or ())
         elif found[one.name] is None:
             found[one.name] = one.metadata["absent"]
     try:
-        return Options(**found).complete()
+        options = Options(**found)
+        options.check()
     except ConfigurationError as error:
         parser.error(str(error))
+    return options
 
 
 if __name__ == "__main__":  # whether options make sense, for who would start the simulator later

@@ -25,7 +25,7 @@ from sim_rtc.link.replay import Replay
 from sim_rtc.options import Options, parse_options
 from sim_rtc.rehearsal import write_live_instrument
 from sim_rtc.telescope.measured import MeasuredPlant
-from sim_rtc.truth import TruthRecorder, write_snapshot
+from sim_rtc.truth import TruthRecorder
 
 _REPORT_PERIOD_S = 10.0
 _WORRYING_DELAY_S = 0.5
@@ -57,9 +57,6 @@ def _build_and_run(options: Options, stopped: threading.Event) -> int:
         )
         if isinstance(telescope.plant, MeasuredPlant):
             _report_matrix(telescope.plant, options)
-        if options.snapshot is not None:
-            write_snapshot(telescope, options.snapshot)
-            return 0
         run(telescope, options, stopped)
     return 0
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -524,7 +525,11 @@ def hear(event: Event) -> Do:
 
 def order(command: Order) -> Do:
     """Return what somebody else orders of the RTC."""
-    return lambda night: _ordered(night, command)
+
+    def happen(night: GoldenNight) -> None:
+        night.dome.order(command)
+
+    return happen
 
 
 def trouble(name: str, text: str = "as it is said", *, over: bool = False) -> Do:
@@ -577,11 +582,6 @@ def restart(mode: Mode = Mode.AUTO) -> Do:
     return lambda night: night.restart_service(mode)
 
 
-def restart_rtc(night: GoldenNight) -> None:
-    """Let the RTC start anew."""
-    night.restart_rtc()
-
-
 def vanish(night: GoldenNight) -> None:
     """Let the RTC be gone."""
     night.silent = True
@@ -609,11 +609,6 @@ def publish_first(night: GoldenNight) -> None:
     night.ask(cmd.Publish(id=night.state.matrices.reconstructors[0].id))
 
 
-def measured(night: GoldenNight) -> None:
-    """Let the RTC's matrix come."""
-    night.measured()
-
-
 LAST = "last"
 
 
@@ -633,10 +628,6 @@ def acknowledged(state: AckState, reason: str, name: str | None = LAST) -> Do:
         night.post(acknowledgement)
 
     return answer
-
-
-def _ordered(night: GoldenNight, command: Order) -> None:
-    night.dome.order(command)
 
 
 def slew(first_deg: float, rate_deg_s: float, begin_s: float, seconds: float) -> Deeds:
@@ -703,184 +694,167 @@ def dither(name: str) -> DitherRequest:
     )
 
 
+def plan_night(name: str, seconds: float, *deeds: tuple[float, Do], **more: Any) -> Plan:  # noqa: ANN401 - fields
+    """Return a night of so many seconds in which these things happen."""
+    return Plan(name=name, seconds=seconds, deeds=deeds, **more)
+
+
 COMMANDED = (
-    Plan(
-        name="propose",
-        seconds=30.0,
+    plan_night(
+        "propose",
+        30.0,
+        (9.0, approve),
+        (12.0, publish_first),
+        (15.0, ask(cmd.Rollback())),
+        (17.0, ask(REFIT)),
+        (21.0, approve),
+        (23.0, reject),
+        (24.0, ask(cmd.SetMode(mode=Mode.AUTO))),
         mode=Mode.PROPOSE,
         words=("--jump=18.0:0.1,0,0,0",),
-        deeds=(
-            (9.0, approve),
-            (12.0, publish_first),
-            (15.0, ask(cmd.Rollback())),
-            (17.0, ask(REFIT)),
-            (21.0, approve),
-            (23.0, reject),
-            (24.0, ask(cmd.SetMode(mode=Mode.AUTO))),
-        ),
     ),
-    Plan(
-        name="stale-approval",
-        seconds=24.0,
+    plan_night(
+        "stale-approval",
+        24.0,
+        (8.0, ask(cmd.SetLoop(gains=(cmd.GainGroup(first=0, last=44, gain=0.3),)))),
+        (9.0, approve),
+        (9.5, order(LoopRequest(id="other-1", leak=0.98))),
+        (16.0, approve),
+        (20.0, approve),
         mode=Mode.PROPOSE,
         words=("--jump=12.0:0.2,0,0,0",),
-        deeds=(
-            (8.0, ask(cmd.SetLoop(gains=(cmd.GainGroup(first=0, last=44, gain=0.3),)))),
-            (9.0, approve),
-            (9.5, order(LoopRequest(id="other-1", leak=0.98))),
-            (16.0, approve),
-            (20.0, approve),
-        ),
     ),
-    Plan(
-        name="probation",
-        seconds=26.0,
-        deeds=(
-            (10.0, lambda night: night.unstable(1.02)),
-            (16.0, ask(cmd.SetMode(mode=Mode.AUTO))),
-            (20.0, lambda night: night.unstable(1.1)),
-            (20.8, ask(cmd.StopEverything())),
-        ),
+    plan_night(
+        "probation",
+        26.0,
+        (10.0, lambda night: night.unstable(1.02)),
+        (16.0, ask(cmd.SetMode(mode=Mode.AUTO))),
+        (20.0, lambda night: night.unstable(1.1)),
+        (20.8, ask(cmd.StopEverything())),
     ),
-    Plan(
-        name="hold",
-        seconds=26.0,
+    plan_night(
+        "hold",
+        26.0,
+        (1.0, ask(REFIT)),
+        (8.0, ask(REFIT)),
+        (9.0, ask(REFIT)),
+        (12.0, approve),
+        (15.0, ask(cmd.Refit(n_modes=85))),
+        (18.0, approve),
+        (20.0, ask(cmd.Refit(n_modes=500))),
+        (21.0, ask(cmd.Rollback())),
+        (24.0, restart(Mode.HOLD)),
         mode=Mode.HOLD,
-        deeds=(
-            (1.0, ask(REFIT)),
-            (8.0, ask(REFIT)),
-            (9.0, ask(REFIT)),
-            (12.0, approve),
-            (15.0, ask(cmd.Refit(n_modes=85))),
-            (18.0, approve),
-            (20.0, ask(cmd.Refit(n_modes=500))),
-            (21.0, ask(cmd.Rollback())),
-            (24.0, restart(Mode.HOLD)),
-        ),
     ),
-    Plan(name="everything-before-alpha", seconds=12.0, deeds=everything(0.3, 0.05, ending=True)),
-    Plan(
-        name="everything-in-peace",
-        seconds=40.0,
-        deeds=tuple((6.0 + 2.0 * k, ask(command)) for k, command in enumerate(EVERYTHING)),
+    plan_night("everything-before-alpha", 12.0, *everything(0.3, 0.05, ending=True)),
+    plan_night(
+        "everything-in-peace",
+        40.0,
+        *tuple((6.0 + 2.0 * k, ask(command)) for k, command in enumerate(EVERYTHING)),
     ),
-    Plan(
-        name="ramp",
-        seconds=24.0,
-        deeds=(
-            (6.0, ask(RAMP)),
-            *everything(6.4, 0.05),
-            (10.0, ask(RAMP)),
-            (10.8, ask(OPEN)),
-            (12.0, ask(CLOSE)),
-            (15.0, ask(cmd.Ramp())),
-            (16.0, ask(cmd.StopDither())),
-            (18.0, refuse(RampRequest)),
-            (20.0, ask(RAMP)),
-        ),
+    plan_night(
+        "ramp",
+        24.0,
+        (6.0, ask(RAMP)),
+        *everything(6.4, 0.05),
+        (10.0, ask(RAMP)),
+        (10.8, ask(OPEN)),
+        (12.0, ask(CLOSE)),
+        (15.0, ask(cmd.Ramp())),
+        (16.0, ask(cmd.StopDither())),
+        (18.0, refuse(RampRequest)),
+        (20.0, ask(RAMP)),
     ),
-    Plan(
-        name="loop",
-        seconds=32.0,
-        deeds=(
-            (5.0, ask(cmd.SetLoop(leak=0.98))),
-            (7.0, ask(cmd.SetLoop(gains=(cmd.GainGroup(first=40, last=44, gain=0.0),)))),
-            (10.0, ask(cmd.SetLoop(effective_gain=0.3))),
-            (13.0, ask(cmd.SetLoop(n_controlled=30))),
-            (17.0, ask(OPEN)),
-            (18.0, ask(cmd.SetLoop(gains=(cmd.GainGroup(first=0, last=3, gain=0.2),)))),
-            (19.0, ask(CLOSE)),
-            (22.0, order(LoopRequest(id="other-1", loop=Loop.OPEN))),
-            (25.0, order(LoopRequest(id="other-2", loop=Loop.CLOSED))),
-            (28.0, ask(cmd.SetLoop(n_controlled=500))),
-            (29.0, refuse(LoopRequest)),
-            (30.0, ask(OPEN)),
-        ),
+    plan_night(
+        "loop",
+        32.0,
+        (5.0, ask(cmd.SetLoop(leak=0.98))),
+        (7.0, ask(cmd.SetLoop(gains=(cmd.GainGroup(first=40, last=44, gain=0.0),)))),
+        (10.0, ask(cmd.SetLoop(effective_gain=0.3))),
+        (13.0, ask(cmd.SetLoop(n_controlled=30))),
+        (17.0, ask(OPEN)),
+        (18.0, ask(cmd.SetLoop(gains=(cmd.GainGroup(first=0, last=3, gain=0.2),)))),
+        (19.0, ask(CLOSE)),
+        (22.0, order(LoopRequest(id="other-1", loop=Loop.OPEN))),
+        (25.0, order(LoopRequest(id="other-2", loop=Loop.CLOSED))),
+        (28.0, ask(cmd.SetLoop(n_controlled=500))),
+        (29.0, refuse(LoopRequest)),
+        (30.0, ask(OPEN)),
     ),
-    Plan(
-        name="dithers",
-        seconds=45.0,
-        deeds=(
-            (5.0, ask(STOP)),
-            (6.0, ask(cmd.StartDither(modes=(50, 55, 60), duration_s=4.0))),
-            (12.0, ask(cmd.StartDither(modes=(50,), amplitude_m=30e-9))),
-            (13.0, ask(cmd.StartDither(amplitude_m=15e-9, duration_s=3.0, over_budget=True))),
-            (18.0, ask(cmd.StartDither(kind=DitherKind.BINARY, modes=ModeSet.ALL, duration_s=6.0))),
-            (27.0, ask(cmd.StartDither(modes=(200,)))),
-            (29.0, order(dither("somebodys"))),
-            (33.0, ask(STOP)),
-            (36.0, order(dither("dither-1"))),
-            (40.0, ask(START)),
-        ),
+    plan_night(
+        "dithers",
+        45.0,
+        (5.0, ask(STOP)),
+        (6.0, ask(cmd.StartDither(modes=(50, 55, 60), duration_s=4.0))),
+        (12.0, ask(cmd.StartDither(modes=(50,), amplitude_m=30e-9))),
+        (13.0, ask(cmd.StartDither(amplitude_m=15e-9, duration_s=3.0, over_budget=True))),
+        (18.0, ask(cmd.StartDither(kind=DitherKind.BINARY, modes=ModeSet.ALL, duration_s=6.0))),
+        (27.0, ask(cmd.StartDither(modes=(200,)))),
+        (29.0, order(dither("somebodys"))),
+        (33.0, ask(STOP)),
+        (36.0, order(dither("dither-1"))),
+        (40.0, ask(START)),
     ),
 )
 
 MEASURING = (
-    Plan(
-        name="noisy",
-        seconds=45.0,
-        deeds=(
-            (6.0, ask(cmd.MeasureNoisy(id="noisy-1", duration_s=NOISY))),
-            *everything(8.0, 0.05),
-            (20.0, ask(cmd.MeasureNoisy(id="noisy-1"))),
-            (21.0, ask(cmd.MeasureNoisy(id="noisy-2", modes=ModeSet.ALL, duration_s=NOISY))),
-            (24.0, ask(cmd.GiveUp(id="noisy-2"))),
-            (25.0, ask(cmd.GiveUp(id="noisy-2"))),
-            (28.0, ask(cmd.MeasureNoisy(id="noisy-3", total_amplitude_m=1e-6))),
-            (29.0, ask(cmd.MeasureNoisy(id="noisy-4", duration_s=NOISY))),
-            (30.0, ask(STOP)),
-            (33.0, ask(cmd.MeasureNoisy(id="noisy-5", duration_s=NOISY))),
-            (35.5, break_worker()),
-            (42.0, break_worker("")),
-        ),
+    plan_night(
+        "noisy",
+        45.0,
+        (6.0, ask(cmd.MeasureNoisy(id="noisy-1", duration_s=NOISY))),
+        *everything(8.0, 0.05),
+        (20.0, ask(cmd.MeasureNoisy(id="noisy-1"))),
+        (21.0, ask(cmd.MeasureNoisy(id="noisy-2", modes=ModeSet.ALL, duration_s=NOISY))),
+        (24.0, ask(cmd.GiveUp(id="noisy-2"))),
+        (25.0, ask(cmd.GiveUp(id="noisy-2"))),
+        (28.0, ask(cmd.MeasureNoisy(id="noisy-3", total_amplitude_m=1e-6))),
+        (29.0, ask(cmd.MeasureNoisy(id="noisy-4", duration_s=NOISY))),
+        (30.0, ask(STOP)),
+        (33.0, ask(cmd.MeasureNoisy(id="noisy-5", duration_s=NOISY))),
+        (35.5, break_worker()),
+        (42.0, break_worker("")),
     ),
-    Plan(
-        name="noisy-refused",
-        seconds=40.0,
-        deeds=(
-            (5.0, refuse(DitherRequest)),
-            (6.0, ask(cmd.MeasureNoisy(id="noisy-1", duration_s=4.0))),
-            (23.0, refuse()),
-            (25.0, ask(cmd.MeasureNoisy(id="noisy-2", duration_s=NOISY))),
-            (27.0, restart_rtc),
-            (31.0, ask(cmd.MeasureNoisy(id="noisy-3", duration_s=NOISY))),
-            (33.0, ask(ACQUIRE)),
-        ),
+    plan_night(
+        "noisy-refused",
+        40.0,
+        (5.0, refuse(DitherRequest)),
+        (6.0, ask(cmd.MeasureNoisy(id="noisy-1", duration_s=4.0))),
+        (23.0, refuse()),
+        (25.0, ask(cmd.MeasureNoisy(id="noisy-2", duration_s=NOISY))),
+        (27.0, GoldenNight.restart_rtc),
+        (31.0, ask(cmd.MeasureNoisy(id="noisy-3", duration_s=NOISY))),
+        (33.0, ask(ACQUIRE)),
     ),
-    Plan(
-        name="measure",
-        seconds=45.0,
-        deeds=(
-            (6.0, ask(STOP)),
-            (8.0, ask(MEASURE)),
-            *everything(9.0, 0.05),
-            (16.0, measured),
-            (18.0, ask(SINE)),
-            (21.0, measured),
-            (24.0, ask(START)),
-            (26.0, ask(STOP)),
-            (28.0, ask(cmd.Measure(id="im-3", pattern=Pattern.HADAMARD))),
-            (29.0, ask(cmd.GiveUp(id="im-3"))),
-            (36.0, refuse(MeasureRequest)),
-            (37.0, ask(cmd.Measure(id="im-4", pattern=Pattern.SYSTEM_MODES))),
-            (39.0, refuse()),
-            (40.0, ask(cmd.Measure(id="im-5", pattern=Pattern.PUSH_PULL_ZONAL))),
-            (41.0, restart_rtc),
-        ),
+    plan_night(
+        "measure",
+        45.0,
+        (6.0, ask(STOP)),
+        (8.0, ask(MEASURE)),
+        *everything(9.0, 0.05),
+        (16.0, GoldenNight.measured),
+        (18.0, ask(SINE)),
+        (21.0, GoldenNight.measured),
+        (24.0, ask(START)),
+        (26.0, ask(STOP)),
+        (28.0, ask(cmd.Measure(id="im-3", pattern=Pattern.HADAMARD))),
+        (29.0, ask(cmd.GiveUp(id="im-3"))),
+        (36.0, refuse(MeasureRequest)),
+        (37.0, ask(cmd.Measure(id="im-4", pattern=Pattern.SYSTEM_MODES))),
+        (39.0, refuse()),
+        (40.0, ask(cmd.Measure(id="im-5", pattern=Pattern.PUSH_PULL_ZONAL))),
+        (41.0, GoldenNight.restart_rtc),
     ),
-    Plan(
-        name="measure-lost",
-        seconds=30.0,
-        deeds=(
-            (5.0, ask(STOP)),
-            (7.0, cut()),
-            (7.5, ask(MEASURE)),
-            (9.0, cut(off=False)),
-            (12.0, ask(cmd.Measure(id="im-6", pattern=Pattern.PUSH_PULL_MODAL))),
-            (14.0, vanish),
-            (17.0, appear),
-            (20.0, ask(START)),
-        ),
+    plan_night(
+        "measure-lost",
+        30.0,
+        (5.0, ask(STOP)),
+        (7.0, cut()),
+        (7.5, ask(MEASURE)),
+        (9.0, cut(off=False)),
+        (12.0, ask(cmd.Measure(id="im-6", pattern=Pattern.PUSH_PULL_MODAL))),
+        (14.0, vanish),
+        (17.0, appear),
+        (20.0, ask(START)),
     ),
 )
 
@@ -891,290 +865,252 @@ FAR = ("--alpha=0.9,-0.6,3.0,1.02",)
 SPARSE = {"dither.longest_pause_s": 6.0}
 BEND = {"tracking.flexure_subap_per_degree": 0.01, "tracking.flexure_deg_per_degree": 0.01}
 TRACKING = (
-    Plan(name="steady", seconds=15.0),
-    Plan(name="jump", seconds=18.0, words=("--jump=8.3:0.1,0,0,0",)),
-    Plan(name="jump-rotation", seconds=18.0, words=("--jump=8.8:0,0,0.12,0",)),
-    Plan(
-        name="jump-and-back",
-        seconds=20.0,
+    plan_night("steady", 15.0),
+    plan_night("jump", 18.0, words=("--jump=8.3:0.1,0,0,0",)),
+    plan_night("jump-rotation", 18.0, words=("--jump=8.8:0,0,0.12,0",)),
+    plan_night(
+        "jump-and-back",
+        20.0,
         words=("--jump=8.0:0.3,0.1,0,0", "--jump=9.1:-0.3,-0.1,0,0", "--jump=13.5:0.2,0.2,0.3,0"),
     ),
-    Plan(name="drift", seconds=25.0, words=("--drift=0.4,-0.3,0.3,0.002",)),
-    Plan(
-        name="slew",
-        seconds=24.0,
+    plan_night("drift", 25.0, words=("--drift=0.4,-0.3,0.3,0.002",)),
+    plan_night(
+        "slew",
+        24.0,
+        *slew(60.0, 0.0, 1.0, 2),
+        *slew(60.0, 2.0, 9.0, 6),
+        *slew(72.0, 0.0, 16.0, 2),
         settings=BEND,
-        deeds=(*slew(60.0, 0.0, 1.0, 2), *slew(60.0, 2.0, 9.0, 6), *slew(72.0, 0.0, 16.0, 2)),
     ),
-    Plan(
-        name="faint", seconds=25.0, words=("--mag=12.5",), settings={"dither.longest_window_s": 5.0}
-    ),
-    Plan(name="pauses", seconds=60.0, settings=SPARSE, words=("--jump=41.0:0.1,0,0,0",)),
-    Plan(
-        name="vibrations",
-        seconds=20.0,
+    plan_night("faint", 25.0, words=("--mag=12.5",), settings={"dither.longest_window_s": 5.0}),
+    plan_night("pauses", 60.0, settings=SPARSE, words=("--jump=41.0:0.1,0,0,0",)),
+    plan_night(
+        "vibrations",
+        20.0,
         words=("--vibration=tilt:239:40", "--vibration=focus:47:15"),
         settings={"dither.avoid_hz": (283.0,)},
     ),
-    Plan(name="slow-worker", seconds=30.0, slow=4.0, words=("--jump=14.0:0.2,0,0.2,0",)),
-    Plan(
-        name="seeing-gains",
-        seconds=15.0,
-        deeds=((3.0, begin(Mischief.SEEING_GAINS)),),
+    plan_night("slow-worker", 30.0, slow=4.0, words=("--jump=14.0:0.2,0,0.2,0",)),
+    plan_night("seeing-gains", 15.0, (3.0, begin(Mischief.SEEING_GAINS))),
+    plan_night(
+        "more-modes", 30.0, words=("--n-controlled=20",), settings={"control.n_modes_target": 80}
     ),
-    Plan(
-        name="more-modes",
-        seconds=30.0,
-        words=("--n-controlled=20",),
-        settings={"control.n_modes_target": 80},
-    ),
-    Plan(
-        name="modes-declined",
-        seconds=30.0,
+    plan_night(
+        "modes-declined",
+        30.0,
+        (8.0, reject),
+        (14.0, approve),
+        (16.0, refuse(LoopRequest)),
+        (20.0, approve),
+        (23.0, refuse()),
+        (26.0, ask(cmd.Refit(n_modes=80))),
         words=("--n-controlled=30",),
         mode=Mode.PROPOSE,
         settings={"control.n_modes_target": 60},
-        deeds=(
-            (8.0, reject),
-            (14.0, approve),
-            (16.0, refuse(LoopRequest)),
-            (20.0, approve),
-            (23.0, refuse()),
-            (26.0, ask(cmd.Refit(n_modes=80))),
-        ),
     ),
 )
 
 ACQUIRING = (
-    Plan(
-        name="acquire-ordered",
-        seconds=35.0,
+    plan_night(
+        "acquire-ordered", 35.0, (2.0, ask(ACQUIRE)), *everything(3.0), words=FAR, mode=Mode.PROPOSE
+    ),
+    plan_night("acquire-alone", 45.0, words=FAR, settings={"acquisition.auto": True}),
+    plan_night(
+        "acquire-aborted",
+        25.0,
+        (2.0, ask(ACQUIRE)),
+        (5.0, ask(ABORT)),
+        (7.0, ask(CLOSE)),
+        (9.0, ask(ABORT)),
+        (11.0, ask(ACQUIRE)),
+        (13.0, ask(STOP)),
+        (16.0, ask(ACQUIRE)),
+        (17.0, ask(cmd.SetMode(mode=Mode.HOLD))),
+        (18.0, ask(ABORT)),
+        (20.0, ask(cmd.SetMode(mode=Mode.AUTO))),
+        words=FAR,
+    ),
+    plan_night(
+        "acquire-refused",
+        25.0,
+        (2.0, refuse(LoopRequest)),
+        (2.5, ask(ACQUIRE)),
+        (5.0, refuse(DitherRequest)),
+        (6.0, ask(ACQUIRE)),
+        (18.0, refuse()),
+        (19.0, ask(ACQUIRE)),
+        words=FAR,
+    ),
+    plan_night(
+        "acquire-cut-off",
+        30.0,
+        (2.0, ask(ACQUIRE)),
+        (4.0, cut()),
+        (8.0, cut(off=False)),
+        (12.0, GoldenNight.restart_rtc),
+        words=FAR,
+    ),
+    plan_night(
+        "acquire-gap",
+        40.0,
+        (2.0, ask(ACQUIRE)),
+        (5.0, vanish),
+        (9.0, appear),
+        words=FAR,
+        settings={"acquisition.auto": True},
+    ),
+    plan_night(
+        "acquire-restart",
+        40.0,
+        (2.0, ask(ACQUIRE)),
+        (6.0, restart()),
+        words=FAR,
+        settings={"acquisition.auto": True},
+    ),
+    plan_night(
+        "acquire-restart-propose",
+        25.0,
+        (2.0, ask(ACQUIRE)),
+        (6.0, restart(Mode.PROPOSE)),
+        (10.0, ask(CLOSE)),
+        (16.0, restart(Mode.PROPOSE)),
         words=FAR,
         mode=Mode.PROPOSE,
-        deeds=((2.0, ask(ACQUIRE)), *everything(3.0)),
     ),
-    Plan(name="acquire-alone", seconds=45.0, words=FAR, settings={"acquisition.auto": True}),
-    Plan(
-        name="acquire-aborted",
-        seconds=25.0,
+    plan_night(
+        "acquire-somebody-closes",
+        30.0,
+        (2.0, ask(ACQUIRE)),
+        (5.0, order(LoopRequest(id="other-1", loop=Loop.CLOSED))),
+        (9.0, break_worker()),
+        (16.0, break_worker("")),
         words=FAR,
-        deeds=(
-            (2.0, ask(ACQUIRE)),
-            (5.0, ask(ABORT)),
-            (7.0, ask(CLOSE)),
-            (9.0, ask(ABORT)),
-            (11.0, ask(ACQUIRE)),
-            (13.0, ask(STOP)),
-            (16.0, ask(ACQUIRE)),
-            (17.0, ask(cmd.SetMode(mode=Mode.HOLD))),
-            (18.0, ask(ABORT)),
-            (20.0, ask(cmd.SetMode(mode=Mode.AUTO))),
-        ),
     ),
-    Plan(
-        name="acquire-refused",
-        seconds=25.0,
-        words=FAR,
-        deeds=(
-            (2.0, refuse(LoopRequest)),
-            (2.5, ask(ACQUIRE)),
-            (5.0, refuse(DitherRequest)),
-            (6.0, ask(ACQUIRE)),
-            (18.0, refuse()),
-            (19.0, ask(ACQUIRE)),
-        ),
-    ),
-    Plan(
-        name="acquire-cut-off",
-        seconds=30.0,
-        words=FAR,
-        deeds=((2.0, ask(ACQUIRE)), (4.0, cut()), (8.0, cut(off=False)), (12.0, restart_rtc)),
-    ),
-    Plan(
-        name="acquire-gap",
-        seconds=40.0,
-        words=FAR,
+    plan_night(
+        "diverging",
+        30.0,
+        (7.0, order(LoopRequest(id="other-1", gains=(1.6,) * 45 + (0.0,) * 45))),
         settings={"acquisition.auto": True},
-        deeds=((2.0, ask(ACQUIRE)), (5.0, vanish), (9.0, appear)),
-    ),
-    Plan(
-        name="acquire-restart",
-        seconds=40.0,
-        words=FAR,
-        settings={"acquisition.auto": True},
-        deeds=((2.0, ask(ACQUIRE)), (6.0, restart())),
-    ),
-    Plan(
-        name="acquire-restart-propose",
-        seconds=25.0,
-        words=FAR,
-        mode=Mode.PROPOSE,
-        deeds=(
-            (2.0, ask(ACQUIRE)),
-            (6.0, restart(Mode.PROPOSE)),
-            (10.0, ask(CLOSE)),
-            (16.0, restart(Mode.PROPOSE)),
-        ),
-    ),
-    Plan(
-        name="acquire-somebody-closes",
-        seconds=30.0,
-        words=FAR,
-        deeds=(
-            (2.0, ask(ACQUIRE)),
-            (5.0, order(LoopRequest(id="other-1", loop=Loop.CLOSED))),
-            (9.0, break_worker()),
-            (16.0, break_worker("")),
-        ),
-    ),
-    Plan(
-        name="diverging",
-        seconds=30.0,
-        settings={"acquisition.auto": True},
-        deeds=((7.0, order(LoopRequest(id="other-1", gains=(1.6,) * 45 + (0.0,) * 45))),),
     ),
 )
 
 FAULTS = (
-    Plan(
-        name="worker-broken",
-        seconds=28.0,
-        deeds=(
-            (4.0, break_worker()),
-            (10.0, break_worker("")),
-            (14.0, break_worker()),
-            (15.0, ask(REFIT)),
-            (17.0, ask(cmd.Rollback())),
-            (19.0, break_worker("")),
+    plan_night(
+        "worker-broken",
+        28.0,
+        (4.0, break_worker()),
+        (10.0, break_worker("")),
+        (14.0, break_worker()),
+        (15.0, ask(REFIT)),
+        (17.0, ask(cmd.Rollback())),
+        (19.0, break_worker("")),
+    ),
+    plan_night(
+        "no-acknowledgement",
+        24.0,
+        (3.0, begin(Mischief.NO_ACK)),
+        (16.0, end(Mischief.NO_ACK)),
+        (18.0, ask(REFIT)),
+    ),
+    plan_night(
+        "not-applied",
+        26.0,
+        (6.0, acknowledged(AckState.REJECTED, "range: it says")),
+        (9.0, GoldenNight.restart_rtc),
+        (15.0, acknowledged(AckState.REJECTED, "it says")),
+        (
+            17.0,
+            acknowledged(AckState.REJECTED, "what?", None),
         ),
-    ),
-    Plan(
-        name="no-acknowledgement",
-        seconds=24.0,
-        deeds=((3.0, begin(Mischief.NO_ACK)), (16.0, end(Mischief.NO_ACK)), (18.0, ask(REFIT))),
-    ),
-    Plan(
-        name="not-applied",
-        seconds=26.0,
+        (
+            18.0,
+            acknowledged(AckState.APPLIED, "", "unknown"),
+        ),
         words=("--jump=13.0:0.1,0,0,0",),
-        deeds=(
-            (6.0, acknowledged(AckState.REJECTED, "range: it says")),
-            (9.0, restart_rtc),
-            (15.0, acknowledged(AckState.REJECTED, "it says")),
-            (
-                17.0,
-                acknowledged(AckState.REJECTED, "what?", None),
-            ),
-            (
-                18.0,
-                acknowledged(AckState.APPLIED, "", "unknown"),
-            ),
-        ),
     ),
-    Plan(
-        name="other-sha",
-        seconds=20.0,
-        deeds=((3.0, begin(Mischief.OTHER_SHA)), (13.0, end(Mischief.OTHER_SHA))),
+    plan_night(
+        "other-sha", 20.0, (3.0, begin(Mischief.OTHER_SHA)), (13.0, end(Mischief.OTHER_SHA))
     ),
-    Plan(
-        name="no-cm-id",
-        seconds=16.0,
-        deeds=((0.1, begin(Mischief.NO_CM_ID)), (9.0, end(Mischief.NO_CM_ID))),
+    plan_night("no-cm-id", 16.0, (0.1, begin(Mischief.NO_CM_ID)), (9.0, end(Mischief.NO_CM_ID))),
+    plan_night(
+        "strong-dither",
+        24.0,
+        (4.0, begin(Mischief.STRONG_DITHER)),
+        (14.0, end(Mischief.STRONG_DITHER)),
     ),
-    Plan(
-        name="strong-dither",
-        seconds=24.0,
-        deeds=((4.0, begin(Mischief.STRONG_DITHER)), (14.0, end(Mischief.STRONG_DITHER))),
+    plan_night(
+        "loop-law",
+        34.0,
+        (3.0, begin(Mischief.LEAK)),
+        (12.0, end(Mischief.LEAK)),
+        (14.0, begin(Mischief.DELAY)),
+        (22.0, end(Mischief.DELAY)),
+        (24.0, begin(Mischief.GAIN)),
+        (31.0, end(Mischief.GAIN)),
     ),
-    Plan(
-        name="loop-law",
-        seconds=34.0,
-        deeds=(
-            (3.0, begin(Mischief.LEAK)),
-            (12.0, end(Mischief.LEAK)),
-            (14.0, begin(Mischief.DELAY)),
-            (22.0, end(Mischief.DELAY)),
-            (24.0, begin(Mischief.GAIN)),
-            (31.0, end(Mischief.GAIN)),
-        ),
-    ),
-    Plan(name="sign", seconds=20.0, deeds=((0.5, speak(Mischief.SIGN)), (12.0, speak(None)))),
-    Plan(name="flip", seconds=20.0, deeds=((5.0, speak(Mischief.FLIP_X)), (14.0, speak(None)))),
-    Plan(
-        name="nanometres",
-        seconds=18.0,
-        deeds=((5.0, speak(Mischief.NANOMETRES)), (12.0, speak(None))),
-    ),
-    Plan(
-        name="rtc-restarts",
-        seconds=26.0,
+    plan_night("sign", 20.0, (0.5, speak(Mischief.SIGN)), (12.0, speak(None))),
+    plan_night("flip", 20.0, (5.0, speak(Mischief.FLIP_X)), (14.0, speak(None))),
+    plan_night("nanometres", 18.0, (5.0, speak(Mischief.NANOMETRES)), (12.0, speak(None))),
+    plan_night(
+        "rtc-restarts",
+        26.0,
+        (7.0, GoldenNight.restart_rtc),
+        (14.0, GoldenNight.restart_rtc),
+        (14.2, vanish),
+        (17.0, appear),
+        (20.0, begin(Mischief.NO_STATUS)),
+        (24.0, end(Mischief.NO_STATUS)),
         words=("--jump=16.0:0.1,0,0,0",),
-        deeds=(
-            (7.0, restart_rtc),
-            (14.0, restart_rtc),
-            (14.2, vanish),
-            (17.0, appear),
-            (20.0, begin(Mischief.NO_STATUS)),
-            (24.0, end(Mischief.NO_STATUS)),
-        ),
     ),
-    Plan(
-        name="service-restarts",
-        seconds=36.0,
-        deeds=(
-            (8.0, restart()),
-            (14.0, ask(cmd.SetMode(mode=Mode.HOLD))),
-            (15.0, ask(STOP)),
-            (17.0, restart()),
-            (22.0, ask(START)),
-            (23.0, ask(cmd.SetMode(mode=Mode.AUTO))),
-            (28.0, ask(cmd.SetMode(mode=Mode.HOLD))),
-            (29.0, restart(Mode.PROPOSE)),
-        ),
+    plan_night(
+        "service-restarts",
+        36.0,
+        (8.0, restart()),
+        (14.0, ask(cmd.SetMode(mode=Mode.HOLD))),
+        (15.0, ask(STOP)),
+        (17.0, restart()),
+        (22.0, ask(START)),
+        (23.0, ask(cmd.SetMode(mode=Mode.AUTO))),
+        (28.0, ask(cmd.SetMode(mode=Mode.HOLD))),
+        (29.0, restart(Mode.PROPOSE)),
     ),
-    Plan(
-        name="second-service",
-        seconds=24.0,
-        deeds=(
-            (6.0, hear(ev.ServicesMet(drives=False, others=("one on host a, process 1",)))),
-            *everything(8.0, 0.05),
-            (12.0, hear(ev.ServicesMet(drives=True, others=("one on b",)))),
-            (16.0, hear(ev.ServicesMet(drives=True, others=()))),
-        ),
+    plan_night(
+        "second-service",
+        24.0,
+        (6.0, hear(ev.ServicesMet(drives=False, others=("one on host a, process 1",)))),
+        *everything(8.0, 0.05),
+        (12.0, hear(ev.ServicesMet(drives=True, others=("one on b",)))),
+        (16.0, hear(ev.ServicesMet(drives=True, others=()))),
     ),
-    Plan(
-        name="alarms",
-        seconds=44.0,
-        deeds=(
-            (5.0, trouble("second-rtc")),
-            (7.0, trouble("basis-mismatch")),
-            (26.0, trouble("archive-failed")),
-            (29.0, trouble("archive-failed", over=True)),
-            (31.0, trouble("worker-behind")),
-            (33.0, trouble("worker-behind", over=True)),
-            (34.0, trouble("columns-misaligned")),
-            (
-                36.0,
-                hear(ev.LogEvent(name="message.malformed", text="status: 3", level=Level.WARNING)),
-            ),
-            (
-                36.5,
-                hear(ev.LogEvent(name="message.malformed", text="status: 4", level=Level.WARNING)),
-            ),
-            (38.0, trouble("commands-off-loop")),
-            (40.0, trouble("commands-off-loop", over=True)),
+    plan_night(
+        "alarms",
+        44.0,
+        (5.0, trouble("second-rtc")),
+        (7.0, trouble("basis-mismatch")),
+        (26.0, trouble("archive-failed")),
+        (29.0, trouble("archive-failed", over=True)),
+        (31.0, trouble("worker-behind")),
+        (33.0, trouble("worker-behind", over=True)),
+        (34.0, trouble("columns-misaligned")),
+        (
+            36.0,
+            hear(ev.LogEvent(name="message.malformed", text="status: 3", level=Level.WARNING)),
         ),
+        (
+            36.5,
+            hear(ev.LogEvent(name="message.malformed", text="status: 4", level=Level.WARNING)),
+        ),
+        (38.0, trouble("commands-off-loop")),
+        (40.0, trouble("commands-off-loop", over=True)),
     ),
-    Plan(name="deaf", seconds=30.0, deeds=((4.0, deaf()), (16.0, deaf(ears=True)))),
-    Plan(
-        name="dither-refused",
-        seconds=34.0,
-        deeds=(
-            (0.1, refuse(DitherRequest)),
-            (12.0, refuse()),
-            (20.0, cut()),
-            (26.0, cut(off=False)),
-        ),
+    plan_night("deaf", 30.0, (4.0, deaf()), (16.0, deaf(ears=True))),
+    plan_night(
+        "dither-refused",
+        34.0,
+        (0.1, refuse(DitherRequest)),
+        (12.0, refuse()),
+        (20.0, cut()),
+        (26.0, cut(off=False)),
     ),
 )
 

@@ -1,19 +1,14 @@
-"""Photon noise, read noise and pixels.
-
-Also how a bright-star sensor is set up for a faint star: slower, and with its pixels binned, which
-makes larger subapertures of them.
-"""
+"""Photon noise, read noise and pixels."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from service.errors import ConfigurationError
 from service.model.instrument import Instrument
 from service.model.kinds import SignalKind
 from service.model.sensors.registry import KINDS, kind_of
@@ -165,70 +160,6 @@ class PixelDetector:
             return read
         read += expected
         return read
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Preset:
-    """Settings of the sensor for stars down to a magnitude."""
-
-    faintest: float
-    """R magnitude of the faintest star it is for."""
-
-    frame_rate_hz: float
-    binning: int
-    """Detector pixels per side of a subaperture, in pixels of the finest one."""
-
-    n_controlled: int
-    """Modes the loop corrects with."""
-
-
-FLAO_PRESETS = (
-    Preset(faintest=10.0, frame_rate_hz=1000.0, binning=1, n_controlled=400),
-    Preset(faintest=11.0, frame_rate_hz=800.0, binning=1, n_controlled=400),
-    Preset(faintest=13.0, frame_rate_hz=800.0, binning=2, n_controlled=153),
-    Preset(faintest=14.5, frame_rate_hz=500.0, binning=3, n_controlled=66),
-    Preset(faintest=16.5, frame_rate_hz=200.0, binning=5, n_controlled=36),
-)
-"""FLAO's practice: 30, 15, 10 and fewer subapertures across as the star gets fainter."""
-
-
-def preset_for(magnitude: float) -> Preset:
-    """Return FLAO's settings for a star of this magnitude.
-
-    Raises
-    ------
-    ConfigurationError
-        If the star is fainter than any that the sensor can use.
-    """
-    for preset in FLAO_PRESETS:
-        if magnitude <= preset.faintest:
-            return preset
-    raise ConfigurationError(
-        f"--preset flao: found magnitude {magnitude:g}; "
-        f"expected a star of {FLAO_PRESETS[-1].faintest:g} or brighter"
-    )
-
-
-def bin_pixels(instrument: Instrument, binning: int) -> Instrument:
-    """Return the instrument with this many detector pixels to a side of a subaperture.
-
-    Raises
-    ------
-    ConfigurationError
-        If the subapertures do not divide by it, or the mask of valid ones is given.
-    """
-    if binning == 1:
-        return instrument
-    wfs = instrument.wfs
-    if binning < 1 or wfs.n_subapertures % binning or wfs.valid_subapertures is not None:
-        raise ConfigurationError(
-            f"binning: found {binning}; {wfs.n_subapertures} subapertures must divide by it, and "
-            "their mask must be found by flux"
-        )
-    return replace(
-        instrument,
-        wfs=kind_of(instrument).bin_sensor(wfs, binning),
-    )
 
 
 def _arrivals(expected: Array32, excess: float, rng: np.random.Generator) -> Array32:

@@ -37,7 +37,7 @@ from service.model.modes import Basis, ModalBasis
 from service.model.pupil import instrument_pupil, rtc_valid_subapertures, valid_subapertures
 from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import Fineness
-from service.model.slopes import rtc_mask, to_conventions, to_rtc
+from service.model.slopes import rtc_mask, to_rtc
 from sim_rtc.telescope.atmosphere import PhaseResponse
 from sim_rtc.telescope.imperfections import SETS, Imperfections, SlopeErrors
 from sim_rtc.telescope.linear import LinearOptics, choose_sampling, optical_gain
@@ -225,11 +225,6 @@ class MeasuredPlant(Plant):
     def sort_rows(self, rows: NDArray[Any]) -> NDArray[Any]:
         recipe = self._instrument.slopes
         return to_rtc(rows, recipe, rtc_mask(self.valid, recipe.assumed_orientation))
-
-    @override
-    def in_conventions(self, slopes: NDArray[Any]) -> NDArray[Any]:
-        recipe = self._instrument.slopes
-        return to_conventions(slopes, recipe, rtc_mask(self.valid, recipe.assumed_orientation))
 
     @override
     def optics(self, alpha: Misregistration) -> LinearOptics:

@@ -120,10 +120,6 @@ class Plant(ABC):
         """Return rows ``(n_slopes, ...)`` of conventions.md as this telescope lists its slopes."""
         return rows
 
-    def in_conventions(self, slopes: NDArray[Any]) -> NDArray[Any]:
-        """Return slopes ``(n_slopes, ...)`` of this telescope as conventions.md lists them."""
-        return slopes
-
     def _image_shift(self, alpha: Misregistration) -> tuple[float, float]:
         """Return by how much the pupil images move on the sensor, subapertures.
 

@@ -131,16 +131,6 @@ class SensorModel(ABC):
         """Return the numbers that make another configuration of it when they change."""
         return (sensor.wavelength_m,)
 
-    def bin_sensor(self, sensor: Any, binning: int) -> SensorDescription:  # noqa: ANN401 - its own
-        """Return the sensor with so many subapertures made one along each axis.
-
-        Raises
-        ------
-        ModelError
-            If it cannot be binned.
-        """
-        raise ModelError(f"a {self.name}: found binning {binning}, expected none")
-
     @abstractmethod
     def noise_terms(self, instrument: Instrument) -> tuple[Term, Term]:
         """Return the variance of a slope by each photon, and by noise 1 of its pixels.

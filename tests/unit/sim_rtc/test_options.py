@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 
 from service.errors import ConfigurationError
-from service.model.surface import mirror_surface
 from sim_rtc.assembly import build_drive, build_plant
 from sim_rtc.faults import FaultKind
 from sim_rtc.options import parse_options
 from sim_rtc.telescope.atmosphere import PROFILES
-from sim_rtc.telescope.detector import bin_pixels
 from sim_rtc.telescope.diffractive import DiffractivePlant
 from sim_rtc.telescope.imperfections import SETS, Imperfections
 from sim_rtc.telescope.mirror import MirrorFaults
@@ -96,7 +94,6 @@ def test_layers_jumps_and_drift_are_read():
         (["--image-offsets", "0,0,0,0,0,0,0,0", "--image-offset-rms", "0.1"], "one of them"),
         (["--excess-noise", "0.5"], "expected a number from 1 to 4"),
         (["--rise-ms", "-1"], "expected a number from 0 to 100"),
-        (["--preset", "flao", "--mag", "19"], "expected a star of 16.5 or brighter"),
         (["--scene", "dusk"], "--scene: found 'dusk', expected one of "),
         (["--scene", "daytime", "--spiders", "2:0.1"], "--spiders: the fibre by day"),
         (["--spiders", "2.5:0.1"], "--spiders: found '2.5:0.1'; expected N:WIDTH_M"),
@@ -190,12 +187,6 @@ def test_the_diffractive_plant_takes_its_time_unless_told_otherwise():
     assert parse_options(["--plant", "diffractive", "--speed", "0.1"]).speed == 0.1
 
 
-def test_a_preset_follows_the_magnitude():
-    options = parse_options(["--preset", "flao", "--mag", "12", "--plant", "diffractive"])
-    assert (options.frame_rate_hz, options.n_controlled(594)) == (800.0, 153)
-    assert options.binning == 2
-
-
 def test_an_ideal_linear_mirror_needs_no_drive(small_instrument, small_basis):
     assert build_drive(parse_options([]), small_instrument, small_basis) is None
     for given in (["--rise-ms", "0.7"], ["--plant", "diffractive"]):
@@ -208,29 +199,11 @@ def test_the_plant_is_the_one_asked_for(small_instrument, small_basis):
     assert isinstance(plant, DiffractivePlant)
 
 
-def test_a_linear_plant_refuses_pixels_it_cannot_bin(small_instrument, small_basis):
-    options = parse_options(["--preset", "flao", "--mag", "12"])
-    with pytest.raises(ConfigurationError, match="needs --plant diffractive; found --plant linear"):
-        build_plant(options, small_instrument, small_basis, np.random.default_rng(1))
-
-
 @pytest.mark.parametrize("plant", ["linear", "diffractive"])
 def test_actuators_the_mirror_does_not_have_are_refused(small_instrument, small_basis, plant):
     options = parse_options(["--plant", plant, "--dead-actuators", "3,500"])
     with pytest.raises(ConfigurationError, match="found actuator 500"):
         build_plant(options, small_instrument, small_basis, np.random.default_rng(1))
-
-
-def test_binning_leaves_the_modes_as_they_are(small_instrument, small_basis):
-    coarse = bin_pixels(small_instrument, 2)
-    surface = mirror_surface(coarse.analytic_mirror, coarse.subaperture_m)
-    basis = small_basis.of_surface(surface)
-    metres = np.random.default_rng(2).uniform(-3.0, 3.0, (40, 2))
-    np.testing.assert_allclose(
-        basis.render(metres / coarse.subaperture_m),
-        small_basis.render(metres / small_instrument.subaperture_m),
-        atol=1e-9,
-    )
 
 
 def test_limits_alone_put_a_linear_mirror_on_a_drive():

@@ -173,8 +173,8 @@ class PyramidModel(SensorModel):
         separation = sensor.image_separation_subap
         return (sensor.wavelength_m, sensor.modulation_lambda_over_d, separation)
 
-    @override
     def bin_sensor(self, sensor: Pyramid, binning: int) -> Pyramid:
+        """Return the sensor with so many subapertures made one along each axis."""
         return replace(
             sensor,
             n_subapertures=sensor.n_subapertures // binning,

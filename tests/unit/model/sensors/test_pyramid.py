@@ -368,8 +368,6 @@ def test_a_kind_without_light_frames_or_working_point_says_so():
     assert plain.frames(None, frozenset()) is None
     with pytest.raises(ModelError, match="expected signals of a plain"):
         plain.signals_of_frames(instrument, np.zeros((1, 2, 2)), np.zeros((2, 2)))
-    with pytest.raises(ModelError, match="expected none"):
-        plain.bin_sensor(instrument.wfs, 2)
 
 
 def test_every_kind_is_found_under_the_name_its_records_have():

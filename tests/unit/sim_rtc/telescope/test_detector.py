@@ -1,20 +1,14 @@
-import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from service.errors import ConfigurationError
 from service.model.kinds import SlopeOrder
-from service.model.pupil import valid_subapertures
 from service.model.slopes import SlopeRecipe
 from sim_rtc.telescope.detector import (
-    FLAO_PRESETS,
     Camera,
     Detector,
     PixelDetector,
-    bin_pixels,
-    preset_for,
 )
 
 N = 10
@@ -129,40 +123,3 @@ def test_five_magnitudes_are_a_factor_of_a_hundred(small_instrument):
         for m in (5.0, 10.0)
     )
     assert bright / faint == pytest.approx(100.0)
-
-
-def test_presets_get_slower_and_coarser_as_stars_get_fainter():
-    for brighter, fainter in itertools.pairwise(FLAO_PRESETS):
-        assert fainter.faintest > brighter.faintest
-        assert fainter.binning >= brighter.binning
-        assert fainter.frame_rate_hz <= brighter.frame_rate_hz
-        assert fainter.n_controlled <= brighter.n_controlled
-
-
-def test_the_preset_is_the_first_that_reaches_the_star():
-    assert preset_for(8.0).binning == 1
-    assert preset_for(12.0).binning == 2
-    with pytest.raises(ConfigurationError, match=r"found magnitude 19; expected a star of 16\.5"):
-        preset_for(19.0)
-
-
-def test_binning_keeps_the_beam_and_halves_the_subapertures(small_instrument):
-    coarse = bin_pixels(small_instrument, 2)
-    assert coarse.wfs.n_subapertures == 5
-    assert coarse.subaperture_m == pytest.approx(2 * small_instrument.subaperture_m)
-    assert coarse.wfs.pupil_separation_subap * coarse.subaperture_m == pytest.approx(
-        small_instrument.wfs.pupil_separation_subap * small_instrument.subaperture_m
-    )
-    assert bin_pixels(small_instrument, 1) is small_instrument
-
-
-def test_a_binning_that_does_not_divide_is_refused(small_instrument):
-    with pytest.raises(ConfigurationError, match="found 3; 10 subapertures must divide by it"):
-        bin_pixels(small_instrument, 3)
-
-
-def test_binning_a_mask_of_valid_subapertures_is_refused(small_instrument):
-    mask = valid_subapertures(small_instrument)
-    wfs = replace(small_instrument.wfs, valid_subapertures=mask)
-    with pytest.raises(ConfigurationError, match="their mask must be found by flux"):
-        bin_pixels(replace(small_instrument, wfs=wfs), 2)

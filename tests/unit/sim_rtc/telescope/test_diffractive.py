@@ -12,10 +12,11 @@ from service.model.misregistration import Misregistration
 from service.model.pupil import valid_subapertures
 from service.model.sensors.pyramid.optics import PyramidOptics
 from service.model.sensors.pyramid.signals import differentiate_signals, reference_slopes
+from service.model.sensors.registry import kind_of
 from sim_rtc.computer.feed import BATCH_FRAMES, PhaseFeed
 from sim_rtc.computer.loop import LoopTerms, ModalLoop
 from sim_rtc.telescope.atmosphere import Layer, build_layers
-from sim_rtc.telescope.detector import PixelDetector, bin_pixels
+from sim_rtc.telescope.detector import PixelDetector
 from sim_rtc.telescope.diffractive import (
     DiffractivePlant,
     DiffractivePyramid,
@@ -240,7 +241,9 @@ def test_a_drift_moves_the_images_exactly(plant):
 
 
 def test_a_binned_sensor_keeps_its_pupil_points(small_instrument, small_basis):
-    coarse = bin_pixels(small_instrument, 2)
+    coarse = replace(
+        small_instrument, wfs=kind_of(small_instrument).bin_sensor(small_instrument.wfs, 2)
+    )
     plant = DiffractivePlant(
         coarse, small_basis, rng=np.random.default_rng(1), binning=2, imperfections=PERFECT
     )
@@ -398,7 +401,9 @@ def test_displacements_of_the_images_reach_the_light(small_instrument, small_bas
     np.testing.assert_allclose(made.image_offsets_px, np.reshape(given, (4, 2)))
     assert ideal.image_offsets_px is None
     images, places = made.optics(TURNED).images, ideal.optics(TURNED).images
-    wider = bin_pixels(small_instrument, 2)
+    wider = replace(
+        small_instrument, wfs=kind_of(small_instrument).bin_sensor(small_instrument.wfs, 2)
+    )
     coarse = DiffractivePlant(
         wider, small_basis, binning=2, rng=np.random.default_rng(1), imperfections=changes
     )

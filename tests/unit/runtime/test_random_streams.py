@@ -11,7 +11,6 @@ from service.estimation.dither_windows import DitherWindows
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import LockIn
 from service.estimation.random_dither import Correlated
-from service.estimation.windows import WindowRefused
 from service.runtime.estimator_bank import EstimatorBank, process_block, with_dither, with_rtc
 from service.tracking.dither_request import Dither, plan_random
 from service.tracking.products import ModeSet
@@ -72,13 +71,6 @@ def test_random_signs_are_correlated_in_windows_of_the_dithers_own_length(stream
     assert streams[DitherWindows].cutter is None
 
 
-def test_another_loop_makes_the_open_window_void(streams):
-    streams, _ = play(streams, 0, 5)
-    streams = with_rtc(streams, replace(RTC, leak=0.99, seq=499))
-    assert streams[DitherWindows].cutter.window is None
-    assert streams[DitherWindows].cutter.plan.first_seq == 799
-
-
 def test_a_sine_after_random_signs_is_read_as_a_sine(streams):
     request = DitherRequest(
         id="d-2",
@@ -102,13 +94,6 @@ def test_a_window_too_short_for_its_modes_is_refused_with_how_long_it_must_be(st
     assert expected in found.loop.dither.why_unreadable
 
 
-def test_a_new_reconstructor_inside_a_window_cuts_it_short(streams):
-    streams, _ = play(streams, 0, 5)
-    _, (refused, whole) = play(streams, 500, 5, cm_id="cm-1")
-    assert isinstance(refused, WindowRefused)
-    assert (whole.first_seq, whole.cm_id) == (500, "cm-1")
-
-
 def test_all_modes_of_a_basis_may_share_a_few_nanometres():
     """5 nm on 594 modes: 0.205 nm each; windows of 594 modes at 1 kHz last 4.75 s at least."""
     dither = plan_random(rtc(), POLICY, 77, modes=ModeSet.ALL, **ASKED)
@@ -118,25 +103,6 @@ def test_all_modes_of_a_basis_may_share_a_few_nanometres():
     assert (request.kind, request.seed, dither.frequency_hz) == (DitherKind.BINARY, 77, ())
     assert dither.window_s == pytest.approx(5.0)
     assert request.duration_s >= 30.0
-
-
-def test_the_controlled_modes_are_those_in_the_loop():
-    dither = plan_random(rtc(), POLICY, 0, modes=ModeSet.CONTROLLED, **ASKED)
-    assert dither.request.modes == tuple(range(400))
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"modes": (3, 594)}, "found mode 594; expected 0 to 593"),
-        ({"modes": (3,), "total_m": 1e-6}, r"found 1e\+03 nm on each of 1 modes"),
-        ({"duration_s": 1.0}, "found 1 s; 400 modes need windows of 3.2 s"),
-    ],
-)
-def test_a_dither_that_cannot_be_played_is_refused_before_it_is_asked_for(changes, words):
-    values = {"modes": ModeSet.CONTROLLED} | ASKED
-    with pytest.raises(CommandError, match=words):
-        plan_random(rtc(), POLICY, 0, **(values | changes))
 
 
 def test_more_modes_than_the_rtc_dithers_are_refused():

@@ -11,7 +11,7 @@ from service.estimation.health import LoopHealth, VibrationMonitor
 from service.estimation.lockin import Spectra
 from service.estimation.loopcheck import LoopCheck
 from service.estimation.passive import Passive
-from service.estimation.windows import RefusalKind, WindowRefused
+from service.estimation.windows import WindowRefused
 from service.runtime.engine import (
     IDLE_GATHER_S,
     Engine,
@@ -94,12 +94,6 @@ def test_the_first_window_begins_when_the_loop_has_settled_and_each_lasts_as_lon
     assert windows[0].cm_id == "initial"
 
 
-def test_without_a_dither_there_are_no_windows(streams):
-    streams = with_dither(streams, None, WINDOW_S)
-    _, windows = play(streams, 0, 14)
-    assert not windows
-
-
 def test_a_dither_the_rtc_has_not_accepted_yet_opens_nothing(streams):
     waiting = played(id="dither-2", start_seq=None)
     assert with_dither(streams, waiting, WINDOW_S)[DitherWindows].cutter is None
@@ -145,22 +139,6 @@ def test_the_same_loop_seen_again_keeps_everything(streams):
     again = with_rtc(streams, replace(RTC, t_ns=5, magnitude=9.0, cm_id="cm-1"))
     assert again[DitherWindows].cutter is streams[DitherWindows].cutter
     assert again[Passive] is streams[Passive]
-
-
-def test_a_new_reconstructor_inside_a_window_cuts_it_short(streams):
-    streams, _ = play(streams, 0, 6)
-    _, (refused, whole) = play(streams, 600, 6, cm_id="cm-1")
-    assert isinstance(refused, WindowRefused)
-    assert refused.reason.startswith("the reconstructor changed")
-    assert refused.kind is RefusalKind.CUT_SHORT
-    assert (whole.first_seq, whole.cm_id) == (600, "cm-1")
-
-
-def test_an_ended_dither_gives_no_window_of_noise(streams):
-    streams, _ = play(streams, 0, 6)
-    _, windows = play(streams, 600, 8, dither=False)
-    assert windows
-    assert all(isinstance(window, WindowRefused) for window in windows)
 
 
 def test_frames_of_another_session_are_left_alone(streams):
@@ -321,12 +299,6 @@ class TestADitherThatIsNotThere:
         short = played(duration_s=0.3)
         streams, _ = play(with_dither(streams, short, WINDOW_S), 0, 20, dither=False)
         assert streams[DitherWatch].silent_s == pytest.approx(0.3)
-
-    def test_one_of_another_frequency_than_told_gives_no_window(self, streams):
-        other = played(frequency_hz=(300.0,))
-        _, windows = play(with_dither(streams, other, WINDOW_S), 0, 9)
-        assert isinstance(windows[0], WindowRefused)
-        assert "mode 6 carries 0.00 nm of dither at 300.0 Hz" in windows[0].reason
 
     def test_a_correction_of_its_first_frame_moves_the_windows(self, streams):
         streams = with_dither(streams, played(start_seq=400), WINDOW_S)
@@ -593,16 +565,6 @@ class TestLaw:
         for moving in ({}, {"moving": True}):
             found = self.after(telemetry, replace(self.TOLD, leak=0.9), **moving)
             assert "leak 0.995 found, 0.900 in the status" in found["loop-law"]
-
-    def test_another_delay_is_named(self):
-        found = self.after(loops.closed_loop(), replace(self.TOLD, delay_frames=3.0))
-        assert "delay 2.00 frames found, 3.00 in the status" in found["loop-law"]
-
-    def test_a_status_that_tells_the_truth_at_last_ends_it(self):
-        telemetry = loops.closed_loop()
-        found = self.after(telemetry, replace(self.TOLD, leak=0.9))
-        assert "loop-law" in found
-        assert "loop-law" not in self.after(telemetry, self.TOLD)
 
     def test_commands_in_nanometres_are_a_unit_and_nothing_else_is_opened_for(self):
         slopes, commands, _ = loops.closed_loop()

@@ -200,6 +200,14 @@ def test_missing_frames_at_the_end_of_a_window_are_counted_too():
     assert spectra.n_missing == 30
 
 
+def test_five_per_cent_missing_is_the_most_a_window_takes():
+    (spectra,) = run(*without(telemetry(1100), 500, 550))
+    assert isinstance(spectra, Spectra)
+    assert spectra.n_missing == 50
+    refused = run(*without(telemetry(1600), 500, 551))[0]
+    assert "51 of 1000 frames missing" in refused.reason
+
+
 def test_many_small_gaps_add_up_to_a_refusal():
     block = telemetry(1100)
     ended = run(*(part(block, start, start + 9) for start in range(0, 1100, 10)))

@@ -98,7 +98,6 @@ def test_no_acknowledgement_of_before_takes_back_what_is_in_use(story):
     assert story.matrix_state("cm-1") is MatrixState.APPLIED
     story.use("cm-2")
     story.acknowledge("cm-1")
-    story.tell(rtc(cm_id="cm-2"))
     assert story.state.matrices.in_use == "cm-2"
     assert story.matrix_state("cm-1") is MatrixState.SUPERSEDED
 

@@ -483,16 +483,6 @@ def test_misaligned_columns_are_an_alarm_until_a_window_is_good_again(story):
 
 
 @pytest.mark.parametrize(
-    ("alarm", "word"), [("loop-diverging", "diverging"), ("edge-slip", "slipped")]
-)
-def test_telemetry_of_a_loop_out_of_hand_is_no_measurement(story, alarm, word):
-    story.tell(ev.ConditionChanged(name=alarm, text="it is"))
-    story.see()
-    assert story.state.alpha.registration is None
-    assert word in story.state.log[-1].text
-
-
-@pytest.mark.parametrize(
     ("kind", "level"),
     [(RefusalKind.CUT_SHORT, Level.INFO), (RefusalKind.OTHER, Level.WARNING)],
 )
@@ -508,16 +498,6 @@ def test_by_day_a_mirror_seen_twice_shows_twice_the_gain_and_the_window_counts()
     story.tell(ev.WindowFitted(estimate=estimate(optical_gain=np.full(4, 1.8 + 0.0j))))
     assert story.state.windows.accepted == 1
     assert story.state.alpha.registration.optical_gain == pytest.approx(1.8)
-
-
-def test_a_window_in_flight_when_the_commands_go_off_the_loop_is_not_good():
-    story = Story().meet()
-    story.tell(ev.ConditionChanged(name="commands-off-loop", text="saturated"))
-    story.see()
-    assert story.state.alpha.registration is None
-    story.tell(ev.ConditionChanged(name="commands-off-loop", text="again", over=True))
-    story.see()
-    assert story.state.alpha.registration is not None
 
 
 # --- what a window of random dither does to the registration
@@ -568,13 +548,6 @@ def test_one_noisy_gain_among_hundreds_is_no_reason_to_refuse_a_window():
     gains[7] = -0.2
     see(story, optical_gain=gains, gain_sigma=np.full(400, 0.3))
     assert story.state.windows.accepted == 1
-
-
-def test_a_dither_nobody_sees_is_refused_for_its_gains():
-    story = Story().meet()
-    see(story, optical_gain=np.full(400, 0.02))
-    assert story.state.windows.refused == 1
-    assert "optical gains of 0.02 to 0.02" in story.state.log[-1].text
 
 
 def test_neighbours_are_averaged_by_their_noise():

@@ -431,6 +431,7 @@ def test_a_matrix_with_missing_parts_a_wrong_sum_or_bad_numbers_is_refused():
 def test_the_memory_of_an_assembler_is_bounded():
     assembler = ChunkAssembler(limit_bytes=50)
     assembler.add(0, bytes(40))
+    assert assembler.missing() == (), "nobody has said yet how many there are"
     with pytest.raises(WireError, match="brings the matrix to 80 bytes, expected at most 50"):
         assembler.add(1, bytes(40))
     with pytest.raises(WireError, match="4000001 bytes, expected 1 to 4000000"):

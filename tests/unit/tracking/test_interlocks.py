@@ -214,6 +214,11 @@ REFUSED = {
         "11 nm RMS in all, budget 8 nm": [
             cmd.MeasureNoisy(id="noisy-9", total_amplitude_m=11e-9, duration_s=60.0)
         ],
+        "found 100 nm on each of 1 modes": [
+            cmd.MeasureNoisy(
+                id="noisy-9", modes=(3,), total_amplitude_m=1e-7, over_budget=True, duration_s=60.0
+            )
+        ],
         "400 modes need windows of 3.2 s": [
             cmd.MeasureNoisy(id="noisy-9", modes=ModeSet.CONTROLLED, duration_s=2.0)
         ],

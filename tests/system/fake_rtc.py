@@ -4,7 +4,6 @@
 it is killed.
 """
 
-import json
 import sys
 import threading
 import time
@@ -37,32 +36,16 @@ from service.wire import (
 )
 from service.wire.signing import Signatures
 from tests.system.pace import patience
+from tests.system.stranger import open_client
 
 T0_NS = 1_800_000_000_000_000_000
 DT_NS = 1_000_000
 
 
 def client_session(endpoint, stamped=True, **more):
-    """Open a zenoh client as wire.md asks an RTC to."""
-    config = zenoh.Config()
-    settings = {
-        "mode": "client",
-        "connect/endpoints": [endpoint],
-        "connect/retry": {
-            "period_init_ms": 200,
-            "period_increase_factor": 1.5,
-            "period_max_ms": 1000,
-        },
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "timestamping/enabled": stamped,
-        "transport/link/tx/lease": 2000,
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 20_000,
-        "transport/shared_memory/enabled": False,
-    }
-    for key, value in (settings | more).items():
-        config.insert_json5(key, json.dumps(value))
-    return zenoh.open(config)
+    """Open a zenoh client as wire.md asks an RTC to; it waits where a link is slow."""
+    patient = {"transport/link/tx/queue/congestion_control/drop/wait_before_drop": 20_000}
+    return open_client(endpoint, **({"timestamping/enabled": stamped} | patient | more))
 
 
 class FakeRtc:

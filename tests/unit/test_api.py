@@ -16,6 +16,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from service import __version__
 from service.archive import Archive
+from service.archive.nights import Annotation
 from service.control.gains import ModeGain
 from service.control.gate import GateVerdict
 from service.errors import (
@@ -30,7 +31,7 @@ from service.link.statistics import LinkStatistics
 from service.model.misregistration import PARAMETERS, Misregistration
 from service.runtime.command_results import Refits
 from service.runtime.snapshot import Snapshot
-from service.tracking.alarms import Alarm, Severity
+from service.tracking.alarms import ALARMS, Alarm, AlarmRecord, OperatorNote, Severity
 from service.tracking.commands import (
     AbortAcquisition,
     AcknowledgeAlarm,
@@ -61,6 +62,7 @@ from service.tracking.operation_records import (
     MeasurementRecord,
     MeasureState,
 )
+from service.tracking.operations.running import ServiceState
 from service.tracking.products import MatrixState, ModeSet, ReconstructorRecord
 from service.tracking.registration import (
     HistoryEntry,
@@ -1062,3 +1064,108 @@ async def test_every_number_carries_its_unit_in_its_name(client):
     assert {"rotation_deg", "frame_rate_hz", "amplitude_m"} <= numbers
     for name in numbers - DIMENSIONLESS:
         assert name.endswith(("_radius", "_ratio", *UNITS)) or name.startswith(COUNTS), name
+
+
+# --- alarms over REST: what is shown of them, and what operators do about them
+
+
+ADA = OperatorNote(by="Ada", reason="known", t_ns_utc=80 * SECOND)
+
+
+async def test_alarms_are_those_that_last_went_unseen_or_are_muted(client, service):
+    service.change(
+        active=(Alarm(name="loop-open", since_ns_utc=70 * SECOND, text="open"),),
+        records=(
+            AlarmRecord(name="loop-open", worst=Severity.WARNING, acknowledged=ADA),
+            AlarmRecord(name="margin", worst=Severity.CRITICAL, text="bad", over_ns_utc=9 * SECOND),
+            AlarmRecord(name="edge-slip", muted=replace(ADA, until_ns_utc=99 * SECOND)),
+        ),
+    )
+    body = await body_of(client, "/v1/alarms")
+    (lasting,), (stale,), (muted,) = (
+        body[name] for name in ("alarms", "stale_alarms", "muted_alarms")
+    )
+    assert (lasting["name"], lasting["severity"]) == ("loop-open", "warning")
+    assert lasting["alarm_state"] == "acknowledged"
+    assert (lasting["acknowledged"]["by"], lasting["acknowledged"]["reason"]) == ("Ada", "known")
+    assert lasting["acknowledged"]["t_utc"] == "1970-01-01T00:01:20.000000Z"
+    assert (lasting["do"], lasting["text"]) == (ALARMS["loop-open"].do, "open")
+    assert (stale["severity"], stale["worst_severity"]) == (None, "critical")
+    assert (stale["alarm_state"], stale["text"]) == ("stale", "bad")
+    assert stale["do"] == ALARMS["margin"].do
+    assert (muted["name"], muted["muted"]["until_ns_utc"]) == ("edge-slip", 99 * SECOND)
+    assert body["worst_severity"] == "critical"
+    state = await body_of(client, "/v1/state")
+    assert {name: state[name] for name in body} == body
+    assert state["operating"]["service_state"] in set(ServiceState)
+    found = await metrics_of(client)
+    counted = ("alarms", "alarms_stale", "alarms_muted", "alarms_unacknowledged")
+    assert [found[name,] for name in counted] == [1, 1, 1, 0]
+    assert found["alarms_shown", "warning"] == 1
+    assert found["service_state", state["operating"]["service_state"]] == 1
+
+
+# --- notes of operators, and how two reconstructors are compared
+
+
+NOTED = {"note": "dome closed, wind 18 m/s", "t_ns_utc": 50 * SECOND, "by": "Ada"}
+
+
+async def test_a_note_is_kept_with_its_time_in_the_history_and_the_trail(client, service):
+    response = await client.post("/v1/annotations", json=NOTED)
+    assert response.status_code == 201, response.text
+    where = response.headers["location"]
+    (found,) = (await client.get(where)).json()["annotations"]
+    assert (found["id"], found["t_ns_utc"], found["who"]) == (1, 50 * SECOND, "Ada")
+    assert found["note"] == NOTED["note"]
+    assert found["written_ns_utc"] > 50 * SECOND
+    (mark,) = (await client.get("/v1/marks")).json()["marks"]
+    assert (mark["kind"], mark["name"], mark["text"]) == ("note", "Ada", NOTED["note"])
+    (entry,) = service.trail
+    assert (entry.name, entry.who, entry.text) == ("annotation", "Ada", NOTED["note"])
+
+
+async def test_a_note_without_a_time_is_of_now(client):
+    await client.post("/v1/annotations", json={"note": "clouds"})
+    (found,) = (await client.get("/v1/annotations")).json()["annotations"]
+    assert found["t_ns_utc"] == found["written_ns_utc"]
+
+
+async def test_notes_of_a_time_are_its_newest_oldest_first(client, service):
+    for k in range(5):
+        note = Annotation(t_ns_utc=k * SECOND, written_ns_utc=k, who="Ada", note=f"note {k}")
+        service.archive.nights.add_note(note)
+    asked = {"since_ns": SECOND, "until_ns": 4 * SECOND, "limit": 3}
+    found = (await client.get("/v1/annotations", params=asked)).json()["annotations"]
+    assert [one["note"] for one in found] == ["note 2", "note 3", "note 4"]
+
+
+@pytest.mark.parametrize("body", [{}, {"note": ""}, {"note": "x" * 2001}, {"t_ns_utc": 5}])
+async def test_a_note_that_says_nothing_is_refused(client, body):
+    assert_problem(await client.post("/v1/annotations", json=body), 422, "invalid", "note")
+
+
+async def test_a_note_the_disk_refuses_is_told(client, service, monkeypatch):
+    def refuses(_):
+        raise StorageError("disk full")
+
+    monkeypatch.setattr(service.archive.nights, "add_note", refuses)
+    refused = await client.post("/v1/annotations", json=NOTED)
+    assert_problem(refused, 507, "archive-failed", "disk full")
+    assert not service.trail
+
+
+async def test_two_reconstructors_are_compared_mode_by_mode(client, service, monkeypatch):
+    turned = -2.0 * MATRIX[:2]
+    matrices = {"cm-1": MATRIX, "cm-2": turned, "cm-3": MATRIX[:, :2]}
+    monkeypatch.setattr(service, "matrix", matrices.__getitem__)
+    body = (await client.get("/v1/reconstructors/cm-1/compared-with/cm-2")).json()
+    assert body["modes"] == [0, 1]
+    assert body["gain"] == pytest.approx([0.5, 0.5])
+    assert body["cosine"] == pytest.approx([-1.0, -1.0])
+    assert body["difference"] == pytest.approx(1.5)
+    same = (await client.get("/v1/reconstructors/cm-1/compared-with/candidate")).json()
+    assert (same["other"], same["difference"]) == ("cm-1", 0.0)
+    np.testing.assert_allclose(same["cosine"], 1.0, rtol=1e-3)
+    other = await client.get("/v1/reconstructors/cm-1/compared-with/cm-3")
+    assert_problem(other, 409, "not-now", "4 slopes in cm-1 and 2 in cm-3")

@@ -3,30 +3,14 @@
 import csv
 import io
 import json
-from types import SimpleNamespace
 
 import pytest
 
 from service.archive import Archive, AuditEntry
 from service.web import archive as kept
+from tests.unit.test_api import SECOND, FakeService, a_snapshot
 
-SECOND = 1_000_000_000
 N_ENTRIES = 12
-
-
-class FakeService:
-    """Remembers what it was asked, and by whom."""
-
-    def __init__(self, archive):
-        self.archive = archive
-        self.asked = []
-
-    def snapshot(self):
-        return SimpleNamespace(tracker=None)
-
-    async def submit(self, command, caller, order_id=""):
-        self.asked.append((command, caller))
-        return "so it is"
 
 
 @pytest.fixture
@@ -46,7 +30,7 @@ def service(tmp_path):
             for k in range(N_ENTRIES)
         )
         archive.record((), entries)
-        yield FakeService(archive)
+        yield FakeService(a_snapshot(), archive=archive)
 
 
 async def names(client, query=""):
@@ -155,11 +139,11 @@ async def test_an_order_says_who_why_and_where_from(client, service, headers, ch
     ):
         answer = await client.request(method, path, json={**body, **said}, headers=headers)
         assert answer.status_code == 202, answer.text
-        assert answer.json()["text"] == "so it is"
-    for command, caller in service.asked:
+        assert answer.json()["text"].endswith("is on its way")
+    for command, caller in zip(service.commands, service.callers, strict=True):
         assert (command.reason, command.by) == ("too many modes", "Ada")
         assert (caller.address, caller.channel) == ("127.0.0.1", channel)
-    assert len(service.asked) == 4
+    assert len(service.commands) == 4
 
 
 @pytest.mark.parametrize(
@@ -180,4 +164,4 @@ async def test_words_that_cannot_be_kept_are_refused_with_all_that_is_wrong(
     assert answer.status_code == 422
     assert words in answer.json()["detail"]
     assert "\x1b" not in answer.text
-    assert service.asked == []
+    assert service.commands == []

@@ -14,6 +14,7 @@ from service.errors import BusyError, MatrixError, TooLargeError, UnknownIdError
 from service.runtime.uploads import FitJob, FitState
 from tests.unit.fitting.made import a_fit, a_report
 from tests.unit.test_api import assert_problem
+from tests.unit.test_api_measured import FILE, FakeMatrices
 
 JOB = FitJob(id="fit-1", state=FitState.WAITING, asked_ns_utc=7, n_bytes=4, sha256="ab")
 
@@ -54,22 +55,9 @@ def desk():
     return FakeDesk()
 
 
-class FakeMatrices:
-    """One that the RTC has measured."""
-
-    def __init__(self, folder):
-        self.path = folder / "product.h5"
-        self.path.write_bytes(b"measured")
-
-    def file(self, measurement_id):
-        if measurement_id != "im-1":
-            raise UnknownIdError(f"measurement {measurement_id}: no such matrix in the archive")
-        return self.path
-
-
 @pytest.fixture
 async def client(desk, tmp_path):
-    service = SimpleNamespace(archive=SimpleNamespace(measured=FakeMatrices(tmp_path)))
+    service = SimpleNamespace(archive=SimpleNamespace(measured=FakeMatrices(tmp_path, "im-1")))
     transport = httpx.ASGITransport(create_app(service, desk), raise_app_exceptions=False)
     async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
         yield client
@@ -152,7 +140,7 @@ async def test_an_upload_that_is_not_taken_says_why(client, desk, refusal, statu
 async def test_a_matrix_the_rtc_has_measured_needs_no_upload(client, desk):
     response = await client.post("/v1/fits", params={"measurement": "im-1", "modes": "0:4"})
     assert response.status_code == 202, response.text
-    assert (desk.body, desk.length) == (b"measured", 8)
+    assert (desk.body, desk.length) == (FILE, len(FILE))
 
 
 async def test_a_measurement_nobody_made_is_404(client):

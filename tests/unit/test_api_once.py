@@ -6,46 +6,28 @@ from dataclasses import replace
 import pytest
 
 from service.errors import CommandError, StorageError
-from service.runtime.snapshot import Snapshot
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.web import connections
-from tests.states import changed, tracker_state
-from tests.unit.tracking.situations import POLICY
+from tests.states import tracker_state
+from tests.unit.test_api import FakeService, a_snapshot
 
 CM = ReconstructorRecord(id="cm-1", state=MatrixState.PROPOSED, n_modes=400, created_ns_utc=1)
 
 
-class FakeService:
-    """Holds a real state, counts what it is asked, and takes its time."""
-
-    def __init__(self):
-        self.commands = []
-        self.refusal = None
-        self.tracker = tracker_state(system="flao-lbt", reconstructors=(CM,))
-
-    def snapshot(self):
-        return Snapshot(
-            policy=POLICY,
-            tracker=self.tracker,
-            link=None,
-            now_ns=0,
-            started_ns=0,
-            ready=True,
-            ready_reason="",
-        )
+class Slow(FakeService):
+    """Counts what it is asked, and takes its time."""
 
     async def submit(self, command, caller, order_id=""):
         await asyncio.sleep(0.01)
         caller.check()
-        if self.refusal is not None:
-            raise self.refusal
-        self.commands.append(command)
+        await super().submit(command, caller, order_id)
         return f"order {len(self.commands)}"
 
 
 @pytest.fixture
 def service():
-    return FakeService()
+    known = tracker_state(system="flao-lbt", reconstructors=(CM,))
+    return Slow(a_snapshot(known, now_ns=0, started_ns=0))
 
 
 def keyed(client, key="k-1", path="/v1/rollback", **body):
@@ -150,7 +132,7 @@ async def test_who_decides_on_what_has_changed_since_is_told_to_look_again(
     assert (await client.get(seen)).headers["etag"] == tag
     assert (await client.post(order, headers={"If-Match": tag})).status_code == 202
     discarded = replace(CM, state=MatrixState.DISCARDED)
-    service.tracker = changed(service.tracker, reconstructors=(discarded,))
+    service.change(reconstructors=(discarded,))
     answer = await client.post(order, headers={"If-Match": tag})
     assert answer.status_code == 412
     assert answer.json()["type"] == "urn:pyrcal:problem:stale"
@@ -165,7 +147,7 @@ async def test_a_rollback_is_decided_on_the_one_before_whatever_is_judged_or_pro
     client, service
 ):
     def use(*records):
-        service.tracker = changed(service.tracker, reconstructors=records, in_use=records[-1].id)
+        service.change(reconstructors=records, in_use=records[-1].id)
 
     async def back(tag):
         return (await client.post("/v1/rollback", headers={"If-Match": tag})).status_code

@@ -6,42 +6,26 @@ import h5py
 import numpy as np
 import pytest
 
+from pyrcal.fitting.recorded import read_recorded
 from service.archive import Archive
-from service.errors import ArchiveError, UnknownIdError, WireError
-from service.tracking.operation_records import MeasurementRecord, MeasureState
+from service.archive.products import NoisyNumbers
+from service.archive.serialisation import to_json
+from service.errors import ArchiveError, UnknownIdError
+from service.tracking.operation_records import MeasureState
 from service.wire import Pattern, checksum
+from tests.unit.test_api_measured import NOISY, STORED
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(4, 3) * 1e6
 
 
 def record_of(name="im-1", matrix=MATRIX, **changes):
-    record = MeasurementRecord(
-        id=name,
-        state=MeasureState.STORED,
-        pattern=Pattern.HADAMARD,
-        modes=(0, 7, 3),
-        amplitude_m=(1e-8, 2e-8, 2e-8),
-        n_average=5,
-        created_ns_utc=1_000,
-        n_slopes=4,
-        double_pass=True,
-        session="s-1",
-        basis_id="kl",
-        config_id="b1",
-        sha256=checksum(matrix),
-    )
-    return replace(record, **changes)
+    values = {"id": name, "pattern": Pattern.HADAMARD, "double_pass": True}
+    return replace(STORED, **(values | {"sha256": checksum(matrix)} | changes))
 
 
 def product(tmp_path, name="im-1"):
-    return tmp_path / "interaction_matrices" / f"{name}.h5"
-
-
-def test_a_measured_matrix_comes_back_bit_for_bit(archive):
-    archive.measured.store(record_of(), np.asfortranarray(MATRIX), "flao-lbt")
-    found = archive.measured.matrix("im-1")
-    assert found.dtype == np.float32
-    assert found.tobytes() == MATRIX.tobytes()
+    folder = "noisy_matrices" if name.startswith("noisy") else "interaction_matrices"
+    return tmp_path / folder / f"{name}.h5"
 
 
 def test_the_file_says_how_the_matrix_was_measured(archive, tmp_path):
@@ -119,11 +103,6 @@ def test_a_matrix_that_is_not_what_its_record_says_is_refused(archive, record, m
     assert archive.measured.records() == ()
 
 
-def test_an_id_that_would_leave_the_directory_is_refused(archive):
-    with pytest.raises(WireError, match="id"):
-        archive.measured.store(record_of("../im"), MATRIX, "flao-lbt")
-
-
 def test_an_unknown_matrix_is_unknown(archive):
     for ask in (archive.measured.matrix, archive.measured.file):
         with pytest.raises(UnknownIdError, match="im-9"):
@@ -160,3 +139,88 @@ def test_a_file_the_index_missed_is_taken_in_and_a_damaged_one_named(tmp_path):
         assert "bad.h5: damaged" in line
         assert archive.measured.records() == (record_of("good"),)
         assert not list(tmp_path.glob("*/*.part"))
+
+
+# --- noisy interaction matrices that outlive the service, and never look like reconstructors
+
+
+NUMBERS = NoisyNumbers(
+    matrix=MATRIX,
+    noise=np.full((4, 3), 3e6, np.float32),
+    synthetic=MATRIX + np.float32(1e5),
+    optical_gain=np.array([0.5, 0.6, 0.7]),
+    gain_sigma=np.array([0.1, 0.1, 0.2]),
+    snr=np.array([1.0, 2.0, 3.0]),
+)
+
+
+def noisy_record(matrix=MATRIX, **changes):
+    finding = replace(NOISY.finding, sha256=checksum(matrix))
+    return replace(NOISY, **({"finding": finding} | changes))
+
+
+def same(one, other):
+    return to_json(one) == to_json(other)
+
+
+def test_the_file_says_how_it_was_measured_and_what_it_says(archive, tmp_path):
+    archive.noisy.store(noisy_record(), NUMBERS, "flao-lbt")
+    with h5py.File(product(tmp_path, "noisy-1")) as file:
+        np.testing.assert_array_equal(file["interaction_matrix"], MATRIX)
+        np.testing.assert_array_equal(file["element_noise"], NUMBERS.noise)
+        np.testing.assert_array_equal(file["synthetic"], NUMBERS.synthetic)
+        np.testing.assert_allclose(file["noise"], 3e6)
+        found = dict(file.attrs)
+    assert found["modes"].tolist() == [0, 7, 3]
+    assert found["amplitude_m"] == pytest.approx(5e-9 / np.sqrt(3))
+    assert (found["seed"], found["n_frames"], found["element_snr"]) == (77, 29_994, 1.4)
+    assert (found["session"], found["basis_id"], found["cm_id"]) == ("s-1", "kl", "cm-1")
+    assert found["rotation_deg"] == pytest.approx(0.2)
+
+
+def test_a_fit_reads_it_like_any_measured_matrix(archive, tmp_path):
+    archive.noisy.store(noisy_record(), NUMBERS, "flao-lbt")
+    recorded = read_recorded(product(tmp_path, "noisy-1"))
+    np.testing.assert_array_equal(recorded.values, MATRIX)
+    assert recorded.modes.tolist() == [0, 7, 3]
+    np.testing.assert_allclose(recorded.noise, 3e6)
+
+
+def test_noisy_ones_come_back_in_the_order_they_were_asked_for(tmp_path):
+    later, older = noisy_record(id="a", asked_ns_utc=2), noisy_record(id="b", asked_ns_utc=1)
+    for record in (later, older):
+        archive = Archive(tmp_path)
+        archive.open()
+        with archive:
+            archive.noisy.store(record, NUMBERS, "flao-lbt")
+    archive = Archive(tmp_path)
+    assert archive.open() == ()
+    with archive:
+        found = archive.noisy.records()
+    assert [record.id for record in found] == ["b", "a"]
+    assert same(found[1], later)
+
+
+def test_the_archive_of_reconstructors_does_not_know_it(archive, tmp_path):
+    archive.noisy.store(noisy_record(), NUMBERS, "flao-lbt")
+    assert archive.reconstructors.records() == ()
+    assert archive.measured.records() == ()
+    for ask in (archive.reconstructors.matrix, archive.measured.matrix):
+        with pytest.raises(UnknownIdError):
+            ask("noisy-1")
+
+
+@pytest.mark.parametrize(
+    ("record", "numbers", "words"),
+    [
+        (noisy_record(modes=(0, 7)), NUMBERS, r"matrix of shape \(4, 3\), expected .* \(4, 2\)"),
+        (noisy_record(), replace(NUMBERS, noise=NUMBERS.noise * np.nan), "found noise of shape"),
+        (noisy_record(matrix=MATRIX + 1), NUMBERS, "found a matrix of checksum"),
+        (noisy_record(finding=None), NUMBERS, "found it stored with nothing"),
+        (noisy_record(state=MeasureState.RUNNING), NUMBERS, "found it running with a finding"),
+    ],
+)
+def test_numbers_that_are_not_what_the_record_says_are_refused(archive, record, numbers, words):
+    with pytest.raises(ArchiveError, match=words):
+        archive.noisy.store(record, numbers, "flao-lbt")
+    assert archive.noisy.records() == ()

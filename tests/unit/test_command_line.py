@@ -189,14 +189,6 @@ def test_a_word_like_no_other_is_not_guessed(capsys):
     assert "mean" not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", [["--help"], ["run", "--help"], ["status", "--help"]])
-def test_help_explains_the_commands(capsys, words):
-    with pytest.raises(SystemExit) as end:
-        main(words)
-    assert end.value.code == 0
-    assert "usage: pyrcal" in capsys.readouterr().out
-
-
 def test_the_precedence_of_settings_is_documented_where_they_are_given(capsys):
     with pytest.raises(SystemExit):
         main(["run", "--help"])
@@ -211,20 +203,6 @@ def test_an_unknown_key_is_named_with_its_file(capsys, tmp_path):
     assert "prot" in line
     assert str(path) in line
     assert "port" in line
-
-
-def test_an_unknown_variable_of_the_environment_is_named(capsys, monkeypatch):
-    monkeypatch.setenv("PYRCAL_API__PROT", "8080")
-    assert "PYRCAL_API__PROT" in refused(capsys, "run")
-
-
-def test_a_value_out_of_range_names_the_variable(capsys, monkeypatch):
-    monkeypatch.setenv("PYRCAL_API__PORT", "70000")
-    assert "PYRCAL_API__PORT" in refused(capsys, "run")
-
-
-def test_an_instrument_nobody_has_is_named(capsys):
-    assert "flao-lbtt" in refused(capsys, "run", "--instrument", "flao-lbtt")
 
 
 def test_a_busy_port_is_said_before_anything_starts(capsys, tmp_path):

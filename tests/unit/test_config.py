@@ -9,19 +9,31 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from astropy.io import fits
 
 from service.config import Settings, load_settings
 from service.errors import ConfigurationError, ModelError
 from service.files.toml import read_toml
-from service.instrument import load_instrument, packaged_file
+from service.instrument import crops, load_instrument, packaged_file
 from service.instrument.mirrors import coincident, grid, hexagonal, rings, typical_pitch
+from service.model import interaction
 from service.model.instrument import instrument_sha256
+from service.model.interaction import InteractionModel
 from service.model.kinds import Influence, LoopFacts, Normalisation, SignalKind, SlopeOrder, Stop
+from service.model.local import LocalShapes
+from service.model.memory import work_of
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
-from service.model.pupil import rtc_valid_subapertures, valid_subapertures
+from service.model.pupil import (
+    instrument_pupil,
+    lit_subapertures,
+    rtc_valid_subapertures,
+    valid_subapertures,
+)
 from service.model.slopes import Orientation
 from service.tracking.state import Mode
+from sim_rtc.telescope.diffractive import build_centred_pupil
+from tests.numerics import SOMEWHERE
 
 ABOUT = '[instrument]\nname = "bench"\ndiameter_m = 8.0\nstop = "telescope"\n'
 WFS = (
@@ -1107,3 +1119,328 @@ def test_positions_in_another_unit_are_named(write, tmp_path, factor, unit):
     words = refusal(load_instrument, write(ABOUT + APART + mirror + MODES))
     assert f"pupil diameters: they look like {unit}" in words
     assert "metres in the pupil plane: about diameter_m = 8" in words
+
+
+# --- measured influence functions that end: known near their actuators, seen as whole ones are
+
+
+N_ACROSS, N_TABLE, DIAMETER_M = 17, 84, 3.0
+PITCH_M, STEP_M = DIAMETER_M / 16, 1.15 * DIAMETER_M / N_TABLE
+TABLE = """
+[instrument]
+name = "measured"
+diameter_m = 3.0
+obscuration_ratio = 0.2
+stop = "mirror"
+[wfs]
+kind = "pyramid"
+n_subapertures = 16
+pupil_separation_subap = 20
+wavelength_m = 750e-9
+modulation_lambda_over_d = 3.0
+[mirror]
+"""
+WHOLE = 'influence_functions = "ifs.h5:/cube"\n'
+LOCAL_CROPPED = """influence_functions = "ifs.h5:/crops"
+influence_origin = "ifs.h5:/origin"
+influence_table = [84, 84]
+"""
+ZONAL, MODAL = 'basis = "zonal"\n', 'mode_to_actuator = "ifs.h5:/m2c"\n'
+SIDE = 35
+
+
+def functions(hole=False):
+    """289 functions that end at 2.9 pitches; with a hole nothing is known of the middle."""
+    line_m = (np.arange(N_TABLE) - (N_TABLE - 1) / 2) * STEP_M
+    actuators_m = (np.arange(N_ACROSS) - (N_ACROSS - 1) / 2) * PITCH_M
+    y, x = np.meshgrid(actuators_m, actuators_m, indexing="ij")
+    along_y, along_x = ((line_m - at.reshape(-1, 1)) / PITCH_M for at in (y, x))
+    squared = along_y[:, :, None] ** 2 + along_x[:, None, :] ** 2
+    found = 0.35**squared * (squared < 2.9**2)
+    if hole:
+        found[:, np.hypot(line_m[:, None], line_m) < 0.25] = 0.0
+    return found
+
+
+def cropped(cube):
+    """Return crops about the middle of each function, and where each begins."""
+    middle = np.rint([np.argwhere(one).mean(axis=0) for one in cube]).astype(int)
+    origin = middle - SIDE // 2
+    around = np.pad(cube, ((0, 0), (SIDE, SIDE), (SIDE, SIDE)))
+    crops = [
+        one[r + SIDE : r + 2 * SIDE, c + SIDE : c + 2 * SIDE]
+        for one, (r, c) in zip(around, origin, strict=True)
+    ]
+    return np.array(crops), origin
+
+
+@pytest.fixture(scope="module")
+def loaded(tmp_path_factory):
+    """Return an instrument of a file's mirror, its functions local, or not."""
+    folder = tmp_path_factory.mktemp("measured")
+    cube = functions()
+    patches, origin = cropped(cube)
+    with h5py.File(folder / "ifs.h5", "w") as file:
+        file["cube"], file["holed"] = cube, functions(hole=True)
+        file["crops"], file["origin"] = patches, origin
+        file["m2c"] = np.random.default_rng(1).normal(size=(len(cube), 250))
+        file["wide"] = cube + 1e-3
+
+    def load(mirror, local=True):
+        path = folder / "bench.toml"
+        path.write_text(f"{TABLE}modes_pitch_m = {STEP_M}\n{mirror}")
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(crops, "_MIN_CROPPED_FUNCTIONS", 0 if local else np.inf)
+            return load_instrument(path)
+
+    return load
+
+
+def model(instrument):
+    return InteractionModel(
+        instrument, modal_basis(instrument), pupil_sampling=2, detector_nodes=2, dtype=np.float64
+    )
+
+
+def apart(one, other):
+    return np.linalg.norm(one - other, axis=-2).max() / np.linalg.norm(other, axis=-2).max()
+
+
+@pytest.mark.parametrize(
+    "given", [WHOLE + ZONAL, LOCAL_CROPPED + MODAL, WHOLE + "parity = -1\n" + MODAL]
+)
+def test_d_and_its_derivatives_are_those_of_whole_tables(loaded, given, monkeypatch):
+    # a mirror this small is drawn as a dense array, which is quicker
+    monkeypatch.setattr(interaction, "_MAX_DENSE_PRODUCT", 0.0)
+    ending, whole = (model(loaded(given, local)) for local in (True, False))
+    assert (ending.instrument.mirror.cube, whole.instrument.mirror.local) == (None, None)
+    assert isinstance(ending._render_modes(SOMEWHERE), LocalShapes)
+    found, expected = ending.linearise(SOMEWHERE), whole.linearise(SOMEWHERE)
+    assert apart(found.matrix, expected.matrix) < 3e-6
+    assert apart(found.rates, expected.rates) < 3e-6
+
+
+def test_beyond_what_is_known_the_surface_goes_on_as_that_of_a_whole_table(loaded):
+    given = WHOLE.replace("cube", "holed") + ZONAL
+    ending, whole = (modal_basis(loaded(given, local)) for local in (True, False))
+    points = np.random.default_rng(2).uniform(-9.0, 9.0, (400, 2))
+    np.testing.assert_array_equal(ending.known(points), whole.known(points))
+    assert not whole.known(points).all()
+    np.testing.assert_allclose(ending.render(points), whole.render(points), atol=5e-6)
+    away = np.tile([0.3, -0.7], (400, 1))
+    slopes = whole.render_slope(points, away)
+    np.testing.assert_allclose(ending.render_slope(points, away), slopes, atol=2e-5)
+
+
+def test_turbulence_moves_the_modes_as_much(loaded):
+    ending, whole = (modal_basis(loaded(WHOLE + MODAL, local)) for local in (True, False))
+    np.testing.assert_allclose(ending.variance_m2, whole.variance_m2, rtol=2e-3)
+    some = ending.subset([3, 5])
+    np.testing.assert_allclose(some.render(np.eye(2)), ending.render(np.eye(2))[:, [3, 5]])
+
+
+def test_functions_that_cover_the_table_stay_a_table(loaded):
+    instrument = loaded(WHOLE.replace("cube", "wide") + ZONAL)
+    assert instrument.mirror.local is None
+    assert len(instrument.mirror.cube) == instrument.modes.n_modes == N_ACROSS**2
+
+
+def test_what_ends_is_another_file_than_what_does_not_and_takes_less(loaded):
+    ending, whole = (loaded(WHOLE + MODAL, local) for local in (True, False))
+    assert instrument_sha256(ending) != instrument_sha256(whole)
+    assert ending.mirror.n_modes == whole.mirror.n_modes == 250
+    needed = [work_of(one, model(one).sensor, model(one).pupil) for one in (ending, whole)]
+    assert needed[0].memory_bytes < needed[1].memory_bytes
+
+
+# --- pupils of instrument files: maps and spiders, and the one line that says what is wrong
+
+
+REST = """
+[wfs]
+kind = "pyramid"
+n_subapertures = 20
+pupil_separation_subap = 24
+wavelength_m = 750e-9
+modulation_lambda_over_d = 3.0
+
+[mirror]
+layout = "grid"
+n_across = 11
+pitch_m = 0.8
+diameter_m = 8.8
+
+[modes]
+n_modes = 50
+"""
+
+
+def ring(n=160, hole=0.25):
+    u = (np.arange(n) - (n - 1) / 2) * 2 / n
+    radius = np.hypot(u, u[:, None])
+    return ((radius <= 1.0) & (radius >= hole)).astype(float)
+
+
+@pytest.fixture
+def bench(tmp_path):
+    def _bench(keys="", lit=None):
+        with h5py.File(tmp_path / "pupil.h5", "w") as file:
+            file["lit"] = ring() if lit is None else lit
+        path = tmp_path / "bench.toml"
+        path.write_text(ABOUT + keys + REST, encoding="utf-8")
+        return load_instrument(path)
+
+    return _bench
+
+
+MAP = 'pupil = "pupil.h5:/lit"\n'
+
+
+def test_a_ring_as_a_map_is_the_ring_but_for_its_points(bench):
+    drawn, mapped = bench("obscuration_ratio = 0.25\n"), bench(MAP)
+    assert mapped.pupil.pitch_m == pytest.approx(8.0 / 160)
+    assert mapped.collecting_area_m2 == pytest.approx(drawn.collecting_area_m2, rel=2e-3)
+    both = [instrument_pupil(instrument, 3).amplitude for instrument in (drawn, mapped)]
+    assert np.abs(both[0] - both[1]).max() < 0.2
+    assert both[1].sum() == pytest.approx(both[0].sum(), rel=2e-3)
+    assert (lit_subapertures(drawn) == lit_subapertures(mapped)).all()
+
+
+@pytest.mark.parametrize("name", ["pupil.fits", "pupil.npy"])
+def test_a_map_may_be_a_fits_image_or_a_numpy_file(bench, tmp_path, name):
+    if name.endswith("npy"):
+        np.save(tmp_path / name, ring().astype(np.uint8))
+    else:
+        fits.writeto(tmp_path / name, ring().astype(">f4"))
+    assert (bench(f'pupil = "{name}"\n').pupil.lit == ring()).all()
+
+
+def test_a_map_keeps_its_axes(bench):
+    """[y, x]: dark at low rows is dark at low y, in the model and in the simulator's own pupil."""
+    lit = ring()
+    lit[:60, 80:] = 0.0
+    instrument = bench(MAP, lit)
+    for pupil in (instrument_pupil(instrument, 2), build_centred_pupil(instrument, 2)):
+        n = len(pupil.amplitude)
+        low_y_high_x = pupil.amplitude[: n // 4, 3 * n // 5 :]
+        assert low_y_high_x.max() < 1e-9
+        assert pupil.amplitude[3 * n // 4 :, 3 * n // 5 :].max() > 0.99
+        area = pupil.amplitude.sum() * (instrument.subaperture_m / pupil.sampling) ** 2
+        assert area == pytest.approx(instrument.collecting_area_m2, rel=5e-3)
+
+
+def test_an_arm_lies_in_its_direction_and_hides_its_width(bench):
+    arms = "obscuration_ratio = 0.2\nspiders_m = 0.4\nspiders_deg = [90.0, 200.0]\n"
+    instrument, open_ = bench(arms), bench("obscuration_ratio = 0.2\n")
+    hidden = open_.collecting_area_m2 - instrument.collecting_area_m2
+    assert hidden == pytest.approx(2 * 0.4 * 3.2)
+    for drawn in (instrument_pupil, build_centred_pupil):
+        pupil, plain = drawn(instrument, 4), drawn(open_, 4)
+        lost = (plain.amplitude - pupil.amplitude).sum() * (0.4 / 4) ** 2
+        assert lost == pytest.approx(hidden, rel=0.01)
+        u = pupil.coordinates
+        x, y = np.meshgrid(u, u)
+        up, down = (np.abs(x) < 0.4) & (y > 3.0) & (y < 8.0), (np.abs(x) < 0.4) & (y < -3.0)
+        assert pupil.amplitude[up].max() < 1e-9
+        assert pupil.amplitude[down & (y > -8.0)].min() > 0.99
+
+
+def test_what_has_neither_has_the_digest_that_it_has_always_had(bench):
+    """Counted before there were maps and arms."""
+    assert instrument_sha256(load_instrument("flao-lbt")) == FLAO
+    digests = {instrument_sha256(bench(keys)) for keys in ("", MAP, ARMS)}
+    assert len(digests) == 3
+
+
+FLAO = "e889ab451b0994e260c9ad7b9989786ecf7da12697f57f43031e3ec1787b2648"
+ARMS = "spiders_m = 0.4\nspiders_deg = [90.0]\n"
+
+
+@pytest.mark.parametrize(
+    ("keys", "lit", "expected"),
+    [
+        (MAP, np.ones((2, 3, 4)), "instrument.pupil: found shape (2, 3, 4), expected (ny, nx)"),
+        (MAP, 2 * ring(), "found values that are not 0 to 1"),
+        (MAP, np.full((160, 160), np.nan), "found values that are not 0 to 1"),
+        (MAP, np.zeros((160, 160)), "found no lit point, expected a pupil of 8 m"),
+        (MAP + "pupil_pitch_m = 50.0\n", ring(), "pupil_pitch_m: found 50 m between points"),
+        (MAP + "pupil_pitch_m = 0.03\n", ring(), "found light over 4.8 m along y, expected about"),
+        (MAP, np.pad(ring(140), ((0, 20), (10, 10))), "m from the centre of the array along y"),
+        (MAP, ring(12), "pupil_pitch_m: found 0.667 m between points, expected at most a suba"),
+        (MAP + "obscuration_ratio = 0.1\n", ring(), "obscuration_ratio: has no effect"),
+        (MAP + ARMS, ring(), "spiders_m: has no effect"),
+        ("pupil_pitch_m = 0.05\n", ring(), "has no meaning without instrument.pupil"),
+        (
+            "spiders_m = 0.4\n",
+            ring(),
+            "instrument.spiders_deg: missing",
+        ),
+        ("spiders_deg = [3.0]\n", ring(), "instrument.spiders_m: missing"),
+        ('pupil = "pupil.h5"\n', ring(), "expected path:/dataset of an HDF5 file, path.fits:EXTN"),
+        ('pupil = "none.npy"\n', ring(), "none.npy"),
+    ],
+)
+def test_a_pupil_that_cannot_be_is_refused_in_one_line(bench, keys, lit, expected):
+    with pytest.raises(ConfigurationError) as refused:
+        bench(keys, lit)
+    assert expected in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+# --- segmented mirrors of instrument files, and the instruments of the ELT
+
+
+@pytest.mark.long
+def test_the_packaged_instruments_of_the_elt_are_what_their_sources_say():
+    """Of Deo et al. 2021, table 2, 6020 valid subapertures: 3 % more than behind our spider."""
+    metis, micado = load_instrument("metis-elt"), load_instrument("micado-elt")
+    assert (metis.wfs.n_subapertures, metis.wfs.pupil_separation_subap) == (90, 108)
+    assert (micado.wfs.n_subapertures, micado.wfs.wavelength_m) == (92, 658e-9)
+    assert micado.slopes.kind.n_planes * valid_subapertures(micado).sum() == pytest.approx(
+        24_080, rel=0.03
+    )
+    for elt in (metis, micado):
+        assert elt.diameter_m == pytest.approx(512 * 0.0762, rel=1e-3)
+        assert (elt.mirror.pitch_m, elt.mirror.shape.coupling) == (0.54, 0.24)
+        assert len(elt.mirror.positions_m) == 4410
+        assert elt.spiders_deg == elt.mirror.segments_deg
+        assert (elt.modes.n_modes, elt.loop.frame_rate_hz, elt.loop.delay_frames) == (4300, 500, 2)
+        assert [remark.split(": ")[1] for remark in elt.remarks] == ["mirror.segments_deg"]
+
+
+@pytest.mark.parametrize(("name", "sources"), [("metis-elt", "SOFD"), ("micado-elt", "SOD")])
+def test_every_value_of_the_packaged_instruments_of_the_elt_names_its_source(name, sources):
+    lines = packaged_file(name).read_text(encoding="utf-8").splitlines()
+    values = [line for line in lines if "=" in line and not line.startswith("#")]
+    named = re.compile(rf"# (\[[{sources}]\]|assumed)")
+    assert [value for value in values if not named.search(value)] == [f'name = "{name}"']
+
+
+SEGMENTED = MIRROR + 'influence = "gaussian"\n'
+
+
+@pytest.mark.parametrize(
+    ("keys", "complaint"),
+    [
+        ("segments_deg = [10.0]\n", "expected at least two gaps"),
+        ("segments_deg = [10.0, 370.0]\n", "expected at least two gaps"),
+        ("segments_deg = [10.0, 10.001]\n", "actuators in 1 segments"),
+    ],
+)
+def test_segments_that_cannot_be_are_refused(write, keys, complaint):
+    assert complaint in refusal(load_instrument, write(ABOUT + WFS + SEGMENTED + keys))
+
+
+def test_segments_belong_to_functions_that_end(write):
+    complaint = refusal(
+        load_instrument, write(ABOUT + WFS + MIRROR + "segments_deg = [0.0, 180.0]\n")
+    )
+    assert 'mirror.segments_deg: belongs to influence = "gaussian"' in complaint
+
+
+def test_no_actuator_of_a_grid_stands_on_a_gap(write):
+    """Of 11 x 11 on a circle the middle row goes, 11 of 97."""
+    keys = "segments_deg = [0.0, 180.0]\n"
+    positions = load_instrument(write(ABOUT + WFS + SEGMENTED + keys)).mirror.positions_m
+    assert np.abs(positions[:, 1]).min() == pytest.approx(0.8)
+    assert len(positions) == len(grid(11, 0.8, 8.8)) - 11

@@ -55,11 +55,11 @@ TESTS = {
         "test_the_number_of_modes_waits_for_a_matrix_of_that_shape",
     ),
     55: (
-        f"{COMPUTER}/test_gains_loop.py",
+        f"{COMPUTER}/test_gains.py",
         "test_while_one_runs_another_is_refused_and_so_is_what_would_spoil_it",
     ),
     60: (
-        f"{COMPUTER}/test_gains_loop.py",
+        f"{COMPUTER}/test_gains.py",
         "test_opening_the_loop_ends_it_with_what_is_chosen_and_what_was_there",
     ),
     64: (

@@ -5,9 +5,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from service.errors import CommandError
 from service.tracker import REACTIONS, TAKEN_BY_OPERATIONS, step
-from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.events import Event
 from service.tracking.products import MatrixState
@@ -22,7 +20,6 @@ from tests.unit.tracking.situations import (
     moved,
     of_kind,
     rtc,
-    verdict,
 )
 
 
@@ -54,17 +51,6 @@ def test_the_main_job_in_auto():
     ]
     assert not story.alarms
     assert story.state.alpha.registration.alpha == ALPHA
-
-
-def test_in_propose_nothing_is_sent_until_the_operator_has_spoken():
-    story = Story(Mode.PROPOSE).meet()
-    story.see(n_windows=10)
-    story.make("cm-1")
-    story.see(n_windows=30)
-    assert not story.asked(ev.SendMatrix)
-    apply_what_is_sent(story, story.tell(cmd.Approve(id="cm-1")), 400)
-    assert story.state.matrices.in_use == "cm-1"
-    assert len(story.asked(ev.SendMatrix)) == 1
 
 
 def test_after_a_jump_the_loop_gets_a_reconstructor_for_the_new_place():
@@ -109,17 +95,6 @@ def test_a_restarted_service_knows_the_matrix_it_once_made():
     assert again.state.reconstructor("cm-1").parent == "initial"
 
 
-def test_a_loop_that_diverges_stops_everything_and_is_named():
-    story = Story(Mode.AUTO).meet()
-    story.see()
-    story.tell(ev.ConditionChanged(name="loop-diverging", text="open the loop"))
-    assert not story.see(n_windows=5)
-    assert not story.wait(60)
-    assert story.alarms >= {"loop-diverging"}
-    story.tell(ev.ConditionChanged(name="loop-diverging", text="calm", over=True))
-    assert story.state.alpha.registration.n_windows == 1
-
-
 def test_a_step_leaves_the_state_it_was_given_as_it_was():
     story = Story(Mode.AUTO).meet()
     story.see(n_windows=2)
@@ -131,30 +106,6 @@ def test_a_step_leaves_the_state_it_was_given_as_it_was():
     assert (len(before.log), len(before.matrices.reconstructors)) == (n_logged, n_records)
     np.testing.assert_array_equal(before.alpha.registration.covariance, covariance)
     assert before.loop.rtc is not None
-
-
-def test_the_same_night_replays_to_the_same_decisions():
-    def night():
-        story = Story(Mode.AUTO).meet()
-        story.see(n_windows=3)
-        story.make("cm-1")
-        story.acknowledge("cm-1")
-        story.tell(ev.MarginJudged(id="cm-1", verdict=verdict()))
-        story.wait(30)
-        return story
-
-    one, other = night(), night()
-    assert [type(effect) for effect in one.effects] == [type(effect) for effect in other.effects]
-    assert one.state.log == other.state.log
-    assert one.state.alarms.active == other.state.alarms.active
-
-
-def test_a_command_that_is_refused_changes_nothing():
-    story = Story(Mode.PROPOSE)
-    with pytest.raises(CommandError):
-        story.tell(cmd.Rollback())
-    assert story.state.log == ()
-    assert story.state.operator.mode is Mode.PROPOSE
 
 
 def test_there_is_a_reaction_to_every_event_and_command_and_to_nothing_else():

@@ -22,7 +22,7 @@ from service.estimation.lockin import (
     fit_window,
     join_windows,
 )
-from service.estimation.windows import WindowRefused
+from service.estimation.windows import RefusalKind, WindowRefused
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 from tests.numerics import (
@@ -159,20 +159,6 @@ def test_strong_turbulence_far_from_the_lines_stays_out_of_all_bins():
     assert np.sqrt(np.mean(error**2)) < 1e-3 * np.sqrt(np.mean(np.abs(expected) ** 2))
 
 
-@pytest.mark.parametrize("size", [1, 7, 50, 999, 1000, 1001])
-def test_the_split_into_blocks_makes_no_difference(size):
-    """1e-5 of the noise: float32 sums in another order."""
-    block = telemetry()
-    whole = run(block)
-    pieces = run(*(part(block, start, start + size) for start in range(0, 2500, size)))
-    assert len(whole) == len(pieces) == 2
-    for one, other in zip(whole, pieces, strict=True):
-        np.testing.assert_allclose(one.slopes, other.slopes, atol=1e-5 * np.abs(one.slopes).max())
-        np.testing.assert_allclose(one.commands, other.commands, atol=1e-5 * 1e-8 * N_FRAMES)
-        np.testing.assert_allclose(one.dither, other.dither, atol=1e-5 * 1e-8 * N_FRAMES)
-        assert (one.first_seq, one.t_end_ns_utc) == (other.first_seq, other.t_end_ns_utc)
-
-
 def test_windows_follow_one_another_from_the_first_frame_of_the_plan():
     first, second = run(telemetry())
     assert (first.first_seq, second.first_seq) == (100, 1100)
@@ -219,7 +205,7 @@ def test_five_per_cent_missing_is_the_most_a_window_takes():
     assert isinstance(spectra, Spectra)
     assert spectra.n_missing == 50
     refused = run(*without(telemetry(1600), 500, 551))[0]
-    assert "51 of 1000 frames missing, more than 5%: check the link" in refused.reason
+    assert "51 of 1000 frames missing" in refused.reason
 
 
 def test_many_small_gaps_add_up_to_a_refusal():
@@ -266,7 +252,9 @@ def test_after_a_refusal_a_new_window_begins_at_the_change():
 def test_a_dither_that_ends_inside_a_window_is_named():
     block = telemetry(1100)
     ended = replace(part(block, 600, 1100), dither_m=None)
-    assert "the dither ended inside the window" in only_refusal(part(block, 0, 600), ended).reason
+    refused = only_refusal(part(block, 0, 600), ended, replace(ended, first_seq=1100))
+    assert "the dither ended inside the window" in refused.reason
+    assert refused.kind is RefusalKind.CUT_SHORT
 
 
 def test_after_a_dither_that_ended_nothing_is_demodulated_until_it_is_back():

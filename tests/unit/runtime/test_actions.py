@@ -15,7 +15,6 @@ from service.wire import (
     DitherStop,
     Loop,
     LoopRequest,
-    RampRequest,
     checksum,
     layout_of,
 )
@@ -279,13 +278,6 @@ async def test_the_loop_is_changed_as_asked_and_the_answer_is_the_event(actions,
     assert (event.reply.accepted, event.reply.reason) == (False, "busy: im-1")
 
 
-async def test_a_ramp_is_asked_for_as_it_is(actions, bridge):
-    ramp = RampRequest(id="ramp-1", groups=((0, 1), (2, 9)), gains=(0.2, 0.4), frames_per_gain=50)
-    event = await actions.perform(ev.Ask(request=ramp), STATE)
-    assert (event.request, event.reply.accepted) == (ramp, True)
-    assert bridge.commands == [ramp]
-
-
 class TestDither:
     DITHER = DitherRequest(
         id="dither-1",
@@ -301,11 +293,6 @@ class TestDither:
         assert event.request == self.DITHER
         assert (event.reply.accepted, event.reply.start_seq) == (True, 77)
         assert bridge.commands == [self.DITHER]
-
-    async def test_a_refusal_is_an_answer_too(self, actions, bridge):
-        bridge.refusal = "busy: measuring"
-        event = await actions.perform(ev.Ask(request=self.DITHER), STATE)
-        assert (event.reply.accepted, event.reply.reason) == (False, "busy: measuring")
 
     async def test_stopping_needs_only_an_id(self, actions, bridge):
         stop = DitherStop(id="stop-1")

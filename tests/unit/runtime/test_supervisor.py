@@ -255,22 +255,6 @@ async def test_an_acquisition_is_saved_at_once_and_not_when_alpha_next_would_be(
         assert in_time(began, 0.5)
 
 
-async def test_an_order_is_on_the_disk_before_a_service_that_is_killed_could_forget_it(
-    supervisor, archive, monkeypatch
-):
-    monkeypatch.setattr("service.runtime.archiving.SAVE_INTERVAL_S", 1.0)
-    async with running(supervisor):
-        known = told(Story(Mode.HOLD).meet(), n_windows=1)
-        know(supervisor, registration=known)
-        await until(lambda: archive.tracking.read() is not None)
-        began = time.monotonic()
-        await supervisor.submit(cmd.StopDither())
-        await until(lambda: archive.tracking.read().orders is not None)
-        assert in_time(began, 0.5)
-    again = tracker_state(system="small", mode=Mode.AUTO)
-    assert restore_tracking(archive, again, POLICY, time.time_ns()).dithers.stopped
-
-
 def told(story, n_windows):
     story.see(n_windows=n_windows)
     return story.state.alpha.registration

@@ -1,19 +1,34 @@
 """The heavy work on a small instrument."""
 
+from __future__ import annotations
+
 from dataclasses import replace
+from functools import cache, cached_property
 
 import numpy as np
 import pytest
 
+from pyrcal_studies.campaign.observatory import OwnHands
 from service.control.dither import COARSE_BAND, FINE_BAND, spread_lines, spread_modes
+from service.errors import ModelError, UnknownIdError
 from service.estimation import passive
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import LockIn, LockInPlan, Spectra
 from service.estimation.openloop import WideCaptureEstimate
+from service.estimation.slope_convention import identify_from_response
 from service.estimation.windows import ClosedLoop, RefusalKind, WindowRefused
-from service.model.interaction import RtcInteractionModel
+from service.model.interaction import InteractionModel, RtcInteractionModel
+from service.model.kinds import Normalisation, SlopeOrder
 from service.model.misregistration import Misregistration
+from service.model.modes import modal_basis
+from service.model.pupil import rtc_valid_subapertures
+from service.model.sensors.pyramid.description import FrameWindows
+from service.model.slopes import Orientation, SlopeRecipe, to_rtc
+from service.runtime.estimates import read_own_matrix
 from service.runtime.worker import OpticsWorker, run_job
+from service.tracking.events import ModesRecognised
+from service.tracking.products import MatrixState, ReconstructorRecord
+from tests.states import tracker_state
 from tests.unit.estimation.lamps import counts_of
 from tests.unit.runtime.small import (
     COMPUTE,
@@ -267,3 +282,465 @@ def test_light_saves_steps_and_changes_nothing(bench):
 def test_noise_alone_is_no_registration(bench):
     spectra = window(bench, noise=30.0)
     assert isinstance(bench.find(spectra, None, None), WindowRefused)
+
+
+# --- RTCs with an order, axes, signs and a mounting of their own
+
+
+NOMINAL_RAD = np.deg2rad(64.5)
+DIALECT_ALPHA = Misregistration(
+    shift_x_subap=0.12,
+    shift_y_subap=-0.08,
+    rotation_rad=NOMINAL_RAD + 0.01,
+    magnification=1.003,
+)
+RECIPE = SlopeRecipe(
+    order=SlopeOrder.INTERLEAVED,
+    orientation=Orientation(swap_xy=True, flip_y=True, sign_x=-1),
+    normalisation=Normalisation.LOCAL,
+)
+
+
+@pytest.fixture(scope="module")
+def instrument():
+    small = small_instrument()
+    mirror = replace(small.mirror, nominal_rotation_rad=NOMINAL_RAD)
+    return replace(small, slopes=RECIPE, mirror=mirror)
+
+
+@pytest.fixture(scope="module")
+def answering_bench(instrument):
+    return OpticsWorker(instrument, COMPUTE)
+
+
+@pytest.fixture(scope="module")
+def seen(instrument):
+    """The true matrix as such an RTC sees it, from the model in the conventions' axes."""
+    model = InteractionModel(instrument, modal_basis(instrument))
+    matrix = model.interaction_matrix(DIALECT_ALPHA)
+    mask = rtc_valid_subapertures(instrument)
+    return to_rtc(matrix, RECIPE, mask)
+
+
+class Sensor:
+    """What ``dithered_window`` asks a workbench for."""
+
+    def __init__(self, matrix):
+        self._model = self
+        self._matrix = matrix
+
+    def interaction_matrix(self, _alpha):
+        return self._matrix
+
+
+def test_its_telemetry_gives_the_registration_from_the_nominal_rotation(answering_bench, seen):
+    reconstructor = answering_bench.make(
+        conditions(DIALECT_ALPHA, np.diag(SIGMA**2), loop_settings(), 0.95)
+    ).matrix
+    answering_bench.describe()
+    estimate = answering_bench.fit(
+        dithered_window(Sensor(seen), DIALECT_ALPHA), open_loop(reconstructor), None
+    )
+    error = estimate.alpha.vector - DIALECT_ALPHA.vector
+    sigma = np.sqrt(np.diag(estimate.covariance))
+    assert np.all(np.abs(error) < 4 * sigma + 2e-4)
+
+
+def test_its_reconstructor_takes_slopes_as_it_lists_them(answering_bench, seen):
+    made = answering_bench.make(conditions(DIALECT_ALPHA, np.diag(SIGMA**2), loop_settings(), 0.95))
+    product = made.matrix @ seen[:, :N_CONTROLLED]
+    np.testing.assert_allclose(product, np.eye(N_CONTROLLED), atol=1e-3)
+    assert made.gate.accepted
+
+
+def test_what_can_only_be_fitted_offline_is_refused(instrument):
+    unknown = replace(instrument, mirror=replace(instrument.mirror, stroke_known=False))
+    with pytest.raises(ModelError, match=r"found mirror\.stroke = unknown"):
+        OpticsWorker(unknown, COMPUTE)
+    with pytest.raises(ModelError, match=r"found wfs\.input = frames"):
+        OpticsWorker(replace(instrument, frames=FrameWindows()), COMPUTE)
+
+
+ALPHA_SMALL = replace(DIALECT_ALPHA, rotation_rad=0.004)
+
+
+@cache
+def matrix_at(alpha):
+    """The small instrument's, in the conventions' axes."""
+    small = small_instrument()
+    return InteractionModel(small, modal_basis(small)).interaction_matrix(alpha)
+
+
+class Mistold:
+    """A workbench whose instrument file says another listing of the slopes than the RTC's."""
+
+    def __init__(self, order="xy", **axes):
+        self.setting = SlopeRecipe(order=SlopeOrder(order), orientation=Orientation(**axes))
+        mask = rtc_valid_subapertures(small_instrument())
+        self.seen = to_rtc(matrix_at(ALPHA_SMALL), self.setting, mask)
+        at_rest = to_rtc(matrix_at(Misregistration()), self.setting, mask)
+        self.own = np.linalg.pinv(at_rest[:, :N_CONTROLLED]).astype(np.float32)
+
+    @cached_property
+    def told(self):
+        slopes = SlopeRecipe(orientation=Orientation())
+        return OpticsWorker(replace(small_instrument(), slopes=slopes), COMPUTE)
+
+    @cached_property
+    def auto(self):
+        return OpticsWorker(small_instrument(), COMPUTE)
+
+
+@pytest.mark.parametrize(
+    ("axes", "named"),
+    [
+        ({"sign_x": -1, "sign_y": -1}, "orientation.sign = -1"),
+        ({"order": "yx"}, 'slopes.order = "yx"'),
+        ({"flip_x": True}, "orientation.flip_x = true"),
+        ({"swap_xy": True, "flip_y": True}, "orientation.swap_xy = true, orientation.flip_y"),
+    ],
+)
+def test_another_listing_of_the_slopes_than_told_is_named_by_the_rtcs_own_matrix(axes, named):
+    rtc = Mistold(**axes)
+    dialect = rtc.told.read_slope_convention(rtc.own, None)
+    assert named in dialect.wrong
+    assert dialect.found == rtc.setting
+    assert not dialect.adopted
+
+
+def test_slopes_of_the_other_sign_are_named_by_the_answer_to_the_dither():
+    rtc = Mistold(sign_x=-1, sign_y=-1)
+    window = dithered_window(Sensor(rtc.seen), ALPHA_SMALL)
+    refused = rtc.told.fit(window, open_loop(rtc.own), None)
+    assert refused.kind is RefusalKind.MISTOLD
+    assert "slopes have the other sign" in refused.reason
+    assert "orientation.sign = -1" in refused.reason
+
+
+def test_slopes_in_another_order_are_named_by_the_answer_to_the_dither():
+    rtc = Mistold(order="interleaved")
+    window = dithered_window(Sensor(rtc.seen), ALPHA_SMALL)
+    refused = rtc.told.fit(window, open_loop(rtc.own), None)
+    assert refused.kind is RefusalKind.MISTOLD
+    assert 'slopes.order = "interleaved"' in refused.reason
+
+
+def test_slopes_two_frames_late_are_not_taken_for_slopes_of_the_other_sign():
+    rtc = Mistold()
+    window = dithered_window(Sensor(rtc.seen), ALPHA_SMALL)
+    turns = 2 * np.pi * np.array(window.plan.bins_hz) / window.plan.frame_rate_hz
+    late = window.slopes * np.exp(-2j * turns)[:, :, None]
+    outcome = rtc.told.fit(replace(window, slopes=late), open_loop(rtc.own), None)
+    assert getattr(outcome, "kind", None) is not RefusalKind.MISTOLD
+
+
+def test_an_orientation_left_open_is_found_in_the_rtcs_own_matrix_and_taken_over():
+    rtc = Mistold(order="yx", flip_y=True, sign_x=-1)
+    dialect = rtc.auto.read_slope_convention(rtc.own, None)
+    assert dialect.adopted
+    assert dialect.found == rtc.setting
+    made = rtc.auto.make(conditions(ALPHA_SMALL, np.diag(SIGMA**2), loop_settings(), 0.95))
+    product = made.matrix @ rtc.seen[:, :N_CONTROLLED]
+    np.testing.assert_allclose(product, np.eye(N_CONTROLLED), atol=1e-3)
+
+
+def test_a_matrix_that_no_orientation_explains_leaves_nothing_to_take_over():
+    rtc = Mistold()
+    noise = np.random.default_rng(1).normal(size=rtc.own.shape).astype(np.float32)
+    dialect = rtc.auto.read_slope_convention(noise * np.abs(rtc.own).mean(), None)
+    assert "no orientation explains" in dialect.wrong
+    assert dialect.found is None
+
+
+@pytest.mark.parametrize(
+    ("metres", "named"),
+    [(1e-9, "nanometres"), (2.0, "surface")],
+)
+def test_commands_in_another_unit_are_named_by_the_rtcs_own_matrix(metres, named):
+    rtc = Mistold()
+    dialect = rtc.told.read_slope_convention((rtc.own / metres).astype(np.float32), None)
+    assert named in dialect.wrong
+
+
+@pytest.mark.parametrize("ratio", [1.9, 3.2])
+def test_a_modulation_that_is_too_large_may_be_why_the_own_matrix_expects_more(ratio):
+    """A pyramid's response grows as its modulation shrinks, as if light met the mirror twice."""
+    rtc = Mistold()
+    wrong = rtc.told.read_slope_convention((rtc.own / ratio).astype(np.float32), None).wrong
+    assert "modulation_lambda_over_d" in wrong
+
+
+def test_commands_in_another_unit_are_named_by_the_answer_to_the_dither():
+    rtc = Mistold()
+    window = dithered_window(Sensor(rtc.seen), ALPHA_SMALL)
+    in_nm = replace(window, commands=window.commands * 1e9, dither=window.dither * 1e9)
+    refused = rtc.told.fit(in_nm, open_loop(rtc.own), None)
+    assert refused.kind is RefusalKind.MISTOLD
+    assert "nanometres" in refused.reason
+
+
+def test_what_is_as_told_is_not_complained_of():
+    rtc = Mistold()
+    for answering_bench in (rtc.told, rtc.auto):
+        assert not answering_bench.read_slope_convention(rtc.own, None).wrong
+        found = answering_bench.fit(
+            dithered_window(Sensor(rtc.seen), ALPHA_SMALL), open_loop(rtc.own), None
+        )
+        assert np.all(np.abs(found.alpha.vector - ALPHA_SMALL.vector) < 0.01)
+
+
+def told_upright():
+    return replace(small_instrument(), slopes=SlopeRecipe(orientation=Orientation()))
+
+
+def seen_mirrored():
+    """The small matrix, as it is and as an RTC with y counted downwards lists it, by mode."""
+    mask, mirrored = rtc_valid_subapertures(small_instrument()), Orientation(flip_y=True)
+    matrix = matrix_at(Misregistration())
+    upright = to_rtc(matrix, SlopeRecipe(orientation=Orientation()), mask)
+    return upright.T, to_rtc(matrix, SlopeRecipe(orientation=mirrored), mask).T
+
+
+def parities(upright, other):
+    """How each mode correlates with itself, y counted the other way."""
+    size = np.linalg.norm(upright, axis=1) * np.linalg.norm(other, axis=1)
+    return np.sum(upright * other, axis=1) / size
+
+
+def test_one_mode_of_the_other_sign_is_not_taken_for_other_axes():
+    """Three modes look the same with y counted downwards, the fourth is turned over by it."""
+    upright, other = seen_mirrored()
+    alike = parities(upright, other)
+    modes = [*np.argsort(alike)[-3:], np.argmin(alike)]
+    expected = upright[modes].astype(complex)
+    slopes = expected * np.array([1.0, 1.0, 1.0, -1.0])[:, None]
+    noise = np.random.default_rng(3).normal(size=(3, expected.shape[1]))
+    slopes[:3] += 0.75 * noise * np.sqrt(np.mean(np.abs(expected[:3]) ** 2, axis=1))[:, None]
+    assert identify_from_response(slopes, expected, np.zeros(4), told_upright()).wrong == ""
+
+
+def test_axes_that_turn_half_of_the_modes_over_are_named():
+    upright, other = seen_mirrored()
+    alike = parities(upright, other)
+    modes = [*np.argsort(alike)[-2:], *np.argsort(alike)[:2]]
+    expected = upright[modes].astype(complex)
+    found = identify_from_response(
+        other[modes].astype(complex), expected, np.zeros(4), told_upright()
+    )
+    assert "orientation.flip_y = true" in found.wrong
+
+
+# --- what the RTC's own matrix tells of its modes goes into every matrix that is made from then
+
+
+@pytest.fixture
+def plain_bench():
+    return OpticsWorker(small_instrument(), COMPUTE)
+
+
+def made_by(plain_bench):
+    return plain_bench.make(conditions(ALPHA, np.diag(SIGMA**2), loop_settings(), 0.95))
+
+
+def own(plain_bench, scale):
+    """The RTC's matrix by day, elsewhere, for modes that answer so many times as drawn."""
+    response = plain_bench.response(Misregistration())[:, :N_CONTROLLED].astype(float)
+    return np.linalg.pinv(response * scale).astype(np.float32)
+
+
+@pytest.mark.parametrize("scale", [0.5, np.where(np.arange(N_CONTROLLED) == 10, 3.0, 1.0)])
+def test_a_matrix_acts_as_strongly_as_the_rtcs_own(plain_bench, scale):
+    theirs, plain = own(plain_bench, scale), made_by(plain_bench)
+    truth = plain_bench.response(ALPHA)[:, :N_CONTROLLED] * scale
+    found, response = plain_bench.recognise(theirs, None, None)
+    assert found.wrong == ""
+    np.testing.assert_allclose(response[:N_CONTROLLED], scale * np.ones(N_CONTROLLED), rtol=0.02)
+    made = made_by(plain_bench)
+    np.testing.assert_allclose(np.diag(made.matrix @ truth), 1.0, atol=0.02)
+    # judged with the response it has, the loop is the one of before
+    assert made.gate.worst_pole_radius == pytest.approx(plain.gate.worst_pole_radius, abs=5e-3)
+
+
+def test_telemetry_is_then_compared_with_that_response(plain_bench):
+    window = dithered_window(plain_bench, ALPHA, gain=0.5)
+    reconstructor = own(plain_bench, 0.5)
+    plain_bench.recognise(reconstructor, None, None)
+    estimate = plain_bench.fit(window, open_loop(reconstructor), None)
+    np.testing.assert_allclose(np.abs(estimate.optical_gain), 1.0, atol=0.05)
+    sigma = np.sqrt(np.diag(estimate.covariance))
+    assert np.all(np.abs(estimate.alpha.vector - ALPHA.vector) < 4 * sigma + 2e-4)
+
+
+def test_a_matrix_that_answers_as_drawn_changes_nothing(plain_bench):
+    before = plain_bench.response(ALPHA)
+    found, response = plain_bench.recognise(own(plain_bench, 1.05), None, None)
+    assert response is None
+    assert found.known.all()
+    np.testing.assert_array_equal(plain_bench.response(ALPHA), before)
+
+
+def test_nothing_is_taken_over_from_a_matrix_of_other_modes(plain_bench):
+    turned = np.where(np.arange(N_CONTROLLED) == 10, -0.5, 0.5)
+    found, response = plain_bench.recognise(own(plain_bench, turned), None, None)
+    assert "mode 10 has the other sign" in found.wrong
+    assert response is None
+
+
+def test_a_new_worker_is_told_what_the_last_one_found(plain_bench):
+    _, response = plain_bench.recognise(own(plain_bench, 0.5), None, None)
+    another = OpticsWorker(small_instrument(), COMPUTE)
+    another.adopt(None, response)
+    np.testing.assert_allclose(another.response(ALPHA), plain_bench.response(ALPHA), rtol=1e-5)
+
+
+def test_a_new_worker_judges_loops_with_the_measured_response_too(plain_bench):
+    """What the model does not explain of the RTC's own matrix weakens the loop of its inverse."""
+    rng = np.random.default_rng(4)
+    response = plain_bench.response(Misregistration())[:, :N_CONTROLLED].astype(float)
+    error = rng.standard_normal(response.shape)
+    error *= 0.4 * np.linalg.norm(response, axis=0) / np.linalg.norm(error, axis=0)
+    found, mode_response = plain_bench.recognise(
+        np.linalg.pinv(response + error).astype(np.float32), None, None
+    )
+    another = OpticsWorker(small_instrument(), COMPUTE)
+    plain = made_by(another).gate.worst_pole_radius
+    another.adopt(None, mode_response, None, found.left_over)
+    radius = made_by(plain_bench).gate.worst_pole_radius
+    assert made_by(another).gate.worst_pole_radius == pytest.approx(radius, abs=1e-3)
+    assert radius > plain + 0.01
+
+
+async def test_after_a_restart_the_rtcs_own_matrix_is_read_and_not_the_one_made_of_the_model(
+    plain_bench,
+):
+    """The one in use agrees with the model in everything: it tells nothing of its error."""
+    rng = np.random.default_rng(4)
+    response = plain_bench.response(Misregistration())[:, :N_CONTROLLED].astype(float)
+    error = rng.standard_normal(response.shape)
+    error *= 0.3 * np.linalg.norm(response, axis=0) / np.linalg.norm(error, axis=0)
+    matrices = {
+        "own": np.linalg.pinv(response + error).astype(np.float32),
+        "made": made_by(plain_bench).matrix,
+    }
+    theirs, made = (
+        ReconstructorRecord(
+            id=name,
+            state=MatrixState.APPLIED,
+            n_modes=N_CONTROLLED,
+            created_ns_utc=0,
+            parent=parent,
+        )
+        for name, parent in (("own", None), ("made", "own"))
+    )
+    state = tracker_state(system="small", reconstructors=(theirs, made), in_use="made")
+
+    async def read(known):
+        workers = OwnHands(OpticsWorker(small_instrument(), COMPUTE))
+        found = await read_own_matrix(made, matrices["made"], state, workers, known)
+        return next(event for event in found if isinstance(event, ModesRecognised))
+
+    assert (await read(matrices.__getitem__)).misfit == pytest.approx(0.3, abs=0.03)
+
+    def lost(name):
+        raise UnknownIdError(name)
+
+    assert (await read(lost)).misfit < 0.02
+
+
+N_MORE = 79
+"""Modes of a matrix that controls more than the RTC's own; beyond, the edge would slip."""
+
+
+def a_window_of_free_modes(response, noise=1e-3):
+    """Two seconds of an open loop whose modes 45 to 89 are dithered together."""
+    rng, time = np.random.default_rng(2), np.arange(2000) / 1000.0
+    modes = tuple(range(N_CONTROLLED, 90))
+    lines = tuple(160.0 + 6.0 * k for k in range(len(modes)))
+    dither = np.zeros((len(time), 90), np.float32)
+    for mode, line in zip(modes, lines, strict=True):
+        dither[:, mode] = 1e-9 * np.sqrt(2) * np.sin(2 * np.pi * line * time)
+    scatter = noise * rng.standard_normal((len(time), len(response)))
+    block = FrameBlock(
+        session="s1",
+        first_seq=0,
+        t0_ns_utc=0,
+        dt_ns=1_000_000,
+        slopes=(dither @ response.T + scatter).astype(np.float32),
+        commands_m=dither,
+        dither_m=dither,
+        cm_id="initial",
+    )
+    plan = LockInPlan(
+        modes=modes,
+        frequencies_hz=lines,
+        amplitude_m=(1e-9,) * len(modes),
+        frame_rate_hz=1000.0,
+        n_frames=len(time),
+        first_seq=0,
+    )
+    _, (window,) = LockIn(plan=plan).accumulate(block)
+    return window
+
+
+def test_a_loop_is_judged_with_the_dithered_response_of_modes_that_the_rtc_does_not_control(
+    plain_bench,
+):
+    """The model's error of the modes above those of the RTC's own matrix makes the loop unstable.
+
+    The error of pairs of modes exchanges them in part: each responds as the other, too, with
+    opposite signs, so that the eigenvalues of g R D are about 0.4 (1 ± 1.3 i).
+    """
+    start = Misregistration()
+    model = plain_bench.response(start).astype(float)
+    first, second = np.arange(N_CONTROLLED, 89, 2), np.arange(N_CONTROLLED + 1, 90, 2)
+    truth = model.copy()
+    # Of random sense, because a rotation of the mirror exchanges all pairs in one sense.
+    ratio = 1.3 * np.random.default_rng(3).choice([-1.0, 1.0], len(first))
+    truth[:, first] += ratio * model[:, second]
+    truth[:, second] -= ratio * model[:, first]
+    own = np.linalg.pinv(truth[:, :N_CONTROLLED]).astype(np.float32)
+    found, _ = plain_bench.recognise(own, None, None)
+    assert found.known.all()
+    more = conditions(start, np.diag(SIGMA**2), loop_settings(N_MORE), 0.95)
+    inverse = np.linalg.pinv(model[:, :N_MORE]).astype(np.float32)
+    assert plain_bench.judge(inverse, more).accepted
+    plain_bench.fit(a_window_of_free_modes(truth), open_loop(own), start)
+    verdict = plain_bench.judge(inverse, more)
+    poles = loop_settings(N_MORE).pole_radius(np.linalg.eigvals(0.4 * inverse @ truth[:, :N_MORE]))
+    assert poles.max() > 1.0
+    assert verdict.worst_pole_radius >= poles.max()
+    assert not verdict.accepted
+    # a matrix of the RTC's own modes alone is judged as before
+    fewer = conditions(start, np.diag(SIGMA**2), loop_settings(), 0.95)
+    assert plain_bench.judge(inverse[:N_CONTROLLED], fewer).accepted
+
+
+def test_a_window_of_a_right_model_changes_no_verdict(plain_bench):
+    start = Misregistration()
+    truth = plain_bench.response(start).astype(float)
+    own = np.linalg.pinv(truth[:, :N_CONTROLLED]).astype(np.float32)
+    plain_bench.recognise(own, None, None)
+    more = conditions(start, np.diag(SIGMA**2), loop_settings(N_MORE), 0.95)
+    inverse = np.linalg.pinv(truth[:, :N_MORE]).astype(np.float32)
+    before = plain_bench.judge(inverse, more).worst_pole_radius
+    plain_bench.fit(a_window_of_free_modes(truth), open_loop(own), start)
+    assert plain_bench.judge(inverse, more).worst_pole_radius == pytest.approx(before, abs=0.02)
+
+
+@pytest.mark.parametrize(("error", "counts"), [(0.02, False), (0.3, True)])
+def test_where_the_model_is_poor_the_noise_of_a_dither_counts_as_its_error(
+    plain_bench, error, counts
+):
+    start, rng = Misregistration(), np.random.default_rng(4)
+    truth = plain_bench.response(start).astype(float)
+    part = rng.standard_normal((len(truth), N_CONTROLLED))
+    part *= error * np.linalg.norm(truth[:, :N_CONTROLLED], axis=0) / np.linalg.norm(part, axis=0)
+    truth[:, :N_CONTROLLED] += part
+    plain_bench.recognise(np.linalg.pinv(truth[:, :N_CONTROLLED]).astype(np.float32), None, None)
+    more = conditions(start, np.diag(SIGMA**2), loop_settings(N_MORE), 0.95)
+    inverse = np.linalg.pinv(plain_bench.response(start)[:, :N_MORE]).astype(np.float32)
+    before = plain_bench.judge(inverse, more).worst_pole_radius
+    own = np.zeros((0, len(truth)), np.float32)
+    plain_bench.fit(a_window_of_free_modes(truth, noise=0.1), open_loop(own), start)
+    raised = plain_bench.judge(inverse, more).worst_pole_radius - before
+    assert raised > 0.1 if counts else raised < 0.02

@@ -11,15 +11,17 @@ from hypothesis import given, settings
 from service.errors import CommandError
 from service.estimation.estimate import MODEL_ERROR_VARIANCE_RATIO
 from service.estimation.openloop import WideCaptureEstimate
+from service.estimation.random_dither import RandomEstimate
 from service.estimation.windows import RefusalKind, WindowRefused
 from service.model.misregistration import Misregistration
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.dither_request import total_m
 from service.tracking.filtering import HISTORY_LENGTH
-from service.tracking.products import MatrixState
-from service.tracking.registration import Validity
+from service.tracking.products import MatrixState, ModeSet
+from service.tracking.registration import Source, Validity
 from service.tracking.state import Level, Mode
-from service.wire import Pointing
+from service.wire import DitherKind, DitherRequest, Pointing
 from tests.states import changed
 from tests.unit.tracking.situations import (
     ALPHA,
@@ -481,16 +483,6 @@ def test_misaligned_columns_are_an_alarm_until_a_window_is_good_again(story):
 
 
 @pytest.mark.parametrize(
-    ("alarm", "word"), [("loop-diverging", "diverging"), ("edge-slip", "slipped")]
-)
-def test_telemetry_of_a_loop_out_of_hand_is_no_measurement(story, alarm, word):
-    story.tell(ev.ConditionChanged(name=alarm, text="it is"))
-    story.see()
-    assert story.state.alpha.registration is None
-    assert word in story.state.log[-1].text
-
-
-@pytest.mark.parametrize(
     ("kind", "level"),
     [(RefusalKind.CUT_SHORT, Level.INFO), (RefusalKind.OTHER, Level.WARNING)],
 )
@@ -508,11 +500,89 @@ def test_by_day_a_mirror_seen_twice_shows_twice_the_gain_and_the_window_counts()
     assert story.state.alpha.registration.optical_gain == pytest.approx(1.8)
 
 
-def test_a_window_in_flight_when_the_commands_go_off_the_loop_is_not_good():
+# --- what a window of random dither does to the registration
+
+
+def random_estimate(alpha=ALPHA, *, t_ns=0, n_modes=400, **changes):
+    values = {
+        "alpha": alpha,
+        "covariance": PRECISE,
+        "optical_gain": np.full(n_modes, 0.6),
+        "gain_sigma": np.full(n_modes, 0.04),
+        "lag_frames": np.zeros(1),
+        "misfit": 1.0,
+        "step": np.zeros(4),
+        "t_ns_utc": t_ns,
+        "cm_id": "initial",
+        "session": "s1",
+        "modes": tuple(range(n_modes)),
+    }
+    return RandomEstimate(**(values | changes))
+
+
+def see(story, **changes):
+    story.now_ns += 5_000_000_000
+    return story.tell(ev.WindowFitted(estimate=random_estimate(t_ns=story.now_ns, **changes)))
+
+
+def test_a_window_of_random_dither_enters_the_registration_like_any_other():
     story = Story().meet()
-    story.tell(ev.ConditionChanged(name="commands-off-loop", text="saturated"))
-    story.see()
-    assert story.state.alpha.registration is None
-    story.tell(ev.ConditionChanged(name="commands-off-loop", text="again", over=True))
-    story.see()
-    assert story.state.alpha.registration is not None
+    see(story)
+    known = story.state.alpha.registration
+    np.testing.assert_allclose(known.alpha.vector, ALPHA.vector)
+    assert story.state.alpha.history[-1].source is Source.RANDOM
+    assert known.optical_gain == pytest.approx(0.6)
+
+
+def test_gains_of_hundreds_of_modes_are_kept_as_those_of_a_few_groups():
+    story = Story().meet()
+    see(story)
+    gains = story.state.alpha.registration.optical_gains
+    assert 4 <= len(gains) <= 32
+    assert gains[0].mode < 50 < 350 < gains[-1].mode
+
+
+def test_one_noisy_gain_among_hundreds_is_no_reason_to_refuse_a_window():
+    story = Story().meet()
+    gains = np.full(400, 0.6)
+    gains[7] = -0.2
+    see(story, optical_gain=gains, gain_sigma=np.full(400, 0.3))
+    assert story.state.windows.accepted == 1
+
+
+def test_neighbours_are_averaged_by_their_noise():
+    """Two modes of gain 1 ± 0.1 and 0 ± 0.2: 0.8, ± 0.0894."""
+    pair = random_estimate(
+        n_modes=2, optical_gain=np.array([1.0, 0.0]), gain_sigma=np.array([0.1, 0.2])
+    )
+    modes, gains, sigma = pair.gains_by_group(1)
+    assert modes == (1,)
+    assert gains[0] == pytest.approx(0.8)
+    assert sigma[0] == pytest.approx(1 / np.sqrt(125))
+
+
+def test_a_jump_seen_by_random_signs_needs_a_second_window():
+    story = Story().meet()
+    for _ in range(3):
+        see(story)
+    see(story, alpha=moved(shift_x_subap=0.1))
+    assert story.state.alpha.registration.suspected_jump is not None
+
+
+def test_an_operator_may_dither_every_mode_of_the_basis():
+    story = Story(policy=replace(POLICY, dither_enabled=False)).meet()
+    command = cmd.StartDither(
+        kind=DitherKind.BINARY, modes=ModeSet.ALL, total_amplitude_m=5e-9, duration_s=60.0
+    )
+    (asked,) = of_kind(story.tell(command), DitherRequest)
+    assert asked.modes == tuple(range(594))
+    assert total_m(asked) == pytest.approx(5e-9)
+    assert "binary, 594 modes, 5 nm RMS in all" in story.state.log[-1].text
+
+
+def test_random_signs_over_the_budget_must_be_meant():
+    story = Story(policy=replace(POLICY, dither_enabled=False)).meet()
+    command = cmd.StartDither(kind=DitherKind.BINARY, total_amplitude_m=20e-9, duration_s=60.0)
+    with pytest.raises(CommandError, match="20 nm RMS in all, budget 8 nm"):
+        story.tell(command)
+    assert of_kind(story.tell(replace(command, over_budget=True)), DitherRequest)

@@ -1,7 +1,9 @@
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from service.control.gains import ModeGain, gain_table
 from service.errors import CommandError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
@@ -9,7 +11,17 @@ from service.tracking.operation_records import CommandState
 from service.tracking.operator import RECLOSING_INTERVAL_S
 from service.tracking.state import Mode
 from service.wire import Loop, LoopRequest, Pattern, RampRequest
-from tests.unit.tracking.situations import Story, judged, loop_answered, of_kind, rtc, verdict
+from tests.states import changed
+from tests.unit.tracking.situations import (
+    N_MODES,
+    START_NS,
+    Story,
+    judged,
+    loop_answered,
+    of_kind,
+    rtc,
+    verdict,
+)
 
 
 @pytest.fixture
@@ -166,3 +178,57 @@ class TestAMeasurementGivenUp:
         story.tell(cmd.GiveUp(id="im-1"))
         story.wait(3700, every_s=60)
         assert story.state.loop.close_since_ns_utc is None
+
+
+# --- loop gains by the table of optical gains, when an operator asks for them
+
+
+MEASURED = tuple(
+    ModeGain(mode=mode, gain=0.7, sigma=0.01, scatter=0.02, t_ns_utc=START_NS)
+    for mode in (509, 527, 545, 563)
+)
+
+
+@pytest.fixture
+def measured():
+    measured = Story(Mode.HOLD).meet()
+    measured.see(n_windows=2)
+    known = replace(measured.state.alpha.registration, optical_gains=MEASURED)
+    measured.state = changed(measured.state, registration=known)
+    return measured
+
+
+def test_they_act_alike_on_every_controlled_mode_and_the_gate_is_asked(measured):
+    (effect,) = measured.tell(cmd.SetLoop(effective_gain=0.3))
+    assert effect.judged
+    asked = effect.request
+    assert len(asked.gains) == N_MODES
+    in_effect = np.array(asked.gains[:400]) * gain_table(MEASURED, 400).optical_gain
+    np.testing.assert_allclose(in_effect, 0.3, rtol=1e-12)
+    assert set(asked.gains[400:]) == {0.0}
+    assert "gain 0.3 in effect on every mode, by the gain table" in measured.state.loop.command.text
+
+
+def test_asked_twice_they_are_the_same(measured):
+    (first,) = of_kind(measured.tell(cmd.SetLoop(effective_gain=0.3)), LoopRequest)
+    measured.now_ns += 1
+    (second,) = of_kind(measured.tell(cmd.SetLoop(effective_gain=0.3)), LoopRequest)
+    assert first.gains == second.gains
+
+
+def test_gains_an_operator_names_are_his_own_business(measured):
+    groups = (cmd.GainGroup(first=0, last=1, gain=0.5),)
+    (asked,) = measured.tell(cmd.SetLoop(gains=groups))
+    assert not asked.judged
+
+
+def test_without_a_measured_gain_there_is_nothing_to_undo():
+    with pytest.raises(CommandError, match="no optical gain is measured yet; start a dither"):
+        Story(Mode.HOLD).meet().tell(cmd.SetLoop(effective_gain=0.3))
+
+
+def test_the_service_never_sets_them_by_itself():
+    measured = Story(Mode.AUTO).meet()
+    measured.see(n_windows=30)
+    measured.wait(60)
+    assert not measured.asked(LoopRequest)

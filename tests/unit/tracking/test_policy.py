@@ -1,17 +1,22 @@
+import re
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from service.control.expected_gain import ExpectedGain
 from service.errors import ModelError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither_request import DitherParameters, lock_in_plan, plan_dither
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
-from service.tracking.update_policy import is_outdated
+from service.tracking.update_policy import THRESHOLD_DECAY_S, is_outdated
 from service.wire import DitherRequest, DitherStop
+from tests.unit.tracking import situations
 from tests.unit.tracking.situations import (
+    ALPHA,
     N_MODES,
     POLICY,
     START_NS,
@@ -318,3 +323,133 @@ class TestProposals:
         story.wait(10)
         story.meet(session="s2")
         assert of_kind(story.see(n_windows=2), ev.MakeMatrix)
+
+
+# --- whether another reconstructor is worth a swap
+
+
+FAR_THRESHOLDS = replace(
+    POLICY,
+    n_modes_target=400,
+    update_threshold=np.array([0.5, 0.5, 0.1, 0.1]),
+    update_gain_m=0.5e-9,
+    update_margin=0.1,
+)
+NEAR = moved(shift_x_subap=0.04)
+
+
+def told(loss_m=0.0, radius=0.6, fresh=0.6):
+    return ExpectedGain(
+        loss_m=loss_m, wavefront_m=1e-7, pole_radius=radius, fresh_pole_radius=fresh
+    )
+
+
+@pytest.fixture
+def moved_a_little():
+    """A reconstructor in use that was made for ``ALPHA``, the mirror since moved a little."""
+    moved_a_little = Story(Mode.AUTO, FAR_THRESHOLDS).meet()
+    moved_a_little.see(n_windows=2)
+    moved_a_little.use("cm-1")
+    moved_a_little.wait(THRESHOLD_DECAY_S + 5)
+    moved_a_little.see(NEAR, n_windows=8)
+    moved_a_little.effects.clear()
+    return moved_a_little
+
+
+def look_at(moved_a_little, expected, alpha=NEAR, matrix_id="cm-1"):
+    """Tell what the worker found; return the reconstructors asked for in the next seconds."""
+    now = situations.judged(moved_a_little.state.alpha.registration, moved_a_little.state.loop.rtc)
+    effects = moved_a_little.tell(
+        ev.MarginJudged(id=matrix_id, verdict=verdict(), alpha=alpha, expected=expected, judged=now)
+    )
+    return of_kind((*effects, *moved_a_little.wait(3)), ev.MakeMatrix)
+
+
+def test_nothing_to_win_is_no_reason(moved_a_little):
+    assert not look_at(moved_a_little, told(loss_m=0.1e-9, radius=0.62))
+
+
+@pytest.mark.parametrize(
+    ("found", "words"),
+    [
+        ({"loss_m": 1e-9}, "expected to win .*nm over cm-1"),
+        ({"radius": 0.7}, "cm-1 has lost 25% of its stability margin"),
+        ({"loss_m": float("inf"), "radius": 1.1}, ""),
+    ],
+)
+def test_nanometres_margin_or_an_unstable_loop_are(moved_a_little, found, words):
+    (made,) = look_at(moved_a_little, told(**found))
+    assert re.search(words, made.why)
+    assert made.n_modes == 400
+
+
+def test_noise_is_not(moved_a_little):
+    """The same loss at a registration that noise alone would bring about."""
+    near = moved(shift_x_subap=0.004)
+    assert not look_at(moved_a_little, told(loss_m=1e-9, radius=0.7), alpha=near)
+
+
+def test_a_loss_of_another_matrix_is_not(moved_a_little):
+    moved_a_little.use("cm-2")
+    moved_a_little.wait(THRESHOLD_DECAY_S + 5)
+    assert not look_at(moved_a_little, told(loss_m=1e-9), matrix_id="cm-1")
+
+
+def test_soon_after_an_update_it_takes_twice_as_much_and_later_as_much_as_ever(moved_a_little):
+    moved_a_little.use("cm-2")
+    for k in range(1, 9):
+        moved_a_little.see(moved(NEAR, shift_x_subap=0.005 * k))
+    there = moved(NEAR, shift_x_subap=0.04)
+    assert not look_at(moved_a_little, told(loss_m=0.8e-9), alpha=there, matrix_id="cm-2")
+    assert look_at(copy(moved_a_little), told(loss_m=1.5e-9), alpha=there, matrix_id="cm-2")
+    moved_a_little.wait(THRESHOLD_DECAY_S)
+    moved_a_little.see(there, n_windows=6)
+    assert look_at(moved_a_little, told(loss_m=0.8e-9), alpha=there, matrix_id="cm-2")
+
+
+def test_a_move_is_looked_at_at_once_and_the_new_matrix_comes_before_the_margin_of_the_old(
+    moved_a_little,
+):
+    look_at(moved_a_little, told())
+    effects = moved_a_little.see(moved(NEAR, shift_x_subap=0.03), n_windows=2)
+    asked = [type(e) for e in effects if isinstance(e, (ev.MakeMatrix, ev.JudgeMatrix))]
+    assert asked == [ev.MakeMatrix, ev.JudgeMatrix]
+
+
+def test_a_registration_that_may_have_jumped_makes_nothing(moved_a_little):
+    moved_a_little.see(moved(shift_x_subap=0.4))
+    assert moved_a_little.state.alpha.registration.suspected_jump is not None
+    assert not look_at(moved_a_little, told(loss_m=5e-9))
+
+
+def test_a_jump_asks_for_one_whatever_it_wins(moved_a_little):
+    moved_a_little.see(moved(NEAR, rotation_rad=np.deg2rad(0.04)), n_windows=2)
+    assert "registration.jump" in moved_a_little.logged
+    (made,) = moved_a_little.asked(ev.MakeMatrix)
+    assert made.why == "cm-1 was made before the mirror jumped"
+
+
+def test_a_jump_that_a_verdict_still_reaches_asks_for_none(moved_a_little):
+    moved_a_little.use("cm-2")
+    moved_a_little.effects.clear()
+    moved_a_little.see(moved(NEAR, rotation_rad=np.deg2rad(0.018)), n_windows=4)
+    assert "registration.jump" in moved_a_little.logged
+    assert not moved_a_little.asked(ev.MakeMatrix)
+
+
+def test_far_enough_needs_no_estimate(moved_a_little):
+    moved_a_little.policy = replace(
+        FAR_THRESHOLDS, update_threshold=np.array([0.03, 0.03, 0.1, 0.1])
+    )
+    (made,) = of_kind(moved_a_little.wait(2), ev.MakeMatrix)
+    assert made.why.startswith("moved by")
+
+
+def test_the_state_remembers_what_was_found(moved_a_little):
+    look_at(moved_a_little, told(loss_m=0.1e-9))
+    assert moved_a_little.state.matrices.assessment.id == "cm-1"
+    assert moved_a_little.state.matrices.assessment.alpha == NEAR
+    assert moved_a_little.state.matrices.assessment.expected.loss_m == 0.1e-9
+    moved_a_little.use("cm-2")
+    assert moved_a_little.state.matrices.assessment is None
+    assert ALPHA != NEAR

@@ -98,7 +98,6 @@ def test_no_acknowledgement_of_before_takes_back_what_is_in_use(story):
     assert story.matrix_state("cm-1") is MatrixState.APPLIED
     story.use("cm-2")
     story.acknowledge("cm-1")
-    story.tell(rtc(cm_id="cm-2"))
     assert story.state.matrices.in_use == "cm-2"
     assert story.matrix_state("cm-1") is MatrixState.SUPERSEDED
 
@@ -140,12 +139,6 @@ def test_a_verdict_that_comes_too_late_belongs_to_its_own_matrix_whose_alarm_has
     assert story.state.matrices.margin is margin
     assert not story.alarms
     assert story.state.reconstructor("initial").gate.worst_pole_radius == 1.2
-
-
-def test_a_fetched_matrix_is_the_one_in_use(story):
-    story.tell(ev.MatrixFetched(record=foreign("other", 300)))
-    assert story.state.matrices.in_use == "other"
-    assert story.matrix_state("initial") is MatrixState.SUPERSEDED
 
 
 class TestOldAcknowledgements:
@@ -199,33 +192,9 @@ def test_a_restarted_service_knows_the_rtcs_own_matrices_and_believes_none_of_th
     assert story.state.matrices.in_use is None
 
 
-def test_a_restarted_service_takes_over_the_newest_only():
-    kept = restored(tuple(record(f"cm-{n}") for n in range(RECONSTRUCTORS_KEPT + 1)))
-    assert [kept[0].id, kept[-1].id] == ["cm-1", f"cm-{RECONSTRUCTORS_KEPT}"]
-
-
-def test_one_reconstructor_in_use_supersedes_another():
-    state = with_record(with_record(STATE, foreign()), record("cm-1"))
-    state = with_in_use(with_in_use(state, "initial"), "cm-1")
-    assert state.matrices.in_use == "cm-1"
-    assert [r.state for r in state.matrices.reconstructors] == [
-        MatrixState.SUPERSEDED,
-        MatrixState.APPLIED,
-    ]
-
-
 def test_telling_again_what_is_in_use_changes_nothing():
     state = with_in_use(with_record(STATE, foreign()), "initial")
     assert with_in_use(state, "initial") is state
-
-
-def test_the_reconstructor_in_use_stays_on_a_full_shelf():
-    state = with_in_use(with_record(STATE, foreign()), "initial")
-    for number in range(RECONSTRUCTORS_KEPT + 5):
-        state = with_record(state, record(f"cm-{number}", MatrixState.REFUSED))
-    assert len(state.matrices.reconstructors) == RECONSTRUCTORS_KEPT
-    assert state.reconstructor("initial") is not None
-    assert state.matrices.reconstructors[-1].id == f"cm-{RECONSTRUCTORS_KEPT + 4}"
 
 
 @pytest.mark.parametrize(

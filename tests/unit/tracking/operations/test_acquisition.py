@@ -312,12 +312,6 @@ class TestNothingWrong:
         story.tell(ev.WideCaptureFitted(found=far))
         assert story.stage is AcquisitionStage.COARSE
 
-    def test_nothing_known_before_is_relied_on(self):
-        story = Acquiring()
-        story.see(n_windows=3)
-        story.tell(cmd.Acquire())
-        assert story.state.alpha.registration is None
-
     def test_fewer_modes_are_made_where_the_gate_refuses_many(self):
         story = Acquiring().to_partial()
         (made,) = story.asked(ev.MakeMatrix)
@@ -462,14 +456,6 @@ class TestTrouble:
         story.wait(MAX_STAGE_DURATION_S + 2)
         assert story.state.operations.acquisition.attempt == 2
 
-    def test_an_rtc_that_will_not_open_its_loop_ends_it(self):
-        story = Acquiring()
-        story.tell(cmd.Acquire())
-        command = story.asked(LoopRequest)[-1]
-        story.tell(loop_answered(command.id, accepted=False, reason="busy"))
-        assert story.stage is AcquisitionStage.FAILED
-        assert "busy" in story.text
-
     def test_an_rtc_that_begins_anew_is_looked_at_anew(self):
         story = Acquiring().to_widening()
         story.session += 1
@@ -537,13 +523,6 @@ class TestOperator:
         story.tell(cmd.Acquire())
         story.open()
         story.tell(cmd.StopDither())
-        assert story.stage is AcquisitionStage.ABORTED
-
-    def test_hold_aborts_what_began_by_itself(self):
-        story = Acquiring()
-        story.tell(DIVERGING)
-        story.wait(4)
-        story.tell(cmd.SetMode(mode=Mode.HOLD))
         assert story.stage is AcquisitionStage.ABORTED
 
     def test_hold_leaves_alone_what_was_asked_for(self):

@@ -225,10 +225,13 @@ class Standby:
             What is to be held while the link is open.
         """
         keys, contract = self._keys, self._keys.alive(Role.SERVICE)
+        # Asked without the lock: routers may take a second to answer, and whoever posts a state or
+        # a token meanwhile would wait as long.
         found = [_name_of(key) for key in link.tokens(session, keys.all_ranks)]
+        contract_held = bool(link.tokens(session, contract))
         with self._lock:
             self._election = LeaderElection()
-            self._election.contract_held = bool(link.tokens(session, contract))
+            self._election.contract_held = contract_held
             name = self._election.join(found, str(session.zid()), time.time_ns())
         # Announced before the decision: of two that start together each must see the other.
         held = [

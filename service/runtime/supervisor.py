@@ -410,26 +410,34 @@ class Supervisor:
             await self._pending_window.some()
             # a fit about the nominal registration may end in a wrong place, and takes longer
             await self._own_matrix_read.wait()
-            async with self._workers.turn(worker.OpticsWorker.fit):
-                # Taken only now that the worker is free: until then later windows are joined to it.
-                window = self._pending_window.take()
-                if window is None:
-                    continue
-                if isinstance(window, lockin.Spectra):
-                    self._worker_load.fitted(window.window_s)
-                state, matrix = self._engine.state, self._actions.matrix
-                event = await fitted(window, state, self._workers, matrix)
-            self._post(event)
+            await self._fit_window()
+
+    # One window, and the sums of one estimate, are fitted in functions of their own: a loop would
+    # hold their 25 MB until the next one comes.
+
+    async def _fit_window(self) -> None:
+        async with self._workers.turn(worker.OpticsWorker.fit):
+            # Taken only now that the worker is free: until then later windows are joined to it.
+            window = self._pending_window.take()
+            if window is None:
+                return
+            if isinstance(window, lockin.Spectra):
+                self._worker_load.fitted(window.window_s)
+            event = await fitted(window, self._engine.state, self._workers, self._actions.matrix)
+        self._post(event)
 
     async def _fit_passive(self) -> None:
         while True:
             await asyncio.sleep(passive.PASSIVE_INTERVAL_S)
-            async with self._workers.turn(worker.OpticsWorker.fit_passive):
-                async with self._telemetry_lock:
-                    sums = self._engine.take_sums()
-                events = await fit_passive(sums, self._engine.state, self._workers)
-            for event in events:
-                self._post(event)
+            await self._fit_sums()
+
+    async def _fit_sums(self) -> None:
+        async with self._workers.turn(worker.OpticsWorker.fit_passive):
+            async with self._telemetry_lock:
+                sums = self._engine.take_sums()
+            events = await fit_passive(sums, self._engine.state, self._workers)
+        for event in events:
+            self._post(event)
 
     def _post(self, event: Event, cause: str = "") -> tuple[Effect, ...]:
         return self._engine.post(event, cause)

@@ -1,6 +1,6 @@
 """The parts of the link that need no network: sessions, offers, events, the ring's edges."""
 
-from unittest.mock import patch
+from unittest.mock import Mock, patch
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ import pytest
 from service.errors import LinkError, UnknownIdError, WireError
 from service.link import session
 from service.link.intake import MAX_QUEUED_EVENTS, MAX_UNDECODED_BATCHES, Intake
-from service.link.leader_election import LeaderElection, SessionWatch
+from service.link.leader_election import LeaderElection, SessionWatch, Standby
 from service.link.matrices import MAX_OFFERS, MeasuredIntake, Offer, Outbox
 from service.link.session import Endpoint
 from service.tracking import events as ev
@@ -224,6 +224,24 @@ def test_tokens_that_are_no_names_are_nobody():
     alone.notice("rubbish", alive=True)
     assert alone.settle()
     assert alone.others(0.0) == ()
+
+
+def test_routers_that_answer_slowly_keep_nobody_waiting(monkeypatch):
+    standby = Standby(Keys("flao"), drive=lambda _: [], report=lambda _: None)
+    free = []
+
+    def tokens(*_):
+        # What zenoh's threads do with a token or a state that comes meanwhile takes this lock.
+        free.append(standby._lock.acquire(timeout=0.0))
+        standby._lock.release()
+        return []
+
+    monkeypatch.setattr(session, "tokens", tokens)
+    for name in ("announce", "watch", "subscribe"):
+        monkeypatch.setattr(session, name, lambda *_: None)
+    standby.join(Mock(), lambda _, callback: callback, wait=False)
+    assert free == [True, True]
+    assert standby.drives
 
 
 # ---------------------------------------------------------------- intake

@@ -414,7 +414,6 @@ class Supervisor:
 
     # One window, and the sums of one estimate, are fitted in functions of their own: a loop would
     # hold their 25 MB until the next one comes.
-
     async def _fit_window(self) -> None:
         async with self._workers.turn(worker.OpticsWorker.fit):
             # Taken only now that the worker is free: until then later windows are joined to it.

@@ -149,7 +149,7 @@ def find_displaced_columns(
     }
     found = {words: correlation(*places) for words, places in tried.items()}
     best = max(found, key=lambda words: found[words])
-    # The listed order is searched like the others, with free axes, so that the two are comparable.
+    # Searched in the same way, so that the correlations are comparable.
     here = correlation(every, every)
     if found[best] > max(ORDER_CORRELATION, ORDER_CORRELATION_RATIO * here):
         yield (

@@ -323,7 +323,7 @@ def try_pupils(few: FitSubset) -> tuple[TriedPupil, ...]:
     little = few.residual_fraction < MIN_PUPIL_EXPLAINED
     for number in _numbers(few.models.instrument):
         rate = number.rate(few)
-        # To first order first: a matrix of another pupil needs a sensor model of its own.
+        # To first order first, because each further value takes the matrix of another sensor model.
         value, lead, moved = number.near(few, rate)
         if not little and lead.share < EXCLUDED_SHARE:
             value, lead, moved = number.far(few, rate)

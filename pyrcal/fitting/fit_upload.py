@@ -49,13 +49,13 @@ def open_upload(upload: Path, folder: Path, reference: str | None, max_bytes: in
     Parameters
     ----------
     upload
-        The file as it came.
+        The uploaded file.
     folder
-        Where files of an archive go.
+        Folder for the files of an archive.
     reference
         Name of the measured file in an archive; None for the only possible one.
-    most_bytes
-        Of all files of an archive together.
+    max_bytes
+        Largest size of all files of an archive together, bytes.
 
     Raises
     ------

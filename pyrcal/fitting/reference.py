@@ -172,7 +172,7 @@ def _find_usable(reference: Reference) -> tuple[NDArray[np.bool_], tuple[str, ..
         )
     kept = finite & alive
     places = np.flatnonzero(kept)
-    # Without dead columns, which are all equal to each other and would count as copies.
+    # Only usable columns, so that none is listed as a copy of a column that is left out itself.
     equal = find_defects(np.ascontiguousarray(reference.matrix.T[kept])) if len(places) else {}
     copies = {
         int(places[column]): f"{COPY}{places[int(reason.removeprefix(COPY))]}"

@@ -264,7 +264,7 @@ def _describe_instrument(findings: FitFindings, rival: AlternativeInstrument) ->
 
 def _check_basis(findings: FitFindings) -> str:
     gains = findings.solution.projection.gains
-    # Medians, because a few columns with wrong signs or strokes do not make another basis.
+    # Medians, because a few columns with other strokes do not make another basis.
     middle = float(np.median(gains))
     scatter = float(np.median(np.abs(gains - middle)) / abs(middle)) * 1.4826
     negative = int(np.sum(gains <= 0.0))

@@ -146,7 +146,7 @@ def _choose_introduction(options: argparse.Namespace) -> str:
 
 
 class _Telescope(NamedTuple):
-    """What a demo depends on in an instrument file."""
+    """Values of an instrument file that a demo depends on."""
 
     diameter_m: float
     across_subap: float

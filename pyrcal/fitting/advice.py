@@ -77,6 +77,7 @@ def add_explanations(fit: Fit, tried: tuple[Alternative, ...], grounds: Grounds)
     preferred = (
         describe_preference(one, fit.sigma)
         for one in tried
+        # The verdict already names the alternative that led to a refusal.
         if one.preferred and one.words not in fit.verdict
     )
     sentences = (*fit.remarks, *grounds.gains, *preferred)
@@ -131,6 +132,7 @@ def _explain_uncertainty(fit: Fit, grounds: Grounds, edge: float, radius: float)
         f"{ENOUGH_SUBAP:g} is enough"
     )
     found = fit.registration
+    # Averaging and more modes reduce the statistical part only.
     if found is None or _at_edge(found.sigma_statistical, radius) > 0.7 * edge:
         if grounds.noise_share >= MIN_NOISE_SHARE:
             return f"{known}; average more, or push more modes"
@@ -164,6 +166,7 @@ def _advise_refused(fit: Fit, grounds: Grounds) -> str:
                 f"{Advice.MEASURE_MORE}: two registrations explain the matrix nearly as well; push "
                 "more modes, or give a start near the true registration (--start)"
             )
+        # Mostly noise: averaging helps. If most of it is structure, averaging does not change it.
         case Refusal.UNEXPLAINED if grounds.structure < 0.5 * fit.residual_fraction:
             return (
                 f"{Advice.MEASURE_MORE}: {fit.residual_fraction:.0%} of the signal is noise; "
@@ -176,6 +179,7 @@ def _find_cause(fit: Fit, grounds: Grounds) -> str:
     """Return the most likely cause of a refusal; a definite cause precedes the verdict."""
     if grounds.refusal in {Refusal.ANOTHER_BASIS, Refusal.ANOTHER_UNIT} and grounds.gains:
         return grounds.gains[0]
+    # Columns are compared with the model in the axes found, which are in doubt in that case.
     if grounds.columns and grounds.refusal is not Refusal.AXES:
         return "; ".join(grounds.columns)
     best = _choose_correction(fit)
@@ -183,6 +187,7 @@ def _find_cause(fit: Fit, grounds: Grounds) -> str:
         number = next(_list_wrong_numbers(fit), None)
         if number is not None and grounds.numbers_share < (best.share or 0.0):
             return f"{number.words}; correct that and fit again"
+        # The verdict names both explanations if the matrix does not distinguish them.
         if UNDECIDED_WORDS in fit.verdict:
             return fit.verdict.rpartition("better: ")[2]
         return (

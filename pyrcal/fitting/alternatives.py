@@ -222,6 +222,7 @@ def add_alternatives(
     open_share = OTHER_SHARE * min(1.0, residual_fraction / MIN_EXPLAINED) ** 2
     moves = [width, *(one.moved for one in tried)]
     shares = [open_share, *(one.weight(residual_fraction) for one in tried)]
+    # If the fitted values explain clearly more, the file's values are excluded and add nothing.
     if without is not None and without.is_undecided:
         moves.append(without.moved)
         shares.append(open_share)
@@ -288,8 +289,10 @@ def _describe_pupil(
     one: TriedPupil, others: tuple[AlternativeInstrument, ...]
 ) -> Alternative | None:
     """Return an alternative with another pupil, or None if it is already in ``others``."""
+    # Listed once, or its change of α would enter σ twice.
     if any(one.words == rival.change.words for rival in others):
         return None
+    # Never preferred here: a pupil that explains enough is among the other instruments.
     return Alternative(
         words=one.words,
         share=one.lead.share,
@@ -312,11 +315,13 @@ def _try_off_centre(few: FitSubset) -> Iterator[Alternative]:
     if few.has_free_pupil:
         return  # the fit itself displaced the pupil
     rates = few.pupil_rates
+    # Where the border cuts no subaperture, a displaced pupil changes no slope.
     if not all(few.tells(few.own, rate) for rate in rates):
         return
     (x, y), lead, moved = _fit_with_rates(few, *rates)
     explained = few.residual_fraction * float(np.sqrt(max(1.0 - lead.share, 0.0)))
     off = float(np.hypot(x, y))
+    # With the mirror as stop the pupil moves with it, and part of that shift looks like an offset.
     shift = float(np.hypot(*alpha.vector[:2])) if about.stop is Stop.MIRROR else 0.0
     notable = max(NOTABLE_OFFSET_SUBAP, NOTABLE_OFFSET_SHARE * shift)
     middle = "mirror's" if about.stop is Stop.MIRROR else "sensor's"
@@ -339,6 +344,7 @@ def _try_off_centre(few: FitSubset) -> Iterator[Alternative]:
 
 def _try_separate_gains(few: FitSubset) -> Iterator[Alternative]:
     """Yield the alternative with separate gains of Sx and Sy."""
+    # Pixels have no x and y components whose gains could differ.
     if few.models.instrument.slopes.kind is not SignalKind.XY:
         return
     half = len(few.own) // 2
@@ -380,6 +386,7 @@ def _try_uneven_light(few: FitSubset) -> Iterator[Alternative]:
 def _try_spiders(few: FitSubset, arms_deg: tuple[float, ...]) -> Iterator[Alternative]:
     """Yield the alternative with spider arms, if the residual shows lines like arms."""
     about = few.models.instrument
+    # A file with spiders or with a pupil map already contains the shadows.
     if not arms_deg or about.spiders_deg or about.pupil is not None:
         return
     width_m = ARM_SUBAP * about.subaperture_m
@@ -406,6 +413,7 @@ def _try_spiders(few: FitSubset, arms_deg: tuple[float, ...]) -> Iterator[Altern
 
 def _fit_with_rates(few: FitSubset, *rates: Array) -> tuple[Array, Lead, Array]:
     """Return the values of further unknowns, their improvement, and the change of α."""
+    # Both steps are from the same grid, so that its error cancels in their difference.
     step = few.step(few.own, *rates)
     return step[-len(rates) :], few.lead(few.own, *rates), step[:4] - few.step(few.own)[:4]
 
@@ -422,6 +430,7 @@ def _try_file_optics(
     settled: Settled, optics: tuple[FoundOptic, ...], without: FileValuesFit | None
 ) -> Iterator[Alternative]:
     """Yield coupling and modulation as in the file, and a 10 % larger modulation."""
+    # Values marked as unknown in the file cannot be restored, so only stated ones are named.
     stated = [one for one in optics if one.reported is not None]
     if without is not None:
         words = (
@@ -431,6 +440,8 @@ def _try_file_optics(
         yield Alternative(words=words, share=1.0 / max(without.share, 1e-12), moved=without.moved)
     first = settled.nuisances.first_optic
     for place, one in enumerate(optics, first):
+        # The file's values were not fitted if none differs notably. To first order they are then
+        # reached along the valley of χ², which takes no matrix.
         if without is None and one.reported is not None:
             share, moved = _fix_nuisances(settled, {place: -one.change})
             near = share < 1.0 / PREFERRED_SHARE
@@ -449,6 +460,7 @@ def _try_fixed_nuisances(settled: Settled) -> Iterator[Alternative]:
     distance = nuisances.from_prior(values)
     groups = [("the slopes' axes not turned", [0])]
     if nuisances.anamorphosis:
+        # Both stretches together, because one alone depends on the direction of the axes.
         groups.append(("no anamorphosis fitted", [1, 2]))
     for words, places in groups:
         share, moved = _fix_nuisances(settled, {place: -float(distance[place]) for place in places})
@@ -473,6 +485,7 @@ def _try_images_in_place(settled: Settled) -> Iterator[Alternative]:
     others = replace(
         nuisances, images=np.zeros((0, 8)), displaced=np.zeros_like(nuisances.displaced)
     )
+    # A fit of its own: displacements that large are far outside the linear range.
     there = refine(models, settled.target, solution.alpha, others, decides=models.cheap)
     share = _ratio(there.projection.chi, solution.projection.chi)
     yield Alternative(
@@ -498,6 +511,7 @@ def _fix_nuisances(settled: Settled, steps: dict[int, float]) -> tuple[float, Ar
     step[free] = -np.linalg.solve(
         held[np.ix_(free, free)], held[np.ix_(free, places)] @ step[places]
     )
+    # Near the minimum χ² grows by the quadratic form. The prior shapes the step but is no misfit.
     return 1.0 + _ratio(float(step @ normal @ step), seen.chi), step[:4]
 
 
@@ -517,6 +531,7 @@ def _try_equal_weights(settled: Settled) -> Iterator[Alternative]:
 def _try_mode_subsets(settled: Settled) -> Iterator[Alternative]:
     """Yield each half of the modes, and all modes but those with the largest residual."""
     n_modes = settled.target.n_modes
+    # Halves by mode number, because columns may be in any order.
     order, numbers = np.argsort(settled.target.modes), np.arange(n_modes)
     worst = np.argsort(settled.by_mode)[: n_modes - int(np.ceil(_WORST_SHARE * n_modes))]
     for words, kept in (

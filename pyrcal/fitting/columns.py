@@ -63,6 +63,8 @@ def find_noise_columns(solution: Solution, target: Target, n_planes: int) -> NDA
     # unit columns: squares of a value such as 1e200, read from a damaged file, would overflow
     measured = _unit(np.where(target.rows[:, None], target.matrix, 0.0))
     alike = np.sum(measured * _unit(np.asarray(solution.matrix, np.float64)), axis=0)
+    # The correlation of noise with any pattern scatters by one over the root of the number of
+    # slopes.
     unlike = np.abs(alike) < CHANCE_SIGMA / np.sqrt(target.rows.sum())
     found = np.zeros(len(unlike), dtype=np.bool_)
     for column in np.flatnonzero(unlike):
@@ -73,6 +75,8 @@ def find_noise_columns(solution: Solution, target: Target, n_planes: int) -> NDA
         squares = float(np.sum(maps**2)) / max(float(counted.sum()), 1.0)
         strength = 0.0
         for axis in (1, 2):
+            # Pairs with a slope that was left out contain no product and must not count as
+            # uncorrelated.
             pairs = np.sum(counted * np.roll(counted, 1, axis=axis))
             product = np.sum(maps * np.roll(maps, 1, axis=axis))
             strength += float(product**2 / (max(float(pairs), 1.0) * squares**2))
@@ -130,6 +134,7 @@ def find_displaced_columns(
     every = np.arange(n)
 
     def correlation(columns: NDArray[np.intp], modes: NDArray[np.intp]) -> float:
+        # Without mode numbers, because the arrangement tried here contradicts them.
         listed = replace(usable, matrix=usable.matrix[:, columns], modes=None, noise=None)
         search = find_orientation(instrument, listed, basis.subset(modes), mapper=mapper)
         return search.best.correlation
@@ -144,6 +149,7 @@ def find_displaced_columns(
     }
     found = {words: correlation(*places) for words, places in tried.items()}
     best = max(found, key=lambda words: found[words])
+    # Searched in the same way, so that the correlations are comparable.
     here = correlation(every, every)
     if found[best] > max(ORDER_CORRELATION, ORDER_CORRELATION_RATIO * here):
         yield (
@@ -187,6 +193,7 @@ def measure_smear(solution: Solution, target: Target) -> Smear:
     # Both neighbours must be consecutive modes: the next one is the control for model errors.
     middles = np.flatnonzero(steps[:-1] & steps[1:]) + 1
     if len(middles) < _MIN_MODES:
+        # An infinite σ, so that nothing is found.
         return Smear(share=0.0, sigma=np.inf)
     found = []
     for k in middles:

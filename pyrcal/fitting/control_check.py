@@ -122,6 +122,7 @@ def check_control(
         residual.
     """
     order = np.argsort(modes, kind="stable")
+    # The plant is divided by the gains, so modes without a positive gain have no plant.
     order = order[gains[order] > 0.0]
     plant = np.asarray(measured, dtype=np.float64)[rows][:, order] / gains[order]
     synthetic = np.asarray(model, dtype=np.float64)[rows][:, order]
@@ -130,12 +131,14 @@ def check_control(
     stable = _most_stable(loops, n_most)
     noise_limited = False
     weakest: tuple[int, ...] = ()
+    # Noise of the matrix alone may make a loop unstable; the result is then a lower bound.
     if stable < n_most:
         beyond = min(n_most, 2 * stable + 1)
         left = plant - synthetic
         level = noise_sigma(left) if noise is None else noise[order] / gains[order]
         # the noise of a column cannot exceed its residual
         level = np.minimum(level, np.sqrt(np.mean(left**2, axis=0)))
+        # A fixed seed, so that the same matrix always has the same verdict.
         added = level * np.random.default_rng(0).standard_normal(synthetic.shape)
         noise_limited = _Loops(synthetic, synthetic + added, gain).radius(beyond) >= 1.0
         weakest = loops.worst_modes(beyond)
@@ -158,6 +161,7 @@ class _Loops:
     """Loops of the first modes of a model on a plant, for any number of them."""
 
     def __init__(self, model: Array, plant: Array, gain: float) -> None:
+        # Products of all modes once: those of fewer modes are their leading blocks.
         self._normal, self._cross, self._gain = model.T @ model, model.T @ plant, gain
         self._radii: dict[int, float] = {}
         self._eigenmodes: dict[int, tuple[NDArray[Any], NDArray[Any], int]] = {}
@@ -165,6 +169,7 @@ class _Loops:
     def coupling(self, n: int) -> tuple[Array, int]:
         """Return R M ``(n, n)`` of the first ``n`` modes, and the singular values left out."""
         power, axes = np.linalg.eigh(self._normal[:n, :n])
+        # Eigenvalues of the normal matrix are squares of singular values, and so is the limit.
         kept = power * MAX_CONDITION**2 > power[-1]
         inverse = (axes[:, kept] / power[kept]) @ axes[:, kept].T
         return inverse @ self._cross[:n, :n], int(np.sum(~kept))
@@ -179,6 +184,8 @@ class _Loops:
             else:
                 coupling, n_left_out = self.coupling(n)
                 eigenvalues = np.linalg.eigvals(coupling)
+            # Combinations left out have eigenvalues of 0 and poles on the unit circle: they would
+            # make every truncated loop look unstable.
             moving = np.argsort(np.abs(eigenvalues))[n_left_out:]
             radii = pole_radius(self._gain * eigenvalues[moving], delay_frames=DELAY_FRAMES)
             self._radii[n] = float(radii.max())
@@ -195,6 +202,7 @@ class _Loops:
         """Return which modes take part most in the eigenvector of the largest pole."""
         eigenvalues, vectors, n_left_out = self.eigenmodes(n)
         radii = pole_radius(self._gain * eigenvalues, delay_frames=DELAY_FRAMES)
+        # The same for the worst pole, which must be one that the loop controls.
         radii[np.argsort(np.abs(eigenvalues))[:n_left_out]] = 0.0
         share = np.abs(vectors[:, int(np.argmax(radii))]) ** 2
         strongest = np.argsort(-share)[:4]
@@ -207,6 +215,8 @@ class _Loops:
         and falls as that of Kolmogorov turbulence beyond.
         """
         frequency = np.geomspace(1e-3, 0.5, N_FREQUENCIES)
+        # The factor of the frequency is the width of a step of ``geomspace``, so that sums are
+        # integrals.
         spectrum = frequency / (1.0 + (frequency * CORNER_FRAMES) ** (17.0 / 3.0))
         z = np.exp(-2j * np.pi * frequency)
         integrator = self._gain * z**DELAY_FRAMES / (1.0 - z)

@@ -79,6 +79,7 @@ def dither_sigma(
         column = near.matrix[:, mode].astype(np.float64)
         column /= np.linalg.norm(column)
         rates = near.derivatives[:, :, mode].astype(np.float64)
+        # The gain of each mode is free, so a change along the column says nothing about α.
         rates -= np.outer(rates @ column, column)
         information += rates @ rates.T
     error = slope_noise / (amplitude_m * np.sqrt(n_frames))

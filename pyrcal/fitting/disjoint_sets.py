@@ -185,6 +185,7 @@ class Normals:
     ) -> tuple[Array, Array]:
         """Return the step of selected parts ``(n_parts,)`` and its 1 σ by leaving out clusters."""
         parts = np.flatnonzero(inside)
+        # ``reduceat`` adds neighbours, so the parts of each cluster are brought together first.
         order = parts[np.argsort(self.clusters[parts], kind="stable")]
         _, first = np.unique(self.clusters[order], return_index=True)
         n_clusters = len(first)
@@ -194,6 +195,8 @@ class Normals:
         # All fits with one cluster left out are solved at once.
         left = np.linalg.solve(every - normals, (scored[:, None] - scores).T[:, :, None])[:, :4, 0]
         spread = np.sum((left - left.mean(axis=0)) ** 2, axis=0)
+        # Fits with one cluster left out share all others and hardly differ. The factor of the
+        # jackknife turns their scatter into the σ of the whole.
         sigma = np.sqrt((n_clusters - 1) / n_clusters * spread)
         return np.linalg.solve(every, scored)[:4], sigma
 
@@ -228,6 +231,7 @@ class Normals:
         across = np.einsum("sa,ski->kai", shapes, self.normals[:, :, :2]).reshape(n, -1)
         among = np.einsum("sa,sb,sij->aibj", shapes, shapes, self.normals[:, :2, :2], optimize=True)
         scored = np.einsum("sa,is->ai", shapes, self.scores[:2]).ravel()
+        # The prior bounds terms that the measured modes hardly determine.
         own = np.full(2 * n_shapes, noise / DISTORTION_SIGMA_SUBAP**2)
         normal = np.block(
             [
@@ -318,6 +322,8 @@ class SetComparison:
                     step, sigma = parts.leave_one_out(inside, self.held, self.pull)
                     members = np.flatnonzero(labels_of[:, column] == number)
                     own = Normals.add([by_group[k] for k in members])
+                    # Leaving out regions does not show errors of single modes, which all slopes of
+                    # a set share.
                     _, single = own.leave_one_out(every, self.held, self.pull)
                     sigma = self._at_least_noise(np.hypot(sigma, single), parts, inside)
                     moved = parts.solve_displacement(inside, self.held, self.distortion.field)
@@ -325,6 +331,7 @@ class SetComparison:
                 yield self._make_sets(words, labels, sets, parts)
 
     def _at_least_noise(self, sigma: Array, parts: Normals, inside: NDArray[np.bool_]) -> Array:
+        # With few clusters the jackknife may be small by chance.
         spread = np.linalg.inv(parts.normals[inside].sum(axis=0) + self.held)
         return np.maximum(sigma, np.sqrt(np.diag(spread)[:4] * self.noise))
 
@@ -347,6 +354,8 @@ def jackknife_sigma(partitions: Sequence[DisjointSets]) -> Array:
     sets differ significantly counts by itself, because it shows an error that the others cannot: a
     distortion that explains the difference leaves the registration uncertain by as much.
     """
+    # A distorted mirror moves opposite halves in opposite directions, which cancels over the pupil,
+    # so halves would overstate the error of α.
     found = [one for one in partitions if one.even]
     if not found:
         return np.zeros(4)
@@ -367,9 +376,12 @@ def mode_partitions(target: Target, n_planes: int, *, by_actuator: bool) -> dict
     # Ranks, not indices: the measured modes may have gaps and any order.
     rank = np.argsort(np.argsort(target.modes, kind="stable"), kind="stable")
     n_combs = min(N_COMBS, n_modes // MIN_MODES)
+    # Sets from every n-th mode contain low and high orders alike.
     found = {"odd and even modes": rank % 2}
+    # Two combs would be the odd and even modes again.
     if n_combs > 2:
         found[f"{n_combs} combs of modes"] = rank % n_combs
+    # A number of an actuator says nothing about its order, but its place does about the pupil.
     if by_actuator:
         x, y = _centroids(target, n_planes)
         found[ACTUATORS[0]] = _sector(x, y) % 2
@@ -405,6 +417,7 @@ def pupil_partitions(
     row, column = np.nonzero(valid)
     x = np.asarray(column - (n - 1) / 2, dtype=np.float64)
     y = np.asarray(row - (n - 1) / 2, dtype=np.float64)
+    # The median of the distance gives two rings with equally many subapertures.
     away = np.hypot(x, y)
     found = {
         "checkerboard": (row + column) % 2,

@@ -204,6 +204,7 @@ def make_reference(recorded: Recorded, instrument: Instrument) -> tuple[Referenc
     """
     notes = list(instrument.remarks)
     double_pass = instrument.double_pass
+    # The measured file describes the measurement itself, so it takes precedence.
     if recorded.double_pass is not None and recorded.double_pass is not double_pass:
         double_pass = recorded.double_pass
         notes.append(

@@ -49,13 +49,13 @@ def open_upload(upload: Path, folder: Path, reference: str | None, max_bytes: in
     Parameters
     ----------
     upload
-        The file as it came.
+        The uploaded file.
     folder
-        Where files of an archive go.
+        Folder for the files of an archive.
     reference
         Name of the measured file in an archive; None for the only possible one.
-    most_bytes
-        Of all files of an archive together.
+    max_bytes
+        Largest size of all files of an archive together, bytes.
 
     Raises
     ------
@@ -110,6 +110,7 @@ def _choose_measured(left: list[str], names: list[str], reference: str | None) -
 def _unpack(archive: zipfile.ZipFile, folder: Path, max_bytes: int) -> list[str]:
     """Write the files of an archive and return their names."""
     entries = [entry for entry in archive.infolist() if not entry.is_dir()]
+    # The stated sizes, before anything is written: a small archive may unpack to any size.
     size = sum(entry.file_size for entry in entries)
     if len(entries) > MOST_FILES or size > max_bytes:
         raise MatrixError(
@@ -118,6 +119,7 @@ def _unpack(archive: zipfile.ZipFile, folder: Path, max_bytes: int) -> list[str]
         )
     names = []
     for entry in entries:
+        # A name such as ../x would be written outside the folder.
         name = PurePosixPath(entry.filename).name
         if name in names or name != entry.filename:
             raise MatrixError(

@@ -100,6 +100,7 @@ def _find_unit(middle: float, settled: Settled, passes: int) -> Iterator[str]:
         "per micrometre: multiply it by 1e6": 1e-6,
         "per nanometre: multiply it by 1e9": 1e-9,
     }
+    # A file that states two passes has its matrix divided by them already.
     if passes == 1:
         units["of both passes and per metre of surface: divide it by 4"] = 4.0
     for words, unit in units.items():

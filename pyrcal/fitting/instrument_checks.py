@@ -109,6 +109,7 @@ class FoundOptic:
             return self.sigma
         if self.optic is Optic.SENSOR:
             return self.found * self.sigma
+        # The derivative of coupling ** exp(-2 change) by the change.
         return -2.0 * self.found * float(np.log(self.found)) * self.sigma
 
     @property
@@ -183,6 +184,7 @@ def compare_instruments(
                 change=change, lead=lead, moved=moved, explained=share_explained(lead)
             )
         )
+    # Changes have different limits, so each is ranked by its own.
     return tuple(sorted(found, key=lambda one: one.share / one.change.max_misfit_ratio))
 
 
@@ -193,6 +195,7 @@ def estimate_width_effect(settled: Settled, few: FitSubset) -> Array:
     and does not correct α: on the diffractive telescope, whose mirror is of another kind, the
     correction was not closer to the truth.
     """
+    # A fitted coupling already follows the width.
     if Optic.WIDTH in settled.models.optics:
         return np.zeros(4)
     settled.models.counter.n += 1
@@ -233,10 +236,13 @@ def fit_file_values(models: FitModels, settled: Settled) -> FileValuesFit:
     Both are compared on the coarse grid, unless so little is left over that its own error counts.
     """
     nothing = replace(settled.nuisances, optics=())
+    # The fitted places of the images are kept, so that the two fits differ in coupling and
+    # modulation only.
     if np.any(nothing.displaced):
         models = models.with_displaced_images(nothing.displaced)
     found, coarse = settled.solution, settled.share > SEARCH_RESIDUAL
     if coarse:
+        # The fit is repeated on the coarse grid as well: both χ² then contain that grid's error.
         found = refine(
             settled.models,
             settled.target,

@@ -108,6 +108,7 @@ class LeftOver:
                 f"the rim leaves {self.border:.1f} times as much as the inside "
                 "(pupil_diameter_subap, valid_subapertures)"
             )
+        # Planes of pixels are the images of a pyramid, which have no x and y.
         if len(self.planes) == 2 and max(self.planes) > PLANE_RATIO:
             worse = "x" if self.planes[0] > self.planes[1] else "y"
             yield (
@@ -240,6 +241,7 @@ def _excess(values: Array, away: Array) -> Array:
     """Return values over the median of their ring; ``away`` is 1 at the edge."""
     ring = np.minimum((away * _RINGS).astype(int), _RINGS - 1)
     typical = np.ones(_RINGS)
+    # Ring by ring, because the border leaves more than the inside without any arm.
     for k in np.unique(ring):
         typical[k] = np.median(values[ring == k])
     return np.asarray(values / np.where(typical > 0.0, typical, 1.0)[ring])

@@ -90,6 +90,8 @@ def _turn(
         return find_rotation(*light, position, _illumination(reference, instrument))
     nominal = instrument.start.rotation_rad
     there = replace(reference, angles_rad=tuple(a + nominal for a in reference.angles_rad))
+    # Evenly spaced arms look the same after one spacing: only around a known rotation, and within
+    # half of the spacing, is the result unambiguous.
     known = instrument.mirror.nominal_rotation_rad is not None
     within = np.pi / len(there.angles_rad) if known else 2 * np.pi
     found = find_rotation(*light, position, there, within_rad=within)

@@ -62,6 +62,7 @@ class Arms:
     def light(self, n: int) -> Array:
         """Return the illumination behind the arms ``(n, n)``, on centred subapertures, 0..1."""
         inside = (np.arange(_SHADOW_SAMPLES) + 0.5) / _SHADOW_SAMPLES - 0.5
+        # Samples within each subaperture, because an arm may be narrower than one.
         fine = (np.arange(n)[:, None] - (n - 1) / 2 + inside).reshape(-1)
         x, y = fine[None, :], fine[:, None]
         hidden = np.zeros((len(fine), len(fine)))
@@ -69,6 +70,8 @@ class Arms:
             along = x * np.cos(angle) + y * np.sin(angle)
             across = y * np.cos(angle) - x * np.sin(angle)
             edge = np.clip((self.width_subap / 2 - np.abs(across)) * _SHADOW_SAMPLES + 0.5, 0, 1)
+            # The largest and not the sum: where arms overlap the light is blocked once. Half lines,
+            # because arms end at the centre.
             hidden = np.maximum(hidden, np.where(along >= 0.0, edge, 0.0))
         cells = hidden.reshape(n, _SHADOW_SAMPLES, n, _SHADOW_SAMPLES)
         return np.asarray(1.0 - cells.mean(axis=(1, 3)))
@@ -112,6 +115,7 @@ def find_rotation(
     if isinstance(reference, Arms):
         template, smooth = reference.light(len(light) + 2), _smooth_shapes(known, 3)
     else:
+        # A measured reference contains the smooth unevenness as well, so only the mean is removed.
         template, smooth = reference.intensity, _smooth_shapes(known, 0)
     seen = _remove_shapes(light[known], smooth)
     turned = np.array(
@@ -128,6 +132,7 @@ def find_rotation(
     refusal = _refusal(angles, correlation, best)
     if refusal:
         return CannotTell(reason=refusal)
+    # The best angle has neighbours, because ``_refusal`` rejects the first and the last one.
     rotation_deg = angles[best] + _STEP_DEG * vertex(*correlation[best - 1 : best + 2])
     # σ of a least-squares rotation: noise of the map over the norm of its derivative
     slope = (turned[best + 1] - turned[best - 1]) / (2 * np.deg2rad(_STEP_DEG))
@@ -174,6 +179,7 @@ def _rotate_reference(
     """Return the reference rotated and moved to ``position``, on the known subapertures."""
     n, middle = len(known), (len(reference) - 1) / 2
     rows, columns = np.nonzero(known)
+    # Each subaperture is looked up in the reference, which takes the inverse rotation.
     x = columns - (n - 1) / 2 - position.at[0]
     y = rows - (n - 1) / 2 - position.at[1]
     cosine, sine = np.cos(angle_rad), np.sin(angle_rad)

@@ -211,6 +211,7 @@ def _fit_usable(
     # remembered here, because ``_fix_mask`` gives every instrument a mask
     own_mask = instrument.wfs.valid_subapertures is not None
     instrument = _fix_mask(instrument)
+    # Kept apart from the recipe that the search finds, so that the report can name what differs.
     reported = replace(
         instrument.slopes, orientation=options.orientation or instrument.slopes.orientation
     )
@@ -228,9 +229,11 @@ def _fit_usable(
     if options.start is not None:
         start = options.start
     else:
+        # The search returns no pose where no rotation explains the lowest orders well enough.
         start = pose if pose is not None else instrument.start
     found = _run_method(models, target, instrument.with_anamorphosis(start), options, report_stage)
     n_lost = np.count_nonzero(found.settled.solution.projection.gains == 0.0)
+    # A gain is exactly 0 where the model's column is 0, or opposite to the measured one.
     if 2 * n_lost > used.n_modes:
         raise ModelError(
             f"{instrument.name}: the fit ended where {n_lost} of {used.n_modes} modes change no "
@@ -244,10 +247,12 @@ def _fit_usable(
         report_stage("fit")
         usable = _remove_noise(usable, noisy)
         used = basis.subset(usable.columns)
+        # The smooth combinations contained the removed modes, so they have to be computed again.
         target, models = target_of(usable, instrument), replace(models, basis=used, lowest=None)
         # From the first result: noise columns moved it little, so the search need not begin again.
         begin = instrument.with_anamorphosis(found.settled.solution.alpha)
         found = _run_method(models, target, begin, options, report_stage)
+    # After the fit, because each column is compared with the model of its neighbours at α.
     smear = measure_smear(found.settled.solution, found.settled.target)
     if smear.is_found:
         report_stage("fit")
@@ -256,11 +261,13 @@ def _fit_usable(
         )
     report_stage("verdict")
     fit = _make_fit(models, found, usable, axes_doubt, reported, options)
+    # An accepted fit has its columns in order, and this search repeats that for the orientation.
     if options.explain and not fit.accepted:
         columns = find_displaced_columns(
             replace(instrument, slopes=reported), usable, used, mapper=mapper
         )
         fit = add_displaced(fit, tuple(columns))
+    # A mask computed from the pupil agrees with the pupil by construction.
     return _note_mask(fit, instrument) if own_mask else fit
 
 
@@ -279,6 +286,7 @@ def _note_mask(fit: Fit, instrument: Instrument) -> Fit:
         instrument.stop is Stop.MIRROR
         and check_mask(replace(instrument, stop=Stop.TELESCOPE), (x, y)) is None
     )
+    # An accepted registration is not overruled by the mask: the difference is a remark only.
     if not fit.accepted and not of_stop:
         advised = f"{Advice.DO_NOT_USE}: {difference}"
     return replace(fit, remarks=remarks, recommendation=advised)
@@ -300,15 +308,19 @@ def _remove_smear(
     the original fit is returned.
     """
     begin = instrument.with_anamorphosis(found.settled.solution.alpha)
+    # The first secant begins without removal, where the whole measured share is left.
     before, left_before, share = 0.0, first.share, first.share
     again, sigma = found, first.sigma
     for _ in range(_SMEAR_STEPS):
         if not 0.0 < share <= MAX_SMEAR:
             return found, usable  # the secants diverged: the residual has another cause
         cleaned = remove_smear(usable, share)
+        # A whole fit for each trial: the registration moves with the share that is removed.
         again = _run_method(models, target_of(cleaned, instrument), begin, options, report_stage)
         left = measure_smear(again.settled.solution, again.settled.target)
         rate = (left.share - left_before) / (share - before)
+        # The share left over changes by ``rate`` for each unit removed, so σ of the removed share
+        # is that of the measured one over the rate.
         sigma = left.sigma / max(abs(rate), _LEAST_RATE)
         # removing more must leave less; a rate of the other sign is noise
         if abs(left.share) < max(left.sigma, _SMEAR_SETTLED) or rate >= 0.0:
@@ -318,6 +330,8 @@ def _remove_smear(
     # Any additional unknown explains a little: it must explain a tenth of the residual.
     if again.settled.share > _SMEAR_EXPLAINS * found.settled.share:
         return found, usable
+    # The solution with the original columns is kept: how far α has moved since then gives the part
+    # of σ that belongs to the share.
     again = replace(again, smear=Smear(share=share, sigma=sigma), before=found.settled.solution)
     return again, remove_smear(usable, share)
 
@@ -376,6 +390,7 @@ def _select_modes(reference: Reference, modes: NDArray[np.intp] | None) -> Refer
 def _remove_shapeless(reference: Reference, instrument: Instrument) -> Reference:
     """Return only the columns of modes that have a usable shape in the instrument file."""
     flat = np.isin(reference.columns, instrument.mirror.flat_modes)
+    # A matrix of another shape is left to ``check_reference``, which reports it.
     if not flat.any() or flat.all() or reference.matrix.shape[1:] != flat.shape:
         return reference
     named = ", ".join(str(mode) for mode in reference.columns[flat][:_MAX_LISTED])
@@ -425,6 +440,7 @@ def _find_axes(
 
     search = search_about(about, stated)
     if options.start is None and search.best.correlation < DOUBTFUL_CORRELATION:
+        # Only without a given start, because the corners take eight further searches.
         corners = [
             about.with_vector(about.vector + FAR_SUBAP * np.array([x, y, 0.0, 0.0]))
             for x, y in product((-1.0, 0.0, 1.0), repeat=2)
@@ -434,16 +450,21 @@ def _find_axes(
         most = max(one.best.correlation for one in far.values())
         # rotated by 180 deg together with the axes, the same mirror is at the opposite shift
         alike = [one for one in far if far[one].best.correlation > most - EQUAL_CORRELATION]
+        # Of equal explanations the one with the fewest changes of the axes and the smallest
+        # rotation is the likeliest.
         place = min(alike, key=lambda one: far[one].best.effort)
         if far[place].best.correlation > search.best.correlation + 2.0 * MIN_CORRELATION_LEAD:
             about, search = place, far[place]
     best = search.best
+    # A weak correlation gives no rotation: the fit then starts from the file's values.
     sure = best.correlation >= MIN_CORRELATION
     pose = replace(about, rotation_rad=best.rotation_rad) if sure else None
     if stated is None:
         return best.slopes, pose, search.refusal, search.lowest
     if best.correlation >= DOUBTFUL_CORRELATION:
         return best.slopes, pose, "", search.lowest
+    # A stated orientation is compared with a free search only if it explains the lowest orders
+    # badly: that search tries every orientation and order.
     doubt = check_stated_orientation(best, search_about(about, None).best)
     return best.slopes, pose, doubt, search.lowest
 
@@ -485,6 +506,8 @@ def _run_method(
             settled = settle(models, target, landing.best.alpha, nuisances)
             return _Found(settled=settled, landing=landing)
         case Method.SENSITIVITY:
+            # From one start, as the method is used at the AOF, so there are no other minima to
+            # compare.
             return _Found(settled=project_on_sensitivities(models, target, start, nuisances))
         case Method.PAPER:
             if not _stroke_known(models.instrument):
@@ -516,6 +539,7 @@ def _make_fit(
     solution, target, models = settled.solution, settled.target, settled.models
     nuisances, slopes = settled.nuisances, models.instrument.slopes
     seen = solution.projection
+    # The registration has no prior, so its distance from one is 0.
     values = np.concatenate([np.zeros(4), nuisances.from_prior(solution.nuisances)])
     regions = pupil_regions(target.valid, slopes.kind.n_planes)[target.rows]
     residual_fraction = settled.share
@@ -523,6 +547,7 @@ def _make_fit(
     pupils = try_pupils(few)
     others = compare_instruments(settled, few, pupils)
     power = np.sum(target.matrix[target.rows] ** 2, axis=0)
+    # The target's columns are divided by the passes, and their noise with them.
     noise = None if usable.noise is None else usable.noise / usable.passes
     structured = measure_structure(seen.residual, power, noise)
     # The share of the power that a smooth gain over the pupil would explain.
@@ -549,6 +574,7 @@ def _make_fit(
     )
     optics = list_optics(as_in_file, settled, before)
     stroke_known = _stroke_known(models.instrument)
+    # This takes further fits, so only if a fitted value differs notably from the file.
     without = fit_file_values(as_in_file, settled) if any(one.notable for one in optics) else None
     left_map = _residual_map(found)
     arms_deg = tuple(arm.angle_deg for arm in find_arms(left_map))
@@ -561,8 +587,11 @@ def _make_fit(
         # The registration moves in proportion to the share that is removed.
         error = by_smear * found.smear.sigma / found.smear.share
         sure = sure.with_moves(error[np.newaxis], np.ones(1))
+    # From the structured part of the residual, because noise says nothing about positions.
     misplaced = _misplacement_sigma(models.instrument, structured)
     images = nuisances.images.T @ solution.nuisances[nuisances.image_places]
+    # Tilted faces of a pyramid displace its images and also turn the edges between the faces. The
+    # model contains the displacement only.
     turned = kind_of(models.instrument).turned_edge_sigma(models.instrument, images.reshape(2, 4).T)
     sure = sure.with_moves(np.array([misplaced, turned]), np.ones(2))
     noise_share = bound_noise_share(seen.residual, solution.matrix[target.rows] * seen.gains)
@@ -581,6 +610,8 @@ def _make_fit(
         structure=structured,
         after_light=float(np.sqrt(max(structured**2 - by_light, 0.0))),
         uncertainty=sure,
+        # A σ that already contains the move of an alternative would always cover that move, so the
+        # verdict compares moves with σ before alternatives were added.
         before=before,
         alternatives=tried,
         landing=found.landing,

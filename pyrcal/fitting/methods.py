@@ -169,6 +169,7 @@ class Landing:
 
 def search_minimum(models: FitModels, target: Target, start: Misregistration) -> Landing:
     """Return the result from a start; if it explains little, the best of many starts."""
+    # Weights by the power of each combination, so that large strokes do not decide alone.
     matrix = models.low_order.combine_columns(target.matrix)
     low = Columns(
         matrix=matrix, weights=1.0 / np.sum(matrix[target.rows] ** 2, axis=0), rows=target.rows
@@ -178,6 +179,7 @@ def search_minimum(models: FitModels, target: Target, start: Misregistration) ->
     for tried in (start, *map(start.with_vector, _other_starts(start.vector))):
         found.append(approach(models.far, low, tried))
         models.counter.n += found[-1].n_matrices
+        # The seven other starts are needed only if the first one ends in a false minimum.
         if found[-1].converged and found[-1].misfit < GOOD_MISFIT:
             break
     # an end that has not converged is used only if no other has
@@ -209,6 +211,8 @@ class Settled:
     @property
     def prior(self) -> Array:
         """``(4 + n_nuisances,)`` effective weight of the prior of each unknown, 1 / σ²."""
+        # Correlated slopes carry less information than their number suggests, so that the prior
+        # weighs more against them.
         return self.nuisances.prior * self.solution.dispersion
 
     @property
@@ -243,6 +247,7 @@ def settle(
     if not solution.on_fine_grid and settled.share < SEARCH_RESIDUAL:
         solution = refine(models, seen, solution.alpha, nuisances, near=solution)
         settled = replace(settled, solution=solution)
+    # Before the repeated fits: far from the true instrument their linear steps converge slowly.
     settled = _with_nearest_instrument(settled)
     models, nuisances = settled.models, settled.nuisances
     # ``approaching``: iterate on the coarse grid, which is cheaper, until that has converged
@@ -272,6 +277,7 @@ def settle(
         taken = settled if images is None and near is None else taken
     if settled.solution.on_fine_grid:
         return settled
+    # The repetitions ended on the coarse grid, but the residual on the fine one defines α.
     solution = refine(models, settled.target, settled.solution.alpha, nuisances)
     return replace(settled, solution=solution)
 
@@ -345,8 +351,11 @@ def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
     best = int(np.argmin(found))
     change = SENSOR_CHANGES[best]
     nothing = float(np.log(NO_SENSOR_NUMBER / models.sensor_number))
+    # The scan of logarithms ends at a third of the number and never reaches a sensor without
+    # modulation, which is therefore tried separately.
     if best == 0 and left(nothing) < found[0]:
         change = nothing
+    # The vertex of a parabola needs a sample on both sides; at an end the sample itself is used.
     elif 0 < best < len(found) - 1:
         change += vertex(*found[best - 1 : best + 2]) * (SENSOR_CHANGES[1] - SENSOR_CHANGES[0])
     if abs(change) < LINEAR_CHANGE:
@@ -411,6 +420,8 @@ def _with_nearest_images(settled: Settled) -> tuple[FitModels, Nuisances]:
         matrix = subset.with_displaced_images(displaced).cheap.interaction_matrix(solution.alpha)
         return few.project(matrix, every).chi_at_best + improbable
 
+    # Fitted values of blurs are dropped: a blur has no effect to first order, so that its value
+    # from linear steps is arbitrary.
     displaced = nuisances.displaced + np.where(blurring, 0.0, values) @ nuisances.images
     least = left(displaced)
     for pattern in nuisances.images[blurring]:
@@ -438,6 +449,8 @@ def _update_models(settled: Settled, *, move_images: bool) -> tuple[FitModels, N
     optics = []
     for k, (optic, offset) in enumerate(nuisances.optics, nuisances.first_optic):
         change = float(settled.solution.nuisances[k])
+        # Smaller changes are described by the derivative. The models, with the matrices already
+        # computed, are then kept, which also ends the repetitions.
         if abs(change) > LINEAR_CHANGE and models.exact(optic):
             change = float(np.clip(change, -LONGEST_OPTIC_STEP, LONGEST_OPTIC_STEP))
             models, offset = models.with_optic(optic, change), offset + change
@@ -559,6 +572,7 @@ def _scan_parameter(
         found[beyond] = chi(start + beyond * step)
     places = np.array(sorted(found))
     values = np.array([found[k] for k in places])
+    # Only near the lowest sample: over a wide scan the criterion is not a parabola.
     near = np.abs(places - best) <= FITTED_HALF_WIDTH
     bend, slope, least = np.polyfit(places[near] - best, values[near], 2)
     # without a minimum near the lowest sample, the polynomial is no better than the sample

@@ -83,6 +83,7 @@ def choose_sampling(instrument: Instrument) -> int:
     points in all: with fewer points its edges become grey.
     """
     usual, pupil = kind_of(instrument).fine_sampling, instrument.pupil
+    # A grey map has no sharp edge that another sampling would blur.
     if pupil is None or np.any((pupil.lit > 0.0) & (pupil.lit < 1.0)):
         return usual
     points = round(instrument.subaperture_m / (instrument.binning * pupil.pitch_m))
@@ -118,6 +119,7 @@ class FitModels:
         pupil.
         """
         known = self.made.get(sampling)
+        # ``replace`` passes the same dictionary on to models of other instruments.
         if known is not None and known.instrument is self.instrument:
             return known.of_modes(basis or self.basis)
         model = InteractionModel(
@@ -131,6 +133,7 @@ class FitModels:
         )
         if known is not None:
             model.share_modes(known)
+        # A trial that is used once must not replace the fit's own model in the shared dictionary.
         if not once:
             self.made[sampling] = model
         return model
@@ -210,6 +213,8 @@ class FitModels:
         if not isinstance(self.basis, ModalBasis) or not isinstance(self.basis.surface, Gaussian):
             raise ModelError("fit: found influence functions without a coupling to be changed")
         surface = self.basis.surface
+        # A Gaussian is coupling ** (r / pitch)²: with a width e times larger its exponent is e²
+        # times smaller.
         coupling = float(surface.coupling ** np.exp(-2.0 * change))
         return replace(self, basis=self.basis.of_surface(replace(surface, coupling=coupling)))
 

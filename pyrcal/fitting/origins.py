@@ -95,6 +95,7 @@ def _find_slopes(reported: SlopeRecipe, found: SlopeRecipe) -> Iterator[Origin]:
             how="scanned: the lowest modes",
             correct=True,
         )
+    # The file leaves the orientation to the search on purpose, so there is nothing to correct.
     if reported.orientation is None:
         yield Origin(
             key="orientation",
@@ -121,6 +122,7 @@ def is_determined(
     number that the file does not have is accepted if hardly more than noise is left over. Agreement
     of disjoint sets proves nothing: they share the errors of the model.
     """
+    # Such a number is hardly better known than its prior.
     if one.sigma > MAX_LOG_SIGMA:
         return False
     if one.reported is None or with_file_values is None:
@@ -151,6 +153,8 @@ def _describe_optic(one: FoundOptic, *, determined: bool) -> Origin:
 
 def _find_wavelength(about: Instrument, gains: NDArray[np.float64]) -> Iterator[Origin]:
     middle = float(np.median(gains))
+    # Slopes per metre go as one over the wavelength. If strokes are unknown too, both scale all
+    # columns alike and cannot be separated.
     if "wfs.wavelength_m" in about.unknown and about.mirror.stroke_known and middle > 0.0:
         scatter = float(np.std(gains)) / middle
         yield Origin(
@@ -163,6 +167,7 @@ def _find_wavelength(about: Instrument, gains: NDArray[np.float64]) -> Iterator[
 
 
 def _find_strokes(about: Instrument) -> Iterator[Origin]:
+    # One gain for each mode is free in every fit, so that unknown strokes cost no information on α.
     if not about.mirror.stroke_known:
         yield Origin(
             key="stroke",

@@ -85,6 +85,7 @@ class PupilNumber:
             step, light = few.step(few.own, rate), self.reported**self.power
             value = self.limit(light + step[-1])
             if value != light:
+                # Less the step of the fit's own instrument, which is not 0 on the coarse grid.
                 moved = step[:4] - few.step(few.own)[:4]
                 return value ** (1.0 / self.power), few.lead(few.own, rate), moved
         return self.reported, Lead(share=1.0, sigma=0.0), np.zeros(4)
@@ -101,6 +102,8 @@ class PupilNumber:
         """
         light, matrix = self.reported**self.power, few.own
         for _ in range(_N_STEPS):
+            # At a new value the border may cut no subaperture, and then nothing determines a
+            # further step.
             if not few.tells(matrix, rate):
                 break
             before, left = light, matrix
@@ -320,6 +323,7 @@ def try_pupils(few: FitSubset) -> tuple[TriedPupil, ...]:
     little = few.residual_fraction < MIN_PUPIL_EXPLAINED
     for number in _numbers(few.models.instrument):
         rate = number.rate(few)
+        # To first order first, because each further value takes the matrix of another sensor model.
         value, lead, moved = number.near(few, rate)
         if not little and lead.share < EXCLUDED_SHARE:
             value, lead, moved = number.far(few, rate)

@@ -102,6 +102,7 @@ def _diameter(answers: Array, about: float) -> float:
     shares = np.clip(
         np.nan_to_num(answers) / np.quantile(answers[known], BRIGHT_QUANTILE), 0.0, 1.0
     )
+    # Responses far outside are stray and gaps far inside are dead pixels: neither changes the area.
     at_border = np.where(beyond > BORDER_SUBAP, 0.0, shares)
     area = float(np.sum(np.where(beyond < -BORDER_SUBAP, 1.0, at_border)))
     return 2.0 * float(np.sqrt(area / np.pi))
@@ -124,6 +125,7 @@ def compute_responses(measured: Array, expected: Array, valid: NDArray[np.bool_]
     known = np.isfinite(found) & np.isfinite(due)
     answers = np.full(valid.shape, np.nan)
     if known.any():
+        # Where hardly any response is expected, the ratio would be one of noise.
         known &= np.nan_to_num(due) > SILENT_SHARE * np.median(due[known])
         answers[valid] = np.divide(found, due, out=np.full(len(due), np.nan), where=known)
     return answers

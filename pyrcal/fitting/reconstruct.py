@@ -68,6 +68,7 @@ def main(options: argparse.Namespace) -> int:
     instrument = _apply_sensor(_apply_orientation(described, fit), fit)
     check_reconstruction(instrument, options.modes, SAMPLING, options.memory_gb)
     light = None if options.flux_map is None else read_light(options.flux_map, instrument)
+    # The pool already has a thread for each core; threads of BLAS would compete with them.
     with threadpool_limits(1), ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         model = RtcInteractionModel(
             instrument,
@@ -155,6 +156,7 @@ def _check_control(path: Path, fit: KnownFit, n_modes: int) -> None:
         it and the registration is not determined.
     """
     way_round = "give the registration itself (X,Y,ROT,MAG) to make the reconstructor regardless"
+    # Files of earlier versions contain no check of the loop.
     if fit.stable_gain is None:
         if not fit.accepted:
             raise MatrixError(
@@ -162,7 +164,10 @@ def _check_control(path: Path, fit: KnownFit, n_modes: int) -> None:
                 f"its reconstructor is stable; fit again with this version, or {way_round}"
             )
         return
+    # The reconstructor's modes are counted in the basis, the stable ones among those fitted.
     fitted = n_modes if fit.modes is None else int((fit.modes < n_modes).sum())
+    # The check of the loop decides here, and not the verdict on the registration: a reconstructor
+    # may be stable although α is not determined.
     if fit.stable_modes is not None and fitted > fit.stable_modes:
         fewer = (
             f"use --modes {fit.stable_modes}, fit with a lower --gain"

@@ -31,6 +31,7 @@ def check_sealed(path: Path) -> None:
         return
     try:
         with open_hdf5(path) as file:
+            # By address, because hard links may form a cycle without an end.
             seen = {h5py.h5o.get_info(file.id).addr}
             groups, n_links = [file["/"]], 0
             while groups:
@@ -46,6 +47,7 @@ def _check_group(group: h5py.Group, path: Path, seen: set[int]) -> list[h5py.Gro
     found = []
     for name in group:
         link = group.get(name, getlink=True)
+        # Only hard links are opened, since opening an external one would read another file.
         item = group[name] if isinstance(link, h5py.HardLink) else link
         beyond = _find_outside_data(item)
         if beyond is not None:
@@ -126,7 +128,10 @@ def read_recorded(path: Path, dataset: str | None = None) -> Recorded:
                 f"{stored.where}: found shape {stored.shape}, expected (n_slopes, n_modes), or "
                 '(n_modes, ny, nx) where wfs.input = "frames"'
             )
+        # Further arrays belong to the matrix next to them: a file may hold several matrices in
+        # groups.
         group = (dataset or DATASET).strip("/").rpartition("/")[0]
+        # A cube of frames has its modes along the first axis, a matrix of slopes along the second.
         n_modes = stored.shape[1 if len(stored.shape) == 2 else 0]
 
         def find_sibling(name: str) -> StoredArray | None:
@@ -160,6 +165,7 @@ def file_sha256(path: Path) -> str:
 
 def _matrix(container: Container, dataset: str | None) -> StoredArray:
     found = container.find(dataset or DATASET)
+    # A FITS extension need not have a name, so the only one is taken.
     if found is None and dataset is None and container.is_fits and len(container.arrays) == 1:
         (found,) = container.arrays.values()
     if found is None:
@@ -189,6 +195,7 @@ def _modes(
     indices = values.astype(np.intp)
     kinds, times = np.unique(indices, return_counts=True)
     if np.any(times > 1):
+        # Two columns of one mode could have different gains, of which the fit has one.
         twice = kinds[times > 1][0]
         raise MatrixError(f"{where}: found mode {twice} more than once, expected each once")
     return indices

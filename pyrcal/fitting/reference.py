@@ -68,6 +68,7 @@ def check_reference(
         unit is not the metre.
     """
     _check_shape(reference, n_slopes, n_modes)
+    # In double precision, because in single precision the limit itself would be infinite.
     damaged = np.abs(reference.matrix) > np.float64(LARGEST_VALUE)
     if damaged.any():
         reference = replace(
@@ -78,6 +79,7 @@ def check_reference(
                 f"{damaged.sum()} values above {LARGEST_VALUE:.0e} are taken as not finite",
             ),
         )
+    # Before the columns: a dead subaperture would make each of them not finite.
     reference, silenced = _remove_dead_rows(reference)
     kept, left_out = _find_usable(reference)
     left_out = (*reference.left_out, *silenced, *left_out)
@@ -100,6 +102,7 @@ def _check_shape(reference: Reference, n_slopes: int, n_modes: int) -> None:
     if matrix.ndim != 2:
         raise MatrixError(f"reference: found {matrix.ndim} axes; expected 2, {expected}")
     if matrix.shape[0] != n_slopes:
+        # A reconstructor has the same shape as a transposed matrix.
         turned = matrix.shape[1] == n_slopes
         hint = ": it is transposed, or a reconstructor" if turned else ""
         expected += likely_kind(matrix.shape[0], n_slopes)
@@ -129,6 +132,7 @@ def _remove_dead_rows(reference: Reference) -> tuple[Reference, tuple[str, ...]]
     it costs two rows and not all columns. Of equal rows only the first is a measurement.
     """
     unknown = ~np.isfinite(reference.matrix)
+    # A column without any value would count against every slope.
     measured = ~unknown.all(axis=0)
     if not measured.any():
         return reference, ()
@@ -168,6 +172,7 @@ def _find_usable(reference: Reference) -> tuple[NDArray[np.bool_], tuple[str, ..
         )
     kept = finite & alive
     places = np.flatnonzero(kept)
+    # Only usable columns, so that none is listed as a copy of a column that is left out itself.
     equal = find_defects(np.ascontiguousarray(reference.matrix.T[kept])) if len(places) else {}
     copies = {
         int(places[column]): f"{COPY}{places[int(reason.removeprefix(COPY))]}"

@@ -74,6 +74,7 @@ def _note_mirrored(reported: SlopeRecipe, found: SlopeRecipe) -> Iterator[str]:
     """Yield a note if the sensor sees the nominal actuator geometry mirrored."""
     axes = found.assumed_orientation
     flags = [f"{name} = true" for name in FLIPS if getattr(axes, name)]
+    # Each flip is a mirror image; two of them make a rotation, which is nothing to report.
     if reported.orientation is None and len(flags) % 2:
         yield (
             f"the slopes' grid is mirrored against the nominal actuator positions "

@@ -93,6 +93,8 @@ def image_patterns(stop: Stop) -> Array:
     images together: α is then the mirror's position on the grid, and the pupil may be displaced
     independently.
     """
+    # Signs follow x, y and x y of the images, and the last row moves all alike, so the patterns are
+    # orthogonal.
     along = np.array([[-1, 1, -1, 1], [-1, -1, 1, 1], [1, -1, -1, 1], [1, 1, 1, 1]]) / 2.0
     both: Array = np.kron(np.eye(2), along).astype(np.float64)  # patterns along x, then along y
     return both if stop is Stop.TELESCOPE else both[[0, 1, 2, 4, 5, 6]]
@@ -105,6 +107,7 @@ def is_blurring(pattern: Array) -> bool:
     looks like a shift along the other axis to one of the slope components, so it can be measured.
     """
     along_x, along_y = pattern.reshape(2, 2, 2)
+    # A blur moves opposite images in opposite directions, so their sum is 0.
     even = np.abs(along_x + along_x[::-1, ::-1]) + np.abs(along_y + along_y[::-1, ::-1])
     return bool(np.all(even < 1e-9))
 
@@ -170,7 +173,9 @@ class Nuisances:
         if self.anamorphosis:
             distance[STRETCHES] -= self.nominal
         for k, (_, offset) in enumerate(self.optics, self.first_optic):
+            # The models are updated during a fit, whereas the prior stays at the file's value.
             distance[k] += offset
+        # The same for images: the models already contain ``displaced``, and the prior expects none.
         distance[self.image_places] += self.images @ self.displaced
         return distance
 
@@ -394,6 +399,7 @@ def refine(
     seen, every = _project_columns(columns, matrix, rates, values, nuisances)
     regions = nuisances.regions[columns.rows]
     counts = dispersion(seen, regions)
+    # The matrix is computed again for these unknowns only; all others act by their derivatives.
     moving, settled, converged = np.arange(4), SETTLED_STEP, False
     coarse_linear, fine_linear = LINEAR_STEP, FINE_LINEAR_STEP
     if nuisances.anamorphosis:
@@ -412,6 +418,7 @@ def refine(
             np.all(np.abs(step[moving]) < (coarse_linear if on_coarse_grid else fine_linear))
         )
         if on_coarse_grid and linear and _expected_share(seen, columns) < fine_below:
+            # A change of grid needs a matrix of its own, however short the step was.
             decides, linear = models.fine, False
         if linear:
             matrix = matrix + sum(step[k].astype(rates.dtype) * rates[k] for k in moving)

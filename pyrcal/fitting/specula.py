@@ -137,9 +137,11 @@ def write_specula(
             f"{places}: found {len(listed.rows)} subapertures, expected the {len(matrix) // 2} of "
             "the matrix"
         )
+    # The inverse of the order in which the import sorted the subapertures.
     by_listing = np.argsort(listed.by_rows)
     order = np.concatenate([by_listing, by_listing + n_slopes // 2])
     unit_m = NANOMETRE_M if stroke_known else 1.0
+    # One is slope per command and the other command per slope, so the unit enters inversely.
     for path, name, values in (
         (intmat, "INTMAT", matrix[order] * unit_m),
         (recmat, "RECMAT", reconstructor[:, order] / unit_m),

@@ -129,11 +129,16 @@ class System:
 
     def _parameters(self) -> Iterator[Parameter]:
         degrees = 180.0 / np.pi
+        # With all mirrors in the pupil, directions of stars have no effect, and any unit serves.
         highest_m = max(abs(mirror.altitude_m) for mirror in self.mirrors) or 1.0
         for sensor in self.sensors:
             free, star, laser = not sensor.fixed, sensor.star, sensor.star.height_m < inf
+            # A rotation or magnification of 1 over the radius moves the pupil's edge by one
+            # subaperture.
             edge = 2.0 / sensor.instrument.wfs.pupil_diameter
             parallax = sensor.instrument.subaperture_m / highest_m
+            # The cone effect images a mirror 1 - altitude / height times as wide, whose derivative
+            # by the height is altitude / height².
             higher = star.height_m**2 / highest_m * edge if laser else 1.0
             yield Parameter(sensor.name, "shift_x_subap", 1.0, 1.0, free)
             yield Parameter(sensor.name, "shift_y_subap", 1.0, 1.0, free)
@@ -141,6 +146,7 @@ class System:
             yield Parameter(sensor.name, "magnification", 1.0, edge, free)
             yield Parameter(sensor.name, "star_x_arcsec", 1 / ARCSEC_RAD, parallax, self.stars_move)
             yield Parameter(sensor.name, "star_y_arcsec", 1 / ARCSEC_RAD, parallax, self.stars_move)
+            # A natural star is at infinity, so there is no height to fit.
             found = self.heights_move and laser
             yield Parameter(sensor.name, "star_height_m", 1.0, higher, found)
         for mirror in self.mirrors:
@@ -230,6 +236,7 @@ class System:
             *(key for key in about.unknown if key.startswith("wfs.")),
             *(key for key in own.unknown if key.startswith("mirror.")),
         )
+        # With the pupil displaced on the grid, the model's pupil has to be displaced as well.
         shift = sensor.place.shift
         return replace(
             about,
@@ -276,6 +283,8 @@ class System:
         if drawn == Similarity() or not isinstance(mirror, Mirror):
             return mirror
         width_m = self.sensors[pair.sensor].instrument.subaperture_m
+        # Rotation and mirror image are in the positions from here on, so the new geometry has
+        # neither.
         sided = mirror.positions_m * [1.0, mirror.y_sign]
         return replace(
             mirror,
@@ -297,6 +306,7 @@ class System:
             turned, shifted = self._pair_rates(pair, values)
             drawn = self.drawn(pair)
             turn = self.seen(pair, values).turn / drawn.turn
+            # α begins where the instrument file's own map ends, so that map's shift is taken out.
             shifted = shifted - turn * turned * drawn.shift
             rates[:] = [shifted.real, shifted.imag, turned.imag, abs(turn) * turned.real]
         return found

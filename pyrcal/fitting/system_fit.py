@@ -86,6 +86,7 @@ def fit_system(system: System, alphas: Array, covariances: Array) -> SystemFit:
         ``(n_pairs, 4, 4)`` covariances of ``alphas``.
     """
     used = np.isfinite(alphas).all(axis=1)
+    # Whitened with the whole covariance, because errors of one pair's parameters are correlated.
     roots = np.array([np.linalg.inv(np.linalg.cholesky(one)) for one in covariances[used]])
     free = np.array([parameter.free for parameter in system.parameters])
     unit = np.array([parameter.subap for parameter in system.parameters])
@@ -145,6 +146,8 @@ class _Directions:
 
     @classmethod
     def of(cls, rates: Array) -> _Directions:
+        # Full, because with fewer measurements than parameters the remaining directions are
+        # unobservable and have to be named too.
         left, size, along = np.linalg.svd(rates, full_matrices=True)
         # singular values are in σ per subaperture: their reciprocal is 1 σ along the direction
         n_seen = int(np.sum(size > 1.0 / UNSEEN_SUBAP))
@@ -180,8 +183,10 @@ def _name_directions(
         for direction in directions:
             moved = (direction / unit)[free]
             size = float(np.linalg.norm(moved))
+            # Fixed parameters are left out, so a direction of such parameters only has no length.
             if size == 0.0 or np.linalg.norm(unseen @ moved) < _MIN_SHARE * size:
                 continue
+            # Only the part outside the directions named before, so that none is named twice.
             moved = moved @ left.T @ left / size
             if np.linalg.norm(moved) < _MIN_NEW_SHARE:
                 continue
@@ -193,6 +198,7 @@ def _name_directions(
         if found:
             yield words
     parameters = [parameter for parameter in system.parameters if parameter.free]
+    # What remains has no simple cause, so its largest parameters are listed.
     for direction in left:
         largest = np.argsort(-np.abs(direction))[:_MAX_LISTED]
         parts = [
@@ -253,6 +259,7 @@ def _of_each_star(system: System, values: Array) -> Iterator[tuple[str, list[Arr
             else f"the star's direction and the shift of {sensor.name}: {one}",
             aside,
         )
+        # The light of a star at infinity has no cone, and so no height to be confused.
         if own[HEIGHT] < inf:
             higher = np.zeros(len(values))
             higher[of_sensor][HEIGHT] = 1.0
@@ -277,6 +284,7 @@ def _common_shift(system: System, values: Array, along: complex) -> Array:
         shift = _xy(-turn * along / sensor.instrument.subaperture_m)
         direction[system.of_sensor(number)][SHIFTS] = shift
     for number, mirror in enumerate(system.mirrors):
+        # A mirror has one shift for all sensors, so stars at several heights share the mean cone.
         narrowed = 1.0 - mirror.altitude_m * float(np.mean(1.0 / heights))
         direction[system.of_mirror(number)][SHIFTS] = _xy(narrowed * along)
     return direction
@@ -296,6 +304,7 @@ def _common_turn(system: System, values: Array, turn: complex) -> Array:
     direction = np.zeros(len(values))
     for number in range(len(system.sensors)):
         own, change = values[system.of_sensor(number)], direction[system.of_sensor(number)]
+        # The sensor's map follows the mirror's, so it has to turn back for an unchanged image.
         change[ROTATION], change[MAGNIFICATION] = -turn.imag, -turn.real * own[MAGNIFICATION]
         change[STAR] = _xy(turn * complex(*own[STAR]))
     for number in range(len(system.mirrors)):

@@ -237,7 +237,10 @@ def uncertainty(
     noise = projection.chi / max(projection.residual.size - len(prior) - n_modes, 1)
     held = np.diag(prior * noise)
     spread = np.linalg.inv(normals.sum(axis=0) + held)
+    # Few modes scatter less about a solution that was fitted to them, which n / (n - 1) makes up
+    # for.
     every = _sandwich(spread, scores) * n_modes / max(n_modes - 1, 1)
+    # A few modes may agree by chance: σ is never below that of white noise.
     from_modes = _at_least(every[:4, :4], (spread * noise)[:4, :4])
     by_region = _sandwich(spread, _regional_scores(projection, regions))
     # noise also scatters between regions, but the statistical part already includes it
@@ -245,12 +248,15 @@ def uncertainty(
     regional = np.sqrt(np.maximum(np.diag(by_region) - white, 0.0))
     few = (1.0 + FEW_MODES_EXCESS * np.exp(-n_modes / FEW_MODES)) ** FEW_MODES_POWER
     share = few * REGIONAL_SHARE * regional[:4]
+    # ``REGIONAL_SHARE`` is known for the registration only, so nuisances have the whole scatter.
     model_error = np.sqrt(np.diag(by_region))[4:]
     if stretches is not None:
         # an anamorphosis is a magnification along one axis and its inverse along the other
         model_error[stretches] = few[3] * REGIONAL_SHARE[3] * regional[4:][stretches]
     kind_share = min(1.0, residual_fraction / STRANGE_RESIDUAL)
     far = kind_share * FAR_SHARE * shift_subap
+    # The floor is a displacement on the pupil: a rotation moves its edge by the radius times as
+    # much.
     floor = np.array([FLOOR_SUBAP, FLOOR_SUBAP, FLOOR_SUBAP / radius_subap, magnification_floor])
     # a quantity fixed by its prior may have any value within that prior
     held_back = (spread * np.diag(held) @ spread)[:4, :4] * noise * dispersed
@@ -274,6 +280,7 @@ def uncertainty(
     statistical = from_modes
     for kind in (mode_sets, pupil_sets):
         found = jackknife_sigma([one for one in sets if one.words in kind])
+        # Partitions have few sets, which may agree by chance, so they only increase σ.
         statistical = _at_least(statistical, np.diag(found**2))
     return Uncertainty(
         covariance=statistical + from_model,
@@ -306,6 +313,7 @@ def misplacement_sigma(
         RMS share of the signal that is left over and is no noise.
     """
     radii = np.hypot(*mirror.positions_m.T)
+    # Actuators up to a pitch outside the pupil still move the surface at its edge.
     seen = radii[radii <= radius_m + mirror.pitch_m]
     if len(seen) < 2:
         return np.zeros(4)
@@ -331,6 +339,7 @@ def nonlinearity_sigma(residual: float, noise_share: float) -> Array:
     """
     left = float(np.sqrt(max(residual**2 * (1.0 - noise_share) - LINEAR_RESIDUAL**2, 0.0)))
     shift = NONLINEAR_SHIFT_SUBAP * left
+    # Only errors of a shift were measured in proportion to the residual.
     return np.array([shift, shift, 0.0, 0.0])
 
 
@@ -390,6 +399,8 @@ def _at_least(covariance: Array, other: Array) -> Array:
 def _regional_scores(projection: Projection, regions: NDArray[np.intp]) -> Array:
     """Return the gradient by the unknowns from each region ``(n_unknowns, n_regions)``."""
     weighted = projection.residual * projection.weights
+    # In the Jacobian's precision: with two precisions einsum would convert the Jacobian, the
+    # largest array of a fit.
     single = weighted.astype(projection.jacobian.dtype, copy=False)
     by_slope = np.einsum("ksm,sm->ks", projection.jacobian, single)
     return np.array([np.bincount(regions, row) for row in by_slope])

@@ -204,6 +204,7 @@ def _check_explanation(findings: FitFindings) -> str:
 
 
 def _check_minimum(findings: FitFindings) -> str:
+    # Methods from one start have seen no other minimum.
     if findings.landing is None or not findings.landing.rivals:
         return ""
     rival = findings.landing.rivals[0].alpha.to_boundary()
@@ -263,9 +264,11 @@ def _describe_instrument(findings: FitFindings, rival: AlternativeInstrument) ->
 
 def _check_basis(findings: FitFindings) -> str:
     gains = findings.solution.projection.gains
+    # Medians, because a few columns with other strokes do not make another basis.
     middle = float(np.median(gains))
     scatter = float(np.median(np.abs(gains - middle)) / abs(middle)) * 1.4826
     negative = int(np.sum(gains <= 0.0))
+    # With unknown strokes gains may scatter freely, but their signs still belong to the basis.
     if negative == 0 and (scatter <= MAX_SCATTER or not findings.stroke_known):
         return ""
     if negative:
@@ -290,6 +293,7 @@ def _check_unit(findings: FitFindings) -> str:
             "unit than slope per metre of OPD (per nanometre would be 1e-09)"
         )
     factor = factor_of_passes(findings)
+    # A pass is a factor common to all modes, so gains that scatter have another cause.
     if factor is None or float(np.std(gains) / middle) >= _PASS_TOLERANCE:
         return ""
     words = "twice" if factor > 1.0 else "half"

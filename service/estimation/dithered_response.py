@@ -77,7 +77,7 @@ class DitheredResponse:
         self._means[mode] = mean + (left - mean) * np.float32(weight / total), total
 
     def _find_significant(self, modes: list[int]) -> None:
-        """Keep of these modes' residuals the patterns that stand out of the noise.
+        """Keep the patterns of these modes' residuals that exceed the noise.
 
         The model's error is smooth over modes and slopes, so that few patterns have most of it,
         while noise is spread over all: a single mode may be measured poorly, and the error of the

@@ -280,7 +280,7 @@ def last_samples(check: LoopCheck, before_seq: int) -> tuple[int, int] | None:
 
 
 def _judge(asked: Array, taken: Array, held: Array, loop: ClosedLoop) -> CommandResidual:
-    """Judge steps that were asked for ``(_TAPS, n_samples, n_modes)``, and taken."""
+    """Compare requested steps ``(_TAPS, n_samples, n_modes)`` with those taken."""
     weights = _lag(asked, taken, loop)
     obeys = np.abs(_shares(asked, taken, weights)[0] - 1.0) < STEP_TOLERANCE
     if obeys.any():

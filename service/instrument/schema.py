@@ -316,7 +316,7 @@ class Section(Generic[Said]):
         refuse(self.where(key), found, expected)
 
     def refuse_useless(self, keys: Iterable[str], beside: str) -> None:
-        """Refuse those of some keys that are written, and have no effect beside something."""
+        """Refuse each of these keys if it is given, because another setting makes it useless."""
         for key in sorted(self.given.intersection(keys)):
             raise ConfigurationError(f"{self.where(key)}: has no effect {beside}; remove it")
 

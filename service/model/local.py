@@ -54,7 +54,10 @@ class Patch:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MadeElsewhere:
-    """How another process makes something, from what can be pickled: a few kilobytes and parts."""
+    """Recipe for another process to make something.
+
+    It can be pickled: a few kilobytes, and parts.
+    """
 
     parts: tuple[object, ...]
     """Parts that all matrices of a model share: instrument, modes. They are sent to a cluster once.
@@ -88,7 +91,7 @@ class LocalShapes:
     and rates. Function j of layer k has the index ``k n_functions + j``."""
 
     elsewhere: MadeElsewhere | None = None
-    """How another process makes them; None if it cannot."""
+    """Recipe for another process to make them; None if it cannot."""
 
     # Makes numpy hand ``array @ shapes`` to __rmatmul__ instead of making an array of objects.
     __array_ufunc__: ClassVar[None] = None

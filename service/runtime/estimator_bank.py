@@ -29,7 +29,7 @@ N_MATRICES_FOLLOWED = 2
 """The reconstructor in use, and the one before: frames of it may still come."""
 
 _PLANS = {DitherKind.SINE: lock_in_plan, DitherKind.BINARY: random_plan}
-"""How the windows of each kind of dither are planned."""
+"""Functions that plan the windows of each kind of dither."""
 
 Member = TypeVar("Member", bound=Streaming)
 

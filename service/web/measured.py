@@ -317,7 +317,7 @@ class FitDocument(BaseModel):
     moved (by name), moved_sigma, preferred, undecided."""
 
     left_over: dict[str, Any] | None = None
-    """Places of the residual: border (over inside), subapertures and modes that stand out."""
+    """Location of the residual: border (over inside), outlying subapertures and modes."""
 
     notes: list[str]
     """Decisions of the fit that the user should know."""
@@ -326,9 +326,10 @@ class FitDocument(BaseModel):
 
 
 class FitMap(BaseModel):
-    """The signals of one mode: rows from the lowest y on, Sx beside Sy; null: not valid.
+    """Signals of one mode.
 
-    For pixels, the four images as they lie on the detector.
+    Rows from the lowest y on, Sx and Sy side by side; null if not valid. For pixels, the four
+    images in their arrangement on the detector.
     """
 
     model_config = ConfigDict(use_attribute_docstrings=True)
@@ -360,7 +361,7 @@ class FitFigures(BaseModel):
 
     residual_map: list[list[int | None]]
     """Residual in each subaperture, percent of the measured RMS: rows from the lowest y on, Sx
-    beside Sy; null: not valid."""
+    and Sy side by side; null if not valid."""
 
     maps: list[FitMap]
     """Signals of a few modes: those of the paper where they were used."""

@@ -40,7 +40,7 @@ class SensorKind(ABC):
     @property
     @abstractmethod
     def model(self) -> SensorModel:
-        """Its optics and its light; imported when they are first asked for."""
+        """Optics and light of the sensor; imported at the first use."""
 
     def as_read(self, written: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return ``[wfs]`` as it is to be held against the table.

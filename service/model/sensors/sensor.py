@@ -38,7 +38,7 @@ class RowTask(ABC):
 
     @property
     def elsewhere(self) -> MadeElsewhere | None:
-        """How another process makes the same; None: it gets megabytes of arrays."""
+        """Recipe for another process to make the same; None if it is sent megabytes of arrays."""
         return None
 
 

@@ -597,7 +597,7 @@ class RowResponse(RowTask):
     @property
     @override
     def elsewhere(self) -> MadeElsewhere | None:
-        """How another process makes the same, if it can make the shapes."""
+        """Recipe for another process to make the same; None if it cannot make the shapes."""
         shapes = self.shapes.elsewhere if isinstance(self.shapes, LocalShapes) else None
         if shapes is None:
             return None

@@ -225,8 +225,10 @@ class Calibration:
         if name == self._known["in_use"]:
             _log.warning("matrix.in-use-already", id=name)
         else:
+            # Read only for its error: an unreadable matrix must not replace the one that waits.
             self._kept(name)
             self._know(waiting=name, written=False, ordered=name)
+        # Removed last: the order remains if the matrix cannot be read or the bridge stops here.
         path.unlink()
 
     def _may(self) -> bool:
@@ -304,6 +306,7 @@ class Calibration:
 
 def keep(folder: Path, matrix: Reconstructor) -> None:
     """Write the numbers, with their sources."""
+    # Numbers before sources: a matrix whose manifest exists is complete.
     numbers, name = io.BytesIO(), matrix.manifest.id
     np.save(numbers, matrix.matrix, allow_pickle=False)
     replace_file(folder / f"{name}.npy", numbers.getvalue())

@@ -133,6 +133,7 @@ class Cacao:
             self._complain(str(error))
             self._unlink()
             return []
+        # take_slopes() sets the dither of new frames to zero, so the played values come after it.
         while self._played and self._played[0][1] <= self._rows.newest:
             self._rows.take_dither(*self._played.popleft())
         player = self._player
@@ -153,10 +154,12 @@ class Cacao:
         slopes, commands = self._open(self._names.slopes), self._open(self._names.commands)
         multiplied = self._open(self._names.multiplied)
         needed = int(self._calibration.index.max()) + 1
+        # With an index a frame may hold values that are not slopes; without one it may not.
         if slopes.n_values < needed or (self._whole and slopes.n_values != needed):
             raise StreamError(f"{slopes.name}: found {slopes.n_values} values, expected {needed}")
         n_modes, n_actuators = self._loop.n_modes, self._projection.shape[0]
         modal = self._loop.commands_are == "modes"
+        # cacao may control fewer modes than the basis has; an actuator command is always complete.
         fits = commands.n_values <= n_modes if modal else commands.n_values == n_actuators
         if not fits:
             expected = f"at most {n_modes} modes" if modal else f"{n_actuators} actuators"
@@ -264,6 +267,7 @@ class Cacao:
             self._rate_from = counter, now_s
         before, since_s = self._rate_from
         if now_s - since_s < _RATE_S:
+            # The last result holds until the next measurement: "" would end the complaint.
             return self.complaint if "frames a second" in self.complaint else ""
         self._rate_from = counter, now_s
         rate_hz, expected_hz = (counter - before) / (now_s - since_s), self._loop.frame_rate_hz
@@ -276,6 +280,7 @@ class Cacao:
         """Let time follow the counter; it is corrected slowly, for frames are written late."""
         if self._clock is not None:
             late_ns = measured_ns - self._time_ns(counter)
+            # A larger difference is a step of the clock or a gap, and is taken over at once.
             if abs(late_ns) < _CLOCK_STEP_NS:
                 measured_ns -= round((1.0 - _CLOCK_SHARE) * late_ns)
         self._clock = counter, measured_ns
@@ -320,6 +325,7 @@ class Cacao:
 
     def terms(self) -> Terms:
         """Return what a new reconstructor must fit at present."""
+        # A dictionary removes a repeated number and keeps the requested one first.
         rows = {self._n_next: None, len(self.reconstructor.matrix): None}
         return Terms(
             session=self.session,
@@ -353,6 +359,7 @@ class Cacao:
         """Return the loop's status."""
         gains, leak = self._gains_and_leak()
         n_controlled = len(self.reconstructor.matrix)
+        # cacao's stream may hold gains for modes that the matrix in use does not control.
         gains = (*gains[:n_controlled], *[0.0] * (self._loop.n_modes - n_controlled))
         stands = time.monotonic() - self._moved_s["commands"] > _STANDS_S
         some = [gain > 0.0 for gain in gains[:n_controlled]]
@@ -395,9 +402,11 @@ class Cacao:
                     row[:], row[: len(values)] = 0.0, values
         except StreamError as error:
             self._law_trouble = str(error)
+            # The last values that could be read, so that a missing stream is not a change of gains.
             return self._law or (tuple(both[0].tolist()), self._loop.leak)
         gains, factors = both
         n_controlled = len(self.reconstructor.matrix)
+        # A mode with zero gain is not in the loop, so its leak is left out.
         in_loop = factors[:n_controlled][gains[:n_controlled] > 0]
         leak, self._law_trouble = float(np.median(in_loop)) if len(in_loop) else self._loop.leak, ""
         # The contract has one leak for all modes.
@@ -443,6 +452,7 @@ class Cacao:
         except StreamError as error:
             return f"busy: {error}"[:1000], None
         per_metre = self._calibration.dm_modes.reshape(loop.n_modes, -1)
+        # The counter is that of slopes, because the telemetry counts frames by slopes.
         start_seq = slopes.counter + round(_LEAD_S * loop.frame_rate_hz) + 1
         mirror = Mirror(
             channel=channel,

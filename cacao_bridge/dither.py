@@ -96,6 +96,7 @@ class Player(Background):
             # Frames that were missed had the value that was still in the channel.
             if now > before + 1:
                 self._played(before + 1, now - 1, value_m)
+            # ``lead`` is added because the answer to this frame is on the mirror that much later.
             # A counter that goes back is another stream: the dither does not continue there.
             over = stands or now + self._mirror.lead >= last or now < before
             over = over or self._stopped.is_set()

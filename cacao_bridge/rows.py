@@ -73,6 +73,7 @@ class Rows:
     def take_slopes(self, first: int, values: Array32) -> None:
         """Take ``(n, n_slopes)`` of frames from ``first`` on."""
         self._put(self._slopes, self._of_slopes, first, values)
+        # The ring still holds the dither of the frame that had this place before.
         self.take_dither(first, first + len(values) - 1, 0.0)
         if self.next < 0:
             self.next = first
@@ -104,12 +105,14 @@ class Rows:
         runs: list[tuple[int, Array32]] = []
         if self.next < 0:
             return runs
+        # Older frames need commands whose place in the ring has been overwritten.
         self.skip(self._newest - self._kept + self._delay + 2)
         newest = self._newest if answers_to is None else min(self._newest, answers_to + self._delay)
         frames = np.arange(self.next, newest + 1)
         whole = self._complete(frames)
         for first, last in _runs(whole):
             if self.next < frames[first]:
+                # A gap is waited for before later rows leave, because frames are sent in order.
                 if self._newest - self.next < PATIENCE_FRAMES:
                     break
                 self.skip(int(frames[first]))
@@ -117,6 +120,7 @@ class Rows:
                 part = frames[start : min(start + self._per_message, last)]
                 runs.append((int(part[0]), self._rows(part)))
             self.next = int(frames[last - 1]) + 1
+        # If no command comes at all, there is no complete run above that could end the wait.
         self.skip(self._newest - self._kept // 2)
         return runs
 

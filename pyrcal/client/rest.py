@@ -126,6 +126,7 @@ class Service:
                         f"{error}; the order was sent and may have been carried out: "
                         "see pyrcal status and pyrcal audit"
                     ) from error
+                # Once only: a second loss is reported to the caller.
                 again = False
 
     @contextmanager
@@ -170,6 +171,7 @@ class Service:
                 f"{self.url}: nothing answers ({error}); start the service with pyrcal run, or "
                 "name its address with --url or PYRCAL_URL"
             ) from error
+        # Only responses with a limit for the whole: a stream of events has no end.
         # A timeout of the socket is for each read: an answer that trickles would never meet it.
         timer = threading.Timer(limit_s, _cut, (connection.sock, late))
         timer.daemon = True

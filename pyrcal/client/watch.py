@@ -132,6 +132,7 @@ def _read(service: Service, response: HTTPResponse, latest: Latest) -> Iterator[
         if "data" in fields:
             with understood(service):
                 data = dict(json.loads(fields["data"]))
+            # An event without an id leaves the place in the log as it was.
             latest.last = fields.get("id", latest.last)
             yield fields.get("event", ""), data
         fields = {}
@@ -187,6 +188,7 @@ def screen(latest: Latest, now_s: float) -> Group:
             for line in reversed(latest.log)
         ]
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        # A state with other fields comes from another version of the service.
         status, log = [f"NOT this version of pyrcal: {error!r}"], []
     return Group(
         head,

@@ -195,6 +195,7 @@ class Matrices(Background):
             _log.info("reconstructor.not-taken", id=manifest.id, reason=refusal)
             return
         active = self._computer.reconstructor.manifest
+        # The same matrix is in use already, so there is nothing to swap.
         if (active.id, active.layout.sha256) == (manifest.id, manifest.layout.sha256):
             return
         self._execute(self._staging.commit(manifest, time.monotonic()))
@@ -251,6 +252,7 @@ class Matrices(Background):
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 priority=zenoh.Priority.DATA_LOW,
             )
+        # The manifest follows at a higher priority and may overtake chunks.
         key = self._keys.measured_commit(manifest.id)
         self._session.put(
             key,

@@ -98,6 +98,7 @@ class Replies:
             self._signatures.check(self._keys.command(kind), data)
             reply = self._cache.handle(decode_command(kind, data), time.monotonic())
         except WireError as error:
+            # The command could not be decoded, so its id is taken from the data if it is readable.
             reply = Reply(id=command_id(data), accepted=False, reason=str(error), start_seq=None)
         _log.info(
             "command",

@@ -39,6 +39,8 @@ class Terms:
 
     def refusal(self, manifest: Manifest) -> str:
         """Return the reason to reject the manifest, in the contract's words, or an empty string."""
+        # The present number of modes stays valid after another was requested: that number takes
+        # effect only with the next matrix.
         rows, columns = manifest.layout.shape
         if columns != self.n_slopes or rows not in self.n_controlled:
             expected = " or ".join(str([n, self.n_slopes]) for n in self.n_controlled)
@@ -95,7 +97,8 @@ class Staging:
 
     def chunk(self, matrix_id: str, index: int, data: bytes) -> Outcome:
         """Add one chunk. An invalid chunk is dropped and requested again after the timeout."""
-        # Late or repeated chunks of a matrix that is settled.
+        # Late or repeated chunks of a matrix that is settled. A new collection for them would never
+        # be completed, and could displace one in progress.
         if matrix_id in self._answers:
             return Outcome()
         with suppress(WireError):
@@ -115,6 +118,7 @@ class Staging:
         refusal = self._terms().refusal(manifest)
         if refusal:
             return self._reject(manifest.id, refusal)
+        # The deadline starts with the manifest, which alone says how many chunks there are.
         collection.deadline_s = now_s + _CHUNK_TIMEOUT_S
         # Chunks that contradict the manifest are dropped here and requested again by poll().
         with suppress(WireError):
@@ -124,6 +128,7 @@ class Staging:
     def poll(self, now_s: float) -> Outcome:
         """Request missing chunks after the first timeout; reject the matrix after the second."""
         outcome = Outcome()
+        # Without a manifest the deadline is infinite. _reject() changes the dictionary.
         for matrix_id, collection in list(self._collected.items()):
             if now_s < collection.deadline_s:
                 continue
@@ -139,6 +144,7 @@ class Staging:
     def applied(self, matrix_id: str, frame_seq: int) -> Acknowledgement | None:
         """Record a swap and return its acknowledgement, or None if the matrix was voided."""
         staged = self._answers.get(matrix_id)
+        # void() drops staged answers, so a swap that belongs to an ended session is not found.
         if staged is None:
             return None
         return self._remember(replace(staged, state=AckState.APPLIED, frame_seq=frame_seq))
@@ -189,6 +195,7 @@ class Staging:
         if manifest.layout.sha256 == known.sha256:
             # In the present session, because the service ignores acknowledgements of others.
             return Outcome(acknowledgements=[replace(known, session=self._terms().session)])
+        # This rejection is not remembered: the first matrix keeps its answer under the id.
         reason = f"id: {manifest.id} was used with sha256 {known.sha256}, expected a new id"
         return Outcome(acknowledgements=[self.answer(manifest, AckState.REJECTED, reason)])
 
@@ -215,8 +222,10 @@ class Staging:
         )
 
     def _remember(self, acknowledgement: Acknowledgement) -> Acknowledgement:
+        # An unreadable commit has no id under which it could be repeated.
         if acknowledgement.id is not None:
             self._answers[acknowledgement.id] = acknowledgement
+            # A replaced entry keeps its old place in the dictionary and would be dropped too early.
             self._answers.move_to_end(acknowledgement.id)
         if len(self._answers) > _MAX_REMEMBERED_ANSWERS:
             self._answers.popitem(last=False)

@@ -121,6 +121,7 @@ class Archive:
             raise StorageError(f"{self.directory}: cannot be used: {error}") from error
         anew = self.index.open()
         told += [line for folder in self.stores for line in folder.adopt(anew=anew)]
+        # A new archive has neither index nor products; products without an index mean a loss.
         if anew and (n_products := len(self.reconstructors.records())):
             lost = self.directory / "index.sqlite"
             text = f"missing; rebuilt from {n_products} products; the audit trail begins here"
@@ -231,6 +232,7 @@ class Archive:
         except OSError as error:
             raise StorageError(f"{path}: cannot be written: {error}") from error
         finally:
+            # The file does not exist if the disk refused to open it.
             path.unlink(missing_ok=True)
 
     def audit_trail(self, part: Range | None = None) -> tuple[AuditEntry, ...]:

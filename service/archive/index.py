@@ -199,6 +199,7 @@ class Index:
         It lacks what a service that was killed had written last.
         """
         memory = sqlite3.connect(self._name_of_copy, uri=True, **_OPTIONS)
+        # If the file cannot be read, the copy stays empty and is rebuilt from the products.
         with contextlib.suppress(sqlite3.Error):
             # immutable: without it SQLite must create files next to the index to read it, which a
             # full disk refuses.
@@ -215,6 +216,8 @@ class Index:
 
     @property
     def _name_of_copy(self) -> str:
+        # Names in the shared cache hold for the whole process: the id of the object separates the
+        # copies of two archives.
         return f"file:pyrcal-{os.getpid()}-{id(self)}?mode=memory&cache=shared"
 
     def _bring_up(self, connection: sqlite3.Connection) -> bool:
@@ -233,6 +236,7 @@ class Index:
         except ArchiveError:
             connection.close()
             raise
+        # The former connection is closed only here: if the new one fails, it stays in use.
         self.close()
         with self._lock:
             self._connection = connection
@@ -332,7 +336,9 @@ class Index:
     def asked(self, question: str, values: Values) -> list[Any]:
         """Return rows over a connection that only reads; no writer waits."""
         name = f"{self._path.absolute().as_uri()}?mode=ro"
+        # A second connection reaches a database in memory only by its name in the shared cache.
         name = self._name_of_copy if self._is_copy else name
+        # With a write-ahead log a reader does not block the writer, so no lock is taken.
         with self._explained(), closing(sqlite3.connect(name, uri=True)) as connection:
             return connection.execute(question, values).fetchall()
 

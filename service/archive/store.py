@@ -138,6 +138,7 @@ class Store(Folder, Generic[Record]):
         """
         known, told = self._index.checksums(self._table), []
         for path in sorted(self.directory.glob("*.h5")):
+            # Written before its row in the index: a service killed in between left it without one.
             if path.stem not in known:
                 try:
                     record, matrix = self._record(path.stem), self._matrix(path.stem)

@@ -169,6 +169,7 @@ def _explain(outcome: BaseException | None) -> None:
     PyrcalError
         The refusal itself.
     """
+    # Task groups wrap even a single exception.
     while isinstance(outcome, BaseExceptionGroup):
         outcome = outcome.exceptions[0]
     if isinstance(outcome, PyrcalError):
@@ -193,7 +194,9 @@ class _Ending:
         self.asked.set()
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)
+        # A thread of its own can end the process even if the event loop hangs.
         guard = threading.Timer(END_WITHIN_S, _leave_behind)
+        # A daemon, so that it does not itself keep an orderly end waiting.
         guard.daemon = True
         guard.start()
 

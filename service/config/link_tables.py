@@ -142,6 +142,7 @@ class ZenohTable(CredentialsTable):
 
     @model_validator(mode="after")
     def _nobody_from_elsewhere_without_a_certificate(self) -> ZenohTable:
+        # With ``connect`` the service opens no port; the observatory's routers control access.
         if self.tls is not None or self.connect or self.anyone_may_command_the_mirror:
             return self
         for endpoint in self.listen:
@@ -162,6 +163,7 @@ def _host_of(endpoint: str) -> str | None:
     if protocol.startswith("unix"):
         return None
     # Metadata and options of zenoh's endpoints follow ? and #; brackets are those of IPv6.
+    # The last colon precedes the port; an IPv6 address contains others.
     return re.split(r"[?#]", address)[0].rpartition(":")[0].strip("[]")
 
 
@@ -236,6 +238,7 @@ def link_security(zenoh: ZenohTable, system: str) -> LinkSecurity:
         LinkRole.SERVICE: access.service,
         LinkRole.VIEWER: access.viewer,
     }
+    # Only a router needs the passwords of all users; a client sends its own.
     if zenoh.users is not None and not zenoh.connect:
         known = {"dictionary_file": _users_file(zenoh.users)}
         told[USERS] = {**_own_user(zenoh.users), **known}

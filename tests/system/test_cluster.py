@@ -53,10 +53,9 @@ def ended(process):
 
 
 def rows_of(path):
-    """Return rows in order, without what each run has of its own: its time, its session's id."""
+    """Return rows in order, without what each run has of its own: its session's id."""
     rows = sorted(map(json.loads, path.read_text().splitlines()), key=lambda row: row["seed"])
     for row in rows:
-        del row["took_s"]
         row["log"] = [line for line in row["log"] if line[2] != "rtc.session"]
     return rows
 

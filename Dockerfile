@@ -14,7 +14,9 @@ COPY pyrcal pyrcal
 COPY check_rtc check_rtc
 COPY sim_rtc sim_rtc
 COPY cacao_bridge cacao_bridge
-RUN /opt/build/bin/pip wheel --no-deps --no-build-isolation --wheel-dir /opt/wheels .
+# The build context has no git: docker build --build-arg COMMIT=$(git describe --always --dirty=-modified) .
+ARG COMMIT=""
+RUN PYRCAL_COMMIT="$COMMIT" /opt/build/bin/pip wheel --no-deps --no-build-isolation --wheel-dir /opt/wheels .
 
 FROM ${BASE}
 COPY deploy/requirements.lock /opt/requirements.lock

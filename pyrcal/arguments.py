@@ -13,7 +13,7 @@ from typing_extensions import override
 from pyrcal.client import remote
 from pyrcal.fitting import arguments as file_arguments
 from pyrcal.playback import arguments as playback_arguments
-from service import __version__, program
+from service import program
 from service.parser import HelpFormatter, OneLineParser, closest
 
 OTHER_PROGRAMS = {
@@ -52,7 +52,7 @@ def command_line() -> OneLineParser:
             "pyrcal fit flao-lbt matrix.h5 --output fit.h5",
         ),
     )
-    parser.add_argument("--version", action="version", version=f"pyrcal {__version__}")
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and commit")
     parser.add_argument(
         "--completion",
         action=_Completion,
@@ -109,6 +109,17 @@ class _Grouped(HelpFormatter):
         text = super()._format_action(action)
         heading = HEADINGS.get(str(action.metavar))
         return text if heading is None else f"\n  {heading}:\n{text}"
+
+
+class _Version(argparse.Action):
+    """Action that prints version and commit and exits; only then is git asked for the commit."""
+
+    @override
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        from service.version import software_version
+
+        print(f"pyrcal {software_version()}")
+        parser.exit()
 
 
 class _Completion(argparse.Action):

@@ -18,7 +18,6 @@ from pyrcal.fitting.control_check import ReconstructorVerdict
 from pyrcal.fitting.fitted import Fit, Registration
 from pyrcal.fitting.instrument_checks import NOTABLE_CHANGE, NOTABLE_SIGMA
 from pyrcal.fitting.left_over import LeftOver
-from service import __version__
 from service.control.gains import CalibrationGains
 from service.control.reconstructor import Inversion, Recipe
 from service.errors import MatrixError
@@ -33,6 +32,7 @@ from service.model.misregistration import (
     Misregistration,
 )
 from service.model.slopes import FLIPS, Orientation
+from service.version import software_version
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -525,6 +525,6 @@ def fill_reconstructor(
 
 def _made_now() -> dict[str, str]:
     return {
-        "software": f"pyrcal {__version__}",
+        "software": f"pyrcal {software_version()}",
         "created_utc": datetime.now(UTC).isoformat(timespec="seconds"),
     }

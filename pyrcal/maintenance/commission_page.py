@@ -19,11 +19,11 @@ from pyrcal.maintenance.acceptance import (
     compare_residuals,
     residuals_per_mode,
 )
-from service import __version__
 from service.errors import ConfigurationError
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.tracking.alarms import ALARMS
 from service.tracking.registration import Source
+from service.version import software_version
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -75,7 +75,7 @@ def format_page(data: Commissioning, criteria: Sequence[Criterion]) -> str:
     parts = [
         f"<h1>Commissioning of {escape(data.instrument.name)}</h1>",
         f'<p class="note">{_time(data.first_ns)} to {_time(data.last_ns)} UTC. Written '
-        f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC by pyrcal {__version__}.</p>",
+        f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC by pyrcal {software_version()}.</p>",
         f'<p class="verdict {"pass" if accepted else "fail"}">{verdict}: '
         f"{n_passed} of {len(criteria)} criteria passed</p>",
         "<h2>Acceptance</h2>",

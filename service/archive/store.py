@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from service import __version__
 from service.archive.index import Index, Product, begun_ns_utc
 from service.archive.serialisation import NOT_UNDERSTOOD, from_json, to_json
 from service.errors import ArchiveError, StorageError, UnknownIdError
 from service.files.whole import open_hdf5, write_whole
+from service.version import software_version
 from service.wire import checksum, validate_id
 
 Provenance = str | int | float | bool | NDArray[Any]
@@ -241,7 +241,7 @@ class Store(Folder, Generic[Record]):
             fill(file)
             file.attrs["id"] = record.id
             file.attrs["sha256"] = found
-            file.attrs["software_version"] = __version__
+            file.attrs["software_version"] = software_version()
             file.attrs["record"] = to_json(record)
 
         write_whole(path, whole)

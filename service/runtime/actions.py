@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from service import __version__, wire
+from service import wire
 from service.control.gains import gain_table
 from service.control.gate import GateVerdict
 from service.control.loop import ControlLoop
@@ -31,6 +31,7 @@ from service.tracking.operation_records import MeasurementRecord
 from service.tracking.pointing_law import registration_ahead
 from service.tracking.registration import Registration
 from service.tracking.state import TrackerState
+from service.version import software_version
 
 UNKNOWN_PARENT = "unknown"
 """Parent id of a matrix made while the matrix in use is unknown: only the RTC's own have no parent.
@@ -376,7 +377,7 @@ class Actions:
         covariance = None if registration is None else registration.total_covariance
         provenance = {
             "instrument": self.instrument.name,
-            "software": f"pyrcal {__version__}",
+            "software": f"pyrcal {software_version()}",
             "why": why,
         }
         await asyncio.to_thread(

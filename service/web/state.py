@@ -17,7 +17,6 @@ from prometheus_client.exposition import choose_encoder
 from prometheus_client.registry import Collector
 from pydantic import BaseModel, Field
 
-from service import __version__
 from service.link.statistics import LinkStatistics
 from service.runtime.snapshot import Snapshot, WorkerLoad
 from service.tracking.alarms import ARCHIVE_FAILED, WORKER_BEHIND, AlarmState, Responsible, Severity
@@ -26,6 +25,7 @@ from service.tracking.operations.running import CurrentOperation, ServiceState
 from service.tracking.products import MatrixState
 from service.tracking.registration import Source, Validity
 from service.tracking.state import Mode, TrackerState
+from service.version import software_version
 from service.web import views
 from service.web.authentication import OPEN
 from service.web.problems import INVALID, problem, problem_response
@@ -117,7 +117,7 @@ async def healthz(request: Request, service: ServiceDep) -> HealthView | Respons
     if snapshot.stalled:
         status = HTTPStatus.SERVICE_UNAVAILABLE
         return problem(request, status, "stalled", snapshot.stalled)
-    return HealthView(status="ok", version=__version__, uptime_s=snapshot.uptime_s)
+    return HealthView(status="ok", version=software_version(), uptime_s=snapshot.uptime_s)
 
 
 @health.get(
@@ -222,7 +222,7 @@ class SnapshotCollector(Collector):
         """Yield every metric."""
         snapshot = self._snapshot()
         tracker = snapshot.tracker
-        yield _gauge("build_info", "Version", {__version__: 1}, "version")
+        yield _gauge("build_info", "Version", {software_version(): 1}, "version")
         parts = {part: not text for part, text in find_problems(snapshot).items()}
         yield _gauge("ready", "1 for each part that does its work; all: /readyz", parts, "part")
         yield _gauge("uptime_seconds", "Since the service started", snapshot.uptime_s)

@@ -36,7 +36,7 @@ def wheel(tmp_path_factory):
         text=True,
         timeout=patience(240.0),
         check=False,
-        env={**os.environ, "PIP_DISABLE_PIP_VERSION_CHECK": "1"},
+        env={**os.environ, "PIP_DISABLE_PIP_VERSION_CHECK": "1", "PYRCAL_COMMIT": "0123abcd"},
     )
     assert done.returncode == 0, done.stderr
     (path,) = folder.glob("*.whl")
@@ -65,6 +65,10 @@ def test_a_wheel_has_what_the_program_reads_besides_its_code(wheel):
     ]
     names = set(wheel.namelist())
     assert {str(path.relative_to(ROOT)) for path in expected if path.is_file()} <= names
+
+
+def test_a_wheel_names_the_commit_that_it_was_built_from(wheel):
+    assert wheel.read("service/commit.txt").decode().strip() == "0123abcd"
 
 
 def test_a_wheel_has_the_demo_and_no_studies(wheel):

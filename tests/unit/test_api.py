@@ -14,7 +14,6 @@ from prometheus_client.openmetrics.parser import (
 )
 from prometheus_client.parser import text_string_to_metric_families
 
-from service import __version__
 from service.archive import Archive
 from service.archive.nights import Annotation
 from service.control.gains import ModeGain
@@ -75,6 +74,7 @@ from service.tracking.registration import (
     ValidityState,
 )
 from service.tracking.state import Level, LogEntry, Mode, TrackerState
+from service.version import software_version
 from service.web.views import to_json
 from service.wire import DitherKind, DitherRequest, DitherStatus, Loop, Pattern, Pointing, Status
 from tests.states import changed, tracker_state
@@ -841,7 +841,7 @@ async def test_a_wrong_method_is_a_problem_that_says_what_is_allowed(client):
 async def test_healthz_answers_while_the_service_goes_on(client):
     assert await body_of(client, "/healthz") == {
         "status": "ok",
-        "version": __version__,
+        "version": software_version(),
         "uptime_s": 60.0,
     }
 

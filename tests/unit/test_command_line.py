@@ -22,12 +22,12 @@ from pyrcal.arguments import (
 )
 from pyrcal.demo.arguments import demo_parser
 from pyrcal.fitting.matrix import FitOptions
-from service import __version__
 from service.config import Settings, load_settings
 from service.control.reconstructor import MAX_CONDITION, Recipe
 from service.control.reconstructor import InversionMethod as MakeMethod
 from service.model.kinds import Method as FitMethod
 from service.tracking.state import Mode
+from service.version import software_version
 from service.wire import CHUNK_LIMIT
 
 ROOT = Path(__file__).parents[2]
@@ -53,7 +53,7 @@ def test_the_version_is_printed(capsys):
     with pytest.raises(SystemExit) as end:
         main(["--version"])
     assert end.value.code == 0
-    assert capsys.readouterr().out.strip() == f"pyrcal {__version__}"
+    assert capsys.readouterr().out.strip() == f"pyrcal {software_version()}"
 
 
 @pytest.mark.parametrize("words", [["--completion", "bash"], ["--help"]])

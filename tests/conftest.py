@@ -2,7 +2,6 @@
 
 import atexit
 import gc
-import inspect
 import os
 import shutil
 import signal
@@ -56,6 +55,9 @@ LASTING = (
     "tests/system/test_harm.py",
 )
 """Long tests of a minute and more, longest first: started late, they would leave workers idle."""
+
+MAX_UNSTABLE = 3
+"""Largest number of system tests that may pass at the second try only."""
 
 SHARED = (
     "tests/system/test_broken_messages.py",
@@ -113,9 +115,9 @@ def pytest_collection_modifyitems(config, items):
         # of each try, not of the first one and the second together
         limit = pytest.mark.timeout(patience(limit_s), func_only=in_system)
         item.add_marker(limit, append=False)
-        if in_system or inspect.iscoroutinefunction(getattr(item, "obj", None)):
-            # Real time on a machine that others use: a change refused for a moment's stall costs
-            # hours, and what is broken fails twice. The first failure is told at the end.
+        if in_system:
+            # Real processes in real time on a machine that others use: a stall of a moment may fail
+            # a test once. Everything else runs once, so that a race condition turns red.
             item.add_marker(pytest.mark.flaky(reruns=1))
 
 
@@ -132,10 +134,26 @@ def pytest_collection():
 
 
 def pytest_terminal_summary(terminalreporter):
-    """Tell why a test that passed at its second try failed at the first."""
+    """Print why a test that passed at its second try failed at the first, and how many did."""
     for report in terminalreporter.getreports("rerun"):
         terminalreporter.write_sep("_", f"first try of {report.nodeid}")
         terminalreporter.line(report.longreprtext)
+    if unstable := _unstable(terminalreporter):
+        limit = f" (more than {MAX_UNSTABLE} make the run fail)"
+        terminalreporter.line(f"unstable: {len(unstable)}{limit}: {', '.join(sorted(unstable))}")
+
+
+def pytest_sessionfinish(session):
+    """Fail a run in which too many tests needed a second try: that is no moment's stall."""
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    if reporter and session.exitstatus == 0 and len(_unstable(reporter)) > MAX_UNSTABLE:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def _unstable(reporter):
+    """Return the ids of the tests that failed at the first try and passed at the second."""
+    passed = {report.nodeid for report in reporter.getreports("passed")}
+    return passed & {report.nodeid for report in reporter.getreports("rerun")}
 
 
 def _only_long(config):

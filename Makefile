@@ -1,7 +1,7 @@
 # Nothing is assumed but make and a Python >= 3.11; everything else goes into .venv.
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo docs test test-long fuzz faults nights restarts check paper bench soak load wheel lock sbom audit clean FORCE
+.PHONY: help setup demo docs test test-long fuzz faults nights restarts check paper bench soak load wheel lint lock sbom audit clean FORCE
 
 PYTHON ?= python3
 PY := .venv/bin/python
@@ -51,9 +51,11 @@ nights: $(STAMP) ## random sequences of faults in simulated time; hours, ARGS="-
 restarts: $(STAMP) ## the service killed two hundred times, and what it had acknowledged; half an hour
 	@$(PY) -m pyrcal_studies.restarts $(ARGS)
 
-check: $(STAMP) ## lint, formatting, types, import contracts and unused code
+lint: $(STAMP) ## lint and formatting, in a second: what .pre-commit-config.yaml calls
 	@$(PY) -m ruff check .
 	@$(PY) -m ruff format --check .
+
+check: lint ## lint, formatting, types, import contracts and unused code
 	@$(PY) -m mypy
 	@.venv/bin/lint-imports --no-logo
 	@$(PY) -m tests.unused_code

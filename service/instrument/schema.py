@@ -9,7 +9,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, NoReturn, TypeVar
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Final,
+    Generic,
+    Literal,
+    NoReturn,
+    TypeVar,
+)
 
 from pydantic import BeforeValidator, Field, PlainValidator, create_model
 
@@ -70,10 +79,12 @@ def _convert_term(value: object) -> Term:
             return Term(repr(float(value)))
         case str():
             term = Term(value)
-        case {"of": str(of), "at": [*at], "values": [*values], **more} if not more:
-            if not all(type(number) in {int, float} for number in (*at, *values)):
-                raise ModelError(f"found {value}, expected numbers in at and values")
-            term = Term(of, tuple(map(float, at)), tuple(map(float, values)))
+        case {"of": str(of), "at": [*at], "values": [*values], **more} if more.keys() <= {"period"}:
+            numbers: list[Any] = [*at, *values, *more.values()]
+            if not all(type(number) in {int, float} for number in numbers):
+                raise ModelError(f"found {value}, expected numbers in at, values and period")
+            *_, period = (*numbers, None) if not more else numbers
+            term = Term(of, tuple(map(float, at)), tuple(map(float, values)), period)
         case _:
             raise ModelError(f"found {value!r}, expected a number, an expression or {_FORM}")
     for name in sorted(term.names - set(ANGLES)):
@@ -103,7 +114,8 @@ class LawTable(Read):
 
     α is tracked as the deviation from it. Each parameter is a number, an expression of `azimuth`
     and `elevation` (degrees) and of names of the observatory's values, or a table `{ of =
-    "elevation", at = [20, 80], values = [0.1, -0.1] }` with linear interpolation. A whole turn of
+    "elevation", at = [20, 80], values = [0.1, -0.1] }` with linear interpolation; `period = 360`
+    beside `at` makes the table repeat itself, as that of a derotator's angle must. A whole turn of
     azimuth must not change it, except by whole turns of the rotation.
     """
 
@@ -118,6 +130,34 @@ class LawTable(Read):
 
     magnification: _Magnification = None
     """None: 1."""
+
+
+_LARGEST_STEPS: Final = {
+    "shift_x_subap": NORTH_STEP_SUBAP,
+    "shift_y_subap": NORTH_STEP_SUBAP,
+    "rotation_deg": NORTH_STEP_DEG,
+    "magnification": NORTH_STEP_MAGNIFICATION,
+}
+"""Largest step of each parameter where a table returns to its beginning."""
+
+
+def remarks_on_law(file: Section[LawTable]) -> tuple[str, ...]:
+    """Return a remark on each table whose ends do not agree although they are one place."""
+    remarks = []
+    for name, largest in _LARGEST_STEPS.items():
+        term: Term | None = getattr(file.said, name)
+        step = 0.0 if term is None else term.closing_step
+        # A rotation by whole turns is none.
+        if term is None or abs(math.remainder(step, 360.0)) <= largest:
+            continue
+        declared = "Give" if term.period else "If it returns there, add period = 360 and give"
+        remarks.append(
+            f"{file.where(name)}: the table ends with {term.values[-1]:g} and begins with "
+            f"{term.values[0]:g}, a whole turn of {term.expression} apart: where it returns, α "
+            "would leap by the difference, and no reconstructor is made until a window has "
+            f"confirmed it. {declared} both ends the same value"
+        )
+    return tuple(remarks)
 
 
 def law_of(table: LawTable) -> PointingLaw | None:

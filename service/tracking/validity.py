@@ -68,7 +68,10 @@ BEFORE_DOUBT = (
 _ROUNDING_NS = 1_000_000
 """A window that follows another begins where that one ends, but for the rounding of a frame."""
 
-_WORTHLESS = (Validity.STALE, Validity.INVALID)
+LEAPT = "the pointing law leapt, and no window has confirmed α since"
+"""Doubt about α, which is then a prediction."""
+
+_WORTHLESS = (Validity.STALE, Validity.PREDICTED, Validity.INVALID)
 
 Array = NDArray[np.float64]
 
@@ -229,6 +232,8 @@ def elapsed_s(state: TrackerState, registration: Registration, now_ns: int) -> f
 
 def _validity_of(context: StepContext, registration: Registration) -> ValidityState:
     policy = context.policy
+    if registration.doubt == LEAPT:
+        return ValidityState(level=Validity.PREDICTED, reason=LEAPT)
     reason = _explain_invalidity(context.state, registration, policy)
     if reason is not None:
         return ValidityState(level=Validity.INVALID, reason=reason)

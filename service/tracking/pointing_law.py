@@ -97,8 +97,9 @@ def follow_law(context: StepContext) -> None:
         _begin(context, now)
         return
     step, leap = difference(before.nominal, now), context.alpha.law.leap
-    if leap is not None and (_has_returned(leap, step) or _goes_on(context, leap, step)):
-        _end_leap(context, returned=_has_returned(leap, step))
+    returned = leap is not None and _has_returned(leap, step)
+    if leap is not None and (returned or _goes_on(context, law, dict(before.reported), step)):
+        _end_leap(context, returned=returned)
         _carry(context, now, step if leap.taken else np.array(leap.step) + step)
         return
     since_s = (context.now_ns - before.worked_out_ns_utc) / SECOND_NS
@@ -277,12 +278,26 @@ def _has_returned(leap: LawLeap, step: Array) -> bool:
     return bool(np.all(np.abs(np.array(leap.step) + step) <= MAX_STEP_AT_REST))
 
 
-def _goes_on(context: StepContext, leap: LawLeap, step: Array) -> bool:
-    """Return whether a step is as far again as a leap, to a factor of 3: both are one motion."""
-    first, second = np.array(leap.step) / MAX_STEP, step / MAX_STEP
-    along, length = float(first @ second), float(first @ first)
-    soon = context.now_ns - leap.since_ns_utc <= MOTION_MEMORY_S * SECOND_NS
-    return soon and not leap.far and length < 3.0 * along < 9.0 * length
+def _goes_on(context: StepContext, law: PointingLaw, was: Reported, step: Array) -> bool:
+    """Return whether a step and the leap before it are one motion.
+
+    Both are as far, to a factor of 3, and so is the step that the law would make next if what it
+    depends on went on: at the edge of a table it would not.
+    """
+    state, leap = context.alpha.law, context.alpha.law.leap
+    if leap is None or leap.far or state.nominal is None:
+        return False
+    if context.now_ns - leap.since_ns_utc > MOTION_MEMORY_S * SECOND_NS:
+        return False
+    next_ = {name: 2.0 * value - was.get(name, value) for name, value in state.reported}
+    then = _nominal(context, law, next_)
+    if isinstance(then, str):
+        return False
+    first = np.array(leap.step) / MAX_STEP
+    length = float(first @ first)
+    further = difference(state.nominal, then) - step
+    along = [float(first @ (each / MAX_STEP)) for each in (step, further)]
+    return all(length < 3.0 * each < 9.0 * length for each in along)
 
 
 def _leap(context: StepContext, before: LawState, now: Misregistration, *, far: bool) -> None:

@@ -386,6 +386,23 @@ def test_a_derotator_that_turns_is_followed(deg_per_s, rate_hz):
     assert night.alpha.rotation_rad == pytest.approx(before + turned)
 
 
+def test_a_step_of_a_table_is_no_motion_though_two_reports_cross_it():
+    law = PointingLaw(rotation_deg=Term("derotator", (-0.01, 0.01), (0.0, 1.5)))
+    night = Night(policy=replace(POLICY, law=law)).meet(t_ns=START_NS)
+    for angle in (-0.03, -0.02, -0.01):
+        night.report({"derotator": angle}, after_s=2.0)
+        night.window(ALPHA)
+    before = night.alpha
+    for angle in (0.0, 0.01, 0.02, 0.03):
+        night.report({"derotator": angle})
+        assert night.known.validity.level is Validity.PREDICTED
+        assert night.alpha.vector == pytest.approx(before.vector)
+    night.report({"derotator": 0.04}, after_s=3.0)
+    night.window(before.add_step(np.array([0.0, 0.0, np.deg2rad(1.5), 0.0])))
+    assert night.known.doubt == ""
+    assert np.rad2deg(night.alpha.rotation_rad - before.rotation_rad) == pytest.approx(1.5)
+
+
 def test_a_value_that_comes_once_an_hour_is_confirmed_first():
     """α has followed the mirror by windows meanwhile: it must not be moved a second time."""
     law = PointingLaw(shift_x_subap=Term("0.02 * temperature"))

@@ -2,11 +2,11 @@
 
 Run: ``python -m pyrcal_studies.campaign.law_leaps --seeds 0:20 --output var/law_leaps.jsonl
 --table table.md``. Each draw is a night of 40 s on the simulator's small telescope in mode auto.
-After 12 s a value that the law depends on wraps, is reported wrong, comes after a long silence or
+After 10 to 18 s a value that the law depends on wraps, is reported wrong, comes after a silence or
 reaches a step of its table, and the law leaps by 0.1 to 1 subaperture, 0.5 to 3 deg, or both. The
-mirror stays where it was, except in the draws ``moves``, in which it jumps as the law says. The row
-has when the leap was named, the matrices that were made or used for another registration than the
-true one, and how long α was wrong.
+mirror stays where it was, except in the draws ``mirror moves``, in which it jumps as the law says.
+A row has when the leap was named, the matrices that were made or used for another registration than
+the true one, and how long α was wrong.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from threadpoolctl import threadpool_limits
+from typing_extensions import override
 
 from pyrcal_studies.campaign.observatory import (
     SETTINGS,
     SMALL,
-    START_NS,
     Observatory,
     bench_of,
 )
@@ -41,15 +41,22 @@ from service.runtime.policy import policy_of
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.policy import Policy
-from service.tracking.state import Mode
+from service.tracking.state import Mode, TrackerState
 
-KINDS = ("wraps", "wraps, two values", "table with a step", "typed wrong", "comes late", "moves")
-LEAP_S, NIGHT_S = 12.0, 40.0
+KINDS = (
+    *("wraps", "wraps, not declared", "wraps, two values", "wraps to and fro", "step of a table"),
+    *("reported wrong", "reported late", "pointing reported wrong", "mirror moves", "mirror moves"),
+)
+"""What a value does; a seed has each in turn. In the last two the law is right."""
+
+NIGHT_S = 40.0
 REPORT_S = 0.2
 """Between two reports of a value."""
 
 SILENCE_S = 8.0
-"""Before a value that comes late."""
+"""Before a value that is reported late."""
+
+TO_AND_FRO_S = 2.0
 
 WRONG = np.array([0.03, 0.03, 0.15, 0.01])
 """Beyond this α, or the registration of a matrix, is wrong: subapertures, degrees, ratio."""
@@ -70,7 +77,10 @@ class Story:
     """Law of a draw, and what is reported when."""
 
     law: PointingLaw
-    values: Callable[[float], dict[str, float]]
+    leap_s: float
+    """Time of the leap, seconds of the night."""
+
+    reports: Callable[[float], dict[str, float]]
     """Values reported at a time, seconds since the leap."""
 
     step: tuple[float, float, float, float]
@@ -79,50 +89,44 @@ class Story:
 
 def story_of(draw: Draw) -> Story:
     """Return the law and the values of a draw."""
-    rng = np.random.default_rng([draw.seed, 48])
-    shift, rotation = rng.uniform(0.1, 1.0), rng.uniform(0.5, 3.0)
-    part = draw.seed % 3  # both, the shift alone, the rotation alone
-    shift, rotation = shift * (part != 2) * rng.choice([-1, 1]), rotation * (part != 1)
-    if draw.kind == "moves":  # as far as a loop survives
-        shift, rotation = 0.5 * shift, rotation / 3.0
-    step = (float(shift), 0.0, float(rotation * rng.choice([-1, 1])), 0.0)
-    ends: tuple[tuple[float, float], tuple[float, float]]
-    match draw.kind:
-        case "wraps" | "wraps, two values":
-            ends = (180.0, -180.0), (-1.0, 1.0)
-            period = 360.0 if draw.seed % 2 else None
-        case _:
-            ends, period = ((-0.01, 0.01), (0.0, 1.0)), None
-    two = draw.kind == "wraps, two values"
-    at, share = ends
-    terms = [
-        Term(
-            "focus" if two and k == 2 else "derotator",
-            tuple(sorted(at)),
-            tuple(s * size for s in (share if at[0] < at[1] else (0.5, -0.5))),
-            period,
-        )
-        for k, size in enumerate(step)
-    ]
-    law = PointingLaw(shift_x_subap=terms[0], rotation_deg=terms[2])
+    rng, kind = np.random.default_rng([draw.seed, 48]), draw.kind
+    part = rng.integers(3)  # both, the shift alone, the rotation alone
+    shift = float(rng.uniform(0.1, 1.0) * rng.choice([-1, 1]) * (part != 2))
+    turn = float(rng.uniform(0.5, 3.0) * rng.choice([-1, 1]) * (part != 1))
+    if kind == "mirror moves":  # as far as a loop survives
+        shift, turn = 0.4 * shift, turn / 3.0
+    wraps = kind.startswith("wraps")
+    name = "azimuth" if kind.startswith("pointing") else "derotator"
+    other = "focus" if kind == "wraps, two values" else name
+    at = (-180.0, 180.0) if wraps else (-0.01, 0.01)
+    # A value that wraps goes from the end of the table to its beginning.
+    low, high = (0.5, -0.5) if wraps else (0.0, 1.0)
+    period = (360.0,) if wraps and kind != "wraps, not declared" else ()
+    law = PointingLaw(
+        shift_x_subap=Term(name, at, (low * shift, high * shift), *period),
+        rotation_deg=Term(other, at, (low * turn, high * turn), *period),
+    )
     speed = float(rng.uniform(0.05, 1.0))  # deg a second
 
-    def values(since_s: float) -> dict[str, float]:
-        turned = speed * since_s
-        match draw.kind:
-            case "wraps" | "wraps, two values":
-                now = (turned + 360.0) % 360.0 - 180.0
-            case "table with a step" | "moves":
-                now = turned + (0.1 if turned >= 0.0 else -0.1)
-            case "typed wrong":
-                now = 5.0 if since_s >= 0.0 else -5.0
-            case _:
-                if -SILENCE_S < since_s < 0.0:
-                    return {}
-                now = 5.0 if since_s >= 0.0 else -5.0
-        return {name: float(now) for name in law.names}
+    def reported(since_s: float) -> dict[str, float]:
+        turned = speed * since_s + 0.01
+        if kind == "wraps to and fro" and 0.0 <= since_s < TO_AND_FRO_S:
+            turned = 0.01 if round(since_s / REPORT_S) % 2 else -0.01
+        if wraps:
+            now = (turned + 360.0) % 360.0 - 180.0
+        elif kind in {"reported wrong", "reported late", "pointing reported wrong"}:
+            now = 5.0 if since_s >= 0.0 else 0.0
+        else:
+            now = turned + 0.05 if since_s >= 0.0 else turned - 0.05
+        late = kind == "reported late" and -SILENCE_S < since_s < 0.0
+        return {} if late else {name: now, other: now}
 
-    return Story(law=law, values=values, step=step)
+    return Story(
+        law=law,
+        leap_s=10.0 + round(float(rng.uniform(0.0, 8.0)) / REPORT_S) * REPORT_S,
+        reports=reported,
+        step=(shift, 0.0, turn, 0.0),
+    )
 
 
 class LawNight(Observatory):
@@ -134,8 +138,8 @@ class LawNight(Observatory):
             *("--optical-gain=0.7,0.9", "--n-controlled=45", f"--seed={draw.seed}"),
             f"--alpha={','.join(map(str, START.to_boundary().values()))}",
         ]
-        if draw.kind == "moves":
-            words.append(f"--jump={LEAP_S}:{','.join(map(str, story.step))}")
+        if draw.kind == "mirror moves":
+            words.append(f"--jump={story.leap_s:.2f}:{','.join(map(str, story.step))}")
         self.made_wrong: list[str] = []
         super().__init__(words, policy, Mode.AUTO, bench_of(SMALL), with_poles=False)
 
@@ -146,9 +150,10 @@ class LawNight(Observatory):
         off = (alpha.vector - self.dome.alpha.vector) * BOUNDARY_SCALE
         return bool(np.any(np.abs(off) > WRONG))
 
-    def stepped(self, before: object, event: ev.Event) -> None:
+    @override
+    def stepped(self, before: TrackerState, event: ev.Event) -> None:
         """Look at each matrix that was made."""
-        super().stepped(before, event)  # type: ignore[arg-type]
+        super().stepped(before, event)
         if isinstance(event, ev.MatrixMade) and self.is_wrong(event.record.alpha):
             self.made_wrong.append(event.record.id)
 
@@ -161,12 +166,16 @@ def play(draw: Draw) -> Row:
     with threadpool_limits(1):
         night = LawNight(draw, story, policy)
         while night.time_s < NIGHT_S - 1e-6:
-            for name, value in story.values(night.time_s - LEAP_S).items():
-                night.command(cmd.SetValue(name=name, value=value, for_s=2.0))
+            for name, value in story.reports(night.time_s - story.leap_s).items():
+                night.command(
+                    cmd.SetPointing(elevation_deg=50.0, azimuth_deg=value)
+                    if name == "azimuth"
+                    else cmd.SetValue(name=name, value=value, for_s=2.0)
+                )
             night.advance(REPORT_S)
     wrong_s, named_s, ended_s = 0.0, None, 0.0
     for glance, moment in zip(night.glances, night.dome.moments, strict=True):
-        since_s = round(glance.time_s - LEAP_S, 2)
+        since_s = round(glance.time_s - story.leap_s, 2)
         if since_s < 0.0:
             continue
         if named_s is None and "law-leap" in glance.alarms:
@@ -177,11 +186,10 @@ def play(draw: Draw) -> Row:
             np.abs((glance.alpha - moment.alpha.vector) * BOUNDARY_SCALE) > WRONG
         ):
             wrong_s = since_s
-    moments = [m for m in night.dome.moments if m.time_s > LEAP_S]
-    before = [m.wavefront_nm for m in night.dome.moments if 6.0 < m.time_s <= LEAP_S]
-    used = [swap for swap in night.swaps if swap.time_s > LEAP_S]
+    moments = [m for m in night.dome.moments if m.time_s > story.leap_s]
+    before = [m.wavefront_nm for m in night.dome.moments if 6.0 < m.time_s <= story.leap_s]
+    used = [swap for swap in night.swaps if swap.time_s > story.leap_s]
     wrong_used = [swap.id for swap in used if swap.id in night.made_wrong]
-    log = [(e.t_ns_utc - START_NS) * 1e-9 - LEAP_S for e in night.state.log if "law" in e.name]
     return asdict(draw) | {
         "step": story.step,
         "named_s": named_s,
@@ -192,7 +200,6 @@ def play(draw: Draw) -> Row:
         "n_swaps": len(used),
         "worst_ratio": max(m.wavefront_nm for m in moments) / float(np.median(before)),
         "alarms": sorted({name for glance in night.glances for name in glance.alarms}),
-        "log_s": log,
     }
 
 

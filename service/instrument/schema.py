@@ -9,16 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import cache, partial
 from pathlib import Path
-from typing import (
-    TYPE_CHECKING,
-    Annotated,
-    Any,
-    Final,
-    Generic,
-    Literal,
-    NoReturn,
-    TypeVar,
-)
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, NoReturn, TypeVar
 
 from pydantic import BeforeValidator, Field, PlainValidator, create_model
 
@@ -80,10 +71,9 @@ def _convert_term(value: object) -> Term:
         case str():
             term = Term(value)
         case {"of": str(of), "at": [*at], "values": [*values], **more} if more.keys() <= {"period"}:
-            numbers: list[Any] = [*at, *values, *more.values()]
-            if not all(type(number) in {int, float} for number in numbers):
+            if not all(type(each) in {int, float} for each in (*at, *values, *more.values())):
                 raise ModelError(f"found {value}, expected numbers in at, values and period")
-            *_, period = (*numbers, None) if not more else numbers
+            period: Any = more.get("period")
             term = Term(of, tuple(map(float, at)), tuple(map(float, values)), period)
         case _:
             raise ModelError(f"found {value!r}, expected a number, an expression or {_FORM}")
@@ -132,32 +122,19 @@ class LawTable(Read):
     """None: 1."""
 
 
-_LARGEST_STEPS: Final = {
-    "shift_x_subap": NORTH_STEP_SUBAP,
-    "shift_y_subap": NORTH_STEP_SUBAP,
-    "rotation_deg": NORTH_STEP_DEG,
-    "magnification": NORTH_STEP_MAGNIFICATION,
-}
-"""Largest step of each parameter where a table returns to its beginning."""
-
-
 def remarks_on_law(file: Section[LawTable]) -> tuple[str, ...]:
-    """Return a remark on each table whose ends do not agree although they are one place."""
-    remarks = []
-    for name, largest in _LARGEST_STEPS.items():
-        term: Term | None = getattr(file.said, name)
-        step = 0.0 if term is None else term.closing_step
+    """Return a remark on each table whose ends are the same place and do not agree."""
+    largest = (NORTH_STEP_SUBAP, NORTH_STEP_SUBAP, NORTH_STEP_DEG, NORTH_STEP_MAGNIFICATION)
+    terms = [(field.name, getattr(file.said, field.name)) for field in fields(LawTable)]
+    return tuple(
+        f"{file.where(name)}: the table ends with {term.values[-1]:g} and begins with "
+        f"{term.values[0]:g}, a whole turn of {term.expression} apart: when it returns, α becomes "
+        "predicted, and no reconstructor is made until a window has confirmed it; give both ends "
+        f"the same value{'' if term.period else ', and period = 360 if it is an angle'}"
+        for (name, term), step in zip(terms, largest, strict=True)
         # A rotation by whole turns is none.
-        if term is None or abs(math.remainder(step, 360.0)) <= largest:
-            continue
-        declared = "Give" if term.period else "If it returns there, add period = 360 and give"
-        remarks.append(
-            f"{file.where(name)}: the table ends with {term.values[-1]:g} and begins with "
-            f"{term.values[0]:g}, a whole turn of {term.expression} apart: where it returns, α "
-            "would leap by the difference, and no reconstructor is made until a window has "
-            f"confirmed it. {declared} both ends the same value"
-        )
-    return tuple(remarks)
+        if term is not None and abs(math.remainder(term.closing_step, 360.0)) > step
+    )
 
 
 def law_of(table: LawTable) -> PointingLaw | None:

@@ -89,26 +89,27 @@ def follow_law(context: StepContext) -> None:
         # The last nominal registration is kept: a missing report is no motion of the telescope.
         _set(context, replace(context.alpha.law, problem=now))
         return
-    before = context.alpha.law
-    used = {name: reported[name] for name in sorted(law.names)}
-    _set(context, replace(before, problem="", reported=tuple(used.items())))
     _forget_decided(context)
-    if before.nominal is None:
-        _begin(context, now)
-        return
-    step, leap = difference(before.nominal, now), context.alpha.law.leap
-    returned = leap is not None and _has_returned(leap, step)
-    if leap is not None and (returned or _goes_on(context, law, dict(before.reported), step)):
-        _end_leap(context, returned=returned)
+    before, registration = context.alpha.law, context.registration
+    used = sorted((name, reported[name]) for name in law.names)
+    _set(context, replace(before, problem="", reported=tuple(used)))
+    # After a restart the law may be elsewhere than when α was saved.
+    known = None if registration is None else registration.nominal
+    place, leap = before.nominal or known, before.leap
+    step = np.zeros(4) if place is None else difference(place, now)
+    returned = leap is not None and np.all(np.abs(np.array(leap.step) + step) <= MAX_STEP_AT_REST)
+    if leap is not None and (returned or _goes_on(context, law, leap, dict(before.reported), now)):
+        _end_leap(context, wrong=bool(returned))
         _carry(context, now, step if leap.taken else np.array(leap.step) + step)
+    elif np.any(np.abs(step) > MAX_STEP_AT_REST + USUAL_STEP_RATIO * _usual_step(context)):
+        _leap(context, before, now, step)
         return
-    since_s = (context.now_ns - before.worked_out_ns_utc) / SECOND_NS
-    # A clock that was set back must not reduce what is allowed at once.
-    far = bool(np.any(np.abs(step) > MAX_STEP * (1.0 + max(since_s, 0.0))))
-    if far or np.any(np.abs(step) > MAX_STEP_AT_REST + USUAL_STEP_RATIO * _usual_step(context)):
-        _leap(context, before, now, far=far)
     else:
         _carry(context, now, step)
+    if np.any(step) and not returned:
+        usual = np.maximum(_usual_step(context), np.abs(step)).tolist()
+        state = context.alpha.law
+        _set(context, replace(state, usual_step=tuple(usual), usual_ns_utc=context.now_ns))
 
 
 def begin_law(context: StepContext) -> None:
@@ -169,18 +170,14 @@ def _rate(state: TrackerState) -> Array:
     It is the slower one of two halves of the last seconds: a single step is no motion.
     """
     way = state.alpha.law.way
-    if len(way) < 2:
-        return np.zeros(4)
-    last_ns = way[-1][0]
-    length_ns = min(RATE_INTERVAL_NS, last_ns - way[0][0])
-    ends = (law_at(state, last_ns - share * length_ns // 2) for share in (2, 1, 0))
-    first, middle, last = (end or way[-1][1] for end in ends)
-    halves = np.array([difference(first, middle), difference(middle, last)])
+    length_ns = min(RATE_INTERVAL_NS, way[-1][0] - way[0][0]) if way else 0
     if length_ns < PATH_SPACING_NS:
         return np.zeros(4)
+    ends = (law_at(state, way[-1][0] - share * length_ns // 2) for share in (2, 1, 0))
+    first, middle, last = (end or way[-1][1] for end in ends)
+    halves = np.array([difference(first, middle), difference(middle, last)])
     slower = np.where(halves.prod(axis=0) > 0.0, np.abs(halves).min(axis=0), 0.0)
-    rate: Array = np.sign(halves[1]) * slower * (2.0 * SECOND_NS / length_ns)
-    return rate
+    return np.asarray(np.sign(halves[1]) * slower * (2.0 * SECOND_NS / length_ns))
 
 
 def check_pointing_motion(state: TrackerState, began_ns_utc: int, ended_ns_utc: int) -> str | None:
@@ -273,63 +270,59 @@ def _usual_step(context: StepContext) -> Array:
     return np.array(law.usual_step) * math.exp(-since_s / MOTION_MEMORY_S)
 
 
-def _has_returned(leap: LawLeap, step: Array) -> bool:
-    """Return whether a step takes the law back to where it was before a leap."""
-    return bool(np.all(np.abs(np.array(leap.step) + step) <= MAX_STEP_AT_REST))
+def _goes_on(
+    context: StepContext, law: PointingLaw, leap: LawLeap, was: Reported, now: Misregistration
+) -> bool:
+    """Return whether a leap was the beginning of a motion.
 
-
-def _goes_on(context: StepContext, law: PointingLaw, was: Reported, step: Array) -> bool:
-    """Return whether a step and the leap before it are one motion.
-
-    Both are as far, to a factor of 3, and so is the step that the law would make next if what it
-    depends on went on: at the edge of a table it would not.
+    The next step is as far, to a factor of 3, and so is the one that the law would make after it if
+    what it depends on went on: at the edge of a table it would not.
     """
-    state, leap = context.alpha.law, context.alpha.law.leap
-    if leap is None or leap.far or state.nominal is None:
+    state, since_ns = context.alpha.law, context.now_ns - leap.since_ns_utc
+    further = {name: 2.0 * value - was.get(name, value) for name, value in state.reported}
+    then = _nominal(context, law, further)
+    late = since_ns > MOTION_MEMORY_S * SECOND_NS
+    if leap.far or late or isinstance(then, str) or state.nominal is None:
         return False
-    if context.now_ns - leap.since_ns_utc > MOTION_MEMORY_S * SECOND_NS:
-        return False
-    next_ = {name: 2.0 * value - was.get(name, value) for name, value in state.reported}
-    then = _nominal(context, law, next_)
-    if isinstance(then, str):
-        return False
-    first = np.array(leap.step) / MAX_STEP
-    length = float(first @ first)
-    further = difference(state.nominal, then) - step
-    along = [float(first @ (each / MAX_STEP)) for each in (step, further)]
+    first = np.array(leap.step) / MAX_STEP**2
+    steps = difference(state.nominal, now), difference(now, then)
+    length, *along = (float(first @ step) for step in (np.array(leap.step), *steps))
     return all(length < 3.0 * each < 9.0 * length for each in along)
 
 
-def _leap(context: StepContext, before: LawState, now: Misregistration, *, far: bool) -> None:
+def _leap(context: StepContext, before: LawState, now: Misregistration, step: Array) -> None:
     """Move the law by a step that no motion explains, and have a window decide about α."""
-    if before.nominal is None:
-        return
-    step, leap = difference(before.nominal, now), context.alpha.law.leap
-    was, reported = dict(before.reported), dict(context.alpha.law.reported)
-    turned_deg = sum(
-        # From 359 to 1 deg the telescope turns by 2 deg.
-        abs(math.remainder(reported[name] - was.get(name, reported[name]), 360.0))
-        for name in reported.keys() & set(ANGLES)
-    )
-    explained = bool(np.all(np.abs(step) <= MAX_STEP_AT_REST + STEP_PER_DEG * turned_deg))
-    taken = explained and not far and (leap is None or leap.taken)
-    _carry(context, now, step if taken else np.zeros(4), usual=False)
+    was, leap, begins = dict(before.reported), before.leap, before.nominal is None
+    since_s = (context.now_ns - before.worked_out_ns_utc) / SECOND_NS
+    # A clock that was set back must not reduce what is allowed at once.
+    far = bool(np.any(np.abs(step) > MAX_STEP * (1.0 + max(since_s, 0.0))))
+    moves = [
+        (name, was.get(name, value), value)
+        for name, value in context.alpha.law.reported
+        if was.get(name, value) != value
+    ]
+    # From 359 to 1 deg the telescope turns by 2 deg.
+    turned_deg = sum(abs(math.remainder(b - a, 360.0)) for name, a, b in moves if name in ANGLES)
+    turns = bool(np.all(np.abs(step) <= MAX_STEP_AT_REST + STEP_PER_DEG * turned_deg))
+    taken = begins or (turns and not far and (leap is None or leap.taken))
+    _carry(context, now, step if taken else np.zeros(4))
     registration = context.registration
     if registration is None:
         return
-    total = step if leap is None or leap.taken is not taken else step + np.array(leap.step)
-    moves = " and ".join(
-        f"{name} went from {was.get(name, value):.6g} to {value:.6g}"
-        for name, value in reported.items()
-        if was.get(name, value) != value
-    )
+    if leap is not None and leap.taken is taken:
+        step = step + np.array(leap.step)
+    because = " and ".join(f"{name} went from {a:.6g} to {b:.6g}" for name, a, b in moves)
     text = (
-        f"the pointing law moves α by {step_text(total)} at once, because {moves}. α "
-        f"{'follows' if taken else 'stays'}, and no reconstructor is made from it until a window "
-        "has shown where the mirror is. If such a value is an angle that begins anew, give its "
-        "table period = 360 and equal values at both ends; else check the program that reports it"
+        f"the pointing law moves α by {step_text(step)} at once, because "
+        f"{because or 'the service was away'}. α {'follows' if taken else 'stays'}, and no "
+        "reconstructor is made from it until a window has shown where the mirror is. If such a "
+        "value is an angle that begins anew, give its table period = 360 and equal values at both "
+        "ends; else check the program that reports it"
     )
-    _set_leap(context, total, taken=taken, far=far, text=text)
+    leap = LawLeap(
+        step=tuple(step.tolist()), taken=taken, far=far, since_ns_utc=context.now_ns, text=text
+    )
+    _set(context, replace(context.alpha.law, leap=leap))
     doubted = replace(registration, doubt=validity.LEAPT, doubt_voids=False, suspected_jump=None)
     validity.store_registration(context, doubted)
     t_ns = 0 if context.rtc is None else context.rtc.t_ns
@@ -337,47 +330,28 @@ def _leap(context: StepContext, before: LawState, now: Misregistration, *, far: 
     validity.void_until(context, t_ns, validity.LEAPT, Purpose.MEASURE)
     validity.request_window(context, validity.LEAPT)
     validity.age_registration(context)
-    context.warn("law.leapt", text)
 
 
-def _set_leap(
-    context: StepContext, step: Array, *, taken: bool, far: bool = False, text: str = ""
-) -> None:
-    x, y, rotation, magnification = step.tolist()
-    leap = LawLeap(
-        step=(x, y, rotation, magnification),
-        taken=taken,
-        far=far,
-        since_ns_utc=context.now_ns,
-        text=text,
-    )
-    _set(context, replace(context.alpha.law, leap=leap))
-
-
-def _end_leap(context: StepContext, *, returned: bool) -> None:
+def _end_leap(context: StepContext, *, wrong: bool) -> None:
     """End a leap that was a wrong report, or a motion: α is as sure as it was before."""
     # The mirror was never on the path to a wrong report.
-    way = () if returned else context.alpha.law.way
+    way = () if wrong else context.alpha.law.way
     _set(context, replace(context.alpha.law, leap=None, way=way))
     registration = context.registration
-    if registration is None or registration.doubt != validity.LEAPT:
-        return
-    validity.store_registration(context, replace(registration, doubt=""))
-    validity.make_valid(context, Purpose.SETTLE)
-    validity.make_valid(context, Purpose.MEASURE, validity.LEAPT)
-    validity.end_window_request(context)
-    validity.age_registration(context)
-    context.log("law.steady", "the law returned from its leap, or moves on: α follows it")
+    if registration is not None and registration.doubt == validity.LEAPT:
+        validity.store_registration(context, replace(registration, doubt=""))
+        validity.make_valid(context, Purpose.SETTLE)
+        validity.make_valid(context, Purpose.MEASURE, validity.LEAPT)
+        validity.end_window_request(context)
+        validity.age_registration(context)
 
 
 def _forget_decided(context: StepContext) -> None:
-    """Forget a leap of which a window has decided, and take one that lasts if no window can."""
+    """Forget a leap of which a window has decided; take one that lasts where none can."""
     leap, registration = context.alpha.law.leap, context.registration
     if leap is None:
         return
-    if registration is None or (
-        registration.window_ns_utc > leap.since_ns_utc and not registration.doubt
-    ):
+    if registration is None or not registration.doubt:
         _set(context, replace(context.alpha.law, leap=None))
     elif leap.far and context.now_ns - leap.since_ns_utc >= LEAP_CONFIRMATION_S * SECOND_NS:
         change_side(context)
@@ -399,31 +373,15 @@ def decide_leap(context: StepContext, window: PointedEstimate) -> None:
 def change_side(context: StepContext) -> None:
     """Move α to the other side of the law's leap, where a fit may begin; it stays in doubt."""
     leap, registration = context.alpha.law.leap, context.registration
-    if leap is None or registration is None:
-        return
-    validity.store_registration(context, moved(registration, leap.other_side))
-    _set(context, replace(context.alpha.law, leap=replace(leap, taken=not leap.taken, far=False)))
+    if leap is not None and registration is not None:
+        validity.store_registration(context, moved(registration, leap.other_side))
+        other = replace(leap, taken=not leap.taken, far=False)
+        _set(context, replace(context.alpha.law, leap=other))
 
 
-def _begin(context: StepContext, now: Misregistration) -> None:
-    """Relate what is known of α to the law: after a restart it follows where the law has gone."""
+def _carry(context: StepContext, now: Misregistration, step: Array) -> None:
+    """Take this for nominal, and move what is known of α by a step ``(4,)``, numeric units."""
     registration = context.registration
-    if registration is None or registration.nominal is None:
-        _carry(context, now, np.zeros(4), usual=False)
-        return
-    step = difference(registration.nominal, now)
-    _carry(context, now, step, usual=False)
-    if np.any(np.abs(step) > MAX_STEP_AT_REST):
-        # Without a doubt: a restored α needs windows anyway.
-        _set_leap(context, step, taken=True)
-
-
-def _carry(context: StepContext, now: Misregistration, step: Array, *, usual: bool = True) -> None:
-    """Take this for nominal, and move what is known of α by a step ``(4,)``, numeric units.
-
-    ``usual``: the step is part of a motion.
-    """
-    registration, before = context.registration, context.alpha.law
     if registration is not None and registration.nominal != now:
         # A registration that was not related to the law yet has not moved with it: it only gets a
         # place.
@@ -432,12 +390,8 @@ def _carry(context: StepContext, now: Misregistration, step: Array, *, usual: bo
         validity.store_registration(context, replace(registration, nominal=now))
     if np.any(step):
         carry_alpha(context, step)
-    law = replace(before, nominal=now, worked_out_ns_utc=context.now_ns, way=_way(context, now))
-    if usual and before.nominal is not None and before.nominal != now:
-        latest = np.abs(difference(before.nominal, now))
-        x, y, rotation, magnification = np.maximum(_usual_step(context), latest).tolist()
-        law = replace(law, usual_step=(x, y, rotation, magnification), usual_ns_utc=context.now_ns)
-    _set(context, law)
+    law, way = context.alpha.law, _way(context, now)
+    _set(context, replace(law, nominal=now, worked_out_ns_utc=context.now_ns, way=way))
 
 
 def _way(context: StepContext, now: Misregistration) -> tuple[tuple[int, Misregistration], ...]:

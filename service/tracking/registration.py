@@ -346,16 +346,12 @@ class HistoryEntry:
     """Id of the matrix in use when it was looked at; None: unknown."""
 
 
-Four = tuple[float, float, float, float]
-"""Numbers of the four parameters, numeric units."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LawLeap:
     """A step of the pointing law that no window has confirmed: α is on one side of it."""
 
-    step: Four
-    """Step of the law."""
+    step: tuple[float, ...]
+    """Step of the law, numeric units."""
 
     taken: bool
     """True if α has been moved by it."""
@@ -366,8 +362,8 @@ class LawLeap:
     since_ns_utc: int
     """Time of the step, by the service's clock."""
 
-    text: str = ""
-    """Law and values that have leapt, for the alarm; empty if α must be confirmed anyway."""
+    text: str
+    """Values that have leapt and what follows, for the alarm."""
 
     @property
     def other_side(self) -> Array:
@@ -392,7 +388,7 @@ class LawState:
     """Previous registrations by the law with their times by the RTC's clock, oldest first, bounded
     in number."""
 
-    usual_step: Four = (0.0, 0.0, 0.0, 0.0)
+    usual_step: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     """Size of its recent steps from one report to the next."""
 
     usual_ns_utc: int = 0

@@ -232,11 +232,12 @@ def elapsed_s(state: TrackerState, registration: Registration, now_ns: int) -> f
 
 def _validity_of(context: StepContext, registration: Registration) -> ValidityState:
     policy = context.policy
-    if registration.doubt == LEAPT:
-        return ValidityState(level=Validity.PREDICTED, reason=LEAPT)
     reason = _explain_invalidity(context.state, registration, policy)
     if reason is not None:
         return ValidityState(level=Validity.INVALID, reason=reason)
+    # A doubt of the watchdog may have replaced that of the law.
+    if registration.doubt == LEAPT or (registration.doubt and context.alpha.law.leap is not None):
+        return ValidityState(level=Validity.PREDICTED, reason=LEAPT)
     sigma, before = sigma_beyond_floor(registration), context.before.alpha.registration
     limit = policy.stale_sigma
     if registration.n_windows == 0:

@@ -359,6 +359,38 @@ def test_a_value_that_wraps_moves_alpha_only_by_a_window(shift_subap, rotation_d
     assert night.alpha.vector == pytest.approx(there.vector, abs=3e-3)
 
 
+def test_a_value_that_wraps_to_and_fro_teaches_no_motion():
+    night = wrapping(0.24, 0.0)
+    before = night.alpha
+    for angle in (-179.9, 179.9) * 4:
+        night.report({"derotator": angle})
+        assert night.alpha.vector == pytest.approx(before.vector, abs=1e-3)
+        assert bool(night.leap) is (angle < 0.0)
+
+
+def test_nothing_is_made_by_order_from_a_predicted_alpha():
+    night = wrapping(0.0, 2.88)
+    night.report({"derotator": -179.8})
+    night.make("cm-7")
+    with pytest.raises(CommandError, match="α is predicted"):
+        night.tell(cmd.Refit())
+    with pytest.raises(CommandError, match="α is predicted"):
+        night.tell(cmd.Approve(id="cm-7"))
+
+
+def test_a_pointing_that_is_reported_wrong_is_undone_by_a_window(night):
+    """By less than a telescope turns in a second: α follows, and nothing is made from it."""
+    before = night.alpha
+    night.tell(cmd.SetPointing(elevation_deg=50.0, azimuth_deg=102.0))
+    assert "azimuth went from 100 to 102" in night.leap
+    assert night.known.validity.level is Validity.PREDICTED
+    night.tell(rtc(t_ns=night.now_ns), after_s=3.0)
+    night.tell(rtc(t_ns=night.now_ns))
+    night.window(before)
+    assert (night.leap, night.known.doubt) == ("", "")
+    assert night.alpha.vector == pytest.approx(before.vector, abs=3e-3)
+
+
 def test_a_table_with_a_period_that_closes_does_not_leap():
     term = Term("derotator", (-180.0, -90.0, 90.0), (0.0, -0.2, 0.2), 360.0)
     night = Night(policy=replace(POLICY, law=PointingLaw(shift_x_subap=term))).meet(t_ns=START_NS)
@@ -447,7 +479,7 @@ def test_after_a_restart_a_window_decides_whether_the_law_was_right():
     again.meet(t_ns=again.now_ns, session="s2")
     again.seen = None
     again.report({"derotator": -179.8}, after_s=60.0)
-    assert again.known.validity.level is Validity.STALE
+    assert again.known.validity.level is Validity.PREDICTED
     again.tell(rtc(t_ns=again.now_ns, session="s2"))
     for _ in range(2):
         again.now_ns += 3 * SECOND

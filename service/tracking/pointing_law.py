@@ -50,7 +50,7 @@ MOTION_MEMORY_S = 12.0
 """Time in which a motion is forgotten, so that a report every ten seconds shows one."""
 
 USUAL_STEP_RATIO = 2.0
-"""Largest ratio of a step to the recent ones: a motion begins and ends smoothly."""
+"""Largest ratio of a step of a motion to those before."""
 
 STEP_PER_DEG = np.array([0.2, 0.2, np.deg2rad(3.0), 0.004])
 """Step per degree that the telescope turns up to which α is moved at once, numeric units. Near the

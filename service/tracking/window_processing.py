@@ -136,10 +136,9 @@ def reject_window(context: StepContext, reason: str, kind: RefusalKind = Refusal
 
 def _drop_unconfirmed(context: StepContext) -> None:
     """Forget a restored α from which no window is found, or fits would begin there for ever."""
-    registration, misses = context.registration, context.acquisition.misses
-    if registration is None or registration.restored_ns_utc is None or registration.n_windows:
-        return
-    if misses >= MISSES_BEFORE_ACQUISITION:
+    known, misses = context.registration, context.acquisition.misses
+    restored = known is not None and known.restored_ns_utc is not None and not known.n_windows
+    if restored and misses >= MISSES_BEFORE_ACQUISITION:
         validity.forget_registration(context)
         text = f"the α from before the restart is dropped: {misses} windows were not found from it"
         context.raise_alarm(alarms.NOT_RESTORED, text)

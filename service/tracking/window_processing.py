@@ -29,7 +29,7 @@ from service.tracking.dither import note_found
 from service.tracking.dither_plan import check_dither_allowed
 from service.tracking.filtering import FilterUpdate, WindowEstimate
 from service.tracking.jumps import Innovation
-from service.tracking.operations.acquisition import MISSES_BEFORE_ACQUISITION, count_miss
+from service.tracking.operations.acquisition import count_miss
 from service.tracking.operations.running import running_ramp
 from service.tracking.policy import SECOND_NS
 from service.tracking.registration import (
@@ -129,19 +129,8 @@ def reject_window(context: StepContext, reason: str, kind: RefusalKind = Refusal
     _note_refusal(context, reason, level)
     if kind not in HARMLESS_REFUSALS:
         pointing_law.change_side(context)
-        _drop_unconfirmed(context)
         run = min(context.windows.run, 0) - 1
         context.windows = replace(context.windows, run=run, refused_because=reason)
-
-
-def _drop_unconfirmed(context: StepContext) -> None:
-    """Forget a restored α from which no window is found, or fits would begin there for ever."""
-    known, misses = context.registration, context.acquisition.misses
-    restored = known is not None and known.restored_ns_utc is not None and not known.n_windows
-    if restored and misses >= MISSES_BEFORE_ACQUISITION:
-        validity.forget_registration(context)
-        text = f"the α from before the restart is dropped: {misses} windows were not found from it"
-        context.raise_alarm(alarms.NOT_RESTORED, text)
 
 
 def _note_refusal(context: StepContext, reason: str, level: Level = Level.INFO) -> None:

@@ -111,11 +111,11 @@ def story_of(draw: Draw) -> Story:
     def reported(since_s: float) -> dict[str, float]:
         turned = speed * since_s + 0.01
         if kind == "wraps to and fro" and 0.0 <= since_s < TO_AND_FRO_S:
-            turned = 0.01 if round(since_s / REPORT_S) % 2 else -0.01
+            turned = -0.01 if round(since_s / REPORT_S) % 2 else 0.01
         if wraps:
             now = (turned + 360.0) % 360.0 - 180.0
         elif kind in {"reported wrong", "reported late", "pointing reported wrong"}:
-            now = 5.0 if since_s >= 0.0 else 0.0
+            now = 1.0 if since_s >= 0.0 else -1.0
         else:
             now = turned + 0.05 if since_s >= 0.0 else turned - 0.05
         late = kind == "reported late" and -SILENCE_S < since_s < 0.0

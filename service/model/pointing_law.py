@@ -119,7 +119,7 @@ class Term:
         if "azimuth" not in self.names:
             return 0.0
         if self.at and self.expression.strip() == "azimuth":
-            return 0.0 - self.closing_step if self.period else self.values[-1] - self.values[0]
+            return -self.closing_step if self.period else self.values[-1] - self.values[0]
         steps = [0.0]
         # Several pointings, because a step may vanish at one of them.
         for elevation, azimuth in itertools.product((20.0, 50.0, 80.0), (-180.0, 0.0)):

@@ -90,6 +90,7 @@ def _react(context: StepContext, event: Event) -> None:
     reaction = REACTIONS.get(type(event))
     if reaction is not None:
         reaction(context, event)
+    resume.drop_unconfirmed(context)
     pointing_law.follow_law(context)
     window_processing.reset_run(context)
     probation.advance(context, event)

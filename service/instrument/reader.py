@@ -16,7 +16,7 @@ from service.files.toml import read_dataset, refuse, refuse_all
 from service.instrument import and_sensor_mode, packaged_file
 from service.instrument import schema as schema
 from service.instrument.mirrors import Pupil, own_modes, read_mirror
-from service.instrument.schema import AboutTable, LawTable, Section, law_of
+from service.instrument.schema import AboutTable, LawTable, Section, law_of, remarks_on_law
 from service.model.aperture import check_mask
 from service.model.instrument import (
     Instrument,
@@ -162,7 +162,11 @@ def _parts(said: schema.InstrumentFile) -> Mapping[str, Callable[[], Any]]:
             section(schema.SlopesTable), kind, has_frames=frames() is not None
         ),
         "loop": lambda: _loop(section(LoopFacts), modes().n_modes),
-        "remarks": lambda: (*mirror()[1], *_list_assumptions(said, sensor(), mirror()[0])),
+        "remarks": lambda: (
+            *mirror()[1],
+            *_list_assumptions(said, sensor(), mirror()[0]),
+            *remarks_on_law(section(LawTable)),
+        ),
     }
 
 

@@ -70,10 +70,11 @@ def _convert_term(value: object) -> Term:
             return Term(repr(float(value)))
         case str():
             term = Term(value)
-        case {"of": str(of), "at": [*at], "values": [*values], **more} if not more:
-            if not all(type(number) in {int, float} for number in (*at, *values)):
-                raise ModelError(f"found {value}, expected numbers in at and values")
-            term = Term(of, tuple(map(float, at)), tuple(map(float, values)))
+        case {"of": str(of), "at": [*at], "values": [*values], **more} if more.keys() <= {"period"}:
+            if not all(type(each) in {int, float} for each in (*at, *values, *more.values())):
+                raise ModelError(f"found {value}, expected numbers in at, values and period")
+            period: Any = more.get("period")
+            term = Term(of, tuple(map(float, at)), tuple(map(float, values)), period)
         case _:
             raise ModelError(f"found {value!r}, expected a number, an expression or {_FORM}")
     for name in sorted(term.names - set(ANGLES)):
@@ -103,7 +104,8 @@ class LawTable(Read):
 
     α is tracked as the deviation from it. Each parameter is a number, an expression of `azimuth`
     and `elevation` (degrees) and of names of the observatory's values, or a table `{ of =
-    "elevation", at = [20, 80], values = [0.1, -0.1] }` with linear interpolation. A whole turn of
+    "elevation", at = [20, 80], values = [0.1, -0.1] }` with linear interpolation; `period = 360`
+    beside `at` makes the table repeat itself, as that of a derotator's angle must. A whole turn of
     azimuth must not change it, except by whole turns of the rotation.
     """
 
@@ -118,6 +120,21 @@ class LawTable(Read):
 
     magnification: _Magnification = None
     """None: 1."""
+
+
+def remarks_on_law(file: Section[LawTable]) -> tuple[str, ...]:
+    """Return a remark on each table whose ends are the same place and do not agree."""
+    largest = (NORTH_STEP_SUBAP, NORTH_STEP_SUBAP, NORTH_STEP_DEG, NORTH_STEP_MAGNIFICATION)
+    terms = [(field.name, getattr(file.said, field.name)) for field in fields(LawTable)]
+    return tuple(
+        f"{file.where(name)}: the table ends with {term.values[-1]:g} and begins with "
+        f"{term.values[0]:g}, a whole turn of {term.expression} apart: when it returns, α becomes "
+        "predicted, and no reconstructor is made until a window has confirmed it; give both ends "
+        f"the same value{'' if term.period else ', and period = 360 if it is an angle'}"
+        for (name, term), step in zip(terms, largest, strict=True)
+        # A rotation by whole turns is none.
+        if term is not None and abs(math.remainder(term.closing_step, 360.0)) > step
+    )
 
 
 def law_of(table: LawTable) -> PointingLaw | None:

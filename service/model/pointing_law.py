@@ -70,6 +70,9 @@ class Term:
     values: tuple[float, ...] = ()
     """The values there, straight lines between them; beyond its ends those of the ends."""
 
+    period: float | None = None
+    """Period of the expression: the table repeats itself after it. None if it does not."""
+
     def __post_init__(self) -> None:
         """Refuse what is no expression, or no table.
 
@@ -86,6 +89,18 @@ class Term:
             )
         if any(after <= before for before, after in zip(self.at, self.at[1:], strict=False)):
             raise ModelError(f"found places {list(self.at)}, expected rising ones")
+        if self.period is not None and not (self.at and self.at[-1] - self.at[0] <= self.period):
+            raise ModelError(f"found period {self.period:g}, expected at least the table's length")
+
+    @property
+    def closing_step(self) -> float:
+        """Step of the table where its expression returns to the beginning; 0 if there is none.
+
+        Without a period that is where the table spans a whole turn, as that of an angle does.
+        """
+        length = self.at[-1] - self.at[0] if self.at else 0.0
+        closes = length > 0.0 and math.isclose(length, self.period or 360.0)
+        return self.values[0] - self.values[-1] if closes else 0.0
 
     @property
     def names(self) -> frozenset[str]:
@@ -104,7 +119,7 @@ class Term:
         if "azimuth" not in self.names:
             return 0.0
         if self.at and self.expression.strip() == "azimuth":
-            return self.values[-1] - self.values[0]
+            return -self.closing_step if self.period else self.values[-1] - self.values[0]
         steps = [0.0]
         # Several pointings, because a step may vanish at one of them.
         for elevation, azimuth in itertools.product((20.0, 50.0, 80.0), (-180.0, 0.0)):
@@ -134,7 +149,12 @@ class Term:
             return found
         from numpy import interp
 
-        return float(interp(found, self.at, self.values))
+        at, values = self.at, self.values
+        if self.period is not None:
+            found = at[0] + (found - at[0]) % self.period
+            if at[-1] < at[0] + self.period:
+                at, values = (*at, at[0] + self.period), (*values, values[0])
+        return float(interp(found, at, values))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -181,6 +181,7 @@ RULES: Final[dict[str, Callable[[StepContext], str | None]]] = {
     alarms.MODES_UNEVEN: mode_proof.explain_uneven,
     alarms.SUSPECTED: _jump_suspected,
     "pointing-law": lambda context: context.alpha.law.problem or None,
+    "law-leap": lambda context: getattr(context.alpha.law.leap, "text", "") or None,
     alarms.STALE: validity.stale_text,
     # the last: windows may be refused for what another alarm says
     alarms.WINDOWS_REFUSED: window_processing.explain_refusals,

@@ -431,8 +431,9 @@ def check_window(context: StepContext, estimate: DitheredEstimate, began_ns_utc:
             "too uncertain: raise the dither's amplitude or the window's length",
         )
     near = context.start_of_fits if context.registration is None else context.registration.alpha
-    distance = np.abs(estimate.alpha.vector - near.vector)
-    if np.any(distance > CAPTURE_RANGE) and not _far_windows_agree(context, estimate):
+    step, leap = estimate.alpha.vector - near.vector, context.alpha.law.leap
+    sides = np.abs([step] if leap is None else [step, step - leap.other_side])
+    if np.all(np.any(sides > CAPTURE_RANGE, axis=1)) and not _far_windows_agree(context, estimate):
         return RefusalKind.OUT_OF_REACH, (
             f"outside the capture range: {estimate.alpha.to_boundary()}, "
             f"the fit began at {near.to_boundary()}"

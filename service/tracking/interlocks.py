@@ -24,6 +24,7 @@ from service.tracking.operations.running import OperationKind, RunningOperation,
 from service.tracking.policy import Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import beyond_judging, check_approved, require_record
+from service.tracking.registration import Validity
 from service.tracking.state import Mode, TrackerState
 from service.tracking.update_policy import is_left_behind
 
@@ -191,8 +192,12 @@ def _resume(moment: Moment, _: str) -> str | None:
 
 
 def _refit(moment: Moment, _: str) -> str | None:
-    unknown = "α is not known yet; start a dither and wait for a window"
-    return _needs_rtc(moment) or (unknown if moment.state.alpha.registration is None else None)
+    registration, why = moment.state.alpha.registration, None
+    if registration is None:
+        why = "α is not known yet; start a dither and wait for a window"
+    elif registration.validity.level is Validity.PREDICTED:
+        why = f"α is predicted ({registration.validity.reason}): wait for a window, or acquire"
+    return _needs_rtc(moment) or why
 
 
 def _approve(moment: Moment, matrix_id: str) -> str | None:
@@ -203,7 +208,8 @@ def _approve(moment: Moment, matrix_id: str) -> str | None:
     registration = state.alpha.registration
     if registration is not None and not registration.usable:
         why = registration.validity.reason
-        return f"{record.id} cannot be judged: α is invalid ({why}): wait for a window"
+        level = registration.validity.level
+        return f"{record.id} cannot be judged: α is {level} ({why}): wait for a window"
     if is_left_behind(state, record, moment.policy):
         return f"{record.id} was made for another α than the present one: refit"
     reason = check_approved(state, record)

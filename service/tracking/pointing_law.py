@@ -17,11 +17,18 @@ from service.errors import ModelError
 from service.model.misregistration import Misregistration, step_text, wrap_angle
 from service.model.pointing_law import ANGLES, PointingLaw, Reported
 from service.tracking import events as ev
-from service.tracking import validity
+from service.tracking import jumps, validity
 from service.tracking.events import Event
 from service.tracking.operations.acquisition import carry_alpha
 from service.tracking.policy import SECOND_NS
-from service.tracking.registration import LawLeap, LawState, Purpose, Registration, moved
+from service.tracking.registration import (
+    LawLeap,
+    LawState,
+    PointedEstimate,
+    Purpose,
+    Registration,
+    moved,
+)
 from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext
 
@@ -36,17 +43,23 @@ MAX_STEP = np.array([0.5, 0.5, np.deg2rad(3.0), 0.02])
 """Largest step of a law at once, and per second in addition, numeric units. Telescopes turn by a
 few degrees a second at most; a larger step is an error of the reported values."""
 
-MAX_STEP_AT_REST = np.array([0.03, 0.03, np.deg2rad(0.3), 0.002])
-"""Largest step of a law of the pointing alone while the telescope is at rest, numeric units."""
+MAX_STEP_AT_REST = np.array([0.03, 0.03, np.deg2rad(0.1), 0.002])
+"""Largest step of a law that has been at rest, numeric units: a matrix hardly suffers from it."""
+
+MOTION_MEMORY_S = 12.0
+"""Time in which a motion is forgotten, so that a report every ten seconds shows one."""
+
+USUAL_STEP_RATIO = 2.0
+"""Largest ratio of a step of a motion to those before."""
 
 STEP_PER_DEG = np.array([0.2, 0.2, np.deg2rad(3.0), 0.004])
-"""Additional step per degree that the telescope turns, numeric units. Near the zenith a field turns
-faster than the azimuth, and a pupil that turns about a point ten subapertures away moves by 0.17. A
-law that is not periodic moves by its whole range at north, where the telescope has hardly turned.
-"""
+"""Step per degree that the telescope turns up to which α is moved at once, numeric units. Near the
+zenith a field turns faster than the azimuth, and a pupil that turns about a point ten subapertures
+away moves by 0.17."""
 
 LEAP_CONFIRMATION_S = 3.0
-"""A leap of the pointing that has lasted for this time is accepted."""
+"""A leap out of reach of a fit is taken after this time: no window could be fitted from before it.
+"""
 
 MATRIX_LEAD_S = 6.0
 """A matrix is made for the law so far ahead: it is judged and sent in half of that."""
@@ -62,23 +75,41 @@ MAX_WINDOW_MOTION = np.array([0.1, 0.1, np.deg2rad(0.3), 0.004])
 
 
 def follow_law(context: StepContext) -> None:
-    """Note where the law has the mirror now, and carry along what is known of α."""
+    """Note where the law has the mirror now, and carry along what is known of α.
+
+    A step of the law that no motion explains is a leap: α stays where it is, or is moved, and
+    nothing is made from it until a window has shown on which side of the leap the mirror is.
+    """
     law = context.policy.law
     if law is None:
         return
-    now = _nominal(context, law)
+    reported = _reported_values(context)
+    now = _nominal(context, law, reported)
     if isinstance(now, str):
         # The last nominal registration is kept: a missing report is no motion of the telescope.
         _set(context, replace(context.alpha.law, problem=now))
         return
-    state = context.alpha.law
-    since_s = (context.now_ns - state.worked_out_ns_utc) / SECOND_NS
-    if state.nominal is not None and (
-        _is_far(state.nominal, now, since_s) or _outruns_pointing(context, law, now)
-    ):
-        _hold(context, state.nominal, now)
+    _forget_decided(context)
+    before, registration = context.alpha.law, context.registration
+    used = sorted((name, reported[name]) for name in law.names)
+    _set(context, replace(before, problem="", reported=tuple(used)))
+    # After a restart the law may be elsewhere than when α was saved.
+    known = None if registration is None else registration.nominal
+    place, leap = before.nominal or known, before.leap
+    step = np.zeros(4) if place is None else difference(place, now)
+    returned = leap is not None and np.all(np.abs(np.array(leap.step) + step) <= MAX_STEP_AT_REST)
+    if leap is not None and (returned or _goes_on(context, law, leap, dict(before.reported), now)):
+        _end_leap(context, wrong=bool(returned))
+        _carry(context, now, step if leap.taken else np.array(leap.step) + step)
+    elif np.any(np.abs(step) > MAX_STEP_AT_REST + USUAL_STEP_RATIO * _usual_step(context)):
+        _leap(context, before, now, step)
         return
-    _carry(context, now)
+    else:
+        _carry(context, now, step)
+    if np.any(step) and not returned:
+        usual = np.maximum(_usual_step(context), np.abs(step)).tolist()
+        state = context.alpha.law
+        _set(context, replace(state, usual_step=tuple(usual), usual_ns_utc=context.now_ns))
 
 
 def begin_law(context: StepContext) -> None:
@@ -134,16 +165,19 @@ def registration_ahead(state: TrackerState, registration: Registration) -> Regis
 
 
 def _rate(state: TrackerState) -> Array:
-    """Return how the law moves ``(4,)``, numeric units a second."""
+    """Return how the law moves ``(4,)``, numeric units a second.
+
+    It is the slower one of two halves of the last seconds: a single step is no motion.
+    """
     way = state.alpha.law.way
-    if len(way) < 2:
+    length_ns = min(RATE_INTERVAL_NS, way[-1][0] - way[0][0]) if way else 0
+    if length_ns < PATH_SPACING_NS:
         return np.zeros(4)
-    (last_ns, last), first_ns = way[-1], way[0][0]
-    since_ns = max(last_ns - RATE_INTERVAL_NS, first_ns)
-    then = law_at(state, since_ns)
-    if then is None or since_ns >= last_ns:
-        return np.zeros(4)
-    return difference(then, last) * (SECOND_NS / (last_ns - since_ns))
+    ends = (law_at(state, way[-1][0] - share * length_ns // 2) for share in (2, 1, 0))
+    first, middle, last = (end or way[-1][1] for end in ends)
+    halves = np.array([difference(first, middle), difference(middle, last)])
+    slower = np.where(halves.prod(axis=0) > 0.0, np.abs(halves).min(axis=0), 0.0)
+    return np.asarray(np.sign(halves[1]) * slower * (2.0 * SECOND_NS / length_ns))
 
 
 def check_pointing_motion(state: TrackerState, began_ns_utc: int, ended_ns_utc: int) -> str | None:
@@ -191,9 +225,8 @@ def _to_present(
     return alpha.add_step(difference(then, now))
 
 
-def _nominal(context: StepContext, law: PointingLaw) -> Misregistration | str:
+def _nominal(context: StepContext, law: PointingLaw, reported: Reported) -> Misregistration | str:
     """Return the present registration by the law, or why it is unknown and what to do."""
-    reported = _reported_values(context)
     missing = sorted(law.names - reported.keys())
     if missing and context.alpha.pointing is None:
         return (
@@ -230,80 +263,135 @@ def _reported_values(context: StepContext) -> Reported:
     return values | {"azimuth": pointing.azimuth_deg, "elevation": pointing.elevation_deg}
 
 
-def _is_far(one: Misregistration, other: Misregistration, since_s: float) -> bool:
+def _usual_step(context: StepContext) -> Array:
+    """Return the size ``(4,)`` of recent steps of the law, numeric units; 0: it was at rest."""
+    law = context.alpha.law
+    since_s = max(context.now_ns - law.usual_ns_utc, 0) / SECOND_NS
+    return np.array(law.usual_step) * math.exp(-since_s / MOTION_MEMORY_S)
+
+
+def _goes_on(
+    context: StepContext, law: PointingLaw, leap: LawLeap, was: Reported, now: Misregistration
+) -> bool:
+    """Return whether a leap was the beginning of a motion.
+
+    The next step is as far, to a factor of 3, and so is the one that the law would make after it if
+    what it depends on went on: at the edge of a table it would not.
+    """
+    state, since_ns = context.alpha.law, context.now_ns - leap.since_ns_utc
+    further = {name: 2.0 * value - was.get(name, value) for name, value in state.reported}
+    then = _nominal(context, law, further)
+    late = since_ns > MOTION_MEMORY_S * SECOND_NS
+    if leap.far or late or isinstance(then, str) or state.nominal is None:
+        return False
+    first = np.array(leap.step) / MAX_STEP**2
+    steps = difference(state.nominal, now), difference(now, then)
+    length, *along = (float(first @ step) for step in (np.array(leap.step), *steps))
+    return all(length < 3.0 * each < 9.0 * length for each in along)
+
+
+def _leap(context: StepContext, before: LawState, now: Misregistration, step: Array) -> None:
+    """Move the law by a step that no motion explains, and have a window decide about α."""
+    was, leap, begins = dict(before.reported), before.leap, before.nominal is None
+    since_s = (context.now_ns - before.worked_out_ns_utc) / SECOND_NS
     # A clock that was set back must not reduce what is allowed at once.
-    allowed = MAX_STEP * (1.0 + max(since_s, 0.0))
-    return bool(np.any(np.abs(difference(one, other)) > allowed))
-
-
-def _outruns_pointing(context: StepContext, law: PointingLaw, now: Misregistration) -> bool:
-    """Return whether a law of the pointing alone moves by more than the telescope has turned."""
-    state, pointing = context.alpha.law, context.alpha.pointing
-    if state.nominal is None or state.pointing is None or pointing is None:
-        return False
-    if not law.names <= set(ANGLES):  # values of the observatory change by themselves
-        return False
-    turned_deg = abs(pointing.elevation_deg - state.pointing.elevation_deg) + abs(
-        # From 359 to 1 deg the telescope turns by 2 deg.
-        math.remainder(pointing.azimuth_deg - state.pointing.azimuth_deg, 360.0)
+    far = bool(np.any(np.abs(step) > MAX_STEP * (1.0 + max(since_s, 0.0))))
+    moves = [
+        (name, was.get(name, value), value)
+        for name, value in context.alpha.law.reported
+        if was.get(name, value) != value
+    ]
+    # From 359 to 1 deg the telescope turns by 2 deg.
+    turned_deg = sum(abs(math.remainder(b - a, 360.0)) for name, a, b in moves if name in ANGLES)
+    turns = bool(np.all(np.abs(step) <= MAX_STEP_AT_REST + STEP_PER_DEG * turned_deg))
+    taken = begins or (turns and not far and (leap is None or leap.taken))
+    _carry(context, now, step if taken else np.zeros(4))
+    registration = context.registration
+    if registration is None:
+        return
+    if leap is not None and leap.taken is taken:
+        step = step + np.array(leap.step)
+    because = " and ".join(f"{name} went from {a:.6g} to {b:.6g}" for name, a, b in moves)
+    text = (
+        f"the pointing law moves α by {step_text(step)} at once, because "
+        f"{because or 'the service was away'}. α {'follows' if taken else 'stays'}, and no "
+        "reconstructor is made from it until a window has shown where the mirror is. If such a "
+        "value is an angle that begins anew, give its table period = 360 and equal values at both "
+        "ends; else check the program that reports it"
     )
-    allowed = MAX_STEP_AT_REST + STEP_PER_DEG * turned_deg
-    return bool(np.any(np.abs(difference(state.nominal, now)) > allowed))
+    leap = LawLeap(
+        step=tuple(step.tolist()), taken=taken, far=far, since_ns_utc=context.now_ns, text=text
+    )
+    _set(context, replace(context.alpha.law, leap=leap))
+    doubted = replace(registration, doubt=validity.LEAPT, doubt_voids=False, suspected_jump=None)
+    validity.store_registration(context, doubted)
+    t_ns = 0 if context.rtc is None else context.rtc.t_ns
+    validity.cast_doubt(context, t_ns)
+    validity.void_until(context, t_ns, validity.LEAPT, Purpose.MEASURE)
+    validity.request_window(context, validity.LEAPT)
+    validity.age_registration(context)
 
 
-def _hold(context: StepContext, before: Misregistration, now: Misregistration) -> None:
-    """Hold α where the reported values leap. A leap that lasts is accepted, and α is in doubt."""
-    law, leap = context.alpha.law, context.alpha.law.leap
-    # A single wrong report must not move α; another leap restarts the wait.
-    if leap is None or _is_far(leap.to, now, (context.now_ns - leap.worked_out_ns_utc) / SECOND_NS):
-        leap = LawLeap(to=now, since_ns_utc=context.now_ns, worked_out_ns_utc=context.now_ns)
-        text = (
-            f"the pointing or values reported for the pointing law jumped, which would move α by "
-            f"{step_text(difference(before, now))} at once; α is left unchanged until they have "
-            f"been steady for {LEAP_CONFIRMATION_S:.0f} s; check the program that reports them"
-        )
-        _set(context, replace(law, problem=text, leap=leap))
-        return
-    leap = replace(leap, to=now, worked_out_ns_utc=context.now_ns)
-    if context.now_ns - leap.since_ns_utc < LEAP_CONFIRMATION_S * SECOND_NS:
-        _set(context, replace(law, leap=leap))
-        return
-    # The path restarts: interpolation across the leap would yield registrations that never were.
-    _set(context, replace(law, way=()))
-    _carry(context, now)
-    because = "the values reported for the pointing law jumped"
-    registration, t_ns = context.registration, 0 if context.rtc is None else context.rtc.t_ns
-    if registration is not None:
-        doubted = replace(registration, doubt=because, doubt_voids=True, suspected_jump=None)
-        validity.store_registration(context, doubted)
-        validity.cast_doubt(context, t_ns)
-        validity.request_window(context, because)
+def _end_leap(context: StepContext, *, wrong: bool) -> None:
+    """End a leap that was a wrong report, or a motion: α is as sure as it was before."""
+    # The mirror was never on the path to a wrong report.
+    way = () if wrong else context.alpha.law.way
+    _set(context, replace(context.alpha.law, leap=None, way=way))
+    registration = context.registration
+    if registration is not None and registration.doubt == validity.LEAPT:
+        validity.store_registration(context, replace(registration, doubt=""))
+        validity.make_valid(context, Purpose.SETTLE)
+        validity.make_valid(context, Purpose.MEASURE, validity.LEAPT)
+        validity.end_window_request(context)
         validity.age_registration(context)
-    validity.void_until(context, t_ns, because, Purpose.MEASURE)
-    context.warn(
-        "law.leapt", f"{because}: α follows the law from now on, until a window confirms it"
+
+
+def _forget_decided(context: StepContext) -> None:
+    """Forget a leap of which a window has decided; take one that lasts where none can."""
+    leap, registration = context.alpha.law.leap, context.registration
+    if leap is None:
+        return
+    if registration is None or not registration.doubt:
+        _set(context, replace(context.alpha.law, leap=None))
+    elif leap.far and context.now_ns - leap.since_ns_utc >= LEAP_CONFIRMATION_S * SECOND_NS:
+        change_side(context)
+
+
+def decide_leap(context: StepContext, window: PointedEstimate) -> None:
+    """Move α to the side of the law's leap that is nearer to a window."""
+    leap, registration = context.alpha.law.leap, context.registration
+    if leap is None or registration is None:
+        return
+    here, there = (
+        jumps.window_innovation(each, window, context.policy).mahalanobis_squared
+        for each in (registration, moved(registration, leap.other_side))
     )
+    if there < here:
+        change_side(context)
 
 
-def _carry(context: StepContext, now: Misregistration) -> None:
-    """Take this for nominal, and move what is known of α as far as it has moved."""
-    registration, before = context.registration, context.alpha.law.nominal
+def change_side(context: StepContext) -> None:
+    """Move α to the other side of the law's leap, where a fit may begin; it stays in doubt."""
+    leap, registration = context.alpha.law.leap, context.registration
+    if leap is not None and registration is not None:
+        validity.store_registration(context, moved(registration, leap.other_side))
+        other = replace(leap, taken=not leap.taken, far=False)
+        _set(context, replace(context.alpha.law, leap=other))
+
+
+def _carry(context: StepContext, now: Misregistration, step: Array) -> None:
+    """Take this for nominal, and move what is known of α by a step ``(4,)``, numeric units."""
+    registration = context.registration
     if registration is not None and registration.nominal != now:
         # A registration that was not related to the law yet has not moved with it: it only gets a
         # place.
         if registration.nominal is not None:
-            registration = moved(registration, difference(registration.nominal, now))
+            registration = moved(registration, step)
         validity.store_registration(context, replace(registration, nominal=now))
-    if before is not None and before != now:
-        carry_alpha(context, difference(before, now))
-    state = LawState(
-        nominal=now,
-        worked_out_ns_utc=context.now_ns,
-        way=_way(context, now),
-        pointing=context.alpha.pointing,
-    )
-    if state != context.alpha.law:
-        _set(context, state)
+    if np.any(step):
+        carry_alpha(context, step)
+    law, way = context.alpha.law, _way(context, now)
+    _set(context, replace(law, nominal=now, worked_out_ns_utc=context.now_ns, way=way))
 
 
 def _way(context: StepContext, now: Misregistration) -> tuple[tuple[int, Misregistration], ...]:
@@ -312,9 +400,12 @@ def _way(context: StepContext, now: Misregistration) -> tuple[tuple[int, Misregi
     if context.rtc is None:
         return way
     t_ns = context.rtc.t_ns
+    if way and t_ns <= way[-1][0] < t_ns + SECOND_NS:
+        # A value that comes between two statuses: the path must stay in order, and not begin to
+        # bend at the status before.
+        t_ns = way[-1][0] + (way[-1][1] != now)
     if way and t_ns <= way[-1][0]:
-        # The RTC's clock was set back, or the status has the same time again: the path must stay in
-        # order for the interpolation.
+        # The RTC's clock was set back, or nothing moved.
         kept = tuple(place for place in way if place[0] < t_ns)
         return (*kept, (t_ns, now))
     # While nothing moves one point is enough: the last one is replaced.

@@ -43,6 +43,9 @@ class Validity(StrEnum):
     STALE = "stale"
     """σ, less the model error, is beyond the limit, or α is unconfirmed since a restart."""
 
+    PREDICTED = "predicted"
+    """The pointing law has leapt: nothing is made from α until a window has confirmed it."""
+
     INVALID = "invalid"
     """α may have changed: nothing is made from it without an order."""
 
@@ -304,7 +307,7 @@ class Registration:
     @property
     def usable(self) -> bool:
         """Return True if reconstructors may be computed and published from it without an order."""
-        return self.validity.level is not Validity.INVALID
+        return self.validity.level not in {Validity.INVALID, Validity.PREDICTED}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -345,14 +348,27 @@ class HistoryEntry:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LawLeap:
-    """A leap of the pointing law's input that may be an error."""
+    """A step of the pointing law that no window has confirmed: α is on one side of it."""
 
-    to: Misregistration
-    """Registration by the law after the leap."""
+    step: tuple[float, ...]
+    """Step of the law, numeric units."""
+
+    taken: bool
+    """True if α has been moved by it."""
+
+    far: bool = False
+    """True if no fit reaches across it. If it lasts, α takes it without a window."""
 
     since_ns_utc: int
-    worked_out_ns_utc: int
-    """Time of the leap and of the last report, by the service's clock."""
+    """Time of the step, by the service's clock."""
+
+    text: str
+    """Values that have leapt and what follows, for the alarm."""
+
+    @property
+    def other_side(self) -> Array:
+        """Way ``(4,)`` from α to where it is if the other side is right, numeric units."""
+        return np.array(self.step) * (-1.0 if self.taken else 1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -362,6 +378,9 @@ class LawState:
     nominal: Misregistration | None = None
     """Present registration by the law; None if there is no law or its input is not reported."""
 
+    reported: tuple[tuple[str, float], ...] = ()
+    """What the law depends on, by name, as it was then."""
+
     worked_out_ns_utc: int = 0
     """Time at which it was computed, by the service's clock."""
 
@@ -369,14 +388,17 @@ class LawState:
     """Previous registrations by the law with their times by the RTC's clock, oldest first, bounded
     in number."""
 
+    usual_step: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+    """Size of its recent steps from one report to the next."""
+
+    usual_ns_utc: int = 0
+    """Time of the last of them, by the service's clock."""
+
     problem: str = ""
     """Why it is not followed, and what to do; empty: it is, or there is none."""
 
     leap: LawLeap | None = None
-    """Leap that is not accepted yet; None if there is none."""
-
-    pointing: Pointing | None = None
-    """Pointing for which the nominal registration was computed."""
+    """Step that no window has confirmed; None if there is none."""
 
 
 def moved(registration: Registration, step: Array) -> Registration:

@@ -10,6 +10,7 @@ from service.tracking.alarm_records import restore_records
 from service.tracking.alarm_rules import derive_alarms
 from service.tracking.alarms import NOT_RESTORED, Interlock
 from service.tracking.operations.acquisition import (
+    MISSES_BEFORE_ACQUISITION,
     abort_acquisition,
     acquisition_to_save,
     restore_acquisition,
@@ -221,6 +222,16 @@ def _take_over_alpha(context: StepContext, saved: Saved, now_ns: int) -> None:
         validity.age_registration(context)
     if saved.mode_proof is not None and saved.session is not None:
         mode_proof.restore_proof(context, saved.mode_proof, saved.session)
+
+
+def drop_unconfirmed(context: StepContext) -> None:
+    """Forget a restored α from which no window is found, or fits would begin there for ever."""
+    known, misses = context.registration, context.acquisition.misses
+    restored = known is not None and known.restored_ns_utc is not None and not known.n_windows
+    if restored and misses >= MISSES_BEFORE_ACQUISITION:
+        validity.forget_registration(context)
+        text = f"the α from before the restart is dropped: {misses} windows were not found from it"
+        context.raise_alarm(NOT_RESTORED, text)
 
 
 def _why_not(state: TrackerState, saved: Saved, now_ns: int) -> str | None:

@@ -68,7 +68,10 @@ BEFORE_DOUBT = (
 _ROUNDING_NS = 1_000_000
 """A window that follows another begins where that one ends, but for the rounding of a frame."""
 
-_WORTHLESS = (Validity.STALE, Validity.INVALID)
+LEAPT = "the pointing law leapt, and no window has confirmed α since"
+"""Doubt about α, which is then a prediction."""
+
+_WORTHLESS = (Validity.STALE, Validity.PREDICTED, Validity.INVALID)
 
 Array = NDArray[np.float64]
 
@@ -232,6 +235,9 @@ def _validity_of(context: StepContext, registration: Registration) -> ValiditySt
     reason = _explain_invalidity(context.state, registration, policy)
     if reason is not None:
         return ValidityState(level=Validity.INVALID, reason=reason)
+    # A doubt of the watchdog may have replaced that of the law.
+    if registration.doubt == LEAPT or (registration.doubt and context.alpha.law.leap is not None):
+        return ValidityState(level=Validity.PREDICTED, reason=LEAPT)
     sigma, before = sigma_beyond_floor(registration), context.before.alpha.registration
     limit = policy.stale_sigma
     if registration.n_windows == 0:

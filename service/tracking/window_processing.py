@@ -128,6 +128,7 @@ def reject_window(context: StepContext, reason: str, kind: RefusalKind = Refusal
     level = Level.INFO if kind is RefusalKind.CUT_SHORT else Level.WARNING
     _note_refusal(context, reason, level)
     if kind not in HARMLESS_REFUSALS:
+        pointing_law.change_side(context)
         run = min(context.windows.run, 0) - 1
         context.windows = replace(context.windows, run=run, refused_because=reason)
 
@@ -139,6 +140,7 @@ def _note_refusal(context: StepContext, reason: str, level: Level = Level.INFO) 
 
 def process_window(context: StepContext, measured: WindowEstimate) -> None:
     """Fold a dithered window in, hold it, or have it decide about the one held before."""
+    pointing_law.decide_leap(context, measured)
     registration = context.registration
     if registration is None:
         joint = kalman.begin_joint(measured.numbers, measured.noise)

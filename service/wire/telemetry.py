@@ -336,7 +336,7 @@ class StateMessage:
     """Reconstructor that the RTC uses; None if unknown."""
 
     validity: codec.Text | None = None
-    """Validity of ``alpha``: fresh, ageing, stale or invalid."""
+    """Validity of ``alpha``: fresh, ageing, stale, predicted or invalid."""
 
     waiting_for: tuple[codec.Text, ...] = ()
     """Conditions that the service waits for, each with its remedy."""

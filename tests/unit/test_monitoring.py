@@ -242,7 +242,7 @@ def test_a_line_has_the_frame_and_the_matrices_it_is_about():
 
 def test_what_alpha_is_worth_is_a_label_of_a_rule():
     (rule,) = [e for name, e in EXPRESSIONS.items() if name == "PyrcalRegistrationUnknown"]
-    assert {Validity.STALE, Validity.INVALID} == set(
+    assert {Validity.STALE, Validity.PREDICTED, Validity.INVALID} == set(
         re.search(r'validity=~"([^"]+)"', rule)[1].split("|")
     )
 

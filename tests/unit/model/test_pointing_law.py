@@ -74,6 +74,29 @@ def test_a_table_is_straight_between_its_places_and_holds_beyond_them():
     assert told == pytest.approx([0.1, 0.1, 0.05, -0.1, -0.2, -0.2])
 
 
+def test_a_table_with_a_period_repeats_itself():
+    term = Term("angle", (-180.0, 0.0, 90.0), (0.1, 0.3, 0.2), 360.0)
+    told = [term.value({"angle": angle}) for angle in (-270.0, 0.0, 45.0, 135.0, 180.0, 405.0)]
+    assert told == pytest.approx([0.2, 0.3, 0.25, 0.15, 0.1, 0.25])
+    with pytest.raises(ModelError, match="at least the table's length"):
+        Term("angle", (0.0, 400.0), (0.0, 1.0), 360.0)
+
+
+@pytest.mark.parametrize(
+    ("at", "values", "period", "step"),
+    [
+        ((-180.0, 0.0, 180.0), (-0.12, 0.0, 0.12), 360.0, -0.24),
+        ((-180.0, 0.0, 180.0), (-0.12, 0.0, 0.12), None, -0.24),
+        ((-180.0, 0.0, 180.0), (0.1, 0.0, 0.1), 360.0, 0.0),
+        ((-180.0, 0.0, 170.0), (-0.12, 0.0, 0.12), 360.0, 0.0),
+        ((20.0, 80.0), (0.1, -0.1), None, 0.0),
+        ((0.0, 180.0), (0.0, 0.3), 180.0, -0.3),
+    ],
+)
+def test_the_step_of_a_table_where_it_begins_again(at, values, period, step):
+    assert Term("angle", at, values, period).closing_step == pytest.approx(step)
+
+
 @pytest.mark.parametrize(
     ("at", "values", "expected"),
     [
@@ -103,6 +126,8 @@ def test_a_law_is_a_registration_and_what_it_leaves_out_is_nominal():
         (Term("0.0008 * azimuth"), 0.288),
         (Term("azimuth", (0.0, 360.0), (0.1, 0.3)), 0.2),
         (Term("azimuth", (-180.0, 180.0), (0.1, 0.1)), 0.0),
+        (Term("azimuth", (-180.0, 180.0), (0.1, 0.3), 360.0), 0.2),
+        (Term("azimuth", (-180.0, 90.0), (0.1, 0.3), 360.0), 0.0),
         (Term("0.1 * sin(azimuth) + elevation / 100"), 0.0),
         (Term("azimuth - 12.98"), 360.0),
         (Term("0.1 * sin(azimuth / 2)"), 0.2),

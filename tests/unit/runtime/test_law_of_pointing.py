@@ -127,3 +127,30 @@ def test_a_law_that_would_leap_at_north_is_refused(tmp_path, term, found):
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigurationError, match=f"{found} more after a whole turn of azimuth"):
         load_instrument(path)
+
+
+@pytest.mark.parametrize(
+    ("term", "remarked"),
+    [
+        ('shift_x_subap = { of = "rotator", at = [-180, 180], values = [-0.1, 0.1] }', True),
+        ('shift_x_subap = { of = "rotator", at = [0, 60], values = [0, 1], period = 60 }', True),
+        ('shift_x_subap = { of = "rotator", at = [0, 50], values = [0, 1], period = 60 }', False),
+        ('rotation_deg = { of = "rotator", at = [-180, 180], values = [-180, 180] }', False),
+        ('shift_x_subap = { of = "temperature", at = [0, 20], values = [0, 0.1] }', False),
+    ],
+)
+def test_a_table_that_does_not_close_is_remarked(tmp_path, term, remarked):
+    path = tmp_path / "law.toml"
+    text = f"{INSTRUMENT.read_text(encoding='utf-8')}\n[law]\n{term}\n"
+    path.write_text(text, encoding="utf-8")
+    found = [remark for remark in load_instrument(path).remarks if "law." in remark]
+    assert len(found) == remarked
+    assert all("law.shift_x_subap" in remark and "rotator" in remark for remark in found)
+
+
+def test_a_period_that_is_no_number_is_refused(tmp_path):
+    path = tmp_path / "law.toml"
+    term = 'shift_x_subap = { of = "rotator", at = [0, 60], values = [0, 1], period = "360" }'
+    path.write_text(f"{INSTRUMENT.read_text(encoding='utf-8')}\n[law]\n{term}\n", "utf-8")
+    with pytest.raises(ConfigurationError, match=r"law.shift_x_subap.*values and period"):
+        load_instrument(path)

@@ -84,6 +84,23 @@ def test_a_window_that_disagrees_is_a_suspected_jump_as_ever(before):
     assert "jump-suspected" in again.alarms
 
 
+def test_a_restored_alpha_that_no_window_finds_is_dropped(before):
+    """It is 2.8 deg off: fits that begin there are refused, those of an unknown α are not."""
+    off = moved(ALPHA, rotation_rad=np.deg2rad(2.8))
+    before.state = changed(
+        before.state, registration=replace(before.state.alpha.registration, alpha=off)
+    )
+    again = restarted(before, 5.0).meet()
+    again.see(n_windows=2)
+    assert again.state.alpha.registration.alpha == off
+    again.see()
+    assert again.state.alpha.registration is None
+    assert "alpha-not-restored" in again.alarms
+    assert of_kind(again.see(n_windows=2), ev.MakeMatrix)
+    assert again.state.alpha.registration.alpha.vector == pytest.approx(ALPHA.vector, abs=1e-3)
+    assert "alpha-not-restored" not in again.alarms
+
+
 def test_a_doubt_survives_but_the_window_that_raised_it_does_not(before):
     before.see(moved(shift_x_subap=0.2))
     again = restarted(before, 5.0)

@@ -63,8 +63,9 @@ the change enters σ, and the advice is to correct the file."""
 
 MIN_EDGE_MOVE_SUBAP = 0.01
 """Smallest displacement at the pupil's edge by which another instrument, or the scatter of sets of
-modes, makes the registration undetermined, subapertures. A smaller one is part of σ and changes no reconstructor: with a matrix
-of HCIPy's lenslets, fitted to 0.0004 subaperture, the wrong stop left half of the misfit of 1 %."""
+modes, makes the registration undetermined, subapertures. A smaller one is part of σ and changes no
+reconstructor: with a matrix of HCIPy's lenslets, fitted to 0.0004 subaperture, the wrong stop left
+half of the misfit of 1 %."""
 
 UNDECIDED_WORDS = "the matrix does not show which"
 

@@ -623,6 +623,7 @@ def _make_fit(
         axes=axes_doubt,
         passes=usable.passes,
         stroke_known=stroke_known,
+        radius_subap=models.instrument.wfs.pupil_diameter / 2.0,
     )
     refusal, verdict = judge_fit(findings)
     smeared = () if found.smear is None else (found.smear.words,)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.fitting.methods import Settled, spread
-from pyrcal.fitting.models import COARSE_SAMPLING, PREFERRED_SHARE, FitModels
+from pyrcal.fitting.models import PREFERRED_SHARE, FitModels
 from pyrcal.fitting.solver import nuisances_of
 from pyrcal.fitting.uncertainty import pupil_regions
 from service.estimation.solver import Projection
@@ -209,7 +209,7 @@ class FitSubset:
         """Return D of an instrument, ``(n_slopes, n_few)``."""
         own = tried.basis is self.models.basis
         basis = self.model.basis if own else tried.basis.subset(self.modes)
-        model = tried.model(COARSE_SAMPLING, basis, once=True)
+        model = tried.model(self.models.cheap_sampling, basis, once=True)
         model.share_modes(self.model)
         return self._at_solution(model)
 

@@ -38,8 +38,8 @@ from service.tracking.products import MatrixState
 from service.tracking.state import ObservatoryValue, TrackerState
 from service.tracking.step_context import StepContext
 
-LINK_ALARM_TIMEOUT_S = 15.0
-"""An alarm that the link repeats while it lasts is over after this much silence."""
+REPEATED_ALARM_TIMEOUT_S = 15.0
+"""An alarm that is repeated while it lasts is over after this much silence."""
 
 MAX_CLOCK_LEAD_S: Final = 5.0
 """Largest lead of an RTC's clock on UTC. GPS time leads by 18 s, TAI by 37 s; frames that are late
@@ -252,7 +252,7 @@ def _is_given_up(context: StepContext) -> bool:
 
 
 def _is_repeated(name: str, context: StepContext) -> bool:
-    alarm, timeout_ns = context.state.alarm(name), LINK_ALARM_TIMEOUT_S * SECOND_NS
+    alarm, timeout_ns = context.state.alarm(name), REPEATED_ALARM_TIMEOUT_S * SECOND_NS
     return alarm is not None and context.now_ns - alarm.seen_ns_utc <= timeout_ns
 
 
@@ -260,6 +260,7 @@ LASTING: Final[dict[str, Callable[[StepContext], bool]]] = {
     alarms.VANISHED: lambda context: context.rtc is None,
     alarms.SECOND_RTC: partial(_is_repeated, alarms.SECOND_RTC),
     alarms.OTHER_BASIS: partial(_is_repeated, alarms.OTHER_BASIS),
+    alarms.UNDECLARED: partial(_is_repeated, alarms.UNDECLARED),
     alarms.NO_DITHER: lambda context: context.dither is None or context.dither.start_seq is None,
     alarms.NOT_AS_ASKED: _is_not_as_asked,
     alarms.OVER_BUDGET: _is_over_budget,

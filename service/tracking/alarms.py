@@ -67,6 +67,7 @@ CLUSTER_LOST = "cluster-lost"
 LOOP_OPENED = "loop-opened"
 SLOPES_STAND = "slopes-stand"
 NOT_FOUND = "registration-not-found"
+UNDECLARED = "undeclared-transition"
 
 
 RULE_PREFIX = "rule."

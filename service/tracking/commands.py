@@ -496,10 +496,9 @@ def _none_twice(groups: tuple[ModeGroup, ...]) -> None:
 
 def makes_safer(command: Command) -> bool:
     """Return True if an order ends something or takes it back: it must not wait for the disk."""
-    match command:
-        case SetLoop():
-            return command.loop == "open"
-        case SetMode():
-            return command.mode is Mode.HOLD
+    if isinstance(command, SetLoop):
+        return command.loop == "open"
+    if isinstance(command, SetMode):
+        return command.mode is Mode.HOLD
     enders = StopEverything | StopDither | Rollback | AbortAcquisition | GiveUp | Reject
     return isinstance(command, enders)

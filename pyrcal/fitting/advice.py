@@ -145,7 +145,12 @@ def _explain_uncertainty(fit: Fit, grounds: Grounds, edge: float, radius: float)
         f"at the pupil's edge the mirror is known to {edge:.3f} subapertures (1 sigma), "
         f"{ENOUGH_SUBAP:g} is enough"
     )
-    found = fit.registration
+    found, best = fit.registration, _choose_correction(fit)
+    if best is not None:
+        return (
+            f"{known}; with {best.words} the misfit is {best.share:.0%} of what it is: correct "
+            "that and fit again"
+        )
     # Averaging and more modes reduce the statistical part only.
     if found is None or edge_move(found.sigma_statistical, radius) > 0.7 * edge:
         if grounds.noise_share >= MIN_NOISE_SHARE:

@@ -41,6 +41,16 @@ from service.tracking.step_context import StepContext
 REPEATED_ALARM_TIMEOUT_S = 15.0
 """An alarm that is repeated while it lasts is over after this much silence."""
 
+MAX_CLOCK_LEAD_S: Final = 5.0
+"""Largest lead of an RTC's clock on UTC. GPS time leads by 18 s, TAI by 37 s; frames that are late
+on their way seem to lag, never to lead."""
+
+MAX_CLOCK_LAG_S: Final = 600.0
+"""Largest lag of the time stamps behind UTC: more is no delay of the telemetry, but the clock."""
+
+_KNOWN_LEADS_S: Final = {18: "GPS time", 37: "TAI"}
+_TIME_ZONE_S: Final = 900
+
 
 def derive_alarms(context: StepContext) -> None:
     """Raise what the state says is the matter, and end what is over."""
@@ -97,6 +107,26 @@ def _loop_open(context: StepContext) -> str | None:
     if rtc.in_loop or interrupted or opened:
         return None
     return f"{explain_open_loop(rtc)}: close it to calibrate"
+
+
+def explain_clock(lead_s: float) -> str | None:
+    """Return how time stamps ``lead_s`` seconds ahead of UTC are wrong; None if they are not."""
+    if -MAX_CLOCK_LAG_S <= lead_s <= MAX_CLOCK_LEAD_S:
+        return None
+    away_s = abs(lead_s)
+    is_zone = abs(away_s - _TIME_ZONE_S * round(away_s / _TIME_ZONE_S)) < MAX_CLOCK_LEAD_S
+    likely = _KNOWN_LEADS_S.get(round(lead_s)) or ("local time" if is_zone else None)
+    side = "ahead of" if lead_s > 0.0 else "behind"
+    return f"time stamps are {away_s:.0f} s {side} UTC{f', as {likely} is' if likely else ''}"
+
+
+def _clock(context: StepContext) -> str | None:
+    """Return how the RTC's clock is wrong; asked of each status, because it comes with its time."""
+    rtc, before = context.rtc, context.alarm_text(alarms.RTC_CLOCK)
+    if rtc is None or rtc is context.before.loop.rtc:
+        return before
+    found = explain_clock((rtc.t_ns - context.now_ns) / SECOND_NS)
+    return found and (before or f"the RTC's {found}")
 
 
 def _other_numbers(context: StepContext) -> str | None:
@@ -171,6 +201,7 @@ def _jump_suspected(context: StepContext) -> str | None:
 RULES: Final[dict[str, Callable[[StepContext], str | None]]] = {
     "stopped": _stopped,
     alarms.LOOP_OPEN: _loop_open,
+    alarms.RTC_CLOCK: _clock,
     "acquisition": _acquisition,
     alarms.NOT_FOUND: _not_found,
     alarms.OTHER_SUM: _other_numbers,

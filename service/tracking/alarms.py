@@ -17,6 +17,7 @@ import msgspec
 
 VANISHED = "rtc-vanished"
 LOOP_OPEN = "loop-open"
+RTC_CLOCK = "rtc-clock"
 SECOND_RTC = "second-rtc"
 OTHER_BASIS = "basis-mismatch"
 OTHER_INSTRUMENT = "instrument-mismatch"

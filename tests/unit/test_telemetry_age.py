@@ -6,10 +6,10 @@ import pytest
 from service.link.intake import Intake
 from service.link.session import Endpoint
 from service.link.telemetry_age import MAX_AGE_S
+from service.records import events as ev
+from service.records.alarms import Interlock, blocking_alarm
+from service.records.state import Mode
 from service.runtime.readiness import complaints
-from service.tracking import events as ev
-from service.tracking.alarms import Interlock, blocking_alarm
-from service.tracking.state import Mode
 from service.wire import FrameHeader, encode, encode_frames
 from tests.unit.tracking.situations import START_NS, Story
 from tests.unit.tracking.situations import rtc as status

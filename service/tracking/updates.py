@@ -14,6 +14,7 @@ from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
+from service.tracking.window_processing import MAX_TIME_WITHOUT_WINDOW_S
 from service.wire import Status
 
 FIRST_MATRIX_INTERVAL_S = 3.0
@@ -63,20 +64,26 @@ def decide_updates(context: StepContext) -> None:
     """Ask for what is wanted now."""
     rtc = context.rtc
     if rtc is None or context.blocking_alarm(Interlock.ASK) is not None:
+        _note_hindrance(context, "")
         return
     ramp = running_ramp(context.state, context.now_ns)
     if ramp is not None or context.blocking_alarm(Interlock.DECIDE) is not None:
+        _note_hindrance(context, "")
         stop_unwanted(context, rtc)
         return
     choose_dither(context, rtc)
-    hindrance = explain_hindrance(context, rtc)
-    if hindrance != context.matrices.hindrance:
-        context.matrices = replace(context.matrices, hindrance=hindrance)
+    _note_hindrance(context, explain_hindrance(context, rtc))
     unjudged = _find_unjudged(context)
     # asked for first: after a jump the loop waits for it, and nobody for the old one's margin
     _choose_update(context, rtc)
     if unjudged is not None:
         reconstructors.request_verdict(context, unjudged)
+
+
+def _note_hindrance(context: StepContext, hindrance: str) -> None:
+    """Store what keeps a reconstructor from being made; an alarm that forbids it says so itself."""
+    if hindrance != context.matrices.hindrance:
+        context.matrices = replace(context.matrices, hindrance=hindrance)
 
 
 def _find_unjudged(context: StepContext) -> str | None:
@@ -163,10 +170,8 @@ def explain_hindrance(context: StepContext, rtc: Status) -> str:
     if registration is None:
         return _explain_no_window(context)
     if not registration.usable and not registration.doubt:
-        return (
-            f"No reconstructor is made while α is invalid: {registration.validity.reason}. Raise "
-            "[dither] budget_m or longest_window_s for a smaller σ."
-        )
+        reason = registration.validity.reason
+        return f"No reconstructor is made while α is invalid: {reason}. {_advise(context)}"
     return _explain_modes(context, rtc)
 
 
@@ -227,11 +232,20 @@ def _explain_unproven(context: StepContext, rtc: Status, n_safe: int) -> str:
             "it. Correct order and signs of the modes in the instrument file."
         )
     if proof.n_tries:
-        return (
-            f"Mode {n_safe} was not seen to answer in {proof.n_tries} dithers: raise [dither] "
-            "budget_m, or see why windows are refused."
-        )
+        tried = f"Mode {n_safe} was not seen to answer in {proof.n_tries} dithers"
+        return f"{tried}. {_advise(context)}"
     return ""
+
+
+def _advise(context: StepContext) -> str:
+    """Return what to do for a surer α: a stronger dither helps only where windows are accepted."""
+    windows, known = context.windows, context.registration
+    if windows.run < 0:
+        return f"Windows are refused: {windows.refused_because}."
+    longest_s = max(MAX_TIME_WITHOUT_WINDOW_S, 2.0 * context.policy.longest_window_s)
+    if known is not None and context.now_ns - known.t_ns_utc > longest_s * SECOND_NS:
+        return "No window comes any more: check the frames of the RTC and its dither."
+    return "Raise [dither] budget_m or longest_window_s for a smaller σ."
 
 
 def _is_busy(context: StepContext) -> bool:

@@ -272,13 +272,10 @@ def _unit_named(ratio: float, instrument: Instrument) -> str:
     unit = unit_like(1.0 / max(ratio, 1e-30), _UNIT_DECADES)
     if unit:
         return (
-            f"commands look like {unit} (metres of OPD are expected), or slopes are in another "
-            "unit than the instrument file says"
+            f"commands look like {unit} (metres of OPD are expected), or slopes have another unit"
         )
-    return (
-        "slopes or commands are in another unit than the instrument file says (commands are metres "
-        f"of OPD), or {_optic_named(ratio, instrument)}"
-    )
+    optic = _optic_named(ratio, instrument)
+    return f"slopes or commands (metres of OPD) have another unit than in the file, or {optic}"
 
 
 def _planes(rows: Array, slopes: SlopeRecipe, mask: NDArray[np.bool_]) -> Array:

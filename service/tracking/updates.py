@@ -64,26 +64,20 @@ def decide_updates(context: StepContext) -> None:
     """Ask for what is wanted now."""
     rtc = context.rtc
     if rtc is None or context.blocking_alarm(Interlock.ASK) is not None:
-        _note_hindrance(context, "")
         return
     ramp = running_ramp(context.state, context.now_ns)
     if ramp is not None or context.blocking_alarm(Interlock.DECIDE) is not None:
-        _note_hindrance(context, "")
         stop_unwanted(context, rtc)
         return
     choose_dither(context, rtc)
-    _note_hindrance(context, explain_hindrance(context, rtc))
+    hindrance = explain_hindrance(context, rtc)
+    if hindrance != context.matrices.hindrance:
+        context.matrices = replace(context.matrices, hindrance=hindrance)
     unjudged = _find_unjudged(context)
     # asked for first: after a jump the loop waits for it, and nobody for the old one's margin
     _choose_update(context, rtc)
     if unjudged is not None:
         reconstructors.request_verdict(context, unjudged)
-
-
-def _note_hindrance(context: StepContext, hindrance: str) -> None:
-    """Store what keeps a reconstructor from being made; an alarm that forbids it says so itself."""
-    if hindrance != context.matrices.hindrance:
-        context.matrices = replace(context.matrices, hindrance=hindrance)
 
 
 def _find_unjudged(context: StepContext) -> str | None:

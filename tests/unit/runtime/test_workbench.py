@@ -469,7 +469,7 @@ def test_commands_in_another_unit_are_named_by_the_rtcs_own_matrix(metres, named
         (2.7, "wavelength_m or modulation_lambda_over_d is too large"),
         (120, "wavelength_m or modulation_lambda_over_d is too large"),
         (1 / 15, "wavelength_m or modulation_lambda_over_d is too small"),
-        (1 / 120, "slopes are in another unit"),
+        (1 / 120, "slopes have another unit"),
     ],
 )
 def test_a_factor_names_every_cause_that_makes_it(ratio, said):

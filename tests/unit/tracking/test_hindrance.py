@@ -72,14 +72,6 @@ def test_a_stronger_dither_is_no_remedy_where_no_window_is_accepted(refused):
     assert ("frames are missing" if refused else "No window comes any more") in hindrance(story)
 
 
-def test_what_hinders_is_not_said_while_an_alarm_forbids_all_decisions():
-    story = Story(policy=replace(POLICY, dither_enabled=False)).meet()
-    assert hindrance(story)
-    story.tell(ev.ConditionChanged(name="no-frames", text="no frame for 2 s"))
-    story.tell(ev.Tick(), after_s=1.0)
-    assert hindrance(story) == ""
-
-
 class Unseen(Story):
     all_shown = False
 

@@ -21,14 +21,7 @@ from service.model.misregistration import at_boundary
 from service.runtime.losses import FRAMES_TIMEOUT_S, silence
 from service.tracking import alarms
 from service.tracking import events as ev
-from service.tracking.alarms import (
-    Alarm,
-    Interlock,
-    Prerequisite,
-    Responsible,
-    alarm_blocks,
-    blocking_alarm,
-)
+from service.tracking.alarms import Alarm, Interlock, Prerequisite, Responsible, alarm_blocks
 from service.tracking.operation_records import AcquisitionStage
 from service.tracking.operations.running import operating
 from service.tracking.policy import SECOND_NS
@@ -303,7 +296,8 @@ def _for_the_matrix(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
         text = f"its reconstructor {rtc.cm_id}: offer it on rtc/cm/applied{_describe_rtc(state)}"
         yield Prerequisite(name="matrix-in-use", responsible=Responsible.RTC, text=text)
     # During an alarm that forbids all decisions it is not renewed, and the alarm says what to do.
-    if state.matrices.hindrance and blocking_alarm(state.alarms.active, Interlock.DECIDE) is None:
+    decides = alarms.blocking_alarm(state.alarms.active, Interlock.DECIDE) is None
+    if state.matrices.hindrance and decides:
         yield Prerequisite(
             name="new-matrix", responsible=Responsible.OPERATOR, text=state.matrices.hindrance
         )

@@ -193,6 +193,9 @@ class ReadinessInputs:
     worker_problem: str = ""
     """Problem of the worker; empty if there is none."""
 
+    rest_missing: str = ""
+    """What keeps REST from listening; empty if nothing does."""
+
     reading: bool = False
     """The RTC's own reconstructor is being read, and windows wait for that."""
 
@@ -234,6 +237,15 @@ def _for_the_worker(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
         yield Prerequisite(name="matrix", responsible=Responsible.WORKER, text=text)
 
 
+def _for_the_network(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
+    if inputs.link.missing:
+        yield Prerequisite(
+            name="link", responsible=Responsible.NETWORK, text=inputs.link.missing, blocks=True
+        )
+    if inputs.rest_missing:
+        yield Prerequisite(name="rest", responsible=Responsible.NETWORK, text=inputs.rest_missing)
+
+
 def _for_messages(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
     """Yield what of the RTC's telemetry does not come."""
     link, where, rtc = inputs.link, f"ao/v1/{inputs.state.system}", inputs.state.loop.rtc
@@ -251,6 +263,8 @@ def _for_messages(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
                 f"{where}/tel/status 1 to 10 times a second"
             )
             yield Prerequisite(name="status", responsible=Responsible.RTC, text=text, blocks=True)
+    elif link.missing:
+        pass  # nothing can come, however well the RTC runs
     elif not link.rtc_alive:
         text = f"no RTC is there: start it, as a zenoh client of this service, system {where}"
         yield Prerequisite(name="rtc", responsible=Responsible.RTC, text=text)
@@ -386,6 +400,7 @@ def _for_measurements(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
 
 _LOOKS: Final[tuple[Callable[[ReadinessInputs], Iterator[Prerequisite]], ...]] = (
     _for_the_worker,
+    _for_the_network,
     _for_messages,
     _for_frames,
     _for_alarms,

@@ -188,6 +188,19 @@ def test_what_the_rtc_does_not_send_is_waited_for(found, name, party, hinders):
     assert len(wait.text) > 20
 
 
+def test_a_network_that_is_not_there_is_waited_for_and_no_rtc_is_blamed():
+    """Nothing of an RTC can arrive, however well it runs."""
+    late = link(rtc_alive=False, session=None, frame_age_s=None, missing="no router answers")
+    inputs = ReadinessInputs(
+        state=TrackerState(system="small"), link=late, preparing=False, rest_missing="port taken"
+    )
+    found = [(w.name, w.responsible, w.text, w.blocks) for w in waiting_for(inputs)]
+    assert found == [
+        ("link", "network", "no router answers", True),
+        ("rest", "network", "port taken", False),
+    ]
+
+
 def test_what_the_rtc_says_of_itself_is_waited_for_in_its_words_while_it_is_there():
     state = tracker_state(system="small", rtc=rtc(trouble="aol1_imWFS2: its counter stands at 7"))
     wait = waits(link(*WELL), state)["rtc-trouble"]

@@ -27,7 +27,7 @@ from service.tracking.registration import HistoryEntry, Source
 REQUIRED_CHECKS: Final = (
     *("connection", "messages", "frames", "sizes", "numbers", "sequence", "clock", "delivery"),
     *("session", "status", "ids", "matrix", "law", "obedience", "orientation", "replies"),
-    *("dither", "columns", "commit", "chunks", "rejection", "reconnect", "loop"),
+    *("dither", "columns", "commit", "chunks", "rejection", "finite", "reconnect", "loop"),
 )
 """Checks of ``pyrcal check-rtc`` that every RTC must pass; the others belong to optional parts."""
 

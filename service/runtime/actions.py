@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
@@ -17,7 +18,7 @@ from service import wire
 from service.control.gains import gain_table
 from service.control.gate import GateVerdict
 from service.control.loop import ControlLoop
-from service.errors import ArchiveError, CommandError, LinkError, UnknownIdError
+from service.errors import ArchiveError, CommandError, LinkError, StorageError, UnknownIdError
 from service.estimation.description import Description
 from service.estimation.loop import extend_gains, same_gains, select_gains
 from service.link.matrices import MeasuredMatrix
@@ -239,7 +240,9 @@ class Actions:
             optical_gains=() if registration is None else registration.optical_gains,
             sha256=wire.checksum(matrix),
         )
-        await self._keep(record, matrix, None, why)
+        # A full disk must not stand in the way of a rollback: the archive has the source's numbers.
+        with contextlib.suppress(StorageError):
+            await self._keep(record, matrix, None, why)
         return ev.MatrixMade(record=record, wanted=effect.judged, anyway=effect.anyway)
 
     async def _judge(

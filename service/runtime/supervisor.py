@@ -196,7 +196,8 @@ class Supervisor:
         UnknownIdError
             If it names an unknown reconstructor.
         StorageError
-            If it cannot be recorded; nothing has been done.
+            If it cannot be recorded; nothing has been done. Orders that make the loop safer are
+            carried out first and recorded when the disk allows it.
         """
         state, now_ns = self._engine.state, self._clock.now_ns()
         order = command_results.GivenCommand(
@@ -210,9 +211,8 @@ class Supervisor:
             # audit.md).
             await self._writer.ordered(order, actor)
         except StorageError as error:
-            if not isinstance(command, cmd.StopEverything):  # that one waits for no disk
-                self._writer.refused(order, actor, error)
-                raise
+            self._writer.refused(order, actor, error)
+            raise
         try:
             # After the order is on record, so that the audit trail has refused orders too.
             actor.check()

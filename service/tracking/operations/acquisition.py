@@ -60,6 +60,7 @@ from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.registration import Registration
 from service.tracking.state import Level, Mode, TrackerState
 from service.tracking.step_context import StepContext, present
+from service.tracking.transitions import move
 from service.wire import DitherKind, DitherRequest, LoopRequest, Reply, Status
 
 MIN_FINAL_WINDOWS = 2
@@ -208,7 +209,7 @@ def _begin(context: StepContext, rtc: Status, why: str, *, commanded: bool) -> N
         sent=left is not None and left.sent,
         cause=context.cause,
     )
-    context.acquisition = begun
+    context.acquisition = move(context, context.acquisition, begun)
     # A window that began before the loop is opened would mix two loops.
     validity.invalidate_telemetry(context, "the acquisition had not begun")
     validity.forget_registration(context)
@@ -445,7 +446,8 @@ def _forget_when_over(context: StepContext, event: Event) -> None:
         text = f"{MIN_FINAL_WINDOWS} windows agree in the closed loop: none is needed any more"
     else:
         return
-    context.acquisition = Acquisition(text=text, since_ns_utc=context.now_ns)
+    idle = Acquisition(text=text, since_ns_utc=context.now_ns)
+    context.acquisition = move(context, acquisition, idle)
     context.log("acquisition.idle", text)
 
 
@@ -511,7 +513,8 @@ def _note_interrupted(context: StepContext, what: str, do: str = "") -> None:
     acquisition, stage = context.acquisition, AcquisitionStage.INTERRUPTED
     if (acquisition.stage, acquisition.text) == (stage, text):
         return
-    context.acquisition = replace(acquisition, stage=stage, text=text, since_ns_utc=context.now_ns)
+    interrupted = replace(acquisition, stage=stage, text=text, since_ns_utc=context.now_ns)
+    context.acquisition = move(context, acquisition, interrupted)
     context.warn("acquisition.interrupted", what)
 
 
@@ -686,7 +689,7 @@ def carry_alpha(context: StepContext, step: NDArray[np.float64]) -> None:
 
 def _enter_stage(context: StepContext, stage: AcquisitionStage, text: str) -> None:
     """Begin a stage."""
-    context.acquisition = replace(
+    entered = replace(
         context.acquisition,
         stage=stage,
         text=text,
@@ -694,6 +697,9 @@ def _enter_stage(context: StepContext, stage: AcquisitionStage, text: str) -> No
         misses=0,
         command=None,
     )
+    context.acquisition = move(context, context.acquisition, entered)
+    if context.acquisition is not entered:
+        return
     level = Level.WARNING if stage is AcquisitionStage.FAILED else Level.INFO
     context.log(f"acquisition.{stage}", text, level)
 

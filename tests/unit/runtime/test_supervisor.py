@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import resource
+import shutil
 import socket
 import threading
 import time
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from service.archive import Actor, AuditEntry, Channel, Range
-from service.errors import ArchiveError, CommandError, PyrcalError
+from service.errors import ArchiveError, CommandError, PyrcalError, UnknownIdError
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime import supervisor as supervising
 from service.runtime.archiving import restore_tracking
@@ -22,6 +23,7 @@ from service.runtime.supervisor import Supervisor
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.state import Level, LogEntry, Mode, TrackerState
+from service.wire import checksum
 from tests.states import changed, tracker_state
 from tests.system.cable import free_port
 from tests.system.fake_rtc import client_session
@@ -456,6 +458,47 @@ async def test_an_order_that_cannot_be_recorded_is_not_carried_out(supervisor, a
     assert names == ["SetMode", "SetMode.refused", "SetMode", "SetMode.answered"]
 
 
+@pytest.mark.parametrize(
+    "order",
+    [
+        cmd.SetMode(mode=Mode.HOLD),
+        cmd.StopDither(),
+        cmd.StopEverything(),
+        cmd.SetLoop(loop="open"),
+        cmd.Rollback(anyway=True),
+        cmd.AbortAcquisition(),
+    ],
+)
+async def test_what_makes_the_loop_safer_needs_no_disk(supervisor, archive, impatient, order):
+    """It is carried out, or refused for what the RTC says, and on record once the disk is back."""
+    async with running(supervisor):
+        know(supervisor, mode=Mode.AUTO)
+        with full_disk(archive):
+            with contextlib.suppress(CommandError, UnknownIdError):
+                await supervisor.submit(order)
+            state = supervisor.snapshot().tracker
+            done = state.operator.mode is Mode.HOLD or bool(state.operator.stopped_because)
+            assert done or not isinstance(order, cmd.SetMode | cmd.StopEverything)
+            await until(lambda: alarm_of(supervisor, "archive-failed"))
+        await until(lambda: alarm_of(supervisor, "archive-failed") is None)
+    kind = type(order).__name__
+    names = [name for name, _ in trail(archive, "operator")]
+    assert names[0] == kind
+    assert names[1] in {f"{kind}.answered", f"{kind}.refused"}
+
+
+async def test_a_data_directory_that_is_gone_is_called_so(supervisor, archive, impatient):
+    async with running(supervisor):
+        shutil.move(archive.directory, f"{archive.directory}-elsewhere")
+        with contextlib.suppress(ArchiveError):
+            await supervisor.submit(cmd.SetMode(mode=Mode.AUTO))
+        await until(lambda: alarm_of(supervisor, "archive-failed"))
+        text = alarm_of(supervisor, "archive-failed").text
+        shutil.move(f"{archive.directory}-elsewhere", archive.directory)
+    assert "data_dir is gone" in text
+    assert "free space" not in text
+
+
 async def test_what_could_not_be_written_is_written_once_it_can_be_and_only_once(
     supervisor, archive, impatient
 ):
@@ -501,9 +544,11 @@ async def test_a_service_that_ends_while_the_disk_refuses_still_writes_what_wait
     assert ("note", "last words") in trail(archive, "service")
 
 
+@pytest.mark.parametrize(("parent", "is_sent"), [(None, False), ("cm-0", False), ("cm-2", True)])
 async def test_a_matrix_is_not_sent_while_it_cannot_be_recorded_why(
-    supervisor, archive, bridge, monkeypatch, impatient
+    supervisor, archive, bridge, monkeypatch, impatient, parent, is_sent
 ):
+    """But for the numbers of an earlier one, which take back what made the loop worse."""
     sent = []
 
     async def publish(manifest, _matrix):
@@ -511,17 +556,19 @@ async def test_a_matrix_is_not_sent_while_it_cannot_be_recorded_why(
 
     monkeypatch.setattr(bridge, "publish", publish)
     matrix = np.zeros((3, 4), np.float32)
-    archive.reconstructors.store(record("cm-1", n_modes=3), matrix, None, {})
+    new = record("cm-1", n_modes=3, sha256=checksum(matrix), parent=parent)
+    archive.reconstructors.store(new, matrix, None, {})
     story = Story(Mode.HOLD).meet()
-    known = changed(story.state, reconstructors=(record("cm-1", n_modes=3),))
+    earlier = record("cm-0", sha256="b" * 64), record("cm-2", sha256=new.sha256)
+    known = changed(story.state, reconstructors=(*earlier, new))
     supervisor._engine.state = known
     effect = ev.SendMatrix(id="cm-1", n_modes=known.loop.rtc.n_controlled, gains=None)
     with full_disk(archive):
         supervisor._post(ev.LogEvent(name="why", text="it is sent"))
         await supervisor._do(effect, known)
-        assert sent == []
+        assert sent == ["cm-1"] * is_sent
     await supervisor._do(effect, known)
-    assert sent == ["cm-1"]
+    assert sent[-1:] == ["cm-1"]
 
 
 async def test_a_matrix_that_cannot_be_stored_is_never_heard_of_and_the_disk_is_named(

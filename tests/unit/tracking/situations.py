@@ -213,6 +213,8 @@ class Story:
     def tell(self, event, after_s=0.0, cause=""):
         """Let time pass, then something happen; return what is to be done about it."""
         self.now_ns += round(after_s * SECOND)
+        if isinstance(event, Status) and event.t_ns == START_NS:
+            event = replace(event, t_ns=self.now_ns)
         try:
             self.state, effects = step(self.state, event, self.policy, self.now_ns, cause)
         except CommandError as refusal:

@@ -40,8 +40,9 @@ def watched(alpha, scatter=SCATTER):
 def watch(story, alpha, after_s=10.0, scatter=SCATTER):
     """A look of the watchdog; the RTC's clock tells when."""
     now_ns = story.now_ns + round(after_s * SECOND)
-    story.tell(rtc(t_ns=now_ns))
-    return story.tell(ev.PassiveFitted(estimate=watched(alpha, scatter), t_ns_utc=now_ns), after_s)
+    effects = story.tell(rtc(t_ns=now_ns), after_s)
+    look = ev.PassiveFitted(estimate=watched(alpha, scatter), t_ns_utc=now_ns)
+    return effects + story.tell(look)
 
 
 @pytest.fixture

@@ -238,12 +238,14 @@ def _for_the_worker(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
 
 
 def _for_the_network(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
-    if inputs.link.missing:
-        yield Prerequisite(
-            name="link", responsible=Responsible.NETWORK, text=inputs.link.missing, blocks=True
-        )
+    """Yield what of the network is not there; without a link no RTC can be blamed."""
+    missing, party = inputs.link.missing, Responsible.NETWORK
     if inputs.rest_missing:
-        yield Prerequisite(name="rest", responsible=Responsible.NETWORK, text=inputs.rest_missing)
+        yield Prerequisite(name="rest", responsible=party, text=inputs.rest_missing)
+    if missing:
+        yield Prerequisite(name="link", responsible=party, text=missing, blocks=True)
+    else:
+        yield from _for_messages(inputs)
 
 
 def _for_messages(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
@@ -263,8 +265,6 @@ def _for_messages(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
                 f"{where}/tel/status 1 to 10 times a second"
             )
             yield Prerequisite(name="status", responsible=Responsible.RTC, text=text, blocks=True)
-    elif link.missing:
-        pass  # nothing can come, however well the RTC runs
     elif not link.rtc_alive:
         text = f"no RTC is there: start it, as a zenoh client of this service, system {where}"
         yield Prerequisite(name="rtc", responsible=Responsible.RTC, text=text)
@@ -401,7 +401,6 @@ def _for_measurements(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
 _LOOKS: Final[tuple[Callable[[ReadinessInputs], Iterator[Prerequisite]], ...]] = (
     _for_the_worker,
     _for_the_network,
-    _for_messages,
     _for_frames,
     _for_alarms,
     _for_the_matrix,

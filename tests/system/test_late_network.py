@@ -22,9 +22,12 @@ def test_it_waits_for_its_router_says_so_and_tracks_once_it_is_there(tmp_path):
     with a_night(tmp_path) as night, late_router(night) as (options, appear):
         night.rtc()
         service = start_service(night, **options)
-        wait = wait_for(lambda: waited_for(night, service), 40.0, lambda: service.log)["link"]
-        assert (wait["responsible"], wait["blocks"]) == ("network", True)
-        assert night.zenoh in wait["text"]
+
+        def wait():
+            return (waited_for(night, service) or {}).get("link", {"text": ""})
+
+        wait_for(lambda: night.zenoh in wait()["text"], 40.0, lambda: service.log)
+        assert (wait()["responsible"], wait()["blocks"]) == ("network", True)
         assert night.client.get("/healthz").is_success
         appear()
         wait_for(lambda: tracks(night), 40.0, lambda: night.state)

@@ -31,6 +31,14 @@ from service.files.fit_folder import FitRequest
 from service.files.last_telemetry import LastTelemetry
 from service.model.instrument import Instrument, instrument_sha256
 from service.program import announce, leave
+from service.records.state import (
+    LoopState,
+    MatrixStates,
+    Mode,
+    Operations,
+    OperatorState,
+    TrackerState,
+)
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.actions import Actions, Publishing
 from service.runtime.archiving import restore_tracking
@@ -42,14 +50,6 @@ from service.runtime.uploads import FitLimits, FitQueue
 from service.runtime.workers import WorkerPool
 from service.tracking.operations.measurement import MEASUREMENTS_KEPT
 from service.tracking.resume import restored
-from service.tracking.state import (
-    LoopState,
-    MatrixStates,
-    Mode,
-    Operations,
-    OperatorState,
-    TrackerState,
-)
 from service.web.keys import KeyFile
 
 LARGE_BYTES = 2_500_000

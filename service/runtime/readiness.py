@@ -18,16 +18,16 @@ from service.link.statistics import (
     LinkStatistics,
 )
 from service.model.misregistration import at_boundary
+from service.records import alarms
+from service.records import events as ev
+from service.records.alarms import Alarm, Interlock, Prerequisite, Responsible, alarm_blocks
+from service.records.operations import AcquisitionStage
+from service.records.products import MatrixState, ReconstructorRecord
+from service.records.state import Mode, TrackerState
 from service.runtime.losses import FRAMES_TIMEOUT_S, silence
-from service.tracking import alarms
-from service.tracking import events as ev
-from service.tracking.alarms import Alarm, Interlock, Prerequisite, Responsible, alarm_blocks
-from service.tracking.operation_records import AcquisitionStage
 from service.tracking.operations.running import operating
 from service.tracking.policy import SECOND_NS
-from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import check_return, explain_unread_matrix
-from service.tracking.state import Mode, TrackerState
 from service.tracking.update_policy import MIN_PROPOSAL_LIFETIME_S, is_outdated
 from service.wire import TEXT_LIMIT, AlarmMessage, StateMessage
 

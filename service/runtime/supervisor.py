@@ -21,9 +21,15 @@ from service.archive.retention import EVERYTHING, RetentionPolicy
 from service.errors import LinkError, PyrcalError, StorageError
 from service.estimation import dither_windows, frames, lockin, passive, random_dither
 from service.estimation.description import Description
-from service.estimation.windows import RefusalKind
 from service.link import matrices, statistics
 from service.model.instrument import Instrument
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.alarms import CLOCK_LEAPT, Prerequisite
+from service.records.estimates import RefusalKind
+from service.records.events import Effect, Event
+from service.records.operations import MeasureState
+from service.records.state import Level, TrackerState
 from service.runtime import archiving, command_results, readiness, worker
 from service.runtime.actions import Actions
 from service.runtime.clock import ServiceClock
@@ -34,14 +40,8 @@ from service.runtime.losses import Losses
 from service.runtime.snapshot import Snapshot, in_words
 from service.runtime.telemetry_recorder import TelemetryRecorder, TrendSampler
 from service.runtime.workers import WorkerLoadMeter, WorkerPool, with_another_worker
-from service.tracking import commands as cmd
-from service.tracking import events as ev
 from service.tracking.alarm_rules import changes_value
-from service.tracking.alarms import CLOCK_LEAPT, Prerequisite
-from service.tracking.events import Effect, Event
-from service.tracking.operation_records import MeasureState
 from service.tracking.policy import Policy
-from service.tracking.state import Level, TrackerState
 from service.tracking.step_context import new_lines
 
 LINK_RETRY_INTERVAL_S = 1.0

@@ -14,13 +14,8 @@ import zenoh.ext
 
 from service.errors import LinkError, UnknownIdError, WireError
 from service.link.matrices import MeasuredMatrix
+from service.records.events import LogEvent, RtcVanished, ServicesMet, SessionStarted
 from service.rtc_bridge import Bridge, Endpoint
-from service.tracking.events import (
-    LogEvent,
-    RtcVanished,
-    ServicesMet,
-    SessionStarted,
-)
 from service.wire import (
     Acknowledgement,
     AckState,

@@ -25,7 +25,7 @@ from service.config import Settings, load_settings
 from service.control.reconstructor import MAX_CONDITION, Recipe
 from service.control.reconstructor import InversionMethod as MakeMethod
 from service.model.kinds import Method as FitMethod
-from service.tracking.state import Mode
+from service.records.state import Mode
 from service.version import software_version
 from service.wire import CHUNK_LIMIT
 

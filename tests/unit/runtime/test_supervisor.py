@@ -15,14 +15,14 @@ import pytest
 
 from service.archive import Actor, AuditEntry, Channel, Range
 from service.errors import ArchiveError, CommandError, PyrcalError, UnknownIdError
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.state import Level, LogEntry, Mode, TrackerState
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime import supervisor as supervising
 from service.runtime.archiving import restore_tracking
 from service.runtime.engine import follow_state
 from service.runtime.supervisor import Supervisor
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.state import Level, LogEntry, Mode, TrackerState
 from service.wire import checksum
 from tests.states import changed, tracker_state
 from tests.system.cable import free_port

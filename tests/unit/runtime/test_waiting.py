@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 from service.link.statistics import Counters, Disposition, LinkStatistics
+from service.records.alarms import Alarm, Prerequisite, Responsible
+from service.records.products import MatrixState
+from service.records.state import Mode, TrackerState
 from service.runtime.readiness import (
     DERIVED_EACH_SECOND,
     ReadinessInputs,
@@ -17,9 +20,6 @@ from service.runtime.readiness import (
     state_message,
     waiting_for,
 )
-from service.tracking.alarms import Alarm, Prerequisite, Responsible
-from service.tracking.products import MatrixState
-from service.tracking.state import Mode, TrackerState
 from tests.states import changed, tracker_state
 from tests.unit.tracking.situations import ALPHA, START_NS, Story, moved, record, rtc
 

@@ -5,12 +5,12 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from service.tracking import commands as cmd
-from service.tracking import events as ev
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.products import MatrixState
+from service.records.registration import Purpose, Validity
+from service.records.state import Mode, TrackerState
 from service.tracking import validity
-from service.tracking.products import MatrixState
-from service.tracking.registration import Purpose, Validity
-from service.tracking.state import Mode, TrackerState
 from service.tracking.validity import (
     INTERVALS_KEPT,
     MAX_TELEMETRY_AGE_S,

@@ -19,23 +19,17 @@ from service.errors import CommandError, UnknownIdError
 from service.estimation.loop import explain_open_loop
 from service.files.toml import nearest
 from service.model.pointing_law import ANGLES
-from service.tracking import (
-    alarms,
-    dither,
-    dither_plan,
-    mode_proof,
-    validity,
-    window_processing,
-)
-from service.tracking import commands as cmd
-from service.tracking.alarms import RULE_PREFIX, AlarmDefinition
+from service.records import alarms
+from service.records import commands as cmd
+from service.records.alarms import RULE_PREFIX, AlarmDefinition
+from service.records.operations import AcquisitionStage
+from service.records.products import MatrixState
+from service.records.state import ObservatoryValue, TrackerState
+from service.tracking import dither, dither_plan, mode_proof, validity, window_processing
 from service.tracking.dither_request import MAX_STOP_DELAY_S
-from service.tracking.operation_records import AcquisitionStage
 from service.tracking.operations.acquisition import has_missed_enough
 from service.tracking.operations.probation import explain_opening
 from service.tracking.policy import SECOND_NS, Rule
-from service.tracking.products import MatrixState
-from service.tracking.state import ObservatoryValue, TrackerState
 from service.tracking.step_context import StepContext
 
 REPEATED_ALARM_TIMEOUT_S = 15.0

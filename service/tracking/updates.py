@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from service.records.alarms import Interlock
+from service.records.events import MakeMatrix
+from service.records.products import MatrixState, ReconstructorRecord
+from service.records.state import Mode, TrackerState
 from service.tracking import reconstructors, update_policy
-from service.tracking.alarms import Interlock
 from service.tracking.dither import choose_dither, stop_unwanted
-from service.tracking.events import MakeMatrix
 from service.tracking.mode_proof import awaits_proof, n_proven_modes
 from service.tracking.operations.running import running_ramp
 from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.window_processing import MAX_TIME_WITHOUT_WINDOW_S
 from service.wire import Status

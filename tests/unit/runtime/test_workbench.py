@@ -14,9 +14,8 @@ from service.errors import ModelError, UnknownIdError
 from service.estimation import passive
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import LockIn, LockInPlan, Spectra
-from service.estimation.openloop import WideCaptureEstimate
 from service.estimation.slope_convention import identify_from_response
-from service.estimation.windows import ClosedLoop, RefusalKind, WindowRefused
+from service.estimation.windows import ClosedLoop
 from service.model.interaction import InteractionModel, RtcInteractionModel
 from service.model.kinds import Normalisation, SlopeOrder
 from service.model.misregistration import Misregistration
@@ -24,10 +23,11 @@ from service.model.modes import modal_basis
 from service.model.pupil import rtc_valid_subapertures
 from service.model.sensors.pyramid.description import FrameWindows
 from service.model.slopes import Orientation, SlopeRecipe, to_rtc
+from service.records.estimates import RefusalKind, WideCaptureEstimate, WindowRefused
+from service.records.events import ModesRecognised
+from service.records.products import MatrixState, ReconstructorRecord
 from service.runtime.estimates import read_own_matrix
 from service.runtime.worker import OpticsWorker, run_job
-from service.tracking.events import ModesRecognised
-from service.tracking.products import MatrixState, ReconstructorRecord
 from tests.states import tracker_state
 from tests.unit.estimation.lamps import counts_of
 from tests.unit.runtime.small import (

@@ -10,13 +10,10 @@ import pytest
 import service
 from service.archive.serialisation import TrackingFile
 from service.errors import CommandError, UnknownIdError
-from service.estimation.windows import RefusalKind, WindowRefused
-from service.tracking import alarms
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.alarm_records import muted_records, stale_records, worst_severity
-from service.tracking.alarm_rules import LASTING, RULES
-from service.tracking.alarms import (
+from service.records import alarms
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.alarms import (
     ALARMS,
     AlarmDefinition,
     AlarmState,
@@ -24,10 +21,13 @@ from service.tracking.alarms import (
     Severity,
     blocking_alarm,
 )
+from service.records.estimates import RefusalKind, WindowRefused
+from service.records.products import MatrixState
+from service.records.state import Mode, TrackerState
+from service.tracking.alarm_records import muted_records, stale_records, worst_severity
+from service.tracking.alarm_rules import LASTING, RULES
 from service.tracking.interlocks import permitted
-from service.tracking.products import MatrixState
 from service.tracking.resume import resumed, saved_of
-from service.tracking.state import Mode, TrackerState
 from service.wire import DitherRequest, LoopRequest
 from tests.unit.tracking.situations import POLICY, Story, judged, of_kind, record, verdict
 

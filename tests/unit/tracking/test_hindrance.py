@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.tracking import events as ev
-from service.tracking.mode_limits import ModeProof
+from service.records import events as ev
+from service.records.products import ModeProof
+from service.records.state import Mode
 from service.tracking.mode_proof import awaits_proof
-from service.tracking.state import Mode
 from service.tracking.step_context import StepContext
 from service.wire import DitherRequest
 from tests.states import changed

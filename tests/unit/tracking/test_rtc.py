@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError
-from service.tracking import commands as cmd
-from service.tracking import events as ev
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.products import MatrixState
+from service.records.state import Level, Mode
 from service.tracking.dither_request import DEFAULT_DURATION_S
-from service.tracking.products import MatrixState
-from service.tracking.state import Level, Mode
 from service.wire import DitherRequest
 from tests.states import changed
 from tests.unit.tracking.situations import (

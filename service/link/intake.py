@@ -401,6 +401,7 @@ class Intake:
                 acknowledgements_unknown=self._counted["unknown"],
                 events_dropped=self._counted["dropped"],
                 callback_errors=self._counted["failed"],
+                missing="",
                 waiting_connections={},
                 frame_age_s=_age_s(self._last_frame_s, now_s),
                 telemetry_age_s=self._age.age_s,

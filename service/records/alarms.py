@@ -130,6 +130,9 @@ class Responsible(StrEnum):
     SERVICE = "service"
     """Another one, of the same system."""
 
+    NETWORK = "network"
+    """Whoever starts routers, addresses and names, or has the port."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prerequisite:

@@ -206,6 +206,9 @@ class ReadinessInputs:
     worker_problem: str = ""
     """Problem of the worker; empty if there is none."""
 
+    rest_missing: str = ""
+    """What keeps REST from listening; empty if nothing does."""
+
     reading: bool = False
     """The RTC's own reconstructor is being read, and windows wait for that."""
 
@@ -245,6 +248,17 @@ def _for_the_worker(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
     if inputs.state.matrices.making_since_ns_utc is not None:
         text = "a reconstructor is being computed and judged: wait"
         yield Prerequisite(name="matrix", responsible=Responsible.WORKER, text=text)
+
+
+def _for_the_network(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
+    """Yield what of the network is not there; without a link no RTC can be blamed."""
+    missing, party = inputs.link.missing, Responsible.NETWORK
+    if inputs.rest_missing:
+        yield Prerequisite(name="rest", responsible=party, text=inputs.rest_missing)
+    if missing:
+        yield Prerequisite(name="link", responsible=party, text=missing, blocks=True)
+    else:
+        yield from _for_messages(inputs)
 
 
 def _for_messages(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
@@ -308,7 +322,9 @@ def _for_the_matrix(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
     ):
         text = f"its reconstructor {rtc.cm_id}: offer it on rtc/cm/applied{_describe_rtc(state)}"
         yield Prerequisite(name="matrix-in-use", responsible=Responsible.RTC, text=text)
-    if state.matrices.hindrance:
+    # During an alarm that forbids all decisions it is not renewed, and the alarm says what to do.
+    decides = alarms.blocking_alarm(state.alarms.active, Interlock.DECIDE) is None
+    if state.matrices.hindrance and decides:
         yield Prerequisite(
             name="new-matrix", responsible=Responsible.OPERATOR, text=state.matrices.hindrance
         )
@@ -399,7 +415,7 @@ def _for_measurements(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
 
 _LOOKS: Final[tuple[Callable[[ReadinessInputs], Iterator[Prerequisite]], ...]] = (
     _for_the_worker,
-    _for_messages,
+    _for_the_network,
     _for_frames,
     _for_alarms,
     _for_the_matrix,

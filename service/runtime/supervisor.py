@@ -44,6 +44,9 @@ from service.tracking.alarm_rules import changes_value
 from service.tracking.policy import Policy
 from service.tracking.step_context import new_lines
 
+LINK_RETRY_INTERVAL_S = 1.0
+"""Between two attempts to open the link, and two checks whether it has to be opened again."""
+
 LINK_POLL_INTERVAL_S = 0.16
 """Between two visits to the link at the least: each costs two milliseconds, whatever there is."""
 
@@ -111,6 +114,7 @@ class Supervisor:
         """Held while estimators are used or changed."""
         self._running: set[asyncio.Task[None]] = set()
         self._heartbeat = Heartbeat()
+        self._rest_missing = ""
         self._broken = ""
         """Last unforeseen error."""
         self._started_ns = self._clock.now_ns()
@@ -153,9 +157,16 @@ class Supervisor:
             link=link,
             preparing=self._engine.bank is None,
             worker_problem=self._workers.problem,
+            rest_missing=self._rest_missing,
             reading=not self._own_matrix_read.is_set(),
         )
         return readiness.waiting_for(inputs)
+
+    def await_rest(self, missing: str) -> None:
+        """Take note of what keeps REST from listening; empty if nothing does."""
+        if missing and missing != self._rest_missing:
+            self._note("api.waiting", missing, Level.WARNING)
+        self._rest_missing = missing
 
     def audit(self, entry: AuditEntry) -> None:
         """Take a line of the audit trail that is of no command."""
@@ -251,7 +262,8 @@ class Supervisor:
     async def _work(self) -> None:
         async with asyncio.TaskGroup() as group:
             # These run before the model is prepared, which takes seconds to minutes: orders and
-            # alarms are recorded meanwhile.
+            # alarms are recorded meanwhile, and RTCs can connect.
+            group.create_task(self._keep_link())
             group.create_task(self._writer.run())
             group.create_task(self._writer.save())
             group.create_task(self.recordings.run())
@@ -360,13 +372,10 @@ class Supervisor:
 
     async def _tick(self) -> None:
         alarms: frozenset[tuple[str, str]] = frozenset()
-        told, revival, losses = readiness.ReadinessLog(), readiness.Revival(), Losses()
+        told, losses = readiness.ReadinessLog(), Losses()
         while True:
             self._heartbeat.beat("the tick")
             link = self._bridge.statistics()
-            if revival.due(link, time.monotonic()):
-                await self._reopen_link()
-                link = self._bridge.statistics()
             with self._survive_errors("a tick"):
                 self._post(ev.Tick())
             self._worker_load.look()
@@ -389,21 +398,31 @@ class Supervisor:
             alarms = raised
             await asyncio.sleep(1.0)
 
-    async def _reopen_link(self) -> None:
-        """Open the link again."""
+    async def _keep_link(self) -> None:
+        """Open the link once its network is there, and again when nothing arrives on it.
+
+        After a power cut the service may start before its router, its name server or its address.
+        """
+        revival, noted = readiness.Revival(), ""
         while True:
-            self._heartbeat.beat("the tick")
-            try:
-                await asyncio.to_thread(self._bridge.reopen)
-            except LinkError as error:
-                self._note("link.lost", f"{error}; tried again every 5 s", Level.ALARM)
-                await asyncio.sleep(5.0)
-            else:
-                text = (
-                    "the RTC's token was present and no message arrived: the link was opened again"
-                )
-                self._note("link.reopened", text, Level.WARNING)
-                return
+            link = self._bridge.statistics()
+            if link.missing or revival.due(link, time.monotonic()):
+                try:
+                    await asyncio.to_thread(self._bridge.reopen)
+                except LinkError as error:
+                    if noted != str(error):
+                        noted = str(error)
+                        text = f"{noted}; tried again every {LINK_RETRY_INTERVAL_S:g} s"
+                        self._note("link.waiting", text, Level.WARNING)
+                else:
+                    noted = ""
+                    if not link.missing:
+                        text = (
+                            "the RTC's token was present and no message arrived: the link was "
+                            "opened again"
+                        )
+                        self._note("link.reopened", text, Level.WARNING)
+            await asyncio.sleep(LINK_RETRY_INTERVAL_S)
 
     async def _fit(self) -> None:
         while True:

@@ -310,7 +310,7 @@ class PyramidModel(SensorModel):
     def pupil_offset(self, instrument: Instrument) -> tuple[float, float] | None:
         turned = description.stated_offsets(instrument)
         if turned is None:
-            return None
+            return super().pupil_offset(instrument)
         x, y = turned.mean(axis=(0, 1))
         return float(x), float(y)
 

@@ -6,24 +6,26 @@ Run: ``python -m pyrcal_studies.pages``, then ``git diff``; a test compares.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
-from typing import get_args
+from typing import Final, get_args
 
 from pyrcal.instruments.schema_texts import described
-from pyrcal_studies import reference
+from pyrcal_studies import reference, state_machines
 from pyrcal_studies.contract_tables import with_tables
 from pyrcal_studies.openapi import document
 from pyrcal_studies.reference import packaged
-from service.tracking.alarms import AlarmState, Interlock, Severity
-from service.tracking.commands import Command
+from pyrcal_studies.state_machines import MACHINES
+from service.records.alarms import AlarmState, Interlock, Severity
+from service.records.commands import Command
+from service.records.operations import AcquisitionStage, MeasureState, ProbationState
+from service.records.products import MatrixState
+from service.records.registration import Validity
+from service.records.state import Mode
 from service.tracking.interlocks import ALLOWS
-from service.tracking.operation_records import AcquisitionStage, MeasureState, ProbationState
 from service.tracking.operations.running import OPERATION_OF, CurrentOperation, ServiceState
-from service.tracking.products import MatrixState
-from service.tracking.registration import Validity
-from service.tracking.state import Mode
 
 ROOT = Path(__file__).parents[1]
 
@@ -84,7 +86,7 @@ def runbook() -> str:
     return reference.runbook(acts)
 
 
-PAGES = {
+PAGES: Final[dict[str, Callable[[], str]]] = {
     "reference/states.md": states,
     "rtc/fields.md": fields,
     "openapi.json": openapi,
@@ -95,6 +97,7 @@ PAGES = {
     "reference/system.md": reference.system,
     "reference/cli.md": reference.commands,
     "developer/tracker.md": reference.tracker_page,
+    **{f"developer/{one.picture}": partial(state_machines.draw, one) for one in MACHINES},
     "reference/rest.md": rest,
     "operate/runbook.md": runbook,
 }

@@ -91,6 +91,17 @@ async def client(service):
 
 
 @pytest.fixture(autouse=True)
+def undeclared_transitions_raise(monkeypatch):
+    """Fail a test in which a state changes in a way that no table declares."""
+    from service.tracking import transitions
+
+    def fail(_, record, to):
+        raise AssertionError(f"a {type(record).__name__} has no declared transition to {to}")
+
+    monkeypatch.setattr(transitions, "report_undeclared", fail)
+
+
+@pytest.fixture(autouse=True)
 def log_of_its_own():
     """Leave no log behind that writes where the test before has looked."""
     yield

@@ -336,7 +336,8 @@ def _try_off_centre(few: FitSubset) -> Iterator[Alternative]:
             and explained > MIN_OFFSET_EXPLAINED
         ),
         undecided=is_open(lead),
-        key=CENTRED_KEY,
+        # With the mirror as stop the pupil is where the mirror is: nothing can be centred.
+        key="" if about.stop is Stop.MIRROR else CENTRED_KEY,
         counts=True,
         is_number=True,
     )

@@ -20,9 +20,9 @@ from service.link.matrices import LinkEvent
 from service.link.ring import FRAME_OUTCOMES, LEAP, FrameRing
 from service.link.session import Endpoint
 from service.link.statistics import MALFORMED, USED, Counters, LinkStatistics
-from service.tracking import events as ev
-from service.tracking.alarms import OTHER_BASIS, SECOND_RTC
-from service.tracking.state import Level
+from service.records import events as ev
+from service.records.alarms import OTHER_BASIS, SECOND_RTC
+from service.records.state import Level
 
 MAX_QUEUED_EVENTS: Final = 1024
 """Events kept; when more wait, the oldest are dropped and counted."""
@@ -393,6 +393,7 @@ class Intake:
                 acknowledgements_unknown=self._counted["unknown"],
                 events_dropped=self._counted["dropped"],
                 callback_errors=self._counted["failed"],
+                missing="",
                 waiting_connections={},
                 frame_age_s=_age_s(self._last_frame_s, now_s),
                 dispositions=tally.dispositions(now_s),

@@ -6,13 +6,15 @@ from dataclasses import replace
 
 from service.errors import CommandError, UnknownIdError
 from service.estimation.loop import NO_RTC, extend_gains, select_gains
-from service.tracking import alarms, update_policy
-from service.tracking import events as ev
-from service.tracking.alarms import Interlock, alarm_blocks, blocking_alarm
+from service.records import alarms
+from service.records import events as ev
+from service.records.alarms import Interlock, alarm_blocks, blocking_alarm
+from service.records.products import Assessment, MatrixState, ReconstructorRecord
+from service.records.state import Level, Mode, TrackerState
+from service.tracking import update_policy
 from service.tracking.mode_proof import check_proven
-from service.tracking.products import Assessment, MatrixState, ReconstructorRecord
-from service.tracking.state import Level, Mode, TrackerState
 from service.tracking.step_context import StepContext
+from service.tracking.transitions import is_declared, move
 from service.wire import Acknowledgement, AckState, Status
 
 _OF_A_SWAP = (
@@ -142,15 +144,20 @@ def require_record(state: TrackerState, matrix_id: str) -> ReconstructorRecord:
 
 def store_reconstructor(context: StepContext, record: ReconstructorRecord) -> None:
     """Keep one more reconstructor; what is needed least gives way."""
+    record = move(context, context.state.reconstructor(record.id), record)
     records = [*(r for r in context.matrices.reconstructors if r.id != record.id), record]
     kept = prune(records, context.matrices.in_use)
     context.matrices = replace(context.matrices, reconstructors=kept)
 
 
-def replace_record(context: StepContext, record: ReconstructorRecord) -> None:
-    """Replace the record of the same id."""
-    records = tuple(record if r.id == record.id else r for r in context.matrices.reconstructors)
+def replace_record(context: StepContext, record: ReconstructorRecord) -> bool:
+    """Replace the record of the same id and return True, unless its state may not follow."""
+    records = tuple(
+        move(context, r, record) if r.id == record.id else r
+        for r in context.matrices.reconstructors
+    )
     context.matrices = replace(context.matrices, reconstructors=records)
+    return record in records
 
 
 def change_state(context: StepContext, matrix_id: str, to: MatrixState, reason: str) -> None:
@@ -368,7 +375,8 @@ def send(
         reason=unjudged,
         cause=context.cause,
     )
-    replace_record(context, sent)
+    if not replace_record(context, sent):
+        return
     text = f"{record.id} sent to the RTC{'; ' if unjudged else ''}{unjudged}"
     context.log("reconstructor.published", text, Level.WARNING if unjudged else Level.INFO)
     context.ask(ev.SendMatrix(id=record.id, n_modes=record.n_modes, gains=gains))
@@ -396,11 +404,19 @@ def on_acknowledgement(context: StepContext, event: Acknowledgement) -> None:
 
 def _on_state(context: StepContext, record: ReconstructorRecord, event: Acknowledgement) -> None:
     """Take a reconstructor further on its way, or note why the RTC holds other numbers."""
-    # The id alone does not prove that the numbers have arrived unchanged.
-    if record.sha256 and event.sha256 not in {None, record.sha256}:
-        _distrust(context, record, MatrixState(event.state.value), event.sha256)
-        return
     reason, state = event.reason, MatrixState(event.state.value)
+    other_numbers = bool(record.sha256) and event.sha256 not in {None, record.sha256}
+    rejected = state is MatrixState.REJECTED
+    # R-72 has the RTC reject a commit that reuses an id, whoever sent it. That says nothing of the
+    # matrix that has the id, nor does a rejection of one that it has applied.
+    if rejected and (other_numbers or not is_declared(record.state, state)):
+        text = f"the RTC rejected a commit with the id of {record.id}, which is {record.state}"
+        context.warn("acknowledgement.other-commit", f"{text}: {reason or 'no reason given'}")
+        return
+    # The id alone does not prove that the numbers have arrived unchanged.
+    if other_numbers:
+        _distrust(context, record, state, event.sha256)
+        return
     if state in {MatrixState.APPLIED, MatrixState.STAGED}:
         reason = reason or _explain_missing_verdict(record)
     if state is MatrixState.APPLIED:
@@ -419,7 +435,7 @@ def _on_state(context: StepContext, record: ReconstructorRecord, event: Acknowle
         context.log("reconstructor.applied", f"{record.id} applied from frame {event.frame_seq}")
         return
     change_state(context, record.id, state, reason)
-    if state is MatrixState.REJECTED:
+    if rejected:
         context.warn("reconstructor.rejected", f"the RTC rejected {record.id}: {event.reason}")
 
 

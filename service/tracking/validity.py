@@ -16,17 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
-from service.tracking.alarms import STALE, Interlock, alarm_blocks
-from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.registration import (
+from service.records.alarms import STALE, Interlock, alarm_blocks
+from service.records.registration import (
+    PassiveBias,
     Purpose,
     Registration,
     Validity,
     ValidityState,
     VoidInterval,
-    without_previous,
 )
-from service.tracking.state import TrackerState
+from service.records.state import TrackerState
+from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.step_context import StepContext
 from service.wire import Pointing
 
@@ -438,3 +438,8 @@ def _store_intervals(context: StepContext, intervals: Iterable[VoidInterval]) ->
     kept = tuple(intervals)
     if kept != context.alpha.void_intervals:
         context.alpha = replace(context.alpha, void_intervals=kept)
+
+
+def without_previous(bias: PassiveBias | None) -> PassiveBias | None:
+    """Return the bias without what was known before its last update: it is out of date."""
+    return bias and replace(bias, previous_estimate=None)

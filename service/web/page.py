@@ -38,8 +38,8 @@ from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.model.pupil import rtc_valid_subapertures
 from service.model.slopes import as_maps, orient_mask, slopes_of, to_conventions
+from service.records.state import LogEntry
 from service.runtime.supervisor import Supervisor
-from service.tracking.state import LogEntry
 from service.tracking.step_context import LOG_LENGTH
 from service.web.authentication import OPEN
 from service.web.connections import Middleware

@@ -11,7 +11,7 @@ from service.link.intake import MAX_QUEUED_EVENTS, MAX_UNDECODED_BATCHES, Intake
 from service.link.leader_election import LeaderElection, SessionWatch, Standby
 from service.link.matrices import MAX_OFFERS, MeasuredIntake, Offer, Outbox
 from service.link.session import Endpoint
-from service.tracking import events as ev
+from service.records import events as ev
 from service.wire import (
     Acknowledgement,
     AckState,

@@ -207,6 +207,10 @@ class SensorModel(ABC):
         """Return how many pupil points along a subaperture the smoothest shapes need."""
         return 1
 
+    def derivative_sampling(self, sensor: Any) -> int:  # noqa: ANN401 - its own
+        """Return how many pupil points along a subaperture derivatives need, and early steps."""
+        return 2
+
     def find_fitted_key(self, sensor: Any) -> str | None:  # noqa: ANN401 - its own
         """Return the key of a sensor parameter that is fitted together with α, by its logarithm.
 

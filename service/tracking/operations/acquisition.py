@@ -31,11 +31,23 @@ from service.control.dither import (
 )
 from service.control.gate import MAX_SLIP_SAFE_LEAK
 from service.estimation.loop import NO_RTC
-from service.estimation.windows import RefusalKind
-from service.tracking import commands as cmd
-from service.tracking import events as ev
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.alarms import LOST, Interlock, alarm_blocks, blocking_alarm
+from service.records.estimates import RefusalKind
+from service.records.events import Event
+from service.records.operations import (
+    Acquisition,
+    AcquisitionStage,
+    Dither,
+    Interruption,
+    LoopFound,
+    ProbationState,
+)
+from service.records.products import MatrixState, ReconstructorRecord
+from service.records.registration import Registration
+from service.records.state import Level, Mode, TrackerState
 from service.tracking import reconstructors, update_policy, validity
-from service.tracking.alarms import LOST, Interlock, alarm_blocks, blocking_alarm
 from service.tracking.dither import (
     allow_dither,
     choose_dither,
@@ -43,23 +55,13 @@ from service.tracking.dither import (
     request_stop,
     stop_running_dither,
 )
-from service.tracking.dither_request import ACQUIRING_DITHER, Dither
-from service.tracking.events import Event
-from service.tracking.operation_records import (
-    Acquisition,
-    AcquisitionStage,
-    Interruption,
-    LoopFound,
-    ProbationState,
-)
+from service.tracking.dither_request import ACQUIRING_DITHER
 from service.tracking.operations.measurement import fail_noisy_measurement
 from service.tracking.operations.running import running_ramp
 from service.tracking.operator import set_loop
 from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.registration import Registration
-from service.tracking.state import Level, Mode, TrackerState
 from service.tracking.step_context import StepContext, present
+from service.tracking.transitions import move
 from service.wire import DitherKind, DitherRequest, LoopRequest, Reply, Status
 
 MIN_FINAL_WINDOWS = 2
@@ -208,7 +210,7 @@ def _begin(context: StepContext, rtc: Status, why: str, *, commanded: bool) -> N
         sent=left is not None and left.sent,
         cause=context.cause,
     )
-    context.acquisition = begun
+    context.acquisition = move(context, context.acquisition, begun)
     # A window that began before the loop is opened would mix two loops.
     validity.invalidate_telemetry(context, "the acquisition had not begun")
     validity.forget_registration(context)
@@ -445,7 +447,8 @@ def _forget_when_over(context: StepContext, event: Event) -> None:
         text = f"{MIN_FINAL_WINDOWS} windows agree in the closed loop: none is needed any more"
     else:
         return
-    context.acquisition = Acquisition(text=text, since_ns_utc=context.now_ns)
+    idle = Acquisition(text=text, since_ns_utc=context.now_ns)
+    context.acquisition = move(context, acquisition, idle)
     context.log("acquisition.idle", text)
 
 
@@ -511,7 +514,8 @@ def _note_interrupted(context: StepContext, what: str, do: str = "") -> None:
     acquisition, stage = context.acquisition, AcquisitionStage.INTERRUPTED
     if (acquisition.stage, acquisition.text) == (stage, text):
         return
-    context.acquisition = replace(acquisition, stage=stage, text=text, since_ns_utc=context.now_ns)
+    interrupted = replace(acquisition, stage=stage, text=text, since_ns_utc=context.now_ns)
+    context.acquisition = move(context, acquisition, interrupted)
     context.warn("acquisition.interrupted", what)
 
 
@@ -686,7 +690,7 @@ def carry_alpha(context: StepContext, step: NDArray[np.float64]) -> None:
 
 def _enter_stage(context: StepContext, stage: AcquisitionStage, text: str) -> None:
     """Begin a stage."""
-    context.acquisition = replace(
+    entered = replace(
         context.acquisition,
         stage=stage,
         text=text,
@@ -694,6 +698,9 @@ def _enter_stage(context: StepContext, stage: AcquisitionStage, text: str) -> No
         misses=0,
         command=None,
     )
+    context.acquisition = move(context, context.acquisition, entered)
+    if context.acquisition is not entered:
+        return
     level = Level.WARNING if stage is AcquisitionStage.FAILED else Level.INFO
     context.log(f"acquisition.{stage}", text, level)
 

@@ -10,15 +10,16 @@ from dataclasses import fields, replace
 import numpy as np
 
 from service.errors import CommandError
-from service.tracking import commands as cmd
-from service.tracking import events as ev
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.events import Event
+from service.records.operations import MeasurementRecord, MeasureState
 from service.tracking.dither import request_dither, stop_running_dither
 from service.tracking.dither_request import DEFAULT_RANDOM_RMS_M, check_modes, cost_of, plan_random
-from service.tracking.events import Event
-from service.tracking.operation_records import MeasurementRecord, MeasureState
 from service.tracking.operator import begin_closing
 from service.tracking.policy import SECOND_NS
 from service.tracking.step_context import StepContext, present
+from service.tracking.transitions import is_declared, move
 from service.wire import DitherRequest, MatrixStrokes, MeasureRequest, Pattern, Reply, Status
 
 MEASUREMENTS_KEPT = 300
@@ -146,8 +147,7 @@ def _update(context: StepContext, record: MeasurementRecord) -> None:
     """Take over how far a measurement is; one that is over does not begin again."""
     before = context.state.measurement(record.id)
     if before is not None:
-        given_up = before.state is MeasureState.GIVEN_UP
-        if given_up or (record.under_way and not before.under_way):
+        if not is_declared(before.state, record.state):
             return
         # The manifest of a matrix does not repeat what the service has asked for.
         record = replace(
@@ -182,7 +182,7 @@ def _update(context: StepContext, record: MeasurementRecord) -> None:
 def fail_measurement(context: StepContext, record: MeasurementRecord | None, text: str) -> None:
     """Record why there is no matrix, unless the measurement was already ended."""
     before = None if record is None else context.state.measurement(record.id)
-    if record is not None and (before is None or before.state is not MeasureState.GIVEN_UP):
+    if record is not None and (before is None or is_declared(before.state, MeasureState.FAILED)):
         store_measurement(context, replace(record, state=MeasureState.FAILED, reason=text))
         with context.because_of(record.cause):
             context.warn(f"{_kind(record)}.failed", f"{record.id}: {text}")
@@ -240,6 +240,7 @@ def _plan_measurement(context: StepContext, command: cmd.Measure, rtc: Status) -
 
 def store_measurement(context: StepContext, record: MeasurementRecord) -> None:
     """Keep what is known of a measurement in place of what was known before."""
+    record = move(context, context.state.measurement(record.id), record)
     others = tuple(r for r in context.operations.measurements if r.id != record.id)
     context.operations = replace(
         context.operations, measurements=(*others, record)[-MEASUREMENTS_KEPT:]

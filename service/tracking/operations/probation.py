@@ -14,22 +14,23 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from service.estimation.comparison import Verdict
 from service.estimation.loop import explain_open_loop, same_but_for_modes
 from service.estimation.probation import MAX_PROBATION_S
-from service.tracking import alarms, mode_proof, reconstructors, validity
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.alarms import Alarm, Interlock
-from service.tracking.events import Event
-from service.tracking.operation_records import CommandState, Probation, ProbationState
+from service.records import alarms
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.alarms import Alarm, Interlock
+from service.records.events import Event
+from service.records.operations import CommandState, Probation, ProbationState, Verdict
+from service.records.products import MatrixState, ReconstructorRecord
+from service.records.state import Mode, TrackerState
+from service.tracking import mode_proof, reconstructors, validity
 from service.tracking.operations.acquisition import may_acquire
 from service.tracking.operator import enter_hold, leave_hold, set_loop
 from service.tracking.policy import SECOND_NS
-from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import check_sendable
-from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
+from service.tracking.transitions import move
 
 MAX_VERDICT_DELAY_S = 1.0
 """Time for the telemetry with the verdict to arrive; everything else waits no longer."""
@@ -102,7 +103,7 @@ def _go_on(context: StepContext, trial: Probation, event: Event) -> None:
         case ProbationState.ACQUIRING:
             _await_acquisition(context, trial, event)
         case ProbationState.OPENED if context.rtc is not None and context.rtc.in_loop:
-            context.probation = replace(trial, state=ProbationState.ROLLED_BACK)
+            _move(context, replace(trial, state=ProbationState.ROLLED_BACK))
 
 
 def on_compared(context: StepContext, event: ev.Compared) -> None:
@@ -176,7 +177,7 @@ def _begin_rollback(
         _keep_worse(context, trial, why)
         return
     text = f"{trial.worse}. The service goes back to {trial.before}"
-    context.probation = replace(trial, state=ProbationState.ROLLING_BACK, text=text)
+    _move(context, replace(trial, state=ProbationState.ROLLING_BACK, text=text))
     context.raise_alarm(alarms.PROBATION, f"{trial.id} {text}")
     why = f"the service goes back to {trial.before}: {trial.id} made the loop worse"
     # Not judged: the loop ran with this matrix, and α may be what is wrong.
@@ -199,7 +200,7 @@ def _on_swap(context: StepContext, before: str | None, in_use: str | None) -> No
     if record is None or before is None:
         if trial is not None and trial.judges is not None:
             why = "the RTC's matrix is unknown"
-            context.probation = replace(trial, state=ProbationState.NOT_JUDGED, text=why)
+            _move(context, replace(trial, state=ProbationState.NOT_JUDGED, text=why))
         return
     why = _explain_missing_probation(context, record, trial)
     # The reference is the last matrix that was good, not the one that made the loop worse.
@@ -223,9 +224,9 @@ def _on_swap(context: StepContext, before: str | None, in_use: str | None) -> No
 def _await_verdict(context: StepContext, trial: Probation) -> None:
     why = _check_comparable(context)
     if why:
-        context.probation = replace(trial, state=ProbationState.NOT_JUDGED, text=why)
+        _move(context, replace(trial, state=ProbationState.NOT_JUDGED, text=why))
     elif trial.under_way and context.now_ns > trial.until_ns_utc + MAX_VERDICT_DELAY_S * SECOND_NS:
-        context.probation = replace(trial, state=ProbationState.OVERDUE, text="telemetry is late")
+        _move(context, replace(trial, state=ProbationState.OVERDUE, text="telemetry is late"))
 
 
 def _begin_watch(context: StepContext, trial: Probation, in_use: str) -> None:
@@ -318,9 +319,9 @@ def _await_opening(context: StepContext, trial: Probation, event: Event) -> None
     rtc, asked = context.rtc, context.loop.command
     # An operator who sets the mode has taken over.
     if isinstance(event, cmd.SetMode):
-        context.probation = replace(trial, state=ProbationState.KEPT)
+        _move(context, replace(trial, state=ProbationState.KEPT))
     elif rtc is not None and not rtc.in_loop:
-        context.probation = replace(trial, state=ProbationState.OPENED)
+        _move(context, replace(trial, state=ProbationState.OPENED))
     elif rtc is not None and asked is not None and not context.operator.stopped_because:
         waited_ns = context.now_ns - asked.asked_ns_utc
         if waited_ns > OPEN_REQUEST_INTERVAL_S * SECOND_NS:
@@ -331,7 +332,7 @@ def _await_acquisition(context: StepContext, trial: Probation, event: Event) -> 
     """Note that the acquisition has begun, or that the operator or the RTC has taken over."""
     closed = context.rtc is not None and context.rtc.in_loop
     if context.acquisition.under_way or not closed or isinstance(event, cmd.SetMode):
-        context.probation = replace(trial, state=ProbationState.NOT_CONFIRMED)
+        _move(context, replace(trial, state=ProbationState.NOT_CONFIRMED))
 
 
 def explain_opening(context: StepContext) -> str | None:
@@ -448,5 +449,11 @@ def _keep_worse(context: StepContext, trial: Probation, why: str) -> None:
 
 
 def _end(context: StepContext, trial: Probation, state: ProbationState, text: str) -> None:
-    context.probation = replace(trial, state=state, text=text)
-    context.log(f"probation.{state}", f"{trial.id}: {text}")
+    if _move(context, replace(trial, state=state, text=text)):
+        context.log(f"probation.{state}", f"{trial.id}: {text}")
+
+
+def _move(context: StepContext, trial: Probation) -> bool:
+    """Store a probation in its new state and return True, unless that is no transition."""
+    context.probation = move(context, context.probation, trial)
+    return context.probation is trial

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.products import MatrixState
+from service.records.registration import Registration
+from service.records.state import Mode
 from service.tracker import step
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.products import MatrixState
-from service.tracking.registration import Registration
-from service.tracking.state import Mode
 from tests.states import changed, tracker_state
 from tests.unit.tracking.situations import (
     ALL_SHOWN,
@@ -122,22 +122,22 @@ def test_an_open_loop_does_not_tell_its_gains_so_the_verdict_stands(waiting):
 
 
 def test_nor_can_one_be_judged_there_that_was_made_before_the_service_restarted(waiting):
-    waiting.make("cm-1", judged=None)
+    waiting.make("cm-2", judged=None)
     waiting.tell(rtc(loop="open", gains=(0.0,) * N_MODES))
     with pytest.raises(CommandError, match="close it first"):
-        waiting.tell(cmd.Approve(id="cm-1"))
+        waiting.tell(cmd.Approve(id="cm-2"))
 
 
 def test_one_must_be_able_to_go_back_with_the_loop_open(waiting):
     waiting.tell(rtc(loop="open", gains=(0.0,) * N_MODES))
-    effects = waiting.make("cm-1", judged=None, gate=None, wanted=True)
+    effects = waiting.make("cm-2", judged=None, gate=None, wanted=True)
     assert of_kind(effects, ev.SendMatrix)
 
 
 def test_but_not_with_one_of_whose_verdict_nobody_knows_the_gains(waiting):
     waiting.tell(rtc(loop="open", gains=(0.0,) * N_MODES))
-    assert not of_kind(waiting.make("cm-1", judged=None, wanted=True), ev.SendMatrix)
-    assert waiting.matrix_state("cm-1") is MatrixState.PROPOSED
+    assert not of_kind(waiting.make("cm-2", judged=None, wanted=True), ev.SendMatrix)
+    assert waiting.matrix_state("cm-2") is MatrixState.PROPOSED
 
 
 def test_with_an_invalid_alpha_nothing_can_be_judged(waiting):

@@ -17,6 +17,7 @@ import msgspec
 
 VANISHED = "rtc-vanished"
 LOOP_OPEN = "loop-open"
+RTC_CLOCK = "rtc-clock"
 SECOND_RTC = "second-rtc"
 OTHER_BASIS = "basis-mismatch"
 OTHER_INSTRUMENT = "instrument-mismatch"
@@ -66,6 +67,7 @@ CLUSTER_LOST = "cluster-lost"
 LOOP_OPENED = "loop-opened"
 SLOPES_STAND = "slopes-stand"
 NOT_FOUND = "registration-not-found"
+UNDECLARED = "undeclared-transition"
 
 
 RULE_PREFIX = "rule."
@@ -126,6 +128,9 @@ class Responsible(StrEnum):
 
     SERVICE = "service"
     """Another one, of the same system."""
+
+    NETWORK = "network"
+    """Whoever starts routers, addresses and names, or has the port."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

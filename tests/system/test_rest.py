@@ -109,7 +109,7 @@ def test_endless_bodies_and_half_open_requests_cost_next_to_nothing(night):
     with ThreadPoolExecutor(5) as clients:  # the connection is closed with the refusal
         list(clients.map(send_without_end, range(5)))
     with contextlib.ExitStack() as held:
-        for _ in range(400):  # beyond MAX_CONNECTIONS the answer is 503
+        for _ in range(400):  # beyond MAX_CONNECTIONS the oldest are ended
             line = socket.create_connection(("127.0.0.1", night.port), timeout=patience(10.0))
             held.enter_context(line).sendall(b"GET /v1/state HTTP/1.1\r\n")
         # within the patience of the client

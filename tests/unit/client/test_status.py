@@ -10,7 +10,7 @@ import pytest
 
 from pyrcal.__main__ import main
 from pyrcal.client.status import status_lines
-from service.tracking.state import Level, LogEntry
+from service.records.state import Level, LogEntry
 from service.web.views import STATE as STATE_VIEW
 from service.web.views import to_json
 from tests.states import changed, tracker_state

@@ -173,6 +173,9 @@ class LinkStatistics:
     frame_age_s: float | None
     """Seconds since the last frame arrived, by arrival; None: none has."""
 
+    telemetry_age_s: float = 0.0
+    """Age of the newest frame at its arrival, seconds: its delay beyond that of the fastest one."""
+
     dispositions: tuple[Disposition, ...] = ()
     """Outcomes of frames and messages by kind, the most frequent first."""
 

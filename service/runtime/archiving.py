@@ -183,12 +183,12 @@ class ArchiveWriter:
 
     def _sends_new_numbers(self, effect: Effect) -> bool:
         """Return True if an effect sends a matrix, and not the numbers of an earlier one again."""
-        record = self._state().reconstructor(getattr(effect, "id", None) or "")
-        if not isinstance(effect, ev.SendMatrix) or record is None:
-            return isinstance(effect, ev.SendMatrix)
+        if not isinstance(effect, ev.SendMatrix):
+            return False
         # A rollback makes the loop safer, and the archive has its numbers under the earlier id.
-        earlier = self._state().reconstructor(record.parent or "")
-        return earlier is None or earlier.sha256 != record.sha256
+        known, record = self._state().reconstructor, self._state().reconstructor(effect.id)
+        earlier = record and known(record.parent or "")
+        return not (record and earlier and earlier.sha256 == record.sha256)
 
     async def flush(self) -> None:
         """Write what waits.

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from typing import Final
 
 from service.link.guard import describe_expiry, describe_flood, describe_refusals
-from service.link.intake import COALESCED
+from service.link.intake import COALESCED, OLD
 from service.link.statistics import (
     MALFORMED,
     STATISTICS_PERIOD_S,
@@ -17,6 +17,7 @@ from service.link.statistics import (
     Disposition,
     LinkStatistics,
 )
+from service.link.telemetry_age import MAX_AGE_S
 from service.model.misregistration import at_boundary
 from service.records import alarms
 from service.records import events as ev
@@ -58,7 +59,7 @@ COMPLAINT_TIMEOUT_NS: Final = 3 * SECOND_NS
 FAULT_OUTCOMES: Final = ("leap", "sequence", "shape", MALFORMED)
 """Outcomes of frames that always mean a violation of the contract."""
 
-OUTCOMES_WITH_ALARM: Final = ("basis", "config")
+OUTCOMES_WITH_ALARM: Final = ("basis", "config", OLD)
 """Outcomes of frames that have an alarm of their own."""
 
 MIN_LOGGED_DURATION_NS: Final = 2 * SECOND_NS
@@ -85,6 +86,7 @@ def complaints(link: LinkStatistics) -> dict[str, str]:
     """Return the alarms of what came in the last seconds, by name."""
     made = {
         alarms.FRAMES_UNUSED: _explain_unused(link),
+        alarms.TELEMETRY_OLD: _explain_age(link),
         alarms.MESSAGES_REFUSED: _explain_refused(link),
         alarms.STATUS_FLOOD: _flood(link),
         alarms.LINK_FLOODED: describe_flood(link.waiting_connections),
@@ -111,6 +113,17 @@ def _explain_unused(link: LinkStatistics) -> str:
     return (
         f"the RTC's frames are not used ({reasons}): {details}; of {came} in the last "
         f"{STATISTICS_PERIOD_S:.0f} s {used} were used: check the RTC's telemetry"
+    )
+
+
+def _explain_age(link: LinkStatistics) -> str:
+    """Return that the frames that come are old; empty: they are not, or none come."""
+    come = link.frame_age_s is not None and link.frame_age_s < FRAMES_TIMEOUT_S
+    if not come or link.telemetry_age_s <= MAX_AGE_S:
+        return ""
+    return (
+        f"telemetry is {link.telemetry_age_s:.0f} s old, expected at most {MAX_AGE_S:g} s: it is "
+        "not used, and no matrix is made, sent or judged; check the network and the RTC's publisher"
     )
 
 
@@ -310,7 +323,9 @@ def _for_the_matrix(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
     ):
         text = f"its reconstructor {rtc.cm_id}: offer it on rtc/cm/applied{_describe_rtc(state)}"
         yield Prerequisite(name="matrix-in-use", responsible=Responsible.RTC, text=text)
-    if state.matrices.hindrance:
+    # During an alarm that forbids all decisions it is not renewed, and the alarm says what to do.
+    decides = alarms.blocking_alarm(state.alarms.active, Interlock.DECIDE) is None
+    if state.matrices.hindrance and decides:
         yield Prerequisite(
             name="new-matrix", responsible=Responsible.OPERATOR, text=state.matrices.hindrance
         )

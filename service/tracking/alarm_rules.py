@@ -42,9 +42,6 @@ on their way seem to lag, never to lead."""
 MAX_CLOCK_LAG_S: Final = 600.0
 """Largest lag of the time stamps behind UTC: more is no delay of the telemetry, but the clock."""
 
-_KNOWN_LEADS_S: Final = {18: "GPS time", 37: "TAI"}
-_TIME_ZONE_S: Final = 900
-
 
 def derive_alarms(context: StepContext) -> None:
     """Raise what the state says is the matter, and end what is over."""
@@ -107,11 +104,8 @@ def explain_clock(lead_s: float) -> str | None:
     """Return how time stamps ``lead_s`` seconds ahead of UTC are wrong; None if they are not."""
     if -MAX_CLOCK_LAG_S <= lead_s <= MAX_CLOCK_LEAD_S:
         return None
-    away_s = abs(lead_s)
-    is_zone = abs(away_s - _TIME_ZONE_S * round(away_s / _TIME_ZONE_S)) < MAX_CLOCK_LEAD_S
-    likely = _KNOWN_LEADS_S.get(round(lead_s)) or ("local time" if is_zone else None)
     side = "ahead of" if lead_s > 0.0 else "behind"
-    return f"time stamps are {away_s:.0f} s {side} UTC{f', as {likely} is' if likely else ''}"
+    return f"time stamps are {abs(lead_s):.0f} s {side} UTC"
 
 
 def _clock(context: StepContext) -> str | None:

@@ -310,7 +310,10 @@ MAX_LISTENERS = 60
 RETRY_MS = 1000
 """Time after which a disconnected listener reconnects, milliseconds."""
 
-_CLOCKS = {"now_ns", "now_utc", "uptime_s", "age_s", "window_age_s", "frame_age_s"}
+_CLOCKS = {
+    *("now_ns", "now_utc", "uptime_s", "age_s"),
+    *("window_age_s", "frame_age_s", "telemetry_age_s"),
+}
 """Fields of the state that change while nothing happens."""
 
 Log = tuple[LogEntry, ...]

@@ -287,6 +287,7 @@ def _of_link(link: LinkStatistics) -> Iterator[Metric]:
     yield _gauge("frames_lost", lost, link.frames_lost)
     yield _gauge("rtc_alive", "1 while the RTC's liveliness token is there", link.rtc_alive)
     yield _gauge("frame_age_seconds", "Since the last frame arrived", link.frame_age_s)
+    yield _gauge("telemetry_age_seconds", "Delay of the newest frame", link.telemetry_age_s)
     yield _gauge("latency_p50_seconds", "Median from put to callback", link.latency_p50_s)
 
 

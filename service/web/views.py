@@ -409,9 +409,9 @@ define_view("WorkerLoadView", WorkerLoad)
 define_view(
     "LinkView",
     LinkStatistics,
-    "rtc_alive session frame_age_s latency_p50_s frames_received frames_lost frames_recovered "
-    "frames_duplicate frames_late frames_nonfinite frames_overwritten frames_refused "
-    "messages_malformed",
+    "rtc_alive session frame_age_s telemetry_age_s latency_p50_s frames_received frames_lost "
+    "frames_recovered frames_duplicate frames_late frames_nonfinite frames_overwritten "
+    "frames_refused messages_malformed",
 )
 STATE = define_view(
     "StateView",

@@ -462,12 +462,22 @@ def test_commands_in_another_unit_are_named_by_the_rtcs_own_matrix(metres, named
     assert named in dialect.wrong
 
 
-@pytest.mark.parametrize("ratio", [1.9, 3.2])
-def test_a_modulation_that_is_too_large_may_be_why_the_own_matrix_expects_more(ratio):
-    """A pyramid's response grows as its modulation shrinks, as if light met the mirror twice."""
+@pytest.mark.parametrize(
+    ("ratio", "said"),
+    [
+        (1.9, "wavelength_m or modulation_lambda_over_d is too large"),
+        (2.7, "wavelength_m or modulation_lambda_over_d is too large"),
+        (120, "wavelength_m or modulation_lambda_over_d is too large"),
+        (1 / 15, "wavelength_m or modulation_lambda_over_d is too small"),
+        (1 / 120, "slopes have another unit"),
+    ],
+)
+def test_a_factor_names_every_cause_that_makes_it(ratio, said):
+    """Slopes in another unit, or a pyramid's wavelength or modulation: the factor is the same."""
     rtc = Mistold()
     wrong = rtc.told.read_slope_convention((rtc.own / ratio).astype(np.float32), None).wrong
-    assert "modulation_lambda_over_d" in wrong
+    assert "slopes" in wrong.partition("model's slopes")[2]
+    assert said in wrong
 
 
 def test_commands_in_another_unit_are_named_by_the_answer_to_the_dither():

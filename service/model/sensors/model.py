@@ -298,6 +298,10 @@ class SensorModel(ABC):
         """
         raise ModelError(f"a {self.name}: found several images to be moved, expected a pyramid's")
 
+    def without_image_places(self, instrument: Instrument) -> Instrument | None:
+        """Return the instrument without the places of its pupil images; None if it states none."""
+        return None
+
     def pupil_offset(self, instrument: Instrument) -> tuple[float, float] | None:
         """Return where file or mask place the pupil's image on the grid, (x, y).
 

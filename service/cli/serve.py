@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import resource
 import signal
 import socket
 import stat
@@ -59,6 +60,10 @@ seconds, matrices."""
 UNUSED_BYTES = 8_000_000
 """Unused memory at the end of the heap above which it is returned to the system."""
 
+OPEN_FILES = 8192
+"""Files that the service may have open, as in ``deploy/pyrcal.service``: thousands of connections
+of strangers, to REST and the link, must not use up what the archive needs."""
+
 REST_RETRY_INTERVAL_S = 1.0
 """Between two attempts to listen for REST."""
 
@@ -72,6 +77,7 @@ def run(settings: Settings, instrument: Instrument, workers: WorkerPool) -> int:
     # the event loop's own products are small; a second BLAS thread would only fight the RTC link
     threadpool_limits(1)
     share_memory()
+    allow_files()
     log_to_the_terminal(settings.service.log_format)
     for remark in instrument.remarks:
         structlog.get_logger().warning("instrument.remark", text=remark)
@@ -86,6 +92,13 @@ def share_memory() -> None:
     between what stays, and 45 MB more at the most, for 0.006 of a core.
     """
     set_allocator(map_bytes=LARGE_BYTES, keep_bytes=UNUSED_BYTES, n_pools=2)
+
+
+def allow_files() -> None:
+    """Let this process open more files: at its limit REST takes no connection for a second."""
+    usual, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with contextlib.suppress(ValueError):  # the system's own limit is lower
+        resource.setrlimit(resource.RLIMIT_NOFILE, (max(usual, OPEN_FILES), most))
 
 
 async def _serve(settings: Settings, instrument: Instrument, workers: WorkerPool) -> int:

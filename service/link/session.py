@@ -123,6 +123,10 @@ def open_session(endpoint: Endpoint) -> zenoh.Session:
         "transport/link/tx/lease": round(1000 * endpoint.lease_s),
         "transport/link/rx/buffer_size": RX_BUFFER_BYTES,
         "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
+        # Silent connections must not keep an RTC out that restarts: by default a hundred may wait
+        # for 10 s each.
+        "transport/unicast/accept_pending": 2000,
+        "transport/unicast/accept_timeout": 3000,
         "transport/shared_memory/enabled": False,
         **endpoint.security.zenoh,
     }

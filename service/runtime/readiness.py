@@ -71,7 +71,8 @@ LOG_INTERVAL_NS: Final = 60 * SECOND_NS
 DERIVED_EACH_SECOND: Final = frozenset(
     name
     for name, alarm in alarms.ALARMS.items()
-    if alarm.origin in ("runtime/readiness.py", "runtime/losses.py", "runtime/supervisor.py")
+    if alarm.origin
+    in ("runtime/readiness.py", "runtime/losses.py", "runtime/supervisor.py", "api.py")
 )
 """Alarms that are derived each second, and end when they are not derived any more."""
 

@@ -95,6 +95,8 @@ class Supervisor:
             audit=self._writer.add,
         )
         """Telemetry kept on request."""
+        self.complaints = {CLOCK_LEAPT: self._clock.complaint}
+        """Functions that return the text of an alarm, empty for none; called each second."""
         self.refits = command_results.Refits()
         """Reconstructors that operators have ordered."""
         self._pending_window = PendingWindow()
@@ -383,7 +385,7 @@ class Supervisor:
                 self._post(trouble)
             now_ns = self._clock.now_ns()
             lost = losses.complaint(link, time.monotonic())
-            also = {**lost, CLOCK_LEAPT: self._clock.complaint()}
+            also = lost | {name: complain() for name, complain in self.complaints.items()}
             for event in readiness.detect_link_changes(link, self._engine.state, now_ns, also):
                 self._post(event)
             waiting = self._waiting_for(link)

@@ -150,6 +150,16 @@ def test_something_else_that_answers_is_not_taken_for_the_service(capsys, body, 
         assert "not pyrcal" in refused(capsys, url)
 
 
+@pytest.mark.parametrize("status", [502, 503, 504])
+def test_a_service_with_too_many_requests_is_not_taken_for_something_else(capsys, status):
+    """uvicorn and proxies answer in plain text then."""
+    with answering(b"Service Unavailable", status) as url:
+        line = refused(capsys, url)
+    assert str(status) in line
+    assert "try again" in line
+    assert "not pyrcal" not in line
+
+
 def test_another_version_of_the_service_is_told_as_one(capsys):
     with answering(b'{"ready": true, "alarms": []}') as url:
         assert "or not this version" in refused(capsys, url)

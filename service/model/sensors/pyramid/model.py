@@ -317,10 +317,17 @@ class PyramidModel(SensorModel):
         return replace(pyramid_in(instrument), image_offsets_subap=places)
 
     @override
+    def without_image_places(self, instrument: Instrument) -> Instrument | None:
+        wfs = pyramid_in(instrument)
+        if wfs.image_offsets_subap is None:
+            return None
+        return replace(instrument, wfs=replace(wfs, image_offsets_subap=None))
+
+    @override
     def pupil_offset(self, instrument: Instrument) -> tuple[float, float] | None:
         turned = description.stated_offsets(instrument)
         if turned is None:
-            return None
+            return super().pupil_offset(instrument)
         x, y = turned.mean(axis=(0, 1))
         return float(x), float(y)
 

@@ -102,6 +102,20 @@ def undeclared_transitions_raise(monkeypatch):
 
 
 @pytest.fixture(autouse=True)
+def invariants_hold(monkeypatch):
+    """Fail a test after whose steps the state violates an invariant."""
+    from service.tracking import alarm_records, invariants
+
+    update = alarm_records.update_records  # the last thing that a step does
+
+    def update_and_validate(context, **options):
+        update(context, **options)
+        assert invariants.find_violations(context.state) == []
+
+    monkeypatch.setattr(alarm_records, "update_records", update_and_validate)
+
+
+@pytest.fixture(autouse=True)
 def log_of_its_own():
     """Leave no log behind that writes where the test before has looked."""
     yield

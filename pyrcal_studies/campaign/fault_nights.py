@@ -61,6 +61,7 @@ from service.runtime.archiving import (
 )
 from service.runtime.losses import silence
 from service.runtime.policy import policy_of
+from service.tracking.invariants import find_violations
 from service.tracking.operations.running import OperationKind, running_operations
 from service.tracking.policy import SECOND_NS
 from service.tracking.resume import restored
@@ -360,10 +361,8 @@ class FaultNight(Observatory):
         owners = [one.text for one in running if one.kind in _OWNERS]
         if len(owners) > 1:
             self._wrong(f"two have the loop: {owners}")
-        records = state.matrices.reconstructors
-        applied = [record.id for record in records if record.state is MatrixState.APPLIED]
-        if len(applied) > 1:
-            self._wrong(f"two matrices are said to be in use: {applied}")
+        for violation in find_violations(state):
+            self._wrong(violation)
         rtc_has = self.dome.computer.reconstructor.manifest.id
         agreed = state.matrices.in_use == rtc_has or (
             state.matrices.in_use is None and self.stands_by  # it asks nothing: not known

@@ -207,8 +207,7 @@ class Crowd(ServerState):
         address, n = self._ended.most_common(1)[0]
         return (
             f"more than {MAX_CONNECTIONS} connections to REST at once: {n} of {address} were "
-            "ended, the oldest first. Orders and the page work, perhaps at the second try: end "
-            "the program there, or limit the connections of an address with a firewall or proxy"
+            "ended, the oldest first: end the program there, or limit connections by a firewall"
         )
 
 

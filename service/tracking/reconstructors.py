@@ -459,7 +459,7 @@ def on_fetched(context: StepContext, fetched: ev.MatrixFetched) -> None:
         return
     _trust(context, record.id)
     # After _trust: the numbers are verified now, even where the id is no news.
-    if context.matrices.in_use == record.id:
+    if context.matrices.in_use == record.id or not _check_swap(context, record.id):
         return
     if before is None:
         store_reconstructor(context, record)

@@ -44,14 +44,14 @@ to 2 s of telemetry to detect it."""
 
 MAX_CALMING_S = 1.0
 """Time for a diverging loop to become calm with the previous matrix; its detector remembers half a
-second. Where the RTC applies other numbers than it says, half of it."""
+second."""
 
 RESUMPTION_INTERVAL_S = 600.0
 """Shortest time between two resumptions after a rollback that did not help: a matrix that is wrong
 must not be sent again and again."""
 
 MAX_OPPOSITE_S = 1.5
-"""Longest time with a matrix whose sign is turned: then the loop is opened."""
+"""Time from the first commands of the wrong sign until a loop that is lost is opened."""
 
 OPEN_REQUEST_INTERVAL_S = 2.0
 """Interval between two requests to open the loop."""
@@ -261,12 +261,14 @@ def _begin_watch(context: StepContext, trial: Probation, in_use: str) -> None:
 def _watch(context: StepContext, trial: Probation) -> None:
     """End the check of the loop with the matrix before: lost, opened, or undecided."""
     waited_s = (context.now_ns - trial.since_ns_utc) / SECOND_NS
-    lost, misapplied = context.blocking_alarm(Interlock.HOLD), context.matrices.misapplied
+    lost, named = context.blocking_alarm(Interlock.HOLD), context.state.alarm(alarms.MISAPPLIED)
+    since_ns = context.now_ns if named is None else named.since_ns_utc
+    opposite_s = (context.now_ns - since_ns) / SECOND_NS
     if gone := _check_loop(context):
         _end_watch(context, trial, gone, lost=False)
     # The detector of divergence averages over half a second, so that it still shows the rejected
     # matrix.
-    elif lost is not None and waited_s > MAX_CALMING_S / (2.0 if misapplied else 1.0):
+    elif lost is not None and (waited_s > MAX_CALMING_S or opposite_s > MAX_OPPOSITE_S):
         _end_watch(context, trial, lost.text, lost=True, helped=False)
     elif waited_s > MAX_PROBATION_S + MAX_VERDICT_DELAY_S:
         _end_watch(context, trial, "telemetry does not show how the loop is since", lost=False)

@@ -75,6 +75,11 @@ class TestAppliedWithoutASwap:
         names(story, "cm-1", SWAP + 600)
         assert alarms.MISAPPLIED not in story.alarms
 
+    def test_nor_does_a_matrix_that_was_read_before_the_swap(self, story):
+        story.tell(ev.MatrixFetched(record=replace(foreign("other"), sha256="c" * 64)))
+        assert story.state.matrices.in_use == "cm-1"
+        assert story.state.reconstructor("other") is None
+
     def test_one_that_is_later_does(self, story):
         names(story, "initial", SWAP + 501)
         assert story.state.matrices.in_use == "initial"
@@ -143,8 +148,9 @@ class TestSignTurned:
         goes_back(story)
         diverges(story)
         assert trial(story).state is ProbationState.WATCHED
+        diverges(story, after_s=0.9)
         assert not opened(story)
-        diverges(story, after_s=0.6)
+        diverges(story, after_s=0.2)
         assert len(opened(story)) == 1
         story.tell(rtc(loop="open", cm_id="cm-2", seq=SWAP + 2000), after_s=0.2)
         story.wait(30)
@@ -162,8 +168,17 @@ class TestSignTurned:
         )
         story.tell(ev.Compared(finding=finding), 0.2)
         assert trial(story).state is ProbationState.WATCHED
-        diverges(story, after_s=0.6)
+        diverges(story, after_s=1.0)
         assert opened(story)
+
+    def test_a_way_back_that_comes_late_has_less_time_to_help(self, story):
+        opposite(story, "cm-1")
+        story.tell(ev.Tick(), 1.3)
+        goes_back(story)
+        diverges(story, after_s=0.1)
+        assert not opened(story)
+        diverges(story, after_s=0.2)
+        assert len(opened(story)) == 1
 
     def test_a_way_back_that_helps_leaves_the_loop_closed(self, story):
         opposite(story, "cm-1")

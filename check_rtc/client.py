@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import msgpack
@@ -66,6 +66,9 @@ MIN_RESPONSE_RATIO: Final = 0.1
 
 _NOISE_BINS: Final = (-4.0, -3.0, 3.0, 4.0)
 """Frequency bins near a line in which its noise is measured; the nearest have its leakage."""
+
+_REPEAT_S: Final = 1.0
+"""Time in which the frames after a repeated command must have no dither."""
 
 _STOP_TIMEOUT_S: Final = 2.0
 """Longest time from the command to stop until frames and status show no dither."""
@@ -135,6 +138,23 @@ def _invalid_commands(client: RtcClient, status: Status) -> list[_InvalidCommand
     offload = {"v": 1, "id": new("offload"), "rotation_deg": 0.0, "magnification": 0.0}
     offload |= {"shift_x_subap": 0.0}
     dithering = CommandKind.DITHER
+    # One frame of a sine, whose first value is 0: the mirror does not move if it is accepted.
+    frame = replace(dither, modes=(0,), duration_s=1.0 / status.frame_rate_hz)
+    lines = status.max_dither_modes + 1
+    many = replace(
+        frame,
+        modes=tuple(range(lines)),
+        amplitude_m=(1e-12,) * lines,
+        frequency_hz=(0.1 * status.frame_rate_hz,) * lines,
+    )
+    beyond = {
+        "a dither above max_dither_m": replace(frame, amplitude_m=(2.0 * status.max_dither_m,)),
+        "a dither at half the frame rate": replace(
+            frame, frequency_hz=(0.5 * status.frame_rate_hz,)
+        ),
+    }
+    if lines <= n_modes:
+        beyond[f"a dither of {lines} modes"] = many
     without = {key: value for key, value in keys.items() if key != "modes"}
     return [
         # 0xc1 is the one byte that msgpack never uses. On a link with signatures these bytes are
@@ -153,6 +173,16 @@ def _invalid_commands(client: RtcClient, status: Status) -> list[_InvalidCommand
             ("v",),
         ),
         _InvalidCommand(dithering, msgpack.packb(keys), f"a dither of mode {n_modes}"),
+        _InvalidCommand(
+            dithering,
+            msgpack.packb({**keys, "duration_s": 0.02}),
+            "another command with a used id",
+            ("id",),
+        ),
+        *(
+            _InvalidCommand(dithering, encode(replace(request, id=new("beyond"))), what)
+            for what, request in beyond.items()
+        ),
         _InvalidCommand(CommandKind.LOOP, gains, "one gain more than modes"),
         _InvalidCommand(
             CommandKind.MEASURE,
@@ -269,6 +299,8 @@ class _DitherRecorder:
         """Slopes times matrix of the controlled modes, ``(n_frames, n_modes)``."""
         self.commands_m: list[NDArray[np.float64]] = []
         """Commands of the same modes, ``(n_frames, n_modes)``."""
+        self.dithers_m: list[NDArray[np.float64]] = []
+        """Dither columns of the same modes, ``(n_frames, n_modes)``."""
         self._monitor, self._matrix, self._in_loop = DitherMonitor(asked=asked), matrix, in_loop
         self._span = asked.first_seq, asked.stop_seq
 
@@ -285,12 +317,16 @@ class _DitherRecorder:
         self.findings += [] if found is None else [found]
         first, stop = self._span
         # Only whole blocks inside the dither: outside it there is no response to measure.
+        dither_m = block.dither_m
         if self._matrix is None or block.first_seq < first or block.next_seq > stop:
+            return
+        if dither_m is None:
             return
         self.seq.append(np.arange(block.first_seq, block.next_seq))
         modes = self._in_loop
         self.responses_m.append(np.asarray(block.slopes @ self._matrix[modes].T, dtype=float))
         self.commands_m.append(np.asarray(block.commands_m[:, modes], dtype=float))
+        self.dithers_m.append(np.asarray(dither_m[:, modes], dtype=float))
 
 
 def check_dither(
@@ -338,6 +374,8 @@ def check_dither(
     )
     client.observer.block_callbacks.remove(recorder.take)
     problem = _compare_dither(client, request, reply.start_seq, recorder)
+    if not problem and has_stopped:
+        problem = _repeat_dither(client, request, reply)
     if not problem and not (ended.accepted and has_stopped):
         still_s = (recorder.last_seq - stop_command_seq) / status.frame_rate_hz
         problem = (
@@ -352,6 +390,30 @@ def check_dither(
         f"{reply.start_seq} as requested, until {recorder.last_seq}"
     )
     return [fine("dither", found), _check_columns(recorder, modes, status)]
+
+
+def _repeat_dither(client: RtcClient, request: DitherRequest, reply: Reply) -> str:
+    """Send the command of a stopped dither again; return what is wrong, empty if nothing is."""
+    played: list[int] = []
+
+    def take(block: FrameBlock) -> None:
+        if block.is_dithered:
+            played.append(block.first_seq)
+
+    client.observer.block_callbacks.append(take)
+    try:
+        again = client.connection.command(request)
+        client.listen(_REPEAT_S, lambda: bool(played))
+    except LinkError as error:
+        return f"its repeated command: {error}"
+    finally:
+        client.observer.block_callbacks.remove(take)
+        ended = stop_dither(client)
+    if played:
+        return f"its repeated command was carried out again: dither from frame {played[0]} on"
+    if again != reply:
+        return f"its repeated command had another reply: {again.reason or again.start_seq}"
+    return "" if ended.accepted else f"a stop without a dither was refused: {ended.reason}"
 
 
 def stop_dither(client: RtcClient) -> Reply:
@@ -441,35 +503,60 @@ def _check_columns(
     seq = np.concatenate(recorder.seq)
     in_loop = [mode in status.in_loop for mode in modes]
     phase_per_frame = 2 * np.pi * np.array(DITHER_LINE_RATIOS[: len(modes)])[in_loop]
-    response, noise = _measure_transfer(
-        seq,
-        np.concatenate(recorder.responses_m),
-        np.concatenate(recorder.commands_m),
-        phase_per_frame,
-    )
+    responses_m = np.concatenate(recorder.responses_m)
+    commands_m, dithers_m = (np.concatenate(x) for x in (recorder.commands_m, recorder.dithers_m))
+    response, noise = _measure_transfer(seq, responses_m, commands_m, phase_per_frame)
     if (np.abs(response) + noise < MIN_RESPONSE_RATIO).all():
         return wrong("columns", "slopes do not respond to the commands: the mirror does not move")
     if (noise > MAX_NOISE_RATIO * np.abs(response)).any():
         ratio = np.max(noise / np.abs(response))
         return skipped("columns", f"too noisy: noise is {ratio:.2f} of the response")
-    # Fit sign and lag to the phases at both lines, each weighted by its signal-to-noise ratio.
+    fit = _fit_lag(response, noise, phase_per_frame)
+    found = f"slopes lag {fit.lag:+.2f} frames behind the commands of their row"
+    share = float(np.median(np.abs(response)))
+    if fit.is_reversed or not fit.is_same_exposure:
+        # Without the dither the columns are the loop's answer to it, which has the other sign.
+        total = _measure_transfer(seq, responses_m, commands_m + dithers_m, phase_per_frame)
+        with_dither = _fit_lag(*total, phase_per_frame)
+        if with_dither.is_same_exposure and not with_dither.is_reversed:
+            lacking = "the command columns lack the dither: with it they agree with the slopes"
+            return wrong("columns", f"{lacking} (lag {with_dither.lag:+.2f} frames)")
+        turned = "slopes times matrix have the opposite sign of the commands"
+        return wrong("columns", turned if fit.is_reversed else found)
+    # Optical gain and double pass explain a response between 0.1 and 3; units do not.
+    found += f"; their response by the matrix in use is {share:.2f}"
+    return (fine if 0.1 < share < 3.0 else seen)("columns", found)
+
+
+@dataclass(frozen=True, slots=True)
+class _LagFit:
+    """Sign and lag of the slopes against the commands of their row."""
+
+    is_reversed: bool
+    lag: float
+    """Lag in frames."""
+
+    sigma: float
+    """1 σ of the lag, frames."""
+
+    @property
+    def is_same_exposure(self) -> bool:
+        """True if the lag is that of slopes and commands of one exposure."""
+        return abs(self.lag) <= MAX_LAG_FRAMES + 3.0 * self.sigma
+
+
+def _fit_lag(
+    response: NDArray[np.complex128],
+    noise: NDArray[np.float64],
+    phase_per_frame: NDArray[np.float64],
+) -> _LagFit:
+    """Fit sign and lag to the phases at all lines, each weighted by its signal-to-noise ratio."""
     unit, weight = response / np.abs(response), np.abs(response) / np.maximum(noise, 1e-9)
     models = np.exp(-1j * np.outer(LAG_GRID_FRAMES, phase_per_frame))
     misfit = np.stack([np.abs(unit - sign * models) ** 2 @ weight**2 for sign in (1.0, -1.0)])
     k_sign, k_lag = np.unravel_index(int(np.argmin(misfit)), misfit.shape)
-    lag, sigma = (
-        float(LAG_GRID_FRAMES[k_lag]),
-        float(1.0 / np.sqrt(np.sum((weight * phase_per_frame) ** 2))),
-    )
-    share = float(np.median(np.abs(response)))
-    if k_sign:
-        return wrong("columns", "slopes times matrix have the opposite sign of the commands")
-    found = f"slopes lag {lag:+.2f} frames behind the commands of their row"
-    if abs(lag) > MAX_LAG_FRAMES + 3.0 * sigma:
-        return wrong("columns", found)
-    # Optical gain and double pass explain a response between 0.1 and 3; units do not.
-    found += f"; their response by the matrix in use is {share:.2f}"
-    return (fine if 0.1 < share < 3.0 else seen)("columns", found)
+    sigma = 1.0 / np.sqrt(np.sum((weight * phase_per_frame) ** 2))
+    return _LagFit(bool(k_sign), float(LAG_GRID_FRAMES[k_lag]), float(sigma))
 
 
 def _measure_transfer(
@@ -487,7 +574,10 @@ def _measure_transfer(
         return np.asarray(np.sum(phasors * (columns - columns.mean(axis=0)), axis=0))
 
     moved = at(commands_m, 0.0)
-    # Slopes see commands and turbulence. What exceeds the commands is turbulence and noise.
-    sides = np.stack([at(responses_m - commands_m, shift) for shift in _NOISE_BINS])
-    noise = np.sqrt(np.mean(np.abs(sides) ** 2, axis=0)) / np.abs(moved)
+    # Slopes see commands and turbulence. What exceeds the commands is turbulence and noise, also
+    # where the slopes are turned.
+    sides = [
+        [at(responses_m - sign * commands_m, shift) for shift in _NOISE_BINS] for sign in (1, -1)
+    ]
+    noise = np.sqrt(np.mean(np.abs(sides) ** 2, axis=1)).min(axis=0) / np.abs(moved)
     return at(responses_m, 0.0) / moved, noise

@@ -230,13 +230,12 @@ class RtcConnection:
         return link.fetch_applied(self._require_session, self.keys, self._signatures)
 
     def offer(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
-        """Answer queries for this matrix from now on.
+        """Answer queries for this matrix from now on, and for no other one.
 
-        Raises
-        ------
-        WireError
-            If another matrix was offered under the same id.
+        The numbers may be others than the manifest says, and its id a used one: an RTC must notice.
         """
+        # A new outbox, because that of the service refuses other numbers under a used id.
+        self._outbox = Outbox(OFFER_DURATION_S)
         self._outbox.add(Offer.of(manifest, matrix))
 
     def put_chunk(self, matrix_id: str, index: int, data: bytes) -> None:

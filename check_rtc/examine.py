@@ -23,6 +23,7 @@ from check_rtc.moving import (
     MatrixInUse,
     check_chunks,
     check_commit,
+    check_finite,
     check_loop,
     check_measure,
     check_reconnect,
@@ -33,7 +34,7 @@ from check_rtc.requirements import REQUIREMENTS, CheckResult, Moves, skipped, wr
 from check_rtc.telemetry_checks import ImageOffsets, TelemetryContext, run_telemetry_checks
 from service.errors import LinkError, WireError
 from service.estimation.slope_convention import SlopeConvention
-from service.estimation.windows import WindowRefused
+from service.records.estimates import WindowRefused
 from service.wire import Status
 
 _MATRIX_CHECKS: Final = ("commit", "chunks", "rejection")
@@ -204,13 +205,18 @@ def list_moves(names: list[str], status: Status) -> tuple[str, ...]:
         )
     if Moves.MATRIX in kinds:
         lines.append(
-            "commit, chunks, rejection: matrices with the same numbers as the one in use are sent "
-            "under new ids, and two of them are swapped in"
+            "commit, chunks, rejection: matrices with the same numbers as the one in use are sent, "
+            "most under new ids, and two of them are swapped in"
         )
     if "reconnect" in names:
         lines.append("reconnect: the link only; the RTC loses its router for a second")
     if "loop" in names:
         lines.append(f"loop: THE LOOP IS OPENED for about {OPEN_LOOP_S:.0f} s and closed again")
+    if "finite" in names:
+        lines.append(
+            "finite: THE LOOP IS OPENED for a few seconds, and matrices with NaN and infinity are "
+            "sent, which the RTC must reject; then it is closed again"
+        )
     if "measure" in names:
         lines.append(
             "measure: the RTC opens THE LOOP, pushes and pulls two modes by "
@@ -237,15 +243,24 @@ def _run_active_checks(
         yield check_reconnect(client)
     if examination.includes("loop"):
         yield check_loop(client, client.observer.status or status)
-    if examination.includes("measure"):
+    yield from _run_matrix_comparisons(client, examination, status)
+    if examination.includes("offload"):
+        yield check_offload(client, client.observer.loop.matrix, examination.fit_registration)
+
+
+def _run_matrix_comparisons(
+    client: RtcClient, examination: Examination, status: Status
+) -> Iterator[CheckResult]:
+    """Run the checks that open the loop and need the matrix in use."""
+    for name, check in (("finite", check_finite), ("measure", check_measure)):
+        if not examination.includes(name):
+            continue
         # Fetched again: an earlier check may have swapped in a matrix with another id.
         in_use = _fetch_matrix(client)
         if in_use is None:
-            yield skipped("measure", _NO_MATRIX)
+            yield skipped(name, _NO_MATRIX)
         else:
-            yield check_measure(client, client.observer.status or status, in_use)
-    if examination.includes("offload"):
-        yield check_offload(client, client.observer.loop.matrix, examination.fit_registration)
+            yield check(client, client.observer.status or status, in_use)
 
 
 def _run_reply_checks(

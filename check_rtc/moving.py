@@ -1,17 +1,18 @@
 """Checks that change the RTC's matrix, loop or link.
 
-Every matrix that is sent has the numbers of the matrix in use under a new id, so that the loop does
-not change whatever the RTC does with it.
+Every matrix that is sent while the loop is closed has the numbers of the matrix in use, so that the
+loop does not change whatever the RTC does with it.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
+import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,6 +31,7 @@ from service.wire import (
     MeasureRequest,
     Pattern,
     Status,
+    checksum,
     encode,
     layout_of,
     split,
@@ -68,27 +70,46 @@ class MatrixInUse:
         manifest = replace(self.manifest, id=name, layout=layout, parent=self.manifest.id)
         return MatrixInUse(manifest=manifest, matrix=self.matrix)
 
+    def with_numbers(self, matrix: NDArray[np.float32]) -> MatrixInUse:
+        """Return other numbers of the same shape under the same id, with their checksum."""
+        # Not by layout_of, which refuses numbers that are not finite.
+        layout = replace(self.manifest.layout, sha256=checksum(matrix))
+        return MatrixInUse(manifest=replace(self.manifest, layout=layout), matrix=matrix)
+
     @property
     def parts(self) -> list[bytes]:
         """Chunks of the matrix as they are sent."""
         return split(self.matrix, self.manifest.layout.chunk_bytes)
 
 
+def _send(
+    client: RtcClient, new: MatrixInUse, changed: Mapping[str, object] | None = None
+) -> list[tuple[float, Acknowledgement]]:
+    """Offer and send a matrix, commit last; return its acknowledgements with their delays.
+
+    ``changed`` replaces keys of the commit, also by values that a manifest cannot have.
+    """
+    name, known = new.manifest.id, len(client.observer.acknowledgements)
+    # Offered as well, because an RTC may ignore chunks and query all of them after the commit.
+    client.connection.offer(new.manifest, new.matrix)
+    for index, part in enumerate(new.parts):
+        client.connection.put_chunk(name, index, part)
+    commit = msgpack.unpackb(encode(new.manifest)) | dict(changed or {})
+    began_s = client.clock()
+    client.connection.put_commit(name, msgpack.packb(commit))
+    answers = _wait_for_acknowledgements(client, name, ACKNOWLEDGEMENT_TIMEOUT_S, known)
+    return [(at_s - began_s, answer) for at_s, answer in answers]
+
+
 def check_commit(client: RtcClient, before: MatrixInUse) -> tuple[CheckResult, MatrixInUse | None]:
     """Send the matrix again, commit last; return the result, and the new matrix if applied."""
     new = before.copy_as(client.connection.new_id("commit"))
     name = new.manifest.id
-    client.connection.offer(new.manifest, new.matrix)
-    for index, part in enumerate(new.parts):
-        client.connection.put_chunk(name, index, part)
-    began_s = client.clock()
-    client.connection.put_commit(name, encode(new.manifest))
-    answers = _wait_for_acknowledgements(client, name, ACKNOWLEDGEMENT_TIMEOUT_S)
-    last = answers[-1][1] if answers else None
+    answers = _send(client, new)
+    took_s, last = answers[-1] if answers else (0.0, None)
     if last is None or last.state is not AckState.APPLIED:
         return wrong("commit", _explain_outcome(client, name, answers)), None
     # Acknowledgement, frames and status must agree on the first frame of the new matrix.
-    took_s = answers[-1][0] - began_s
     client.observer.loop.use(name, new.matrix)
     found = f"applied {took_s:.2f} s after its commit, from frame {last.frame_seq} on"
     client.listen(STATUS_TIMEOUT_S, lambda: _status_has_matrix(client, name))
@@ -130,17 +151,14 @@ def check_chunks(client: RtcClient, before: MatrixInUse) -> tuple[CheckResult, M
 def check_rejection(client: RtcClient, in_use: MatrixInUse) -> CheckResult:
     """Check that invalid commits are rejected; their chunks have the numbers in use."""
     problems, reasons = [], []
-    for what, manifest in _bad_manifests(client, in_use):
-        name = manifest.id
-        known = len(client.observer.acknowledgements)
-        for index, part in enumerate(in_use.copy_as(name).parts):
-            client.connection.put_chunk(name, index, part)
-        client.connection.put_commit(name, encode(manifest))
-        answers = _wait_for_acknowledgements(client, name, ACKNOWLEDGEMENT_TIMEOUT_S, known)
-        if not answers or answers[-1][1].state is not AckState.REJECTED:
-            problems.append(f"{what}: {_explain_outcome(client, name, answers)}")
+    for what, bad, changed in _bad_matrices(client, in_use):
+        problem, reason = _offer_bad_matrix(client, what, bad, changed)
+        if problem:
+            problems.append(problem)
+            # What follows starts from the matrix in use again, and not from one with a wrong id.
+            in_use = _put_back(client, in_use) or in_use
         else:
-            reasons.append(f"{what} ({answers[-1][1].reason:.40})")
+            reasons.append(reason)
     problems += _check_repeat(client, in_use)
     problems += _check_unreadable_commit(client)
     if problems:
@@ -150,29 +168,62 @@ def check_rejection(client: RtcClient, in_use: MatrixInUse) -> CheckResult:
     )
 
 
-def _bad_manifests(client: RtcClient, in_use: MatrixInUse) -> list[tuple[str, Manifest]]:
-    """Return manifests that must be rejected, each with a description of its defect."""
-    new = client.connection.new_id
+def _bad_matrices(
+    client: RtcClient, in_use: MatrixInUse
+) -> Iterator[tuple[str, MatrixInUse, Mapping[str, object]]]:
+    """Yield matrices that must be rejected: defect, matrix, and changed keys of the commit."""
     other_sum = hashlib.sha256(b"other numbers").hexdigest()
-    first = in_use.copy_as(new("sum")).manifest
-    second = in_use.copy_as(new("basis")).manifest
-    used = in_use.manifest
-    return [
-        ("a wrong checksum", replace(first, layout=replace(first.layout, sha256=other_sum))),
-        ("another basis", replace(second, basis_id="no-basis-of-this-rtc")),
-        ("a used id", replace(used, layout=replace(used.layout, sha256=other_sum))),
-    ]
+    for what, changed in (
+        ("a wrong checksum", {"sha256": other_sum}),
+        ("another dtype", {"dtype": "<f8"}),
+        ("another basis", {"basis_id": "no-basis-of-this-rtc"}),
+        ("another configuration", {"config_id": "no-configuration-of-this-rtc"}),
+        ("another system", {"system": "no-system-of-this-rtc"}),
+    ):
+        yield what, in_use.copy_as(client.connection.new_id("bad")), changed
+    if len(in_use.matrix) > 1:
+        # The last mode would be left out, and no other one would change.
+        fewer = MatrixInUse(manifest=in_use.manifest, matrix=in_use.matrix[:-1])
+        yield "a row too few", fewer.copy_as(client.connection.new_id("shape")), {}
+    # Other numbers with their right checksum, so that only the id is wrong: the loop does not
+    # notice the last bit of one number.
+    changed_bit = in_use.matrix.copy()
+    changed_bit.flat[0] = np.nextafter(changed_bit.flat[0], np.float32(np.inf))
+    yield "a used id", in_use.with_numbers(changed_bit), {}
+
+
+def _offer_bad_matrix(
+    client: RtcClient, what: str, bad: MatrixInUse, changed: Mapping[str, object]
+) -> tuple[str, str]:
+    """Send a matrix that must be rejected; return the problem, empty if it was, and the reason."""
+    answers = _send(client, bad, changed)
+    if not answers or answers[-1][1].state is not AckState.REJECTED:
+        return f"{what}: {_explain_outcome(client, bad.manifest.id, answers)}", ""
+    return "", f"{what} ({answers[-1][1].reason:.40})"
+
+
+def _put_back(client: RtcClient, in_use: MatrixInUse) -> MatrixInUse | None:
+    """Send the matrix in use under a new id; return it, or None if it was not applied."""
+    new = in_use.copy_as(client.connection.new_id("back"))
+    answers = _send(client, new)
+    if not answers or answers[-1][1].state is not AckState.APPLIED:
+        return None
+    client.observer.loop.use(new.manifest.id, new.matrix)
+    return new
 
 
 def _check_repeat(client: RtcClient, in_use: MatrixInUse) -> list[str]:
-    """Send the commit of the matrix in use again; return a problem if no acknowledgement comes."""
+    """Send the commit of the matrix in use again; return a problem if its answer is another one."""
     # A service that lost the acknowledgement on the network sends its commit again.
     name, known = in_use.manifest.id, len(client.observer.acknowledgements)
+    first_seq = {one.frame_seq for _, one in client.observer.acknowledgements if one.id == name}
+    client.connection.offer(in_use.manifest, in_use.matrix)
     client.connection.put_commit(name, encode(in_use.manifest))
     answers = _wait_for_acknowledgements(client, name, MAX_APPLY_DELAY_S, known)
-    if answers and answers[-1][1].state is AckState.APPLIED:
-        return []
-    return [f"the repeated commit: {_explain_outcome(client, name, answers)}"]
+    if not answers or answers[-1][1].state is not AckState.APPLIED:
+        return [f"the repeated commit: {_explain_outcome(client, name, answers)}"]
+    again_seq = answers[-1][1].frame_seq
+    return [] if again_seq in first_seq else [f"a repeated commit: applied again at {again_seq}"]
 
 
 def _check_unreadable_commit(client: RtcClient) -> list[str]:
@@ -198,7 +249,8 @@ def _wait_for_acknowledgements(
 
     def answers() -> list[tuple[float, Acknowledgement]]:
         every = client.observer.acknowledgements[n_known:]
-        return [(at_s, one) for at_s, one in every if one.id == name]
+        # Without an id it is the rejection of a commit that the RTC cannot read (R-71).
+        return [(at_s, one) for at_s, one in every if one.id in {name, None}]
 
     client.listen(patience_s, lambda: any(one.state is not AckState.STAGED for _, one in answers()))
     return answers()
@@ -243,7 +295,19 @@ def _find_contradictions(
         )
     if acknowledgement.sha256 != new.manifest.layout.sha256:
         problems.append("its acknowledgement has another checksum")
-    return problems
+    return problems + _read_back(client, new)
+
+
+def _read_back(client: RtcClient, new: MatrixInUse) -> list[str]:
+    """Return how the matrix that the RTC reports as applied differs from the one sent."""
+    try:
+        manifest, matrix = client.connection.fetch_applied()
+    except (LinkError, WireError) as error:
+        return [f"rtc/cm/applied afterwards: {error}"]
+    if manifest.id != new.manifest.id:
+        return [f"rtc/cm/applied afterwards has {manifest.id}"]
+    same = np.array_equal(matrix, new.matrix)
+    return [] if same else ["rtc/cm/applied afterwards has other numbers than were sent"]
 
 
 # --- link and loop
@@ -342,6 +406,41 @@ def check_loop(client: RtcClient, status: Status) -> CheckResult:
     return fine("loop", f"opened in session {during.session if during else ''}, closed in it again")
 
 
+def check_finite(client: RtcClient, status: Status, in_use: MatrixInUse) -> CheckResult:
+    """Check that a matrix with a number that is not finite is rejected, with the loop open."""
+    was_open, n_before = status.loop == Loop.OPEN, client.observer.n_nonfinite
+    if not was_open:
+        refused = _send_command(
+            client, LoopRequest(id=client.connection.new_id("open"), loop=Loop.OPEN)
+        )
+        # Where the loop may be closed, such a matrix would reach every actuator in one frame.
+        if refused or not client.listen(LOOP_CHANGE_TIMEOUT_S, lambda: _loop_is(client, Loop.OPEN)):
+            return skipped("finite", f"the loop did not open: {refused or 'no status says so'}")
+    problems, reasons, is_safe = list[str](), list[str](), False
+    try:
+        for value in (np.nan, np.inf):
+            bad = in_use.matrix.copy()
+            bad.flat[-1] = value
+            new = in_use.copy_as(client.connection.new_id("finite")).with_numbers(bad)
+            problem, reason = _offer_bad_matrix(client, f"a matrix with {value}", new, {})
+            (problems if problem else reasons).append(problem or reason)
+        is_safe = not problems
+    finally:  # also if the user interrupts the check
+        is_safe = is_safe or _put_back(client, in_use) is not None
+        client.listen(OPEN_LOOP_S)
+        if not was_open and is_safe and client.observer.n_nonfinite == n_before:
+            refused = _send_command(
+                client, LoopRequest(id=client.connection.new_id("close"), loop=Loop.CLOSED)
+            )
+            problems += [f"the loop is not closed again: {refused}"] if refused else []
+        elif not was_open:
+            problems.append("THE LOOP STAYS OPEN, because these numbers may still be in it")
+    client.listen(LOOP_CHANGE_TIMEOUT_S, lambda: _loop_is(client, Loop.OPEN) is was_open)
+    if problems:
+        return wrong("finite", "; ".join(problems))
+    return fine("finite", f"rejected: {'; '.join(reasons)}")
+
+
 def _find_opening_problems(client: RtcClient, before: Status) -> list[str]:
     problems = []
     now = client.observer.status
@@ -371,11 +470,14 @@ def check_measure(client: RtcClient, status: Status, in_use: MatrixInUse) -> Che
         n_average=4,
     )
     n_known = len(client.observer.measured)
-    refused = _send_command(client, request)
-    if refused.startswith(("unsupported", "busy", "no answer")):
-        return skipped("measure", f"not offered now: {refused}")
-    if refused:
-        return wrong("measure", refused)
+    try:
+        reply = client.connection.command(request)
+    except LinkError as error:  # the command is optional, and "replies" judges what must answer
+        return skipped("measure", f"not offered: {error}")
+    if reply.reason.startswith(("unsupported", "busy")):
+        return skipped("measure", f"not offered now: {reply.reason}")
+    if not reply.accepted:
+        return wrong("measure", reply.reason or "refused without a reason")
     found = _wait_for_matrix(client, n_known)
     was_open = status.loop == Loop.OPEN
     back = client.listen(LOOP_CHANGE_TIMEOUT_S, lambda: _loop_is(client, Loop.OPEN) is was_open)

@@ -38,7 +38,7 @@ class Moves(StrEnum):
     """The check sends commands that must be refused, and moves nothing."""
 
     MATRIX = "matrix"
-    """The check sends the numbers of the matrix in use again under new ids."""
+    """The check sends the numbers of the matrix in use again, most under new ids."""
 
     MIRROR = "mirror"
     """The check plays a small dither."""
@@ -88,7 +88,9 @@ REQUIREMENTS: Final[dict[str, Requirement]] = {
     "sequence": Requirement(
         (25,), "each frame comes once, none is lost, seq0 never decreases", "sessions-sequence-time"
     ),
-    "clock": Requirement((26,), "t0_ns increases by dt_ns per frame", "sessions-sequence-time"),
+    "clock": Requirement(
+        (26,), "t0_ns is UTC and increases by dt_ns per frame", "sessions-sequence-time"
+    ),
     "delivery": Requirement(
         (19,), "a batch is sent as soon as its last frame is complete", "timing"
     ),
@@ -141,20 +143,22 @@ REQUIREMENTS: Final[dict[str, Requirement]] = {
         Moves.WORDS,
     ),
     "dither": Requirement(
-        (17, 40, 45, 46, 50),
-        "a dither begins at start_seq as requested, is in the status, and stops on request",
+        (17, 40, 44, 45, 46, 50),
+        "a dither begins at start_seq as requested, is in the status, stops on request, and is "
+        "played once, however often its id comes",
         "dither",
         Moves.MIRROR,
     ),
     "columns": Requirement(
-        (13,),
-        "row k has slopes and command of the same exposure, with the sign of the matrix",
+        (13, 14),
+        "row k has slopes and total command of the same exposure, with the sign of the matrix",
         "frames",
         Moves.MIRROR,
     ),
     "commit": Requirement(
-        (18, 67, 68, 69, 70),
-        "a matrix is applied within 2 s of its commit, from the frame acknowledged",
+        (18, 67, 68, 69, 70, 75),
+        "a matrix is applied within 2 s of its commit, from the frame acknowledged, and can then "
+        "be read back",
         "reconstructors",
         Moves.MATRIX,
     ),
@@ -165,9 +169,9 @@ REQUIREMENTS: Final[dict[str, Requirement]] = {
         Moves.MATRIX,
     ),
     "rejection": Requirement(
-        (11, 66, 71, 72),
-        "a wrong checksum, basis or manifest and a used id are rejected, and a repeated commit is "
-        "acknowledged again",
+        (11, 53, 66, 71, 72),
+        "a wrong checksum, shape, basis or manifest and a used id are rejected, and a repeated "
+        "commit is acknowledged again",
         "reconstructors",
         Moves.MATRIX,
     ),
@@ -182,6 +186,12 @@ REQUIREMENTS: Final[dict[str, Requirement]] = {
         "opening the loop begins a session with a zero integrator; closing continues it; the "
         "matrix stays in use",
         "loop",
+        Moves.LOOP,
+    ),
+    "finite": Requirement(
+        (66,),
+        "a matrix with a number that is not finite is rejected, with the loop open",
+        "reconstructors",
         Moves.LOOP,
     ),
     "measure": Requirement(

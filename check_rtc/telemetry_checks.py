@@ -20,6 +20,7 @@ from check_rtc.watch import Arrival, TelemetryObserver, select_session, sort_by_
 from service.estimation.orientation import format_setting
 from service.estimation.slope_convention import SlopeConvention
 from service.runtime.readiness import MAX_STATUSES_HZ
+from service.tracking.alarm_rules import explain_clock
 from service.wire import Keys, Manifest, Status
 
 MIN_RATE_RATIO, MAX_RATE_RATIO = 0.8, 1.1
@@ -37,9 +38,8 @@ NOTABLE_DELAY_S: Final = 0.25
 MAX_DELAY_S: Final = 0.5
 """Largest delay of a batch; the service does not wait longer for missing frames."""
 
-MAX_CLOCK_OFFSET_NS: Final = 86_400 * 10**9
-"""Largest usual difference between the RTC's clock and this one."""
-
+NOTABLE_CLOCK_LAG_S: Final = 10.0
+"""Delay of the RTC's clock from which it is reported; telemetry may be late by as much."""
 
 NOTABLE_PX: Final = 0.03
 """RMS offset of pupil images from which the instrument file should give it, in pixels.
@@ -279,10 +279,14 @@ def _clock(observer: TelemetryObserver, _: TelemetryContext) -> CheckResult:
         return seen("clock", f"the loop paused for {step_s:.2f} s before frame {seq}")
     if not observer.arrivals:
         return skipped("clock", "no frame has come")
-    away_ns = observer.arrivals[-1].header.t0_ns - time.time_ns()
-    if abs(away_ns) > MAX_CLOCK_OFFSET_NS:
-        return seen("clock", f"{away_ns * 1e-9:+.3g} s from the clock of this machine")
-    return fine("clock", f"even, and {away_ns * 1e-9:+.2g} s from the clock of this machine")
+    lead_s = (observer.arrivals[-1].header.t0_ns - time.time_ns()) * 1e-9
+    problem = explain_clock(lead_s)
+    if problem:
+        return wrong("clock", f"{problem}, by the clock of this machine")
+    found = f"{lead_s:+.2g} s from the clock of this machine"
+    if lead_s < -NOTABLE_CLOCK_LAG_S:
+        return seen("clock", f"even, and {found}")
+    return fine("clock", f"even, and {found}")
 
 
 def _delivery(observer: TelemetryObserver, _: TelemetryContext) -> CheckResult:

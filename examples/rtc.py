@@ -26,7 +26,7 @@ signing, root = Signing(*secured[1:]), f"ao/v1/{system}"
 plant, start_ns, lock = np.load(file), time.time_ns(), threading.Lock()
 telescope, matrix, (n_slopes, n) = Telescope(plant), plant["matrix"], plant["response"].shape
 commands_m = np.zeros((2, n))  # of the next two exposures: the loop has a delay of two frames
-seq, n_next, used_ids = 0, len(matrix), {}
+seq, n_next, used_ids = 0, len(matrix), {}  # ids of matrices and commands, with their bytes
 
 ids = {"v": 1, "basis_id": "plant-1", "config_id": "plant-1"}
 status = {"session": str(start_ns), "loop": "closed", "frame_rate_hz": RATE_HZ, **ids}
@@ -60,9 +60,11 @@ def execute(kind, command):
     elif (
         command["kind"] != "sine"
         or max(command["modes"]) >= n
+        or len(command["modes"]) > status["max_dither_modes"]
         or max(command["amplitude_m"]) > MAX_DITHER_M
+        or max(command["frequency_hz"]) >= RATE_HZ / 2
     ):
-        return f"range: expected sines of modes below {n} and at most {MAX_DITHER_M} m"
+        return f"range: expected at most 8 sines of modes below {n} and at most {MAX_DITHER_M} m"
     else:
         # Announced some frames ahead, so that the reply comes before the dither begins.
         status["dither"] = {**command, "start_seq": seq + ANNOUNCED_FRAMES}
@@ -76,7 +78,10 @@ def reply(kind, data):
     try:
         command = msgpack.unpackb(data)
         command_id = command["id"]
-        reason = execute(kind, command) if command["v"] == 1 else "v: expected 1"
+        reason = "" if command["v"] == 1 else "v: expected 1"
+        if used_ids.setdefault(command_id, data) != data:
+            reason = "id: it was used for another command"
+        reason = reason or execute(kind, command)
     except Exception as error:
         reason = f"{'missing' if isinstance(error, KeyError) else 'range'}: {error}"
     start = None if reason else seq + ANNOUNCED_FRAMES
@@ -125,7 +130,7 @@ def swap(commit):
         ack["reason"] = "range: id, sum, shape, basis, configuration, system, or not finite"
         # A matrix for another basis, sensor or number of modes would be applied to the wrong
         # slopes or modes, which can destroy the loop in a few frames.
-        expected = {**ids, "shape": [n_next, n_slopes], "system": system}
+        expected = {**ids, "shape": [n_next, n_slopes], "dtype": "<f4", "system": system}
         valid = hashlib.sha256(data).hexdigest() == new["sha256"]
         valid = valid and expected.items() <= new.items()
         numbers = np.frombuffer(data, "<f4")
@@ -200,6 +205,7 @@ keys = f"{root}/cmd/rtc/dither", f"{root}/cmd/rtc/loop", f"{root}/rtc/cm/applied
 declared = [session.declare_queryable(key, answer) for key in keys]
 # The token comes last: the service sends commands as soon as it sees it.
 declared += [session.liveliness().declare_token(f"{root}/alive/rtc")]
+start_ns = time.time_ns()  # of the first frame: waiting for the router is no part of the loop
 while True:
     header, payload, signed_status = run_batch()
     frames.put(payload, attachment=signing.sign(f"{root}/tel/frames", header, payload))

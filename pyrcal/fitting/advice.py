@@ -18,13 +18,26 @@ from pyrcal.fitting.alternatives import (
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.left_over import locate_residual
 from pyrcal.fitting.origins import Origin
-from pyrcal.fitting.verdict import UNDECIDED_WORDS, Refusal
+from pyrcal.fitting.verdict import (
+    MIN_EDGE_MOVE_SUBAP,
+    UNDECIDED_WORDS,
+    Refusal,
+    edge_move,
+)
 
 Array = NDArray[np.float64]
 
 ENOUGH_SUBAP = 0.03
 """Sufficient 1 σ of the mirror's position at the pupil's edge: 3 σ are then a tenth of a
 subaperture, the accuracy that Heritier et al. 2018, section 3.2, require of a shift."""
+
+MAX_USABLE_SUBAP = 0.1
+"""Largest 1 σ at the pupil's edge of a registration that is recommended, even if the reconstructor
+is stable with all modes."""
+
+MIN_CORRECTION_EXPLAINED = 0.01
+"""RMS share of the signal that a correction of the instrument file must explain if it would hardly
+move the registration."""
 
 MIN_NOISE_SHARE = 0.5
 """Share of the residual's power that must be noise for averaging to be advised. With pokes of
@@ -102,12 +115,13 @@ def recommend_action(fit: Fit, grounds: Grounds) -> str:
     if grounds.refusal is not None:
         return _advise_refused(fit, grounds)
     radius = _radius(fit)
-    edge = float(_at_edge(fit.sigma, radius))
+    edge = edge_move(fit.sigma, radius)
     control = fit.reconstructor
     if control is not None and not control.usable:
         return f"{Advice.MEASURE_MORE}: the reconstructor is not stable: {control.reason}"
-    # a reconstructor that is stable with all modes is good enough, however large sigma is
-    if edge > ENOUGH_SUBAP and not (control is not None and control.holds):
+    # a reconstructor that is stable with all modes is good enough, unless sigma says nothing
+    enough = MAX_USABLE_SUBAP if control is not None and control.holds else ENOUGH_SUBAP
+    if edge > enough:
         return f"{Advice.MEASURE_MORE}: {_explain_uncertainty(fit, grounds, edge, radius)}"
     if grounds.n_sets < FEWEST_SETS:
         return (
@@ -131,9 +145,14 @@ def _explain_uncertainty(fit: Fit, grounds: Grounds, edge: float, radius: float)
         f"at the pupil's edge the mirror is known to {edge:.3f} subapertures (1 sigma), "
         f"{ENOUGH_SUBAP:g} is enough"
     )
-    found = fit.registration
+    found, best = fit.registration, _choose_correction(fit)
+    if best is not None:
+        return (
+            f"{known}; with {best.words} the misfit is {best.share:.0%} of what it is: correct "
+            "that and fit again"
+        )
     # Averaging and more modes reduce the statistical part only.
-    if found is None or _at_edge(found.sigma_statistical, radius) > 0.7 * edge:
+    if found is None or edge_move(found.sigma_statistical, radius) > 0.7 * edge:
         if grounds.noise_share >= MIN_NOISE_SHARE:
             return f"{known}; average more, or push more modes"
         left = (
@@ -147,8 +166,8 @@ def _explain_uncertainty(fit: Fit, grounds: Grounds, edge: float, radius: float)
             )
         return f"{left}: the model differs from the bench, and only more modes average that out"
     terms = systematic_terms(fit.alternatives, fit.residual_fraction, fit.sigma)
-    most = max(terms, key=lambda term: _at_edge(term.sigma, radius), default=None)
-    if most is None or _at_edge(most.sigma, radius) < 0.5 * edge:
+    most = max(terms, key=lambda term: edge_move(term.sigma, radius), default=None)
+    if most is None or edge_move(most.sigma, radius) < 0.5 * edge:
         return f"{known}; the model differs from the bench, and more averaging does not help"
     other = most.alternative
     return (
@@ -206,7 +225,12 @@ def _list_corrections(fit: Fit) -> Iterator[str]:
         if one.correct:
             yield f"{one.key} = {one.found}"
     best = _choose_correction(fit)
-    if best is not None:
+    # What explains little and changes nothing at the edge is no reason to edit a file: errors of
+    # the model look the same.
+    if best is not None and (
+        fit.residual_fraction**2 * (1.0 - (best.share or 0.0)) > MIN_CORRECTION_EXPLAINED**2
+        or edge_move(best.moved, _radius(fit)) > MIN_EDGE_MOVE_SUBAP
+    ):
         yield best.key
 
 
@@ -233,8 +257,3 @@ def _choose_correction(fit: Fit) -> Alternative | None:
 def _radius(fit: Fit) -> float:
     """Return the radius of the pupil, in subapertures."""
     return float(np.sqrt(fit.valid.sum() / np.pi))
-
-
-def _at_edge(step: Array, radius: float) -> float:
-    """Return the displacement at the pupil's edge for a change of α, subapertures."""
-    return float(np.sqrt(np.max(step[:2] ** 2) + radius**2 * np.sum(step[2:] ** 2)))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pyrcal.fitting.disjoint_sets import SIGNIFICANT
 from pyrcal.fitting.instrument_checks import (
     MIN_EXPLAINED,
+    UNKNOWN_IMAGES,
     AlternativeInstrument,
     FileValuesFit,
     FoundOptic,
@@ -281,7 +282,7 @@ def _describe_rival(rival: AlternativeInstrument, pupils: tuple[TriedPupil, ...]
         undecided=not rival.preferred and is_open(rival.lead),
         key=rival.change.words,
         counts=True,
-        is_number=any(one.words == rival.change.words for one in pupils),
+        is_number=rival.change.words in {UNKNOWN_IMAGES, *(one.words for one in pupils)},
     )
 
 
@@ -336,7 +337,8 @@ def _try_off_centre(few: FitSubset) -> Iterator[Alternative]:
             and explained > MIN_OFFSET_EXPLAINED
         ),
         undecided=is_open(lead),
-        key=CENTRED_KEY,
+        # With the mirror as stop the pupil is where the mirror is: nothing can be centred.
+        key="" if about.stop is Stop.MIRROR else CENTRED_KEY,
         counts=True,
         is_number=True,
     )

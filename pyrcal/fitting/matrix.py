@@ -286,8 +286,10 @@ def _note_mask(fit: Fit, instrument: Instrument) -> Fit:
         instrument.stop is Stop.MIRROR
         and check_mask(replace(instrument, stop=Stop.TELESCOPE), (x, y)) is None
     )
-    # An accepted registration is not overruled by the mask: the difference is a remark only.
-    if not fit.accepted and not of_stop:
+    # An accepted registration is not overruled by the mask: the difference is a remark only. Nor is
+    # another pupil or stop that explains the matrix, because the mask is compared with the file's.
+    explained = any(one.preferred and one.key for one in fit.alternatives)
+    if not (fit.accepted or of_stop or explained):
         advised = f"{Advice.DO_NOT_USE}: {difference}"
     return replace(fit, remarks=remarks, recommendation=advised)
 
@@ -623,6 +625,7 @@ def _make_fit(
         axes=axes_doubt,
         passes=usable.passes,
         stroke_known=stroke_known,
+        radius_subap=models.instrument.wfs.pupil_diameter / 2.0,
     )
     refusal, verdict = judge_fit(findings)
     smeared = () if found.smear is None else (found.smear.words,)

@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.fitting.models import COARSE_SAMPLING, FitModels, Optic
+from pyrcal.fitting.models import FitModels, Optic
 from pyrcal.fitting.solver import (
     LONGEST_OPTIC_STEP,
     Nuisances,
@@ -343,7 +343,7 @@ def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
     def left(change: float) -> float:
         models.counter.n += 1
         changed = subset.with_optic(Optic.SENSOR, change) if change else subset
-        matrix = changed.model(COARSE_SAMPLING, once=True).interaction_matrix(solution.alpha)
+        matrix = changed.model(models.cheap_sampling, once=True).interaction_matrix(solution.alpha)
         return few.project(matrix, every).chi_at_best
 
     found = _scan_outwards(left)

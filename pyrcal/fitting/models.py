@@ -25,10 +25,6 @@ from service.model.surface import Gaussian, ThinPlate, mirror_surface
 
 Array = NDArray[np.float64]
 
-COARSE_SAMPLING = 2
-"""Pupil points per subaperture, and nodes, of the model for derivatives. The sensor's kind defines
-the sampling for residuals and for far steps."""
-
 PREFERRED_SHARE = 0.95
 """Share of χ² that another instrument must leave at most to be preferred. On the diffractive
 telescope the correct stop left 0.83 to 0.94 of the wrong one's χ², noise included, from a shift of
@@ -155,7 +151,12 @@ class FitModels:
     @cached_property
     def cheap(self) -> InteractionModel:
         """Model for derivatives near the solution."""
-        return self.model(COARSE_SAMPLING)
+        return self.model(self.cheap_sampling)
+
+    @property
+    def cheap_sampling(self) -> int:
+        """Pupil points per subaperture, and nodes, of the model for derivatives."""
+        return kind_of(self.instrument).derivative_sampling(self.instrument.wfs)
 
     @cached_property
     def fine(self) -> InteractionModel:
@@ -240,7 +241,7 @@ class FitModels:
                 found.append(self.cheap.width_derivative(alpha))
                 continue
             own = self.cheap.interaction_matrix(alpha) if cheap_matrix is None else cheap_matrix
-            other = self.with_optic(optic, SENSOR_STEP).model(COARSE_SAMPLING, once=True)
+            other = self.with_optic(optic, SENSOR_STEP).model(self.cheap_sampling, once=True)
             found.append((other.interaction_matrix(alpha) - own) / SENSOR_STEP)
             self.counter.n += 1
         self.counter.n += len(found)

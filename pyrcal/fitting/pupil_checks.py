@@ -1,6 +1,6 @@
-"""Try another obscuration and pupil size.
+"""Try another obscuration, pupil size, pupil map or spider than the instrument file states.
 
-Neither is fitted together with the registration: a wrong pupil has an effect at its edges only, and
+None is fitted together with the registration: a wrong pupil has an effect at its edges only, and
 uneven light has a similar one. A value that would explain the matrix far better is reported
 instead.
 """
@@ -8,20 +8,23 @@ instead.
 from __future__ import annotations
 
 import operator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from pyrcal.fitting.methods import Settled, spread
-from pyrcal.fitting.models import COARSE_SAMPLING, PREFERRED_SHARE, FitModels
+from pyrcal.fitting.models import PREFERRED_SHARE, FitModels
 from pyrcal.fitting.solver import nuisances_of
 from pyrcal.fitting.uncertainty import pupil_regions
 from service.estimation.solver import Projection
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
+from service.model.pupil import light_per_subaperture
 
 Array = NDArray[np.float64]
 
@@ -34,6 +37,24 @@ OFFSET_STEP_SUBAP = 0.05
 EXCLUDED_SHARE = 0.98
 """Share of χ² left by a pupil to first order, above which its own model is not computed: it would
 have to leave 0.95 to be reported."""
+
+ARMS, TURN = "spiders_m", "spiders_deg"
+"""Keys of the arms. A number of the second one is the turn of the arms, or of a pupil map, in
+degrees."""
+
+MIN_OUTLINE_EXPLAINED = 0.01
+"""RMS share of the signal that turned or wider arms must explain. Arms of one subaperture
+that are turned by one degree leave 0.027 of it."""
+
+TURNS_DEG = (-8.0, -4.0, 4.0, 8.0)
+"""Angles at which the fit of a turned pupil may start besides 0, degrees."""
+
+MAX_LIGHT_SHARE = 0.95
+"""Share of χ² left with the light of a mirrored pupil map, above which it has no matrix computed:
+light that no map describes leaves 0.97."""
+
+MIN_LIGHT = 0.1
+"""Smallest light of a subaperture that others are compared with, over that of a full one."""
 
 _N_STEPS = 2
 """Number of steps towards the value that explains the most."""
@@ -61,18 +82,38 @@ class PupilNumber:
     notable: float
     """Smallest reported difference: simulators round their pupils to whole points."""
 
+    explained: float = MIN_PUPIL_EXPLAINED
+    """RMS share of the signal that another value must explain to be reported."""
+
+    starts: tuple[float, ...] = ()
+    """Values far from the file's from which the best one is searched as well."""
+
+    def words(self, about: Instrument, value: float) -> str:
+        """Return a value in the notation of the file."""
+        if self.key == ARMS and value < 0.1 * self.reported:
+            return "no spider"
+        if self.key != TURN:
+            return f"{self.key} = {value:.3g}"
+        if about.pupil is not None:
+            return f"the pupil map turned by {value:.2g} deg"
+        angles = np.round(_turn(about, value).spiders_deg, 1)
+        return f"{self.key} = [{', '.join(f'{angle:g}' for angle in angles)}]"
+
     def with_value(self, about: Instrument, light: float) -> Instrument:
         """Return the instrument with another value, given as its power."""
         value = light ** (1.0 / self.power)
+        if self.key == TURN:
+            return _turn(about, value)
+        if self.key == ARMS:
+            return replace(about, spiders_m=value)
         if self.key == "obscuration_ratio":
             return replace(about, obscuration_ratio=value)
         return replace(about, wfs=replace(about.wfs, pupil_diameter_subap=value))
 
-    def rate(self, few: FitSubset) -> Array:
-        """Return the derivative of D by the value's power ``(n_slopes, n_few)``."""
-        stepped = self.reported**self.power + self.step
-        there = few.matrix(few.of(self.with_value(few.models.instrument, stepped)))
-        return np.asarray((there - few.own) / self.step)
+    def rate(self, few: FitSubset, light: float, matrix: Array) -> Array:
+        """Return the derivative of D ``(n_slopes, n_few)`` by the power of the value there."""
+        there = few.matrix(few.of(self.with_value(few.models.instrument, light + self.step)))
+        return np.asarray((there - matrix) / self.step)
 
     def limit(self, light: float) -> float:
         """Return a power of the value, limited to the plausible range."""
@@ -101,6 +142,12 @@ class PupilNumber:
         A second step takes its derivative from the first, unless that was too short.
         """
         light, matrix = self.reported**self.power, few.own
+        for start in self.starts:
+            other = few.matrix(few.of(self.with_value(few.models.instrument, start)))
+            if few.left(other) < few.left(matrix):
+                light, matrix = start, other
+        if matrix is not few.own:
+            rate = self.rate(few, light, matrix)
         for _ in range(_N_STEPS):
             # At a new value the border may cut no subaperture, and then nothing determines a
             # further step.
@@ -126,8 +173,18 @@ def _numbers(about: Instrument) -> tuple[PupilNumber, ...]:
         range=(0.94 * size, 1.06 * size),
         notable=0.01 * size,
     )
+    turn = PupilNumber(
+        key=TURN,
+        reported=0.0,
+        power=1,
+        step=1.0,
+        range=(-12.0, 12.0),
+        notable=0.3,
+        explained=MIN_OUTLINE_EXPLAINED,
+        starts=TURNS_DEG,
+    )
     if about.pupil is not None:
-        return (width,)  # the pupil map contains the obscuration
+        return width, turn  # the pupil map contains the obscuration
     inner = PupilNumber(
         key="obscuration_ratio",
         reported=hole,
@@ -136,7 +193,18 @@ def _numbers(about: Instrument) -> tuple[PupilNumber, ...]:
         range=(0.0, max(0.6, hole)),
         notable=0.03,
     )
-    return inner, width
+    if not about.spiders_deg or about.spiders_m is None:
+        return inner, width
+    arms = PupilNumber(
+        key=ARMS,
+        reported=about.spiders_m,
+        power=1,
+        step=0.1 * about.spiders_m,
+        range=(0.0, 4.0 * about.spiders_m),
+        notable=0.2 * about.spiders_m,
+        explained=MIN_OUTLINE_EXPLAINED,
+    )
+    return inner, width, arms, turn
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -209,7 +277,7 @@ class FitSubset:
         """Return D of an instrument, ``(n_slopes, n_few)``."""
         own = tried.basis is self.models.basis
         basis = self.model.basis if own else tried.basis.subset(self.modes)
-        model = tried.model(COARSE_SAMPLING, basis, once=True)
+        model = tried.model(self.models.cheap_sampling, basis, once=True)
         model.share_modes(self.model)
         return self._at_solution(model)
 
@@ -320,26 +388,75 @@ def try_pupils(few: FitSubset) -> tuple[TriedPupil, ...]:
     explain, or if the pupil explains next to nothing.
     """
     found = []
-    little = few.residual_fraction < MIN_PUPIL_EXPLAINED
-    for number in _numbers(few.models.instrument):
-        rate = number.rate(few)
+    about = few.models.instrument
+    for number in _numbers(about):
+        little = few.residual_fraction < number.explained
+        rate = number.rate(few, number.reported**number.power, few.own)
         # To first order first, because each further value takes the matrix of another sensor model.
         value, lead, moved = number.near(few, rate)
         if not little and lead.share < EXCLUDED_SHARE:
             value, lead, moved = number.far(few, rate)
         explained = few.residual_fraction * np.sqrt(max(1.0 - lead.share, 0.0))
-        notable = (
-            abs(value - number.reported) >= number.notable and explained >= MIN_PUPIL_EXPLAINED
-        )
+        notable = abs(value - number.reported) >= number.notable and explained >= number.explained
         found.append(
             TriedPupil(
-                words=f"{number.key} = {value:.3g}",
+                words=number.words(about, value),
                 lead=lead,
                 moved=moved,
                 explains=notable and lead.share < PREFERRED_SHARE,
             )
         )
-    return tuple(found)
+    return (*found, *_try_other_ways_round(few))
+
+
+def _turn(about: Instrument, turn_deg: float) -> Instrument:
+    """Return the instrument with its arms or its pupil map turned, from +x towards +y."""
+    own = about.pupil
+    if own is None:
+        angles = tuple((angle + turn_deg) % 360.0 for angle in about.spiders_deg)
+        return replace(about, spiders_deg=angles)
+    turned = scipy.ndimage.rotate(own.lit, -turn_deg, reshape=False, order=1)
+    return replace(about, pupil=replace(own, lit=np.clip(turned, 0.0, 1.0)))
+
+
+def _try_other_ways_round(few: FitSubset) -> Iterator[TriedPupil]:
+    """Yield the pupil map mirrored or turned by quarters, if that explains the matrix better.
+
+    The eight ways are compared by the gain that their light gives each subaperture, which takes no
+    model. Only the best has its matrix computed.
+    """
+    about = few.models.instrument
+    if about.pupil is None or few.residual_fraction < MIN_PUPIL_EXPLAINED:
+        return
+    lit = about.pupil.lit
+    ways = {f"turned by {90 * k} deg": np.rot90(lit, -k) for k in (1, 2, 3)}
+    ways |= {"mirrored along x": lit[:, ::-1], "mirrored along y": lit[::-1]}
+    ways |= {"mirrored at a diagonal": lit.T, "mirrored at the other diagonal": lit[::-1, ::-1].T}
+    own, best = np.maximum(_light(few, about), MIN_LIGHT), ("", about, MAX_LIGHT_SHARE)
+    for words, way in ways.items():
+        other = replace(about, pupil=replace(about.pupil, lit=way))
+        rate = (_light(few, other) / own - 1.0)[:, None] * few.own
+        if few.tells(few.own, rate) and few.step(few.own, rate)[-1] > 0.0:
+            share = few.lead(few.own, rate).share
+            best = min(best, (words, other, share), key=lambda one: one[2])
+    words, other, _ = best
+    if other is not about:
+        matrix = few.matrix(few.of(other))
+        lead = few.lead(matrix)
+        yield TriedPupil(
+            words=f"the pupil map {words}",
+            lead=lead,
+            moved=few.step(matrix)[:4] - few.step(few.own)[:4],
+            explains=lead.share < PREFERRED_SHARE,
+        )
+
+
+def _light(few: FitSubset, about: Instrument) -> Array:
+    """Return the light of a pupil at each slope ``(n_slopes,)``, of a full subaperture."""
+    # the pupil moves with the mirror if that is the stop
+    x, y = few.here.vector[:2] if about.stop is Stop.MIRROR else (0.0, 0.0)
+    seen = scipy.ndimage.shift(light_per_subaperture(about), (y, x), order=1)
+    return np.tile(seen[few.target.valid], about.slopes.kind.n_planes)
 
 
 def fit_smooth_gain(few: FitSubset) -> float:

@@ -37,10 +37,10 @@ from pyrcal_studies.campaign.rows import (
     tell,
 )
 from service.config import load_settings
+from service.records import alarms
+from service.records import events as ev
+from service.records.state import Mode
 from service.runtime.policy import policy_of
-from service.tracking import alarms
-from service.tracking import events as ev
-from service.tracking.state import Mode
 from service.wire import Acknowledgement
 
 KINDS = ("never swapped", "swapped late", "sign turned", "sign turned once", "as it should")

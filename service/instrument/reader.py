@@ -34,10 +34,13 @@ _LIT_FRACTION = 0.5
 """Illumination of a point, of the largest, above which it belongs to the pupil."""
 
 _WIDTHS = (0.8, 1.1)
-"""Plausible width of a map's light divided by ``diameter_m``; the corners of a segmented pupil
-extend beyond it."""
+"""Plausible width of a map's light divided by ``diameter_m``, along its longer axis; the corners of
+a segmented pupil extend beyond it."""
 
-_OFF_CENTRE = 0.02
+_MIN_AXIS_RATIO = 0.5
+"""Smallest ratio of the axes of an elliptical pupil; off-axis telescopes have 0.7 and more."""
+
+_OFF_CENTRE = 0.05
 """Tolerated distance of a map's light from the middle of its array, as a fraction of the diameter.
 """
 
@@ -84,14 +87,18 @@ def _read_pupil_map(file: Section[AboutTable], subaperture_m: float) -> PupilMap
             f"{pitch_m:.3g} m between points",
             f"at most a subaperture, {subaperture_m:.3g} m",
         )
+    x_m, y_m = ((place[-1] - place[0] + 1) * pitch_m for place in (columns, rows))
+    longer_m, ratio = max(x_m, y_m), min(x_m, y_m) / max(x_m, y_m)
+    if not _WIDTHS[0] <= longer_m / diameter_m <= _WIDTHS[1] or ratio < _MIN_AXIS_RATIO:
+        stated = file.said.pupil_pitch_m is not None
+        refuse(
+            where,
+            f"light over {x_m:.3g} m along x and {y_m:.3g} m along y",
+            f"about diameter_m = {diameter_m:g} along the longer axis and at least "
+            f"{_MIN_AXIS_RATIO:g} of it along the other: {'correct' if stated else 'give'} "
+            "pupil_pitch_m, metres in the pupil plane between two points",
+        )
     for name, place, n in (("y", rows, lit.shape[0]), ("x", columns, lit.shape[1])):
-        wide_m = (place[-1] - place[0] + 1) * pitch_m
-        if not _WIDTHS[0] <= wide_m / diameter_m <= _WIDTHS[1]:
-            refuse(
-                where,
-                f"light over {wide_m:.3g} m along {name}",
-                f"about diameter_m = {diameter_m:g}: give pupil_pitch_m, metres in the pupil plane",
-            )
         aside_m = ((place[0] + place[-1]) / 2 - (n - 1) / 2) * pitch_m
         if abs(aside_m) > _OFF_CENTRE * diameter_m:
             refuse(

@@ -245,14 +245,17 @@ def lit_subapertures(instrument: Instrument) -> NDArray[np.bool_]:
     The flux is the pupil's light on each subaperture, so that the mask depends neither on the
     sampling nor on the light diffracted out of the images.
     """
-    flux = _light_per_subaperture(_outline(instrument))
-    return np.asarray(flux >= instrument.wfs.flux_threshold)
+    return np.asarray(light_per_subaperture(instrument) >= instrument.wfs.flux_threshold)
 
 
 def fully_lit_subapertures(instrument: Instrument) -> NDArray[np.bool_]:
     """Return which subapertures ``(n, n)`` the edge of the pupil does not cut at α = 0."""
-    flux = _light_per_subaperture(_outline(instrument))
-    return np.asarray(flux > _FULL_SHARE)
+    return np.asarray(light_per_subaperture(instrument) > _FULL_SHARE)
+
+
+def light_per_subaperture(instrument: Instrument) -> NDArray[np.float64]:
+    """Return the share of each subaperture ``(n, n)`` that the pupil lights at α = 0."""
+    return _light_per_subaperture(_outline(instrument))
 
 
 @lru_cache(maxsize=8)

@@ -21,17 +21,17 @@ from service.archive import Actor, Archive, AuditEntry
 from service.archive.nights import TrendSample
 from service.archive.retention import RetentionPolicy, due, items, low_on_space, remove
 from service.errors import ArchiveError, StorageError
+from service.records import events as ev
+from service.records.alarms import ARCHIVE_FAILED, DISK_LOW
+from service.records.commands import Command, makes_safer
+from service.records.events import Effect
+from service.records.products import ReconstructorRecord
+from service.records.registration import HistoryEntry
+from service.records.state import Level, LogEntry, TrackerState
 from service.runtime.command_results import GivenCommand
-from service.tracking import events as ev
-from service.tracking.alarms import ARCHIVE_FAILED, DISK_LOW
-from service.tracking.commands import Command
-from service.tracking.events import Effect
 from service.tracking.mode_proof import proof_to_keep
 from service.tracking.policy import Policy
-from service.tracking.products import ReconstructorRecord
-from service.tracking.registration import HistoryEntry
 from service.tracking.resume import orders_of, resumed, saved_of, with_orders
-from service.tracking.state import Level, LogEntry, TrackerState
 from service.tracking.step_context import logged
 from service.wire import DitherRequest, MeasureRequest, OffloadRequest, RampRequest
 
@@ -136,13 +136,16 @@ class ArchiveWriter:
     async def ordered(self, order: GivenCommand, actor: Actor) -> None:
         """Write down what an operator asks for, before it is done.
 
+        What makes the loop safer never waits for the disk: it is written soon after.
+
         Raises
         ------
         StorageError
             If the disk refuses: it must not be done.
         """
         self._order(order, actor)
-        await self.flush()
+        if not makes_safer(order.command):
+            await self.flush()
 
     def answered(self, order: GivenCommand, actor: Actor, answer: str) -> None:
         """Record the answer to an order."""
@@ -173,10 +176,19 @@ class ArchiveWriter:
             If that fails: an action that cannot be recorded must not begin.
         """
         request = effect.request if isinstance(effect, ev.Ask) else None
-        if isinstance(request, RECORDED_REQUESTS) or isinstance(effect, ev.SendMatrix):
+        if isinstance(request, RECORDED_REQUESTS) or self._sends_new_numbers(effect):
             await self.flush()
         if isinstance(request, OffloadRequest):
             await self._save_now()
+
+    def _sends_new_numbers(self, effect: Effect) -> bool:
+        """Return True if an effect sends a matrix, and not the numbers of an earlier one again."""
+        if not isinstance(effect, ev.SendMatrix):
+            return False
+        # A rollback makes the loop safer, and the archive has its numbers under the earlier id.
+        known, record = self._state().reconstructor, self._state().reconstructor(effect.id)
+        earlier = record and known(record.parent or "")
+        return not (record and earlier and earlier.sha256 == record.sha256)
 
     async def flush(self) -> None:
         """Write what waits.
@@ -200,9 +212,13 @@ class ArchiveWriter:
         # The disk is tried every two seconds; the same failure would be a new line each time.
         if self._trouble != str(error):
             self._trouble = str(error)
+            remedy = "free space there or mend the disk"
+            # The open index belongs to the folder that was removed, also if another one is made.
+            if not self._archive.directory.is_dir():
+                remedy = "data_dir is gone: mount or restore it, then restart the service"
             text = (
-                f"{error}: free space there or mend the disk; until it can be written orders are "
-                "refused, nothing is made or sent by itself, and the audit trail waits in memory"
+                f"{error}: {remedy}; until it can be written only orders that make the loop safer "
+                "are carried out, nothing is made or sent by itself, and records wait in memory"
             )
             self._post(ev.ConditionChanged(name=ARCHIVE_FAILED, text=text))
 

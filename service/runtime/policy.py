@@ -13,8 +13,8 @@ from service.files.disk_cache import usual_folder
 from service.model.instrument import Instrument, TabulatedModes
 from service.model.misregistration import BOUNDARY_SCALE
 from service.model.sensors.registry import kind_of
+from service.records.alarms import Interlock, Severity
 from service.runtime.worker import Compute, Sampling
-from service.tracking.alarms import Interlock, Severity
 from service.tracking.policy import Offloading, Policy, Rule, SensorModePolicy
 
 FLAT = (0.004, 0.01, 0.001)

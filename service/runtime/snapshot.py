@@ -9,18 +9,17 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from service.control.gains import ModeGain
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import COVARIANCE_SCALE, PARAMETERS, Misregistration
+from service.records.alarms import ALARMS, AlarmDefinition, AlarmRecord, Prerequisite, Severity
+from service.records.commands import GainGroup
+from service.records.registration import ModeGain, Registration
+from service.records.state import LogEntry, TrackerState
 from service.tracking.alarm_records import muted_records, record_of, stale_records, worst_severity
-from service.tracking.alarms import ALARMS, AlarmDefinition, AlarmRecord, Prerequisite, Severity
-from service.tracking.commands import GainGroup
 from service.tracking.interlocks import Permission, permissions
 from service.tracking.operations.running import Operating, operating
 from service.tracking.policy import Policy
 from service.tracking.reconstructors import check_return
-from service.tracking.registration import Registration
-from service.tracking.state import LogEntry, TrackerState
 from service.wire import Status
 
 

@@ -19,27 +19,28 @@ from service.errors import CommandError, UnknownIdError
 from service.estimation.loop import explain_open_loop
 from service.files.toml import nearest
 from service.model.pointing_law import ANGLES
-from service.tracking import (
-    alarms,
-    dither,
-    dither_plan,
-    mode_proof,
-    validity,
-    window_processing,
-)
-from service.tracking import commands as cmd
-from service.tracking.alarms import RULE_PREFIX, AlarmDefinition
+from service.records import alarms
+from service.records import commands as cmd
+from service.records.alarms import RULE_PREFIX, AlarmDefinition
+from service.records.operations import AcquisitionStage
+from service.records.products import MatrixState
+from service.records.state import ObservatoryValue, TrackerState
+from service.tracking import dither, dither_plan, mode_proof, validity, window_processing
 from service.tracking.dither_request import MAX_STOP_DELAY_S
-from service.tracking.operation_records import AcquisitionStage
 from service.tracking.operations.acquisition import has_missed_enough
 from service.tracking.operations.probation import explain_opening
 from service.tracking.policy import SECOND_NS, Rule
-from service.tracking.products import MatrixState
-from service.tracking.state import ObservatoryValue, TrackerState
 from service.tracking.step_context import StepContext
 
 REPEATED_ALARM_TIMEOUT_S = 15.0
 """An alarm that is repeated while it lasts is over after this much silence."""
+
+MAX_CLOCK_LEAD_S: Final = 5.0
+"""Largest lead of an RTC's clock on UTC. GPS time leads by 18 s, TAI by 37 s; frames that are late
+on their way seem to lag, never to lead."""
+
+MAX_CLOCK_LAG_S: Final = 600.0
+"""Largest lag of the time stamps behind UTC: more is no delay of the telemetry, but the clock."""
 
 
 def derive_alarms(context: StepContext) -> None:
@@ -97,6 +98,23 @@ def _loop_open(context: StepContext) -> str | None:
     if rtc.in_loop or interrupted or opened:
         return None
     return f"{explain_open_loop(rtc)}: close it to calibrate"
+
+
+def explain_clock(lead_s: float) -> str | None:
+    """Return how time stamps ``lead_s`` seconds ahead of UTC are wrong; None if they are not."""
+    if -MAX_CLOCK_LAG_S <= lead_s <= MAX_CLOCK_LEAD_S:
+        return None
+    side = "ahead of" if lead_s > 0.0 else "behind"
+    return f"time stamps are {abs(lead_s):.0f} s {side} UTC"
+
+
+def _clock(context: StepContext) -> str | None:
+    """Return how the RTC's clock is wrong; asked of each status, because it comes with its time."""
+    rtc, before = context.rtc, context.alarm_text(alarms.RTC_CLOCK)
+    if rtc is None or rtc is context.before.loop.rtc:
+        return before
+    found = explain_clock((rtc.t_ns - context.now_ns) / SECOND_NS)
+    return found and (before or f"the RTC's {found}")
 
 
 def _other_numbers(context: StepContext) -> str | None:
@@ -171,6 +189,7 @@ def _jump_suspected(context: StepContext) -> str | None:
 RULES: Final[dict[str, Callable[[StepContext], str | None]]] = {
     "stopped": _stopped,
     alarms.LOOP_OPEN: _loop_open,
+    alarms.RTC_CLOCK: _clock,
     "acquisition": _acquisition,
     alarms.NOT_FOUND: _not_found,
     alarms.OTHER_SUM: _other_numbers,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from service.model.misregistration import Misregistration
 from service.model.pointing_law import PointingLaw
-from service.tracking.alarms import Interlock, Severity
+from service.records.alarms import Interlock, Severity
 
 if TYPE_CHECKING:
     from service.wire import Status

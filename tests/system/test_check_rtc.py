@@ -1,14 +1,11 @@
 """``pyrcal check-rtc`` on the simulated RTC: healthy, and with each of its faults."""
 
-import json
-import re
-
 import pytest
 
 from sim_rtc.faults import FaultKind
 from tests.system.cable import free_port
+from tests.system.checker import checked_beside, late_with_the_machine
 from tests.system.night import INSTRUMENT, Process
-from tests.system.pace import slowness
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
 
@@ -53,34 +50,12 @@ def checked(folder, *options, faults=()):
     return checked_beside(folder, lambda at: ["sim_rtc", "--connect", at, *given], *options)
 
 
-def checked_beside(folder, rtc_words, *options):
-    """The same of an RTC that a module and its words start."""
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    words = ["pyrcal", "check-rtc", "--instrument", str(INSTRUMENT), "--listen", endpoint]
-    check = Process("check", [*words, "--json", *options], folder)
-    rtc = Process("rtc", rtc_words(endpoint), folder)
-    try:
-        status = check.ended(90.0)
-    finally:
-        rtc.kill()
-        check.kill()
-    told = json.loads(check.log[check.log.index("{") : check.log.rindex("}") + 1])
-    return status, {one["check"]: one for one in told["checks"]}, check.log
-
-
-def late_with_the_machine(delivery):
-    """Whether a busy machine is why frames came late: the RTC runs on it, too."""
-    late_ms = re.search(r"at most (\d+) ms", delivery["found"])
-    slower = slowness(again=True)
-    return late_ms is not None and slower > 1.2 and int(late_ms[1]) < 500 * slower
-
-
 @pytest.mark.long
 def test_a_healthy_rtc_keeps_the_contract_and_is_told_what_was_moved(tmp_path):
     status, checks, text = checked(tmp_path, "--yes", "--open-loop", "--seconds", "4")
     assert status == 0, text
     assert {name: one for name, one in checks.items() if one["outcome"] != "ok"} == {}
-    assert len(checks) == 26
+    assert len(checks) == 27
     assert "will move: loop: THE LOOP IS OPENED" in text
     assert all(one["where"].startswith("docs/rtc.md#") for one in checks.values())
 

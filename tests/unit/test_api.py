@@ -16,8 +16,6 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from service.archive import Archive
 from service.archive.nights import Annotation
-from service.control.gains import ModeGain
-from service.control.gate import GateVerdict
 from service.errors import (
     ArchiveError,
     CommandError,
@@ -28,10 +26,8 @@ from service.errors import (
 )
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import PARAMETERS, Misregistration
-from service.runtime.command_results import Refits
-from service.runtime.snapshot import Snapshot
-from service.tracking.alarms import ALARMS, Alarm, AlarmRecord, OperatorNote, Severity
-from service.tracking.commands import (
+from service.records.alarms import ALARMS, Alarm, AlarmRecord, OperatorNote, Severity
+from service.records.commands import (
     AbortAcquisition,
     AcknowledgeAlarm,
     Acquire,
@@ -51,20 +47,23 @@ from service.tracking.commands import (
     StopDither,
     UnmuteAlarm,
 )
-from service.tracking.dither_request import Dither, DitherPhase, DitherPlan, DitherPolicyState
-from service.tracking.events import MakeMatrix
-from service.tracking.operation_records import (
+from service.records.events import MakeMatrix
+from service.records.operations import (
     Acquisition,
     AcquisitionStage,
     CommandState,
+    Dither,
+    DitherPhase,
+    DitherPlan,
+    DitherPolicyState,
     LoopCommand,
     MeasurementRecord,
     MeasureState,
 )
-from service.tracking.operations.running import ServiceState
-from service.tracking.products import MatrixState, ModeSet, ReconstructorRecord
-from service.tracking.registration import (
+from service.records.products import GateVerdict, MatrixState, ModeSet, ReconstructorRecord
+from service.records.registration import (
     HistoryEntry,
+    ModeGain,
     PassiveBias,
     PassiveState,
     Registration,
@@ -73,7 +72,10 @@ from service.tracking.registration import (
     Validity,
     ValidityState,
 )
-from service.tracking.state import Level, LogEntry, Mode, TrackerState
+from service.records.state import Level, LogEntry, Mode, TrackerState
+from service.runtime.command_results import Refits
+from service.runtime.snapshot import Snapshot
+from service.tracking.operations.running import ServiceState
 from service.version import software_version
 from service.web.views import to_json
 from service.wire import DitherKind, DitherRequest, DitherStatus, Loop, Pattern, Pointing, Status

@@ -31,7 +31,7 @@ from service.model.pupil import (
     valid_subapertures,
 )
 from service.model.slopes import Orientation
-from service.tracking.state import Mode
+from service.records.state import Mode
 from sim_rtc.telescope.diffractive import build_centred_pupil
 from tests.numerics import SOMEWHERE
 
@@ -1364,7 +1364,10 @@ ARMS = "spiders_m = 0.4\nspiders_deg = [90.0]\n"
         (MAP, np.full((160, 160), np.nan), "found values that are not 0 to 1"),
         (MAP, np.zeros((160, 160)), "found no lit point, expected a pupil of 8 m"),
         (MAP + "pupil_pitch_m = 50.0\n", ring(), "pupil_pitch_m: found 50 m between points"),
-        (MAP + "pupil_pitch_m = 0.03\n", ring(), "found light over 4.8 m along y, expected about"),
+        (MAP + "pupil_pitch_m = 0.03\n", ring(), "along the other: correct pupil_pitch_m"),
+        (MAP, np.pad(ring(80), 40), "light over 4 m along x and 4 m along y, expected about diam"),
+        (MAP, np.pad(ring(80), 40), "along the other: give pupil_pitch_m"),
+        (MAP, ring()[60:100], "found light over 8 m along x and 2 m along y, expected about"),
         (MAP, np.pad(ring(140), ((0, 20), (10, 10))), "m from the centre of the array along y"),
         (MAP, ring(12), "pupil_pitch_m: found 0.667 m between points, expected at most a suba"),
         (MAP + "obscuration_ratio = 0.1\n", ring(), "obscuration_ratio: has no effect"),
@@ -1385,6 +1388,13 @@ def test_a_pupil_that_cannot_be_is_refused_in_one_line(bench, keys, lit, expecte
         bench(keys, lit)
     assert expected in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_the_pupil_of_an_off_axis_telescope_may_be_an_ellipse(bench):
+    u = (np.arange(160) - 79.5) / 80.0
+    ellipse = np.hypot(u, u[:, None] / 0.75) <= 1.0
+    mapped = bench(MAP, ellipse.astype(float))
+    assert mapped.collecting_area_m2 == pytest.approx(0.75 * np.pi * 16.0, rel=3e-3)
 
 
 # --- segmented mirrors of instrument files, and the instruments of the ELT

@@ -206,6 +206,10 @@ class SensorModel(ABC):
         """Return how many pupil points along a subaperture the smoothest shapes need."""
         return 1
 
+    def derivative_sampling(self, sensor: Any) -> int:  # noqa: ANN401 - its own
+        """Return how many pupil points along a subaperture derivatives need, and early steps."""
+        return 2
+
     def find_fitted_key(self, sensor: Any) -> str | None:  # noqa: ANN401 - its own
         """Return the key of a sensor parameter that is fitted together with α, by its logarithm.
 
@@ -292,6 +296,10 @@ class SensorModel(ABC):
             If it has only one image.
         """
         raise ModelError(f"a {self.name}: found several images to be moved, expected a pyramid's")
+
+    def without_image_places(self, instrument: Instrument) -> Instrument | None:
+        """Return the instrument without the places of its pupil images; None if it states none."""
+        return None
 
     def pupil_offset(self, instrument: Instrument) -> tuple[float, float] | None:
         """Return where the instrument file places the pupil's image on the grid, (x, y).

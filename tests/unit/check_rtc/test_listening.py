@@ -75,6 +75,7 @@ DAMAGE = {
     "basis": (every(7, renamed(basis_id="kl-2")), {"ids"}),
     "second": (beside, {"session"}),
     "clock": (lambda h, r: [(replace(h, t0_ns=h.t0_ns + (h.seq0 > 2000) * 10**8), r)], {"clock"}),
+    "hour": (lambda h, r: [(replace(h, t0_ns=h.t0_ns + 3600 * 10**9), r)], {"clock"}),
     "period": (renamed(dt_ns=2 * 10**6), {"frames", "clock"}),
 }
 

@@ -21,10 +21,10 @@ from service.api import create_app
 from service.archive import AuditEntry, Channel
 from service.archive.products import RecordingRecord
 from service.errors import CommandError
-from service.tracking.events import MakeMatrix, MatrixMade
-from service.tracking.operation_records import AcquisitionStage
-from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.state import Mode
+from service.records.events import MakeMatrix, MatrixMade
+from service.records.operations import AcquisitionStage
+from service.records.products import MatrixState, ReconstructorRecord
+from service.records.state import Mode
 from service.web.connections import Server
 from tests.states import changed
 from tests.unit.test_api import MATRIX, SECOND, STATE, FakeService, a_snapshot

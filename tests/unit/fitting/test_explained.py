@@ -13,6 +13,7 @@ import pytest
 
 from pyrcal.fitting import alternatives, instrument_checks, models, pupil_checks
 from pyrcal.fitting.advice import Grounds, recommend_action
+from pyrcal.fitting.control_check import check_control
 from pyrcal.fitting.fit_table import table
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.left_over import LeftOver
@@ -52,6 +53,11 @@ def explained(about, values, **options) -> Fit:
 @cache
 def clean() -> Fit:
     return explained(modal_bench(), modal())
+
+
+def every(values: np.ndarray):
+    """Return the number of each column, and that every row counts."""
+    return np.arange(values.shape[1]), np.ones(len(values), dtype=bool)
 
 
 def named(found: Fit, words: str):
@@ -327,6 +333,15 @@ def test_a_sigma_next_to_what_is_enough_is_said_to_its_third_place():
     assert "known to 0.030 subapertures (1 sigma), 0.03 is enough" in recommend_action(
         known, grounds
     )
+
+
+@pytest.mark.parametrize(("sigma_subap", "action"), [(0.09, "use it"), (0.11, "measure more")])
+def test_a_stable_reconstructor_recommends_no_sigma_beyond_a_tenth(sigma_subap, action):
+    stable = check_control(MODES, MODES, np.ones(MODES.shape[1]), *every(MODES))
+    assert stable.holds
+    known = a_fit(covariance=np.diag([sigma_subap**2, 1e-6, 1e-12, 1e-12]), reconstructor=stable)
+    grounds = Grounds(refusal=None, structure=0.0, n_sets=8)
+    assert recommend_action(known, grounds).startswith(f"{action}: ")
 
 
 def test_too_few_modes_and_too_much_noise_are_reasons_to_measure_more():

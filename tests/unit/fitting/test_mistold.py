@@ -17,10 +17,10 @@ from pyrcal_studies.fft_pyramid import FftPyramid
 from service.errors import ModelError
 from service.estimation.reference import Reference
 from service.instrument.mirrors import grid
-from service.model.instrument import Instrument, Mirror
+from service.model.instrument import Instrument, Mirror, PupilMap
 from service.model.kinds import BasisKind, Influence, InfluenceShape, Stop
 from service.model.misregistration import Misregistration
-from service.model.pupil import lit_subapertures
+from service.model.pupil import instrument_pupil, lit_subapertures
 from service.model.sensors.pyramid.description import Pyramid
 from service.model.slopes import Orientation, SlopeRecipe
 
@@ -29,6 +29,9 @@ TRUTH = Misregistration(
 )
 COUPLING = 0.35
 N, SAMPLING, DIAMETER_M, OBSCURATION, PITCH_M = 12, 4, 3.0, 0.1, 0.25
+ARM_M, ARMS_DEG = 0.2, (40.0, 150.0, 270.0)
+"""Width and directions of the arms of a spider."""
+
 ACTUATORS_M = grid(13, PITCH_M, 3.3)
 MODES = np.linalg.qr(np.random.default_rng(5).normal(size=(len(ACTUATORS_M), 60)))[0]
 """A user's own combinations of actuators."""
@@ -61,7 +64,9 @@ def modulated(radius: float) -> Instrument:
 
 @cache
 def zonal(
-    truth: Misregistration = TRUTH, pupil_subap: tuple[float, float] = (0.0, 0.0)
+    truth: Misregistration = TRUTH,
+    pupil_subap: tuple[float, float] = (0.0, 0.0),
+    arms_deg: tuple[float, ...] = (),
 ) -> np.ndarray:
     """Every actuator pushed where the truth puts it, ``(n_slopes, n_actuators)``."""
     n = N * SAMPLING
@@ -69,6 +74,10 @@ def zonal(
     off_x, off_y = np.array(pupil_subap) * 2.0 / N
     radius = np.hypot(fine - off_x, (fine - off_y)[:, None])
     lit = (radius <= 1.0) & (radius >= OBSCURATION)
+    for angle in np.deg2rad(arms_deg):
+        along = np.cos(angle) * fine + np.sin(angle) * fine[:, None]
+        across = np.cos(angle) * fine[:, None] - np.sin(angle) * fine
+        lit &= (along < 0.0) | (np.abs(across) > ARM_M / DIAMETER_M)
     pyramid = FftPyramid(
         amplitude=lit.reshape(n, 8, n, 8).mean(axis=(1, 3)),
         sampling=SAMPLING,
@@ -131,6 +140,60 @@ def test_four_modes_and_nine_say_the_same_of_a_modulation():
         found = fitted(about, zonal() @ strokes)
         assert found.accepted, found.verdict
         assert np.all(sigmas_off(found) < 3.0)
+
+
+def with_arms(**changes) -> Instrument:
+    about = replace(bench(), spiders_m=ARM_M, spiders_deg=ARMS_DEG)
+    wfs = replace(about.wfs, valid_subapertures=lit_subapertures(bench()))
+    return replace(about, wfs=wfs, **changes)
+
+
+@pytest.mark.parametrize("turn", [-8.0, 0.0, 2.0])
+def test_arms_of_the_file_are_questioned(turn):
+    """Arms turned by 2 deg turn a registration by 0.03 deg."""
+    about = with_arms(spiders_deg=tuple(angle + turn for angle in ARMS_DEG))
+    found = fitted(about, zonal(arms_deg=ARMS_DEG))
+    assert np.all(sigmas_off(found) < 3.0)
+    assert found.accepted == (turn == 0.0)
+    tried = {one.words: one for one in found.alternatives if one.preferred}
+    named = [words for words in tried if words.startswith("spiders_deg")]
+    assert len(named) == (turn != 0.0)
+    for words in named:
+        angles = re.findall(r"[\d.]+", words)
+        assert np.array(angles, float) == pytest.approx(ARMS_DEG, abs=0.5)
+        assert words in found.recommendation
+
+
+@pytest.mark.parametrize("ratio", [0.5, 2.0])
+def test_width_of_the_arms_of_the_file_is_questioned(ratio):
+    found = fitted(with_arms(spiders_m=ratio * ARM_M), zonal(arms_deg=ARMS_DEG))
+    assert np.all(sigmas_off(found) < 3.0)
+    (width,) = (one for one in found.alternatives if one.key.startswith("spiders_m"))
+    assert width.preferred
+    assert float(width.words.split()[-1]) == pytest.approx(ARM_M, rel=0.1)
+
+
+def test_a_file_of_arms_that_do_not_exist_is_questioned():
+    found = fitted(with_arms())
+    assert np.all(sigmas_off(found) < 3.0)
+    assert "no spider" in {one.words for one in found.alternatives if one.preferred}
+
+
+@pytest.mark.parametrize(
+    ("quarters", "turn_deg", "named"),
+    [(0, 0.0, ""), (2, 0.0, "turned by 180 deg"), (0, 5.0, "turned by -5"), (3, 0.0, "by 270 deg")],
+)
+def test_a_pupil_map_turned_the_wrong_way_is_named(quarters, turn_deg, named):
+    arms = with_arms(spiders_deg=tuple(angle + turn_deg for angle in ARMS_DEG))
+    lit = np.rot90(instrument_pupil(arms, 8).amplitude, quarters)
+    pupil = PupilMap(lit=lit, pitch_m=DIAMETER_M / N / 8)
+    about = with_arms(spiders_m=None, spiders_deg=(), obscuration_ratio=0.0, pupil=pupil)
+    found = fitted(about, zonal(arms_deg=ARMS_DEG))
+    assert np.all(sigmas_off(found) < 3.0)
+    words = [one.words for one in found.alternatives if one.preferred and "map" in one.words]
+    assert len(words) == bool(named)
+    assert all(named in one for one in words), words
+    assert named in found.recommendation
 
 
 def test_a_wavelength_told_wrong_is_named_and_moves_nothing():

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from pyrcal.fitting.matrix import FitOptions
+from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.model.pupil import Illumination
-from tests.numerics import small_instrument
+from tests.numerics import small_basis, small_instrument
 from tests.unit.estimation.bench import (
     ELSEWHERE,
     error,
@@ -37,6 +38,39 @@ def test_a_wrong_stop_is_recognised_and_the_right_one_named(true, assumed):
         np.testing.assert_allclose(places, found.alpha.vector[:2], atol=0.01)
     else:
         assert f'stop = "{true}"' in found.verdict + found.recommendation
+
+
+def own_matrix(about, alpha=ELSEWHERE):
+    """D on the grid of the fit itself, without noise."""
+    model = InteractionModel(about, small_basis(), pupil_sampling=3, detector_nodes=3)
+    return model.interaction_matrix(alpha).astype(np.float64)
+
+
+def test_an_own_matrix_with_a_modulation_wide_for_its_subapertures_is_fitted_exactly():
+    """Two points a subaperture alias from about 5 λ/D on: the derivatives take three."""
+    about = changed(modulation_lambda_over_d=7.0)
+    found = fit(own_matrix(about), about, options=EXPLAIN)
+    assert found.accepted, found.verdict
+    assert found.residual_fraction < 1e-4
+    assert np.all(np.abs(error(found)) < 1e-5)
+    (modulation,) = (one.found for one in found.optics if "modulation" in one.key)
+    assert modulation == pytest.approx(7.0, rel=1e-4)
+
+
+@pytest.mark.parametrize(("shift_subap", "accepted"), [(0.06, True), (0.15, False)])
+def test_a_wrong_stop_refuses_only_if_it_moves_the_mirror_at_the_pupils_edge(shift_subap, accepted):
+    alpha = replace(ELSEWHERE, shift_x_subap=shift_subap, shift_y_subap=0.0)
+    found = fit(
+        own_matrix(replace(instrument(), stop=Stop.TELESCOPE), alpha),
+        replace(instrument(), stop=Stop.MIRROR),
+        options=EXPLAIN,
+    )
+    (other,) = (one for one in found.alternatives if one.words == 'stop = "telescope"')
+    assert other.preferred
+    assert found.accepted is accepted, found.verdict
+    assert 'stop = "telescope"' in found.recommendation
+    assert "centre" not in found.recommendation, "with the mirror as stop nothing can be centred"
+    assert not accepted or np.all(np.abs(error(found, alpha)) < found.sigma)
 
 
 def test_a_modulation_is_found_beside_uneven_light():

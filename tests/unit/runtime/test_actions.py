@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.errors import ArchiveError, CommandError, LinkError, UnknownIdError
+from service.errors import ArchiveError, CommandError, LinkError, StorageError, UnknownIdError
 from service.model.misregistration import Misregistration
-from service.tracking import events as ev
-from service.tracking.products import MatrixState, ReconstructorRecord
+from service.records import events as ev
+from service.records.products import MatrixState, ReconstructorRecord
 from service.wire import (
     DitherKind,
     DitherRequest,
@@ -144,6 +144,19 @@ async def test_a_copy_has_the_same_numbers_a_new_id_and_a_new_verdict(actions, a
     np.testing.assert_array_equal(
         archive.reconstructors.matrix(copy.id), archive.reconstructors.matrix(source.id)
     )
+
+
+async def test_a_copy_of_an_earlier_matrix_needs_no_disk(actions, archive, monkeypatch):
+    source, state = await made(actions)
+
+    def refuse(*_):
+        raise StorageError("full")
+
+    monkeypatch.setattr(archive.reconstructors, "store", refuse)
+    copy = (await actions.perform(ev.RepublishMatrix(source=source.id, why="back"), state)).record
+    np.testing.assert_array_equal(actions.matrix(copy.id), actions.matrix(source.id))
+    with pytest.raises(StorageError):
+        await made(actions)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,8 @@
 import asyncio
 import contextlib
 import resource
+import shutil
+import socket
 import threading
 import time
 from dataclasses import replace
@@ -12,15 +14,16 @@ import numpy as np
 import pytest
 
 from service.archive import Actor, AuditEntry, Channel, Range
-from service.errors import ArchiveError, CommandError, PyrcalError
+from service.errors import ArchiveError, CommandError, PyrcalError, UnknownIdError
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.state import Level, LogEntry, Mode, TrackerState
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime import supervisor as supervising
 from service.runtime.archiving import restore_tracking
 from service.runtime.engine import follow_state
 from service.runtime.supervisor import Supervisor
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.state import Level, LogEntry, Mode, TrackerState
+from service.wire import checksum
 from tests.states import changed, tracker_state
 from tests.system.cable import free_port
 from tests.system.fake_rtc import client_session
@@ -41,6 +44,10 @@ def bridge():
 
 @pytest.fixture
 def supervisor(workers, archive, bridge, actions):
+    return supervisor_of(workers, archive, bridge, actions)
+
+
+def supervisor_of(workers, archive, bridge, actions):
     return Supervisor(
         state=tracker_state(system="small", mode=Mode.HOLD),
         policy=replace(POLICY),
@@ -451,6 +458,47 @@ async def test_an_order_that_cannot_be_recorded_is_not_carried_out(supervisor, a
     assert names == ["SetMode", "SetMode.refused", "SetMode", "SetMode.answered"]
 
 
+@pytest.mark.parametrize(
+    "order",
+    [
+        cmd.SetMode(mode=Mode.HOLD),
+        cmd.StopDither(),
+        cmd.StopEverything(),
+        cmd.SetLoop(loop="open"),
+        cmd.Rollback(anyway=True),
+        cmd.AbortAcquisition(),
+    ],
+)
+async def test_what_makes_the_loop_safer_needs_no_disk(supervisor, archive, impatient, order):
+    """It is carried out, or refused for what the RTC says, and on record once the disk is back."""
+    async with running(supervisor):
+        know(supervisor, mode=Mode.AUTO)
+        with full_disk(archive):
+            with contextlib.suppress(CommandError, UnknownIdError):
+                await supervisor.submit(order)
+            state = supervisor.snapshot().tracker
+            done = state.operator.mode is Mode.HOLD or bool(state.operator.stopped_because)
+            assert done or not isinstance(order, cmd.SetMode | cmd.StopEverything)
+            await until(lambda: alarm_of(supervisor, "archive-failed"))
+        await until(lambda: alarm_of(supervisor, "archive-failed") is None)
+    kind = type(order).__name__
+    names = [name for name, _ in trail(archive, "operator")]
+    assert names[0] == kind
+    assert names[1] in {f"{kind}.answered", f"{kind}.refused"}
+
+
+async def test_a_data_directory_that_is_gone_is_called_so(supervisor, archive, impatient):
+    async with running(supervisor):
+        shutil.move(archive.directory, f"{archive.directory}-elsewhere")
+        with contextlib.suppress(ArchiveError):
+            await supervisor.submit(cmd.SetMode(mode=Mode.AUTO))
+        await until(lambda: alarm_of(supervisor, "archive-failed"))
+        text = alarm_of(supervisor, "archive-failed").text
+        shutil.move(f"{archive.directory}-elsewhere", archive.directory)
+    assert "data_dir is gone" in text
+    assert "free space" not in text
+
+
 async def test_what_could_not_be_written_is_written_once_it_can_be_and_only_once(
     supervisor, archive, impatient
 ):
@@ -496,9 +544,11 @@ async def test_a_service_that_ends_while_the_disk_refuses_still_writes_what_wait
     assert ("note", "last words") in trail(archive, "service")
 
 
+@pytest.mark.parametrize(("parent", "is_sent"), [(None, False), ("cm-0", False), ("cm-2", True)])
 async def test_a_matrix_is_not_sent_while_it_cannot_be_recorded_why(
-    supervisor, archive, bridge, monkeypatch, impatient
+    supervisor, archive, bridge, monkeypatch, impatient, parent, is_sent
 ):
+    """But for the numbers of an earlier one, which take back what made the loop worse."""
     sent = []
 
     async def publish(manifest, _matrix):
@@ -506,17 +556,19 @@ async def test_a_matrix_is_not_sent_while_it_cannot_be_recorded_why(
 
     monkeypatch.setattr(bridge, "publish", publish)
     matrix = np.zeros((3, 4), np.float32)
-    archive.reconstructors.store(record("cm-1", n_modes=3), matrix, None, {})
+    new = record("cm-1", n_modes=3, sha256=checksum(matrix), parent=parent)
+    archive.reconstructors.store(new, matrix, None, {})
     story = Story(Mode.HOLD).meet()
-    known = changed(story.state, reconstructors=(record("cm-1", n_modes=3),))
+    earlier = record("cm-0", sha256="b" * 64), record("cm-2", sha256=new.sha256)
+    known = changed(story.state, reconstructors=(*earlier, new))
     supervisor._engine.state = known
     effect = ev.SendMatrix(id="cm-1", n_modes=known.loop.rtc.n_controlled, gains=None)
     with full_disk(archive):
         supervisor._post(ev.LogEvent(name="why", text="it is sent"))
         await supervisor._do(effect, known)
-        assert sent == []
+        assert sent == ["cm-1"] * is_sent
     await supervisor._do(effect, known)
-    assert sent == ["cm-1"]
+    assert sent[-1:] == ["cm-1"]
 
 
 async def test_a_matrix_that_cannot_be_stored_is_never_heard_of_and_the_disk_is_named(
@@ -611,6 +663,31 @@ async def test_a_token_without_a_message_has_the_link_opened_anew_and_is_told(
             await until(lambda: bridge.statistics().rtc_alive)
             token.undeclare()
             await until(lambda: not bridge.statistics().rtc_alive)
+
+
+async def test_a_link_whose_port_is_taken_is_opened_once_it_is_free(workers, archive, actions):
+    port = free_port()
+    bridge = Bridge(Endpoint(system="small", listen=(f"tcp/127.0.0.1:{port}",)))
+    supervisor = supervisor_of(workers, archive, bridge, actions)
+    with socket.create_server(("127.0.0.1", port)):
+        task = asyncio.create_task(supervisor.run())
+
+        def waits():
+            return {wait.name: wait for wait in supervisor.snapshot().waiting_for}
+
+        await until(lambda: "already in use" in waits()["link"].text, 15.0)
+        # REST and the ticks go on meanwhile
+        await until(lambda: "model" not in waits(), 30.0)
+        assert not supervisor.snapshot().ready
+        log = [entry.name for entry in supervisor.snapshot().tracker.log]
+        assert log.count("link.waiting") == 1
+        assert "rtc-vanished" not in log
+    await until(lambda: supervisor.snapshot().ready, 15.0)
+    assert not bridge.statistics().missing
+    task.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await task
+    bridge.close()
 
 
 async def test_a_window_waits_until_the_rtcs_own_matrix_has_been_read(supervisor, monkeypatch):

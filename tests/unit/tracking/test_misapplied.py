@@ -6,13 +6,13 @@ import pytest
 
 from service.errors import CommandError
 from service.estimation.comparison import ProbationFinding, Verdict
-from service.tracking import alarms
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.operation_records import AcquisitionStage, ProbationState
+from service.records import alarms
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.operations import AcquisitionStage, ProbationState
+from service.records.products import MatrixState
+from service.records.state import Mode
 from service.tracking.operations import acquisition
-from service.tracking.products import MatrixState
-from service.tracking.state import Mode
 from service.tracking.step_context import StepContext
 from service.wire import Loop, LoopRequest
 from tests.states import changed

@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError
-from service.tracking import commands as cmd
-from service.tracking import events as ev
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.products import MatrixState
+from service.records.state import Level, Mode
 from service.tracking.dither_request import DEFAULT_DURATION_S
-from service.tracking.products import MatrixState
-from service.tracking.state import Level, Mode
 from service.wire import DitherRequest
 from tests.states import changed
 from tests.unit.tracking.situations import (
+    SECOND,
     Story,
     dither_answered,
     of_kind,
@@ -81,6 +82,28 @@ def test_an_open_loop_is_an_alarm_until_it_is_closed(story):
     assert "loop-open" in story.alarms
     story.tell(rtc())
     assert "loop-open" not in story.alarms
+
+
+@pytest.mark.parametrize(
+    ("lead_s", "words"),
+    [
+        (3600, "3600 s ahead of UTC"),
+        (-3600, "3600 s behind UTC"),
+        (37, "37 s ahead of UTC"),
+        (18, "18 s ahead of UTC"),
+        (1234, "1234 s ahead of UTC"),
+        (4, None),
+        (-500, None),
+    ],
+)
+def test_an_rtc_whose_clock_is_not_utc_raises_one_alarm_until_it_is(story, lead_s, words):
+    for seconds in (0.0, 0.3):
+        t_ns = story.now_ns + round((lead_s + seconds) * SECOND)
+        story.tell(rtc(t_ns=t_ns, seq=int(10 * seconds)))
+    text = story.state.alarm("rtc-clock")
+    assert (text and text.text.removeprefix("the RTC's time stamps are ")) == words
+    story.tell(rtc(t_ns=story.now_ns + 1, seq=9))
+    assert "rtc-clock" not in story.alarms
 
 
 def test_a_status_tells_which_matrix_is_in_use_even_when_its_acknowledgement_was_lost(story):

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.estimation.estimate import PassiveEstimate
 from service.estimation.loop import loop_numbers
 from service.model.misregistration import Misregistration
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.registration import Source, Validity
-from service.tracking.state import Mode, TrackerState
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.estimates import PassiveEstimate
+from service.records.registration import Source, Validity
+from service.records.state import Mode, TrackerState
 from service.tracking.window_processing import fit_begins_at
 from tests.states import changed
 from tests.unit.tracking.situations import (
@@ -40,8 +40,9 @@ def watched(alpha, scatter=SCATTER):
 def watch(story, alpha, after_s=10.0, scatter=SCATTER):
     """A look of the watchdog; the RTC's clock tells when."""
     now_ns = story.now_ns + round(after_s * SECOND)
-    story.tell(rtc(t_ns=now_ns))
-    return story.tell(ev.PassiveFitted(estimate=watched(alpha, scatter), t_ns_utc=now_ns), after_s)
+    effects = story.tell(rtc(t_ns=now_ns), after_s)
+    look = ev.PassiveFitted(estimate=watched(alpha, scatter), t_ns_utc=now_ns)
+    return effects + story.tell(look)
 
 
 @pytest.fixture

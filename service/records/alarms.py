@@ -17,6 +17,7 @@ import msgspec
 
 VANISHED = "rtc-vanished"
 LOOP_OPEN = "loop-open"
+RTC_CLOCK = "rtc-clock"
 SECOND_RTC = "second-rtc"
 OTHER_BASIS = "basis-mismatch"
 OTHER_INSTRUMENT = "instrument-mismatch"
@@ -52,9 +53,11 @@ STANDING_BY = "standing-by"
 FRAMES_UNUSED = "frames-unused"
 FRAMES_LOST = "frames-lost"
 NO_FRAMES = "no-frames"
+TELEMETRY_OLD = "telemetry-old"
 CLOCK_LEAPT = "clock-leapt"
 NOT_RESTORED = "alpha-not-restored"
 LINK_FLOODED = "link-flooded"
+REST_CROWDED = "rest-crowded"
 LINK_REFUSED = "link-refused"
 CERTIFICATE_ENDING = "certificate-ending"
 WINDOWS_REFUSED = "windows-refused"
@@ -128,6 +131,9 @@ class Responsible(StrEnum):
 
     SERVICE = "service"
     """Another one, of the same system."""
+
+    NETWORK = "network"
+    """Whoever starts routers, addresses and names, or has the port."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,9 +15,9 @@ from typing_extensions import override
 
 from service.errors import shown
 from service.files import MAX_MODES
-from service.tracking.alarms import Severity
-from service.tracking.products import ModeSet
-from service.tracking.state import Mode
+from service.records.alarms import Severity
+from service.records.products import ModeSet
+from service.records.state import Mode
 from service.wire import DitherKind, Pattern
 
 MAX_SINES = 64
@@ -492,3 +492,13 @@ def _none_twice(groups: tuple[ModeGroup, ...]) -> None:
     for before, after in pairwise(sorted((group.first, group.last) for group in groups)):
         if after[0] <= before[1]:
             raise ValueError(f"no mode in two groups: mode {after[0]} is")
+
+
+def makes_safer(command: Command) -> bool:
+    """Return True if an order ends something or takes it back: it must not wait for the disk."""
+    if isinstance(command, SetLoop):
+        return command.loop == "open"
+    if isinstance(command, SetMode):
+        return command.mode is Mode.HOLD
+    enders = StopEverything | StopDither | Rollback | AbortAcquisition | GiveUp | Reject
+    return isinstance(command, enders)

@@ -117,6 +117,16 @@ class SensorModel(ABC):
         """
         return instrument, ()
 
+    def measure_image_offsets(self, instrument: Instrument, light: Array) -> Array | CannotTell:
+        """Return the displacement (x, y) of each pupil image in its light, ``(4, 2)`` subapertures.
+
+        Raises
+        ------
+        ModelError
+            If the light is not that of this sensor.
+        """
+        return CannotTell(reason=f"a {self.name} has no pupil images to be located")
+
     def is_weakly_modulated(self, sensor: Any) -> bool:  # noqa: ANN401 - its own
         """Return whether a modulation is so narrow that models of the focus differ."""
         return False

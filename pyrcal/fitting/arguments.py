@@ -254,7 +254,7 @@ def _describe_fit(fit: OneLineParser) -> None:
     add(
         fit,
         _INSTRUMENT,
-        words("reference REFERENCE", "HDF5, FITS or NumPy file", type=Path),
+        words("reference REFERENCE", "HDF5, FITS, NumPy or MATLAB file", type=Path),
         words("--dataset NAME", "dataset of the matrix, default interaction_matrix"),
         words("--method", methods, choices=("joint", "paper", "sensitivity"), default="joint"),
         words("--modes FIRST:END", modes, type=_read_by(parse_modes)),
@@ -366,7 +366,7 @@ def _describe_conventions(check: OneLineParser) -> None:
     add(
         check,
         _INSTRUMENT,
-        words("reference REFERENCE", "HDF5, FITS or NumPy file", type=Path),
+        words("reference REFERENCE", "HDF5, FITS, NumPy or MATLAB file", type=Path),
         words("--dataset NAME", "dataset of the matrix, default interaction_matrix"),
     )
 
@@ -382,6 +382,7 @@ def _describe_instrument(instrument: OneLineParser) -> None:
         "--kind KIND", "kind of sensor, default pyramid", choices=tuple(KINDS), default="pyramid"
     )
     memory = "compute the matrix only if that takes no more, default %(default)g"
+    light = words("--light FRAME", "mean frame of the pupil images: print their places", type=Path)
     new = words("file FILE.toml", "file to write", type=Path)
     picture = words("picture PICTURE.png", "picture to write", type=Path)
     actions = instrument.add_subparsers(dest="action", required=True, metavar="COMMAND")
@@ -390,7 +391,7 @@ def _describe_instrument(instrument: OneLineParser) -> None:
         (
             "check",
             "print all errors of the file, and what follows from it",
-            (_INSTRUMENT, words("--memory-gb GB", memory, type=float, default=4.0)),
+            (_INSTRUMENT, words("--memory-gb GB", memory, type=float, default=4.0), light),
             "check bench.toml",
         ),
         (

@@ -318,6 +318,16 @@ class Registration:
         return np.sqrt(np.diag(self.total_covariance))
 
     @property
+    def tracking_sigma(self) -> Array:
+        """``(4,)`` 1 σ of changes of α now: without the model error, the same for every window.
+
+        Limits of age apply to it. The model error is neither age nor reduced by a window: it
+        includes unknown places of pupil images, a coarse mirror and what windows leave unexplained.
+        Whether a loop is safe with it is decided by the stability gate, which examines α ± 3σ.
+        """
+        return np.sqrt(np.diag(self.covariance) + self.grown)
+
+    @property
     def shown_covariance(self) -> Array:
         """``(4, 4)`` covariance of the error of α now, unstated places of images included."""
         return self.total_covariance + np.diag(self.image_floor**2)

@@ -22,6 +22,9 @@ from service.tracking.policy import Policy
 from service.tracking.reconstructors import check_return
 from service.wire import Status
 
+IMAGES_LIMIT = "measure the places of the pupil images: pyrcal instrument check FILE --light FRAME"
+"""Remedy where the places of the pupil images are most of the variance of α."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerLoad:
@@ -209,6 +212,12 @@ class Alpha:
         """1 σ of both numbers of α's anamorphosis; null: it is not followed."""
         known = self.registration.stretches
         return None if known is None else tuple(known.sigma.tolist())
+
+    @property
+    def sigma_limit(self) -> str | None:
+        """What limits sigma and can be measured, with the remedy; null: nothing is known to."""
+        images = self.snapshot.policy.image_sigma
+        return IMAGES_LIMIT if np.any(images > self.registration.shown_sigma / np.sqrt(2)) else None
 
     @property
     def age_s(self) -> float:

@@ -240,7 +240,7 @@ def _validity_of(context: StepContext, registration: Registration) -> ValiditySt
     # A doubt of the watchdog may have replaced that of the law.
     if registration.doubt == LEAPT or (registration.doubt and context.alpha.law.leap is not None):
         return ValidityState(level=Validity.PREDICTED, reason=LEAPT)
-    sigma, before = sigma_beyond_floor(registration), context.before.alpha.registration
+    sigma, before = registration.tracking_sigma, context.before.alpha.registration
     limit = policy.stale_sigma
     if registration.n_windows == 0:
         return ValidityState(level=Validity.STALE, reason="no window has confirmed it yet")
@@ -270,20 +270,10 @@ def _explain_invalidity(
     # With a pointing law α follows the slew.
     if moved_deg > policy.slew_limit_deg and registration.nominal is None:
         return f"the telescope has moved by {moved_deg:.0f} deg since the last dithered window"
-    sigma = sigma_beyond_floor(registration)
+    sigma = registration.tracking_sigma
     if np.any(sigma > policy.useless_sigma):
         return _worst(sigma, policy.useless_sigma)
     return None
-
-
-def sigma_beyond_floor(registration: Registration) -> Array:
-    """Return 1 σ of α now ``(4,)`` without the model error, which is what limits of age apply to.
-
-    The model error is neither age nor reduced by a window: it includes unknown places of pupil
-    images, a coarse mirror and what windows leave unexplained. Whether a loop is safe with it is
-    decided by the stability gate, which examines α ± 3σ.
-    """
-    return np.sqrt(np.diag(registration.covariance) + registration.grown)
 
 
 def _worst(sigma: Array, limit: Array) -> str:

@@ -312,6 +312,7 @@ def _of_registration(snapshot: Snapshot) -> Iterator[Metric]:
     for name, text, four in (
         ("alpha", "Registration", registration.alpha.vector),
         ("alpha_sigma", "1 sigma, floor included", registration.shown_sigma),
+        ("alpha_tracking_sigma", "1 sigma of changes", registration.tracking_sigma),
     ):
         for parameter, value in zip(_ALPHA, four.tolist(), strict=True):
             yield _gauge(f"{name}_{parameter}", text, value)

@@ -307,7 +307,8 @@ define_view(
 ALPHA = define_view(
     "AlphaView",
     Alpha,
-    "registration.alpha sigma=registration.shown_sigma anamorphosis_sigma registration.floor "
+    "registration.alpha sigma=registration.shown_sigma registration.tracking_sigma sigma_limit "
+    "anamorphosis_sigma registration.floor "
     "covariance parameters "
     "registration.t_ns_utc age_s window_age_s "
     "registration.n_windows validity=registration.validity.level "

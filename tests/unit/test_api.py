@@ -316,6 +316,8 @@ async def test_alpha_leaves_in_the_units_of_its_names(client):
         {"shift_x_subap": 0.2, "shift_y_subap": -0.1, "rotation_deg": 0.3, "magnification": 1.005}
     )
     assert body["sigma"]["rotation_deg"] == pytest.approx(np.hypot(0.03, 0.005))
+    assert body["tracking_sigma"]["rotation_deg"] == pytest.approx(0.03)
+    assert body["sigma_limit"] is None
     assert body["floor"]["rotation_deg"] == pytest.approx(0.005)
     assert body["parameters"] == list(PARAMETERS)
     covariance = np.array(body["covariance"])
@@ -381,6 +383,21 @@ def test_an_acquisition_is_shown_with_its_stage_and_what_it_found_in_degrees():
     assert (shown["stage"], shown["under_way"], shown["n_attempts"]) == ("confirming", True, 1)
     assert shown["alpha"]["rotation_deg"] == pytest.approx(0.3)
     assert to_json(Acquisition())["alpha"] is None
+
+
+@pytest.mark.parametrize(("image_sigma", "limited"), [(0.008, False), (0.0375, True)])
+async def test_places_of_images_that_limit_sigma_are_named_with_the_command(
+    client, service, image_sigma, limited
+):
+    places = np.array([image_sigma, image_sigma, 0.0, 0.0])
+    known = replace(STATE.alpha.registration, image_floor=places)
+    policy = replace(service.now.policy, image_sigma=places)
+    state = changed(STATE, registration=known)
+    service.now = replace(service.now, tracker=state, policy=policy)
+    body = await body_of(client, "/v1/alpha")
+    assert body["tracking_sigma"]["shift_x_subap"] == pytest.approx(SIGMA[0])
+    assert body["sigma"]["shift_x_subap"] > image_sigma
+    assert ("--light FRAME" in (body["sigma_limit"] or "")) is limited
 
 
 async def test_a_reading_that_cannot_tell_has_no_sigma(client, service):
@@ -884,6 +901,7 @@ async def test_metrics_show_what_the_service_knows(client):
     assert found["alpha_sigma_rotation_radians",] == pytest.approx(
         np.deg2rad(np.hypot(0.03, 0.005))
     )
+    assert found["alpha_tracking_sigma_rotation_radians",] == pytest.approx(np.deg2rad(0.03))
     assert found["alpha_shift_x_subapertures",] == 0.2
     assert found["alpha_age_seconds",] == 10.0
     assert found["optical_gain_ratio",] == 0.6

@@ -308,7 +308,7 @@ def test_every_command_that_reads_prints_its_answer():
 
 def test_every_screen_is_there_and_json_is_what_rest_answers(capsys, service):
     for words, part in (
-        (["alpha"], "shift x       +0.2000 ± 0.0104 subap"),
+        (["alpha"], "shift x       +0.2000 ± 0.0104 subap, changes ± 0.0100"),
         (["reconstructors", "list"], "cm-1   proposed    400 modes"),
         (["reconstructors", "show", "in-use"], "rtc-0: applied"),
         (["alarms", "list"], "no status: look at it"),

@@ -20,7 +20,7 @@ from service.model.sensors.pyramid.light import PyramidLight
 from service.model.sensors.pyramid.optics import PyramidOptics, enough_modulation_points
 from service.model.sensors.pyramid.table import IMAGE_KEY, PyramidMode, PyramidNumbers, PyramidTable
 from service.model.sensors.pyramid.working_point import Halo
-from service.model.sensors.sensor import Fineness, WorkingPoint
+from service.model.sensors.sensor import CannotTell, Fineness, WorkingPoint
 from service.model.slopes import SlopeRecipe
 
 Array = NDArray[np.float64]
@@ -163,6 +163,10 @@ class PyramidModel(SensorModel):
         self, instrument: Instrument, flux_frame: NDArray[Any]
     ) -> tuple[Instrument, tuple[str, ...]]:
         return detector_windows.locate_images(instrument, flux_frame)
+
+    @override
+    def measure_image_offsets(self, instrument: Instrument, light: Array) -> Array | CannotTell:
+        return detector_windows.measure_image_offsets(instrument, light)
 
     @override
     def image_centres(self, instrument: Instrument, flux_frame: NDArray[Any]) -> Array | None:
@@ -323,7 +327,7 @@ class PyramidModel(SensorModel):
     def pupil_offset(self, instrument: Instrument) -> tuple[float, float] | None:
         turned = description.stated_offsets(instrument)
         if turned is None:
-            return None
+            return super().pupil_offset(instrument)
         x, y = turned.mean(axis=(0, 1))
         return float(x), float(y)
 

@@ -35,6 +35,9 @@ ORDER_CORRELATION_RATIO = 1.3
 NOISE_GAIN = 0.2
 """Gain of a column over the median, either way, within which the column may hold noise only."""
 
+WEAK_COLUMN = 0.7
+"""Largest size of such a column, over the expected one."""
+
 MAX_NOISE_SHARE = 0.25
 """Largest share of columns with such a gain; more of them are the columns of another basis."""
 
@@ -65,8 +68,8 @@ def find_noise_columns(solution: Solution, target: Target, n_planes: int) -> NDA
 
     Such a column has nothing in common with its model, and its neighbouring subapertures are
     uncorrelated. A column of another mode, or of another basis, is smooth. So is the noise of
-    vibration and turbulence: a smooth column counts as noise if its gain is near 0, unless it is
-    that of another mode or many columns are like it.
+    vibration and turbulence: a smooth column counts as noise if it is weak and its gain near 0,
+    unless it is that of another mode or many columns are like it.
     """
     # unit columns: squares of a value such as 1e200, read from a damaged file, would overflow
     measured = _unit(np.where(target.rows[:, None], target.matrix, 0.0))
@@ -75,9 +78,13 @@ def find_noise_columns(solution: Solution, target: Target, n_planes: int) -> NDA
     # The correlation of noise with any pattern scatters by one over the root of the number of
     # slopes.
     unlike = alike < CHANCE_SIGMA / np.sqrt(target.rows.sum())
-    gains = solution.projection.gains
+    gains, middle = solution.projection.gains, float(np.abs(np.median(solution.projection.gains)))
+    size = np.linalg.norm(target.matrix[target.rows], axis=0)
+    expected = np.linalg.norm(solution.matrix[target.rows], axis=0) * middle
     found = np.asarray(
-        (np.abs(gains) < NOISE_GAIN * np.abs(np.median(gains)))
+        (np.abs(gains) < NOISE_GAIN * middle)
+        # The columns of actuators that are listed one place off are as strong as others.
+        & (size < WEAK_COLUMN * expected)
         & (alike < OWN_MODE_CORRELATION)
         & (every.max(axis=1) < OTHER_MODE_CORRELATION)
     )

@@ -37,6 +37,7 @@ from service.estimation.random_dither import RandomDither, RandomPlan
 from service.estimation.windows import ClosedLoop
 from service.instrument import load_instrument
 from service.model.modes import karhunen_loeve_basis
+from service.records.operations import Dither
 from service.runtime.estimator_bank import (
     EstimatorBank,
     process_block,
@@ -44,7 +45,6 @@ from service.runtime.estimator_bank import (
     with_matrix,
     with_rtc,
 )
-from service.tracking.dither_request import Dither
 from service.wire import DitherKind, DitherRequest, Loop, Status
 
 N_SLOPES, N_MODES, N_CONTROLLED = 1408, 594, 400

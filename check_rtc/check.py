@@ -24,9 +24,9 @@ from check_rtc.telemetry_checks import ImageOffsets
 from check_rtc.watch import TelemetryObserver
 from service.config.link_tables import ZenohTable, link_security, read_link_tables
 from service.errors import ConfigurationError, LinkError, ModelError, say, shown
-from service.estimation.lockin import LockInEstimate, Spectra
+from service.estimation.lockin import Spectra
 from service.estimation.slope_convention import SlopeConvention, identify_from_reconstructor
-from service.estimation.windows import ClosedLoop, WindowRefused
+from service.estimation.windows import ClosedLoop
 from service.files.disk_cache import DiskCache, usual_folder
 from service.instrument import load_instrument, packaged_instrument
 from service.link.session import Endpoint
@@ -35,6 +35,7 @@ from service.model.interaction import RtcInteractionModel
 from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import CannotTell
 from service.model.slopes import likely_kind
+from service.records.estimates import LockInEstimate, WindowRefused
 
 if TYPE_CHECKING:
     from service.runtime.worker import OpticsWorker

@@ -574,7 +574,10 @@ def _measure_transfer(
         return np.asarray(np.sum(phasors * (columns - columns.mean(axis=0)), axis=0))
 
     moved = at(commands_m, 0.0)
-    # Slopes see commands and turbulence. What exceeds the commands is turbulence and noise.
-    sides = np.stack([at(responses_m - commands_m, shift) for shift in _NOISE_BINS])
-    noise = np.sqrt(np.mean(np.abs(sides) ** 2, axis=0)) / np.abs(moved)
+    # Slopes see commands and turbulence. What exceeds the commands is turbulence and noise, also
+    # where the slopes are turned.
+    sides = [
+        [at(responses_m - sign * commands_m, shift) for shift in _NOISE_BINS] for sign in (1, -1)
+    ]
+    noise = np.sqrt(np.mean(np.abs(sides) ** 2, axis=1)).min(axis=0) / np.abs(moved)
     return at(responses_m, 0.0) / moved, noise

@@ -34,7 +34,7 @@ from check_rtc.requirements import REQUIREMENTS, CheckResult, Moves, skipped, wr
 from check_rtc.telemetry_checks import ImageOffsets, TelemetryContext, run_telemetry_checks
 from service.errors import LinkError, WireError
 from service.estimation.slope_convention import SlopeConvention
-from service.estimation.windows import WindowRefused
+from service.records.estimates import WindowRefused
 from service.wire import Status
 
 _MATRIX_CHECKS: Final = ("commit", "chunks", "rejection")

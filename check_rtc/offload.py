@@ -13,12 +13,12 @@ from check_rtc.client import DITHER_RMS_M, MAX_REPLY_DELAY_S, RtcClient, stop_di
 from check_rtc.connection import ANSWER_TIMEOUT_S
 from check_rtc.requirements import CheckResult, fine, seen, skipped, wrong
 from service.errors import LinkError, WireError
-from service.estimation.estimate import Estimate
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import LockIn, LockInPlan, Spectra
 from service.estimation.loop import build_loop
-from service.estimation.windows import ClosedLoop, WindowRefused
+from service.estimation.windows import ClosedLoop
 from service.model.misregistration import BOUNDARY_SCALE
+from service.records.estimates import Estimate, WindowRefused
 from service.wire import (
     CommandKind,
     DitherKind,

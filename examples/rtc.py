@@ -205,6 +205,7 @@ keys = f"{root}/cmd/rtc/dither", f"{root}/cmd/rtc/loop", f"{root}/rtc/cm/applied
 declared = [session.declare_queryable(key, answer) for key in keys]
 # The token comes last: the service sends commands as soon as it sees it.
 declared += [session.liveliness().declare_token(f"{root}/alive/rtc")]
+start_ns = time.time_ns()  # of the first frame: waiting for the router is no part of the loop
 while True:
     header, payload, signed_status = run_batch()
     frames.put(payload, attachment=signing.sign(f"{root}/tel/frames", header, payload))

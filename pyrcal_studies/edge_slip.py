@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from service.control.gains import ModeGain, gain_table
+from service.control.gains import gain_table
 from service.control.gate import compute_edge_motion_m
 from service.control.loop import ControlLoop, pole_radius
 from service.control.reconstructor import invert
@@ -32,6 +32,7 @@ from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
+from service.records.registration import ModeGain
 from sim_rtc.assembly import build_telescope
 from sim_rtc.computer.feed import BATCH_FRAMES
 from sim_rtc.computer.loop import LoopTerms, ModalLoop

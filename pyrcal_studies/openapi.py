@@ -21,8 +21,8 @@ from fastapi.routing import APIRoute, iter_route_contexts
 from pydantic import AliasPath, TypeAdapter
 
 from service.api import create_app
+from service.records import commands
 from service.runtime import telemetry_recorder
-from service.tracking import commands
 from service.web import matrices, problems
 from service.web.authentication import OPEN, SCHEMES, needs, scope_of
 from service.web.commands import JSON, Body

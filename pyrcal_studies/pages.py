@@ -18,14 +18,14 @@ from pyrcal_studies.contract_tables import with_tables
 from pyrcal_studies.openapi import document
 from pyrcal_studies.reference import packaged
 from pyrcal_studies.state_machines import MACHINES
-from service.tracking.alarms import AlarmState, Interlock, Severity
-from service.tracking.commands import Command
+from service.records.alarms import AlarmState, Interlock, Severity
+from service.records.commands import Command
+from service.records.operations import AcquisitionStage, MeasureState, ProbationState
+from service.records.products import MatrixState
+from service.records.registration import Validity
+from service.records.state import Mode
 from service.tracking.interlocks import ALLOWS
-from service.tracking.operation_records import AcquisitionStage, MeasureState, ProbationState
 from service.tracking.operations.running import OPERATION_OF, CurrentOperation, ServiceState
-from service.tracking.products import MatrixState
-from service.tracking.registration import Validity
-from service.tracking.state import Mode
 
 ROOT = Path(__file__).parents[1]
 

@@ -33,10 +33,10 @@ from service.instrument.schema import whole_of
 from service.model.sensors.kind import SensorKind
 from service.model.sensors.registry import KINDS
 from service.parser import OneLineParser, operand_text, option_text, wrap_usage
+from service.records.alarms import ALARMS
+from service.records.commands import Command
+from service.records.events import Event
 from service.tracker import REACTIONS
-from service.tracking.alarms import ALARMS
-from service.tracking.commands import Command
-from service.tracking.events import Event
 from service.wire import Keys
 from service.wire.access import Rights, list_rights
 from sim_rtc.options import sim_parser

@@ -12,8 +12,8 @@ from html import escape
 from typing import Final
 
 from pyrcal.instruments.schema_texts import described
-from service.tracking.operation_records import AcquisitionStage, MeasureState, ProbationState
-from service.tracking.products import MatrixState
+from service.records.operations import AcquisitionStage, MeasureState, ProbationState
+from service.records.products import MatrixState
 from service.tracking.transitions import TABLES
 
 _BOX_WIDTH, _BOX_HEIGHT, _ROW = 130, 28, 58

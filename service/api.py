@@ -13,6 +13,7 @@ from starlette.routing import BaseRoute
 
 from service import __version__
 from service.config.settings import ApiTable
+from service.records.alarms import REST_CROWDED
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitQueue
 from service.web import (
@@ -56,6 +57,7 @@ async def answer(
     hosts = Hosts(bound=host, allowed=(settings.host, *settings.allowed_hosts))
     app = create_app(service, desk, hosts=hosts, keys=keys, over=over)
     server = Server(app, over, within_s=SHUTDOWN_TIMEOUT_S, proxies=settings.trusted_proxies)
+    service.complaints[REST_CROWDED] = server.crowd.complaint
     structlog.get_logger().info("api.listening", url=f"http://{host}:{port}")
     await server.serve(sockets=[listener])
 

@@ -63,6 +63,7 @@ class Bridge:
         """Record of the programs on a secured link, and of what they were refused."""
         self._session: zenoh.Session | None = None
         self._closed = False
+        self._missing = "the link is being opened"
         self._recorder: RecordingWriter | None = None
         self._publishers: dict[str, zenoh.ext.AdvancedPublisher] = {}
         self._held: list[object] = []
@@ -85,6 +86,8 @@ class Bridge:
 
         Raises
         ------
+        ConfigurationError
+            If zenoh does not understand an endpoint.
         LinkError
             If the port is busy, no router answers, or the link is open already.
         """
@@ -94,12 +97,14 @@ class Bridge:
         self._open()
 
     def _open(self) -> None:
-        self._session = session = link.open_session(self._endpoint)
         try:
+            self._session = session = link.open_session(self._endpoint)
             self._declare(session)
-        except BaseException:
-            self.close()
+        except BaseException as error:
+            self._leave()
+            self._missing = str(error)
             raise
+        self._missing = ""
         self._log.info("link.opened", listen=self._endpoint.listen, connect=self._endpoint.connect)
 
     def close(self) -> None:
@@ -120,17 +125,19 @@ class Bridge:
         return session is not None
 
     def reopen(self) -> None:
-        """Close the session and open another, so that RTCs have to connect again.
+        """Open the session, or close it and open another, so that RTCs have to connect again.
 
-        Does nothing if the link is closed.
+        Does nothing after :meth:`close`.
 
         Raises
         ------
+        ConfigurationError
+            If zenoh does not understand an endpoint.
         LinkError
-            If the port has been taken meanwhile, or no router answers; the link is then closed.
+            If the port is busy, or no router answers; the session is then closed.
         """
-        self._leave()
-        self._intake.liveliness(alive=False)
+        if self._leave():
+            self._intake.liveliness(alive=False)
         if not self._closed:
             self._open()
         # close() in another thread may have come between the two tests; the new session would
@@ -175,6 +182,7 @@ class Bridge:
         """Return all counters of the link."""
         return replace(
             self._intake.statistics(),
+            missing=self._missing,
             refusals=self.guard.refusals(),
             ending_certificates=self.guard.ending(),
             waiting_connections=count_waiting(self._endpoint.listen),
@@ -278,11 +286,11 @@ class Bridge:
         )
 
     def publish_state(self, message: wire.StateMessage) -> None:
-        """Publish the service's state; it is dropped if the network is congested."""
+        """Publish the service's state; it is dropped if the network is congested or not there."""
         self._publish_last(self._keys.state, wire.encode(message), wire.Encodings.STATE)
 
     def publish_alarm(self, message: wire.AlarmMessage) -> None:
-        """Publish an alarm that began or ended; it is dropped if the network is congested."""
+        """Publish an alarm that began or ended; it is dropped like a state."""
         self._publish_last(self._keys.alarm, wire.encode(message), wire.Encodings.ALARM)
 
     def _declare(self, session: zenoh.Session) -> None:
@@ -429,11 +437,8 @@ class Bridge:
 
     def _publish_last(self, key: str, data: bytes, encoding: str) -> None:
         publisher = self._publishers.get(key)
-        if publisher is None:
-            raise LinkError(f"cannot send on {key}: the link is not open")
-        if not self._standby.drives:
-            return
-        publisher.put(data, encoding=encoding)
+        if publisher is not None and self._standby.drives:
+            link.put_last(publisher, data, encoding)
 
     def _require_lead(self) -> zenoh.Session:
         """Return the session if this service may send commands and matrices.

@@ -10,10 +10,16 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from service import wire
+from service.records import alarms
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.commands import Command
+from service.records.events import Effect, Event
+from service.records.operations import CommandState, MeasureState
+from service.records.state import TrackerState
 from service.tracking import (
     alarm_records,
     alarm_rules,
-    alarms,
     dither,
     interlocks,
     mode_proof,
@@ -26,15 +32,9 @@ from service.tracking import (
     validity,
     window_processing,
 )
-from service.tracking import commands as cmd
-from service.tracking import events as ev
 from service.tracking.alarm_rules import derive_alarms
-from service.tracking.commands import Command
-from service.tracking.events import Effect, Event
-from service.tracking.operation_records import CommandState, MeasureState
 from service.tracking.operations import acquisition, measurement, probation
 from service.tracking.policy import Policy
-from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.update_policy import note_declined
 from service.tracking.updates import decide_updates, fetch_in_use

@@ -2,7 +2,7 @@
 
 from dataclasses import fields, replace
 
-from service.tracking.state import TrackerState
+from service.records.state import TrackerState
 
 RECORDS = [field.name for field in fields(TrackerState) if field.name not in {"system", "log"}]
 _BLANK = TrackerState(system="")

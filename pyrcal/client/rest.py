@@ -32,6 +32,9 @@ MAX_ANSWER_BYTES = 100_000_000
 
 _SAYS_PYRCAL = "urn:pyrcal:problem:"
 
+_BUSY = {502, 503, 504}
+"""Status of a server that has too much to do, and of a proxy whose service does not answer."""
+
 
 class UnreachableError(LinkError):
     """No answer in time, or one that does not come from this version of pyrcal."""
@@ -221,7 +224,13 @@ class Service:
         kind, detail = problem.get("type"), problem.get("detail")
         if isinstance(kind, str) and kind.startswith(_SAYS_PYRCAL) and isinstance(detail, str):
             return RefusedError(detail)
-        return self.foreign_answer_error(f"{response.status} {response.reason}")
+        found = f"{response.status} {response.reason}"
+        if response.status in _BUSY:
+            return UnreachableError(
+                f"{self.url}: {found}: the service, or a proxy before it, has too many requests or "
+                "does not reach it now; try again"
+            )
+        return self.foreign_answer_error(found)
 
     def foreign_answer_error(self, found: str) -> UnreachableError:
         """Return the error for an answer that is not pyrcal's."""

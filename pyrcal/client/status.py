@@ -113,10 +113,12 @@ def _refusal(state: Document) -> list[str]:
 
 
 def registration_lines(known: Document) -> list[str]:
-    """Return the four parameters of a registration, each with its 1 sigma and unit."""
+    """Return the four parameters, each with its 1 sigma and unit, and what limits sigma."""
+    tracked = known.get("tracking_sigma")
     lines = [
         f"{label:13} {_number(known['alpha'][name], form)} ± "
         f"{_number(known['sigma'][name], form.lstrip('+'))} {unit}".rstrip()
+        + (f", changes ± {_number(tracked[name], form.lstrip('+'))}" if tracked else "")
         for name, (label, form, unit) in _ALPHA.items()
     ]
     stretched = zip(
@@ -128,6 +130,7 @@ def registration_lines(known: Document) -> list[str]:
     return [
         *lines,
         *(f"{label:13} {value:+.5f} ± {sigma:.5f}" for label, value, sigma in stretched),
+        *filter(None, [known.get("sigma_limit")]),
     ]
 
 

@@ -38,7 +38,7 @@ _MAX_LINE_BYTES = 10_000_000
 Event = tuple[str, Document]
 """Its name and its data."""
 
-_GROWS = {"age_s", "window_age_s", "frame_age_s", "uptime_s"}
+_GROWS = {"age_s", "window_age_s", "frame_age_s", "telemetry_age_s", "uptime_s"}
 
 
 @dataclass

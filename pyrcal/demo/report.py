@@ -10,7 +10,7 @@ from typing import Any
 
 from pyrcal.demo.truth import TruthFile
 from service.model.misregistration import PARAMETERS
-from service.tracking.alarms import WORKER_BEHIND
+from service.records.alarms import WORKER_BEHIND
 
 TOLERANCE = {
     "shift_x_subap": 0.02,

@@ -21,7 +21,7 @@ from pyrcal.demo.report import (
 )
 from pyrcal.demo.truth import Line, TruthFile
 from service.model.misregistration import PARAMETERS
-from service.tracking.alarms import WORKER_BEHIND
+from service.records.alarms import WORKER_BEHIND
 
 POLL_S = 0.5
 """Time between two requests to the service, seconds."""

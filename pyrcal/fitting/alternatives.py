@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pyrcal.fitting.disjoint_sets import SIGNIFICANT
 from pyrcal.fitting.instrument_checks import (
     MIN_EXPLAINED,
+    UNKNOWN_IMAGES,
     AlternativeInstrument,
     FileValuesFit,
     FoundOptic,
@@ -106,9 +107,9 @@ class Alternative:
         """Return the weight of the square of its change of α in σ, 0 to 1.
 
         An explanation that the matrix prefers counts in full, one that is not excluded by its
-        probability, which is smaller the larger its misfit is. Models of one instrument differ by ``MIN_EXPLAINED`` of the signal, and any
-        additional fitted number explains some of that by coincidence: smaller improvements are no
-        evidence for it.
+        probability, which is smaller the larger its misfit is. Models of one instrument differ by
+        ``MIN_EXPLAINED`` of the signal, and any additional fitted number explains some of that by
+        coincidence: smaller improvements are no evidence for it.
         """
         if not self.counts or not (self.preferred or self.undecided):
             return 0.0
@@ -282,7 +283,7 @@ def _describe_rival(rival: AlternativeInstrument, pupils: tuple[TriedPupil, ...]
         undecided=not rival.preferred and is_open(rival.lead),
         key=rival.change.words,
         counts=True,
-        is_number=any(one.words == rival.change.words for one in pupils),
+        is_number=rival.change.words in {UNKNOWN_IMAGES, *(one.words for one in pupils)},
     )
 
 

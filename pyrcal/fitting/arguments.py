@@ -382,6 +382,7 @@ def _describe_instrument(instrument: OneLineParser) -> None:
         "--kind KIND", "kind of sensor, default pyramid", choices=tuple(KINDS), default="pyramid"
     )
     memory = "compute the matrix only if that takes no more, default %(default)g"
+    light = words("--light FRAME", "mean frame of the pupil images: print their places", type=Path)
     new = words("file FILE.toml", "file to write", type=Path)
     picture = words("picture PICTURE.png", "picture to write", type=Path)
     actions = instrument.add_subparsers(dest="action", required=True, metavar="COMMAND")
@@ -390,7 +391,7 @@ def _describe_instrument(instrument: OneLineParser) -> None:
         (
             "check",
             "print all errors of the file, and what follows from it",
-            (_INSTRUMENT, words("--memory-gb GB", memory, type=float, default=4.0)),
+            (_INSTRUMENT, words("--memory-gb GB", memory, type=float, default=4.0), light),
             "check bench.toml",
         ),
         (

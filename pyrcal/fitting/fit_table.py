@@ -188,7 +188,8 @@ def _extra_lines(fit: Fit) -> Iterator[str]:
     places = fit.image_offsets_px
     if places is not None and np.abs(places).max() > NOTABLE_DISPLACEMENT_PX:
         plausible = np.abs(places).max() < PLAUSIBLE_DISPLACEMENT_PX
-        why = "the file does not say" if plausible else "larger than pyramids have: model errors"
+        large = "larger than pyramids have: model errors, or a pupil off the middle of the grid"
+        why = "the file does not say" if plausible else large
         yield f"{'pupil images':20s}{displacement_words(places)} (fitted; {why})"
     distortion = None if fit.registration is None else fit.registration.distortion
     if distortion is not None and distortion.rms_subap > NOTABLE_DISTORTION_SUBAP:

@@ -7,22 +7,27 @@ and so are other pupils.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.fitting.disjoint_sets import SIGNIFICANT
-from pyrcal.fitting.methods import SEARCH_RESIDUAL, Settled
+from pyrcal.fitting.methods import SEARCH_RESIDUAL, Settled, settle
 from pyrcal.fitting.models import FAR_PREFERRED_SHARE, FitModels, InstrumentChange, Optic
 from pyrcal.fitting.pupil_checks import FitSubset, Lead, TriedPupil
-from pyrcal.fitting.solver import refine
+from pyrcal.fitting.solver import image_patterns, is_blurring, refine
 from pyrcal.fitting.uncertainty import Uncertainty
+from service.model.sensors.registry import kind_of
 
 Array = NDArray[np.float64]
 
 COUPLING_KEY = "coupling"
 """Key of the instrument file for the width of influence functions."""
+
+UNKNOWN_IMAGES = 'image_offsets_px = "unknown"'
+"""Entry of the instrument file by which the places of the pupil images are fitted."""
 
 NOTABLE_CHANGE = 0.03
 """Smallest difference of a logarithm from the file's value that is reported."""
@@ -184,8 +189,41 @@ def compare_instruments(
                 change=change, lead=lead, moved=moved, explained=share_explained(lead)
             )
         )
+    found += _try_free_images(settled, few)
     # Changes have different limits, so each is ranked by its own.
     return tuple(sorted(found, key=lambda one: one.share / one.change.max_misfit_ratio))
+
+
+def _try_free_images(settled: Settled, few: FitSubset) -> Iterator[AlternativeInstrument]:
+    """Yield the fit with fitted pupil images, if the file states where they are."""
+    about = settled.models.instrument
+    other = kind_of(about).without_image_places(about)
+    if other is None or len(settled.nuisances.images):
+        return
+    patterns = image_patterns(about.stop)
+    nuisances = replace(
+        settled.nuisances,
+        images=patterns,
+        image_sigma=kind_of(other).image_sigma_subap(other) or 0.0,
+    )
+    rates = nuisances.combine_images(few.model.image_derivatives(few.here), few.derivatives)
+    # To first order first. Blurs have no effect to first order, and displacements never only blur.
+    seen = [rate for one, rate in zip(patterns, rates, strict=True) if not is_blurring(one)]
+    lead = few.lead(few.own, *seen)
+    moved = few.step(few.own, *seen)[:4] - few.step(few.own)[:4]
+    if settled.share * np.sqrt(max(1.0 - lead.share, 0.0)) > MIN_EXPLAINED:
+        models, before = replace(settled.models, instrument=other), settled.solution
+        after = settle(models, settled.target, before.alpha, nuisances).solution
+        share = after.projection.chi / before.projection.chi
+        # the fit may end where a blur has the wrong sign
+        if after.converged and share < lead.share:
+            lead, moved = replace(lead, share=share), after.vector - before.vector
+    yield AlternativeInstrument(
+        change=InstrumentChange(words=UNKNOWN_IMAGES, max_misfit_ratio=FAR_PREFERRED_SHARE),
+        lead=lead,
+        moved=moved,
+        explained=settled.share * float(np.sqrt(max(1.0 - lead.share, 0.0))),
+    )
 
 
 def estimate_width_effect(settled: Settled, few: FitSubset) -> Array:

@@ -523,10 +523,17 @@ def _run_method(
 
 def _unknown_images(models: FitModels) -> dict[str, Any]:
     """Return the displacement patterns of the pupil images and their σ, if they are unknown."""
-    sigma = kind_of(models.instrument).image_sigma_subap(models.instrument)
+    instrument, kind = models.instrument, kind_of(models.instrument)
+    sigma = kind.image_sigma_subap(instrument)
     if sigma is None:
         return {}
-    return {"images": image_patterns(models.instrument.stop), "image_sigma": sigma}
+    # All images together: the models have them where the mask shows the pupil.
+    place = kind.pupil_offset(instrument) if instrument.stop is Stop.TELESCOPE else None
+    return {
+        "images": image_patterns(instrument.stop),
+        "image_sigma": sigma,
+        "displaced": np.repeat(place or (0.0, 0.0), 4),
+    }
 
 
 def _make_fit(

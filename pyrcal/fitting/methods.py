@@ -412,7 +412,8 @@ def _with_nearest_images(settled: Settled) -> tuple[FitModels, Nuisances]:
     unlikely = solution.dispersion * noise / nuisances.image_sigma**2
 
     def left(displaced: Array) -> float:
-        improbable = unlikely * float(np.sum((nuisances.images @ displaced) ** 2))
+        away = nuisances.images @ (displaced - nuisances.expected)
+        improbable = unlikely * float(np.sum(away**2))
         # Without computing the matrix: no fit could make up for a prior that costs this much.
         if improbable > seen.chi:
             return np.inf

@@ -25,6 +25,7 @@ from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
 from service.model.pupil import light_per_subaperture
+from service.model.sensors.registry import kind_of
 
 Array = NDArray[np.float64]
 
@@ -263,7 +264,8 @@ class FitSubset:
         about = self.models.instrument
         if about.stop is Stop.MIRROR:  # the pupil is displaced together with the mirror
             return np.asarray(self.derivatives[:2] - self.model.mirror_shift_derivatives(self.here))
-        place, rates = np.array(about.pupil_shift_subap or (0.0, 0.0)), []
+        known = about.pupil_shift_subap or kind_of(about).pupil_offset(about)
+        place, rates = np.array(known or (0.0, 0.0)), []
         for step in np.eye(2) * OFFSET_STEP_SUBAP:
             displaced = replace(about, pupil_shift_subap=tuple(place + step))
             rates.append((self.matrix(self.of(displaced)) - self.own) / OFFSET_STEP_SUBAP)

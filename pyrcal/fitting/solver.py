@@ -144,6 +144,9 @@ class Nuisances:
     displaced: Array = field(default_factory=lambda: np.zeros(8))
     """``(8,)`` displacements of the images already included in the models, subapertures."""
 
+    expected: Array = field(default_factory=lambda: np.zeros(8))
+    """``(8,)`` the same that the prior expects."""
+
     @property
     def sigma(self) -> Array:
         """``(n_nuisances,)`` prior 1 σ of each nuisance."""
@@ -175,8 +178,8 @@ class Nuisances:
         for k, (_, offset) in enumerate(self.optics, self.first_optic):
             # The models are updated during a fit, whereas the prior stays at the file's value.
             distance[k] += offset
-        # The same for images: the models already contain ``displaced``, and the prior expects none.
-        distance[self.image_places] += self.images @ self.displaced
+        # The same for images: the models already contain ``displaced``.
+        distance[self.image_places] += self.images @ (self.displaced - self.expected)
         return distance
 
     def image_offsets(self, values: Array) -> Array:
@@ -278,8 +281,10 @@ def nuisances_of(
     unknown: frozenset[Optic] = frozenset(),
     images: Array | None = None,
     image_sigma: float = 0.0,
+    displaced: Array | None = None,
 ) -> Nuisances:
     """Return the nuisances: the axes' rotation, and the optional ones that were requested."""
+    place = np.zeros(8) if displaced is None else displaced
     unknowns = Nuisances(
         maps=np.empty((0, kind.n_planes * int(valid.sum()))),
         anamorphosis=anamorphosis,
@@ -288,6 +293,8 @@ def nuisances_of(
         unknown=unknown,
         images=np.zeros((0, 8)) if images is None else images,
         image_sigma=image_sigma,
+        displaced=place,
+        expected=place,
         regions=pupil_regions(valid, kind.n_planes),
     )
     if not gain_map:

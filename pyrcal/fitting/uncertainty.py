@@ -260,7 +260,9 @@ def uncertainty(
     kind_share = min(1.0, residual_fraction / STRANGE_RESIDUAL)
     far = kind_share * FAR_SHARE * shift_subap
     # A rotation moves the pupil's edge by the radius times as much.
-    floor = np.array([FLOOR_SUBAP, FLOOR_SUBAP, EDGE_FLOOR_SUBAP / radius_subap, magnification_floor])
+    floor = np.array(
+        [FLOOR_SUBAP, FLOOR_SUBAP, EDGE_FLOOR_SUBAP / radius_subap, magnification_floor]
+    )
     # a quantity fixed by its prior may have any value within that prior
     held_back = (spread * np.diag(held) @ spread)[:4, :4] * noise * dispersed
     from_model = np.diag(share**2 + floor**2 + far**2) + held_back

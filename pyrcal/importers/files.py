@@ -20,7 +20,7 @@ from pyrcal.fitting.pupil_width import compute_responses, measure_pupil
 from pyrcal.importers.actuators import Mirror, read_mirror
 from pyrcal.importers.frames import Frames, describe_frames, frames_of
 from pyrcal.importers.imported import UNKNOWN, Array, Imported, Signals, in_arrays_file, matrix_of
-from pyrcal.importers.layouts import ROLES, centre_grid, find_lit, maps_of, mask_of, plane_of
+from pyrcal.importers.layouts import ROLES, find_lit, maps_of, mask_of, plane_of
 from service.errors import ConfigurationError, MatrixError
 from service.model.aperture import measure_aperture
 from service.model.defects import explain_defects, find_defects
@@ -59,6 +59,9 @@ UNITS_M = {"m": 1.0, "um": 1e-6, "nm": 1e-9}
 
 MIN_WIDTH_DIFFERENCE_SUBAP = 0.75
 """Difference of the widths of grid and pupil above which the pupil's width is recorded."""
+
+MAX_ROWS_DIFFERENCE_SUBAP = 0.5
+"""Difference of the diameter by area from the number of rows below which the rows count."""
 
 MIN_OBSCURATION = 0.05
 """Smallest obscuration ratio that is read from a mask."""
@@ -276,24 +279,24 @@ def read_slopes(
     # NaN are allowed: a dead subaperture or a failed poke is left out below, with its number.
     matrix = matrix_of(found, n_rows, n_columns, notes=notes, broken_entries=True)
     matrix, valid = _remove_dead_rows(matrix, valid, notes)
-    grid = centre_grid(valid)
-    if grid.shape != valid.shape or np.any(grid != valid):
-        notes.append(
-            f"valid: the lit subapertures are put into the middle of a grid of {len(grid)} x "
-            f"{len(grid)} instead of {len(valid)} x {len(valid)}: their order is the same"
-        )
-    aperture = measure_aperture(grid)
-    notes.append(f"valid: {int(grid.sum())} subapertures, {aperture.words}")
+    aperture = measure_aperture(valid)
+    notes.append(f"valid: {int(valid.sum())} subapertures, {aperture.words}")
     width: dict[str, Any] = {}
-    if len(grid) - aperture.diameter_subap > MIN_WIDTH_DIFFERENCE_SUBAP:
-        width = {"pupil_diameter_subap": round(aperture.diameter_subap, 2)}
+    across = aperture.diameter_subap
+    # Without a dark ring around it a mask may only lack a part of its rim.
+    dark_ring = not (valid[[0, -1]].any() or valid[:, [0, -1]].any())
+    if dark_ring or (aperture.is_round and len(valid) - across > MIN_WIDTH_DIFFERENCE_SUBAP):
+        # A flux threshold changes the area rather than the number of rows.
+        if abs(aperture.n_across - across) < MAX_ROWS_DIFFERENCE_SUBAP:
+            across = aperture.n_across
+        width = {"pupil_diameter_subap": round(across, 2)}
     return Signals(
         table={
-            "n_subapertures": len(grid),
+            "n_subapertures": len(valid),
             "valid_subapertures": in_arrays_file("valid_subapertures"),
             **width,
         },
-        arrays={"interaction_matrix": matrix, "valid_subapertures": grid.astype(np.uint8)},
+        arrays={"interaction_matrix": matrix, "valid_subapertures": valid.astype(np.uint8)},
         obscuration_ratio=aperture.obscuration_ratio,
         columns=1,
     )
@@ -424,6 +427,11 @@ def _sensor(reported: Reported, signals: Signals, notes: list[str]) -> dict[str,
     # A stated diameter is not questioned.
     if reported.pupil_diameter_subap is not None:
         return {**table, "pupil_diameter_subap": reported.pupil_diameter_subap}
+    if "pupil_diameter_subap" in table and table.get("input") != "frames":
+        notes.append(
+            f"pupil_diameter_subap = {table['pupil_diameter_subap']:g}: read from the mask, to "
+            "half a subaperture; the magnification is relative to it: say --pupil-subap if known"
+        )
     if table.get("input") != "frames":
         valid = signals.arrays["valid_subapertures"].astype(bool)
         notes += _check_width(signals.arrays["interaction_matrix"], valid)

@@ -84,8 +84,9 @@ def _cube_of(matrix: Array, light_map: Array, valid: Array | None) -> Array | No
     if valid is None or not np.isin(valid, (0, 1)).all():
         return None
     lit = valid.astype(bool)
-    # A mask that lists its subapertures twice is one for Sx and Sy: the rows are slopes.
-    if lit.sum() not in matrix.shape or is_listed_twice(lit):
+    # A mask that lists its subapertures twice is one for Sx and Sy: the rows are slopes. Twice as
+    # many rows are slopes as well, although there may be as many modes as subapertures.
+    if lit.sum() not in matrix.shape or is_listed_twice(lit) or 2 * lit.sum() in matrix.shape:
         return None
     flat = matrix if matrix.shape[0] == lit.sum() else matrix.T
     cube = np.zeros((flat.shape[1], *lit.shape), dtype=matrix.dtype)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pyrcal.importers.imported import Array
 from service.errors import MatrixError
-from service.model.aperture import OFF_CENTRE_SUBAP, SMALLEST_HOLE
+from service.model.aperture import SMALLEST_HOLE
 
 _NUMBERED = re.compile(r"(?:_\d{1,6})+$")
 
@@ -149,32 +149,6 @@ def _largest_piece(lit: NDArray[np.bool_]) -> NDArray[np.bool_]:
     gaps, _ = scipy.ndimage.label(scipy.ndimage.binary_fill_holes(piece) & ~piece)
     small = np.bincount(gaps.ravel()) < SMALLEST_HOLE
     return np.asarray(piece | (small[gaps] & (gaps > 0)))
-
-
-def centre_grid(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return a mask on the smallest square grid that centres its pupil.
-
-    Subapertures keep their order, so the order of the slopes does not change.
-    """
-    rows, columns = np.flatnonzero(valid.any(axis=1)), np.flatnonzero(valid.any(axis=0))
-    filled = scipy.ndimage.binary_fill_holes(valid)
-    centre = np.argwhere(filled).mean(axis=0)
-    first, last = np.array([rows[0], columns[0]]), np.array([rows[-1], columns[-1]])
-    best: tuple[float, int, NDArray[np.intp]] | None = None
-    least = int(np.max(last - first)) + 1
-    for side in range(least, least + 3):
-        start = np.rint(centre - (side - 1) / 2.0).astype(np.intp)
-        if np.any(start > first) or np.any(start + side - 1 < last):
-            continue
-        off = float(np.hypot(*(centre - start - (side - 1) / 2.0)))
-        if best is None or off < best[0] - OFF_CENTRE_SUBAP:
-            best = off, side, start
-    if best is None:
-        return valid
-    _, side, start = best
-    grid = np.zeros((side, side), dtype=bool)
-    grid[tuple((np.argwhere(valid) - start).T)] = True
-    return grid
 
 
 def maps_of(values: Array, n: int | None, notes: list[str]) -> Array:

@@ -13,10 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from pyrcal.fitting.figures import check_plots, map_to_sensor, mirror_outline, save_figure
+from pyrcal.fitting.light import FLUX
 from pyrcal.instruments.schema_texts import KeyText, TableText, tables_of
 from pyrcal.terminal import print_lines, span
 from service.control.reconstructor import MAX_CONDITION, invert
-from service.errors import ConfigurationError, ModelError, StorageError
+from service.errors import ConfigurationError, MatrixError, ModelError, StorageError
+from service.files.container import opened
 from service.instrument import load_instrument
 from service.instrument.schema import whole_of
 from service.model.instrument import Instrument
@@ -27,7 +29,7 @@ from service.model.modes import modal_basis
 from service.model.pupil import instrument_pupil, rtc_valid_subapertures, valid_subapertures
 from service.model.sensors.kind import SensorKind
 from service.model.sensors.registry import KINDS, kind_of
-from service.model.sensors.sensor import Fineness
+from service.model.sensors.sensor import CannotTell, Fineness
 
 EXAMPLES: Mapping[str, Mapping[str, object]] = {
     "[instrument]": {"name": "bench", "diameter_m": 8.0, "stop": "telescope"},
@@ -266,4 +268,31 @@ def _check(options: argparse.Namespace) -> int:
     print_lines([f"{options.instrument}: {instrument.name}"])
     print_lines(describe_properties(instrument, found))
     print_lines(f"note: {remark}" for remark in instrument.remarks)
+    if options.light is not None:
+        print_lines([find_image_offsets(instrument, options.light)])
     return USABLE
+
+
+def find_image_offsets(instrument: Instrument, path: Path) -> str:
+    """Return the line of the instrument file with the places of the pupil images in their light.
+
+    The file has the mean light in the axes of the RTC: a frame of one pixel for each subaperture,
+    or images ``(4, n, n)`` as in a status; as ``flux``, or as its only array.
+
+    Raises
+    ------
+    MatrixError
+        If it has no such light.
+    ModelError
+        If the light does not show the places.
+    """
+    as_listed = replace(instrument, slopes=replace(instrument.slopes, orientation=None))
+    with opened(path) as container:
+        only = FLUX if len(container.arrays) != 1 else next(iter(container.arrays))
+        if (stored := container.find(only)) is None:
+            raise MatrixError(f"{path}: no dataset {FLUX}; it holds {container.listing()}")
+        found = kind_of(instrument).measure_image_offsets(as_listed, stored.numbers())
+    if isinstance(found, CannotTell):
+        raise ModelError(f"{path}: {found.reason}")
+    places = ", ".join(f"[{x:.3f}, {y:.3f}]" for x, y in found * instrument.binning)
+    return f"image_offsets_px = [{places}]  # add this line to [wfs] of the instrument file"

@@ -18,11 +18,11 @@ from service.archive.nights import Mark, MarkKind, TrendSample
 from service.config import Settings
 from service.model.instrument import Instrument
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
+from service.records.alarms import ALARMS, Severity
+from service.records.products import MatrixState, ReconstructorRecord
+from service.records.registration import HistoryEntry, Source
 from service.runtime.policy import policy_of
-from service.tracking.alarms import ALARMS, Severity
 from service.tracking.policy import Policy
-from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.registration import HistoryEntry, Source
 
 REQUIRED_CHECKS: Final = (
     *("connection", "messages", "frames", "sizes", "numbers", "sequence", "clock", "delivery"),

@@ -20,7 +20,7 @@ from service.archive.serialisation import to_json
 from service.config import Settings, load_settings
 from service.errors import ArchiveError, ConfigurationError, UnknownIdError, say, shown
 from service.files.documents import json_text
-from service.tracking.products import MatrixState
+from service.records.products import MatrixState
 
 DONE, DAMAGED = 0, 1
 

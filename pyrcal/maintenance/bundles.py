@@ -24,7 +24,7 @@ from service.instrument import load_instrument
 from service.model.instrument import Instrument, instrument_sha256
 from service.model.interaction import RtcInteractionModel
 from service.model.modes import ModalBasis
-from service.tracking.products import MatrixState, ReconstructorRecord
+from service.records.products import MatrixState, ReconstructorRecord
 from service.wire import checksum
 
 IN_USE = "in-use"

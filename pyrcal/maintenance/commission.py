@@ -24,7 +24,7 @@ from service.files.documents import json_text
 from service.files.whole import open_hdf5
 from service.instrument import load_instrument
 from service.model.misregistration import PARAMETERS
-from service.tracking.products import MatrixState
+from service.records.products import MatrixState
 
 ACCEPTED, NOT_ACCEPTED = 0, 1
 """Exit status."""

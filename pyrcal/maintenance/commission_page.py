@@ -21,8 +21,8 @@ from pyrcal.maintenance.acceptance import (
 )
 from service.errors import ConfigurationError
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
-from service.tracking.alarms import ALARMS
-from service.tracking.registration import Source
+from service.records.alarms import ALARMS
+from service.records.registration import Source
 from service.version import software_version
 
 if TYPE_CHECKING:

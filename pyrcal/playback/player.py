@@ -34,16 +34,16 @@ from service.link.session import Endpoint
 from service.model.instrument import Instrument
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.model.slopes import SlopeRecipe
+from service.records import events as ev
+from service.records.events import Effect, Event
+from service.records.products import ReconstructorRecord
+from service.records.registration import HistoryEntry, PassiveState
+from service.records.state import LogEntry, LoopState, Mode, OperatorState, TrackerState
 from service.runtime.engine import Engine
 from service.runtime.estimates import fit_passive, fitted, read_own_matrix
 from service.runtime.policy import compute_of, policy_of
 from service.runtime.worker import Done, OpticsWorker
-from service.tracking import events as ev
-from service.tracking.events import Effect, Event
 from service.tracking.policy import SECOND_NS
-from service.tracking.products import ReconstructorRecord
-from service.tracking.registration import HistoryEntry, PassiveState
-from service.tracking.state import LogEntry, LoopState, Mode, OperatorState, TrackerState
 from service.tracking.step_context import new_lines
 from service.wire import DitherRequest, Manifest, Reply, Status, decode
 

@@ -22,10 +22,10 @@ from service.model.misregistration import (
     at_boundary,
     wrap_angle,
 )
-from service.tracking import alarms
+from service.records import alarms
+from service.records.registration import HistoryEntry, Source
+from service.records.state import Level
 from service.tracking.policy import SECOND_NS
-from service.tracking.registration import HistoryEntry, Source
-from service.tracking.state import Level
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

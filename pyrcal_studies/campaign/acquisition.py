@@ -33,9 +33,9 @@ from pyrcal_studies.campaign.rows import (
 from pyrcal_studies.campaign.system_nights import GAINS
 from service.config import load_settings
 from service.model.misregistration import BOUNDARY_SCALE
+from service.records.operations import AcquisitionStage
+from service.records.state import Mode
 from service.runtime.policy import policy_of
-from service.tracking.operation_records import AcquisitionStage
-from service.tracking.state import Mode
 
 RANGE = np.array([1.5, 1.5, 6.0, 0.05])
 """Of the registrations that are drawn, boundary units."""

@@ -47,6 +47,11 @@ from service.archive import Archive
 from service.config import load_settings
 from service.errors import LinkError, PyrcalError
 from service.estimation.frames import FrameBlock
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.operations import DitherPhase
+from service.records.products import MatrixState
+from service.records.state import MatrixStates, Mode, OperatorState, TrackerState
 from service.runtime.archiving import (
     SAVE_INTERVAL_S,
     is_unsaved,
@@ -56,14 +61,9 @@ from service.runtime.archiving import (
 )
 from service.runtime.losses import silence
 from service.runtime.policy import policy_of
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.dither_request import DitherPhase
 from service.tracking.operations.running import OperationKind, running_operations
 from service.tracking.policy import SECOND_NS
-from service.tracking.products import MatrixState
 from service.tracking.resume import restored
-from service.tracking.state import MatrixStates, Mode, OperatorState, TrackerState
 from service.wire import Acknowledgement, Command, Manifest, Reply
 
 STEP_S = 0.25

@@ -29,13 +29,13 @@ import numpy as np
 from service.config import load_settings
 from service.errors import PyrcalError
 from service.model.misregistration import Misregistration
+from service.records.events import Effect, Event
+from service.records.state import MatrixStates, Mode, OperatorState, TrackerState
 from service.runtime.policy import policy_of
 from service.tracker import step
-from service.tracking.events import Effect, Event
 from service.tracking.operations.running import running_operations
 from service.tracking.policy import Policy
 from service.tracking.resume import restored, resumed, saved_of
-from service.tracking.state import MatrixStates, Mode, OperatorState, TrackerState
 from service.tracking.step_context import new_lines
 
 Json = Any

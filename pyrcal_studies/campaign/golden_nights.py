@@ -51,16 +51,16 @@ from service.errors import LinkError, PyrcalError
 from service.estimation.frames import FrameBlock
 from service.instrument import load_instrument
 from service.model.pupil import valid_subapertures
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.commands import Command
+from service.records.events import Effect, Event
+from service.records.operations import MeasurementRecord, MeasureState, NoisyFinding
+from service.records.products import MatrixState, ModeSet
+from service.records.state import Level, Mode, TrackerState
 from service.runtime.policy import policy_of
 from service.runtime.worker import Compute, OpticsWorker
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.commands import Command
-from service.tracking.events import Effect, Event
-from service.tracking.operation_records import MeasurementRecord, MeasureState, NoisyFinding
 from service.tracking.policy import Policy
-from service.tracking.products import MatrixState, ModeSet
-from service.tracking.state import Level, Mode, TrackerState
 from service.wire import (
     Acknowledgement,
     AckState,

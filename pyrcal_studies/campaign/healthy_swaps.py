@@ -29,12 +29,13 @@ from pyrcal_studies.campaign.observatory import SMALL, Dome, bench_of
 from pyrcal_studies.campaign.rows import Row, RowFile, campaign_parser, heading, line, tell
 from service.control.reconstructor import Recipe, reconstruct
 from service.estimation import health
-from service.estimation.comparison import REFERENCE_PERIOD_S, Verdict
+from service.estimation.comparison import REFERENCE_PERIOD_S
 from service.estimation.description import actuator_watch
 from service.estimation.health import LoopHealth, PlayedCommands, observe_played
 from service.estimation.probation import Comparison, observe
 from service.model.misregistration import Misregistration
-from service.tracking import alarms
+from service.records import alarms
+from service.records.operations import Verdict
 
 Array32 = NDArray[np.float32]
 

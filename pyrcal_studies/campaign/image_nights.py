@@ -41,9 +41,9 @@ from pyrcal_studies.campaign.rows import (
 from service.config import load_settings
 from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.records.state import Mode
 from service.runtime.policy import policy_of
 from service.runtime.worker import Compute, OpticsWorker
-from service.tracking.state import Mode
 from service.wire import checksum
 from sim_rtc.assembly import Telescope
 from sim_rtc.computer.reconstructors import compute_truncated_inverse

@@ -37,11 +37,11 @@ from pyrcal_studies.campaign.rows import (
 from service.config import load_settings
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.pointing_law import PointingLaw, Term
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.state import Mode, TrackerState
 from service.runtime.policy import policy_of
-from service.tracking import commands as cmd
-from service.tracking import events as ev
 from service.tracking.policy import Policy
-from service.tracking.state import Mode, TrackerState
 
 KINDS = (
     *("wraps", "wraps, not declared", "wraps, two values", "wraps to and fro", "step of a table"),

@@ -48,11 +48,11 @@ from service.model.modes import analytic_basis, modal_basis
 from service.model.pupil import rtc_valid_subapertures
 from service.model.sensors.registry import kind_of
 from service.model.surface import mirror_surface
+from service.records import commands as cmd
+from service.records.products import MatrixState
+from service.records.state import Mode
 from service.runtime.policy import policy_of
 from service.runtime.worker import Compute, OpticsWorker
-from service.tracking import commands as cmd
-from service.tracking.products import MatrixState
-from service.tracking.state import Mode
 from service.wire import Status, checksum, decode, encode
 from sim_rtc.assembly import Telescope
 from sim_rtc.computer.feed import BATCH_FRAMES, Block, OpenLoopBlock

@@ -38,10 +38,11 @@ from pyrcal_studies.campaign.rows import (
 )
 from service.config import load_settings
 from service.estimation.estimate import model_error
-from service.estimation.lockin import LockIn, LockInEstimate, LockInPlan, Spectra
-from service.estimation.windows import ClosedLoop, WindowRefused
+from service.estimation.lockin import LockIn, LockInPlan, Spectra
+from service.estimation.windows import ClosedLoop
 from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.records.estimates import LockInEstimate, WindowRefused
 from service.runtime.policy import floor_of
 from service.runtime.worker import Compute, OpticsWorker, Sampling
 from service.wire import DitherKind, DitherRequest

@@ -30,7 +30,6 @@ from pyrcal.rtc import staging
 from pyrcal.rtc.identity import Reconstructor
 from service.archive.products import NoisyNumbers
 from service.archive.store import Provenance
-from service.control.gate import GateVerdict
 from service.control.loop import pole_radius
 from service.errors import PyrcalError, UnknownIdError, WorkerError
 from service.estimation.dither_windows import EndedWindow
@@ -41,6 +40,12 @@ from service.estimation.random_dither import Correlated
 from service.instrument import load_instrument
 from service.model.misregistration import Misregistration
 from service.model.slopes import SlopeRecipe
+from service.records import commands
+from service.records import events as ev
+from service.records.events import Effect, Event
+from service.records.operations import MeasurementRecord
+from service.records.products import GateVerdict, MatrixState, ReconstructorRecord
+from service.records.state import LoopState, Mode, OperatorState, TrackerState
 from service.runtime.actions import Actions, Publishing, present_conditions
 from service.runtime.engine import Engine
 from service.runtime.estimates import PendingWindow, fit_passive, fitted, read_own_matrix
@@ -48,13 +53,7 @@ from service.runtime.ports import StorePort
 from service.runtime.worker import Compute, Done, OpticsWorker, Sampling
 from service.runtime.worker.records import patience_s
 from service.tracker import step
-from service.tracking import commands
-from service.tracking import events as ev
-from service.tracking.events import Effect, Event
-from service.tracking.operation_records import MeasurementRecord
 from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.state import LoopState, Mode, OperatorState, TrackerState
 from service.wire import (
     CHUNK_LIMIT,
     Acknowledgement,

@@ -46,11 +46,11 @@ from service.config import load_settings
 from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE
 from service.program import status_of
+from service.records import alarms
+from service.records.products import MatrixState
+from service.records.state import Mode
 from service.runtime.policy import policy_of
 from service.runtime.worker import Compute, OpticsWorker, Sampling
-from service.tracking import alarms
-from service.tracking.products import MatrixState
-from service.tracking.state import Mode
 from service.wire import DitherRequest
 
 LATER_S = 10.0

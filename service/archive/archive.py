@@ -20,9 +20,9 @@ from service.archive.serialisation import TrackingFile
 from service.archive.store import FOLDER_MODE, Store
 from service.errors import ArchiveError, StorageError, UnknownIdError
 from service.files.durable import lock_file
-from service.tracking.operation_records import MeasurementRecord
-from service.tracking.products import ReconstructorRecord
-from service.tracking.registration import HistoryEntry
+from service.records.operations import MeasurementRecord
+from service.records.products import ReconstructorRecord
+from service.records.registration import HistoryEntry
 
 
 class Archive:

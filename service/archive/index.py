@@ -18,9 +18,9 @@ from service.archive import nights
 from service.archive.nights import TrendSample, Values
 from service.archive.serialisation import NOT_UNDERSTOOD, from_json, to_json
 from service.errors import ArchiveError, StorageError, shown
-from service.tracking.operation_records import MeasurementRecord
-from service.tracking.products import ReconstructorRecord
-from service.tracking.registration import HistoryEntry
+from service.records.operations import MeasurementRecord
+from service.records.products import ReconstructorRecord
+from service.records.registration import HistoryEntry
 
 Product = ReconstructorRecord | MeasurementRecord
 Indexed = TypeVar("Indexed", bound=Product)

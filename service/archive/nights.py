@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from service.errors import TooLargeError
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
-from service.tracking.alarms import ALARMS
-from service.tracking.registration import HistoryEntry, Source
+from service.records.alarms import ALARMS
+from service.records.registration import HistoryEntry, Source
 
 Values = Sequence[object] | Mapping[str, object]
 """Values of a query's placeholders."""

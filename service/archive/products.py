@@ -21,8 +21,8 @@ from service.files.container import put_covariance
 from service.files.durable import replace_file
 from service.files.recording import Recording
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
-from service.tracking.operation_records import MeasurementRecord, MeasureState, NoisyFinding
-from service.tracking.products import MatrixState, ReconstructorRecord
+from service.records.operations import MeasurementRecord, MeasureState, NoisyFinding
+from service.records.products import MatrixState, ReconstructorRecord
 from service.wire import checksum
 
 PROBE_BYTES = 1 << 20

@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ArchiveError, ModelError, StorageError
-from service.estimation.estimate import BIAS_FLOOR, BIAS_OVER_SCATTER, BIAS_WANDER
+from service.estimation.estimate import BIAS_WANDER
 from service.files.durable import replace_file
 from service.model.misregistration import BOUNDARY_SCALE, COVARIANCE_SCALE
+from service.records.estimates import BIAS_FLOOR, BIAS_OVER_SCATTER
+from service.records.registration import Registration
+from service.records.state import Saved
 from service.tracking.filtering import joint_of
-from service.tracking.registration import Registration
-from service.tracking.state import Saved
 
 NOT_UNDERSTOOD = (ValueError, KeyError, TypeError, ModelError)
 """Errors raised by a record that is damaged or of another version."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import resource
 import signal
 import socket
 import stat
@@ -31,6 +32,14 @@ from service.files.fit_folder import FitRequest
 from service.files.last_telemetry import LastTelemetry
 from service.model.instrument import Instrument, instrument_sha256
 from service.program import announce, leave
+from service.records.state import (
+    LoopState,
+    MatrixStates,
+    Mode,
+    Operations,
+    OperatorState,
+    TrackerState,
+)
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.actions import Actions, Publishing
 from service.runtime.archiving import restore_tracking
@@ -42,14 +51,6 @@ from service.runtime.uploads import FitLimits, FitQueue
 from service.runtime.workers import WorkerPool
 from service.tracking.operations.measurement import MEASUREMENTS_KEPT
 from service.tracking.resume import restored
-from service.tracking.state import (
-    LoopState,
-    MatrixStates,
-    Mode,
-    Operations,
-    OperatorState,
-    TrackerState,
-)
 from service.web.keys import KeyFile
 
 LARGE_BYTES = 2_500_000
@@ -58,6 +59,13 @@ seconds, matrices."""
 
 UNUSED_BYTES = 8_000_000
 """Unused memory at the end of the heap above which it is returned to the system."""
+
+OPEN_FILES = 8192
+"""Files that the service may have open, as in ``deploy/pyrcal.service``: thousands of connections
+of strangers, to REST and the link, must not use up what the archive needs."""
+
+REST_RETRY_INTERVAL_S = 1.0
+"""Between two attempts to listen for REST."""
 
 END_WITHIN_S = 4.5
 """Time after which the parts that delay the end are named and abandoned: operators and process
@@ -69,6 +77,7 @@ def run(settings: Settings, instrument: Instrument, workers: WorkerPool) -> int:
     # the event loop's own products are small; a second BLAS thread would only fight the RTC link
     threadpool_limits(1)
     share_memory()
+    allow_files()
     log_to_the_terminal(settings.service.log_format)
     for remark in instrument.remarks:
         structlog.get_logger().warning("instrument.remark", text=remark)
@@ -85,6 +94,13 @@ def share_memory() -> None:
     set_allocator(map_bytes=LARGE_BYTES, keep_bytes=UNUSED_BYTES, n_pools=2)
 
 
+def allow_files() -> None:
+    """Let this process open more files: at its limit REST takes no connection for a second."""
+    usual, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with contextlib.suppress(ValueError):  # the system's own limit is lower
+        resource.setrlimit(resource.RLIMIT_NOFILE, (max(usual, OPEN_FILES), most))
+
+
 async def _serve(settings: Settings, instrument: Instrument, workers: WorkerPool) -> int:
     """Open everything, run until asked to stop or the service fails, close everything."""
     system = settings.service.system or instrument.name
@@ -95,24 +111,23 @@ async def _serve(settings: Settings, instrument: Instrument, workers: WorkerPool
         connect=settings.zenoh.connect,
         security=link_security(settings.zenoh, system),
     )
-    with _listener(settings.api.host, settings.api.port) as listener:
-        archive.open()
-        warn_of_readers(archive.directory)
-        where = "http://{}:{}".format(*listener.getsockname()[:2])
-        last = LastTelemetry(
-            settings.archive.last_telemetry_s, settings.archive.last_telemetry_mb * 1_000_000
-        )
-        bridge = Bridge(endpoint, last)
-        with archive, announce(archive.directory, where), bridge:
-            modes = [mode.config_id for mode in instrument.sensor_modes]
-            bridge.expect(instrument.basis_id, instrument.config_id, modes)
-            supervisor = _supervisor(settings, instrument, system, bridge, workers, archive)
-            desk = _desk(settings, instrument)
-            keys = KeyFile(settings.service.data_dir)
-            try:
-                return await _until_stopped(supervisor, desk, listener, settings.api, keys)
-            finally:
-                workers.close()
+    archive.open()
+    warn_of_readers(archive.directory)
+    last = LastTelemetry(
+        settings.archive.last_telemetry_s, settings.archive.last_telemetry_mb * 1_000_000
+    )
+    bridge = Bridge(endpoint, last)
+    # The supervisor opens the link, as soon as its network is there.
+    with archive, contextlib.closing(bridge):
+        modes = [mode.config_id for mode in instrument.sensor_modes]
+        bridge.expect(instrument.basis_id, instrument.config_id, modes)
+        supervisor = _supervisor(settings, instrument, system, bridge, workers, archive)
+        desk = _desk(settings, instrument)
+        keys = KeyFile(settings.service.data_dir)
+        try:
+            return await _until_stopped(supervisor, desk, settings.api, keys)
+        finally:
+            workers.close()
 
 
 def warn_of_readers(folder: Path) -> None:
@@ -126,7 +141,6 @@ def warn_of_readers(folder: Path) -> None:
 async def _until_stopped(
     supervisor: Supervisor,
     desk: FitQueue,
-    listener: socket.socket,
     settings: ApiTable,
     keys: KeyFile,
 ) -> int:
@@ -138,7 +152,12 @@ async def _until_stopped(
         await asyncio.to_thread(import_module, "service.api")
         from service import api
 
-        await api.answer(supervisor, desk, listener, settings, keys, ending.asked)
+        listener = await _listener(settings, supervisor, ending.asked)
+        if listener is None:
+            return
+        where = "http://{}:{}".format(*listener.getsockname()[:2])
+        with listener, announce(supervisor.archive.directory, where):
+            await api.answer(supervisor, desk, listener, settings, keys, ending.asked)
 
     work = asyncio.create_task(supervisor.run())
     web = asyncio.create_task(answer())
@@ -208,16 +227,35 @@ def _leave_behind() -> None:
     leave(1)
 
 
-def _listener(host: str, port: int) -> socket.socket:
-    """Bind the REST port first: a busy one must be said in one line before anything starts."""
-    try:
-        listener = socket.create_server((host, port))
-    except OSError as error:
-        raise ConfigurationError(
-            f"api.port: cannot listen on {host}:{port}: {error.strerror or error}; "
-            "choose another with --port"
-        ) from error
-    return listener
+async def _listener(
+    settings: ApiTable, supervisor: Supervisor, over: asyncio.Event
+) -> socket.socket | None:
+    """Return the socket of REST once its address exists and its port is free; None at the end.
+
+    Raises
+    ------
+    ConfigurationError
+        If this user may not listen there.
+    """
+    host, port = settings.host, settings.port
+    while not over.is_set():
+        try:
+            # In a thread, because a name may be looked up for seconds.
+            listener = await asyncio.to_thread(socket.create_server, (host, port))
+        except OSError as error:
+            text = f"api.port: cannot listen on {host}:{port}: {error.strerror or error}"
+            remedy = "choose another with --port"
+            if isinstance(error, PermissionError):
+                raise ConfigurationError(f"{text}; {remedy}") from error
+            supervisor.await_rest(
+                f"{text}; tried again every {REST_RETRY_INTERVAL_S:g} s. Start the network, stop "
+                f"the program that has the port (another pyrcal?), or {remedy}"
+            )
+            await asyncio.sleep(REST_RETRY_INTERVAL_S)
+        else:
+            supervisor.await_rest("")
+            return listener
+    return None
 
 
 def _supervisor(

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+import ssl
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Final
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from service.files.toml import Table, in_file, read_toml, refuse, validated
 from service.wire.access import (
@@ -23,6 +24,8 @@ from service.wire.keys import Keys
 
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 
+MAX_PORT: Final = 65_535
+
 USERS: Final = "transport/auth/usrpwd"
 """Key of zenoh's configuration."""
 
@@ -30,6 +33,10 @@ SHORTEST_SECRET: Final = 32
 """Characters."""
 
 _ENCRYPTED: Final = re.compile("(tls|quic)/")
+
+_USABLE: Final = re.compile("(tcp|tls|udp|quic|ws)/[^?#]*:([0-9]{1,5})([?#].*)?|unixsock-stream/.+")
+"""Endpoint of a protocol that zenoh's Python package has. Anything else could never be opened, and
+the service would wait for it for ever."""
 
 Names = tuple[Annotated[str, Field(min_length=1, max_length=64)], ...]
 
@@ -128,6 +135,18 @@ class ZenohTable(CredentialsTable):
     anyone_may_command_the_mirror: bool = False
     """Accept addresses other than loopback without ``[zenoh.tls]``: anybody who reaches them can
     put a matrix on the mirror."""
+
+    @field_validator("listen", "connect")
+    @classmethod
+    def _that_can_be_opened(cls, endpoints: tuple[str, ...]) -> tuple[str, ...]:
+        for endpoint in endpoints:
+            parts = _USABLE.fullmatch(endpoint)
+            if parts is None or int(parts[2] or 0) > MAX_PORT:
+                raise ValueError(
+                    f"found {endpoint}, expected PROTOCOL/HOST:PORT like {DEFAULT_ENDPOINT}, "
+                    f"PROTOCOL tcp, tls, udp, quic or ws, PORT at most {MAX_PORT}"
+                )
+        return endpoints
 
     @model_validator(mode="after")
     def _with_certificates_no_way_around_them(self) -> ZenohTable:
@@ -293,6 +312,11 @@ def secret_of(credentials: CredentialsTable) -> bytes | None:
 def _certificates(tls: TlsTable) -> dict[str, object]:
     ca = _there(tls.ca, "zenoh.tls.ca")
     own, key = _there(tls.certificate, "zenoh.tls.certificate"), _secret(tls.key, "zenoh.tls.key")
+    try:
+        # zenoh would say so only when it opens the link, like a network that is not there yet.
+        ssl.create_default_context().load_cert_chain(own, key, password="")
+    except (OSError, ValueError) as error:
+        refuse("zenoh.tls.key", f"{tls.key}: {error!s:.80}", f"the key of {own}, PEM")
     return {
         "root_ca_certificate": ca,
         "enable_mtls": True,

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.interaction import Linearisation
+from service.records.operations import Schedule
 
 Array = NDArray[np.float64]
 
@@ -55,23 +56,6 @@ class DitherRequirement:
 
     longest_s: float = np.inf
     """Longest interval between the starts of two bursts, however stable α is, seconds."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Schedule:
-    """Dither with one burst every ``interval_s``."""
-
-    total_m: float
-    """RMS of all lines together, metres OPD."""
-
-    interval_s: float
-    """Interval between the starts of two bursts, seconds; without pauses it is ``window_s``."""
-
-    sigma: Array
-    """``(4,)`` 1 σ of α just before each burst, which is its maximum, numeric units."""
-
-    sufficient: bool
-    """True if the required σ is met; else the whole budget is used and σ is close to the best."""
 
 
 def compute_schedule(precision: Array, requirement: DitherRequirement) -> Schedule:

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from service.control.loop import ControlLoop, find_eigenmodes
 from service.model.instrument import Instrument
 from service.model.sensors.registry import kind_of
+from service.records.products import ExpectedGain
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -60,24 +61,6 @@ class Sky:
 
     slope_noise: float
     """1 σ of one slope in one frame."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ExpectedGain:
-    """Predicted loss of wavefront with the reconstructor in use, against a new one."""
-
-    loss_m: float
-    """Wavefront error minus that with a new reconstructor, metres RMS; infinite if only the new one
-    is stable."""
-
-    wavefront_m: float
-    """Wavefront error with a new reconstructor, metres RMS."""
-
-    pole_radius: float
-    """Largest pole radius with the reconstructor in use, at α without its uncertainty."""
-
-    fresh_pole_radius: float
-    """Largest pole radius with a new reconstructor, at the same α."""
 
 
 def extrapolate_variance_m2(variance_m2: Array) -> float:

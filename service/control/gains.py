@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
+from service.records.registration import ModeGain
 
 Array = NDArray[np.float64]
 
@@ -146,26 +147,6 @@ GATE_GAIN_SIGMAS = 2.0
 
 GAIN_SWING = 0.05
 """Relative 1 σ of the change of the optical gain with the seeing between two windows."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ModeGain:
-    """Optical gain of one mode, averaged over the windows in which it was dithered."""
-
-    mode: int
-    """0-based basis index."""
-
-    gain: float
-    """Modulus of the measured over the modelled response."""
-
-    sigma: float
-    """1 σ of ``gain`` at ``t_ns_utc``."""
-
-    scatter: float
-    """1 σ of a single window, from the scatter of the windows."""
-
-    t_ns_utc: int
-    """End of the last window in which the mode was dithered, ns since the Unix epoch, UTC."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

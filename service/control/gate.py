@@ -14,7 +14,7 @@ unit of slope noise on, and none up to 326 nm (docs/results/reliability.md).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import scipy
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from service.control.loop import ControlLoop, find_eigenmodes
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
+from service.records.products import GateVerdict
 
 Array = NDArray[np.float64]
 Coupling = NDArray[np.float32]
@@ -43,38 +44,6 @@ _N_SIDE_POINTS = 24
 
 _N_MODES_FOR_BOUNDS = 1000
 """Number of modes from which a proven bound is cheaper than all eigenvalues."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GateVerdict:
-    """Verdict of the gate on a reconstructor, over the whole range of α."""
-
-    accepted: bool
-    """True only if every pole, everywhere within α ± 3σ, stays inside the bound."""
-
-    worst_pole_radius: float
-    """Largest closed-loop pole radius; 1 is the edge of stability. If the reconstructor is
-    accepted, the true maximum is below the bound and at most 0.02 above this value."""
-
-    aligned_pole_radius: float
-    """Pole radius of a perfect reconstructor at these gains, the smallest that is possible."""
-
-    bound: float
-    """Largest radius that would have been accepted."""
-
-    n_points: int
-    """Number of registrations considered."""
-
-    reason: str
-    """Explanation for the operator; with what to do if the reconstructor was refused."""
-
-    edge_motion_m: float | None = None
-    """Largest RMS motion of an outer actuator for slope noise of 1, metres; None if unknown."""
-
-    @property
-    def unstable(self) -> bool:
-        """True if some loop within α ± 3σ has a pole on or outside the unit circle."""
-        return self.worst_pole_radius >= 1.0
 
 
 def judge(

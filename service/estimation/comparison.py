@@ -6,7 +6,6 @@ Numbers are from docs/results/reliability.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 from functools import reduce
 from typing import NamedTuple
 
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.estimation.residual import Residual, ResidualLevel
+from service.records.operations import ProbationFinding, Verdict
 
 Array = NDArray[np.float64]
 
@@ -96,62 +96,6 @@ MIN_MODE_SCATTER = 0.05
 """The same of a mode's steps: white noise has 0.06 in a group of 500 frames."""
 
 SLOPES, OUTER, INNER = -3, -2, -1
-
-
-class Verdict(StrEnum):
-    """Outcome of a comparison."""
-
-    AS_GOOD = "as-good"
-    WORSE = "worse"
-    UNKNOWN = "unknown"
-    """It could not be made; the text says why."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ProbationFinding:
-    """Telemetry with one matrix against telemetry with the one before."""
-
-    verdict: Verdict
-    before: str
-    """Id of the matrix before."""
-
-    after: str
-    """Id of the one that is judged."""
-
-    text: str
-    """The numbers in words, or why there are none."""
-
-    after_s: float = 0.0
-    """Telemetry with it, seconds."""
-
-    mode: int = -1
-    """The one that has grown most against all others; -1: none was compared."""
-
-    mode_ratio: float = 0.0
-    """RMS of its steps over that before, less what all modes have in common."""
-
-    limit: float = 0.0
-    """Limit of that ratio; a larger ratio is worse."""
-
-    common_ratio: float = 0.0
-    """RMS of the steps over those before: the median of all modes."""
-
-    slopes_ratio: float = 0.0
-    """RMS of all slopes over that before."""
-
-    lost: bool = False
-    """True if the loop has stopped correcting: the wavefront would be no worse without it."""
-
-    residual_ratio: float | None = None
-    """RMS of the residual as both matrices measure it, divided by that before the swap, with seeing
-    taken out. If the numbers of the new matrix are unknown, as the previous matrix measures it;
-    None if neither is known."""
-
-    residual_limit: float | None = None
-    """Limit of that ratio; a larger ratio is worse. None if the ratio is None."""
-
-    ring_ratio: float | None = None
-    """RMS of the outer ring against the mirror inside, over that before; None: too few modes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -354,13 +354,17 @@ def _strays(stray: Array, wanted_m: float) -> list[str]:
 def _find_hidden_modes(
     asked: ExpectedDither, own: Array, reported_m: Array, moved: Array
 ) -> list[str]:
-    """Return which modes outside the loop move more than the columns of the dither say."""
+    """Return modes outside the loop that move more than their dither column says, or not at all.
+
+    Commands that lack the dither look like slopes of the other sign where the loop answers it.
+    """
     if not asked.frequency_hz:
         return []
     much = moved > MAX_AMPLITUDE_RATIO * reported_m + MIN_AMPLITUDE_RATIO * np.array(
         asked.amplitude_m
     )
-    hidden = np.flatnonzero(own & much)
+    lacking = moved < MAX_STRAY_SHARE * reported_m
+    hidden = np.flatnonzero(own & (much | lacking))
     return [
         f"the commands of mode {asked.modes[k]} hold {1e9 * moved[k]:.3g} nm at "
         f"{asked.frequency_hz[k]:g} Hz, its dither column {1e9 * reported_m[k]:.3g} nm"

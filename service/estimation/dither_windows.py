@@ -16,7 +16,7 @@ from service.estimation.estimator import (
 )
 from service.estimation.lockin import LockIn, LockInPlan, Spectra
 from service.estimation.random_dither import Correlated, RandomDither, RandomPlan
-from service.estimation.windows import WindowRefused
+from service.records.estimates import WindowRefused
 
 EndedWindow = Spectra | Correlated
 """One that the worker can fit."""

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.lockin import LockInEstimate, Spectra
+from service.estimation.lockin import Spectra
 from service.estimation.own_matrix import LeftOver
+from service.records.estimates import LockInEstimate
 
 Array = NDArray[Any]
 

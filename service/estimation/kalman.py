@@ -13,12 +13,13 @@ that b has changed by as much.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.estimate import BIAS_FLOOR
+from service.records.estimates import BIAS_FLOOR
+from service.records.registration import Bias
 
 Array = NDArray[np.float64]
 
@@ -37,18 +38,6 @@ they are mounted, not in the course of a night."""
 
 SCATTER_LEARNING = 0.05
 """Weight of the newest in how much windows, and looks, scatter: twenty are remembered."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Bias:
-    """State of the bias of the passive estimate, besides mean and covariance."""
-
-    excess: Array = field(default_factory=lambda: np.zeros(4))
-    """``(4,)`` variance of the bias beyond its floor that estimates have indicated, and that is in
-    the covariance or has been learnt since."""
-
-    scatter: float = 1.0
-    """Ratio of the scatter of estimates to their covariances, in variance; at least 1."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -19,17 +19,10 @@ from typing_extensions import override
 
 from service.errors import ModelError
 from service.estimation.demodulation import SIDE_OFFSETS_HZ, DemodulationBank
-from service.estimation.estimate import DitheredEstimate
 from service.estimation.frames import FrameBlock
-from service.estimation.windows import (
-    ClosedLoop,
-    Telemetry,
-    Window,
-    WindowCutter,
-    WindowPlan,
-    WindowRefused,
-)
+from service.estimation.windows import ClosedLoop, Telemetry, Window, WindowCutter, WindowPlan
 from service.model.interaction import Linearisation
+from service.records.estimates import LockInEstimate, WindowRefused
 
 Array = NDArray[Any]
 
@@ -235,21 +228,6 @@ WEAK_LINE_RATIO = 0.3
 
 MAX_LAG_FRAMES = 0.2
 """A larger lag between slopes and commands: the columns are not aligned as the wire demands."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LockInEstimate(DitheredEstimate):
-    """Registration from one window of sines.
-
-    There is one gain and one lag for each line. Gains are complex, because a lag turns the phase of
-    a line. The misfit is the residual power at the lines over that at the side bins.
-    """
-
-    dither_m: float = 0.0
-    """RMS of all lines together, as applied to the mirror, metres OPD; 0 if it is unknown."""
-
-    window_s: float = 0.0
-    """Length of the window, seconds; 0 if it is unknown."""
 
 
 def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop) -> LockInEstimate:

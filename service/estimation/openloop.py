@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.estimation import solver
-from service.estimation.lockin import MAX_LAG_FRAMES, LockInEstimate, Spectra, fit_window
+from service.estimation.lockin import MAX_LAG_FRAMES, Spectra, fit_window
 from service.estimation.solver import MAX_STEP, Columns
-from service.estimation.windows import ClosedLoop, RefusalKind, WindowRefused
+from service.estimation.windows import ClosedLoop
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
@@ -27,6 +27,11 @@ from service.model.misregistration import Misregistration
 from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import CannotTell
 from service.model.slopes import Orientation
+from service.records.estimates import (
+    RefusalKind,
+    WideCaptureEstimate,
+    WindowRefused,
+)
 
 Array = NDArray[Any]
 
@@ -49,20 +54,6 @@ MAX_PUPIL_SHIFT_SUBAP = 3.0
 instrument."""
 
 _TURNS_RAD = np.deg2rad([5.0, -5.0])
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class WideCaptureEstimate:
-    """Registration from one window with the loop open."""
-
-    estimate: LockInEstimate
-    """Its covariance is the noise's alone."""
-
-    unexplained: float
-    """Share of the columns' power, noise taken off, that the model leaves."""
-
-    n_starts: int
-    """Starts that were tried."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

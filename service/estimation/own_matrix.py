@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from service.control.reconstructor import MAX_CONDITION
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
+from service.records.products import UNEVEN_RATIO
 
 Array = NDArray[Any]
 
@@ -48,9 +49,6 @@ MAX_STEP = np.array([0.7, 0.7, np.deg2rad(4.0), 0.04])
 MAX_STRANGE_SHARE = 0.3
 """Share of columns that may be no mode of the model before all are taken for another basis."""
 
-UNEVEN_RATIO = 1.6
-"""A mode that answers so many times as its neighbours do, or one over that, is named: those of
-healthy telescopes are within 1.12, but for the last of a basis that has all of a mirror's."""
 
 N_NEIGHBOURS = 10
 """Number of neighbours that a mode's response is compared with."""

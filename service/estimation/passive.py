@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.errors import ModelError
-from service.estimation.estimate import PassiveEstimate
 from service.estimation.estimator import Change, FrameContext, LoopContext, Mark, Streaming
 from service.estimation.frames import FrameBlock, join_frames
 from service.estimation.loop import explain_open_loop
@@ -30,6 +29,7 @@ from service.estimation.solver import Columns
 from service.estimation.windows import CHUNK_FRAMES
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
+from service.records.estimates import PassiveEstimate
 
 Array = NDArray[Any]
 

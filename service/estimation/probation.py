@@ -36,8 +36,6 @@ from service.estimation.comparison import (
     SLOPES,
     Before,
     Part,
-    ProbationFinding,
-    Verdict,
     compare_telemetry,
     not_compared,
 )
@@ -46,6 +44,7 @@ from service.estimation.estimator import Change, FrameContext, LoopContext, Mark
 from service.estimation.frames import FrameBlock
 from service.estimation.loop import same_but_for_modes
 from service.estimation.residual import Reader
+from service.records.operations import ProbationFinding, Verdict
 from service.wire import Status
 
 Array = NDArray[np.float64]

@@ -16,19 +16,16 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.errors import ModelError
-from service.estimation.estimate import DitheredEstimate
 from service.estimation.frames import FrameBlock
 from service.estimation.solver import Columns
-from service.estimation.windows import (
+from service.estimation.windows import Telemetry, Window, WindowCutter, WindowPlan
+from service.model.interaction import Linearisation
+from service.records.estimates import (
+    RandomEstimate,
     RefusalKind,
-    Telemetry,
     Why,
-    Window,
-    WindowCutter,
-    WindowPlan,
     WindowRefused,
 )
-from service.model.interaction import Linearisation
 
 Array = NDArray[Any]
 
@@ -254,31 +251,6 @@ class NoisyMatrix:
         """RMS signal of an element over its noise, over the whole matrix."""
         power = float(np.mean((self.matrix / self.noise) ** 2)) - 1.0
         return float(np.sqrt(max(power, 0.0)))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RandomEstimate(DitheredEstimate):
-    """Registration from one window of random signs.
-
-    Its lag ``(1,)`` is the share of the response that comes one frame late.
-    """
-
-    gain_sigma: NDArray[np.float64]
-    """``(n_dithered,)`` 1 σ of each gain."""
-
-    def gains_by_group(self, n_groups: int) -> tuple[tuple[int, ...], Array, Array]:
-        """Return modes, gains and 1 σ of at most ``n_groups`` groups of neighbouring modes.
-
-        One mode among hundreds contains little information on its gain, and neighbours have nearly
-        equal gains. They are averaged by their noise, and the middle mode represents the group.
-        """
-        order = np.argsort(self.modes)
-        groups = [g for g in np.array_split(order, min(n_groups, len(order))) if len(g)]
-        weights = self.gain_sigma**-2.0
-        gains = [float(np.average(self.optical_gain[g], weights=weights[g])) for g in groups]
-        sigma = [float(weights[g].sum() ** -0.5) for g in groups]
-        modes = tuple(self.modes[g[len(g) // 2]] for g in groups)
-        return modes, np.array(gains), np.array(sigma)
 
 
 def noisy_matrix(window: Correlated) -> NoisyMatrix:

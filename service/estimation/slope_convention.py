@@ -247,9 +247,10 @@ def _unit_of_matrix(ratio: float, instrument: Instrument) -> str:
     """
     if DOUBLED_RESPONSE_RANGE[0] < ratio < DOUBLED_RESPONSE_RANGE[1] and not instrument.double_pass:
         return (
-            f"the RTC's own matrix expects {ratio:.2f} times the model's slopes: its commands are "
-            "metres of surface, not of OPD, or it was measured in double pass ([instrument] "
-            f"double_pass = true){_optic_named(instrument)}"
+            f"the RTC's own matrix expects {ratio:.2f} times the model's slopes: its slopes are in "
+            "another unit than the instrument file says, its commands are metres of surface, not "
+            "of OPD, it was measured in double pass ([instrument] double_pass = true), or "
+            f"{_optic_named(ratio, instrument)}"
         )
     if RESPONSE_RATIO_RANGE[0] < ratio < RESPONSE_RATIO_RANGE[1]:
         return ""
@@ -259,19 +260,22 @@ def _unit_of_matrix(ratio: float, instrument: Instrument) -> str:
     )
 
 
-def _optic_named(instrument: Instrument) -> str:
-    """Return the value of the sensor that also explains too large a response; empty if none."""
+def _optic_named(ratio: float, instrument: Instrument) -> str:
+    """Return the values of the sensor that also explain so many times the model's response."""
     key = kind_of(instrument).find_fitted_key(instrument.wfs)
-    return "" if key is None else f", or [wfs] {key} is too large"
+    keys = "wavelength_m" if key is None else f"wavelength_m or {key}"
+    return f"[wfs] {keys} is too {'large' if ratio > 1.0 else 'small'}"
 
 
 def _unit_named(ratio: float, instrument: Instrument) -> str:
     """Return what makes commands answer so many times as metres of OPD would."""
     unit = unit_like(1.0 / max(ratio, 1e-30), _UNIT_DECADES)
     if unit:
-        return f"commands look like {unit}; metres of OPD are expected"
-    optic = _optic_named(instrument) if ratio > 1.0 else ""
-    return f"commands are in another unit than metres of OPD, or decoded wrongly{optic}"
+        return (
+            f"commands look like {unit} (metres of OPD are expected), or slopes have another unit"
+        )
+    optic = _optic_named(ratio, instrument)
+    return f"slopes or commands (metres of OPD) have another unit than in the file, or {optic}"
 
 
 def _planes(rows: Array, slopes: SlopeRecipe, mask: NDArray[np.bool_]) -> Array:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from service.control.loop import ControlLoop
 from service.estimation.frames import FrameBlock, join_frames
+from service.records.estimates import RefusalKind, Why, WindowRefused
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -151,48 +151,6 @@ class Telemetry:
             other.cm_id,
             replace(other.plan, first_seq=0),
         )
-
-
-class RefusalKind(StrEnum):
-    """Kinds of windows that give no estimate, as far as anything follows from it."""
-
-    OTHER = "other"
-    """It is counted, and no more."""
-
-    CUT_SHORT = "cut-short"
-    """Its reconstructor or its dither ended in it, which they do when all is well."""
-
-    VOID = "void"
-    """It was taken while nothing could be measured, for a reason that is known."""
-
-    MISALIGNED = "misaligned"
-    """The slopes of a row are not those that its commands were sent for."""
-
-    OUT_OF_REACH = "out-of-reach"
-    """The registration is too far from where the fit began."""
-
-    NOT_FOUND = "not-found"
-    """It was good, of an open loop, and no registration explains it."""
-
-    MISTOLD = "mistold"
-    """It shows that slopes or commands are not what the instrument file says."""
-
-
-Why = tuple[RefusalKind, str]
-"""Kind of a rejection, and its text."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WindowRefused:
-    """A window that gave no estimate."""
-
-    reason: str
-    """Description of the cause, and what to do about it."""
-
-    t_ns_utc: int
-    """Time of the rejection."""
-
-    kind: RefusalKind = RefusalKind.OTHER
 
 
 P = TypeVar("P", bound=WindowPlan)

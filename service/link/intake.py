@@ -20,9 +20,10 @@ from service.link.matrices import LinkEvent
 from service.link.ring import FRAME_OUTCOMES, LEAP, FrameRing
 from service.link.session import Endpoint
 from service.link.statistics import MALFORMED, USED, Counters, LinkStatistics
-from service.tracking import events as ev
-from service.tracking.alarms import OTHER_BASIS, SECOND_RTC
-from service.tracking.state import Level
+from service.link.telemetry_age import MAX_AGE_S, TelemetryAge
+from service.records import events as ev
+from service.records.alarms import OTHER_BASIS, SECOND_RTC
+from service.records.state import Level
 
 MAX_QUEUED_EVENTS: Final = 1024
 """Events kept; when more wait, the oldest are dropped and counted."""
@@ -48,6 +49,9 @@ MAX_CHANGED_STATUSES: Final = 10
 
 COALESCED: Final = "spared"
 """Outcome of a status that a later one made superfluous."""
+
+OLD: Final = "old"
+"""Outcome of frames that took too long to arrive."""
 
 PLACEMENT_TEXTS: Final = {
     "duplicate": "they had come before",
@@ -120,6 +124,7 @@ class Intake:
         self._changes = 0
         self._coalesced: bytes | None = None
         self._latency_s: deque[float] = deque(maxlen=N_LATENCY_BATCHES)
+        self._age = TelemetryAge()
 
     def expect(
         self, basis_id: str | None, config_id: str | None, modes: Collection[str] = ()
@@ -204,7 +209,7 @@ class Intake:
         if arrived.latency_s is not None:
             self._latency_s.append(arrived.latency_s)
         if self._belongs(batch.header, arrived.at_s):
-            self._store(batch, arrived.at_s)
+            self._store(batch, arrived.at_s, arrived.latency_s)
 
     def status(self, data: bytes) -> None:
         """Take the RTC's account of its loop; of a flood of them as many as are of use.
@@ -247,6 +252,7 @@ class Intake:
             self._counters.add("status", USED, 1, now_s)
             self._essentials = found
             self._last_status_s = now_s
+            self._age.add_status(status, now_s)
             self._check_ids(status.basis_id, status.config_id, now_s)
             self._shape = (status.n_slopes, status.n_modes)
             self._put(status)
@@ -270,6 +276,8 @@ class Intake:
             self._rtc_alive = alive
             if not alive:
                 self._sessions.leave()
+                # A connection of its own, perhaps of another machine, has other delays.
+                self._age = TelemetryAge()
         appeared = ev.LogEvent(name="rtc.appeared", text="the RTC is there")
         self.event(appeared if alive else ev.RtcVanished())
 
@@ -393,8 +401,10 @@ class Intake:
                 acknowledgements_unknown=self._counted["unknown"],
                 events_dropped=self._counted["dropped"],
                 callback_errors=self._counted["failed"],
+                missing="",
                 waiting_connections={},
                 frame_age_s=_age_s(self._last_frame_s, now_s),
+                telemetry_age_s=self._age.age_s,
                 dispositions=tally.dispositions(now_s),
                 status_age_s=_age_s(self._last_status_s, now_s),
                 session_age_s=now_s - self._begun_s,
@@ -426,7 +436,7 @@ class Intake:
             "the RTC's status says"
         )
 
-    def _store(self, batch: wire.FrameBatch, now_s: float) -> None:
+    def _store(self, batch: wire.FrameBatch, now_s: float, latency_s: float | None) -> None:
         header = batch.header
         self._counted["batches"] += 1
         self._last_frame_s = now_s
@@ -444,7 +454,12 @@ class Intake:
             if not batches:
                 self._counters.add("frames", reason, header.n, now_s, text)
         for each in batches:
-            self._place(self._ring, each, now_s)
+            age_s = self._age.add_frames(each.header, now_s, latency_s)
+            if age_s > MAX_AGE_S:
+                self._ring.skip(each.header, now_s)
+                self._counters.add("frames", OLD, each.header.n, now_s, f"{age_s:.1f} s old")
+            else:
+                self._place(self._ring, each, now_s)
 
     def _place(self, ring: FrameRing, batch: wire.FrameBatch, now_s: float) -> None:
         """Put frames in their places, and count what became of them."""

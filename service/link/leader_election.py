@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Final
 
 from service.link import session as link
-from service.tracking.events import ServicesMet
+from service.records.events import ServicesMet
 from service.wire import Keys, Role
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from service import wire
 from service.errors import UnknownIdError, WireError
-from service.tracking.events import Event
+from service.records.events import Event
 
 MAX_OFFERS: Final = 8
 """Most matrices kept, whatever their age; the current one is always among them."""

@@ -153,6 +153,16 @@ class FrameRing:
             # copied: a few frames must not keep the memory of all that came with them
             self._hold(_part(batch, start, stop, copied=True))
 
+    def skip(self, header: FrameHeader, now_s: float) -> None:
+        """Pass the places of frames that are not used, and all that waits."""
+        n_new = max(header.seq0 + header.n - self._head, 0)
+        if n_new:
+            self._newest_ns = header.t0_ns + (header.n - 1) * header.dt_ns
+        self._leapt = []
+        self._advance(self._head + n_new, now_s)
+        self._counts["lost"] -= min(n_new, header.n)  # they have come
+        self._cursor = self._head
+
     @property
     def head(self) -> int:
         """Number of the frame that comes next."""

@@ -6,7 +6,9 @@ minor and their use is confined to this page.
 
 from __future__ import annotations
 
+import contextlib
 import json
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +20,7 @@ import zenoh.ext
 from numpy.typing import NDArray
 
 from service import wire
-from service.errors import LinkError, WireError
+from service.errors import ConfigurationError, LinkError, WireError
 from service.wire.access import NO_SECURITY, LinkSecurity
 from service.wire.signing import Signatures
 
@@ -33,6 +35,10 @@ clears another for almost every 64 kB that come."""
 MAX_MESSAGE_BYTES = 2 * max(wire.CHUNK_LIMIT, wire.BATCH_LIMIT)
 """Longest message that a link assembles: twice the longest of the contract, in which a matrix of
 any size travels in parts. zenoh's own limit is 1 GB for each sender, and that memory is kept."""
+
+CONNECT_TIMEOUT_MS = 2000
+"""Longest attempt to reach a router, which without this waits 10 s for one that is silent. The
+service has to notice at once that the router has come, and to end in time."""
 
 TOKENS_TIMEOUT_S = 1.0
 """Time for the routers to report which tokens exist; they answer within milliseconds."""
@@ -96,8 +102,10 @@ def open_session(endpoint: Endpoint) -> zenoh.Session:
 
     Raises
     ------
+    ConfigurationError
+        If zenoh does not understand an endpoint.
     LinkError
-        If the port is busy or no router answers.
+        If the network is not there yet: an address, a name, a free port, or a router.
     """
     config = zenoh.Config()
     client = bool(endpoint.connect)
@@ -106,6 +114,7 @@ def open_session(endpoint: Endpoint) -> zenoh.Session:
         "listen/endpoints": [] if client else list(endpoint.listen),
         "connect/endpoints": list(endpoint.connect),
         "connect/retry": RETRY_OPTIONS,
+        "connect/timeout_ms": CONNECT_TIMEOUT_MS,
         # Only the configured endpoints count: scouting would connect any zenoh program of the
         # network.
         "scouting/multicast/enabled": False,
@@ -114,6 +123,10 @@ def open_session(endpoint: Endpoint) -> zenoh.Session:
         "transport/link/tx/lease": round(1000 * endpoint.lease_s),
         "transport/link/rx/buffer_size": RX_BUFFER_BYTES,
         "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
+        # Silent connections must not keep an RTC out that restarts: by default a hundred may wait
+        # for 10 s each.
+        "transport/unicast/accept_pending": 2000,
+        "transport/unicast/accept_timeout": 3000,
         "transport/shared_memory/enabled": False,
         **endpoint.security.zenoh,
     }
@@ -122,7 +135,7 @@ def open_session(endpoint: Endpoint) -> zenoh.Session:
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
         found = ", ".join(map(repr, endpoint.connect if client else endpoint.listen))
-        raise LinkError(
+        raise ConfigurationError(
             f"zenoh.{'connect' if client else 'listen'}: found {found}, expected endpoints like "
             "tcp/127.0.0.1:7447"
         ) from error
@@ -133,9 +146,12 @@ def open_session(endpoint: Endpoint) -> zenoh.Session:
 
 
 def _complaint(endpoint: Endpoint, text: str) -> str:
-    text = text.partition("!  at ")[0]  # where in zenoh's own source that was
     if endpoint.connect:
-        return f"no zenoh router answers at {', '.join(endpoint.connect)}: {text:.160}"
+        return (
+            f"no zenoh router answers at {', '.join(endpoint.connect)}: start it, and see that its "
+            "name resolves and its port can be reached from here"
+        )
+    text = re.split(r"[.!]?\s+at /", text)[0]  # where in zenoh's own source that was
     where = ", ".join(endpoint.listen)
     if "already in use" in text:
         return (
@@ -204,6 +220,12 @@ def last_value(session: zenoh.Session, key: str) -> zenoh.ext.AdvancedPublisher:
         congestion_control=zenoh.CongestionControl.DROP,
         cache=zenoh.ext.CacheConfig(1),
     )
+
+
+def put_last(publisher: zenoh.ext.AdvancedPublisher, data: bytes, encoding: str) -> None:
+    """Publish the latest value; it is dropped if another thread closes the link meanwhile."""
+    with contextlib.suppress(zenoh.ZError):
+        publisher.put(data, encoding=encoding)
 
 
 def put(session: zenoh.Session, key: str, data: bytes, encoding: str, *, urgent: bool) -> None:

@@ -173,8 +173,14 @@ class LinkStatistics:
     frame_age_s: float | None
     """Seconds since the last frame arrived, by arrival; None: none has."""
 
+    telemetry_age_s: float = 0.0
+    """Age of the newest frame at its arrival, seconds: its delay beyond that of the fastest one."""
+
     dispositions: tuple[Disposition, ...] = ()
     """Outcomes of frames and messages by kind, the most frequent first."""
+
+    missing: str = ""
+    """What keeps the link from being opened; empty if it is open."""
 
     waiting_connections: Mapping[int, int] = field(default_factory=dict)
     """Connections closed before a TLS handshake that zenoh has not dealt with yet, by port."""

@@ -16,22 +16,22 @@ from numpy.typing import NDArray
 
 from service import wire
 from service.control.gains import gain_table
-from service.control.gate import GateVerdict
 from service.control.loop import ControlLoop
 from service.errors import ArchiveError, CommandError, LinkError, StorageError, UnknownIdError
 from service.estimation.description import Description
 from service.estimation.loop import extend_gains, same_gains, select_gains
 from service.link.matrices import MeasuredMatrix
 from service.model.instrument import Instrument
+from service.records import alarms, products
+from service.records import events as ev
+from service.records.events import Effect, Event
+from service.records.operations import MeasurementRecord
+from service.records.products import GateVerdict
+from service.records.registration import Registration
+from service.records.state import TrackerState
 from service.runtime import estimates, ports
 from service.runtime.worker import Conditions, OpticsWorker, run_job
-from service.tracking import alarms, products
-from service.tracking import events as ev
-from service.tracking.events import Effect, Event
-from service.tracking.operation_records import MeasurementRecord
 from service.tracking.pointing_law import registration_ahead
-from service.tracking.registration import Registration
-from service.tracking.state import TrackerState
 from service.version import software_version
 
 UNKNOWN_PARENT = "unknown"

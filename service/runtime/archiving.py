@@ -21,17 +21,17 @@ from service.archive import Actor, Archive, AuditEntry
 from service.archive.nights import TrendSample
 from service.archive.retention import RetentionPolicy, due, items, low_on_space, remove
 from service.errors import ArchiveError, StorageError
+from service.records import events as ev
+from service.records.alarms import ARCHIVE_FAILED, DISK_LOW
+from service.records.commands import Command, makes_safer
+from service.records.events import Effect
+from service.records.products import ReconstructorRecord
+from service.records.registration import HistoryEntry
+from service.records.state import Level, LogEntry, TrackerState
 from service.runtime.command_results import GivenCommand
-from service.tracking import events as ev
-from service.tracking.alarms import ARCHIVE_FAILED, DISK_LOW
-from service.tracking.commands import Command, makes_safer
-from service.tracking.events import Effect
 from service.tracking.mode_proof import proof_to_keep
 from service.tracking.policy import Policy
-from service.tracking.products import ReconstructorRecord
-from service.tracking.registration import HistoryEntry
 from service.tracking.resume import orders_of, resumed, saved_of, with_orders
-from service.tracking.state import Level, LogEntry, TrackerState
 from service.tracking.step_context import logged
 from service.wire import DitherRequest, MeasureRequest, OffloadRequest, RampRequest
 
@@ -183,12 +183,12 @@ class ArchiveWriter:
 
     def _sends_new_numbers(self, effect: Effect) -> bool:
         """Return True if an effect sends a matrix, and not the numbers of an earlier one again."""
-        record = self._state().reconstructor(getattr(effect, "id", None) or "")
-        if not isinstance(effect, ev.SendMatrix) or record is None:
-            return isinstance(effect, ev.SendMatrix)
+        if not isinstance(effect, ev.SendMatrix):
+            return False
         # A rollback makes the loop safer, and the archive has its numbers under the earlier id.
-        earlier = self._state().reconstructor(record.parent or "")
-        return earlier is None or earlier.sha256 != record.sha256
+        known, record = self._state().reconstructor, self._state().reconstructor(effect.id)
+        earlier = record and known(record.parent or "")
+        return not (record and earlier and earlier.sha256 == record.sha256)
 
     async def flush(self) -> None:
         """Write what waits.

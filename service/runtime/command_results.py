@@ -8,18 +8,18 @@ from enum import StrEnum
 from typing import Any, Final
 
 from service.errors import CommandError, LinkError, UnknownIdError
-from service.tracking import commands as cmd
-from service.tracking import events as ev
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.alarms import AlarmRecord
+from service.records.commands import Command
+from service.records.events import Effect, Event
+from service.records.operations import CommandState, MeasureState
+from service.records.products import MatrixState, ReconstructorRecord
+from service.records.state import TrackerState
 from service.tracking.alarm_records import muted_records
 from service.tracking.alarm_rules import format_value
-from service.tracking.alarms import AlarmRecord
-from service.tracking.commands import Command
 from service.tracking.dither_request import total_m
-from service.tracking.events import Effect, Event
-from service.tracking.operation_records import CommandState, MeasureState
-from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import check_sendable
-from service.tracking.state import TrackerState
 
 SILENT = "sent, the RTC has not answered yet"
 

@@ -16,8 +16,13 @@ from service.estimation.description import Description
 from service.estimation.dither_windows import EndedWindow, Window
 from service.estimation.frames import FrameBlock
 from service.estimation.passive import Passive
-from service.estimation.windows import WindowRefused
 from service.model.slopes import likely_kind
+from service.records import alarms
+from service.records import events as ev
+from service.records.alarms import Interlock, blocking_alarm
+from service.records.estimates import WindowRefused
+from service.records.events import Effect, Event
+from service.records.state import TrackerState
 from service.runtime.estimator_bank import (
     EstimatorBank,
     close_sums,
@@ -27,13 +32,8 @@ from service.runtime.estimator_bank import (
     with_rtc,
 )
 from service.tracker import step
-from service.tracking import alarms
-from service.tracking import events as ev
-from service.tracking.alarms import Interlock, blocking_alarm
-from service.tracking.events import Effect, Event
 from service.tracking.operations.running import OperationKind, running_operations
 from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.state import TrackerState
 from service.wire import Status
 
 RECENT_WINDOW_S = 8.0

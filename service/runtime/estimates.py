@@ -13,31 +13,32 @@ from numpy.typing import NDArray
 
 from service.archive.products import NoisyNumbers
 from service.errors import CommandError, ModelError, PyrcalError, UnknownIdError
-from service.estimation import lockin, openloop, orientation, random_dither
+from service.estimation import lockin, orientation, random_dither
 from service.estimation.dither_windows import EndedWindow
 from service.estimation.loop import loop_numbers
 from service.estimation.own_matrix import OwnMatrix
 from service.estimation.passive import Passive
-from service.estimation.random_dither import Correlated, RandomEstimate, noisy_matrix
+from service.estimation.random_dither import Correlated, noisy_matrix
 from service.estimation.slope_convention import SlopeConvention
-from service.estimation.windows import (
-    OTHER_SESSION,
-    ClosedLoop,
-    RefusalKind,
-    Telemetry,
-    WindowRefused,
-)
+from service.estimation.windows import OTHER_SESSION, ClosedLoop, Telemetry
 from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
+from service.records import alarms, products
+from service.records import events as ev
+from service.records.estimates import (
+    LockInEstimate,
+    RandomEstimate,
+    RefusalKind,
+    WideCaptureEstimate,
+    WindowRefused,
+)
+from service.records.events import Event
+from service.records.operations import MeasurementRecord, MeasureState, NoisyFinding
+from service.records.state import Level, TrackerState
 from service.runtime.ports import StorePort, WorkerPort
 from service.runtime.worker import OpticsWorker, run_job
 from service.runtime.worker.records import waits
-from service.tracking import alarms, products
-from service.tracking import events as ev
-from service.tracking.events import Event
-from service.tracking.operation_records import MeasurementRecord, MeasureState, NoisyFinding
 from service.tracking.pointing_law import start_of_fit
-from service.tracking.state import Level, TrackerState
 from service.tracking.window_processing import fit_begins_at
 from service.wire import checksum
 
@@ -115,14 +116,14 @@ async def fitted(
     if state.loop.rtc is not None:
         n_frames = window.n_windows * window.plan.n_frames
         began_ns = window.t_end_ns_utc - round(n_frames * 1e9 / state.loop.rtc.frame_rate_hz)
-    if isinstance(outcome, openloop.WideCaptureEstimate):
+    if isinstance(outcome, WideCaptureEstimate):
         return ev.WideCaptureFitted(found=outcome, began_ns_utc=began_ns)
     return ev.WindowFitted(estimate=outcome, began_ns_utc=began_ns)
 
 
 async def _outcome(
     window: EndedWindow, state: TrackerState, workers: WorkerPort, matrix_of: MatrixOf
-) -> lockin.LockInEstimate | RandomEstimate | openloop.WideCaptureEstimate | WindowRefused:
+) -> LockInEstimate | RandomEstimate | WideCaptureEstimate | WindowRefused:
     rtc, registration = state.loop.rtc, state.alpha.registration
     alpha = None if registration is None else registration.alpha
     if alpha is None and state.alpha.law.nominal is None:

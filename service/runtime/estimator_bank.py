@@ -20,9 +20,11 @@ from service.estimation.estimator import Change, FrameContext, LoopContext, Mark
 from service.estimation.frames import FrameBlock
 from service.estimation.loop import last_seq, same_loop, same_rate
 from service.estimation.passive import Passive
-from service.estimation.windows import DITHER_SETTLING_S, WindowRefused
+from service.estimation.windows import DITHER_SETTLING_S
+from service.records.estimates import WindowRefused
+from service.records.operations import Dither
 from service.runtime.registry import REGISTRY, Entry
-from service.tracking.dither_request import Dither, expected_dither, lock_in_plan, random_plan
+from service.tracking.dither_request import expected_dither, lock_in_plan, random_plan
 from service.wire import DitherKind, Status
 
 N_MATRICES_FOLLOWED = 2

@@ -6,7 +6,7 @@ from collections import deque
 from typing import Final
 
 from service.link.statistics import LinkStatistics
-from service.tracking.alarms import FRAMES_LOST, NO_FRAMES
+from service.records.alarms import FRAMES_LOST, NO_FRAMES
 from service.wire import Status
 
 LOSS_PERIOD_S: Final = 5.0

@@ -13,8 +13,8 @@ from service.files.disk_cache import usual_folder
 from service.model.instrument import Instrument, TabulatedModes
 from service.model.misregistration import BOUNDARY_SCALE
 from service.model.sensors.registry import kind_of
+from service.records.alarms import Interlock, Severity
 from service.runtime.worker import Compute, Sampling
-from service.tracking.alarms import Interlock, Severity
 from service.tracking.policy import Offloading, Policy, Rule, SensorModePolicy
 
 FLAT = (0.004, 0.01, 0.001)
@@ -84,6 +84,9 @@ def policy_of(settings: Settings, instrument: Instrument | None = None) -> Polic
     it there are no modes and no law, and the mirror is like FLAO's.
     """
     dither, tracking, control = settings.dither, settings.tracking, settings.control
+    unknown = unstated = np.zeros(4)
+    if instrument is not None:
+        unknown, unstated = kind_of(instrument).image_floors(instrument)
     per_minute = _vector(
         tracking.drift_subap_per_minute,
         tracking.drift_deg_per_minute,
@@ -105,9 +108,8 @@ def policy_of(settings: Settings, instrument: Instrument | None = None) -> Polic
         # A random walk: its σ grows with the square root of time.
         drift_rate=per_minute / np.sqrt(60.0),
         floor=floor_of(settings, instrument) / BOUNDARY_SCALE,
-        image_floor=np.zeros(4)
-        if instrument is None
-        else kind_of(instrument).image_floors(instrument)[1],
+        image_floor=unstated,
+        image_sigma=unknown + unstated,
         bias_memory_s=tracking.bias_memory_s,
         flexure_per_degree=_vector(
             tracking.flexure_subap_per_degree,

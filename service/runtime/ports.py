@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from service.archive.products import NoisyNumbers
 from service.archive.store import Provenance
 from service.model.slopes import SlopeRecipe
+from service.records.operations import MeasurementRecord
+from service.records.products import ReconstructorRecord
 from service.runtime.worker import Done, OpticsWorker
-from service.tracking.operation_records import MeasurementRecord
-from service.tracking.products import ReconstructorRecord
 from service.wire import Command, Manifest, Reply
 
 P = ParamSpec("P")

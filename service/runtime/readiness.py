@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from typing import Final
 
 from service.link.guard import describe_expiry, describe_flood, describe_refusals
-from service.link.intake import COALESCED
+from service.link.intake import COALESCED, OLD
 from service.link.statistics import (
     MALFORMED,
     STATISTICS_PERIOD_S,
@@ -17,17 +17,18 @@ from service.link.statistics import (
     Disposition,
     LinkStatistics,
 )
+from service.link.telemetry_age import MAX_AGE_S
 from service.model.misregistration import at_boundary
+from service.records import alarms
+from service.records import events as ev
+from service.records.alarms import Alarm, Interlock, Prerequisite, Responsible, alarm_blocks
+from service.records.operations import AcquisitionStage
+from service.records.products import MatrixState, ReconstructorRecord
+from service.records.state import Mode, TrackerState
 from service.runtime.losses import FRAMES_TIMEOUT_S, silence
-from service.tracking import alarms
-from service.tracking import events as ev
-from service.tracking.alarms import Alarm, Interlock, Prerequisite, Responsible, alarm_blocks
-from service.tracking.operation_records import AcquisitionStage
 from service.tracking.operations.running import operating
 from service.tracking.policy import SECOND_NS
-from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import check_return, explain_unread_matrix
-from service.tracking.state import Mode, TrackerState
 from service.tracking.update_policy import MIN_PROPOSAL_LIFETIME_S, is_outdated
 from service.wire import TEXT_LIMIT, AlarmMessage, StateMessage
 
@@ -58,7 +59,7 @@ COMPLAINT_TIMEOUT_NS: Final = 3 * SECOND_NS
 FAULT_OUTCOMES: Final = ("leap", "sequence", "shape", MALFORMED)
 """Outcomes of frames that always mean a violation of the contract."""
 
-OUTCOMES_WITH_ALARM: Final = ("basis", "config")
+OUTCOMES_WITH_ALARM: Final = ("basis", "config", OLD)
 """Outcomes of frames that have an alarm of their own."""
 
 MIN_LOGGED_DURATION_NS: Final = 2 * SECOND_NS
@@ -70,7 +71,8 @@ LOG_INTERVAL_NS: Final = 60 * SECOND_NS
 DERIVED_EACH_SECOND: Final = frozenset(
     name
     for name, alarm in alarms.ALARMS.items()
-    if alarm.origin in ("runtime/readiness.py", "runtime/losses.py", "runtime/supervisor.py")
+    if alarm.origin
+    in ("runtime/readiness.py", "runtime/losses.py", "runtime/supervisor.py", "api.py")
 )
 """Alarms that are derived each second, and end when they are not derived any more."""
 
@@ -84,6 +86,7 @@ def complaints(link: LinkStatistics) -> dict[str, str]:
     """Return the alarms of what came in the last seconds, by name."""
     made = {
         alarms.FRAMES_UNUSED: _explain_unused(link),
+        alarms.TELEMETRY_OLD: _explain_age(link),
         alarms.MESSAGES_REFUSED: _explain_refused(link),
         alarms.STATUS_FLOOD: _flood(link),
         alarms.LINK_FLOODED: describe_flood(link.waiting_connections),
@@ -110,6 +113,17 @@ def _explain_unused(link: LinkStatistics) -> str:
     return (
         f"the RTC's frames are not used ({reasons}): {details}; of {came} in the last "
         f"{STATISTICS_PERIOD_S:.0f} s {used} were used: check the RTC's telemetry"
+    )
+
+
+def _explain_age(link: LinkStatistics) -> str:
+    """Return that the frames that come are old; empty: they are not, or none come."""
+    come = link.frame_age_s is not None and link.frame_age_s < FRAMES_TIMEOUT_S
+    if not come or link.telemetry_age_s <= MAX_AGE_S:
+        return ""
+    return (
+        f"telemetry is {link.telemetry_age_s:.0f} s old, expected at most {MAX_AGE_S:g} s: it is "
+        "not used, and no matrix is made, sent or judged; check the network and the RTC's publisher"
     )
 
 
@@ -193,6 +207,9 @@ class ReadinessInputs:
     worker_problem: str = ""
     """Problem of the worker; empty if there is none."""
 
+    rest_missing: str = ""
+    """What keeps REST from listening; empty if nothing does."""
+
     reading: bool = False
     """The RTC's own reconstructor is being read, and windows wait for that."""
 
@@ -232,6 +249,17 @@ def _for_the_worker(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
     if inputs.state.matrices.making_since_ns_utc is not None:
         text = "a reconstructor is being computed and judged: wait"
         yield Prerequisite(name="matrix", responsible=Responsible.WORKER, text=text)
+
+
+def _for_the_network(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
+    """Yield what of the network is not there; without a link no RTC can be blamed."""
+    missing, party = inputs.link.missing, Responsible.NETWORK
+    if inputs.rest_missing:
+        yield Prerequisite(name="rest", responsible=party, text=inputs.rest_missing)
+    if missing:
+        yield Prerequisite(name="link", responsible=party, text=missing, blocks=True)
+    else:
+        yield from _for_messages(inputs)
 
 
 def _for_messages(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
@@ -295,7 +323,9 @@ def _for_the_matrix(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
     ):
         text = f"its reconstructor {rtc.cm_id}: offer it on rtc/cm/applied{_describe_rtc(state)}"
         yield Prerequisite(name="matrix-in-use", responsible=Responsible.RTC, text=text)
-    if state.matrices.hindrance:
+    # During an alarm that forbids all decisions it is not renewed, and the alarm says what to do.
+    decides = alarms.blocking_alarm(state.alarms.active, Interlock.DECIDE) is None
+    if state.matrices.hindrance and decides:
         yield Prerequisite(
             name="new-matrix", responsible=Responsible.OPERATOR, text=state.matrices.hindrance
         )
@@ -386,7 +416,7 @@ def _for_measurements(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
 
 _LOOKS: Final[tuple[Callable[[ReadinessInputs], Iterator[Prerequisite]], ...]] = (
     _for_the_worker,
-    _for_messages,
+    _for_the_network,
     _for_frames,
     _for_alarms,
     _for_the_matrix,

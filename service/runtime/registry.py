@@ -24,11 +24,11 @@ from service.estimation.loopcheck import LoopCheck
 from service.estimation.passive import Passive
 from service.estimation.probation import Comparison
 from service.estimation.residual import Rejection
-from service.tracking import alarms
-from service.tracking import events as ev
+from service.records import alarms
+from service.records import events as ev
+from service.records.events import Event
+from service.records.state import TrackerState
 from service.tracking.dither import MISSING_DITHER_ALARM_S
-from service.tracking.events import Event
-from service.tracking.state import TrackerState
 
 Changes = Callable[[Any, Any, LoopContext, TrackerState], list[Event]]
 """Returns the tracker's events of a detector, from its state before these blocks and after."""

@@ -9,19 +9,21 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from service.control.gains import ModeGain
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import COVARIANCE_SCALE, PARAMETERS, Misregistration
+from service.records.alarms import ALARMS, AlarmDefinition, AlarmRecord, Prerequisite, Severity
+from service.records.commands import GainGroup
+from service.records.registration import ModeGain, Registration
+from service.records.state import LogEntry, TrackerState
 from service.tracking.alarm_records import muted_records, record_of, stale_records, worst_severity
-from service.tracking.alarms import ALARMS, AlarmDefinition, AlarmRecord, Prerequisite, Severity
-from service.tracking.commands import GainGroup
 from service.tracking.interlocks import Permission, permissions
 from service.tracking.operations.running import Operating, operating
 from service.tracking.policy import Policy
 from service.tracking.reconstructors import check_return
-from service.tracking.registration import Registration
-from service.tracking.state import LogEntry, TrackerState
 from service.wire import Status
+
+IMAGES_LIMIT = "measure the places of the pupil images: pyrcal instrument check FILE --light FRAME"
+"""Remedy where the places of the pupil images are most of the variance of α."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -210,6 +212,12 @@ class Alpha:
         """1 σ of both numbers of α's anamorphosis; null: it is not followed."""
         known = self.registration.stretches
         return None if known is None else tuple(known.sigma.tolist())
+
+    @property
+    def sigma_limit(self) -> str | None:
+        """What limits sigma and can be measured, with the remedy; null: nothing is known to."""
+        images = self.snapshot.policy.image_sigma
+        return IMAGES_LIMIT if np.any(images > self.registration.shown_sigma / np.sqrt(2)) else None
 
     @property
     def age_s(self) -> float:

@@ -21,9 +21,15 @@ from service.archive.retention import EVERYTHING, RetentionPolicy
 from service.errors import LinkError, PyrcalError, StorageError
 from service.estimation import dither_windows, frames, lockin, passive, random_dither
 from service.estimation.description import Description
-from service.estimation.windows import RefusalKind
 from service.link import matrices, statistics
 from service.model.instrument import Instrument
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.alarms import CLOCK_LEAPT, Prerequisite
+from service.records.estimates import RefusalKind
+from service.records.events import Effect, Event
+from service.records.operations import MeasureState
+from service.records.state import Level, TrackerState
 from service.runtime import archiving, command_results, readiness, worker
 from service.runtime.actions import Actions
 from service.runtime.clock import ServiceClock
@@ -34,15 +40,12 @@ from service.runtime.losses import Losses
 from service.runtime.snapshot import Snapshot, in_words
 from service.runtime.telemetry_recorder import TelemetryRecorder, TrendSampler
 from service.runtime.workers import WorkerLoadMeter, WorkerPool, with_another_worker
-from service.tracking import commands as cmd
-from service.tracking import events as ev
 from service.tracking.alarm_rules import changes_value
-from service.tracking.alarms import CLOCK_LEAPT, Prerequisite
-from service.tracking.events import Effect, Event
-from service.tracking.operation_records import MeasureState
 from service.tracking.policy import Policy
-from service.tracking.state import Level, TrackerState
 from service.tracking.step_context import new_lines
+
+LINK_RETRY_INTERVAL_S = 1.0
+"""Between two attempts to open the link, and two checks whether it has to be opened again."""
 
 LINK_POLL_INTERVAL_S = 0.16
 """Between two visits to the link at the least: each costs two milliseconds, whatever there is."""
@@ -92,6 +95,8 @@ class Supervisor:
             audit=self._writer.add,
         )
         """Telemetry kept on request."""
+        self.complaints = {CLOCK_LEAPT: self._clock.complaint}
+        """Functions that return the text of an alarm, empty for none; called each second."""
         self.refits = command_results.Refits()
         """Reconstructors that operators have ordered."""
         self._pending_window = PendingWindow()
@@ -111,6 +116,7 @@ class Supervisor:
         """Held while estimators are used or changed."""
         self._running: set[asyncio.Task[None]] = set()
         self._heartbeat = Heartbeat()
+        self._rest_missing = ""
         self._broken = ""
         """Last unforeseen error."""
         self._started_ns = self._clock.now_ns()
@@ -153,9 +159,16 @@ class Supervisor:
             link=link,
             preparing=self._engine.bank is None,
             worker_problem=self._workers.problem,
+            rest_missing=self._rest_missing,
             reading=not self._own_matrix_read.is_set(),
         )
         return readiness.waiting_for(inputs)
+
+    def await_rest(self, missing: str) -> None:
+        """Take note of what keeps REST from listening; empty if nothing does."""
+        if missing and missing != self._rest_missing:
+            self._note("api.waiting", missing, Level.WARNING)
+        self._rest_missing = missing
 
     def audit(self, entry: AuditEntry) -> None:
         """Take a line of the audit trail that is of no command."""
@@ -251,7 +264,8 @@ class Supervisor:
     async def _work(self) -> None:
         async with asyncio.TaskGroup() as group:
             # These run before the model is prepared, which takes seconds to minutes: orders and
-            # alarms are recorded meanwhile.
+            # alarms are recorded meanwhile, and RTCs can connect.
+            group.create_task(self._keep_link())
             group.create_task(self._writer.run())
             group.create_task(self._writer.save())
             group.create_task(self.recordings.run())
@@ -360,13 +374,10 @@ class Supervisor:
 
     async def _tick(self) -> None:
         alarms: frozenset[tuple[str, str]] = frozenset()
-        told, revival, losses = readiness.ReadinessLog(), readiness.Revival(), Losses()
+        told, losses = readiness.ReadinessLog(), Losses()
         while True:
             self._heartbeat.beat("the tick")
             link = self._bridge.statistics()
-            if revival.due(link, time.monotonic()):
-                await self._reopen_link()
-                link = self._bridge.statistics()
             with self._survive_errors("a tick"):
                 self._post(ev.Tick())
             self._worker_load.look()
@@ -374,7 +385,7 @@ class Supervisor:
                 self._post(trouble)
             now_ns = self._clock.now_ns()
             lost = losses.complaint(link, time.monotonic())
-            also = {**lost, CLOCK_LEAPT: self._clock.complaint()}
+            also = lost | {name: complain() for name, complain in self.complaints.items()}
             for event in readiness.detect_link_changes(link, self._engine.state, now_ns, also):
                 self._post(event)
             waiting = self._waiting_for(link)
@@ -389,21 +400,31 @@ class Supervisor:
             alarms = raised
             await asyncio.sleep(1.0)
 
-    async def _reopen_link(self) -> None:
-        """Open the link again."""
+    async def _keep_link(self) -> None:
+        """Open the link once its network is there, and again when nothing arrives on it.
+
+        After a power cut the service may start before its router, its name server or its address.
+        """
+        revival, noted = readiness.Revival(), ""
         while True:
-            self._heartbeat.beat("the tick")
-            try:
-                await asyncio.to_thread(self._bridge.reopen)
-            except LinkError as error:
-                self._note("link.lost", f"{error}; tried again every 5 s", Level.ALARM)
-                await asyncio.sleep(5.0)
-            else:
-                text = (
-                    "the RTC's token was present and no message arrived: the link was opened again"
-                )
-                self._note("link.reopened", text, Level.WARNING)
-                return
+            link = self._bridge.statistics()
+            if link.missing or revival.due(link, time.monotonic()):
+                try:
+                    await asyncio.to_thread(self._bridge.reopen)
+                except LinkError as error:
+                    if noted != str(error):
+                        noted = str(error)
+                        text = f"{noted}; tried again every {LINK_RETRY_INTERVAL_S:g} s"
+                        self._note("link.waiting", text, Level.WARNING)
+                else:
+                    noted = ""
+                    if not link.missing:
+                        text = (
+                            "the RTC's token was present and no message arrived: the link was "
+                            "opened again"
+                        )
+                        self._note("link.reopened", text, Level.WARNING)
+            await asyncio.sleep(LINK_RETRY_INTERVAL_S)
 
     async def _fit(self) -> None:
         while True:

@@ -29,9 +29,9 @@ from service.errors import (
 )
 from service.estimation.frames import FrameBlock
 from service.files.recording import RecordingWriter
-from service.tracking.commands import Instruction
-from service.tracking.events import new_id
-from service.tracking.state import TrackerState
+from service.records.commands import Instruction
+from service.records.events import new_id
+from service.records.state import TrackerState
 
 MAX_RECORDING_S = 3600.0
 

@@ -15,13 +15,13 @@ from typing import Concatenate, ParamSpec, TypeVar
 
 from service.errors import WorkerError
 from service.model.slopes import SlopeRecipe
+from service.records import events as ev
+from service.records.alarms import CLUSTER_LOST, WORKER_BEHIND, WORKER_LOST
+from service.records.state import TrackerState
 from service.runtime.processes import Worker
 from service.runtime.snapshot import WorkerLoad
 from service.runtime.worker import Done, OpticsWorker, run_job
 from service.runtime.worker.records import patience_s
-from service.tracking import events as ev
-from service.tracking.alarms import CLUSTER_LOST, WORKER_BEHIND, WORKER_LOST
-from service.tracking.state import TrackerState
 
 P = ParamSpec("P")
 R = TypeVar("R")

@@ -11,11 +11,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.errors import CommandError, UnknownIdError
-from service.tracking import alarms
-from service.tracking import commands as cmd
-from service.tracking.alarms import Alarm, AlarmRecord, AlarmState, OperatorNote, Severity
+from service.records import alarms
+from service.records import commands as cmd
+from service.records.alarms import Alarm, AlarmRecord, AlarmState, OperatorNote, Severity
+from service.records.state import Orders, TrackerState
 from service.tracking.policy import SECOND_NS
-from service.tracking.state import Orders, TrackerState
 from service.tracking.step_context import StepContext
 
 RESTART_GRACE_S = 60.0

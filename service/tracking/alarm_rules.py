@@ -19,23 +19,17 @@ from service.errors import CommandError, UnknownIdError
 from service.estimation.loop import explain_open_loop
 from service.files.toml import nearest
 from service.model.pointing_law import ANGLES
-from service.tracking import (
-    alarms,
-    dither,
-    dither_plan,
-    mode_proof,
-    validity,
-    window_processing,
-)
-from service.tracking import commands as cmd
-from service.tracking.alarms import RULE_PREFIX, AlarmDefinition
+from service.records import alarms
+from service.records import commands as cmd
+from service.records.alarms import RULE_PREFIX, AlarmDefinition
+from service.records.operations import AcquisitionStage
+from service.records.products import MatrixState
+from service.records.state import ObservatoryValue, TrackerState
+from service.tracking import dither, dither_plan, mode_proof, validity, window_processing
 from service.tracking.dither_request import MAX_STOP_DELAY_S
-from service.tracking.operation_records import AcquisitionStage
 from service.tracking.operations.acquisition import has_missed_enough
 from service.tracking.operations.probation import explain_opening
 from service.tracking.policy import SECOND_NS, Rule
-from service.tracking.products import MatrixState
-from service.tracking.state import ObservatoryValue, TrackerState
 from service.tracking.step_context import StepContext
 
 REPEATED_ALARM_TIMEOUT_S = 15.0
@@ -47,9 +41,6 @@ on their way seem to lag, never to lead."""
 
 MAX_CLOCK_LAG_S: Final = 600.0
 """Largest lag of the time stamps behind UTC: more is no delay of the telemetry, but the clock."""
-
-_KNOWN_LEADS_S: Final = {18: "GPS time", 37: "TAI"}
-_TIME_ZONE_S: Final = 900
 
 
 def derive_alarms(context: StepContext) -> None:
@@ -113,11 +104,8 @@ def explain_clock(lead_s: float) -> str | None:
     """Return how time stamps ``lead_s`` seconds ahead of UTC are wrong; None if they are not."""
     if -MAX_CLOCK_LAG_S <= lead_s <= MAX_CLOCK_LEAD_S:
         return None
-    away_s = abs(lead_s)
-    is_zone = abs(away_s - _TIME_ZONE_S * round(away_s / _TIME_ZONE_S)) < MAX_CLOCK_LEAD_S
-    likely = _KNOWN_LEADS_S.get(round(lead_s)) or ("local time" if is_zone else None)
     side = "ahead of" if lead_s > 0.0 else "behind"
-    return f"time stamps are {away_s:.0f} s {side} UTC{f', as {likely} is' if likely else ''}"
+    return f"time stamps are {abs(lead_s):.0f} s {side} UTC"
 
 
 def _clock(context: StepContext) -> str | None:

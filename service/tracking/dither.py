@@ -11,15 +11,15 @@ from dataclasses import replace
 import numpy as np
 
 from service.control.dither import compute_precision_ratio, update_mean_ratio
-from service.estimation.lockin import LockInEstimate
-from service.estimation.random_dither import RandomEstimate
-from service.tracking import alarms, dither_plan, dither_request, mode_proof
-from service.tracking import commands as cmd
-from service.tracking import events as ev
+from service.records import alarms
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.estimates import LockInEstimate, RandomEstimate
+from service.records.operations import Dither, DitherPhase, Precision
+from service.records.state import Level, TrackerState
+from service.tracking import dither_plan, dither_request, mode_proof
 from service.tracking.dither_plan import WantedDither
-from service.tracking.dither_request import Dither, DitherPhase, Precision
 from service.tracking.policy import SECOND_NS
-from service.tracking.state import Level, TrackerState
 from service.tracking.step_context import StepContext
 from service.wire import DitherRequest, DitherStatus, DitherStop, Reply, Status
 

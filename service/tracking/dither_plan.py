@@ -8,26 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.control import dither
-from service.control.dither import (
-    DitherRequirement,
-    Schedule,
-    compute_schedule,
-    look_up_precision,
-)
+from service.control.dither import DitherRequirement, compute_schedule, look_up_precision
 from service.estimation.loop import explain_open_loop
 from service.estimation.windows import DITHER_SETTLING_S
+from service.records.alarms import Interlock
+from service.records.operations import Dither, DitherPhase, DitherPlan, Schedule
+from service.records.registration import Registration
+from service.records.state import TrackerState
 from service.tracking import mode_proof
-from service.tracking.alarms import Interlock
 from service.tracking.dither_request import (
     DEFAULT_DURATION_S,
     DITHER_MARGIN_S,
     N_LINES,
     OUR_DITHERS,
     OWN_DITHER,
-    Dither,
     DitherParameters,
-    DitherPhase,
-    DitherPlan,
     choose_modes,
     clear_lines,
     controlled,
@@ -39,8 +34,6 @@ from service.tracking.dither_request import (
     total_m,
 )
 from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.registration import Registration
-from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext
 from service.wire import Status
 

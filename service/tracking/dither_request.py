@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from enum import StrEnum
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.control.dither import (
-    N_MODES_ABOVE_LOOP,
-    Schedule,
-    place_lines,
-    select_informative_modes,
-)
+from service.control.dither import N_MODES_ABOVE_LOOP, place_lines, select_informative_modes
 from service.control.loop import compute_amplification
 from service.errors import CommandError, ModelError
 from service.estimation.demodulation import SIDE_OFFSETS_HZ
 from service.estimation.lockin import LockInPlan
 from service.estimation.random_dither import FRAMES_PER_MODE, RandomPlan
 from service.estimation.windows import DITHER_SETTLING_S, ExpectedDither
+from service.records.operations import Dither
+from service.records.products import ModeSet
 from service.tracking.policy import Policy
-from service.tracking.products import ModeSet
 from service.wire import DitherKind, DitherRequest, Status
 
 N_LINES = 4
@@ -155,36 +150,6 @@ OUR_DITHERS = (OWN_DITHER, OPERATOR_DITHER, NOISY_DITHER, ACQUIRING_DITHER)
 
 MAX_STOP_DELAY_S = 3.0
 """Time for a stop to be acknowledged, and for the next status to show it."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Dither:
-    """A dither that the service follows, requested or running."""
-
-    request: DitherRequest
-    """Request that the RTC plays."""
-
-    start_seq: int | None = None
-    """First frame that contains it; None until the RTC has accepted."""
-
-    asked_ns_utc: int
-    """Time of the request, later of its acceptance or adoption."""
-
-    window_s: float | None = None
-    """Telemetry in one estimate, seconds, if planned with the dither; otherwise None."""
-
-    cause: str = field(default="", compare=False)
-    """Id of the order or event that led to the request; empty if the dither was adopted."""
-
-    @property
-    def id(self) -> str:
-        """Id of the request."""
-        return self.request.id
-
-    @property
-    def frequency_hz(self) -> tuple[float, ...]:
-        """Frequency of each mode of a sine dither; empty for a binary dither."""
-        return self.request.frequency_hz or ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -498,127 +463,3 @@ def _modes(asked: tuple[int, ...] | ModeSet, rtc: Status) -> tuple[int, ...]:
             f"found {len(modes)} modes; the RTC dithers at most {rtc.max_dither_modes}"
         )
     return modes
-
-
-class DitherPhase(StrEnum):
-    """Phases of the dither policy."""
-
-    OFF = "off"
-    """None is wanted, or none can be had."""
-
-    ACQUIRE = "acquire"
-    """α is not known, or something asks to see it again: the whole budget, without pause."""
-
-    PROVE = "prove"
-    """Modes that are to be controlled are shown to the sensor first, the whole budget on them."""
-
-    FOLLOW = "follow"
-    """Without pause, for the flexure leaves no time for one; as weak as that allows."""
-
-    SPARSE = "sparse"
-    """A sitting of a few windows now and then, off in between."""
-
-    OPERATOR = "operator"
-    """An operator's own, or one somebody else started."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Precision:
-    """Precision of windows, learnt from accepted ones and kept from star to star."""
-
-    ratio: NDArray[np.float64]
-    """``(4,)`` measured κ of ``σ = κ / (A sqrt(T))`` over that of the table for the magnitude."""
-
-    n_windows: int
-    """Windows it was learnt from."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DitherPlan(Schedule):
-    """The dither that is wanted in the present state."""
-
-    mean_cost_m: float
-    """Quadratic mean of the dither over time, pauses included, metres OPD."""
-
-    window_s: float
-    """Telemetry in one estimate, seconds."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DitherPolicyState:
-    """Memory of the dither policy, and its report to the operator."""
-
-    phase: DitherPhase = DitherPhase.OFF
-    reason: str = "nothing has been decided yet"
-    """Reason for the present phase."""
-
-    budget_m: float = 0.0
-    """Largest RMS of all lines together that settings and RTC allow, metres OPD."""
-
-    plan: DitherPlan | None = None
-    """Present schedule; None if none has been computed yet."""
-
-    next_ns_utc: int | None = None
-    """Start of the next dither; None if one runs now or none is planned."""
-
-    precision: Precision | None = None
-    """Precision of windows; None if no window has been accepted yet."""
-
-    avoided_hz: tuple[float, ...] = ()
-    """Vibrations that the lines avoid, Hz."""
-
-    lines_hz: tuple[float, ...] = ()
-    """Lines of the last requested dither, Hz; they are kept if possible."""
-
-    passive_ns_utc: int | None = None
-    """Time at which the estimate was last renewed without a dithered window."""
-
-    results_due: int = 0
-    """Total of accepted windows at which the last dither has delivered its results."""
-
-    ended_ns_utc: int | None = None
-    """Time at which the service's last dither ended by itself; None if one runs, or it was stopped.
-    """
-
-    stopped_id: str | None = None
-    """Id of the last dither that the service stopped without an order."""
-
-    stopped_ns_utc: int = 0
-    """Time of the first request to stop it."""
-
-    unwanted_id: str | None = None
-    """Id of a dither that the RTC plays and should not; None if there is none."""
-
-    stop_asked_ns_utc: int = 0
-    """Time of the last request to stop an unwanted dither."""
-
-    loud_id: str | None = None
-    """Id of the last dither that the RTC played stronger than requested and than the budget."""
-
-    loud_ns_utc: int = 0
-    """Time of the last request to stop a dither that was too strong; 0 if there was none."""
-
-    loud_text: str = ""
-    """Measured excess of that dither; empty if its status showed it."""
-
-    amiss_id: str | None = None
-    """Id of the last dither that differed from its request in the frames."""
-
-    amiss_m: float = 0.0
-    """RMS of all its lines together, metres OPD."""
-
-    mean_square_m2: float = 0.0
-    """Mean square of the dither on the mirror, over ten minutes, metres OPD squared."""
-
-    seen_ns_utc: int | None = None
-    """End of the interval of that mean."""
-
-    @property
-    def mean_cost_m(self) -> float:
-        """Quadratic mean of the dither on the mirror, over ten minutes, metres OPD."""
-        return float(np.sqrt(self.mean_square_m2))
-
-    @property
-    def n_windows_learnt(self) -> int:
-        """Windows from which the precision was learnt."""
-        return 0 if self.precision is None else self.precision.n_windows

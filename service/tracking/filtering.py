@@ -8,21 +8,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.control.gains import ModeGain
 from service.estimation import kalman
-from service.estimation.estimate import DitheredEstimate, model_error
+from service.estimation.estimate import model_error
 from service.estimation.kalman import Drift, Joint, begin_joint, predict_state
 from service.estimation.lockin import MAX_LAG_FRAMES
-from service.estimation.random_dither import RandomEstimate
-from service.estimation.windows import OTHER_SESSION, RefusalKind, Why
+from service.estimation.windows import OTHER_SESSION
 from service.model.misregistration import Misregistration
-from service.tracking import mode_proof, validity
-from service.tracking.alarms import Interlock, blocking_alarm
-from service.tracking.jumps import to_previous_estimate
-from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.registration import (
+from service.records.alarms import Interlock, blocking_alarm
+from service.records.estimates import DitheredEstimate, RandomEstimate, RefusalKind, Why
+from service.records.registration import (
     HistoryEntry,
     KnownStretches,
+    ModeGain,
     PassiveBias,
     PointedEstimate,
     PreviousEstimate,
@@ -30,10 +27,13 @@ from service.tracking.registration import (
     Registration,
     Source,
     TimedEstimate,
-    without_previous,
 )
-from service.tracking.state import TrackerState
+from service.records.state import TrackerState
+from service.tracking import mode_proof, validity
+from service.tracking.jumps import to_previous_estimate
+from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.step_context import StepContext
+from service.tracking.validity import without_previous
 
 MODES_KEPT = 64
 """More than any dither plays at once: of those measured longest ago the rest is forgotten."""

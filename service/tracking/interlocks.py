@@ -14,18 +14,18 @@ from typing import Final, get_args
 
 from service.errors import CommandError, UnknownIdError
 from service.estimation.loop import NO_RTC
-from service.tracking import commands as cmd
-from service.tracking.alarms import ALARMS, RULE_PREFIX
-from service.tracking.commands import Command
-from service.tracking.events import kebab
-from service.tracking.operation_records import AcquisitionStage
+from service.records import commands as cmd
+from service.records.alarms import ALARMS, RULE_PREFIX
+from service.records.commands import Command
+from service.records.events import kebab
+from service.records.operations import AcquisitionStage
+from service.records.products import MatrixState, ReconstructorRecord
+from service.records.registration import Validity
+from service.records.state import Mode, TrackerState
 from service.tracking.operations.acquisition import check_acquisition
 from service.tracking.operations.running import OperationKind, RunningOperation, running_operations
 from service.tracking.policy import Policy
-from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import beyond_judging, check_approved, require_record
-from service.tracking.registration import Validity
-from service.tracking.state import Mode, TrackerState
 from service.tracking.update_policy import is_left_behind
 
 

@@ -12,16 +12,17 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.estimate import BIAS_FLOOR, BIAS_WANDER
+from service.estimation.estimate import BIAS_WANDER
 from service.estimation.kalman import JUMP_THRESHOLD, Joint
 from service.model.misregistration import Misregistration
-from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.registration import (
+from service.records.estimates import BIAS_FLOOR
+from service.records.registration import (
     PointedEstimate,
     PreviousEstimate,
     Registration,
     TimedEstimate,
 )
+from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.validity import CLOCK_SET_BACK_S, flexure
 
 DRIFT_TIME_S = 60.0

@@ -14,12 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.estimation.demodulation import SIDE_OFFSETS_HZ
-from service.estimation.estimate import DitheredEstimate
-from service.estimation.lockin import LockInEstimate
-from service.estimation.own_matrix import N_NEIGHBOURS, UNEVEN_RATIO
-from service.estimation.random_dither import RandomEstimate
-from service.tracking import alarms
-from service.tracking import events as ev
+from service.estimation.own_matrix import N_NEIGHBOURS
+from service.records import alarms
+from service.records import events as ev
+from service.records.estimates import DitheredEstimate, LockInEstimate, RandomEstimate
+from service.records.products import (
+    UNEVEN_RATIO,
+    MatrixState,
+    ModeAnswer,
+    ModeProof,
+    ModeRatio,
+    ReconstructorRecord,
+)
+from service.records.registration import Registration
+from service.records.state import Mode, TrackerState
 from service.tracking.dither_request import (
     N_LINES,
     PROVING_LINE_RANGE,
@@ -29,18 +37,12 @@ from service.tracking.dither_request import (
 )
 from service.tracking.mode_limits import (
     MAX_LISTED_MODES,
-    ModeAnswer,
-    ModeProof,
-    ModeRatio,
     add_ratios,
     compare,
     format_modes,
     format_subject,
 )
 from service.tracking.policy import SECOND_NS
-from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.registration import Registration
-from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.update_policy import is_settled, limit_modes
 from service.wire import Status

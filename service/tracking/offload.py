@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, step_text, wrap_angle
-from service.tracking import events as ev
+from service.records import events as ev
+from service.records.alarms import Interlock
+from service.records.registration import Offload, OffloadState, Purpose, Registration, Validity
+from service.records.state import Mode, TrackerState
 from service.tracking import validity
-from service.tracking.alarms import Interlock
 from service.tracking.operations.running import running_ramp
 from service.tracking.policy import SECOND_NS, Offloading
-from service.tracking.registration import Offload, OffloadState, Purpose, Registration, Validity
-from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.update_policy import REFUSED_INTERVAL_S, is_settled
 from service.tracking.validity import MOVING, end_of, make_valid, void_until

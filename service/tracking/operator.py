@@ -7,18 +7,17 @@ from dataclasses import replace
 from service.control.gains import gain_table
 from service.errors import CommandError
 from service.estimation.loop import extend_gains
-from service.tracking import commands as cmd
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.alarms import PROBATION
+from service.records.commands import GainGroup, ModeGroup
+from service.records.operations import CommandState, Dither, LoopCommand
+from service.records.products import MatrixState, ModeSet
+from service.records.state import Level, Mode
 from service.tracking import dither_request, reconstructors
-from service.tracking import events as ev
-from service.tracking.alarms import PROBATION
-from service.tracking.commands import GainGroup, ModeGroup
 from service.tracking.dither import allow_dither, request_dither
 from service.tracking.dither_plan import operator_parameters
-from service.tracking.dither_request import Dither
-from service.tracking.operation_records import CommandState, LoopCommand
 from service.tracking.policy import SECOND_NS
-from service.tracking.products import MatrixState, ModeSet
-from service.tracking.state import Level, Mode
 from service.tracking.step_context import StepContext, present
 from service.tracking.validity import note_pointing
 from service.wire import DitherKind, Loop, LoopRequest, Pointing, RampRequest, Status

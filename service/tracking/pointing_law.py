@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,20 +17,21 @@ from numpy.typing import NDArray
 from service.errors import ModelError
 from service.model.misregistration import Misregistration, step_text, wrap_angle
 from service.model.pointing_law import ANGLES, PointingLaw, Reported
-from service.tracking import events as ev
-from service.tracking import jumps, validity
-from service.tracking.events import Event
-from service.tracking.operations.acquisition import carry_alpha
-from service.tracking.policy import SECOND_NS
-from service.tracking.registration import (
+from service.records import events as ev
+from service.records.events import Event
+from service.records.registration import (
     LawLeap,
     LawState,
     PointedEstimate,
+    PreviousEstimate,
     Purpose,
     Registration,
-    moved,
+    TimedEstimate,
 )
-from service.tracking.state import TrackerState
+from service.records.state import TrackerState
+from service.tracking import jumps, validity
+from service.tracking.operations.acquisition import carry_alpha
+from service.tracking.policy import SECOND_NS
 from service.tracking.step_context import StepContext
 
 Array = NDArray[np.float64]
@@ -417,3 +419,35 @@ def _way(context: StepContext, now: Misregistration) -> tuple[tuple[int, Misregi
 def _set(context: StepContext, law: LawState) -> None:
     if law != context.alpha.law:
         context.alpha = replace(context.alpha, law=law)
+
+
+_Timed = TypeVar("_Timed", bound="TimedEstimate")
+
+
+def moved(registration: Registration, step: Array) -> Registration:
+    """Return what is known of α with all of it a step ``(4,)`` further, numeric units."""
+    bias = registration.bias
+    if bias is not None:
+        bias = replace(bias, previous_estimate=_previous_moved(bias.previous_estimate, step))
+    return replace(
+        registration,
+        alpha=registration.alpha.add_step(step),
+        previous_estimate=_previous_moved(registration.previous_estimate, step),
+        suspected_jump=_moved(registration.suspected_jump, step),
+        bias=bias,
+    )
+
+
+def _previous_moved(previous: PreviousEstimate | None, step: Array) -> PreviousEstimate | None:
+    if previous is None:
+        return None
+    return replace(
+        previous,
+        alpha=previous.alpha.add_step(step),
+        next_window=_moved(previous.next_window, step),
+        previous_estimate=_previous_moved(previous.previous_estimate, step),
+    )
+
+
+def _moved(estimate: _Timed | None, step: Array) -> _Timed | None:
+    return None if estimate is None else replace(estimate, alpha=estimate.alpha.add_step(step))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from service.model.misregistration import Misregistration
 from service.model.pointing_law import PointingLaw
-from service.tracking.alarms import Interlock, Severity
+from service.records.alarms import Interlock, Severity
 
 if TYPE_CHECKING:
     from service.wire import Status
@@ -124,6 +124,10 @@ class Policy:
 
     image_floor: NDArray[np.float64]
     """``(4,)`` 1 σ of α by places of pupil images that the instrument file does not state."""
+
+    image_sigma: NDArray[np.float64]
+    """``(4,)`` 1 σ of α by places of pupil images that nobody has measured; ``image_floor``, or a
+    part of ``floor`` if the instrument file calls them unknown."""
 
     bias_memory_s: float
     """Time after which the information learnt on the passive estimate's bias has decayed to 1/e."""

@@ -6,12 +6,13 @@ from dataclasses import replace
 
 from service.errors import CommandError, UnknownIdError
 from service.estimation.loop import NO_RTC, extend_gains, select_gains
-from service.tracking import alarms, update_policy
-from service.tracking import events as ev
-from service.tracking.alarms import Interlock, alarm_blocks, blocking_alarm
+from service.records import alarms
+from service.records import events as ev
+from service.records.alarms import Interlock, alarm_blocks, blocking_alarm
+from service.records.products import Assessment, MatrixState, ReconstructorRecord
+from service.records.state import Level, Mode, TrackerState
+from service.tracking import update_policy
 from service.tracking.mode_proof import check_proven
-from service.tracking.products import Assessment, MatrixState, ReconstructorRecord
-from service.tracking.state import Level, Mode, TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.transitions import is_declared, move
 from service.wire import Acknowledgement, AckState, Status

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from service.tracking import commands as cmd
+from service.records import commands as cmd
+from service.records.alarms import NOT_RESTORED, Interlock
+from service.records.products import MatrixState, ReconstructorRecord
+from service.records.state import Orders, Saved, TrackerState
 from service.tracking import dither, mode_proof, offload, validity
 from service.tracking.alarm_records import restore_records
 from service.tracking.alarm_rules import derive_alarms
-from service.tracking.alarms import NOT_RESTORED, Interlock
 from service.tracking.operations.acquisition import (
     MISSES_BEFORE_ACQUISITION,
     abort_acquisition,
@@ -19,11 +21,9 @@ from service.tracking.operations.measurement import give_up
 from service.tracking.operations.running import running_ramp
 from service.tracking.operator import change_mode
 from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import prune
-from service.tracking.registration import without_previous
-from service.tracking.state import Orders, Saved, TrackerState
 from service.tracking.step_context import StepContext
+from service.tracking.validity import without_previous
 
 MAX_CLOCK_DIFFERENCE_S = 60.0
 """A state from further in the future than this was saved under another clock."""

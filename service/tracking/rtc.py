@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.estimation.loop import loop_numbers, same_loop, same_numbers
+from service.records import alarms
+from service.records import events as ev
+from service.records.events import Effect
+from service.records.products import MatrixState
 from service.tracking import (
-    alarms,
     dither,
     mode_proof,
     pointing_law,
@@ -14,11 +17,8 @@ from service.tracking import (
     update_policy,
     validity,
 )
-from service.tracking import events as ev
-from service.tracking.events import Effect
 from service.tracking.operator import end_ramp
 from service.tracking.policy import SECOND_NS
-from service.tracking.products import MatrixState
 from service.tracking.step_context import StepContext, log_bursts
 from service.wire import DitherRequest, DitherStop, Status
 

@@ -12,18 +12,11 @@ from typing import Any, Generic, TypeVar
 from service.errors import CommandError
 from service.estimation.loop import NO_RTC
 from service.model.misregistration import Misregistration
-from service.tracking.alarms import (
-    Alarm,
-    AlarmDefinition,
-    Interlock,
-    blocking_alarm,
-)
-from service.tracking.dither_request import Dither, DitherPolicyState
-from service.tracking.events import Effect
-from service.tracking.operation_records import Acquisition, Probation
-from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.registration import Registration
-from service.tracking.state import (
+from service.records.alarms import Alarm, AlarmDefinition, Interlock, blocking_alarm
+from service.records.events import Effect
+from service.records.operations import Acquisition, Dither, DitherPolicyState, Probation
+from service.records.registration import Registration
+from service.records.state import (
     AlarmStates,
     AlphaState,
     DitherState,
@@ -37,6 +30,7 @@ from service.tracking.state import (
     TrackerState,
     WindowCounts,
 )
+from service.tracking.policy import SECOND_NS, Policy
 from service.wire import Status
 
 LOG_LENGTH = 500

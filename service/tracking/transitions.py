@@ -10,8 +10,8 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Final, TypeVar
 
-from service.tracking import alarms
-from service.tracking.operation_records import (
+from service.records import alarms
+from service.records.operations import (
     Acquisition,
     AcquisitionStage,
     MeasurementRecord,
@@ -19,7 +19,7 @@ from service.tracking.operation_records import (
     Probation,
     ProbationState,
 )
-from service.tracking.products import MatrixState, ReconstructorRecord
+from service.records.products import MatrixState, ReconstructorRecord
 from service.tracking.step_context import StepContext
 
 Record = Acquisition | MeasurementRecord | Probation | ReconstructorRecord

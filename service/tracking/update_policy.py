@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from service.control.expected_gain import estimate_noise_loss_m
 from service.estimation.loop import SAME_DELAY, SAME_LEAK, same_gains
 from service.model.misregistration import Misregistration, step_text
-from service.tracking.mode_limits import ModeLimit
+from service.records.products import Assessment, Judged, MatrixState, ModeLimit, ReconstructorRecord
+from service.records.registration import Registration
+from service.records.state import TrackerState
 from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.products import Assessment, Judged, MatrixState, ReconstructorRecord
-from service.tracking.registration import Registration
-from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext
 from service.wire import Status
 

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from service.records.alarms import Interlock
+from service.records.events import MakeMatrix
+from service.records.products import MatrixState, ReconstructorRecord
+from service.records.state import Mode, TrackerState
 from service.tracking import reconstructors, update_policy
-from service.tracking.alarms import Interlock
 from service.tracking.dither import choose_dither, stop_unwanted
-from service.tracking.events import MakeMatrix
 from service.tracking.mode_proof import awaits_proof, n_proven_modes
 from service.tracking.operations.running import running_ramp
 from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
+from service.tracking.window_processing import MAX_TIME_WITHOUT_WINDOW_S
 from service.wire import Status
 
 FIRST_MATRIX_INTERVAL_S = 3.0
@@ -163,10 +164,8 @@ def explain_hindrance(context: StepContext, rtc: Status) -> str:
     if registration is None:
         return _explain_no_window(context)
     if not registration.usable and not registration.doubt:
-        return (
-            f"No reconstructor is made while α is invalid: {registration.validity.reason}. Raise "
-            "[dither] budget_m or longest_window_s for a smaller σ."
-        )
+        reason = registration.validity.reason
+        return f"No reconstructor is made while α is invalid: {reason}. {_advise(context)}"
     return _explain_modes(context, rtc)
 
 
@@ -227,11 +226,20 @@ def _explain_unproven(context: StepContext, rtc: Status, n_safe: int) -> str:
             "it. Correct order and signs of the modes in the instrument file."
         )
     if proof.n_tries:
-        return (
-            f"Mode {n_safe} was not seen to answer in {proof.n_tries} dithers: raise [dither] "
-            "budget_m, or see why windows are refused."
-        )
+        tried = f"Mode {n_safe} was not seen to answer in {proof.n_tries} dithers"
+        return f"{tried}. {_advise(context)}"
     return ""
+
+
+def _advise(context: StepContext) -> str:
+    """Return what to do for a surer α: a stronger dither helps only where windows are accepted."""
+    windows, known = context.windows, context.registration
+    if windows.run < 0:
+        return f"Windows are refused: {windows.refused_because}."
+    longest_s = max(MAX_TIME_WITHOUT_WINDOW_S, 2.0 * context.policy.longest_window_s)
+    if known is not None and context.now_ns - known.t_ns_utc > longest_s * SECOND_NS:
+        return "No window comes any more: check the frames of the RTC and its dither."
+    return "Raise [dither] budget_m or longest_window_s for a smaller σ."
 
 
 def _is_busy(context: StepContext) -> bool:

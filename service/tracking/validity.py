@@ -16,17 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
-from service.tracking.alarms import STALE, Interlock, alarm_blocks
-from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.registration import (
+from service.records.alarms import STALE, TELEMETRY_OLD, Interlock, alarm_blocks
+from service.records.registration import (
+    PassiveBias,
     Purpose,
     Registration,
     Validity,
     ValidityState,
     VoidInterval,
-    without_previous,
 )
-from service.tracking.state import TrackerState
+from service.records.state import TrackerState
+from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.step_context import StepContext
 from service.wire import Pointing
 
@@ -223,10 +223,12 @@ def slewed_deg(state: TrackerState, registration: Registration) -> float:
 def elapsed_s(state: TrackerState, registration: Registration, now_ns: int) -> float:
     """Return the age of the estimate: by the RTC's clock if there is one, else by arrival.
 
-    A simulated RTC may be slower than its timestamps, and the mirror drifts by its time.
+    A simulated RTC may be slower than its timestamps, and the mirror drifts by its time. Statuses
+    are as old as the telemetry: where that is old, arrival counts.
     """
-    if state.loop.rtc is not None and state.loop.rtc.t_ns >= registration.t_ns_utc:
-        return (state.loop.rtc.t_ns - registration.t_ns_utc) / SECOND_NS
+    rtc, is_old = state.loop.rtc, state.alarm(TELEMETRY_OLD) is not None
+    if rtc is not None and rtc.t_ns >= registration.t_ns_utc and not is_old:
+        return (rtc.t_ns - registration.t_ns_utc) / SECOND_NS
     return max(now_ns - registration.arrived_ns_utc, 0) / SECOND_NS
 
 
@@ -238,7 +240,7 @@ def _validity_of(context: StepContext, registration: Registration) -> ValiditySt
     # A doubt of the watchdog may have replaced that of the law.
     if registration.doubt == LEAPT or (registration.doubt and context.alpha.law.leap is not None):
         return ValidityState(level=Validity.PREDICTED, reason=LEAPT)
-    sigma, before = sigma_beyond_floor(registration), context.before.alpha.registration
+    sigma, before = registration.tracking_sigma, context.before.alpha.registration
     limit = policy.stale_sigma
     if registration.n_windows == 0:
         return ValidityState(level=Validity.STALE, reason="no window has confirmed it yet")
@@ -268,20 +270,10 @@ def _explain_invalidity(
     # With a pointing law α follows the slew.
     if moved_deg > policy.slew_limit_deg and registration.nominal is None:
         return f"the telescope has moved by {moved_deg:.0f} deg since the last dithered window"
-    sigma = sigma_beyond_floor(registration)
+    sigma = registration.tracking_sigma
     if np.any(sigma > policy.useless_sigma):
         return _worst(sigma, policy.useless_sigma)
     return None
-
-
-def sigma_beyond_floor(registration: Registration) -> Array:
-    """Return 1 σ of α now ``(4,)`` without the model error, which is what limits of age apply to.
-
-    The model error is neither age nor reduced by a window: it includes unknown places of pupil
-    images, a coarse mirror and what windows leave unexplained. Whether a loop is safe with it is
-    decided by the stability gate, which examines α ± 3σ.
-    """
-    return np.sqrt(np.diag(registration.covariance) + registration.grown)
 
 
 def _worst(sigma: Array, limit: Array) -> str:
@@ -438,3 +430,8 @@ def _store_intervals(context: StepContext, intervals: Iterable[VoidInterval]) ->
     kept = tuple(intervals)
     if kept != context.alpha.void_intervals:
         context.alpha = replace(context.alpha, void_intervals=kept)
+
+
+def without_previous(bias: PassiveBias | None) -> PassiveBias | None:
+    """Return the bias without what was known before its last update: it is out of date."""
+    return bias and replace(bias, previous_estimate=None)

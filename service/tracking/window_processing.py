@@ -16,23 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.estimation import kalman
-from service.estimation.estimate import PassiveEstimate
 from service.estimation.kalman import Joint
 from service.estimation.loop import loop_numbers, same_numbers
-from service.estimation.random_dither import RandomEstimate
-from service.estimation.windows import RefusalKind
 from service.model.misregistration import Misregistration, step_text
-from service.tracking import alarms, filtering, jumps, pointing_law, validity
-from service.tracking import events as ev
-from service.tracking.alarms import Interlock
-from service.tracking.dither import note_found
-from service.tracking.dither_plan import check_dither_allowed
-from service.tracking.filtering import FilterUpdate, WindowEstimate
-from service.tracking.jumps import Innovation
-from service.tracking.operations.acquisition import count_miss
-from service.tracking.operations.running import running_ramp
-from service.tracking.policy import SECOND_NS
-from service.tracking.registration import (
+from service.records import alarms
+from service.records import events as ev
+from service.records.alarms import Interlock
+from service.records.estimates import PassiveEstimate, RandomEstimate, RefusalKind
+from service.records.registration import (
+    Bias,
     HistoryEntry,
     PassiveBias,
     PassiveState,
@@ -43,11 +35,18 @@ from service.tracking.registration import (
     Source,
     SuspectedJump,
     TimedEstimate,
-    without_previous,
 )
-from service.tracking.state import Level, TrackerState
+from service.records.state import Level, TrackerState
+from service.tracking import filtering, jumps, pointing_law, validity
+from service.tracking.dither import note_found
+from service.tracking.dither_plan import check_dither_allowed
+from service.tracking.filtering import FilterUpdate, WindowEstimate
+from service.tracking.jumps import Innovation
+from service.tracking.operations.acquisition import count_miss
+from service.tracking.operations.running import running_ramp
+from service.tracking.policy import SECOND_NS
 from service.tracking.step_context import StepContext, same_but_for_numbers
-from service.tracking.validity import BOTH_SIDES
+from service.tracking.validity import BOTH_SIDES, without_previous
 
 Array = NDArray[Any]
 
@@ -358,7 +357,7 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
     measured = estimate.alpha.vector
     window = PointedEstimate(
         alpha=estimate.alpha,
-        covariance=(prior.bias or kalman.Bias()).scatter * estimate.covariance,
+        covariance=(prior.bias or Bias()).scatter * estimate.covariance,
         t_ns_utc=event.t_ns_utc,
         pointing=validity.pointing_at(context.state, event.t_ns_utc),
     )

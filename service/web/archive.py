@@ -22,9 +22,9 @@ from service.archive.nights import FOREVER_NS
 from service.archive.products import RecordingRecord
 from service.archive.retention import Item, items
 from service.errors import PyrcalError
+from service.records.commands import Instruction
 from service.runtime.archiving import needed
 from service.runtime.telemetry_recorder import RecordingChoice
-from service.tracking.commands import Instruction
 from service.web.commands import AcceptedView, Client, ClientDep, Said, body
 from service.web.connections import not_modified, tag_of
 from service.web.history import TimeParameters

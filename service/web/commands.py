@@ -24,12 +24,12 @@ from starlette.datastructures import MutableHeaders
 
 from service.archive import Actor
 from service.errors import StaleError, UntaggedError
+from service.records import commands as instructions
+from service.records.commands import Instruction
+from service.records.events import new_id
+from service.records.state import TrackerState
 from service.runtime.command_results import RefitJob
 from service.runtime.supervisor import Supervisor
-from service.tracking import commands as instructions
-from service.tracking.commands import Instruction
-from service.tracking.events import new_id
-from service.tracking.state import TrackerState
 from service.web import keys, matrices, measured, views
 from service.web.authentication import actor_of, needs
 from service.web.problems import COMMAND, DECISION, INVALID, UNKNOWN

@@ -9,12 +9,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hashlib
+import math
 import re
-from collections import OrderedDict
+import time
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from http import HTTPStatus
-from typing import Any
+from typing import Any, cast
 from uuid import uuid4
 
 import uvicorn
@@ -24,6 +26,8 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from structlog.contextvars import bound_contextvars
 from typing_extensions import override
+from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.server import ServerState
 
 from service.errors import PyrcalError, TooLargeError, TooSlowError
 from service.web.problems import known_problem, problem
@@ -105,9 +109,14 @@ def again(body: bytes, receive: Receive) -> Receive:
 
 
 MAX_CONNECTIONS = 500
-"""Connections and requests at once; uvicorn answers 503 to more. A page holds two of them, and the
-system allows 1024 open files by default. Where clients are not trusted, a reverse proxy limits
-each of them (docs/operate/deploying.md)."""
+"""Connections at once; older ones end for more. A page holds two of them."""
+
+MAX_HEAD_S = 5
+"""Time for the head of a request from the beginning of its connection, or the answer before it,
+seconds."""
+
+CROWD_REPORT_S = 10.0
+"""Time for which connections that had to end are reported."""
 
 UNAVAILABLE_RETRY_S = 5
 """``Retry-After`` when the service ends or cannot read its keys, seconds."""
@@ -153,6 +162,88 @@ async def to_its_end(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -
             await problem(Request(scope), status, "ending", detail, headers)(scope, receive, send)
 
 
+class Crowd(ServerState):
+    """uvicorn's list of connections, in which there is always room for one more.
+
+    An operator who wants to stop the service is the last to come. So the oldest connections end for
+    a new one, of the address that has the most, and those without a whole request first. An
+    operator may share the address, if that is a proxy's or this machine's.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._ended: Counter[str] = Counter()
+        self._last_s = -math.inf
+
+    def make_room(self) -> None:
+        """End some connections if there are more than there may be."""
+        members = cast("set[Connection]", self.connections)
+        if len(members) <= MAX_CONNECTIONS:
+            return
+        address, n = Counter(each.address for each in members).most_common(1)[0]
+        # A tenth of them at once: a choice among all for each that comes would take too long.
+        oldest = sorted((each for each in members if each.address == address), key=Connection.rank)
+        for each in oldest[: max(n // 10, 1)]:
+            # connection_lost() comes later, and others may come before it.
+            members.discard(each)
+            each.transport.abort()  # close() would wait for one that does not read
+            self._ended[address] += 1
+        self._last_s = time.monotonic()
+
+    def complaint(self) -> str:
+        """Return whose connections had to end lately; empty: nobody's."""
+        if time.monotonic() - self._last_s > CROWD_REPORT_S:
+            self._ended.clear()
+            return ""
+        address, n = self._ended.most_common(1)[0]
+        return (
+            f"more than {MAX_CONNECTIONS} connections to REST at once: {n} of {address} were "
+            "ended, the oldest first. Orders and the page work, perhaps at the second try: end "
+            "the program there, or limit the connections of an address with a firewall or proxy"
+        )
+
+
+class Connection(H11Protocol):
+    """A connection of uvicorn on which a request has to begin in time.
+
+    uvicorn limits the time until the next request of a connection begins; here the limit is for
+    the whole head of a request, the first one included. The body has a limit of its own.
+    """
+
+    @override
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self.address = self.client[0] if self.client else ""
+        self._since_s = time.monotonic()
+        self.timeout_keep_alive_task = self.loop.call_later(
+            self.timeout_keep_alive, self.timeout_keep_alive_handler
+        )
+        cast(Crowd, self.server_state).make_room()
+
+    @override
+    def data_received(self, data: bytes) -> None:
+        # uvicorn would cancel the timer with the first byte.
+        timer, self.timeout_keep_alive_task = self.timeout_keep_alive_task, None
+        super().data_received(data)
+        if self._answers and timer is not None:
+            self._since_s = time.monotonic()
+            timer.cancel()
+        else:
+            self.timeout_keep_alive_task = timer
+
+    def rank(self) -> tuple[bool, float]:
+        """Return the place among those that may have to end for others, the first one lowest.
+
+        Whoever has sent a whole request and waits for its answer comes last.
+        """
+        return self._answers and not self.cycle.more_body, self._since_s
+
+    @property
+    def _answers(self) -> bool:
+        # None until the first request, which uvicorn's annotation leaves out.
+        return self.cycle is not None and not self.cycle.response_complete  # type: ignore[redundant-expr]
+
+
 class Server(uvicorn.Server):
     """uvicorn that leaves the signals to the service and ends with it.
 
@@ -174,16 +265,17 @@ class Server(uvicorn.Server):
     ) -> None:
         config = uvicorn.Config(
             app,
-            http="h11",
+            http=Connection,
             ws="none",
             log_config=None,
             access_log=False,
-            limit_concurrency=MAX_CONNECTIONS,
+            timeout_keep_alive=MAX_HEAD_S,
             timeout_graceful_shutdown=within_s,
             proxy_headers=bool(proxies),
             forwarded_allow_ips=list(proxies),
         )
         super().__init__(config)
+        self.server_state = self.crowd = Crowd()
         self._over = over
 
     @override

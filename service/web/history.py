@@ -13,9 +13,9 @@ from pydantic import AfterValidator, AwareDatetime, BeforeValidator, Field, mode
 
 from service.archive import Archive, Mark, Night
 from service.archive.nights import FOREVER_NS, TREND_S, Annotation, TrendSample
+from service.records.registration import HistoryEntry
 from service.runtime.supervisor import Supervisor
 from service.runtime.telemetry_recorder import AnnotationChoice
-from service.tracking.registration import HistoryEntry
 from service.web import commands, connections, problems, views
 from service.web.views import ServiceDep, answer, define_view, shows
 

@@ -14,11 +14,12 @@ from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from fastapi.responses import FileResponse, StreamingResponse
 from numpy.typing import NDArray
 
-from service.control.gains import ModeGain, gain_table
+from service.control.gains import gain_table
 from service.errors import CommandError
+from service.records.products import MatrixState
+from service.records.registration import ModeGain
 from service.runtime.snapshot import ModeGainTable
 from service.runtime.supervisor import Supervisor
-from service.tracking.products import MatrixState
 from service.web import views
 from service.web.connections import tag_of, unless_kept
 from service.web.problems import COMMAND, INVALID, UNKNOWN

@@ -20,9 +20,9 @@ from starlette.requests import ClientDisconnect
 
 from service import errors, files
 from service.model.kinds import Method
+from service.records.operations import MeasurementRecord, NoisyFinding
+from service.records.state import TrackerState
 from service.runtime.uploads import FitJob, FitQueue, FitState
-from service.tracking.operation_records import MeasurementRecord, NoisyFinding
-from service.tracking.state import TrackerState
 from service.web import views
 from service.web.matrices import (
     RESPONSE_PART_BYTES,

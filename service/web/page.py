@@ -38,8 +38,8 @@ from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.model.pupil import rtc_valid_subapertures
 from service.model.slopes import as_maps, orient_mask, slopes_of, to_conventions
+from service.records.state import LogEntry
 from service.runtime.supervisor import Supervisor
-from service.tracking.state import LogEntry
 from service.tracking.step_context import LOG_LENGTH
 from service.web.authentication import OPEN
 from service.web.connections import Middleware
@@ -310,7 +310,10 @@ MAX_LISTENERS = 60
 RETRY_MS = 1000
 """Time after which a disconnected listener reconnects, milliseconds."""
 
-_CLOCKS = {"now_ns", "now_utc", "uptime_s", "age_s", "window_age_s", "frame_age_s"}
+_CLOCKS = {
+    *("now_ns", "now_utc", "uptime_s", "age_s"),
+    *("window_age_s", "frame_age_s", "telemetry_age_s"),
+}
 """Fields of the state that change while nothing happens."""
 
 Log = tuple[LogEntry, ...]

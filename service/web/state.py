@@ -18,13 +18,13 @@ from prometheus_client.registry import Collector
 from pydantic import BaseModel, Field
 
 from service.link.statistics import LinkStatistics
+from service.records.alarms import ARCHIVE_FAILED, WORKER_BEHIND, AlarmState, Responsible, Severity
+from service.records.operations import DitherPhase
+from service.records.products import MatrixState
+from service.records.registration import Source, Validity
+from service.records.state import Mode, TrackerState
 from service.runtime.snapshot import Snapshot, WorkerLoad
-from service.tracking.alarms import ARCHIVE_FAILED, WORKER_BEHIND, AlarmState, Responsible, Severity
-from service.tracking.dither_request import DitherPhase
 from service.tracking.operations.running import CurrentOperation, ServiceState
-from service.tracking.products import MatrixState
-from service.tracking.registration import Source, Validity
-from service.tracking.state import Mode, TrackerState
 from service.version import software_version
 from service.web import views
 from service.web.authentication import OPEN
@@ -287,6 +287,7 @@ def _of_link(link: LinkStatistics) -> Iterator[Metric]:
     yield _gauge("frames_lost", lost, link.frames_lost)
     yield _gauge("rtc_alive", "1 while the RTC's liveliness token is there", link.rtc_alive)
     yield _gauge("frame_age_seconds", "Since the last frame arrived", link.frame_age_s)
+    yield _gauge("telemetry_age_seconds", "Delay of the newest frame", link.telemetry_age_s)
     yield _gauge("latency_p50_seconds", "Median from put to callback", link.latency_p50_s)
 
 
@@ -311,6 +312,7 @@ def _of_registration(snapshot: Snapshot) -> Iterator[Metric]:
     for name, text, four in (
         ("alpha", "Registration", registration.alpha.vector),
         ("alpha_sigma", "1 sigma, floor included", registration.shown_sigma),
+        ("alpha_tracking_sigma", "1 sigma of changes", registration.tracking_sigma),
     ):
         for parameter, value in zip(_ALPHA, four.tolist(), strict=True):
             yield _gauge(f"{name}_{parameter}", text, value)

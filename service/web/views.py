@@ -44,25 +44,27 @@ from pydantic_core import from_json
 from typing_extensions import TypedDict  # pydantic needs it before Python 3.12
 
 from service import errors, wire
-from service.control.expected_gain import ExpectedGain
-from service.control.gains import ModeGain
-from service.control.gate import GateVerdict
-from service.estimation.comparison import ProbationFinding
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import Misregistration, at_boundary
-from service.runtime.snapshot import AlarmStatus, Alpha, ModeGainTable, Rtc, Snapshot, WorkerLoad
-from service.runtime.supervisor import Supervisor
-from service.tracking import alarms, dither_request, interlocks, mode_limits, products
-from service.tracking import commands as cmd
-from service.tracking.operation_records import (
+from service.records import alarms, products
+from service.records import commands as cmd
+from service.records.operations import (
     Acquisition,
+    Dither,
+    DitherPlan,
+    DitherPolicyState,
     LoopCommand,
     MeasurementRecord,
     Probation,
+    ProbationFinding,
 )
+from service.records.products import ExpectedGain, GateVerdict, ModeLimit, ModeProof
+from service.records.registration import HistoryEntry, ModeGain, Offload, PassiveState
+from service.records.state import LogEntry, ObservatoryValue, TrackerState
+from service.runtime.snapshot import AlarmStatus, Alpha, ModeGainTable, Rtc, Snapshot, WorkerLoad
+from service.runtime.supervisor import Supervisor
+from service.tracking import interlocks
 from service.tracking.operations.running import Operating
-from service.tracking.registration import HistoryEntry, Offload, PassiveState
-from service.tracking.state import LogEntry, ObservatoryValue, TrackerState
 
 Record = TypeVar("Record")
 
@@ -296,16 +298,17 @@ define_view("ProbationFindingView", ProbationFinding)
 define_view(
     "ProbationView", Probation, "id before state text since_ns_utc until_ns_utc finding rollback"
 )
-define_view("ModeLimitView", mode_limits.ModeLimit, "n_modes since_ns_utc until_ns_utc reason")
+define_view("ModeLimitView", ModeLimit, "n_modes since_ns_utc until_ns_utc reason")
 define_view(
     "ModeProofView",
-    mode_limits.ModeProof,
+    ModeProof,
     "n_proven contrary_modes own_response_ratio own_misfit_ratio",
 )
 ALPHA = define_view(
     "AlphaView",
     Alpha,
-    "registration.alpha sigma=registration.shown_sigma anamorphosis_sigma registration.floor "
+    "registration.alpha sigma=registration.shown_sigma registration.tracking_sigma sigma_limit "
+    "anamorphosis_sigma registration.floor "
     "covariance parameters "
     "registration.t_ns_utc age_s window_age_s "
     "registration.n_windows validity=registration.validity.level "
@@ -332,14 +335,14 @@ define_view(
 define_view("LoopCommandView", LoopCommand, "id text state reason asked_ns_utc lasts_s")
 define_view(
     "DitherView",
-    dither_request.Dither,
+    Dither,
     "id request.modes request.amplitude_m request.kind frequency_hz request.seed "
     "request.duration_s start_seq",
 )
-define_view("DitherPlanView", dither_request.DitherPlan)
+define_view("DitherPlanView", DitherPlan)
 define_view(
     "DitherPolicyView",
-    dither_request.DitherPolicyState,
+    DitherPolicyState,
     "phase reason budget_m mean_cost_m plan next_ns_utc n_windows_learnt avoided_hz",
 )
 define_view(
@@ -407,9 +410,9 @@ define_view("WorkerLoadView", WorkerLoad)
 define_view(
     "LinkView",
     LinkStatistics,
-    "rtc_alive session frame_age_s latency_p50_s frames_received frames_lost frames_recovered "
-    "frames_duplicate frames_late frames_nonfinite frames_overwritten frames_refused "
-    "messages_malformed",
+    "rtc_alive session frame_age_s telemetry_age_s latency_p50_s frames_received frames_lost "
+    "frames_recovered frames_duplicate frames_late frames_nonfinite frames_overwritten "
+    "frames_refused messages_malformed",
 )
 STATE = define_view(
     "StateView",

@@ -6,6 +6,7 @@ four images are displaced by 0.1 subaperture RMS along either axis.
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 
 from pyrcal.fitting.matrix import FitOptions, fit_matrix
 from pyrcal.importers.files import Reported, from_arrays
+from pyrcal.instruments.program import find_image_offsets
 from pyrcal_studies.fft_pyramid import DisplacedPyramid
 from pyrcal_studies.image_offsets import (
     SEPARATION,
@@ -85,28 +87,52 @@ def test_a_pupil_beside_the_middle_of_the_grid_is_found_with_a_telescope_as_stop
     assert fit.image_offsets_px.mean(axis=0) == pytest.approx([0.3, -0.2], abs=0.02)
 
 
-@pytest.mark.parametrize("unevenness", [0.0, 0.3])
-def test_centres_in_a_flux_frame_are_found_to_a_hundredth_of_a_pixel(unevenness):
-    wide = int(SEPARATION)  # the quadrants of the frame touch each other
-    instrument = replace(bench(Stop.TELESCOPE), frames=FrameWindows())
+def frame_of(instrument, offsets, unevenness, wide):
+    """Return a frame of the light, four touching quadrants ``wide`` pixels across."""
     pupil = model_of(instrument).pupil
     slope = pupil.coordinates / (N / 2)
     light = 1.0 + unevenness * slope + 0.5 * unevenness * slope[:, None] ** 2
+    camera = DisplacedPyramid(
+        amplitude=pupil.amplitude * np.sqrt(light),
+        sampling=4,
+        wavelength_m=750e-9,
+        n_subapertures=wide,
+        image_separation_subap=float(wide),
+        modulation_lambda_over_d=3.0 * wide / N,
+        n_nodes=3,
+        padded_subap=6 * N,
+        offsets=offsets,
+    )
+    return camera.images(np.zeros_like(pupil.amplitude)).reshape(2 * wide, 2 * wide)
+
+
+@pytest.mark.parametrize("unevenness", [0.0, 0.3])
+def test_one_command_finds_the_places_of_the_images_in_a_frame_or_a_flux(tmp_path, unevenness):
+    wide = 18
+    instrument, errors = bench(Stop.TELESCOPE), []
+    instrument = replace(instrument, wfs=replace(instrument.wfs, pupil_separation_subap=18.0))
+    for seed in range(3):
+        offsets = np.random.default_rng(seed).uniform(-0.3, 0.3, size=(2, 2, 2))
+        frame = frame_of(instrument, offsets, unevenness, wide)
+        first = (wide - N) // 2 + np.array([0, wide])
+        flux = [frame[y : y + N, x : x + N] for y in first for x in first]
+        for name, light in (("frame.npy", frame), ("flux.npy", np.stack(flux))):
+            np.save(tmp_path / name, light)
+            line = find_image_offsets(instrument, tmp_path / name)
+            places = np.array(tomllib.loads(line)["image_offsets_px"])
+            errors.append(places - offsets.reshape(4, 2) + offsets.mean(axis=(0, 1)))
+    assert np.sqrt(np.mean(np.square(errors))) < 0.01
+    assert np.abs(errors).max() < 0.03
+
+
+@pytest.mark.parametrize("unevenness", [0.0, 0.3])
+def test_centres_in_a_flux_frame_are_found_to_a_hundredth_of_a_pixel(unevenness):
+    wide = int(SEPARATION)
+    instrument = replace(bench(Stop.TELESCOPE), frames=FrameWindows())
     rough, errors = [], []
     for seed in range(3):
         offsets = np.random.default_rng(seed).uniform(-0.5, 0.5, size=(2, 2, 2))
-        camera = DisplacedPyramid(
-            amplitude=pupil.amplitude * np.sqrt(light),
-            sampling=4,
-            wavelength_m=750e-9,
-            n_subapertures=wide,
-            image_separation_subap=SEPARATION,
-            modulation_lambda_over_d=3.0 * wide / N,
-            n_nodes=3,
-            padded_subap=6 * N,
-            offsets=offsets,
-        )
-        frame = camera.images(np.zeros_like(pupil.amplitude)).reshape(2 * wide, 2 * wide)
+        frame = frame_of(instrument, offsets, unevenness, wide)
         sides = np.array([0.0, wide]) + (wide - 1) / 2
         nominal = np.stack(np.meshgrid(sides, sides, indexing="ij"), axis=-1)
         centres = nominal + offsets[..., ::-1]

@@ -4,10 +4,10 @@ import hypothesis.strategies as st
 from hypothesis import HealthCheck, settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from service.tracking import commands as cmd
-from service.tracking import events as ev
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.operations import MeasureState
 from service.tracking.interlocks import ALLOWS
-from service.tracking.operation_records import MeasureState
 from service.tracking.operations.running import OperationKind, running_operations
 from service.wire import DitherStop
 from tests.unit.tracking.operations.test_running import (

@@ -7,9 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.archive.serialisation import from_json, to_json
-from service.control.gate import GateVerdict
 from service.model.misregistration import Misregistration
-from service.tracking.products import MatrixState, ReconstructorRecord
+from service.records.products import GateVerdict, MatrixState, ReconstructorRecord
 
 numbers = st.floats(-10, 10)
 radii = st.floats(0, allow_nan=False)

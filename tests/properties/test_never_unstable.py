@@ -5,12 +5,11 @@ from dataclasses import replace
 import hypothesis.strategies as st
 from hypothesis import given
 
-from service.control.expected_gain import ExpectedGain
 from service.estimation.loop import select_gains
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.products import MatrixState
-from service.tracking.state import Mode
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.products import ExpectedGain, MatrixState
+from service.records.state import Mode
 from service.tracking.update_policy import verdict_invalid_reason
 from tests.properties.test_tracker_laws import LAWS, Night, commands, heard, ids
 from tests.unit.tracking.situations import ALPHA, moved, record, rtc, verdict

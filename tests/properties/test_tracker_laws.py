@@ -7,17 +7,17 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 
 from service.errors import CommandError
-from service.estimation.windows import WindowRefused
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.estimates import WindowRefused
+from service.records.operations import MeasurementRecord, MeasureState
+from service.records.products import MatrixState
+from service.records.state import Mode
 from service.tracker import step
-from service.tracking import commands as cmd
-from service.tracking import events as ev
 from service.tracking.dither_request import total_m
 from service.tracking.filtering import HISTORY_LENGTH
-from service.tracking.operation_records import MeasurementRecord, MeasureState
 from service.tracking.operations.measurement import MEASUREMENTS_KEPT
-from service.tracking.products import MatrixState
 from service.tracking.reconstructors import RECONSTRUCTORS_KEPT
-from service.tracking.state import Mode
 from service.tracking.step_context import LOG_LENGTH
 from service.wire import (
     DitherRequest,

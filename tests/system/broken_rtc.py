@@ -122,7 +122,7 @@ VIOLATIONS = {
     "sign": ("columns", "opposite sign", {"return [*slopes,": "return [*-slopes,"}),
     "clock": (
         "clock",
-        "3600 s ahead of UTC, as local time is",
+        "s ahead of UTC",
         {'{"t0_ns": start_ns': ('{"t0_ns": 3600 * 10**9 + start_ns')},
     ),
     "session": (

@@ -13,11 +13,11 @@ from service.api import create_app
 from service.archive import Archive
 from service.instrument import packaged_instrument
 from service.model.misregistration import Misregistration
+from service.records.alarms import Alarm
+from service.records.products import MatrixState, ReconstructorRecord
+from service.records.registration import HistoryEntry
 from service.runtime.snapshot import Snapshot
 from service.tracking.alarm_records import record_of
-from service.tracking.alarms import Alarm
-from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.registration import HistoryEntry
 from tests.states import changed
 from tests.system.cable import free_port
 from tests.unit.test_api import ALPHA, LINK, SECOND, SIGMA, STATE, VERDICT, FakeService

@@ -14,13 +14,8 @@ import zenoh.ext
 
 from service.errors import LinkError, UnknownIdError, WireError
 from service.link.matrices import MeasuredMatrix
+from service.records.events import LogEvent, RtcVanished, ServicesMet, SessionStarted
 from service.rtc_bridge import Bridge, Endpoint
-from service.tracking.events import (
-    LogEvent,
-    RtcVanished,
-    ServicesMet,
-    SessionStarted,
-)
 from service.wire import (
     Acknowledgement,
     AckState,
@@ -610,10 +605,19 @@ def test_a_busy_port_is_one_clear_line(bridge, endpoint):
     assert "\n" not in text
 
 
-def test_a_missing_router_is_one_clear_line(endpoint):
-    client = Endpoint(system=SYSTEM, connect=endpoint.listen)
-    with pytest.raises(LinkError, match="no zenoh router answers at tcp"):
-        Bridge(client).open()
+def test_a_missing_router_is_one_clear_line_and_reached_once_it_is_there(endpoint):
+    client = Bridge(Endpoint(system=SYSTEM, connect=endpoint.listen))
+    with pytest.raises(LinkError, match="no zenoh router answers at tcp") as refusal:
+        client.open()
+    assert client.statistics().missing == str(refusal.value)
+    with Bridge(replace(endpoint, system="router")):
+        client.reopen()
+        assert not client.statistics().missing
+        assert client.events() == []  # no RTC has gone
+        client.close()
+        client.reopen()
+        assert client.statistics().missing == ""
+        assert client._session is None
 
 
 def test_the_service_can_be_a_client_of_another_router(bridge, endpoint, rtc):
@@ -628,10 +632,10 @@ def test_nothing_works_before_open_and_closing_twice_is_fine(endpoint):
     bridge = Bridge(endpoint)
     with pytest.raises(LinkError, match="not open"):
         asyncio.run(bridge.fetch_applied())
-    with pytest.raises(LinkError, match="the link is not open"):
-        bridge.publish_state(
-            StateMessage(system=SYSTEM, t_ns=1, mode="auto", alpha=None, sigma=None, in_use=None)
-        )
+    # dropped: the service goes on while its link waits for the network
+    bridge.publish_state(
+        StateMessage(system=SYSTEM, t_ns=1, mode="auto", alpha=None, sigma=None, in_use=None)
+    )
     assert bridge.drain() == []
     bridge.open()
     with pytest.raises(LinkError, match="open already"):

@@ -20,9 +20,9 @@ import zenoh
 from service.config.link_tables import AccessTable, TlsTable, UsersTable, ZenohTable, link_security
 from service.errors import LinkError
 from service.link.guard import MIN_ALARM_CONNECTIONS
+from service.records.alarms import LINK_FLOODED
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.readiness import complaints
-from service.tracking.alarms import LINK_FLOODED
 from service.wire import LoopRequest, Role
 from service.wire.access import NO_SECURITY, LinkSecurity
 from service.wire.signing import Signatures

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from service.tracking.alarms import ALARMS, OperatorNote, Severity
-from service.tracking.commands import AcknowledgeAlarm, Approve, MuteAlarm
-from service.tracking.products import MatrixState
+from service.records.alarms import ALARMS, OperatorNote, Severity
+from service.records.commands import AcknowledgeAlarm, Approve, MuteAlarm
+from service.records.products import MatrixState
 from service.wire import Loop
 from tests.system.browser import LAPTOP, NARROW, NEEDS_A_BROWSER, Keys, Page, a_browser
 from tests.system.night import ROOT

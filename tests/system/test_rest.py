@@ -13,7 +13,7 @@ import h5py
 import httpx
 import pytest
 
-from tests.system.night import a_night, wait_for
+from tests.system.night import N_TARGET, a_night, wait_for
 from tests.system.pace import patience
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
@@ -109,7 +109,7 @@ def test_endless_bodies_and_half_open_requests_cost_next_to_nothing(night):
     with ThreadPoolExecutor(5) as clients:  # the connection is closed with the refusal
         list(clients.map(send_without_end, range(5)))
     with contextlib.ExitStack() as held:
-        for _ in range(400):  # beyond MAX_CONNECTIONS the answer is 503
+        for _ in range(400):  # beyond MAX_CONNECTIONS the oldest are ended
             line = socket.create_connection(("127.0.0.1", night.port), timeout=patience(10.0))
             held.enter_context(line).sendall(b"GET /v1/state HTTP/1.1\r\n")
         # within the patience of the client
@@ -150,18 +150,45 @@ def test_on_a_disk_that_refuses_nothing_is_ordered_and_afterwards_all_is_on_reco
         assert "index.sqlite" in refused.json()["detail"]
         assert night.state["mode"] == "hold"
         wait_for(lambda: "archive-failed" in night.alarms, 5.0, "the alarm")
+        held = night.client.put("/v1/mode", json={"mode": "hold"})
+        assert held.status_code == httpx.codes.ACCEPTED, held.text
         assert night.metrics["pyrcal_archive_failures_total"] > 0
         assert night.client.get("/healthz").status_code == httpx.codes.OK
     wait_for(lambda: "archive-failed" not in night.alarms, 10.0, "the end of the alarm")
     assert night.client.put("/v1/mode", json={"mode": "auto"}).status_code == httpx.codes.ACCEPTED
     unknown = night.client.post("/v1/reconstructors/cm-7/approve")
     assert unknown.status_code == httpx.codes.NOT_FOUND
-    wait_for(lambda: len(audit_of(night)) == 6, 5.0, "the refusal in the audit trail")
+    wait_for(lambda: len(audit_of(night)) == 8, 5.0, "the refusal in the audit trail")
     names = [name for name, _ in audit_of(night)]
-    orders = ["SetMode", "SetMode.refused", "SetMode", "SetMode.answered"]
+    orders = ["SetMode", "SetMode.refused", *("SetMode", "SetMode.answered") * 2]
     assert names == [*orders, "Approve", "Approve.refused"]
     process.send(signal.SIGTERM)
     assert process.ended(30.0) == 0, process.log
+
+
+@pytest.mark.long
+def test_on_a_full_disk_a_matrix_is_taken_back_and_the_loop_is_opened(tmp_path):
+    with a_night(tmp_path) as night:
+        service = night.service("auto")
+        night.rtc()
+        night.wait_for_modes(N_TARGET)
+        sent = night.rtc_says("cm_id")
+        with no_file_may_grow(service):
+            for path, order in (
+                ("/v1/rollback", {"anyway": True}),
+                ("/v1/dither", {"action": "stop"}),
+                ("/v1/loop", {"loop": "open"}),
+                ("/v1/stop", {}),
+            ):
+                answer = night.client.post(path, json=order)
+                assert answer.status_code == httpx.codes.ACCEPTED, answer.text
+                if path == "/v1/rollback":
+                    wait_for(lambda: night.rtc_says("cm_id") != sent, 10.0, "the matrix before")
+            wait_for(lambda: night.rtc_says("loop") == "open", 10.0, "an open loop")
+            assert "archive-failed" in night.alarms
+        wait_for(lambda: "archive-failed" not in night.alarms, 10.0, "the end of the alarm")
+        wait_for(lambda: len(audit_of(night)) == 8, 5.0, "orders and answers on record")
+        assert "Traceback" not in service.log
 
 
 @pytest.mark.long

@@ -60,7 +60,7 @@ def test_a_wheel_has_what_the_program_reads_besides_its_code(wheel):
         *(ROOT / "service" / "web" / "dashboard").iterdir(),
         *(ROOT / "pyrcal" / "samples" / "data").iterdir(),
         ROOT / "service" / "commands.toml",
-        ROOT / "service" / "tracking" / "alarms.toml",
+        ROOT / "service" / "records" / "alarms.toml",
         ROOT / "service" / "web" / "openapi.json",
     ]
     names = set(wheel.namelist())

@@ -16,8 +16,6 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from service.archive import Archive
 from service.archive.nights import Annotation
-from service.control.gains import ModeGain
-from service.control.gate import GateVerdict
 from service.errors import (
     ArchiveError,
     CommandError,
@@ -28,10 +26,8 @@ from service.errors import (
 )
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import PARAMETERS, Misregistration
-from service.runtime.command_results import Refits
-from service.runtime.snapshot import Snapshot
-from service.tracking.alarms import ALARMS, Alarm, AlarmRecord, OperatorNote, Severity
-from service.tracking.commands import (
+from service.records.alarms import ALARMS, Alarm, AlarmRecord, OperatorNote, Severity
+from service.records.commands import (
     AbortAcquisition,
     AcknowledgeAlarm,
     Acquire,
@@ -51,20 +47,23 @@ from service.tracking.commands import (
     StopDither,
     UnmuteAlarm,
 )
-from service.tracking.dither_request import Dither, DitherPhase, DitherPlan, DitherPolicyState
-from service.tracking.events import MakeMatrix
-from service.tracking.operation_records import (
+from service.records.events import MakeMatrix
+from service.records.operations import (
     Acquisition,
     AcquisitionStage,
     CommandState,
+    Dither,
+    DitherPhase,
+    DitherPlan,
+    DitherPolicyState,
     LoopCommand,
     MeasurementRecord,
     MeasureState,
 )
-from service.tracking.operations.running import ServiceState
-from service.tracking.products import MatrixState, ModeSet, ReconstructorRecord
-from service.tracking.registration import (
+from service.records.products import GateVerdict, MatrixState, ModeSet, ReconstructorRecord
+from service.records.registration import (
     HistoryEntry,
+    ModeGain,
     PassiveBias,
     PassiveState,
     Registration,
@@ -73,7 +72,10 @@ from service.tracking.registration import (
     Validity,
     ValidityState,
 )
-from service.tracking.state import Level, LogEntry, Mode, TrackerState
+from service.records.state import Level, LogEntry, Mode, TrackerState
+from service.runtime.command_results import Refits
+from service.runtime.snapshot import Snapshot
+from service.tracking.operations.running import ServiceState
 from service.version import software_version
 from service.web.views import to_json
 from service.wire import DitherKind, DitherRequest, DitherStatus, Loop, Pattern, Pointing, Status
@@ -314,6 +316,8 @@ async def test_alpha_leaves_in_the_units_of_its_names(client):
         {"shift_x_subap": 0.2, "shift_y_subap": -0.1, "rotation_deg": 0.3, "magnification": 1.005}
     )
     assert body["sigma"]["rotation_deg"] == pytest.approx(np.hypot(0.03, 0.005))
+    assert body["tracking_sigma"]["rotation_deg"] == pytest.approx(0.03)
+    assert body["sigma_limit"] is None
     assert body["floor"]["rotation_deg"] == pytest.approx(0.005)
     assert body["parameters"] == list(PARAMETERS)
     covariance = np.array(body["covariance"])
@@ -379,6 +383,21 @@ def test_an_acquisition_is_shown_with_its_stage_and_what_it_found_in_degrees():
     assert (shown["stage"], shown["under_way"], shown["n_attempts"]) == ("confirming", True, 1)
     assert shown["alpha"]["rotation_deg"] == pytest.approx(0.3)
     assert to_json(Acquisition())["alpha"] is None
+
+
+@pytest.mark.parametrize(("image_sigma", "limited"), [(0.008, False), (0.0375, True)])
+async def test_places_of_images_that_limit_sigma_are_named_with_the_command(
+    client, service, image_sigma, limited
+):
+    places = np.array([image_sigma, image_sigma, 0.0, 0.0])
+    known = replace(STATE.alpha.registration, image_floor=places)
+    policy = replace(service.now.policy, image_sigma=places)
+    state = changed(STATE, registration=known)
+    service.now = replace(service.now, tracker=state, policy=policy)
+    body = await body_of(client, "/v1/alpha")
+    assert body["tracking_sigma"]["shift_x_subap"] == pytest.approx(SIGMA[0])
+    assert body["sigma"]["shift_x_subap"] > image_sigma
+    assert ("--light FRAME" in (body["sigma_limit"] or "")) is limited
 
 
 async def test_a_reading_that_cannot_tell_has_no_sigma(client, service):
@@ -882,6 +901,7 @@ async def test_metrics_show_what_the_service_knows(client):
     assert found["alpha_sigma_rotation_radians",] == pytest.approx(
         np.deg2rad(np.hypot(0.03, 0.005))
     )
+    assert found["alpha_tracking_sigma_rotation_radians",] == pytest.approx(np.deg2rad(0.03))
     assert found["alpha_shift_x_subapertures",] == 0.2
     assert found["alpha_age_seconds",] == 10.0
     assert found["optical_gain_ratio",] == 0.6

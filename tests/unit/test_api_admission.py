@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import json
 import socket
-import time
 
 import httpx
 import pytest
@@ -14,7 +13,7 @@ from service.web import connections
 from service.web.authentication import Hosts
 from service.web.connections import Server
 from service.web.keys import KeyFile, KeyScope
-from tests.system.pace import in_time
+from tests.system.pace import patience
 from tests.unit.test_api import FakeService, a_snapshot, assert_problem
 
 pytestmark = pytest.mark.timeout(60)
@@ -155,6 +154,7 @@ async def serving(service, keys=None, proxies=()):
     listener = socket.create_server(("127.0.0.1", 0))
     over = asyncio.Event()
     server = Server(create_app(service, keys=keys), over, within_s=2, proxies=proxies)
+    service.crowd = server.crowd
     task = asyncio.create_task(server.serve(sockets=[listener]))
     while not server.started:  # noqa: ASYNC110 - uvicorn has no event for it
         await asyncio.sleep(0.01)
@@ -211,18 +211,89 @@ async def test_a_body_may_come_in_many_pieces(service):
         writer.close()
 
 
-async def test_more_connections_than_there_may_be_are_answered_503(service, monkeypatch):
+HALF_HEAD = b"POST /v1/stop HTTP/1.1\r\nHost: localhost\r\nX-"
+
+
+@pytest.mark.parametrize("sent", [b"", HALF_HEAD, SLOW_BODY])
+async def test_for_more_connections_than_there_may_be_the_oldest_end(service, monkeypatch, sent):
     monkeypatch.setattr(connections, "MAX_CONNECTIONS", 3)
     async with serving(service) as port:
-        held = [await connected(port) for _ in range(3)]
-        assert (await state_of(port)).status_code == 503
+        held = [await connected(port, sent) for _ in range(3)]
+        assert service.crowd.complaint() == ""
+        assert (await state_of(port)).status_code == 200
+        assert "1 of 127.0.0.1" in service.crowd.complaint()
+        with contextlib.suppress(ConnectionResetError):
+            assert await asyncio.wait_for(held[0][0].read(), patience(5.0)) == b""
+        assert not any(reader.at_eof() for reader, _ in held[1:])
+        monkeypatch.setattr(connections, "CROWD_REPORT_S", 0.0)
+        assert service.crowd.complaint() == ""
         for _, writer in held:
             writer.close()
-            await writer.wait_closed()
-        began = time.monotonic()
-        while (await state_of(port)).status_code != 200:
-            assert in_time(began, 4.0)
-            await asyncio.sleep(0.05)
+
+
+async def test_connections_without_a_request_end_before_those_that_are_answered(
+    service, monkeypatch
+):
+    """The page's stream is older than a crowd, and outlives it."""
+    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 3)
+    async with serving(service) as port:
+        stream, writer = await connected(
+            port, b"GET /v1/stream HTTP/1.1\r\nHost: localhost\r\n\r\n"
+        )
+        assert b" 200 " in await asyncio.wait_for(stream.readline(), patience(5.0))
+        idle = [await connected(port, sent) for sent in (SLOW_BODY, b"")]
+        assert (await state_of(port)).status_code == 200
+        with contextlib.suppress(ConnectionResetError):
+            assert await asyncio.wait_for(idle[0][0].read(), patience(5.0)) == b""
+        assert not stream.at_eof()
+        assert not idle[1][0].at_eof()
+        for each in (writer, idle[0][1], idle[1][1]):
+            each.close()
+
+
+async def test_the_address_with_most_connections_makes_room(service, monkeypatch):
+    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 3)
+    async with serving(service) as port:
+        first, writer = await asyncio.open_connection(
+            "127.0.0.1", port, local_addr=("127.0.0.2", 0)
+        )
+        held = [await connected(port) for _ in range(2)]
+        assert (await state_of(port)).status_code == 200
+        with contextlib.suppress(ConnectionResetError):
+            assert await asyncio.wait_for(held[0][0].read(), patience(5.0)) == b""
+        assert not first.at_eof()
+        for each in (writer, held[0][1], held[1][1]):
+            each.close()
+
+
+@pytest.mark.parametrize("sent", [b"", HALF_HEAD])
+async def test_the_head_of_a_request_has_a_time_limit(service, monkeypatch, sent):
+    """Bytes that trickle do not extend it."""
+    monkeypatch.setattr(connections, "MAX_HEAD_S", 1)
+    async with serving(service) as port:
+        reader, writer = await connected(port, sent)
+
+        async def trickle():
+            while not reader.at_eof():
+                writer.write(sent and b"x")
+                await asyncio.sleep(0.05)
+
+        async with asyncio.timeout(patience(5.0)):
+            with contextlib.suppress(ConnectionResetError):
+                await asyncio.gather(reader.read(), trickle())
+        writer.close()
+    assert service.commands == []
+
+
+async def test_a_head_in_many_pieces_is_answered(service):
+    async with serving(service) as port:
+        head = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
+        reader, writer = await connected(port)
+        for k in range(0, len(head), 8):
+            writer.write(head[k : k + 8])
+            await asyncio.sleep(0.01)
+        assert b" 200 " in await asyncio.wait_for(reader.readline(), patience(5.0))
+        writer.close()
 
 
 async def test_what_is_no_http_is_refused(service):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from service.control.gains import ModeGain
+from service.records.registration import ModeGain
 from tests.states import tracker_state
 from tests.unit.runtime.handmade import REGISTRATION
 from tests.unit.test_api import FakeService, a_snapshot

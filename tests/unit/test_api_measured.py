@@ -10,9 +10,9 @@ import pytest
 
 from service.errors import UnknownIdError
 from service.model.misregistration import Misregistration
-from service.tracking.commands import GiveUp, Measure, MeasureNoisy
-from service.tracking.operation_records import MeasurementRecord, MeasureState, NoisyFinding
-from service.tracking.products import ModeSet
+from service.records.commands import GiveUp, Measure, MeasureNoisy
+from service.records.operations import MeasurementRecord, MeasureState, NoisyFinding
+from service.records.products import ModeSet
 from service.web.views import NOISY_MEASUREMENT, to_json
 from service.wire import Pattern
 from tests.states import tracker_state

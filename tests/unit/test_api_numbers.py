@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from service.archive import Archive
-from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.state import TrackerState
+from service.records.products import MatrixState, ReconstructorRecord
+from service.records.state import TrackerState
 from service.wire import checksum
 from tests.states import tracker_state
 from tests.unit.test_api import FakeService, a_snapshot

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from service.errors import CommandError, StorageError
-from service.tracking.products import MatrixState, ReconstructorRecord
+from service.records.products import MatrixState, ReconstructorRecord
 from service.web import connections
 from tests.states import tracker_state
 from tests.unit.test_api import FakeService, a_snapshot

@@ -4,8 +4,8 @@ import httpx
 import pytest
 
 from service.api import create_app
+from service.records.commands import Refit
 from service.tracker import step
-from service.tracking.commands import Refit
 from service.tracking.interlocks import ORDERS
 from tests.unit.test_api import FakeService, a_snapshot
 from tests.unit.tracking.moments import MOMENTS, meant

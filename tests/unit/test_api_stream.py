@@ -10,7 +10,7 @@ import httpx
 import pytest
 
 from service.api import create_app
-from service.tracking.state import Level, LogEntry
+from service.records.state import Level, LogEntry
 from service.tracking.step_context import LOG_LENGTH
 from service.web import page
 from service.web.connections import Server

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.products import MatrixState, ReconstructorRecord
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.products import MatrixState, ReconstructorRecord
 from tests.unit.test_api import SECOND, STATE, assert_problem, entry, service
 
 __all__ = ["service"]  # a fixture

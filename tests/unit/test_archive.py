@@ -25,20 +25,25 @@ import pytest
 from service.archive import Archive, AuditEntry, Pin, Range
 from service.archive.nights import TREND_S, TrendSample
 from service.archive.serialisation import TrackingFile
-from service.control.expected_gain import ExpectedGain
-from service.control.gains import ModeGain
-from service.control.gate import GateVerdict
 from service.errors import ArchiveError, StorageError, UnknownIdError, WireError
 from service.estimation.frames import FrameBlock
 from service.model.misregistration import Misregistration
+from service.records import commands as cmd
+from service.records.products import (
+    Assessment,
+    ExpectedGain,
+    GateVerdict,
+    Judged,
+    MatrixState,
+    ModeAnswer,
+    ModeProof,
+    ReconstructorRecord,
+)
+from service.records.registration import ModeGain, Registration
+from service.records.state import Mode, Orders
 from service.runtime import telemetry_recorder as of_moments
 from service.runtime.telemetry_recorder import TrendSampler, residual_of, sample_of
-from service.tracking import commands as cmd
-from service.tracking.mode_limits import ModeAnswer, ModeProof
-from service.tracking.products import Assessment, Judged, MatrixState, ReconstructorRecord
-from service.tracking.registration import Registration
 from service.tracking.resume import saved_of
-from service.tracking.state import Mode, Orders
 from service.web.keys import KeyFile, KeyScope
 from service.wire import Pointing, checksum
 from tests.states import changed
@@ -574,7 +579,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from service.archive import Archive, AuditEntry, Pin, Range
-from service.tracking.products import Judged, MatrixState, ReconstructorRecord
+from service.records.products import Judged, MatrixState, ReconstructorRecord
 
 archive = Archive(Path(sys.argv[1]))
 archive.open()

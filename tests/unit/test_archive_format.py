@@ -11,11 +11,11 @@ import pytest
 
 from service.archive import Archive, AuditEntry
 from service.archive.serialisation import TrackingFile
-from service.control.gains import ModeGain
 from service.errors import ArchiveError
-from service.tracking.operation_records import AcquisitionStage, MeasureState
-from service.tracking.products import MatrixState
-from service.tracking.state import Mode, Orders
+from service.records.operations import AcquisitionStage, MeasureState
+from service.records.products import MatrixState
+from service.records.registration import ModeGain
+from service.records.state import Mode, Orders
 from service.wire import Pattern
 
 WRITTEN = Path(__file__).parents[1] / "data" / "archive"

@@ -11,7 +11,7 @@ from service.archive import Archive
 from service.archive.products import NoisyNumbers
 from service.archive.serialisation import to_json
 from service.errors import ArchiveError, UnknownIdError
-from service.tracking.operation_records import MeasureState
+from service.records.operations import MeasureState
 from service.wire import Pattern, checksum
 from tests.unit.test_api_measured import NOISY, STORED
 

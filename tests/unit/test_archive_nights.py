@@ -15,7 +15,7 @@ from service.archive import nights as of_nights
 from service.archive.nights import DAY_NS, HOUR_NS, MarkKind
 from service.errors import ArchiveError, StorageError, TooLargeError
 from service.model.misregistration import Misregistration
-from service.tracking.registration import HistoryEntry, Source
+from service.records.registration import HistoryEntry, Source
 from service.web.history import downsample
 from tests.states import tracker_state
 

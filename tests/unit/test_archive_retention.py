@@ -19,10 +19,10 @@ from service.archive import Archive, Pin, retention
 from service.archive.nights import DAY_NS
 from service.archive.retention import RetentionPolicy, due, items
 from service.errors import UnknownIdError
+from service.records.alarms import Alarm
+from service.records.products import MatrixState
+from service.records.state import TrackerState
 from service.runtime import archiving
-from service.tracking.alarms import Alarm
-from service.tracking.products import MatrixState
-from service.tracking.state import TrackerState
 from tests.states import changed, tracker_state
 from tests.unit.test_archive import product, record_of
 

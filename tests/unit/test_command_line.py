@@ -3,7 +3,6 @@ import json
 import os
 import shlex
 import signal
-import socket
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -26,7 +25,7 @@ from service.config import Settings, load_settings
 from service.control.reconstructor import MAX_CONDITION, Recipe
 from service.control.reconstructor import InversionMethod as MakeMethod
 from service.model.kinds import Method as FitMethod
-from service.tracking.state import Mode
+from service.records.state import Mode
 from service.version import software_version
 from service.wire import CHUNK_LIMIT
 
@@ -203,15 +202,6 @@ def test_an_unknown_key_is_named_with_its_file(capsys, tmp_path):
     assert "prot" in line
     assert str(path) in line
     assert "port" in line
-
-
-def test_a_busy_port_is_said_before_anything_starts(capsys, tmp_path):
-    with socket.create_server(("127.0.0.1", 0)) as busy:
-        port = str(busy.getsockname()[1])
-        line = refused(capsys, "run", "--port", port)
-    assert f"127.0.0.1:{port}" in line
-    assert "choose another with --port" in line
-    assert not (tmp_path / "var").exists()
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,8 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 from pyrcal.client import remote
+from service.records.commands import Command
 from service.tracking import interlocks
-from service.tracking.commands import Command
 from service.tracking.dither_request import NOISY_DITHER
 from service.web.commands import ORDERS, OrderRoute
 

@@ -14,7 +14,7 @@ from pyrcal.maintenance.acceptance import REQUIRED_CHECKS
 from service.archive import Archive, AuditEntry
 from service.archive.nights import TrendSample
 from service.model.misregistration import Misregistration
-from service.tracking.registration import HistoryEntry
+from service.records.registration import HistoryEntry
 from tests.system.night import INSTRUMENT
 from tests.unit.test_archive import MATRIX, record_of
 

@@ -31,7 +31,7 @@ from service.model.pupil import (
     valid_subapertures,
 )
 from service.model.slopes import Orientation
-from service.tracking.state import Mode
+from service.records.state import Mode
 from sim_rtc.telescope.diffractive import build_centred_pupil
 from tests.numerics import SOMEWHERE
 

@@ -22,7 +22,7 @@ from pyrcal.fitting.system_file import load_system
 from service.api import create_app
 from service.config import load_settings
 from service.instrument import load_instrument
-from service.tracking.alarms import ALARMS
+from service.records.alarms import ALARMS
 from service.web import page
 from sim_rtc.options import parse_options
 from tests.unit.test_api import assert_problem, service

@@ -8,8 +8,10 @@ import re
 from collections import defaultdict
 from pathlib import Path
 
+import grimp
+
 import service
-from service.tracking.alarms import ALARMS
+from service.records.alarms import ALARMS
 
 ROOT = Path(service.__file__).parent.parent
 HELD = ("service", "pyrcal", "check_rtc")
@@ -29,6 +31,18 @@ def test_the_name_of_an_alarm_is_written_once():
             for node in ast.walk(ast.parse(text)):
                 if isinstance(node, ast.Constant) and node.value in ALARMS.keys() - WORDS_TOO:
                     where[node.value].append(str(path.relative_to(ROOT)))
-    places = (["service/tracking/alarms.py"], ["service/tracking/alarm_rules.py"])
+    places = (["service/records/alarms.py"], ["service/tracking/alarm_rules.py"])
     assert {name: found for name, found in where.items() if found not in places} == {}
     assert where
+
+
+def test_records_lie_at_the_ground():
+    """Who names the state imports neither the planner of dithers nor an estimator."""
+    imports = grimp.build_graph("service")
+    ground = {"numpy", "service.errors", "service.model.misregistration"}
+    for module in imports.find_descendants("service.records"):
+        for imported in imports.find_modules_directly_imported_by(module):
+            if imported.startswith("service.") and imported not in ground:
+                assert imported.startswith(("service.records.", "service.wire", "service.files"))
+    assert len(imports.find_upstream_modules("service.records.state")) <= 12
+    assert len(imports.find_upstream_modules("service.link.intake")) <= 26

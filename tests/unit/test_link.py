@@ -11,7 +11,7 @@ from service.link.intake import MAX_QUEUED_EVENTS, MAX_UNDECODED_BATCHES, Intake
 from service.link.leader_election import LeaderElection, SessionWatch, Standby
 from service.link.matrices import MAX_OFFERS, MeasuredIntake, Offer, Outbox
 from service.link.session import Endpoint
-from service.tracking import events as ev
+from service.records import events as ev
 from service.wire import (
     Acknowledgement,
     AckState,
@@ -441,8 +441,8 @@ def test_two_interleaved_sessions_are_reported_once_per_burst(intake, clock):
     send(intake, 0)
     for k in range(1, 30):
         clock.now_s += 0.3
-        send(intake, 10 * k)
-        send(intake, 10 * k, session="s2")
+        send(intake, 300 * k)
+        send(intake, 300 * k, session="s2")
     assert sum("sessions s1 and s2" in told(e, "second-rtc") for e in intake.events()) == 1
     assert intake.statistics().frames_refused == {"session": 290}
 

@@ -82,6 +82,6 @@ def test_connections_that_were_closed_before_a_handshake_are_counted_by_port(tmp
 
 @pytest.mark.parametrize("name", ["link-refused", "certificate-ending"])
 def test_each_has_its_alarm(name):
-    from service.tracking.alarms import ALARMS
+    from service.records.alarms import ALARMS
 
     assert ALARMS[name].severity == "warning"

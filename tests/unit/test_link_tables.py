@@ -11,6 +11,7 @@ import zenoh
 from service.config import load_settings
 from service.config.link_tables import (
     AccessTable,
+    ZenohTable,
     link_security,
     read_certificate,
     read_link_tables,
@@ -227,6 +228,38 @@ def test_a_missing_file_is_named_with_its_key(folder, key):
     found = refusal(folder, secured + tls(folder, **{key: "gone.pem"}))
     assert found.startswith(f"zenoh.tls.{key}: found no file")
     assert "pyrcal certificates new" in found
+
+
+@pytest.mark.parametrize("key", ["listen", "connect"])
+@pytest.mark.parametrize(
+    "endpoint",
+    ["tcp/127.0.0.1", "tcp/127.0.0.1:65536", "tcp/ao-pc:", "pigeon/127.0.0.1:7447", "7447"],
+)
+def test_an_endpoint_that_could_never_be_opened_is_refused(tmp_path, key, endpoint):
+    """Waiting for it, as for a network that comes later, would never end."""
+    path = tmp_path / "bad.toml"
+    path.write_text(f'[zenoh]\n{key} = ["{endpoint}"]\n')
+    with pytest.raises(ConfigurationError, match=f"zenoh.{key}: found {endpoint}, expected"):
+        load_settings(path, {})
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    ["tcp/[::1]:7447", "tls/localhost:65535#so_sndbuf=1", "udp/127.0.0.1:0", "unixsock-stream/x"],
+)
+def test_endpoints_of_zenoh_are_taken(endpoint):
+    assert ZenohTable(listen=(endpoint,)).listen == (endpoint,)
+
+
+@pytest.mark.parametrize("name", ["rtc-key.pem", "garbage.pem"])
+def test_a_key_of_another_certificate_is_refused(folder, name):
+    """Only a file that is wrong ends the service: zenoh would say so when it opens the link."""
+    garbage = folder / "garbage.pem"
+    garbage.touch(0o600)
+    garbage.write_text("none")
+    secured = '[zenoh]\nlisten = ["tls/127.0.0.1:7447"]\n'
+    found = refusal(folder, secured + tls(folder, key=name))
+    assert found.startswith(f"zenoh.tls.key: found {folder / name}")
 
 
 def test_a_private_key_that_others_can_read_is_refused(folder):

@@ -10,8 +10,7 @@ import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
 from service.cli.serve import log_to_the_terminal
-from service.runtime.archiving import ids_of
-from service.tracking.alarms import (
+from service.records.alarms import (
     ALARMS,
     ARCHIVE_FAILED,
     WORKER_BEHIND,
@@ -19,7 +18,8 @@ from service.tracking.alarms import (
     Prerequisite,
     Responsible,
 )
-from service.tracking.registration import Validity
+from service.records.registration import Validity
+from service.runtime.archiving import ids_of
 from tests.states import changed
 from tests.unit.test_api import LINK, SECOND, STATE, assert_problem, service
 from tests.unit.test_house import ROOT

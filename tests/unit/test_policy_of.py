@@ -104,7 +104,9 @@ def test_places_of_images_that_are_not_stated_widen_only_what_is_shown():
     assert left_out.floor[0] == FLAT[0]
     assert not unknown.image_floor.any()
     np.testing.assert_allclose(unknown.floor, np.hypot(left_out.floor, left_out.image_floor))
-    assert not policy_of(settings, load_instrument(LENSLETS)).image_floor.any()
+    np.testing.assert_array_equal(left_out.image_sigma, left_out.image_floor)
+    np.testing.assert_array_equal(unknown.image_sigma, left_out.image_floor)
+    assert not policy_of(settings, load_instrument(LENSLETS)).image_sigma.any()
 
 
 def test_a_coarse_basis_tolerates_more():

@@ -12,7 +12,7 @@ from pyrcal.rtc.staging import Staging, Terms
 from pyrcal_studies.contract_tables import MESSAGES, rows_of
 from service import wire
 from service.errors import WireError
-from service.tracking.alarms import ALARMS
+from service.records.alarms import ALARMS
 from service.wire import CommandKind, Keys
 from service.wire.codec import MESSAGE_LIMIT
 from sim_rtc.computer.telemetry import Batch, frames_of

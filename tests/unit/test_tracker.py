@@ -5,11 +5,11 @@ from typing import get_args
 import numpy as np
 import pytest
 
+from service.records import events as ev
+from service.records.events import Event
+from service.records.products import MatrixState
+from service.records.state import Mode
 from service.tracker import REACTIONS, TAKEN_BY_OPERATIONS, step
-from service.tracking import events as ev
-from service.tracking.events import Event
-from service.tracking.products import MatrixState
-from service.tracking.state import Mode
 from service.wire import DitherRequest
 from tests.states import tracker_state
 from tests.unit.tracking.situations import (

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
+from service.model.aperture import find_offset
 from service.model.instrument import Instrument, SensorDescription, SensorMode
-from service.model.pupil import PupilGrid
+from service.model.pupil import PupilGrid, valid_subapertures
 from service.model.sensors.sensor import CannotTell, Fineness, Light, Sensor, WorkingPoint
 from service.model.slopes import SlopeRecipe
 
@@ -115,6 +116,16 @@ class SensorModel(ABC):
         Only images that the instrument file leaves open are located.
         """
         return instrument, ()
+
+    def measure_image_offsets(self, instrument: Instrument, light: Array) -> Array | CannotTell:
+        """Return the displacement (x, y) of each pupil image in its light, ``(4, 2)`` subapertures.
+
+        Raises
+        ------
+        ModelError
+            If the light is not that of this sensor.
+        """
+        return CannotTell(reason=f"a {self.name} has no pupil images to be located")
 
     def is_weakly_modulated(self, sensor: Any) -> bool:  # noqa: ANN401 - its own
         """Return whether a modulation is so narrow that models of the focus differ."""
@@ -297,12 +308,18 @@ class SensorModel(ABC):
         """
         raise ModelError(f"a {self.name}: found several images to be moved, expected a pyramid's")
 
-    def pupil_offset(self, instrument: Instrument) -> tuple[float, float] | None:
-        """Return where the instrument file places the pupil's image on the grid, (x, y).
-
-        Subapertures, axes of conventions.md; None if the file does not say.
-        """
+    def without_image_places(self, instrument: Instrument) -> Instrument | None:
+        """Return the instrument without the places of its pupil images; None if it states none."""
         return None
+
+    def pupil_offset(self, instrument: Instrument) -> tuple[float, float] | None:
+        """Return where file or mask place the pupil's image on the grid, (x, y).
+
+        Subapertures, axes of conventions.md; None if they do not say.
+        """
+        if instrument.wfs.valid_subapertures is None:
+            return None
+        return find_offset(valid_subapertures(instrument), instrument.wfs.pupil_diameter)
 
     def light(self, instrument: Instrument) -> Light | CannotTell:
         """Return what an instrument's light says of the pupil, or why it says nothing."""

@@ -12,28 +12,20 @@ from numpy.typing import NDArray
 
 from service.control.dither import compute_information
 from service.control.expected_gain import (
-    ExpectedGain,
     Sky,
     estimate_slope_noise,
     extrapolate_variance_m2,
     predict_gain,
 )
 from service.control.gains import CalibrationGains
-from service.control.gate import GateVerdict, judge
+from service.control.gate import judge
 from service.control.loop import ControlLoop
 from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
 from service.estimation import passive
 from service.estimation.description import Description
 from service.estimation.dithered_response import DitheredResponse
-from service.estimation.estimate import DitheredEstimate, PassiveEstimate
-from service.estimation.lockin import LockInEstimate, Spectra, fit_window
-from service.estimation.openloop import (
-    WideCaptureEstimate,
-    WideCaptureSearch,
-    far_starts,
-    find,
-    not_found,
-)
+from service.estimation.lockin import Spectra, fit_window
+from service.estimation.openloop import WideCaptureSearch, far_starts, find, not_found
 from service.estimation.own_matrix import (
     LeftOver,
     OwnMatrix,
@@ -41,20 +33,30 @@ from service.estimation.own_matrix import (
     recognise_modes,
     weights_of_modes,
 )
-from service.estimation.random_dither import Correlated, RandomEstimate, fit_random
+from service.estimation.random_dither import Correlated, fit_random
 from service.estimation.slope_convention import (
     RESPONSE_RATIO_RANGE,
     SlopeConvention,
     identify_from_reconstructor,
     identify_from_response,
 )
-from service.estimation.windows import ClosedLoop, RefusalKind, WindowRefused
+from service.estimation.windows import ClosedLoop
 from service.files.disk_cache import DiskCache
 from service.model.instrument import Instrument
 from service.model.interaction import Linearisation, RtcInteractionModel
 from service.model.misregistration import Misregistration
 from service.model.sensors.sensor import WorkingPoint
 from service.model.slopes import SlopeRecipe
+from service.records.estimates import (
+    DitheredEstimate,
+    LockInEstimate,
+    PassiveEstimate,
+    RandomEstimate,
+    RefusalKind,
+    WideCaptureEstimate,
+    WindowRefused,
+)
+from service.records.products import ExpectedGain, GateVerdict
 from service.runtime.worker.records import (
     Compute,
     Conditions,

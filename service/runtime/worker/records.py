@@ -10,7 +10,6 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from service.control.gate import GateVerdict
 from service.control.loop import ControlLoop
 from service.control.reconstructor import MAX_CONDITION, InversionMethod
 from service.errors import ModelError
@@ -25,6 +24,7 @@ from service.model.modes import ModalBasis
 from service.model.pupil import instrument_pupil
 from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import Fineness
+from service.records.products import GateVerdict
 
 _Job = TypeVar("_Job", bound=Callable[..., Any])
 

@@ -13,12 +13,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.estimate import DitheredEstimate
 from service.model.instrument import Instrument
 from service.model.interaction import Linearisation, RtcInteractionModel
 from service.model.misregistration import Misregistration
 from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import WorkingPoint
+from service.records.estimates import DitheredEstimate
 
 Array = NDArray[np.float64]
 

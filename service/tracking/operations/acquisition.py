@@ -31,11 +31,23 @@ from service.control.dither import (
 )
 from service.control.gate import MAX_SLIP_SAFE_LEAK
 from service.estimation.loop import NO_RTC
-from service.estimation.windows import RefusalKind
-from service.tracking import commands as cmd
-from service.tracking import events as ev
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.alarms import LOST, Interlock, alarm_blocks, blocking_alarm
+from service.records.estimates import RefusalKind
+from service.records.events import Event
+from service.records.operations import (
+    Acquisition,
+    AcquisitionStage,
+    Dither,
+    Interruption,
+    LoopFound,
+    ProbationState,
+)
+from service.records.products import MatrixState, ReconstructorRecord
+from service.records.registration import Registration
+from service.records.state import Level, Mode, TrackerState
 from service.tracking import reconstructors, update_policy, validity
-from service.tracking.alarms import LOST, Interlock, alarm_blocks, blocking_alarm
 from service.tracking.dither import (
     allow_dither,
     choose_dither,
@@ -43,22 +55,11 @@ from service.tracking.dither import (
     request_stop,
     stop_running_dither,
 )
-from service.tracking.dither_request import ACQUIRING_DITHER, Dither
-from service.tracking.events import Event
-from service.tracking.operation_records import (
-    Acquisition,
-    AcquisitionStage,
-    Interruption,
-    LoopFound,
-    ProbationState,
-)
+from service.tracking.dither_request import ACQUIRING_DITHER
 from service.tracking.operations.measurement import fail_noisy_measurement
 from service.tracking.operations.running import running_ramp
 from service.tracking.operator import set_loop
 from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.registration import Registration
-from service.tracking.state import Level, Mode, TrackerState
 from service.tracking.step_context import StepContext, present
 from service.tracking.transitions import move
 from service.wire import DitherKind, DitherRequest, LoopRequest, Reply, Status

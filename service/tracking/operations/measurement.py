@@ -10,12 +10,12 @@ from dataclasses import fields, replace
 import numpy as np
 
 from service.errors import CommandError
-from service.tracking import commands as cmd
-from service.tracking import events as ev
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.events import Event
+from service.records.operations import MeasurementRecord, MeasureState
 from service.tracking.dither import request_dither, stop_running_dither
 from service.tracking.dither_request import DEFAULT_RANDOM_RMS_M, check_modes, cost_of, plan_random
-from service.tracking.events import Event
-from service.tracking.operation_records import MeasurementRecord, MeasureState
 from service.tracking.operator import begin_closing
 from service.tracking.policy import SECOND_NS
 from service.tracking.step_context import StepContext, present

@@ -14,21 +14,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from service.estimation.comparison import Verdict
 from service.estimation.loop import explain_open_loop, same_but_for_modes
 from service.estimation.probation import MAX_PROBATION_S
-from service.tracking import alarms, mode_proof, reconstructors, validity
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.alarms import Alarm, Interlock
-from service.tracking.events import Event
-from service.tracking.operation_records import CommandState, Probation, ProbationState
+from service.records import alarms
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.alarms import Alarm, Interlock
+from service.records.events import Event
+from service.records.operations import CommandState, Probation, ProbationState, Verdict
+from service.records.products import MatrixState, ReconstructorRecord
+from service.records.state import Mode, TrackerState
+from service.tracking import mode_proof, reconstructors, validity
 from service.tracking.operations.acquisition import may_acquire
 from service.tracking.operator import enter_hold, leave_hold, set_loop
 from service.tracking.policy import SECOND_NS
-from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import check_sendable
-from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.transitions import move
 

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from service.estimation.loop import NO_RTC, explain_open_loop
-from service.tracking.alarms import STANDING_BY, Alarm, Severity
+from service.records.alarms import STANDING_BY, Alarm, Severity
+from service.records.operations import CommandState, LoopCommand
+from service.records.state import Mode, TrackerState
 from service.tracking.dither_request import MAX_STOP_DELAY_S, OUR_DITHERS, OWN_DITHER
-from service.tracking.operation_records import CommandState, LoopCommand
 from service.tracking.policy import SECOND_NS
-from service.tracking.state import Mode, TrackerState
 
 RAMP_REPLY_TIMEOUT_S = 30.0
 """A gain ramp that the RTC has neither accepted nor refused for so long is none."""

@@ -105,7 +105,7 @@ export function showLoop(service, mirror) {
   const dither = state?.dither_policy;
   put($("#dither"), !rtc && dither ? `${dither.phase}: ${dither.reason}` : dither ? `${dither.phase}, ${nanometres(dither.mean_cost_m)} of ${nanometres(dither.budget_m)}: ${dither.reason}` : DASH);
   const link = state?.link;
-  put($("#frames"), link ? `${link.frames_received} received, ${link.frames_lost} lost, last ${present(link.frame_age_s) ? `${span(link.frame_age_s)} ago` : DASH}` : DASH);
+  put($("#frames"), link ? `${link.frames_received} received, ${link.frames_lost} lost, last ${present(link.frame_age_s) ? `${span(link.frame_age_s)} ago` : DASH}${link.telemetry_age_s >= 1 ? `, ${span(link.telemetry_age_s)} old on arrival` : ""}` : DASH);
 }
 
 // What the matrix before left, by the same model: a swap shows what it was for.

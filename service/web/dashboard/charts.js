@@ -50,11 +50,12 @@ export class Charts {
   }
 
   // The numbers beside the charts: of now, or of where the cursor is.
-  tell(four, sigma) {
+  tell(four, sigma, tracking) {
     for (const row of this.rows) {
       const shown = rounded(four?.[row.parameter.key], sigma?.[row.parameter.key], row.parameter);
       put(row.value, `${shown.value}${four && row.parameter.short ? ` ${row.parameter.short}` : ""}`);
-      put(row.sigma, four ? `± ${shown.sigma}` : "");
+      const changes = rounded(four?.[row.parameter.key], tracking?.[row.parameter.key], row.parameter);
+      put(row.sigma, four ? `± ${shown.sigma} (changes ± ${changes.sigma})` : "");
     }
   }
 

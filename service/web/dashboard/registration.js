@@ -137,7 +137,7 @@ export class Registration {
 
   #onState() {
     const known = this.#service.state.registration;
-    this.#charts.tell(known?.alpha, known?.sigma);
+    this.#charts.tell(known?.alpha, known?.sigma, known?.tracking_sigma);
     const newest = this.#entries.at(-1)?.t_ns_utc ?? 0;
     // the state itself is the last point of every line: what is behind it may come later
     const due = performance.now() - this.#asked > EVERY_MS || !newest;
@@ -154,7 +154,7 @@ export class Registration {
     // nobody knows what it is worth by now: only how old it is
     const worth = fresh ? known?.validity : `✕ connection lost ${span(this.#service.age_s)} ago`;
     const why = fresh && known?.validity_reason ? `: ${known.validity_reason}` : "";
-    const told = known ? `${worth}, from telemetry of ${ago(measured, now)}${why}` : "not measured yet";
+    const told = known ? `${worth}, from telemetry of ${ago(measured, now)}${why}${known.sigma_limit ? `; ${known.sigma_limit}` : ""}` : "not measured yet";
     put(this.root.querySelector(".worth"), state ? told : DASH);
     if (performance.now() - this.#drawn > 1000) this.#draw();
   }

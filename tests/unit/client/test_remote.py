@@ -21,10 +21,10 @@ from service.api import create_app
 from service.archive import AuditEntry, Channel
 from service.archive.products import RecordingRecord
 from service.errors import CommandError
-from service.tracking.events import MakeMatrix, MatrixMade
-from service.tracking.operation_records import AcquisitionStage
-from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.state import Mode
+from service.records.events import MakeMatrix, MatrixMade
+from service.records.operations import AcquisitionStage
+from service.records.products import MatrixState, ReconstructorRecord
+from service.records.state import Mode
 from service.web.connections import Server
 from tests.states import changed
 from tests.unit.test_api import MATRIX, SECOND, STATE, FakeService, a_snapshot
@@ -308,7 +308,7 @@ def test_every_command_that_reads_prints_its_answer():
 
 def test_every_screen_is_there_and_json_is_what_rest_answers(capsys, service):
     for words, part in (
-        (["alpha"], "shift x       +0.2000 ± 0.0104 subap"),
+        (["alpha"], "shift x       +0.2000 ± 0.0104 subap, changes ± 0.0100"),
         (["reconstructors", "list"], "cm-1   proposed    400 modes"),
         (["reconstructors", "show", "in-use"], "rtc-0: applied"),
         (["alarms", "list"], "no status: look at it"),

@@ -10,7 +10,7 @@ import pytest
 
 from pyrcal.__main__ import main
 from pyrcal.client.status import status_lines
-from service.tracking.state import Level, LogEntry
+from service.records.state import Level, LogEntry
 from service.web.views import STATE as STATE_VIEW
 from service.web.views import to_json
 from tests.states import changed, tracker_state
@@ -148,6 +148,16 @@ def test_an_address_that_makes_no_sense_is_named(capsys, url):
 def test_something_else_that_answers_is_not_taken_for_the_service(capsys, body, status):
     with answering(body, status) as url:
         assert "not pyrcal" in refused(capsys, url)
+
+
+@pytest.mark.parametrize("status", [502, 503, 504])
+def test_a_service_with_too_many_requests_is_not_taken_for_something_else(capsys, status):
+    """uvicorn and proxies answer in plain text then."""
+    with answering(b"Service Unavailable", status) as url:
+        line = refused(capsys, url)
+    assert str(status) in line
+    assert "try again" in line
+    assert "not pyrcal" not in line
 
 
 def test_another_version_of_the_service_is_told_as_one(capsys):

@@ -20,7 +20,6 @@ from service.control.dither import (
     PRECISION_TABLE,
     TABLE_MAGNITUDES,
     DitherRequirement,
-    Schedule,
     choose_burst_s,
     choose_window_s,
     compute_information,
@@ -35,6 +34,7 @@ from service.control.dither import (
 )
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
+from service.records.operations import Schedule
 
 KAPPA = np.array([0.02, 0.02, np.deg2rad(0.08), 0.004]) * 1e-9
 """Magnitude 10 of the design study: 2 % of a subaperture in 1 s at 1 nm."""

@@ -1,14 +1,9 @@
 import numpy as np
 import pytest
 
-from service.control.gains import (
-    GAIN_FACTOR_RANGE,
-    REFERENCE_GAINS,
-    REFERENCE_MODES,
-    ModeGain,
-    gain_table,
-)
+from service.control.gains import GAIN_FACTOR_RANGE, REFERENCE_GAINS, REFERENCE_MODES, gain_table
 from service.errors import ModelError
+from service.records.registration import ModeGain
 
 HIGH = np.array([509, 527, 545, 563])
 NONE = np.array([])

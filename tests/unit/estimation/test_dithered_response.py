@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from service.estimation.dithered_response import DitheredResponse
-from service.estimation.lockin import LockInEstimate, LockInPlan, Spectra
+from service.estimation.lockin import LockInPlan, Spectra
 from service.model.misregistration import Misregistration
+from service.records.estimates import LockInEstimate
 
 N_SLOPES, N_MODES = 200, 60
 MODES = tuple(range(30, 60))

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.estimation.estimate import BIAS_FLOOR, BIAS_OVER_SCATTER
 from service.estimation.kalman import (
     JUMP_THRESHOLD,
     Drift,
@@ -22,6 +21,7 @@ from service.estimation.kalman import (
     widen_after_jump,
     with_stretches,
 )
+from service.records.estimates import BIAS_FLOOR, BIAS_OVER_SCATTER
 
 DITHERED = np.diag(np.array([0.008, 0.008, np.deg2rad(0.02), 0.0008]) ** 2)
 SCATTER = np.diag(np.array([0.003, 0.003, np.deg2rad(0.01), 0.0003]) ** 2)

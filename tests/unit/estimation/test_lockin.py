@@ -15,16 +15,15 @@ from service.estimation.frames import FrameBlock
 from service.estimation.lockin import (
     MAX_LAG_FRAMES,
     LockIn,
-    LockInEstimate,
     LockInPlan,
     Spectra,
     compute_total_commands,
     fit_window,
     join_windows,
 )
-from service.estimation.windows import RefusalKind, WindowRefused
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
+from service.records.estimates import LockInEstimate, RefusalKind, WindowRefused
 from tests.numerics import (
     DT_NS,
     FRAME_RATE_HZ,

@@ -8,19 +8,13 @@ import pytest
 
 from service.control.dither import COARSE_BAND, FINE_BAND, spread_lines, spread_modes
 from service.estimation.lockin import LockIn, LockInPlan
-from service.estimation.openloop import (
-    MAX_UNEXPLAINED_SHARE,
-    WideCaptureEstimate,
-    WideCaptureSearch,
-    far_starts,
-    find,
-)
-from service.estimation.windows import RefusalKind, WindowRefused
+from service.estimation.openloop import MAX_UNEXPLAINED_SHARE, WideCaptureSearch, far_starts, find
 from service.model.instrument import SlopeRecipe
 from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.model.slopes import Orientation
+from service.records.estimates import RefusalKind, WideCaptureEstimate, WindowRefused
 from tests.numerics import (
     FRAME_RATE_HZ,
     N_MODES,

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.estimation.estimate import BIAS_FLOOR, PassiveEstimate
 from service.estimation.frames import FrameBlock
 from service.estimation.passive import (
     MIN_FRAMES_PER_MODE,
@@ -24,6 +23,7 @@ from service.estimation.passive import (
 )
 from service.estimation.windows import CHUNK_FRAMES
 from service.model.misregistration import Misregistration
+from service.records.estimates import BIAS_FLOOR, PassiveEstimate
 from tests.numerics import (
     N_CONTROLLED,
     N_MODES,

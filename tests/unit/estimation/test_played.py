@@ -104,6 +104,12 @@ def test_a_mode_outside_the_loop_that_moves_more_than_its_column_says_is_named_a
     assert found.found_m == pytest.approx(160e-9, rel=0.01)
 
 
+def test_commands_that_lack_the_dither_are_named():
+    """And not taken for slopes of another sign or unit."""
+    (found,) = played(columns, commands=lambda s, n: np.zeros((n, N_MODES)))
+    assert "the commands of mode 11 hold 0 nm at 331 Hz, its dither column 4 nm" in found.text
+
+
 def test_a_mode_of_the_loop_may_answer_the_dither():
     asked = replace(ASKED, own=(False,) * 4)
     (found,) = played(columns, asked=asked, commands=lambda s, n: columns(s, n, by=3.0))

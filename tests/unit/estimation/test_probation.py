@@ -9,9 +9,10 @@ import pytest
 import scipy
 
 from service.estimation import probation
-from service.estimation.comparison import PRIOR_SCATTER, Verdict, measure_sigma
+from service.estimation.comparison import PRIOR_SCATTER, measure_sigma
 from service.estimation.frames import FrameBlock
 from service.estimation.probation import MAX_PROBATION_S, Comparison, begun_anew, observe
+from service.records.operations import Verdict
 
 N_MODES, BLOCK, DT_NS = 60, 50, 1_000_000
 BEFORE_S, AFTER_S = 2.0, 4.5

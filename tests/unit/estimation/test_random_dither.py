@@ -12,14 +12,13 @@ from service.estimation import random_dither
 from service.estimation.random_dither import (
     Correlated,
     RandomDither,
-    RandomEstimate,
     RandomPlan,
     fit_random,
     join_random_windows,
     noisy_matrix,
 )
-from service.estimation.windows import RefusalKind, WindowRefused
 from service.model.interaction import Linearisation
+from service.records.estimates import RandomEstimate, RefusalKind, WindowRefused
 from tests.numerics import (
     N_MODES,
     SOMEWHERE,

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import scipy
 
-from service.estimation.comparison import Verdict
 from service.estimation.frames import FrameBlock
 from service.estimation.probation import Comparison, observe
 from service.estimation.residual import (
@@ -22,6 +21,7 @@ from service.estimation.residual import (
     ratio,
     stride_frames,
 )
+from service.records.operations import Verdict
 
 N_MODES, N_SLOPES, BLOCK, DT_NS = 40, 100, 20, 1_000_000
 STRIDE = stride_frames(DT_NS)

@@ -9,7 +9,7 @@ from service.archive import Archive
 from service.errors import ConfigurationError, MatrixError
 from service.files.bundle import DESCRIBED, Bundle, read_bundle, write_bundle
 from service.model.misregistration import Misregistration
-from service.tracking.products import MatrixState, ReconstructorRecord
+from service.records.products import MatrixState, ReconstructorRecord
 from service.wire import checksum
 
 RNG = np.random.default_rng(1)

@@ -9,11 +9,15 @@ import pytest
 
 import pyrcal.fitting.alternatives as alternatives
 from pyrcal.fitting.instrument_checks import fit_file_values
+from pyrcal.fitting.matrix import FitOptions, fit_matrix
 from pyrcal.fitting.methods import settle_at
 from pyrcal.fitting.models import FitModels
 from pyrcal.fitting.pupil_checks import Lead
 from pyrcal.fitting.solver import image_patterns, nuisances_of
 from pyrcal_studies.benches import coarse_bench, fit_bench, some_columns
+from pyrcal_studies.drawn_fits import Condition, Draw, instrument_of
+from pyrcal_studies.drawn_fits import measured as drawn_matrices
+from pyrcal_studies.image_offsets import as_told
 from service.estimation.reference import Reference, target_of
 from tests.numerics import small_basis
 from tests.unit.estimation.bench import ELSEWHERE, fit, instrument, matrix
@@ -46,6 +50,23 @@ def test_images_displaced_beyond_belief_are_tried_in_their_places(monkeypatch):
     # the true images are in their places: nothing is lost and hardly anything moves
     assert one.share == pytest.approx(1.0, abs=0.05)
     assert np.all(np.abs(one.moved) < 0.01)
+
+
+@pytest.mark.parametrize("stated", [0.0, 1.0])
+def test_places_of_pupil_images_in_the_file_are_questioned(stated):
+    """Places stated as zeros of images 0.1 pixel off the grid move a shift by 0.02 subaperture."""
+    draw = Draw(code="fft", condition=Condition(images_px=0.1, images="told"), seed=0)
+    ((_, measured),) = drawn_matrices([draw])
+    about = as_told(instrument_of(draw, measured), stated * draw.offsets)
+    found = fit_matrix(about, Reference(matrix=measured.matrix), FitOptions(explain=True))
+    assert np.all(np.abs(found.alpha.vector - draw.alpha.vector) < 3.0 * found.sigma)
+    named = [one for one in found.alternatives if one.words == 'image_offsets_px = "unknown"']
+    assert [one.preferred for one in named] == [stated == 0.0]
+    if stated:
+        assert found.accepted
+        assert np.all(found.sigma[:2] < 2e-3)
+    else:
+        assert named[0].words in found.recommendation
 
 
 def test_file_values_are_fitted_with_the_images_where_the_fit_displaced_them():

@@ -23,6 +23,7 @@ from pyrcal.fitting.specula import write_specula
 from pyrcal.importers.aot import from_aot
 from pyrcal.importers.cacao import from_cacao
 from pyrcal.importers.files import Reported, calibration_of, from_arrays
+from pyrcal.importers.frames import frames_of
 from pyrcal.importers.layouts import by_role, cube_of, maps_of, mask_of
 from pyrcal.importers.saved import read_npz
 from pyrcal.importers.specula import from_specula
@@ -165,6 +166,36 @@ def test_a_mask_that_is_wider_than_the_pupil_is_said_and_a_diameter_that_is_told
     else:
         assert note is None
         assert imported.tables["wfs"]["pupil_diameter_subap"] == told
+
+
+@pytest.mark.parametrize("way", ["absent", "zeros", "NaN"])
+def test_the_grid_stays_where_the_file_has_it(way):
+    rows, columns = np.mgrid[:16, :16] - 7.5
+    valid = np.hypot(rows, columns) <= 8.0
+    matrix = np.random.default_rng(1).normal(size=(2, int(valid.sum()), 5))
+    gone = (columns < -6) | (rows + columns > 10)
+    kept = valid & ~gone
+    if way == "absent":
+        matrix, valid = matrix[:, ~gone[valid]], kept
+    else:
+        matrix[:, gone[valid]] = 0.0 if way == "zeros" else np.nan
+    given = arrays(matrix=matrix.reshape(-1, 5), valid=valid)
+    imported = from_arrays("x", given, REPORTED)
+    assert np.array_equal(imported.arrays["valid_subapertures"], kept)
+    assert imported.tables["wfs"]["n_subapertures"] == 16
+    assert "pupil_diameter_subap" not in imported.tables["wfs"]
+    # A dark ring around it means a narrower pupil, also where a part is missing.
+    imported = from_arrays("x", {**given, "valid": np.pad(valid, 2)}, REPORTED)
+    wfs = imported.tables["wfs"]
+    assert (wfs["n_subapertures"], wfs["pupil_diameter_subap"]) == (20, 16.0)
+    assert any("--pupil-subap" in note for note in imported.notes)
+
+
+def test_slopes_of_as_many_modes_as_subapertures_are_no_frames():
+    n = int(VALID.sum())
+    matrix = np.random.default_rng(1).normal(size=(2 * n, n))
+    assert frames_of(matrix, None, VALID) is None
+    assert frames_of(matrix[:n, :9], None, VALID).cube.shape == (9, N, N)
 
 
 def test_a_bare_array_has_no_record_and_is_refused_without_its_role(tmp_path, capsys):

@@ -3,6 +3,8 @@
 import re
 import tomllib
 
+import h5py
+import numpy as np
 import pytest
 
 from pyrcal.__main__ import main
@@ -18,9 +20,11 @@ from service.errors import ConfigurationError
 from service.instrument import load_instrument
 from service.instrument.schema import whole_of
 from service.model.sensors.registry import KINDS
+from tests.unit.estimation.lamps import counts_of
 from tests.unit.test_house import ROOT
 
 TINY = ROOT / "tests" / "data" / "tiny" / "tiny.toml"
+LENSLETS = ROOT / "tests" / "data" / "lenslets.toml"
 
 WRONG = """
 [instrument]
@@ -147,6 +151,33 @@ def test_what_the_model_cannot_work_with_is_said(tmp_path, capsys):
     path.write_text(text, "utf-8")
     assert main(["instrument", "check", str(path)]) == 1
     assert "expected metres in the pupil plane" in capsys.readouterr().out
+
+
+def test_places_of_the_pupil_images_are_printed_as_a_line_of_the_file(tmp_path, capsys):
+    about = load_instrument(TINY)
+    path = tmp_path / "flux.npy"
+    np.save(path, counts_of(about))
+    assert main(["instrument", "check", str(TINY), "--light", str(path)]) == 0
+    places = tomllib.loads(capsys.readouterr().out.splitlines()[-1])["image_offsets_px"]
+    np.testing.assert_allclose(places, np.zeros((4, 2)), atol=0.005)
+
+
+@pytest.mark.parametrize(
+    ("file", "arrays", "reason"),
+    [
+        (TINY, {"a": np.ones((4, 4)), "b": np.ones(3)}, "no dataset flux; it holds a (4, 4), b"),
+        (TINY, {"flux": np.zeros((4, 12, 12))}, "no light"),
+        (LENSLETS, {"flux": np.ones((30, 30))}, "has no pupil images"),
+    ],
+)
+def test_light_that_shows_no_places_is_refused(tmp_path, capsys, file, arrays, reason):
+    path = tmp_path / "light.h5"
+    with h5py.File(path, "w") as out:
+        for name, values in arrays.items():
+            out[name] = values
+    assert main(["instrument", "check", str(file), "--light", str(path)]) != 0
+    said = capsys.readouterr()
+    assert reason in said.out + said.err
 
 
 def test_the_picture_is_drawn(tmp_path, capsys):

@@ -7,7 +7,7 @@ import pytest
 from pyrcal.fitting.recorded import read_recorded
 from service.archive import Archive
 from service.errors import MatrixError
-from service.tracking.operation_records import MeasurementRecord, MeasureState
+from service.records.operations import MeasurementRecord, MeasureState
 from service.wire import Pattern, checksum
 
 MATRIX = np.random.default_rng(1).normal(size=(8, 3))

@@ -11,7 +11,7 @@ from pyrcal.fitting.advice import Advice
 from pyrcal.fitting.matrix import FitOptions, fit_matrix
 from service.estimation.reference import Reference
 from service.instrument import load_instrument
-from service.model.aperture import check_mask, measure_aperture
+from service.model.aperture import check_mask, find_offset, measure_aperture
 from service.model.interaction import RtcInteractionModel
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
@@ -68,7 +68,6 @@ def test_a_mask_as_wide_as_its_pupil_is_not_mentioned(diameter, x, tmp_path):
             "pupil_diameter_subap = 12.0",
             ("{mask:.1f} subap", "wfs.pupil_diameter_subap"),
         ),
-        (mask_of(15.0, (-0.5, 0.0)), "pupil_diameter_subap = 15.0", ("-0.50, +0.00",)),
     ],
 )
 def test_a_mask_unlike_its_pupil_is_named_with_numbers(mask, more, said, tmp_path, capsys):
@@ -78,6 +77,49 @@ def test_a_mask_unlike_its_pupil_is_named_with_numbers(mask, more, said, tmp_pat
     assert all(words.format(mask=wide) in note for words in said)
     assert main(["instrument", "check", str(path), "--memory-gb=0.001"]) == 0
     assert f"note: {note}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("hole", [0.0, 4.0])
+@pytest.mark.parametrize("way", ["column", "three columns", "row and column", "corner", "arm"])
+def test_a_part_that_is_missing_neither_moves_nor_narrows_a_pupil(way, hole):
+    mask = mask_of(16.0) & ~mask_of(hole)
+    whole, wide = measure_aperture(mask), measure_aperture(np.pad(mask, 1))
+    assert whole.is_round
+    assert (whole.n_across, wide.n_across) == (16, 16)
+    mask[:, 0] &= way not in {"column", "three columns", "row and column"}
+    mask[:, 1:3] &= way != "three columns"
+    mask[-1] &= way != "row and column"
+    mask[:5, :5] &= way != "corner"
+    mask[10] &= way != "arm"
+    cut = measure_aperture(mask)
+    assert np.hypot(*cut.centre) < 0.15
+    assert abs(cut.diameter_subap - whole.diameter_subap) < 0.2
+    assert cut.n_across == 16
+    assert find_offset(mask, 16.0) is None
+
+
+def test_a_mask_of_which_much_is_missing_says_nothing_of_the_place_of_the_pupil():
+    mask = mask_of(16.0)
+    mask[:3, :], mask[:, :3] = False, False
+    assert not measure_aperture(mask).is_round
+    assert find_offset(mask, 16.0) is None
+
+
+def test_lenslets_see_the_pupil_where_the_whole_mask_shows_it(tmp_path):
+    path = bench(tmp_path, mask_of(15.0, (-0.5, 0.0)), "pupil_diameter_subap = 15.0")
+    about = load_instrument(path)
+    assert check_mask(about) is None
+    seen, told, centred = (
+        RtcInteractionModel(one, modal_basis(one), pupil_sampling=3, detector_nodes=3)
+        .interaction_matrix(Misregistration())
+        .astype(float)
+        for one in (
+            about,
+            replace(about, pupil_shift_subap=(-0.5, 0.0)),
+            replace(about, pupil_shift_subap=(1e-9, 0.0)),
+        )
+    )
+    assert np.abs(seen - told).max() < 0.05 * np.abs(told - centred).max()
 
 
 def test_the_pupil_moves_with_the_mirror_where_that_is_the_stop(tmp_path):

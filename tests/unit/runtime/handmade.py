@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from service.model.misregistration import Misregistration
+from service.records.registration import Registration
 from service.runtime.estimator_bank import close_sums
-from service.tracking.registration import Registration
 from service.wire import Reply, layout_of
 from tests.states import tracker_state
 from tests.unit.runtime.small import N_CONTROLLED, SIGMA

@@ -7,8 +7,8 @@ import pytest
 
 from service.errors import ArchiveError, CommandError, LinkError, StorageError, UnknownIdError
 from service.model.misregistration import Misregistration
-from service.tracking import events as ev
-from service.tracking.products import MatrixState, ReconstructorRecord
+from service.records import events as ev
+from service.records.products import MatrixState, ReconstructorRecord
 from service.wire import (
     DitherKind,
     DitherRequest,

@@ -11,12 +11,12 @@ from pyrcal_studies.campaign.observatory import Observatory, latencies_of
 from service.archive.serialisation import TrackingFile
 from service.config import load_settings
 from service.instrument import load_instrument
+from service.records.products import MatrixState
+from service.records.state import Mode
 from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
 from service.runtime.worker.records import Compute
-from service.tracking.products import MatrixState
 from service.tracking.resume import saved_of
-from service.tracking.state import Mode
 from tests.unit.runtime.small import COMPUTE, SIGMA, conditions, loop_settings, small_instrument
 from tests.unit.runtime.test_workbench import ALPHA, dithered_window, open_loop
 

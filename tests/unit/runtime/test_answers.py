@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 
 from service.errors import CommandError, LinkError
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.products import MatrixState
+from service.records.state import Mode
 from service.runtime.command_results import GivenCommand
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.products import MatrixState
-from service.tracking.state import Mode
 from service.wire import AckState, Pattern, Reply
 from tests.states import changed
 from tests.unit.tracking.operations.test_running import (

@@ -7,11 +7,11 @@ import pytest
 
 from service.archive import AuditEntry
 from service.errors import StorageError
+from service.records import events as ev
+from service.records.registration import OffloadState
+from service.records.state import Level, LogEntry, TrackerState
 from service.runtime import archiving
 from service.runtime.archiving import ArchiveWriter
-from service.tracking import events as ev
-from service.tracking.registration import OffloadState
-from service.tracking.state import Level, LogEntry, TrackerState
 from service.wire import OffloadRequest
 from tests.states import changed
 from tests.system.pace import patience

@@ -2,8 +2,8 @@
 
 import pytest
 
+from service.records.state import Mode
 from service.runtime.clock import ServiceClock
-from service.tracking.state import Mode
 from tests.unit.tracking.situations import START_NS, dither_answered
 from tests.unit.tracking.world import World
 

@@ -7,10 +7,10 @@ import pytest
 
 from service.estimation import passive
 from service.estimation.loop import loop_numbers
+from service.records import events as ev
+from service.records.state import Mode
 from service.runtime.estimates import PendingWindow, fit_passive
 from service.runtime.worker import OpticsWorker
-from service.tracking import events as ev
-from service.tracking.state import Mode
 from tests.numerics import block_of
 from tests.unit.estimation.test_lockin import run, telemetry
 from tests.unit.tracking.situations import ALPHA, Story

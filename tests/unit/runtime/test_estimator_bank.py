@@ -7,9 +7,9 @@ from typing_extensions import override
 
 from service.estimation.estimator import UNMARKED, Change, LoopContext, Mark, Streaming
 from service.estimation.health import LoopHealth
+from service.records.alarms import ALARMS
 from service.runtime.estimator_bank import EstimatorBank, process_block, with_dither, with_rtc
 from service.runtime.registry import Entry
-from service.tracking.alarms import ALARMS
 from tests.unit.runtime.test_streams import DESCRIPTION, DITHER, RTC, WINDOW_S, block
 
 

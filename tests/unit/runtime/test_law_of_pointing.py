@@ -10,9 +10,9 @@ from pyrcal_studies.campaign.observatory import Dome, Observatory
 from service.config import load_settings
 from service.errors import ConfigurationError
 from service.instrument import load_instrument
+from service.records.state import Mode
 from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
-from service.tracking.state import Mode
 from sim_rtc.assembly import build_telescope
 from sim_rtc.options import parse_options
 from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED

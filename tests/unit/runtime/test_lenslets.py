@@ -14,11 +14,11 @@ from service.estimation.reference import Reference
 from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import modal_basis
+from service.records.products import MatrixState
+from service.records.state import Mode
 from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
 from service.runtime.worker.records import Compute
-from service.tracking.products import MatrixState
-from service.tracking.state import Mode
 from service.tracking.validity import Validity
 from sim_rtc.telescope.imperfections import SETS
 from sim_rtc.telescope.linear import LinearPlant

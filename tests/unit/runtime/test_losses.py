@@ -2,10 +2,10 @@
 
 import pytest
 
+from service.records.alarms import Alarm
+from service.records.state import TrackerState
 from service.runtime.losses import Losses, silence
 from service.runtime.readiness import detect_link_changes
-from service.tracking.alarms import Alarm
-from service.tracking.state import TrackerState
 from tests.states import changed
 from tests.unit.runtime.test_waiting import SECOND, WELL, disposition, link
 from tests.unit.tracking.situations import START_NS, rtc

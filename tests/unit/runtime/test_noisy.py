@@ -8,12 +8,12 @@ from service.errors import CommandError, UnknownIdError
 from service.estimation.frames import FrameBlock
 from service.estimation.random_dither import RandomDither, RandomPlan
 from service.model.misregistration import Misregistration
+from service.records import events as ev
+from service.records.alarms import Alarm
+from service.records.operations import MeasurementRecord, MeasureState
 from service.runtime.actions import Actions, Publishing
 from service.runtime.estimates import NoisySums
 from service.runtime.worker import OpticsWorker
-from service.tracking import events as ev
-from service.tracking.alarms import Alarm
-from service.tracking.operation_records import MeasurementRecord, MeasureState
 from tests.states import changed, tracker_state
 from tests.unit.runtime.small import COMPUTE, small_instrument
 from tests.unit.tracking.situations import rtc

@@ -9,15 +9,15 @@ from service.archive import Archive
 from service.config import load_settings
 from service.instrument import load_instrument
 from service.model.misregistration import Misregistration
+from service.records import events as ev
+from service.records.operations import AcquisitionStage
+from service.records.state import Mode
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.actions import Actions, Publishing
 from service.runtime.policy import policy_of
 from service.runtime.supervisor import Supervisor
 from service.runtime.worker import OpticsWorker, start_worker
 from service.runtime.workers import WorkerPool
-from service.tracking import events as ev
-from service.tracking.operation_records import AcquisitionStage
-from service.tracking.state import Mode
 from tests.states import tracker_state
 from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED
 from tests.unit.runtime.test_supervisor import running

@@ -10,13 +10,13 @@ from pyrcal_studies.campaign.observatory import Observatory
 from service.config import load_settings
 from service.estimation.description import LOW_MODES
 from service.estimation.health import LoopHealth
+from service.records import commands as cmd
+from service.records.registration import Source
+from service.records.state import Mode
 from service.runtime.engine import shape_mismatch
 from service.runtime.estimator_bank import EstimatorBank, process_block, with_rtc
 from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
-from service.tracking import commands as cmd
-from service.tracking.registration import Source
-from service.tracking.state import Mode
 from tests.unit.runtime.handmade import take_sums
 from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED, small_instrument
 from tests.unit.runtime.test_streams import DESCRIPTION, MANY, N_MANY, RING, driven

@@ -10,17 +10,17 @@ from pyrcal_studies.campaign.observatory import Observatory
 from service.archive import Archive
 from service.config import load_settings
 from service.instrument import load_instrument
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.operations import AcquisitionStage
+from service.records.products import ModeProof
+from service.records.state import Mode, TrackerState
 from service.runtime.archiving import is_unsaved, is_urgent, leave, restore_tracking
 from service.runtime.engine import Engine
 from service.runtime.estimates import PendingWindow
 from service.runtime.policy import policy_of
 from service.runtime.worker import Compute, OpticsWorker
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.mode_limits import ModeProof
-from service.tracking.operation_records import AcquisitionStage
 from service.tracking.resume import restored
-from service.tracking.state import Mode, TrackerState
 from tests.states import changed, tracker_state
 from tests.unit.tracking.operations.test_acquisition import Acquiring
 from tests.unit.tracking.situations import START_NS

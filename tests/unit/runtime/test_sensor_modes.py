@@ -10,18 +10,18 @@ from threadpoolctl import threadpool_limits
 from pyrcal_studies.campaign.observatory import Dome, Observatory, OwnHands
 from service.config import load_settings
 from service.errors import ModelError
-from service.estimation.windows import RefusalKind
 from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE
 from service.model.slopes import Orientation, SlopeRecipe
+from service.records.estimates import RefusalKind
+from service.records.products import MatrixState
+from service.records.state import LoopState, Mode, TrackerState
 from service.runtime.actions import Actions
 from service.runtime.estimates import fitted, read_own_matrix
 from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
-from service.tracking.products import MatrixState
 from service.tracking.reconstructors import check_sendable
 from service.tracking.resume import resumed, saved_of
-from service.tracking.state import LoopState, Mode, TrackerState
 from sim_rtc.options import parse_options
 from tests.unit.runtime.small import COMPUTE
 

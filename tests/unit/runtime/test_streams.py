@@ -13,7 +13,11 @@ from service.estimation.lockin import LockIn, Spectra
 from service.estimation.loopcheck import LoopCheck
 from service.estimation.passive import Passive
 from service.estimation.random_dither import Correlated
-from service.estimation.windows import WindowRefused
+from service.records import events as ev
+from service.records.alarms import Alarm
+from service.records.estimates import WindowRefused
+from service.records.operations import Dither
+from service.records.products import MatrixState, ModeSet
 from service.runtime.engine import (
     IDLE_GATHER_S,
     Engine,
@@ -27,10 +31,7 @@ from service.runtime.estimator_bank import (
     with_matrix,
     with_rtc,
 )
-from service.tracking import events as ev
-from service.tracking.alarms import Alarm
-from service.tracking.dither_request import Dither, plan_random
-from service.tracking.products import MatrixState, ModeSet
+from service.tracking.dither_request import plan_random
 from service.wire import DitherKind, DitherRequest
 from tests.states import changed, tracker_state
 from tests.unit.estimation import test_loopcheck as loops

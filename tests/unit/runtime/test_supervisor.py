@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import resource
 import shutil
+import socket
 import threading
 import time
 from dataclasses import replace
@@ -14,14 +15,14 @@ import pytest
 
 from service.archive import Actor, AuditEntry, Channel, Range
 from service.errors import ArchiveError, CommandError, PyrcalError, UnknownIdError
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.state import Level, LogEntry, Mode, TrackerState
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime import supervisor as supervising
 from service.runtime.archiving import restore_tracking
 from service.runtime.engine import follow_state
 from service.runtime.supervisor import Supervisor
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.state import Level, LogEntry, Mode, TrackerState
 from service.wire import checksum
 from tests.states import changed, tracker_state
 from tests.system.cable import free_port
@@ -43,6 +44,10 @@ def bridge():
 
 @pytest.fixture
 def supervisor(workers, archive, bridge, actions):
+    return supervisor_of(workers, archive, bridge, actions)
+
+
+def supervisor_of(workers, archive, bridge, actions):
     return Supervisor(
         state=tracker_state(system="small", mode=Mode.HOLD),
         policy=replace(POLICY),
@@ -658,6 +663,31 @@ async def test_a_token_without_a_message_has_the_link_opened_anew_and_is_told(
             await until(lambda: bridge.statistics().rtc_alive)
             token.undeclare()
             await until(lambda: not bridge.statistics().rtc_alive)
+
+
+async def test_a_link_whose_port_is_taken_is_opened_once_it_is_free(workers, archive, actions):
+    port = free_port()
+    bridge = Bridge(Endpoint(system="small", listen=(f"tcp/127.0.0.1:{port}",)))
+    supervisor = supervisor_of(workers, archive, bridge, actions)
+    with socket.create_server(("127.0.0.1", port)):
+        task = asyncio.create_task(supervisor.run())
+
+        def waits():
+            return {wait.name: wait for wait in supervisor.snapshot().waiting_for}
+
+        await until(lambda: "already in use" in waits()["link"].text, 15.0)
+        # REST and the ticks go on meanwhile
+        await until(lambda: "model" not in waits(), 30.0)
+        assert not supervisor.snapshot().ready
+        log = [entry.name for entry in supervisor.snapshot().tracker.log]
+        assert log.count("link.waiting") == 1
+        assert "rtc-vanished" not in log
+    await until(lambda: supervisor.snapshot().ready, 15.0)
+    assert not bridge.statistics().missing
+    task.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await task
+    bridge.close()
 
 
 async def test_a_window_waits_until_the_rtcs_own_matrix_has_been_read(supervisor, monkeypatch):

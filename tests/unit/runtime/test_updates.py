@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from service.control.gains import ModeGain
 from service.control.gate import MAX_EDGE_MOTION_M, MAX_HELD_EDGE_MOTION_M
 from service.control.loop import ControlLoop
 from service.errors import CommandError
 from service.model.misregistration import Misregistration
+from service.records import events as ev
+from service.records.alarms import Alarm
+from service.records.products import MatrixState
+from service.records.registration import ModeGain
 from service.runtime.actions import (
     GAIN_SAFETY,
     expected_gains,
@@ -19,9 +22,6 @@ from service.runtime.actions import (
     modes_that_hold,
 )
 from service.runtime.worker import OpticsWorker
-from service.tracking import events as ev
-from service.tracking.alarms import Alarm
-from service.tracking.products import MatrixState
 from service.tracking.update_policy import fewer_modes_than
 from service.wire import LoopRequest
 from tests.states import changed

@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 from service.link.statistics import Counters, Disposition, LinkStatistics
+from service.records.alarms import Alarm, Prerequisite, Responsible
+from service.records.products import MatrixState
+from service.records.state import Mode, TrackerState
 from service.runtime.readiness import (
     DERIVED_EACH_SECOND,
     ReadinessInputs,
@@ -17,9 +20,6 @@ from service.runtime.readiness import (
     state_message,
     waiting_for,
 )
-from service.tracking.alarms import Alarm, Prerequisite, Responsible
-from service.tracking.products import MatrixState
-from service.tracking.state import Mode, TrackerState
 from tests.states import changed, tracker_state
 from tests.unit.tracking.situations import ALPHA, START_NS, Story, moved, record, rtc
 
@@ -188,6 +188,19 @@ def test_what_the_rtc_does_not_send_is_waited_for(found, name, party, hinders):
     assert len(wait.text) > 20
 
 
+def test_a_network_that_is_not_there_is_waited_for_and_no_rtc_is_blamed():
+    """Nothing of an RTC can arrive, however well it runs."""
+    late = link(rtc_alive=False, session=None, frame_age_s=None, missing="no router answers")
+    inputs = ReadinessInputs(
+        state=TrackerState(system="small"), link=late, preparing=False, rest_missing="port taken"
+    )
+    found = [(w.name, w.responsible, w.text, w.blocks) for w in waiting_for(inputs)]
+    assert found == [
+        ("link", "network", "no router answers", True),
+        ("rest", "network", "port taken", False),
+    ]
+
+
 def test_what_the_rtc_says_of_itself_is_waited_for_in_its_words_while_it_is_there():
     state = tracker_state(system="small", rtc=rtc(trouble="aol1_imWFS2: its counter stands at 7"))
     wait = waits(link(*WELL), state)["rtc-trouble"]
@@ -332,3 +345,10 @@ def test_what_keeps_a_matrix_from_being_made_is_waited_for():
     found = waits(link(*WELL), state)["new-matrix"]
     assert (found.responsible, found.blocks) == (Responsible.OPERATOR, False)
     assert found.text == "Mode 30 does not answer."
+
+
+def test_what_kept_a_matrix_is_not_said_while_an_alarm_forbids_all_decisions():
+    hindrance, alarm = "Raise [dither] budget_m.", Alarm(name="no-frames", since_ns_utc=0, text="")
+    assert "new-matrix" in waits(link(*WELL), tracker_state(system="s", hindrance=hindrance))
+    state = tracker_state(system="s", hindrance=hindrance, active=(alarm,))
+    assert "new-matrix" not in waits(link(*WELL), state)

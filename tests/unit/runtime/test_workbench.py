@@ -14,9 +14,8 @@ from service.errors import ModelError, UnknownIdError
 from service.estimation import passive
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import LockIn, LockInPlan, Spectra
-from service.estimation.openloop import WideCaptureEstimate
 from service.estimation.slope_convention import identify_from_response
-from service.estimation.windows import ClosedLoop, RefusalKind, WindowRefused
+from service.estimation.windows import ClosedLoop
 from service.model.interaction import InteractionModel, RtcInteractionModel
 from service.model.kinds import Normalisation, SlopeOrder
 from service.model.misregistration import Misregistration
@@ -24,10 +23,11 @@ from service.model.modes import modal_basis
 from service.model.pupil import rtc_valid_subapertures
 from service.model.sensors.pyramid.description import FrameWindows
 from service.model.slopes import Orientation, SlopeRecipe, to_rtc
+from service.records.estimates import RefusalKind, WideCaptureEstimate, WindowRefused
+from service.records.events import ModesRecognised
+from service.records.products import MatrixState, ReconstructorRecord
 from service.runtime.estimates import read_own_matrix
 from service.runtime.worker import OpticsWorker, run_job
-from service.tracking.events import ModesRecognised
-from service.tracking.products import MatrixState, ReconstructorRecord
 from tests.states import tracker_state
 from tests.unit.estimation.lamps import counts_of
 from tests.unit.runtime.small import (
@@ -462,12 +462,22 @@ def test_commands_in_another_unit_are_named_by_the_rtcs_own_matrix(metres, named
     assert named in dialect.wrong
 
 
-@pytest.mark.parametrize("ratio", [1.9, 3.2])
-def test_a_modulation_that_is_too_large_may_be_why_the_own_matrix_expects_more(ratio):
-    """A pyramid's response grows as its modulation shrinks, as if light met the mirror twice."""
+@pytest.mark.parametrize(
+    ("ratio", "said"),
+    [
+        (1.9, "wavelength_m or modulation_lambda_over_d is too large"),
+        (2.7, "wavelength_m or modulation_lambda_over_d is too large"),
+        (120, "wavelength_m or modulation_lambda_over_d is too large"),
+        (1 / 15, "wavelength_m or modulation_lambda_over_d is too small"),
+        (1 / 120, "slopes have another unit"),
+    ],
+)
+def test_a_factor_names_every_cause_that_makes_it(ratio, said):
+    """Slopes in another unit, or a pyramid's wavelength or modulation: the factor is the same."""
     rtc = Mistold()
     wrong = rtc.told.read_slope_convention((rtc.own / ratio).astype(np.float32), None).wrong
-    assert "modulation_lambda_over_d" in wrong
+    assert "slopes" in wrong.partition("model's slopes")[2]
+    assert said in wrong
 
 
 def test_commands_in_another_unit_are_named_by_the_answer_to_the_dither():

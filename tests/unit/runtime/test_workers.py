@@ -8,14 +8,14 @@ from functools import partial
 import pytest
 
 from service.errors import WorkerError
+from service.records.alarms import Alarm
+from service.records.state import TrackerState
 from service.runtime import workers as crew_module
 from service.runtime import workers as workers_module
 from service.runtime.estimates import work_out
 from service.runtime.processes import Worker
 from service.runtime.worker import OpticsWorker, run_job, start_worker
 from service.runtime.workers import WorkerLoadMeter, WorkerPool
-from service.tracking.alarms import Alarm
-from service.tracking.state import TrackerState
 from tests.states import tracker_state
 from tests.system.pace import in_time
 from tests.unit.runtime.jobs import (

@@ -16,8 +16,8 @@ from pyrcal_studies.campaign.fault_nights import (
     worse,
 )
 from pyrcal_studies.campaign.observatory import Moment, latencies_of
-from service.tracking import commands as cmd
-from service.tracking.state import Mode
+from service.records import commands as cmd
+from service.records.state import Mode
 from tests.system.night import INSTRUMENT
 
 WORDS = (f"--instrument={INSTRUMENT}", "--plant=linear", "--n-controlled=45", "--seed=1")

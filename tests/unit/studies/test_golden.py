@@ -13,11 +13,11 @@ from pyrcal_studies.campaign.golden import (
     read,
     written,
 )
-from service.estimation.random_dither import RandomEstimate
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.products import ModeSet
-from service.tracking.state import Mode
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.estimates import RandomEstimate
+from service.records.products import ModeSet
+from service.records.state import Mode
 from service.wire import DitherKind
 from tests.states import tracker_state
 from tests.unit.tracking.situations import (

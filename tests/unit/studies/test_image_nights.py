@@ -12,9 +12,9 @@ from pyrcal_studies.campaign.image_nights import (
 from pyrcal_studies.campaign.observatory import Observatory
 from service.config import load_settings
 from service.instrument import load_instrument
+from service.records.state import Mode
 from service.runtime.policy import policy_of
 from service.runtime.worker import Compute, OpticsWorker
-from service.tracking.state import Mode
 
 
 def test_sigma_that_is_shown_covers_what_displaced_images_do_to_a_shift():

@@ -34,12 +34,12 @@ from service.estimation.health import (
     observe,
     observe_played,
 )
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.products import MatrixState
+from service.records.state import Mode
 from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.products import MatrixState
-from service.tracking.state import Mode
 from service.wire import DitherRequest
 from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED, small_instrument
 

@@ -10,9 +10,9 @@ from pyrcal_studies.campaign.observatory import Latencies, Observatory
 from service.config import load_settings
 from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE
+from service.records.state import Mode
 from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
-from service.tracking.state import Mode
 from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED
 
 GIVEN = {

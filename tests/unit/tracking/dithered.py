@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 
 from service.control.dither import look_up_precision
-from service.estimation.estimate import PassiveEstimate
 from service.estimation.windows import DITHER_SETTLING_S
-from service.tracking import events as ev
+from service.records import events as ev
+from service.records.estimates import PassiveEstimate
+from service.records.state import Mode
 from service.tracking.dither_request import total_m
-from service.tracking.state import Mode
 from service.wire import DitherRequest, DitherStatus, DitherStop
 from tests.unit.tracking.situations import ALPHA, Story, dither_answered, estimate, moved, rtc
 

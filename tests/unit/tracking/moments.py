@@ -2,12 +2,12 @@
 
 from dataclasses import replace
 
-from service.control.gains import ModeGain
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.alarms import AlarmRecord, Severity
-from service.tracking.products import MatrixState
-from service.tracking.state import Mode
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.alarms import AlarmRecord, Severity
+from service.records.products import MatrixState
+from service.records.registration import ModeGain
+from service.records.state import Mode
 from tests.states import changed
 from tests.unit.tracking.operations.test_running import ACTIVITIES
 from tests.unit.tracking.situations import POLICY, Story, moved, rtc

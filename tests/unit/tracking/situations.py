@@ -6,18 +6,22 @@ import numpy as np
 
 from pyrcal.client.remote import REQUESTS
 from service.config import load_settings
-from service.control.gate import GateVerdict
 from service.errors import CommandError
-from service.estimation.lockin import LockInEstimate
 from service.estimation.loop import select_gains
 from service.model.misregistration import Misregistration
+from service.records import events as ev
+from service.records.estimates import LockInEstimate
+from service.records.operations import Dither
+from service.records.products import (
+    GateVerdict,
+    Judged,
+    MatrixState,
+    ModeProof,
+    ReconstructorRecord,
+)
+from service.records.state import Mode
 from service.runtime.policy import policy_of
 from service.tracker import step
-from service.tracking import events as ev
-from service.tracking.dither_request import Dither
-from service.tracking.mode_limits import ModeProof
-from service.tracking.products import Judged, MatrixState, ReconstructorRecord
-from service.tracking.state import Mode
 from service.tracking.step_context import StepContext
 from service.wire import (
     Acknowledgement,

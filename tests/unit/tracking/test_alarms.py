@@ -10,13 +10,10 @@ import pytest
 import service
 from service.archive.serialisation import TrackingFile
 from service.errors import CommandError, UnknownIdError
-from service.estimation.windows import RefusalKind, WindowRefused
-from service.tracking import alarms
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.alarm_records import muted_records, stale_records, worst_severity
-from service.tracking.alarm_rules import LASTING, RULES
-from service.tracking.alarms import (
+from service.records import alarms
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.alarms import (
     ALARMS,
     AlarmDefinition,
     AlarmState,
@@ -24,9 +21,13 @@ from service.tracking.alarms import (
     Severity,
     blocking_alarm,
 )
-from service.tracking.products import MatrixState
+from service.records.estimates import RefusalKind, WindowRefused
+from service.records.products import MatrixState
+from service.records.state import Mode, TrackerState
+from service.tracking.alarm_records import muted_records, stale_records, worst_severity
+from service.tracking.alarm_rules import LASTING, RULES
+from service.tracking.interlocks import permitted
 from service.tracking.resume import resumed, saved_of
-from service.tracking.state import Mode, TrackerState
 from service.wire import DitherRequest, LoopRequest
 from tests.unit.tracking.situations import POLICY, Story, judged, of_kind, record, verdict
 
@@ -370,3 +371,34 @@ def test_what_lasts_without_news_costs_the_disk_nothing(story):
         story.tell(ev.ConditionChanged(name="frames-unused", text=f"{k} frames"))
         story.wait(1)
     assert story.state.alarms.records is before
+
+
+REMEDIES = {
+    "Open the loop": cmd.SetLoop(loop="open"),
+    "lower the gain": cmd.SetLoop(gains=(cmd.GainGroup(first=0, last=9, gain=0.1),)),
+    "dither stop": cmd.StopDither,
+    "loop acquire": cmd.Acquire,
+    "loop close": cmd.SetLoop(loop="closed"),
+    "reconstructors approve": cmd.Approve,
+    "reconstructors publish": cmd.Publish,
+    "pyrcal resume": cmd.Resume,
+    "Setting another mode": cmd.SetMode(mode=Mode.PROPOSE),
+}
+"""Orders that remedies ask for, by their words."""
+
+
+@pytest.mark.parametrize("name", ALARMS)
+def test_what_an_alarm_asks_for_may_be_ordered_while_it_lasts(name):
+    story = Story(Mode.HOLD).meet()
+    story.see(n_windows=2)
+    story.use("cm-1")
+    story.make("cm-2")
+    story.tell(cmd.StopEverything() if name == "stopped" else of_alarm(name))
+    for words, order in REMEDIES.items():
+        if words in ALARMS[name].do:
+            allowed = permitted(story.state, order, story.policy, story.now_ns)
+            assert allowed.allowed, (words, allowed.reason)
+
+
+def of_alarm(name):
+    return ev.ConditionChanged(name=name, text="it is so")

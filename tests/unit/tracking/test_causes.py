@@ -3,10 +3,10 @@
 import pytest
 
 from service.errors import CommandError
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.operation_records import MeasureState
-from service.tracking.state import Mode
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.operations import MeasureState
+from service.records.state import Mode
 from service.wire import DitherRequest, Reply
 from tests.unit.tracking.operations.test_running import idle, sending
 from tests.unit.tracking.situations import START_NS, Story, rtc

@@ -13,9 +13,11 @@ from service.control.dither import look_up_precision
 from service.control.loop import compute_amplification
 from service.errors import CommandError
 from service.estimation.windows import DITHER_SETTLING_S
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.alarms import OVER_BUDGET
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.alarms import OVER_BUDGET
+from service.records.operations import DitherPhase
+from service.records.state import Level, Mode
 from service.tracking.dither import FIRST_DITHER_RETRY_S, MAX_DITHER_RETRY_S
 from service.tracking.dither_plan import (
     FAINT_WINDOW_S,
@@ -26,14 +28,12 @@ from service.tracking.dither_plan import (
 from service.tracking.dither_request import (
     LINE_RANGE,
     DitherParameters,
-    DitherPhase,
     choose_modes,
     clear_lines,
     controlled,
     expected_amplification,
     total_m,
 )
-from service.tracking.state import Level, Mode
 from service.wire import DitherRequest, DitherStop
 from tests.states import changed
 from tests.unit.tracking.dithered import DitheredNight

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.alarms import NOT_AS_ASKED, NOT_STOPPED, OVER_BUDGET
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.alarms import NOT_AS_ASKED, NOT_STOPPED, OVER_BUDGET
+from service.records.operations import AcquisitionStage, Dither, DitherPhase, MeasureState
 from service.tracking.dither import (
     COST_AVERAGING_TIME_S,
     FAILED_DITHER_PAUSE_S,
@@ -15,14 +16,11 @@ from service.tracking.dither import (
 )
 from service.tracking.dither_request import (
     MAX_STOP_DELAY_S,
-    Dither,
     DitherParameters,
-    DitherPhase,
     check_dither_usable,
     plan_dither,
     total_m,
 )
-from service.tracking.operation_records import AcquisitionStage, MeasureState
 from service.wire import DitherRequest, DitherStop
 from tests.unit.tracking.situations import (
     POLICY,

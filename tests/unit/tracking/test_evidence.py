@@ -10,17 +10,20 @@ from hypothesis import given, settings
 
 from service.errors import CommandError
 from service.estimation.estimate import MODEL_ERROR_VARIANCE_RATIO
-from service.estimation.openloop import WideCaptureEstimate
-from service.estimation.random_dither import RandomEstimate
-from service.estimation.windows import RefusalKind, WindowRefused
 from service.model.misregistration import Misregistration
-from service.tracking import commands as cmd
-from service.tracking import events as ev
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.estimates import (
+    RandomEstimate,
+    RefusalKind,
+    WideCaptureEstimate,
+    WindowRefused,
+)
+from service.records.products import MatrixState, ModeSet
+from service.records.registration import Source, Validity
+from service.records.state import Level, Mode
 from service.tracking.dither_request import total_m
 from service.tracking.filtering import HISTORY_LENGTH
-from service.tracking.products import MatrixState, ModeSet
-from service.tracking.registration import Source, Validity
-from service.tracking.state import Level, Mode
 from service.wire import DitherKind, DitherRequest, Pointing
 from tests.states import changed
 from tests.unit.tracking.situations import (

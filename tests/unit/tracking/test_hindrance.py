@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.tracking import events as ev
-from service.tracking.mode_limits import ModeProof
+from service.records import events as ev
+from service.records.products import ModeProof
+from service.records.state import Mode
 from service.tracking.mode_proof import awaits_proof
-from service.tracking.state import Mode
 from service.tracking.step_context import StepContext
 from service.wire import DitherRequest
 from tests.states import changed
@@ -53,6 +53,23 @@ def test_an_invalid_registration_is_named_with_the_settings_that_make_it_surer()
     story.state = changed(story.state, registration=wide)
     story.tell(ev.Tick(), after_s=1.0)
     assert "budget_m" in hindrance(story)
+
+
+@pytest.mark.parametrize("refused", [True, False])
+def test_a_stronger_dither_is_no_remedy_where_no_window_is_accepted(refused):
+    """A frozen RTC, or one that loses its frames: α grows uncertain because nothing comes."""
+    story = Story().meet()
+    story.see(n_windows=2)
+    story.tell(ev.Tick(), after_s=1.0)
+    known = story.state.alpha.registration
+    wide = replace(known, covariance=np.diag(POLICY.useless_sigma**2) * 4.0)
+    run = -5 if refused else 0
+    windows = replace(story.state.windows, run=run, refused_because="frames are missing")
+    story.state = changed(story.state, registration=wide, windows=windows)
+    story.now_ns += 600 * 10**9 * (not refused)
+    story.tell(ev.Tick(), after_s=1.0)
+    assert "budget_m" not in hindrance(story)
+    assert ("frames are missing" if refused else "No window comes any more") in hindrance(story)
 
 
 class Unseen(Story):

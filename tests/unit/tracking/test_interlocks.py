@@ -6,11 +6,11 @@ from functools import cache
 import pytest
 
 from service.errors import CommandError, UnknownIdError
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.products import MatrixState, ModeSet
 from service.tracker import step
-from service.tracking import commands as cmd
-from service.tracking import events as ev
 from service.tracking.interlocks import ORDERS, Permission, permissions, permitted
-from service.tracking.products import MatrixState, ModeSet
 from service.wire import DitherKind, Pattern
 from tests.unit.tracking.moments import (
     MOMENTS,

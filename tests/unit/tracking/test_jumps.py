@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.estimation.estimate import PassiveEstimate
 from service.model.misregistration import Misregistration
-from service.tracking import events as ev
-from service.tracking.state import Mode
+from service.records import events as ev
+from service.records.estimates import PassiveEstimate
+from service.records.state import Mode
 from service.tracking.update_policy import is_settled
 from tests.unit.tracking.situations import ALPHA, POLICY, SECOND, Story, estimate, rtc
 

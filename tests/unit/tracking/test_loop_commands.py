@@ -3,13 +3,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.control.gains import ModeGain, gain_table
+from service.control.gains import gain_table
 from service.errors import CommandError
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.operation_records import CommandState
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.operations import CommandState
+from service.records.registration import ModeGain
+from service.records.state import Mode
 from service.tracking.operator import RECLOSING_INTERVAL_S
-from service.tracking.state import Mode
 from service.wire import Loop, LoopRequest, Pattern, RampRequest
 from tests.states import changed
 from tests.unit.tracking.situations import (

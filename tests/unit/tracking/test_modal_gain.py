@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from service.tracking import events as ev
+from service.records import events as ev
+from service.records.state import Mode
 from service.tracking.filtering import GAIN_RATE, MODES_KEPT, PRIOR_SCATTER, update_gains
-from service.tracking.state import Mode
 from tests.unit.tracking.situations import SECOND, START_NS, Story, estimate
 
 

@@ -6,10 +6,10 @@ from itertools import pairwise
 
 import pytest
 
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.products import MatrixState
-from service.tracking.state import Mode
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.products import MatrixState
+from service.records.state import Mode
 from service.tracking.update_policy import (
     DECLINED_MODES_DELAY_S,
     FIRST_MODES_DELAY_S,

@@ -7,21 +7,21 @@ import pytest
 
 from service.errors import CommandError
 from service.estimation.lockin import WEAK_LINE_RATIO
-from service.estimation.windows import WindowRefused
-from service.tracking import alarms
-from service.tracking import commands as cmd
-from service.tracking import events as ev
+from service.records import alarms
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.estimates import WindowRefused
+from service.records.products import MAX_COMPARED_WINDOWS, MatrixState, ModeProof, ModeRatio
+from service.records.state import Mode
 from service.tracking.dither_request import PROVING_LINE_RANGE
-from service.tracking.mode_limits import MAX_COMPARED_WINDOWS, ModeProof, ModeRatio, compare
+from service.tracking.mode_limits import compare
 from service.tracking.mode_proof import (
     MAX_PROOF_TRIES,
     MAX_WEAK_LINES,
     n_proven_modes,
     proven_modes,
 )
-from service.tracking.products import MatrixState
 from service.tracking.resume import restored, resumed, saved_of
-from service.tracking.state import Mode
 from service.wire import DitherRequest
 from tests.states import changed, tracker_state
 from tests.unit.tracking.situations import N_MODES, POLICY, SECOND, estimate, foreign, of_kind

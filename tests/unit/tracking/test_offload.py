@@ -9,13 +9,13 @@ import pytest
 
 from service.archive.serialisation import TrackingFile
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.registration import OffloadState, Validity
+from service.records.state import Mode
 from service.runtime.archiving import is_urgent
-from service.tracking import commands as cmd
-from service.tracking import events as ev
 from service.tracking.policy import Offloading
-from service.tracking.registration import OffloadState, Validity
 from service.tracking.resume import resumed, saved_of
-from service.tracking.state import Mode
 from service.tracking.validity import MOVING, end_of
 from service.wire import OffloadRequest, Reply
 from tests.states import changed, tracker_state

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from service import tracking
-from service.tracking.state import TrackerState
+from service.records.state import TrackerState
 
 RECORDS = {field.name for field in fields(TrackerState)}
 BLANK = TrackerState(system="")

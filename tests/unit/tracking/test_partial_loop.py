@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 
 from service.estimation.loop import extend_gains
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.operation_records import MeasureState
-from service.tracking.registration import Validity
-from service.tracking.state import Mode
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.operations import MeasureState
+from service.records.registration import Validity
+from service.records.state import Mode
 from service.tracking.update_policy import more_modes_to_try
 from service.wire import LoopRequest
 from tests.unit.tracking.dithered import DitheredNight

@@ -8,8 +8,9 @@ import pytest
 from service.errors import CommandError, UnknownIdError
 from service.model.misregistration import Misregistration
 from service.model.pointing_law import PointingLaw, Term
-from service.tracking import commands as cmd
-from service.tracking import events as ev
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.registration import Validity
 from service.tracking.pointing_law import (
     LEAP_CONFIRMATION_S,
     law_at,
@@ -17,7 +18,6 @@ from service.tracking.pointing_law import (
     start_of_fit,
 )
 from service.tracking.policy import SensorModePolicy
-from service.tracking.registration import Validity
 from service.tracking.resume import resumed, saved_of
 from service.wire import Pointing
 from tests.states import tracker_state

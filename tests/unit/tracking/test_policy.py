@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.control.expected_gain import ExpectedGain
 from service.errors import ModelError
-from service.tracking import commands as cmd
-from service.tracking import events as ev
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.products import ExpectedGain, MatrixState
+from service.records.state import Mode
 from service.tracking.dither_request import DitherParameters, lock_in_plan, plan_dither
-from service.tracking.products import MatrixState
-from service.tracking.state import Mode
 from service.tracking.update_policy import THRESHOLD_DECAY_S, is_outdated
 from service.wire import DitherRequest, DitherStop
 from tests.unit.tracking import situations

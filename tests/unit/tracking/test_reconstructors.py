@@ -4,9 +4,10 @@ import pytest
 
 from service.errors import UnknownIdError
 from service.estimation.loop import extend_gains
+from service.records import events as ev
+from service.records.products import MatrixState
+from service.records.state import Level, Mode, TrackerState
 from service.tracker import step
-from service.tracking import events as ev
-from service.tracking.products import MatrixState
 from service.tracking.reconstructors import (
     RECONSTRUCTORS_KEPT,
     RETURNS_KEPT,
@@ -16,7 +17,6 @@ from service.tracking.reconstructors import (
     store_reconstructor,
 )
 from service.tracking.resume import restored
-from service.tracking.state import Level, Mode, TrackerState
 from tests.states import changed, tracker_state
 from tests.unit.tracking.situations import (
     POLICY,

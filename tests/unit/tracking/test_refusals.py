@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import pytest
 
-from service.estimation.windows import RefusalKind, WindowRefused
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.alarms import WINDOWS_REFUSED
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.alarms import WINDOWS_REFUSED
+from service.records.estimates import RefusalKind, WindowRefused
+from service.records.state import Mode
 from service.tracking.operations.running import ServiceState, operating
-from service.tracking.state import Mode
 from service.tracking.window_processing import N_CONSECUTIVE_WINDOWS
 from service.wire import DitherStatus
 from tests.unit.tracking.situations import ALPHA, Story, dither_answered, moved, rtc

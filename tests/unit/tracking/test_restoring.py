@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.registration import Validity
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.registration import Validity
+from service.records.state import Level, Mode, TrackerState
 from service.tracking.resume import resumed, saved_of
-from service.tracking.state import Level, Mode, TrackerState
 from service.wire import DitherRequest, DitherStop
 from tests.states import changed, tracker_state
 from tests.unit.tracking.situations import (

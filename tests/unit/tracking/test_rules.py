@@ -7,13 +7,13 @@ import pytest
 from service.config import load_settings
 from service.config.settings import STATE_FIELDS
 from service.errors import CommandError, ConfigurationError, UnknownIdError
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.alarms import Interlock, Severity, blocking_alarm
+from service.records.state import Mode
 from service.runtime.policy import policy_of
 from service.tracker import step
-from service.tracking import commands as cmd
-from service.tracking import events as ev
 from service.tracking.alarm_rules import FIELDS, changes_value
-from service.tracking.alarms import Interlock, Severity, blocking_alarm
-from service.tracking.state import Mode
 from tests.states import tracker_state
 
 SHUTTER = """

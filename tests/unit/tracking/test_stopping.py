@@ -3,14 +3,14 @@
 import pytest
 
 from service.errors import CommandError
-from service.tracking import commands as cmd
-from service.tracking import events as ev
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.operations import AcquisitionStage, MeasureState
+from service.records.products import MatrixState
+from service.records.state import Mode
 from service.tracking.interlocks import ALLOWS
-from service.tracking.operation_records import AcquisitionStage, MeasureState
 from service.tracking.operations.running import running_operations
-from service.tracking.products import MatrixState
 from service.tracking.resume import resumed, saved_of
-from service.tracking.state import Mode
 from service.wire import DitherStop, Loop, LoopRequest
 from tests.states import tracker_state
 from tests.unit.tracking.operations.test_running import (

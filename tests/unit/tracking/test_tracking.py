@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.products import MatrixState
-from service.tracking.registration import Source, Validity
-from service.tracking.state import Level, Mode
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.products import MatrixState
+from service.records.registration import Source, Validity
+from service.records.state import Level, Mode
 from tests.states import changed
 from tests.unit.tracking.situations import (
     ALPHA,

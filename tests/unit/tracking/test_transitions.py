@@ -8,19 +8,15 @@ from pyrcal_studies.campaign import golden
 from pyrcal_studies.state_machines import MACHINES, draw
 from service.config import load_settings
 from service.errors import PyrcalError
+from service.records import alarms
+from service.records import events as ev
+from service.records.operations import UNDER_WAY, AcquisitionStage, MeasurementRecord, MeasureState
+from service.records.products import MatrixState
+from service.records.state import Mode, OperatorState, TrackerState
 from service.runtime.policy import policy_of
 from service.tracker import step
-from service.tracking import alarms, reconstructors, resume, transitions
-from service.tracking import events as ev
+from service.tracking import reconstructors, resume, transitions
 from service.tracking.alarm_rules import REPEATED_ALARM_TIMEOUT_S
-from service.tracking.operation_records import (
-    UNDER_WAY,
-    AcquisitionStage,
-    MeasurementRecord,
-    MeasureState,
-)
-from service.tracking.products import MatrixState
-from service.tracking.state import Mode, OperatorState, TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.transitions import TABLES, is_declared
 from service.wire import LoopRequest, MeasureRequest, Pattern

@@ -1,4 +1,4 @@
-from service.tracking.state import Level, TrackerState
+from service.records.state import Level, TrackerState
 from service.tracking.step_context import LOG_LENGTH, StepContext, log_bursts, logged
 from tests.unit.tracking.situations import turned
 

@@ -5,12 +5,12 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from service.tracking import commands as cmd
-from service.tracking import events as ev
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.products import MatrixState
+from service.records.registration import Purpose, Validity
+from service.records.state import Mode, TrackerState
 from service.tracking import validity
-from service.tracking.products import MatrixState
-from service.tracking.registration import Purpose, Validity
-from service.tracking.state import Mode, TrackerState
 from service.tracking.validity import (
     INTERVALS_KEPT,
     MAX_TELEMETRY_AGE_S,
@@ -134,8 +134,9 @@ class TestTime:
         assert len(texts) == 1
 
     def test_an_open_loop_needs_no_alpha(self, story):
-        story.tell(rtc(loop="open"))
-        story.wait(80)
+        for _ in range(80):
+            story.tell(rtc(loop="open"), after_s=1.0)
+            story.tell(ev.Tick())
         assert worth(story) is Validity.STALE
         assert "estimate-stale" not in story.alarms
 

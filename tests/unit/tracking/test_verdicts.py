@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.products import MatrixState
+from service.records.registration import Registration
+from service.records.state import Mode
 from service.tracker import step
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.products import MatrixState
-from service.tracking.registration import Registration
-from service.tracking.state import Mode
 from tests.states import changed, tracker_state
 from tests.unit.tracking.situations import (
     ALL_SHOWN,

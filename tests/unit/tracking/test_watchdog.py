@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.estimation.estimate import PassiveEstimate
 from service.estimation.loop import loop_numbers
 from service.model.misregistration import Misregistration
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.registration import Source, Validity
-from service.tracking.state import Mode, TrackerState
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.estimates import PassiveEstimate
+from service.records.registration import Source, Validity
+from service.records.state import Mode, TrackerState
 from service.tracking.window_processing import fit_begins_at
 from tests.states import changed
 from tests.unit.tracking.situations import (

@@ -3,10 +3,10 @@
 import pytest
 
 from service.errors import CommandError
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.products import MatrixState
-from service.tracking.state import Mode
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.products import MatrixState
+from service.records.state import Mode
 from service.wire import DitherRequest
 from tests.states import changed
 from tests.unit.tracking.situations import Story, acknowledged, foreign, record, rtc

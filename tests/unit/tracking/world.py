@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 
-from service.estimation.openloop import WideCaptureEstimate
-from service.tracking import events as ev
-from service.tracking.operation_records import MeasureState, NoisyFinding
-from service.tracking.products import MatrixState
-from service.tracking.state import Mode
+from service.records import events as ev
+from service.records.estimates import WideCaptureEstimate
+from service.records.operations import MeasureState, NoisyFinding
+from service.records.products import MatrixState
+from service.records.state import Mode
 from service.wire import (
     DitherRequest,
     DitherStatus,

@@ -112,20 +112,48 @@ def _refine_centres(instrument: Instrument, flux_frame: Array, pixels: int) -> A
     from service.model.sensors.pyramid.light import image_places
 
     centres = found_centres(flux_frame, instrument.wfs.pupil_diameter * pixels)
-    n = instrument.wfs.n_subapertures
-    # The centre of an even number of pixels is between two of them.
-    between = (n * pixels / 2 - 0.5) % 1.0
-    whole = np.round(centres - between) + between
     try:
-        images = _windows_at(instrument, whole, flux_frame, pixels).cut(flux_frame)
+        whole, images = _cut_whole_pixels(instrument, centres, flux_frame, pixels)
     except ModelError:
         return centres
-    places = image_places(images.transpose(0, 2, 1, 3).reshape(4, n, n), instrument)
+    places = image_places(images, instrument)
     if isinstance(places, CannotTell):
         return centres
     # Far from the circles the model has taken uneven light for a displacement.
     found = whole + pixels * places[:, ::-1].reshape(2, 2, 2)  # (x, y) to (row, column)
     return found if np.abs(found - centres).max() < _MAX_EDGE_DISTANCE_SUBAP * pixels else centres
+
+
+def measure_image_offsets(instrument: Instrument, light: Array) -> Array | CannotTell:
+    """Return the displacement (x, y) of each image from whole pixels ``(4, 2)``, less their mean.
+
+    ``light`` is a mean frame of one pixel for each subaperture, or images ``(4, n, n)`` cut from
+    one.
+
+    Raises
+    ------
+    ModelError
+        If a frame shows no images, a window leaves it, or there are not four images of this size.
+    """
+    from service.model.sensors.pyramid.light import image_places
+
+    if light.ndim == 2:
+        centres = found_centres(light, instrument.wfs.pupil_diameter)
+        _, light = _cut_whole_pixels(instrument, centres, light, 1)
+    places = image_places(light, instrument)
+    return places if isinstance(places, CannotTell) else places - places.mean(axis=0)
+
+
+def _cut_whole_pixels(
+    instrument: Instrument, centres: Array, flux_frame: Array, pixels: int
+) -> tuple[Array, Array]:
+    """Return the nearest centres of windows of whole pixels, and the images ``(4, n, n)`` there."""
+    n = instrument.wfs.n_subapertures
+    # The centre of an even number of pixels is between two of them.
+    between = (n * pixels / 2 - 0.5) % 1.0
+    whole = np.round(centres - between) + between
+    images = _windows_at(instrument, whole, flux_frame, pixels).cut(flux_frame)
+    return whole, images.transpose(0, 2, 1, 3).reshape(4, n, n)
 
 
 def image_centres(instrument: Instrument, flux_frame: NDArray[np.floating]) -> Array | None:

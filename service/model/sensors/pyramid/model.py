@@ -20,7 +20,7 @@ from service.model.sensors.pyramid.light import PyramidLight
 from service.model.sensors.pyramid.optics import PyramidOptics, enough_modulation_points
 from service.model.sensors.pyramid.table import IMAGE_KEY, PyramidMode, PyramidNumbers, PyramidTable
 from service.model.sensors.pyramid.working_point import Halo
-from service.model.sensors.sensor import Fineness, WorkingPoint
+from service.model.sensors.sensor import CannotTell, Fineness, WorkingPoint
 from service.model.slopes import SlopeRecipe
 
 Array = NDArray[np.float64]
@@ -163,6 +163,10 @@ class PyramidModel(SensorModel):
         self, instrument: Instrument, flux_frame: NDArray[Any]
     ) -> tuple[Instrument, tuple[str, ...]]:
         return detector_windows.locate_images(instrument, flux_frame)
+
+    @override
+    def measure_image_offsets(self, instrument: Instrument, light: Array) -> Array | CannotTell:
+        return detector_windows.measure_image_offsets(instrument, light)
 
     @override
     def image_centres(self, instrument: Instrument, flux_frame: NDArray[Any]) -> Array | None:
@@ -313,10 +317,17 @@ class PyramidModel(SensorModel):
         return replace(pyramid_in(instrument), image_offsets_subap=places)
 
     @override
+    def without_image_places(self, instrument: Instrument) -> Instrument | None:
+        wfs = pyramid_in(instrument)
+        if wfs.image_offsets_subap is None:
+            return None
+        return replace(instrument, wfs=replace(wfs, image_offsets_subap=None))
+
+    @override
     def pupil_offset(self, instrument: Instrument) -> tuple[float, float] | None:
         turned = description.stated_offsets(instrument)
         if turned is None:
-            return None
+            return super().pupil_offset(instrument)
         x, y = turned.mean(axis=(0, 1))
         return float(x), float(y)
 

@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.estimation.openloop import WideCaptureEstimate
-from service.estimation.windows import RefusalKind, WindowRefused
 from service.model.misregistration import Misregistration
-from service.tracking import commands as cmd
-from service.tracking import events as ev
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.estimates import RefusalKind, WideCaptureEstimate, WindowRefused
+from service.records.operations import AcquisitionStage
+from service.records.products import MatrixState
+from service.records.state import Mode
 from service.tracking.dither_request import lock_in_plan
-from service.tracking.operation_records import AcquisitionStage
 from service.tracking.operations.acquisition import (
     MAX_ATTEMPTS,
     MAX_DIVERGENCE_S,
@@ -21,8 +22,6 @@ from service.tracking.operations.acquisition import (
     MISSES_WHILE_TRACKING,
     wide_capture_dither,
 )
-from service.tracking.products import MatrixState
-from service.tracking.state import Mode
 from service.tracking.update_policy import fewer_modes_than
 from service.wire import DitherRequest, DitherStop, Loop, LoopRequest
 from tests.unit.tracking.situations import (

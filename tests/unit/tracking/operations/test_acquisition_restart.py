@@ -4,18 +4,18 @@ from dataclasses import replace
 
 import pytest
 
-from service.estimation.windows import RefusalKind
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.operation_records import AcquisitionStage
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.estimates import RefusalKind
+from service.records.operations import AcquisitionStage
+from service.records.products import MatrixState
+from service.records.state import Mode
 from service.tracking.operations.acquisition import (
     MAX_ATTEMPTS,
     MIN_FINAL_WINDOWS,
     MISSES_WHILE_TRACKING,
 )
-from service.tracking.products import MatrixState
 from service.tracking.resume import resumed, saved_of
-from service.tracking.state import Mode
 from service.wire import DitherRequest, DitherStop, Loop, LoopRequest
 from tests.states import tracker_state
 from tests.unit.tracking.operations.test_acquisition import (

@@ -4,12 +4,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.operation_records import MeasureState
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.operations import MeasureState
+from service.records.products import MatrixState
+from service.records.state import Mode
 from service.tracking.operations.measurement import MAX_MATRIX_DELAY_S, MAX_MEASUREMENT_S
-from service.tracking.products import MatrixState
-from service.tracking.state import Mode
 from service.wire import DitherRequest, MeasureRequest, Pattern
 from tests.states import changed
 from tests.unit.tracking.situations import Story, of_kind, rtc

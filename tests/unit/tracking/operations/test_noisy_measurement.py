@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.operation_records import MeasureState
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.operations import MeasureState
+from service.records.products import ModeSet
 from service.tracking.operations.measurement import DITHER_END_TIMEOUT_S
-from service.tracking.products import ModeSet
 from service.wire import DitherKind, DitherRequest, DitherStop
 from tests.unit.tracking.situations import (
     POLICY,

@@ -4,12 +4,11 @@ from dataclasses import replace
 
 import pytest
 
-from service.estimation.comparison import ProbationFinding, Verdict
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.operation_records import ProbationState
-from service.tracking.products import MatrixState
-from service.tracking.state import Mode
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.operations import ProbationFinding, ProbationState, Verdict
+from service.records.products import MatrixState
+from service.records.state import Mode
 from tests.states import changed
 from tests.unit.tracking.situations import Story, acknowledged, moved, rtc, verdict
 

@@ -7,18 +7,18 @@ from functools import cache
 import pytest
 
 from service.errors import CommandError, UnknownIdError
-from service.tracking import commands as cmd
-from service.tracking import events as ev
-from service.tracking.alarms import Alarm
-from service.tracking.operation_records import Acquisition, AcquisitionStage, MeasureState
+from service.records import commands as cmd
+from service.records import events as ev
+from service.records.alarms import Alarm
+from service.records.operations import Acquisition, AcquisitionStage, MeasureState
+from service.records.products import MatrixState, ModeSet
+from service.records.state import Mode
 from service.tracking.operations.running import (
     CurrentOperation,
     ServiceState,
     operating,
     running_operations,
 )
-from service.tracking.products import MatrixState, ModeSet
-from service.tracking.state import Mode
 from service.wire import DitherKind, DitherRequest, DitherStatus, Loop, Pattern
 from tests.states import changed
 from tests.unit.tracking.situations import POLICY, Story, rtc

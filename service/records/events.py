@@ -6,19 +6,18 @@ import re
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
-from service.control.expected_gain import ExpectedGain
-from service.control.gate import GateVerdict
-from service.estimation.comparison import ProbationFinding
-from service.estimation.estimate import PassiveEstimate
-from service.estimation.lockin import LockInEstimate
-from service.estimation.openloop import WideCaptureEstimate
-from service.estimation.random_dither import RandomEstimate
-from service.estimation.windows import WindowRefused
 from service.model.misregistration import Misregistration
-from service.tracking.commands import Command
-from service.tracking.operation_records import MeasurementRecord
-from service.tracking.products import Judged, ReconstructorRecord
-from service.tracking.state import Level, TrackerState
+from service.records.commands import Command
+from service.records.estimates import (
+    LockInEstimate,
+    PassiveEstimate,
+    RandomEstimate,
+    WideCaptureEstimate,
+    WindowRefused,
+)
+from service.records.operations import MeasurementRecord, ProbationFinding
+from service.records.products import ExpectedGain, GateVerdict, Judged, ReconstructorRecord
+from service.records.state import Level, TrackerState
 from service.wire import Acknowledgement, Reply, Status
 from service.wire import Command as Request
 

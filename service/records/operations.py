@@ -8,9 +8,237 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.comparison import ProbationFinding
 from service.model.misregistration import Misregistration
-from service.wire import MatrixStrokes, MeasuredManifest, Pattern, Status
+from service.wire import DitherRequest, MatrixStrokes, MeasuredManifest, Pattern, Status
+
+Array = NDArray[np.float64]
+
+
+class Verdict(StrEnum):
+    """Outcome of a comparison."""
+
+    AS_GOOD = "as-good"
+    WORSE = "worse"
+    UNKNOWN = "unknown"
+    """It could not be made; the text says why."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProbationFinding:
+    """Telemetry with one matrix against telemetry with the one before."""
+
+    verdict: Verdict
+    before: str
+    """Id of the matrix before."""
+
+    after: str
+    """Id of the one that is judged."""
+
+    text: str
+    """The numbers in words, or why there are none."""
+
+    after_s: float = 0.0
+    """Telemetry with it, seconds."""
+
+    mode: int = -1
+    """The one that has grown most against all others; -1: none was compared."""
+
+    mode_ratio: float = 0.0
+    """RMS of its steps over that before, less what all modes have in common."""
+
+    limit: float = 0.0
+    """Limit of that ratio; a larger ratio is worse."""
+
+    common_ratio: float = 0.0
+    """RMS of the steps over those before: the median of all modes."""
+
+    slopes_ratio: float = 0.0
+    """RMS of all slopes over that before."""
+
+    lost: bool = False
+    """True if the loop has stopped correcting: the wavefront would be no worse without it."""
+
+    residual_ratio: float | None = None
+    """RMS of the residual as both matrices measure it, divided by that before the swap, with seeing
+    taken out. If the numbers of the new matrix are unknown, as the previous matrix measures it;
+    None if neither is known."""
+
+    residual_limit: float | None = None
+    """Limit of that ratio; a larger ratio is worse. None if the ratio is None."""
+
+    ring_ratio: float | None = None
+    """RMS of the outer ring against the mirror inside, over that before; None: too few modes."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Schedule:
+    """Dither with one burst every ``interval_s``."""
+
+    total_m: float
+    """RMS of all lines together, metres OPD."""
+
+    interval_s: float
+    """Interval between the starts of two bursts, seconds; without pauses it is ``window_s``."""
+
+    sigma: Array
+    """``(4,)`` 1 σ of α just before each burst, which is its maximum, numeric units."""
+
+    sufficient: bool
+    """True if the required σ is met; else the whole budget is used and σ is close to the best."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Dither:
+    """A dither that the service follows, requested or running."""
+
+    request: DitherRequest
+    """Request that the RTC plays."""
+
+    start_seq: int | None = None
+    """First frame that contains it; None until the RTC has accepted."""
+
+    asked_ns_utc: int
+    """Time of the request, later of its acceptance or adoption."""
+
+    window_s: float | None = None
+    """Telemetry in one estimate, seconds, if planned with the dither; otherwise None."""
+
+    cause: str = field(default="", compare=False)
+    """Id of the order or event that led to the request; empty if the dither was adopted."""
+
+    @property
+    def id(self) -> str:
+        """Id of the request."""
+        return self.request.id
+
+    @property
+    def frequency_hz(self) -> tuple[float, ...]:
+        """Frequency of each mode of a sine dither; empty for a binary dither."""
+        return self.request.frequency_hz or ()
+
+
+class DitherPhase(StrEnum):
+    """Phases of the dither policy."""
+
+    OFF = "off"
+    """None is wanted, or none can be had."""
+
+    ACQUIRE = "acquire"
+    """α is not known, or something asks to see it again: the whole budget, without pause."""
+
+    PROVE = "prove"
+    """Modes that are to be controlled are shown to the sensor first, the whole budget on them."""
+
+    FOLLOW = "follow"
+    """Without pause, for the flexure leaves no time for one; as weak as that allows."""
+
+    SPARSE = "sparse"
+    """A sitting of a few windows now and then, off in between."""
+
+    OPERATOR = "operator"
+    """An operator's own, or one somebody else started."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Precision:
+    """Precision of windows, learnt from accepted ones and kept from star to star."""
+
+    ratio: NDArray[np.float64]
+    """``(4,)`` measured κ of ``σ = κ / (A sqrt(T))`` over that of the table for the magnitude."""
+
+    n_windows: int
+    """Windows it was learnt from."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DitherPlan(Schedule):
+    """The dither that is wanted in the present state."""
+
+    mean_cost_m: float
+    """Quadratic mean of the dither over time, pauses included, metres OPD."""
+
+    window_s: float
+    """Telemetry in one estimate, seconds."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DitherPolicyState:
+    """Memory of the dither policy, and its report to the operator."""
+
+    phase: DitherPhase = DitherPhase.OFF
+    reason: str = "nothing has been decided yet"
+    """Reason for the present phase."""
+
+    budget_m: float = 0.0
+    """Largest RMS of all lines together that settings and RTC allow, metres OPD."""
+
+    plan: DitherPlan | None = None
+    """Present schedule; None if none has been computed yet."""
+
+    next_ns_utc: int | None = None
+    """Start of the next dither; None if one runs now or none is planned."""
+
+    precision: Precision | None = None
+    """Precision of windows; None if no window has been accepted yet."""
+
+    avoided_hz: tuple[float, ...] = ()
+    """Vibrations that the lines avoid, Hz."""
+
+    lines_hz: tuple[float, ...] = ()
+    """Lines of the last requested dither, Hz; they are kept if possible."""
+
+    passive_ns_utc: int | None = None
+    """Time at which the estimate was last renewed without a dithered window."""
+
+    results_due: int = 0
+    """Total of accepted windows at which the last dither has delivered its results."""
+
+    ended_ns_utc: int | None = None
+    """Time at which the service's last dither ended by itself; None if one runs, or it was stopped.
+    """
+
+    stopped_id: str | None = None
+    """Id of the last dither that the service stopped without an order."""
+
+    stopped_ns_utc: int = 0
+    """Time of the first request to stop it."""
+
+    unwanted_id: str | None = None
+    """Id of a dither that the RTC plays and should not; None if there is none."""
+
+    stop_asked_ns_utc: int = 0
+    """Time of the last request to stop an unwanted dither."""
+
+    loud_id: str | None = None
+    """Id of the last dither that the RTC played stronger than requested and than the budget."""
+
+    loud_ns_utc: int = 0
+    """Time of the last request to stop a dither that was too strong; 0 if there was none."""
+
+    loud_text: str = ""
+    """Measured excess of that dither; empty if its status showed it."""
+
+    amiss_id: str | None = None
+    """Id of the last dither that differed from its request in the frames."""
+
+    amiss_m: float = 0.0
+    """RMS of all its lines together, metres OPD."""
+
+    mean_square_m2: float = 0.0
+    """Mean square of the dither on the mirror, over ten minutes, metres OPD squared."""
+
+    seen_ns_utc: int | None = None
+    """End of the interval of that mean."""
+
+    @property
+    def mean_cost_m(self) -> float:
+        """Quadratic mean of the dither on the mirror, over ten minutes, metres OPD."""
+        return float(np.sqrt(self.mean_square_m2))
+
+    @property
+    def n_windows_learnt(self) -> int:
+        """Windows from which the precision was learnt."""
+        return 0 if self.precision is None else self.precision.n_windows
 
 
 class AcquisitionStage(StrEnum):

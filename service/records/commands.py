@@ -15,9 +15,9 @@ from typing_extensions import override
 
 from service.errors import shown
 from service.files import MAX_MODES
-from service.tracking.alarms import Severity
-from service.tracking.products import ModeSet
-from service.tracking.state import Mode
+from service.records.alarms import Severity
+from service.records.products import ModeSet
+from service.records.state import Mode
 from service.wire import DitherKind, Pattern
 
 MAX_SINES = 64

@@ -1,21 +1,49 @@
-"""The registration and the estimates it is made of."""
+"""Records of α: the estimate in force, its gains and bias, history, law and offload."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.control.gains import ModeGain
-from service.estimation.kalman import Bias
 from service.model.misregistration import Determination, Misregistration
 from service.wire import Pointing
 
 Array = NDArray[np.float64]
-_Timed = TypeVar("_Timed", bound="TimedEstimate")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModeGain:
+    """Optical gain of one mode, averaged over the windows in which it was dithered."""
+
+    mode: int
+    """0-based basis index."""
+
+    gain: float
+    """Modulus of the measured over the modelled response."""
+
+    sigma: float
+    """1 σ of ``gain`` at ``t_ns_utc``."""
+
+    scatter: float
+    """1 σ of a single window, from the scatter of the windows."""
+
+    t_ns_utc: int
+    """End of the last window in which the mode was dithered, ns since the Unix epoch, UTC."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Bias:
+    """State of the bias of the passive estimate, besides mean and covariance."""
+
+    excess: Array = field(default_factory=lambda: np.zeros(4))
+    """``(4,)`` variance of the bias beyond its floor that estimates have indicated, and that is in
+    the covariance or has been learnt since."""
+
+    scatter: float = 1.0
+    """Ratio of the scatter of estimates to their covariances, in variance; at least 1."""
 
 
 class Source(StrEnum):
@@ -142,11 +170,6 @@ class PassiveBias(Bias):
 
     previous_estimate: PreviousEstimate | None = None
     """α and bias together before that one; None: it was the first, or has been doubted."""
-
-
-def without_previous(bias: PassiveBias | None) -> PassiveBias | None:
-    """Return the bias without what was known before its last update: it is out of date."""
-    return bias and replace(bias, previous_estimate=None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -295,6 +318,16 @@ class Registration:
         return np.sqrt(np.diag(self.total_covariance))
 
     @property
+    def tracking_sigma(self) -> Array:
+        """``(4,)`` 1 σ of changes of α now: without the model error, the same for every window.
+
+        Limits of age apply to it. The model error is neither age nor reduced by a window: it
+        includes unknown places of pupil images, a coarse mirror and what windows leave unexplained.
+        Whether a loop is safe with it is decided by the stability gate, which examines α ± 3σ.
+        """
+        return np.sqrt(np.diag(self.covariance) + self.grown)
+
+    @property
     def shown_covariance(self) -> Array:
         """``(4, 4)`` covariance of the error of α now, unstated places of images included."""
         return self.total_covariance + np.diag(self.image_floor**2)
@@ -399,35 +432,6 @@ class LawState:
 
     leap: LawLeap | None = None
     """Step that no window has confirmed; None if there is none."""
-
-
-def moved(registration: Registration, step: Array) -> Registration:
-    """Return what is known of α with all of it a step ``(4,)`` further, numeric units."""
-    bias = registration.bias
-    if bias is not None:
-        bias = replace(bias, previous_estimate=_previous_moved(bias.previous_estimate, step))
-    return replace(
-        registration,
-        alpha=registration.alpha.add_step(step),
-        previous_estimate=_previous_moved(registration.previous_estimate, step),
-        suspected_jump=_moved(registration.suspected_jump, step),
-        bias=bias,
-    )
-
-
-def _previous_moved(previous: PreviousEstimate | None, step: Array) -> PreviousEstimate | None:
-    if previous is None:
-        return None
-    return replace(
-        previous,
-        alpha=previous.alpha.add_step(step),
-        next_window=_moved(previous.next_window, step),
-        previous_estimate=_previous_moved(previous.previous_estimate, step),
-    )
-
-
-def _moved(estimate: _Timed | None, step: Array) -> _Timed | None:
-    return None if estimate is None else replace(estimate, alpha=estimate.alpha.add_step(step))
 
 
 class OffloadState(StrEnum):

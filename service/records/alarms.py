@@ -53,9 +53,11 @@ STANDING_BY = "standing-by"
 FRAMES_UNUSED = "frames-unused"
 FRAMES_LOST = "frames-lost"
 NO_FRAMES = "no-frames"
+TELEMETRY_OLD = "telemetry-old"
 CLOCK_LEAPT = "clock-leapt"
 NOT_RESTORED = "alpha-not-restored"
 LINK_FLOODED = "link-flooded"
+REST_CROWDED = "rest-crowded"
 LINK_REFUSED = "link-refused"
 CERTIFICATE_ENDING = "certificate-ending"
 WINDOWS_REFUSED = "windows-refused"
@@ -128,6 +130,9 @@ class Responsible(StrEnum):
 
     SERVICE = "service"
     """Another one, of the same system."""
+
+    NETWORK = "network"
+    """Whoever starts routers, addresses and names, or has the port."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -5,19 +5,25 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from service.control.gate import GateVerdict
 from service.model.misregistration import Misregistration
-from service.tracking.alarms import Alarm, AlarmRecord
-from service.tracking.dither_request import Dither, DitherPolicyState
-from service.tracking.mode_limits import ModeLimit, ModeProof
-from service.tracking.operation_records import (
+from service.records.alarms import Alarm, AlarmRecord
+from service.records.operations import (
     Acquisition,
+    Dither,
+    DitherPolicyState,
     LoopCommand,
     MeasurementRecord,
     Probation,
 )
-from service.tracking.products import Assessment, MatrixState, ReconstructorRecord
-from service.tracking.registration import (
+from service.records.products import (
+    Assessment,
+    GateVerdict,
+    MatrixState,
+    ModeLimit,
+    ModeProof,
+    ReconstructorRecord,
+)
+from service.records.registration import (
     HistoryEntry,
     LawState,
     Offload,

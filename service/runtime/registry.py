@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+import numpy as np
+
 from service.estimation.control_law import ControlLawCheck
 from service.estimation.dither_monitor import MAX_AMPLITUDE_RATIO, DitherMeasurement, DitherWatch
 from service.estimation.dither_windows import DitherWindows
@@ -100,6 +102,20 @@ def _held(_: Rejection, now: Rejection, loop: LoopContext, state: TrackerState) 
     return [] if holds is None or holds is state.loop.holds else [ev.LoopHeld(holds=holds)]
 
 
+def _report_opposite(
+    before: LoopCheck, now: LoopCheck, loop: LoopContext, state: TrackerState
+) -> list[Event]:
+    found = now.opposite
+    if found is None or found is before.opposite:
+        return []
+    text = (
+        "the RTC applies another matrix than it says: the first commands with "
+        f"{found.cm_id} are {np.nanmedian(found.share):.2f} times what its numbers require: the "
+        "sign of the matrix is turned in the RTC"
+    )
+    return [ev.MatrixMisapplied(id=found.cm_id, text=text)]
+
+
 def _report_comparison(
     _: Comparison, now: Comparison, loop: LoopContext, state: TrackerState
 ) -> list[Event]:
@@ -142,7 +158,11 @@ REGISTRY: Final = (
     Entry(ControlLawCheck, {alarms.WRONG_LOOP: "the loop follows its status again"}),
     Entry(EdgeHealth, {alarms.EDGE_SLIP: "the outer ring is back"}),
     Entry(PlayedCommands, {alarms.NOT_PLAYED: "the slopes answer the commands again"}),
-    Entry(LoopCheck, {alarms.OFF_LOOP: "commands obey the loop equation again"}),
+    Entry(
+        LoopCheck,
+        {alarms.OFF_LOOP: "commands obey the loop equation again"},
+        events=_report_opposite,
+    ),
     Entry(Rejection, events=_held),
     Entry(Comparison, events=_report_comparison),
     Entry(Passive),

@@ -76,7 +76,7 @@ POSITION_ERROR_PITCH = 0.02
 none: an assumption. It is bounded by the residual beyond ``EXACT_RESIDUAL``, for such errors leave
 about the same share: 2 % of a pitch leave 2.2 % of the signal of 40 modes of 144 actuators."""
 
-EXACT_RESIDUAL = 0.01
+EXACT_RESIDUAL = 0.015
 """RMS share of the signal that may be left over although all actuators are in place: matrices of
 other codes leave 0.2 to 2 %, most of them about 1 %."""
 

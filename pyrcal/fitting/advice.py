@@ -18,12 +18,7 @@ from pyrcal.fitting.alternatives import (
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.left_over import locate_residual
 from pyrcal.fitting.origins import Origin
-from pyrcal.fitting.verdict import (
-    MIN_EDGE_MOVE_SUBAP,
-    UNDECIDED_WORDS,
-    Refusal,
-    edge_move,
-)
+from pyrcal.fitting.verdict import UNDECIDED_WORDS, Refusal, edge_move
 
 Array = NDArray[np.float64]
 
@@ -34,10 +29,6 @@ subaperture, the accuracy that Heritier et al. 2018, section 3.2, require of a s
 MAX_USABLE_SUBAP = 0.1
 """Largest 1 σ at the pupil's edge of a registration that is recommended, even if the reconstructor
 is stable with all modes."""
-
-MIN_CORRECTION_EXPLAINED = 0.01
-"""RMS share of the signal that a correction of the instrument file must explain if it would hardly
-move the registration."""
 
 MIN_NOISE_SHARE = 0.5
 """Share of the residual's power that must be noise for averaging to be advised. With pokes of
@@ -230,12 +221,7 @@ def _list_corrections(fit: Fit) -> Iterator[str]:
         if one.correct:
             yield f"{one.key} = {one.found}"
     best = _choose_correction(fit)
-    # What explains little and changes nothing at the edge is no reason to edit a file: errors of
-    # the model look the same.
-    if best is not None and (
-        fit.residual_fraction**2 * (1.0 - (best.share or 0.0)) > MIN_CORRECTION_EXPLAINED**2
-        or edge_move(best.moved, _radius(fit)) > MIN_EDGE_MOVE_SUBAP
-    ):
+    if best is not None:
         yield best.key
 
 

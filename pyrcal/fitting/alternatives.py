@@ -110,16 +110,17 @@ class Alternative:
         """Return the weight of the square of its change of α in σ, 0 to 1.
 
         An explanation that the matrix prefers counts in full, one that is not excluded by its
-        probability. Models of one instrument differ by ``MIN_EXPLAINED`` of the signal, and any
-        additional fitted number explains some of that by coincidence: smaller improvements are no
-        evidence for it.
+        probability, which is smaller the larger its misfit is. Models of one instrument differ by
+        ``MIN_EXPLAINED`` of the signal, and any additional fitted number explains some of that by
+        coincidence: smaller improvements are no evidence for it.
         """
         if not self.counts or not (self.preferred or self.undecided):
             return 0.0
         explained = residual_fraction
         if self.is_number and self.share is not None:
             explained *= float(np.sqrt(max(1.0 - self.share, 0.0)))
-        probability = 1.0 if self.preferred else OTHER_SHARE
+        worse = 1.0 if self.share is None else max(self.share, 1.0)
+        probability = 1.0 if self.preferred else OTHER_SHARE / worse**2
         return probability * min(1.0, explained / MIN_EXPLAINED) ** 2
 
 

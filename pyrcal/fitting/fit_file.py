@@ -202,7 +202,7 @@ def make_reference(recorded: Recorded, instrument: Instrument) -> tuple[Referenc
     MatrixError
         If the file holds frames and the instrument slopes, or the other way round.
     """
-    notes = list(instrument.remarks)
+    notes = [*instrument.remarks, *filter(None, [recorded.remark])]
     double_pass = instrument.double_pass
     # The measured file describes the measurement itself, so it takes precedence.
     if recorded.double_pass is not None and recorded.double_pass is not double_pass:

@@ -76,6 +76,10 @@ class Advice(StrEnum):
     DO_NOT_USE = "do not use it"
 
 
+_BY_ANOTHER_INSTRUMENT = {Refusal.ANOTHER_INSTRUMENT, Refusal.UNSETTLED, Refusal.UNDETERMINED}
+"""Reasons of a refusal that a wrong value of the instrument file also causes."""
+
+
 def add_explanations(fit: Fit, tried: tuple[Alternative, ...], grounds: Grounds) -> Fit:
     """Return the fit with alternatives, residual analysis and recommendation filled in."""
     preferred = (
@@ -169,7 +173,8 @@ def _explain_uncertainty(fit: Fit, grounds: Grounds, edge: float, radius: float)
 
 def _advise_refused(fit: Fit, grounds: Grounds) -> str:
     match grounds.refusal:
-        case Refusal.UNDETERMINED:
+        # an explanation that the matrix prefers widens sigma: it is the cause then
+        case Refusal.UNDETERMINED if _choose_correction(fit) is None:
             return f"{Advice.MEASURE_MORE}: the modes do not determine the registration"
         case Refusal.ANOTHER_MINIMUM:
             return (
@@ -193,7 +198,7 @@ def _find_cause(fit: Fit, grounds: Grounds) -> str:
     if grounds.columns and grounds.refusal is not Refusal.AXES:
         return "; ".join(grounds.columns)
     best = _choose_correction(fit)
-    if best is not None and grounds.refusal is Refusal.ANOTHER_INSTRUMENT:
+    if best is not None and grounds.refusal in _BY_ANOTHER_INSTRUMENT:
         number = next(_list_wrong_numbers(fit), None)
         if number is not None and grounds.numbers_share < (best.share or 0.0):
             return f"{number.words}; correct that and fit again"

@@ -59,6 +59,9 @@ LIGHT_KEY = "--gain-map"
 CENTRED_KEY = "pupil, or valid_subapertures, centred"
 """Keys of the instrument file to correct if the pupil is not centred."""
 
+LIGHT_KEY = "--gain-map"
+"""Option by which uneven light is fitted."""
+
 ARM_SUBAP = 0.5
 """Width of the arms in the trial model, subapertures; the best width is extrapolated from it."""
 
@@ -379,7 +382,7 @@ def _try_uneven_light(few: FitSubset) -> Iterator[Alternative]:
     maps = [pattern[:, None] * few.own for pattern in gain_maps(few)]
     _, lead, moved = _fit_with_rates(few, *maps)
     yield Alternative(
-        words="uneven light (--gain-map)",
+        words=f"uneven light ({LIGHT_KEY})",
         share=lead.share,
         moved=moved,
         undecided=is_open(lead),

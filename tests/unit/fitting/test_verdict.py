@@ -166,6 +166,16 @@ def test_as_much_noise_as_signal_determines_the_registration_as_far_as_sigma_say
     assert np.all(np.abs(error(found)) < 3.0 * found.sigma)
 
 
+@pytest.mark.parametrize(("scatter", "accepted"), [(0.2, True), (0.7, False)])
+def test_half_of_the_signal_left_over_without_noise_or_cause_is_refused(scatter, accepted):
+    """Gains of single slopes: no instrument explains them, and no mode moves by them."""
+    gains = 1.0 + scatter * np.random.default_rng(8).normal(size=(len(matrix()), 1))
+    found = fit(gains * matrix(), options=EXPLAIN)
+    assert found.accepted == accepted
+    assert ("no cause was found" in found.verdict) != accepted
+    assert ("no cause was found" in found.recommendation) != accepted
+
+
 def test_columns_of_noise_alone_are_named_and_left_out():
     dead = matrix()
     dead[:, [3, 20, 30]] = 0.3 * dead.std() * RNG.normal(size=(len(dead), 3))

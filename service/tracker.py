@@ -233,6 +233,7 @@ REACTIONS: Final[dict[type, Callable[[StepContext, Any], object]]] = {
     ev.DitherMeasured: _on_dither_measured,
     ev.Compared: probation.on_compared,
     ev.LoopHeld: rtc.on_loop_held,
+    ev.MatrixMisapplied: reconstructors.on_misapplied,
     ev.Vibrations: rtc.on_vibrations,
     ev.JobFailed: _on_failure,
     cmd.SetMode: operator.set_mode,

@@ -54,6 +54,8 @@ class FaultKind(StrEnum):
     MUTE = "mute"
     DEAF = "deaf"
     LATE_SWAP = "late-swap"
+    EARLY_ACK = "early-ack"
+    TURNED_SIGN = "turned-sign"
     DITHER_LOST = "dither-lost"
     DITHER_LATE = "dither-late"
     MIRROR_SILENT = "mirror-silent"
@@ -113,6 +115,11 @@ FORMS: Final[dict[FaultKind, tuple[tuple[Argument, ...], str]]] = {
         (Argument("DELAY", 4.0, 0.001, 600.0), _SECONDS),
         "reconstructors are staged, and applied DELAY seconds later",
     ),
+    FaultKind.EARLY_ACK: (
+        (Argument("DELAY", 4.0, 0.001, 1e6), _SECONDS),
+        "reconstructors are acknowledged as applied at once, and applied DELAY seconds later",
+    ),
+    FaultKind.TURNED_SIGN: ((_SECONDS,), "reconstructors are applied with the sign turned"),
     FaultKind.DITHER_LOST: ((_SECONDS,), "dithers are accepted and never reach the mirror"),
     FaultKind.DITHER_LATE: ((_DELAY, _SECONDS), "dithers begin DELAY after the announced frame"),
     FaultKind.MIRROR_SILENT: (

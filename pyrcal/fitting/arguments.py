@@ -254,7 +254,7 @@ def _describe_fit(fit: OneLineParser) -> None:
     add(
         fit,
         _INSTRUMENT,
-        words("reference REFERENCE", "HDF5, FITS or NumPy file", type=Path),
+        words("reference REFERENCE", "HDF5, FITS, NumPy or MATLAB file", type=Path),
         words("--dataset NAME", "dataset of the matrix, default interaction_matrix"),
         words("--method", methods, choices=("joint", "paper", "sensitivity"), default="joint"),
         words("--modes FIRST:END", modes, type=_read_by(parse_modes)),
@@ -366,7 +366,7 @@ def _describe_conventions(check: OneLineParser) -> None:
     add(
         check,
         _INSTRUMENT,
-        words("reference REFERENCE", "HDF5, FITS or NumPy file", type=Path),
+        words("reference REFERENCE", "HDF5, FITS, NumPy or MATLAB file", type=Path),
         words("--dataset NAME", "dataset of the matrix, default interaction_matrix"),
     )
 

@@ -1,4 +1,4 @@
-"""A measured interaction matrix in an HDF5, FITS or NumPy file."""
+"""A measured interaction matrix in an HDF5, FITS, NumPy or MATLAB file."""
 
 from __future__ import annotations
 
@@ -101,9 +101,12 @@ class Recorded:
     sha256: str
     """SHA-256 of the whole file, 64 lower-case hex digits."""
 
+    remark: str = ""
+    """What a user has to know of the values; empty if nothing."""
+
 
 def read_recorded(path: Path, dataset: str | None = None) -> Recorded:
-    """Read a measured matrix from an HDF5, FITS or NumPy file.
+    """Read a measured matrix from an HDF5, FITS, NumPy or MATLAB file.
 
     In the same HDF5 group, or as further FITS extensions, ``modes`` (``(n_modes,)``, basis
     indices), ``noise`` (``(n_modes,)``) and ``flux_frame`` are read if present. ``modes`` and
@@ -145,6 +148,7 @@ def read_recorded(path: Path, dataset: str | None = None) -> Recorded:
             flux_frame=_numbers(find_sibling(FLUX_FRAME)),
             where=stored.where,
             sha256=file_sha256(path),
+            remark=stored.remark,
         )
 
 

@@ -141,6 +141,7 @@ class _Folder:
             values = stored.numbers()
         self.used.add(path.resolve())
         self.taken.append(f"took {self.name(path)} {values.shape}: {purpose}")
+        self.taken += filter(None, [stored.remark])
         return values
 
     def name(self, path: Path) -> str:

@@ -53,7 +53,7 @@ def _arrays(options: argparse.Namespace) -> Imported:
     found: dict[str, Array] = {}
     inventory: list[str] = []
     for role, path in _files(options.files):
-        arrays = _by_role(role, path, options.source)
+        arrays = _by_role(role, path, options.source, inventory)
         if not arrays:
             inventory.append(f"ignored {path}: no name of a role, see docs/howto/importing.md")
         # Modes of the command line are preferred to those in a file's name.
@@ -78,15 +78,17 @@ def _files(given: Sequence[tuple[str | None, Path]]) -> Iterator[tuple[str | Non
         if role is None and path.is_dir():
             for one in sorted(path.iterdir()):
                 name = one.name.lower()
-                if one.is_file() and name.endswith(_ARRAY_FILES) and _role_of(one) is not None:
+                # Arrays of a MATLAB file have names, whatever that of the file is.
+                known = _role_of(one) is not None or name.endswith(".mat")
+                if one.is_file() and name.endswith(_ARRAY_FILES) and known:
                     yield None, one
         else:
             yield role, path
 
 
-def _by_role(role: str | None, path: Path, source: str) -> dict[str, Array]:
+def _by_role(role: str | None, path: Path, source: str, inventory: list[str]) -> dict[str, Array]:
     """Return the arrays of a file by role, from their names or the file's name."""
-    arrays = _read(path)
+    arrays = _read(path, inventory)
     if role is not None:
         return {role: _only(arrays, str(path))}
     if source == "pyrtc":
@@ -114,11 +116,12 @@ def _role_of(path: Path) -> str | None:
     return role_of_name(path.name.partition(".")[0])
 
 
-def _read(path: Path) -> dict[str, Array]:
-    """Return the arrays of a file by name."""
+def _read(path: Path, inventory: list[str]) -> dict[str, Array]:
+    """Return the arrays of a file by name; remarks on them are appended to ``inventory``."""
     if zipfile.is_zipfile(path):
         return read_npz(path)
     with opened(path) as container:
+        inventory += filter(None, (stored.remark for stored in container.arrays.values()))
         return {name: stored.read() for name, stored in container.arrays.items()}
 
 
@@ -133,7 +136,7 @@ def _only(arrays: Mapping[str, Array], where: str) -> Array:
 def _positions(path: Path) -> Array:
     """Return positions ``(n_actuators, 2)`` of an array file, or of a text file of two columns."""
     if path.suffix.lower() not in {".txt", ".csv", ".dat"}:
-        return _only(_read(path), str(path))
+        return _only(_read(path, []), str(path))
     delimiter = "," if path.suffix.lower() == ".csv" else None
     try:
         return np.loadtxt(path, delimiter=delimiter, ndmin=2)
@@ -165,7 +168,7 @@ def _make_reported(options: argparse.Namespace) -> Reported:
     )
 
 
-_ARRAY_FILES = (".npy", ".fits", ".fits.gz", ".fits.fz", ".npz", ".h5")
+_ARRAY_FILES = (".npy", ".fits", ".fits.gz", ".fits.fz", ".npz", ".h5", ".mat")
 """Suffixes of files that are read from a folder."""
 
 

@@ -16,7 +16,7 @@ dither.
 
 _EPILOG = """
 TELEMETRY is a recording (pyrcal recordings start, pyrcal sim --record), an AOT file, a folder of
-the pyRTC recorder, or an HDF5 file or .npz with the arrays slopes (n_frames, n_slopes) and
+the pyRTC recorder, or an HDF5 file, .mat or .npz with the arrays slopes (n_frames, n_slopes) and
 commands_m (n_frames, n_modes), the number frame_rate_hz, and the optional arrays of
 docs/howto/tracking.md. Exit status: 0 alpha was estimated; 1 it was not (the table says why); 2
 input that cannot be used.
@@ -35,7 +35,7 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     add(
         track,
         words("instrument INSTRUMENT", INSTRUMENT),
-        words("telemetry TELEMETRY", "recording, AOT, pyRTC session, HDF5 or .npz", type=Path),
+        words("telemetry TELEMETRY", "recording, AOT, pyRTC, HDF5, .mat or .npz", type=Path),
         words("--config FILE", "settings of the service, TOML", type=Path),
         words("--json", "print JSON"),
         words("--plot FILE.png", "draw alpha over time", type=Path),

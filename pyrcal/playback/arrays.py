@@ -39,6 +39,7 @@ from pyrcal.playback.alignment import MAX_FRAMES, measure_delay
 from pyrcal.rtc.identity import Identity, Reconstructor
 from service.errors import ConfigurationError, say
 from service.files import FileKind, kind_of
+from service.files.container import opened
 from service.files.recording import Message, RecordedKind
 from service.files.whole import open_hdf5
 from service.model.instrument import Instrument
@@ -105,8 +106,11 @@ def open_arrays(path: Path) -> Iterator[Arrays]:
                 # Numbers may be attributes; an attribute does not take the place of an array.
                 found = {name: np.asarray(value) for name, value in file.attrs.items()}
                 found |= {k: v for k, v in file.items() if isinstance(v, h5py.Dataset)}
+            elif kind_of(path) is FileKind.MATLAB:
+                with opened(path) as container:
+                    found = {name: stored.read() for name, stored in container.arrays.items()}
             else:
-                raise ConfigurationError(f"{path}: expected telemetry in HDF5 or .npz")
+                raise ConfigurationError(f"{path}: expected telemetry in HDF5, .npz or .mat")
         except (OSError, RuntimeError, ValueError, KeyError) as error:
             raise ConfigurationError(f"{path}: damaged: {error}") from error
         yield Arrays(path=path, found=found)

@@ -84,11 +84,14 @@ def track(
         if _is_recording(path):
             with Recording(path) as recording:
                 return _play(recording.messages(), instrument, settings, recording.system)
-        if _is_fits(path):
-            return _play_aot(path, instrument, settings)
         if is_session(path):
             session = Arrays(path=path, found=read_session(path, instrument))
             return _play_arrays(session, instrument, settings)
+        begins = _read_header(path)
+        if path.is_dir() or path.suffix == ".txt" or (begins and b"AOT-VERS" not in begins):
+            raise ConfigurationError(f"{path}: {ONE_STREAM}")
+        if begins:
+            return _play_aot(path, instrument, settings)
         with open_arrays(path) as arrays:
             return _play_arrays(arrays, instrument, settings)
 
@@ -102,13 +105,23 @@ def _is_recording(path: Path) -> bool:
         return False
 
 
-def _is_fits(path: Path) -> bool:
+ONE_STREAM = (
+    "found a folder, a cube or its timing file, as recorders of MagAO-X and cacao write for each "
+    "stream; expected one file (.npz, HDF5 or MATLAB) with slopes (n_frames, n_slopes), the "
+    "commands_m (n_frames, n_modes) that were on the mirror meanwhile, metres of OPD, and "
+    "frame_rate_hz: pair both streams by their timing files, and make slopes of camera frames"
+)
+
+
+def _read_header(path: Path) -> bytes:
+    """Return the first keywords of a FITS file; nothing if it is another kind of file."""
     try:
         with path.open("rb") as file:
-            return file.read(6) == b"SIMPLE"
+            begins = file.read(1 << 16)
     except OSError:
         # Read as arrays it is refused with the reason.
-        return False
+        return b""
+    return begins if begins.startswith(b"SIMPLE") else b""
 
 
 def _play_aot(path: Path, instrument: Instrument, settings: Settings) -> Track:

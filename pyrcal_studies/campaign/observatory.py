@@ -925,6 +925,8 @@ class Observatory:
 
     def _performed(self, effect: Effect, state: TrackerState) -> Event | None:
         try:
+            if isinstance(effect, ev.SendMatrix):
+                self._engine.learn(effect.id, self._actions.matrix(effect.id))
             event = asyncio.run(self._actions.perform(effect, state))
         except PyrcalError as error:
             event = ev.JobFailed(effect=effect, text=str(error))

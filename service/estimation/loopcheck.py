@@ -56,6 +56,10 @@ MEAN_STEP_TOLERANCE = 0.12
 
 MAX_DELAY_FRAMES = 8
 
+MAX_OPPOSITE_SHARE = -0.5
+"""Median of the steps of all modes below which another matrix than the named one has made them. A
+mirror at its limits takes less of its steps, never the opposite of them."""
+
 MAX_CONSTANT_SHARE = 0.1
 """Fraction of the samples in which a mode may stay constant although it should move."""
 
@@ -83,6 +87,12 @@ class LoopCheck(Streaming):
 
     cm_id: str | None = None
     """The reconstructor all samples are of; None: there are none."""
+
+    swap_seq: int | None = None
+    """First frame of this reconstructor; None once its first frames have been judged."""
+
+    opposite_id: str | None = None
+    """Its id if its first commands went the opposite way; None if they did not."""
 
     tail: FrameBlock | None = None
     """The last few frames, for those that come."""
@@ -205,6 +215,12 @@ class CommandResidual:
         return not self.disobeys.any()
 
     @property
+    def is_opposite(self) -> bool:
+        """Return True if most modes move against the steps that the law requires."""
+        moving = self.share[~np.isnan(self.share)]
+        return len(moving) > 0 and bool(np.median(moving) < MAX_OPPOSITE_SHARE)
+
+    @property
     def text(self) -> str:
         """Return which modes do not, by how much, and what may be the cause."""
         off = np.flatnonzero(self.disobeys)
@@ -225,15 +241,21 @@ def observe(check: LoopCheck, block: FrameBlock, loop: ClosedLoop) -> LoopCheck:
     if n_delay > MAX_DELAY_FRAMES or block.cm_id != loop.cm_id:
         return replace(check, tail=None)
     if check.cm_id != loop.cm_id:  # frames of another matrix come before the status that tells it
+        first_seq = max(block.first_seq, check.from_seq)
         check = replace(check, cm_id=loop.cm_id, tail=None, waiting=(), batches=())
+        check = replace(check, swap_seq=first_seq, opposite_id=None)
     depth = n_delay + _STEPS + _TAPS - 1
     tail = check.tail
     if tail is not None and not _goes_on(tail, block):
         tail = None
     stride = max(1, round(loop.frame_rate_hz / SAMPLES_PER_S))
     waiting = list(check.waiting)
-    # By frame number: the samples do not depend on how the frames are cut into blocks.
-    for row in range(-block.first_seq % stride, block.n_frames, stride):
+    # A matrix of the wrong sign loses the loop within some tens of frames: each of the first is
+    # looked at. By frame number: the samples do not depend on how frames are cut into blocks.
+    judged_seq = -1 if check.swap_seq is None else check.swap_seq + depth - 1 + MIN_SAMPLES
+    n_first = min(max(judged_seq - block.first_seq, 0), block.n_frames)
+    later = n_first + -(block.first_seq + n_first) % stride
+    for row in (*range(n_first), *range(later, block.n_frames, stride)):
         if row + 1 < depth:
             frames = _last(tail, block.rows(0, row + 1), depth)
         else:
@@ -241,7 +263,12 @@ def observe(check: LoopCheck, block: FrameBlock, loop: ClosedLoop) -> LoopCheck:
         if frames.n_frames == depth and frames.first_seq >= check.from_seq:
             waiting.append(_sample(frames, loop))
     check = replace(check, tail=_last(tail, block, depth), waiting=tuple(waiting))
-    return _multiply_waiting(check, loop) if len(waiting) >= BATCH_SAMPLES else check
+    if check.swap_seq is not None and block.next_seq >= judged_seq:
+        _, found = command_residual(check, loop, check.swap_seq, judged_seq - 1, WINDOW_SAMPLES)
+        opposite_id = loop.cm_id if found is not None and found.is_opposite else None
+        kept = tuple(s for s in waiting if s.seq >= judged_seq or s.seq % stride == 0)
+        check = replace(check, swap_seq=None, opposite_id=opposite_id, waiting=kept)
+    return _multiply_waiting(check, loop) if len(check.waiting) >= BATCH_SAMPLES else check
 
 
 def command_residual(

@@ -30,7 +30,6 @@ _FITS_BEGINS = (b"SIMPLE  =", b"\x1f\x8b")
 NUMPY_BEGINS = b"\x93NUMPY"
 
 _OTHERS = {
-    b"MATLAB 5": ("a MATLAB file older than 7.3", "save it with -v7.3"),
     b"PK\x03\x04": (
         "a zip archive, as np.savez writes",
         "save the matrix alone with np.save, or read it with pyrcal import files",
@@ -49,6 +48,8 @@ class FileKind(StrEnum):
     HDF5 = "HDF5"
     FITS = "FITS"
     NUMPY = "NumPy"
+    MATLAB = "MATLAB"
+    """Version 5 to 7, or the HDF5 of version 7.3, with its axes reversed."""
 
 
 def kind_of(path: Path) -> FileKind:
@@ -70,6 +71,8 @@ def kind_of(path: Path) -> FileKind:
                 there, offset = file.read(8), 2 * offset
     except OSError as error:
         raise MatrixError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if begins.startswith(b"MATLAB "):
+        return FileKind.MATLAB
     if there:
         return FileKind.HDF5
     if begins.startswith(_FITS_BEGINS):
@@ -77,7 +80,7 @@ def kind_of(path: Path) -> FileKind:
     if begins.startswith(NUMPY_BEGINS):
         return FileKind.NUMPY
     kind, advice = _other_kind(begins)
-    raise MatrixError(f"{path}: found {kind}, expected an HDF5, a FITS or a NumPy file; {advice}")
+    raise MatrixError(f"{path}: found {kind}, expected HDF5, FITS, NumPy or MATLAB; {advice}")
 
 
 def _other_kind(begins: bytes) -> tuple[str, str]:

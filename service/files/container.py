@@ -1,4 +1,4 @@
-"""Read HDF5, FITS and NumPy files alike.
+"""Read HDF5, FITS, NumPy and MATLAB files alike.
 
 Their arrays have names and can be looked at before they are read.
 """
@@ -10,7 +10,7 @@ import warnings
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tokenize import TokenError
@@ -18,6 +18,7 @@ from typing import Any, NoReturn, Protocol
 
 import h5py
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from service.errors import MatrixError
@@ -58,6 +59,9 @@ class StoredArray:
 
     at_once: tuple[int, ...] = ()
     """Shape of what is unpacked at once, which may exceed ``shape``; empty: all of it."""
+
+    remark: str = ""
+    """What a user has to know of the values; empty if nothing."""
 
     def numbers(self) -> NDArray[np.float64]:
         """Return it as native float64, whatever its byte order.
@@ -134,14 +138,19 @@ class _ImageHdu(Protocol):
 
 @contextmanager
 def opened(path: Path) -> Iterator[Container]:
-    """Open an HDF5, FITS or NumPy file, known by its content and not by its name.
+    """Open an HDF5, FITS, NumPy or MATLAB file, known by its content and not by its name.
 
     Raises
     ------
     MatrixError
         If there is no such file, it is none of them, or it is damaged.
     """
-    readers = {FileKind.HDF5: _hdf5, FileKind.FITS: _fits, FileKind.NUMPY: _numpy}
+    readers = {
+        FileKind.HDF5: _hdf5,
+        FileKind.FITS: _fits,
+        FileKind.NUMPY: _numpy,
+        FileKind.MATLAB: _matlab,
+    }
     with readers[kind_of(path)](path) as container:
         yield container
 
@@ -243,7 +252,20 @@ def _image(hdu: _ImageHdu, where: str, file_bytes: int) -> StoredArray:
         dtype=np.dtype(f"f{8 if abs(hdu.header['BITPIX']) > 32 else 4}"),
         stored_bytes=file_bytes,
         load=partial(_data, hdu),
+        remark=f"{where}: {LOSSY}" if _is_lossy(hdu) else "",
     )
+
+
+LOSSY = (
+    "compressed with loss: values are rounded to a fraction of their noise, or of the signal where "
+    "there is none; fpack -g -q 0 loses nothing"
+)
+
+
+def _is_lossy(hdu: _ImageHdu) -> bool:
+    """Return True if an image was rounded before it was compressed."""
+    packed = getattr(hdu, "compressed_data", None)
+    return packed is not None and "ZSCALE" in packed.names
 
 
 def _data(hdu: _ImageHdu) -> NDArray[Any]:
@@ -279,6 +301,46 @@ def _numpy(path: Path) -> Iterator[Container]:
     )
     arrays = {DATASET: stored}
     yield Container(path=path, arrays=arrays, find=arrays.get, facts={})
+
+
+@contextmanager
+def _matlab(path: Path) -> Iterator[Container]:
+    """Open a MATLAB file: of version 7.3, which is HDF5, or an older one."""
+    if h5py.is_hdf5(path):
+        with _hdf5(path) as found:
+            yield _reverse_axes(found)
+        return
+    try:
+        loaded = scipy.io.loadmat(path)
+    except Exception as error:  # scipy's reader raises whatever damaged numbers lead to
+        raise MatrixError(f"{path}: damaged MATLAB file: {error}") from error
+    arrays = {
+        name: StoredArray(
+            where=f"{path}:{name}",
+            shape=values.T.shape,
+            dtype=values.dtype,
+            stored_bytes=values.nbytes,
+            load=partial(np.transpose, values),
+        )
+        for name, values in loaded.items()
+        if isinstance(values, np.ndarray) and values.dtype.kind in "biuf"
+    }
+    yield _reverse_axes(Container(path=path, arrays=arrays, find=arrays.get, facts={}))
+
+
+def _reverse_axes(found: Container) -> Container:
+    """Return the arrays of MATLAB, whose first axis is the last one in HDF5."""
+    # Groups like "#refs#" hold what cells and objects refer to.
+    arrays = {name: _reversed(one) for name, one in found.arrays.items() if name[0] != "#"}
+    return replace(found, arrays=arrays, find=lambda name: arrays.get(name.strip("/")))
+
+
+def _reversed(stored: StoredArray) -> StoredArray:
+    shape = stored.shape[::-1]
+    # MATLAB has no vectors: theirs are matrices of one row or column.
+    if len(shape) == 2 and 1 in shape:
+        shape = (max(shape),)
+    return replace(stored, shape=shape, load=lambda: stored.load().T.reshape(shape))
 
 
 # --- a measured interaction matrix, with what its file says of the measurement

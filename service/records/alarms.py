@@ -70,6 +70,7 @@ LOOP_OPENED = "loop-opened"
 SLOPES_STAND = "slopes-stand"
 NOT_FOUND = "registration-not-found"
 UNDECLARED = "undeclared-transition"
+MISAPPLIED = "matrix-misapplied"
 
 
 RULE_PREFIX = "rule."

@@ -363,6 +363,13 @@ class Compared:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class MatrixMisapplied:
+    """The commands show that the RTC multiplies with other numbers than those of this matrix."""
+
+    id: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LoopHeld:
     """Telemetry says that the loop holds well, or that it does so no longer."""
 
@@ -418,6 +425,7 @@ Event = (
     | DitherMeasured
     | Compared
     | LoopHeld
+    | MatrixMisapplied
     | Vibrations
     | MatrixMeasured
     | JobFailed

@@ -215,6 +215,16 @@ class MatrixStates:
     mismatched_id: str | None = None
     """Id under which the RTC holds other numbers than were sent; None: it holds what it should."""
 
+    unconfirmed_id: str | None = None
+    """Id of the matrix that the RTC has acknowledged as applied and no status has named since."""
+
+    misapplied: str = ""
+    """How the RTC has applied another matrix than it said; empty if it has not, or an operator has
+    set the mode since."""
+
+    misapplied_id: str | None = None
+    """Id under which it multiplies with other numbers; None if it has not swapped at all."""
+
     hindrance: str = ""
     """Reason why a required reconstructor cannot be computed, and what to change; empty if there is
     none."""

@@ -27,8 +27,9 @@ from service.runtime.registry import REGISTRY, Entry
 from service.tracking.dither_request import expected_dither, lock_in_plan, random_plan
 from service.wire import DitherKind, Status
 
-N_MATRICES_FOLLOWED = 2
-"""The reconstructor in use, and the one before: frames of it may still come."""
+N_MATRICES_FOLLOWED = 3
+"""The reconstructor in use, the one before, of which frames may still come, and one that is sent.
+"""
 
 _PLANS = {DitherKind.SINE: lock_in_plan, DitherKind.BINARY: random_plan}
 """Functions that plan the windows of each kind of dither."""
@@ -142,8 +143,10 @@ def _reset_members(bank: EstimatorBank, loop: LoopContext, changes: Change) -> E
 
 def with_matrix(bank: EstimatorBank, cm_id: str, matrix: NDArray[np.float32]) -> EstimatorBank:
     """Know the numbers of one more reconstructor."""
-    # Removed and appended again, so that the last two are those most recently in use.
+    # Removed and appended again, so that the last are those most recently in use. However many are
+    # sent and rejected, the one that multiplies stays.
     others = tuple(known for known in bank.loop.matrices if known[0] != cm_id)
+    others = tuple(sorted(others, key=lambda known: known[0] == bank.loop.cm_id))
     matrices = (*others, (cm_id, matrix))[-N_MATRICES_FOLLOWED:]
     return replace(bank, loop=replace(bank.loop, matrices=matrices))
 

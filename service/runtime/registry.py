@@ -100,6 +100,13 @@ def _held(_: Rejection, now: Rejection, loop: LoopContext, state: TrackerState) 
     return [] if holds is None or holds is state.loop.holds else [ev.LoopHeld(holds=holds)]
 
 
+def _report_opposite(
+    before: LoopCheck, now: LoopCheck, loop: LoopContext, state: TrackerState
+) -> list[Event]:
+    opposite = now.opposite_id
+    return [] if opposite in {None, before.opposite_id} else [ev.MatrixMisapplied(id=opposite)]
+
+
 def _report_comparison(
     _: Comparison, now: Comparison, loop: LoopContext, state: TrackerState
 ) -> list[Event]:
@@ -142,7 +149,7 @@ REGISTRY: Final = (
     Entry(ControlLawCheck, {alarms.WRONG_LOOP: "the loop follows its status again"}),
     Entry(EdgeHealth, {alarms.EDGE_SLIP: "the outer ring is back"}),
     Entry(PlayedCommands, {alarms.NOT_PLAYED: "the slopes answer the commands again"}),
-    Entry(LoopCheck, {alarms.OFF_LOOP: "commands obey the loop equation again"}),
+    Entry(LoopCheck, {alarms.OFF_LOOP: "commands obey the loop equation again"}, _report_opposite),
     Entry(Rejection, events=_held),
     Entry(Comparison, events=_report_comparison),
     Entry(Passive),

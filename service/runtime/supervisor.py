@@ -414,14 +414,12 @@ class Supervisor:
                 except LinkError as error:
                     if noted != str(error):
                         noted = str(error)
-                        text = f"{noted}; tried again every {LINK_RETRY_INTERVAL_S:g} s"
-                        self._note("link.waiting", text, Level.WARNING)
+                        self._note("link.waiting", f"{noted}; tried each second", Level.WARNING)
                 else:
                     noted = ""
                     if not link.missing:
                         text = (
-                            "the RTC's token was present and no message arrived: the link was "
-                            "opened again"
+                            "no message of an RTC that is there arrived: the link was opened again"
                         )
                         self._note("link.reopened", text, Level.WARNING)
             await asyncio.sleep(LINK_RETRY_INTERVAL_S)
@@ -509,16 +507,20 @@ class Supervisor:
         try:
             await asyncio.to_thread(self._actions.offer, self._engine.state)
             if in_use is not None and self._engine.bank is not None:
-                matrix = await asyncio.to_thread(self._actions.matrix, in_use)
-                async with self._telemetry_lock:
-                    self._engine.learn(in_use, matrix)
-                await self._hear_out(in_use, matrix)
+                await self._hear_out(in_use, await self._learn(in_use))
         except PyrcalError as error:
             self._note("reconstructor.not-offered", str(error), Level.WARNING)
         finally:
             self._n_readings -= 1
             if not self._n_readings:
                 self._own_matrix_read.set()
+
+    async def _learn(self, matrix_id: str) -> NDArray[np.float32]:
+        """Compare commands with a matrix, from its first frame on if it has only been sent."""
+        matrix = await asyncio.to_thread(self._actions.matrix, matrix_id)
+        async with self._telemetry_lock:
+            self._engine.learn(matrix_id, matrix)
+        return matrix
 
     async def _hear_out(self, in_use: str, matrix: NDArray[np.float32]) -> None:
         """Learn from the matrix in use how the RTC lists its slopes and counts its commands."""
@@ -536,6 +538,8 @@ class Supervisor:
         try:
             # Nothing is done that cannot be recorded (docs/decisions/0034-archive-and-audit.md).
             await self._writer.before(effect)
+            if isinstance(effect, ev.SendMatrix):
+                await self._learn(effect.id)
             event = await self._actions.perform(effect, state)
         except StorageError as error:
             self._writer.failed(error)

@@ -193,6 +193,7 @@ RULES: Final[dict[str, Callable[[StepContext], str | None]]] = {
     "acquisition": _acquisition,
     alarms.NOT_FOUND: _not_found,
     alarms.OTHER_SUM: _other_numbers,
+    alarms.MISAPPLIED: lambda context: context.matrices.misapplied or None,
     alarms.SHORT_MARGIN: _margin,
     alarms.LOOP_OPENED: explain_opening,
     alarms.NOT_STOPPED: _not_stopped,

@@ -27,6 +27,7 @@ def set_mode(context: StepContext, command: cmd.SetMode) -> None:
     """Set the mode; remember that of the settings."""
     change_mode(context, command.mode)
     context.clear_alarm(PROBATION)
+    reconstructors.forget_misapplied(context)
     context.log("mode", f"mode is {command.mode}")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.errors import CommandError, UnknownIdError
-from service.estimation.loop import NO_RTC, extend_gains, select_gains
+from service.estimation.loop import NO_RTC, extend_gains, last_seq, select_gains
 from service.records import alarms
 from service.records import events as ev
 from service.records.alarms import Interlock, alarm_blocks, blocking_alarm
@@ -116,6 +116,10 @@ def _was_in_use(state: TrackerState, record: ReconstructorRecord) -> bool:
     return bool(record.sha256) and any(r.was_used for r in same)
 
 
+MAX_SWAP_DELAY_S = 0.5
+"""A status of a frame that is so much later than the one from which a matrix is said to be applied
+must name it (R-69); one before may have been made while the matrices were swapped."""
+
 RECONSTRUCTORS_KEPT = 200
 
 RETURNS_KEPT = 100
@@ -205,6 +209,7 @@ def forget_session(context: StepContext) -> None:
         in_use=None,
         verified_ids=frozenset(),
         mismatched_id=None,
+        unconfirmed_id=None,
         applied_asked_ns_utc=0,
         read_back_error="",
         margin=None,
@@ -423,6 +428,8 @@ def _on_state(context: StepContext, record: ReconstructorRecord, event: Acknowle
         _trust(context, record.id)
         record = replace(record, applied_frame_seq=event.frame_seq, reason=reason)
         replace_record(context, record)
+        if context.matrices.in_use != record.id and event.frame_seq is not None:
+            context.matrices = replace(context.matrices, unconfirmed_id=record.id)
         mark_applied(context, record.id)
         gains = () if context.rtc is None else select_gains(context.rtc, record.n_modes)
         of_other = update_policy.verdict_doubtful_reason(context.state, record.judged, gains)
@@ -453,7 +460,7 @@ def on_fetched(context: StepContext, fetched: ev.MatrixFetched) -> None:
         return
     _trust(context, record.id)
     # After _trust: the numbers are verified now, even where the id is no news.
-    if context.matrices.in_use == record.id:
+    if context.matrices.in_use == record.id or not _check_swap(context, record.id):
         return
     if before is None:
         store_reconstructor(context, record)
@@ -469,12 +476,51 @@ def apply_named(context: StepContext, matrix_id: str) -> None:
     record = context.state.reconstructor(matrix_id)
     if record is None or explain_unread_matrix(context.state, matrix_id):
         return
+    if not _check_swap(context, matrix_id):
+        return
     mark_applied(context, matrix_id)
     if record.state is MatrixState.FAILED:
         # The acknowledgement may be lost or late; the status is repeated.
         text = f"{matrix_id} is in use after all, by the RTC's status, without an acknowledgement"
         change_state(context, matrix_id, MatrixState.APPLIED, text)
         context.log("reconstructor.applied", text)
+
+
+def _check_swap(context: StepContext, named: str) -> bool:
+    """Return False if the matrix that is named may be that from before an acknowledged swap.
+
+    One that is named long after the swap proves that it has not happened.
+    """
+    sent, rtc = context.state.reconstructor(context.matrices.unconfirmed_id), context.rtc
+    if sent is None or rtc is None:
+        return True
+    since, text = sent.applied_frame_seq or 0, context.matrices.misapplied
+    if named != sent.id:
+        if last_seq(rtc) <= since + MAX_SWAP_DELAY_S * rtc.frame_rate_hz:
+            return False
+        text = (
+            f"the RTC applies another matrix than it says: it acknowledged {sent.id} from frame "
+            f"{since}, and its status of frame {rtc.seq} still names {named}. Nothing more is "
+            "sent: see why the RTC does not swap, then set the mode"
+        )
+        change_state(context, sent.id, MatrixState.FAILED, text)
+    context.matrices = replace(context.matrices, unconfirmed_id=None, misapplied=text)
+    return True
+
+
+def on_misapplied(context: StepContext, event: ev.MatrixMisapplied) -> None:
+    """Note that the RTC multiplies with other numbers; nothing more is sent by itself."""
+    text = (
+        f"the RTC applies another matrix than it says: the first commands with {event.id} are the "
+        "opposite of what its numbers require, so the RTC turns the sign of the matrix. Nothing "
+        "more is sent: mend the RTC, then set the mode"
+    )
+    context.matrices = replace(context.matrices, misapplied=text, misapplied_id=event.id)
+
+
+def forget_misapplied(context: StepContext) -> None:
+    """Trust what the RTC says of its swaps again: an operator has set the mode."""
+    context.matrices = replace(context.matrices, misapplied="", misapplied_id=None)
 
 
 def on_margin(context: StepContext, event: ev.MarginJudged) -> None:

@@ -73,7 +73,7 @@ running: overdue passed not-judged rolling-back kept opening
 overdue: passed not-judged rolling-back kept opening
 passed: rolling-back kept opening
 rolling-back: watched kept opening
-watched: rolled-back not-confirmed acquiring opening not-judged
+watched: rolled-back not-confirmed acquiring opening kept not-judged
 kept: watched
 opening: opened kept
 opened: rolled-back

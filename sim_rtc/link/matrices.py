@@ -2,37 +2,44 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import zenoh
 from typing_extensions import override
 
 from pyrcal.rtc.identity import Reconstructor
 from pyrcal.rtc.matrices import Matrices
-from pyrcal.rtc.replies import Computer
 from service.files.recording import RecordedKind, RecordingWriter
-from service.wire import Keys
+from service.wire import Acknowledgement, AckState, Keys
 from service.wire.signing import Signatures
+from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.faults import Fault, FaultKind, FaultPlan
 
 
 class FaultyMatrices(Matrices):
     """Exchanges matrices, with the faults of a plan.
 
-    Faults: commits are ignored or rejected, swaps are late, acknowledgements are not sent.
+    Faults: commits are ignored or rejected, swaps are late or acknowledged before they happen,
+    matrices are applied with the sign turned, acknowledgements are not sent.
     """
 
     def __init__(
         self,
         session: zenoh.Session,
         keys: Keys,
-        computer: Computer,
+        computer: RealTimeComputer,
         *,
         signatures: Signatures,
         plan: FaultPlan,
         recorder: RecordingWriter | None,
     ) -> None:
         super().__init__(session, keys, computer, signatures=signatures)
+        self._rtc = computer
         self._plan = plan
         self._recorder = recorder
+        self._early: set[str] = set()
+        """Ids of the matrices that were acknowledged before they were swapped in."""
+
         self._n_rejected: dict[Fault, int] = {}
         self._late: list[tuple[float, Reconstructor]] = []
         """Loop time in seconds at which each delayed matrix is passed to the loop."""
@@ -63,11 +70,26 @@ class FaultyMatrices(Matrices):
 
     @override
     def _stage(self, reconstructor: Reconstructor) -> None:
-        late = self._plan.active(FaultKind.LATE_SWAP)
+        if self._plan.active(FaultKind.TURNED_SIGN):
+            reconstructor = replace(reconstructor, matrix=-reconstructor.matrix)
+        early = self._plan.active(FaultKind.EARLY_ACK)
+        late = early or self._plan.active(FaultKind.LATE_SWAP)
         if late is None:
             super()._stage(reconstructor)
-        else:
-            self._late.append((self._plan.now_s + late.value("DELAY"), reconstructor))
+            return
+        self._late.append((self._plan.now_s + late.value("DELAY"), reconstructor))
+        if early is not None:
+            matrix_id, seq = reconstructor.manifest.id, (self._rtc.status().seq or 0) + 1
+            applied = self._staging.applied(matrix_id, seq)
+            if applied is not None:
+                self._acknowledge(applied)
+                self._early.add(matrix_id)
+
+    @override
+    def _acknowledge(self, acknowledgement: Acknowledgement) -> None:
+        # The swap itself is not acknowledged a second time.
+        if acknowledgement.state is not AckState.APPLIED or acknowledgement.id not in self._early:
+            super()._acknowledge(acknowledgement)
 
     @override
     def _put_acknowledgement(self, data: bytes) -> None:

@@ -150,6 +150,28 @@ def test_a_swap_that_comes_late_is_an_alarm_until_it_comes(night, late):
     assert "Traceback" not in service.log
 
 
+def test_a_swap_that_comes_after_it_was_acknowledged_is_named(night, late):
+    service = night.service("auto")
+    night.rtc(*faults(f"early-ack@0:{late(3.0)},1000"))
+    named(service, "matrix-misapplied", 40.0)
+    wait_for(lambda: night.state["in_use"].startswith("cm-"), 15.0, "the late swap is taken in")
+    state = night.state
+    assert "matrix-misapplied" in {waiting["name"] for waiting in state["waiting_for"]}
+    sent = [r["id"] for r in night.shelf if r["published_ns_utc"] is not None]
+    assert sent == [state["in_use"]]
+    assert "Traceback" not in service.log
+
+
+def test_a_matrix_of_the_wrong_sign_is_taken_back_and_the_loop_opened(night):
+    service = night.service("auto")
+    night.rtc(*faults("turned-sign@0:1000"))
+    named(service, "matrix-misapplied", 40.0)
+    wait_for(lambda: night.state["rtc"]["loop"] == "open", 10.0, "the loop is opened")
+    sent = [r["id"] for r in night.shelf if r["published_ns_utc"] is not None]
+    assert len(sent) == 2
+    assert "Traceback" not in service.log
+
+
 def saturated(night):
     """Return how many windows there were, at the end and at the beginning of a saturation."""
     accepted = []

@@ -718,7 +718,8 @@ def _restart_acquisition(context: StepContext, reason: str, *, slipped: bool = F
     A loop that has slipped is closed on half as many modes next time.
     """
     acquisition = context.acquisition
-    if acquisition.attempt >= MAX_ATTEMPTS:
+    # What is sent to an RTC that applies something else does not lead anywhere.
+    if acquisition.attempt >= MAX_ATTEMPTS or context.matrices.misapplied:
         _fail_acquisition(context, f"{reason}, after {acquisition.attempt} attempts")
         return
     most = acquisition.max_modes

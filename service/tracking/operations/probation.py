@@ -50,6 +50,9 @@ RESUMPTION_INTERVAL_S = 600.0
 """Shortest time between two resumptions after a rollback that did not help: a matrix that is wrong
 must not be sent again and again."""
 
+MAX_OPPOSITE_S = 1.5
+"""Time from the first commands of the wrong sign until a loop that is lost is opened."""
+
 OPEN_REQUEST_INTERVAL_S = 2.0
 """Interval between two requests to open the loop."""
 
@@ -58,6 +61,7 @@ MAY_HAVE_JUMPED = "the mirror may have jumped at the time of a swap"
 _CONCLUSIVE_ALARMS = (alarms.WRONG_LOOP, alarms.OFF_LOOP, alarms.DIVERGING)
 """Alarms that say by themselves that the RTC plays another matrix, or one that does not hold."""
 
+_JUDGED = frozenset({ProbationState.RUNNING, ProbationState.OVERDUE, ProbationState.PASSED})
 _FINAL_STATES = frozenset(
     {MatrixState.FAILED, MatrixState.REJECTED, MatrixState.REFUSED, MatrixState.DISCARDED}
 )
@@ -81,8 +85,10 @@ def advance(context: StepContext, event: Event) -> None:
     trial = context.probation
     if trial is None:
         return
-    alarm = _alarm_of_swap(context, trial)
-    if alarm is not None:
+    alarm, misapplied = _alarm_of_swap(context, trial), context.matrices.misapplied_id
+    if trial.state in _JUDGED and trial.id == misapplied and not _check_comparable(context):
+        _begin_rollback(context, trial, context.matrices.misapplied, resumes=False)
+    elif alarm is not None:
         # Commands that contradict the law of the loop are the RTC's fault and not the mirror's.
         _begin_rollback(context, trial, alarm.text, resumes=alarm.name == alarms.DIVERGING)
     else:
@@ -116,6 +122,10 @@ def on_compared(context: StepContext, event: ev.Compared) -> None:
         return
     # The comparison now concerns the previous matrix, which is in use again.
     if trial.state is ProbationState.WATCHED:
+        # A mirror at its limits stands still, so that nothing can be compared: the alarms decide.
+        unknown = found.verdict is Verdict.UNKNOWN
+        if unknown and context.blocking_alarm(Interlock.HOLD) is not None:
+            return
         helped = found.verdict is not Verdict.WORSE
         _end_watch(context, trial, found.text, lost=found.lost, helped=helped)
         return
@@ -189,12 +199,13 @@ def _begin_rollback(
 def _on_swap(context: StepContext, before: str | None, in_use: str | None) -> None:
     trial = context.probation
     record = context.state.reconstructor(in_use)
-    if (
-        trial is not None
-        and trial.state in _ROLLBACK_STATES
-        and trial.rollback == in_use is not None
-    ):
-        _begin_watch(context, trial, in_use)
+    if trial is not None and trial.rollback == in_use is not None:
+        # It may come when the loop is being opened already.
+        if trial.state in _ROLLBACK_STATES:
+            _begin_watch(context, trial, in_use)
+        return
+    if trial is not None and trial.state is ProbationState.WATCHED and trial.id == in_use:
+        _keep_worse(context, trial, context.matrices.misapplied or f"the RTC names {in_use} again")
         return
     # Without both matrices nothing can be compared.
     if record is None or before is None:
@@ -250,12 +261,14 @@ def _begin_watch(context: StepContext, trial: Probation, in_use: str) -> None:
 def _watch(context: StepContext, trial: Probation) -> None:
     """End the check of the loop with the matrix before: lost, opened, or undecided."""
     waited_s = (context.now_ns - trial.since_ns_utc) / SECOND_NS
-    lost = context.blocking_alarm(Interlock.HOLD)
+    lost, named = context.blocking_alarm(Interlock.HOLD), context.state.alarm(alarms.MISAPPLIED)
+    opposite = named is not None and context.matrices.misapplied_id is not None
+    opposite_s = (context.now_ns - named.since_ns_utc) / SECOND_NS if named and opposite else 0.0
     if gone := _check_loop(context):
         _end_watch(context, trial, gone, lost=False)
     # The detector of divergence averages over half a second, so that it still shows the rejected
     # matrix.
-    elif lost is not None and waited_s > MAX_CALMING_S:
+    elif lost is not None and (waited_s > MAX_CALMING_S or opposite_s > MAX_OPPOSITE_S):
         _end_watch(context, trial, lost.text, lost=True, helped=False)
     elif waited_s > MAX_PROBATION_S + MAX_VERDICT_DELAY_S:
         _end_watch(context, trial, "telemetry does not show how the loop is since", lost=False)
@@ -284,6 +297,8 @@ def _may_resume(context: StepContext, trial: Probation, *, lost: bool) -> bool:
     since_ns = trial.resumed_ns_utc
     again = since_ns is not None and (context.now_ns - since_ns < RESUMPTION_INTERVAL_S * SECOND_NS)
     # An operator who has set a mode meanwhile has taken over.
+    # Where the RTC applies other numbers the mirror is not the cause, and nothing more is sent.
+    again = again or bool(context.matrices.misapplied)
     if again or not trial.resumes or context.operator.mode is not Mode.HOLD:
         return False
     return not lost or may_acquire(context.state, context.policy)
@@ -355,10 +370,9 @@ def explain_opening(context: StepContext) -> str | None:
 
 def _alarm_of_swap(context: StepContext, trial: Probation) -> Alarm | None:
     """Return an alarm that has come with a matrix just applied, or None."""
-    judged = {ProbationState.RUNNING, ProbationState.OVERDUE, ProbationState.PASSED}
     # A later alarm has another cause than the swap.
     late = context.now_ns > trial.since_ns_utc + MAX_LAW_DETECTION_S * SECOND_NS
-    if trial.state not in judged or late or _check_comparable(context):
+    if trial.state not in _JUDGED or late or _check_comparable(context):
         return None
     if _check_jump(context, trial):
         return None
@@ -370,6 +384,10 @@ def _explain_missing_probation(
     context: StepContext, record: ReconstructorRecord, last: Probation | None
 ) -> str:
     """Return why a matrix just applied is not put on probation; empty: it is."""
+    said = None if last is None or last.before != record.id else last.id
+    named = context.state.reconstructor(said)
+    if context.matrices.misapplied and named is not None and named.state is MatrixState.FAILED:
+        return "it never was out of use"
     if record.published_ns_utc is None:
         return "the RTC took it by itself"
     if last is not None and last.state in _WORSE_STATES:
@@ -408,6 +426,9 @@ def _explain_failed_rollback(context: StepContext, trial: Probation, event: Even
     if isinstance(event, ev.JobFailed) and isinstance(event.effect, ev.RepublishMatrix):
         return event.text
     sent = context.state.reconstructor(trial.rollback)
+    waited_s = (context.now_ns - trial.since_ns_utc) / SECOND_NS
+    if trial.id == context.matrices.misapplied_id and waited_s > MAX_OPPOSITE_S:
+        return f"it is not back after {MAX_OPPOSITE_S:g} s"
     if sent is None:
         late = context.now_ns > trial.until_ns_utc + REPUBLICATION_TIMEOUT_S * SECOND_NS
         return "its copy did not come" if late else ""
@@ -438,7 +459,8 @@ def _keep_worse(context: StepContext, trial: Probation, why: str) -> None:
     text = f"{trial.worse}; the service did not go back to {trial.before}: {why}"
     # If there is no way back, an open loop is better than a lost one.
     out_of_hand = context.blocking_alarm(Interlock.HOLD) is not None
-    lost = out_of_hand or (trial.finding is not None and trial.finding.lost)
+    lost = out_of_hand or trial.id == context.matrices.misapplied_id
+    lost = lost or (trial.finding is not None and trial.finding.lost)
     if lost and trial.opens and context.rtc is not None and not context.operator.stopped_because:
         _open(context, replace(trial, text=text))
         return

@@ -249,3 +249,47 @@ def test_frames_of_another_matrix_begin_another_check():
         check = observe(check, replace(block, cm_id="cm-2"), new)
     assert command_residual(check, old, 0, 10**9)[1] is None
     assert command_residual(check, new, 0, 10**9)[1].holds
+
+
+def opposite(telemetry, told=None, **how):
+    """Return what the first frames show if the commands go the opposite way, else None."""
+    check = LoopCheck()
+    for block in blocks(telemetry, **how):
+        check = observe(check, block, told or terms())
+    assert check.swap_seq is None, "the first frames have been judged"
+    return check.opposite_id
+
+
+@pytest.mark.parametrize("lengths", [(37, 5, 50, 1, 20), (300,), (1,)])
+def test_a_matrix_of_the_wrong_sign_is_found_in_its_first_frames(lengths):
+    assert opposite(closed_loop(n_frames=60, matrix=-INVERSE), lengths=lengths) == "cm-1"
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {},
+        {"delay": 3},
+        {"lag_frames": 0.64},
+        {"played_m": 2e-7},
+        {"dither_m": 5e-8},
+        {"stroke_m": 5e-9},
+        {"gains": 5.0 * GAINS, "stroke_m": 1e-7},
+    ],
+)
+def test_a_mirror_at_its_limits_or_late_goes_the_right_way(how):
+    """The last loop diverges by its gains, as the status says, and is at its limits at once."""
+    told = terms(float(how.get("delay", 2)), gains=how.get("gains", GAINS))
+    assert opposite(closed_loop(n_frames=300, **how), told) is None
+
+
+def test_each_reconstructor_is_judged_anew_from_its_first_frame():
+    check = LoopCheck()
+    for block in blocks(closed_loop(n_frames=400)):
+        check = observe(check, block, terms())
+    assert check.opposite_id is None
+    turned = closed_loop(n_frames=60, matrix=-INVERSE, seed=3)
+    for block in blocks(turned, first=400):
+        named = replace(terms(), cm_id="cm-2")
+        check = observe(check, replace(block, cm_id="cm-2"), named)
+    assert check.opposite_id == "cm-2"

@@ -10,8 +10,10 @@ import shutil
 import warnings
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
+import scipy
 from astropy.io import fits
 from hypothesis import given
 from hypothesis import strategies as st
@@ -28,6 +30,7 @@ from pyrcal.importers.layouts import by_role, cube_of, maps_of, mask_of
 from pyrcal.importers.saved import read_npz
 from pyrcal.importers.specula import from_specula
 from service.errors import MatrixError
+from service.files.container import opened
 from tests.unit.test_house import ROOT
 
 DATA = ROOT / "pyrcal" / "samples" / "data"
@@ -196,6 +199,78 @@ def test_slopes_of_as_many_modes_as_subapertures_are_no_frames():
     matrix = np.random.default_rng(1).normal(size=(2 * n, n))
     assert frames_of(matrix, None, VALID) is None
     assert frames_of(matrix[:n, :9], None, VALID).cube.shape == (9, N, N)
+
+
+def save_matlab73(path, given):
+    """Write arrays as MATLAB 7.3 does: HDF5 behind a header, all axes reversed, no vectors."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in given.items():
+            file[name] = np.atleast_2d(values).astype(np.uint8 if name == "valid" else float).T
+        file["#refs#/modes"] = np.ones((3, 3))
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
+
+
+def save_matlab5(path, given):
+    scipy.io.savemat(path, {**given, "made_by": "a text"}, do_compression=True)
+
+
+@pytest.mark.parametrize("save", [save_matlab73, save_matlab5])
+@pytest.mark.parametrize("together", [True, False])
+def test_files_of_matlab_are_the_same_as_npz(save, together, tmp_path):
+    valid = VALID.copy()
+    valid[0] = False  # exchanging x and y must show
+    cube = CUBE.copy()
+    cube[:, 3:, 7:] = 0.0
+    given = {
+        "im": np.random.default_rng(3).normal(size=(2 * valid.sum(), 4)),
+        "valid": valid,
+        "cube": cube,
+        "M2C": np.random.default_rng(4).normal(size=(5, 4)),
+    }
+    np.savez(tmp_path / "all.npz", **given)
+    (tmp_path / "matlab").mkdir()
+    if together:
+        save(tmp_path / "matlab" / "of the bench.mat", given)
+    else:
+        for name, values in given.items():
+            save(tmp_path / "matlab" / f"{name}.mat", {name: values})
+    found = []
+    for name in ("all.npz", "matlab"):
+        words = ["import", "files", str(tmp_path / name), "--diameter-m", "2", "--output"]
+        assert main([*words, str(tmp_path / f"of {name}")]) == 0
+        with h5py.File(tmp_path / f"of {name}" / "matrix.h5") as file:
+            found.append({key: file[key][()] for key in file})
+    assert found[0].keys() == found[1].keys()
+    assert all(np.array_equal(found[0][key], found[1][key]) for key in found[0])
+    save(tmp_path / "fit.mat", {"interaction_matrix": given["im"], "modes": np.array([3, 0, 1, 4])})
+    recorded = pyrcal.fitting.recorded.read_recorded(tmp_path / "fit.mat")
+    assert np.array_equal(recorded.values, given["im"])
+    assert recorded.modes.tolist() == [3, 0, 1, 4]
+
+
+@pytest.mark.parametrize("cut", [60, 140, 300, -20])
+def test_a_damaged_file_of_matlab_is_refused(cut, tmp_path):
+    path = tmp_path / "im.mat"
+    save_matlab5(path, {"im": MATRIX})
+    path.write_bytes(path.read_bytes()[:cut])
+    with pytest.raises(MatrixError, match=re.escape(str(path))), opened(path) as container:
+        container.arrays["im"].read()
+
+
+@pytest.mark.parametrize("lossy", [True, False])
+def test_an_image_that_was_compressed_with_loss_is_named(lossy, tmp_path, capsys):
+    path = tmp_path / "im.fits.fz"
+    image = fits.CompImageHDU(
+        MATRIX.astype(np.float32), compression_type="GZIP_2", quantize_level=4.0 * lossy
+    )
+    fits.HDUList([fits.PrimaryHDU(), image]).writeto(path)
+    np.save(tmp_path / "valid.npy", VALID)
+    np.save(tmp_path / "modes.npy", CUBE)
+    words = ["import", "files", str(tmp_path), "--diameter-m", "2", "--output"]
+    assert main([*words, str(tmp_path / "out")]) == 0
+    assert ("with loss" in capsys.readouterr().out) is lossy
+    assert bool(pyrcal.fitting.recorded.read_recorded(path).remark) is lossy
 
 
 def test_a_bare_array_has_no_record_and_is_refused_without_its_role(tmp_path, capsys):

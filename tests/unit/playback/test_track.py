@@ -7,6 +7,7 @@ import json
 import h5py
 import numpy as np
 import pytest
+from astropy.io import fits
 
 import pyrcal
 from pyrcal.__main__ import main
@@ -146,6 +147,26 @@ def test_hdf5_says_the_same_as_npz(telemetry, answer, tmp_path, capsys):
     _, found, _ = tracked(capsys, path)
     assert found["entries"] == answer[1]["entries"]
     assert found["entries"]
+
+
+def test_a_file_of_matlab_says_the_same_as_npz(telemetry, answer, tmp_path, capsys):
+    path = tmp_path / "night.mat"
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in telemetry.items():
+            file[name] = np.atleast_2d(values).T
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
+    _, found, _ = tracked(capsys, path)
+    assert found["entries"] == answer[1]["entries"]
+
+
+@pytest.mark.parametrize("name", ["cube.fits", "cube.txt", "."])
+def test_a_cube_with_its_timing_file_is_refused_with_what_is_missing(name, tmp_path, capsys):
+    fits.writeto(tmp_path / "cube.fits", np.zeros((5, 4, 4), np.float32))
+    (tmp_path / "cube.txt").write_text("0 0.001 1700000000.001\n1 0.002 1700000000.002\n")
+    status, _, err = tracked(capsys, tmp_path / name)
+    assert status == 2
+    assert all(missing in err for missing in ("slopes", "commands_m", "frame_rate_hz"))
 
 
 def test_commands_as_asked_that_the_mirror_clipped_are_named(tmp_path, capsys):

@@ -282,9 +282,15 @@ class TestCommandsOffTheLoop:
         assert streams[LoopCheck].from_seq == 1100
 
     def test_only_the_matrices_that_may_still_come_are_kept(self, streams):
-        for name in ("a", "b", "c", "b"):
+        for name in ("a", "b", "c", "d", "b"):
             streams = with_matrix(streams, name, self.R)
-        assert [name for name, _ in streams.loop.matrices] == ["c", "b"]
+        assert [name for name, _ in streams.loop.matrices] == ["c", "d", "b"]
+
+    def test_the_matrix_that_multiplies_is_kept_however_many_are_sent(self, streams):
+        streams = replace(streams, loop=replace(streams.loop, cm_id="in-use"))
+        for name in ("in-use", "sent-1", "sent-2", "sent-3", "sent-4"):
+            streams = with_matrix(streams, name, self.R)
+        assert "in-use" in [name for name, _ in streams.loop.matrices]
 
 
 class TestADitherThatIsNotThere:

@@ -223,6 +223,8 @@ class Night:
             if event is None:
                 self.last = ()
                 return
+        if isinstance(event, Status):
+            event = replace(event, t_ns=self.now_ns)
         try:
             self.state, self.last = step(self.state, event, POLICY, self.now_ns)
         except CommandError:

@@ -425,7 +425,7 @@ def test_a_wrong_instrument_file_is_refused_in_one_line_with_file_and_key(write,
         ("mask.h5:/grey", "values other than 0 and 1"),
         ("mask.h5:/empty", "no valid subaperture"),
         ("mask.h5:/text", "expected numbers"),
-        ("text.h5:/valid", "expected an HDF5, a FITS or a NumPy file"),
+        ("text.h5:/valid", "expected HDF5, FITS, NumPy or MATLAB"),
     ],
 )
 def test_a_mask_that_cannot_be_used_is_refused(write, tmp_path, reference, expected):

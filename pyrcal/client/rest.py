@@ -226,10 +226,7 @@ class Service:
             return RefusedError(detail)
         found = f"{response.status} {response.reason}"
         if response.status in _BUSY:
-            return UnreachableError(
-                f"{self.url}: {found}: the service, or a proxy before it, has too many requests or "
-                "does not reach it now; try again"
-            )
+            return UnreachableError(f"{self.url}: {found}: too many requests at once; try again")
         return self.foreign_answer_error(found)
 
     def foreign_answer_error(self, found: str) -> UnreachableError:

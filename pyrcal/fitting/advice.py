@@ -18,12 +18,7 @@ from pyrcal.fitting.alternatives import (
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.left_over import locate_residual
 from pyrcal.fitting.origins import Origin
-from pyrcal.fitting.verdict import (
-    MIN_EDGE_MOVE_SUBAP,
-    UNDECIDED_WORDS,
-    Refusal,
-    edge_move,
-)
+from pyrcal.fitting.verdict import UNDECIDED_WORDS, Refusal, edge_move
 
 Array = NDArray[np.float64]
 
@@ -34,10 +29,6 @@ subaperture, the accuracy that Heritier et al. 2018, section 3.2, require of a s
 MAX_USABLE_SUBAP = 0.1
 """Largest 1 σ at the pupil's edge of a registration that is recommended, even if the reconstructor
 is stable with all modes."""
-
-MIN_CORRECTION_EXPLAINED = 0.01
-"""RMS share of the signal that a correction of the instrument file must explain if it would hardly
-move the registration."""
 
 MIN_NOISE_SHARE = 0.5
 """Share of the residual's power that must be noise for averaging to be advised. With pokes of
@@ -83,6 +74,10 @@ class Advice(StrEnum):
     USE = "use it"
     MEASURE_MORE = "measure more"
     DO_NOT_USE = "do not use it"
+
+
+_BY_ANOTHER_INSTRUMENT = {Refusal.ANOTHER_INSTRUMENT, Refusal.UNSETTLED, Refusal.UNDETERMINED}
+"""Reasons of a refusal that a wrong value of the instrument file also causes."""
 
 
 def add_explanations(fit: Fit, tried: tuple[Alternative, ...], grounds: Grounds) -> Fit:
@@ -178,7 +173,8 @@ def _explain_uncertainty(fit: Fit, grounds: Grounds, edge: float, radius: float)
 
 def _advise_refused(fit: Fit, grounds: Grounds) -> str:
     match grounds.refusal:
-        case Refusal.UNDETERMINED:
+        # an explanation that the matrix prefers widens sigma: it is the cause then
+        case Refusal.UNDETERMINED if _choose_correction(fit) is None:
             return f"{Advice.MEASURE_MORE}: the modes do not determine the registration"
         case Refusal.ANOTHER_MINIMUM:
             return (
@@ -202,7 +198,7 @@ def _find_cause(fit: Fit, grounds: Grounds) -> str:
     if grounds.columns and grounds.refusal is not Refusal.AXES:
         return "; ".join(grounds.columns)
     best = _choose_correction(fit)
-    if best is not None and grounds.refusal is Refusal.ANOTHER_INSTRUMENT:
+    if best is not None and grounds.refusal in _BY_ANOTHER_INSTRUMENT:
         number = next(_list_wrong_numbers(fit), None)
         if number is not None and grounds.numbers_share < (best.share or 0.0):
             return f"{number.words}; correct that and fit again"
@@ -225,12 +221,7 @@ def _list_corrections(fit: Fit) -> Iterator[str]:
         if one.correct:
             yield f"{one.key} = {one.found}"
     best = _choose_correction(fit)
-    # What explains little and changes nothing at the edge is no reason to edit a file: errors of
-    # the model look the same.
-    if best is not None and (
-        fit.residual_fraction**2 * (1.0 - (best.share or 0.0)) > MIN_CORRECTION_EXPLAINED**2
-        or edge_move(best.moved, _radius(fit)) > MIN_EDGE_MOVE_SUBAP
-    ):
+    if best is not None:
         yield best.key
 
 

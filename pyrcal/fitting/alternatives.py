@@ -53,8 +53,14 @@ functions left 94 times the χ² of a matrix of HCIPy, and with 2.9 σ they made
 NOTABLE_GAIN_RATIO = 0.02
 """Smallest reported ratio of the gains of Sx and Sy, less 1."""
 
+LIGHT_KEY = "--gain-map"
+"""Option of the command that allows for uneven light."""
+
 CENTRED_KEY = "pupil, or valid_subapertures, centred"
 """Keys of the instrument file to correct if the pupil is not centred."""
+
+LIGHT_KEY = "--gain-map"
+"""Option by which uneven light is fitted."""
 
 ARM_SUBAP = 0.5
 """Width of the arms in the trial model, subapertures; the best width is extrapolated from it."""
@@ -107,16 +113,17 @@ class Alternative:
         """Return the weight of the square of its change of α in σ, 0 to 1.
 
         An explanation that the matrix prefers counts in full, one that is not excluded by its
-        probability. Models of one instrument differ by ``MIN_EXPLAINED`` of the signal, and any
-        additional fitted number explains some of that by coincidence: smaller improvements are no
-        evidence for it.
+        probability, which is smaller the larger its misfit is. Models of one instrument differ by
+        ``MIN_EXPLAINED`` of the signal, and any additional fitted number explains some of that by
+        coincidence: smaller improvements are no evidence for it.
         """
         if not self.counts or not (self.preferred or self.undecided):
             return 0.0
         explained = residual_fraction
         if self.is_number and self.share is not None:
             explained *= float(np.sqrt(max(1.0 - self.share, 0.0)))
-        probability = 1.0 if self.preferred else OTHER_SHARE
+        worse = 1.0 if self.share is None else max(self.share, 1.0)
+        probability = 1.0 if self.preferred else OTHER_SHARE / worse**2
         return probability * min(1.0, explained / MIN_EXPLAINED) ** 2
 
 
@@ -375,11 +382,11 @@ def _try_uneven_light(few: FitSubset) -> Iterator[Alternative]:
     maps = [pattern[:, None] * few.own for pattern in gain_maps(few)]
     _, lead, moved = _fit_with_rates(few, *maps)
     yield Alternative(
-        words="uneven light (--gain-map)",
+        words=f"uneven light ({LIGHT_KEY})",
         share=lead.share,
         moved=moved,
         undecided=is_open(lead),
-        key="--gain-map",
+        key=LIGHT_KEY,
         counts=True,
         is_number=True,
     )

@@ -32,6 +32,15 @@ ORDER_CORRELATION = 0.7
 ORDER_CORRELATION_RATIO = 1.3
 """Factor by which that correlation must exceed the one of the listed arrangement."""
 
+NOISE_GAIN = 0.2
+"""Gain of a column over the median, either way, within which the column may hold noise only."""
+
+WEAK_COLUMN = 0.7
+"""Largest size of such a column, over the expected one."""
+
+MAX_NOISE_SHARE = 0.25
+"""Largest share of columns with such a gain; more of them are the columns of another basis."""
+
 CHANCE_SIGMA = 4.0
 """Correlation with the model, in 1 σ of that of noise, below which a column may be noise only."""
 
@@ -58,16 +67,30 @@ def find_noise_columns(solution: Solution, target: Target, n_planes: int) -> NDA
     """Return the columns that contain noise only ``(n_modes,)``.
 
     Such a column has nothing in common with its model, and its neighbouring subapertures are
-    uncorrelated. A column of another mode, or of another basis, is smooth.
+    uncorrelated. A column of another mode, or of another basis, is smooth. So is the noise of
+    vibration and turbulence: a smooth column counts as noise if it is weak and its gain near 0,
+    unless it is that of another mode or many columns are like it.
     """
     # unit columns: squares of a value such as 1e200, read from a damaged file, would overflow
     measured = _unit(np.where(target.rows[:, None], target.matrix, 0.0))
-    alike = np.sum(measured * _unit(np.asarray(solution.matrix, np.float64)), axis=0)
+    every = np.abs(measured.T @ _unit(np.asarray(solution.matrix, np.float64)))
+    alike = np.diag(every)
     # The correlation of noise with any pattern scatters by one over the root of the number of
     # slopes.
-    unlike = np.abs(alike) < CHANCE_SIGMA / np.sqrt(target.rows.sum())
-    found = np.zeros(len(unlike), dtype=np.bool_)
-    for column in np.flatnonzero(unlike):
+    unlike = alike < CHANCE_SIGMA / np.sqrt(target.rows.sum())
+    gains, middle = solution.projection.gains, float(np.abs(np.median(solution.projection.gains)))
+    size = np.linalg.norm(target.matrix[target.rows], axis=0)
+    expected = np.linalg.norm(solution.matrix[target.rows], axis=0) * middle
+    found = np.asarray(
+        (np.abs(gains) < NOISE_GAIN * middle)
+        # The columns of actuators that are listed one place off are as strong as others.
+        & (size < WEAK_COLUMN * expected)
+        & (alike < OWN_MODE_CORRELATION)
+        & (every.max(axis=1) < OTHER_MODE_CORRELATION)
+    )
+    if found.mean() > MAX_NOISE_SHARE:
+        found = np.zeros(len(unlike), dtype=np.bool_)
+    for column in np.flatnonzero(unlike & ~found):
         maps = np.zeros((n_planes, *target.valid.shape))
         maps[:, target.valid] = measured[:, column].reshape(n_planes, -1)
         counted = np.zeros_like(maps)

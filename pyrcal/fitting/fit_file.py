@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
+from pyrcal.fitting.alternatives import LIGHT_KEY
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.matrix import FitOptions, fit_matrix
 from pyrcal.fitting.memory import check_fit
@@ -24,9 +25,12 @@ from service.instrument import load_instrument
 from service.model.instrument import Instrument, instrument_sha256
 from service.model.modes import Basis
 from service.model.sensors.registry import kind_of
-from service.model.sensors.sensor import Mapper
+from service.model.sensors.sensor import CannotTell, Mapper
 
 Progress = Callable[[str], None]
+
+MIN_LIGHT_EXPLAINED = 0.03
+"""RMS share of the signal that uneven light must explain for a note that the file has the light."""
 
 
 def fit(
@@ -186,12 +190,29 @@ def _fit_recorded(
             if basis is None:
                 report_stage("modes")
                 basis = cached_basis(instrument)
-            return fit_matrix(
+            found = fit_matrix(
                 instrument, reference, options, basis=basis, mapper=mapper, progress=report_stage
             )
         except MatrixError as error:
             text = str(error).removeprefix("reference: ")
             raise MatrixError(f"{recorded.where}: {text}") from error
+    no_map = isinstance(kind_of(instrument).light(instrument), CannotTell)
+    if recorded.flux_frame is None or options.illumination is not None or no_map:
+        return found
+    return replace(found, remarks=(*found.remarks, *_note_flux_frame(found)))
+
+
+def _note_flux_frame(found: Fit) -> Iterator[str]:
+    """Yield that the light in the file of the matrix would lower σ, if it would."""
+    for one in found.alternatives:
+        gained = 1.0 - (1.0 if one.share is None else min(one.share, 1.0))
+        explained = found.residual_fraction * float(np.sqrt(gained))
+        if one.key == LIGHT_KEY and explained > MIN_LIGHT_EXPLAINED:
+            yield (
+                f"uneven light explains {explained:.0%} of the signal, and sigma allows for it; "
+                f"the light is in the same file: cut the four pupil images out of {FLUX_FRAME}, "
+                "save their counts as flux (4, n, n) and give them (--flux-map)"
+            )
 
 
 def make_reference(recorded: Recorded, instrument: Instrument) -> tuple[Reference, tuple[str, ...]]:

@@ -32,10 +32,10 @@ UNKNOWN_IMAGES = 'image_offsets_px = "unknown"'
 NOTABLE_CHANGE = 0.03
 """Smallest difference of a logarithm from the file's value that is reported."""
 
-MIN_EXPLAINED = 0.005
+MIN_EXPLAINED = 0.01
 """RMS share of the signal that another instrument must explain to be preferred. Models of one
-instrument differ by about as much: with OOPAO's own Shack-Hartmann 0.2 % is left over, and another
-stop explains 0.12 % by coincidence with model errors."""
+instrument differ by about as much: with HCIPy's lenslets 1.0 % is left over, and another stop
+explains 0.7 % by coincidence with model errors."""
 
 UNDECIDED_SHARE = 0.3
 """Share of χ² left by another coupling or modulation above which it may compensate something else.

@@ -633,6 +633,7 @@ def _make_fit(
         axes=axes_doubt,
         passes=usable.passes,
         stroke_known=stroke_known,
+        noise_share=noise_share,
         radius_subap=models.instrument.wfs.pupil_diameter / 2.0,
     )
     refusal, verdict = judge_fit(findings)

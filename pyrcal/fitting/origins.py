@@ -23,6 +23,10 @@ MAX_LOG_SIGMA = 0.5
 """
 
 
+MAX_GAIN_SCATTER = 0.35
+"""Relative scatter of the gains above which their median says nothing of the wavelength."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Origin:
     """A number or choice determined from the matrix."""
@@ -162,7 +166,7 @@ def _find_wavelength(about: Instrument, gains: NDArray[np.float64]) -> Iterator[
             found=f"{about.wfs.wavelength_m / middle:.3g}",
             reported='"unknown"',
             how=f"from the gains, which scatter by {scatter:.1%}",
-            correct=True,
+            correct=scatter < MAX_GAIN_SCATTER,
         )
 
 

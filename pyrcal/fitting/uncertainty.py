@@ -30,10 +30,14 @@ from service.model.instrument import Mirror
 Array = NDArray[np.float64]
 
 FLOOR_SUBAP = 3e-4
-"""Smallest 1 σ of a point's position on the pupil: of a shift, and at the pupil's edge of a
-rotation. Noise-free matrices of other codes, of the same mirror at 0.3 to 1.1 subapertures, were
-fitted with errors of 0.017 to 0.038 % (RMS of a shift); with modes of a sensor of 20 subapertures,
-modulated by 20 points, 0.05 % and 0.0017 deg."""
+"""Smallest 1 σ of a shift. Noise-free matrices of other codes, of the same mirror at 0.3 to 1.1
+subapertures, were fitted with errors of 0.017 to 0.038 % (RMS of a shift); with modes of a sensor
+of 20 subapertures, modulated by 20 points, 0.05 %."""
+
+EDGE_FLOOR_SUBAP = 1.5e-4
+"""Smallest 1 σ of a point at the pupil's edge by a rotation. With 12 subapertures matrices of an
+FFT pyramid and of OOPAO had errors of 0.5 and 1.4e-4 (RMS), with 20 subapertures 3e-4, of which
+the scatter between modes and regions shows the rest."""
 
 MAGNIFICATION_FLOOR = 1e-4
 """Smallest 1 σ of the magnification: the error on those matrices was 3e-5 with modes, 1.2e-4 with
@@ -255,9 +259,10 @@ def uncertainty(
         model_error[stretches] = few[3] * REGIONAL_SHARE[3] * regional[4:][stretches]
     kind_share = min(1.0, residual_fraction / STRANGE_RESIDUAL)
     far = kind_share * FAR_SHARE * shift_subap
-    # The floor is a displacement on the pupil: a rotation moves its edge by the radius times as
-    # much.
-    floor = np.array([FLOOR_SUBAP, FLOOR_SUBAP, FLOOR_SUBAP / radius_subap, magnification_floor])
+    # A rotation moves the pupil's edge by the radius times as much.
+    floor = np.array(
+        [FLOOR_SUBAP, FLOOR_SUBAP, EDGE_FLOOR_SUBAP / radius_subap, magnification_floor]
+    )
     # a quantity fixed by its prior may have any value within that prior
     held_back = (spread * np.diag(held) @ spread)[:4, :4] * noise * dispersed
     from_model = np.diag(share**2 + floor**2 + far**2) + held_back

@@ -17,7 +17,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.fitting.alternatives import Alternative
+from pyrcal.fitting.alternatives import LIGHT_KEY, Alternative
 from pyrcal.fitting.instrument_checks import AlternativeInstrument, FileValuesFit, FoundOptic
 from pyrcal.fitting.methods import Landing
 from pyrcal.fitting.pupil_width import SeenPupil
@@ -34,6 +34,10 @@ of another basis or in a false minimum the model explains a quarter of the signa
 MIN_CHANCE_RATIO = 4.0
 """Smallest power that the model explains over what it explains of pure noise, with one gain fitted
 for each mode."""
+
+MAX_WITHOUT_CAUSE = 0.4
+"""Largest RMS share of the signal that may be left over beyond noise where nothing that was tried
+explains any of it."""
 
 NOTABLE_STRUCTURE = 0.09
 """RMS share of the signal in the structured residual above which a note names a cause."""
@@ -119,6 +123,9 @@ class FitFindings:
 
     stroke_known: bool
 
+    noise_share: float
+    """Largest share of the residual's power that is noise, 0 to 1."""
+
     radius_subap: float
     """Radius of the pupil, subapertures."""
 
@@ -150,6 +157,7 @@ class Refusal(StrEnum):
     ANOTHER_BASIS = "another basis"
     ANOTHER_UNIT = "another unit"
     DIVIDED = "divided"
+    WITHOUT_CAUSE = "without cause"
 
 
 def judge_fit(findings: FitFindings) -> tuple[Refusal | None, str]:
@@ -165,6 +173,7 @@ def judge_fit(findings: FitFindings) -> tuple[Refusal | None, str]:
         (Refusal.ANOTHER_BASIS, _check_basis(findings)),
         (Refusal.ANOTHER_UNIT, _check_unit(findings)),
         (Refusal.DIVIDED, _check_agreement(findings)),
+        (Refusal.WITHOUT_CAUSE, _check_cause(findings)),
     ):
         if refusal:
             return reason, f"refused: {refusal}"
@@ -209,6 +218,20 @@ def _check_explanation(findings: FitFindings) -> str:
         f"the model explains {1.0 - findings.residual_fraction**2:.0%} of the signal's power, and "
         f"what it leaves is not noise alone ({findings.structure:.0%} of the signal): a false "
         "minimum (start closer), or another basis or instrument than the file's"
+    )
+
+
+def _check_cause(findings: FitFindings) -> str:
+    # Uneven light is a cause as well, although it is no correction of the instrument file.
+    light = [one.share for one in findings.alternatives if one.key == LIGHT_KEY]
+    share = min((one for one in light if one is not None), default=1.0)
+    left = findings.residual_fraction * float(np.sqrt(share * (1.0 - findings.noise_share)))
+    if left < MAX_WITHOUT_CAUSE or any(one.preferred and one.key for one in findings.alternatives):
+        return ""
+    return (
+        f"{findings.residual_fraction:.0%} of the signal is left over, at most "
+        f"{findings.noise_share:.0%} of its power is noise, and no cause was found: the sensor, "
+        "the mirror, the modes or the pupil are not those of the instrument file"
     )
 
 

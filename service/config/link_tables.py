@@ -142,10 +142,8 @@ class ZenohTable(CredentialsTable):
         for endpoint in endpoints:
             parts = _USABLE.fullmatch(endpoint)
             if parts is None or int(parts[2] or 0) > MAX_PORT:
-                raise ValueError(
-                    f"found {endpoint}, expected PROTOCOL/HOST:PORT like {DEFAULT_ENDPOINT}, "
-                    f"PROTOCOL tcp, tls, udp, quic or ws, PORT at most {MAX_PORT}"
-                )
+                expected = f"tcp, tls, udp, quic or ws/HOST:PORT like {DEFAULT_ENDPOINT}"
+                raise ValueError(f"found {endpoint}, expected {expected}, PORT up to {MAX_PORT}")
         return endpoints
 
     @model_validator(mode="after")

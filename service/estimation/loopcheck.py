@@ -91,8 +91,8 @@ class LoopCheck(Streaming):
     swap_seq: int | None = None
     """First frame of this reconstructor; None once its first frames have been judged."""
 
-    opposite: CommandResidual | None = None
-    """What they show if the commands went the opposite way; None if they did not."""
+    opposite_id: str | None = None
+    """Its id if its first commands went the opposite way; None if they did not."""
 
     tail: FrameBlock | None = None
     """The last few frames, for those that come."""
@@ -243,7 +243,7 @@ def observe(check: LoopCheck, block: FrameBlock, loop: ClosedLoop) -> LoopCheck:
     if check.cm_id != loop.cm_id:  # frames of another matrix come before the status that tells it
         first_seq = max(block.first_seq, check.from_seq)
         check = replace(check, cm_id=loop.cm_id, tail=None, waiting=(), batches=())
-        check = replace(check, swap_seq=first_seq, opposite=None)
+        check = replace(check, swap_seq=first_seq, opposite_id=None)
     depth = n_delay + _STEPS + _TAPS - 1
     tail = check.tail
     if tail is not None and not _goes_on(tail, block):
@@ -265,9 +265,9 @@ def observe(check: LoopCheck, block: FrameBlock, loop: ClosedLoop) -> LoopCheck:
     check = replace(check, tail=_last(tail, block, depth), waiting=tuple(waiting))
     if check.swap_seq is not None and block.next_seq >= judged_seq:
         _, found = command_residual(check, loop, check.swap_seq, judged_seq - 1, WINDOW_SAMPLES)
-        opposite = found if found is not None and found.is_opposite else None
+        opposite_id = loop.cm_id if found is not None and found.is_opposite else None
         kept = tuple(s for s in waiting if s.seq >= judged_seq or s.seq % stride == 0)
-        check = replace(check, swap_seq=None, opposite=opposite, waiting=kept)
+        check = replace(check, swap_seq=None, opposite_id=opposite_id, waiting=kept)
     return _multiply_waiting(check, loop) if len(check.waiting) >= BATCH_SAMPLES else check
 
 

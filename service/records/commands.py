@@ -494,10 +494,18 @@ def _none_twice(groups: tuple[ModeGroup, ...]) -> None:
             raise ValueError(f"no mode in two groups: mode {after[0]} is")
 
 
-def makes_safer(command: Command) -> bool:
-    """Return True if an order ends something or takes it back: it must not wait for the disk."""
+def makes_safer(command: Command, gains: tuple[float, ...] = ()) -> bool:
+    """Return True if an order ends something, takes it back, or lowers gains of the loop.
+
+    It must not wait for the disk. ``gains`` are those of the RTC, one per mode.
+    """
     if isinstance(command, SetLoop):
-        return command.loop == "open"
+        changes = (command.loop, command.leak, command.n_controlled, command.effective_gain)
+        lowers = changes == (None,) * len(changes) and all(
+            group.gain <= min(gains[group.first : group.last + 1], default=0.0)
+            for group in command.gains or ()
+        )
+        return command.loop == "open" or lowers
     if isinstance(command, SetMode):
         return command.mode is Mode.HOLD
     enders = StopEverything | StopDither | Rollback | AbortAcquisition | GiveUp | Reject

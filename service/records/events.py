@@ -367,8 +367,6 @@ class MatrixMisapplied:
     """The commands show that the RTC multiplies with other numbers than those of this matrix."""
 
     id: str
-    text: str
-    """What the commands show."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -144,7 +144,8 @@ class ArchiveWriter:
             If the disk refuses: it must not be done.
         """
         self._order(order, actor)
-        if not makes_safer(order.command):
+        rtc = self._state().loop.rtc
+        if not makes_safer(order.command, () if rtc is None else rtc.gains):
             await self.flush()
 
     def answered(self, order: GivenCommand, actor: Actor, answer: str) -> None:

@@ -9,8 +9,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-import numpy as np
-
 from service.estimation.control_law import ControlLawCheck
 from service.estimation.dither_monitor import MAX_AMPLITUDE_RATIO, DitherMeasurement, DitherWatch
 from service.estimation.dither_windows import DitherWindows
@@ -105,15 +103,8 @@ def _held(_: Rejection, now: Rejection, loop: LoopContext, state: TrackerState) 
 def _report_opposite(
     before: LoopCheck, now: LoopCheck, loop: LoopContext, state: TrackerState
 ) -> list[Event]:
-    found = now.opposite
-    if found is None or found is before.opposite:
-        return []
-    text = (
-        "the RTC applies another matrix than it says: the first commands with "
-        f"{found.cm_id} are {np.nanmedian(found.share):.2f} times what its numbers require: the "
-        "sign of the matrix is turned in the RTC"
-    )
-    return [ev.MatrixMisapplied(id=found.cm_id, text=text)]
+    opposite = now.opposite_id
+    return [] if opposite in {None, before.opposite_id} else [ev.MatrixMisapplied(id=opposite)]
 
 
 def _report_comparison(
@@ -158,11 +149,7 @@ REGISTRY: Final = (
     Entry(ControlLawCheck, {alarms.WRONG_LOOP: "the loop follows its status again"}),
     Entry(EdgeHealth, {alarms.EDGE_SLIP: "the outer ring is back"}),
     Entry(PlayedCommands, {alarms.NOT_PLAYED: "the slopes answer the commands again"}),
-    Entry(
-        LoopCheck,
-        {alarms.OFF_LOOP: "commands obey the loop equation again"},
-        events=_report_opposite,
-    ),
+    Entry(LoopCheck, {alarms.OFF_LOOP: "commands obey the loop equation again"}, _report_opposite),
     Entry(Rejection, events=_held),
     Entry(Comparison, events=_report_comparison),
     Entry(Passive),

@@ -414,14 +414,12 @@ class Supervisor:
                 except LinkError as error:
                     if noted != str(error):
                         noted = str(error)
-                        text = f"{noted}; tried again every {LINK_RETRY_INTERVAL_S:g} s"
-                        self._note("link.waiting", text, Level.WARNING)
+                        self._note("link.waiting", f"{noted}; tried each second", Level.WARNING)
                 else:
                     noted = ""
                     if not link.missing:
                         text = (
-                            "the RTC's token was present and no message arrived: the link was "
-                            "opened again"
+                            "no message of an RTC that is there arrived: the link was opened again"
                         )
                         self._note("link.reopened", text, Level.WARNING)
             await asyncio.sleep(LINK_RETRY_INTERVAL_S)

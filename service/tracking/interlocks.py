@@ -84,7 +84,11 @@ ALLOWS: Final[dict[OperationKind, frozenset[type]]] = {
     OperationKind.MAKING: _ALL - {cmd.Measure, cmd.Refit, cmd.Publish},
     OperationKind.SENDING: _ALL - {cmd.Measure},
 }
-"""Orders that are carried out while it runs; a gain ramp also lets the loop be opened."""
+"""Orders that are carried out while it runs; ``_LET_OPEN`` also let the loop be opened."""
+
+_LET_OPEN: Final = {OperationKind.RAMPING, OperationKind.STOPPED}
+"""Operations during which the loop may be opened. An RTC ends a gain ramp when its loop is opened,
+and knows no other way; alarms ask for an open loop also while everything is stopped."""
 
 
 def permitted(state: TrackerState, order: Order, policy: Policy, now_ns: int) -> Permission:
@@ -136,9 +140,7 @@ def _decide(moment: Moment, order: Order) -> Permission:
     kind = order if isinstance(order, type) else type(order)
     opens = isinstance(order, cmd.SetLoop) and order.loop == "open"
     for running in moment.running:
-        # An RTC ends a gain ramp when its loop is opened, and knows no other way.
-        ends_it = opens and running.kind is OperationKind.RAMPING
-        if kind not in ALLOWS[running.kind] and not ends_it:
+        if kind not in ALLOWS[running.kind] and not (opens and running.kind in _LET_OPEN):
             return Permission(allowed=False, reason=running.text)
     interlock = INTERLOCKS.get(kind)
     reason = None if interlock is None else interlock(moment, _named(order))

@@ -510,7 +510,11 @@ def _check_swap(context: StepContext, named: str) -> bool:
 
 def on_misapplied(context: StepContext, event: ev.MatrixMisapplied) -> None:
     """Note that the RTC multiplies with other numbers; nothing more is sent by itself."""
-    text = f"{event.text}. Nothing more is sent: mend the RTC, then set the mode"
+    text = (
+        f"the RTC applies another matrix than it says: the first commands with {event.id} are the "
+        "opposite of what its numbers require, so the RTC turns the sign of the matrix. Nothing "
+        "more is sent: mend the RTC, then set the mode"
+    )
     context.matrices = replace(context.matrices, misapplied=text, misapplied_id=event.id)
 
 

@@ -115,6 +115,10 @@ MAX_HEAD_S = 5
 """Time for the head of a request from the beginning of its connection, or the answer before it,
 seconds."""
 
+ARRIVAL_S = 0.05
+"""Time for the request of a new connection to arrive before others are ended, seconds. A wave of
+strangers may be accepted at once, with an operator among the first of them."""
+
 CROWD_REPORT_S = 10.0
 """Time for which connections that had to end are reported."""
 
@@ -174,21 +178,26 @@ class Crowd(ServerState):
         super().__init__()
         self._ended: Counter[str] = Counter()
         self._last_s = -math.inf
+        self._makes_room = False
 
-    def make_room(self) -> None:
-        """End some connections if there are more than there may be."""
+    def admit(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Make room after a new connection, when its request has had time to arrive."""
+        if len(self.connections) > MAX_CONNECTIONS and not self._makes_room:
+            self._makes_room = True
+            loop.call_later(ARRIVAL_S, self._make_room)
+
+    def _make_room(self) -> None:
+        self._makes_room = False
         members = cast("set[Connection]", self.connections)
-        if len(members) <= MAX_CONNECTIONS:
-            return
-        address, n = Counter(each.address for each in members).most_common(1)[0]
-        # A tenth of them at once: a choice among all for each that comes would take too long.
-        oldest = sorted((each for each in members if each.address == address), key=Connection.rank)
-        for each in oldest[: max(n // 10, 1)]:
-            # connection_lost() comes later, and others may come before it.
-            members.discard(each)
-            each.transport.abort()  # close() would wait for one that does not read
-            self._ended[address] += 1
-        self._last_s = time.monotonic()
+        while (excess := len(members) - MAX_CONNECTIONS) > 0:
+            address, _ = Counter(each.address for each in members).most_common(1)[0]
+            theirs = (each for each in members if each.address == address)
+            for each in sorted(theirs, key=Connection.rank)[:excess]:
+                # connection_lost() comes later.
+                members.discard(each)
+                each.transport.abort()  # close() would wait for one that does not read
+                self._ended[address] += 1
+            self._last_s = time.monotonic()
 
     def complaint(self) -> str:
         """Return whose connections had to end lately; empty: nobody's."""
@@ -198,8 +207,7 @@ class Crowd(ServerState):
         address, n = self._ended.most_common(1)[0]
         return (
             f"more than {MAX_CONNECTIONS} connections to REST at once: {n} of {address} were "
-            "ended, the oldest first. Orders and the page work, perhaps at the second try: end "
-            "the program there, or limit the connections of an address with a firewall or proxy"
+            "ended, the oldest first: end the program there, or limit connections by a firewall"
         )
 
 
@@ -218,7 +226,7 @@ class Connection(H11Protocol):
         self.timeout_keep_alive_task = self.loop.call_later(
             self.timeout_keep_alive, self.timeout_keep_alive_handler
         )
-        cast(Crowd, self.server_state).make_room()
+        cast(Crowd, self.server_state).admit(self.loop)
 
     @override
     def data_received(self, data: bytes) -> None:

@@ -310,11 +310,8 @@ MAX_LISTENERS = 60
 RETRY_MS = 1000
 """Time after which a disconnected listener reconnects, milliseconds."""
 
-_CLOCKS = {
-    *("now_ns", "now_utc", "uptime_s", "age_s"),
-    *("window_age_s", "frame_age_s", "telemetry_age_s"),
-}
-"""Fields of the state that change while nothing happens."""
+_CLOCKS = ("now_ns", "now_utc", "uptime_s", "age_s")
+"""Ends of the names of the state's fields that change while nothing happens."""
 
 Log = tuple[LogEntry, ...]
 
@@ -419,7 +416,7 @@ def _without_clocks(shown: dict[str, Any]) -> dict[str, Any]:
     return {
         key: _without_clocks(value) if isinstance(value, dict) else value
         for key, value in shown.items()
-        if key not in _CLOCKS
+        if not key.endswith(_CLOCKS)
     }
 
 

@@ -18,7 +18,7 @@ from tests.system.night import a_night, wait_for
 from tests.system.pace import patience
 
 N_CONNECTIONS = 1000
-LASTS_S = 20.0
+LASTS_S = 8.0
 AGAIN_S = 1.0
 
 HEAD = b"POST /v1/stop HTTP/1.1\r\nHost: 127.0.0.1\r\n"

@@ -214,21 +214,35 @@ async def test_a_body_may_come_in_many_pieces(service):
 HALF_HEAD = b"POST /v1/stop HTTP/1.1\r\nHost: localhost\r\nX-"
 
 
+async def ended(connection):
+    with contextlib.suppress(ConnectionResetError):
+        assert await asyncio.wait_for(connection[0].read(), patience(5.0)) == b""
+    return True
+
+
+@contextlib.asynccontextmanager
+async def held(port, *sent, local="127.0.0.1"):
+    """Connections that have sent something, in this order."""
+    lines = [await asyncio.open_connection("127.0.0.1", port, local_addr=(local, 0)) for _ in sent]
+    for (_, writer), data in zip(lines, sent, strict=True):
+        writer.write(data)
+    yield lines
+    for _, writer in lines:
+        writer.close()
+
+
 @pytest.mark.parametrize("sent", [b"", HALF_HEAD, SLOW_BODY])
 async def test_for_more_connections_than_there_may_be_the_oldest_end(service, monkeypatch, sent):
     monkeypatch.setattr(connections, "MAX_CONNECTIONS", 3)
-    async with serving(service) as port:
-        held = [await connected(port, sent) for _ in range(3)]
+    async with serving(service) as port, held(port, *[sent] * 3) as lines:
         assert service.crowd.complaint() == ""
-        assert (await state_of(port)).status_code == 200
-        assert "1 of 127.0.0.1" in service.crowd.complaint()
-        with contextlib.suppress(ConnectionResetError):
-            assert await asyncio.wait_for(held[0][0].read(), patience(5.0)) == b""
-        assert not any(reader.at_eof() for reader, _ in held[1:])
-        monkeypatch.setattr(connections, "CROWD_REPORT_S", 0.0)
-        assert service.crowd.complaint() == ""
-        for _, writer in held:
-            writer.close()
+        async with held(port, sent):
+            assert await ended(lines[0])
+            assert (await state_of(port)).status_code == 200
+            assert "1 of 127.0.0.1" in service.crowd.complaint()
+            assert not any(reader.at_eof() for reader, _ in lines[1:])
+            monkeypatch.setattr(connections, "CROWD_REPORT_S", 0.0)
+            assert service.crowd.complaint() == ""
 
 
 async def test_connections_without_a_request_end_before_those_that_are_answered(
@@ -236,34 +250,35 @@ async def test_connections_without_a_request_end_before_those_that_are_answered(
 ):
     """The page's stream is older than a crowd, and outlives it."""
     monkeypatch.setattr(connections, "MAX_CONNECTIONS", 3)
-    async with serving(service) as port:
-        stream, writer = await connected(
-            port, b"GET /v1/stream HTTP/1.1\r\nHost: localhost\r\n\r\n"
-        )
-        assert b" 200 " in await asyncio.wait_for(stream.readline(), patience(5.0))
-        idle = [await connected(port, sent) for sent in (SLOW_BODY, b"")]
-        assert (await state_of(port)).status_code == 200
-        with contextlib.suppress(ConnectionResetError):
-            assert await asyncio.wait_for(idle[0][0].read(), patience(5.0)) == b""
-        assert not stream.at_eof()
-        assert not idle[1][0].at_eof()
-        for each in (writer, idle[0][1], idle[1][1]):
-            each.close()
+    stream = b"GET /v1/stream HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    async with serving(service) as port, held(port, stream) as lines:
+        assert b" 200 " in await asyncio.wait_for(lines[0][0].readline(), patience(5.0))
+        async with held(port, b"", SLOW_BODY, b"") as idle:
+            assert await ended(idle[0])
+            assert not any(reader.at_eof() for reader, _ in [*lines, *idle[1:]])
+
+
+async def test_a_request_that_comes_with_a_crowd_is_answered(service, monkeypatch):
+    """Its connection is older than most of the crowd's, and its bytes have not been read yet."""
+    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 3)
+    monkeypatch.setattr(connections, "ARRIVAL_S", 0.5)
+    stream = b"GET /v1/stream HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    async with serving(service) as port, held(port, b"") as lines, held(port, *[b""] * 6) as crowd:
+        lines[0][1].write(stream)
+        assert b" 200 " in await asyncio.wait_for(lines[0][0].readline(), patience(5.0))
+        assert await ended(crowd[0])
+        assert not lines[0][0].at_eof()
 
 
 async def test_the_address_with_most_connections_makes_room(service, monkeypatch):
     monkeypatch.setattr(connections, "MAX_CONNECTIONS", 3)
-    async with serving(service) as port:
-        first, writer = await asyncio.open_connection(
-            "127.0.0.1", port, local_addr=("127.0.0.2", 0)
-        )
-        held = [await connected(port) for _ in range(2)]
-        assert (await state_of(port)).status_code == 200
-        with contextlib.suppress(ConnectionResetError):
-            assert await asyncio.wait_for(held[0][0].read(), patience(5.0)) == b""
-        assert not first.at_eof()
-        for each in (writer, held[0][1], held[1][1]):
-            each.close()
+    async with (
+        serving(service) as port,
+        held(port, b"", local="127.0.0.2") as lines,
+        held(port, b"", b"", b"") as crowd,
+    ):
+        assert await ended(crowd[0])
+        assert not any(reader.at_eof() for reader, _ in [*lines, *crowd[1:]])
 
 
 @pytest.mark.parametrize("sent", [b"", HALF_HEAD])

@@ -105,7 +105,7 @@ async def test_a_change_is_told_and_the_clock_alone_is_none(service):
     async with serving(service) as listening, listening() as listener:
         await listener.event("reset")
         service.now = replace(service.now, now_ns=200)
-        service.now = replace(service.now, link=replace(LINK, frame_age_s=3.0))
+        service.now = replace(service.now, link=replace(LINK, frame_age_s=3.0, telemetry_age_s=0.4))
         told = await listener.message()
         assert told[""] == "nothing new"  # the heartbeat came before any state
         assert json.loads((await listener.event("state"))["data"])["now_ns"] == 200

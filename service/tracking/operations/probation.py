@@ -262,8 +262,8 @@ def _watch(context: StepContext, trial: Probation) -> None:
     """End the check of the loop with the matrix before: lost, opened, or undecided."""
     waited_s = (context.now_ns - trial.since_ns_utc) / SECOND_NS
     lost, named = context.blocking_alarm(Interlock.HOLD), context.state.alarm(alarms.MISAPPLIED)
-    since_ns = context.now_ns if named is None else named.since_ns_utc
-    opposite_s = (context.now_ns - since_ns) / SECOND_NS
+    opposite = named is not None and context.matrices.misapplied_id is not None
+    opposite_s = (context.now_ns - named.since_ns_utc) / SECOND_NS if named and opposite else 0.0
     if gone := _check_loop(context):
         _end_watch(context, trial, gone, lost=False)
     # The detector of divergence averages over half a second, so that it still shows the rejected

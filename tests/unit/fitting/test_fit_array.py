@@ -9,6 +9,7 @@ import pyrcal
 from pyrcal.fitting.fit_file import fit_file
 from service.errors import MatrixError
 from service.model.misregistration import Misregistration
+from service.model.pupil import Illumination
 from tests.unit.estimation.bench import ELSEWHERE, error, instrument, matrix
 
 MODES = np.arange(10, 40)
@@ -29,6 +30,19 @@ def test_a_fit_of_an_array_is_that_of_its_file(tmp_path):
     np.testing.assert_allclose(of_array.covariance, of_file.covariance, rtol=1e-6)
     assert of_array.verdict == of_file.verdict
     assert len(of_array.alternatives) == len(of_file.alternatives)
+
+
+@pytest.mark.parametrize(("uneven", "said"), [(0.6, True), (0.0, False)])
+def test_a_mean_frame_in_the_file_is_mentioned_where_its_light_would_lower_sigma(uneven, said):
+    across = np.linspace(-7.0, 7.0, 57)
+    lamp = Illumination(
+        coordinates=across, intensity=1.0 + uneven * np.sin(0.4 * across) + 0.0 * across[:, None]
+    )
+    columns = matrix(illumination=lamp if said else None, noise=0.05)
+    frame = np.ones((40, 40))
+    found = pyrcal.fit(instrument(), columns, flux_frame=frame, threads=1)
+    assert any("out of flux_frame" in one for one in found.remarks) is said
+    assert not any("flux_frame" in one for one in pyrcal.fit(instrument(), columns).remarks)
 
 
 def test_columns_of_some_modes_are_named_by_their_indices():

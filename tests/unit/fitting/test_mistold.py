@@ -13,6 +13,8 @@ import pytest
 
 from pyrcal.fitting.matrix import FitOptions, fit_matrix
 from pyrcal.fitting.models import Optic
+from pyrcal_studies.drawn_fits import Condition, Draw, instrument_of
+from pyrcal_studies.drawn_fits import measured as drawn_matrices
 from pyrcal_studies.fft_pyramid import FftPyramid
 from service.errors import ModelError
 from service.estimation.reference import Reference
@@ -67,6 +69,7 @@ def zonal(
     truth: Misregistration = TRUTH,
     pupil_subap: tuple[float, float] = (0.0, 0.0),
     arms_deg: tuple[float, ...] = (),
+    modulation: float = 3.0,
 ) -> np.ndarray:
     """Every actuator pushed where the truth puts it, ``(n_slopes, n_actuators)``."""
     n = N * SAMPLING
@@ -85,6 +88,7 @@ def zonal(
         n_subapertures=N,
         image_separation_subap=16.0,
         padded_subap=80,
+        modulation_lambda_over_d=modulation,
     )
     x, y = np.meshgrid(pyramid.coordinates, pyramid.coordinates)
     x, y = x - truth.shift_x_subap, y - truth.shift_y_subap
@@ -127,6 +131,39 @@ def test_whatever_modulation_is_told_the_registration_is_right_and_the_modulatio
     assert np.all(sigmas_off(found) < 3.0)
     assert any("modulation_lambda_over_d = 3" in remark for remark in found.remarks)
     assert not any("coupling" in remark for remark in found.remarks)
+
+
+@pytest.mark.parametrize(
+    ("true", "told", "named"),
+    [
+        (3.0, 0.0, 'modulation_lambda_over_d = "unknown"'),
+        (0.0, 3.0, "modulation_lambda_over_d = 0"),
+    ],
+)
+def test_no_modulation_and_one_are_never_taken_for_each_other(true, told, named):
+    """They leave half of the signal and move the magnification by a tenth."""
+    matrix = zonal(modulation=true) @ MODES
+    wrong = replace(modulated(told), mirror=bench(mode_to_actuator=MODES).mirror)
+    found = fitted(wrong, matrix, explain=True)
+    assert not found.accepted
+    assert named in found.recommendation
+    again = fitted(replace(wrong, wfs=modulated(true).wfs), matrix)
+    assert again.accepted
+    assert np.all(sigmas_off(again) < 3.0)
+
+
+@pytest.mark.parametrize("also", [(), ("wfs.wavelength_m",)])
+def test_an_unknown_modulation_of_an_unmodulated_pyramid_is_named_as_zero(also):
+    """The search from 3 λ/D ends at 6.5 λ/D, with gains that scatter by 40 %."""
+    draw = Draw(code="fft", condition=Condition(modulation_lambda_over_d=0.0), seed=0)
+    ((_, measured),) = drawn_matrices([draw])
+    about = instrument_of(draw, measured)
+    wfs = replace(about.wfs, modulation_lambda_over_d=3.0)
+    about = replace(about, wfs=wfs, unknown=("wfs.modulation_lambda_over_d", *also))
+    found = fitted(about, measured.matrix, explain=True)
+    assert not found.accepted
+    assert "with modulation_lambda_over_d = 0 the misfit is" in found.recommendation
+    assert not any(one.correct for one in found.origins if one.key == "wavelength_m")
 
 
 def test_four_modes_and_nine_say_the_same_of_a_modulation():

@@ -2,12 +2,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from pyrcal.fitting.matrix import FitOptions
 from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
-from service.model.pupil import Illumination
+from service.model.pupil import Illumination, rtc_valid_subapertures
 from tests.numerics import small_basis, small_instrument
 from tests.unit.estimation.bench import (
     ELSEWHERE,
@@ -165,6 +166,16 @@ def test_as_much_noise_as_signal_determines_the_registration_as_far_as_sigma_say
     assert np.all(np.abs(error(found)) < 3.0 * found.sigma)
 
 
+@pytest.mark.parametrize(("scatter", "accepted"), [(0.2, True), (0.7, False)])
+def test_half_of_the_signal_left_over_without_noise_or_cause_is_refused(scatter, accepted):
+    """Gains of single slopes: no instrument explains them, and no mode moves by them."""
+    gains = 1.0 + scatter * np.random.default_rng(8).normal(size=(len(matrix()), 1))
+    found = fit(gains * matrix(), options=EXPLAIN)
+    assert found.accepted == accepted
+    assert ("no cause was found" in found.verdict) != accepted
+    assert ("no cause was found" in found.recommendation) != accepted
+
+
 def test_columns_of_noise_alone_are_named_and_left_out():
     dead = matrix()
     dead[:, [3, 20, 30]] = 0.3 * dead.std() * RNG.normal(size=(len(dead), 3))
@@ -172,6 +183,29 @@ def test_columns_of_noise_alone_are_named_and_left_out():
     assert found.accepted, found.verdict
     assert any("3 of 40 columns hold noise only: modes 3, 20, 30" in one for one in found.left_out)
     assert np.all(np.abs(error(found)) < 3.0 * found.sigma)
+
+
+def test_columns_of_smooth_noise_are_named_and_left_out_but_not_those_of_another_basis():
+    """Vibration and turbulence are smooth over the pupil; half of such columns had a wrong sign."""
+    valid, rng = rtc_valid_subapertures(instrument()), np.random.default_rng(5)
+
+    def with_noise(columns):
+        maps = gaussian_filter(rng.normal(size=(len(columns), 2, *valid.shape)), (0, 0, 1.0, 1.0))
+        noise = maps[:, :, valid].reshape(len(columns), -1).T
+        spoilt = matrix()
+        spoilt[:, columns] = 0.3 * spoilt.std() * noise / noise.std()
+        return fit(spoilt)
+
+    found = with_noise([5, 12, 18, 25, 30, 36])
+    assert found.accepted, found.verdict
+    assert any(
+        "6 of 40 columns hold noise only: modes 5, 12, 18, 25, 30, 36" in one
+        for one in found.left_out
+    )
+    assert np.all(np.abs(error(found)) < 3.0 * found.sigma)
+    other = with_noise(list(range(26, 40)))
+    assert not other.accepted
+    assert not any("noise only" in one for one in other.left_out)
 
 
 def test_sets_of_modes_that_were_measured_at_two_registrations_disagree():

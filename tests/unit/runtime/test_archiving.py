@@ -7,9 +7,10 @@ import pytest
 
 from service.archive import AuditEntry
 from service.errors import StorageError
+from service.records import commands as cmd
 from service.records import events as ev
 from service.records.registration import OffloadState
-from service.records.state import Level, LogEntry, TrackerState
+from service.records.state import Level, LogEntry, Mode, TrackerState
 from service.runtime import archiving
 from service.runtime.archiving import ArchiveWriter
 from service.wire import OffloadRequest
@@ -142,3 +143,23 @@ class TestDemandToMoveTheImage:
         go_on.set()
         await asyncio.gather(first, second)
         assert written == [None, story.state.alpha.offload]
+
+
+@pytest.mark.parametrize(
+    ("order", "safer"),
+    [
+        (cmd.SetLoop(loop="open"), True),
+        (cmd.SetLoop(loop="closed"), False),
+        (cmd.SetLoop(gains=(cmd.GainGroup(first=0, last=1, gain=0.2),)), True),
+        (cmd.SetLoop(gains=(cmd.GainGroup(first=0, last=2, gain=0.2),)), False),
+        (cmd.SetLoop(gains=(cmd.GainGroup(first=0, last=1, gain=0.5),)), False),
+        (cmd.SetLoop(gains=(cmd.GainGroup(first=0, last=1, gain=0.2),), leak=1.0), False),
+        (cmd.SetLoop(leak=0.0), False),
+        (cmd.SetMode(mode=Mode.HOLD), True),
+        (cmd.SetMode(mode=Mode.AUTO), False),
+        (cmd.Reject(id="cm-1"), True),
+        (cmd.Approve(id="cm-1"), False),
+    ],
+)
+def test_an_order_is_safer_if_it_ends_something_or_lowers_gains(order, safer):
+    assert cmd.makes_safer(order, gains=(0.4, 0.4, 0.1)) is safer

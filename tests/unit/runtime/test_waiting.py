@@ -341,7 +341,7 @@ def test_the_state_on_the_network_is_short_and_in_boundary_units():
 
 
 def test_what_keeps_a_matrix_from_being_made_is_waited_for():
-    state = tracker_state(system="small", hindrance="Mode 30 does not answer.")
+    state = tracker_state(system="small", rtc=rtc(), hindrance="Mode 30 does not answer.")
     found = waits(link(*WELL), state)["new-matrix"]
     assert (found.responsible, found.blocks) == (Responsible.OPERATOR, False)
     assert found.text == "Mode 30 does not answer."
@@ -349,6 +349,7 @@ def test_what_keeps_a_matrix_from_being_made_is_waited_for():
 
 def test_what_kept_a_matrix_is_not_said_while_an_alarm_forbids_all_decisions():
     hindrance, alarm = "Raise [dither] budget_m.", Alarm(name="no-frames", since_ns_utc=0, text="")
-    assert "new-matrix" in waits(link(*WELL), tracker_state(system="s", hindrance=hindrance))
-    state = tracker_state(system="s", hindrance=hindrance, active=(alarm,))
-    assert "new-matrix" not in waits(link(*WELL), state)
+    state = tracker_state(system="s", rtc=rtc(), hindrance=hindrance)
+    assert "new-matrix" in waits(link(*WELL), state)
+    assert "new-matrix" not in waits(link(*WELL), changed(state, active=(alarm,)))
+    assert "new-matrix" not in waits(link(*WELL), changed(state, rtc=None))

@@ -44,7 +44,7 @@ def names(story, matrix_id, seq):
 
 
 def opposite(story, matrix_id):
-    return story.tell(ev.MatrixMisapplied(id=matrix_id, text="commands go the opposite way"))
+    return story.tell(ev.MatrixMisapplied(id=matrix_id))
 
 
 def goes_back(story, *, answered=True):

@@ -117,13 +117,21 @@ def test_one_that_is_on_its_way_cannot_be_called_back():
         cmd.StartDither(),
         cmd.Acquire(),
         cmd.Rollback(),
-        cmd.SetLoop(loop="open"),
+        cmd.SetLoop(loop="closed"),
         cmd.Measure(id="im-9"),
     ],
 )
 def test_a_command_is_refused_with_who_stopped_it_and_how_it_is_released(command):
     with pytest.raises(CommandError, match=r"stopped by Ada \(someone.*release the stop"):
         stopped(idle()).tell(command)
+
+
+def test_the_loop_may_be_opened_while_everything_is_stopped():
+    """Alarms ask for it; it is no reason to release the stop, which would begin more."""
+    world = stopped(idle())
+    effects = world.tell(cmd.SetLoop(loop="open"))
+    assert [request.loop for request in of_kind(effects, LoopRequest)] == [Loop.OPEN]
+    assert world.state.operator.stopped_because
 
 
 def test_released_it_goes_on_as_it_was_ordered_before():

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.errors import ModelError
-from service.model.instrument import Instrument, SensorMode
+from service.model.instrument import Instrument, SensorDescription, SensorMode
 from service.model.kinds import LoopFacts, Normalisation
 from service.model.pupil import PupilGrid, valid_subapertures
 from service.model.sensors.model import SensorModel, Term
@@ -62,6 +62,9 @@ EDGE_ERROR_RATIO = 0.03
 _SEPARATION_TOLERANCE = 0.1
 
 _FRAME_KEYS = ("pupil_centres_px", "pixels_per_subaperture")
+
+USUAL_MODULATION = 3.0
+"""Modulation, λ/D, that is tried where the instrument file states none."""
 
 _WEAK_LAMBDA_OVER_D = 1.5
 """Modulation up to which the star's own width counts as much."""
@@ -265,6 +268,14 @@ class PyramidModel(SensorModel):
         local = recipe.normalisation is Normalisation.LOCAL
         divisor = Normalisation.GLOBAL if local else Normalisation.LOCAL
         return {f'normalisation = "{divisor}"': replace(recipe, normalisation=divisor)}
+
+    @override
+    def other_sensors(self, sensor: Pyramid) -> dict[str, SensorDescription]:
+        # No modulation is reached by no logarithm of another one, and the reverse.
+        if sensor.modulation_lambda_over_d > 0.0:
+            return {"modulation_lambda_over_d = 0": replace(sensor, modulation_lambda_over_d=0.0)}
+        modulated = replace(sensor, modulation_lambda_over_d=USUAL_MODULATION)
+        return {'modulation_lambda_over_d = "unknown"': modulated}
 
     @override
     def aot(self, recipe: SlopeRecipe) -> tuple[str, dict[str, int]]:

@@ -2,7 +2,6 @@
 
 import json
 import signal
-import socket
 import time
 
 import pytest
@@ -183,13 +182,6 @@ class TestRefusedAtTheStart:
         assert len(lines) == 1, process.log
         assert "Traceback" not in process.log
         return lines[0]
-
-    def test_a_busy_zenoh_port(self, night):
-        port = int(night.zenoh.rpartition(":")[2])
-        words = ["--port", "0", "--listen", night.zenoh, "--instrument", str(INSTRUMENT)]
-        with socket.create_server(("127.0.0.1", port)):
-            line = self.refused(night, *words, "--data-dir", str(night.directory / "data"))
-        assert str(port) in line
 
     def test_a_data_directory_another_service_uses(self, night):
         data = night.directory / "data"

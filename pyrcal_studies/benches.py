@@ -3,7 +3,8 @@
 PAPYRUS (Observatoire de Haute-Provence) and AO188 (Subaru) publish interaction matrices as frames
 of a pyramid's camera, under licences that do not allow them here: they are read from a folder that
 holds ``papyrus/`` and ``ao188/`` as those projects name their files. With ``--wrong`` they are also
-fitted with one value of the instrument file wrong; answers are kept in ``var/benches``.
+fitted with one value of the instrument file wrong; answers are kept in ``var/benches``. With
+``--centres`` AO188 is fitted with other centres of its pupil images, and no page is written.
 Run: ``python -m pyrcal_studies.benches --data PATH --wrong``.
 """
 
@@ -33,6 +34,7 @@ from pyrcal_studies.peers import ROOT
 from pyrcal_studies.shared import save_picture, study_parser
 from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
+from service.model.pupil_images import find_pupil_images
 from service.model.slopes import as_maps, side_by_side
 
 Array = NDArray[np.float64]
@@ -505,12 +507,34 @@ def _over_sigma(one: dict[str, Any]) -> float:
     return float(np.max(np.abs(one["error"]) / np.array(one["sigma"])))
 
 
+def choose_centres(data: Path) -> None:
+    """Fit AO188 with circles at three levels of the light, and print what α moves over σ."""
+    from astropy.io import fits
+
+    light = fits.getdata(data / "ao188" / "wfsref.fits").astype(np.float64)
+    bright = np.maximum(light - np.percentile(light, 2), 0.0)
+    first: Fit | None = None
+    for level in (0.5, 0.25, 0.71):
+        power = float(np.log(0.5) / np.log(level))
+        centres = find_pupil_images(bright**power, "ao188").centres_px
+        key = f"pupil_centres_px = {np.round(centres, 3).tolist()}"
+        told = AO188.replace('pupil_centres_px = "auto"', key)
+        fit = fit_bench(replace(BENCHES[1], instrument=told), data)
+        first = first or fit
+        moved = fit.alpha.vector - first.alpha.vector
+        print(level, key, *np.round(moved * BOUNDARY_SCALE, 4), "over sigma", moved / first.sigma)
+
+
 def main() -> int:
     """Fit, draw, and write the page."""
     parser = study_parser("pyrcal_studies.benches", __doc__)
     parser.add_argument("--data", type=Path, required=True, help="folder of papyrus/ and ao188/")
     parser.add_argument("--wrong", action="store_true", help="fit with wrong values as well")
+    parser.add_argument("--centres", action="store_true", help="only AO188, three sets of centres")
     given = parser.parse_args()
+    if given.centres:
+        choose_centres(given.data)
+        return 0
     found = {}
     for bench in BENCHES:
         if not (given.data / bench.name).is_dir():

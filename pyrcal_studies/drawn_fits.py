@@ -9,7 +9,8 @@ simulated telescope of ``tests/data/tiny`` with its usual imperfections. Both ki
 ``python -m pyrcal_studies.drawn_fits images --codes fft oopao --rms 0.05 --draws 40`` appends a
 line of JSON for each fit to ``var/drawn``; fits that are there already are not made again. With
 ``--table`` it prints the tables of all that is there. Campaigns: images, actuators,
-noise, modulations, mistold (instrument files with one thing wrong), small (the telescope).
+noise, modulations, mistold (instrument files with one thing wrong), stated (the same behind a
+spider, with all that a file states), small (the telescope).
 """
 
 from __future__ import annotations
@@ -51,11 +52,11 @@ from pyrcal_studies.peers import LISTINGS, ROOT, environment, mirror_points, var
 from pyrcal_studies.peers_pushpull import JOB, Bench, Measured, read_product, write_job
 from service.estimation.reference import Reference
 from service.instrument import load_instrument
-from service.model.instrument import Instrument
+from service.model.instrument import Instrument, PupilMap
 from service.model.kinds import Influence, InfluenceShape, Normalisation, SlopeOrder, Stop
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration, rotation
 from service.model.modes import karhunen_loeve_basis
-from service.model.pupil import valid_subapertures
+from service.model.pupil import instrument_pupil, valid_subapertures
 from service.model.sensors.pyramid.description import FrameWindows
 from service.model.slopes import Orientation, SlopeRecipe
 from sim_rtc.telescope.mirror import misplace_actuators
@@ -159,6 +160,9 @@ def _pupil(factor: float) -> Callable[[Instrument], Instrument]:
     )
 
 
+ARM_M, ARMS_DEG = 0.2, (0.0, 90.0, 180.0, 270.0)
+"""Width and directions of the arms of a spider, the same in all axes that a code may have."""
+
 MISTELLINGS = (
     Mistelling(words="coupling 0.20", tell=_coupling(0.2)),
     Mistelling(words="coupling 0.50", tell=_coupling(0.5)),
@@ -175,6 +179,49 @@ MISTELLINGS = (
     Mistelling(words="diameter 2 % large", tell=_diameter(1.02), size=1.0 / 1.02),
     Mistelling(words="pupil image 2 % small", tell=_pupil(0.98), size=0.98),
 )
+
+
+def _arms(turn_deg: float, ratio: float = 1.0) -> Callable[[Instrument], Instrument]:
+    angles = tuple((angle + turn_deg) % 360.0 for angle in ARMS_DEG)
+    return lambda about: replace(about, spiders_m=ratio * ARM_M, spiders_deg=angles)
+
+
+def _map(turn_deg: float) -> Callable[[Instrument], Instrument]:
+    def tell(about: Instrument) -> Instrument:
+        lit = instrument_pupil(_arms(turn_deg)(about), 8).amplitude
+        pupil = PupilMap(lit=lit, pitch_m=about.subaperture_m / 8)
+        return replace(about, pupil=pupil, spiders_m=None, spiders_deg=(), obscuration_ratio=0.0)
+
+    return tell
+
+
+def _hole(ratio: float) -> Callable[[Instrument], Instrument]:
+    return lambda about: replace(about, obscuration_ratio=ratio)
+
+
+def _on_the_grid(about: Instrument) -> Instrument:
+    return as_told(about, np.zeros((2, 2, 2)))
+
+
+def _other_normalisation(about: Instrument) -> Instrument:
+    local = about.slopes.normalisation is Normalisation.LOCAL
+    divisor = Normalisation.GLOBAL if local else Normalisation.LOCAL
+    return replace(about, slopes=replace(about.slopes, normalisation=divisor))
+
+
+STATED = (
+    *(Mistelling(words=f"arms turned by {turn:g} deg", tell=_arms(turn)) for turn in (1, -4, 8)),
+    Mistelling(words="arms twice as wide", tell=_arms(0.0, 2.0)),
+    *(Mistelling(words=f"map turned by {turn:g} deg", tell=_map(turn)) for turn in (-2, 6)),
+    Mistelling(words="images on the grid", tell=_on_the_grid),
+    Mistelling(words="modulation 0", tell=_modulation(0.0)),
+    Mistelling(words="modulation 3", tell=_modulation(3.0)),
+    *(Mistelling(words=f"hole {ratio:g}", tell=_hole(ratio)) for ratio in (0.1, 0.3)),
+    Mistelling(words="the other normalisation", tell=_other_normalisation),
+    Mistelling(words="pupil image 3 % large", tell=_pupil(1.03), size=1.03),
+)
+"""What a file says of a bench with arms; with seven of ``MISTELLINGS`` and no mistake at all."""
+
 AS_IT_IS = Mistelling(words="nothing", tell=lambda about: about)
 
 
@@ -204,7 +251,7 @@ def error(alpha: Misregistration, truth: Misregistration, told: Mistelling) -> A
     return np.asarray(min(errors, key=lambda off: float(np.abs(off[:3]).sum())))
 
 
-TOLD = {one.words: one for one in (AS_IT_IS, *MISTELLINGS)}
+TOLD = {one.words: one for one in (AS_IT_IS, *MISTELLINGS, *STATED)}
 """Instrument files with one thing wrong."""
 
 
@@ -229,6 +276,9 @@ class Condition:
 
     modulation_lambda_over_d: float = 3.0
     """Radius of the modulation circle."""
+
+    arms: bool = False
+    """True with the four arms of a spider."""
 
     told: str = AS_IT_IS.words
     """What the instrument file says that is not so."""
@@ -272,6 +322,12 @@ class Draw:
         return displacements(self.seed, rms) if rms else np.zeros((2, 2, 2))
 
     @property
+    def telescope(self) -> Instrument:
+        """The bench as it is."""
+        about = bench(self.stop)
+        return _arms(0.0)(about) if self.condition.arms else about
+
+    @property
     def bench(self) -> Bench:
         """What a peer is told of the optics."""
         alpha, offsets = self.alpha, self.offsets.reshape(4, 2)
@@ -288,6 +344,7 @@ class Draw:
             stroke_m=self.condition.stroke_m,
             image_shift_subap=(alpha.shift_x_subap, alpha.shift_y_subap) if moved else (0.0, 0.0),
             image_offsets_px=tuple(map(tuple, offsets.tolist())) if offsets.any() else (),
+            arm_subap=ARM_M / 4.0 * N if self.condition.arms else 0.0,
         )
 
     @property
@@ -352,7 +409,7 @@ def _with_noise(draw: Draw, found: Measured) -> Measured:
 def _fft_matrix(draw: Draw) -> Measured:
     """Return the matrix of the FFT pyramid, with the noise of photons."""
     told, stroke_m = draw.bench, draw.condition.stroke_m
-    model = model_of(bench(draw.stop))
+    model = model_of(draw.telescope)
     pyramid = camera(model, draw.offsets, N, told.modulation_lambda_over_d)
     pushes = [
         [pyramid.images(sign * stroke_m * shape, told.image_shift_subap) for sign in (1.0, -1.0)]
@@ -403,7 +460,7 @@ def instrument_of(draw: Draw, found: Measured) -> Instrument:
     """Return what a user of the code knows; a peer's axes are searched for."""
     if draw.code == "diffractive":
         return _tiny(draw)
-    about = bench(draw.stop)
+    about = draw.telescope
     wfs = replace(
         about.wfs,
         wavelength_m=found.wavelength_m,
@@ -484,6 +541,16 @@ def _mistold(given: argparse.Namespace) -> Iterator[Condition]:
     yield from (Condition(told=words) for words in TOLD)
 
 
+def _stated(given: argparse.Namespace) -> Iterator[Condition]:
+    for words in (AS_IT_IS.words, *(one.words for one in (*MISTELLINGS[:7], *STATED))):
+        yield Condition(
+            arms=True,
+            images_px=0.2 if words == "images on the grid" else 0.0,
+            modulation_lambda_over_d=0.0 if words == "modulation 3" else 3.0,
+            told=words,
+        )
+
+
 CAMPAIGNS: dict[str, Callable[[argparse.Namespace], Iterator[Condition]]] = {
     "images": _images,
     "actuators": _actuators,
@@ -491,6 +558,7 @@ CAMPAIGNS: dict[str, Callable[[argparse.Namespace], Iterator[Condition]]] = {
     "modulations": _modulations,
     "small": _modulations,
     "mistold": _mistold,
+    "stated": _stated,
 }
 
 
@@ -503,6 +571,9 @@ def run(name: str, given: argparse.Namespace) -> None:
         seeds = range(given.first_seed, given.first_seed + given.draws)
         draws = [Draw(code=code, condition=condition, seed=seed) for seed in seeds]
         draws = [one for one in draws if (code, str(asdict(condition)), one.seed) not in known]
+        # The axes of a code's detector are found by a poke, which an unmodulated pyramid spreads.
+        if code in LISTINGS and condition.modulation_lambda_over_d == 0.0:
+            continue
         for draw, found, cpu_s in _fits(draws):
             file.add(row(draw, found, cpu_s))
 

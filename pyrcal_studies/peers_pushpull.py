@@ -76,6 +76,9 @@ class Bench:
     """Displacement (columns, rows) of each pupil image, pixels, in the order of the detector's
     quadrants, row by row. Empty if the images lie on the pixel grid."""
 
+    arm_subap: float = 0.0
+    """Width of the four arms of a spider along x and y, subapertures; 0 without."""
+
     @property
     def n_pupil(self) -> int:
         """Pupil points across."""
@@ -87,6 +90,8 @@ class Bench:
         along = (np.arange(fine) - (fine - 1) / 2) / (fine / 2)
         radius = np.hypot(along, along[:, None])
         lit = (radius <= 1.0) & (radius >= self.obscuration_ratio)
+        across = np.minimum(np.abs(along), np.abs(along[:, None]))
+        lit &= across >= self.arm_subap / self.n_subapertures
         return np.asarray(lit.reshape(self.n_pupil, _FINE, self.n_pupil, _FINE).mean(axis=(1, 3)))
 
     @property

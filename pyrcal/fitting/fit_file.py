@@ -237,21 +237,25 @@ def make_reference(recorded: Recorded, instrument: Instrument) -> tuple[Referenc
     frames = recorded.values.ndim == 3
     if frames and recorded.noise is not None:
         notes.append("the noise in the measured file is of frames, not of slopes: not used")
-    matrix, found = _slopes(recorded, instrument)
+    matrix, found, place_sigma = _slopes(recorded, instrument)
     notes += found
     reference = Reference(
         matrix=matrix,
         modes=recorded.modes,
         noise=None if frames else recorded.noise,
         double_pass=double_pass,
+        place_sigma_subap=place_sigma,
     )
     return reference, tuple(notes)
 
 
 def _slopes(
     recorded: Recorded, instrument: Instrument
-) -> tuple[NDArray[np.float64], tuple[str, ...]]:
-    """Return the measured slopes, extracted from detector frames if necessary, and notes."""
+) -> tuple[NDArray[np.float64], tuple[str, ...], float]:
+    """Return the measured slopes, made of detector frames if necessary, notes, and σ.
+
+    The last value is 1 σ of the place of the grid on the pupil images, subapertures.
+    """
     found = f"{recorded.where}: found shape {recorded.values.shape}"
     if instrument.frames is None:
         if recorded.values.ndim == 3:
@@ -259,7 +263,7 @@ def _slopes(
                 f"{found}, expected (n_slopes, n_modes): detector frames need "
                 'wfs.input = "frames" in the instrument file'
             )
-        return recorded.values, ()
+        return recorded.values, (), 0.0
     if recorded.values.ndim != 3:
         raise MatrixError(
             f'{found}, expected detector frames (n_modes, ny, nx): wfs.input is "frames"'
@@ -270,5 +274,5 @@ def _slopes(
             "(ny, nx) in the same counts"
         )
     kind, flux_frame = kind_of(instrument), recorded.flux_frame
-    located, remarks = kind.locate_images(instrument, flux_frame)
-    return kind.signals_of_frames(located, recorded.values, flux_frame), remarks
+    located, remarks, sigma = kind.locate_images(instrument, flux_frame)
+    return kind.signals_of_frames(located, recorded.values, flux_frame), remarks, sigma

@@ -602,7 +602,8 @@ def _make_fit(
     # Tilted faces of a pyramid displace its images and also turn the edges between the faces. The
     # model contains the displacement only.
     turned = kind_of(models.instrument).turned_edge_sigma(models.instrument, images.reshape(2, 4).T)
-    sure = sure.with_moves(np.array([misplaced, turned]), np.ones(2))
+    shifted = usable.place_sigma_subap * np.eye(4)[:2]
+    sure = sure.with_moves(np.array([misplaced, turned, *shifted]), np.ones(4))
     noise_share = bound_noise_share(seen.residual, solution.matrix[target.rows] * seen.gains)
     # large pokes look like a wider modulation, which the fit may have taken for the true one
     weakly_modulated = any(

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pyrcal.fitting.methods import Settled, spread
 from pyrcal.fitting.models import PREFERRED_SHARE, FitModels
-from pyrcal.fitting.solver import nuisances_of
+from pyrcal.fitting.solver import nuisances_of, refine
 from pyrcal.fitting.uncertainty import pupil_regions
 from service.estimation.solver import Projection
 from service.model.instrument import Instrument
@@ -231,7 +231,7 @@ class FitSubset:
     """A subset of a fit's modes at its solution, on the coarse grid."""
 
     def __init__(self, settled: Settled) -> None:
-        solution, self.models = settled.solution, settled.models
+        self._settled, solution, self.models = settled, settled.solution, settled.models
         self.residual_fraction = settled.share
         self.modes = spread(settled.target.n_modes)
         self.target = settled.target.column_subset(self.modes)
@@ -274,6 +274,17 @@ class FitSubset:
     def of(self, about: Instrument) -> FitModels:
         """Return the models of another instrument with the same modes."""
         return replace(self.models, instrument=about)
+
+    def fit_again(self, about: Instrument) -> tuple[float, Array]:
+        """Return χ² over that of the fit, and the change of α ``(4,)``, with another instrument.
+
+        All modes are fitted on the fine grid: on the coarse one, with two points per subaperture,
+        arms turned by one degree moved a rotation by half of what they do.
+        """
+        settled = self._settled
+        models, own = replace(settled.models, instrument=about), settled.solution
+        there = refine(models, settled.target, own.alpha, settled.nuisances)
+        return there.projection.chi / own.projection.chi, there.vector - own.vector
 
     def matrix(self, tried: FitModels) -> Array:
         """Return D of an instrument, ``(n_slopes, n_few)``."""
@@ -398,6 +409,9 @@ def try_pupils(few: FitSubset) -> tuple[TriedPupil, ...]:
         value, lead, moved = number.near(few, rate)
         if not little and lead.share < EXCLUDED_SHARE:
             value, lead, moved = number.far(few, rate)
+            if number.key in {ARMS, TURN}:
+                share, moved = few.fit_again(number.with_value(about, value**number.power))
+                lead = replace(lead, share=share)
         explained = few.residual_fraction * np.sqrt(max(1.0 - lead.share, 0.0))
         notable = abs(value - number.reported) >= number.notable and explained >= number.explained
         found.append(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import tempfile
 from collections.abc import Mapping
@@ -122,41 +123,42 @@ class Imported:
             )
         place = Path(folder)
         saved = Saved(place / INSTRUMENT_FILE, place / ARRAYS_FILE)
+        made: list[Path] = []
         try:
-            # Folders that are made here are removed again if nothing can be written.
-            made = [one for one in (place, *place.parents) if not one.exists()]
+            made += (one for one in (place, *place.parents) if not one.exists())
             place.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise StorageError(f"{place}: cannot be written: {error}") from error
-        try:
             self._write(place)
-        except BaseException:
+        except BaseException as error:
+            # Folders that were made here are removed again, the innermost first.
             for one in made:
-                one.rmdir()
+                with contextlib.suppress(OSError):
+                    one.rmdir()
+            if isinstance(error, OSError):
+                raise StorageError(f"{place}: cannot be written: {error}") from error
             raise
         return saved
 
     def _write(self, place: Path) -> None:
         """Write both files to a temporary folder, check them by reading, then move them."""
-        try:
-            with tempfile.TemporaryDirectory(dir=place, prefix=".import-") as name:
-                draft = Saved(Path(name) / INSTRUMENT_FILE, Path(name) / ARRAYS_FILE)
-                write_whole(draft.matrix, self._fill)
-                draft.instrument.write_text(self.instrument_text(), encoding="utf-8")
-                try:
-                    instrument = load_instrument(draft.instrument)
-                    self._check(instrument)
-                    if self.centres_found:
-                        refined = self._with_refined_centres(instrument)
-                        draft.instrument.write_text(refined.instrument_text(), encoding="utf-8")
-                except ConfigurationError as error:
-                    # The message must not name the temporary folder, which is deleted by then.
-                    raise ConfigurationError(str(error).replace(name, str(place))) from error
-                # The arrays first: an instrument file without the arrays it names would be refused.
-                draft.matrix.replace(place / ARRAYS_FILE)
-                draft.instrument.replace(place / INSTRUMENT_FILE)
-        except OSError as error:
-            raise StorageError(f"{place}: cannot be written: {error}") from error
+        for name in (INSTRUMENT_FILE, ARRAYS_FILE):
+            if (place / name).is_dir():
+                raise IsADirectoryError(f"{name}: found a folder, expected a file or none")
+        with tempfile.TemporaryDirectory(dir=place, prefix=".import-") as name:
+            draft = Saved(Path(name) / INSTRUMENT_FILE, Path(name) / ARRAYS_FILE)
+            write_whole(draft.matrix, self._fill)
+            draft.instrument.write_text(self.instrument_text(), encoding="utf-8")
+            try:
+                instrument = load_instrument(draft.instrument)
+                self._check(instrument)
+                if self.centres_found:
+                    refined = self._with_refined_centres(instrument)
+                    draft.instrument.write_text(refined.instrument_text(), encoding="utf-8")
+            except ConfigurationError as error:
+                # The message must not name the temporary folder, which is deleted by then.
+                raise ConfigurationError(str(error).replace(name, str(place))) from error
+            # The arrays first: an instrument file without the arrays it names would be refused.
+            draft.matrix.replace(place / ARRAYS_FILE)
+            draft.instrument.replace(place / INSTRUMENT_FILE)
 
     def _check(self, instrument: Instrument) -> None:
         """Raise if the matrix does not belong to the instrument."""

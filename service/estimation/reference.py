@@ -38,6 +38,9 @@ class Reference:
     left_out: tuple[str, ...] = ()
     """Columns that were no measurement and are removed, with the reason: one sentence per kind."""
 
+    place_sigma_subap: float = 0.0
+    """1 σ of the place of the grid on the pupil images, where slopes were made of frames."""
+
     @property
     def columns(self) -> NDArray[np.intp]:
         """Index of each column in the instrument's basis, ``(n_columns,)``."""

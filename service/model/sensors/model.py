@@ -110,12 +110,13 @@ class SensorModel(ABC):
 
     def locate_images(
         self, instrument: Instrument, flux_frame: NDArray[Any]
-    ) -> tuple[Instrument, tuple[str, ...]]:
-        """Return the instrument with its pupil images located in a mean frame, and remarks.
+    ) -> tuple[Instrument, tuple[str, ...], float]:
+        """Return the instrument with its pupil images located in a mean frame, remarks, and σ.
 
-        Only images that the instrument file leaves open are located.
+        Only images that the instrument file leaves open are located. The last value is 1 σ of the
+        middle of the images, subapertures.
         """
-        return instrument, ()
+        return instrument, (), 0.0
 
     def measure_image_offsets(self, instrument: Instrument, light: Array) -> Array | CannotTell:
         """Return the displacement (x, y) of each pupil image in its light, ``(4, 2)`` subapertures.

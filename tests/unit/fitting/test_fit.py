@@ -204,7 +204,7 @@ def test_a_matrix_that_cannot_be_used_is_one_sentence_and_status_2(capsys, matri
         ((MATRIX, "--dataset", "D"), "it holds interaction_matrix (224, 40)"),
         ((MATRIX, "--plot", "none/fit.png"), "found no folder none"),
         ((MATRIX, "--output", "none/fit.h5"), "found no folder none"),
-        ((TINY,), "expected an HDF5, a FITS or a NumPy file"),
+        ((TINY,), "expected HDF5, FITS, NumPy or MATLAB"),
     ],
 )
 def test_other_input_that_cannot_be_used_is_one_sentence_and_status_2(run, words, said):

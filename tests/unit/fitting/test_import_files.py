@@ -273,6 +273,36 @@ def test_an_image_that_was_compressed_with_loss_is_named(lossy, tmp_path, capsys
     assert bool(pyrcal.fitting.recorded.read_recorded(path).remark) is lossy
 
 
+def spoil_nothing(_):
+    """Let an import fail by what it reads or by its name."""
+
+
+@pytest.mark.parametrize(
+    ("changed", "where", "spoil"),
+    [
+        ({"matrix": MATRIX[:-1]}, "new/out", spoil_nothing),
+        ({"matrix": MATRIX[:, :0]}, "new/out", spoil_nothing),
+        ({"valid": VALID * 2}, "out", spoil_nothing),
+        ({"cube": CUBE[0]}, "out", spoil_nothing),
+        ({"cube": np.zeros_like(CUBE)}, "new/out", spoil_nothing),
+        ({"cube": CUBE[:, :7, :7]}, "new/out", spoil_nothing),
+        ({}, "new/" + 300 * "x", spoil_nothing),
+        ({}, "all.npz/out", spoil_nothing),
+        ({}, "out", lambda folder: (folder / "out" / "instrument.toml").mkdir(parents=True)),
+        ({}, "out", lambda folder: (folder / "out" / "matrix.h5").mkdir(parents=True)),
+        ({}, "out", lambda folder: (folder / "out").write_text("a file")),
+    ],
+)
+def test_an_import_that_fails_leaves_nothing(changed, where, spoil, tmp_path, capsys):
+    np.savez(tmp_path / "all.npz", **({"matrix": MATRIX, "valid": VALID, "cube": CUBE} | changed))
+    spoil(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    words = ["import", "files", str(tmp_path / "all.npz"), "--diameter-m", "2", "--output"]
+    assert main([*words, str(tmp_path / where)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 def test_a_bare_array_has_no_record_and_is_refused_without_its_role(tmp_path, capsys):
     np.save(tmp_path / "im.npy", MATRIX)
     words = ["import", "pyrtc", str(tmp_path / "im.npy"), "--diameter-m", "2"]

@@ -48,6 +48,21 @@ def test_errors_of_noisy_matrices_are_those_that_sigma_says():
     assert 0.8 < np.mean(chi) < 7.6
 
 
+def test_a_place_of_the_grid_that_is_not_known_is_in_sigma_of_a_shift():
+    options = from_here(0.1, 0.1, 0.2, 0.0)
+    found = [
+        fit_matrix(
+            instrument(),
+            Reference(matrix=matrix(), place_sigma_subap=sigma),
+            options,
+            basis=small_basis(),
+        ).sigma
+        for sigma in (0.0, 0.03)
+    ]
+    assert np.allclose(found[1][:2], np.hypot(found[0][:2], 0.03), rtol=0.01)
+    assert np.allclose(found[1][2:], found[0][2:])
+
+
 def test_far_shifts_are_less_sure_by_a_share_of_themselves_where_the_mirror_may_be_another():
     """The errors of a model whose mirror is of another kind grow with the shift."""
     far = replace(ELSEWHERE, shift_x_subap=0.9, shift_y_subap=0.3)

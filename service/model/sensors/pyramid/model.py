@@ -164,7 +164,7 @@ class PyramidModel(SensorModel):
     @override
     def locate_images(
         self, instrument: Instrument, flux_frame: NDArray[Any]
-    ) -> tuple[Instrument, tuple[str, ...]]:
+    ) -> tuple[Instrument, tuple[str, ...], float]:
         return detector_windows.locate_images(instrument, flux_frame)
 
     @override

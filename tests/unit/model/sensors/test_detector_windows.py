@@ -176,3 +176,14 @@ def test_centres_half_a_subaperture_beside_the_light_are_said():
     assert "up to 0.5" in remark
     assert "[14.0" in remark
     assert locate_images(replace(moved, stop=Stop.MIRROR), light)[1] == ()
+
+
+def test_uneven_light_makes_the_place_of_the_images_unsure():
+    about = bench(RECTANGLE)
+    light = four_discs(60, RECTANGLE, about.wfs.pupil_diameter * 2)
+    assert locate_images(about, light)[2] == 0.0
+    across = np.linspace(0.0, 3.0, 60) % 1.5  # brighter to the right in each image
+    sigma = locate_images(about, light * (0.3 + across))[2]
+    found = found_centres(light * (0.3 + across), about.wfs.pupil_diameter * 2).reshape(4, 2)
+    error = np.hypot(*np.mean(found - RECTANGLE, axis=0)) / 2
+    assert error / 3.0 < sigma < 3.0 * error

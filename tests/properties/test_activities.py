@@ -9,7 +9,7 @@ from service.records import events as ev
 from service.records.operations import MeasureState
 from service.tracking.interlocks import ALLOWS
 from service.tracking.operations.running import OperationKind, running_operations
-from service.wire import DitherStop
+from service.wire import DitherStop, Loop, LoopRequest
 from tests.unit.tracking.operations.test_running import (
     ACTIVITIES,
     COMMANDS,
@@ -28,9 +28,12 @@ OWNERS = {
 
 
 def harmless(effect):
-    """Whether it may be done though everything is stopped: a question, or the end of a dither."""
-    stop = isinstance(effect, ev.Ask) and isinstance(effect.request, DitherStop)
-    return stop or isinstance(effect, ev.FetchMatrix)
+    """Whether it may be done though everything is stopped: only what makes the loop safer."""
+    if not isinstance(effect, ev.Ask):
+        return isinstance(effect, ev.FetchMatrix)
+    request = effect.request
+    opens = isinstance(request, LoopRequest) and request.loop is Loop.OPEN
+    return opens or isinstance(request, DitherStop)
 
 
 TROUBLES = ["loop-diverging", "commands-off-loop", "basis-mismatch", "matrix-mismatch"]
@@ -86,7 +89,7 @@ class Operators(RuleBasedStateMachine):
         assert not self.world.state.operator.stopped_because
 
     @invariant()
-    def what_is_stopped_stays_so_and_asks_for_nothing_but_the_end_of_a_dither(self):
+    def what_is_stopped_stays_so_and_asks_for_nothing_but_what_is_safer(self):
         stopped, effects = bool(self.world.state.operator.stopped_because), self.world.effects
         if stopped and self.quiet_from is not None:
             assert not [one for one in effects[self.quiet_from :] if not harmless(one)]

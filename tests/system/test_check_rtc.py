@@ -32,6 +32,8 @@ LINES = {
     "mute@0:100": {"commit"},
     "deaf@0:100": {"commit"},
     "late-swap@0:4,100": {"commit"},
+    "early-ack@0:4,100": {"commit"},
+    "turned-sign@0:100": {"commit"},
     "dither-lost@0:100": {"dither"},
     "dither-late@0:0.3,100": {"dither"},
     "mirror-silent@0:100": {"columns"},

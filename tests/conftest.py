@@ -12,7 +12,7 @@ import structlog
 from hypothesis import HealthCheck, settings
 from xdist.scheduler import LoadScopeScheduling
 
-from tests.system.pace import patience
+from tests.support.pace import patience
 
 # Two shared cores and several processes per test: nested BLAS threads make everything slower.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):

@@ -48,7 +48,7 @@ from service.wire import (
     decode_command,
     decode_frames,
 )
-from tests.unit.files.forged import TWO_BY_THREE, fits_bytes
+from tests.support.forged import TWO_BY_THREE, fits_bytes
 
 ROOT = Path(__file__).parents[1]
 VECTORS = ROOT / "docs" / "rtc"
@@ -191,7 +191,7 @@ class Rest:
     """The real application on an archive of its own; its RTC accepts what it is asked."""
 
     def __init__(self):
-        from tests.unit.test_api_schemathesis import application
+        from tests.support.api_schemathesis import application
 
         self._folder = tempfile.TemporaryDirectory(dir=_memory())
         self._made = application(Path(self._folder.name), keys=None)

@@ -166,27 +166,27 @@ def cubes():
 
 def frames():
     """Camera frames of a pyramid, the light, and positions of actuators."""
-    from tests.unit.fitting.test_import_cacao import CUBE, LIGHT, PLACES
+    from tests.support.import_cacao import CUBE, LIGHT, PLACES
 
     return {"matrix": CUBE, "light": LIGHT, "positions": PLACES[:, 1:]}
 
 
 def cacao_files():
-    from tests.unit.fitting import test_import_cacao as made
+    from tests.support import import_cacao as made_import_cacao
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        made.a_list_of_actuators(folder)
-        np.savetxt(folder / "act2Dpos.txt", made.PLACES)
+        made_import_cacao.a_list_of_actuators(folder)
+        np.savetxt(folder / "act2Dpos.txt", made_import_cacao.PLACES)
         return {f"conf/{one.name}": one.read_bytes() for one in sorted(folder.iterdir())}
 
 
 def cacao_maps():
-    from tests.unit.fitting import test_import_cacao as made
+    from tests.support import import_cacao as made_import_cacao
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        made.a_grid(folder)
+        made_import_cacao.a_grid(folder)
         return {f"conf/{one.name}": one.read_bytes() for one in sorted(folder.iterdir())}
 
 
@@ -236,47 +236,48 @@ def telemetry():
 def recording():
     from service.files.recording import RecordedKind, RecordingWriter
     from service.wire import encode, encode_frames
-    from tests.unit.fitting import test_aot as made
+    from tests.support import fitted_aot as made_aot
 
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "night.h5"
         with RecordingWriter(path, system="small") as recorder:
-            recorder.put(RecordedKind.MATRIX, made.MATRIX.tobytes(), encode(made.MANIFEST))
-            recorder.put(RecordedKind.STATUS, encode(made.STATUS))
-            for k in range(0, made.N_FRAMES, 20):
-                payload = encode_frames(made.header(k), made.ROWS[k : k + 20])
+            recorder.put(RecordedKind.MATRIX, made_aot.MATRIX.tobytes(), encode(made_aot.MANIFEST))
+            recorder.put(RecordedKind.STATUS, encode(made_aot.STATUS))
+            for k in range(0, made_aot.N_FRAMES, 20):
+                payload = encode_frames(made_aot.header(k), made_aot.ROWS[k : k + 20])
                 recorder.put(RecordedKind.FRAMES, *payload)
         return {"night.h5": path.read_bytes()}
 
 
 def aot_matrix():
-    from tests.unit.fitting import test_import_files as made
+    from tests.support import import_files as made_import_files
 
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "it.fits"
-        made.aot_file(path, interaction_matrix=made.MATRIX.reshape(2, -1, 5))
+        matrix = made_import_files.MATRIX.reshape(2, -1, 5)
+        made_import_files.aot_file(path, interaction_matrix=matrix)
         return {"it.fits": path.read_bytes()}
 
 
 @cache
 def aot_telemetry():
     from service.instrument import load_instrument
-    from tests.unit.playback import test_aot as made
+    from tests.support import played_aot as made_aot_played
 
     with tempfile.TemporaryDirectory() as name:
-        made.Hand(load_instrument(made.SMALL)).read(Path(name), load_instrument(made.SMALL))
+        made_aot_played.Hand(load_instrument(TRACKED)).read(Path(name), load_instrument(TRACKED))
         return {"hand.fits": (Path(name) / "hand.fits").read_bytes()}
 
 
 def session():
-    from tests.unit.playback import test_pyrtc as made
+    from tests.support import pyrtc as made_pyrtc_played
 
     ids = range(100, 160)
     with tempfile.TemporaryDirectory() as name:
-        folder = made.session_in(
+        folder = made_pyrtc_played.session_in(
             Path(name) / "s",
-            signals=made.counted(ids, made.N_SLOPES),
-            commands=made.counted(ids, made.N_MODES),
+            signals=made_pyrtc_played.counted(ids, made_pyrtc_played.N_SLOPES),
+            commands=made_pyrtc_played.counted(ids, made_pyrtc_played.N_MODES),
             facts={"delay_frames": 2.0, "leak": 0.99, "frame_rate_hz": 500.0},
         )
         return {
@@ -288,7 +289,7 @@ def session():
 
 @cache
 def system_files():
-    from tests.unit.fitting import systems
+    from tests.support import systems
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -306,7 +307,7 @@ def system_files():
 def fit_outputs():
     from pyrcal.fitting.report import document, fill_fit
     from service.files.documents import json_text
-    from tests.unit.fitting.made import a_fit, a_report
+    from tests.support.made import a_fit, a_report
 
     n = bench()[0].shape[1]
     maps = np.full((2, 5, 5), 0.02)

@@ -4,7 +4,7 @@ import sys
 
 import vulture
 
-from tests.unit.test_house import HELD, ROOT
+from tests.support.repository import HELD, ROOT
 
 CALLED_FROM_ELSEWHERE = {
     "__getattr__",  # Python

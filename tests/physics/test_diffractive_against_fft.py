@@ -11,7 +11,7 @@ from service.model.pupil import valid_subapertures
 from service.model.sensors.pyramid.optics import PyramidOptics
 from service.model.sensors.pyramid.signals import differentiate_signals, reference_slopes
 from sim_rtc.telescope.diffractive import DiffractivePyramid, Quadrature, build_centred_pupil
-from tests.numerics import flao_basis
+from tests.support.numerics import flao_basis
 
 MODES = [0, 1, 2, 5, 12, 35, 110, 230, 400, 593]
 """Ten modes from the tilts to the last one."""

@@ -15,7 +15,7 @@ from service.model.modes import modal_basis
 from service.model.sensors.registry import kind_of
 from service.model.sensors.shack_hartmann.table import Centroid, LaserStar
 from service.model.slopes import Orientation, SlopeRecipe
-from tests.physics.fft_spots import FINE, PADDED, PUSH_M, SAMPLES, centroids, fine_points
+from tests.support.fft_spots import FINE, PADDED, PUSH_M, SAMPLES, centroids, fine_points
 
 FILE = Path(__file__).parents[1] / "data" / "lenslets.toml"
 N_PIXELS = 6

@@ -20,7 +20,7 @@ from service.model.sensors.pyramid.detector_windows import (
     slopes_per_unit,
 )
 from service.model.slopes import SlopeRecipe
-from tests.numerics import small_basis, small_instrument
+from tests.support.numerics import small_basis, small_instrument
 
 SEPARATION_SUBAP = 18
 N = 12

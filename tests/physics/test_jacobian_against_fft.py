@@ -10,7 +10,7 @@ from service.instrument.reader import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
-from tests.numerics import flao_basis
+from tests.support.numerics import flao_basis
 
 AGREEMENT = 0.003
 """Relative Frobenius norm of the difference when the reference is padded to 160 subapertures.

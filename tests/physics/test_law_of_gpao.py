@@ -22,7 +22,7 @@ from service.model.modes import modal_basis
 from service.model.pointing_law import PointingLaw, Term
 from service.model.pupil import valid_subapertures
 from service.model.sensors.shack_hartmann.table import PartlyLit
-from tests.physics.fft_spots import pushed, sampled
+from tests.support.fft_spots import pushed, sampled
 
 FILE = Path(__file__).parents[1] / "data" / "lenslets.toml"
 LAW = PointingLaw(rotation_deg=Term("azimuth - 12.984"))

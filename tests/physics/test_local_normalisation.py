@@ -16,7 +16,7 @@ from service.model.interaction import InteractionModel
 from service.model.kinds import Normalisation, SlopeOrder, Stop
 from service.model.misregistration import Misregistration
 from service.model.slopes import SlopeRecipe
-from tests.numerics import SOMEWHERE, small_basis, small_instrument
+from tests.support.numerics import SOMEWHERE, small_basis, small_instrument
 
 MODES = [0, 1, 2, 5, 11, 23, 39]
 STROKE_M = 1e-9

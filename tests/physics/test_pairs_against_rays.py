@@ -14,8 +14,8 @@ from pyrcal.fitting.system import Pair
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
-from tests.physics.fft_spots import pushed
-from tests.unit.fitting import systems
+from tests.support import systems
+from tests.support.fft_spots import pushed
 
 ACTUATORS = np.array([29, 41])
 """Near the middle of either mirror."""

@@ -18,7 +18,7 @@ from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
-from tests.unit.runtime.small import INSTRUMENT
+from tests.support.small import INSTRUMENT
 
 AGREEMENT = 0.004
 """Relative Frobenius norm, as the streamed sensor was held to: 0.2 % are light that leaves the

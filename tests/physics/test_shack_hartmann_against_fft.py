@@ -12,7 +12,7 @@ from service.model.kinds import Stop
 from service.model.misregistration import Misregistration, rotation
 from service.model.modes import modal_basis
 from service.model.sensors.shack_hartmann.table import Centroid
-from tests.physics.fft_spots import pushed, sampled
+from tests.support.fft_spots import pushed, sampled
 
 FILE = Path(__file__).parents[1] / "data" / "lenslets.toml"
 ALPHA = Misregistration(

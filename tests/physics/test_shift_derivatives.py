@@ -10,7 +10,7 @@ import pytest
 from service.instrument.reader import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
-from tests.numerics import SOMEWHERE, flao_basis
+from tests.support.numerics import SOMEWHERE, flao_basis
 
 STEP = 1e-4
 

@@ -12,7 +12,7 @@ from service.control.loop import ControlLoop, pole_radius
 from service.control.reconstructor import invert
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
-from tests.numerics import flao_matrix, flao_model
+from tests.support.numerics import flao_matrix, flao_model
 
 GAIN = 0.5
 TINY = np.diag(np.array([1e-4, 1e-4, 1e-6, 1e-6]) ** 2)

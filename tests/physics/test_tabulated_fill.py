@@ -16,7 +16,7 @@ from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from service.model.tabulated import fill_table
-from tests.numerics import small_basis, small_instrument
+from tests.support.numerics import small_basis, small_instrument
 
 TRUTH = Misregistration(shift_x_subap=0.9, shift_y_subap=-0.35)
 POINTS_PER_SUBAPERTURE = 6.0

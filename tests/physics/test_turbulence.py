@@ -8,7 +8,7 @@ import pytest
 from service.model.kinds import KarhunenLoeve
 from service.model.modes import karhunen_loeve_basis
 from service.model.turbulence import REFERENCE_WAVELENGTH_M, von_karman_covariance
-from tests.numerics import flao_basis, small_instrument
+from tests.support.numerics import flao_basis, small_instrument
 
 TURBULENCE = KarhunenLoeve(r0_m=0.10, outer_scale_m=25.0)
 RADIANS = 2 * np.pi / REFERENCE_WAVELENGTH_M

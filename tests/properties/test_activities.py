@@ -10,13 +10,7 @@ from service.records.operations import MeasureState
 from service.tracking.interlocks import ALLOWS
 from service.tracking.operations.running import OperationKind, running_operations
 from service.wire import DitherStop, Loop, LoopRequest
-from tests.unit.tracking.operations.test_running import (
-    ACTIVITIES,
-    COMMANDS,
-    LONGEST_S,
-    refused,
-    strands,
-)
+from tests.support.activities import ACTIVITIES, COMMANDS, LONGEST_S, refused, strands
 
 OWNERS = {
     OperationKind.MEASURING,

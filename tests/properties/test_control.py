@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from service.control.loop import pole_radius
 from service.control.reconstructor import invert
-from tests.unit.control.test_loop import integrator_limit
+from tests.support.loop import integrator_limit
 
 arguments = st.floats(-np.pi, np.pi)
 moduli = st.floats(1e-3, 3.0)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from service.estimation import kalman, lockin
 from service.estimation.health import LoopHealth, observe
-from tests.numerics import block_of, part, sines
+from tests.support.numerics import block_of, part, sines
 
 PLAN = lockin.LockInPlan(
     modes=(1,),

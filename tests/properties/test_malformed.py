@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from service.errors import MatrixError, PyrcalError
 from service.files.container import opened
 from tests import malformed, malformed_commands
-from tests.unit.files.forged import TWO_BY_THREE, fits_bytes
+from tests.support.forged import TWO_BY_THREE, fits_bytes
 
 OF_BYTES = [kind for kind in malformed.KINDS if kind.name != "rest"]
 N_EXAMPLES = {"messages": 300, "frames": 150, "npy": 60, "hdf5": 30, "fits": 30, "toml": 15}

@@ -17,7 +17,7 @@ from service.model.slopes import (
     to_conventions,
     to_rtc,
 )
-from tests.numerics import small_linearisation, small_model
+from tests.support.numerics import small_linearisation, small_model
 
 registrations = st.builds(
     Misregistration,

@@ -11,8 +11,8 @@ from service.records import events as ev
 from service.records.products import ExpectedGain, MatrixState
 from service.records.state import Mode
 from service.tracking.update_policy import verdict_invalid_reason
-from tests.properties.test_tracker_laws import LAWS, Night, commands, heard, ids
-from tests.unit.tracking.situations import ALPHA, moved, record, rtc, verdict
+from tests.support.laws import LAWS, Night, commands, heard, ids
+from tests.support.situations import ALPHA, moved, record, rtc, verdict
 
 MADE = [f"made-{k}" for k in range(1, 6)]
 any_id = st.one_of(ids, st.sampled_from(MADE))

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import httpx
 
-from tests.system.night import a_night, wait_for
-from tests.system.pace import patience
+from tests.support.night import a_night, wait_for
+from tests.support.pace import patience
 
 N_CONNECTIONS = 1000
 LASTS_S = 8.0

@@ -18,8 +18,8 @@ from pathlib import Path
 import httpx
 import zenoh
 
-from tests.system.cable import free_port
-from tests.system.night import INSTRUMENT, Night, a_night, wait_for
+from tests.support.cable import free_port
+from tests.support.night import INSTRUMENT, Night, a_night, wait_for
 
 ABSENT_S = 7.0
 """Time for which the network is not there."""

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.unit.cacao.milk import Milk
+from tests.support.milk import Milk
 
 HZ, GAIN, MULT, UNIT, RING = 500.0, 0.4, 0.99, 1e-6, 128
 

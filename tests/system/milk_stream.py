@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.support.milk import Milk
 from tests.system.milk_loop import path_of
-from tests.unit.cacao.milk import Milk
 
 
 def main(folder, hz, n_slopes, n_modes, seconds):

@@ -36,9 +36,9 @@ from service.wire import (
     encode_frames,
     layout_of,
 )
-from tests.system.cable import free_port
-from tests.system.fake_rtc import FakeRtc, client_session
-from tests.system.pace import Deadline, patience, slowness
+from tests.support.cable import free_port
+from tests.support.fake_rtc import FakeRtc, client_session
+from tests.support.pace import Deadline, patience, slowness
 
 pytestmark = pytest.mark.system
 
@@ -69,7 +69,7 @@ def rtc(bridge, endpoint):
 def rtc_process(endpoint, session, n_slopes=6, n_modes=4, rate_hz=1000, per_batch=10):
     arguments = (endpoint.listen[0], SYSTEM, session, n_slopes, n_modes, rate_hz, per_batch)
     process = subprocess.Popen(
-        [sys.executable, "-m", "tests.system.fake_rtc", *map(str, arguments)], cwd=ROOT
+        [sys.executable, "-m", "tests.support.fake_rtc", *map(str, arguments)], cwd=ROOT
     )
     try:
         yield process

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from service.wire import Keys
-from tests.system.fake_rtc import client_session
-from tests.system.night import a_night, wait_for
-from tests.system.pace import Deadline, patience
-from tests.system.stranger import Stranger, open_client, small_telescope
+from tests.support.fake_rtc import client_session
+from tests.support.night import a_night, wait_for
+from tests.support.pace import Deadline, patience
+from tests.support.stranger import Stranger, open_client, small_telescope
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
 

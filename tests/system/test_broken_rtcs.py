@@ -2,8 +2,8 @@
 
 import pytest
 
-from tests.system.broken_rtc import VIOLATIONS
-from tests.system.checker import checked_beside, late_with_the_machine, write_plant
+from tests.support.broken_rtc import VIOLATIONS
+from tests.support.checker import checked_beside, late_with_the_machine, write_plant
 
 pytestmark = [pytest.mark.system, pytest.mark.slow, pytest.mark.timeout(180)]
 
@@ -13,7 +13,7 @@ PUSH_ONLY = {"no query"}
 
 def checked(folder, violation, fetch, *options):
     plant = write_plant(folder / "plant.npz")
-    words = ["tests.system.broken_rtc", violation, fetch]
+    words = ["tests.support.broken_rtc", violation, fetch]
     options = ("--yes", "--open-loop", "--seconds", "2", *options)
     return checked_beside(folder, lambda at: [*words, at, "small", str(plant)], *options)
 

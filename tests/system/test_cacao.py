@@ -13,12 +13,12 @@ import pytest
 from service.files.bundle import read_bundle, write_bundle
 from service.link.session import Endpoint, open_session, subscribe_frames
 from service.wire import decode_frames
-from tests.system import night as nights
-from tests.system.cable import free_port
+from tests.support import night as nights
+from tests.support.cable import free_port
+from tests.support.milk import Milk
+from tests.support.night import ALPHA, N_START, N_TARGET, Process, a_night, wait_for
+from tests.support.stranger import small_telescope
 from tests.system.milk_loop import GAIN, HZ, MULT, UNIT, path_of
-from tests.system.night import ALPHA, N_START, N_TARGET, Process, a_night, wait_for
-from tests.system.stranger import small_telescope
-from tests.unit.cacao.milk import Milk
 
 pytestmark = pytest.mark.system
 

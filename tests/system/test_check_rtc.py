@@ -3,9 +3,9 @@
 import pytest
 
 from sim_rtc.faults import FaultKind
-from tests.system.cable import free_port
-from tests.system.checker import checked_beside, late_with_the_machine
-from tests.system.night import INSTRUMENT, Process
+from tests.support.cable import free_port
+from tests.support.checker import checked_beside, late_with_the_machine
+from tests.support.night import INSTRUMENT, Process
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
 

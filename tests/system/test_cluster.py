@@ -12,12 +12,12 @@ import pytest
 from service.errors import ClusterError
 from service.runtime.cluster import Cluster
 from service.runtime.worker import rows
-from tests.system.cable import free_port
-from tests.system.dask_cluster import dask_cluster
-from tests.system.night import INSTRUMENT, N_TARGET, ROOT, a_night, wait_for
-from tests.system.pace import patience
-from tests.unit.runtime.test_remote_rows import FIRST, model_of
-from tests.unit.runtime.test_shared_rows import helped_by
+from tests.support.cable import free_port
+from tests.support.dask_cluster import dask_cluster
+from tests.support.night import INSTRUMENT, N_TARGET, ROOT, a_night, wait_for
+from tests.support.pace import patience
+from tests.support.remote_rows import FIRST, model_of
+from tests.support.shared_rows import helped_by
 
 pytestmark = [pytest.mark.system, pytest.mark.long]
 

@@ -5,9 +5,9 @@ import time
 
 import pytest
 
-from tests.system.night import INSTRUMENT, a_night, wait_for
-from tests.system.test_fit import pyrcal
-from tests.system.test_measure import measured, no_dither
+from tests.support.fitting import pyrcal
+from tests.support.measure import measured, no_dither
+from tests.support.night import INSTRUMENT, a_night, wait_for
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(400)]
 

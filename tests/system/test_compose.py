@@ -7,8 +7,8 @@ import subprocess
 import httpx
 import pytest
 
-from tests.system.night import wait_for
-from tests.unit.test_house import ROOT
+from tests.support.night import wait_for
+from tests.support.repository import ROOT
 
 PROJECT = "pyrcal-test"
 COMPOSE = ("docker", "compose", "--project-name", PROJECT, "-f", str(ROOT / "deploy/compose.yml"))

@@ -2,8 +2,8 @@
 
 import pytest
 
+from tests.support.night import a_night, wait_for
 from tests.system.crowd import crowded, has_alarm, time_of
-from tests.system.night import a_night, wait_for
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from service.model.misregistration import PARAMETERS
-from tests.system.night import a_night, children_of, session_members, wait_for
-from tests.system.pace import in_time, patience
+from tests.support.night import a_night, children_of, session_members, wait_for
+from tests.support.pace import in_time, patience
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(300)]
 

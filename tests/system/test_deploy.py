@@ -6,11 +6,11 @@ import socket
 
 import pytest
 
-from tests.system.cable import free_port
-from tests.system.night import INSTRUMENT, Process, session_members
-from tests.system.pace import patience
-from tests.unit.test_deploy import SERVICE
-from tests.unit.test_house import ROOT
+from tests.support.cable import free_port
+from tests.support.deploy import SERVICE
+from tests.support.night import INSTRUMENT, Process, session_members
+from tests.support.pace import patience
+from tests.support.repository import ROOT
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
 

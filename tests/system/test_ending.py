@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.night import INSTRUMENT, a_night, session_members, wait_for
-from tests.system.stranger import Stranger, small_telescope
+from tests.support.ending import maps_of, stranger, workers_of
+from tests.support.night import INSTRUMENT, a_night, session_members, wait_for
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(120)]
 
@@ -36,26 +36,6 @@ def check_end(night, service, number, *, group=False):
     # the tracker that the standard library puts beside workers ends after the service has
     service.alone()
     assert not list(night.directory.rglob("*.part"))
-
-
-def stranger(night):
-    return Stranger(night.zenoh, *small_telescope(0.1, -0.05, 0.3, 1.003))
-
-
-def maps_of(pid):
-    """Return which files the process has mapped: how far its imports are."""
-    try:
-        return Path(f"/proc/{pid}/maps").read_text(encoding="utf-8")
-    except OSError:
-        return ""
-
-
-def workers_of(service):
-    """Return the processes of the service that have numpy: the worker and not its tracker."""
-    others = (
-        member for member in session_members(service.popen.pid) if member != service.popen.pid
-    )
-    return [member for member in others if "_multiarray_umath" in maps_of(member)]
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,9 @@ import msgpack
 import pytest
 import zenoh
 
-from tests.system.cable import free_port
-from tests.system.checker import checked_beside, late_with_the_machine, write_plant
-from tests.system.night import ALPHA, INSTRUMENT, N_START, N_TARGET, ROOT, a_night, wait_for
+from tests.support.cable import free_port
+from tests.support.checker import checked_beside, late_with_the_machine, write_plant
+from tests.support.night import ALPHA, INSTRUMENT, N_START, N_TARGET, ROOT, a_night, wait_for
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
 

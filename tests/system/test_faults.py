@@ -4,9 +4,9 @@ and goes on."""
 import httpx
 import pytest
 
-from tests.system.night import N_START, N_TARGET, a_night, wait_for
-from tests.system.pace import slowness
-from tests.system.test_service import check_registration
+from tests.support.night import N_START, N_TARGET, a_night, wait_for
+from tests.support.pace import slowness
+from tests.support.service import check_registration
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(150)]
 

@@ -2,11 +2,8 @@
 
 import io
 import json
-import os
 import signal
 import socket
-import subprocess
-import sys
 import zipfile
 
 import h5py
@@ -15,8 +12,9 @@ import numpy as np
 import pytest
 
 from tests.data.tiny.make import ALPHA, HERE, N_MODES
-from tests.system.night import ROOT, a_night, wait_for
-from tests.system.pace import patience
+from tests.support.fitting import pyrcal
+from tests.support.night import a_night, wait_for
+from tests.support.pace import patience
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 
@@ -24,19 +22,6 @@ TOML, MATRIX = HERE / "tiny.toml", HERE / "tiny.h5"
 CLOSE = {"shift_x_subap": 0.02, "shift_y_subap": 0.02, "rotation_deg": 0.1, "magnification": 0.003}
 """The simulator's mirror and light are not the model's, and 40 modes of a small bench average
 little of that: a few per cent of the matrix, about as much of these."""
-
-
-def pyrcal(*words, folder):
-    """Run a command in an empty folder, as a shell would."""
-    return subprocess.run(
-        [sys.executable, "-m", "pyrcal", *map(str, words)],
-        capture_output=True,
-        text=True,
-        timeout=patience(120.0),
-        check=False,
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )
 
 
 def check_close(found):

@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from tests.system.night import ROOT
-from tests.system.pace import patience
+from tests.support.night import ROOT
+from tests.support.pace import patience
 
 pytestmark = pytest.mark.long
 

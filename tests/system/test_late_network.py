@@ -5,6 +5,7 @@ import time
 
 import pytest
 
+from tests.support.night import a_night, wait_for
 from tests.system.late_network import (
     late_rest_port,
     late_router,
@@ -13,7 +14,6 @@ from tests.system.late_network import (
     tracks,
     waited_for,
 )
-from tests.system.night import a_night, wait_for
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
 

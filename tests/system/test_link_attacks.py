@@ -26,9 +26,9 @@ from service.runtime.readiness import complaints
 from service.wire import LoopRequest, Role
 from service.wire.access import NO_SECURITY, LinkSecurity
 from service.wire.signing import Signatures
-from tests.system.cable import free_port
-from tests.system.fake_rtc import FakeRtc
-from tests.system.pace import Deadline
+from tests.support.cable import free_port
+from tests.support.fake_rtc import FakeRtc
+from tests.support.pace import Deadline
 
 pytestmark = pytest.mark.system
 

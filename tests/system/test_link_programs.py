@@ -11,10 +11,10 @@ import pytest
 import zenoh
 
 from service.config.link_tables import read_link_tables
-from tests.system.cable import free_port
-from tests.system.fake_rtc import FakeRtc
-from tests.system.night import INSTRUMENT, ROOT, a_night, wait_for
-from tests.system.pace import patience
+from tests.support.cable import free_port
+from tests.support.fake_rtc import FakeRtc
+from tests.support.night import INSTRUMENT, ROOT, a_night, wait_for
+from tests.support.pace import patience
 
 TLS = "transport/link/tls"
 

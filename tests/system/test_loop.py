@@ -3,7 +3,7 @@
 import httpx
 import pytest
 
-from tests.system.night import N_START, a_night, wait_for
+from tests.support.night import N_START, a_night, wait_for
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(120)]
 

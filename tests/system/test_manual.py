@@ -22,12 +22,12 @@ from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import PARAMETERS, Misregistration
 from service.model.modes import modal_basis
 from tests.data.tiny.make import push_pull
-from tests.system.night import ROOT, a_night, wait_for
-from tests.system.pace import patience
-from tests.system.reader import Reader
-from tests.unit.fitting import systems
-from tests.unit.test_docs import PAGES, blocks_of, commands
-from tests.unit.tutorial_blocks import steps
+from tests.support import systems
+from tests.support.manual import PAGES, blocks_of, commands
+from tests.support.night import ROOT, a_night, wait_for
+from tests.support.pace import patience
+from tests.support.reader import Reader
+from tests.support.tutorial_blocks import steps
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(600)]
 

@@ -8,8 +8,8 @@ import uvicorn
 from fastapi import FastAPI
 
 from service.web import page
-from tests.system.browser import AXE, NARROW, NEEDS_A_BROWSER, Page, a_browser
-from tests.system.night import wait_for
+from tests.support.browser import AXE, NARROW, NEEDS_A_BROWSER, Page, a_browser
+from tests.support.night import wait_for
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(300), NEEDS_A_BROWSER]
 

@@ -12,7 +12,8 @@ from service.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
-from tests.system.night import ALPHA, INSTRUMENT, N_START, a_night, wait_for
+from tests.support.measure import measured, no_dither
+from tests.support.night import ALPHA, INSTRUMENT, N_START, a_night, wait_for
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(180)]
 
@@ -29,24 +30,6 @@ def quiet_night(night):
     night.rtc()
     wait_for(lambda: night.state["in_use"], what="the RTC's matrix")
     no_dither(night)
-
-
-def no_dither(night):
-    night.post("/v1/dither", {"action": "stop"})
-    wait_for(lambda: night.state["dither"] is None, what="no dither")
-
-
-def measured(night, body, timeout_s=60.0):
-    answer = night.client.post("/v1/measurements", json=body)
-    assert answer.status_code == httpx.codes.ACCEPTED, answer.text
-    path = f"/v1/measurements/{answer.json()['id']}"
-    return wait_for(
-        lambda: (lambda record: record if record["state"] != "running" else None)(
-            night.client.get(path).json()
-        ),
-        timeout_s,
-        "the end of the measurement",
-    )
 
 
 def numbers_of(night, record):

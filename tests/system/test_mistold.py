@@ -5,8 +5,8 @@ import time
 import numpy as np
 import pytest
 
-from tests.system.night import ALPHA, a_night, wait_for
-from tests.system.stranger import Stranger, small_telescope
+from tests.support.night import ALPHA, a_night, wait_for
+from tests.support.stranger import Stranger, small_telescope
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(150)]
 

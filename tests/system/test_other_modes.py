@@ -6,8 +6,8 @@ import time
 import numpy as np
 import pytest
 
-from tests.system.night import a_night, wait_for
-from tests.system.other_rtc import OtherRtc
+from tests.support.night import a_night, wait_for
+from tests.support.other_rtc import OtherRtc
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(150)]
 

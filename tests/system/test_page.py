@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from service.web.keys import KeyFile, KeyScope
-from tests.system.browser import LAPTOP, NARROW, NEEDS_A_BROWSER, WIDE, Keys, Page, a_browser
-from tests.system.night import a_night, wait_for
-from tests.system.pace import patience
+from tests.support.browser import LAPTOP, NARROW, NEEDS_A_BROWSER, WIDE, Keys, Page, a_browser
+from tests.support.night import a_night, wait_for
+from tests.support.pace import patience
 
 TINY = Path(__file__).parents[1] / "data" / "tiny"
 FIRST_LOAD_BYTES = 300_000

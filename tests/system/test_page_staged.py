@@ -9,10 +9,10 @@ from service.records.alarms import ALARMS, OperatorNote, Severity
 from service.records.commands import AcknowledgeAlarm, Approve, MuteAlarm
 from service.records.products import MatrixState
 from service.wire import Loop
-from tests.system.browser import LAPTOP, NARROW, NEEDS_A_BROWSER, Keys, Page, a_browser
-from tests.system.night import ROOT
-from tests.system.staged import JUMPED, staged, state_of_now
-from tests.unit.test_api import LINK
+from tests.support.api import LINK
+from tests.support.browser import LAPTOP, NARROW, NEEDS_A_BROWSER, Keys, Page, a_browser
+from tests.support.night import ROOT
+from tests.support.staged import JUMPED, staged, state_of_now
 
 FULL = (1920, 1080)
 CRITICAL = {name: kind for name, kind in ALARMS.items() if kind.severity is Severity.CRITICAL}

@@ -8,7 +8,7 @@ import pytest
 
 from service.errors import PyrcalError
 from service.files.bundle import Bundle, write_bundle
-from tests.system.night import ROOT, a_night, wait_for
+from tests.support.night import ROOT, a_night, wait_for
 
 MISSING = [name for name in ("pyrtc", "OOPAO") if find_spec(name) is None]
 pytestmark = [

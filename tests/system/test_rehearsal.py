@@ -11,7 +11,7 @@ from service.instrument import load_instrument
 from service.model.slopes import rtc_mask, to_rtc
 from sim_rtc.assembly import build_telescope
 from sim_rtc.options import parse_options
-from tests.system.night import ALPHA, INSTRUMENT, N_START, N_TARGET, ROOT, a_night, wait_for
+from tests.support.night import ALPHA, INSTRUMENT, N_START, N_TARGET, ROOT, a_night, wait_for
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(240)]
 

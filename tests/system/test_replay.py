@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from service.model.misregistration import PARAMETERS
-from tests.system.night import INSTRUMENT, N_TARGET, ROOT, a_night, wait_for
-from tests.system.pace import patience
+from tests.support.night import INSTRUMENT, N_TARGET, ROOT, a_night, wait_for
+from tests.support.pace import patience
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(150)]
 

@@ -13,8 +13,8 @@ import h5py
 import httpx
 import pytest
 
-from tests.system.night import N_TARGET, a_night, wait_for
-from tests.system.pace import patience
+from tests.support.night import N_TARGET, a_night, wait_for
+from tests.support.pace import patience
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
 

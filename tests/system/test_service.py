@@ -7,8 +7,7 @@ import time
 import pytest
 
 from service.archive import Archive
-from tests.system.night import (
-    ALPHA,
+from tests.support.night import (
     INSTRUMENT,
     N_START,
     N_TARGET,
@@ -16,29 +15,16 @@ from tests.system.night import (
     session_members,
     wait_for,
 )
-from tests.system.pace import patience
+from tests.support.pace import patience
+from tests.support.service import TOLERANCE, check_registration
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
-
-TOLERANCE = {
-    "shift_x_subap": 0.02,
-    "shift_y_subap": 0.02,
-    "rotation_deg": 0.05,
-    "magnification": 0.002,
-}
 
 
 @pytest.fixture
 def night(tmp_path):
     with a_night(tmp_path) as night:
         yield night
-
-
-def check_registration(known):
-    for name, tolerance in TOLERANCE.items():
-        error = known["alpha"][name] - ALPHA[name]
-        assert abs(error) < tolerance, (name, error)
-        assert abs(error) < 4 * known["sigma"][name], (name, error, known["sigma"][name])
 
 
 def test_in_auto_the_registration_is_found_and_the_loop_served_first_its_modes_then_more(night):

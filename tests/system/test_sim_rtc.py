@@ -31,9 +31,9 @@ from service.wire import (
     layout_of,
     split,
 )
-from tests.system.cable import Cable, free_port
-from tests.system.night import Process, wait_for
-from tests.system.pace import patience, slowness
+from tests.support.cable import Cable, free_port
+from tests.support.night import Process, wait_for
+from tests.support.pace import patience, slowness
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(180)]
 

@@ -8,8 +8,8 @@ import zipfile
 
 import pytest
 
-from tests.system.night import ROOT
-from tests.system.pace import patience
+from tests.support.night import ROOT
+from tests.support.pace import patience
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(300)]
 

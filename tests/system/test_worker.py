@@ -6,9 +6,9 @@ import time
 
 import pytest
 
-from tests.system.night import a_night, session_members, wait_for
-from tests.system.pace import Deadline
-from tests.system.test_ending import stranger, workers_of
+from tests.support.ending import stranger, workers_of
+from tests.support.night import a_night, session_members, wait_for
+from tests.support.pace import Deadline
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(180)]
 

@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import json
-import socket
 
 import httpx
 import pytest
@@ -11,10 +10,10 @@ import pytest
 from service.api import create_app
 from service.web import connections
 from service.web.authentication import Hosts
-from service.web.connections import Server
 from service.web.keys import KeyFile, KeyScope
-from tests.system.pace import patience
-from tests.unit.test_api import FakeService, a_snapshot, assert_problem
+from tests.support.api import FakeService, a_snapshot, assert_problem
+from tests.support.api_admission import serving
+from tests.support.pace import patience
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -147,22 +146,6 @@ async def test_a_body_within_the_limit_reaches_the_service(service):
 
 
 # --- connections, over real sockets
-
-
-@contextlib.asynccontextmanager
-async def serving(service, keys=None, proxies=()):
-    listener = socket.create_server(("127.0.0.1", 0))
-    over = asyncio.Event()
-    server = Server(create_app(service, keys=keys), over, within_s=2, proxies=proxies)
-    service.crowd = server.crowd
-    task = asyncio.create_task(server.serve(sockets=[listener]))
-    while not server.started:  # noqa: ASYNC110 - uvicorn has no event for it
-        await asyncio.sleep(0.01)
-    try:
-        yield listener.getsockname()[1]
-    finally:
-        over.set()
-        await task
 
 
 async def connected(port, sent=b""):

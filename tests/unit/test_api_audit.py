@@ -8,7 +8,7 @@ import pytest
 
 from service.archive import Archive, AuditEntry
 from service.web import archive as kept
-from tests.unit.test_api import SECOND, FakeService, a_snapshot
+from tests.support.api import SECOND, FakeService, a_snapshot
 
 N_ENTRIES = 12
 

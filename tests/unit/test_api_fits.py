@@ -12,9 +12,9 @@ from pyrcal.fitting.report import document
 from service.api import create_app
 from service.errors import BusyError, MatrixError, TooLargeError, UnknownIdError
 from service.runtime.uploads import FitJob, FitState
-from tests.unit.fitting.made import a_fit, a_report
-from tests.unit.test_api import assert_problem
-from tests.unit.test_api_measured import FILE, FakeMatrices
+from tests.support.api import assert_problem
+from tests.support.api_measured import FILE, FakeMatrices
+from tests.support.made import a_fit, a_report
 
 JOB = FitJob(id="fit-1", state=FitState.WAITING, asked_ns_utc=7, n_bytes=4, sha256="ab")
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 
 from service.records.registration import ModeGain
-from tests.states import tracker_state
-from tests.unit.runtime.handmade import REGISTRATION
-from tests.unit.test_api import FakeService, a_snapshot
-from tests.unit.tracking.situations import START_NS, record, rtc
+from tests.support.api import FakeService, a_snapshot
+from tests.support.handmade import REGISTRATION
+from tests.support.situations import START_NS, record, rtc
+from tests.support.states import tracker_state
 
 MEASURED = (
     ModeGain(mode=20, gain=0.5, sigma=0.01, scatter=0.02, t_ns_utc=START_NS),

@@ -12,7 +12,7 @@ from service.estimation.frames import FrameBlock
 from service.instrument import packaged_instrument
 from service.model.pupil import rtc_valid_subapertures
 from service.web import matrices, page
-from tests.unit.test_api_fits import assert_problem
+from tests.support.api import assert_problem
 
 
 class FakeService:

@@ -14,8 +14,8 @@ from service.api import create_app
 from service.web import authentication, page
 from service.web.authentication import COOKIE, Hosts, Refusal, RefusalLog
 from service.web.keys import KeyFile, KeyScope
-from tests.unit.test_api import FakeService, a_snapshot, assert_problem
-from tests.unit.test_api_admission import serving
+from tests.support.api import FakeService, a_snapshot, assert_problem
+from tests.support.api_admission import serving
 
 ORIGIN = "http://127.0.0.1:8080"
 OPEN = {("GET", "/healthz"), ("GET", "/readyz"), ("DELETE", "/v1/session")}

@@ -13,8 +13,8 @@ from service.archive import Archive
 from service.records.products import MatrixState, ReconstructorRecord
 from service.records.state import TrackerState
 from service.wire import checksum
-from tests.states import tracker_state
-from tests.unit.test_api import FakeService, a_snapshot
+from tests.support.api import FakeService, a_snapshot
+from tests.support.states import tracker_state
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(3, 4) / 7
 

@@ -8,8 +8,8 @@ import pytest
 from service.errors import CommandError, StorageError
 from service.records.products import MatrixState, ReconstructorRecord
 from service.web import connections
-from tests.states import tracker_state
-from tests.unit.test_api import FakeService, a_snapshot
+from tests.support.api import FakeService, a_snapshot
+from tests.support.states import tracker_state
 
 CM = ReconstructorRecord(id="cm-1", state=MatrixState.PROPOSED, n_modes=400, created_ns_utc=1)
 

@@ -11,16 +11,8 @@ from service.instrument import packaged_instrument
 from service.model.instrument import TabulatedModes
 from service.model.misregistration import PARAMETERS
 from service.web.page import FILES
-from tests.unit.test_api import (
-    ALPHA,
-    SECOND,
-    FakeService,
-    a_snapshot,
-    assert_problem,
-    body_of,
-    entry,
-)
-from tests.unit.tracking.situations import POLICY
+from tests.support.api import ALPHA, SECOND, FakeService, a_snapshot, assert_problem, body_of, entry
+from tests.support.situations import POLICY
 
 LIMIT_BYTES = 300_000
 

@@ -7,8 +7,8 @@ from service.api import create_app
 from service.records.commands import Refit
 from service.tracker import step
 from service.tracking.interlocks import ORDERS
-from tests.unit.test_api import FakeService, a_snapshot
-from tests.unit.tracking.moments import MOMENTS, meant
+from tests.support.api import FakeService, a_snapshot
+from tests.support.moments import MOMENTS, meant
 
 REQUESTS = {
     "stop_everything": ("POST", "/v1/stop", {}),

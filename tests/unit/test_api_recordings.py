@@ -14,9 +14,7 @@ from service.errors import StorageError
 from service.files.recording import RecordedKind, Recording
 from service.runtime import telemetry_recorder
 from service.runtime.telemetry_recorder import TelemetryRecorder
-from tests.unit.test_api import assert_problem, service
-
-__all__ = ["service"]  # a fixture
+from tests.support.api import assert_problem
 
 WANTED = {"duration_s": 30, "by": "Ada", "reason": "strange edge"}
 

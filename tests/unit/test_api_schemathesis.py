@@ -4,11 +4,9 @@ The service behind it is a real one with an archive, which an RTC has told its s
 accepts whatever it is asked and there is no worker: what is ordered is decided as ever.
 """
 
-import contextlib
 import json
 import re
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import schemathesis
@@ -16,19 +14,8 @@ from schemathesis.config import SchemathesisConfig
 from schemathesis.engine import from_schema
 from schemathesis.engine.events import FatalError, NonFatalError, ScenarioFinished
 
-from service.api import create_app
-from service.archive import Archive
-from service.errors import WorkerError
-from service.files.fit_folder import FitRequest
-from service.runtime.actions import Actions, Publishing
-from service.runtime.supervisor import Supervisor
-from service.runtime.uploads import FitLimits, FitQueue
-from service.web.authentication import Hosts
 from service.web.keys import KeyFile, KeyScope
-from tests.unit.runtime.handmade import STATE, Clock, HandmadeBridge
-from tests.unit.runtime.small import small_instrument
-from tests.unit.test_api import LINK
-from tests.unit.tracking.situations import POLICY
+from tests.support.api_schemathesis import application
 
 OPENAPI = Path(__file__).parents[2] / "docs" / "openapi.json"
 
@@ -51,57 +38,6 @@ ANYWHERE = (
     "a time in nanoseconds or as RFC 3339|expected a time from 1970-|since <= until"
 )
 """Names and reasons that act on a terminal; a whole number that is written as 36.0; times."""
-
-
-class Bridge(HandmadeBridge):
-    def statistics(self):
-        return LINK
-
-
-class NoWorkers(SimpleNamespace):
-    problem, busy_s, cpu_s = "", 0.0, {}
-
-    async def call(self, *_):
-        raise WorkerError("nobody is there")
-
-
-@contextlib.contextmanager
-def application(folder, keys):
-    """Give the application, its archive in a folder."""
-    bridge, workers, archive = Bridge(), NoWorkers(), Archive(folder)
-    archive.open()
-    with archive:
-        actions = Actions(
-            bridge=bridge,
-            workers=workers,
-            archive=archive,
-            instrument=small_instrument(),
-            publishing=Publishing(system="small", chunk_bytes=4096, pole_radius_bound=0.95),
-            clock_ns=Clock(),
-        )
-        supervisor = Supervisor(
-            state=STATE,
-            policy=POLICY,
-            bridge=bridge,
-            workers=workers,
-            archive=archive,
-            actions=actions,
-        )
-        limits = FitLimits(max_bytes=10_000, waiting=10_000, seconds=1)
-        request = FitRequest(
-            asked={},
-            own_instrument="small",
-            own_sha256="",
-            max_bytes=10_000,
-            threads=1,
-            nice=0,
-            memory_mb=500,
-        )
-        desk = FitQueue(
-            folder=folder, program=("false",), request=request, limits=limits, clock_ns=Clock()
-        )
-        hosts = Hosts(allowed=("testserver",))
-        yield create_app(supervisor, desk, hosts=hosts, keys=keys)
 
 
 @pytest.fixture

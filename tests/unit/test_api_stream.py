@@ -14,8 +14,8 @@ from service.records.state import Level, LogEntry
 from service.tracking.step_context import LOG_LENGTH
 from service.web import page
 from service.web.connections import Server
-from tests.system.pace import patience
-from tests.unit.test_api import LINK, STATE, FakeService, a_snapshot
+from tests.support.api import LINK, STATE, FakeService, a_snapshot
+from tests.support.pace import patience
 
 pytestmark = pytest.mark.timeout(60)
 

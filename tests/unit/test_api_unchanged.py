@@ -8,9 +8,7 @@ import pytest
 from service.records import commands as cmd
 from service.records import events as ev
 from service.records.products import MatrixState, ReconstructorRecord
-from tests.unit.test_api import SECOND, STATE, assert_problem, entry, service
-
-__all__ = ["service"]  # a fixture
+from tests.support.api import SECOND, STATE, assert_problem, entry
 
 DESCRIBED = json.loads(
     (Path(__file__).parents[2] / "docs" / "openapi.json").read_text(encoding="utf-8")

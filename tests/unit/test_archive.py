@@ -32,7 +32,6 @@ from service.records import commands as cmd
 from service.records.products import (
     Assessment,
     ExpectedGain,
-    GateVerdict,
     Judged,
     MatrixState,
     ModeAnswer,
@@ -46,37 +45,12 @@ from service.runtime.telemetry_recorder import TrendSampler, residual_of, sample
 from service.tracking.resume import saved_of
 from service.web.keys import KeyFile, KeyScope
 from service.wire import Pointing, checksum
-from tests.states import changed
-from tests.unit.test_api import ALPHA, SECOND, SIGMA, STATE, service
-from tests.unit.tracking.operations.test_acquisition import Acquiring
-from tests.unit.tracking.situations import START_NS, Story, moved
-from tests.unit.tracking.test_watchdog import learnt, watch
-
-MATRIX = np.arange(12, dtype=np.float32).reshape(3, 4)
-VERDICT = GateVerdict(
-    accepted=False,
-    worst_pole_radius=float("inf"),
-    aligned_pole_radius=0.7,
-    bound=0.95,
-    n_points=9,
-    reason="unstable at +3 sigma: measure longer",
-)
-
-
-def record_of(matrix_id="cm-1", **changes) -> ReconstructorRecord:
-    record = ReconstructorRecord(
-        id=matrix_id,
-        state=MatrixState.PROPOSED,
-        n_modes=3,
-        created_ns_utc=1_000,
-        alpha=Misregistration(shift_x_subap=0.2, rotation_rad=np.deg2rad(0.3), magnification=1.01),
-        sigma=np.array([0.01, 0.02, np.deg2rad(0.03), 0.004]),
-        parent="cm-0",
-        condition_number=8.4,
-        gate=VERDICT,
-        reason="waits for an operator",
-    )
-    return replace(record, **changes)
+from tests.support.acquiring import Acquiring
+from tests.support.api import ALPHA, SECOND, SIGMA, STATE
+from tests.support.archived import MATRIX, product, record_of
+from tests.support.situations import START_NS, Story, moved
+from tests.support.states import changed
+from tests.support.watchdog import learnt, watch
 
 
 def assert_same(found: ReconstructorRecord, expected: ReconstructorRecord) -> None:
@@ -95,10 +69,6 @@ def archive(tmp_path):
     archive.open()
     with archive:
         yield archive
-
-
-def product(archive, matrix_id="cm-1"):
-    return archive.reconstructors.path_of(matrix_id)
 
 
 def damage(path):
@@ -899,8 +869,6 @@ def test_it_lies_in_the_archives_directory(tmp_path, saved):
 
 # --- trends
 
-
-__all__ = ["service"]  # a fixture
 
 FULL = TrendSample(
     t_ns_utc=SECOND,

@@ -13,7 +13,7 @@ from service.archive.serialisation import to_json
 from service.errors import ArchiveError, UnknownIdError
 from service.records.operations import MeasureState
 from service.wire import Pattern, checksum
-from tests.unit.test_api_measured import NOISY, STORED
+from tests.support.api_measured import NOISY, STORED
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(4, 3) * 1e6
 

@@ -17,27 +17,8 @@ from service.errors import ArchiveError, StorageError, TooLargeError
 from service.model.misregistration import Misregistration
 from service.records.registration import HistoryEntry, Source
 from service.web.history import downsample
-from tests.states import tracker_state
-
-SECOND = 1_000_000_000
-NOON = 20_000 * DAY_NS + 12 * HOUR_NS
-"""2024-10-04."""
-
-
-def entry(t_ns, shift_x=0.1, **changes):
-    return HistoryEntry(
-        **{
-            "t_ns_utc": t_ns,
-            "measured": Misregistration(shift_x_subap=shift_x, rotation_rad=0.01),
-            "measured_sigma": np.array([0.01, 0.02, 0.003, 0.0004]),
-            "filtered": Misregistration(shift_x_subap=shift_x, magnification=1.002),
-            "filtered_sigma": np.array([0.001, 0.002, 0.0003, 0.00004]),
-            "innovation": 3.5,
-            "misfit": 1.2,
-            "in_use": "cm-1",
-        }
-        | changes
-    )
+from tests.support.archive_nights import NOON, SECOND, entry
+from tests.support.states import tracker_state
 
 
 def line(t_ns, name, text="so it was", who="service"):

@@ -23,8 +23,8 @@ from service.records.alarms import Alarm
 from service.records.products import MatrixState
 from service.records.state import TrackerState
 from service.runtime import archiving
-from tests.states import changed, tracker_state
-from tests.unit.test_archive import product, record_of
+from tests.support.archived import product, record_of
+from tests.support.states import changed, tracker_state
 
 NOW = 20_000 * DAY_NS
 WRITTEN = Path(__file__).parents[1] / "data" / "archive"

@@ -15,8 +15,8 @@ from service.archive import Archive, AuditEntry
 from service.archive.nights import TrendSample
 from service.model.misregistration import Misregistration
 from service.records.registration import HistoryEntry
-from tests.system.night import INSTRUMENT
-from tests.unit.test_archive import MATRIX, record_of
+from tests.support.archived import MATRIX, record_of
+from tests.support.night import INSTRUMENT
 
 SECOND = 1_000_000_000
 EVENING = 1_800_000_000 * SECOND

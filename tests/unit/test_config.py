@@ -33,16 +33,14 @@ from service.model.pupil import (
 from service.model.slopes import Orientation
 from service.records.state import Mode
 from sim_rtc.telescope.diffractive import build_centred_pupil
-from tests.numerics import SOMEWHERE
+from tests.support.config import ABOUT, MIRROR, MODES
+from tests.support.numerics import SOMEWHERE
 
-ABOUT = '[instrument]\nname = "bench"\ndiameter_m = 8.0\nstop = "telescope"\n'
 WFS = (
     '[wfs]\nkind = "pyramid"\nn_subapertures = 20\nwavelength_m = 750e-9\n'
     "modulation_lambda_over_d = 3.0\n"
 )
 APART = WFS + "pupil_separation_subap = 24\n"
-MIRROR = '[mirror]\nlayout = "grid"\nn_across = 11\npitch_m = 0.8\ndiameter_m = 8.8\n'
-MODES = "[modes]\nn_modes = 50\n"
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import re
 from check_rtc.check import as_document, format_line
 from check_rtc.requirements import REQUIREMENTS, fine
 from pyrcal_studies.sequence_diagrams import DIAGRAMS, FOLDER, draw_diagram
-from tests.unit.test_house import ROOT
+from tests.support.repository import ROOT
 
 PAGE = (ROOT / "docs" / "rtc.md").read_text(encoding="utf-8")
 

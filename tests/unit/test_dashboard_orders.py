@@ -12,7 +12,7 @@ import pytest
 
 from service.tracking.interlocks import ORDERS, permissions
 from service.web.page import FILES
-from tests.unit.tracking.moments import MOMENTS
+from tests.support.moments import MOMENTS
 
 NODE = shutil.which("node")
 

@@ -11,24 +11,12 @@ import yaml
 from packaging.requirements import Requirement
 
 from service.config import load_settings
-from tests.unit.test_house import ROOT
+from tests.support.deploy import DEPLOY, SERVICE, UNIT
+from tests.support.repository import ROOT
 
-DEPLOY = ROOT / "deploy"
-UNIT = (DEPLOY / "pyrcal.service").read_text(encoding="utf-8")
 SETTINGS = (DEPLOY / "pyrcal.toml").read_text(encoding="utf-8")
 
 
-def unit_table(name):
-    """Return a section of the unit: every key with its values."""
-    found = {}
-    for line in UNIT.partition(f"[{name}]\n")[2].partition("\n[")[0].splitlines():
-        if line and not line.startswith("#"):
-            key, _, value = line.partition("=")
-            found.setdefault(key, []).append(value)
-    return found
-
-
-SERVICE = unit_table("Service")
 COMPOSE = yaml.safe_load((DEPLOY / "compose.yml").read_text(encoding="utf-8"))
 
 

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import tomllib
 from importlib.util import find_spec
-from itertools import groupby
 
 import httpx
 import pytest
@@ -25,24 +24,15 @@ from service.instrument import load_instrument
 from service.records.alarms import ALARMS
 from service.web import page
 from sim_rtc.options import parse_options
-from tests.unit.test_api import assert_problem, service
-from tests.unit.test_house import ROOT
-
-__all__ = ["service"]  # fixtures
-
-DOCS = ROOT / "docs"
-RECORDS = {"decisions", "results", "rtc"}
-"""Folders of docs that nobody works through with their hands at the keys."""
+from tests.support.api import assert_problem
+from tests.support.manual import DOCS, PAGES, blocks_of, commands
+from tests.support.repository import ROOT
 
 READ_WHOLE = tuple(
     f"{page.stem}-" for name in ("tutorials", "howto") for page in (DOCS / name).glob("*.md")
 )
 """Pages whose blocks build on each other: tests/system/test_manual.py runs them."""
 
-PAGES = [
-    ROOT / "README.md",
-    *sorted(page for page in DOCS.rglob("*.md") if page.parent.name not in RECORDS),
-]
 SHELL_ALONE = {
     *("buildah", "cd", "chown", "dask", "docker", "export", "git", "grep", "install", "mkdir"),
     *("mmdebstrap", "openssl", "runuser", "systemctl", "useradd", "zip"),
@@ -54,35 +44,12 @@ PARSER = command_line()
 REST = json.loads((DOCS / "openapi.json").read_text(encoding="utf-8"))["paths"]
 
 
-NOT_RUN = re.compile(r"<!-- not run: (.+) -->\n\Z")
-"""On the line before a block that no test can run, with the reason."""
-
-
-def blocks_of(page, kind):
-    """Every fenced block of a kind on a page, and why it is not run; None: it is."""
-    whole = page.read_text("utf-8")
-    for found in re.finditer(rf"^```{kind}\n(.*?)^```", whole, re.M | re.S):
-        mark = NOT_RUN.search(whole[: found.start()])
-        yield found[1], mark and mark[1]
-
-
 def blocks(kind, *, run=False):
     """Every fenced block of a kind: (page and number, text); those alone that can be ``run``."""
     for path in PAGES:
         for number, (text, why) in enumerate(blocks_of(path, kind)):
             if not (run and why):
                 yield pytest.param(text, id=f"{path.stem}-{number}")
-
-
-def commands(text):
-    """The commands of a block, as words."""
-    text = re.sub(r"(?<!\S)#.*", "", text.replace("\\\n", " "))
-    lexer = shlex.shlex(text, posix=True, punctuation_chars=";|&<>\n")
-    lexer.whitespace, lexer.whitespace_split = " \t", True
-    for ends, words in groupby(lexer, lambda word: not set(word) - set(";|&\n")):
-        if not ends:
-            words = list(words)
-            yield words[: words.index(">")] if ">" in words else words
 
 
 def check_pyrcal(words):

@@ -6,15 +6,11 @@ What is not so yet is listed here by name. No list may grow, and what has been m
 import ast
 import re
 from collections import defaultdict
-from pathlib import Path
 
 import grimp
 
-import service
 from service.records.alarms import ALARMS
-
-ROOT = Path(service.__file__).parent.parent
-HELD = ("service", "pyrcal", "check_rtc")
+from tests.support.repository import HELD, ROOT
 
 WORDS_TOO = {"acquisition", "archive-failed", "dither", "margin"}
 """Alarms whose name means something else, too: a word of the wire, of REST, of a file."""
@@ -46,3 +42,13 @@ def test_records_lie_at_the_ground():
                 assert imported.startswith(("service.records.", "service.wire", "service.files"))
     assert len(imports.find_upstream_modules("service.records.state")) <= 12
     assert len(imports.find_upstream_modules("service.link.intake")) <= 26
+
+
+def test_no_test_module_imports_another():
+    """What tests share is in ``tests/support``."""
+    imports = re.compile(
+        r"^\s*(from tests\S*\.test_\w+ import|from tests\S* import test_)", re.MULTILINE
+    )
+    modules = list((ROOT / "tests").rglob("*.py"))
+    assert [str(path) for path in modules if imports.search(path.read_text("utf-8"))] == []
+    assert len(modules) > 300

@@ -14,8 +14,6 @@ from service.link.session import Endpoint
 from service.records import events as ev
 from service.wire import (
     Acknowledgement,
-    AckState,
-    FrameHeader,
     Keys,
     Loop,
     Manifest,
@@ -25,10 +23,10 @@ from service.wire import (
     Status,
     decode,
     encode,
-    encode_frames,
     layout_of,
 )
 from service.wire.signing import Signatures
+from tests.support.link import applied, send
 
 
 class Clock:
@@ -51,25 +49,6 @@ def clock():
 @pytest.fixture
 def intake(clock):
     return Intake(Endpoint(system="bench", ring_seconds=0.5), clock)
-
-
-def send(intake, seq0, n=10, rows=None, **changes):
-    values = {
-        "session": "s1",
-        "seq0": seq0,
-        "n": n,
-        "t0_ns": 10**18 + seq0 * 1_000_000,
-        "dt_ns": 1_000_000,
-        "n_slopes": 3,
-        "n_modes": 2,
-        "dither": False,
-        "cm_id": None,
-        "basis_id": "b",
-        "config_id": "c",
-    }
-    header = FrameHeader(**(values | changes))
-    rows = np.zeros((n, header.n_columns), np.float32) if rows is None else rows
-    intake.frames(*encode_frames(header, rows), recoverable=True)
 
 
 def spans(blocks):
@@ -262,18 +241,6 @@ def test_frames_of_another_size_start_over_in_the_same_session(intake):
     send(intake, 10, n_modes=4)
     (block,) = intake.drain()
     assert block.commands_m.shape == (10, 4)
-
-
-def applied(intake, session):
-    acknowledgement = Acknowledgement(
-        session=session,
-        id="cm-1",
-        sha256="0" * 64,
-        state=AckState.APPLIED,
-        reason="",
-        frame_seq=5,
-    )
-    intake.acknowledgement(acknowledgement, known=True)
 
 
 def say(intake, **changes):

@@ -5,8 +5,8 @@ import tomllib
 
 import pytest
 
-from tests.unit.test_house import ROOT
-from tests.unit.test_shelf import anchors
+from tests.support.repository import ROOT
+from tests.support.shelf import anchors
 
 RESULTS = ROOT / "docs" / "results"
 ENTRIES = tomllib.loads((RESULTS / "measured.toml").read_text("utf-8"))

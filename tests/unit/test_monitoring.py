@@ -20,11 +20,9 @@ from service.records.alarms import (
 )
 from service.records.registration import Validity
 from service.runtime.archiving import ids_of
-from tests.states import changed
-from tests.unit.test_api import LINK, SECOND, STATE, assert_problem, service
-from tests.unit.test_house import ROOT
-
-__all__ = ["service"]  # fixtures
+from tests.support.api import LINK, SECOND, STATE, assert_problem
+from tests.support.repository import ROOT
+from tests.support.states import changed
 
 SCRAPED = (ROOT / "deploy" / "prometheus.yml").read_text(encoding="utf-8")
 RULES = yaml.safe_load((ROOT / "deploy" / "alerts.yml").read_text(encoding="utf-8"))

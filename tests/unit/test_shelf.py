@@ -4,7 +4,8 @@ import re
 
 import pytest
 
-from tests.unit.test_house import ROOT
+from tests.support.repository import ROOT
+from tests.support.shelf import anchors
 
 DOCS = ROOT / "docs"
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md")])
@@ -18,13 +19,6 @@ MOST_DECISIONS, MOST_WORDS = 30, 600
 TOPS = (ROOT / "service", ROOT / "pyrcal", ROOT)
 DEPENDENCIES = "0001-dependencies.md"
 """One line for each: as long as it must be."""
-
-
-def anchors(page):
-    """The anchors of a page's headings, as GitHub and Sphinx make them."""
-    for title in re.findall(r"^#+ (.*)$", page.read_text("utf-8"), re.M):
-        words = re.sub(r"[^\w\s-]", "", re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", title).lower())
-        yield re.sub(r"\s", "-", words).strip("-")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

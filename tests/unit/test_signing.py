@@ -9,7 +9,7 @@ import pytest
 from service.errors import WireError
 from service.wire import FrameHeader, Keys, Role, decode, encode
 from service.wire.signing import ReplayWindow, Signatures
-from tests.unit.test_house import ROOT
+from tests.support.repository import ROOT
 
 SECRET = b"the same on both sides, 32 bytes"
 KEYS = Keys("bench")

@@ -11,8 +11,8 @@ from service.records.alarms import Interlock, blocking_alarm
 from service.records.state import Mode
 from service.runtime.readiness import complaints
 from service.wire import FrameHeader, encode, encode_frames
-from tests.unit.tracking.situations import START_NS, Story
-from tests.unit.tracking.situations import rtc as status
+from tests.support.situations import START_NS, Story
+from tests.support.situations import rtc as status
 
 N_FRAMES = 20
 

@@ -11,16 +11,8 @@ from service.records.products import MatrixState
 from service.records.state import Mode
 from service.tracker import REACTIONS, TAKEN_BY_OPERATIONS, step
 from service.wire import DitherRequest
-from tests.states import tracker_state
-from tests.unit.tracking.situations import (
-    ALPHA,
-    POLICY,
-    Story,
-    dither_answered,
-    moved,
-    of_kind,
-    rtc,
-)
+from tests.support.situations import ALPHA, POLICY, Story, dither_answered, moved, of_kind, rtc
+from tests.support.states import tracker_state
 
 
 def apply_what_is_sent(story, effects, n_modes):

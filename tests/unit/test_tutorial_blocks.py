@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.unit.tutorial_blocks import ENDING, agrees, missing_lines, steps
+from tests.support.tutorial_blocks import ENDING, agrees, missing_lines, steps
 
 PRINTED = "shift x             -0.0978      0.0029  subapertures\n...\nverdict: accepted\n"
 

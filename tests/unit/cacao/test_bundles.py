@@ -8,7 +8,7 @@ from cacao_bridge.settings import Settings
 from cacao_bridge.streams import StreamError, create, path_of
 from service.errors import ConfigurationError, PyrcalError
 from service.files.bundle import Bundle, write_bundle
-from tests.unit.cacao.test_calibration import (
+from tests.support.calibration import (
     IDENTITY,
     INDEX,
     N_MODES,

@@ -8,8 +8,8 @@ import pytest
 
 from cacao_bridge.computer import Cacao
 from service.wire import Loop
-from tests.unit.cacao.milk import Milk
-from tests.unit.cacao.test_calibration import INDEX, N_MODES, SHAPE, settings_in
+from tests.support.calibration import INDEX, N_MODES, SHAPE, settings_in
+from tests.support.milk import Milk
 
 ROWS, GAIN, MULT = 3, 0.4, 0.9
 

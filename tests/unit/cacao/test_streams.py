@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cacao_bridge.streams import GoneError, Stream, StreamError, create, path_of
-from tests.unit.cacao.milk import Milk, keywords_in
+from tests.support.milk import Milk, keywords_in
 
 ROOT = Path(__file__).parents[3]
 
@@ -87,7 +87,7 @@ def test_frames_of_another_process_come_whole_while_it_writes(path):
     text = f"""
         import pathlib, sys, time
         sys.path.insert(0, {str(ROOT)!r})
-        from tests.unit.cacao.milk import Milk, keywords_in
+        from tests.support.milk import Milk, keywords_in
         milk = Milk(pathlib.Path({str(path)!r}), (20, 10), n_ring=64)
         print("made", flush=True)
         for k in range(1, 1001):

@@ -18,8 +18,8 @@ from service.model.slopes import Orientation
 from sim_rtc.telescope.detector import Detector
 from sim_rtc.telescope.diffractive import DiffractivePlant
 from sim_rtc.telescope.imperfections import SETS
-from tests.system.night import INSTRUMENT
-from tests.unit.check_rtc.pretend import Pretend
+from tests.support.night import INSTRUMENT
+from tests.support.pretend import Pretend
 
 
 @cache

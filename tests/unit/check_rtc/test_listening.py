@@ -11,7 +11,7 @@ from check_rtc.requirements import REQUIREMENTS, Outcome
 from service.errors import LinkError, WireError
 from service.estimation.slope_convention import SlopeConvention
 from service.model.slopes import Orientation, SlopeRecipe
-from tests.unit.check_rtc.pretend import Pretend
+from tests.support.pretend import Pretend
 from tests.vectors import PAGE, anchors_of
 
 

@@ -10,7 +10,7 @@ from check_rtc import moving
 from check_rtc.examine import Examination, examine
 from check_rtc.requirements import REQUIREMENTS, Moves, Outcome
 from service.wire import AckState, CommandKind
-from tests.unit.check_rtc.pretend import Pretend
+from tests.support.pretend import Pretend
 
 ASKING = frozenset(
     name

@@ -14,7 +14,7 @@ from service.cli import serve
 from service.cli.serve import warn_of_readers
 from service.config.settings import ApiTable
 from service.errors import ConfigurationError
-from tests.system.pace import patience
+from tests.support.pace import patience
 
 POOLS_OF_MANY_THREADS = """
 import ctypes, threading

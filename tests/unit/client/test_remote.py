@@ -26,9 +26,9 @@ from service.records.operations import AcquisitionStage
 from service.records.products import MatrixState, ReconstructorRecord
 from service.records.state import Mode
 from service.web.connections import Server
-from tests.states import changed
-from tests.unit.test_api import MATRIX, SECOND, STATE, FakeService, a_snapshot
-from tests.unit.tracking.situations import ALL_SHOWN
+from tests.support.api import MATRIX, SECOND, STATE, FakeService, a_snapshot
+from tests.support.situations import ALL_SHOWN
+from tests.support.states import changed
 
 BEFORE = ReconstructorRecord(
     id="cm-0", state=MatrixState.SUPERSEDED, n_modes=300, created_ns_utc=SECOND

@@ -11,17 +11,9 @@ import pytest
 from pyrcal.__main__ import main
 from pyrcal.client.status import status_lines
 from service.records.state import Level, LogEntry
-from service.web.views import STATE as STATE_VIEW
-from service.web.views import to_json
-from tests.states import changed, tracker_state
-from tests.unit.test_api import SECOND, STATE, a_snapshot
-
-
-def told(tracker=STATE, *, ready=True, **changes):
-    """What the service would answer."""
-    reason = "telemetry flows" if ready else "no RTC is there"
-    snapshot = a_snapshot(changed(tracker, **changes), ready=ready, ready_reason=reason)
-    return to_json(snapshot, STATE_VIEW)
+from tests.support.api import SECOND, STATE
+from tests.support.states import tracker_state
+from tests.support.status import told
 
 
 def test_the_first_line_says_whether_it_is_ready_and_the_next_what_is_wrong():

@@ -14,7 +14,7 @@ from rich.console import Console
 from pyrcal.__main__ import main
 from pyrcal.client import rest, watch
 from pyrcal.client.rest import Service, UnreachableError
-from tests.unit.client.test_status import told
+from tests.support.status import told
 
 
 @contextlib.contextmanager

@@ -18,7 +18,7 @@ from service.control.expected_gain import (
 from service.control.loop import ControlLoop
 from service.control.reconstructor import invert
 from service.model.misregistration import Misregistration
-from tests.numerics import N_CONTROLLED, N_MODES, small_basis, small_instrument, small_model
+from tests.support.numerics import N_CONTROLLED, N_MODES, small_basis, small_instrument, small_model
 
 NOISE = 0.05
 SKY = Sky(

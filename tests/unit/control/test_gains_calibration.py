@@ -8,7 +8,7 @@ import pytest
 from service.control.gains import CalibrationGains
 from service.control.reconstructor import invert
 from service.errors import ModelError
-from tests.numerics import N_MODES, small_linearisation
+from tests.support.numerics import N_MODES, small_linearisation
 
 MATRIX = small_linearisation().matrix
 

@@ -22,7 +22,7 @@ from service.control.gate import (
 from service.control.loop import ControlLoop, pole_radius
 from service.control.reconstructor import invert
 from service.model.misregistration import Misregistration
-from tests.numerics import N_CONTROLLED, SOMEWHERE, small_linearisation, small_model
+from tests.support.numerics import N_CONTROLLED, SOMEWHERE, small_linearisation, small_model
 
 SIGMA = np.array([0.01, 0.01, np.deg2rad(0.01), 0.0005])
 BOUND = 0.95

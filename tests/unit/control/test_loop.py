@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 
 from service.control.loop import pole_radius
-
-
-def integrator_limit(eigenvalue_argument_rad):
-    """Return the largest stable ``gain |λ|`` for two frames of delay and no leak.
-
-    ``2 sin((π/2 - |arg λ|) / 3)``; negative where no gain is stable.
-    """
-    return 2.0 * np.sin((np.pi / 2 - np.abs(eigenvalue_argument_rad)) / 3.0)
+from tests.support.loop import integrator_limit
 
 
 def test_an_integrator_of_two_frames_loses_stability_at_a_gain_of_one():

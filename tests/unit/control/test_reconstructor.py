@@ -22,7 +22,13 @@ from service.control.reconstructor import (
 )
 from service.errors import ModelError
 from service.model.misregistration import Misregistration
-from tests.numerics import N_CONTROLLED, N_MODES, SOMEWHERE, small_basis, small_linearisation
+from tests.support.numerics import (
+    N_CONTROLLED,
+    N_MODES,
+    SOMEWHERE,
+    small_basis,
+    small_linearisation,
+)
 
 
 def with_singular_values(values: list[float], n_slopes: int = 20) -> np.ndarray:

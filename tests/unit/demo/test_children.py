@@ -5,8 +5,8 @@ import time
 import pytest
 
 from pyrcal.demo.children import GRACE_S, interrupt_on_end, run_children
-from tests.system.night import session_members, wait_for
-from tests.system.pace import in_time
+from tests.support.night import session_members, wait_for
+from tests.support.pace import in_time
 
 WITH_A_CHILD = """
 import subprocess, sys, time

@@ -6,59 +6,9 @@ import pytest
 
 from pyrcal.demo.report import Circumstances, Report, Stage, make_report, table
 from pyrcal.demo.truth import TruthFile
-
-TRUE = {"shift_x_subap": 0.1, "shift_y_subap": 0.0, "rotation_deg": 0.2, "magnification": 1.003}
-SIGMA = {
-    "shift_x_subap": 0.004,
-    "shift_y_subap": 0.004,
-    "rotation_deg": 0.006,
-    "magnification": 0.0004,
-}
-
+from tests.support.demo_report import TRUE, gate, service_state, shelf, waiting
 
 WELL = Circumstances(seconds_to_ready=4.0, seconds_to_first_applied=12.0, pace=1.0)
-
-
-def gate(radius):
-    return {"worst_pole_radius": radius}
-
-
-def shelf(**changes):
-    """The RTC's own matrix, one for 400 modes, one for 500."""
-    records = []
-    for name, n_modes, parent, radius in (
-        ("initial", 400, None, 0.93),
-        ("cm-400", 400, "initial", 0.66),
-        ("cm-500", 500, "cm-400", 0.67),
-    ):
-        records.append(
-            {
-                "id": name,
-                "n_modes": n_modes,
-                "parent": parent,
-                "state": "applied",
-                "gate": gate(radius),
-                "published_ns_utc": None if parent is None else 5,
-                "applied_frame_seq": None if parent is None else 100,
-            }
-            | changes.get(name.replace("-", "_"), {})
-        )
-    return records
-
-
-def service_state(alarms=(), **error):
-    alpha = {name: TRUE[name] + error.get(name, 0.0) for name in TRUE}
-    return {
-        "ready": True,
-        "ready_reason": "ready",
-        "waiting_for": [],
-        "uptime_s": 70.0,
-        "windows_accepted": 30,
-        "windows_refused": 2,
-        "link": {"frames_received": 50_000, "frames_lost": 0},
-        "alarms": [{"name": name, "text": "found"} for name in alarms],
-        "registration": {"alpha": alpha, "sigma": SIGMA, "floor": SIGMA},
-    }
 
 
 @pytest.fixture
@@ -283,10 +233,6 @@ def test_a_simulator_that_is_slow_or_silent_is_the_reason(truth):
 def test_a_service_that_was_never_ready_says_what_it_waited_for(truth):
     reasons = failed(truth, waiting_for=[waiting("model", "worker", "the model is prepared")])
     assert names(reasons, "not ready", "worker", "the model is prepared")
-
-
-def waiting(name, party, text):
-    return {"name": name, "responsible": party, "text": text, "blocks": True}
 
 
 def test_what_the_service_waits_for_is_passed_on_once(truth):

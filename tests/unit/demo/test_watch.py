@@ -19,7 +19,7 @@ from pyrcal.demo.watch import (
     rate_line,
     slow_line,
 )
-from tests.unit.demo.test_report import TRUE, service_state, shelf, waiting
+from tests.support.demo_report import TRUE, service_state, shelf, waiting
 
 SECOND_NS = 1_000_000_000
 

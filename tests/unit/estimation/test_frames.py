@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.numerics import block_of
+from tests.support.numerics import block_of
 
 
 def test_a_block_has_as_many_frames_as_rows_of_slopes():

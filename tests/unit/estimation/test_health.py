@@ -22,7 +22,7 @@ from service.estimation.health import (
     observe,
 )
 from service.model.misregistration import Misregistration
-from tests.numerics import (
+from tests.support.numerics import (
     N_CONTROLLED,
     N_MODES,
     Sky,

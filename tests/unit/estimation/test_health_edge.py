@@ -13,7 +13,7 @@ from service.estimation.health import SLIPPED_RATIO, SUSPECT_RATIO, EdgeHealth, 
 from service.instrument.mirrors import rings
 from service.model.kinds import KarhunenLoeve
 from service.model.modes import ModalBasis, karhunen_loeve_basis
-from tests.numerics import block_of, small_instrument
+from tests.support.numerics import block_of, small_instrument
 
 N_MODES = 100
 SECONDS = 4

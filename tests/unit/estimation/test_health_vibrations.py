@@ -9,7 +9,7 @@ import pytest
 import scipy
 
 from service.estimation.health import MIN_SEGMENTS, SEGMENT_FRAMES, SlopeSpectra, VibrationMonitor
-from tests.numerics import block_of, part
+from tests.support.numerics import block_of, part
 
 N_SLOPES = 60
 

@@ -24,7 +24,8 @@ from service.estimation.lockin import (
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 from service.records.estimates import LockInEstimate, RefusalKind, WindowRefused
-from tests.numerics import (
+from tests.support.lockin import N_FRAMES, N_SLOPES, N_SMALL_MODES, PLAN, plan, run, telemetry
+from tests.support.numerics import (
     DT_NS,
     FRAME_RATE_HZ,
     N_CONTROLLED,
@@ -40,34 +41,6 @@ from tests.numerics import (
     small_loop,
     small_model,
 )
-
-N_FRAMES = 1000
-N_SLOPES, N_SMALL_MODES = 6, 5
-
-PLAN = LockInPlan(
-    modes=(3, 1),
-    frequencies_hz=(230.0, 270.0),
-    amplitude_m=(5e-9, 8e-9),
-    frame_rate_hz=FRAME_RATE_HZ,
-    n_frames=N_FRAMES,
-    first_seq=100,
-)
-
-
-def telemetry(n_frames: int = 2500, plan: LockInPlan = PLAN) -> FrameBlock:
-    """Noise with the dither in the commands, from frame 0."""
-    rng = np.random.default_rng(7)
-    dither = sines(plan, n_frames, N_SMALL_MODES)
-    commands = dither + 1e-8 * rng.normal(size=dither.shape)
-    return block_of(rng.normal(size=(n_frames, N_SLOPES)), commands, dither)
-
-
-def run(*blocks: FrameBlock, plan: LockInPlan = PLAN) -> list[Spectra | WindowRefused]:
-    lock_in, ended = LockIn(plan=plan), []
-    for block in blocks:
-        lock_in, more = lock_in.accumulate(block)
-        ended += more
-    return ended
 
 
 def only_refusal(*blocks: FrameBlock) -> WindowRefused:
@@ -361,18 +334,6 @@ def the_response(dither, matrix, loop, frequency_hz, gain):
         dither[None], loop.reconstructor @ matrix, loop, (frequency_hz,), np.array([gain])
     )
     return found[0]
-
-
-def plan(*frequencies_hz: float, amplitude_m: float = 10e-9) -> LockInPlan:
-    """Two of the modes that the loop does not control, one-second windows."""
-    return LockInPlan(
-        modes=(33, 37),
-        frequencies_hz=frequencies_hz,
-        amplitude_m=(amplitude_m, amplitude_m),
-        frame_rate_hz=FRAME_RATE_HZ,
-        n_frames=1000,
-        first_seq=0,
-    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.estimation.control_law import KEPT_FRAMES, ControlLawCheck, follow, judge_frames
-from tests.unit.estimation.test_loopcheck import GAINS, INVERSE, blocks, closed_loop, terms
+from tests.support.loopcheck import GAINS, INVERSE, blocks, closed_loop, terms
 
 
 def found(telemetry, told=None, *, keep=lambda block: True, **how):

@@ -15,7 +15,8 @@ from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.model.slopes import Orientation
 from service.records.estimates import RefusalKind, WideCaptureEstimate, WindowRefused
-from tests.numerics import (
+from tests.support.lamps import counts_of, small
+from tests.support.numerics import (
     FRAME_RATE_HZ,
     N_MODES,
     Sky,
@@ -25,7 +26,6 @@ from tests.numerics import (
     small_instrument,
     small_loop,
 )
-from tests.unit.estimation.lamps import counts_of, small
 
 FAR = Misregistration(
     shift_x_subap=1.3, shift_y_subap=-1.1, rotation_rad=np.deg2rad(-5.0), magnification=1.045

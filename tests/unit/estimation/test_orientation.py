@@ -8,8 +8,8 @@ from service.estimation.reference import Reference
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration
 from service.model.slopes import Orientation
-from tests.numerics import small_basis
-from tests.unit.estimation.bench import ELSEWHERE, GRID, error, fit, instrument, listed, matrix
+from tests.support.bench import ELSEWHERE, GRID, error, fit, instrument, listed, matrix
+from tests.support.numerics import small_basis
 
 UNKNOWN = instrument(None)
 

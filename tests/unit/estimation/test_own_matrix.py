@@ -17,7 +17,7 @@ from service.instrument import load_instrument
 from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
-from tests.system.stranger import INSTRUMENT
+from tests.support.stranger import INSTRUMENT
 
 N_CONTROLLED = 60
 ALPHAS = {

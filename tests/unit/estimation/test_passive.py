@@ -24,7 +24,7 @@ from service.estimation.passive import (
 from service.estimation.windows import CHUNK_FRAMES
 from service.model.misregistration import Misregistration
 from service.records.estimates import BIAS_FLOOR, PassiveEstimate
-from tests.numerics import (
+from tests.support.numerics import (
     N_CONTROLLED,
     N_MODES,
     SOMEWHERE,

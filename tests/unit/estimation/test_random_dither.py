@@ -19,7 +19,7 @@ from service.estimation.random_dither import (
 )
 from service.model.interaction import Linearisation
 from service.records.estimates import RandomEstimate, RefusalKind, WindowRefused
-from tests.numerics import (
+from tests.support.numerics import (
     N_MODES,
     SOMEWHERE,
     Sky,

@@ -10,7 +10,7 @@ from service.estimation.reference import Reference, target_of
 from service.model.instrument import Instrument
 from service.model.kinds import BasisKind
 from service.model.pupil import valid_subapertures
-from tests.unit.estimation.bench import instrument
+from tests.support.bench import instrument
 
 
 def weights(about: Instrument, scale: list[float]) -> list[float]:

@@ -12,7 +12,7 @@ from pyrcal.fitting.recorded import check_sealed
 from service.errors import MatrixError
 from service.files import container
 from service.files.container import opened
-from tests.unit.files.forged import TWO_BY_THREE, fits_bytes
+from tests.support.forged import TWO_BY_THREE, fits_bytes
 
 AT_ONCE_S = 2.0
 """Of processor time: astropy's import takes a quarter of it."""

@@ -13,7 +13,7 @@ from pyrcal.fitting.design import interaction_matrix
 from service.files import disk_cache
 from service.files.disk_cache import DiskCache, usual_folder
 from service.model.modes import modal_basis
-from tests.numerics import small_instrument
+from tests.support.numerics import small_instrument
 
 PARTS = ("mode_to_actuator", "coefficients", "variance_m2")
 

@@ -9,7 +9,7 @@ import pytest
 
 from service.errors import ConfigurationError
 from service.files.recording import RecordedKind, Recording, RecordingWriter
-from tests.system.pace import in_time
+from tests.support.pace import in_time
 
 WRITER = """
 import sys, time

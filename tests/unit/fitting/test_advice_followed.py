@@ -25,7 +25,7 @@ from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from service.model.pupil import Illumination, rtc_valid_subapertures
-from tests.unit.estimation.lamps import counts_of
+from tests.support.lamps import counts_of
 
 EXPLAIN = FitOptions(explain=True)
 

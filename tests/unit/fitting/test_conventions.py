@@ -16,8 +16,8 @@ from pyrcal.importers.oopao import from_saved
 from pyrcal.importers.saved import read_npz
 from service.instrument import load_instrument
 from service.model.modes import modal_basis
-from tests.unit.fitting.mutations import GOOD_FILE, MATRICES, STREAMS, good
-from tests.unit.test_house import ROOT
+from tests.support.mutations import GOOD_FILE, MATRICES, STREAMS, good
+from tests.support.repository import ROOT
 
 DATA = ROOT / "pyrcal" / "samples" / "data"
 RULES = {

@@ -7,7 +7,7 @@ import pytest
 
 from pyrcal.fitting import figures
 from service.model.slopes import as_maps
-from tests.unit.fitting.made import GAINS, SYNTHETIC, VALID, a_fit
+from tests.support.made import GAINS, SYNTHETIC, VALID, a_fit
 
 
 def test_slopes_become_maps_side_by_side():

@@ -28,9 +28,9 @@ from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from service.model.pupil import lit_subapertures
 from service.model.slopes import SlopeRecipe
-from tests.unit.estimation.bench import ELSEWHERE, PLAIN, fit, instrument, matrix
-from tests.unit.fitting.made import a_fit, a_report
-from tests.unit.fitting.test_mistold import MODES, TRUTH, N, bench, masked, sigmas_off, zonal
+from tests.support.bench import ELSEWHERE, PLAIN, fit, instrument, matrix
+from tests.support.made import a_fit, a_report
+from tests.support.mistold import MODES, TRUTH, N, bench, masked, sigmas_off, zonal
 
 EXPLAIN = FitOptions(explain=True)
 RNG = np.random.default_rng(7)

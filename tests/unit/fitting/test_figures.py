@@ -9,8 +9,8 @@ from pyrcal.fitting import figures
 from pyrcal.fitting.figures import check_plots, write_sheet
 from service.errors import ConfigurationError
 from service.model.misregistration import Misregistration
-from tests.numerics import small_instrument
-from tests.unit.fitting.made import ALPHA, GAINS, SCAN, SYNTHETIC, a_fit, a_report
+from tests.support.made import ALPHA, GAINS, SCAN, SYNTHETIC, a_fit, a_report
+from tests.support.numerics import small_instrument
 
 
 @pytest.fixture

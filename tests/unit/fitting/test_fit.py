@@ -10,7 +10,7 @@ from pyrcal.__main__ import main
 from pyrcal.fitting import fit
 from pyrcal.fitting.fit_file import fit_file
 from tests.data.tiny.make import ALPHA
-from tests.unit.fitting.test_report import KEYS
+from tests.support.fit_keys import KEYS
 
 DATA = Path(__file__).parents[2] / "data" / "tiny"
 TINY, MATRIX = str(DATA / "tiny.toml"), str(DATA / "tiny.h5")

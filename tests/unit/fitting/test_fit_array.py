@@ -10,7 +10,7 @@ from pyrcal.fitting.fit_file import fit_file
 from service.errors import MatrixError
 from service.model.misregistration import Misregistration
 from service.model.pupil import Illumination
-from tests.unit.estimation.bench import ELSEWHERE, error, instrument, matrix
+from tests.support.bench import ELSEWHERE, error, instrument, matrix
 
 MODES = np.arange(10, 40)
 

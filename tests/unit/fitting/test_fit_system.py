@@ -14,8 +14,8 @@ from pyrcal.fitting.system_file import load_system
 from pyrcal.fitting.system_report import document, fill_system, table
 from service.errors import ConfigurationError
 from service.model.misregistration import Misregistration
-from tests.unit.fitting import systems
-from tests.unit.fitting.made import a_fit, a_report
+from tests.support import systems
+from tests.support.made import a_fit, a_report
 
 NOISE = 0.005
 """Of the largest slope."""

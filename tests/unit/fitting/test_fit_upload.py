@@ -17,7 +17,7 @@ from service.files.fit_folder import DOCUMENT, FIGURES, STAGE, UPLOAD, FitReques
 from service.instrument import load_instrument
 from service.model.instrument import instrument_sha256
 from tests.data.tiny.make import ALPHA, HERE
-from tests.numerics import flao_basis
+from tests.support.numerics import flao_basis
 
 TOML = '[wfs]\nvalid_subapertures = "mask.h5:/mask"\n[mirror]\nmodes = "modes.fits"\n'
 

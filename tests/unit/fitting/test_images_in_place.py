@@ -19,8 +19,8 @@ from pyrcal_studies.drawn_fits import Condition, Draw, instrument_of
 from pyrcal_studies.drawn_fits import measured as drawn_matrices
 from pyrcal_studies.image_offsets import as_told
 from service.estimation.reference import Reference, target_of
-from tests.numerics import small_basis
-from tests.unit.estimation.bench import ELSEWHERE, fit, instrument, matrix
+from tests.support.bench import ELSEWHERE, fit, instrument, matrix
+from tests.support.numerics import small_basis
 
 
 def in_place(found):

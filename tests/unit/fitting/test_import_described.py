@@ -13,7 +13,7 @@ from pyrcal.__main__ import main
 from pyrcal.importers.described import from_described
 from service.errors import ConfigurationError, MatrixError
 from service.instrument import packaged_file
-from tests.unit.fitting.discs import four_discs
+from tests.support.discs import four_discs
 
 PAPYRUS = Path(os.environ.get("PYRCAL_BENCH_DATA", "../shared/data")) / "papyrus"
 

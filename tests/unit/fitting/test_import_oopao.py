@@ -26,7 +26,7 @@ from pyrcal.importers.saved import read_npz
 from service.errors import ConfigurationError, MatrixError
 from service.model.instrument import PupilMap
 from service.model.misregistration import Misregistration
-from tests.unit.test_house import ROOT
+from tests.support.repository import ROOT
 
 DATA = ROOT / "pyrcal" / "samples" / "data"
 TRUE = np.array([-0.2 * 31 / 32, 0.0, np.deg2rad(2.0), 1.0])

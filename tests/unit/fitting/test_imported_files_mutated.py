@@ -12,7 +12,7 @@ from pyrcal.fitting.matrix import fit_matrix
 from service.errors import ConfigurationError, MatrixError, ModelError
 from service.estimation.reference import Reference
 from service.instrument import load_instrument
-from tests.unit.fitting.imported_mutations import MENDED, OF, PEERS, REFUSED, SLOW
+from tests.support.imported_mutations import MENDED, OF, PEERS, REFUSED, SLOW
 
 CASES = [
     pytest.param(peer, name, marks=[pytest.mark.long] * ((peer, name) in SLOW))

@@ -10,7 +10,7 @@ from pyrcal.importers.cacao import from_cacao
 from pyrcal.importers.files import Reported, from_arrays
 from service.errors import MatrixError
 from service.model.modes import modal_basis
-from tests.unit.fitting.mutations import MATRICES, good
+from tests.support.mutations import MATRICES, good
 
 REPORTED = Reported(
     diameter_m=3.0, sensor="pyramid", stop="telescope", obscuration_ratio=0.1, unit="m"

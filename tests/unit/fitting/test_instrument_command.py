@@ -20,8 +20,8 @@ from service.errors import ConfigurationError
 from service.instrument import load_instrument
 from service.instrument.schema import whole_of
 from service.model.sensors.registry import KINDS
-from tests.unit.estimation.lamps import counts_of
-from tests.unit.test_house import ROOT
+from tests.support.lamps import counts_of
+from tests.support.repository import ROOT
 
 TINY = ROOT / "tests" / "data" / "tiny" / "tiny.toml"
 LENSLETS = ROOT / "tests" / "data" / "lenslets.toml"

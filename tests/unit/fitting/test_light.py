@@ -21,8 +21,8 @@ from service.model.sensors.sensor import CannotTell, PupilPosition
 from service.model.slopes import Orientation
 from sim_rtc.telescope.diffractive import DiffractivePlant
 from tests.data.tiny.make import ALPHA, HERE, ORIENTATION, SEED
-from tests.unit.estimation.lamps import beam, counts_of, flao, gaussian
-from tests.unit.model.sensors.test_pyramid_light_illumination import at
+from tests.support.lamps import beam, counts_of, flao, gaussian
+from tests.support.pyramid_light_illumination import at
 
 
 def oriented(orientation):

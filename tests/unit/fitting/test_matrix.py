@@ -18,8 +18,8 @@ from service.model.kinds import Method, Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from service.model.pupil import Illumination
-from tests.numerics import small_basis
-from tests.unit.estimation.bench import ELSEWHERE, GRID, PLAIN, error, fit, instrument, matrix
+from tests.support.bench import ELSEWHERE, GRID, PLAIN, error, fit, instrument, matrix
+from tests.support.numerics import small_basis
 
 
 def from_here(*steps: float) -> FitOptions:

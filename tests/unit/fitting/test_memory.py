@@ -18,8 +18,8 @@ from service.model.memory import PROGRAM_BYTES
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from service.model.slopes import Orientation, SlopeRecipe
-from tests.unit.fitting.test_reconstruct import TINY
-from tests.unit.model.test_memory import instrument_of
+from tests.support.memory import instrument_of
+from tests.support.reconstruct import TINY
 
 
 @pytest.mark.parametrize("n_modes", [400, 60])

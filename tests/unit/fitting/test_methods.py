@@ -24,8 +24,8 @@ from service.errors import ModelError
 from service.estimation.reference import Reference, Target, target_of
 from service.model.kinds import Method
 from service.model.misregistration import PARAMETERS, Misregistration
-from tests.numerics import small_basis
-from tests.unit.estimation.bench import ELSEWHERE, GRID, PLAIN, fit, instrument, matrix
+from tests.support.bench import ELSEWHERE, GRID, PLAIN, fit, instrument, matrix
+from tests.support.numerics import small_basis
 
 ALL_MODES = np.arange(small_basis().n_modes)
 

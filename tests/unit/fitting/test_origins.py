@@ -11,8 +11,8 @@ from pyrcal.fitting.models import Optic
 from pyrcal.fitting.origins import is_determined, list_origins, list_undetermined_keys
 from pyrcal.fitting.report import document
 from service.model.slopes import Orientation, SlopeRecipe
-from tests.unit.fitting.made import a_fit, a_report
-from tests.unit.fitting.test_mistold import bench
+from tests.support.made import a_fit, a_report
+from tests.support.mistold import bench
 
 TEN = FoundOptic(
     optic=Optic.SENSOR,

@@ -16,17 +16,8 @@ from service.estimation.slope_convention import identify_from_response
 from service.model.kinds import SignalKind, SlopeOrder
 from service.model.pupil import valid_subapertures
 from service.model.slopes import Orientation, SlopeRecipe, slopes_of
-from tests.numerics import small_basis
-from tests.unit.estimation.bench import (
-    ELSEWHERE,
-    GRID,
-    PLAIN,
-    error,
-    fit,
-    instrument,
-    listed,
-    matrix,
-)
+from tests.support.bench import ELSEWHERE, GRID, PLAIN, error, fit, instrument, listed, matrix
+from tests.support.numerics import small_basis
 
 PIXELS = instrument(PLAIN, SlopeOrder.IMAGES)
 ODD = Orientation(swap_xy=True, flip_x=True, sign_y=-1)

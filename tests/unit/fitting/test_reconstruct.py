@@ -20,9 +20,9 @@ from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from service.model.slopes import Orientation, SlopeRecipe, rtc_mask, to_conventions
-from tests.unit.fitting.made import a_fit, a_report
+from tests.support.made import a_fit, a_report
+from tests.support.reconstruct import TINY
 
-TINY = Path(__file__).parents[2] / "data" / "tiny" / "tiny.toml"
 WORDS = "-0.31,0.17,64.2,0.985"
 ALPHA = Misregistration.from_boundary(
     {

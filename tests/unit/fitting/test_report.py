@@ -18,35 +18,9 @@ from service.model.instrument import instrument_sha256
 from service.model.kinds import SlopeOrder, Stop
 from service.model.misregistration import PARAMETERS
 from service.model.slopes import Orientation
-from tests.numerics import small_instrument
-from tests.unit.fitting.made import ALPHA, GAINS, SCAN, a_fit, a_report
-
-KEYS = {
-    *PARAMETERS,
-    "sigma",
-    "covariance",
-    "gains",
-    "residual_fraction",
-    "condition_number",
-    "n_modes_used",
-    "orientation",
-    "subset_scatter",
-    "converged",
-    "verdict",
-    "registration",
-    "reconstructor",
-    "notes",
-    "recommendation",
-    "found_not_told",
-    "unknown_not_found",
-    "alternatives",
-    "left_over",
-    "anamorphosis",
-    "anamorphosis_sigma",
-    "image_offsets_px",
-    "instrument_found",
-    "seconds",
-}
+from tests.support.fit_keys import KEYS
+from tests.support.made import ALPHA, GAINS, SCAN, a_fit, a_report
+from tests.support.numerics import small_instrument
 
 
 def test_the_document_has_exactly_the_keys_it_promises():

@@ -10,7 +10,7 @@ from pyrcal.fitting.system_file import load_system
 from service.errors import ConfigurationError
 from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import Misregistration
-from tests.unit.fitting import systems
+from tests.support import systems
 
 NUMBER = {"lgs1": 0, "lgs2": 1, "ngs": 2, "dm1": 0, "dm2": 1}
 

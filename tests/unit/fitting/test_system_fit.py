@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pyrcal.fitting.system_fit import fit_system
-from tests.unit.fitting import systems
+from tests.support import systems
 
 SIGMA = np.array([0.01, 0.01, np.deg2rad(0.05), 5e-4])
 

@@ -9,14 +9,8 @@ from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.model.pupil import Illumination, rtc_valid_subapertures
-from tests.numerics import small_basis, small_instrument
-from tests.unit.estimation.bench import (
-    ELSEWHERE,
-    error,
-    fit,
-    instrument,
-    matrix,
-)
+from tests.support.bench import ELSEWHERE, error, fit, instrument, matrix
+from tests.support.numerics import small_basis, small_instrument
 
 STRAIGHT = replace(ELSEWHERE, magnification=1.006)
 """So near to 1 that neither pitch nor diameter is doubted."""

@@ -13,8 +13,8 @@ from service.model.arrays import NUMPY, Arrays, arrays_of
 from service.model.interaction import InteractionModel
 from service.model.kinds import Normalisation, SlopeOrder, Stop
 from service.model.local import LocalShapes
-from tests.numerics import SOMEWHERE, small_basis, small_instrument
-from tests.unit.model.test_local import RECIPES, basis, many_actuators
+from tests.support.local import RECIPES, basis, many_actuators
+from tests.support.numerics import SOMEWHERE, small_basis, small_instrument
 
 STRICT = Arrays("array_api_strict")
 """Only what the standard has, and nothing that NumPy alone can do."""

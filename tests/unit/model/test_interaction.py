@@ -17,7 +17,7 @@ from service.model.pupil import instrument_pupil
 from service.model.sensors.pyramid.optics import PyramidOptics
 from service.model.sensors.pyramid.signals import reference_slopes
 from service.model.slopes import Orientation, SlopeRecipe, to_conventions
-from tests.numerics import (
+from tests.support.numerics import (
     SOMEWHERE,
     flao_basis,
     flao_matrix,

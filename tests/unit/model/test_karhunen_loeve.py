@@ -12,7 +12,7 @@ from service.model import karhunen_loeve
 from service.model.kinds import Influence
 from service.model.modes import analytic_basis
 from service.model.pupil import instrument_pupil
-from tests.numerics import small_instrument
+from tests.support.numerics import small_instrument
 
 N_MODES = 300
 

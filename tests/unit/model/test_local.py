@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -11,42 +10,13 @@ import scipy
 
 from service.errors import ModelError
 from service.model.interaction import InteractionModel
-from service.model.kinds import BasisKind, Influence, Normalisation, SlopeOrder, Stop
+from service.model.kinds import Stop
 from service.model.local import LocalShapes, beside, tiles_of
-from service.model.modes import ModalBasis, analytic_basis
+from service.model.modes import ModalBasis
 from service.model.pupil import instrument_pupil
 from service.model.sensors.shack_hartmann.description import ShackHartmann
-from tests.numerics import SOMEWHERE, small_basis, small_instrument
-
-RECIPES = [
-    (order, normalisation)
-    for order in (SlopeOrder.XY, SlopeOrder.IMAGES)
-    for normalisation in Normalisation
-]
-
-
-def grid_m(n_across, pitch_m):
-    line = (np.arange(n_across) - (n_across - 1) / 2) * pitch_m
-    y, x = np.meshgrid(line, line, indexing="ij")
-    return np.column_stack([x.ravel(), y.ravel()])
-
-
-@cache
-def many_actuators(stop=Stop.MIRROR, n_subapertures=24):
-    """24 subapertures, 625 actuators, zonal: more than reach any tile."""
-    plain = small_instrument(grid_m(25, 8.0 / 24), stop=stop, influence=Influence.GAUSSIAN)
-    return replace(
-        plain,
-        wfs=replace(plain.wfs, n_subapertures=n_subapertures, pupil_separation_subap=30.0),
-        mirror=replace(plain.mirror, pitch_m=8.0 / 24, basis=BasisKind.ZONAL),
-    )
-
-
-@cache
-def basis():
-    found = analytic_basis(many_actuators())
-    assert isinstance(found, ModalBasis)
-    return found
+from tests.support.local import RECIPES, basis, many_actuators
+from tests.support.numerics import SOMEWHERE, small_basis
 
 
 class Everywhere(ModalBasis):

@@ -3,33 +3,18 @@
 from __future__ import annotations
 
 import tracemalloc
-from dataclasses import replace
 
 import pytest
 
-from service.instrument.mirrors import grid
 from service.model.interaction import InteractionModel
-from service.model.kinds import Influence, Stop
+from service.model.kinds import Influence
 from service.model.memory import PROGRAM_BYTES, work_of
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from service.model.pupil import instrument_pupil
 from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import Fineness
-from tests.numerics import small_instrument
-
-
-def instrument_of(influence: Influence, n_modes: int):
-    """24 subapertures and 437 actuators."""
-    pitch_m = 8.0 / 23
-    plain = small_instrument(
-        grid(25, pitch_m, 8.2), influence=influence, n_modes=n_modes, stop=Stop.TELESCOPE
-    )
-    return replace(
-        plain,
-        wfs=replace(plain.wfs, n_subapertures=24, pupil_separation_subap=30.0),
-        mirror=replace(plain.mirror, pitch_m=pitch_m),
-    )
+from tests.support.memory import instrument_of
 
 
 @pytest.mark.parametrize(

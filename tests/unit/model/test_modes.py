@@ -16,7 +16,7 @@ from service.model.kinds import Influence, InfluenceShape
 from service.model.modes import ModalBasis, karhunen_loeve_basis
 from service.model.pupil import instrument_pupil
 from service.model.surface import Gaussian, ThinPlate, mirror_surface
-from tests.numerics import N_MODES, flao_basis, small_basis, small_instrument
+from tests.support.numerics import N_MODES, flao_basis, small_basis, small_instrument
 
 STEEPEST = 1e-6
 """Largest change of a stroke, relative to the largest, that rounding in the covariance may make."""

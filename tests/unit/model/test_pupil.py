@@ -9,7 +9,7 @@ from service.errors import ModelError
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.pupil import Illumination, annular_pupil
-from tests.numerics import small_basis, small_instrument, small_model
+from tests.support.numerics import small_basis, small_instrument, small_model
 
 
 def pupil(sampling=3, diameter=30.0, obscuration=0.11, n=30):

@@ -14,7 +14,7 @@ from service.model.kinds import Influence, InfluenceShape
 from service.model.modes import analytic_basis
 from service.model.pupil import instrument_pupil
 from service.model.surface import Gaussian, segment_of
-from tests.numerics import small_instrument
+from tests.support.numerics import small_instrument
 
 GAPS = (30.0, 90.0, 150.0, 210.0, 270.0, 330.0)
 PITCH_M = 0.6

@@ -19,7 +19,7 @@ from service.model.tabulated import (
     known_samples,
     pad_mask,
 )
-from tests.numerics import N_MODES, small_basis, small_instrument
+from tests.support.numerics import N_MODES, small_basis, small_instrument
 
 SUBAPERTURE_M = 8.0 / 12
 

@@ -1,6 +1,5 @@
 """An AOT file that somebody has written by hand, from the standard alone."""
 
-import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,16 +12,8 @@ from pyrcal.playback.arrays import Arrays
 from pyrcal_studies.campaign.observatory import SMALL
 from service.errors import ConfigurationError, MatrixError
 from service.instrument import load_instrument
-from service.model.pupil import rtc_valid_subapertures
 from service.model.slopes import Orientation
-
-aotpy = pytest.importorskip("aotpy")
-
-N, N_CONTROLLED, RATE_HZ = 6, 5, 500.0
-SEQ = [3, 4, 5, 7, 8, 9]
-"""One is missing."""
-
-RNG = np.random.default_rng(4)
+from tests.support.played_aot import N_CONTROLLED, RATE_HZ, RNG, SEQ, Hand, N, aotpy
 
 
 @pytest.fixture(scope="module")
@@ -35,61 +26,6 @@ def with_strokes(small):
     """The same with modes of its user's own: 20 combinations of its actuators."""
     strokes = np.linalg.qr(RNG.normal(size=(len(small.mirror.positions_m), 20)))[0]
     return replace(small, mirror=replace(small.mirror, mode_to_actuator=strokes))
-
-
-class Hand:
-    """Someone's own AOT file of an instrument, to be spoilt before it is written."""
-
-    def __init__(self, about):
-        self.others = []
-        mask = rtc_valid_subapertures(about)
-        n_valid = int(mask.sum())
-        places = np.full(mask.shape, -1)
-        places[mask] = np.arange(n_valid)
-        self.slopes = RNG.normal(size=(N, 2, n_valid)).astype(np.float32)
-        self.modal_m = RNG.normal(size=(N, 20)).astype(np.float32)
-        self.control = RNG.normal(size=(N_CONTROLLED, 2, n_valid)).astype(np.float32)
-        stamps = [1.7e9 + seq / RATE_HZ for seq in SEQ]
-        self.time = aotpy.Time("when", timestamps=stamps, frame_numbers=SEQ)
-        self.telescope = aotpy.MainTelescope("telescope", enclosing_diameter=about.diameter_m)
-        self.sensor = aotpy.Pyramid(
-            uid="sensor",
-            n_sides=4,
-            source=aotpy.NaturalGuideStar("star"),
-            n_valid_subapertures=n_valid,
-            subaperture_mask=aotpy.Image("mask", places),
-            measurements=aotpy.Image("slopes", self.slopes, time=self.time),
-        )
-        self.mirror = aotpy.DeformableMirror("dm", telescope=self.telescope, n_valid_actuators=9)
-        self.loop = aotpy.ControlLoop(
-            "loop",
-            input_sensor=self.sensor,
-            commanded_corrector=self.mirror,
-            framerate=RATE_HZ,
-            delay=1.5,
-            modal_coefficients=aotpy.Image("modal", self.modal_m, unit="m", time=self.time),
-            measurements_to_modes=aotpy.Image("control", self.control),
-        )
-
-    def filter(self, above, below):
-        self.loop.time_filter_num = aotpy.Image("num", np.array(above))
-        self.loop.time_filter_den = aotpy.Image("den", np.array(below))
-
-    def read(self, folder, about):
-        system = aotpy.AOSystem(
-            ao_mode="SCAO",
-            name="by hand",
-            main_telescope=self.telescope,
-            sources=[self.sensor.source, *(one.source for one in self.others)],
-            wavefront_sensors=[self.sensor, *self.others],
-            wavefront_correctors=[self.mirror],
-            loops=[self.loop],
-        )
-        path = folder / "hand.fits"
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            system.write_to_file(path, "fits")
-        return read_telemetry(path, about)
 
 
 def test_signals_of_somebody_elses_file_are_as_its_instrument_lists_them(small, tmp_path):

@@ -5,14 +5,14 @@ import pytest
 from service.runtime.actions import Actions, Publishing
 from service.runtime.worker import start_worker
 from service.runtime.workers import WorkerPool
-from tests.unit.runtime.handmade import Clock, HandmadeBridge
-from tests.unit.runtime.small import COMPUTE, small_instrument
+from tests.support.handmade import Clock, HandmadeBridge
+from tests.support.small import COMPUTE, small_instrument
 
 
 @pytest.fixture
 def light_processes(monkeypatch):
     """Processes that import no optics before their work, which is of these tests."""
-    monkeypatch.setattr("service.runtime.processes.WORKER_MODULE", "tests.unit.runtime.jobs")
+    monkeypatch.setattr("service.runtime.processes.WORKER_MODULE", "tests.support.jobs")
 
 
 @pytest.fixture(scope="session")
@@ -37,3 +37,17 @@ def actions(bridge, workers, archive):
         publishing=Publishing(system="small", chunk_bytes=4096, pole_radius_bound=0.95),
         clock_ns=Clock(),
     )
+
+
+@pytest.fixture(scope="module")
+def scheduler():
+    distributed = pytest.importorskip("distributed")  # of the extra that setup installs
+    with distributed.LocalCluster(
+        n_workers=1,
+        threads_per_worker=2,
+        processes=False,
+        protocol="tcp://",
+        host="127.0.0.1",
+        dashboard_address="127.0.0.1:0",
+    ) as found:
+        yield found

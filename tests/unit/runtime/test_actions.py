@@ -18,22 +18,10 @@ from service.wire import (
     checksum,
     layout_of,
 )
-from tests.states import changed
-from tests.unit.runtime.handmade import (
-    ALPHA,
-    BROUGHT,
-    N_MODES,
-    N_SLOPES,
-    REGISTRATION,
-    RTC,
-    STATE,
-)
-from tests.unit.runtime.small import N_CONTROLLED, SIGMA
-from tests.unit.tracking.situations import (
-    foreign,
-    record,
-    rtc,
-)
+from tests.support.handmade import ALPHA, BROUGHT, N_MODES, N_SLOPES, REGISTRATION, RTC, STATE
+from tests.support.situations import foreign, record, rtc
+from tests.support.small import N_CONTROLLED, SIGMA
+from tests.support.states import changed
 
 pytestmark = pytest.mark.timeout(60)
 

@@ -17,8 +17,8 @@ from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
 from service.runtime.worker.records import Compute
 from service.tracking.resume import saved_of
-from tests.unit.runtime.small import COMPUTE, SIGMA, conditions, loop_settings, small_instrument
-from tests.unit.runtime.test_workbench import ALPHA, dithered_window, open_loop
+from tests.support.small import COMPUTE, SIGMA, conditions, loop_settings, small_instrument
+from tests.support.workbench import ALPHA, dithered_window, open_loop
 
 FILE = Path(__file__).parents[2] / "data" / "lenslets.toml"
 STRETCHES = np.array([0.0185, -0.003])

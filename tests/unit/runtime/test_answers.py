@@ -11,16 +11,9 @@ from service.records.products import MatrixState
 from service.records.state import Mode
 from service.runtime.command_results import GivenCommand
 from service.wire import AckState, Pattern, Reply
-from tests.states import changed
-from tests.unit.tracking.operations.test_running import (
-    acquiring,
-    gathering,
-    idle,
-    measuring,
-    own_dither,
-    sending,
-)
-from tests.unit.tracking.situations import acknowledged, record, verdict
+from tests.support.activities import acquiring, gathering, idle, measuring, own_dither, sending
+from tests.support.situations import acknowledged, record, verdict
+from tests.support.states import changed
 
 
 def given(world, command):

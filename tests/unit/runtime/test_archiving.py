@@ -14,10 +14,10 @@ from service.records.state import Level, LogEntry, Mode, TrackerState
 from service.runtime import archiving
 from service.runtime.archiving import ArchiveWriter
 from service.wire import OffloadRequest
-from tests.states import changed
-from tests.system.pace import patience
-from tests.unit.test_archive_nights import NOON, entry
-from tests.unit.tracking.test_offload import a_story
+from tests.support.archive_nights import NOON, entry
+from tests.support.offload import a_story
+from tests.support.pace import patience
+from tests.support.states import changed
 
 EMPTY = TrackerState(system="small")
 

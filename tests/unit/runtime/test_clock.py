@@ -4,8 +4,8 @@ import pytest
 
 from service.records.state import Mode
 from service.runtime.clock import ServiceClock
-from tests.unit.tracking.situations import START_NS, dither_answered
-from tests.unit.tracking.world import World
+from tests.support.situations import START_NS, dither_answered
+from tests.support.world import World
 
 SECOND = 1_000_000_000
 HOUR = 3600 * SECOND

@@ -11,20 +11,7 @@ from service.errors import ClusterError, ModelError
 from service.runtime import cluster as module
 from service.runtime.cluster import Cluster, own_versions
 
-LocalCluster = pytest.importorskip("distributed").LocalCluster  # of the extra that setup installs
-
-
-@pytest.fixture(scope="module")
-def scheduler():
-    with LocalCluster(
-        n_workers=1,
-        threads_per_worker=2,
-        processes=False,
-        protocol="tcp://",
-        host="127.0.0.1",
-        dashboard_address="127.0.0.1:0",
-    ) as found:
-        yield found
+pytest.importorskip("distributed")  # of the extra that setup installs
 
 
 def halved(number):

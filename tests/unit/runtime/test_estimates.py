@@ -11,10 +11,10 @@ from service.records import events as ev
 from service.records.state import Mode
 from service.runtime.estimates import PendingWindow, fit_passive
 from service.runtime.worker import OpticsWorker
-from tests.numerics import block_of
-from tests.unit.estimation.test_lockin import run, telemetry
-from tests.unit.tracking.situations import ALPHA, Story
-from tests.unit.tracking.test_watchdog import watched as look
+from tests.support.lockin import run, telemetry
+from tests.support.numerics import block_of
+from tests.support.situations import ALPHA, Story
+from tests.support.watchdog import watched as look
 
 
 class Worker:

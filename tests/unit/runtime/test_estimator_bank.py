@@ -10,7 +10,7 @@ from service.estimation.health import LoopHealth
 from service.records.alarms import ALARMS
 from service.runtime.estimator_bank import EstimatorBank, process_block, with_dither, with_rtc
 from service.runtime.registry import Entry
-from tests.unit.runtime.test_streams import DESCRIPTION, DITHER, RTC, WINDOW_S, block
+from tests.support.streams import DESCRIPTION, DITHER, RTC, WINDOW_S, block
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,7 +10,7 @@ from service.config.settings import load_settings
 from service.control.reconstructor import InversionMethod, Prior, invert, invert_with_prior
 from service.model.misregistration import Misregistration
 from service.runtime.worker import OpticsWorker
-from tests.unit.runtime.small import (
+from tests.support.small import (
     COMPUTE,
     N_CONTROLLED,
     SIGMA,

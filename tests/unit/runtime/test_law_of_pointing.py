@@ -15,7 +15,7 @@ from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
 from sim_rtc.assembly import build_telescope
 from sim_rtc.options import parse_options
-from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED
+from tests.support.small import COMPUTE, INSTRUMENT, N_CONTROLLED
 
 LAW = '\n[law]\nrotation_deg = "azimuth - 12.984 + 0.25 * (elevation - 60)"\n'
 

@@ -6,9 +6,9 @@ from service.records.alarms import Alarm
 from service.records.state import TrackerState
 from service.runtime.losses import Losses, silence
 from service.runtime.readiness import detect_link_changes
-from tests.states import changed
-from tests.unit.runtime.test_waiting import SECOND, WELL, disposition, link
-from tests.unit.tracking.situations import START_NS, rtc
+from tests.support.situations import START_NS, rtc
+from tests.support.states import changed
+from tests.support.waiting import SECOND, WELL, disposition, link
 
 
 class Counting:

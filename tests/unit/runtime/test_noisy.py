@@ -14,9 +14,9 @@ from service.records.operations import MeasurementRecord, MeasureState
 from service.runtime.actions import Actions, Publishing
 from service.runtime.estimates import NoisySums
 from service.runtime.worker import OpticsWorker
-from tests.states import changed, tracker_state
-from tests.unit.runtime.small import COMPUTE, small_instrument
-from tests.unit.tracking.situations import rtc
+from tests.support.situations import rtc
+from tests.support.small import COMPUTE, small_instrument
+from tests.support.states import changed, tracker_state
 
 ALPHA = Misregistration(
     shift_x_subap=0.12, shift_y_subap=-0.08, rotation_rad=0.004, magnification=1.003

@@ -18,10 +18,10 @@ from service.runtime.policy import policy_of
 from service.runtime.supervisor import Supervisor
 from service.runtime.worker import OpticsWorker, start_worker
 from service.runtime.workers import WorkerPool
-from tests.states import tracker_state
-from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED
-from tests.unit.runtime.test_supervisor import running
-from tests.unit.tracking.situations import POLICY, estimate, rtc
+from tests.support.situations import POLICY, estimate, rtc
+from tests.support.small import COMPUTE, INSTRUMENT, N_CONTROLLED
+from tests.support.states import tracker_state
+from tests.support.supervisor import running
 
 NOMINAL_DEG = 65.08
 """As at the LBT."""

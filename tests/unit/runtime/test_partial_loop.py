@@ -17,9 +17,9 @@ from service.runtime.engine import shape_mismatch
 from service.runtime.estimator_bank import EstimatorBank, process_block, with_rtc
 from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
-from tests.unit.runtime.handmade import take_sums
-from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED, small_instrument
-from tests.unit.runtime.test_streams import DESCRIPTION, MANY, N_MANY, RING, driven
+from tests.support.handmade import take_sums
+from tests.support.small import COMPUTE, INSTRUMENT, N_CONTROLLED, small_instrument
+from tests.support.streams import DESCRIPTION, MANY, N_MANY, RING, driven
 
 STILL = ((10, 14), (30, 39))
 

@@ -7,32 +7,14 @@ from functools import partial
 import numpy as np
 import pytest
 
-from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
-from service.model.misregistration import Misregistration
 from service.runtime.cluster import Cluster
 from service.runtime.worker import rows
 from service.runtime.worker.rows import RemoteRows
-from tests.unit.model.test_local import basis, many_actuators
-from tests.unit.runtime.test_cluster import scheduler
-from tests.unit.runtime.test_shared_rows import helped_by
+from tests.support.remote_rows import FIRST, model_of
+from tests.support.shared_rows import helped_by
 
-__all__ = ["scheduler"]  # fixtures
-
-FIRST = Misregistration(shift_x_subap=0.2, rotation_rad=0.01, magnification=1.003)
 SECOND = replace(FIRST, shift_y_subap=-0.1)
-
-
-def model_of(stop=Stop.TELESCOPE, mapper=map, **settings):
-    return InteractionModel(
-        many_actuators(stop),
-        basis(),
-        pupil_sampling=2,
-        detector_nodes=1,
-        kept_bytes=0,
-        mapper=mapper,
-        **settings,
-    )
 
 
 def collected(**settings):

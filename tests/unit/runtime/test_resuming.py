@@ -21,9 +21,9 @@ from service.runtime.estimates import PendingWindow
 from service.runtime.policy import policy_of
 from service.runtime.worker import Compute, OpticsWorker
 from service.tracking.resume import restored
-from tests.states import changed, tracker_state
-from tests.unit.tracking.operations.test_acquisition import Acquiring
-from tests.unit.tracking.situations import START_NS
+from tests.support.acquiring import Acquiring
+from tests.support.situations import START_NS
+from tests.support.states import changed, tracker_state
 
 SMALL = Path(__file__).parents[2] / "system" / "small.toml"
 START = Start(instrument=str(SMALL), n_controlled=60, seed=0)

@@ -14,7 +14,7 @@ from service.model.sensors.pyramid import working_point as pyramid_at_work
 from service.model.sensors.pyramid.working_point import working_point
 from service.runtime.worker import OpticsWorker
 from service.runtime.worker.sensor import MIN_GAIN_CHANGE, STRENGTH_RANGE
-from tests.unit.runtime.small import (
+from tests.support.small import (
     COMPUTE,
     N_CONTROLLED,
     SIGMA,
@@ -22,7 +22,7 @@ from tests.unit.runtime.small import (
     loop_settings,
     small_instrument,
 )
-from tests.unit.runtime.test_workbench import ALPHA, MODES, dithered_window
+from tests.support.workbench import ALPHA, MODES, dithered_window
 
 AT_WORK = replace(COMPUTE, sampling=COMPUTE.sampling._replace(working_point_modes=N_CONTROLLED))
 

@@ -23,7 +23,7 @@ from service.runtime.worker import OpticsWorker
 from service.tracking.reconstructors import check_sendable
 from service.tracking.resume import resumed, saved_of
 from sim_rtc.options import parse_options
-from tests.unit.runtime.small import COMPUTE
+from tests.support.small import COMPUTE
 
 FILE = """
 [instrument]

@@ -16,9 +16,7 @@ from service.model.sensors.sensor import RowTask
 from service.runtime.cluster import Cluster
 from service.runtime.worker import rows as module
 from service.runtime.worker.rows import SharedRows
-from tests.unit.runtime.test_cluster import scheduler
-
-__all__ = ["scheduler"]  # fixtures
+from tests.support.shared_rows import helped_by
 
 SMALL = Path(__file__).parents[2] / "system" / "small.toml"
 ALPHA = Misregistration(shift_x_subap=0.2, rotation_rad=0.01, magnification=1.003)
@@ -66,12 +64,6 @@ class Slow(RowTask):
 def everything_pays(monkeypatch):
     monkeypatch.setattr(module, "MIN_REMOTE_ROW_S", 0.0)
     monkeypatch.setattr(module, "MIN_REMOTE_JOB_S", 0.0)
-
-
-def helped_by(cluster, n_threads=2):
-    shared = SharedRows(n_threads)
-    shared._cluster = cluster
-    return shared
 
 
 def test_rows_come_in_their_order_whoever_has_computed_them():

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError
-from service.estimation.description import LOW_MODES, Actuators, Description
+from service.estimation.description import LOW_MODES, Description
 from service.estimation.dither_monitor import DitherWatch
 from service.estimation.dither_windows import DitherWindows
-from service.estimation.frames import FrameBlock
 from service.estimation.health import LoopHealth, VibrationMonitor
 from service.estimation.lockin import LockIn, Spectra
 from service.estimation.loopcheck import LoopCheck
@@ -33,53 +32,29 @@ from service.runtime.estimator_bank import (
 )
 from service.tracking.dither_request import plan_random
 from service.wire import DitherKind, DitherRequest
-from tests.states import changed, tracker_state
-from tests.unit.estimation import test_loopcheck as loops
-from tests.unit.runtime import handmade
-from tests.unit.tracking.situations import POLICY, START_NS, foreign, rtc
-
-N_SLOPES, N_MODES = 6, 8
-DESCRIPTION = Description(
-    n_slopes=N_SLOPES, n_modes=N_MODES, mode_variance_m2=np.full(N_MODES, 1e-16)
+from tests.support import handmade
+from tests.support.loopcheck import GAIN, INVERSE, LEAK, blocks, closed_loop
+from tests.support.situations import POLICY, START_NS, foreign, rtc
+from tests.support.states import changed, tracker_state
+from tests.support.streams import (
+    DESCRIPTION,
+    DITHER,
+    MANY,
+    N_MANY,
+    N_MODES,
+    N_SLOPES,
+    REQUEST,
+    RING,
+    RTC,
+    WINDOW_S,
+    block,
+    driven,
 )
-RTC = rtc(4, n_modes=N_MODES, n_slopes=N_SLOPES, gains=(0.4,) * 4 + (0.0,) * 4)
-WINDOW_S = 0.5
-REQUEST = DitherRequest(
-    id="dither-1",
-    kind=DitherKind.SINE,
-    modes=(6,),
-    amplitude_m=(5e-9,),
-    frequency_hz=(240.0,),
-    duration_s=60.0,
-)
-DITHER = Dither(request=REQUEST, start_seq=0, asked_ns_utc=0)
 
 
 def played(start_seq=0, window_s=None, **changes):
     request = replace(REQUEST, **changes)
     return Dither(request=request, start_seq=start_seq, asked_ns_utc=0, window_s=window_s)
-
-
-def block(first_seq, n=100, *, session="s1", cm_id="initial", dither=True, scale=1e-9, signs=False):
-    """Noise with a sine on mode 6, or with random signs on modes 1 and 6."""
-    rng = np.random.default_rng(first_seq)
-    commands = (scale * rng.standard_normal((n, N_MODES))).astype(np.float32)
-    added = np.zeros_like(commands)
-    seq = first_seq + np.arange(n)
-    if signs:
-        added[:, [1, 6]] = 2e-9 * rng.choice([-1.0, 1.0], (n, 2))
-    else:
-        added[:, 6] = 5e-9 * np.sqrt(2) * np.sin(2 * np.pi * 0.24 * seq)
-    return FrameBlock(
-        session=session,
-        first_seq=first_seq,
-        t0_ns_utc=first_seq * 1_000_000,
-        dt_ns=1_000_000,
-        slopes=rng.standard_normal((n, N_SLOPES)).astype(np.float32),
-        commands_m=commands + added,
-        dither_m=added if dither else None,
-        cm_id=cm_id,
-    )
 
 
 @pytest.fixture
@@ -326,30 +301,6 @@ class TestADitherThatIsNotThere:
         assert found == pytest.approx(5e-9, rel=0.01)
 
 
-N_MANY = 80
-STROKES = np.random.default_rng(4).normal(size=(20, N_MANY))
-RING = Actuators(
-    positions=np.array(
-        [[r * np.cos(t), r * np.sin(t)] for r in (1.0, 2.0) for t in np.arange(10) * 0.628]
-    ),
-    strokes=STROKES,
-)
-MANY = rtc(N_MANY, n_modes=N_MANY, n_slopes=N_SLOPES, gains=(0.4,) * N_MANY)
-
-
-def driven(first_seq, outermost_m):
-    """Frames of turbulence of 10 nm per mode, and the last actuator pushed away."""
-    rng = np.random.default_rng(first_seq)
-    push = np.linalg.lstsq(STROKES[:, 30:], np.eye(20)[19] * outermost_m, rcond=None)[0]
-    commands = 1e-8 * rng.standard_normal((10, N_MANY))
-    commands[:, 30:] += push
-    return replace(
-        block(first_seq, 10, dither=False),
-        commands_m=commands.astype(np.float32),
-        dither_m=None,
-    )
-
-
 @pytest.fixture(name="slipped")
 def slipped_edge():
     """A loop whose outermost actuator has gone away, and that says so."""
@@ -550,8 +501,8 @@ class TestLaw:
         16,
         n_modes=24,
         n_slopes=60,
-        gains=(float(loops.GAIN),) * 16 + (0.0,) * 8,
-        leak=loops.LEAK,
+        gains=(float(GAIN),) * 16 + (0.0,) * 8,
+        leak=LEAK,
         cm_id="cm-1",
         seq=0,
     )
@@ -560,8 +511,8 @@ class TestLaw:
         """Streams after two and a half seconds with a status five times a second."""
         description = Description(n_slopes=60, n_modes=24, mode_variance_m2=np.full(24, 4e-14 / 24))
         bank = with_rtc(EstimatorBank.of(description), told)
-        bank = with_matrix(bank, "cm-1", loops.INVERSE)
-        for part in loops.blocks(telemetry, lengths=(50,)):
+        bank = with_matrix(bank, "cm-1", INVERSE)
+        for part in blocks(telemetry, lengths=(50,)):
             bank, _ = process_block(bank, part)
             seq = part.first_seq + part.n_frames
             if seq % 200 == 0:
@@ -571,16 +522,16 @@ class TestLaw:
         return raised(bank)
 
     def test_one_that_is_as_told_raises_nothing(self):
-        assert self.after(loops.closed_loop()) == {}
+        assert self.after(closed_loop()) == {}
 
     def test_another_leak_is_named_within_a_second_and_a_half_whatever_the_gains_do(self):
-        telemetry = loops.closed_loop(n_frames=1500)
+        telemetry = closed_loop(n_frames=1500)
         for moving in ({}, {"moving": True}):
             found = self.after(telemetry, replace(self.TOLD, leak=0.9), **moving)
             assert "leak 0.995 found, 0.900 in the status" in found["loop-law"]
 
     def test_commands_in_nanometres_are_a_unit_and_nothing_else_is_opened_for(self):
-        slopes, commands, _ = loops.closed_loop()
+        slopes, commands, _ = closed_loop()
         found = self.after((slopes, commands * np.float32(1e9), None))
         assert "nanometres" in found["command-unit"]
         assert not {"loop-diverging", "edge-slip"} & set(found)

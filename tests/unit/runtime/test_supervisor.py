@@ -24,13 +24,14 @@ from service.runtime.archiving import restore_tracking
 from service.runtime.engine import follow_state
 from service.runtime.supervisor import Supervisor
 from service.wire import checksum
-from tests.states import changed, tracker_state
-from tests.system.cable import free_port
-from tests.system.fake_rtc import client_session
-from tests.system.pace import Deadline, in_time, patience
-from tests.unit.test_link import applied, send
-from tests.unit.tracking.operations.test_acquisition import Acquiring
-from tests.unit.tracking.situations import POLICY, Story, record
+from tests.support.acquiring import Acquiring
+from tests.support.cable import free_port
+from tests.support.fake_rtc import client_session
+from tests.support.link import applied, send
+from tests.support.pace import in_time, patience
+from tests.support.situations import POLICY, Story, record
+from tests.support.states import changed, tracker_state
+from tests.support.supervisor import running, until
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -56,25 +57,6 @@ def supervisor_of(workers, archive, bridge, actions):
         archive=archive,
         actions=actions,
     )
-
-
-async def until(condition, timeout_s=5.0):
-    deadline = Deadline(timeout_s)
-    while not condition():
-        assert not deadline.passed, f"not within {deadline}"
-        await asyncio.sleep(0.02)
-
-
-@contextlib.asynccontextmanager
-async def running(supervisor):
-    task = asyncio.create_task(supervisor.run())
-    try:
-        await until(lambda: supervisor.snapshot().ready, 30.0)
-        yield
-    finally:
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
 
 
 async def test_it_is_ready_when_the_model_is(supervisor):

@@ -24,10 +24,10 @@ from service.runtime.actions import (
 from service.runtime.worker import OpticsWorker
 from service.tracking.update_policy import fewer_modes_than
 from service.wire import LoopRequest
-from tests.states import changed
-from tests.unit.runtime.handmade import N_MODES, REGISTRATION, STATE
-from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, conditions, small_instrument
-from tests.unit.tracking.situations import START_NS, rtc
+from tests.support.handmade import N_MODES, REGISTRATION, STATE
+from tests.support.situations import START_NS, rtc
+from tests.support.small import COMPUTE, N_CONTROLLED, SIGMA, conditions, small_instrument
+from tests.support.states import changed
 
 pytestmark = pytest.mark.timeout(60)
 

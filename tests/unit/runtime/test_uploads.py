@@ -22,7 +22,7 @@ from service.errors import (
 from service.files.fit_folder import FitRequest
 from service.runtime import uploads
 from service.runtime.uploads import FitLimits, FitQueue, FitState
-from tests.system.pace import in_time
+from tests.support.pace import in_time
 
 pytestmark = pytest.mark.timeout(60)
 

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from service.link.statistics import Counters, Disposition, LinkStatistics
+from service.link.statistics import Counters
 from service.records.alarms import Alarm, Prerequisite, Responsible
 from service.records.products import MatrixState
 from service.records.state import Mode, TrackerState
@@ -20,53 +20,9 @@ from service.runtime.readiness import (
     state_message,
     waiting_for,
 )
-from tests.states import changed, tracker_state
-from tests.unit.tracking.situations import ALPHA, START_NS, Story, moved, record, rtc
-
-SECOND = 1_000_000_000
-
-
-def link(*dispositions, **changes):
-    """A link on which all is well but for what is given."""
-    counts = dict.fromkeys(
-        (
-            "batches_received",
-            "frames_received",
-            "frames_lost",
-            "frames_recovered",
-            "frames_duplicate",
-            "frames_late",
-            "frames_nonfinite",
-            "frames_overwritten",
-            "statuses_received",
-            "acknowledgements_received",
-            "acknowledgements_unknown",
-            "events_dropped",
-            "callback_errors",
-        ),
-        0,
-    )
-    values = {
-        "rtc_alive": True,
-        "session": "s1",
-        "basis_id": "b",
-        "config_id": "c",
-        "frames_refused": {},
-        "messages_malformed": {},
-        "frame_age_s": 0.01,
-        "status_age_s": 0.2,
-        "session_age_s": 60.0,
-        "latency_p50_s": None,
-        "dispositions": dispositions,
-    }
-    return LinkStatistics(**(counts | values | changes))
-
-
-def disposition(outcome, n, kind="frames", text="", age_s=0.1):
-    return Disposition(kind=kind, outcome=outcome, n=n, age_s=age_s, text=text)
-
-
-WELL = (disposition("used", 2000), disposition("used", 10, "status"))
+from tests.support.situations import ALPHA, START_NS, Story, moved, record, rtc
+from tests.support.states import changed, tracker_state
+from tests.support.waiting import SECOND, WELL, disposition, link
 
 
 def waits(link, state=None, *, preparing=False):

@@ -8,7 +8,7 @@ from service.errors import ModelError
 from service.files.disk_cache import DiskCache
 from service.runtime.worker.optics_worker import OpticsWorker
 from service.runtime.worker.records import Compute
-from tests.numerics import small_instrument
+from tests.support.numerics import small_instrument
 
 
 def test_it_is_refused_in_one_line_before_anything_is_computed(monkeypatch):

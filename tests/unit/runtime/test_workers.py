@@ -16,9 +16,7 @@ from service.runtime.estimates import work_out
 from service.runtime.processes import Worker
 from service.runtime.worker import OpticsWorker, run_job, start_worker
 from service.runtime.workers import WorkerLoadMeter, WorkerPool
-from tests.states import tracker_state
-from tests.system.pace import in_time
-from tests.unit.runtime.jobs import (
+from tests.support.jobs import (
     asleep,
     endless,
     failing,
@@ -31,7 +29,9 @@ from tests.unit.runtime.jobs import (
     remembering,
     spinning,
 )
-from tests.unit.runtime.small import COMPUTE, small_instrument
+from tests.support.pace import in_time
+from tests.support.small import COMPUTE, small_instrument
+from tests.support.states import tracker_state
 
 pytestmark = pytest.mark.timeout(60)
 

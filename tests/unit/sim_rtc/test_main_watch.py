@@ -9,7 +9,7 @@ from structlog.testing import capture_logs
 from sim_rtc.computer.telemetry import Pace
 from sim_rtc.options import parse_options
 from sim_rtc.simulator import Watch
-from tests.system.pace import Deadline
+from tests.support.pace import Deadline
 
 COMPUTER = SimpleNamespace(reconstructor=SimpleNamespace(manifest=SimpleNamespace(id="cm")))
 

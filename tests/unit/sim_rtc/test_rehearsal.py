@@ -10,7 +10,7 @@ from service.instrument import load_instrument
 from service.model.instrument import instrument_sha256
 from service.model.kinds import BasisKind
 from sim_rtc.rehearsal import with_modes, write_live_instrument
-from tests.system.night import INSTRUMENT
+from tests.support.night import INSTRUMENT
 
 BENCH = """
 [instrument]

@@ -18,7 +18,7 @@ from pyrcal_studies.campaign.fault_nights import (
 from pyrcal_studies.campaign.observatory import Moment, latencies_of
 from service.records import commands as cmd
 from service.records.state import Mode
-from tests.system.night import INSTRUMENT
+from tests.support.night import INSTRUMENT
 
 WORDS = (f"--instrument={INSTRUMENT}", "--plant=linear", "--n-controlled=45", "--seed=1")
 

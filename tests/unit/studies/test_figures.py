@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from tests.unit.test_house import ROOT
+from tests.support.repository import ROOT
 
 figures = pytest.importorskip("pyrcal_studies.figures", reason="needs the extra plots")
 PAGES = "\n".join(page.read_text("utf-8") for page in (ROOT / "docs").rglob("*.md"))

@@ -19,8 +19,7 @@ from service.records.estimates import RandomEstimate
 from service.records.products import ModeSet
 from service.records.state import Mode
 from service.wire import DitherKind
-from tests.states import tracker_state
-from tests.unit.tracking.situations import (
+from tests.support.situations import (
     ALPHA,
     POLICY,
     START_NS,
@@ -30,6 +29,7 @@ from tests.unit.tracking.situations import (
     rtc,
     verdict,
 )
+from tests.support.states import tracker_state
 
 EVENTS = [
     ev.Tick(),

@@ -41,7 +41,7 @@ from service.records.state import Mode
 from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
 from service.wire import DitherRequest
-from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED, small_instrument
+from tests.support.small import COMPUTE, INSTRUMENT, N_CONTROLLED, small_instrument
 
 WORDS = [
     f"--instrument={INSTRUMENT}",

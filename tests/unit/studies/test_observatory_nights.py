@@ -9,7 +9,7 @@ import pytest
 from pyrcal_studies.campaign import system_nights
 from pyrcal_studies.campaign.system_nights import Case, Plan, line_of, table
 from sim_rtc.options import parse_options
-from tests.unit.runtime.small import INSTRUMENT, N_CONTROLLED
+from tests.support.small import INSTRUMENT, N_CONTROLLED
 
 
 def row(case, **changes):

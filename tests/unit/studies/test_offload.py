@@ -13,7 +13,7 @@ from service.model.misregistration import BOUNDARY_SCALE
 from service.records.state import Mode
 from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
-from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED
+from tests.support.small import COMPUTE, INSTRUMENT, N_CONTROLLED
 
 GIVEN = {
     "dither.budget_m": 20e-9,

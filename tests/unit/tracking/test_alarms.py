@@ -29,7 +29,7 @@ from service.tracking.alarm_rules import LASTING, RULES
 from service.tracking.interlocks import permitted
 from service.tracking.resume import resumed, saved_of
 from service.wire import DitherRequest, LoopRequest
-from tests.unit.tracking.situations import POLICY, Story, judged, of_kind, record, verdict
+from tests.support.situations import POLICY, Story, judged, of_kind, record, verdict
 
 STRANGERS = ["second-rtc", "basis-mismatch", "instrument-mismatch"]
 OUT_OF_HAND = ["loop-diverging", "edge-slip", "commands-off-loop"]

@@ -8,8 +8,8 @@ from service.records import events as ev
 from service.records.operations import MeasureState
 from service.records.state import Mode
 from service.wire import DitherRequest, Reply
-from tests.unit.tracking.operations.test_running import idle, sending
-from tests.unit.tracking.situations import START_NS, Story, rtc
+from tests.support.activities import idle, sending
+from tests.support.situations import START_NS, Story, rtc
 
 DITHER = (DitherRequest, "noisy-1")
 SOME_NS = 1_795_574_159_123_456_000

@@ -35,9 +35,8 @@ from service.tracking.dither_request import (
     total_m,
 )
 from service.wire import DitherRequest, DitherStop
-from tests.states import changed
-from tests.unit.tracking.dithered import DitheredNight
-from tests.unit.tracking.situations import (
+from tests.support.dithered import DitheredNight
+from tests.support.situations import (
     ALPHA,
     N_MODES,
     POLICY,
@@ -47,6 +46,7 @@ from tests.unit.tracking.situations import (
     of_kind,
     rtc,
 )
+from tests.support.states import changed
 
 START = 1000
 

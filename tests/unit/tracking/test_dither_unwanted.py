@@ -22,7 +22,7 @@ from service.tracking.dither_request import (
     total_m,
 )
 from service.wire import DitherRequest, DitherStop
-from tests.unit.tracking.situations import (
+from tests.support.situations import (
     POLICY,
     START_NS,
     Story,

@@ -25,8 +25,7 @@ from service.records.state import Level, Mode
 from service.tracking.dither_request import total_m
 from service.tracking.filtering import HISTORY_LENGTH
 from service.wire import DitherKind, DitherRequest, Pointing
-from tests.states import changed
-from tests.unit.tracking.situations import (
+from tests.support.situations import (
     ALPHA,
     POLICY,
     PRECISE,
@@ -42,7 +41,8 @@ from tests.unit.tracking.situations import (
     rtc,
     verdict,
 )
-from tests.unit.tracking.test_watchdog import SCATTER, watched
+from tests.support.states import changed
+from tests.support.watchdog import SCATTER, watched
 
 THERE = moved(shift_x_subap=0.15)
 ELSEWHERE = moved(shift_x_subap=0.5, shift_y_subap=0.5)

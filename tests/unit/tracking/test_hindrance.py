@@ -11,8 +11,8 @@ from service.records.state import Mode
 from service.tracking.mode_proof import awaits_proof
 from service.tracking.step_context import StepContext
 from service.wire import DitherRequest
-from tests.states import changed
-from tests.unit.tracking.situations import POLICY, PRECISE, Story, dither_answered, of_kind, rtc
+from tests.support.situations import POLICY, PRECISE, Story, dither_answered, of_kind, rtc
+from tests.support.states import changed
 
 
 def hindrance(story):

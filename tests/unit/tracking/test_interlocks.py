@@ -12,19 +12,7 @@ from service.records.products import MatrixState, ModeSet
 from service.tracker import step
 from service.tracking.interlocks import ORDERS, Permission, permissions, permitted
 from service.wire import DitherKind, Pattern
-from tests.unit.tracking.moments import (
-    MOMENTS,
-    in_use,
-    meant,
-    met,
-    nobody_there,
-    opened,
-    proposed,
-    refused_since,
-    small,
-    without_dither,
-)
-from tests.unit.tracking.operations.test_running import (
+from tests.support.activities import (
     COMMANDS,
     acquiring,
     gathering,
@@ -35,6 +23,18 @@ from tests.unit.tracking.operations.test_running import (
     others_dither,
     ramping,
     sending,
+)
+from tests.support.moments import (
+    MOMENTS,
+    in_use,
+    meant,
+    met,
+    nobody_there,
+    opened,
+    proposed,
+    refused_since,
+    small,
+    without_dither,
 )
 
 NAMED = [name for name in ORDERS if name != "set_value"]

@@ -16,8 +16,8 @@ from service.records.products import MatrixState
 from service.tracking import transitions
 from service.tracking.invariants import INVARIANTS, find_violations
 from service.wire import Loop, Pattern
-from tests.states import changed
-from tests.unit.tracking.situations import Story, dither_request, record, rtc
+from tests.support.situations import Story, dither_request, record, rtc
+from tests.support.states import changed
 
 
 @pytest.fixture(scope="module")

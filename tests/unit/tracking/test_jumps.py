@@ -10,7 +10,7 @@ from service.records import events as ev
 from service.records.estimates import PassiveEstimate
 from service.records.state import Mode
 from service.tracking.update_policy import is_settled
-from tests.unit.tracking.situations import ALPHA, POLICY, SECOND, Story, estimate, rtc
+from tests.support.situations import ALPHA, POLICY, SECOND, Story, estimate, rtc
 
 PER_MINUTE = np.array([0.05, 0.05, np.deg2rad(0.05), 0.0005])
 NIGHT = replace(

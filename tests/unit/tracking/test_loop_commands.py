@@ -12,8 +12,7 @@ from service.records.registration import ModeGain
 from service.records.state import Mode
 from service.tracking.operator import RECLOSING_INTERVAL_S
 from service.wire import Loop, LoopRequest, Pattern, RampRequest
-from tests.states import changed
-from tests.unit.tracking.situations import (
+from tests.support.situations import (
     N_MODES,
     START_NS,
     Story,
@@ -23,6 +22,7 @@ from tests.unit.tracking.situations import (
     rtc,
     verdict,
 )
+from tests.support.states import changed
 
 
 @pytest.fixture

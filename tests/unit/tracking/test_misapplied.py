@@ -15,8 +15,8 @@ from service.records.state import Mode
 from service.tracking.operations import acquisition
 from service.tracking.step_context import StepContext
 from service.wire import Loop, LoopRequest
-from tests.states import changed
-from tests.unit.tracking.situations import POLICY, Story, acknowledged, foreign, moved, rtc
+from tests.support.situations import POLICY, Story, acknowledged, foreign, moved, rtc
+from tests.support.states import changed
 
 OWN_SUM, OUR_SUM = "a" * 64, "b" * 64
 SWAP = 1000

@@ -6,7 +6,7 @@ import pytest
 from service.records import events as ev
 from service.records.state import Mode
 from service.tracking.filtering import GAIN_RATE, MODES_KEPT, PRIOR_SCATTER, update_gains
-from tests.unit.tracking.situations import SECOND, START_NS, Story, estimate
+from tests.support.situations import SECOND, START_NS, Story, estimate
 
 
 def windows(gains, mode=501, every_s=2.0, sigma=0.001):

@@ -17,16 +17,7 @@ from service.tracking.update_policy import (
     MIN_TRIED_MODES,
     fewer_modes_than,
 )
-from tests.unit.tracking.situations import (
-    POLICY,
-    Story,
-    judged,
-    moved,
-    of_kind,
-    record,
-    rtc,
-    verdict,
-)
+from tests.support.situations import POLICY, Story, judged, moved, of_kind, record, rtc, verdict
 
 WANTED = replace(POLICY, n_modes_target=500)
 

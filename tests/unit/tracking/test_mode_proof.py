@@ -23,9 +23,9 @@ from service.tracking.mode_proof import (
 )
 from service.tracking.resume import restored, resumed, saved_of
 from service.wire import DitherRequest
-from tests.states import changed, tracker_state
-from tests.unit.tracking.situations import N_MODES, POLICY, SECOND, estimate, foreign, of_kind
-from tests.unit.tracking.world import STEP_S, WINDOW_S, World
+from tests.support.situations import N_MODES, POLICY, SECOND, estimate, foreign, of_kind
+from tests.support.states import changed, tracker_state
+from tests.support.world import STEP_S, WINDOW_S, World
 
 TARGET = replace(POLICY, n_modes_target=450)
 

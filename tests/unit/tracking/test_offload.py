@@ -14,41 +14,16 @@ from service.records import events as ev
 from service.records.registration import OffloadState, Validity
 from service.records.state import Mode
 from service.runtime.archiving import is_urgent
-from service.tracking.policy import Offloading
 from service.tracking.resume import resumed, saved_of
 from service.tracking.validity import MOVING, end_of
 from service.wire import OffloadRequest, Reply
-from tests.states import changed, tracker_state
-from tests.unit.tracking.situations import ALPHA, POLICY, SECOND, Story, moved, rtc
+from tests.support.offload import LIMITS, MOVES, STAYS, a_story
+from tests.support.situations import ALPHA, SECOND, Story, moved, rtc
+from tests.support.states import changed, tracker_state
 
-LIMITS = Offloading(
-    share=0.5,
-    near=np.array([0.02, 0.02, 0.02, 0.002]) / BOUNDARY_SCALE,
-    max_step=np.array([0.1, 0.03, 0.2, 0.005]) / BOUNDARY_SCALE,
-    travel=np.array([1.0, 1.0, 1.0, 0.0]) / BOUNDARY_SCALE,
-    settle_s=3.0,
-)
-"""The magnification of this device cannot be moved."""
-
-STAYS = replace(POLICY, n_modes_target=400, update_threshold=np.full(4, 9.0))
-MOVES = replace(STAYS, offloading=LIMITS)
 AFTER = Misregistration.from_vector(
     ALPHA.vector + np.array([-0.06, 0.03, -0.1, 0.0]) / BOUNDARY_SCALE
 )
-
-
-def a_story(mode=Mode.AUTO, policy=MOVES, n_windows=3, alpha=ALPHA):
-    """α is known, and the loop runs on a matrix that was made for it."""
-    story = Story(Mode.AUTO, STAYS)
-    story.meet()
-    story.see(alpha, n_windows=3)
-    story.use("cm-1")
-    story.wait(40.0)
-    story.tell(cmd.SetMode(mode=mode))
-    story.tell(rtc(cm_id="cm-1", t_ns=story.now_ns))
-    story.policy = policy
-    story.see(alpha, n_windows=n_windows)
-    return story
 
 
 def answer(story, *, accepted=True, reason="", start_seq=None):

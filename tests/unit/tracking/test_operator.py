@@ -8,8 +8,8 @@ from service.records import events as ev
 from service.records.products import MatrixState
 from service.records.state import Level, Mode
 from service.wire import DitherRequest
-from tests.states import changed
-from tests.unit.tracking.situations import Story, moved, of_kind, record, stopping
+from tests.support.situations import Story, moved, of_kind, record, stopping
+from tests.support.states import changed
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ from service.records.registration import Validity
 from service.records.state import Mode
 from service.tracking.update_policy import more_modes_to_try
 from service.wire import LoopRequest
-from tests.unit.tracking.dithered import DitheredNight
-from tests.unit.tracking.situations import ALPHA, N_MODES, POLICY, Story, moved, of_kind, rtc
+from tests.support.dithered import DitheredNight
+from tests.support.situations import ALPHA, N_MODES, POLICY, Story, moved, of_kind, rtc
 
 ONE_STILL = (0.0, *(0.4,) * 399, *(0.0,) * (N_MODES - 400))
 NONE = (0.0,) * N_MODES

@@ -20,17 +20,8 @@ from service.tracking.pointing_law import (
 from service.tracking.policy import SensorModePolicy
 from service.tracking.resume import resumed, saved_of
 from service.wire import Pointing
-from tests.states import tracker_state
-from tests.unit.tracking.situations import (
-    ALPHA,
-    POLICY,
-    SECOND,
-    START_NS,
-    Story,
-    estimate,
-    of_kind,
-    rtc,
-)
+from tests.support.situations import ALPHA, POLICY, SECOND, START_NS, Story, estimate, of_kind, rtc
+from tests.support.states import tracker_state
 
 LAW = PointingLaw(
     rotation_deg=Term("azimuth - 12.98"), shift_x_subap=Term("elevation", (20.0, 80.0), (0.2, -0.1))

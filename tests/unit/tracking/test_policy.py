@@ -13,8 +13,8 @@ from service.records.state import Mode
 from service.tracking.dither_request import DitherParameters, lock_in_plan, plan_dither
 from service.tracking.update_policy import THRESHOLD_DECAY_S, is_outdated
 from service.wire import DitherRequest, DitherStop
-from tests.unit.tracking import situations
-from tests.unit.tracking.situations import (
+from tests.support import situations
+from tests.support.situations import (
     ALPHA,
     N_MODES,
     POLICY,

@@ -17,8 +17,7 @@ from service.tracking.reconstructors import (
     store_reconstructor,
 )
 from service.tracking.resume import restored
-from tests.states import changed, tracker_state
-from tests.unit.tracking.situations import (
+from tests.support.situations import (
     POLICY,
     START_NS,
     Story,
@@ -30,6 +29,7 @@ from tests.unit.tracking.situations import (
     turned,
     verdict,
 )
+from tests.support.states import changed, tracker_state
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from service.records.state import Mode
 from service.tracking.operations.running import ServiceState, operating
 from service.tracking.window_processing import N_CONSECUTIVE_WINDOWS
 from service.wire import DitherStatus
-from tests.unit.tracking.situations import ALPHA, Story, dither_answered, moved, rtc
+from tests.support.situations import ALPHA, Story, dither_answered, moved, rtc
 
 MISSING = "150 of 2000 frames missing, more than 5%: check the link to the RTC"
 

@@ -11,8 +11,7 @@ from service.records.registration import Validity
 from service.records.state import Level, Mode, TrackerState
 from service.tracking.resume import resumed, saved_of
 from service.wire import DitherRequest, DitherStop
-from tests.states import changed, tracker_state
-from tests.unit.tracking.situations import (
+from tests.support.situations import (
     ALPHA,
     POLICY,
     PRECISE,
@@ -23,6 +22,7 @@ from tests.unit.tracking.situations import (
     of_kind,
     rtc,
 )
+from tests.support.states import changed, tracker_state
 
 
 @pytest.fixture

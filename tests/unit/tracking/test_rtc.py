@@ -10,15 +10,8 @@ from service.records.products import MatrixState
 from service.records.state import Level, Mode
 from service.tracking.dither_request import DEFAULT_DURATION_S
 from service.wire import DitherRequest
-from tests.states import changed
-from tests.unit.tracking.situations import (
-    SECOND,
-    Story,
-    dither_answered,
-    of_kind,
-    rtc,
-    stopping,
-)
+from tests.support.situations import SECOND, Story, dither_answered, of_kind, rtc, stopping
+from tests.support.states import changed
 
 
 @pytest.fixture

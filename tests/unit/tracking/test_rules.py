@@ -14,7 +14,7 @@ from service.records.state import Mode
 from service.runtime.policy import policy_of
 from service.tracker import step
 from service.tracking.alarm_rules import FIELDS, changes_value
-from tests.states import tracker_state
+from tests.support.states import tracker_state
 
 SHUTTER = """
 [[rules]]

@@ -12,8 +12,7 @@ from service.tracking.interlocks import ALLOWS
 from service.tracking.operations.running import running_operations
 from service.tracking.resume import resumed, saved_of
 from service.wire import DitherStop, Loop, LoopRequest
-from tests.states import tracker_state
-from tests.unit.tracking.operations.test_running import (
+from tests.support.activities import (
     ACTIVITIES,
     acquiring,
     gathering,
@@ -24,8 +23,9 @@ from tests.unit.tracking.operations.test_running import (
     ramping,
     sending,
 )
-from tests.unit.tracking.situations import POLICY, of_kind
-from tests.unit.tracking.world import World
+from tests.support.situations import POLICY, of_kind
+from tests.support.states import tracker_state
+from tests.support.world import World
 
 STOP = cmd.StopEverything(by="Ada", reason="someone is on the platform")
 

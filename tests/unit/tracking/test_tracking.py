@@ -11,8 +11,7 @@ from service.records import events as ev
 from service.records.products import MatrixState
 from service.records.registration import Source, Validity
 from service.records.state import Level, Mode
-from tests.states import changed
-from tests.unit.tracking.situations import (
+from tests.support.situations import (
     ALPHA,
     POLICY,
     PRECISE,
@@ -24,6 +23,7 @@ from tests.unit.tracking.situations import (
     of_kind,
     rtc,
 )
+from tests.support.states import changed
 
 THERE = moved(shift_x_subap=0.1)
 

@@ -20,7 +20,7 @@ from service.tracking.alarm_rules import REPEATED_ALARM_TIMEOUT_S
 from service.tracking.step_context import StepContext
 from service.tracking.transitions import TABLES, is_declared
 from service.wire import LoopRequest, MeasureRequest, Pattern
-from tests.unit.tracking.situations import POLICY, Story, acknowledged, of_kind, record
+from tests.support.situations import POLICY, Story, acknowledged, of_kind, record
 
 NIGHTS = Path(__file__).parents[2] / "data" / "golden"
 REPORT = transitions.report_undeclared

@@ -1,6 +1,6 @@
 from service.records.state import Level, TrackerState
 from service.tracking.step_context import LOG_LENGTH, StepContext, log_bursts, logged
-from tests.unit.tracking.situations import turned
+from tests.support.situations import turned
 
 STATE = TrackerState(system="flao")
 

@@ -21,8 +21,7 @@ from service.tracking.validity import (
     void_until,
 )
 from service.wire import Pointing
-from tests.states import changed, tracker_state
-from tests.unit.tracking.situations import (
+from tests.support.situations import (
     POLICY,
     PRECISE,
     SECOND,
@@ -34,6 +33,7 @@ from tests.unit.tracking.situations import (
     turned,
     verdict,
 )
+from tests.support.states import changed, tracker_state
 
 BENDING = replace(
     POLICY, flexure_per_degree=np.array([0.02, 0.02, 2e-4, 1e-4]), dither_enabled=False

@@ -12,8 +12,7 @@ from service.records.products import MatrixState
 from service.records.registration import Registration
 from service.records.state import Mode
 from service.tracker import step
-from tests.states import changed, tracker_state
-from tests.unit.tracking.situations import (
+from tests.support.situations import (
     ALL_SHOWN,
     ALPHA,
     N_MODES,
@@ -27,6 +26,7 @@ from tests.unit.tracking.situations import (
     rtc,
     verdict,
 )
+from tests.support.states import changed, tracker_state
 
 HIGH = (0.9,) * 400 + (0.0,) * (N_MODES - 400)
 

@@ -9,40 +9,12 @@ from service.estimation.loop import loop_numbers
 from service.model.misregistration import Misregistration
 from service.records import commands as cmd
 from service.records import events as ev
-from service.records.estimates import PassiveEstimate
 from service.records.registration import Source, Validity
 from service.records.state import Mode, TrackerState
 from service.tracking.window_processing import fit_begins_at
-from tests.states import changed
-from tests.unit.tracking.situations import (
-    ALPHA,
-    POLICY,
-    SECOND,
-    Story,
-    moved,
-    of_kind,
-    rtc,
-)
-
-SCATTER = np.array([0.003, 0.003, 1e-4, 1e-4])
-
-
-def watched(alpha, scatter=SCATTER):
-    return PassiveEstimate(
-        alpha=alpha,
-        covariance=np.diag(scatter**2),
-        optical_gain=np.full(400, 0.6),
-        misfit=1.0,
-        step=np.zeros(4),
-    )
-
-
-def watch(story, alpha, after_s=10.0, scatter=SCATTER):
-    """A look of the watchdog; the RTC's clock tells when."""
-    now_ns = story.now_ns + round(after_s * SECOND)
-    effects = story.tell(rtc(t_ns=now_ns), after_s)
-    look = ev.PassiveFitted(estimate=watched(alpha, scatter), t_ns_utc=now_ns)
-    return effects + story.tell(look)
+from tests.support.situations import ALPHA, POLICY, SECOND, Story, moved, of_kind, rtc
+from tests.support.states import changed
+from tests.support.watchdog import SCATTER, learnt, watch, watched
 
 
 @pytest.fixture
@@ -55,14 +27,6 @@ def story():
 def disagrees(story):
     """Whether a look has put α in question, and no window has told since."""
     return bool(story.state.alpha.registration.doubt)
-
-
-def learnt(story, off=0.06, n_looks=20):
-    """A night in which windows and looks alternate: the passive shift is off by so much."""
-    for _ in range(n_looks):
-        story.see(every_s=5.0)
-        watch(story, moved(shift_x_subap=off), after_s=5.0)
-    return story
 
 
 def test_it_only_reports_while_there_is_nothing_to_compare_with():

@@ -12,7 +12,7 @@ from service.records.state import Mode
 from service.tracking.resume import restored
 from service.tracking.update_policy import is_settled
 from service.wire import Loop, LoopRequest
-from tests.unit.tracking.situations import POLICY, Story, foreign, loop_answered, moved, rtc
+from tests.support.situations import POLICY, Story, foreign, loop_answered, moved, rtc
 
 OWN_SUM, OUR_SUM = "a" * 64, "b" * 64
 LAW = "gain 3 times the one in the status"

@@ -8,8 +8,8 @@ from service.records import events as ev
 from service.records.products import MatrixState
 from service.records.state import Mode
 from service.wire import DitherRequest
-from tests.states import changed
-from tests.unit.tracking.situations import Story, acknowledged, foreign, record, rtc
+from tests.support.situations import Story, acknowledged, foreign, record, rtc
+from tests.support.states import changed
 
 SUM, OTHER = "a" * 64, "b" * 64
 

@@ -18,8 +18,8 @@ from service.model.sensors.pyramid.detector_windows import (
     slopes_per_unit,
 )
 from service.model.slopes import SlopeRecipe
-from tests.numerics import small_instrument
-from tests.unit.fitting.discs import four_discs
+from tests.support.discs import four_discs
+from tests.support.numerics import small_instrument
 
 RECTANGLE = np.array([[14.0, 15.0], [14.0, 45.0], [44.0, 15.0], [44.0, 45.0]])
 

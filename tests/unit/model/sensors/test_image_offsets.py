@@ -17,7 +17,7 @@ from service.model.sensors.pyramid.description import FrameWindows, image_offset
 from service.model.sensors.pyramid.model import EDGE_SHIFT, EDGE_TURN, LOCATED_SIGMA_PX
 from service.model.sensors.registry import KINDS, kind_of
 from service.model.slopes import Orientation
-from tests.numerics import small_basis, small_instrument
+from tests.support.numerics import small_basis, small_instrument
 
 AT = Misregistration(shift_x_subap=0.3, rotation_rad=0.01)
 

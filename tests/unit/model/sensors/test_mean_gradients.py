@@ -17,7 +17,7 @@ from service.model.pupil import instrument_pupil
 from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import Fineness
 from service.model.sensors.shack_hartmann.table import Centroid
-from tests.numerics import SOMEWHERE
+from tests.support.numerics import SOMEWHERE
 
 FILE = Path(__file__).parents[3] / "data" / "lenslets.toml"
 

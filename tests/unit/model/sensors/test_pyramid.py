@@ -26,16 +26,8 @@ from service.model.sensors.pyramid.signals import pixel_places
 from service.model.sensors.pyramid.working_point import Halo, working_point
 from service.model.sensors.registry import KINDS, kind_of
 from service.model.sensors.sensor import CannotTell, Fineness, PupilPosition, WorkingPoint
-from tests.numerics import small_basis, small_instrument, small_model
-from tests.unit.estimation.lamps import (
-    beam,
-    counts_of,
-    flao,
-    fringes,
-    gaussian,
-    small,
-    with_diameter,
-)
+from tests.support.lamps import beam, counts_of, flao, fringes, gaussian, small, with_diameter
+from tests.support.numerics import small_basis, small_instrument, small_model
 
 LIGHT = PyramidLight(instrument=flao())
 

@@ -10,14 +10,11 @@ from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.sensors.pyramid.light import PyramidLight
 from service.model.sensors.sensor import PupilPosition
-from tests.numerics import small_basis
-from tests.unit.estimation.lamps import beam, counts_of, flao, fringes, gaussian, small
+from tests.support.lamps import beam, counts_of, flao, fringes, gaussian, small
+from tests.support.numerics import small_basis
+from tests.support.pyramid_light_illumination import at
 
 LIGHT = PyramidLight(instrument=flao())
-
-
-def at(x: float = 0.0, y: float = 0.0) -> PupilPosition:
-    return PupilPosition(at=(x, y), sigma=(0.02, 0.02))
 
 
 def inside(illumination, function, radius: float = 13.0):

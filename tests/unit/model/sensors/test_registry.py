@@ -16,7 +16,7 @@ from service.model.sensors import registry
 from service.model.sensors.kind import SensorKind
 from service.model.sensors.model import SensorModel
 from service.runtime.worker.sensor import SensorAtWork
-from tests.unit.test_config import ABOUT, MIRROR, MODES
+from tests.support.config import ABOUT, MIRROR, MODES
 
 WFS = '[wfs]\nkind = "curvature"\nn_subapertures = 20\nwavelength_m = 750e-9\nextra_m = 1.0\n'
 

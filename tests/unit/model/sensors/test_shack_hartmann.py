@@ -25,7 +25,7 @@ from service.model.pupil import (
 from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import CannotTell, Fineness
 from service.model.sensors.shack_hartmann.table import LaserStar
-from tests.numerics import SOMEWHERE
+from tests.support.numerics import SOMEWHERE
 
 FILE = Path(__file__).parents[3] / "data" / "lenslets.toml"
 DOUBLE = Fineness(dtype=np.float64)

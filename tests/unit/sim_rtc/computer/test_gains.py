@@ -9,7 +9,7 @@ from sim_rtc.computer.gains import GainRamp, by_group
 from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.telemetry import LoopSettings
 from sim_rtc.options import parse_options
-from tests.unit.sim_rtc.computer.test_real_time_computer import (
+from tests.support.real_time_computer import (
     IDENTITY,
     N_MODES,
     N_SLOPES,

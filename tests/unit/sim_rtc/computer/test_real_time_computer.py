@@ -3,54 +3,24 @@ from itertools import count
 import numpy as np
 import pytest
 
-from pyrcal.rtc.identity import Identity, Reconstructor
 from pyrcal.rtc.replies import ReplyCache
-from service.model.misregistration import Misregistration
 from service.wire import (
-    DitherKind,
-    DitherRequest,
     DitherStop,
     Loop,
     LoopRequest,
-    Manifest,
     OffloadRequest,
-    layout_of,
 )
 from sim_rtc.computer.feed import OpenLoopBlock
 from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.telemetry import LoopSettings
-from sim_rtc.telescope.linear import LinearOptics
-
-N_MODES, N_SLOPES = 4, 8
-# Orthogonal modes: what is not controlled does not alias into what is.
-RESPONSE = np.linalg.qr(np.random.default_rng(1).standard_normal((N_SLOPES, N_MODES)))[0].astype(
-    np.float32
+from tests.support.real_time_computer import (
+    IDENTITY,
+    N_MODES,
+    OPTICS,
+    RESPONSE,
+    dither_request,
+    reconstructor,
 )
-OPTICS = LinearOptics(
-    alpha=Misregistration(),
-    stuck_opd_m=np.zeros(5, dtype=np.float32),
-    slopes_per_command=RESPONSE,
-    opd_per_command=np.zeros((5, N_MODES), dtype=np.float32),
-    images=np.ones((2, 1, 2, 1)) / 4,
-)
-IDENTITY = Identity(system="small", basis_id="basis", config_id="sensor")
-
-
-def reconstructor(name, n_controlled):
-    matrix = np.linalg.pinv(RESPONSE[:, :n_controlled]).astype(np.float32)
-    manifest = Manifest(
-        id=name,
-        layout=layout_of(matrix, 1000),
-        alpha=None,
-        sigma=None,
-        im_id=None,
-        parent=None,
-        basis_id="basis",
-        config_id="sensor",
-        system="small",
-        created_ns=1,
-    )
-    return Reconstructor(manifest=manifest, matrix=matrix)
 
 
 def blocks():
@@ -86,17 +56,6 @@ def run(computer, n_batches):
 
 def loop_request(name, **changes):
     return LoopRequest(id=name, **changes)
-
-
-def dither_request(name):
-    return DitherRequest(
-        id=name,
-        kind=DitherKind.SINE,
-        modes=(3,),
-        amplitude_m=(1e-9,),
-        frequency_hz=(100.0,),
-        duration_s=1.0,
-    )
 
 
 def test_the_loop_takes_out_what_it_controls(computer):

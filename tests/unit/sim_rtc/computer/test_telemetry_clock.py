@@ -2,7 +2,7 @@ import threading
 import time
 
 from sim_rtc.computer.telemetry import FrameClock, Pace
-from tests.system.pace import in_time, patience
+from tests.support.pace import in_time, patience
 
 
 def test_timestamps_are_ends_of_exposure_that_follow_the_sequence():

@@ -20,7 +20,7 @@ from sim_rtc.telescope.detector import Camera, Detector, PixelDetector
 from sim_rtc.telescope.diffractive import DiffractivePlant, build_centred_pupil
 from sim_rtc.telescope.imperfections import SETS
 from sim_rtc.telescope.lenslets import LENSLET_SAMPLING, DiffractiveLenslets
-from tests.physics.fft_spots import pushed
+from tests.support.fft_spots import pushed
 
 FILE = Path(__file__).parents[3] / "data" / "lenslets.toml"
 SHIFT = (0.3, -0.2)

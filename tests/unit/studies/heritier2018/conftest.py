@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 
 from pyrcal_studies.heritier2018 import telescope
-from tests.numerics import small_basis, small_instrument
+from tests.support.numerics import small_basis, small_instrument
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from pyrcal_studies.heritier2018 import figures
 from pyrcal_studies.heritier2018.page import CAPTIONS
 from pyrcal_studies.heritier2018.tables import listed, table
 from pyrcal_studies.shared import save_picture
-from tests.unit.studies.heritier2018.test_paper import PAGE
+from tests.support.paper_page import PAGE
 
 
 def main_rows() -> list[list[str]]:

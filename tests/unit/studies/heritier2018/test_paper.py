@@ -11,9 +11,8 @@ import pytest
 from pyrcal.fitting.methods import TABLE_1 as SCANNED
 from pyrcal_studies.heritier2018 import paper, plan, results
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
+from tests.support.paper_page import PAGE, ROOT
 
-ROOT = Path(__file__).parents[4]
-PAGE = ROOT / "docs" / "results" / "heritier2018.md"
 NAME = "heritier2018.tex"
 
 

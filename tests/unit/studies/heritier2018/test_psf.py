@@ -12,7 +12,7 @@ from pyrcal_studies.heritier2018.loops import (
 )
 from sim_rtc.telescope.diffractive import DiffractivePlant
 from sim_rtc.telescope.imperfections import SETS
-from tests.numerics import small_basis, small_instrument
+from tests.support.numerics import small_basis, small_instrument
 
 
 @pytest.fixture(scope="module")

@@ -17,15 +17,9 @@ from service.tracking.operations.acquisition import (
 )
 from service.tracking.resume import resumed, saved_of
 from service.wire import DitherRequest, DitherStop, Loop, LoopRequest
-from tests.states import tracker_state
-from tests.unit.tracking.operations.test_acquisition import (
-    ACQUIRES,
-    CALM,
-    DIVERGING,
-    FAR,
-    Acquiring,
-)
-from tests.unit.tracking.situations import POLICY, SECOND, foreign, moved
+from tests.support.acquiring import ACQUIRES, CALM, DIVERGING, FAR, Acquiring
+from tests.support.situations import POLICY, SECOND, foreign, moved
+from tests.support.states import tracker_state
 
 N_MODES = 594
 OPEN = {"loop": "open", "gains": (0.0,) * N_MODES, "cm_id": "initial"}

@@ -11,8 +11,8 @@ from service.records.products import MatrixState
 from service.records.state import Mode
 from service.tracking.operations.measurement import MAX_MATRIX_DELAY_S, MAX_MEASUREMENT_S
 from service.wire import DitherRequest, MeasureRequest, Pattern
-from tests.states import changed
-from tests.unit.tracking.situations import Story, of_kind, rtc
+from tests.support.situations import Story, of_kind, rtc
+from tests.support.states import changed
 
 
 @pytest.fixture

@@ -11,14 +11,8 @@ from service.records.operations import MeasureState
 from service.records.products import ModeSet
 from service.tracking.operations.measurement import DITHER_END_TIMEOUT_S
 from service.wire import DitherKind, DitherRequest, DitherStop
-from tests.unit.tracking.situations import (
-    POLICY,
-    Story,
-    dither_answered,
-    of_kind,
-    rtc,
-)
-from tests.unit.tracking.world import FOUND
+from tests.support.situations import POLICY, Story, dither_answered, of_kind, rtc
+from tests.support.world import FOUND
 
 ASK = cmd.MeasureNoisy(
     id="noisy-1", modes=ModeSet.CONTROLLED, total_amplitude_m=5e-9, duration_s=30.0

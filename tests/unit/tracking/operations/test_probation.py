@@ -9,8 +9,8 @@ from service.records import events as ev
 from service.records.operations import ProbationFinding, ProbationState, Verdict
 from service.records.products import MatrixState
 from service.records.state import Mode
-from tests.states import changed
-from tests.unit.tracking.situations import Story, acknowledged, moved, rtc, verdict
+from tests.support.situations import Story, acknowledged, moved, rtc, verdict
+from tests.support.states import changed
 
 NUMBERS = "mode 30 moves 3.10 times as much"
 

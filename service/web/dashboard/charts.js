@@ -54,7 +54,7 @@ export class Charts {
     for (const row of this.rows) {
       const shown = rounded(four?.[row.parameter.key], sigma?.[row.parameter.key], row.parameter);
       put(row.value, `${shown.value}${four && row.parameter.short ? ` ${row.parameter.short}` : ""}`);
-      const changes = tracking ? ` (changes ± ${rounded(four?.[row.parameter.key], tracking[row.parameter.key], row.parameter).sigma})` : "";
+      const changes = tracking ? ` (changes ±\u00a0${rounded(four?.[row.parameter.key], tracking[row.parameter.key], row.parameter).sigma})` : "";
       put(row.sigma, four ? `± ${shown.sigma}${changes}` : "");
     }
   }

@@ -102,7 +102,7 @@ class Recorded:
     """SHA-256 of the whole file, 64 lower-case hex digits."""
 
     remark: str = ""
-    """What a user has to know of the values; empty if nothing."""
+    """Notes on the values for the user; empty if there are none."""
 
 
 def read_recorded(path: Path, dataset: str | None = None) -> Recorded:

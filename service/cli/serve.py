@@ -65,7 +65,7 @@ OPEN_FILES = 8192
 of strangers, to REST and the link, must not use up what the archive needs."""
 
 REST_RETRY_INTERVAL_S = 1.0
-"""Between two attempts to listen for REST."""
+"""Interval of attempts to listen for REST, seconds."""
 
 END_WITHIN_S = 4.5
 """Time after which the parts that delay the end are named and abandoned: operators and process

@@ -61,7 +61,7 @@ class StoredArray:
     """Shape of what is unpacked at once, which may exceed ``shape``; empty: all of it."""
 
     remark: str = ""
-    """What a user has to know of the values; empty if nothing."""
+    """Notes on the values for the user; empty if there are none."""
 
     def numbers(self) -> NDArray[np.float64]:
         """Return it as native float64, whatever its byte order.

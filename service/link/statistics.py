@@ -180,7 +180,7 @@ class LinkStatistics:
     """Outcomes of frames and messages by kind, the most frequent first."""
 
     missing: str = ""
-    """What keeps the link from being opened; empty if it is open."""
+    """Reason why the link is not open; empty if it is."""
 
     waiting_connections: Mapping[int, int] = field(default_factory=dict)
     """Connections closed before a TLS handshake that zenoh has not dealt with yet, by port."""

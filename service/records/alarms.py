@@ -133,7 +133,7 @@ class Responsible(StrEnum):
     """Another one, of the same system."""
 
     NETWORK = "network"
-    """Whoever starts routers, addresses and names, or has the port."""
+    """Administrator of routers, addresses, names and ports."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -412,7 +412,7 @@ class LawState:
     """Present registration by the law; None if there is no law or its input is not reported."""
 
     reported: tuple[tuple[str, float], ...] = ()
-    """What the law depends on, by name, as it was then."""
+    """Values that the law depends on, by name, as they were then."""
 
     worked_out_ns_utc: int = 0
     """Time at which it was computed, by the service's clock."""

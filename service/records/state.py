@@ -219,8 +219,8 @@ class MatrixStates:
     """Id of the matrix that the RTC has acknowledged as applied and no status has named since."""
 
     misapplied: str = ""
-    """How the RTC has applied another matrix than it said; empty if it has not, or an operator has
-    set the mode since."""
+    """Difference between the matrix that the RTC names and the one it applies; empty if there is
+    none, or an operator has set the mode since."""
 
     misapplied_id: str | None = None
     """Id under which it multiplies with other numbers; None if it has not swapped at all."""

@@ -208,7 +208,7 @@ class ReadinessInputs:
     """Problem of the worker; empty if there is none."""
 
     rest_missing: str = ""
-    """What keeps REST from listening; empty if nothing does."""
+    """Reason why REST does not listen; empty if it does."""
 
     reading: bool = False
     """The RTC's own reconstructor is being read, and windows wait for that."""

@@ -215,7 +215,7 @@ class Alpha:
 
     @property
     def sigma_limit(self) -> str | None:
-        """What limits sigma and can be measured, with the remedy; null: nothing is known to."""
+        """Cause of sigma that can be measured, with the remedy; null if none is known."""
         images = self.snapshot.policy.image_sigma
         return IMAGES_LIMIT if np.any(images > self.registration.shown_sigma / np.sqrt(2)) else None
 

@@ -45,7 +45,7 @@ from service.tracking.policy import Policy
 from service.tracking.step_context import new_lines
 
 LINK_RETRY_INTERVAL_S = 1.0
-"""Between two attempts to open the link, and two checks whether it has to be opened again."""
+"""Interval of attempts to open the link, and of checks whether it is still open, seconds."""
 
 LINK_POLL_INTERVAL_S = 0.16
 """Between two visits to the link at the least: each costs two milliseconds, whatever there is."""

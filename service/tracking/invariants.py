@@ -1,4 +1,4 @@
-"""What is true of the state after every step.
+"""Invariants of the state after every step.
 
 :data:`INVARIANTS` is the list; tests ask :func:`find_violations` after each step of theirs, of the
 golden nights and of random nights. In operation nothing asks: what a violated invariant would need
@@ -104,7 +104,7 @@ INVARIANTS: Final[dict[str, Callable[[TrackerState], object]]] = {
     "pointings are in the order of their time": _is_in_order,
     "nothing waits in a state from which no transition leads on": _what_waits_can_go_on,
 }
-"""What finds a violation, by what is true: it returns what violates it, or something empty."""
+"""Functions that return violations, or something empty, by the invariant in words."""
 
 
 def find_violations(state: TrackerState) -> list[str]:

@@ -200,7 +200,7 @@ class Crowd(ServerState):
             self._last_s = time.monotonic()
 
     def complaint(self) -> str:
-        """Return whose connections had to end lately; empty: nobody's."""
+        """Return whose connections had to end lately; empty if none had to."""
         if time.monotonic() - self._last_s > CROWD_REPORT_S:
             self._ended.clear()
             return ""
@@ -240,7 +240,7 @@ class Connection(H11Protocol):
             self.timeout_keep_alive_task = timer
 
     def rank(self) -> tuple[bool, float]:
-        """Return the place among those that may have to end for others, the first one lowest.
+        """Return the sort key of a connection; the lowest one ends first.
 
         Whoever has sent a whole request and waits for its answer comes last.
         """

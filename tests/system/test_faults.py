@@ -166,7 +166,7 @@ def test_a_matrix_of_the_wrong_sign_is_taken_back_and_the_loop_opened(night):
     service = night.service("auto")
     night.rtc(*faults("turned-sign@0:1000"))
     named(service, "matrix-misapplied", 40.0)
-    wait_for(lambda: night.state["rtc"]["loop"] == "open", 10.0, "the loop is opened")
+    named(service, "loop.accepted", 10.0)
     sent = [r["id"] for r in night.shelf if r["published_ns_utc"] is not None]
     assert len(sent) == 2
     assert "Traceback" not in service.log

@@ -53,9 +53,6 @@ functions left 94 times the χ² of a matrix of HCIPy, and with 2.9 σ they made
 NOTABLE_GAIN_RATIO = 0.02
 """Smallest reported ratio of the gains of Sx and Sy, less 1."""
 
-LIGHT_KEY = "--gain-map"
-"""Option of the command that allows for uneven light."""
-
 CENTRED_KEY = "pupil, or valid_subapertures, centred"
 """Keys of the instrument file to correct if the pupil is not centred."""
 

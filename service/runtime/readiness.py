@@ -323,8 +323,8 @@ def _for_the_matrix(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
     ):
         text = f"its reconstructor {rtc.cm_id}: offer it on rtc/cm/applied{_describe_rtc(state)}"
         yield Prerequisite(name="matrix-in-use", responsible=Responsible.RTC, text=text)
-    # Without an RTC, or during an alarm that forbids all decisions, it is of before, and something
-    # else says what to do.
+    # Without an RTC, or during an alarm that forbids all decisions, it is out of date, and another
+    # text says what to do.
     decides = alarms.blocking_alarm(state.alarms.active, Interlock.DECIDE) is None
     if state.matrices.hindrance and decides and rtc is not None:
         yield Prerequisite(

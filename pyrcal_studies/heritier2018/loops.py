@@ -221,7 +221,9 @@ def wavefront_error_nm(
     that were controlled.
     """
     modal = record["modal_nm2"]
-    end = int(record["n_controlled"]) if n_modes is None else n_modes
+    end = n_modes
+    if n_modes is None and over is not Over.PUPIL:
+        end = int(record["n_controlled"])
     match over:
         case Over.PUPIL:
             variance = float(record["total_nm2"]) - float(modal[:without_first].sum())

@@ -276,10 +276,10 @@ def markdown(budget: Budget, store: Store) -> str:
 def figures_index(budget: Budget, store: Store) -> str:
     """Return the table of the paper's figures with a link to each of ours."""
     rows = [
-        ("Figure 1: method", "[in words](../explanation/method.md)", "diagram", "no diagram"),
+        ("[Figure 1](../explanation/method.md): method", "in words", "diagram", "no diagram"),
         (
-            "Figure 2: model",
-            "[in words](../explanation/method.md#the-model)",
+            "[Figure 2](../explanation/method.md#the-model): model",
+            "in words",
             "diagram",
             "no diagram",
         ),

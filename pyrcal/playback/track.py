@@ -15,7 +15,7 @@ import structlog
 from threadpoolctl import threadpool_limits
 
 from pyrcal.fitting.figures import check_plots, save_figure
-from pyrcal.playback.aot import read_telemetry
+from pyrcal.importers.aot import read_telemetry
 from pyrcal.playback.arrays import Arrays, open_arrays
 from pyrcal.playback.player import Player
 from pyrcal.playback.pyrtc import is_session, read_session

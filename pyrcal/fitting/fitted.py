@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -156,6 +157,11 @@ class Fit(Determination):
 
     recommendation: str = ""
     """Recommended action, in one sentence."""
+
+    corrections: Mapping[str, Any] = field(default_factory=dict)
+    """Values that the recommendation asks to write into the instrument file, by table and key, such
+    as ``wfs.modulation_lambda_over_d``; None removes a key. That of ``instrument.pupil`` describes
+    how the map is to be turned or mirrored."""
 
     paper_table: tuple[ScanStep, ...] | None = None
     """Scans of the paper's method, in order; None for the other methods."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,6 +110,11 @@ class Fit(FittedMatrix):
 
     unknown_not_found: tuple[str, ...] = ()
     """Keys marked as unknown in the file that the matrix does not determine."""
+
+    corrections: Mapping[str, Any] = field(default_factory=dict)
+    """Values that the recommendation asks to write into the instrument file, by table and key, such
+    as ``wfs.modulation_lambda_over_d``; None removes a key. That of ``instrument.pupil`` describes
+    how the map is to be turned or mirrored."""
 
     @property
     def anamorphosis(self) -> NDArray[np.float64] | None:

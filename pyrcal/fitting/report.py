@@ -98,6 +98,7 @@ def document(report: FitReport) -> dict[str, Any]:
             for one in fit.optics
         },
         "recommendation": fit.recommendation,
+        "corrections": dict(fit.corrections),
         "found_not_told": [
             {
                 "key": one.key,

@@ -235,6 +235,7 @@ REACTIONS: Final[dict[type, Callable[[StepContext, Any], object]]] = {
     ev.LoopHeld: rtc.on_loop_held,
     ev.MatrixMisapplied: reconstructors.on_misapplied,
     ev.Vibrations: rtc.on_vibrations,
+    ev.ModelChanged: rtc.on_model_changed,
     ev.JobFailed: _on_failure,
     cmd.SetMode: operator.set_mode,
     cmd.SetPointing: operator.set_pointing,

@@ -9,7 +9,6 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,6 @@ from service import wire
 from service.control.gains import gain_table
 from service.control.loop import ControlLoop
 from service.errors import ArchiveError, CommandError, LinkError, StorageError, UnknownIdError
-from service.estimation.description import Description
 from service.estimation.loop import extend_gains, same_gains, select_gains
 from service.link.matrices import MeasuredMatrix
 from service.model.instrument import Instrument
@@ -30,7 +28,7 @@ from service.records.products import GateVerdict
 from service.records.registration import Registration
 from service.records.state import TrackerState
 from service.runtime import estimates, ports
-from service.runtime.worker import Conditions, OpticsWorker, run_job
+from service.runtime.worker import Conditions, OpticsWorker
 from service.tracking.pointing_law import registration_ahead
 from service.version import software_version
 
@@ -125,22 +123,6 @@ class Actions:
         matrix = self._archive.reconstructors.matrix(matrix_id) if kept is None else kept
         self._remember(matrix_id, matrix)
         return matrix
-
-    async def enter_sensor_mode(self, config_id: str) -> Description:
-        """Have the worker model another mode of the sensor, and each worker after it.
-
-        Raises
-        ------
-        WorkerError
-            If the worker dies of it.
-        """
-        slopes = self._workers.found_slopes
-        # Before the call: if the worker dies while it makes the models, its successor must start in
-        # the new mode.
-        self._workers.first = partial(run_job, OpticsWorker.adopt, slopes, None, config_id)
-        self._commanded_modes = None
-        self.instrument = self.instrument.in_mode(config_id)
-        return await self._workers.call(OpticsWorker.enter_mode, config_id)
 
     def offer(self, state: TrackerState) -> None:
         """Let an RTC ask for the matrix in use.

@@ -9,6 +9,7 @@ from service.records import alarms
 from service.records import events as ev
 from service.records.events import Effect
 from service.records.products import MatrixState
+from service.records.state import ModelState
 from service.tracking import (
     dither,
     mode_proof,
@@ -96,6 +97,24 @@ def on_loop_held(context: StepContext, event: ev.LoopHeld) -> None:
     context.loop = replace(context.loop, holds=event.holds)
 
 
+def on_model_changed(context: StepContext, event: ev.ModelChanged) -> None:
+    """Store what a job of the worker has made of the model."""
+    model = event.model
+    # The job may have begun before the sensor's mode changed: its results belong to that mode.
+    if model.sensor_mode == context.model.sensor_mode:
+        context.model = replace(
+            context.model,
+            slopes=model.slopes,
+            own_matrix_read=model.own_matrix_read,
+            response=model.response,
+            own_residual=model.own_residual,
+            dither_session=model.dither_session,
+            dithered=model.dithered,
+            strength=model.strength,
+            linearised_at=model.linearised_at,
+        )
+
+
 def _log_partial_loop(context: StepContext, before: Status | None, rtc: Status) -> None:
     """Say how many modes are in the loop where it is not all that are controlled."""
     n_before = rtc.n_controlled if before is None else len(before.in_loop)
@@ -126,6 +145,9 @@ def _enter_sensor_mode(context: StepContext, config_id: str) -> None:
     reconstructors.discard_proposals(context, f"the sensor's mode is {config_id} now")
     update_policy.forget_limit(context)
     context.loop = replace(context.loop, config_id=config_id)
+    # Order and signs of the slopes are those of every mode; all else is measured again.
+    slopes, context.model = context.model.slopes, ModelState()
+    context.model = replace(context.model, sensor_mode=config_id, slopes=slopes)
     pointing_law.begin_law(context)
     kept, scale = "", context.policy.alpha_scale(before, config_id)
     if scale is not None and context.registration is not None:

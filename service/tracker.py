@@ -191,6 +191,9 @@ def _on_answer(context: StepContext, answered: ev.Answered) -> None:
         case wire.LoopRequest() | wire.RampRequest() as request:
             outcome = CommandState.ACCEPTED if reply.accepted else CommandState.REFUSED
             operator.on_loop_answer(context, request.id, outcome, reply.reason)
+            n_modes = getattr(request, "n_controlled", None)
+            if n_modes is not None and reply.accepted:
+                rtc.on_modes_commanded(context, ev.ModesCommanded(n_modes=n_modes))
 
 
 def _on_failure(context: StepContext, failed: ev.JobFailed) -> None:
@@ -236,6 +239,7 @@ REACTIONS: Final[dict[type, Callable[[StepContext, Any], object]]] = {
     ev.MatrixMisapplied: reconstructors.on_misapplied,
     ev.Vibrations: rtc.on_vibrations,
     ev.ModelChanged: rtc.on_model_changed,
+    ev.ModesCommanded: rtc.on_modes_commanded,
     ev.JobFailed: _on_failure,
     cmd.SetMode: operator.set_mode,
     cmd.SetPointing: operator.set_pointing,

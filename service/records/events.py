@@ -385,6 +385,13 @@ class Vibrations:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ModesCommanded:
+    """The RTC has accepted to control another number of modes with the next matrix."""
+
+    n_modes: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ModelChanged:
     """A job has changed the optical model: it has measured something or linearised elsewhere."""
 
@@ -435,6 +442,7 @@ Event = (
     | MatrixMisapplied
     | Vibrations
     | ModelChanged
+    | ModesCommanded
     | MatrixMeasured
     | JobFailed
 )

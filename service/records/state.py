@@ -309,6 +309,10 @@ class LoopState:
     config_id: str | None = None
     """Pinned or adopted; frames of another configuration are refused."""
 
+    commanded_modes: int | None = None
+    """Number of modes that the RTC has accepted to control and no status has shown yet; None if
+    there is none."""
+
     vibrations_hz: tuple[float, ...] = ()
     """Vibration lines in the slopes, lowest first."""
 

@@ -76,7 +76,6 @@ class Actions:
         # The cache of matrices is read from threads as well: the archive is waited for off the
         # event loop.
         self._guard = threading.Lock()
-        self._commanded_modes: int | None = None
         self._judging: set[str] = set()
         self.noisy = estimates.NoisySums(workers=workers, archive=archive, instrument=instrument)
         """Sums of the noisy interaction matrix under way."""
@@ -159,8 +158,6 @@ class Actions:
 
     async def _ask(self, request: wire.Command) -> Event | None:
         reply = await self._bridge.command(request)
-        if isinstance(request, wire.LoopRequest) and reply.accepted:
-            self._commanded_modes = request.n_controlled or self._commanded_modes
         if isinstance(request, wire.DitherStop) and reply.accepted:
             return None  # the next status tells
         return ev.Answered(request=request, reply=reply)
@@ -311,16 +308,16 @@ class Actions:
         if record is None:
             raise UnknownIdError(f"unknown reconstructor {effect.id}")
         matrix = await asyncio.to_thread(self.matrix, effect.id)
-        # The status lags behind an accepted command, which would then be sent twice.
-        commanded = self._commanded_modes or rtc.n_controlled
-        if effect.gains is not None or commanded != effect.n_modes:
+        commanded = state.loop.commanded_modes or rtc.n_controlled
+        anew = effect.gains is not None or commanded != effect.n_modes
+        if anew:
             # First, because the RTC rejects a matrix with another number of rows than was commanded
             # (R-53).
             await self._command_modes(effect)
         layout = wire.layout_of(matrix, self._publishing.chunk_bytes)
         manifest = record.manifest(layout, rtc, self._publishing.system)
         await self._bridge.publish(manifest, matrix)
-        return None
+        return ev.ModesCommanded(n_modes=effect.n_modes) if anew else None
 
     async def _command_modes(self, effect: ev.SendMatrix) -> None:
         """Command the number of modes and the gains of the next matrix."""
@@ -331,7 +328,6 @@ class Actions:
         )
         if not reply.accepted:
             raise CommandError(f"the RTC will not control {effect.n_modes} modes: {reply.reason}")
-        self._commanded_modes = effect.n_modes
 
     def _record(
         self, n_modes: int, why: str, registration: Registration | None, parent: str | None

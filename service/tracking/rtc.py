@@ -67,9 +67,11 @@ def on_status(context: StepContext, rtc: Status) -> None:
     if registration is not None and bias is not None and bias.looked_ns_utc and elsewhere:
         # it was learnt in another loop, in whichever session
         validity.store_registration(context, replace(registration, bias=None))
+    pending = context.loop.commanded_modes
     context.loop = replace(
         context.loop,
         rtc=rtc,
+        commanded_modes=None if pending == rtc.n_controlled else pending,
         # Pinned by the instrument file or the first status: a later one does not replace them.
         basis_id=context.loop.basis_id or rtc.basis_id,
         config_id=context.loop.config_id or rtc.config_id,
@@ -95,6 +97,11 @@ def on_vibrations(context: StepContext, event: ev.Vibrations) -> None:
 def on_loop_held(context: StepContext, event: ev.LoopHeld) -> None:
     """Store whether the loop is stable."""
     context.loop = replace(context.loop, holds=event.holds)
+
+
+def on_modes_commanded(context: StepContext, event: ev.ModesCommanded) -> None:
+    """Store the number of modes until a status shows it: the status lags behind the answer."""
+    context.loop = replace(context.loop, commanded_modes=event.n_modes)
 
 
 def on_model_changed(context: StepContext, event: ev.ModelChanged) -> None:
@@ -175,7 +182,7 @@ def _begin_anew(context: StepContext, because: str) -> None:
     # α belongs to the telescope and is kept, but windows must confirm it.
     validity.require_new_windows(context)
     context.retry_all()
-    context.loop = replace(context.loop, rtc=None, holds=False)
+    context.loop = replace(context.loop, rtc=None, holds=False, commanded_modes=None)
     dither.note_found(context)
     context.clear_alarm(alarms.MIRROR_SILENT)
     dither.forget_unwanted(context)
@@ -241,6 +248,8 @@ def on_failure(context: StepContext, effect: Effect, text: str) -> None:
         case ev.FetchMatrix():
             reconstructors.note_not_fetched(context, text)
         case ev.SendMatrix(id=matrix_id):
+            # It may have failed after its command was accepted.
+            context.loop = replace(context.loop, commanded_modes=None)
             reconstructors.change_state(context, matrix_id, MatrixState.FAILED, text)
         case _:
             context.put_off(make_s=5.0)

@@ -76,8 +76,9 @@ LINEAR_DISPLACEMENT_RATIO = 0.08
 """The same limit over the root of the residual share of the signal: the second order of a
 displacement d, at most (π d)² / 2 of the signal, is then a thirtieth of that share."""
 
-BLUR_STEPS = (-0.5, -0.25, 0.25, 0.5)
-"""Trial amplitudes of a blurring pattern, subapertures: half of each in every image."""
+BLUR_STEPS = (0.25, 0.5)
+"""Trial amplitudes of a blurring pattern to either side, subapertures: half of each in every image.
+"""
 
 LONGEST_MOVE = 0.3
 """Longest change of one displacement pattern, subapertures; the derivatives hold no further."""
@@ -426,11 +427,18 @@ def _with_nearest_images(settled: Settled) -> tuple[FitModels, Nuisances]:
     displaced = nuisances.displaced + np.where(blurring, 0.0, values) @ nuisances.images
     least = left(displaced)
     for pattern in nuisances.images[blurring]:
-        tried = [displaced + size * pattern for size in BLUR_STEPS]
-        found = [left(one) for one in tried]
-        best = int(np.argmin(found))
-        if found[best] < least:
-            displaced, least = tried[best], found[best]
+        centre, at_centre = displaced, least
+        # Both sides, because the sign is hardly measurable; each outwards until χ² grows.
+        for side in (-1.0, 1.0):
+            before = at_centre
+            for size in BLUR_STEPS:
+                tried = centre + side * size * pattern
+                found = left(tried)
+                if found >= before:
+                    break
+                before = found
+                if found < least:
+                    displaced, least = tried, found
     return models.with_displaced_images(displaced), replace(nuisances, displaced=displaced)
 
 

@@ -84,7 +84,7 @@ def _rtc(state: Document) -> list[str]:
 
 
 def _references(state: Document) -> list[str]:
-    """Return name and age of reference slopes that the RTC has changed; older services have none."""
+    """Return name and age of changed reference slopes; older services do not report them."""
     since_ns = state.get("reference_since_ns_utc")
     if since_ns is None:
         return []

@@ -81,7 +81,7 @@ def document(report: FitReport) -> dict[str, Any]:
         "orientation": orientation_words(fit.orientation, fit.order),
         "subset_scatter": _parameters(fit.subset_scatter),
         "converged": bool(fit.converged),
-        "verdict": verdict_line(fit),
+        "verdict": fit.verdict_line,
         "registration": None if fit.registration is None else _registration(fit.registration),
         "reconstructor": None if fit.reconstructor is None else _reconstructor(fit.reconstructor),
         "anamorphosis": None if fit.anamorphosis is None else _plain(fit.anamorphosis),
@@ -98,6 +98,7 @@ def document(report: FitReport) -> dict[str, Any]:
             for one in fit.optics
         },
         "recommendation": fit.recommendation,
+        "corrections": dict(fit.corrections),
         "found_not_told": [
             {
                 "key": one.key,
@@ -183,13 +184,6 @@ def _left_over(left: LeftOver) -> dict[str, Any]:
         "planes": list(left.planes),
         "gradient": list(left.gradient),
     }
-
-
-def verdict_line(fit: Fit) -> str:
-    """Return the verdict and the columns left out, on one line."""
-    if not fit.left_out:
-        return fit.verdict
-    return f"{fit.verdict}; left out: {'; '.join(fit.left_out)}"
 
 
 def orientation_words(orientation: Orientation, order: SlopeOrder) -> dict[str, Any]:

@@ -1,9 +1,10 @@
-"""Report the results of telemetry as a table, as one document, as HDF5, as a plot."""
+"""Results of the estimators from telemetry, as a table, as one document, as HDF5, as a plot."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.fitting.figures import check_plots
-from pyrcal.playback.player import Track, to_boundary
+from pyrcal.importers.registration import Dated
 from pyrcal.terminal import table as aligned
+from service.estimation.random_dither import NoisyMatrix
 from service.files.container import put_array
 from service.model.misregistration import (
     BOUNDARY_SCALE,
@@ -23,8 +25,8 @@ from service.model.misregistration import (
     wrap_angle,
 )
 from service.records import alarms
-from service.records.registration import HistoryEntry, Source
-from service.records.state import Level
+from service.records.registration import HistoryEntry, PassiveState, Source
+from service.records.state import Level, LogEntry, TrackerState
 from service.tracking.policy import SECOND_NS
 
 if TYPE_CHECKING:
@@ -54,6 +56,77 @@ _OF_MISALIGNED = frozenset(
 
 _MAX_REASONS = 8
 """Number of kinds of refusals and warnings listed in the table."""
+
+
+@dataclass(slots=True, kw_only=True)
+class Track:
+    """Results of the estimators from telemetry."""
+
+    entries: list[HistoryEntry] = field(default_factory=list)
+    """Measurements of α, in the order in which they were processed."""
+
+    passive: list[PassiveState] = field(default_factory=list)
+    """Estimates of α from ordinary telemetry alone, each with its bias included."""
+
+    lines: list[LogEntry] = field(default_factory=list)
+    """Log entries of the tracker."""
+
+    noisy: NoisyMatrix | None = None
+    """Interaction matrix from the last random dither; None if there was none."""
+
+    stated: tuple[Dated, ...] = ()
+    """α from the file itself, in its order; only AOT files have it."""
+
+    misaligned: str = ""
+    """Measured offset between slopes and commands; empty if it is as stated or not measurable."""
+
+    n_frames: int = 0
+    """Number of frames used."""
+
+    n_missing: int = 0
+    """Number of frames missing between these, from their sequence numbers."""
+
+    n_gaps: int = 0
+    """Number of gaps."""
+
+    first_ns_utc: int = 0
+    last_ns_utc: int = 0
+    """End of the last used frame, the RTC's clock; ``first_ns_utc`` is that of the first."""
+
+    state: TrackerState
+    """State of the tracker at the end."""
+
+    @property
+    def t(self) -> NDArray[np.float64]:
+        """``(n,)`` end of each measurement of α, seconds since the first frame."""
+        ends_ns = np.array([entry.t_ns_utc for entry in self.entries], np.int64)
+        return (ends_ns - self.first_ns_utc) / SECOND_NS
+
+    @property
+    def alpha(self) -> NDArray[np.float64]:
+        """``(n, 4)`` filtered α after each measurement, in the units of ``PARAMETERS``."""
+        return to_boundary([entry.filtered.vector for entry in self.entries])
+
+    @property
+    def sigma(self) -> NDArray[np.float64]:
+        """``(n, 4)`` 1 σ of ``alpha``, model error included."""
+        return to_boundary([entry.filtered_sigma for entry in self.entries])
+
+    def plot(self, title: str = "") -> Figure:
+        """Return α over time as a figure, as ``pyrcal track --plot`` draws it.
+
+        Raises
+        ------
+        ConfigurationError
+            If matplotlib, the extra ``plots``, is not installed.
+        """
+        return draw(self, title)
+
+
+def to_boundary(vectors: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return vectors in numeric units as rows in the units of ``PARAMETERS``."""
+    # Reshaped, because no vector at all must give (0, 4) as well.
+    return np.asarray(np.array(vectors).reshape(-1, len(PARAMETERS)) * BOUNDARY_SCALE)
 
 
 def table(track: Track) -> str:

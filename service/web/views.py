@@ -336,7 +336,7 @@ define_view("LoopCommandView", LoopCommand, "id text state reason asked_ns_utc l
 define_view(
     "DitherView",
     Dither,
-    "id request.modes request.amplitude_m request.kind frequency_hz request.seed "
+    "id purpose request.modes request.amplitude_m request.kind frequency_hz request.seed "
     "request.duration_s start_seq",
 )
 define_view("DitherPlanView", DitherPlan)

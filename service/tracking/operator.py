@@ -11,7 +11,7 @@ from service.records import commands as cmd
 from service.records import events as ev
 from service.records.alarms import PROBATION
 from service.records.commands import GainGroup, ModeGroup
-from service.records.operations import CommandState, Dither, LoopCommand
+from service.records.operations import CommandState, Dither, DitherPurpose, LoopCommand
 from service.records.products import MatrixState, ModeSet
 from service.records.state import Level, Mode
 from service.tracking import dither_request, reconstructors
@@ -108,7 +108,8 @@ def _plan_dither(context: StepContext, rtc: Status, command: cmd.StartDither) ->
             rtc,
             policy,
             now_ns,
-            dither_id=f"{dither_request.OPERATOR_DITHER}{now_ns}",
+            purpose=DitherPurpose.OPERATOR,
+            dither_id=dither_request.name_dither(DitherPurpose.OPERATOR, now_ns),
             modes=command.modes or ModeSet.CONTROLLED,
             total_m=command.total_amplitude_m
             or min(dither_request.DEFAULT_RANDOM_RMS_M, policy.dither_budget_m),

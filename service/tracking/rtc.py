@@ -74,6 +74,7 @@ def on_status(context: StepContext, rtc: Status) -> None:
         basis_id=context.loop.basis_id or rtc.basis_id,
         config_id=context.loop.config_id or rtc.config_id,
     )
+    _note_references(context, rtc)
     validity.note_pointing(context, rtc.pointing)
     _drop_other_basis(context)
     mode_proof.believe_restored(context, rtc)
@@ -106,6 +107,18 @@ def _log_partial_loop(context: StepContext, before: Status | None, rtc: Status) 
         context.log("loop.partial", text)
 
 
+def _note_references(context: StepContext, rtc: Status) -> None:
+    """Record new reference slopes; they end windows under way, and α and matrices stay."""
+    before, name = context.loop.reference_id, rtc.reference_name
+    if name == before:
+        return
+    context.loop = replace(context.loop, reference_id=name)
+    if before is not None:
+        context.loop = replace(context.loop, reference_since_ns_utc=context.now_ns)
+        text = f"the RTC subtracts the reference slopes {name}, they were {before}"
+        context.log("references.changed", text)
+
+
 def _drop_other_basis(context: StepContext) -> None:
     """Drop an α that was restored from a night with another basis or configuration."""
     registration, loop = context.registration, context.loop
@@ -126,7 +139,8 @@ def _enter_sensor_mode(context: StepContext, config_id: str) -> None:
     _begin_anew(context, "the sensor was in another mode")
     reconstructors.discard_proposals(context, f"the sensor's mode is {config_id} now")
     update_policy.forget_limit(context)
-    context.loop = replace(context.loop, config_id=config_id)
+    # An RTC that does not name its references is named by its mode: that says nothing of them.
+    context.loop = replace(context.loop, config_id=config_id, reference_id=None)
     pointing_law.begin_law(context)
     kept, scale = "", context.policy.alpha_scale(before, config_id)
     if scale is not None and context.registration is not None:

@@ -248,6 +248,7 @@ class RealTimeComputer:
                 cm_id=self._active.manifest.id,
                 basis_id=self.identity.basis_id,
                 config_id=self.identity.config_id,
+                reference_id=self.identity.reference_id,
                 dither=self._activities.dither,
                 max_dither_m=MAX_DITHER_AMPLITUDE_M,
                 max_dither_modes=self._n_modes,

@@ -85,6 +85,7 @@ def frames_of(
         cm_id=batch.cm_id,
         basis_id=identity.basis_id,
         config_id=identity.config_id,
+        reference_id=identity.reference_id,
     )
     return header, np.hstack(columns)
 

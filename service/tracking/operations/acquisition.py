@@ -41,6 +41,7 @@ from service.records.operations import (
     Acquisition,
     AcquisitionStage,
     Dither,
+    DitherPurpose,
     Interruption,
     LoopFound,
     ProbationState,
@@ -56,7 +57,7 @@ from service.tracking.dither import (
     request_stop,
     stop_running_dither,
 )
-from service.tracking.dither_request import ACQUIRING_DITHER
+from service.tracking.dither_request import name_dither
 from service.tracking.operations.measurement import fail_noisy_measurement
 from service.tracking.operations.running import running_ramp
 from service.tracking.operator import set_loop
@@ -590,14 +591,19 @@ def wide_capture_dither(
     if reason is not None:
         return reason
     request = DitherRequest(
-        id=f"{ACQUIRING_DITHER}{now_ns}",
+        id=name_dither(DitherPurpose.ACQUIRE, now_ns),
         kind=DitherKind.SINE,
         modes=modes,
         amplitude_m=(min(policy.acquisition_amplitude_m, rtc.max_dither_m),) * len(modes),
         frequency_hz=lines[: len(modes)],
         duration_s=FAR_DITHER_DURATION_S,
     )
-    return Dither(request=request, asked_ns_utc=now_ns, window_s=FAR_WINDOW_S)
+    return Dither(
+        request=request,
+        purpose=DitherPurpose.ACQUIRE,
+        asked_ns_utc=now_ns,
+        window_s=FAR_WINDOW_S,
+    )
 
 
 def _wide_capture_modes(

@@ -12,7 +12,7 @@ import numpy as np
 from service.errors import CommandError
 from service.records import commands as cmd
 from service.records import events as ev
-from service.records.operations import MeasurementRecord, MeasureState
+from service.records.operations import DitherPurpose, MeasurementRecord, MeasureState
 from service.tracking.dither import request_dither, stop_running_dither
 from service.tracking.dither_request import DEFAULT_RANDOM_RMS_M, check_modes, cost_of, plan_random
 from service.tracking.operator import begin_closing
@@ -290,6 +290,7 @@ def measure_noisy(context: StepContext, command: cmd.MeasureNoisy) -> None:
         rtc,
         context.policy,
         context.now_ns,
+        purpose=DitherPurpose.NOISY,
         dither_id=command.id,
         modes=command.modes,
         total_m=total,
@@ -361,6 +362,7 @@ def _begin_noisy(context: StepContext, record: MeasurementRecord, rtc: Status) -
             rtc,
             context.policy,
             context.now_ns,
+            purpose=DitherPurpose.NOISY,
             dither_id=record.id,
             modes=record.modes,
             total_m=record.total_m,

@@ -14,7 +14,7 @@ from service.control.dither import compute_precision_ratio, update_mean_ratio
 from service.records import alarms
 from service.records import commands as cmd
 from service.records import events as ev
-from service.records.estimates import LockInEstimate, RandomEstimate
+from service.records.estimates import RandomEstimate
 from service.records.operations import Dither, DitherPhase, DitherPurpose, Precision
 from service.records.state import Level, TrackerState
 from service.tracking import dither_plan, dither_request, mode_proof
@@ -148,7 +148,13 @@ def on_answer(context: StepContext, request: DitherRequest, reply: Reply) -> Non
     context.fail(text)
 
 
-def on_stop_answer(context: StepContext, reply: Reply) -> None:
+def on_failure(context: StepContext, _: DitherRequest, __: str) -> None:
+    """Follow no dither that the RTC could not be asked for, and ask for none for a while."""
+    context.put_off(dither_s=5.0)
+    context.dither = None
+
+
+def on_stop_answer(context: StepContext, _: DitherStop, reply: Reply) -> None:
     """Put on record that the RTC goes on; it is asked again for as long as it must be."""
     if not reply.accepted:
         context.warn("job.failed", f"the RTC did not stop the dither: {reply.reason}")
@@ -210,9 +216,9 @@ def note_found(context: StepContext) -> None:
     context.clear_alarm(alarms.DITHER_LOST)
 
 
-def learn_precision(context: StepContext, estimate: LockInEstimate | RandomEstimate) -> None:
+def learn_precision(context: StepContext, event: ev.WindowFitted) -> None:
     """Take over from an accepted window what it says of the precision of windows."""
-    rtc, before = context.rtc, context.dither_policy.precision
+    estimate, rtc, before = event.estimate, context.rtc, context.dither_policy.precision
     accepted = context.windows.accepted > context.before.windows.accepted
     if isinstance(estimate, RandomEstimate) or not accepted or rtc is None:
         return

@@ -18,7 +18,6 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from importlib import import_module
 from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple, NoReturn, TypeVar
@@ -67,18 +66,21 @@ def _memory_limit_mb() -> float | None:
 def run_command(
     read: Callable[[], argparse.Namespace],
     check: Callable[[argparse.Namespace], None],
+    load: Callable[[argparse.Namespace], Callable[[argparse.Namespace], int]],
     *,
     own_process: bool,
     serves: bool,
 ) -> int:
-    """Return the exit status of a command; each command is a module with a ``main`` function.
+    """Return the exit status of a command.
 
     Parameters
     ----------
     read
-        Reads the command line; ``module`` of what it returns names the command's.
+        Reads the command line.
     check
         Refuses files of the wrong type before large modules are imported.
+    load
+        Imports the command's modules and returns what performs it.
     own_process
         True if this program may install signal handlers.
     serves
@@ -89,12 +91,11 @@ def run_command(
 
     def perform(options: argparse.Namespace) -> int:
         check(options)
-        command = import_module(options.module)
+        command = load(options)
         if own_process and not serves:
             signal.signal(signal.SIGINT, signal.default_int_handler)
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        status: int = command.main(options)
-        return status
+        return command(options)
 
     try:
         try:

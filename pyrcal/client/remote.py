@@ -8,17 +8,14 @@ verbatim.
 from __future__ import annotations
 
 import argparse
-import os
 import re
 import tomllib
 from collections.abc import Mapping
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from pyrcal.options import Words, add, words
 from service import errors
-from service.errors import ConfigurationError, say
 
 DONE, NOT_DONE, UNREACHABLE = 0, 1, 3
 """Exit statuses; 2 is that of a wrong command line."""
@@ -46,7 +43,7 @@ class Request(NamedTuple):
     name: str
     purpose: str
     module: str
-    """Module of this package whose ``run_command`` does the work."""
+    """Module of this package that does the work, as ``ask`` lists it."""
 
     call: str
     """Method and path of REST; words in braces are options."""
@@ -395,7 +392,7 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
             epilog=EPILOG,
             examples=[f"pyrcal {request.name} {request.example}".rstrip()],
         )
-        parser.set_defaults(request=request, module=__name__)
+        parser.set_defaults(request=request, module=f"{__package__}.ask")
         add(parser, *request.words)
         if request.module == "orders":
             order = parser.add_argument_group(ORDER)
@@ -419,39 +416,3 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
 
 def _sentence(purpose: str) -> str:
     return f"{purpose[:1].upper()}{purpose[1:]}."
-
-
-def main(options: argparse.Namespace) -> int:
-    """Ask, print, and return the exit status.
-
-    Raises
-    ------
-    ConfigurationError
-        If the address or the key is none.
-    """
-    # importing the HTTP client takes longer than printing help, so it is imported here
-    from pyrcal.client.rest import RefusedError, Service, UnreachableError
-
-    request: Request = options.request
-    service = Service(options.url or os.environ.get(URL) or USUAL_URL, _key(options.key_file))
-    try:
-        status: int = import_module(f"{__package__}.{request.module}").run_command(
-            service, request, options
-        )
-    except RefusedError as error:
-        say(f"pyrcal {request.name}: {error}")
-        return NOT_DONE
-    except UnreachableError as error:
-        say(f"pyrcal: {error}")
-        return UNREACHABLE
-    return status
-
-
-def _key(file: Path | None) -> str:
-    """Return the API key; empty if there is none."""
-    if file is None:
-        return os.environ.get(KEY, "").strip()
-    try:
-        return file.read_text(encoding="ascii").strip()
-    except (OSError, ValueError) as error:
-        raise ConfigurationError(f"--key-file {file}: {error}") from error

@@ -10,7 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.fitting.advice import Advice, Grounds, add_displaced, add_explanations, recommend_action
+from pyrcal.fitting.advice import (
+    Advice,
+    Grounds,
+    add_displaced,
+    add_explanations,
+    add_recommendation,
+)
 from pyrcal.fitting.alternatives import add_alternatives, find_alternatives, find_decentred_pupil
 from pyrcal.fitting.columns import (
     MAX_SMEAR,
@@ -280,7 +286,6 @@ def _note_mask(fit: Fit, instrument: Instrument) -> Fit:
     remarks = fit.remarks
     if difference not in instrument.remarks:
         remarks = (*remarks, difference)
-    advised = fit.recommendation
     # where the mirror is the stop, its shift moves the pupil: another stop may be the cause
     of_stop = (
         instrument.stop is Stop.MIRROR
@@ -291,7 +296,8 @@ def _note_mask(fit: Fit, instrument: Instrument) -> Fit:
     explained = any(one.preferred and one.key for one in fit.alternatives)
     if not (fit.accepted or of_stop or explained):
         advised = f"{Advice.DO_NOT_USE}: {difference}"
-    return replace(fit, remarks=remarks, recommendation=advised)
+        fit = replace(fit, recommendation=advised, corrections={})
+    return replace(fit, remarks=remarks)
 
 
 def _remove_smear(
@@ -712,7 +718,7 @@ def _make_fit(
         large_pokes=weakly_modulated and without is not None and without.is_undecided,
     )
     if not options.explain:
-        return replace(fit, recommendation=recommend_action(fit, grounds))
+        return add_recommendation(fit, grounds)
     causes = find_gain_causes(settled, passes=usable.passes, stroke_known=stroke_known)
     return add_explanations(fit, tried, replace(grounds, gains=tuple(causes)))
 

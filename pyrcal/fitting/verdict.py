@@ -73,6 +73,15 @@ half of the misfit of 1 %."""
 
 UNDECIDED_WORDS = "the matrix does not show which"
 
+ENTRIES = (
+    'stroke = "unknown"',
+    'modes_kind = "surface"',
+    "double_pass = true",
+    "double_pass = false",
+    "sign = -1",
+)
+"""Entries of the instrument file that a verdict, or a cause of its gains, advises."""
+
 _PASS_TOLERANCE = 0.12
 """Largest relative deviation from a factor of two, and scatter, that indicates a forgotten pass."""
 

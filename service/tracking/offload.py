@@ -112,11 +112,14 @@ def on_answer(context: StepContext, request: OffloadRequest, reply: Reply) -> No
     context.log("offload.moved", f"{offload.id}: α is expected {step_text(offload.step)} away")
 
 
-def on_failure(context: StepContext, name: str, text: str) -> None:
-    """Know no more whether the image has moved: no reply came."""
+def on_failure(context: StepContext, request: OffloadRequest, text: str) -> None:
+    """Note that nobody knows whether the image has moved: no reply came."""
     offload, limits = context.alpha.offload, context.policy.offloading
-    if offload is None or limits is None or offload.id != name:
-        return
+    if offload is not None and limits is not None and offload.id == request.id:
+        _note_failure(context, offload, limits, text)
+
+
+def _note_failure(context: StepContext, offload: Offload, limits: Offloading, text: str) -> None:
     still_ns = max(end_of(context.state, MOVING), _clock_ns(context, limits.settle_s))
     failed = replace(offload, state=OffloadState.FAILED, text=text)
     _expect(context, failed, limits, still_ns)
@@ -144,11 +147,12 @@ def restore_offload(context: StepContext, offload: Offload) -> None:
 
     A service that asks for no moves forgets it: somebody may bring the device elsewhere meanwhile.
     """
-    if context.policy.offloading is None:
+    limits = context.policy.offloading
+    if limits is None:
         return
     context.alpha = replace(context.alpha, offload=offload)
     if offload.state is OffloadState.ASKED:
-        on_failure(context, offload.id, "the service ended before the reply came")
+        _note_failure(context, offload, limits, "the service ended before the reply came")
 
 
 def _may_move(

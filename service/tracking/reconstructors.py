@@ -231,11 +231,6 @@ def request_applied(context: StepContext, rtc: Status) -> None:
     context.ask(ev.FetchMatrix(id=rtc.cm_id))
 
 
-def note_not_fetched(context: StepContext, why: str) -> None:
-    """Note why the matrix in use is not to be had."""
-    context.matrices = replace(context.matrices, read_back_error=why)
-
-
 def request_matrix(context: StepContext, effect: ev.MakeMatrix | ev.RepublishMatrix) -> None:
     """Have a reconstructor computed, or copied."""
     context.matrices = replace(context.matrices, making_since_ns_utc=context.now_ns)
@@ -245,6 +240,28 @@ def request_matrix(context: StepContext, effect: ev.MakeMatrix | ev.RepublishMat
 def note_none_made(context: StepContext) -> None:
     """Note that no reconstructor is being computed."""
     context.matrices = replace(context.matrices, making_since_ns_utc=None)
+
+
+def on_judging_failed(context: StepContext, _: ev.Effect, __: str) -> None:
+    """Make and judge nothing for a while."""
+    # Without a pause a worker that fails at once would be asked in every step.
+    context.put_off(make_s=5.0)
+
+
+def on_making_failed(context: StepContext, effect: ev.Effect, text: str) -> None:
+    """Note that no reconstructor comes, and make none for a while."""
+    note_none_made(context)
+    on_judging_failed(context, effect, text)
+
+
+def on_send_failed(context: StepContext, effect: ev.SendMatrix, text: str) -> None:
+    """Note that a reconstructor has not reached the RTC."""
+    change_state(context, effect.id, MatrixState.FAILED, text)
+
+
+def on_fetch_failed(context: StepContext, _: ev.FetchMatrix, text: str) -> None:
+    """Note why the RTC's matrix is not known."""
+    context.matrices = replace(context.matrices, read_back_error=text)
 
 
 def request_verdict(context: StepContext, matrix_id: str) -> None:
@@ -452,7 +469,7 @@ def on_fetched(context: StepContext, fetched: ev.MatrixFetched) -> None:
     Ids are not sufficient: a restarted RTC may order its slopes differently, and use a different
     matrix under a known id.
     """
-    note_not_fetched(context, "")
+    context.matrices = replace(context.matrices, read_back_error="")
     record = fetched.record
     before = context.state.reconstructor(record.id)
     if before is not None and before.sha256 not in {"", record.sha256}:

@@ -356,39 +356,32 @@ def note_limit(
         )
 
 
-def note_declined(context: StepContext, *, rejected: bool) -> None:
-    """Note that a reconstructor which had passed the gate was declined before it came into use.
-
-    If it has more modes than are controlled, that is what it was made for: no more are tried for a
-    while, longer each time. An acquisition counts its own failures. ``rejected``: an operator has
-    done so now.
-    """
-    before, records = context.before, context.matrices.reconstructors
-    if records is before.matrices.reconstructors or context.acquisition.under_way:
+def note_declined(context: StepContext) -> None:
+    """Note that a reconstructor which had passed the gate was declined by the gate or the RTC."""
+    before, records = context.before.matrices.reconstructors, context.matrices.reconstructors
+    if records is before:
         return
-    rtc = context.rtc or before.loop.rtc
-    if rtc is None or rtc.n_controlled == 0:
-        return
-    earlier = {record.id: record.state for record in before.matrices.reconstructors}
+    earlier = {record.id: record.state for record in before}
     for record in records:
-        wait_s = _wait_after(record, earlier.get(record.id), rejected=rejected)
-        if wait_s is not None and record.n_modes > rtc.n_controlled:
-            reason = f"{record.id} was {record.state}: {record.reason}"
-            limit_modes(context, rtc.n_controlled, reason, wait_s)
+        changed = earlier.get(record.id, record.state) is not record.state
+        if changed and record.state in _DECLINED_STATES:
+            limit_after_declined(context, record, FIRST_MODES_DELAY_S)
 
 
-def _wait_after(
-    record: ReconstructorRecord, earlier: MatrixState | None, *, rejected: bool
-) -> float | None:
-    """Return for how long more modes are not tried after what became of one; None: no matter."""
-    if earlier is None or earlier is record.state:
-        return None
-    if record.state in _DECLINED_STATES:
-        return FIRST_MODES_DELAY_S
-    # A proposal that another one has replaced is discarded, too, and says nothing of its modes.
-    if record.state is MatrixState.DISCARDED and rejected:
-        return DECLINED_MODES_DELAY_S
-    return None
+def limit_after_declined(
+    context: StepContext, record: ReconstructorRecord, first_wait_s: float
+) -> None:
+    """Try no more modes for a while, longer each time, after a reconstructor was declined.
+
+    If it has more modes than are controlled, that is what it was made for. An acquisition counts
+    its own failures.
+    """
+    rtc = context.rtc or context.before.loop.rtc
+    if rtc is None or context.acquisition.under_way:
+        return
+    if 0 < rtc.n_controlled < record.n_modes:
+        reason = f"{record.id} was {record.state}: {record.reason}"
+        limit_modes(context, rtc.n_controlled, reason, first_wait_s)
 
 
 def limit_modes(

@@ -43,6 +43,7 @@ from service.tracking.dither_plan import check_dither_allowed
 from service.tracking.filtering import FilterUpdate, WindowEstimate
 from service.tracking.jumps import Innovation
 from service.tracking.operations.acquisition import count_miss
+from service.tracking.operations.measurement import MEASURING
 from service.tracking.operations.running import running_ramp
 from service.tracking.policy import SECOND_NS
 from service.tracking.step_context import StepContext, same_but_for_numbers
@@ -65,7 +66,12 @@ HARMLESS_REFUSALS = (RefusalKind.CUT_SHORT, RefusalKind.VOID)
 
 def on_window(context: StepContext, event: ev.WindowFitted) -> None:
     """Fold one window's estimate into the registration, or refuse it with its reason."""
-    estimate = event.estimate
+    if context.state.measuring is not None:
+        reject_window(context, MEASURING)
+        return
+    estimate = validity.at_present(
+        context.state, event.estimate, event.began_ns_utc, event.estimate.t_ns_utc
+    )
     # A window whose beginning is not known counts as short.
     began_ns = event.began_ns_utc or estimate.t_ns_utc
     why = filtering.check_window(context, estimate, began_ns)
@@ -339,7 +345,10 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
         text = f"the passive estimate was not used: {reason}"
         context.alpha = replace(context.alpha, passive_unavailable_reason=text)
         return
-    registration, estimate = context.registration, event.estimate
+    estimate = validity.at_present(
+        context.state, event.estimate, event.began_ns_utc, event.t_ns_utc
+    )
+    registration, event = context.registration, replace(event, estimate=estimate)
     if registration is None:
         _show_passive_alone(context, event)
         return

@@ -51,7 +51,7 @@ class Done(Generic[R]):
 
 def start_worker(instrument: Instrument, compute: Compute, early: Worker | None = None) -> Worker:
     """Return a nice'd worker process; nothing runs before the first job but what began early."""
-    return (early or Worker()).begun(functools.partial(_enter, instrument, compute))
+    return (early or Worker(__name__)).begun(functools.partial(_enter, instrument, compute))
 
 
 def run_job(

@@ -45,6 +45,7 @@ from service.files.disk_cache import DiskCache
 from service.model.instrument import Instrument
 from service.model.interaction import Linearisation, RtcInteractionModel
 from service.model.misregistration import Misregistration
+from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import WorkingPoint
 from service.model.slopes import SlopeRecipe
 from service.records.estimates import (
@@ -81,16 +82,9 @@ left the minimum: the fit has failed."""
 MAX_REFINEMENTS = 4
 """Linearisations of the fine model about the estimate of the last, until one settles."""
 
-FAR_SAMPLING = 1
-"""The same of the model that leads from afar: biased by some per cent of a subaperture."""
-
 NOMINAL_RESPONSE_TOLERANCE = 0.15
 """Relative difference of a mode's response from the model's below which it counts as equal: noise
 and the model's own error are of this size."""
-
-COARSE_SAMPLING = 2
-"""Pupil points per subaperture and nodes of the coarse model: biased by 0.05 % of a subaperture,
-four times as fast."""
 
 MAX_FIT_DISTANCE = np.array([1.5, 1.5, np.deg2rad(6.0), 0.05])
 """An estimate further than this from its start has diverged (numeric units)."""
@@ -144,7 +138,12 @@ class OpticsWorker:
             sampling * instrument.binning,
         )
         self._model = self._sensor.flat
-        self._coarse = model(COARSE_SAMPLING, COARSE_SAMPLING, None)
+        kind = kind_of(instrument)
+        # Biased by 0.05 % of a subaperture, and four times as fast; the model that leads from afar
+        # by some per cent.
+        coarse = kind.derivative_sampling(instrument.wfs)
+        self._samplings = (kind.coarsest_sampling(instrument.wfs), coarse)
+        self._coarse = model(coarse, coarse, None)
         self._start = instrument.with_anamorphosis(instrument.start)
         self._wide_capture: dict[tuple[int, ...], tuple[RtcInteractionModel, ...]] = {}
 
@@ -379,7 +378,7 @@ class OpticsWorker:
                     mapper=self.rows.map,
                     mode_response=None if every is None else every[list(modes)],
                 )
-                for sampling in (FAR_SAMPLING, COARSE_SAMPLING)
+                for sampling in self._samplings
             )
         far, near = self._wide_capture[modes]
         instrument, nominal = self._model.instrument, nominal or self._start

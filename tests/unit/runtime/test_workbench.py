@@ -503,6 +503,18 @@ def test_a_matrix_that_answers_as_drawn_changes_nothing(plain_bench):
     np.testing.assert_array_equal(plain_bench.response(ALPHA), before)
 
 
+def test_a_wide_modulation_on_few_subapertures_takes_nothing_over_from_an_exact_matrix():
+    """With two pupil points per subaperture 7 lambda/D alias: responses were wrong by up to 2.7."""
+    small = small_instrument()
+    wfs = replace(small.wfs, n_subapertures=10, modulation_lambda_over_d=7.0)
+    wide = OpticsWorker(replace(small, wfs=wfs), COMPUTE)
+    found, response = wide.recognise(own(wide, 1.0), None, None)
+    assert response is None
+    assert found.known.all()
+    assert found.typical_misfit < 0.05
+    np.testing.assert_allclose(found.alpha.vector, [0.0, 0.0, 0.0, 1.0], atol=2e-3)
+
+
 def test_nothing_is_taken_over_from_a_matrix_of_other_modes(plain_bench):
     turned = np.where(np.arange(N_CONTROLLED) == 10, -0.5, 0.5)
     found, response = plain_bench.recognise(own(plain_bench, turned), None, None)

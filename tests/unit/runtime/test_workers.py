@@ -121,7 +121,7 @@ async def test_an_interrupt_from_the_keyboard_is_the_services_business(shared):
 
 
 async def test_a_worker_that_began_early_is_the_first_one_and_as_polite():
-    worker = Worker().begin()
+    worker = Worker("service.runtime.worker").begin()
     early = worker.pid
     start_worker(small_instrument(), type(COMPUTE)(threads=1, nice=5), worker)
     assert early is not None

@@ -24,6 +24,7 @@ from service import wire
 from service.records import alarms
 from service.records import commands as cmd
 from service.records import events as ev
+from service.records.alarms import Interlock
 from service.records.commands import Command
 from service.records.events import Effect, Event
 from service.records.operations import MeasureState
@@ -47,6 +48,7 @@ from service.tracking import (
 )
 from service.tracking.alarm_rules import derive_alarms
 from service.tracking.operations import acquisition, measurement, probation
+from service.tracking.operations.running import running_ramp
 from service.tracking.policy import Policy
 from service.tracking.step_context import StepContext
 
@@ -88,7 +90,7 @@ def step(
     for react in REACTIONS[type(event)]:
         react(context, event)
     for decider in DECIDERS:
-        if all(guard(context.state) for guard in decider.guards):
+        if all(guard(context) for guard in decider.guards):
             decider.decide(context)
     alarm_records.update_records(context, ordered=isinstance(event, Command))
     return context.state, tuple(context.effects)
@@ -248,44 +250,48 @@ FAILURES: Final[Reactions] = {
 """Functions of context, effect and text for each kind of effect, or request, that has failed."""
 
 
-def not_measuring(state: TrackerState) -> bool:
+def not_measuring(context: StepContext) -> bool:
     """Return True unless the RTC measures a matrix, with an open loop that nobody may disturb."""
-    return state.measuring is None
+    return context.state.measuring is None
 
 
-def stopped(state: TrackerState) -> bool:
-    """Return True after an order to stop everything: nothing is sent or played until it ends."""
-    return bool(state.operator.stopped_because)
+def not_stopped(context: StepContext) -> bool:
+    """Return True unless everything is stopped: then nothing is sent or played."""
+    return not context.operator.stopped_because
 
 
-def not_stopped(state: TrackerState) -> bool:
-    """Return True unless everything is stopped."""
-    return not stopped(state)
-
-
-def not_acquiring(state: TrackerState) -> bool:
+def not_acquiring(context: StepContext) -> bool:
     """Return True unless an acquisition is under way: updates follow α, which it determines."""
-    return not state.operations.acquisition.under_way
+    return not context.acquisition.under_way
 
 
-def no_noisy_matrix_waits(state: TrackerState) -> bool:
+def no_noisy_matrix_waits(context: StepContext) -> bool:
     """Return True unless a noisy matrix waits for a dither to end: until then none begins."""
-    noisy = state.noisy_measurement
+    noisy = context.state.noisy_measurement
     return noisy is None or noisy.state is not MeasureState.WAITING
 
 
-Guard = Callable[[TrackerState], bool]
+def may_ask(context: StepContext) -> bool:
+    """Return True if an RTC is there, and no alarm forbids to ask anything of it."""
+    return context.rtc is not None and context.blocking_alarm(Interlock.ASK) is None
+
+
+def may_decide(context: StepContext) -> bool:
+    """Return True unless a gain ramp changes the loop, or an alarm forbids to decide."""
+    ramp = running_ramp(context.state, context.now_ns)
+    return ramp is None and context.blocking_alarm(Interlock.DECIDE) is None
 
 
 class Decider(NamedTuple):
     """A decision that is made after every event, where all guards hold."""
 
     name: str
-    guards: tuple[Guard, ...]
+    guards: tuple[Callable[[StepContext], bool], ...]
     decide: Callable[[StepContext], None]
 
 
 _FREE: Final = (not_measuring, not_stopped, not_acquiring)
+_READY: Final = (*_FREE, no_noisy_matrix_waits, may_ask, may_decide)
 
 DECIDERS: Final = (
     Decider("a restored α", (), resume.drop_unconfirmed),
@@ -295,15 +301,21 @@ DECIDERS: Final = (
     Decider("declined modes", (), update_policy.note_declined),
     # Before all that an alarm forbids: a reaction may have raised one.
     Decider("alarms", (), derive_alarms),
-    Decider("the RTC's matrix", (not_measuring,), updates.fetch_in_use),
-    Decider("everything stopped", (not_measuring, stopped), resume.keep_stopped),
+    Decider("the RTC's matrix", (not_measuring, may_ask), updates.fetch_in_use),
     Decider("the acquisition", (not_measuring, not_stopped), acquisition.advance),
     Decider("a noisy matrix", _FREE, measurement.advance_noisy),
-    Decider("updates", (*_FREE, no_noisy_matrix_waits), updates.decide_updates),
-    Decider("the offload", (*_FREE, no_noisy_matrix_waits), offload.request_offload),
+    # Also while everything is stopped, and before another dither is chosen.
+    Decider(
+        "unwanted dithers",
+        (not_measuring, not_acquiring, no_noisy_matrix_waits, may_ask),
+        dither.stop_unwanted,
+    ),
+    Decider("the dither", _READY, dither.choose_dither),
+    Decider("reconstructors", _READY, updates.decide_updates),
+    Decider("the offload", _READY, offload.request_offload),
     Decider("alarms of what was decided", (), derive_alarms),
 )
 """Decisions in the order in which they are made.
 
-None of them knows the event. Guards ask about the state as the deciders before have left it.
+None of them knows the event. Guards see the state as the deciders before have left it.
 """

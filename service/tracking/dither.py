@@ -20,7 +20,7 @@ from service.records.state import Level, TrackerState
 from service.tracking import dither_plan, dither_request, mode_proof
 from service.tracking.dither_plan import WantedDither
 from service.tracking.policy import SECOND_NS
-from service.tracking.step_context import StepContext
+from service.tracking.step_context import StepContext, present
 from service.wire import DitherRequest, DitherStatus, DitherStop, Reply, Status
 
 MAX_MEASURED_AMPLITUDE_RATIO = 1.1
@@ -53,11 +53,10 @@ _STATUS_DELAY_S = 2.0
 """Time for a status made before the dither began to arrive, if it has no frame number."""
 
 
-def choose_dither(context: StepContext, rtc: Status) -> None:
+def choose_dither(context: StepContext) -> None:
     """Dither as much and as often as the policy asks while the loop is closed, its matrix known."""
+    rtc, dither = present(context.rtc), context.dither
     _update_cost(context, rtc)
-    stop_unwanted(context, rtc)
-    dither = context.dither
     if dither is not None and not dither_request.is_automatic_sine(dither.request, dither.purpose):
         _set_phase(context, DitherPhase.OPERATOR, f"{dither.id} runs")
         return
@@ -274,8 +273,9 @@ def stop_unanswered(context: StepContext, text: str) -> None:
         stop_running_dither(context)
 
 
-def stop_unwanted(context: StepContext, rtc: Status) -> None:
+def stop_unwanted(context: StepContext) -> None:
     """Ask the RTC, again and again, to stop what it should not play."""
+    rtc = present(context.rtc)
     running, loud = rtc.dither_id, dither_plan.check_dither_strength(context, rtc)
     why = loud or dither_plan.check_dither_wanted(context, rtc)
     if running is None or why is None:

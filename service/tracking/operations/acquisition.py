@@ -56,6 +56,7 @@ from service.tracking.dither import (
     request_dither,
     request_stop,
     stop_running_dither,
+    stop_unwanted,
 )
 from service.tracking.dither_request import name_dither
 from service.tracking.operations.measurement import fail_noisy_measurement
@@ -443,7 +444,8 @@ def _widen(context: StepContext, rtc: Status, record: ReconstructorRecord | None
         if seen >= MIN_FINAL_WINDOWS:
             _finish(context, record)
             return
-    choose_dither(context, rtc)
+    stop_unwanted(context)
+    choose_dither(context)
 
 
 def _make(context: StepContext, n_modes: int, rtc: Status, *, at_least: int = 0) -> None:

@@ -131,14 +131,6 @@ def _on_made(context: StepContext, made: ev.MatrixMade) -> None:
         reconstructors.on_matrix(context, made)
 
 
-def _on_dither_measured(context: StepContext, event: ev.DitherMeasured) -> None:
-    """Stop a dither measured stronger than requested."""
-    reason = dither.check_measured_dither(context, event)
-    if reason is not None:
-        measurement.fail_noisy_measurement(context, f"its dither was too strong: {event.text}")
-        dither.stop_too_strong(context, event.id, reason)
-
-
 def _on_unusable(context: StepContext, event: ev.DitherUnusable) -> None:
     """Log that no windows can be cut from this dither."""
     context.warn("dither.unusable", event.text)
@@ -183,7 +175,11 @@ REACTIONS: Final[Reactions] = {
     ev.Answered: (_on_answer,),
     ev.DitherSilent: (dither.on_silence,),
     ev.DitherUnusable: (_on_unusable, acquisition.on_dither_unusable),
-    ev.DitherMeasured: (_on_dither_measured, acquisition.on_dither_measured),
+    ev.DitherMeasured: (
+        dither.on_measured,
+        acquisition.on_dither_measured,
+        measurement.on_dither_measured,
+    ),
     ev.Compared: (probation.on_compared,),
     ev.LoopHeld: (rtc.on_loop_held,),
     ev.MatrixMisapplied: (reconstructors.on_misapplied,),

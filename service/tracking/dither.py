@@ -233,31 +233,27 @@ def learn_precision(context: StepContext, event: ev.WindowFitted) -> None:
         context.dither_policy = replace(context.dither_policy, precision=precision)
 
 
-def check_measured_dither(context: StepContext, event: ev.DitherMeasured) -> str | None:
-    """Report a dither that differs from the request; return the reason why it must be stopped.
+def on_measured(context: StepContext, event: ev.DitherMeasured) -> None:
+    """Report a dither that differs from the request; stop one that is too strong.
 
     The commands in the frames are what the mirror does, whatever the RTC's status says.
     """
     rtc, dither = context.rtc, context.dither
     if not event.text:
         context.dither_policy = replace(context.dither_policy, loud_text="", amiss_id=None)
-        return None
+        return
     if rtc is None or dither is None or dither.id != event.id:
-        return None
+        return
     context.dither_policy = replace(context.dither_policy, amiss_id=event.id, amiss_m=event.found_m)
     most_m = dither_plan.budget_m(rtc, context.policy)
     # An operator may have allowed more than the budget.
-    if event.found_m > MAX_MEASURED_AMPLITUDE_RATIO * max(event.asked_m, most_m):
-        return f"{event.text}; the budget is {1e9 * most_m:.3g} nm"
-    context.raise_alarm(alarms.NOT_AS_ASKED, f"{event.text}; check the RTC's dither")
-    return None
-
-
-def stop_too_strong(context: StepContext, dither_id: str, loud: str) -> None:
-    """Stop a dither that the frames show to be too strong."""
-    _note_unwanted(context, dither_id)
-    context.dither_policy = replace(context.dither_policy, loud_id=dither_id, loud_text=loud)
-    _raise_over_budget(context, dither_id, loud)
+    if event.found_m <= MAX_MEASURED_AMPLITUDE_RATIO * max(event.asked_m, most_m):
+        context.raise_alarm(alarms.NOT_AS_ASKED, f"{event.text}; check the RTC's dither")
+        return
+    loud = f"{event.text}; the budget is {1e9 * most_m:.3g} nm"
+    _note_unwanted(context, event.id)
+    context.dither_policy = replace(context.dither_policy, loud_id=event.id, loud_text=loud)
+    _raise_over_budget(context, event.id, loud)
     stop_unfollowed(context)
 
 

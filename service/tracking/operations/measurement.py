@@ -184,6 +184,12 @@ def on_dither_answer(context: StepContext, request: DitherRequest, reply: Reply)
         on_dither_failed(context, request, f"the RTC refused the dither: {reply.reason}")
 
 
+def on_dither_measured(context: StepContext, event: ev.DitherMeasured) -> None:
+    """Give up a noisy matrix whose dither was too strong."""
+    if event.text and event.id == context.dither_policy.loud_id:
+        fail_noisy_measurement(context, f"its dither was too strong: {event.text}")
+
+
 def on_dither_failed(context: StepContext, request: DitherRequest, text: str) -> None:
     """Give up a noisy matrix whose dither does not begin."""
     record = context.state.noisy_measurement

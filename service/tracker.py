@@ -41,7 +41,6 @@ from service.tracking import (
     reconstructors,
     resume,
     rtc,
-    update_policy,
     updates,
     validity,
     window_processing,
@@ -294,7 +293,6 @@ DECIDERS: Final = (
     Decider("the pointing law", (), pointing_law.follow_law),
     Decider("windows in a row", (), window_processing.reset_run),
     Decider("the probation", (), probation.advance),
-    Decider("declined modes", (), update_policy.note_declined),
     # Before all that an alarm forbids: a reaction may have raised one.
     Decider("alarms", (), derive_alarms),
     Decider("the RTC's matrix", (not_measuring, may_ask), updates.fetch_in_use),

@@ -167,7 +167,8 @@ def replace_record(context: StepContext, record: ReconstructorRecord) -> bool:
     context.matrices = replace(context.matrices, reconstructors=records)
     if record not in records:
         return False
-    if before is not None and before.state is not record.state in _DECLINED:
+    changed = before is not None and before.state is not record.state
+    if changed and record.state in _DECLINED:
         update_policy.limit_declined(context, record)
     return True
 

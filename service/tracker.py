@@ -8,11 +8,10 @@ Three tables say what the service does:
 :data:`REACTIONS`
     What each event and command changes. Only these functions are given the event.
 :data:`DECIDERS`
-    What is decided after every event, whatever it was, from all that is known by then. A lost
-    event therefore delays a decision and prevents none.
+    What is decided after every event, whatever it was, from all that is known by then.
 :data:`service.tracking.alarm_rules.RULES`
     Which alarms follow from what is known. ``derive_alarms`` applies them before the reactions, and
-    where it is among the deciders. They are beside the functions that find their texts.
+    where it is among the deciders. The table is next to the functions that it names.
 """
 
 from __future__ import annotations
@@ -174,11 +173,7 @@ REACTIONS: Final[Reactions] = {
     ev.Answered: (_on_answer,),
     ev.DitherSilent: (dither.on_silence,),
     ev.DitherUnusable: (_on_unusable, acquisition.on_dither_unusable),
-    ev.DitherMeasured: (
-        dither.on_measured,
-        acquisition.on_dither_measured,
-        measurement.on_dither_measured,
-    ),
+    ev.DitherMeasured: (dither.on_measured, acquisition.on_too_strong, measurement.on_too_strong),
     ev.Compared: (probation.on_compared,),
     ev.LoopHeld: (rtc.on_loop_held,),
     ev.MatrixMisapplied: (reconstructors.on_misapplied,),
@@ -194,11 +189,7 @@ REACTIONS: Final[Reactions] = {
     cmd.Acquire: (acquisition.acquire_on_command,),
     cmd.AbortAcquisition: (acquisition.abort_on_command,),
     cmd.StartDither: (operator.start_dither,),
-    cmd.StopDither: (
-        dither.stop_by_operator,
-        acquisition.on_dither_stopped,
-        measurement.on_dither_stopped,
-    ),
+    cmd.StopDither: (dither.on_stop, acquisition.on_dither_stop, measurement.on_dither_stop),
     cmd.Measure: (measurement.measure,),
     cmd.GiveUp: (measurement.give_up_on_command,),
     cmd.MeasureNoisy: (measurement.measure_noisy,),

@@ -114,7 +114,7 @@ def allow_dither(context: StepContext, *, allowed: bool = True) -> None:
     context.dithers = replace(context.dithers, stopped=not allowed)
 
 
-def stop_by_operator(context: StepContext, _: cmd.StopDither) -> None:
+def on_stop(context: StepContext, _: cmd.StopDither) -> None:
     """Stop the dither until it is ordered again."""
     forget_dither(context)
     allow_dither(context, allowed=False)

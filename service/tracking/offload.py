@@ -161,14 +161,12 @@ def _may_move(
     state, last = context.state, context.alpha.offload
     if state.operator.mode is not Mode.AUTO or state.on_probation or not rtc.in_loop:
         return False
-    if context.blocking_alarm(Interlock.SEND_NEW) is not None:
+    if context.blocking_alarm(Interlock.SEND_NEW) or state.noisy_measurement is not None:
         return False
     sure = is_settled(registration) and registration.validity.level is Validity.FRESH
     if not sure or np.any(np.sqrt(np.diag(registration.covariance)) > limits.near):
         return False
     if state.matrices.making_since_ns_utc is not None or state.sent is not None:
-        return False
-    if state.noisy_measurement is not None:
         return False
     if last is None:
         return True

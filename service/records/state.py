@@ -313,6 +313,14 @@ class LoopState:
     """Number of modes that the RTC has accepted to control and no status has shown yet; None if
     there is none."""
 
+    reference_id: str | None = None
+    """Name of the reference slopes: the RTC's ``reference_id``, or its ``config_id`` if it sends
+    none; None before the first status."""
+
+    reference_since_ns_utc: int | None = None
+    """Time since which the RTC uses them; None if it has not changed them since the service began.
+    """
+
     vibrations_hz: tuple[float, ...] = ()
     """Vibration lines in the slopes, lowest first."""
 

@@ -177,6 +177,7 @@ class Actions:
         record = replace(
             record,
             config_id=state.loop.config_id,
+            reference_id=state.loop.reference_id,
             state=products.MatrixState.PROPOSED if accepted else products.MatrixState.REFUSED,
             condition_number=made.condition_number,
             gate=made.gate,

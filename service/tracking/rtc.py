@@ -21,7 +21,8 @@ from service.tracking import (
 from service.tracking.operator import end_ramp
 from service.tracking.policy import SECOND_NS
 from service.tracking.step_context import StepContext, log_bursts
-from service.wire import DitherRequest, DitherStop, Status
+from service.wire import Command as Request
+from service.wire import LoopRequest, Reply, Status
 
 ACKNOWLEDGEMENT_TIMEOUT_S = 3.0
 """An RTC applies within 2 s of the commit, or it has failed."""
@@ -32,7 +33,7 @@ COMPUTATION_TIMEOUT_S = 60.0
 """A reconstructor that takes longer was lost with its worker."""
 
 
-def on_tick(context: StepContext) -> None:
+def give_up_overdue(context: StepContext) -> None:
     """Give up what has been waited for too long."""
     for record in context.matrices.reconstructors:
         # Without a time of publication nothing is overdue.
@@ -76,6 +77,7 @@ def on_status(context: StepContext, rtc: Status) -> None:
         basis_id=context.loop.basis_id or rtc.basis_id,
         config_id=context.loop.config_id or rtc.config_id,
     )
+    _note_references(context, rtc)
     validity.note_pointing(context, rtc.pointing)
     _drop_other_basis(context)
     mode_proof.believe_restored(context, rtc)
@@ -102,6 +104,17 @@ def on_loop_held(context: StepContext, event: ev.LoopHeld) -> None:
 def on_modes_commanded(context: StepContext, event: ev.ModesCommanded) -> None:
     """Store the number of modes until a status shows it: the status lags behind the answer."""
     context.loop = replace(context.loop, commanded_modes=event.n_modes)
+
+
+def on_loop_answer(context: StepContext, request: LoopRequest, reply: Reply) -> None:
+    """Store the number of modes that an order has set."""
+    if reply.accepted and request.n_controlled is not None:
+        context.loop = replace(context.loop, commanded_modes=request.n_controlled)
+
+
+def on_modes_unknown(context: StepContext, _: Effect | Request, __: str) -> None:
+    """Believe the next status: what failed may have been accepted."""
+    context.loop = replace(context.loop, commanded_modes=None)
 
 
 def on_model_changed(context: StepContext, event: ev.ModelChanged) -> None:
@@ -131,6 +144,18 @@ def _log_partial_loop(context: StepContext, before: Status | None, rtc: Status) 
         context.log("loop.partial", text)
 
 
+def _note_references(context: StepContext, rtc: Status) -> None:
+    """Record new reference slopes; they end windows under way, and α and matrices stay."""
+    before, name = context.loop.reference_id, rtc.reference_name
+    if name == before:
+        return
+    context.loop = replace(context.loop, reference_id=name)
+    if before is not None:
+        context.loop = replace(context.loop, reference_since_ns_utc=context.now_ns)
+        text = f"the RTC subtracts the reference slopes {name}, they were {before}"
+        context.log("references.changed", text)
+
+
 def _drop_other_basis(context: StepContext) -> None:
     """Drop an α that was restored from a night with another basis or configuration."""
     registration, loop = context.registration, context.loop
@@ -151,7 +176,8 @@ def _enter_sensor_mode(context: StepContext, config_id: str) -> None:
     _begin_anew(context, "the sensor was in another mode")
     reconstructors.discard_proposals(context, f"the sensor's mode is {config_id} now")
     update_policy.forget_limit(context)
-    context.loop = replace(context.loop, config_id=config_id)
+    # An RTC that does not name its references is named by its mode: that says nothing of them.
+    context.loop = replace(context.loop, config_id=config_id, reference_id=None)
     # Order and signs of the slopes are those of every mode; all else is measured again.
     slopes, context.model = context.model.slopes, ModelState()
     context.model = replace(context.model, sensor_mode=config_id, slopes=slopes)
@@ -228,29 +254,12 @@ def on_services(context: StepContext, event: ev.ServicesMet) -> None:
     validity.end_alarm(context, alarms.STANDING_BY)
 
 
-def on_failure(context: StepContext, effect: Effect, text: str) -> None:
-    """Undo the memory of having asked, so that it can be asked again later."""
-    match effect:
-        # Without a pause a worker that fails at once would be asked in every step.
-        case ev.MakeMatrix() | ev.RepublishMatrix():
-            context.put_off(make_s=5.0)
-            reconstructors.note_none_made(context)
-            context.fail(text)
-        case ev.Ask(request=DitherRequest()):
-            context.put_off(dither_s=5.0)
-            dither.forget_dither(context)
-            context.fail(text)
-        case ev.JudgeProposal():
-            context.put_off(make_s=5.0)
-            context.fail(text)
-        case ev.Ask(request=DitherStop()):
-            pass  # it is asked again while it must be; nothing else has to wait for that
-        case ev.FetchMatrix():
-            reconstructors.note_not_fetched(context, text)
-        case ev.SendMatrix(id=matrix_id):
-            # It may have failed after its command was accepted.
-            context.loop = replace(context.loop, commanded_modes=None)
-            reconstructors.change_state(context, matrix_id, MatrixState.FAILED, text)
-        case _:
-            context.put_off(make_s=5.0)
+def fail_order(context: StepContext, effect: Effect | Request, text: str) -> None:
+    """Log the failure, and note it under the id of the order that led to it."""
+    context.fail(text)
+    log_failure(context, effect, text)
+
+
+def log_failure(context: StepContext, _: Effect | Request, text: str) -> None:
+    """Log the failure; what is still needed is asked for again."""
     context.warn("job.failed", text)

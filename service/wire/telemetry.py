@@ -79,6 +79,11 @@ class FrameHeader:
         """Number of floats in a row: slopes, commands and, if present, dither."""
         return self.n_slopes + self.n_modes * (2 if self.dither else 1)
 
+    @property
+    def reference_name(self) -> str:
+        """Name of the reference slopes; an RTC of version 1 may have only ``config_id`` for it."""
+        return self.reference_id or self.config_id
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrameBatch:
@@ -297,6 +302,11 @@ class Status(ControlLaw):
 
     reference_id: codec.Opaque | None = None
     """Reference slopes in use; nil or absent: the RTC does not name them."""
+
+    @property
+    def reference_name(self) -> str:
+        """Name of the reference slopes, as :attr:`FrameHeader.reference_name`."""
+        return self.reference_id or self.config_id
 
     @property
     def dither_id(self) -> str | None:

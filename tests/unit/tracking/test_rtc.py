@@ -70,6 +70,32 @@ def test_the_first_of_two_services_drives_on_and_says_so(story):
     assert story.tell(cmd.StopDither()) == (stopping(story),)
 
 
+def test_new_references_are_recorded_and_change_nothing_else(story):
+    story.tell(rtc(reference_id="ncpa-1"))
+    before = story.state
+    story.wait(15.0)
+    story.effects.clear()
+    story.tell(rtc(reference_id="ncpa-2"))
+    loop = story.state.loop
+    assert (loop.reference_id, loop.reference_since_ns_utc) == ("ncpa-2", story.now_ns)
+    assert "references.changed" in story.logged
+    assert story.state.matrices == before.matrices
+    assert story.state.alpha.registration.alpha == before.alpha.registration.alpha
+    assert not story.alarms
+    story.wait(1.0)
+    story.tell(rtc(reference_id="ncpa-2"))
+    assert story.state.loop.reference_since_ns_utc == loop.reference_since_ns_utc
+
+
+def test_the_first_references_are_no_change_and_those_of_a_new_session_may_be():
+    story = Story(Mode.HOLD).meet()
+    assert story.state.loop.reference_id == "pyramid-30"
+    assert story.state.loop.reference_since_ns_utc is None
+    story.tell(ev.SessionStarted(session="s2"))
+    story.tell(rtc(session="s2", reference_id="ncpa-1"))
+    assert story.state.loop.reference_since_ns_utc == story.now_ns
+
+
 def test_an_open_loop_is_an_alarm_until_it_is_closed(story):
     story.tell(rtc(loop="open"))
     assert "loop-open" in story.alarms

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pyrcal.fitting.fitted_matrix import FittedMatrix
 from pyrcal.fitting.methods import FITTED_HALF_WIDTH, ScanStep
 from service.errors import ConfigurationError
+from service.files.documents import plain
 from service.model.instrument import Instrument, TabulatedModes
 from service.model.kinds import SignalKind
 from service.model.misregistration import Misregistration
@@ -54,6 +55,20 @@ def check_plots(what: str = "--plot") -> None:
         ) from error
 
 
+def new_figure(width_in: float, height_in: float, what: str = "plot") -> Figure:
+    """Return an empty figure of a size in inches; ``what`` names it.
+
+    Raises
+    ------
+    ConfigurationError
+        If matplotlib is not installed.
+    """
+    check_plots(what)
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width_in, height_in), layout="constrained")
+
+
 def write_sheet(fit: FittedMatrix, heading: str, instrument: Instrument, path: Path) -> None:
     """Write the figures as an image of the kind the file's name says.
 
@@ -62,7 +77,6 @@ def write_sheet(fit: FittedMatrix, heading: str, instrument: Instrument, path: P
     ConfigurationError
         If matplotlib is not installed, or the file cannot be written.
     """
-    check_plots()
     save_figure(draw_sheet(fit, heading, instrument), path)
 
 
@@ -88,14 +102,11 @@ def draw_sheet(fit: FittedMatrix, heading: str, instrument: Instrument | None = 
     ConfigurationError
         If matplotlib is not installed.
     """
-    check_plots("plot")
-    from matplotlib.figure import Figure
-
     steps = fit.paper_table or ()
     heights = [2 * _ROW, _MAP_ROW * _rows(shown_modes(fit), _MODES_ACROSS) + 0.4]
     if steps:
         heights.append(_SCAN_ROW * _rows(steps, _SCANS_ACROSS))
-    figure = Figure(figsize=(_WIDTH, sum(heights) + 0.8), layout="constrained")
+    figure = new_figure(_WIDTH, sum(heights) + 0.8)
     advice = textwrap.wrap(fit.recommendation, 150) + textwrap.wrap(fit.verdict_line, 150)
     figure.suptitle("\n".join([heading, *advice]), fontsize="medium")
     parts = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False).ravel()
@@ -304,14 +315,17 @@ def numbers(fit: FittedMatrix) -> dict[str, Any]:
     """
     shown = shown_modes(fit)
     picked = shown[np.unique(np.linspace(0, len(shown) - 1, N_MAPS).round().astype(int))]
-    singular = {name: _plain(values, 5) for name, values in singular_values_of(fit).items()}
-    return {
-        "modes": fit.modes.tolist(),
-        "residual_by_mode": _plain(fit.residual_by_mode, 4),
-        "singular_values": singular,
+    found: dict[str, Any] = {
+        "modes": fit.modes,
+        "residual_by_mode": np.round(fit.residual_by_mode, 4),
+        "singular_values": {
+            name: np.round(values, 5) for name, values in singular_values_of(fit).items()
+        },
         "residual_map": _percent(side_by_side(fit.residual_map)),
         "maps": [_columns(fit, int(column)) for column in picked],
     }
+    document: dict[str, Any] = plain(found)
+    return document
 
 
 def singular_values_of(fit: FittedMatrix) -> dict[str, Array]:
@@ -348,7 +362,3 @@ def _columns(fit: FittedMatrix, column: int) -> dict[str, Any]:
 
 def _percent(shares: Array) -> Any:  # noqa: ANN401 - as nested as the array
     return np.ma.fix_invalid(np.round(100.0 * shares), fill_value=0.0).astype(int).tolist()
-
-
-def _plain(values: Array, digits: int) -> Any:  # noqa: ANN401 - as nested as the array
-    return np.ma.masked_invalid(np.round(values, digits)).tolist()

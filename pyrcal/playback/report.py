@@ -12,11 +12,12 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.fitting.figures import check_plots
+from pyrcal.fitting.figures import new_figure
 from pyrcal.importers.registration import Dated
 from pyrcal.terminal import table as aligned
 from service.estimation.random_dither import NoisyMatrix
 from service.files.container import put_array
+from service.files.documents import pick, plain
 from service.model.misregistration import (
     BOUNDARY_SCALE,
     COVARIANCE_SCALE,
@@ -237,23 +238,17 @@ def _list_problems(track: Track) -> list[str]:
 
 def document(track: Track, source: Path) -> dict[str, Any]:
     """Return the result as one JSON object; its entries are like REST's of α."""
-    registration = track.state.alpha.registration
-    return {
+    registration, state = track.state.alpha.registration, track.state
+    found: dict[str, Any] = {
         "telemetry": str(source),
         "misaligned": track.misaligned or None,
-        "n_frames": track.n_frames,
-        "n_missing": track.n_missing,
-        "first_ns_utc": track.first_ns_utc,
-        "last_ns_utc": track.last_ns_utc,
+        **pick(track, "n_frames n_missing first_ns_utc last_ns_utc"),
         "alpha": None if registration is None else registration.alpha.to_boundary(),
-        "covariance": None
-        if registration is None
-        else (registration.covariance * COVARIANCE_SCALE).tolist(),
+        "covariance": None if registration is None else registration.covariance * COVARIANCE_SCALE,
         "entries": [_entry(entry) for entry in track.entries],
         "passive": [
             {
-                "t_ns_utc": one.t_ns_utc,
-                "estimator": one.estimator,
+                **pick(one, "t_ns_utc estimator"),
                 "alpha": one.alpha.to_boundary(),
                 "sigma": at_boundary(one.sigma) if np.isfinite(one.sigma).all() else None,
                 "text": one.text,
@@ -264,30 +259,25 @@ def document(track: Track, source: Path) -> dict[str, Any]:
             {
                 "t_ns_utc": at.t_ns_utc,
                 "alpha": at.alpha.to_boundary(),
-                "anamorphosis": at.alpha.stretches.tolist(),
+                "anamorphosis": at.alpha.stretches,
             }
             for at in track.stated
         ],
-        "alarms": [{"name": a.name, "text": a.text} for a in track.state.alarms.active],
-        "windows": {
-            "accepted": track.state.windows.accepted,
-            "refused": track.state.windows.refused,
-        },
+        "alarms": [pick(alarm, "name text") for alarm in state.alarms.active],
+        "windows": pick(state.windows, "accepted refused"),
     }
+    document: dict[str, Any] = plain(found)
+    return document
 
 
 def _entry(entry: HistoryEntry) -> dict[str, Any]:
     return {
-        "t_ns_utc": entry.t_ns_utc,
-        "source": entry.source.value,
+        **pick(entry, "t_ns_utc source"),
         "measured": entry.measured.to_boundary(),
         "measured_sigma": at_boundary(entry.measured_sigma),
         "filtered": entry.filtered.to_boundary(),
         "filtered_sigma": at_boundary(entry.filtered_sigma),
-        "innovation": entry.innovation,
-        "misfit": entry.misfit if np.isfinite(entry.misfit) else None,
-        "entered": entry.entered,
-        "in_use": entry.in_use,
+        **pick(entry, "innovation misfit entered in_use"),
     }
 
 
@@ -324,10 +314,7 @@ def draw(track: Track, title: str) -> Figure:
     ConfigurationError
         If matplotlib is not installed.
     """
-    check_plots("plot")
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11.0, 9.0), layout="constrained")
+    figure = new_figure(11.0, 9.0)
     figure.suptitle(title)
     every = figure.subplots(len(PARAMETERS), 1, sharex=True)
     for k, axes in enumerate(every):

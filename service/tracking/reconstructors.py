@@ -138,6 +138,9 @@ RETURNS_KEPT = 100
 UNSENT_KEPT = 50
 """Newest of those that were never sent: enough to see what is being refused, and why."""
 
+_DECLINED = frozenset({MatrixState.REFUSED, MatrixState.REJECTED, MatrixState.FAILED})
+"""States after a rejection by the gate, when it judged again, or by the RTC."""
+
 _UNSENT = frozenset({MatrixState.REFUSED, MatrixState.DISCARDED})
 _SPARE = frozenset({MatrixState.REJECTED, MatrixState.FAILED, MatrixState.SUPERSEDED})
 
@@ -170,8 +173,14 @@ def replace_record(context: StepContext, record: ReconstructorRecord) -> bool:
         move(context, r, record) if r.id == record.id else r
         for r in context.matrices.reconstructors
     )
+    before = context.state.reconstructor(record.id)
     context.matrices = replace(context.matrices, reconstructors=records)
-    return record in records
+    if record not in records:
+        return False
+    changed = before is not None and before.state is not record.state
+    if changed and record.state in _DECLINED:
+        update_policy.limit_declined(context, record)
+    return True
 
 
 def change_state(context: StepContext, matrix_id: str, to: MatrixState, reason: str) -> None:

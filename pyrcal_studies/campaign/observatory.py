@@ -244,6 +244,7 @@ class Dome:
             commands_m=np.concatenate([batch.commands_m for batch in batches]),
             dither_m=np.concatenate(dithers) if dithers else None,
             cm_id=first.cm_id,
+            reference_name=first.identity.reference_id or first.identity.config_id,
         )
 
 
@@ -274,7 +275,7 @@ def _dither_nm(batches: list[Batch]) -> float:
 
 
 def _on_the_wire(batch: Batch) -> object:
-    return batch.session, batch.cm_id, batch.dither_m is None
+    return batch.session, batch.cm_id, batch.dither_m is None, batch.identity
 
 
 def _optics_of(batch: Batch) -> object:

@@ -19,8 +19,9 @@ from service.tracking.dither import allow_dither, request_dither
 from service.tracking.dither_plan import operator_parameters
 from service.tracking.policy import SECOND_NS
 from service.tracking.step_context import StepContext, present
+from service.tracking.update_policy import DECLINED_MODES_DELAY_S, limit_declined
 from service.tracking.validity import note_pointing
-from service.wire import DitherKind, Loop, LoopRequest, Pointing, RampRequest, Status
+from service.wire import DitherKind, Loop, LoopRequest, Pointing, RampRequest, Reply, Status
 
 
 def set_mode(context: StepContext, command: cmd.SetMode) -> None:
@@ -42,6 +43,8 @@ def reject(context: StepContext, command: cmd.Reject) -> None:
         context, command.id, MatrixState.DISCARDED, command.reason or "by the operator"
     )
     context.log("reconstructor.discarded", command.id)
+    record = reconstructors.require_record(context.state, command.id)
+    limit_declined(context, record, DECLINED_MODES_DELAY_S)
 
 
 def publish(context: StepContext, command: cmd.Publish) -> None:
@@ -233,7 +236,18 @@ def ramp(context: StepContext, command: cmd.Ramp) -> None:
     _ask_loop(context, request, text, lasts_s)
 
 
-def on_loop_answer(context: StepContext, command: str, outcome: CommandState, reason: str) -> None:
+def on_loop_answer(context: StepContext, request: LoopRequest | RampRequest, reply: Reply) -> None:
+    """Note whether the RTC carries out a command."""
+    outcome = CommandState.ACCEPTED if reply.accepted else CommandState.REFUSED
+    _note_outcome(context, request.id, outcome, reply.reason)
+
+
+def on_loop_failed(context: StepContext, request: LoopRequest | RampRequest, text: str) -> None:
+    """Note that a command had no answer."""
+    _note_outcome(context, request.id, CommandState.FAILED, text)
+
+
+def _note_outcome(context: StepContext, command: str, outcome: CommandState, reason: str) -> None:
     """Note what became of a command; one that a later one has replaced is only logged."""
     asked, text = context.loop.command, command
     if asked is not None and asked.id == command:

@@ -20,7 +20,8 @@ from service.tracking import (
 from service.tracking.operator import end_ramp
 from service.tracking.policy import SECOND_NS
 from service.tracking.step_context import StepContext, log_bursts
-from service.wire import DitherRequest, DitherStop, Status
+from service.wire import Command as Request
+from service.wire import Status
 
 ACKNOWLEDGEMENT_TIMEOUT_S = 3.0
 """An RTC applies within 2 s of the commit, or it has failed."""
@@ -31,7 +32,7 @@ COMPUTATION_TIMEOUT_S = 60.0
 """A reconstructor that takes longer was lost with its worker."""
 
 
-def on_tick(context: StepContext) -> None:
+def give_up_overdue(context: StepContext) -> None:
     """Give up what has been waited for too long."""
     for record in context.matrices.reconstructors:
         # Without a time of publication nothing is overdue.
@@ -213,27 +214,12 @@ def on_services(context: StepContext, event: ev.ServicesMet) -> None:
     validity.end_alarm(context, alarms.STANDING_BY)
 
 
-def on_failure(context: StepContext, effect: Effect, text: str) -> None:
-    """Undo the memory of having asked, so that it can be asked again later."""
-    match effect:
-        # Without a pause a worker that fails at once would be asked in every step.
-        case ev.MakeMatrix() | ev.RepublishMatrix():
-            context.put_off(make_s=5.0)
-            reconstructors.note_none_made(context)
-            context.fail(text)
-        case ev.Ask(request=DitherRequest()):
-            context.put_off(dither_s=5.0)
-            dither.forget_dither(context)
-            context.fail(text)
-        case ev.JudgeProposal():
-            context.put_off(make_s=5.0)
-            context.fail(text)
-        case ev.Ask(request=DitherStop()):
-            pass  # it is asked again while it must be; nothing else has to wait for that
-        case ev.FetchMatrix():
-            reconstructors.note_not_fetched(context, text)
-        case ev.SendMatrix(id=matrix_id):
-            reconstructors.change_state(context, matrix_id, MatrixState.FAILED, text)
-        case _:
-            context.put_off(make_s=5.0)
+def fail_order(context: StepContext, effect: Effect | Request, text: str) -> None:
+    """Log the failure, and note it under the id of the order that led to it."""
+    context.fail(text)
+    log_failure(context, effect, text)
+
+
+def log_failure(context: StepContext, _: Effect | Request, text: str) -> None:
+    """Log the failure; what is still needed is asked for again."""
     context.warn("job.failed", text)

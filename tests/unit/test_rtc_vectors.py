@@ -137,7 +137,10 @@ def test_the_simulators_frames_are_those_bytes(name):
     vector = named(name)
     told, rows = vector.told["message"], np.array(vector.told["rows"], dtype=np.float32)
     n_slopes, n_modes = told["n_slopes"], told["n_modes"]
+    names = ("basis_id", "config_id", "reference_id")
+    identity = Identity(system="bench", **{name: told.get(name) for name in names})
     batch = Batch(
+        identity=identity,
         session=told["session"],
         seq0=told["seq0"],
         slopes=rows[:, :n_slopes],
@@ -150,9 +153,7 @@ def test_the_simulators_frames_are_those_bytes(name):
         optics=None,
         phase_m=np.zeros(1),
     )
-    names = ("basis_id", "config_id", "reference_id")
-    identity = Identity(system="bench", **{name: told.get(name) for name in names})
-    made = frames_of(batch, identity, told["t0_ns"], told["dt_ns"])
+    made = frames_of(batch, told["t0_ns"], told["dt_ns"])
     assert wire.encode_frames(*made) == (vector.payload, vector.message)
 
 

@@ -281,7 +281,8 @@ def interrupted_at(module, words, number):
 @pytest.mark.parametrize(
     ("module", "words", "status"),
     [
-        ("pyrcal.client.remote", ["sim", "--seconds", "1"], 0),  # imported before sim_rtc takes over
+        # imported before sim_rtc takes over
+        ("pyrcal.client.remote", ["sim", "--seconds", "1"], 0),
         ("structlog", ["sim", "--seconds", "1"], 0),
         ("pyrcal.client.remote", ["fit", "flao-lbt", __file__], 130),
     ],

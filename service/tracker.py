@@ -142,8 +142,7 @@ def _on_answer(context: StepContext, answered: ev.Answered) -> None:
 
 def _on_failure(context: StepContext, failed: ev.JobFailed) -> None:
     """Process the failure of an effect, as ``FAILURES`` says."""
-    effect = failed.effect
-    what = effect.request if isinstance(effect, ev.Ask) else effect
+    what = failed.effect.request if isinstance(failed.effect, ev.Ask) else failed.effect
     for react in FAILURES[type(what)]:
         react(context, what, failed.text)
 
@@ -282,8 +281,8 @@ class Decider(NamedTuple):
     decide: Callable[[StepContext], None]
 
 
-_FREE: Final = (not_measuring, not_stopped, not_acquiring)
-_READY: Final = (*_FREE, no_noisy_matrix_waits, may_ask, may_decide)
+_UNDISTURBED: Final = (not_measuring, not_acquiring, no_noisy_matrix_waits, may_ask)
+_READY: Final = (*_UNDISTURBED, not_stopped, may_decide)
 
 DECIDERS: Final = (
     Decider("a restored α", (), resume.drop_unconfirmed),
@@ -294,13 +293,11 @@ DECIDERS: Final = (
     Decider("alarms", (), derive_alarms),
     Decider("the RTC's matrix", (not_measuring, may_ask), updates.fetch_in_use),
     Decider("the acquisition", (not_measuring, not_stopped), acquisition.advance),
-    Decider("a noisy matrix", _FREE, measurement.advance_noisy),
-    # Also while everything is stopped, and before another dither is chosen.
     Decider(
-        "unwanted dithers",
-        (not_measuring, not_acquiring, no_noisy_matrix_waits, may_ask),
-        dither.stop_unwanted,
+        "a noisy matrix", (not_measuring, not_stopped, not_acquiring), measurement.advance_noisy
     ),
+    # Also while everything is stopped, and before another dither is chosen.
+    Decider("unwanted dithers", _UNDISTURBED, dither.stop_unwanted),
     Decider("the dither", _READY, dither.choose_dither),
     Decider("reconstructors", _READY, updates.decide_updates),
     Decider("the offload", _READY, offload.request_offload),

@@ -37,7 +37,7 @@ from service.estimation.random_dither import RandomDither, RandomPlan
 from service.estimation.windows import ClosedLoop
 from service.instrument import load_instrument
 from service.model.modes import karhunen_loeve_basis
-from service.records.operations import Dither
+from service.records.operations import Dither, DitherPurpose
 from service.runtime.estimator_bank import (
     EstimatorBank,
     process_block,
@@ -233,7 +233,7 @@ def _bank() -> Part:
     )
     bank = with_rtc(EstimatorBank.of(description), rtc)
     bank = with_matrix(bank, "cm", np.ones((N_CONTROLLED, N_SLOPES), np.float32))
-    dither = Dither(request=request, start_seq=0, asked_ns_utc=0)
+    dither = Dither(request=request, purpose=DitherPurpose.FOLLOW, start_seq=0, asked_ns_utc=0)
     bank = with_dither(bank, dither, WINDOW_FRAMES / RATE_HZ)
     return Part(name=BANK, begin=bank, feed=lambda state, block: process_block(state, block)[0])
 

@@ -36,8 +36,7 @@ class WireTable(Table):
     """Name of the modal basis. Choose another when the modes, their order or their scale change."""
 
     config_id: Opaque
-    """Name of the sensor configuration. Choose another when mask, reference, binning or modulation
-    change."""
+    """Name of the sensor configuration. Choose another when mask, binning or modulation change."""
 
 
 class StreamsTable(Table):

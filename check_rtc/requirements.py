@@ -108,8 +108,9 @@ REQUIREMENTS: Final[dict[str, Requirement]] = {
         "status",
     ),
     "ids": Requirement(
-        (31,),
-        "one basis and one configuration, in frames, status and manifest",
+        (31, 82),
+        "one basis and one configuration, in frames, status and manifest; references have the same "
+        "name in frames and status",
         "slopes-commands-orientation",
     ),
     "matrix": Requirement(

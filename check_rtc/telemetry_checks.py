@@ -393,7 +393,19 @@ def _ids(observer: TelemetryObserver, context: TelemetryContext) -> CheckResult:
         for name, expected in zip(pair, pinned, strict=True):
             if expected not in {None, name}:
                 return wrong("ids", f"{words}; the instrument file expects {expected}")
-    return fine("ids", words) if found else skipped("ids", "nothing has come")
+    return _references(observer, words) if found else skipped("ids", "nothing has come")
+
+
+def _references(observer: TelemetryObserver, words: str) -> CheckResult:
+    """Return the result for the ids with the names of the references, which may change."""
+    frames = dict.fromkeys(a.header.reference_id for a in observer.arrivals)
+    statuses = dict.fromkeys(s.reference_id for _, s in observer.statuses)
+    shown = [", then ".join(name or "nil" for name in names) for names in (frames, statuses)]
+    if frames and statuses and not frames.keys() & statuses.keys():
+        found = f"{shown[0]} in frames and {shown[1]} in the status"
+        return wrong("ids", f"{words}; references {found}, expected the same in both")
+    named = any(frames)
+    return fine("ids", f"{words}; references {shown[0]}" if named else words)
 
 
 def _matrix(observer: TelemetryObserver, context: TelemetryContext) -> CheckResult:

@@ -69,9 +69,10 @@ static void put_ids(buffer *to) {
     put_text(to, "config_id"), put_text(to, CONFIG);
 }
 
-static buffer header(const char *session, uint64_t seq0, uint64_t t0_ns, const char *cm_id) {
+static buffer header(const char *session, uint64_t seq0, uint64_t t0_ns, const char *cm_id,
+                     const char *reference_id) {
     buffer to = {.n = 0};
-    put_map(&to, 12);
+    put_map(&to, reference_id ? 13 : 12);
     put_text(&to, "v"), put_integer(&to, 1);
     put_text(&to, "session"), put_text(&to, session);
     put_text(&to, "seq0"), put_integer(&to, seq0);
@@ -83,6 +84,7 @@ static buffer header(const char *session, uint64_t seq0, uint64_t t0_ns, const c
     put_text(&to, "dither"), put_bool(&to, true);
     put_text(&to, "cm_id"), put_text(&to, cm_id);
     put_ids(&to);
+    if (reference_id) put_text(&to, "reference_id"), put_text(&to, reference_id); /* optional */
     return to;
 }
 
@@ -158,7 +160,7 @@ int main(int argc, char **argv) {
     uint64_t start_ns = 1000000000ull * (uint64_t)time(NULL);
     snprintf(name, sizeof name, "c-%llu", (unsigned long long)start_ns);
     for (uint64_t seq = 0;; seq += N_FRAMES) { /* a loop would put its own slopes and commands here */
-        buffer with = header(name, seq, start_ns + seq * 1000000, NULL);
+        buffer with = header(name, seq, start_ns + seq * 1000000, NULL, NULL);
         send(&session, frames, ROWS, sizeof ROWS, &with);
         if (seq % 200 == 0) {
             buffer said = status(name, start_ns + seq * 1000000);
@@ -179,7 +181,7 @@ static int save(const char *folder, const char *name, const void *data, size_t n
 
 int main(int argc, char **argv) {
     if (argc != 2) return fprintf(stderr, "usage: telemetry FOLDER\n"), 2;
-    buffer with = header("s-2027-01-15-1", 1000, 1800000000000000000ull, "start-5e2c");
+    buffer with = header("s-2027-01-15-1", 1000, 1800000000000000000ull, "start-5e2c", "ncpa-2027-01-15-a");
     buffer said = status("s-2027-01-15-1", 1800000000000000000ull);
     return save(argv[1], "frames.bin", ROWS, sizeof ROWS) ||
            save(argv[1], "frames.msgpack", with.bytes, with.n) ||

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pyrcal.fitting.report import read_fit as read_fit
     from pyrcal.importers.oopao import from_oopao as from_oopao
     from pyrcal.importers.oopao import to_oopao as to_oopao
-    from pyrcal.playback.player import Track as Track
+    from pyrcal.playback.report import Track as Track
     from pyrcal.playback.track import track as track
     from service.config.settings import Settings as Settings
     from service.control.reconstructor import Inversion as Inversion
@@ -63,7 +63,7 @@ _HOMES = {
     "RtcInteractionModel": "service.model.interaction",
     "Service": "pyrcal.client.rest",
     "Settings": "service.config.settings",
-    "Track": "pyrcal.playback.player",
+    "Track": "pyrcal.playback.report",
     "dither_sigma": "pyrcal.fitting.design",
     "fit": "pyrcal.fitting.fit_file",
     "fit_file": "pyrcal.fitting.fit_file",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 
 from service.program import INTERRUPTED, leave_when_asked, run_command
 
@@ -29,6 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run_command(
         lambda: command_line().parse_args(words),
         check_files,
+        lambda options: import_module(options.module).main,
         own_process=arguments is None,
         serves=words[:1] == ["run"],
     )

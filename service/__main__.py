@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 
 from service.parser import OneLineParser
 from service.program import check_settings, declare, run_command
@@ -17,6 +18,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run_command(
         lambda: parser.parse_args(words),
         check_settings,
+        lambda _: import_module("service.cli.commands").main,
         own_process=arguments is None,
         serves=words[:1] == ["run"],
     )

@@ -26,7 +26,12 @@ from service.model.slopes import Orientation
 from sim_rtc.computer.feed import BATCH_FRAMES, Block, Feed, OpenLoopFeed, PhaseFeed, Source
 from sim_rtc.computer.gains import by_group
 from sim_rtc.computer.real_time_computer import RealTimeComputer
-from sim_rtc.computer.reconstructors import identity_of, initial_reconstructor, own_reconstructor
+from sim_rtc.computer.reconstructors import (
+    ReferenceSchedule,
+    identity_of,
+    initial_reconstructor,
+    own_reconstructor,
+)
 from sim_rtc.computer.telemetry import LoopSettings
 from sim_rtc.held_rate import DITHERED_FROM_HZ, frame_s, held_rate_hz, slow_motion
 from sim_rtc.options import Options
@@ -83,6 +88,9 @@ class Telescope:
     """Moves the mirror's image by ``(4,)``, numeric units, and returns the time of arrival; None if
     the telescope has no such stage."""
 
+    references: ReferenceSchedule | None = None
+    """New reference slopes of the RTC; None: it has none."""
+
     def computer(self, blocks: Iterator[Block]) -> RealTimeComputer:
         """Return a computer that runs on these blocks of the feed."""
         return RealTimeComputer(
@@ -96,6 +104,7 @@ class Telescope:
             drive=self.drive,
             reports_asked=self.reports_asked,
             move=self.move,
+            references=self.references,
         )
 
 
@@ -250,6 +259,7 @@ def build_telescope(
         drive=build_drive(options, instrument, basis),
         reports_asked=options.reports_asked,
         move=build_stage(options, optics),
+        references=build_references(options, reconstructor),
     )
 
 
@@ -325,6 +335,20 @@ def build_reconstructor(
         )
     model = RtcInteractionModel(instrument, basis).interaction_matrix(nominal)
     return own_reconstructor(model[:, :n_controlled], identity, nominal)
+
+
+def build_references(options: Options, reconstructor: Reconstructor) -> ReferenceSchedule | None:
+    """Return the schedule of new reference slopes; None if there is none."""
+    if options.references is None:
+        return None
+    rms_m, period_s = options.references
+    return ReferenceSchedule(
+        reconstructor.matrix,
+        rms_m=rms_m,
+        period_s=period_s,
+        named_by=options.references_named_by,
+        seed=options.seed,
+    )
 
 
 def build_stage(

@@ -306,6 +306,21 @@ class Options:
     delay_frames: int = option(
         "--delay FRAMES", "from an exposure to the command that answers it", count(1, 10), default=2
     )
+    references: tuple[float, float] | None = several(
+        "--references NM,SECONDS",
+        "new reference slopes every so many seconds, each for another shape of so many nanometres "
+        "RMS on the mirror, in low modes at random",
+        lambda rms_nm, period_s: (rms_nm * 1e-9, period_s),
+        lambda rms_nm, period_s: 0.0 <= rms_nm <= 300.0 and 0.1 <= period_s <= 86400.0,
+        ", 0 to 300 nm, every 0.1 to 86400 seconds",
+    )
+    references_named_by: str = option(
+        "--references-named-by",
+        "field of frames and status that names them: reference_id, or config_id as in RTCs that "
+        "have none",
+        default="reference_id",
+        choices=["reference_id", "config_id"],
+    )
     given_n_controlled: int | None = option(
         "--n-controlled N",
         "modes in the loop at the start (default: 400, or 7 tenths of all)",

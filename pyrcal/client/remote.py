@@ -8,17 +8,14 @@ verbatim.
 from __future__ import annotations
 
 import argparse
-import os
 import re
 import tomllib
-from collections.abc import Mapping
-from importlib import import_module
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from pyrcal.options import Words, add, words
 from service import errors
-from service.errors import ConfigurationError, say
+from service.parser import Words, in_group, words
 
 DONE, NOT_DONE, UNREACHABLE = 0, 1, 3
 """Exit statuses; 2 is that of a wrong command line."""
@@ -46,7 +43,7 @@ class Request(NamedTuple):
     name: str
     purpose: str
     module: str
-    """Module of this package whose ``run_command`` does the work."""
+    """Module of this package that does the work, as ``ask`` lists it."""
 
     call: str
     """Method and path of REST; words in braces are options."""
@@ -373,85 +370,58 @@ CONNECTION, ORDER = "connection options", "order options"
 """Titles of options that many commands share."""
 
 
+_CONNECTION = in_group(
+    CONNECTION,
+    words("--json", "print the answer of the REST interface"),
+    words("--url URL", f"address of the service; default {URL}, else {USUAL_URL}"),
+    words("--key-file FILE", f"file with the API key; default: the key in {KEY}", type=Path),
+)
+
+
 def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     """Add these commands to a command line."""
     groups: dict[str, Any] = {}
     for request in REQUESTS:
         name, _, word = request.name.partition(" ")
         if word and name not in groups:
+            below = [one for one in REQUESTS if one.name.startswith(f"{name} ")]
             group = commands.add_parser(
-                name, help=GROUPS[name], description=_sentence(GROUPS[name])
+                name,
+                help=GROUPS[name],
+                description=_sentence(GROUPS[name]),
+                examples=[f"{one.name.partition(' ')[2]} {one.example}".rstrip() for one in below],
             )
-            group.examples = [
-                f"pyrcal {r.name} {r.example}".rstrip()
-                for r in REQUESTS
-                if r.name.startswith(f"{name} ")
-            ]
             groups[name] = group.add_subparsers(dest="word", required=True, metavar="COMMAND")
         parser = (groups[name] if word else commands).add_parser(
             word or name,
             help=request.purpose,
             description=_sentence(request.purpose),
             epilog=EPILOG,
-            examples=[f"pyrcal {request.name} {request.example}".rstrip()],
+            examples=[request.example],
+            options=(*request.words, *_order_options(request), *_CONNECTION),
+            module=f"{__package__}.ask",
         )
-        parser.set_defaults(request=request, module=__name__)
-        add(parser, *request.words)
-        if request.module == "orders":
-            order = parser.add_argument_group(ORDER)
-            required = " (prompted for at a terminal)" if request.needs_why else ""
-            add(
-                order,
-                words("--why WHY", f"reason, kept in the audit trail{required}", default=""),
-                words("--who WHO", "your name; default: the login name"),
-            )
-            if request.asks:
-                add(order, words("--yes", "do it without confirmation"))
-        add(
-            parser.add_argument_group(CONNECTION),
-            words("--json", "print the answer of the REST interface"),
-            words("--url URL", f"address of the service; default {URL}, else {USUAL_URL}"),
-            words(
-                "--key-file FILE", f"file with the API key; default: the key in {KEY}", type=Path
-            ),
-        )
+        parser.set_defaults(request=request)
+
+
+def _order_options(request: Request) -> tuple[Words, ...]:
+    """Return the options that every order has."""
+    if request.module != "orders":
+        return ()
+    required = " (prompted for at a terminal)" if request.needs_why else ""
+    return in_group(
+        ORDER,
+        words("--why WHY", f"reason, kept in the audit trail{required}", default=""),
+        words("--who WHO", "your name; default: the login name"),
+        *([words("--yes", "do it without confirmation")] if request.asks else []),
+    )
 
 
 def _sentence(purpose: str) -> str:
     return f"{purpose[:1].upper()}{purpose[1:]}."
 
 
-def main(options: argparse.Namespace) -> int:
-    """Ask, print, and return the exit status.
-
-    Raises
-    ------
-    ConfigurationError
-        If the address or the key is none.
-    """
-    # importing the HTTP client takes longer than printing help, so it is imported here
-    from pyrcal.client.rest import RefusedError, Service, UnreachableError
-
-    request: Request = options.request
-    service = Service(options.url or os.environ.get(URL) or USUAL_URL, _key(options.key_file))
-    try:
-        status: int = import_module(f"{__package__}.{request.module}").run_command(
-            service, request, options
-        )
-    except RefusedError as error:
-        say(f"pyrcal {request.name}: {error}")
-        return NOT_DONE
-    except UnreachableError as error:
-        say(f"pyrcal: {error}")
-        return UNREACHABLE
-    return status
-
-
-def _key(file: Path | None) -> str:
-    """Return the API key; empty if there is none."""
-    if file is None:
-        return os.environ.get(KEY, "").strip()
-    try:
-        return file.read_text(encoding="ascii").strip()
-    except (OSError, ValueError) as error:
-        raise ConfigurationError(f"--key-file {file}: {error}") from error
+def collect_arguments(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
+    """Return those of the named options that were given."""
+    given = {name: getattr(options, name, None) for name in names}
+    return {name: value for name, value in given.items() if value is not None}

@@ -80,7 +80,16 @@ def _rtc(state: Document) -> list[str]:
     age_s = link["frame_age_s"]
     last = "" if age_s is None else f", the last {span(age_s)} ago"
     frames = f"{link['frames_received']} received, {link['frames_lost']} lost{last}"
-    return [_line("RTC", loop), _line("Frames", frames)]
+    return [_line("RTC", loop), _line("Frames", frames), *_references(state)]
+
+
+def _references(state: Document) -> list[str]:
+    """Return name and age of changed reference slopes; older services do not report them."""
+    since_ns = state.get("reference_since_ns_utc")
+    if since_ns is None:
+        return []
+    age = span(max(0.0, (state["now_ns"] - since_ns) / 1e9))
+    return [_line("References", f"{state['reference_id']}, for {age}")]
 
 
 def _line(label: str, text: str) -> str:

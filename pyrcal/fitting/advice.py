@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.fitting.alternatives import (
+    CENTRED_KEY,
     Alternative,
     describe_preference,
     format_move,
@@ -18,7 +21,9 @@ from pyrcal.fitting.alternatives import (
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.left_over import locate_residual
 from pyrcal.fitting.origins import Origin
-from pyrcal.fitting.verdict import UNDECIDED_WORDS, Refusal, edge_move
+from pyrcal.fitting.pupil_checks import MAP_WORDS, WITHOUT_ARMS
+from pyrcal.fitting.verdict import ENTRIES, UNDECIDED_WORDS, Refusal, edge_move
+from service.instrument.schema import AboutTable, MirrorTable, SlopesTable
 
 Array = NDArray[np.float64]
 
@@ -54,6 +59,9 @@ class Grounds:
     columns: tuple[str, ...] = ()
     """Sentences on columns with wrong signs or in wrong places."""
 
+    axes_entry: str = ""
+    """Order and orientation of the slopes that explain the matrix better than those stated."""
+
     numbers_share: float = 1.0
     """χ² left with coupling and modulation as fitted, over that with those of the file."""
 
@@ -76,6 +84,9 @@ class Advice(StrEnum):
     DO_NOT_USE = "do not use it"
 
 
+_Action = tuple[str, tuple[str, ...]]
+"""Recommended action in one sentence, and the entries of the instrument file that it changes."""
+
 _BY_ANOTHER_INSTRUMENT = {Refusal.ANOTHER_INSTRUMENT, Refusal.UNSETTLED, Refusal.UNDETERMINED}
 """Reasons of a refusal that a wrong value of the instrument file also causes."""
 
@@ -94,7 +105,7 @@ def add_explanations(fit: Fit, tried: tuple[Alternative, ...], grounds: Grounds)
         fit.residual_map, fit.residual_by_mode, valid=fit.valid, modes=fit.modes, size=size
     )
     fit = replace(fit, alternatives=tried, remarks=sentences, left_over=left)
-    return replace(fit, recommendation=recommend_action(fit, grounds))
+    return add_recommendation(fit, grounds)
 
 
 def add_displaced(fit: Fit, columns: tuple[str, ...]) -> Fit:
@@ -102,36 +113,64 @@ def add_displaced(fit: Fit, columns: tuple[str, ...]) -> Fit:
     if not columns:
         return fit
     advised = f"{Advice.DO_NOT_USE}: {columns[0]}"
-    return replace(fit, remarks=(*fit.remarks, *columns), recommendation=advised)
+    remarks = (*fit.remarks, *columns)
+    return replace(fit, remarks=remarks, recommendation=advised, corrections={})
 
 
-def recommend_action(fit: Fit, grounds: Grounds) -> str:
-    """Return the recommended action for a fit and its reason, in one sentence."""
+def add_recommendation(fit: Fit, grounds: Grounds) -> Fit:
+    """Return the fit with the recommended action, in one sentence and as values to be set."""
+    words, entries = _choose_action(fit, grounds)
+    return replace(fit, recommendation=words, corrections=_read_entries(entries))
+
+
+def _read_entries(entries: Iterable[str]) -> Mapping[str, Any]:
+    """Return the values that entries of the instrument file set, by table and key."""
+    values: dict[str, Any] = {}
+    for entry in entries:
+        if entry == WITHOUT_ARMS:
+            values |= {"spiders_m": None, "spiders_deg": None}
+        elif entry.startswith(MAP_WORDS):
+            values["pupil"] = entry.removeprefix(MAP_WORDS)
+        elif entry != CENTRED_KEY:  # no key of a file moves a pupil
+            values |= tomllib.loads(f"it = {{ {entry} }}")["it"]
+    tables = {
+        "instrument": {field.name for field in fields(AboutTable)},
+        "mirror": {field.name for field in fields(MirrorTable)},
+        "slopes": SlopesTable.model_fields,
+    }
+    place = {key: next((name for name in tables if key in tables[name]), "wfs") for key in values}
+    return {f"{place[key]}.{key}": value for key, value in values.items()}
+
+
+def _choose_action(fit: Fit, grounds: Grounds) -> _Action:
     if grounds.refusal is not None:
         return _advise_refused(fit, grounds)
     radius = _radius(fit)
     edge = edge_move(fit.sigma, radius)
     control = fit.reconstructor
     if control is not None and not control.usable:
-        return f"{Advice.MEASURE_MORE}: the reconstructor is not stable: {control.reason}"
+        return f"{Advice.MEASURE_MORE}: the reconstructor is not stable: {control.reason}", ()
     # a reconstructor that is stable with all modes is good enough, unless sigma says nothing
     enough = MAX_USABLE_SUBAP if control is not None and control.holds else ENOUGH_SUBAP
     if edge > enough:
-        return f"{Advice.MEASURE_MORE}: {_explain_uncertainty(fit, grounds, edge, radius)}"
+        best = _choose_correction(fit)
+        words = _explain_uncertainty(fit, grounds, edge, radius)
+        return f"{Advice.MEASURE_MORE}: {words}", () if best is None else (best.key,)
     if grounds.n_sets < FEWEST_SETS:
         return (
             f"{Advice.MEASURE_MORE}: too few modes ({len(fit.modes)}) to check each other; push "
             "six or more"
-        )
+        ), ()
     if grounds.columns:
-        return f"{Advice.USE} for the registration alone: {'; '.join(grounds.columns)}"
+        return f"{Advice.USE} for the registration alone: {'; '.join(grounds.columns)}", ()
     known = f"the mirror is known to {edge:.2g} subapertures at the pupil's edge (1 sigma)"
     if control is not None and not control.holds:
         known = f"{known}; the reconstructor is {control.reason}"
-    corrections = ", ".join(_list_corrections(fit))
-    if corrections:
-        return f"{Advice.USE}, and correct the instrument file ({corrections}): {known}"
-    return f"{Advice.USE}: {known}"
+    entries = tuple(_list_corrections(fit))
+    if entries:
+        listed = ", ".join(entries)
+        return f"{Advice.USE}, and correct the instrument file ({listed}): {known}", entries
+    return f"{Advice.USE}: {known}", ()
 
 
 def _explain_uncertainty(fit: Fit, grounds: Grounds, edge: float, radius: float) -> str:
@@ -140,6 +179,8 @@ def _explain_uncertainty(fit: Fit, grounds: Grounds, edge: float, radius: float)
         f"at the pupil's edge the mirror is known to {edge:.3f} subapertures (1 sigma), "
         f"{ENOUGH_SUBAP:g} is enough"
     )
+    if grounds.columns:
+        return f"{known}; {'; '.join(grounds.columns)}"
     found, best = fit.registration, _choose_correction(fit)
     if best is not None:
         return (
@@ -171,55 +212,58 @@ def _explain_uncertainty(fit: Fit, grounds: Grounds, edge: float, radius: float)
     )
 
 
-def _advise_refused(fit: Fit, grounds: Grounds) -> str:
+def _advise_refused(fit: Fit, grounds: Grounds) -> _Action:
     match grounds.refusal:
         # an explanation that the matrix prefers widens sigma: it is the cause then
         case Refusal.UNDETERMINED if _choose_correction(fit) is None:
-            return f"{Advice.MEASURE_MORE}: the modes do not determine the registration"
+            return f"{Advice.MEASURE_MORE}: the modes do not determine the registration", ()
         case Refusal.ANOTHER_MINIMUM:
             return (
                 f"{Advice.MEASURE_MORE}: two registrations explain the matrix nearly as well; push "
                 "more modes, or give a start near the true registration (--start)"
-            )
+            ), ()
         # Mostly noise: averaging helps. If most of it is structure, averaging does not change it.
         case Refusal.UNEXPLAINED if grounds.structure < 0.5 * fit.residual_fraction:
             return (
                 f"{Advice.MEASURE_MORE}: {fit.residual_fraction:.0%} of the signal is noise; "
                 "average more, or push further"
-            )
-    return f"{Advice.DO_NOT_USE}: {_find_cause(fit, grounds)}"
+            ), ()
+    cause, entries = _find_cause(fit, grounds)
+    return f"{Advice.DO_NOT_USE}: {cause}", entries
 
 
-def _find_cause(fit: Fit, grounds: Grounds) -> str:
+def _find_cause(fit: Fit, grounds: Grounds) -> _Action:
     """Return the most likely cause of a refusal; a definite cause precedes the verdict."""
     if grounds.refusal in {Refusal.ANOTHER_BASIS, Refusal.ANOTHER_UNIT} and grounds.gains:
-        return grounds.gains[0]
+        return grounds.gains[0], ()
     # Columns are compared with the model in the axes found, which are in doubt in that case.
     if grounds.columns and grounds.refusal is not Refusal.AXES:
-        return "; ".join(grounds.columns)
+        return "; ".join(grounds.columns), ()
     best = _choose_correction(fit)
     if best is not None and grounds.refusal in _BY_ANOTHER_INSTRUMENT:
         number = next(_list_wrong_numbers(fit), None)
         if number is not None and grounds.numbers_share < (best.share or 0.0):
-            return f"{number.words}; correct that and fit again"
+            return f"{number.words}; correct that and fit again", (number.entry,)
         # The verdict names both explanations if the matrix does not distinguish them.
         if UNDECIDED_WORDS in fit.verdict:
-            return fit.verdict.rpartition("better: ")[2]
+            return fit.verdict.rpartition("better: ")[2], ()
         return (
             f"with {best.words} the misfit is {best.share:.0%} of what it is; correct that and fit "
             "again"
-        )
+        ), (best.key,)
     left = fit.left_over
     if grounds.refusal is Refusal.DIVIDED and left is not None and left.modes:
-        return f"{left.words}; measure these again, or leave them out (--modes)"
-    return fit.verdict.removeprefix("refused: ")
+        return f"{left.words}; measure these again, or leave them out (--modes)", ()
+    named = tuple(entry for entry in ENTRIES if entry in fit.verdict)
+    entries = (grounds.axes_entry,) if grounds.axes_entry else named
+    return fit.verdict.removeprefix("refused: "), entries
 
 
 def _list_corrections(fit: Fit) -> Iterator[str]:
     """Yield corrections of the instrument file, in its own notation."""
     for one in fit.origins:
         if one.correct:
-            yield f"{one.key} = {one.found}"
+            yield one.entry
     best = _choose_correction(fit)
     if best is not None:
         yield best.key

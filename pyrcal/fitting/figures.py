@@ -15,10 +15,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pyrcal.fitting.fitted import Fit
+from pyrcal.fitting.fitted_matrix import FittedMatrix
 from pyrcal.fitting.methods import FITTED_HALF_WIDTH, ScanStep
-from pyrcal.fitting.report import FitReport, verdict_line
 from service.errors import ConfigurationError
+from service.files.documents import plain
 from service.model.instrument import Instrument, TabulatedModes
 from service.model.kinds import SignalKind
 from service.model.misregistration import Misregistration
@@ -55,7 +55,21 @@ def check_plots(what: str = "--plot") -> None:
         ) from error
 
 
-def write_sheet(report: FitReport, instrument: Instrument, path: Path) -> None:
+def new_figure(width_in: float, height_in: float, what: str = "plot") -> Figure:
+    """Return an empty figure of a size in inches; ``what`` names it.
+
+    Raises
+    ------
+    ConfigurationError
+        If matplotlib is not installed.
+    """
+    check_plots(what)
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width_in, height_in), layout="constrained")
+
+
+def write_sheet(fit: FittedMatrix, heading: str, instrument: Instrument, path: Path) -> None:
     """Write the figures as an image of the kind the file's name says.
 
     Raises
@@ -63,9 +77,6 @@ def write_sheet(report: FitReport, instrument: Instrument, path: Path) -> None:
     ConfigurationError
         If matplotlib is not installed, or the file cannot be written.
     """
-    check_plots()
-    fit = report.fit
-    heading = f"{report.instrument}: {report.reference}"
     save_figure(draw_sheet(fit, heading, instrument), path)
 
 
@@ -83,7 +94,7 @@ def save_figure(figure: Figure, path: Path) -> None:
         raise ConfigurationError(f"--plot: cannot write {path}: {error}") from error
 
 
-def draw_sheet(fit: Fit, heading: str, instrument: Instrument | None = None) -> Figure:
+def draw_sheet(fit: FittedMatrix, heading: str, instrument: Instrument | None = None) -> Figure:
     """Return all figures of a fit; the mirror over the subapertures needs the instrument.
 
     Raises
@@ -91,15 +102,12 @@ def draw_sheet(fit: Fit, heading: str, instrument: Instrument | None = None) -> 
     ConfigurationError
         If matplotlib is not installed.
     """
-    check_plots("plot")
-    from matplotlib.figure import Figure
-
     steps = fit.paper_table or ()
     heights = [2 * _ROW, _MAP_ROW * _rows(shown_modes(fit), _MODES_ACROSS) + 0.4]
     if steps:
         heights.append(_SCAN_ROW * _rows(steps, _SCANS_ACROSS))
-    figure = Figure(figsize=(_WIDTH, sum(heights) + 0.8), layout="constrained")
-    advice = textwrap.wrap(fit.recommendation, 150) + textwrap.wrap(verdict_line(fit), 150)
+    figure = new_figure(_WIDTH, sum(heights) + 0.8)
+    advice = textwrap.wrap(fit.recommendation, 150) + textwrap.wrap(fit.verdict_line, 150)
     figure.suptitle("\n".join([heading, *advice]), fontsize="medium")
     parts = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False).ravel()
     grid = parts[0].subplots(2, 3)
@@ -124,7 +132,7 @@ MEASURED = "tab:red"
 SYNTHETIC = "tab:blue"
 
 
-def singular_values(axes: Axes, fit: Fit) -> None:
+def singular_values(axes: Axes, fit: FittedMatrix) -> None:
     """Draw the singular values of both matrices, each over its largest, and their conditions."""
     for name, values in singular_values_of(fit).items():
         colour, style = {"synthetic": (SYNTHETIC, "-"), "measured": (MEASURED, "--")}[name]
@@ -134,14 +142,14 @@ def singular_values(axes: Axes, fit: Fit) -> None:
     axes.legend(fontsize="small")
 
 
-def gains(axes: Axes, fit: Fit) -> None:
+def gains(axes: Axes, fit: FittedMatrix) -> None:
     """Draw the gain of every mode, measured over synthetic."""
     axes.plot(fit.modes, fit.gains, ".", color=MEASURED, markersize=3.0)
     axes.axhline(float(np.median(fit.gains)), color="0.5", linewidth=0.8)
     axes.set(title="gain of each mode", xlabel="mode", ylabel="measured / synthetic")
 
 
-def slopes_rms(axes: Axes, fit: Fit) -> None:
+def slopes_rms(axes: Axes, fit: FittedMatrix) -> None:
     """Draw the RMS of every column: measured, synthetic, residual."""
     measured = np.sqrt(np.mean(np.square(fit.measured, dtype=np.float64), axis=0)) * 1e-9
     synthetic = np.sqrt(np.mean(np.square(fit.synthetic, dtype=np.float64), axis=0)) * 1e-9
@@ -153,7 +161,7 @@ def slopes_rms(axes: Axes, fit: Fit) -> None:
     axes.legend(fontsize="small")
 
 
-def registration(axes: Axes, fit: Fit, instrument: Instrument) -> None:
+def registration(axes: Axes, fit: FittedMatrix, instrument: Instrument) -> None:
     """Draw the actuators, or the edge of a table of modes, over the valid subapertures."""
     n = len(fit.valid)
     edge = n / 2
@@ -185,11 +193,11 @@ def map_to_sensor(points: Array, alpha: Misregistration) -> Array:
     return np.asarray(points @ alpha.image.T + alpha.vector[:2])
 
 
-def _panel_title(fit: Fit) -> str:
+def _panel_title(fit: FittedMatrix) -> str:
     return "Sx | Sy" if fit.order.kind is SignalKind.XY else "four images"
 
 
-def residual(axes: Axes, fit: Fit) -> None:
+def residual(axes: Axes, fit: FittedMatrix) -> None:
     """Draw the residual of every subaperture."""
     image = axes.imshow(
         100.0 * side_by_side(fit.residual_map), origin="lower", cmap="viridis", vmin=0.0
@@ -203,7 +211,7 @@ def residual(axes: Axes, fit: Fit) -> None:
     axes.figure.colorbar(image, ax=axes, shrink=0.7)
 
 
-def _draw_arms(axes: Axes, fit: Fit) -> None:
+def _draw_arms(axes: Axes, fit: FittedMatrix) -> None:
     """Plot the lines with an increased residual, in the first plane."""
     if fit.left_over is None:
         return
@@ -216,7 +224,7 @@ def _draw_arms(axes: Axes, fit: Fit) -> None:
         axes.plot(ends[:, 0], ends[:, 1], "-", color="white", linewidth=1.0)
 
 
-def residual_by_mode(axes: Axes, fit: Fit) -> None:
+def residual_by_mode(axes: Axes, fit: FittedMatrix) -> None:
     """Draw the residual of every mode."""
     axes.semilogy(fit.modes, 100.0 * fit.residual_by_mode, ".", color="0.4", markersize=3.0)
     axes.axhline(100.0 * fit.residual_fraction, color=MEASURED, linewidth=0.8)
@@ -237,7 +245,7 @@ def mirror_outline(instrument: Instrument) -> tuple[Array, str]:
 _COLUMNS = ("synthetic", "measured", "difference")
 
 
-def slope_maps(figure: SubFigure, fit: Fit) -> None:
+def slope_maps(figure: SubFigure, fit: FittedMatrix) -> None:
     """Draw the signals of a few modes; all three maps of a mode have one scale."""
     columns = shown_modes(fit)
     n_rows = _rows(columns, _MODES_ACROSS)
@@ -256,7 +264,7 @@ def _rows(shown: Sized, across: int) -> int:
     return math.ceil(len(shown) / across)
 
 
-def _mode(triple: NDArray[Any], fit: Fit, column: int) -> None:
+def _mode(triple: NDArray[Any], fit: FittedMatrix, column: int) -> None:
     """Draw one mode into three axes."""
     measured, synthetic, limit = _of_mode(fit, column)
     for axes, values in zip(triple, (synthetic, measured, measured - synthetic), strict=True):
@@ -298,7 +306,7 @@ N_MAPS = 4
 """Number of modes whose slope maps are sent to a browser."""
 
 
-def numbers(fit: Fit) -> dict[str, Any]:
+def numbers(fit: FittedMatrix) -> dict[str, Any]:
     """Return the figures of a fit as JSON; null for unknown values.
 
     Maps are lists of rows from the lowest y upwards, Sx next to Sy, or the four images as on the
@@ -307,17 +315,20 @@ def numbers(fit: Fit) -> dict[str, Any]:
     """
     shown = shown_modes(fit)
     picked = shown[np.unique(np.linspace(0, len(shown) - 1, N_MAPS).round().astype(int))]
-    singular = {name: _plain(values, 5) for name, values in singular_values_of(fit).items()}
-    return {
-        "modes": fit.modes.tolist(),
-        "residual_by_mode": _plain(fit.residual_by_mode, 4),
-        "singular_values": singular,
+    found: dict[str, Any] = {
+        "modes": fit.modes,
+        "residual_by_mode": np.round(fit.residual_by_mode, 4),
+        "singular_values": {
+            name: np.round(values, 5) for name, values in singular_values_of(fit).items()
+        },
         "residual_map": _percent(side_by_side(fit.residual_map)),
         "maps": [_columns(fit, int(column)) for column in picked],
     }
+    document: dict[str, Any] = plain(found)
+    return document
 
 
-def singular_values_of(fit: Fit) -> dict[str, Array]:
+def singular_values_of(fit: FittedMatrix) -> dict[str, Array]:
     """Return the normalised singular values of both matrices, by the matrix's name."""
     found = {}
     for name, matrix in (("synthetic", fit.synthetic * fit.gains), ("measured", fit.measured)):
@@ -326,20 +337,20 @@ def singular_values_of(fit: Fit) -> dict[str, Array]:
     return found
 
 
-def shown_modes(fit: Fit) -> NDArray[np.intp]:
+def shown_modes(fit: FittedMatrix) -> NDArray[np.intp]:
     """Return the columns of the fit that are shown: the paper's modes, if they were used."""
     found = np.flatnonzero(np.isin(fit.modes + 1, PAPER_MODES))
     return found if len(found) else np.arange(min(len(fit.modes), N_MAPS))
 
 
-def _of_mode(fit: Fit, column: int) -> tuple[Array, Array, float]:
+def _of_mode(fit: FittedMatrix, column: int) -> tuple[Array, Array, float]:
     """Return one mode's slopes as maps, measured and synthetic, and the scale of both."""
     measured = as_maps(fit.measured[:, column], fit.valid)
     synthetic = as_maps(fit.synthetic[:, column] * fit.gains[column], fit.valid)
     return measured, synthetic, 3.0 * float(np.nanstd(measured)) or 1.0
 
 
-def _columns(fit: Fit, column: int) -> dict[str, Any]:
+def _columns(fit: FittedMatrix, column: int) -> dict[str, Any]:
     """Return one mode's slopes in per cent of their scale."""
     measured, synthetic, limit = _of_mode(fit, column)
     return {
@@ -351,7 +362,3 @@ def _columns(fit: Fit, column: int) -> dict[str, Any]:
 
 def _percent(shares: Array) -> Any:  # noqa: ANN401 - as nested as the array
     return np.ma.fix_invalid(np.round(100.0 * shares), fill_value=0.0).astype(int).tolist()
-
-
-def _plain(values: Array, digits: int) -> Any:  # noqa: ANN401 - as nested as the array
-    return np.ma.masked_invalid(np.round(values, digits)).tolist()

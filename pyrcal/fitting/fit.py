@@ -66,7 +66,8 @@ def main(options: argparse.Namespace) -> int:
     if options.output is not None:
         write_whole(options.output, partial(fill_fit, report=report))
     if options.plot is not None:
-        write_sheet(report, instrument, options.plot)
+        heading = f"{report.instrument}: {report.reference}"
+        write_sheet(report.fit, heading, instrument, options.plot)
     return ACCEPTED if report.fit.accepted else REFUSED
 
 

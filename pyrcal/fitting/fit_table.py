@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pyrcal.fitting.alternatives import PLAUSIBLE_DISPLACEMENT_PX, format_move, systematic_terms
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.methods import ScanStep
-from pyrcal.fitting.report import FitReport, orientation_words, verdict_line
+from pyrcal.fitting.report import FitReport, orientation_words
 from service.errors import shown
 from service.model.defects import list_ranges
 from service.model.misregistration import BOUNDARY_SCALE
@@ -38,7 +38,7 @@ def table(report: FitReport) -> str:
     fit = report.fit
     lines = [
         *([fit.recommendation] if fit.recommendation else []),
-        verdict_line(fit),
+        fit.verdict_line,
         *_verdict_lines(fit),
         "",
         *_registration_lines(fit),

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from importlib import import_module
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,13 +12,10 @@ from numpy.typing import NDArray
 from pyrcal.fitting.alternatives import Alternative
 from pyrcal.fitting.control_check import ReconstructorVerdict
 from pyrcal.fitting.disjoint_sets import DisjointSets, Distortion
+from pyrcal.fitting.fitted_matrix import FittedMatrix
 from pyrcal.fitting.instrument_checks import FoundOptic
-from pyrcal.fitting.left_over import LeftOver
-from pyrcal.fitting.methods import ScanStep
 from pyrcal.fitting.origins import Origin
 from pyrcal.fitting.solver import ANAMORPHOSIS_SIGMA
-from service.model.kinds import SlopeOrder
-from service.model.misregistration import Determination
 from service.model.slopes import Orientation
 
 if TYPE_CHECKING:
@@ -56,37 +53,17 @@ class Registration:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Fit(Determination):
+class Fit(FittedMatrix):
     """A fitted registration with its σ and verdict.
 
     The covariance includes noise, the scatter of disjoint sets and the floor of model errors.
     """
 
-    gains: NDArray[np.float64]
-    """``(n_used,)`` amplitude of each measured column over the model's, number of passes included.
-    """
-
-    residual_fraction: float
-    """RMS of the residual over RMS of the measurement, with all modes weighted equally."""
-
-    residual_map: NDArray[np.float64]
-    """``(n_planes, n, n)`` [x or y, or image; row, column] RMS of the residual over modes, in units
-    of the measurement's own RMS; NaN outside the valid subapertures."""
-
-    residual_by_mode: NDArray[np.float64]
-    """``(n_used,)`` RMS of the residual over RMS of the measurement, for each mode."""
-
     condition_number: float
     """Condition number of the synthetic matrix at ``alpha``, with the modes used."""
 
-    modes: NDArray[np.intp]
-    """``(n_used,)`` basis indices."""
-
     orientation: Orientation
     """Orientation of the slopes, given or found."""
-
-    order: SlopeOrder
-    """Order of the components, given or found."""
 
     subset_scatter: NDArray[np.float64]
     """``(4,)`` 1 σ scatter of disjoint sets of modes, units of ``alpha.vector``."""
@@ -97,28 +74,11 @@ class Fit(Determination):
     converged: bool
     """True if the steps converged."""
 
-    verdict: str
-    """Verdict in one line: accepted with its quality, or refused with the reason and the remedy."""
-
-    left_out: tuple[str, ...]
-    """Unused columns and slopes, one sentence for each kind."""
-
     remarks: tuple[str, ...]
     """Further notes on the fit, one sentence each."""
 
     n_evaluations: int
     """Number of interaction matrices computed, those for derivatives included."""
-
-    synthetic: NDArray[Any]
-    """``(n_slopes, n_used)`` model matrix at ``alpha`` without gains, in the axes of
-    conventions.md."""
-
-    measured: NDArray[Any]
-    """``(n_slopes, n_used)`` measured matrix in the same axes and unit, divided by the number of
-    passes."""
-
-    valid: NDArray[np.bool_]
-    """``(n, n)`` [y, x] mask of the subapertures in both, in the axes of conventions.md."""
 
     gain_map: NDArray[np.float64] | None = None
     """``(n, n)`` gain over the pupil common to all modes, mean 1; None if it was not fitted."""
@@ -151,14 +111,10 @@ class Fit(Determination):
     unknown_not_found: tuple[str, ...] = ()
     """Keys marked as unknown in the file that the matrix does not determine."""
 
-    left_over: LeftOver | None = None
-    """Location of the residual in pupil and modes; None if it was not computed."""
-
-    recommendation: str = ""
-    """Recommended action, in one sentence."""
-
-    paper_table: tuple[ScanStep, ...] | None = None
-    """Scans of the paper's method, in order; None for the other methods."""
+    corrections: Mapping[str, Any] = field(default_factory=dict)
+    """Values that the recommendation asks to write into the instrument file, by table and key, such
+    as ``wfs.modulation_lambda_over_d``; None removes a key. That of ``instrument.pupil`` describes
+    how the map is to be turned or mirrored."""
 
     @property
     def anamorphosis(self) -> NDArray[np.float64] | None:
@@ -180,7 +136,6 @@ class Fit(Determination):
         ConfigurationError
             If matplotlib, the extra ``plots``, is not installed.
         """
-        figures = import_module("pyrcal.fitting.figures")  # imported late: it imports this module
-        heading = "" if instrument is None else instrument.name
-        figure: Figure = figures.draw_sheet(self, heading, instrument)
-        return figure
+        from pyrcal.fitting.figures import draw_sheet  # a fit without a figure does not need it
+
+        return draw_sheet(self, "" if instrument is None else instrument.name, instrument)

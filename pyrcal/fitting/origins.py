@@ -47,9 +47,14 @@ class Origin:
     """True if the file should be corrected or completed."""
 
     @property
+    def entry(self) -> str:
+        """Entry for the instrument file."""
+        return f"{self.key} = {self.found}"
+
+    @property
     def words(self) -> str:
         """Summary of key, values and method."""
-        return f"{self.key} = {self.found} ({self.how}; the file says {self.reported})"
+        return f"{self.entry} ({self.how}; the file says {self.reported})"
 
 
 def list_origins(

@@ -43,6 +43,10 @@ ARMS, TURN = "spiders_m", "spiders_deg"
 """Keys of the arms. A number of the second one is the turn of the arms, or of a pupil map, in
 degrees."""
 
+WITHOUT_ARMS, MAP_WORDS = "no spider", "the pupil map "
+"""What stands for an entry of the instrument file where the arms are to be removed, and the
+beginning of what a turned or mirrored map is called."""
+
 MIN_OUTLINE_EXPLAINED = 0.01
 """RMS share of the signal that turned or wider arms must explain. Arms of one subaperture
 that are turned by one degree leave 0.027 of it."""
@@ -92,11 +96,11 @@ class PupilNumber:
     def words(self, about: Instrument, value: float) -> str:
         """Return a value in the notation of the file."""
         if self.key == ARMS and value < 0.1 * self.reported:
-            return "no spider"
+            return WITHOUT_ARMS
         if self.key != TURN:
             return f"{self.key} = {value:.3g}"
         if about.pupil is not None:
-            return f"the pupil map turned by {value:.2g} deg"
+            return f"{MAP_WORDS}turned by {value:.2g} deg"
         angles = np.round(_turn(about, value).spiders_deg, 1)
         return f"{self.key} = [{', '.join(f'{angle:g}' for angle in angles)}]"
 
@@ -460,7 +464,7 @@ def _try_other_ways_round(few: FitSubset) -> Iterator[TriedPupil]:
         matrix = few.matrix(few.of(other))
         lead = few.lead(matrix)
         yield TriedPupil(
-            words=f"the pupil map {words}",
+            words=f"{MAP_WORDS}{words}",
             lead=lead,
             moved=few.step(matrix)[:4] - few.step(few.own)[:4],
             explains=lead.share < PREFERRED_SHARE,

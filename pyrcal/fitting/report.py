@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pyrcal.fitting.alternatives import Alternative
-from pyrcal.fitting.control_check import ReconstructorVerdict
 from pyrcal.fitting.fitted import Fit, Registration
 from pyrcal.fitting.instrument_checks import NOTABLE_CHANGE, NOTABLE_SIGMA
 from pyrcal.fitting.left_over import LeftOver
@@ -22,7 +21,7 @@ from service.control.gains import CalibrationGains
 from service.control.reconstructor import Inversion, Recipe
 from service.errors import MatrixError
 from service.files.container import put_array, put_covariance
-from service.files.documents import json_text
+from service.files.documents import json_text, pick, plain
 from service.files.whole import open_hdf5
 from service.model.kinds import Method, SlopeOrder
 from service.model.misregistration import (
@@ -70,56 +69,48 @@ def document(report: FitReport) -> dict[str, Any]:
     "accepted" or "refused" and names what was left out.
     """
     fit = report.fit
-    return {
+    found: dict[str, Any] = {
         **fit.alpha.to_boundary(),
         "sigma": _parameters(fit.sigma),
-        "covariance": _plain(fit.covariance * COVARIANCE_SCALE),
-        "gains": _plain(fit.gains),
-        "residual_fraction": _plain(fit.residual_fraction),
-        "condition_number": _plain(fit.condition_number),
+        "covariance": fit.covariance * COVARIANCE_SCALE,
+        **pick(fit, "gains residual_fraction condition_number"),
         "n_modes_used": len(fit.modes),
         "orientation": orientation_words(fit.orientation, fit.order),
         "subset_scatter": _parameters(fit.subset_scatter),
-        "converged": bool(fit.converged),
-        "verdict": verdict_line(fit),
+        **pick(fit, "converged verdict=verdict_line"),
         "registration": None if fit.registration is None else _registration(fit.registration),
-        "reconstructor": None if fit.reconstructor is None else _reconstructor(fit.reconstructor),
-        "anamorphosis": None if fit.anamorphosis is None else _plain(fit.anamorphosis),
-        "anamorphosis_sigma": None
-        if fit.anamorphosis_sigma is None
-        else _plain(fit.anamorphosis_sigma),
-        "image_offsets_px": None if fit.image_offsets_px is None else _plain(fit.image_offsets_px),
+        "reconstructor": None if fit.reconstructor is None else pick(fit.reconstructor, _CONTROL),
+        **pick(fit, "anamorphosis anamorphosis_sigma image_offsets_px"),
         "instrument_found": {
             one.key if one.found is not None else _WIDTH: {
-                "found": _plain(one.found if one.found is not None else np.exp(one.change)),
-                "sigma": _plain(one.found_sigma),
-                "told": one.reported,
+                "found": one.found if one.found is not None else np.exp(one.change),
+                **pick(one, "sigma=found_sigma told=reported"),
             }
             for one in fit.optics
         },
         "recommendation": fit.recommendation,
-        "found_not_told": [
-            {
-                "key": one.key,
-                "found": one.found,
-                "told": one.reported,
-                "how": one.how,
-                "correct": one.correct,
-            }
-            for one in fit.origins
-        ],
-        "unknown_not_found": list(fit.unknown_not_found),
+        "corrections": dict(fit.corrections),
+        "found_not_told": [pick(one, "key found told=reported how correct") for one in fit.origins],
+        "unknown_not_found": fit.unknown_not_found,
         "alternatives": [_alternative(one, fit) for one in fit.alternatives],
         "left_over": None if fit.left_over is None else _left_over(fit.left_over),
-        "notes": list(report.notes),
+        "notes": report.notes,
         "seconds": round(report.seconds, 3),
     }
+    document: dict[str, Any] = plain(found)
+    return document
+
+
+_CONTROL = (
+    "stable_modes n_modes gain pole_radius pole_radius_all aligned_pole_radius "
+    "wavefront_ratio=loss_ratio noise_limited weakest_modes reason"
+)
 
 
 def _registration(found: Registration) -> dict[str, Any]:
+    distortion = found.distortion
     return {
-        "determined": bool(found.determined),
-        "reason": found.reason,
+        **pick(found, "determined reason"),
         "sigma_statistical": _parameters(found.sigma_statistical),
         "sigma_systematic": _parameters(found.sigma_systematic),
         "disjoint_sets": [
@@ -127,45 +118,24 @@ def _registration(found: Registration) -> dict[str, Any]:
                 "of": one.words,
                 "steps": [_parameters(step) for step in one.steps],
                 "sigma": [_parameters(sigma) for sigma in one.sigma],
-                "tension": dict(zip(PARAMETERS, _plain(one.tension), strict=True)),
-                "tension_without_distortion": dict(
-                    zip(PARAMETERS, _plain(one.straight_tension), strict=True)
-                ),
+                "tension": _by_parameter(one.tension),
+                "tension_without_distortion": _by_parameter(one.straight_tension),
                 "in_sigma": one.even,
             }
             for one in found.sets
         ],
-        "distortion_rms_subap": None
-        if found.distortion is None
-        else _plain(found.distortion.rms_subap),
-    }
-
-
-def _reconstructor(found: ReconstructorVerdict) -> dict[str, Any]:
-    return {
-        "stable_modes": found.stable_modes,
-        "n_modes": found.n_modes,
-        "gain": found.gain,
-        "pole_radius": _plain(found.pole_radius),
-        "pole_radius_all": _plain(found.pole_radius_all),
-        "aligned_pole_radius": _plain(found.aligned_pole_radius),
-        "wavefront_ratio": None if found.loss_ratio is None else _plain(found.loss_ratio),
-        "noise_limited": bool(found.noise_limited),
-        "weakest_modes": list(found.weakest_modes),
-        "reason": found.reason,
+        "distortion_rms_subap": None if distortion is None else distortion.rms_subap,
     }
 
 
 def _alternative(one: Alternative, fit: Fit) -> dict[str, Any]:
     return {
-        "words": one.words,
-        "misfit": None if one.share is None else _plain(one.share),
+        **pick(one, "words misfit=share"),
         "moved": _parameters(one.moved),
-        "moved_sigma": dict(zip(PARAMETERS, _plain(one.moved / fit.sigma), strict=True)),
-        "preferred": bool(one.preferred),
-        "undecided": bool(one.undecided),
+        "moved_sigma": _by_parameter(one.moved / fit.sigma),
+        **pick(one, "preferred undecided"),
         "key": one.key or None,
-        "in_sigma": _plain(one.weight(fit.residual_fraction)),
+        "in_sigma": one.weight(fit.residual_fraction),
     }
 
 
@@ -176,20 +146,9 @@ def _left_over(left: LeftOver) -> dict[str, Any]:
             {"row": y, "column": x, "share": share} for y, x, share in left.subapertures
         ],
         "modes": [{"mode": mode, "share": share} for mode, share in left.modes],
-        "arms": [
-            {"angle_deg": arm.angle_deg, "offset_subap": arm.offset_subap, "excess": arm.excess}
-            for arm in left.arms
-        ],
-        "planes": list(left.planes),
-        "gradient": list(left.gradient),
+        "arms": [pick(arm, "angle_deg offset_subap excess") for arm in left.arms],
+        **pick(left, "planes gradient"),
     }
-
-
-def verdict_line(fit: Fit) -> str:
-    """Return the verdict and the columns left out, on one line."""
-    if not fit.left_out:
-        return fit.verdict
-    return f"{fit.verdict}; left out: {'; '.join(fit.left_out)}"
 
 
 def orientation_words(orientation: Orientation, order: SlopeOrder) -> dict[str, Any]:
@@ -199,13 +158,12 @@ def orientation_words(orientation: Orientation, order: SlopeOrder) -> dict[str, 
     return {"order": str(order), **flips, "sign": both[0] if both[0] == both[1] else both}
 
 
-def _parameters(values: NDArray[np.float64]) -> dict[str, float | None]:
-    return dict(zip(PARAMETERS, _plain(values * BOUNDARY_SCALE), strict=True))
+def _parameters(values: NDArray[np.float64]) -> dict[str, float]:
+    return _by_parameter(values * BOUNDARY_SCALE)
 
 
-def _plain(values: float | NDArray[np.float64]) -> Any:  # noqa: ANN401 - as nested as the array
-    """Return numbers or nested lists of them, None for one that is not finite."""
-    return np.ma.masked_invalid(np.asarray(values, dtype=np.float64)).tolist()
+def _by_parameter(values: NDArray[np.float64]) -> dict[str, float]:
+    return dict(zip(PARAMETERS, values, strict=True))
 
 
 _WIDTH = "influence_width"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pyrcal.fitting.figures import save_figure
+from pyrcal.fitting.figures import new_figure, save_figure
 from pyrcal.fitting.system_report import SystemReport
 from service.model.instrument import Mirror
 from service.model.misregistration import PARAMETERS
@@ -29,11 +29,9 @@ def write_system_sheet(report: SystemReport, path: Path) -> None:
     ConfigurationError
         If the file cannot be written.
     """
-    from matplotlib.figure import Figure
-
     n_panels = len(report.system.mirrors) + (2 if report.found is not None else 0)
     n_rows = ceil(n_panels / _ACROSS)
-    figure = Figure(figsize=(_ACROSS * _SIDE, n_rows * _SIDE + 0.8), layout="constrained")
+    figure = new_figure(_ACROSS * _SIDE, n_rows * _SIDE + 0.8)
     figure.suptitle(f"{report.system.name}: {report.verdict}", fontsize="medium", wrap=True)
     panels = figure.subplots(n_rows, _ACROSS, squeeze=False).ravel()
     for number in range(len(report.system.mirrors)):

@@ -15,7 +15,7 @@ from pyrcal.fitting.system import ARCSEC_RAD, STAR, System
 from pyrcal.fitting.system_fit import SystemFit, fit_system
 from service.errors import shown
 from service.files.container import put_array
-from service.files.documents import json_text
+from service.files.documents import json_text, pick
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 
 MIN_PROBABILITY = 1e-4
@@ -139,12 +139,8 @@ def document(report: SystemReport) -> dict[str, Any]:
         pairs[sensor][mirror] = fit_report.document(one)
     places: dict[str, dict[str, Any]] = {}
     for row in _rows(report):
-        places.setdefault(row.owner, {})[row.name] = {
-            "value": row.value,
-            "sigma": row.sigma,
-            "nominal": row.nominal,
-            "unseen_share": row.unseen_share,
-        }
+        number = pick(row, "value sigma nominal unseen_share")
+        places.setdefault(row.owner, {})[row.name] = number
     return {
         "system": system.name,
         "verdict": report.verdict,

@@ -73,6 +73,14 @@ half of the misfit of 1 %."""
 
 UNDECIDED_WORDS = "the matrix does not show which"
 
+ENTRIES = (
+    'stroke = "unknown"',
+    'modes_kind = "surface"',
+    "double_pass = true",
+    "double_pass = false",
+)
+"""Entries of the instrument file that a verdict advises."""
+
 _PASS_TOLERANCE = 0.12
 """Largest relative deviation from a factor of two, and scatter, that indicates a forgotten pass."""
 
@@ -195,8 +203,7 @@ def _check_convergence(findings: FitFindings) -> str:
     noise = "" if findings.explained else "there is too much noise, "
     return (
         f"the fit did not converge: {noise}the modes (basis or order) or the instrument file do "
-        "not match the matrix, or the start is outside the capture range: start closer (--start), "
-        "or leave the start out"
+        "not match the matrix, or a start that was given (--start) is outside the capture range"
     )
 
 

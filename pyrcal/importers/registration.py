@@ -164,6 +164,14 @@ def decompose(linear: NDArray[np.float64], shift_subap: NDArray[np.float64]) -> 
     )
 
 
+def affine(alpha: Misregistration, subaperture_m: float) -> NDArray[np.float64]:
+    """Return ``(3, 3)``, from ``(x, y, 1)`` on the mirror to the sensor, metres in the pupil."""
+    matrix = np.eye(3)
+    matrix[:2, :2] = alpha.image
+    matrix[:2, 2] = alpha.vector[:2] * subaperture_m
+    return matrix
+
+
 def _times(time: Aot, n: int, where: str) -> Sequence[int | None]:
     """Return UTC nanoseconds; times written from nanoseconds are restored to the same double."""
     # A Fraction, because seconds times 1e9 would be rounded to a multiple of 256 ns.

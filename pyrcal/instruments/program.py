@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pyrcal.fitting.figures import check_plots, map_to_sensor, mirror_outline, save_figure
+from pyrcal.fitting.figures import map_to_sensor, mirror_outline, new_figure, save_figure
 from pyrcal.fitting.light import FLUX
 from pyrcal.instruments.schema_texts import KeyText, TableText, tables_of
 from pyrcal.terminal import print_lines, span
@@ -188,11 +188,9 @@ def write_drawing(instrument: Instrument, path: Path) -> None:
     ConfigurationError
         If matplotlib is not installed, or the file cannot be written.
     """
-    check_plots("a picture")
+    figure = new_figure(8.0, 8.4, "a picture")
     from matplotlib.collections import PolyCollection
-    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8.0, 8.4), layout="constrained")
     axes = figure.subplots()
     pupil = instrument_pupil(instrument, _POINTS)
     half = len(pupil.coordinates) / 2 / pupil.sampling

@@ -173,8 +173,8 @@ def _prune(settings: Settings, *, dry_run: bool, as_json: bool) -> int:
 def _aot(options: argparse.Namespace, settings: Settings) -> int:
     """Write the measurements of a night, or those around a recording, as AOT FITS."""
     # Imported here, because the other commands of the archive must not wait for it.
+    from pyrcal.importers.aot import excerpt, write_aot
     from pyrcal.importers.registration import Dated
-    from pyrcal.maintenance.aot import excerpt, write_aot
     from service.instrument import load_instrument
 
     if (options.night is None) is (options.recording is None):

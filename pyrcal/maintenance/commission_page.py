@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pyrcal.fitting.figures import check_plots
+from pyrcal.fitting.figures import check_plots, new_figure
 from pyrcal.maintenance.acceptance import (
     Commissioning,
     Criterion,
@@ -218,9 +218,7 @@ def _alarms(data: Commissioning) -> str:
 
 
 def _draw(n_rows: int, height_in: float) -> tuple[Figure, list[Axes]]:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.6, height_in), layout="constrained")
+    figure = new_figure(9.6, height_in, "pyrcal commission")
     axes = figure.subplots(n_rows, 1, sharex=True, squeeze=False)[:, 0]
     for one in axes:
         one.spines[["top", "right"]].set_visible(False)

@@ -7,15 +7,14 @@ the α of a moment later.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from importlib import import_module
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Concatenate, Final, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.importers.registration import Dated
+from pyrcal.playback.report import Track
 from service.config.settings import Settings
 from service.errors import ModelError, UnknownIdError, WireError
 from service.estimation.dither_windows import EndedWindow
@@ -23,7 +22,6 @@ from service.estimation.frames import FrameBlock
 from service.estimation.passive import PASSIVE_INTERVAL_S
 from service.estimation.random_dither import (
     Correlated,
-    NoisyMatrix,
     join_random_windows,
     noisy_matrix,
 )
@@ -32,23 +30,20 @@ from service.link.intake import Intake
 from service.link.matrices import MeasuredMatrix
 from service.link.session import Endpoint
 from service.model.instrument import Instrument
-from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
-from service.model.slopes import SlopeRecipe
 from service.records import events as ev
 from service.records.events import Effect, Event
 from service.records.products import ReconstructorRecord
-from service.records.registration import HistoryEntry, PassiveState
-from service.records.state import LogEntry, LoopState, Mode, OperatorState, TrackerState
+from service.records.state import LoopState, Mode, OperatorState, TrackerState
 from service.runtime.engine import Engine
 from service.runtime.estimates import fit_passive, fitted, read_own_matrix
 from service.runtime.policy import compute_of, policy_of
-from service.runtime.worker import Done, OpticsWorker
+from service.runtime.worker import OpticsWorker
 from service.tracking.policy import SECOND_NS
 from service.tracking.step_context import new_lines
 from service.wire import DitherRequest, Manifest, Reply, Status, decode
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -59,88 +54,8 @@ TICK_S: Final = 1.0
 NOT_CARRIED_OUT: Final = "unsupported: recorded telemetry"
 
 
-@dataclass(slots=True, kw_only=True)
-class Track:
-    """Results of the estimators from telemetry."""
-
-    entries: list[HistoryEntry] = field(default_factory=list)
-    """Measurements of α, in the order in which they were processed."""
-
-    passive: list[PassiveState] = field(default_factory=list)
-    """Estimates of α from ordinary telemetry alone, each with its bias included."""
-
-    lines: list[LogEntry] = field(default_factory=list)
-    """Log entries of the tracker."""
-
-    noisy: NoisyMatrix | None = None
-    """Interaction matrix from the last random dither; None if there was none."""
-
-    stated: tuple[Dated, ...] = ()
-    """α from the file itself, in its order; only AOT files have it."""
-
-    misaligned: str = ""
-    """Measured offset between slopes and commands; empty if it is as stated or not measurable."""
-
-    n_frames: int = 0
-    """Number of frames used."""
-
-    n_missing: int = 0
-    """Number of frames missing between these, from their sequence numbers."""
-
-    n_gaps: int = 0
-    """Number of gaps."""
-
-    first_ns_utc: int = 0
-    last_ns_utc: int = 0
-    """End of the last used frame, the RTC's clock; ``first_ns_utc`` is that of the first."""
-
-    state: TrackerState
-    """State of the tracker at the end."""
-
-    @property
-    def t(self) -> NDArray[np.float64]:
-        """``(n,)`` end of each measurement of α, seconds since the first frame."""
-        ends_ns = np.array([entry.t_ns_utc for entry in self.entries], np.int64)
-        return (ends_ns - self.first_ns_utc) / SECOND_NS
-
-    @property
-    def alpha(self) -> NDArray[np.float64]:
-        """``(n, 4)`` filtered α after each measurement, in the units of ``PARAMETERS``."""
-        return to_boundary([entry.filtered.vector for entry in self.entries])
-
-    @property
-    def sigma(self) -> NDArray[np.float64]:
-        """``(n, 4)`` 1 σ of ``alpha``, model error included."""
-        return to_boundary([entry.filtered_sigma for entry in self.entries])
-
-    def plot(self, title: str = "") -> Figure:
-        """Return α over time as a figure, as ``pyrcal track --plot`` draws it.
-
-        Raises
-        ------
-        ConfigurationError
-            If matplotlib, the extra ``plots``, is not installed.
-        """
-        # Imported late, because it imports this module.
-        report = import_module("pyrcal.playback.report")
-        figure: Figure = report.draw(self, title)
-        return figure
-
-
-def to_boundary(vectors: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return vectors in numeric units as rows in the units of ``PARAMETERS``."""
-    # Reshaped, because no vector at all must give (0, 4) as well.
-    return np.asarray(np.array(vectors).reshape(-1, len(PARAMETERS)) * BOUNDARY_SCALE)
-
-
 class Player:
     """Driver of an engine without network, processes and clocks."""
-
-    first: Callable[[], Done[None]] | None = None
-    """Job for new workers, required by the interface; not used here, because the only worker has
-    already run it."""
-
-    found_slopes: SlopeRecipe | None = None
 
     def __init__(self, instrument: Instrument, settings: Settings, system: str) -> None:
         """Prepare the optical model.
@@ -152,14 +67,16 @@ class Player:
         """
         # The loop of a recording cannot be opened, so nothing is acquired from nothing.
         policy = replace(policy_of(settings, instrument), acquires=False)
+        self._optics = OpticsWorker(instrument, compute_of(settings))
+        description = self._optics.describe()
         state = TrackerState(
             system=system,
+            model=self._optics.state,
             # A matrix that would be made has no RTC to go to.
             operator=OperatorState(mode=Mode.HOLD),
             loop=LoopState(basis_id=instrument.basis_id, config_id=instrument.config_id),
         )
         self.track = Track(state=state)
-        self._optics = OpticsWorker(instrument, compute_of(settings))
         self._now_s, self._began_ns = 0.0, 0
         self._ticked_s = self._summed_s = 0.0
         self._intake = Intake(Endpoint(system=system), clock=lambda: self._now_s)
@@ -171,7 +88,7 @@ class Player:
         self._random: Correlated | None = None
         self._next: tuple[str, int] | None = None
         self._engine = Engine(state, policy, self)
-        self._engine.set_description(self._optics.describe())
+        self._engine.set_description(description)
 
     async def play(self, messages: Iterable[Message], progress: Callable[[float], None]) -> Track:
         """Play messages in the order of sending; ``progress`` receives the seconds played."""
@@ -328,7 +245,8 @@ class Player:
 
     def sensor_mode_changed(self, config_id: str) -> None:
         """Build the model of another mode of the sensor."""
-        self._engine.set_description(self._optics.enter_mode(config_id))
+        self._optics.restore(self._engine.state.model, {})
+        self._engine.set_description(self._optics.describe())
         self._unread_matrix = self._engine.state.matrices.in_use
 
     def perform(self, effect: Effect) -> None:
@@ -343,4 +261,8 @@ class Player:
         self, job: Callable[Concatenate[OpticsWorker, P], R], *args: P.args, **kwargs: P.kwargs
     ) -> R:
         """Run a method of the worker synchronously."""
-        return job(self._optics, *args, **kwargs)
+        self._optics.restore(self._engine.state.model, {})
+        result = job(self._optics, *args, **kwargs)
+        if self._optics.state != self._engine.state.model:
+            self._engine.post(ev.ModelChanged(model=self._optics.state))
+        return result

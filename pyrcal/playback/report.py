@@ -1,9 +1,10 @@
-"""Report the results of telemetry as a table, as one document, as HDF5, as a plot."""
+"""Results of the estimators from telemetry, as a table, as one document, as HDF5, as a plot."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,10 +12,12 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.fitting.figures import check_plots
-from pyrcal.playback.player import Track, to_boundary
+from pyrcal.fitting.figures import new_figure
+from pyrcal.importers.registration import Dated
 from pyrcal.terminal import table as aligned
+from service.estimation.random_dither import NoisyMatrix
 from service.files.container import put_array
+from service.files.documents import pick, plain
 from service.model.misregistration import (
     BOUNDARY_SCALE,
     COVARIANCE_SCALE,
@@ -23,8 +26,8 @@ from service.model.misregistration import (
     wrap_angle,
 )
 from service.records import alarms
-from service.records.registration import HistoryEntry, Source
-from service.records.state import Level
+from service.records.registration import HistoryEntry, PassiveState, Source
+from service.records.state import Level, LogEntry, TrackerState
 from service.tracking.policy import SECOND_NS
 
 if TYPE_CHECKING:
@@ -54,6 +57,77 @@ _OF_MISALIGNED = frozenset(
 
 _MAX_REASONS = 8
 """Number of kinds of refusals and warnings listed in the table."""
+
+
+@dataclass(slots=True, kw_only=True)
+class Track:
+    """Results of the estimators from telemetry."""
+
+    entries: list[HistoryEntry] = field(default_factory=list)
+    """Measurements of α, in the order in which they were processed."""
+
+    passive: list[PassiveState] = field(default_factory=list)
+    """Estimates of α from ordinary telemetry alone, each with its bias included."""
+
+    lines: list[LogEntry] = field(default_factory=list)
+    """Log entries of the tracker."""
+
+    noisy: NoisyMatrix | None = None
+    """Interaction matrix from the last random dither; None if there was none."""
+
+    stated: tuple[Dated, ...] = ()
+    """α from the file itself, in its order; only AOT files have it."""
+
+    misaligned: str = ""
+    """Measured offset between slopes and commands; empty if it is as stated or not measurable."""
+
+    n_frames: int = 0
+    """Number of frames used."""
+
+    n_missing: int = 0
+    """Number of frames missing between these, from their sequence numbers."""
+
+    n_gaps: int = 0
+    """Number of gaps."""
+
+    first_ns_utc: int = 0
+    last_ns_utc: int = 0
+    """End of the last used frame, the RTC's clock; ``first_ns_utc`` is that of the first."""
+
+    state: TrackerState
+    """State of the tracker at the end."""
+
+    @property
+    def t(self) -> NDArray[np.float64]:
+        """``(n,)`` end of each measurement of α, seconds since the first frame."""
+        ends_ns = np.array([entry.t_ns_utc for entry in self.entries], np.int64)
+        return (ends_ns - self.first_ns_utc) / SECOND_NS
+
+    @property
+    def alpha(self) -> NDArray[np.float64]:
+        """``(n, 4)`` filtered α after each measurement, in the units of ``PARAMETERS``."""
+        return to_boundary([entry.filtered.vector for entry in self.entries])
+
+    @property
+    def sigma(self) -> NDArray[np.float64]:
+        """``(n, 4)`` 1 σ of ``alpha``, model error included."""
+        return to_boundary([entry.filtered_sigma for entry in self.entries])
+
+    def plot(self, title: str = "") -> Figure:
+        """Return α over time as a figure, as ``pyrcal track --plot`` draws it.
+
+        Raises
+        ------
+        ConfigurationError
+            If matplotlib, the extra ``plots``, is not installed.
+        """
+        return draw(self, title)
+
+
+def to_boundary(vectors: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return vectors in numeric units as rows in the units of ``PARAMETERS``."""
+    # Reshaped, because no vector at all must give (0, 4) as well.
+    return np.asarray(np.array(vectors).reshape(-1, len(PARAMETERS)) * BOUNDARY_SCALE)
 
 
 def table(track: Track) -> str:
@@ -164,23 +238,17 @@ def _list_problems(track: Track) -> list[str]:
 
 def document(track: Track, source: Path) -> dict[str, Any]:
     """Return the result as one JSON object; its entries are like REST's of α."""
-    registration = track.state.alpha.registration
-    return {
+    registration, state = track.state.alpha.registration, track.state
+    found: dict[str, Any] = {
         "telemetry": str(source),
         "misaligned": track.misaligned or None,
-        "n_frames": track.n_frames,
-        "n_missing": track.n_missing,
-        "first_ns_utc": track.first_ns_utc,
-        "last_ns_utc": track.last_ns_utc,
+        **pick(track, "n_frames n_missing first_ns_utc last_ns_utc"),
         "alpha": None if registration is None else registration.alpha.to_boundary(),
-        "covariance": None
-        if registration is None
-        else (registration.covariance * COVARIANCE_SCALE).tolist(),
+        "covariance": None if registration is None else registration.covariance * COVARIANCE_SCALE,
         "entries": [_entry(entry) for entry in track.entries],
         "passive": [
             {
-                "t_ns_utc": one.t_ns_utc,
-                "estimator": one.estimator,
+                **pick(one, "t_ns_utc estimator"),
                 "alpha": one.alpha.to_boundary(),
                 "sigma": at_boundary(one.sigma) if np.isfinite(one.sigma).all() else None,
                 "text": one.text,
@@ -191,30 +259,25 @@ def document(track: Track, source: Path) -> dict[str, Any]:
             {
                 "t_ns_utc": at.t_ns_utc,
                 "alpha": at.alpha.to_boundary(),
-                "anamorphosis": at.alpha.stretches.tolist(),
+                "anamorphosis": at.alpha.stretches,
             }
             for at in track.stated
         ],
-        "alarms": [{"name": a.name, "text": a.text} for a in track.state.alarms.active],
-        "windows": {
-            "accepted": track.state.windows.accepted,
-            "refused": track.state.windows.refused,
-        },
+        "alarms": [pick(alarm, "name text") for alarm in state.alarms.active],
+        "windows": pick(state.windows, "accepted refused"),
     }
+    document: dict[str, Any] = plain(found)
+    return document
 
 
 def _entry(entry: HistoryEntry) -> dict[str, Any]:
     return {
-        "t_ns_utc": entry.t_ns_utc,
-        "source": entry.source.value,
+        **pick(entry, "t_ns_utc source"),
         "measured": entry.measured.to_boundary(),
         "measured_sigma": at_boundary(entry.measured_sigma),
         "filtered": entry.filtered.to_boundary(),
         "filtered_sigma": at_boundary(entry.filtered_sigma),
-        "innovation": entry.innovation,
-        "misfit": entry.misfit if np.isfinite(entry.misfit) else None,
-        "entered": entry.entered,
-        "in_use": entry.in_use,
+        **pick(entry, "innovation misfit entered in_use"),
     }
 
 
@@ -251,10 +314,7 @@ def draw(track: Track, title: str) -> Figure:
     ConfigurationError
         If matplotlib is not installed.
     """
-    check_plots("plot")
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11.0, 9.0), layout="constrained")
+    figure = new_figure(11.0, 9.0)
     figure.suptitle(title)
     every = figure.subplots(len(PARAMETERS), 1, sharex=True)
     for k, axes in enumerate(every):

@@ -15,11 +15,11 @@ import structlog
 from threadpoolctl import threadpool_limits
 
 from pyrcal.fitting.figures import check_plots, save_figure
-from pyrcal.playback.aot import read_telemetry
+from pyrcal.importers.aot import read_telemetry
 from pyrcal.playback.arrays import Arrays, open_arrays
-from pyrcal.playback.player import Player, Track
+from pyrcal.playback.player import Player
 from pyrcal.playback.pyrtc import is_session, read_session
-from pyrcal.playback.report import document, draw, fill, table
+from pyrcal.playback.report import Track, document, draw, fill, table
 from pyrcal.terminal import show_progress
 from service.config import load_settings
 from service.config.settings import Settings

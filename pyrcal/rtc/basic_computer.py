@@ -76,6 +76,7 @@ class BasicComputer:
         max_dither_modes: int = 8,
     ) -> None:
         self.identity = identity
+        """Names. Replace them by others (``dataclasses.replace``) between two batches."""
         self.gains = np.asarray(gains, dtype=np.float64)
         """Gain of each mode, ``(n_modes,)``."""
         self.leak = leak
@@ -179,6 +180,7 @@ class BasicComputer:
                 cm_id=self._reconstructor.manifest.id,
                 basis_id=self.identity.basis_id,
                 config_id=self.identity.config_id,
+                reference_id=self.identity.reference_id,
             )
             self.seq += len(rows)
             self._n_exposing = 0
@@ -208,6 +210,7 @@ class BasicComputer:
                 cm_id=self._reconstructor.manifest.id,
                 basis_id=self.identity.basis_id,
                 config_id=self.identity.config_id,
+                reference_id=self.identity.reference_id,
                 dither=None if self._dither is None else self._dither.status,
                 max_dither_m=self._max_dither_m,
                 max_dither_modes=self._max_dither_modes,

@@ -1,4 +1,4 @@
-"""Names that telemetry and reconstructors carry: system, modal basis, sensor configuration."""
+"""Names that telemetry and reconstructors carry: system, modal basis, sensor, references."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ Array32 = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Identity:
-    """System, modal basis and sensor configuration of an RTC.
+    """System, modal basis, sensor configuration and reference slopes of an RTC.
 
-    The service accepts telemetry, and the RTC a reconstructor, only if these names agree.
+    The service accepts telemetry, and the RTC a reconstructor, only if the first three agree.
     """
 
     system: str
@@ -30,6 +30,9 @@ class Identity:
 
     config_id: str
     """Name of the sensor configuration. It must change when the sensor's geometry changes."""
+
+    reference_id: str | None = None
+    """Name of the reference slopes. It must change when they change; None if they have no name."""
 
     double_pass: bool = False
     """True if the light is reflected by the mirror twice, as with a retro-reflector by day."""

@@ -73,7 +73,9 @@ def _run(options: argparse.Namespace) -> int:
     # from here on each import takes its time: the worker's first, so that it imports beside them
     from service.runtime.processes import Worker
 
-    early = Worker().begin() if options.own_process else Worker()
+    early = Worker("service.runtime.worker")
+    if options.own_process:
+        early.begin()
     from service.instrument import load_instrument
     from service.runtime.policy import compute_of
     from service.runtime.worker import start_worker

@@ -46,6 +46,9 @@ class Change(Flag):
     MATRIX = auto()
     """Another matrix multiplied the slopes of this block than those of the one before."""
 
+    REFERENCES = auto()
+    """Other reference slopes were subtracted from this block than from the one before."""
+
     STANDSTILL = auto()
     """The slopes are frozen. Set for every such block; the frames before it are not used either."""
 
@@ -98,6 +101,9 @@ class LoopContext:
 
     cm_id: str | None = None
     """The matrix of the last block."""
+
+    reference_name: str | None = None
+    """The reference slopes of the last block."""
 
     from_seq: int = 0
     """Frames before this one may have been made by another loop, or by no measurement."""

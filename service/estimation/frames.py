@@ -1,4 +1,4 @@
-"""Telemetry as estimators take it: contiguous frames of one session and matrix."""
+"""Telemetry as estimators take it: contiguous frames of one session, matrix and references."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrameBlock:
-    """Frames of one session, contiguous in sequence and recorded under one reconstructor.
+    """Frames of one session, contiguous, of one reconstructor and one set of reference slopes.
 
     Row k holds the slopes and the command that was on the mirror during the exposure that made
     them: there is no lag between the columns.
@@ -39,6 +39,9 @@ class FrameBlock:
 
     cm_id: str | None
     """The reconstructor that multiplied these slopes; None when the RTC does not know."""
+
+    reference_name: str | None = None
+    """Name of the reference slopes subtracted from these slopes; None if unknown."""
 
     @property
     def n_frames(self) -> int:
@@ -75,6 +78,7 @@ class FrameBlock:
             commands_m=self.commands_m[some],
             dither_m=None if self.dither_m is None else self.dither_m[some],
             cm_id=self.cm_id,
+            reference_name=self.reference_name,
         )
 
     def last(self, n: int) -> FrameBlock:
@@ -94,12 +98,14 @@ class FrameBlock:
         return replace(self, commands_m=self.commands_m - self.dither_m, dither_m=None)
 
     def follows(self, before: FrameBlock) -> bool:
-        """Return whether this block goes on where another ends."""
-        # Sequence numbers mean nothing outside of their session.
-        return (self.session, self.dt_ns, self.first_seq) == (
+        """Return whether this block goes on where another ends, with the same reference slopes."""
+        # Sequence numbers mean nothing outside of their session, nor do differences of slopes whose
+        # zero points differ.
+        return (self.session, self.dt_ns, self.first_seq, self.reference_name) == (
             before.session,
             before.dt_ns,
             before.next_seq,
+            before.reference_name,
         )
 
 

@@ -156,11 +156,16 @@ class UpperPower:
         return replace(state, lost_from_m2=usual_m2) if runs_away(last, usual_m2) else state
 
 
+_OF_COMMANDS = Change.LOOP | Change.REFERENCES
+"""Changes after which the power of the commands before is no reference for that after: the noise in
+them goes with the gain, and reference slopes put a constant shape into them."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopHealth(Streaming):
     """Forgetting mean of how far the high modes are beyond what turbulence asks of them."""
 
-    resets = Change.GONE | Change.SESSION | Change.OPEN | Change.MATRIX | Change.LOOP
+    resets = Change.GONE | Change.SESSION | Change.OPEN | _OF_COMMANDS | Change.MATRIX
     unless = Mark.STANDS
     only_closed = True
 
@@ -184,10 +189,9 @@ class LoopHealth(Streaming):
     def begun_anew(self, loop: LoopContext, why: Change) -> LoopHealth:
         """Return it with nothing; what another matrix made of the loop says nothing of this one.
 
-        The power before stays the reference of another matrix: turbulence is the same. With other
-        gains it is none, because the noise in the commands goes with the gain.
+        The power before stays the reference of another matrix: turbulence is the same.
         """
-        if why == Change.LOOP:
+        if why in _OF_COMMANDS:
             known = self.power.lost_from_m2 is None
             return replace(self, power=UpperPower()) if known else self
         return replace(self, ratio=0.0) if why == Change.MATRIX else LoopHealth()

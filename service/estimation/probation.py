@@ -103,7 +103,7 @@ rate may be 0 in all of them."""
 class Comparison(Streaming):
     """Telemetry with the matrix in use and with the one before."""
 
-    resets = Change.GONE
+    resets = Change.GONE | Change.REFERENCES
     unless = Mark.STANDS | Mark.ABSURD
     only_closed = True
 
@@ -154,6 +154,11 @@ class Comparison(Streaming):
 
     of_loop: Status | None = None
     """The loop that both must be of, but for how many modes are controlled."""
+
+    @override
+    def begun_anew(self, loop: LoopContext, why: Change) -> Comparison:
+        """Return it with nothing; new references are no swap, and settle as after one."""
+        return replace(self, n_skipped=0) if why == Change.REFERENCES else self.begin(loop)
 
     @override
     def on_status(self, loop: LoopContext, *, fresh: bool) -> Comparison:

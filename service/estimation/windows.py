@@ -164,6 +164,7 @@ class Window(Generic[S]):
 
     session: str
     cm_id: str | None
+    reference_name: str | None
     first_seq: int
     next_seq: int
     """The frame expected next."""
@@ -212,6 +213,10 @@ class Window(Generic[S]):
         if block.cm_id != self.cm_id:
             changed = f"{self.cm_id} -> {block.cm_id}"
             return RefusalKind.CUT_SHORT, f"the reconstructor changed inside the window: {changed}"
+        if block.reference_name != self.reference_name:
+            changed = f"{self.reference_name} -> {block.reference_name}"
+            text = f"the reference slopes changed inside the window: {changed}"
+            return RefusalKind.CUT_SHORT, text
         if block.dither_m is None:
             return RefusalKind.CUT_SHORT, "the dither ended inside the window"
         if abs(block.t0_ns_utc - expected_ns) > block.dt_ns / 2:
@@ -282,6 +287,7 @@ class WindowCutter(Generic[P, S, F]):
             window = Window(
                 session=block.session,
                 cm_id=block.cm_id,
+                reference_name=block.reference_name,
                 first_seq=block.first_seq,
                 next_seq=block.first_seq,
                 next_t_ns=block.t0_ns_utc,

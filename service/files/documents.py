@@ -25,6 +25,15 @@ def json_text(document: Mapping[str, Any] | list[Any], *, indent: int | None = N
     return json.dumps(plain(document), indent=indent, allow_nan=False)
 
 
+def pick(record: object, names: str) -> dict[str, Any]:
+    """Return attributes of a record for a document, in the order of the names.
+
+    A name like ``verdict=verdict_line`` gives the attribute behind it another key.
+    """
+    pairs = (name.partition("=") for name in names.split())
+    return {key: getattr(record, attribute or key) for key, _, attribute in pairs}
+
+
 def plain(value: object, *, finite: bool = True) -> Any:  # noqa: ANN401 - as nested as the value
     """Return a value made of Python's own types.
 

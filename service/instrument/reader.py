@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from service.errors import ConfigurationError, ModelError
 from service.files.toml import read_dataset, refuse, refuse_all
-from service.instrument import and_sensor_mode, packaged_file
 from service.instrument import schema as schema
 from service.instrument.mirrors import Pupil, own_modes, read_mirror
+from service.instrument.paths import and_sensor_mode, packaged_file
 from service.instrument.schema import AboutTable, LawTable, Section, law_of, remarks_on_law
 from service.model.aperture import check_mask
 from service.model.instrument import (

@@ -15,7 +15,7 @@ from pydantic import BeforeValidator, Field, PlainValidator, create_model
 
 from service.errors import ConfigurationError, ModelError
 from service.files.toml import Id, Table, in_file, read_dataset, read_toml, refuse, validated
-from service.instrument import instrument_path
+from service.instrument.paths import instrument_path
 from service.model import kinds
 from service.model.kinds import Read
 from service.model.pointing_law import ANGLES, PointingLaw, Term

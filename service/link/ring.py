@@ -175,7 +175,7 @@ class FrameRing:
 
         Frames behind a missing one are held back until it comes or ``patience_s`` have gone by
         since it was missed. A hole, a clock step of more than half a period, another
-        reconstructor, period or kind of row begins a new block.
+        reconstructor, set of references, period or kind of row begins a new block.
         """
         last = min(self._head if end is None else end, self._head, self._cursor + limit)
         slots = np.arange(self._cursor, last) % self._capacity
@@ -276,6 +276,7 @@ def _goes_on(before: FrameHeader, after: FrameHeader) -> bool:
         after.seq0 == before.seq0 + before.n
         and abs(late_ns) <= 0.5 * before.dt_ns
         and (after.dt_ns, after.dither, after.cm_id) == (before.dt_ns, before.dither, before.cm_id)
+        and after.reference_name == before.reference_name
     )
 
 
@@ -293,6 +294,7 @@ def _block(parts: list[FrameBatch]) -> FrameBlock:
         commands_m=together.commands_m,
         dither_m=together.dither_m,
         cm_id=header.cm_id,
+        reference_name=header.reference_name,
     )
 
 

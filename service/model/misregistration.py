@@ -112,6 +112,12 @@ class Misregistration:
         """Return the registration a step ``(4,)`` further, numeric units."""
         return self.with_vector(self.vector + step)
 
+    def step_to(self, other: Self) -> NDArray[np.float64]:
+        """Return the step ``(4,)`` to another registration, numeric units, by the shorter turn."""
+        step = other.vector - self.vector
+        step[2] = wrap_angle(float(step[2]))
+        return step
+
     def with_anamorphosis(self, stretches: NDArray[np.float64]) -> Self:
         """Return the registration with another anamorphosis ``(2,)``."""
         return replace(self, anamorphosis=(float(stretches[0]), float(stretches[1])))

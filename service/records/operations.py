@@ -87,12 +87,42 @@ class Schedule:
     """True if the required σ is met; else the whole budget is used and σ is close to the best."""
 
 
+class DitherPurpose(StrEnum):
+    """Purposes of a dither; the value is how the id of a requested one begins."""
+
+    FOLLOW = "dither"
+    """Follow α."""
+
+    PROVE = "dither-prove"
+    """Show how modes respond before they are controlled."""
+
+    OPERATOR = "operator"
+    """Ordered by an operator."""
+
+    NOISY = "noisy"
+    """Measure a noisy interaction matrix."""
+
+    ACQUIRE = "acquire"
+    """Find α in an acquisition."""
+
+    FOREIGN = "foreign"
+    """Unknown: another program requested it."""
+
+    @property
+    def automatic(self) -> bool:
+        """True if the service chooses such a dither by itself in closed loop."""
+        return self in {DitherPurpose.FOLLOW, DitherPurpose.PROVE}
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dither:
     """A dither that the service follows, requested or running."""
 
     request: DitherRequest
     """Request that the RTC plays."""
+
+    purpose: DitherPurpose
+    """Purpose of the dither; of an adopted one, as far as its id shows it."""
 
     start_seq: int | None = None
     """First frame that contains it; None until the RTC has accepted."""

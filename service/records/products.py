@@ -347,6 +347,9 @@ class ReconstructorRecord:
     config_id: str | None = None
     """The RTC's configuration that it is for; None: not known, or the RTC has one alone."""
 
+    reference_id: str | None = None
+    """Reference slopes that the RTC used when it was computed; None if they are not known."""
+
     cause: str = field(default="", compare=False)
     """Id of the order or event that has made it, or sent it since."""
 

@@ -200,7 +200,14 @@ def process_block(bank: EstimatorBank, block: FrameBlock) -> Fed:
     closed = len(loop.in_loop) > 0
     changes = estimator.NOTHING if closed else Change.OPEN
     changes |= estimator.NOTHING if block.cm_id == loop.cm_id else Change.MATRIX
-    loop = replace(loop, received_ns_utc=block.next_t_ns - block.dt_ns, cm_id=block.cm_id)
+    same_references = block.reference_name == loop.reference_name
+    changes |= estimator.NOTHING if same_references else Change.REFERENCES
+    loop = replace(
+        loop,
+        received_ns_utc=block.next_t_ns - block.dt_ns,
+        cm_id=block.cm_id,
+        reference_name=block.reference_name,
+    )
     frames = FrameContext(
         block=block,
         loop=loop,

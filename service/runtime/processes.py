@@ -32,9 +32,6 @@ from threadpoolctl import threadpool_limits
 
 from service.errors import PyrcalError, WorkerError
 
-WORKER_MODULE = "service.runtime.worker"
-"""Module that every process imports before its first job."""
-
 MAX_COPIED_BYTES = 1 << 16
 """An array that is larger is not copied to be sent: windows of many modes are 45 MB."""
 
@@ -42,10 +39,13 @@ R = TypeVar("R")
 
 
 class JobProcess:
-    """A process that does one piece of work after another; nothing runs before the first."""
+    """A process that does one piece of work after another; nothing runs before the first.
 
-    def __init__(self, *, nice: int) -> None:
-        self._nice = nice
+    Before its first job it imports the module ``imports``, which need not be imported here.
+    """
+
+    def __init__(self, imports: str, *, nice: int) -> None:
+        self._imports, self._nice = imports, nice
         self._busy = threading.Lock()
         self._process: BaseProcess | None = None
         self._line: Connection | None = None
@@ -121,7 +121,7 @@ class JobProcess:
             process = context.Process(
                 # Daemon, so that the interpreter does not wait for a fit at exit.
                 target=_work,
-                args=(theirs, self._nice, WORKER_MODULE),
+                args=(theirs, self._nice, self._imports),
                 daemon=True,
             )
             with _deaf_to_the_keyboard():
@@ -136,8 +136,8 @@ class JobProcess:
 class Worker(JobProcess):
     """A process that keeps the optical models between jobs."""
 
-    def __init__(self) -> None:
-        super().__init__(nice=0)  # until it knows how nice it is to be
+    def __init__(self, imports: str) -> None:
+        super().__init__(imports, nice=0)  # until it knows how nice it is to be
         self._enter: Callable[[], None] | None = None
         self._enters = False
 

@@ -22,15 +22,11 @@ RESTART_GRACE_S = 60.0
 """Time after a restart of the service for an active alarm to be raised again."""
 
 
-def update_records(context: StepContext, *, timely: bool, ordered: bool) -> None:
+def update_records(context: StepContext, *, ordered: bool) -> None:
     """Keep the notes in step with the alarms, and with the time.
 
-    ``timely``: the time has gone on. ``ordered``: an operator has given a command, and what it ends
-    has been seen.
+    ``ordered``: an operator has given a command, and what it ends has been seen.
     """
-    # The same tuple: no alarm has begun, ended or changed. Mutes and graces end by time alone.
-    if context.alarms.active is context.before.alarms.active and not timely:
-        return
     notes = {record.name: record for record in context.alarms.records}
     raised = {alarm.name: alarm for alarm in context.alarms.active}
     for alarm in raised.values():

@@ -14,13 +14,13 @@ from service.control.dither import compute_precision_ratio, update_mean_ratio
 from service.records import alarms
 from service.records import commands as cmd
 from service.records import events as ev
-from service.records.estimates import LockInEstimate, RandomEstimate
-from service.records.operations import Dither, DitherPhase, Precision
+from service.records.estimates import RandomEstimate
+from service.records.operations import Dither, DitherPhase, DitherPurpose, Precision
 from service.records.state import Level, TrackerState
 from service.tracking import dither_plan, dither_request, mode_proof
 from service.tracking.dither_plan import WantedDither
 from service.tracking.policy import SECOND_NS
-from service.tracking.step_context import StepContext
+from service.tracking.step_context import StepContext, present
 from service.wire import DitherRequest, DitherStatus, DitherStop, Reply, Status
 
 MAX_MEASURED_AMPLITUDE_RATIO = 1.1
@@ -53,12 +53,11 @@ _STATUS_DELAY_S = 2.0
 """Time for a status made before the dither began to arrive, if it has no frame number."""
 
 
-def choose_dither(context: StepContext, rtc: Status) -> None:
+def choose_dither(context: StepContext) -> None:
     """Dither as much and as often as the policy asks while the loop is closed, its matrix known."""
+    rtc, dither = present(context.rtc), context.dither
     _update_cost(context, rtc)
-    stop_unwanted(context, rtc)
-    dither = context.dither
-    if dither is not None and not dither_request.is_own_sine(dither.request):
+    if dither is not None and not dither_request.is_automatic_sine(dither.request, dither.purpose):
         _set_phase(context, DitherPhase.OPERATOR, f"{dither.id} runs")
         return
     forbidden = dither_plan.check_dither_allowed(context, rtc)
@@ -115,7 +114,7 @@ def allow_dither(context: StepContext, *, allowed: bool = True) -> None:
     context.dithers = replace(context.dithers, stopped=not allowed)
 
 
-def stop_by_operator(context: StepContext, _: cmd.StopDither) -> None:
+def on_stop(context: StepContext, _: cmd.StopDither) -> None:
     """Stop the dither until it is ordered again."""
     forget_dither(context)
     allow_dither(context, allowed=False)
@@ -139,7 +138,7 @@ def on_answer(context: StepContext, request: DitherRequest, reply: Reply) -> Non
             context.dither, start_seq=reply.start_seq, asked_ns_utc=context.now_ns
         )
         text = f"{request.id} starts at frame {reply.start_seq}"
-        context.log("dither.started", text, _level(request))
+        context.log("dither.started", text, _level(context.dither))
         return
     context.put_off(dither_s=10.0)
     context.dither = None
@@ -148,7 +147,13 @@ def on_answer(context: StepContext, request: DitherRequest, reply: Reply) -> Non
     context.fail(text)
 
 
-def on_stop_answer(context: StepContext, reply: Reply) -> None:
+def on_failure(context: StepContext, _: DitherRequest, __: str) -> None:
+    """Follow no dither that the RTC could not be asked for, and ask for none for a while."""
+    context.put_off(dither_s=5.0)
+    context.dither = None
+
+
+def on_stop_answer(context: StepContext, _: DitherStop, reply: Reply) -> None:
     """Put on record that the RTC goes on; it is asked again for as long as it must be."""
     if not reply.accepted:
         context.warn("job.failed", f"the RTC did not stop the dither: {reply.reason}")
@@ -177,7 +182,7 @@ def follow_status(context: StepContext, rtc: Status) -> None:
         context.dither_policy = replace(context.dither_policy, ended_ns_utc=context.now_ns)
         context.dither = None
         context.clear_alarm(alarms.DITHER_LOST)
-        context.log("dither.ended", f"{dither.id} has ended", _level(dither.request))
+        context.log("dither.ended", f"{dither.id} has ended", _level(dither))
         return
     # The first loss is retried at once; an RTC that begins late needs more time.
     if context.dithers.losses:
@@ -210,9 +215,9 @@ def note_found(context: StepContext) -> None:
     context.clear_alarm(alarms.DITHER_LOST)
 
 
-def learn_precision(context: StepContext, estimate: LockInEstimate | RandomEstimate) -> None:
+def learn_precision(context: StepContext, event: ev.WindowFitted) -> None:
     """Take over from an accepted window what it says of the precision of windows."""
-    rtc, before = context.rtc, context.dither_policy.precision
+    estimate, rtc, before = event.estimate, context.rtc, context.dither_policy.precision
     accepted = context.windows.accepted > context.before.windows.accepted
     if isinstance(estimate, RandomEstimate) or not accepted or rtc is None:
         return
@@ -228,31 +233,27 @@ def learn_precision(context: StepContext, estimate: LockInEstimate | RandomEstim
         context.dither_policy = replace(context.dither_policy, precision=precision)
 
 
-def check_measured_dither(context: StepContext, event: ev.DitherMeasured) -> str | None:
-    """Report a dither that differs from the request; return the reason why it must be stopped.
+def on_measured(context: StepContext, event: ev.DitherMeasured) -> None:
+    """Report a dither that differs from the request; stop one that is too strong.
 
     The commands in the frames are what the mirror does, whatever the RTC's status says.
     """
     rtc, dither = context.rtc, context.dither
     if not event.text:
         context.dither_policy = replace(context.dither_policy, loud_text="", amiss_id=None)
-        return None
+        return
     if rtc is None or dither is None or dither.id != event.id:
-        return None
+        return
     context.dither_policy = replace(context.dither_policy, amiss_id=event.id, amiss_m=event.found_m)
     most_m = dither_plan.budget_m(rtc, context.policy)
     # An operator may have allowed more than the budget.
-    if event.found_m > MAX_MEASURED_AMPLITUDE_RATIO * max(event.asked_m, most_m):
-        return f"{event.text}; the budget is {1e9 * most_m:.3g} nm"
-    context.raise_alarm(alarms.NOT_AS_ASKED, f"{event.text}; check the RTC's dither")
-    return None
-
-
-def stop_too_strong(context: StepContext, dither_id: str, loud: str) -> None:
-    """Stop a dither that the frames show to be too strong."""
-    _note_unwanted(context, dither_id)
-    context.dither_policy = replace(context.dither_policy, loud_id=dither_id, loud_text=loud)
-    _raise_over_budget(context, dither_id, loud)
+    if event.found_m <= MAX_MEASURED_AMPLITUDE_RATIO * max(event.asked_m, most_m):
+        context.raise_alarm(alarms.NOT_AS_ASKED, f"{event.text}; check the RTC's dither")
+        return
+    loud = f"{event.text}; the budget is {1e9 * most_m:.3g} nm"
+    _note_unwanted(context, event.id)
+    context.dither_policy = replace(context.dither_policy, loud_id=event.id, loud_text=loud)
+    _raise_over_budget(context, event.id, loud)
     stop_unfollowed(context)
 
 
@@ -268,8 +269,9 @@ def stop_unanswered(context: StepContext, text: str) -> None:
         stop_running_dither(context)
 
 
-def stop_unwanted(context: StepContext, rtc: Status) -> None:
+def stop_unwanted(context: StepContext) -> None:
     """Ask the RTC, again and again, to stop what it should not play."""
+    rtc = present(context.rtc)
     running, loud = rtc.dither_id, dither_plan.check_dither_strength(context, rtc)
     why = loud or dither_plan.check_dither_wanted(context, rtc)
     if running is None or why is None:
@@ -300,9 +302,8 @@ def _begin(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
         return
     if context.now_ns < context.dithers.no_dither_before_ns_utc:
         return
-    if rtc.dither_id is not None and rtc.dither_id.startswith(
-        (dither_request.OWN_DITHER, dither_request.NOISY_DITHER)
-    ):
+    left = None if rtc.dither_id is None else dither_request.infer_purpose(rtc.dither_id, None)
+    if left is not None and (left.automatic or left is DitherPurpose.NOISY):
         # left behind by this service: its window of another length, or to stop
         context.put_off(dither_s=2.0)
         stop_running_dither(context)
@@ -360,9 +361,8 @@ def _end_when_done(context: StepContext, rtc: Status, dither: Dither, wanted: Wa
     moved = dither_plan.check_dithered_modes(dither, rtc, context.policy, wanted.parameters.shunned)
     # weak lines are worth another dither where what is known was restored, and is to be confirmed
     confirms = registration is not None and bool(wanted.parameters.modes)
-    if (confirms or wanted.phase is DitherPhase.PROVE) and not dither_request.is_proving(
-        dither.request
-    ):
+    proves = dither.purpose is DitherPurpose.PROVE
+    if (confirms or wanted.phase is DitherPhase.PROVE) and not proves:
         moved = wanted.reason
     if done or weak or moved:
         # the next one must not overtake the command to stop
@@ -378,8 +378,9 @@ def _adopt(context: StepContext, rtc: Status) -> bool:
     if rtc.dither is None or rtc.dither_id == context.dithers.lost:
         return False
     running, begun_seq, dithering = rtc.dither.request, rtc.dither.start_seq, context.dither_policy
+    purpose = dither_request.infer_purpose(running.id, None)
     over = (
-        dither_request.is_own_sine(running)
+        dither_request.is_automatic_sine(running, purpose)
         and dither_request.total_m(running)
         > dither_plan.AMPLITUDE_ROUNDING_RATIO * dithering.budget_m
     )
@@ -390,7 +391,11 @@ def _adopt(context: StepContext, rtc: Status) -> bool:
         return False
     for window_s in dither_plan.window_lengths_s(context.policy):
         dither = Dither(
-            request=running, start_seq=begun_seq, asked_ns_utc=context.now_ns, window_s=window_s
+            request=running,
+            purpose=purpose,
+            start_seq=begun_seq,
+            asked_ns_utc=context.now_ns,
+            window_s=window_s,
         )
         if dither_request.check_dither_usable(dither, rtc, context.policy) is None:
             context.dither = dither
@@ -399,9 +404,9 @@ def _adopt(context: StepContext, rtc: Status) -> bool:
     return False
 
 
-def _level(request: DitherRequest) -> Level:
+def _level(dither: Dither) -> Level:
     """Return the log level of a dither: the service's own come and go all night."""
-    return Level.DEBUG if request.id.startswith(dither_request.OWN_DITHER) else Level.INFO
+    return Level.DEBUG if dither.purpose.automatic else Level.INFO
 
 
 def _update_cost(context: StepContext, rtc: Status) -> None:

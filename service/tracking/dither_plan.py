@@ -12,7 +12,7 @@ from service.control.dither import DitherRequirement, compute_schedule, look_up_
 from service.estimation.loop import explain_open_loop
 from service.estimation.windows import DITHER_SETTLING_S
 from service.records.alarms import Interlock
-from service.records.operations import Dither, DitherPhase, DitherPlan, Schedule
+from service.records.operations import Dither, DitherPhase, DitherPlan, DitherPurpose, Schedule
 from service.records.registration import Registration
 from service.records.state import TrackerState
 from service.tracking import mode_proof
@@ -20,16 +20,14 @@ from service.tracking.dither_request import (
     DEFAULT_DURATION_S,
     DITHER_MARGIN_S,
     N_LINES,
-    OUR_DITHERS,
-    OWN_DITHER,
     DitherParameters,
     choose_modes,
     clear_lines,
     controlled,
     expected_amplification,
     has_free_modes,
-    is_own_sine,
-    is_proving,
+    infer_purpose,
+    is_automatic_sine,
     step_of,
     total_m,
 )
@@ -283,7 +281,7 @@ def check_dithered_modes(
     It was requested when fewer modes were controlled, or before the measured response of one of its
     modes disagreed with the model.
     """
-    if is_proving(dither.request):
+    if dither.purpose is DitherPurpose.PROVE:
         return ""
     odd = shunned.intersection(dither.request.modes)
     if odd and not odd.intersection(choose_modes(rtc, policy, shunned)):
@@ -452,7 +450,8 @@ def check_dither_strength(context: StepContext, rtc: Status) -> str | None:
         return None
     running, dithering = rtc.dither.request, context.dither_policy
     found_m, most_m = total_m(running), budget_m(rtc, context.policy)
-    over = is_own_sine(running) and found_m > AMPLITUDE_ROUNDING_RATIO * most_m
+    purpose = infer_purpose(running.id, context.dither)
+    over = is_automatic_sine(running, purpose) and found_m > AMPLITUDE_ROUNDING_RATIO * most_m
     if not over and running.id != dithering.loud_id:
         return None
     if running.id == dithering.loud_id and dithering.loud_text:
@@ -465,15 +464,14 @@ def check_dither_strength(context: StepContext, rtc: Status) -> str | None:
 
 def check_dither_wanted(context: StepContext, rtc: Status) -> str | None:
     """Return why the dither that the RTC plays must go though it is not too strong, or None."""
-    state, running = context.state, rtc.dither_id
-    if running is None or not running.startswith(OUR_DITHERS):
+    followed, running = context.dither, rtc.dither_id
+    purpose = None if running is None else infer_purpose(running, followed)
+    if purpose is None or purpose is DitherPurpose.FOREIGN:
         return None
-    if state.operator.stopped_because:
+    if context.operator.stopped_because:
         return "everything is stopped"
-    followed = state.dithers.dither is not None and state.dithers.dither.id == running
-    if state.dithers.stopped and not followed:
+    if context.dithers.stopped and (followed is None or followed.id != running):
         return "an operator has stopped the dither"
-    forbidden = not context.policy.dither_enabled
-    if forbidden and state.dithers.dither is None and running.startswith(OWN_DITHER):
+    if not context.policy.dither_enabled and followed is None and purpose.automatic:
         return "the settings forbid a dither"
     return None

@@ -15,7 +15,7 @@ from service.estimation.demodulation import SIDE_OFFSETS_HZ
 from service.estimation.lockin import LockInPlan
 from service.estimation.random_dither import FRAMES_PER_MODE, RandomPlan
 from service.estimation.windows import DITHER_SETTLING_S, ExpectedDither
-from service.records.operations import Dither
+from service.records.operations import Dither, DitherPurpose
 from service.records.products import ModeSet
 from service.tracking.policy import Policy
 from service.wire import DitherKind, DitherRequest, Status
@@ -138,16 +138,6 @@ PROVING_DITHER_MARGIN_S = 0.9
 """Dither after the last window if there is only one: frames may be delayed by half a second, and a
 status that shows the end of the dither before they are processed would cost the window."""
 
-OWN_DITHER = "dither-"
-PROVING_DITHER = "dither-prove-"
-OPERATOR_DITHER = "operator-"
-NOISY_DITHER = "noisy-"
-ACQUIRING_DITHER = "acquire-"
-"""First part of a dither's id, by purpose: to follow α, to show how modes respond, an operator's
-own, to measure a noisy interaction matrix, to acquire."""
-
-OUR_DITHERS = (OWN_DITHER, OPERATOR_DITHER, NOISY_DITHER, ACQUIRING_DITHER)
-
 MAX_STOP_DELAY_S = 3.0
 """Time for a stop to be acknowledged, and for the next status to show it."""
 
@@ -221,26 +211,39 @@ def plan_dither(
     spare_s = PROVING_DITHER_MARGIN_S if proving else DITHER_MARGIN_S
     lasting_s = DITHER_SETTLING_S + choice.n_windows * choice.window_s + spare_s
     step_hz = step_of(rtc, choice.window_s)
-    begins = OPERATOR_DITHER if asked else PROVING_DITHER if proving else OWN_DITHER
+    purpose = DitherPurpose.PROVE if proving else DitherPurpose.FOLLOW
+    purpose = DitherPurpose.OPERATOR if asked else purpose
     request = DitherRequest(
-        id=f"{begins}{now_ns}",
+        id=name_dither(purpose, now_ns),
         kind=DitherKind.SINE,
         modes=chosen,
         amplitude_m=tuple(float(min(size, rtc.max_dither_m)) for size in sizes),
         frequency_hz=tuple(round(f / step_hz) * step_hz for f in lines),
         duration_s=duration_s or lasting_s,
     )
-    return Dither(request=request, asked_ns_utc=now_ns, window_s=choice.window_s)
+    return Dither(request=request, purpose=purpose, asked_ns_utc=now_ns, window_s=choice.window_s)
 
 
-def is_own_sine(request: DitherRequest) -> bool:
+def name_dither(purpose: DitherPurpose, now_ns: int) -> str:
+    """Return the id of a dither requested now; an engineer at the RTC reads its purpose there."""
+    return f"{purpose}-{now_ns}"
+
+
+def infer_purpose(shown_id: str, followed: Dither | None) -> DitherPurpose:
+    """Return the purpose of the dither that the RTC's status shows."""
+    if followed is not None and followed.id == shown_id:
+        return followed.purpose
+    # Nobody follows it. An earlier run may have requested it, or a service on another machine that
+    # this one has taken over from, whose archive it cannot read: the status has nothing but the id.
+    # This is the only place where an id is parsed.
+    begins, _, time = shown_id.rpartition("-")
+    known = begins in {*DitherPurpose} and time[:1].isdigit()
+    return DitherPurpose(begins) if known else DitherPurpose.FOREIGN
+
+
+def is_automatic_sine(request: DitherRequest, purpose: DitherPurpose) -> bool:
     """Return whether a dither is one that the service has chosen by itself."""
-    return request.id.startswith(OWN_DITHER) and request.kind is DitherKind.SINE
-
-
-def is_proving(request: DitherRequest) -> bool:
-    """Return whether a dither is there to see how its modes answer."""
-    return request.id.startswith(PROVING_DITHER)
+    return purpose.automatic and request.kind is DitherKind.SINE
 
 
 def total_m(request: DitherRequest) -> float:
@@ -350,6 +353,7 @@ def plan_random(
     policy: Policy,
     now_ns: int,
     *,
+    purpose: DitherPurpose,
     dither_id: str,
     modes: tuple[int, ...] | ModeSet,
     total_m: float,
@@ -361,8 +365,8 @@ def plan_random(
     ----------
     rtc, policy, now_ns
         The RTC, the settings and the time.
-    dither_id
-        Of the request.
+    purpose, dither_id
+        Purpose of the dither, and the id of the request.
     modes
         0-based basis indices, or which they are.
     total_m
@@ -401,7 +405,9 @@ def plan_random(
         seed=now_ns % (1 << 31),
         duration_s=DITHER_SETTLING_S + duration_s + DITHER_MARGIN_S,
     )
-    return Dither(request=request, asked_ns_utc=now_ns, window_s=duration_s / n_windows)
+    return Dither(
+        request=request, purpose=purpose, asked_ns_utc=now_ns, window_s=duration_s / n_windows
+    )
 
 
 def random_plan(dither: Dither, rtc: Status, window_s: float) -> RandomPlan:

@@ -15,9 +15,9 @@ from typing import Final
 
 import numpy as np
 
+from service.records.operations import DitherPurpose
 from service.records.products import MatrixState
 from service.records.state import TrackerState
-from service.tracking.dither_request import ACQUIRING_DITHER, NOISY_DITHER, OWN_DITHER
 from service.tracking.transitions import TABLES
 from service.wire import Loop
 
@@ -62,12 +62,12 @@ def _one_has_the_mirror(state: TrackerState) -> object:
 
 def _open_loop_is_not_dithered(state: TrackerState) -> object:
     rtc, dither = state.loop.rtc, state.dithers.dither
-    own = dither is not None and dither.id.startswith((OWN_DITHER, NOISY_DITHER))
-    asked_since = dither is not None and rtc is not None and dither.asked_ns_utc > rtc.t_ns
-    if own and asked_since and rtc is not None and rtc.loop is Loop.OPEN:
-        return dither
-    acquires = dither is not None and dither.id.startswith(ACQUIRING_DITHER)
-    return acquires and not state.operations.acquisition.under_way and asked_since
+    if dither is None or rtc is None or dither.asked_ns_utc <= rtc.t_ns:
+        return None
+    if dither.purpose is DitherPurpose.ACQUIRE:
+        return not state.operations.acquisition.under_way
+    closed_only = dither.purpose.automatic or dither.purpose is DitherPurpose.NOISY
+    return closed_only and rtc.loop is Loop.OPEN and dither
 
 
 def _alpha_is_finite(state: TrackerState) -> object:

@@ -261,9 +261,11 @@ def awaits_result(context: StepContext, window_s: float) -> bool:
     return bool(proof.shown) and waited_s < window_s + RESULT_TIMEOUT_S
 
 
-def learn_modes(context: StepContext, estimate: LockInEstimate | RandomEstimate) -> None:
+def learn_modes(context: StepContext, event: ev.WindowFitted) -> None:
     """Record which modes of a window respond as the model predicts, even if its α is rejected."""
-    rtc, proof = context.rtc, context.matrices.mode_proof
+    estimate, rtc, proof = event.estimate, context.rtc, context.matrices.mode_proof
+    if context.state.measuring is not None:
+        return  # these frames are no ordinary telemetry
     if rtc is None or estimate.session != rtc.session or estimate.gain_sigma is None:
         return
     modes, gains = np.array(estimate.modes), np.real(estimate.optical_gain)

@@ -19,7 +19,6 @@ from service.records.alarms import Interlock
 from service.records.registration import Offload, OffloadState, Purpose, Registration, Validity
 from service.records.state import Mode, TrackerState
 from service.tracking import validity
-from service.tracking.operations.running import running_ramp
 from service.tracking.policy import SECOND_NS, Offloading
 from service.tracking.step_context import StepContext
 from service.tracking.update_policy import REFUSED_INTERVAL_S, is_settled
@@ -112,11 +111,14 @@ def on_answer(context: StepContext, request: OffloadRequest, reply: Reply) -> No
     context.log("offload.moved", f"{offload.id}: α is expected {step_text(offload.step)} away")
 
 
-def on_failure(context: StepContext, name: str, text: str) -> None:
-    """Know no more whether the image has moved: no reply came."""
+def on_failure(context: StepContext, request: OffloadRequest, text: str) -> None:
+    """Note that nobody knows whether the image has moved: no reply came."""
     offload, limits = context.alpha.offload, context.policy.offloading
-    if offload is None or limits is None or offload.id != name:
-        return
+    if offload is not None and limits is not None and offload.id == request.id:
+        _note_failure(context, offload, limits, text)
+
+
+def _note_failure(context: StepContext, offload: Offload, limits: Offloading, text: str) -> None:
     still_ns = max(end_of(context.state, MOVING), _clock_ns(context, limits.settle_s))
     failed = replace(offload, state=OffloadState.FAILED, text=text)
     _expect(context, failed, limits, still_ns)
@@ -144,11 +146,12 @@ def restore_offload(context: StepContext, offload: Offload) -> None:
 
     A service that asks for no moves forgets it: somebody may bring the device elsewhere meanwhile.
     """
-    if context.policy.offloading is None:
+    limits = context.policy.offloading
+    if limits is None:
         return
     context.alpha = replace(context.alpha, offload=offload)
     if offload.state is OffloadState.ASKED:
-        on_failure(context, offload.id, "the service ended before the reply came")
+        _note_failure(context, offload, limits, "the service ended before the reply came")
 
 
 def _may_move(
@@ -158,14 +161,12 @@ def _may_move(
     state, last = context.state, context.alpha.offload
     if state.operator.mode is not Mode.AUTO or state.on_probation or not rtc.in_loop:
         return False
-    if any(map(context.blocking_alarm, (Interlock.ASK, Interlock.DECIDE, Interlock.SEND_NEW))):
+    if context.blocking_alarm(Interlock.SEND_NEW) or state.noisy_measurement is not None:
         return False
     sure = is_settled(registration) and registration.validity.level is Validity.FRESH
     if not sure or np.any(np.sqrt(np.diag(registration.covariance)) > limits.near):
         return False
     if state.matrices.making_since_ns_utc is not None or state.sent is not None:
-        return False
-    if state.noisy_measurement is not None or running_ramp(state, context.now_ns) is not None:
         return False
     if last is None:
         return True

@@ -11,7 +11,7 @@ from service.records import commands as cmd
 from service.records import events as ev
 from service.records.alarms import PROBATION
 from service.records.commands import GainGroup, ModeGroup
-from service.records.operations import CommandState, Dither, LoopCommand
+from service.records.operations import CommandState, Dither, DitherPurpose, LoopCommand
 from service.records.products import MatrixState, ModeSet
 from service.records.state import Level, Mode
 from service.tracking import dither_request, reconstructors
@@ -19,8 +19,9 @@ from service.tracking.dither import allow_dither, request_dither
 from service.tracking.dither_plan import operator_parameters
 from service.tracking.policy import SECOND_NS
 from service.tracking.step_context import StepContext, present
+from service.tracking.update_policy import DECLINED_MODES_DELAY_S, limit_declined
 from service.tracking.validity import note_pointing
-from service.wire import DitherKind, Loop, LoopRequest, Pointing, RampRequest, Status
+from service.wire import DitherKind, Loop, LoopRequest, Pointing, RampRequest, Reply, Status
 
 
 def set_mode(context: StepContext, command: cmd.SetMode) -> None:
@@ -42,6 +43,8 @@ def reject(context: StepContext, command: cmd.Reject) -> None:
         context, command.id, MatrixState.DISCARDED, command.reason or "by the operator"
     )
     context.log("reconstructor.discarded", command.id)
+    record = reconstructors.require_record(context.state, command.id)
+    limit_declined(context, record, DECLINED_MODES_DELAY_S)
 
 
 def publish(context: StepContext, command: cmd.Publish) -> None:
@@ -105,7 +108,8 @@ def _plan_dither(context: StepContext, rtc: Status, command: cmd.StartDither) ->
             rtc,
             policy,
             now_ns,
-            dither_id=f"{dither_request.OPERATOR_DITHER}{now_ns}",
+            purpose=DitherPurpose.OPERATOR,
+            dither_id=dither_request.name_dither(DitherPurpose.OPERATOR, now_ns),
             modes=command.modes or ModeSet.CONTROLLED,
             total_m=command.total_amplitude_m
             or min(dither_request.DEFAULT_RANDOM_RMS_M, policy.dither_budget_m),
@@ -232,7 +236,18 @@ def ramp(context: StepContext, command: cmd.Ramp) -> None:
     _ask_loop(context, request, text, lasts_s)
 
 
-def on_loop_answer(context: StepContext, command: str, outcome: CommandState, reason: str) -> None:
+def on_loop_answer(context: StepContext, request: LoopRequest | RampRequest, reply: Reply) -> None:
+    """Note whether the RTC carries out a command."""
+    outcome = CommandState.ACCEPTED if reply.accepted else CommandState.REFUSED
+    _note_outcome(context, request.id, outcome, reply.reason)
+
+
+def on_loop_failed(context: StepContext, request: LoopRequest | RampRequest, text: str) -> None:
+    """Note that a command had no answer."""
+    _note_outcome(context, request.id, CommandState.FAILED, text)
+
+
+def _note_outcome(context: StepContext, command: str, outcome: CommandState, reason: str) -> None:
     """Note what became of a command; one that a later one has replaced is only logged."""
     asked, text = context.loop.command, command
     if asked is not None and asked.id == command:

@@ -15,10 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.model.misregistration import Misregistration, step_text, wrap_angle
+from service.model.misregistration import Misregistration, step_text
 from service.model.pointing_law import ANGLES, PointingLaw, Reported
-from service.records import events as ev
-from service.records.events import Event
 from service.records.registration import (
     LawLeap,
     LawState,
@@ -98,7 +96,7 @@ def follow_law(context: StepContext) -> None:
     # After a restart the law may be elsewhere than when α was saved.
     known = None if registration is None else registration.nominal
     place, leap = before.nominal or known, before.leap
-    step = np.zeros(4) if place is None else difference(place, now)
+    step = np.zeros(4) if place is None else place.step_to(now)
     returned = leap is not None and np.all(np.abs(np.array(leap.step) + step) <= MAX_STEP_AT_REST)
     if leap is not None and (returned or _goes_on(context, law, leap, dict(before.reported), now)):
         _end_leap(context, wrong=bool(returned))
@@ -119,31 +117,14 @@ def begin_law(context: StepContext) -> None:
     _set(context, LawState())
 
 
-def event_of_now(context: StepContext, event: Event) -> Event:
-    """Return an event whose estimate of α is brought to the present pointing."""
-    match event:
-        case ev.WindowFitted(estimate=estimate, began_ns_utc=began_ns):
-            alpha = _to_present(context.state, estimate.alpha, began_ns, estimate.t_ns_utc)
-            return replace(event, estimate=replace(estimate, alpha=alpha))
-        case ev.PassiveFitted(estimate=estimate, began_ns_utc=began_ns, t_ns_utc=t_ns):
-            alpha = _to_present(context.state, estimate.alpha, began_ns, t_ns)
-            return replace(event, estimate=replace(estimate, alpha=alpha))
-        case ev.WideCaptureFitted(found=found, began_ns_utc=began_ns):
-            estimate = found.estimate
-            alpha = _to_present(context.state, estimate.alpha, began_ns, estimate.t_ns_utc)
-            return replace(event, found=replace(found, estimate=replace(estimate, alpha=alpha)))
-        case _:
-            return event
-
-
 def start_of_fit(
     state: TrackerState, alpha: Misregistration | None, t_ns_utc: int
 ) -> Misregistration | None:
     """Return where α of now, or the nominal registration, lay at a time of the RTC's clock."""
-    now, then = state.alpha.law.nominal, law_at(state, t_ns_utc)
+    now, then = state.alpha.law.nominal, validity.law_at(state, t_ns_utc)
     if now is None or then is None:
         return alpha
-    return then if alpha is None else alpha.add_step(difference(now, then))
+    return then if alpha is None else alpha.add_step(now.step_to(then))
 
 
 def registration_ahead(state: TrackerState, registration: Registration) -> Registration:
@@ -175,56 +156,22 @@ def _rate(state: TrackerState) -> Array:
     length_ns = min(RATE_INTERVAL_NS, way[-1][0] - way[0][0]) if way else 0
     if length_ns < PATH_SPACING_NS:
         return np.zeros(4)
-    ends = (law_at(state, way[-1][0] - share * length_ns // 2) for share in (2, 1, 0))
+    ends = (validity.law_at(state, way[-1][0] - share * length_ns // 2) for share in (2, 1, 0))
     first, middle, last = (end or way[-1][1] for end in ends)
-    halves = np.array([difference(first, middle), difference(middle, last)])
+    halves = np.array([first.step_to(middle), middle.step_to(last)])
     slower = np.where(halves.prod(axis=0) > 0.0, np.abs(halves).min(axis=0), 0.0)
     return np.asarray(np.sign(halves[1]) * slower * (2.0 * SECOND_NS / length_ns))
 
 
 def check_pointing_motion(state: TrackerState, began_ns_utc: int, ended_ns_utc: int) -> str | None:
     """Return why a window belongs to no single registration (the law moved within it), or None."""
-    first, last = law_at(state, began_ns_utc), law_at(state, ended_ns_utc)
+    first, last = validity.law_at(state, began_ns_utc), validity.law_at(state, ended_ns_utc)
     if first is None or last is None:
         return None
-    step = difference(first, last)
+    step = first.step_to(last)
     if np.all(np.abs(step) <= MAX_WINDOW_MOTION):
         return None
     return f"the law of pointing moved α inside the window, by {step_text(step)}"
-
-
-def law_at(state: TrackerState, t_ns_utc: int) -> Misregistration | None:
-    """Return the registration by the law at a time of the RTC's clock; None if unknown."""
-    way = state.alpha.law.way
-    later = next((k for k, (t_ns, _) in enumerate(way) if t_ns >= t_ns_utc), len(way))
-    if not way:
-        return state.alpha.law.nominal
-    # Outside of the recorded path its nearest end counts: nothing is extrapolated.
-    if later in {0, len(way)}:
-        return way[min(later, len(way) - 1)][1]
-    (before_ns, before), (after_ns, after) = way[later - 1], way[later]
-    share = (t_ns_utc - before_ns) / (after_ns - before_ns)
-    return before.add_step(share * difference(before, after))
-
-
-def difference(one: Misregistration, other: Misregistration) -> Array:
-    """Return the step ``(4,)`` from one to the other, numeric units, by the shorter turn."""
-    step = other.vector - one.vector
-    step[2] = wrap_angle(float(step[2]))
-    return step
-
-
-def _to_present(
-    state: TrackerState, alpha: Misregistration, began_ns_utc: int, ended_ns_utc: int
-) -> Misregistration:
-    """Return an estimate at the present pointing, made of telemetry of another."""
-    now = state.alpha.law.nominal
-    # A window measures the mean registration, which is that of its middle if the law is smooth.
-    middle_ns = ((began_ns_utc or ended_ns_utc) + ended_ns_utc) // 2
-    then = law_at(state, middle_ns)
-    if now is None or then is None:
-        return alpha
-    return alpha.add_step(difference(then, now))
 
 
 def _nominal(context: StepContext, law: PointingLaw, reported: Reported) -> Misregistration | str:
@@ -287,7 +234,7 @@ def _goes_on(
     if leap.far or late or isinstance(then, str) or state.nominal is None:
         return False
     first = np.array(leap.step) / MAX_STEP**2
-    steps = difference(state.nominal, now), difference(now, then)
+    steps = state.nominal.step_to(now), now.step_to(then)
     length, *along = (float(first @ step) for step in (np.array(leap.step), *steps))
     return all(length < 3.0 * each < 9.0 * length for each in along)
 

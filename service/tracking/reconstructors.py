@@ -52,7 +52,17 @@ def check_sendable(
         if alarm_blocks(alarm, interlock) and not (of_swap and alarm.name in _OF_A_SWAP):
             return alarm.text
     unread = explain_unread_matrix(state, state.loop.rtc.cm_id)
-    return unread if unread or was_used else check_proven(state, record)
+    return unread if unread or was_used else _check_renaming(state) or check_proven(state, record)
+
+
+def _check_renaming(state: TrackerState) -> str | None:
+    """Return that nothing has shown the sensor to be the same under another name, or None."""
+    if state.loop.renamed_ns_utc is None or state.loop.rtc is None:
+        return None
+    return (
+        f"the RTC's config_id is {state.loop.rtc.config_id}, it was another: no window has shown "
+        "yet that the sensor is the same"
+    )
 
 
 def check_approved(
@@ -128,6 +138,9 @@ RETURNS_KEPT = 100
 UNSENT_KEPT = 50
 """Newest of those that were never sent: enough to see what is being refused, and why."""
 
+_DECLINED = frozenset({MatrixState.REFUSED, MatrixState.REJECTED, MatrixState.FAILED})
+"""States after a rejection by the gate, when it judged again, or by the RTC."""
+
 _UNSENT = frozenset({MatrixState.REFUSED, MatrixState.DISCARDED})
 _SPARE = frozenset({MatrixState.REJECTED, MatrixState.FAILED, MatrixState.SUPERSEDED})
 
@@ -160,8 +173,14 @@ def replace_record(context: StepContext, record: ReconstructorRecord) -> bool:
         move(context, r, record) if r.id == record.id else r
         for r in context.matrices.reconstructors
     )
+    before = context.state.reconstructor(record.id)
     context.matrices = replace(context.matrices, reconstructors=records)
-    return record in records
+    if record not in records:
+        return False
+    changed = before is not None and before.state is not record.state
+    if changed and record.state in _DECLINED:
+        update_policy.limit_declined(context, record)
+    return True
 
 
 def change_state(context: StepContext, matrix_id: str, to: MatrixState, reason: str) -> None:
@@ -218,6 +237,13 @@ def forget_session(context: StepContext) -> None:
     )
 
 
+def verify_again(context: StepContext) -> None:
+    """Have the matrix in use read again before anything new is sent."""
+    context.matrices = replace(
+        context.matrices, verified_ids=frozenset(), applied_asked_ns_utc=0, read_back_error=""
+    )
+
+
 def discard_proposals(context: StepContext, why: str) -> None:
     """Discard proposals that wait for an operator because they are out of date."""
     for record in context.matrices.reconstructors:
@@ -231,11 +257,6 @@ def request_applied(context: StepContext, rtc: Status) -> None:
     context.ask(ev.FetchMatrix(id=rtc.cm_id))
 
 
-def note_not_fetched(context: StepContext, why: str) -> None:
-    """Note why the matrix in use is not to be had."""
-    context.matrices = replace(context.matrices, read_back_error=why)
-
-
 def request_matrix(context: StepContext, effect: ev.MakeMatrix | ev.RepublishMatrix) -> None:
     """Have a reconstructor computed, or copied."""
     context.matrices = replace(context.matrices, making_since_ns_utc=context.now_ns)
@@ -245,6 +266,28 @@ def request_matrix(context: StepContext, effect: ev.MakeMatrix | ev.RepublishMat
 def note_none_made(context: StepContext) -> None:
     """Note that no reconstructor is being computed."""
     context.matrices = replace(context.matrices, making_since_ns_utc=None)
+
+
+def on_judging_failed(context: StepContext, _: ev.Effect, __: str) -> None:
+    """Make and judge nothing for a while."""
+    # Without a pause a worker that fails at once would be asked in every step.
+    context.put_off(make_s=5.0)
+
+
+def on_making_failed(context: StepContext, effect: ev.Effect, text: str) -> None:
+    """Note that no reconstructor comes, and make none for a while."""
+    note_none_made(context)
+    on_judging_failed(context, effect, text)
+
+
+def on_send_failed(context: StepContext, effect: ev.SendMatrix, text: str) -> None:
+    """Note that a reconstructor has not reached the RTC."""
+    change_state(context, effect.id, MatrixState.FAILED, text)
+
+
+def on_fetch_failed(context: StepContext, _: ev.FetchMatrix, text: str) -> None:
+    """Note why the RTC's matrix is not known."""
+    context.matrices = replace(context.matrices, read_back_error=text)
 
 
 def request_verdict(context: StepContext, matrix_id: str) -> None:
@@ -452,7 +495,7 @@ def on_fetched(context: StepContext, fetched: ev.MatrixFetched) -> None:
     Ids are not sufficient: a restarted RTC may order its slopes differently, and use a different
     matrix under a known id.
     """
-    note_not_fetched(context, "")
+    context.matrices = replace(context.matrices, read_back_error="")
     record = fetched.record
     before = context.state.reconstructor(record.id)
     if before is not None and before.sha256 not in {"", record.sha256}:

@@ -9,6 +9,7 @@ from service.records import alarms
 from service.records import events as ev
 from service.records.events import Effect
 from service.records.products import MatrixState
+from service.records.state import ModelState
 from service.tracking import (
     dither,
     mode_proof,
@@ -20,7 +21,8 @@ from service.tracking import (
 from service.tracking.operator import end_ramp
 from service.tracking.policy import SECOND_NS
 from service.tracking.step_context import StepContext, log_bursts
-from service.wire import DitherRequest, DitherStop, Status
+from service.wire import Command as Request
+from service.wire import LoopRequest, Reply, Status
 
 ACKNOWLEDGEMENT_TIMEOUT_S = 3.0
 """An RTC applies within 2 s of the commit, or it has failed."""
@@ -31,7 +33,7 @@ COMPUTATION_TIMEOUT_S = 60.0
 """A reconstructor that takes longer was lost with its worker."""
 
 
-def on_tick(context: StepContext) -> None:
+def give_up_overdue(context: StepContext) -> None:
     """Give up what has been waited for too long."""
     for record in context.matrices.reconstructors:
         # Without a time of publication nothing is overdue.
@@ -66,13 +68,17 @@ def on_status(context: StepContext, rtc: Status) -> None:
     if registration is not None and bias is not None and bias.looked_ns_utc and elsewhere:
         # it was learnt in another loop, in whichever session
         validity.store_registration(context, replace(registration, bias=None))
+    pending = context.loop.commanded_modes
     context.loop = replace(
         context.loop,
         rtc=rtc,
+        commanded_modes=None if pending == rtc.n_controlled else pending,
         # Pinned by the instrument file or the first status: a later one does not replace them.
         basis_id=context.loop.basis_id or rtc.basis_id,
         config_id=context.loop.config_id or rtc.config_id,
     )
+    _note_references(context, rtc)
+    _note_renaming(context, before, rtc)
     validity.note_pointing(context, rtc.pointing)
     _drop_other_basis(context)
     mode_proof.believe_restored(context, rtc)
@@ -96,6 +102,40 @@ def on_loop_held(context: StepContext, event: ev.LoopHeld) -> None:
     context.loop = replace(context.loop, holds=event.holds)
 
 
+def on_modes_commanded(context: StepContext, event: ev.ModesCommanded) -> None:
+    """Store the number of modes until a status shows it: the status lags behind the answer."""
+    context.loop = replace(context.loop, commanded_modes=event.n_modes)
+
+
+def on_loop_answer(context: StepContext, request: LoopRequest, reply: Reply) -> None:
+    """Store the number of modes that an order has set."""
+    if reply.accepted and request.n_controlled is not None:
+        context.loop = replace(context.loop, commanded_modes=request.n_controlled)
+
+
+def on_modes_unknown(context: StepContext, _: Effect | Request, __: str) -> None:
+    """Believe the next status: what failed may have been accepted."""
+    context.loop = replace(context.loop, commanded_modes=None)
+
+
+def on_model_changed(context: StepContext, event: ev.ModelChanged) -> None:
+    """Store what a job of the worker has made of the model."""
+    model = event.model
+    # The job may have begun before the sensor's mode changed: its results belong to that mode.
+    if model.sensor_mode == context.model.sensor_mode:
+        context.model = replace(
+            context.model,
+            slopes=model.slopes,
+            own_matrix_read=model.own_matrix_read,
+            response=model.response,
+            own_residual=model.own_residual,
+            dither_session=model.dither_session,
+            dithered=model.dithered,
+            strength=model.strength,
+            linearised_at=model.linearised_at,
+        )
+
+
 def _log_partial_loop(context: StepContext, before: Status | None, rtc: Status) -> None:
     """Say how many modes are in the loop where it is not all that are controlled."""
     n_before = rtc.n_controlled if before is None else len(before.in_loop)
@@ -103,6 +143,49 @@ def _log_partial_loop(context: StepContext, before: Status | None, rtc: Status) 
     if rtc.loop != "open" and n_now not in {n_before, rtc.n_controlled}:
         text = f"{n_now} of {rtc.n_controlled} controlled modes have a gain: the others are let be"
         context.log("loop.partial", text)
+
+
+def _note_references(context: StepContext, rtc: Status) -> None:
+    """Record new reference slopes; they end windows under way, and α and matrices stay."""
+    before, name = context.loop.reference_id, rtc.reference_name
+    if name == before:
+        return
+    context.loop = replace(context.loop, reference_id=name)
+    if before is not None:
+        context.loop = replace(context.loop, reference_since_ns_utc=context.now_ns)
+        text = f"the RTC subtracts the reference slopes {name}, they were {before}"
+        context.log("references.changed", text)
+
+
+def _note_renaming(context: StepContext, before: Status | None, rtc: Status) -> None:
+    """Let matrix and response show that a sensor is the same under another ``config_id``.
+
+    The link refuses one that the instrument file fixes, and one that comes with other sizes.
+    """
+    loop, registration = context.loop, context.registration
+    known = loop.config_id if before is None else before.config_id
+    if rtc.config_id != known:
+        context.loop = replace(context.loop, renamed_ns_utc=rtc.t_ns)
+        reconstructors.verify_again(context)
+        validity.request_window(context, "the RTC has another config_id")
+        text = (
+            f"the RTC's config_id has changed from {known} to {rtc.config_id} with the same number "
+            "of slopes and modes: R-31 allows that for another mask, slope recipe, binning or "
+            "modulation only. It is taken for new reference slopes: have the RTC name them by "
+            "reference_id"
+        )
+        context.raise_alarm(alarms.RENAMED, context.alarm_text(alarms.RENAMED) or text)
+        return
+    since_ns = loop.renamed_ns_utc
+    if since_ns is None or registration is None or registration.window_began_ns_utc < since_ns:
+        return
+    contradicted = {alarms.WRONG_MATRIX, alarms.WRONG_ANSWER} & {
+        alarm.name for alarm in context.alarms.active
+    }
+    if reconstructors.explain_unread_matrix(context.state, rtc.cm_id) or contradicted:
+        return
+    context.loop = replace(context.loop, renamed_ns_utc=None)
+    context.log("sensor.same", f"matrix and response are the model's with {rtc.config_id}, too")
 
 
 def _drop_other_basis(context: StepContext) -> None:
@@ -125,7 +208,11 @@ def _enter_sensor_mode(context: StepContext, config_id: str) -> None:
     _begin_anew(context, "the sensor was in another mode")
     reconstructors.discard_proposals(context, f"the sensor's mode is {config_id} now")
     update_policy.forget_limit(context)
-    context.loop = replace(context.loop, config_id=config_id)
+    # An RTC that does not name its references is named by its mode: that says nothing of them.
+    context.loop = replace(context.loop, config_id=config_id, reference_id=None)
+    # Order and signs of the slopes are those of every mode; all else is measured again.
+    slopes, context.model = context.model.slopes, ModelState()
+    context.model = replace(context.model, sensor_mode=config_id, slopes=slopes)
     pointing_law.begin_law(context)
     kept, scale = "", context.policy.alpha_scale(before, config_id)
     if scale is not None and context.registration is not None:
@@ -153,7 +240,7 @@ def _begin_anew(context: StepContext, because: str) -> None:
     # α belongs to the telescope and is kept, but windows must confirm it.
     validity.require_new_windows(context)
     context.retry_all()
-    context.loop = replace(context.loop, rtc=None, holds=False)
+    context.loop = replace(context.loop, rtc=None, holds=False, commanded_modes=None)
     dither.note_found(context)
     context.clear_alarm(alarms.MIRROR_SILENT)
     dither.forget_unwanted(context)
@@ -199,27 +286,12 @@ def on_services(context: StepContext, event: ev.ServicesMet) -> None:
     validity.end_alarm(context, alarms.STANDING_BY)
 
 
-def on_failure(context: StepContext, effect: Effect, text: str) -> None:
-    """Undo the memory of having asked, so that it can be asked again later."""
-    match effect:
-        # Without a pause a worker that fails at once would be asked in every step.
-        case ev.MakeMatrix() | ev.RepublishMatrix():
-            context.put_off(make_s=5.0)
-            reconstructors.note_none_made(context)
-            context.fail(text)
-        case ev.Ask(request=DitherRequest()):
-            context.put_off(dither_s=5.0)
-            dither.forget_dither(context)
-            context.fail(text)
-        case ev.JudgeProposal():
-            context.put_off(make_s=5.0)
-            context.fail(text)
-        case ev.Ask(request=DitherStop()):
-            pass  # it is asked again while it must be; nothing else has to wait for that
-        case ev.FetchMatrix():
-            reconstructors.note_not_fetched(context, text)
-        case ev.SendMatrix(id=matrix_id):
-            reconstructors.change_state(context, matrix_id, MatrixState.FAILED, text)
-        case _:
-            context.put_off(make_s=5.0)
+def fail_order(context: StepContext, effect: Effect | Request, text: str) -> None:
+    """Log the failure, and note it under the id of the order that led to it."""
+    context.fail(text)
+    log_failure(context, effect, text)
+
+
+def log_failure(context: StepContext, _: Effect | Request, text: str) -> None:
+    """Log the failure; what is still needed is asked for again."""
     context.warn("job.failed", text)

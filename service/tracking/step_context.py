@@ -25,6 +25,7 @@ from service.records.state import (
     LogEntry,
     LoopState,
     MatrixStates,
+    ModelState,
     Operations,
     OperatorState,
     TrackerState,
@@ -92,7 +93,7 @@ class StepContext:
     """One event being worked out: the state as it becomes, and what is to be done about it.
 
     It lasts as long as ``service.tracker.step``; before and after it states are values. It does not
-    hold the event: only the table of ``step`` and the operation that runs are given that.
+    hold the event: only the functions of ``service.tracker.REACTIONS`` are given that.
     """
 
     __slots__ = ("before", "cause", "effects", "now_ns", "policy", "state")
@@ -116,6 +117,7 @@ class StepContext:
     operations = _Part[Operations]()
     dithers = _Part[DitherState]()
     loop = _Part[LoopState]()
+    model = _Part[ModelState]()
     alarms = _Part[AlarmStates]()
     acquisition = _Part[Acquisition]("operations")
     probation = _Part[Probation | None]("operations")

@@ -283,9 +283,6 @@ MODES_LIMIT_MEMORY_S = 3600.0
 MORE_MODES_MARGIN_RATIO = 1.5
 """More modes are tried only while there is this times the margin that the gate asks for."""
 
-_DECLINED_STATES = frozenset({MatrixState.REFUSED, MatrixState.REJECTED, MatrixState.FAILED})
-"""States after a rejection by the gate, when it judged again, or by the RTC."""
-
 
 def half_of_modes(n_modes: int) -> int:
     """Return half of ``n_modes``, or all of them where half is below ``MIN_TRIED_MODES``."""
@@ -356,39 +353,20 @@ def note_limit(
         )
 
 
-def note_declined(context: StepContext, *, rejected: bool) -> None:
-    """Note that a reconstructor which had passed the gate was declined before it came into use.
+def limit_declined(
+    context: StepContext, record: ReconstructorRecord, first_wait_s: float = FIRST_MODES_DELAY_S
+) -> None:
+    """Try no more modes for a while, longer each time, after a reconstructor was declined.
 
-    If it has more modes than are controlled, that is what it was made for: no more are tried for a
-    while, longer each time. An acquisition counts its own failures. ``rejected``: an operator has
-    done so now.
+    If it has more modes than are controlled, that is what it was made for. An acquisition counts
+    its own failures.
     """
-    before, records = context.before, context.matrices.reconstructors
-    if records is before.matrices.reconstructors or context.acquisition.under_way:
+    rtc = context.rtc or context.before.loop.rtc
+    if rtc is None or context.acquisition.under_way:
         return
-    rtc = context.rtc or before.loop.rtc
-    if rtc is None or rtc.n_controlled == 0:
-        return
-    earlier = {record.id: record.state for record in before.matrices.reconstructors}
-    for record in records:
-        wait_s = _wait_after(record, earlier.get(record.id), rejected=rejected)
-        if wait_s is not None and record.n_modes > rtc.n_controlled:
-            reason = f"{record.id} was {record.state}: {record.reason}"
-            limit_modes(context, rtc.n_controlled, reason, wait_s)
-
-
-def _wait_after(
-    record: ReconstructorRecord, earlier: MatrixState | None, *, rejected: bool
-) -> float | None:
-    """Return for how long more modes are not tried after what became of one; None: no matter."""
-    if earlier is None or earlier is record.state:
-        return None
-    if record.state in _DECLINED_STATES:
-        return FIRST_MODES_DELAY_S
-    # A proposal that another one has replaced is discarded, too, and says nothing of its modes.
-    if record.state is MatrixState.DISCARDED and rejected:
-        return DECLINED_MODES_DELAY_S
-    return None
+    if 0 < rtc.n_controlled < record.n_modes:
+        reason = f"{record.id} was {record.state}: {record.reason}"
+        limit_modes(context, rtc.n_controlled, reason, first_wait_s)
 
 
 def limit_modes(

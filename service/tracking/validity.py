@@ -11,12 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.records.alarms import STALE, TELEMETRY_OLD, Interlock, alarm_blocks
+from service.records.estimates import LockInEstimate, PassiveEstimate, RandomEstimate
 from service.records.registration import (
     PassiveBias,
     Purpose,
@@ -75,6 +77,8 @@ _WORTHLESS = (Validity.STALE, Validity.PREDICTED, Validity.INVALID)
 
 Array = NDArray[np.float64]
 
+EstimateT = TypeVar("EstimateT", bound=LockInEstimate | PassiveEstimate | RandomEstimate)
+
 
 def note_pointing(context: StepContext, pointing: Pointing | None) -> None:
     """Record the pointing of the telescope and its path; None if it is not reported."""
@@ -94,6 +98,32 @@ def pointing_at(state: TrackerState, t_ns_utc: int) -> Pointing | None:
     # A report is valid until the next one.
     earlier = state.alpha.pointings[: len(state.alpha.pointings) - len(later)]
     return earlier[-1][1] if earlier else later[0][1]
+
+
+def law_at(state: TrackerState, t_ns_utc: int) -> Misregistration | None:
+    """Return the registration by the law at a time of the RTC's clock; None if unknown."""
+    way = state.alpha.law.way
+    later = next((k for k, (t_ns, _) in enumerate(way) if t_ns >= t_ns_utc), len(way))
+    if not way:
+        return state.alpha.law.nominal
+    # Outside of the recorded path its nearest end counts: nothing is extrapolated.
+    if later in {0, len(way)}:
+        return way[min(later, len(way) - 1)][1]
+    (before_ns, before), (after_ns, after) = way[later - 1], way[later]
+    share = (t_ns_utc - before_ns) / (after_ns - before_ns)
+    return before.add_step(share * before.step_to(after))
+
+
+def at_present(
+    state: TrackerState, estimate: EstimateT, began_ns_utc: int, ended_ns_utc: int
+) -> EstimateT:
+    """Return an estimate at the present pointing, made of telemetry of another."""
+    now = state.alpha.law.nominal
+    # A window measures the mean registration, which is that of its middle if the law is smooth.
+    then = law_at(state, (began_ns_utc + ended_ns_utc) // 2)
+    if now is None or then is None:
+        return estimate
+    return replace(estimate, alpha=estimate.alpha.add_step(then.step_to(now)))
 
 
 def store_registration(context: StepContext, registration: Registration | None) -> None:

@@ -43,6 +43,7 @@ from service.tracking.dither_plan import check_dither_allowed
 from service.tracking.filtering import FilterUpdate, WindowEstimate
 from service.tracking.jumps import Innovation
 from service.tracking.operations.acquisition import count_miss
+from service.tracking.operations.measurement import MEASURING
 from service.tracking.operations.running import running_ramp
 from service.tracking.policy import SECOND_NS
 from service.tracking.step_context import StepContext, same_but_for_numbers
@@ -65,9 +66,13 @@ HARMLESS_REFUSALS = (RefusalKind.CUT_SHORT, RefusalKind.VOID)
 
 def on_window(context: StepContext, event: ev.WindowFitted) -> None:
     """Fold one window's estimate into the registration, or refuse it with its reason."""
+    if context.state.measuring is not None:
+        reject_window(context, MEASURING)
+        return
     estimate = event.estimate
     # A window whose beginning is not known counts as short.
     began_ns = event.began_ns_utc or estimate.t_ns_utc
+    estimate = validity.at_present(context.state, estimate, began_ns, estimate.t_ns_utc)
     why = filtering.check_window(context, estimate, began_ns)
     smeared = pointing_law.check_pointing_motion(context.state, began_ns, estimate.t_ns_utc)
     # Last, so that it replaces any other reason: what a smeared window says proves no fault.
@@ -339,7 +344,9 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
         text = f"the passive estimate was not used: {reason}"
         context.alpha = replace(context.alpha, passive_unavailable_reason=text)
         return
-    registration, estimate = context.registration, event.estimate
+    began_ns = event.began_ns_utc or event.t_ns_utc
+    estimate = validity.at_present(context.state, event.estimate, began_ns, event.t_ns_utc)
+    registration, event = context.registration, replace(event, estimate=estimate)
     if registration is None:
         _show_passive_alone(context, event)
         return

@@ -305,6 +305,10 @@ class FitDocument(BaseModel):
     recommendation: str = ""
     """Advice in one sentence, which begins with "use it", "measure more" or "do not use"."""
 
+    corrections: dict[str, Any] = {}
+    """Values that the recommendation asks to write into the instrument file, by table and key; null
+    removes a key. That of `instrument.pupil` describes how to turn or mirror the map."""
+
     found_not_told: list[dict[str, Any]] = []
     """Values that the matrix determines: key, found, told (the file's), how, and whether to correct
     the file."""

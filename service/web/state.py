@@ -232,6 +232,10 @@ class SnapshotCollector(Collector):
         yield _gauge("archive_waiting", waiting, snapshot.archive_waiting)
         yield from _of_worker_load(snapshot.worker_load)
         yield from _of_link(snapshot.link)
+        since_ns = tracker.loop.reference_since_ns_utc
+        unchanged = "Since the RTC changed its reference slopes; NaN: it has not"
+        age_s = None if since_ns is None else (snapshot.now_ns - since_ns) / 1e9
+        yield _gauge("reference_age_seconds", unchanged, age_s)
         yield from _of_registration(snapshot)
         yield from _of_the_dither(tracker)
         yield from _of_reconstructors(tracker)

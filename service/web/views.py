@@ -336,7 +336,7 @@ define_view("LoopCommandView", LoopCommand, "id text state reason asked_ns_utc l
 define_view(
     "DitherView",
     Dither,
-    "id request.modes request.amplitude_m request.kind frequency_hz request.seed "
+    "id purpose request.modes request.amplitude_m request.kind frequency_hz request.seed "
     "request.duration_s start_seq",
 )
 define_view("DitherPlanView", DitherPlan)
@@ -355,8 +355,8 @@ define_view("OffloadView", Offload, "id state text step total n_moves asked_ns_u
 RECONSTRUCTOR = define_view(
     "ReconstructorView",
     products.ReconstructorRecord,
-    "id state n_modes config_id created_ns_utc alpha sigma parent origin sha256 condition_number "
-    "gate reason published_ns_utc applied_frame_seq",
+    "id state n_modes config_id reference_id created_ns_utc alpha sigma parent origin sha256 "
+    "condition_number gate reason published_ns_utc applied_frame_seq",
 )
 RECONSTRUCTORS = define_view(
     "ReconstructorsView",
@@ -421,7 +421,8 @@ STATE = define_view(
     "now_ns uptime_s registration=alpha tracker.matrices.in_use tracker.matrices.margin "
     "tracker.matrices.assessment tracker.matrices.mode_limit tracker.matrices.mode_proof "
     "tracker.operations.probation rtc instrument_remarks tracker.alpha.pointing "
-    "tracker.loop.basis_id tracker.loop.config_id tracker.dithers.dither "
+    "tracker.loop.basis_id tracker.loop.config_id tracker.loop.reference_id "
+    "tracker.loop.reference_since_ns_utc tracker.dithers.dither "
     "dither_policy=tracker.dithers.policy tracker.loop.vibrations_hz tracker.measuring "
     "tracker.noisy_measurement tracker.operations.acquisition tracker.alpha.offload "
     "loop_command=tracker.loop.command tracker.alpha.dither_due_since_ns_utc "

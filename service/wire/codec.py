@@ -335,8 +335,9 @@ def read(values: Map, kind: type[_R], where: str, absent: tuple[str, ...] = ()) 
         raise _find_mismatch(values, kind, where) from error
     # A regular expression cannot express "printable", so msgspec has checked the length only.
     for name in _opaque_fields(kind):
-        if not getattr(record, name).isprintable():
-            raise refusal(name, getattr(record, name), describe_field(kind, name), where)
+        value = getattr(record, name)
+        if value is not None and not value.isprintable():
+            raise refusal(name, value, describe_field(kind, name), where)
     return record
 
 
@@ -369,6 +370,14 @@ def check_applicability(record: DataclassInstance, where: str, **applies: bool) 
             raise refusal(key, value, describe_field(type(record), key), where)
         if not is_needed and value is not None:
             raise refusal(key, value, "nil, it does not apply", where)
+
+
+def without_nil(keys: Map, *names: str) -> Map:
+    """Return the map without these keys where they are nil, as an older sender writes it.
+
+    Absent and nil mean the same for them.
+    """
+    return {key: value for key, value in keys.items() if value is not None or key not in names}
 
 
 def nil_reason_to_text(values: Map, _where: str) -> Map:

@@ -69,12 +69,20 @@ class FrameHeader:
     """Modal basis; changes with modes, order and scale."""
 
     config_id: codec.Opaque
-    """Sensor configuration; changes with mask, slopes, reference slopes, binning, modulation."""
+    """Sensor configuration; changes with mask, slope recipe, binning, modulation."""
+
+    reference_id: codec.Opaque | None = None
+    """Reference slopes in use; nil or absent: the RTC does not name them."""
 
     @property
     def n_columns(self) -> int:
         """Number of floats in a row: slopes, commands and, if present, dither."""
         return self.n_slopes + self.n_modes * (2 if self.dither else 1)
+
+    @property
+    def reference_name(self) -> str:
+        """Name of the reference slopes; an RTC of version 1 may have only ``config_id`` for it."""
+        return self.reference_id or self.config_id
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -159,7 +167,9 @@ def decode_frames(payload: bytes, attachment: bytes | None) -> FrameBatch:
 codec.register(
     FrameHeader,
     "the attachment of a frame batch",
+    optional_keys=("reference_id",),
     unpack=lambda data, where: codec.unpack(data, where, ATTACHMENT_LIMIT),
+    keys=lambda keys: codec.without_nil(keys, "reference_id"),
 )
 
 
@@ -191,6 +201,7 @@ ESSENTIAL_KEYS: Final = (
     "n_modes",
     "basis_id",
     "config_id",
+    "reference_id",
 )
 """Keys of a status whose changes must not be missed, even if a newer status has come already."""
 
@@ -288,6 +299,14 @@ class Status(ControlLaw):
 
     trouble: codec.Text | None = None
     """Fault of the RTC, for people."""
+
+    reference_id: codec.Opaque | None = None
+    """Reference slopes in use; nil or absent: the RTC does not name them."""
+
+    @property
+    def reference_name(self) -> str:
+        """Name of the reference slopes, as :attr:`FrameHeader.reference_name`."""
+        return self.reference_id or self.config_id
 
     @property
     def dither_id(self) -> str | None:
@@ -394,10 +413,7 @@ def _unpack_status(data: bytes, where: str) -> codec.Map:
 
 
 def _status_keys(keys: codec.Map) -> codec.Map:
-    playing = keys["dither"]
-    if keys["trouble"] is None:
-        # absent and nil mean the same; a status without a fault is the one of version 1
-        del keys["trouble"]
+    playing, keys = keys["dither"], codec.without_nil(keys, "trouble", "reference_id")
     if playing is None:
         return keys
     return {**keys, "dither": {**codec.to_map(playing.request), "start_seq": playing.start_seq}}
@@ -432,7 +448,7 @@ codec.register(
     Status,
     STATUS_NAME,
     first=("session", "seq", "t_ns", "loop", "frame_rate_hz"),
-    optional_keys=("pointing", "trouble"),
+    optional_keys=("pointing", "trouble", "reference_id"),
     unpack=_unpack_status,
     keys=_status_keys,
     fields=_status_fields,

@@ -45,11 +45,21 @@ class LoopTerms:
     """R D ``(n_controlled, n_modes)``, in columns: for two frames at a time a copy of it would cost
     four times the product."""
 
+    references: Array32 | None = None
+    """Reference slopes ``(n_slopes,)``, subtracted from the sensor's; None: they are zero."""
+
     @classmethod
-    def of(cls, optics: Optics, reconstructor: Array32, gains: Array32, leak: float) -> LoopTerms:
+    def of(
+        cls,
+        optics: Optics,
+        reconstructor: Array32,
+        gains: Array32,
+        leak: float,
+        references: Array32 | None = None,
+    ) -> LoopTerms:
         """Return the terms of a loop around these optics."""
         if not isinstance(optics, LinearOptics):
-            return cls(reconstructor=reconstructor, gains=gains, leak=leak)
+            return cls(reconstructor=reconstructor, gains=gains, leak=leak, references=references)
         response = optics.slopes_per_command
         return cls(
             # in columns, as the product with rows of slopes reads it
@@ -58,6 +68,7 @@ class LoopTerms:
             leak=leak,
             slopes_per_command=response,
             modal_response=np.asfortranarray(reconstructor @ response),
+            references=references,
         )
 
 
@@ -156,6 +167,8 @@ class ModalLoop:
             raise TypeError("loop: found no matrix of the plant; only a linear one has open slopes")
         if open_modes is None:
             open_modes = open_slopes @ terms.reconstructor.T
+        if terms.references is not None:
+            open_modes = open_modes - terms.reconstructor @ terms.references
         block = LoopBlock.of(open_slopes, dither_m, played_m, self._decided.shape[1])
         added = dither_m is not None or played_m is not None
         moved = self._count_movable_modes(block.commands_m if added else None, len(terms.gains))
@@ -169,6 +182,8 @@ class ModalLoop:
         self._integrate(estimate, terms, block)
         block.slopes = block.commands_m[:, :moved] @ matrix[:, :moved].T
         block.slopes += open_slopes
+        if terms.references is not None:
+            block.slopes -= terms.references
         return block.reported()
 
     def _count_movable_modes(self, added_m: Array32 | None, n_controlled: int) -> int:
@@ -190,10 +205,11 @@ class ModalLoop:
     ) -> LoopBlock:
         """Run frames one by one, each with the slopes that ``sense`` says it makes."""
         slopes = np.empty((n_frames, terms.reconstructor.shape[1]), dtype=np.float32)
+        references = 0.0 if terms.references is None else terms.references
 
         def estimate(first: int, commands: Array32) -> Array32:
             for k, command in enumerate(commands, first):
-                slopes[k] = sense(k, command)
+                slopes[k] = sense(k, command) - references
             return np.asarray(slopes[first : first + len(commands)] @ terms.reconstructor.T)
 
         block = LoopBlock.of(slopes, dither_m, played_m, self._decided.shape[1])

@@ -39,6 +39,7 @@ from sim_rtc.computer.feed import BATCH_FRAMES, BLOCK_FRAMES, Block
 from sim_rtc.computer.gains import LARGEST_GAIN, GainRamp, ramp_refusal
 from sim_rtc.computer.loop import LoopTerms, ModalLoop
 from sim_rtc.computer.measure import Measurement, MeasurementRules
+from sim_rtc.computer.reconstructors import ReferenceSchedule
 from sim_rtc.computer.telemetry import Batch, LoopSettings
 from sim_rtc.telescope.mirror import MirrorDrive
 from sim_rtc.telescope.plant import Optics
@@ -73,10 +74,13 @@ class RealTimeComputer:
         reports_asked: bool = False,
         mode_to_actuator: NDArray[np.float64] | None = None,
         move: Callable[[NDArray[np.float64]], float] | None = None,
+        references: ReferenceSchedule | None = None,
     ) -> None:
         self._blocks = blocks
+        self._schedule = references
         self._move = move
         self.identity = identity
+        self._references: Array32 | None = None
         self._settings = settings
         self._n_slopes, self._n_modes = optics.n_slopes, optics.opd_per_command.shape[1]
         self._loop = ModalLoop(
@@ -117,6 +121,10 @@ class RealTimeComputer:
         """Process the next frames, whatever the clock says."""
         block, row = self._next_rows()
         n_frames = self.batch_frames = block.batch_frames
+        frame_rate_hz = self._settings.frame_rate_hz
+        due = self._schedule and self._schedule.next((block.first_frame + row) / frame_rate_hz)
+        if due:
+            self.use_references(due[0], **due[1])
         with self._lock:
             self._swap()
             terms = self._current_terms(block.optics)
@@ -134,6 +142,7 @@ class RealTimeComputer:
                 commands_m=result.commands_m,
                 dither_m=result.dither_m if activities.telemetry_dithers else None,
                 cm_id=self._active.manifest.id,
+                identity=self.identity,
                 n_clipped=result.n_clipped,
                 closed=self._settings.closed,
                 n_controlled=len(terms.gains),
@@ -148,6 +157,21 @@ class RealTimeComputer:
         """Take a checked matrix; it is swapped in before the next batch."""
         with self._lock:
             self._staged.append(reconstructor)
+
+    def use_references(
+        self, references: Array32, *, reference_id: str | None = None, config_id: str | None = None
+    ) -> None:
+        """Subtract other reference slopes ``(n_slopes,)`` from the next batch on, under a new name.
+
+        An RTC of version 1 has no name for them but ``config_id``.
+        """
+        with self._lock:
+            self._references, self._terms = references.astype(np.float32), None
+            self.identity = replace(
+                self.identity,
+                reference_id=reference_id or self.identity.reference_id,
+                config_id=config_id or self.identity.config_id,
+            )
 
     def restart(self) -> None:
         """Begin a session from frame 0 with the matrix of the start, as a new process would."""
@@ -248,6 +272,7 @@ class RealTimeComputer:
                 cm_id=self._active.manifest.id,
                 basis_id=self.identity.basis_id,
                 config_id=self.identity.config_id,
+                reference_id=self.identity.reference_id,
                 dither=self._activities.dither,
                 max_dither_m=MAX_DITHER_AMPLITUDE_M,
                 max_dither_modes=self._n_modes,
@@ -294,7 +319,8 @@ class RealTimeComputer:
     def _current_terms(self, optics: Optics) -> LoopTerms:
         matrix = self._active.matrix
         if self._terms is None or self._optics is not optics:
-            self._terms = LoopTerms.of(optics, matrix, self._gains(), self._settings.leak)
+            leak, references = self._settings.leak, self._references
+            self._terms = LoopTerms.of(optics, matrix, self._gains(), leak, references)
             self._optics = optics
         return self._terms
 

@@ -1,4 +1,4 @@
-"""The simulator's own reconstructors, and the names of its basis and sensor configuration."""
+"""The simulator's own reconstructors and reference slopes, and the names of basis and sensor."""
 
 from __future__ import annotations
 
@@ -55,6 +55,39 @@ def own_reconstructor(
     name = f"initial-{len(matrix)}-{checksum(matrix)[:8]}"
     told = None if alpha is None else alpha.to_boundary()
     return Reconstructor.own(name, matrix, identity, created_ns=time.time_ns(), alpha=told)
+
+
+FIRST_SHAPE_MODE, N_SHAPE_MODES = 2, 20
+"""Modes of the shapes that references put on the mirror: as static aberrations of optics, low ones.
+"""
+
+
+class ReferenceSchedule:
+    """New reference slopes at regular times, each for a shape at random.
+
+    The slopes are those of a matrix that the reconstructor inverts, as an RTC has it from its own
+    calibration. Strength of the modes falls as their index, and so as the square of their order.
+    """
+
+    def __init__(
+        self, matrix: Array32, *, rms_m: float, period_s: float, named_by: str, seed: int | None
+    ) -> None:
+        n_modes = min(N_SHAPE_MODES, len(matrix) - FIRST_SHAPE_MODE)
+        modes = np.arange(FIRST_SHAPE_MODE, FIRST_SHAPE_MODE + n_modes)
+        shapes = np.eye(len(matrix))[:, modes] / modes
+        self._slopes = np.linalg.lstsq(matrix.astype(np.float64), shapes)[0]
+        self._scale_m = rms_m / np.linalg.norm(1.0 / modes)
+        self._period_s, self._named_by = period_s, named_by
+        self._rng, self._n = np.random.default_rng(seed), 0
+
+    def next(self, time_s: float) -> tuple[Array32, dict[str, str]] | None:
+        """Return reference slopes and their name if new ones are due at this time; else None."""
+        if time_s < (self._n + 1) * self._period_s:
+            return None
+        self._n += 1
+        amplitudes_m = self._scale_m * self._rng.normal(size=self._slopes.shape[1])
+        references = (self._slopes @ amplitudes_m).astype(np.float32)
+        return references, {self._named_by: f"references-{self._n}"}
 
 
 def identity_of(instrument: Instrument, valid: NDArray[np.bool_]) -> Identity:

@@ -43,7 +43,7 @@ class Batch:
     session: str
     seq0: int
     slopes: Array32
-    """``(n_frames, n_slopes)``."""
+    """``(n_frames, n_slopes)``, the reference slopes subtracted."""
 
     commands_m: Array32
     """``(n_frames, n_modes)``, dither included, after clipping."""
@@ -53,6 +53,9 @@ class Batch:
 
     cm_id: str
     """The matrix that multiplied these slopes."""
+
+    identity: Identity
+    """Names of basis, sensor and reference slopes of these frames."""
 
     n_clipped: int
     """Commands that met the stroke limit."""
@@ -66,11 +69,9 @@ class Batch:
     """``(n_points,)`` turbulence OPD during the first frame: never on the wire."""
 
 
-def frames_of(
-    batch: Batch, identity: Identity, t0_ns: int, dt_ns: int
-) -> tuple[FrameHeader, NDArray[np.float32]]:
+def frames_of(batch: Batch, t0_ns: int, dt_ns: int) -> tuple[FrameHeader, NDArray[np.float32]]:
     """Return header and rows of a batch whose first exposure ended at ``t0_ns``."""
-    columns = [batch.slopes, batch.commands_m]
+    columns, identity = [batch.slopes, batch.commands_m], batch.identity
     if batch.dither_m is not None:
         columns.append(batch.dither_m)
     header = FrameHeader(
@@ -85,6 +86,7 @@ def frames_of(
         cm_id=batch.cm_id,
         basis_id=identity.basis_id,
         config_id=identity.config_id,
+        reference_id=identity.reference_id,
     )
     return header, np.hstack(columns)
 

@@ -123,7 +123,7 @@ class Link(Background):
             if outgoing is not None:
                 batch, t0_ns, time_s = outgoing
                 self._note_matrix(batch.cm_id)
-                header, rows = frames_of(batch, self._computer.identity, t0_ns, self._clock.dt_ns)
+                header, rows = frames_of(batch, t0_ns, self._clock.dt_ns)
                 for payload, attachment in self._faults.messages(header, rows, time_s):
                     link.publish_encoded_frames(payload, attachment)
                     self._record(RecordedKind.FRAMES, payload, attachment)

@@ -1,6 +1,7 @@
 """However frames arrive, what is drained is in order, true to its number, and accounted for."""
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 from hypothesis import given, settings
@@ -71,6 +72,18 @@ def test_frames_come_out_once_in_order_and_every_number_is_accounted_for(steps, 
     assert counts["received"] + counts["nonfinite"] + counts["duplicate"] + counts["late"] == sent
     assert counts["received"] + counts["nonfinite"] + counts["lost"] == head - first
     assert len(delivered) + counts["overwritten"] + ring.undelivered == counts["received"]
+
+
+@given(change=st.sampled_from(["reference_id", "config_id"]), n_before=st.integers(1, 20))
+def test_new_references_begin_a_block_by_whichever_id_they_are_named(change, n_before):
+    one, other = batch(0, n_before), batch(n_before, 7)
+    ring = FrameRing(one.header, CAPACITY, Counter())
+    ring.store(one, 0.0)
+    ring.store(replace(other, header=replace(other.header, **{change: "ncpa-2"})), 0.0)
+    blocks = ring.take(0.0, PATIENCE_S, 10**6)
+    named = [(block.first_seq, block.n_frames, block.reference_name) for block in blocks]
+    assert named == [(0, n_before, "c"), (n_before, 7, "ncpa-2")]
+    assert not blocks[1].follows(blocks[0])
 
 
 @given(order=st.permutations(range(8)))

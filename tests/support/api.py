@@ -15,7 +15,13 @@ from service.model.misregistration import Misregistration
 from service.records.alarms import Alarm
 from service.records.commands import Refit
 from service.records.events import MakeMatrix
-from service.records.operations import Dither, DitherPhase, DitherPlan, DitherPolicyState
+from service.records.operations import (
+    Dither,
+    DitherPhase,
+    DitherPlan,
+    DitherPolicyState,
+    DitherPurpose,
+)
 from service.records.products import GateVerdict, MatrixState, ReconstructorRecord
 from service.records.registration import HistoryEntry, PassiveState, Registration
 from service.records.state import Level, LogEntry, Mode
@@ -164,7 +170,7 @@ STATE = tracker_state(
         mean_square_m2=9e-18,
     ),
     vibrations_hz=(61.0,),
-    dither=Dither(request=REQUEST, start_seq=17, asked_ns_utc=5),
+    dither=Dither(request=REQUEST, purpose=DitherPurpose.FOLLOW, start_seq=17, asked_ns_utc=5),
     passive=PassiveState(
         alpha=ALPHA,
         sigma=10 * SIGMA,

@@ -20,6 +20,7 @@ KEYS = {
     "reconstructor",
     "notes",
     "recommendation",
+    "corrections",
     "found_not_told",
     "unknown_not_found",
     "alternatives",

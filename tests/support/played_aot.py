@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 import pytest
 
-from pyrcal.playback.aot import read_telemetry
+from pyrcal.importers.aot import read_telemetry
 from service.model.pupil import rtc_valid_subapertures
 
 aotpy = pytest.importorskip("aotpy")

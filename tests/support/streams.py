@@ -8,7 +8,7 @@ import numpy as np
 
 from service.estimation.description import Actuators, Description
 from service.estimation.frames import FrameBlock
-from service.records.operations import Dither
+from service.records.operations import Dither, DitherPurpose
 from service.wire import DitherKind, DitherRequest
 from tests.support.situations import rtc
 
@@ -36,7 +36,7 @@ REQUEST = DitherRequest(
 )
 
 
-DITHER = Dither(request=REQUEST, start_seq=0, asked_ns_utc=0)
+DITHER = Dither(request=REQUEST, purpose=DitherPurpose.FOLLOW, start_seq=0, asked_ns_utc=0)
 
 
 def block(first_seq, n=100, *, session="s1", cm_id="initial", dither=True, scale=1e-9, signs=False):

@@ -10,8 +10,8 @@ from pydantic import TypeAdapter, ValidationError
 
 from pyrcal.client import remote
 from service.records.commands import Command
+from service.records.operations import DitherPurpose
 from service.tracking import interlocks
-from service.tracking.dither_request import NOISY_DITHER
 from service.web.commands import ORDERS, OrderRoute
 
 PATHS = json.loads((Path(__file__).parents[2] / "docs" / "openapi.json").read_text("utf-8"))[
@@ -28,7 +28,7 @@ def test_every_command_has_its_route():
 
 
 def test_the_id_of_a_noisy_matrix_is_that_of_its_dither():
-    assert f"{ORDERS['measure_noisy'].makes}-" == NOISY_DITHER
+    assert ORDERS["measure_noisy"].makes == DitherPurpose.NOISY
 
 
 @pytest.mark.parametrize("order", ORDERS.values(), ids=ORDERS)

@@ -6,10 +6,14 @@ What is not so yet is listed here by name. No list may grow, and what has been m
 import ast
 import re
 from collections import defaultdict
+from typing import get_args
 
 import grimp
+import pytest
 
 from service.records.alarms import ALARMS
+from service.records.commands import Instruction
+from service.records.events import Event
 from tests.support.repository import HELD, ROOT
 
 WORDS_TOO = {"acquisition", "archive-failed", "dither", "margin"}
@@ -52,3 +56,99 @@ def test_no_test_module_imports_another():
     modules = list((ROOT / "tests").rglob("*.py"))
     assert [str(path) for path in modules if imports.search(path.read_text("utf-8"))] == []
     assert len(modules) > 300
+
+
+KINDS = {kind.__name__ for kind in (*get_args(Event), Instruction)}
+"""Names of all events and commands."""
+
+
+def kinds_asked_for(source):
+    """Yield each kind of event or command that some code asks whether an event is."""
+    for node in ast.walk(ast.parse(source)):
+        match node:
+            case ast.MatchClass(cls=asked) | ast.Call(ast.Name("isinstance"), [_, asked]):
+                yield from KINDS & names_in(asked)
+            case ast.Compare(left=left, comparators=others) if "type(" in ast.unparse(node):
+                yield from KINDS & names_in(left, *others)
+
+
+def names_in(*nodes):
+    """Return the last parts of the names in expressions."""
+    parts = (part for node in nodes for part in ast.walk(node))
+    return {getattr(part, "attr", getattr(part, "id", None)) for part in parts}
+
+
+@pytest.mark.parametrize(
+    ("source", "kinds"),
+    [
+        ("isinstance(event, ev.Tick)", {"Tick"}),
+        ("isinstance(event, (cmd.SetMode, Status))", {"SetMode", "Status"}),
+        ("isinstance(event, ev.Tick | ev.RtcVanished)", {"Tick", "RtcVanished"}),
+        ("match it:\n case ev.Answered(reply=None) | Reject(): pass", {"Answered", "Reject"}),
+        ("type(event) is ev.Tick", {"Tick"}),
+        ("type(event) in {ev.Tick, Reject}", {"Tick", "Reject"}),
+        ("match reply:\n case wire.Reply(): pass", set()),
+        ("isinstance(value, bool)", set()),
+        ("ev.Tick()", set()),
+    ],
+)
+def test_a_look_at_an_event_is_found(source, kinds):
+    assert set(kinds_asked_for(source)) == kinds
+
+
+def test_no_module_of_the_tracker_asks_what_an_event_is():
+    """The tables of ``service.tracker`` say who is given an event, which it is there."""
+    folder = ROOT / "service" / "tracking"
+    sources = {
+        path: path.read_text("utf-8")
+        for path in (*folder.rglob("*.py"), folder.parent / "tracker.py")
+    }
+    asked = {path.stem: set(kinds_asked_for(source)) for path, source in sources.items()}
+    assert len(asked) > 25
+    # An order is looked at before the step, to refuse it.
+    assert asked.pop("interlocks") == {"SetLoop"}
+    assert {module: kinds for module, kinds in asked.items() if kinds} == {}
+    for path, source in sources.items():
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, ast.arg) and node.annotation and path.stem != "tracker":
+                assert "Event" not in names_in(node.annotation), f"{path.name}, {node.lineno}"
+
+
+PACKAGES = ("service", "pyrcal", "check_rtc", "sim_rtc", "cacao_bridge")
+
+
+def test_no_import_by_name_closes_a_circle():
+    """A name handed to ``import_module`` is an import that the contracts do not see."""
+    imports = grimp.build_graph(*PACKAGES)
+    by_name = {
+        (module, name)
+        for module in imports.modules
+        for name in names_imported(module, has_children=bool(imports.find_children(module)))
+        if name in imports.modules
+    }
+    for importer, imported in by_name:
+        imports.add_import(importer=importer, imported=imported)
+    closed = [
+        imports.find_shortest_chain(importer=imported, imported=importer)
+        for importer, imported in by_name
+    ]
+    assert list(filter(None, closed)) == []
+    assert ("service.instrument", "service.instrument.reader") in by_name
+
+
+def names_imported(module, *, has_children):
+    """Yield every text of a module that imports by name: any may be such a name."""
+    path = ROOT / module.replace(".", "/")
+    text = (path / "__init__.py" if has_children else path.with_suffix(".py")).read_text("utf-8")
+    if "import_module" not in text and "__import__" not in text:
+        return
+    own = {"__name__": module, "__package__": module if has_children else module.rpartition(".")[0]}
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Constant):
+            yield node.value
+        elif isinstance(node, ast.JoinedStr):
+            parts = [
+                part.value if isinstance(part, ast.Constant) else own.get(ast.unparse(part.value))
+                for part in node.values
+            ]
+            yield "".join(part or "?" for part in parts)

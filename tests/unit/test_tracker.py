@@ -1,15 +1,18 @@
 """Whole stories: what the service does, event after event, as a pure function of them."""
 
-from typing import get_args
+from types import NoneType
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
 
+from service import wire
 from service.records import events as ev
 from service.records.events import Event
 from service.records.products import MatrixState
 from service.records.state import Mode
-from service.tracker import REACTIONS, TAKEN_BY_OPERATIONS, step
+from service.tracker import ANSWERS, DECIDERS, FAILURES, REACTIONS, step
+from service.tracking.step_context import StepContext
 from service.wire import DitherRequest
 from tests.support.situations import ALPHA, POLICY, Story, dither_answered, moved, of_kind, rtc
 from tests.support.states import tracker_state
@@ -101,10 +104,25 @@ def test_a_step_leaves_the_state_it_was_given_as_it_was():
 
 
 def test_there_is_a_reaction_to_every_event_and_command_and_to_nothing_else():
-    assert set(REACTIONS) == set(get_args(Event)) - TAKEN_BY_OPERATIONS
+    requests = set(get_args(wire.Command))
+    assert set(REACTIONS) == set(get_args(Event))
+    assert set(ANSWERS) == requests
+    assert set(FAILURES) == (set(get_args(ev.Effect)) - {ev.Ask}) | requests
 
 
-def test_each_is_taken_in_by_one_function_that_says_what_it_does():
-    for kind, reaction in REACTIONS.items():
-        assert reaction.__name__ != "<lambda>", kind
-        assert reaction.__doc__, kind
+def test_every_function_of_a_table_says_what_it_does():
+    functions = [decider.decide for decider in DECIDERS]
+    functions += [guard for decider in DECIDERS for guard in decider.guards]
+    for table in (REACTIONS, ANSWERS, FAILURES):
+        assert all(table.values())
+        functions += [react for reactions in table.values() for react in reactions]
+    for function in functions:
+        assert function.__name__ != "<lambda>", function
+        assert function.__doc__, function
+
+
+def test_deciders_and_guards_are_not_given_the_event():
+    for name, guards, decide in DECIDERS:
+        assert list(get_type_hints(decide).values()) == [StepContext, NoneType], name
+        for guard in guards:
+            assert list(get_type_hints(guard).values()) == [StepContext, bool], name

@@ -14,8 +14,10 @@ leaves the decision to the operator. It never closes a loop.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, wraps
+from typing import Concatenate, ParamSpec
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,11 +37,11 @@ from service.records import commands as cmd
 from service.records import events as ev
 from service.records.alarms import LOST, Interlock, alarm_blocks, blocking_alarm
 from service.records.estimates import RefusalKind
-from service.records.events import Event
 from service.records.operations import (
     Acquisition,
     AcquisitionStage,
     Dither,
+    DitherPurpose,
     Interruption,
     LoopFound,
     ProbationState,
@@ -54,8 +56,9 @@ from service.tracking.dither import (
     request_dither,
     request_stop,
     stop_running_dither,
+    stop_unwanted,
 )
-from service.tracking.dither_request import ACQUIRING_DITHER
+from service.tracking.dither_request import name_dither
 from service.tracking.operations.measurement import fail_noisy_measurement
 from service.tracking.operations.running import running_ramp
 from service.tracking.operator import set_loop
@@ -63,6 +66,8 @@ from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.step_context import StepContext, present
 from service.tracking.transitions import move
 from service.wire import DitherKind, DitherRequest, LoopRequest, Reply, Status
+
+ReactionP = ParamSpec("ReactionP")
 
 MIN_FINAL_WINDOWS = 2
 """Ordinary windows that must agree with the last reconstructor in the loop."""
@@ -140,26 +145,109 @@ def abort_on_command(context: StepContext, _: cmd.AbortAcquisition) -> None:
     abort_acquisition(context, "by the operator", held_off=True)
 
 
-def advance(context: StepContext, event: Event) -> None:
-    """Take an acquisition further after an event, or begin one where the service needs it."""
+def on_mode_set(context: StepContext, command: cmd.SetMode) -> None:
+    """End an acquisition that nobody ordered, unless the mode is auto; hold back none any more."""
+    acquisition = context.acquisition
+    if acquisition.held_off:
+        text = f"an operator has set the mode, {command.mode}, since the last was ended"
+        _forget(context, text)
+    elif acquisition.under_way and not acquisition.commanded and command.mode is not Mode.AUTO:
+        abort_acquisition(context, f"because the mode is {command.mode}")
+
+
+def on_dither_stop(context: StepContext, _: cmd.StopDither) -> None:
+    """End an acquisition whose dither an operator stops."""
+    if context.acquisition.under_way:
+        abort_acquisition(context, "because the dither was stopped")
+
+
+def _during_acquisition(
+    react: Callable[Concatenate[StepContext, ReactionP], None],
+) -> Callable[Concatenate[StepContext, ReactionP], None]:
+    """Have a reaction take place only during an acquisition, which is then its cause."""
+
+    @wraps(react)
+    def guarded(context: StepContext, /, *args: ReactionP.args, **kwargs: ReactionP.kwargs) -> None:
+        if context.acquisition.under_way:
+            with context.because_of(context.acquisition.cause):
+                react(context, *args, **kwargs)
+
+    return guarded
+
+
+@_during_acquisition
+def on_new_session(context: StepContext, _: ev.SessionStarted) -> None:
+    """Restart an acquisition whose loop was changed from outside."""
+    # Opening the loop begins a session of its own.
+    if context.acquisition.stage is not AcquisitionStage.OPENING:
+        _restart_acquisition(context, "the RTC began a new session")
+
+
+@_during_acquisition
+def on_vanished(context: StepContext, _: ev.RtcVanished) -> None:
+    """Interrupt an acquisition whose RTC has gone."""
+    # the state before still knows in which session that was
+    context.acquisition = _interrupt(context.before, "the RTC vanished")
+    _note_interrupted(context, NO_RTC_LEFT)
+
+
+@_during_acquisition
+def on_too_strong(context: StepContext, event: ev.DitherMeasured) -> None:
+    """End an acquisition whose dither was too strong."""
+    if event.text and event.id == context.dither_policy.loud_id:
+        _fail_acquisition(context, event.text)
+
+
+@_during_acquisition
+def on_dither_unusable(context: StepContext, event: ev.DitherUnusable) -> None:
+    """End an acquisition whose dither cannot be read."""
+    _fail_acquisition(context, f"its dither cannot be read: {event.text}")
+
+
+@_during_acquisition
+def on_loop_answer(context: StepContext, request: LoopRequest, reply: Reply) -> None:
+    """End an acquisition for which the RTC does not change its loop."""
+    if request.id == context.acquisition.command and not reply.accepted:
+        _fail_acquisition(context, f"the RTC will not change its loop: {reply.reason}")
+
+
+@_during_acquisition
+def on_loop_failed(context: StepContext, request: LoopRequest, text: str) -> None:
+    """Restart an acquisition whose request to change the loop had no answer."""
+    if request.id == context.acquisition.command:
+        _restart_acquisition(context, text)
+
+
+@_during_acquisition
+def on_dither_answer(context: StepContext, _: DitherRequest, reply: Reply) -> None:
+    """Count a dither that the RTC has refused as a window without a result."""
+    if not reply.accepted:
+        _note_miss(context, f"the RTC refused the dither: {reply.reason}")
+
+
+@_during_acquisition
+def on_lost(context: StepContext, event: ev.WindowLost) -> None:
+    """Count a window of an open loop that no registration explains."""
+    if event.refused.kind is RefusalKind.NOT_FOUND:
+        _note_miss(context, event.refused.reason)
+
+
+def advance(context: StepContext) -> None:
+    """Take an acquisition further, or begin one where the service needs it."""
     acquisition = context.acquisition
     if acquisition.stage is AcquisitionStage.INTERRUPTED:
         _resume_interrupted(context)
-    elif not acquisition.under_way:
+    elif acquisition.under_way:
+        with context.because_of(acquisition.cause):
+            _advance_stage(context)
+    else:
         if context.windows.accepted > context.before.windows.accepted:
             # An accepted window ends the sequence of misses.
             context.acquisition = replace(acquisition, misses=0)
-        _forget_when_over(context, event)
+        _forget_when_over(context)
         why = explain_acquisition(context.state, context.policy, context.now_ns)
         if why is not None and context.rtc and running_ramp(context.state, context.now_ns) is None:
             _begin(context, context.rtc, why, commanded=False)
-    elif isinstance(event, ev.RtcVanished):
-        # the state before still knows in which session that was
-        context.acquisition = _interrupt(context.before, "the RTC vanished")
-        _note_interrupted(context, NO_RTC_LEFT)
-    else:
-        with context.because_of("" if isinstance(event, cmd.Instruction) else acquisition.cause):
-            _advance(context, event)
 
 
 def acquisition_to_save(state: TrackerState) -> Acquisition | None:
@@ -234,69 +322,21 @@ def _own_loop_lost(context: StepContext) -> str | None:
     return None if alarm is None else alarm.name
 
 
-def _advance(context: StepContext, event: Event) -> None:
-    """Take one that is under way further."""
-    n_effects = len(context.effects)
-    _end_by_event(context, event)
-    acted = len(context.effects) > n_effects
-    if acted or not context.acquisition.under_way or context.rtc is None:
+def _advance_stage(context: StepContext) -> None:
+    """Take one that is under way further, unless what it has asked for is awaited."""
+    acquisition, rtc = context.acquisition, context.rtc
+    # The RTC or the worker first answers what the acquisition has asked for in this step.
+    if any(effect.cause == acquisition.cause for effect in context.effects):
         return
-    if context.acquisition.stage in {AcquisitionStage.PARTIAL, AcquisitionStage.WIDENING}:
-        _closed_stage(context, context.rtc)
+    if context.now_ns - acquisition.since_ns_utc > MAX_STAGE_DURATION_S * SECOND_NS:
+        reason = f"{acquisition.text}: not done in {MAX_STAGE_DURATION_S:.0f} s"
+        _restart_acquisition(context, reason)
+    elif rtc is None:
+        return
+    elif acquisition.stage in {AcquisitionStage.PARTIAL, AcquisitionStage.WIDENING}:
+        _closed_stage(context, rtc)
     else:
-        _wide_capture_stage(context, context.rtc)
-
-
-def _end_by_event(context: StepContext, event: Event) -> None:
-    """End or restart an acquisition that cannot go on after the event, else make use of it."""
-    acquisition, state = context.acquisition, context.state
-    late = context.now_ns - acquisition.since_ns_utc > MAX_STAGE_DURATION_S * SECOND_NS
-    match event:
-        case cmd.StopDither():
-            abort_acquisition(context, "because the dither was stopped")
-        case cmd.SetMode(mode=mode) if mode is not Mode.AUTO and not acquisition.commanded:
-            abort_acquisition(context, f"because the mode is {mode}")
-        # Opening the loop begins a session of its own. In a later stage the loop was changed from
-        # outside.
-        case ev.SessionStarted() if acquisition.stage is not AcquisitionStage.OPENING:
-            _restart_acquisition(context, "the RTC began a new session")
-        case ev.DitherMeasured(id=loud, text=text) if loud == state.dithers.policy.loud_id and text:
-            _fail_acquisition(context, text)
-        case ev.DitherUnusable(text=text):
-            _fail_acquisition(context, f"its dither cannot be read: {text}")
-        case ev.Tick() if late:
-            _restart_acquisition(
-                context, f"{acquisition.text}: not done in {MAX_STAGE_DURATION_S:.0f} s"
-            )
-        case _:
-            _end_by_answer(context, event)
-
-
-def _end_by_answer(context: StepContext, event: Event) -> None:
-    acquisition = context.acquisition
-    match event:
-        case ev.Answered(
-            request=LoopRequest(id=acquisition.command), reply=Reply(accepted=False, reason=reason)
-        ):
-            _fail_acquisition(context, f"the RTC will not change its loop: {reason}")
-        case ev.JobFailed(effect=ev.Ask(request=LoopRequest(id=acquisition.command)), text=text):
-            _restart_acquisition(context, text)
-        case _:
-            _take_in(context, event)
-
-
-def _take_in(context: StepContext, event: Event) -> None:
-    match event:
-        case ev.WideCaptureFitted():
-            _on_wide_capture(context, event)
-        case ev.WindowLost(refused=refused) if refused.kind is RefusalKind.NOT_FOUND:
-            _on_missed(context, refused.reason)
-        case ev.Answered(request=DitherRequest(), reply=Reply(accepted=False, reason=reason)):
-            _on_missed(context, f"the RTC refused the dither: {reason}")
-        case ev.MatrixMade():
-            _on_made(context, event)
-        case _:
-            pass
+        _wide_capture_stage(context, rtc)
 
 
 def _closed_stage(context: StepContext, rtc: Status) -> None:
@@ -323,7 +363,8 @@ def _closed_stage(context: StepContext, rtc: Status) -> None:
         _enter_stage(context, AcquisitionStage.WIDENING, text)
 
 
-def _on_made(context: StepContext, made: ev.MatrixMade) -> None:
+@_during_acquisition
+def on_made(context: StepContext, made: ev.MatrixMade) -> None:
     """Send a reconstructor that has passed the gate, with the gains it was judged with."""
     record, acquisition, rtc = made.record, context.acquisition, context.rtc
     if acquisition.stage not in {AcquisitionStage.PARTIAL, AcquisitionStage.WIDENING}:
@@ -402,7 +443,8 @@ def _widen(context: StepContext, rtc: Status, record: ReconstructorRecord | None
         if seen >= MIN_FINAL_WINDOWS:
             _finish(context, record)
             return
-    choose_dither(context, rtc)
+    stop_unwanted(context)
+    choose_dither(context)
 
 
 def _make(context: StepContext, n_modes: int, rtc: Status, *, at_least: int = 0) -> None:
@@ -431,24 +473,23 @@ def _finish(context: StepContext, record: ReconstructorRecord) -> None:
     _enter_stage(context, AcquisitionStage.TRACKING, text)
 
 
-def _forget_when_over(context: StepContext, event: Event) -> None:
-    """Forget an acquisition that holds back the next one, when that is no longer necessary.
+def _forget_when_over(context: StepContext) -> None:
+    """Forget an acquisition that holds back the next one, when α is known without it.
 
-    One that failed is forgotten when α is known without it: the operator who closed the loop has
-    mended its cause, and a later failure has another. One that an operator ended is forgotten then
-    too, or when an operator sets the mode and so decides what the service may do by itself.
+    The operator who closed the loop has mended the cause of one that failed, and a later failure
+    has another. One that an operator ended is forgotten also when the mode is set, which decides
+    what the service may do by itself (:func:`on_mode_set`).
     """
     acquisition = context.acquisition
-    if acquisition.stage is not AcquisitionStage.FAILED and not acquisition.held_off:
-        return
-    if acquisition.held_off and isinstance(event, cmd.SetMode):
-        text = f"an operator has set the mode, {event.mode}, since the last was ended"
-    elif _is_followed(context.state):
+    holds_back = acquisition.stage is AcquisitionStage.FAILED or acquisition.held_off
+    if holds_back and _is_followed(context.state):
         text = f"{MIN_FINAL_WINDOWS} windows agree in the closed loop: none is needed any more"
-    else:
-        return
+        _forget(context, text)
+
+
+def _forget(context: StepContext, text: str) -> None:
     idle = Acquisition(text=text, since_ns_utc=context.now_ns)
-    context.acquisition = move(context, acquisition, idle)
+    context.acquisition = move(context, context.acquisition, idle)
     context.log("acquisition.idle", text)
 
 
@@ -551,14 +592,19 @@ def wide_capture_dither(
     if reason is not None:
         return reason
     request = DitherRequest(
-        id=f"{ACQUIRING_DITHER}{now_ns}",
+        id=name_dither(DitherPurpose.ACQUIRE, now_ns),
         kind=DitherKind.SINE,
         modes=modes,
         amplitude_m=(min(policy.acquisition_amplitude_m, rtc.max_dither_m),) * len(modes),
         frequency_hz=lines[: len(modes)],
         duration_s=FAR_DITHER_DURATION_S,
     )
-    return Dither(request=request, asked_ns_utc=now_ns, window_s=FAR_WINDOW_S)
+    return Dither(
+        request=request,
+        purpose=DitherPurpose.ACQUIRE,
+        asked_ns_utc=now_ns,
+        window_s=FAR_WINDOW_S,
+    )
 
 
 def _wide_capture_modes(
@@ -798,10 +844,12 @@ def _wide_capture_stage(context: StepContext, rtc: Status) -> None:
     _keep_dithering(context, rtc)
 
 
-def _on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
+@_during_acquisition
+def on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
     """Take over where a window puts the mirror, or hold it against where another one did."""
     rtc, before, estimate = context.rtc, context.acquisition, event.found.estimate
     began_ns = event.began_ns_utc or estimate.t_ns_utc
+    estimate = validity.at_present(context.state, estimate, began_ns, estimate.t_ns_utc)
     if validity.explain_void(context.state, began_ns) is not None:
         return
     if rtc is None or not before.uses_wide_capture or estimate.session != rtc.session:
@@ -866,7 +914,7 @@ def _lift_limit_of_jump(context: StepContext) -> None:
     context.log("modes.limit-lifted", f"the mirror has moved since {record.id}: {n_modes} modes")
 
 
-def _on_missed(context: StepContext, reason: str) -> None:
+def _note_miss(context: StepContext, reason: str) -> None:
     """Count a window without a result; after a few, restart."""
     misses = context.acquisition.misses + 1
     if misses >= MAX_STAGE_MISSES:

@@ -12,8 +12,7 @@ import numpy as np
 from service.errors import CommandError
 from service.records import commands as cmd
 from service.records import events as ev
-from service.records.events import Event
-from service.records.operations import MeasurementRecord, MeasureState
+from service.records.operations import DitherPurpose, MeasurementRecord, MeasureState
 from service.tracking.dither import request_dither, stop_running_dither
 from service.tracking.dither_request import DEFAULT_RANDOM_RMS_M, check_modes, cost_of, plan_random
 from service.tracking.operator import begin_closing
@@ -115,16 +114,16 @@ def give_up(context: StepContext, measurement_id: str) -> None:
     context.put_off(dither_s=left_s, make_s=left_s)
 
 
-def give_up_lost(context: StepContext, event: Event) -> None:
-    """Give up a matrix that cannot come any more, before anybody else sees the event."""
-    record, rtc = context.state.measuring, context.rtc
-    if record is None:
-        return
-    if isinstance(event, ev.RtcVanished):
-        fail_measurement(context, record, "the RTC vanished")
-    elif isinstance(event, ev.Tick):
-        closed = rtc is not None and rtc.loop != "open"
-        _give_up_overdue(context, record, closed=closed)
+def on_vanished(context: StepContext, _: ev.RtcVanished) -> None:
+    """Give up a matrix whose RTC has gone."""
+    fail_measurement(context, context.state.measuring, "the RTC vanished")
+
+
+def on_dither_stop(context: StepContext, _: cmd.StopDither) -> None:
+    """Give up a noisy matrix that waits for another dither to end."""
+    record = context.state.noisy_measurement
+    if record is not None and record.state is MeasureState.WAITING:
+        fail_measurement(context, record, "the operator stopped the dither")
 
 
 def on_answer(context: StepContext, request: MeasureRequest, reply: Reply) -> None:
@@ -179,6 +178,35 @@ def _update(context: StepContext, record: MeasurementRecord) -> None:
             context.log(name, record.id)
 
 
+def on_dither_answer(context: StepContext, request: DitherRequest, reply: Reply) -> None:
+    """Give up a noisy matrix whose dither the RTC refuses."""
+    if not reply.accepted:
+        on_dither_failed(context, request, f"the RTC refused the dither: {reply.reason}")
+
+
+def on_too_strong(context: StepContext, event: ev.DitherMeasured) -> None:
+    """Give up a noisy matrix whose dither was too strong."""
+    if event.text and event.id == context.dither_policy.loud_id:
+        fail_noisy_measurement(context, f"its dither was too strong: {event.text}")
+
+
+def on_dither_failed(context: StepContext, request: DitherRequest, text: str) -> None:
+    """Give up a noisy matrix whose dither does not begin."""
+    record = context.state.noisy_measurement
+    if record is not None and record.id == request.id:
+        fail_measurement(context, record, text)
+
+
+def on_failure(context: StepContext, request: MeasureRequest, text: str) -> None:
+    """Give up a matrix that the RTC could not be asked for."""
+    fail_measurement(context, context.state.measurement(request.id), text)
+
+
+def on_finish_failed(context: StepContext, effect: ev.FinishNoisy, text: str) -> None:
+    """Give up a noisy matrix that could not be fitted."""
+    fail_measurement(context, effect.record, text)
+
+
 def fail_measurement(context: StepContext, record: MeasurementRecord | None, text: str) -> None:
     """Record why there is no matrix, unless the measurement was already ended."""
     before = None if record is None else context.state.measurement(record.id)
@@ -193,8 +221,12 @@ def _kind(record: MeasurementRecord) -> str:
     return "noisy-matrix" if record.pattern is None else "measurement"
 
 
-def _give_up_overdue(context: StepContext, record: MeasurementRecord, *, closed: bool) -> None:
+def give_up_overdue(context: StepContext) -> None:
     """Give up a matrix that does not arrive although the RTC seems done."""
+    record, rtc = context.state.measuring, context.rtc
+    if record is None:
+        return
+    closed = rtc is not None and rtc.loop != "open"
     asked_ns = record.asked_ns_utc or context.now_ns
     if context.now_ns - asked_ns > MAX_MEASUREMENT_S * SECOND_NS:
         fail_measurement(context, record, f"no matrix came within {MAX_MEASUREMENT_S:.0f} s")
@@ -264,6 +296,7 @@ def measure_noisy(context: StepContext, command: cmd.MeasureNoisy) -> None:
         rtc,
         context.policy,
         context.now_ns,
+        purpose=DitherPurpose.NOISY,
         dither_id=command.id,
         modes=command.modes,
         total_m=total,
@@ -292,21 +325,19 @@ def measure_noisy(context: StepContext, command: cmd.MeasureNoisy) -> None:
     stop_running_dither(context)
 
 
-def advance_noisy(context: StepContext, event: Event) -> None:
-    """Go on with the one under way, if there is one."""
+def advance_noisy(context: StepContext) -> None:
+    """Take a noisy interaction matrix further, if one is being measured."""
     record = context.state.noisy_measurement
     if record is not None:
         with context.because_of(record.cause):
-            _go_on(context, record, event)
+            _go_on(context, record)
 
 
-def _go_on(context: StepContext, record: MeasurementRecord, event: Event) -> None:
+def _go_on(context: StepContext, record: MeasurementRecord) -> None:
     """Start its dither, note that it plays, or that it is over."""
     rtc = context.rtc
     waited_s = (context.now_ns - (record.asked_ns_utc or 0)) / SECOND_NS
     match record.state:
-        case MeasureState.WAITING if isinstance(event, cmd.StopDither):
-            fail_noisy_measurement(context, "the operator stopped the dither")
         case MeasureState.WAITING:
             if rtc is not None and rtc.loop != "open" and rtc.dither_id is None:
                 _begin_noisy(context, record, rtc)
@@ -315,7 +346,7 @@ def _go_on(context: StepContext, record: MeasurementRecord, event: Event) -> Non
                     context, f"the dither that ran did not end within {DITHER_END_TIMEOUT_S:.0f} s"
                 )
         case MeasureState.ASKED | MeasureState.RUNNING:
-            _follow_playing(context, record, event)
+            _follow_playing(context, record)
         case _:
             # a simulated RTC may be ten times slower than its timestamps
             if waited_s >= 10.0 * (
@@ -337,6 +368,7 @@ def _begin_noisy(context: StepContext, record: MeasurementRecord, rtc: Status) -
             rtc,
             context.policy,
             context.now_ns,
+            purpose=DitherPurpose.NOISY,
             dither_id=record.id,
             modes=record.modes,
             total_m=record.total_m,
@@ -352,18 +384,7 @@ def _begin_noisy(context: StepContext, record: MeasurementRecord, rtc: Status) -
     request_dither(context, dither)
 
 
-def _follow_playing(context: StepContext, record: MeasurementRecord, event: Event) -> None:
-    match event:
-        case ev.Answered(
-            request=DitherRequest(id=record.id), reply=Reply(accepted=False, reason=reason)
-        ):
-            fail_measurement(context, record, f"the RTC refused the dither: {reason}")
-            return
-        case ev.JobFailed(effect=ev.Ask(request=DitherRequest(id=record.id)), text=text):
-            fail_measurement(context, record, text)
-            return
-        case _:
-            pass
+def _follow_playing(context: StepContext, record: MeasurementRecord) -> None:
     dither, asked = context.dither, record.state is MeasureState.ASKED
     if dither is not None and dither.id == record.id:
         if asked and dither.start_seq is not None:

@@ -20,7 +20,6 @@ from service.records import alarms
 from service.records import commands as cmd
 from service.records import events as ev
 from service.records.alarms import Alarm, Interlock
-from service.records.events import Event
 from service.records.operations import CommandState, Probation, ProbationState, Verdict
 from service.records.products import MatrixState, ReconstructorRecord
 from service.records.state import Mode, TrackerState
@@ -66,6 +65,10 @@ _FINAL_STATES = frozenset(
     {MatrixState.FAILED, MatrixState.REJECTED, MatrixState.REFUSED, MatrixState.DISCARDED}
 )
 _ROLLBACK_STATES = frozenset({ProbationState.ROLLING_BACK, ProbationState.KEPT})
+_TAKEN_OVER = {
+    ProbationState.OPENING: ProbationState.KEPT,
+    ProbationState.ACQUIRING: ProbationState.NOT_CONFIRMED,
+}
 _WORSE_STATES = frozenset(
     {
         ProbationState.ROLLING_BACK,
@@ -77,7 +80,7 @@ _WORSE_STATES = frozenset(
 )
 
 
-def advance(context: StepContext, event: Event) -> None:
+def advance(context: StepContext) -> None:
     """Begin a probation with every matrix that is applied, and end one that nothing can end."""
     if context.matrices.in_use != context.before.matrices.in_use:
         _on_swap(context, context.before.matrices.in_use, context.matrices.in_use)
@@ -92,24 +95,38 @@ def advance(context: StepContext, event: Event) -> None:
         # Commands that contradict the law of the loop are the RTC's fault and not the mirror's.
         _begin_rollback(context, trial, alarm.text, resumes=alarm.name == alarms.DIVERGING)
     else:
-        _go_on(context, trial, event)
+        _go_on(context, trial)
 
 
-def _go_on(context: StepContext, trial: Probation, event: Event) -> None:
+def _go_on(context: StepContext, trial: Probation) -> None:
     match trial.state:
         case ProbationState.RUNNING | ProbationState.OVERDUE:
             _await_verdict(context, trial)
         case ProbationState.ROLLING_BACK:
-            if why := _explain_failed_rollback(context, trial, event):
+            if why := _explain_failed_rollback(context, trial):
                 _keep_worse(context, trial, why)
         case ProbationState.WATCHED:
             _watch(context, trial)
         case ProbationState.OPENING:
-            _await_opening(context, trial, event)
+            _await_opening(context, trial)
         case ProbationState.ACQUIRING:
-            _await_acquisition(context, trial, event)
+            _await_acquisition(context, trial)
         case ProbationState.OPENED if context.rtc is not None and context.rtc.in_loop:
             _move(context, replace(trial, state=ProbationState.ROLLED_BACK))
+
+
+def on_mode_set(context: StepContext, _: cmd.SetMode) -> None:
+    """Leave a lost loop to the operator, who has taken over by setting the mode."""
+    trial = context.probation
+    if trial is not None and trial.state in _TAKEN_OVER:
+        _move(context, replace(trial, state=_TAKEN_OVER[trial.state]))
+
+
+def on_copy_failed(context: StepContext, _: ev.RepublishMatrix, text: str) -> None:
+    """Keep a matrix that is worse where the one before cannot be copied."""
+    trial = context.probation
+    if trial is not None and trial.state is ProbationState.ROLLING_BACK:
+        _keep_worse(context, trial, text)
 
 
 def on_compared(context: StepContext, event: ev.Compared) -> None:
@@ -329,13 +346,10 @@ def _open(context: StepContext, trial: Probation) -> None:
     set_loop(context, cmd.SetLoop(loop="open"))
 
 
-def _await_opening(context: StepContext, trial: Probation, event: Event) -> None:
-    """Ask again until the loop is open, or an operator says how to go on."""
+def _await_opening(context: StepContext, trial: Probation) -> None:
+    """Ask again until the loop is open."""
     rtc, asked = context.rtc, context.loop.command
-    # An operator who sets the mode has taken over.
-    if isinstance(event, cmd.SetMode):
-        _move(context, replace(trial, state=ProbationState.KEPT))
-    elif rtc is not None and not rtc.in_loop:
+    if rtc is not None and not rtc.in_loop:
         _move(context, replace(trial, state=ProbationState.OPENED))
     elif rtc is not None and asked is not None and not context.operator.stopped_because:
         waited_ns = context.now_ns - asked.asked_ns_utc
@@ -343,10 +357,10 @@ def _await_opening(context: StepContext, trial: Probation, event: Event) -> None
             set_loop(context, cmd.SetLoop(loop="open"))
 
 
-def _await_acquisition(context: StepContext, trial: Probation, event: Event) -> None:
-    """Note that the acquisition has begun, or that the operator or the RTC has taken over."""
+def _await_acquisition(context: StepContext, trial: Probation) -> None:
+    """Note that the acquisition has begun, or that the loop is open."""
     closed = context.rtc is not None and context.rtc.in_loop
-    if context.acquisition.under_way or not closed or isinstance(event, cmd.SetMode):
+    if context.acquisition.under_way or not closed:
         _move(context, replace(trial, state=ProbationState.NOT_CONFIRMED))
 
 
@@ -421,10 +435,8 @@ def _check_jump(context: StepContext, trial: Probation) -> str:
     return "the mirror has jumped since the swap" if jumped else ""
 
 
-def _explain_failed_rollback(context: StepContext, trial: Probation, event: Event) -> str:
+def _explain_failed_rollback(context: StepContext, trial: Probation) -> str:
     """Return why the matrix before does not come into use again; empty: it is on its way."""
-    if isinstance(event, ev.JobFailed) and isinstance(event.effect, ev.RepublishMatrix):
-        return event.text
     sent = context.state.reconstructor(trial.rollback)
     waited_s = (context.now_ns - trial.since_ns_utc) / SECOND_NS
     if trial.id == context.matrices.misapplied_id and waited_s > MAX_OPPOSITE_S:

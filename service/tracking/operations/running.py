@@ -12,9 +12,9 @@ from enum import StrEnum
 
 from service.estimation.loop import NO_RTC, explain_open_loop
 from service.records.alarms import STANDING_BY, Alarm, Severity
-from service.records.operations import CommandState, LoopCommand
+from service.records.operations import CommandState, DitherPurpose, LoopCommand
 from service.records.state import Mode, TrackerState
-from service.tracking.dither_request import MAX_STOP_DELAY_S, OUR_DITHERS, OWN_DITHER
+from service.tracking.dither_request import MAX_STOP_DELAY_S, infer_purpose
 from service.tracking.policy import SECOND_NS
 
 RAMP_REPLY_TIMEOUT_S = 30.0
@@ -92,14 +92,15 @@ def _dither(state: TrackerState, now_ns: int) -> Iterator[RunningOperation]:
     """Yield the dither that plays, unless it was ordered to stop."""
     # A status may be a second old, and still show a dither that was just asked to stop. One of the
     # service's own that nobody follows is about to be stopped: nobody has to wait for it.
-    followed = None if state.dithers.dither is None else state.dithers.dither.id
+    followed = state.dithers.dither
     stopping = now_ns - state.dithers.policy.stop_asked_ns_utc < MAX_STOP_DELAY_S * SECOND_NS
     seen = None if state.loop.rtc is None or stopping else state.loop.rtc.dither_id
-    playing = followed or (None if seen is None or seen.startswith(OUR_DITHERS) else seen)
-    if playing is not None:
-        own = playing.startswith(OWN_DITHER)
-        activity = OperationKind.OWN_DITHER if own else OperationKind.OTHER_DITHER
-        yield RunningOperation(activity, f"{playing} is running; stop it first")
+    if followed is not None:
+        own = followed.purpose.automatic
+        kind = OperationKind.OWN_DITHER if own else OperationKind.OTHER_DITHER
+        yield RunningOperation(kind, f"{followed.id} is running; stop it first")
+    elif seen is not None and infer_purpose(seen, None) is DitherPurpose.FOREIGN:
+        yield RunningOperation(OperationKind.OTHER_DITHER, f"{seen} is running; stop it first")
 
 
 def _of_matrices(state: TrackerState) -> Iterator[RunningOperation]:

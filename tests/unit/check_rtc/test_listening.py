@@ -113,6 +113,7 @@ def test_slopes_that_repeat_are_named_though_every_other_number_is_new():
         ({"gains": (0.4,) * 24}, "status"),
         ({"frame_rate_hz": 500.0}, "frames"),
         ({"config_id": "mask-2"}, "ids"),
+        ({"reference_id": "ncpa-1"}, "ids"),
     ],
 )
 def test_what_a_status_tells_otherwise_is_named_by_its_line(told, line):

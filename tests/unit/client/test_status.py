@@ -55,6 +55,12 @@ def test_it_says_why_the_last_window_was_refused():
     assert "frames were lost" not in "\n".join(status_lines(told()))
 
 
+def test_references_are_named_once_the_rtc_has_changed_them():
+    assert "References" not in "\n".join(status_lines(told()))
+    changed_at = told(reference_id="ncpa-2", reference_since_ns_utc=88 * SECOND)
+    assert "ncpa-2, for 12 s" in "\n".join(status_lines(changed_at))
+
+
 def test_a_service_that_knows_nothing_says_so():
     text = "\n".join(status_lines(told(tracker_state(system="small", mode=STATE.operator.mode))))
     assert "not connected" in text

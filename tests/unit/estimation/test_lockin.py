@@ -195,6 +195,7 @@ def test_many_small_gaps_add_up_to_a_refusal():
         ({"session": "night-2"}, "the RTC started a new session inside the window"),
         ({"cm_id": "cm-2"}, "the reconstructor changed inside the window: cm-1 -> cm-2"),
         ({"cm_id": None}, "the reconstructor changed inside the window: cm-1 -> None"),
+        ({"reference_name": "ncpa-2"}, "the reference slopes changed inside the window"),
         ({"t0_ns_utc": T0_NS + 600 * DT_NS + 600_000}, "clock stepped or it paused"),
         ({"t0_ns_utc": T0_NS + 600 * DT_NS - 600_000}, "clock stepped or it paused"),
     ],

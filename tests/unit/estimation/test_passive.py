@@ -358,6 +358,31 @@ def test_a_constant_offset_of_slopes_and_commands_hardly_matters():
     assert np.linalg.norm(plain - offset) < 0.01 * np.linalg.norm(plain)
 
 
+def test_new_references_leave_nothing_of_their_step_if_they_have_a_name():
+    """The mirror takes the new shape, and the slopes see it against the new zero point.
+
+    1 %: a shape of 40 times the commands' RMS is seen at the two ends of a run. One over the step
+    is off by four times as much as that.
+    """
+    block, n = random_block(4000), 2000
+    response = small_model().interaction_matrix(SOMEWHERE)
+    shape_m = np.zeros(N_MODES, np.float32)
+    shape_m[:5] = 4e-7
+    slopes = block.commands_m @ response.T
+    after = part(block_of(slopes, block.commands_m + shape_m, None), n, 4000)
+    before = fed(part(block_of(slopes, block.commands_m, None), 0, n))
+    plain = passive_matrix(fed(block_of(slopes, block.commands_m, None))).matrix
+    errors = []
+    for name in ("ncpa-2", None):
+        state = before
+        for start in range(0, n, 200):
+            state = accumulate(state, replace(part(after, start, start + 200), reference_name=name))
+        found = passive_matrix(state).matrix
+        errors.append(np.linalg.norm(found - plain) / np.linalg.norm(plain))
+    assert errors[0] < 0.01
+    assert errors[1] > 0.03
+
+
 def test_a_dither_outside_the_loop_is_not_taken_for_a_controlled_mode():
     """Sines ten times the noise on four uncontrolled modes: α moves by less than 4 of its σ."""
     n_frames = 12000

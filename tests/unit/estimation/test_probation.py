@@ -10,6 +10,7 @@ import scipy
 
 from service.estimation import probation
 from service.estimation.comparison import PRIOR_SCATTER, measure_sigma
+from service.estimation.estimator import Change, LoopContext
 from service.estimation.frames import FrameBlock
 from service.estimation.probation import MAX_PROBATION_S, Comparison, begun_anew, observe
 from service.records.operations import Verdict
@@ -139,6 +140,23 @@ def test_a_night_of_many_dithers_keeps_the_sines_of_a_few():
         lines = (205.0 + k, 293.0)
         judged([("a", residual(np.random.default_rng(1), 0.4))], N_MODES - 2, lines, played)
     assert probation._sines.cache_info().currsize <= probation.N_SINE_BASES
+
+
+def test_new_references_are_no_swap_and_the_frames_in_which_the_loop_follows_do_not_count():
+    """0.03 s of a residual ten times as large, in one part, would be no chance."""
+    rng = np.random.default_rng(7)
+    state = Comparison()
+    for block in blocks([("a", residual(rng, BEFORE_S))]):
+        state = observe(state, block, np.arange(N_MODES))
+    parts = state.parts
+    state = state.begun_anew(LoopContext(description=None), Change.REFERENCES)
+    (follows, after) = blocks([("a", 10.0 * residual(rng, 0.03))]), residual(rng, 0.5)
+    for block in follows:
+        state = observe(state, block, np.arange(N_MODES))
+    assert (state.parts, state.found) == (parts, None)
+    for block in blocks([("a", after)]):
+        state = observe(state, block, np.arange(N_MODES))
+    assert len(state.parts) > len(parts)
 
 
 def test_without_enough_before_nothing_is_said():

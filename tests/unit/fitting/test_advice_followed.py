@@ -127,15 +127,6 @@ def measured(about, spoil=lambda values: values, *, alpha=ALPHA, illumination=No
 _ADVICE = re.compile(r"\b([a-z_]+) = (\"[a-z-]+\"|[-+.\de]+|true|false|\{[^}]*\})")
 
 
-def first_line_of(found):
-    """Return the values that the first line of a fit advises by their keys."""
-    return {
-        key: tomllib.loads(f"it = {value.rstrip('.')}")["it"]
-        for key, value in _ADVICE.findall(found.recommendation)
-        if key in SECTION
-    }
-
-
 def advice_of(found):
     """Return the first value that the fit advises for each key."""
     said = (found.recommendation, found.verdict, *found.remarks)
@@ -267,7 +258,7 @@ def test_advice_followed_once_gives_a_fit_that_is_accepted_and_right(name, tmp_p
         return
     assert case.key in advice
     if not first.accepted:
-        assert first_line_of(first) == {case.key: advice[case.key]}
+        assert first.corrections == {f"{SECTION[case.key]}.{case.key}": advice[case.key]}
     about = loaded(tmp_path, changed(stated, **{case.key: advice[case.key]}), mask)
     check_right(fit_matrix(about, Reference(matrix=values, double_pass=about.double_pass), EXPLAIN))
 

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from pyrcal.__main__ import main
-from pyrcal.importers.registration import Dated, registrations_of
-from pyrcal.maintenance.aot import affine, excerpt, write_aot
-from pyrcal.playback.aot import read_telemetry
+from pyrcal.importers.aot import excerpt, read_telemetry, write_aot
+from pyrcal.importers.registration import Dated, affine, registrations_of
 from service.archive import Archive
 from service.errors import ConfigurationError, MatrixError
 from service.files.recording import RecordedKind, Recording, RecordingWriter
@@ -110,7 +109,7 @@ def test_a_point_of_the_mirror_lands_where_the_model_has_it():
 
 
 def test_the_rtcs_own_listing_is_told_in_our_axes():
-    from pyrcal.maintenance.aot import _as_listed
+    from pyrcal.importers.aot import _as_listed
 
     turned = Orientation(swap_xy=True, sign_x=-1)
     recipe = SlopeRecipe(order=SlopeOrder.INTERLEAVED, orientation=turned)
@@ -274,7 +273,7 @@ def test_telemetry_that_is_of_something_else_is_refused(night, monkeypatch, chan
     write_aot(night / "a.fits", INSTRUMENT, (), excerpt(night / "night.h5", 0.0, 10.0))
     system = aotpy.AOSystem.read_from_file(night / "a.fits")
     change(system)
-    monkeypatch.setattr("pyrcal.playback.aot.read_system", lambda _: system)
+    monkeypatch.setattr("pyrcal.importers.aot.read_system", lambda _: system)
     with pytest.raises(MatrixError, match=said):
         read_telemetry(night / "a.fits", INSTRUMENT)
 
@@ -295,7 +294,7 @@ def test_what_others_list_and_scale_otherwise_is_read_the_same(night, monkeypatc
     control, commands = system.loops[0].measurements_to_modes, system.loops[0].modal_coefficients
     control.data = control.data[..., back]
     commands.data, commands.unit = commands.data.astype(float) * 1e9, "nm"
-    monkeypatch.setattr("pyrcal.playback.aot.read_system", lambda _: system)
+    monkeypatch.setattr("pyrcal.importers.aot.read_system", lambda _: system)
     found = read_telemetry(night / "a.fits", INSTRUMENT).arrays
     for name in ("slopes", "reconstructor", "seq"):
         np.testing.assert_array_equal(found[name], expected[name])

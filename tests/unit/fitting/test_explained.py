@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from pyrcal.fitting import alternatives, instrument_checks, models, pupil_checks
-from pyrcal.fitting.advice import Grounds, recommend_action
+from pyrcal.fitting.advice import Grounds, add_recommendation
+from pyrcal.fitting.alternatives import CENTRED_KEY, Alternative
 from pyrcal.fitting.control_check import check_control
 from pyrcal.fitting.fit_table import table
 from pyrcal.fitting.fitted import Fit
@@ -321,18 +322,40 @@ def test_modes_that_fit_badly_are_the_cause_where_sets_of_modes_disagree():
     bad = LeftOver(border=None, subapertures=(), modes=((67, 0.71),))
     divided = a_fit(accepted=False, verdict="refused: sets of modes disagree", left_over=bad)
     grounds = Grounds(refusal=Refusal.DIVIDED, structure=0.05, n_sets=8)
-    assert recommend_action(divided, grounds) == (
+    assert add_recommendation(divided, grounds).recommendation == (
         "do not use it: modes that fit worse than the others: 67 (71%) left over; measure these "
         "again, or leave them out (--modes)"
     )
 
 
+@pytest.mark.parametrize(
+    ("entry", "values"),
+    [
+        ('stop = "mirror"', {"instrument.stop": "mirror"}),
+        (
+            "spiders_m = 0.2, spiders_deg = [0, 90]",
+            {"instrument.spiders_m": 0.2, "instrument.spiders_deg": [0, 90]},
+        ),
+        ("no spider", {"instrument.spiders_m": None, "instrument.spiders_deg": None}),
+        ("the pupil map turned by 2 deg", {"instrument.pupil": "turned by 2 deg"}),
+        ("pupil_diameter_subap = 11.8", {"wfs.pupil_diameter_subap": 11.8}),
+        ('influence = "thin-plate"', {"mirror.influence": "thin-plate"}),
+        ('normalisation = "local"', {"slopes.normalisation": "local"}),
+        (CENTRED_KEY, {}),
+    ],
+)
+def test_a_recommended_correction_is_also_given_as_keys_with_their_values(entry, values):
+    better = Alternative(words=entry, key=entry, share=0.2, moved=np.zeros(4), preferred=True)
+    found = a_fit(accepted=False, verdict="refused: another", alternatives=(better,))
+    grounds = Grounds(refusal=Refusal.ANOTHER_INSTRUMENT, structure=0.1, n_sets=8)
+    assert add_recommendation(found, grounds).corrections == values
+
+
 def test_a_sigma_next_to_what_is_enough_is_said_to_its_third_place():
     known = a_fit(covariance=np.diag([0.0304**2, 1e-6, 1e-12, 1e-12]))
     grounds = Grounds(refusal=None, structure=0.0, n_sets=8)
-    assert "known to 0.030 subapertures (1 sigma), 0.03 is enough" in recommend_action(
-        known, grounds
-    )
+    words = add_recommendation(known, grounds).recommendation
+    assert "known to 0.030 subapertures (1 sigma), 0.03 is enough" in words
 
 
 @pytest.mark.parametrize(("sigma_subap", "action"), [(0.09, "use it"), (0.11, "measure more")])
@@ -341,7 +364,7 @@ def test_a_stable_reconstructor_recommends_no_sigma_beyond_a_tenth(sigma_subap, 
     assert stable.holds
     known = a_fit(covariance=np.diag([sigma_subap**2, 1e-6, 1e-12, 1e-12]), reconstructor=stable)
     grounds = Grounds(refusal=None, structure=0.0, n_sets=8)
-    assert recommend_action(known, grounds).startswith(f"{action}: ")
+    assert add_recommendation(known, grounds).recommendation.startswith(f"{action}: ")
 
 
 def test_too_few_modes_and_too_much_noise_are_reasons_to_measure_more():

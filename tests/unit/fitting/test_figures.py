@@ -9,7 +9,7 @@ from pyrcal.fitting import figures
 from pyrcal.fitting.figures import check_plots, write_sheet
 from service.errors import ConfigurationError
 from service.model.misregistration import Misregistration
-from tests.support.made import ALPHA, GAINS, SCAN, SYNTHETIC, a_fit, a_report
+from tests.support.made import ALPHA, GAINS, SCAN, SYNTHETIC, a_fit
 from tests.support.numerics import small_instrument
 
 
@@ -66,7 +66,7 @@ def test_the_scans_take_as_many_rows_of_five_as_they_need(n_scans, n_places):
 def test_the_sheet_is_written(tmp_path):
     pytest.importorskip("matplotlib")
     path = tmp_path / "fit.png"
-    write_sheet(a_report(a_fit(paper_table=(SCAN,) * 6)), small_instrument(), path)
+    write_sheet(a_fit(paper_table=(SCAN,) * 6), "a fit", small_instrument(), path)
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
@@ -78,14 +78,14 @@ def test_a_refused_fit_with_holes_is_drawn_too(tmp_path):
         residual_map=np.full((2, 3, 3), np.nan),
         residual_fraction=np.nan,
     )
-    write_sheet(a_report(fit), small_instrument(), tmp_path / "fit.png")
+    write_sheet(fit, "a fit", small_instrument(), tmp_path / "fit.png")
     assert (tmp_path / "fit.png").exists()
 
 
 def test_a_kind_of_file_nobody_knows_is_refused(tmp_path):
     pytest.importorskip("matplotlib")
     with pytest.raises(ConfigurationError, match="--plot: cannot write"):
-        write_sheet(a_report(), small_instrument(), tmp_path / "fit.doc")
+        write_sheet(a_fit(), "a fit", small_instrument(), tmp_path / "fit.doc")
 
 
 def test_without_matplotlib_it_says_what_to_install(monkeypatch):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from pyrcal.playback.aot import read_telemetry
+from pyrcal.importers.aot import read_telemetry
 from pyrcal.playback.arrays import Arrays
 from pyrcal_studies.campaign.observatory import SMALL
 from service.errors import ConfigurationError, MatrixError

@@ -340,9 +340,8 @@ def test_other_files_are_refused_in_one_line(tmp_path, capsys, fill):
 
 def test_an_aot_file_is_played_and_its_own_alpha_is_compared(telemetry, tmp_path, capsys):
     pytest.importorskip("aotpy")
+    from pyrcal.importers.aot import Excerpt, read_telemetry, write_aot
     from pyrcal.importers.registration import Dated
-    from pyrcal.maintenance.aot import Excerpt, write_aot
-    from pyrcal.playback.aot import read_telemetry
     from service.model.misregistration import Misregistration
     from service.wire import FrameBatch, FrameHeader
 

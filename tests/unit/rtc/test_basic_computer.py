@@ -1,5 +1,7 @@
 """The bookkeeping of an RTC."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -60,3 +62,15 @@ def test_a_matrix_that_waits_when_the_loop_opens_is_void():
     loop.stage(staged)
     loop.begin_batch(10)
     assert [name for name, _ in loop.take_swaps()] == ["staged"]
+
+
+def test_new_references_are_named_in_the_next_batch_and_status_and_nothing_else_changes():
+    loop = computer()
+    names = []
+    for reference_id in (None, "ncpa-1", "ncpa-2"):
+        loop.identity = replace(loop.identity, reference_id=reference_id)
+        dither_m = loop.begin_batch(10)
+        header, _ = loop.end_batch(np.zeros((10, N_SLOPES)), dither_m, dither_m)
+        names.append((header.reference_id, loop.status().reference_id))
+        assert (header.session, header.config_id) == (loop.status().session, "mask-1")
+    assert names == [(None, None), ("ncpa-1", "ncpa-1"), ("ncpa-2", "ncpa-2")]

@@ -9,12 +9,6 @@ from tests.support.handmade import Clock, HandmadeBridge
 from tests.support.small import COMPUTE, small_instrument
 
 
-@pytest.fixture
-def light_processes(monkeypatch):
-    """Processes that import no optics before their work, which is of these tests."""
-    monkeypatch.setattr("service.runtime.processes.WORKER_MODULE", "tests.support.jobs")
-
-
 @pytest.fixture(scope="session")
 def workers():
     workers = WorkerPool(lambda: start_worker(small_instrument(), COMPUTE))

@@ -17,7 +17,7 @@ def doubled(array):
 
 
 def test_an_array_is_sent_as_it_lies_and_may_be_written_to_where_it_comes():
-    worker = JobProcess(nice=0)
+    worker = JobProcess("tests.support.jobs", nice=0)
     try:
         found = worker.do(partial(doubled, LARGE))
     finally:

@@ -15,7 +15,7 @@ from service.estimation.random_dither import Correlated
 from service.records import events as ev
 from service.records.alarms import Alarm
 from service.records.estimates import WindowRefused
-from service.records.operations import Dither
+from service.records.operations import DitherPurpose
 from service.records.products import MatrixState, ModeSet
 from service.runtime.engine import (
     IDLE_GATHER_S,
@@ -54,7 +54,7 @@ from tests.support.streams import (
 
 def played(start_seq=0, window_s=None, **changes):
     request = replace(REQUEST, **changes)
-    return Dither(request=request, start_seq=start_seq, asked_ns_utc=0, window_s=window_s)
+    return replace(DITHER, request=request, start_seq=start_seq, window_s=window_s)
 
 
 @pytest.fixture
@@ -718,8 +718,13 @@ RANDOM_REQUEST = DitherRequest(
     seed=5,
     duration_s=1.2,
 )
-ASKED = {"dither_id": "noisy-1", "total_m": 5e-9, "duration_s": 30.0}
-RANDOM_DITHER = Dither(request=RANDOM_REQUEST, window_s=0.4, start_seq=0, asked_ns_utc=0)
+ASKED = {
+    "purpose": DitherPurpose.NOISY,
+    "dither_id": "noisy-1",
+    "total_m": 5e-9,
+    "duration_s": 30.0,
+}
+RANDOM_DITHER = replace(DITHER, request=RANDOM_REQUEST, window_s=0.4)
 
 
 @pytest.fixture
@@ -744,7 +749,7 @@ def test_a_sine_after_random_signs_is_read_as_a_sine(signs):
         frequency_hz=(240.0,),
         duration_s=60.0,
     )
-    sine = Dither(request=request, start_seq=0, window_s=0.5, asked_ns_utc=0)
+    sine = replace(DITHER, request=request, window_s=0.5)
     signs = with_dither(signs, sine, 2.0)
     assert isinstance(signs[DitherWindows].cutter, LockIn)
     assert signs[DitherWindows].cutter.plan.modes == (6,)

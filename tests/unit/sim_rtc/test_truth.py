@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 
+from pyrcal.rtc.identity import Identity
 from service.model.misregistration import Misregistration
 from sim_rtc.computer.telemetry import Batch, FrameClock
 from sim_rtc.options import parse_options
@@ -22,6 +23,8 @@ OPTICS = LinearOptics(
     images=np.ones((2, 1, 2, 1)),
 )
 
+IDENTITY = Identity(system="small", basis_id="basis", config_id="sensor")
+
 
 def frames(seq0, phase_m, cm_id="a", commands_m=None):
     return Batch(
@@ -31,6 +34,7 @@ def frames(seq0, phase_m, cm_id="a", commands_m=None):
         commands_m=np.zeros((10, 2), dtype=np.float32) if commands_m is None else commands_m,
         dither_m=None,
         cm_id=cm_id,
+        identity=IDENTITY,
         n_clipped=0,
         closed=True,
         n_controlled=2,

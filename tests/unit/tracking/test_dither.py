@@ -16,7 +16,7 @@ from service.estimation.windows import DITHER_SETTLING_S
 from service.records import commands as cmd
 from service.records import events as ev
 from service.records.alarms import OVER_BUDGET
-from service.records.operations import DitherPhase
+from service.records.operations import DitherPhase, DitherPurpose
 from service.records.state import Level, Mode
 from service.tracking.dither import FIRST_DITHER_RETRY_S, MAX_DITHER_RETRY_S
 from service.tracking.dither_plan import (
@@ -32,8 +32,11 @@ from service.tracking.dither_request import (
     clear_lines,
     controlled,
     expected_amplification,
+    infer_purpose,
+    name_dither,
     total_m,
 )
+from service.tracking.operations.running import OperationKind, running_operations
 from service.wire import DitherRequest, DitherStop
 from tests.support.dithered import DitheredNight
 from tests.support.situations import (
@@ -72,6 +75,31 @@ def silence(story, silent_s):
     return story.tell(
         ev.DitherSilent(id=story.state.dithers.dither.id, silent_s=silent_s), after_s=0.5
     )
+
+
+@pytest.mark.parametrize("purpose", DitherPurpose)
+def test_the_id_of_a_dither_that_nobody_follows_shows_its_purpose(purpose):
+    assert infer_purpose(name_dither(purpose, START), None) is purpose
+
+
+@pytest.mark.parametrize(
+    "foreign", ["dither-by-hand", "dither", "dither-", "noisy1", "lab-dither-1"]
+)
+def test_the_dither_of_another_program_goes_on_though_its_id_begins_like_ours(foreign):
+    story = Story(policy=replace(POLICY, dither_enabled=False)).meet(dither_id=foreign)
+    assert not story.asked(DitherStop)
+    (running,) = running_operations(story.state, story.now_ns)
+    assert running.kind is OperationKind.OTHER_DITHER
+
+
+def test_a_noisy_matrix_of_any_id_is_measured_by_a_dither_of_that_purpose():
+    story = Story(Mode.HOLD, policy=replace(POLICY, dither_enabled=False)).meet()
+    story.tell(cmd.MeasureNoisy(id="dither-7"), after_s=1)
+    story.tell(rtc(), after_s=1)
+    dither = story.state.dithers.dither
+    assert (dither.id, dither.purpose) == ("dither-7", DitherPurpose.NOISY)
+    assert infer_purpose(dither.id, dither) is DitherPurpose.NOISY
+    assert running_operations(story.state, story.now_ns)[-1].kind is OperationKind.OTHER_DITHER
 
 
 class TestTheStatusShowsNone:

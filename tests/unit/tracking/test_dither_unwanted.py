@@ -8,7 +8,7 @@ import pytest
 from service.records import commands as cmd
 from service.records import events as ev
 from service.records.alarms import NOT_AS_ASKED, NOT_STOPPED, OVER_BUDGET
-from service.records.operations import AcquisitionStage, Dither, DitherPhase, MeasureState
+from service.records.operations import AcquisitionStage, DitherPhase, MeasureState
 from service.tracking.dither import (
     COST_AVERAGING_TIME_S,
     FAILED_DITHER_PAUSE_S,
@@ -414,6 +414,6 @@ def test_one_over_budget_from_before_a_restart_is_stopped_and_read_only_where_it
 
 
 def test_only_a_sine_can_be_demodulated():
-    random = Dither(request=dither_request("d-1"), start_seq=4000, asked_ns_utc=0)
+    random = replace(RUNNING, request=dither_request("d-1"))
     assert check_dither_usable(random, rtc(), POLICY) == "d-1 is binary, not a sine"
     assert check_dither_usable(RUNNING, rtc(), POLICY) is None

@@ -9,6 +9,7 @@ from service.records.operations import (
     Acquisition,
     AcquisitionStage,
     Dither,
+    DitherPurpose,
     MeasurementRecord,
     MeasureState,
 )
@@ -42,10 +43,10 @@ def measured(name, **changes):
     )
 
 
-def with_dither(state, name, loop, asked_after_s=1.0):
+def with_dither(state, purpose, loop, asked_after_s=1.0):
     view = replace(state.loop.rtc, loop=loop)
     asked_ns = view.t_ns + round(1e9 * asked_after_s)
-    dither = Dither(request=dither_request(name), asked_ns_utc=asked_ns)
+    dither = Dither(request=dither_request("d-1"), purpose=purpose, asked_ns_utc=asked_ns)
     return changed(state, rtc=view, dither=dither)
 
 
@@ -74,7 +75,7 @@ WRONG = {
         measurements=(measured("im-1"),),
         acquisition=Acquisition(stage=AcquisitionStage.COARSE),
     ),
-    "dither an open loop": lambda state: with_dither(state, "dither-1", Loop.OPEN),
+    "dither an open loop": lambda state: with_dither(state, DitherPurpose.FOLLOW, Loop.OPEN),
     "α and its covariance are finite": lambda state: with_alpha(
         state, covariance=np.full((4, 4), np.nan)
     ),
@@ -86,9 +87,9 @@ WRONG = {
 
 def test_an_ordinary_state_violates_none(state):
     assert find_violations(state) == []
-    closed = with_dither(state, "dither-1", Loop.CLOSED)
-    operators = with_dither(state, "operator-1", Loop.OPEN)
-    before_it_opened = with_dither(state, "dither-1", Loop.OPEN, asked_after_s=-1.0)
+    closed = with_dither(state, DitherPurpose.FOLLOW, Loop.CLOSED)
+    operators = with_dither(state, DitherPurpose.OPERATOR, Loop.OPEN)
+    before_it_opened = with_dither(state, DitherPurpose.FOLLOW, Loop.OPEN, asked_after_s=-1.0)
     assert [find_violations(one) for one in (closed, operators, before_it_opened)] == [[], [], []]
 
 

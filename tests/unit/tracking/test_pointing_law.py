@@ -13,12 +13,12 @@ from service.records import events as ev
 from service.records.registration import Validity
 from service.tracking.pointing_law import (
     LEAP_CONFIRMATION_S,
-    law_at,
     registration_ahead,
     start_of_fit,
 )
 from service.tracking.policy import SensorModePolicy
 from service.tracking.resume import resumed, saved_of
+from service.tracking.validity import law_at
 from service.wire import Pointing
 from tests.support.situations import ALPHA, POLICY, SECOND, START_NS, Story, estimate, of_kind, rtc
 from tests.support.states import tracker_state

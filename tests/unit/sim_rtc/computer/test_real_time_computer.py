@@ -176,3 +176,24 @@ def test_the_image_is_moved_by_who_can_and_refused_by_who_cannot(computer):
     assert reply.accepted
     assert reply.start_seq >= 2500
     np.testing.assert_allclose(moved, [[-0.1, 0.0, np.pi / 2, 0.002]])
+
+
+@pytest.mark.parametrize("named_by", ["reference_id", "config_id"])
+def test_new_references_put_their_shape_on_the_mirror_from_the_batch_that_names_them(
+    computer, named_by
+):
+    """0.1 %: single precision after 30 batches of a loop with a gain of 0.4."""
+    before = run(computer, 30)[-1]
+    shape_m = np.array([0.0, 3e-8, -2e-8, 0.0], np.float32)
+    computer.use_references(RESPONSE @ shape_m, **{named_by: "ncpa-1"})
+    after = run(computer, 30)
+    assert getattr(before.identity, named_by) != "ncpa-1"
+    assert getattr(after[0].identity, named_by) == "ncpa-1"
+    assert getattr(computer.status(), named_by) == "ncpa-1"
+    assert after[0].session == before.session
+    # The first frame still has the command of before, against the new zero point.
+    step = before.slopes[-1] - after[0].slopes[0]
+    np.testing.assert_allclose(step, RESPONSE @ shape_m, atol=1e-11)
+    moved = (after[-1].commands_m - before.commands_m)[-1]
+    np.testing.assert_allclose(moved, shape_m, atol=3e-11)
+    np.testing.assert_allclose((after[-1].slopes @ RESPONSE)[-1, :3], 0.0, atol=1e-10)

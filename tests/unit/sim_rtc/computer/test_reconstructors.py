@@ -6,7 +6,7 @@ import pytest
 from pyrcal.rtc.identity import Identity
 from pyrcal.rtc.staging import Staging, Terms
 from service.wire import AckState, Manifest, layout_of, split
-from sim_rtc.computer.reconstructors import compute_truncated_inverse
+from sim_rtc.computer.reconstructors import ReferenceSchedule, compute_truncated_inverse
 
 TERMS = Terms(
     session="s1",
@@ -157,3 +157,22 @@ def test_the_inverse_leaves_directions_the_sensor_hardly_sees():
     inverse = compute_truncated_inverse((left * values @ right.T).astype(np.float32))
     identity = inverse @ (left * values @ right.T)
     np.testing.assert_allclose(identity, right[:, :4] @ right[:, :4].T, atol=1e-3)
+
+
+def test_a_schedule_of_references_makes_a_shape_of_the_given_strength_at_each_time():
+    """20 %: the RMS of 200 shapes of 20 modes, of which the first is strongest."""
+    rng = np.random.default_rng(1)
+    interaction = np.linalg.qr(rng.normal(size=(60, 30)))[0]
+    matrix = np.linalg.pinv(interaction).astype(np.float32)
+    schedule = ReferenceSchedule(matrix, rms_m=1e-7, period_s=15.0, named_by="config_id", seed=1)
+    assert schedule.next(14.9) is None
+    shapes_m, names = [], []
+    for k in range(1, 201):
+        references, name = schedule.next(15.0 * k)
+        assert schedule.next(15.0 * k) is None
+        shapes_m.append(matrix @ references)
+        names.append(name)
+    assert names[:2] == [{"config_id": "references-1"}, {"config_id": "references-2"}]
+    shapes_m = np.array(shapes_m)
+    assert np.sqrt(np.mean(np.sum(shapes_m**2, axis=1))) == pytest.approx(1e-7, rel=0.2)
+    np.testing.assert_allclose(shapes_m[:, [0, 1, *range(22, 30)]], 0.0, atol=1e-12)

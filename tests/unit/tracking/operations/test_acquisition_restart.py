@@ -471,6 +471,16 @@ def test_setting_the_mode_anew_lets_it_begin():
     assert story.began == 2
 
 
+def test_a_mode_that_is_set_while_everything_is_stopped_counts():
+    story = Ended()
+    story.tell(cmd.StopEverything())
+    story.tell(cmd.SetMode(mode=Mode.AUTO))
+    assert not story.state.operations.acquisition.held_off
+    assert story.began == 1
+    story.tell(cmd.Resume())
+    assert story.stage is AcquisitionStage.OPENING
+
+
 def test_so_does_an_operator_who_asks():
     story = Ended()
     story.tell(cmd.Acquire())

@@ -8,11 +8,10 @@ Three tables say what the service does:
 :data:`REACTIONS`
     What each event and command changes. Only these functions are given the event.
 :data:`DECIDERS`
-    What is decided after every event, whatever it was, from all that is known by then. A lost
-    event therefore delays a decision and prevents none.
+    What is decided after every event, whatever it was, from all that is known by then.
 :data:`service.tracking.alarm_rules.RULES`
     Which alarms follow from what is known. ``derive_alarms`` applies them before the reactions, and
-    where it is among the deciders. They are beside the functions that find their texts.
+    where it is among the deciders. The table is next to the functions that it names.
 """
 
 from __future__ import annotations
@@ -24,6 +23,7 @@ from service import wire
 from service.records import alarms
 from service.records import commands as cmd
 from service.records import events as ev
+from service.records.alarms import Interlock
 from service.records.commands import Command
 from service.records.events import Effect, Event
 from service.records.operations import MeasureState
@@ -40,13 +40,13 @@ from service.tracking import (
     reconstructors,
     resume,
     rtc,
-    update_policy,
     updates,
     validity,
     window_processing,
 )
 from service.tracking.alarm_rules import derive_alarms
 from service.tracking.operations import acquisition, measurement, probation
+from service.tracking.operations.running import running_ramp
 from service.tracking.policy import Policy
 from service.tracking.step_context import StepContext
 
@@ -88,7 +88,7 @@ def step(
     for react in REACTIONS[type(event)]:
         react(context, event)
     for decider in DECIDERS:
-        if all(guard(context.state) for guard in decider.guards):
+        if all(guard(context) for guard in decider.guards):
             decider.decide(context)
     alarm_records.update_records(context, ordered=isinstance(event, Command))
     return context.state, tuple(context.effects)
@@ -127,14 +127,6 @@ def _on_made(context: StepContext, made: ev.MatrixMade) -> None:
         probation.send_way_back(context, made)
     else:
         reconstructors.on_matrix(context, made)
-
-
-def _on_dither_measured(context: StepContext, event: ev.DitherMeasured) -> None:
-    """Stop a dither measured stronger than requested."""
-    reason = dither.check_measured_dither(context, event)
-    if reason is not None:
-        measurement.fail_noisy_measurement(context, f"its dither was too strong: {event.text}")
-        dither.stop_too_strong(context, event.id, reason)
 
 
 def _on_unusable(context: StepContext, event: ev.DitherUnusable) -> None:
@@ -181,7 +173,7 @@ REACTIONS: Final[Reactions] = {
     ev.Answered: (_on_answer,),
     ev.DitherSilent: (dither.on_silence,),
     ev.DitherUnusable: (_on_unusable, acquisition.on_dither_unusable),
-    ev.DitherMeasured: (_on_dither_measured, acquisition.on_dither_measured),
+    ev.DitherMeasured: (dither.on_measured, acquisition.on_too_strong, measurement.on_too_strong),
     ev.Compared: (probation.on_compared,),
     ev.LoopHeld: (rtc.on_loop_held,),
     ev.MatrixMisapplied: (reconstructors.on_misapplied,),
@@ -197,11 +189,7 @@ REACTIONS: Final[Reactions] = {
     cmd.Acquire: (acquisition.acquire_on_command,),
     cmd.AbortAcquisition: (acquisition.abort_on_command,),
     cmd.StartDither: (operator.start_dither,),
-    cmd.StopDither: (
-        dither.stop_by_operator,
-        acquisition.on_dither_stopped,
-        measurement.on_dither_stopped,
-    ),
+    cmd.StopDither: (dither.on_stop, acquisition.on_dither_stop, measurement.on_dither_stop),
     cmd.Measure: (measurement.measure,),
     cmd.GiveUp: (measurement.give_up_on_command,),
     cmd.MeasureNoisy: (measurement.measure_noisy,),
@@ -248,62 +236,71 @@ FAILURES: Final[Reactions] = {
 """Functions of context, effect and text for each kind of effect, or request, that has failed."""
 
 
-def not_measuring(state: TrackerState) -> bool:
+def not_measuring(context: StepContext) -> bool:
     """Return True unless the RTC measures a matrix, with an open loop that nobody may disturb."""
-    return state.measuring is None
+    return context.state.measuring is None
 
 
-def stopped(state: TrackerState) -> bool:
-    """Return True after an order to stop everything: nothing is sent or played until it ends."""
-    return bool(state.operator.stopped_because)
+def not_stopped(context: StepContext) -> bool:
+    """Return True unless everything is stopped: then nothing is sent or played."""
+    return not context.operator.stopped_because
 
 
-def not_stopped(state: TrackerState) -> bool:
-    """Return True unless everything is stopped."""
-    return not stopped(state)
-
-
-def not_acquiring(state: TrackerState) -> bool:
+def not_acquiring(context: StepContext) -> bool:
     """Return True unless an acquisition is under way: updates follow α, which it determines."""
-    return not state.operations.acquisition.under_way
+    return not context.acquisition.under_way
 
 
-def no_noisy_matrix_waits(state: TrackerState) -> bool:
+def no_noisy_matrix_waits(context: StepContext) -> bool:
     """Return True unless a noisy matrix waits for a dither to end: until then none begins."""
-    noisy = state.noisy_measurement
+    noisy = context.state.noisy_measurement
     return noisy is None or noisy.state is not MeasureState.WAITING
 
 
-Guard = Callable[[TrackerState], bool]
+def may_ask(context: StepContext) -> bool:
+    """Return True if an RTC is there, and no alarm forbids to ask anything of it."""
+    return context.rtc is not None and context.blocking_alarm(Interlock.ASK) is None
+
+
+def may_decide(context: StepContext) -> bool:
+    """Return True unless a gain ramp changes the loop, or an alarm forbids to decide."""
+    ramp = running_ramp(context.state, context.now_ns)
+    return ramp is None and context.blocking_alarm(Interlock.DECIDE) is None
 
 
 class Decider(NamedTuple):
     """A decision that is made after every event, where all guards hold."""
 
     name: str
-    guards: tuple[Guard, ...]
+    guards: tuple[Callable[[StepContext], bool], ...]
     decide: Callable[[StepContext], None]
 
 
 _FREE: Final = (not_measuring, not_stopped, not_acquiring)
+_READY: Final = (*_FREE, no_noisy_matrix_waits, may_ask, may_decide)
 
 DECIDERS: Final = (
     Decider("a restored α", (), resume.drop_unconfirmed),
     Decider("the pointing law", (), pointing_law.follow_law),
     Decider("windows in a row", (), window_processing.reset_run),
     Decider("the probation", (), probation.advance),
-    Decider("declined modes", (), update_policy.note_declined),
     # Before all that an alarm forbids: a reaction may have raised one.
     Decider("alarms", (), derive_alarms),
-    Decider("the RTC's matrix", (not_measuring,), updates.fetch_in_use),
-    Decider("everything stopped", (not_measuring, stopped), resume.keep_stopped),
+    Decider("the RTC's matrix", (not_measuring, may_ask), updates.fetch_in_use),
     Decider("the acquisition", (not_measuring, not_stopped), acquisition.advance),
     Decider("a noisy matrix", _FREE, measurement.advance_noisy),
-    Decider("updates", (*_FREE, no_noisy_matrix_waits), updates.decide_updates),
-    Decider("the offload", (*_FREE, no_noisy_matrix_waits), offload.request_offload),
+    # Also while everything is stopped, and before another dither is chosen.
+    Decider(
+        "unwanted dithers",
+        (not_measuring, not_acquiring, no_noisy_matrix_waits, may_ask),
+        dither.stop_unwanted,
+    ),
+    Decider("the dither", _READY, dither.choose_dither),
+    Decider("reconstructors", _READY, updates.decide_updates),
+    Decider("the offload", _READY, offload.request_offload),
     Decider("alarms of what was decided", (), derive_alarms),
 )
 """Decisions in the order in which they are made.
 
-None of them knows the event. Guards ask about the state as the deciders before have left it.
+None of them knows the event. Guards see the state as the deciders before have left it.
 """

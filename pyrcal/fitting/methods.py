@@ -76,7 +76,7 @@ LINEAR_DISPLACEMENT_RATIO = 0.08
 """The same limit over the root of the residual share of the signal: the second order of a
 displacement d, at most (π d)² / 2 of the signal, is then a thirtieth of that share."""
 
-BLUR_STEPS = (-0.5, -0.25, 0.25, 0.5)
+BLUR_STEPS = np.arange(-2, 3) * 0.25
 """Trial amplitudes of a blurring pattern, subapertures: half of each in every image."""
 
 LONGEST_MOVE = 0.3
@@ -346,7 +346,7 @@ def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
         matrix = changed.model(models.cheap_sampling, once=True).interaction_matrix(solution.alpha)
         return few.project(matrix, every).chi_at_best
 
-    found = _scan_outwards(left)
+    found = _scan_outwards(left, SENSOR_CHANGES, left(0.0))
     # The scan stops where χ² grows, so the rest is infinite and never the minimum.
     best = int(np.argmin(found))
     change = SENSOR_CHANGES[best]
@@ -367,19 +367,23 @@ def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
     return moved, replace(nuisances, optics=tuple(optics))
 
 
-def _scan_outwards(left: Callable[[float], float]) -> Array:
-    """Return χ² at ``SENSOR_CHANGES``, outwards from no change until it grows; infinite beyond.
+def _scan_outwards(
+    left: Callable[[float], float], changes: NDArray[np.floating], at_none: float
+) -> Array:
+    """Return χ² at some changes, outwards from the middle one until it grows; infinite beyond.
 
-    The widest modulations take longest, so they are not computed without need.
+    ``at_none`` is χ² without a change, the middle one. The widest modulations take longest, so they
+    are not computed without need.
     """
-    found = np.full(len(SENSOR_CHANGES), np.inf)
-    middle = len(SENSOR_CHANGES) // 2
-    found[middle] = left(0.0)
-    # Both sides: four low modes have a minimum on each, and the first may be the wrong one.
+    found = np.full(len(changes), np.inf)
+    middle = len(changes) // 2
+    found[middle] = at_none
+    # Both sides: four low modes have a minimum of the modulation on each, and the first may be the
+    # wrong one. The sign of a blur is hardly measurable.
     for side in (-1, 1):
         k = middle + side
         while 0 <= k < len(found):
-            found[k] = left(SENSOR_CHANGES[k])
+            found[k] = left(float(changes[k]))
             if found[k] > found[k - side]:
                 break
             k += side
@@ -421,16 +425,17 @@ def _with_nearest_images(settled: Settled) -> tuple[FitModels, Nuisances]:
         matrix = subset.with_displaced_images(displaced).cheap.interaction_matrix(solution.alpha)
         return few.project(matrix, every).chi_at_best + improbable
 
+    def blurred(displaced: Array, pattern: Array, size: float) -> float:
+        return left(displaced + size * pattern)
+
     # Fitted values of blurs are dropped: a blur has no effect to first order, so that its value
     # from linear steps is arbitrary.
     displaced = nuisances.displaced + np.where(blurring, 0.0, values) @ nuisances.images
     least = left(displaced)
     for pattern in nuisances.images[blurring]:
-        tried = [displaced + size * pattern for size in BLUR_STEPS]
-        found = [left(one) for one in tried]
-        best = int(np.argmin(found))
-        if found[best] < least:
-            displaced, least = tried[best], found[best]
+        found = _scan_outwards(partial(blurred, displaced, pattern), BLUR_STEPS, least)
+        displaced = displaced + BLUR_STEPS[np.argmin(found)] * pattern
+        least = float(found.min())
     return models.with_displaced_images(displaced), replace(nuisances, displaced=displaced)
 
 

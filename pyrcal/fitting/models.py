@@ -111,13 +111,15 @@ class FitModels:
     ) -> InteractionModel:
         """Return a model of this sampling, for ``basis`` or the models' own modes.
 
-        A model that is used ``once`` does not store the sensor's response to every point of the
-        pupil.
+        A model that is used ``once`` for few modes does not compute the sensor's response to every
+        point of the pupil.
         """
         known = self.made.get(sampling)
         # ``replace`` passes the same dictionary on to models of other instruments.
         if known is not None and known.instrument is self.instrument:
             return known.of_modes(basis or self.basis)
+        # with more modes the response to every point costs less, even if it is used once
+        few = (basis or self.basis).n_modes < self.instrument.wfs.n_subapertures
         model = InteractionModel(
             self.instrument,
             basis or self.basis,
@@ -125,7 +127,7 @@ class FitModels:
             detector_nodes=sampling,
             illumination=self.illumination,
             mapper=self.mapper,
-            kept_bytes=0.0 if once else KEPT_BYTES,
+            kept_bytes=0.0 if once and few else KEPT_BYTES,
         )
         if known is not None:
             model.share_modes(known)

@@ -314,7 +314,11 @@ class LoopState:
     """Pinned or adopted; frames of another basis are refused."""
 
     config_id: str | None = None
-    """Pinned or adopted; frames of another configuration are refused."""
+    """Pinned or adopted; an RTC that names its reference slopes by it has another in its status."""
+
+    renamed_ns_utc: int | None = None
+    """Time by the RTC's clock at which it had another ``config_id``, until its matrix and a window
+    have shown that the sensor is the same; None if that is known."""
 
     reference_id: str | None = None
     """Name of the reference slopes: the RTC's ``reference_id``, or its ``config_id`` if it sends

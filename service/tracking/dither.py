@@ -21,7 +21,7 @@ from service.records.state import Level, TrackerState
 from service.tracking import dither_plan, dither_request, mode_proof
 from service.tracking.dither_plan import WantedDither
 from service.tracking.policy import SECOND_NS
-from service.tracking.step_context import StepContext
+from service.tracking.step_context import StepContext, present
 from service.wire import DitherRequest, DitherStatus, DitherStop, Reply, Status
 
 MAX_MEASURED_AMPLITUDE_RATIO = 1.1
@@ -54,11 +54,10 @@ _STATUS_DELAY_S = 2.0
 """Time for a status made before the dither began to arrive, if it has no frame number."""
 
 
-def choose_dither(context: StepContext, rtc: Status) -> None:
+def choose_dither(context: StepContext) -> None:
     """Dither as much and as often as the policy asks while the loop is closed, its matrix known."""
+    rtc, dither = present(context.rtc), context.dither
     _update_cost(context, rtc)
-    stop_unwanted(context, rtc)
-    dither = context.dither
     if dither is not None and not dither_request.is_automatic_sine(dither.request, dither.purpose):
         _set_phase(context, DitherPhase.OPERATOR, f"{dither.id} runs")
         return
@@ -116,7 +115,7 @@ def allow_dither(context: StepContext, *, allowed: bool = True) -> None:
     context.dithers = replace(context.dithers, stopped=not allowed)
 
 
-def stop_by_operator(context: StepContext, _: cmd.StopDither) -> None:
+def on_stop(context: StepContext, _: cmd.StopDither) -> None:
     """Stop the dither until it is ordered again."""
     forget_dither(context)
     allow_dither(context, allowed=False)
@@ -232,31 +231,27 @@ def learn_precision(context: StepContext, event: ev.WindowFitted) -> None:
         context.dither_policy = replace(context.dither_policy, precision=precision)
 
 
-def check_measured_dither(context: StepContext, event: ev.DitherMeasured) -> str | None:
-    """Report a dither that differs from the request; return the reason why it must be stopped.
+def on_measured(context: StepContext, event: ev.DitherMeasured) -> None:
+    """Report a dither that differs from the request; stop one that is too strong.
 
     The commands in the frames are what the mirror does, whatever the RTC's status says.
     """
     rtc, dither = context.rtc, context.dither
     if not event.text:
         context.dither_policy = replace(context.dither_policy, loud_text="", amiss_id=None)
-        return None
+        return
     if rtc is None or dither is None or dither.id != event.id:
-        return None
+        return
     context.dither_policy = replace(context.dither_policy, amiss_id=event.id, amiss_m=event.found_m)
     most_m = dither_plan.budget_m(rtc, context.policy)
     # An operator may have allowed more than the budget.
-    if event.found_m > MAX_MEASURED_AMPLITUDE_RATIO * max(event.asked_m, most_m):
-        return f"{event.text}; the budget is {1e9 * most_m:.3g} nm"
-    context.raise_alarm(alarms.NOT_AS_ASKED, f"{event.text}; check the RTC's dither")
-    return None
-
-
-def stop_too_strong(context: StepContext, dither_id: str, loud: str) -> None:
-    """Stop a dither that the frames show to be too strong."""
-    _note_unwanted(context, dither_id)
-    context.dither_policy = replace(context.dither_policy, loud_id=dither_id, loud_text=loud)
-    _raise_over_budget(context, dither_id, loud)
+    if event.found_m <= MAX_MEASURED_AMPLITUDE_RATIO * max(event.asked_m, most_m):
+        context.raise_alarm(alarms.NOT_AS_ASKED, f"{event.text}; check the RTC's dither")
+        return
+    loud = f"{event.text}; the budget is {1e9 * most_m:.3g} nm"
+    _note_unwanted(context, event.id)
+    context.dither_policy = replace(context.dither_policy, loud_id=event.id, loud_text=loud)
+    _raise_over_budget(context, event.id, loud)
     stop_unfollowed(context)
 
 
@@ -272,8 +267,9 @@ def stop_unanswered(context: StepContext, text: str) -> None:
         stop_running_dither(context)
 
 
-def stop_unwanted(context: StepContext, rtc: Status) -> None:
+def stop_unwanted(context: StepContext) -> None:
     """Ask the RTC, again and again, to stop what it should not play."""
+    rtc = present(context.rtc)
     running, loud = rtc.dither_id, dither_plan.check_dither_strength(context, rtc)
     why = loud or dither_plan.check_dither_wanted(context, rtc)
     if running is None or why is None:

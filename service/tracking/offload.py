@@ -19,7 +19,6 @@ from service.records.alarms import Interlock
 from service.records.registration import Offload, OffloadState, Purpose, Registration, Validity
 from service.records.state import Mode, TrackerState
 from service.tracking import validity
-from service.tracking.operations.running import running_ramp
 from service.tracking.policy import SECOND_NS, Offloading
 from service.tracking.step_context import StepContext
 from service.tracking.update_policy import REFUSED_INTERVAL_S, is_settled
@@ -162,14 +161,12 @@ def _may_move(
     state, last = context.state, context.alpha.offload
     if state.operator.mode is not Mode.AUTO or state.on_probation or not rtc.in_loop:
         return False
-    if any(map(context.blocking_alarm, (Interlock.ASK, Interlock.DECIDE, Interlock.SEND_NEW))):
+    if context.blocking_alarm(Interlock.SEND_NEW) or state.noisy_measurement is not None:
         return False
     sure = is_settled(registration) and registration.validity.level is Validity.FRESH
     if not sure or np.any(np.sqrt(np.diag(registration.covariance)) > limits.near):
         return False
     if state.matrices.making_since_ns_utc is not None or state.sent is not None:
-        return False
-    if state.noisy_measurement is not None or running_ramp(state, context.now_ns) is not None:
         return False
     if last is None:
         return True

@@ -19,7 +19,7 @@ from service.tracking.dither import allow_dither, request_dither
 from service.tracking.dither_plan import operator_parameters
 from service.tracking.policy import SECOND_NS
 from service.tracking.step_context import StepContext, present
-from service.tracking.update_policy import DECLINED_MODES_DELAY_S, limit_after_declined
+from service.tracking.update_policy import DECLINED_MODES_DELAY_S, limit_declined
 from service.tracking.validity import note_pointing
 from service.wire import DitherKind, Loop, LoopRequest, Pointing, RampRequest, Reply, Status
 
@@ -44,7 +44,7 @@ def reject(context: StepContext, command: cmd.Reject) -> None:
     )
     context.log("reconstructor.discarded", command.id)
     record = reconstructors.require_record(context.state, command.id)
-    limit_after_declined(context, record, DECLINED_MODES_DELAY_S)
+    limit_declined(context, record, DECLINED_MODES_DELAY_S)
 
 
 def publish(context: StepContext, command: cmd.Publish) -> None:

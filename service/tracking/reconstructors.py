@@ -53,7 +53,17 @@ def check_sendable(
         if alarm_blocks(alarm, interlock) and not (of_swap and alarm.name in _OF_A_SWAP):
             return alarm.text
     unread = explain_unread_matrix(state, state.loop.rtc.cm_id)
-    return unread if unread or was_used else check_proven(state, record)
+    return unread if unread or was_used else _check_renaming(state) or check_proven(state, record)
+
+
+def _check_renaming(state: TrackerState) -> str | None:
+    """Return that nothing has shown the sensor to be the same under another name, or None."""
+    if state.loop.renamed_ns_utc is None or state.loop.rtc is None:
+        return None
+    return (
+        f"the RTC's config_id is {state.loop.rtc.config_id}, it was another: no window has shown "
+        "yet that the sensor is the same"
+    )
 
 
 def check_approved(
@@ -129,6 +139,9 @@ RETURNS_KEPT = 100
 UNSENT_KEPT = 50
 """Newest of those that were never sent: enough to see what is being refused, and why."""
 
+_DECLINED = frozenset({MatrixState.REFUSED, MatrixState.REJECTED, MatrixState.FAILED})
+"""States after a rejection by the gate, when it judged again, or by the RTC."""
+
 _UNSENT = frozenset({MatrixState.REFUSED, MatrixState.DISCARDED})
 _SPARE = frozenset({MatrixState.REJECTED, MatrixState.FAILED, MatrixState.SUPERSEDED})
 
@@ -161,8 +174,14 @@ def replace_record(context: StepContext, record: ReconstructorRecord) -> bool:
         move(context, r, record) if r.id == record.id else r
         for r in context.matrices.reconstructors
     )
+    before = context.state.reconstructor(record.id)
     context.matrices = replace(context.matrices, reconstructors=records)
-    return record in records
+    if record not in records:
+        return False
+    changed = before is not None and before.state is not record.state
+    if changed and record.state in _DECLINED:
+        update_policy.limit_declined(context, record)
+    return True
 
 
 def change_state(context: StepContext, matrix_id: str, to: MatrixState, reason: str) -> None:
@@ -216,6 +235,13 @@ def forget_session(context: StepContext) -> None:
         margin=None,
         assessment=None,
         judged_ns_utc=None,
+    )
+
+
+def verify_again(context: StepContext) -> None:
+    """Have the matrix in use read again before anything new is sent."""
+    context.matrices = replace(
+        context.matrices, verified_ids=frozenset(), applied_asked_ns_utc=0, read_back_error=""
     )
 
 

@@ -66,12 +66,6 @@ def resume_everything(context: StepContext, command: cmd.Resume) -> None:
     context.log("resumed", command.signed)
 
 
-def keep_stopped(context: StepContext) -> None:
-    """Have no dither of the service's own on the mirror while everything is stopped."""
-    if context.rtc is not None and context.blocking_alarm(Interlock.ASK) is None:
-        dither.stop_unwanted(context, context.rtc)
-
-
 def orders_of(state: TrackerState) -> Orders:
     """Return what the next service has to obey; the default is nothing."""
     return Orders(

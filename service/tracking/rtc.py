@@ -75,6 +75,7 @@ def on_status(context: StepContext, rtc: Status) -> None:
         config_id=context.loop.config_id or rtc.config_id,
     )
     _note_references(context, rtc)
+    _note_renaming(context, before, rtc)
     validity.note_pointing(context, rtc.pointing)
     _drop_other_basis(context)
     mode_proof.believe_restored(context, rtc)
@@ -117,6 +118,37 @@ def _note_references(context: StepContext, rtc: Status) -> None:
         context.loop = replace(context.loop, reference_since_ns_utc=context.now_ns)
         text = f"the RTC subtracts the reference slopes {name}, they were {before}"
         context.log("references.changed", text)
+
+
+def _note_renaming(context: StepContext, before: Status | None, rtc: Status) -> None:
+    """Let matrix and response show that a sensor is the same under another ``config_id``.
+
+    The link refuses one that the instrument file fixes, and one that comes with other sizes.
+    """
+    loop, registration = context.loop, context.registration
+    known = loop.config_id if before is None else before.config_id
+    if rtc.config_id != known:
+        context.loop = replace(context.loop, renamed_ns_utc=rtc.t_ns)
+        reconstructors.verify_again(context)
+        validity.request_window(context, "the RTC has another config_id")
+        text = (
+            f"the RTC's config_id has changed from {known} to {rtc.config_id} with the same number "
+            "of slopes and modes: R-31 allows that for another mask, slope recipe, binning or "
+            "modulation only. It is taken for new reference slopes: have the RTC name them by "
+            "reference_id"
+        )
+        context.raise_alarm(alarms.RENAMED, context.alarm_text(alarms.RENAMED) or text)
+        return
+    since_ns = loop.renamed_ns_utc
+    if since_ns is None or registration is None or registration.window_began_ns_utc < since_ns:
+        return
+    contradicted = {alarms.WRONG_MATRIX, alarms.WRONG_ANSWER} & {
+        alarm.name for alarm in context.alarms.active
+    }
+    if reconstructors.explain_unread_matrix(context.state, rtc.cm_id) or contradicted:
+        return
+    context.loop = replace(context.loop, renamed_ns_utc=None)
+    context.log("sensor.same", f"matrix and response are the model's with {rtc.config_id}, too")
 
 
 def _drop_other_basis(context: StepContext) -> None:

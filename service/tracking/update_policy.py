@@ -283,9 +283,6 @@ MODES_LIMIT_MEMORY_S = 3600.0
 MORE_MODES_MARGIN_RATIO = 1.5
 """More modes are tried only while there is this times the margin that the gate asks for."""
 
-_DECLINED_STATES = frozenset({MatrixState.REFUSED, MatrixState.REJECTED, MatrixState.FAILED})
-"""States after a rejection by the gate, when it judged again, or by the RTC."""
-
 
 def half_of_modes(n_modes: int) -> int:
     """Return half of ``n_modes``, or all of them where half is below ``MIN_TRIED_MODES``."""
@@ -356,20 +353,8 @@ def note_limit(
         )
 
 
-def note_declined(context: StepContext) -> None:
-    """Note that a reconstructor which had passed the gate was declined by the gate or the RTC."""
-    before, records = context.before.matrices.reconstructors, context.matrices.reconstructors
-    if records is before:
-        return
-    earlier = {record.id: record.state for record in before}
-    for record in records:
-        changed = earlier.get(record.id, record.state) is not record.state
-        if changed and record.state in _DECLINED_STATES:
-            limit_after_declined(context, record, FIRST_MODES_DELAY_S)
-
-
-def limit_after_declined(
-    context: StepContext, record: ReconstructorRecord, first_wait_s: float
+def limit_declined(
+    context: StepContext, record: ReconstructorRecord, first_wait_s: float = FIRST_MODES_DELAY_S
 ) -> None:
     """Try no more modes for a while, longer each time, after a reconstructor was declined.
 

@@ -9,11 +9,9 @@ from service.records.events import MakeMatrix
 from service.records.products import MatrixState, ReconstructorRecord
 from service.records.state import Mode, TrackerState
 from service.tracking import reconstructors, update_policy
-from service.tracking.dither import choose_dither, stop_unwanted
 from service.tracking.mode_proof import awaits_proof, n_proven_modes
-from service.tracking.operations.running import running_ramp
 from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.step_context import StepContext
+from service.tracking.step_context import StepContext, present
 from service.tracking.window_processing import MAX_TIME_WITHOUT_WINDOW_S
 from service.wire import Status
 
@@ -43,9 +41,7 @@ _FAILED_STATES = frozenset(
 
 def fetch_in_use(context: StepContext) -> None:
     """Ask for the matrix in use until it was had once in this session."""
-    rtc, state = context.rtc, context.state
-    if rtc is None or context.blocking_alarm(Interlock.ASK) is not None:
-        return
+    rtc, state = present(context.rtc), context.state
     # A matrix of FLAO is 3 MB: it travels once in a session.
     if rtc.cm_id in state.matrices.verified_ids:
         return
@@ -61,15 +57,8 @@ def fetch_in_use(context: StepContext) -> None:
 
 
 def decide_updates(context: StepContext) -> None:
-    """Ask for what is wanted now."""
-    rtc = context.rtc
-    if rtc is None or context.blocking_alarm(Interlock.ASK) is not None:
-        return
-    ramp = running_ramp(context.state, context.now_ns)
-    if ramp is not None or context.blocking_alarm(Interlock.DECIDE) is not None:
-        stop_unwanted(context, rtc)
-        return
-    choose_dither(context, rtc)
+    """Ask for a reconstructor, or for a verdict on the one in use, where one is needed."""
+    rtc = present(context.rtc)
     hindrance = explain_hindrance(context, rtc)
     if hindrance != context.matrices.hindrance:
         context.matrices = replace(context.matrices, hindrance=hindrance)

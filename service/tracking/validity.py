@@ -117,13 +117,10 @@ def law_at(state: TrackerState, t_ns_utc: int) -> Misregistration | None:
 def at_present(
     state: TrackerState, estimate: EstimateT, began_ns_utc: int, ended_ns_utc: int
 ) -> EstimateT:
-    """Return an estimate at the present pointing, made of telemetry of another.
-
-    ``began_ns_utc``: start of its telemetry by the RTC's clock; 0 if unknown.
-    """
+    """Return an estimate at the present pointing, made of telemetry of another."""
     now = state.alpha.law.nominal
     # A window measures the mean registration, which is that of its middle if the law is smooth.
-    then = law_at(state, ((began_ns_utc or ended_ns_utc) + ended_ns_utc) // 2)
+    then = law_at(state, (began_ns_utc + ended_ns_utc) // 2)
     if now is None or then is None:
         return estimate
     return replace(estimate, alpha=estimate.alpha.add_step(then.step_to(now)))

@@ -70,11 +70,10 @@ def on_window(context: StepContext, event: ev.WindowFitted) -> None:
     if context.state.measuring is not None:
         reject_window(context, MEASURING)
         return
-    estimate = validity.at_present(
-        context.state, event.estimate, event.began_ns_utc, event.estimate.t_ns_utc
-    )
+    estimate = event.estimate
     # A window whose beginning is not known counts as short.
     began_ns = event.began_ns_utc or estimate.t_ns_utc
+    estimate = validity.at_present(context.state, estimate, began_ns, estimate.t_ns_utc)
     why = filtering.check_window(context, estimate, began_ns)
     smeared = pointing_law.check_pointing_motion(context.state, began_ns, estimate.t_ns_utc)
     # Last, so that it replaces any other reason: what a smeared window says proves no fault.
@@ -351,9 +350,8 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
         text = f"the passive estimate was not used: {reason}"
         context.alpha = replace(context.alpha, passive_unavailable_reason=text)
         return
-    estimate = validity.at_present(
-        context.state, event.estimate, event.began_ns_utc, event.t_ns_utc
-    )
+    began_ns = event.began_ns_utc or event.t_ns_utc
+    estimate = validity.at_present(context.state, event.estimate, began_ns, event.t_ns_utc)
     registration, event = context.registration, replace(event, estimate=estimate)
     if registration is None:
         _show_passive_alone(context, event)

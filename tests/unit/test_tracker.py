@@ -10,7 +10,7 @@ from service import wire
 from service.records import events as ev
 from service.records.events import Event
 from service.records.products import MatrixState
-from service.records.state import Mode, TrackerState
+from service.records.state import Mode
 from service.tracker import ANSWERS, DECIDERS, FAILURES, REACTIONS, step
 from service.tracking.step_context import StepContext
 from service.wire import DitherRequest
@@ -125,4 +125,4 @@ def test_deciders_and_guards_are_not_given_the_event():
     for name, guards, decide in DECIDERS:
         assert list(get_type_hints(decide).values()) == [StepContext, NoneType], name
         for guard in guards:
-            assert list(get_type_hints(guard).values()) == [TrackerState, bool], name
+            assert list(get_type_hints(guard).values()) == [StepContext, bool], name

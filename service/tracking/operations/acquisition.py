@@ -56,6 +56,7 @@ from service.tracking.dither import (
     request_dither,
     request_stop,
     stop_running_dither,
+    stop_unwanted,
 )
 from service.tracking.dither_request import name_dither
 from service.tracking.operations.measurement import fail_noisy_measurement
@@ -145,7 +146,7 @@ def abort_on_command(context: StepContext, _: cmd.AbortAcquisition) -> None:
 
 
 def on_mode_set(context: StepContext, command: cmd.SetMode) -> None:
-    """End one that no operator has ordered, unless the mode is auto; hold back none any more."""
+    """End an acquisition that nobody ordered, unless the mode is auto; hold back none any more."""
     acquisition = context.acquisition
     if not acquisition.under_way:
         if acquisition.held_off:
@@ -155,7 +156,7 @@ def on_mode_set(context: StepContext, command: cmd.SetMode) -> None:
         abort_acquisition(context, f"because the mode is {command.mode}")
 
 
-def on_dither_stopped(context: StepContext, _: cmd.StopDither) -> None:
+def on_dither_stop(context: StepContext, _: cmd.StopDither) -> None:
     """End an acquisition whose dither an operator stops."""
     if context.acquisition.under_way:
         abort_acquisition(context, "because the dither was stopped")
@@ -192,7 +193,7 @@ def on_vanished(context: StepContext, _: ev.RtcVanished) -> None:
 
 
 @_during_acquisition
-def on_dither_measured(context: StepContext, event: ev.DitherMeasured) -> None:
+def on_too_strong(context: StepContext, event: ev.DitherMeasured) -> None:
     """End an acquisition whose dither was too strong."""
     if event.text and event.id == context.dither_policy.loud_id:
         _fail_acquisition(context, event.text)
@@ -323,7 +324,7 @@ def _own_loop_lost(context: StepContext) -> str | None:
 
 
 def _advance_stage(context: StepContext) -> None:
-    """Take one that is under way further, unless its reaction to the event has."""
+    """Take one that is under way further, unless what it has asked for is awaited."""
     acquisition, rtc = context.acquisition, context.rtc
     # The RTC or the worker first answers what the acquisition has asked for in this step.
     if any(effect.cause == acquisition.cause for effect in context.effects):
@@ -443,7 +444,8 @@ def _widen(context: StepContext, rtc: Status, record: ReconstructorRecord | None
         if seen >= MIN_FINAL_WINDOWS:
             _finish(context, record)
             return
-    choose_dither(context, rtc)
+    stop_unwanted(context)
+    choose_dither(context)
 
 
 def _make(context: StepContext, n_modes: int, rtc: Status, *, at_least: int = 0) -> None:
@@ -846,9 +848,9 @@ def _wide_capture_stage(context: StepContext, rtc: Status) -> None:
 @_during_acquisition
 def on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
     """Take over where a window puts the mirror, or hold it against where another one did."""
-    rtc, before, found = context.rtc, context.acquisition, event.found.estimate
-    estimate = validity.at_present(context.state, found, event.began_ns_utc, found.t_ns_utc)
+    rtc, before, estimate = context.rtc, context.acquisition, event.found.estimate
     began_ns = event.began_ns_utc or estimate.t_ns_utc
+    estimate = validity.at_present(context.state, estimate, began_ns, estimate.t_ns_utc)
     if validity.explain_void(context.state, began_ns) is not None:
         return
     if rtc is None or not before.uses_wide_capture or estimate.session != rtc.session:

@@ -119,7 +119,7 @@ def on_vanished(context: StepContext, _: ev.RtcVanished) -> None:
     fail_measurement(context, context.state.measuring, "the RTC vanished")
 
 
-def on_dither_stopped(context: StepContext, _: cmd.StopDither) -> None:
+def on_dither_stop(context: StepContext, _: cmd.StopDither) -> None:
     """Give up a noisy matrix that waits for another dither to end."""
     record = context.state.noisy_measurement
     if record is not None and record.state is MeasureState.WAITING:
@@ -182,6 +182,12 @@ def on_dither_answer(context: StepContext, request: DitherRequest, reply: Reply)
     """Give up a noisy matrix whose dither the RTC refuses."""
     if not reply.accepted:
         on_dither_failed(context, request, f"the RTC refused the dither: {reply.reason}")
+
+
+def on_too_strong(context: StepContext, event: ev.DitherMeasured) -> None:
+    """Give up a noisy matrix whose dither was too strong."""
+    if event.text and event.id == context.dither_policy.loud_id:
+        fail_noisy_measurement(context, f"its dither was too strong: {event.text}")
 
 
 def on_dither_failed(context: StepContext, request: DitherRequest, text: str) -> None:
@@ -320,7 +326,7 @@ def measure_noisy(context: StepContext, command: cmd.MeasureNoisy) -> None:
 
 
 def advance_noisy(context: StepContext) -> None:
-    """Go on with the one under way, if there is one."""
+    """Take a noisy interaction matrix further, if one is being measured."""
     record = context.state.noisy_measurement
     if record is not None:
         with context.because_of(record.cause):

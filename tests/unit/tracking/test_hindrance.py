@@ -70,7 +70,7 @@ def test_a_stronger_dither_is_no_remedy_where_no_window_is_accepted(refused):
     story.now_ns += 600 * 10**9 * (not refused)
     story.tell(ev.Tick(), after_s=1.0)
     assert "budget_m" not in hindrance(story)
-    assert ("frames are missing" if refused else "No window comes any more") in hindrance(story)
+    assert ("the RTC is not known" if refused else "No window comes any more") in hindrance(story)
 
 
 class Unseen(Story):

@@ -237,8 +237,9 @@ class PyramidOptics:
     @property
     def _apart(self) -> bool:
         """True if each image is computed by itself, and the signals are combined of them."""
-        # pixels that differ in many places of the sum are cheaper image by image
-        return self.recipe.kind is SignalKind.INTENSITY
+        # pixels that differ in many places of the sum are cheaper image by image, and so are images
+        # on grids of their own: each is in one plane then, and not in all
+        return self.recipe.kind is SignalKind.INTENSITY or self.offsets is not None
 
     def prepare(self, of_row: RowResponse) -> PreparedRows:
         """Return what all rows of subapertures share."""

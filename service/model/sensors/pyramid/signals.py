@@ -60,8 +60,7 @@ class PyramidSensor:
         n, side = optics.wfs.n_subapertures, len(optics.pupil.coordinates)
         n_points = int(optics.pupil.lit.sum())
         local = optics.recipe.normalisation is Normalisation.LOCAL
-        each = 4 if optics.offsets is None else 8  # one image at a time has half the terms of four
-        n_terms = each * optics.n_pairs * optics.n_nodes
+        n_terms = 4 * optics.n_pairs * optics.n_nodes
         in_a_row = optics.recipe.kind.n_planes * n + (n if local else 1)
         gradients = rows + (n_valid if local else int(self.valid.any(axis=1).sum()))
         n_lines = 2 * n * optics.n_nodes

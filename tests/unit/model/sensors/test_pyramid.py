@@ -279,11 +279,14 @@ def test_pixels_of_a_subaperture_are_its_four_places_in_the_light():
     np.testing.assert_array_equal(light.reshape(-1)[pixel_places(valid)][:, 0], expected)
 
 
+@pytest.mark.parametrize("displaced", [False, True])
 @pytest.mark.parametrize("keeps", [True, False])
 @pytest.mark.parametrize("normalisation", Normalisation)
-def test_the_memory_of_a_response_is_known_beforehand(normalisation, keeps):
+def test_the_memory_of_a_response_is_known_beforehand(normalisation, keeps, displaced):
     """20 subapertures across."""
     plain = instrument_with(SlopeOrder.XY, normalisation)
+    if displaced:
+        plain = replace(plain, wfs=kind_of(plain).displace_images(plain, np.arange(8.0) / 50.0))
     wide = replace(plain, wfs=replace(plain.wfs, n_subapertures=20, pupil_separation_subap=25.0))
     sensor, pupil = sensor_of(wide, 3, np.float32, kept_bytes=1e9 if keeps else 0.0)
     assert sensor.keeps_gradient is keeps

@@ -691,7 +691,7 @@ def _make_fit(
         noise_share=noise_share,
         radius_subap=models.instrument.wfs.pupil_diameter / 2.0,
     )
-    refusal, verdict = judge_fit(findings)
+    refusal, reason = judge_fit(findings)
     smeared = () if found.smear is None else (found.smear.words,)
     # Columns are compared with the model at α, which means nothing where the fit found none.
     columns = (
@@ -718,7 +718,7 @@ def _make_fit(
         subset_scatter=sure.subset_scatter,
         accepted=refusal is None,
         converged=solution.converged,
-        verdict=verdict,
+        verdict=f"{'accepted' if refusal is None else 'refused'}: {reason}",
         remarks=(
             *collect_remarks(findings, reported=reported, found=slopes, about=models.instrument),
             *columns,
@@ -745,7 +745,7 @@ def _make_fit(
         alternatives=tried,
         registration=Registration(
             determined=refusal is None,
-            reason=verdict.partition(": ")[2],
+            reason=reason,
             sigma_statistical=sure.sigma_statistical,
             sigma_systematic=sure.sigma_systematic,
             sets=sure.sets,
@@ -764,6 +764,7 @@ def _make_fit(
     )
     grounds = Grounds(
         refusal=refusal,
+        reason=reason,
         structure=structured,
         n_sets=len(sure.subset_steps),
         columns=columns,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,6 +87,7 @@ from service.estimation.orientation import (
     Search,
     check_stated_orientation,
     find_orientation,
+    format_setting,
 )
 from service.estimation.reference import Reference, Target, is_by_actuator, target_of
 from service.model.aperture import OFF_CENTRE_SUBAP, check_mask, measure_aperture
@@ -461,9 +462,17 @@ EQUAL_CORRELATION = 0.02
 """Largest difference of two correlations that rounding of the angles causes."""
 
 
+class AxesDoubt(NamedTuple):
+    """Reason why the axes of the slopes are uncertain; empty if they are not."""
+
+    reason: str = ""
+    entry: str = ""
+    """Entry of the instrument file that explains the matrix better; empty if there is none."""
+
+
 def _find_axes(
     instrument: Instrument, usable: Reference, basis: Basis, options: FitOptions, mapper: Mapper
-) -> tuple[SlopeRecipe, Misregistration | None, str, LowOrder | None]:
+) -> tuple[SlopeRecipe, Misregistration | None, AxesDoubt, LowOrder | None]:
     """Return the slope recipe, the start pose, and the reason if the axes are uncertain.
 
     The last are the smooth combinations of modes that the search compared.
@@ -475,7 +484,7 @@ def _find_axes(
     stated = options.orientation or instrument.slopes.orientation
     slopes = replace(instrument.slopes, orientation=stated)
     if stated is not None and options.start is not None:
-        return slopes, None, "", None
+        return slopes, None, AxesDoubt(), None
     about = options.start or instrument.start
 
     def search_about(place: Misregistration, setting: Orientation | None) -> Search:
@@ -504,13 +513,16 @@ def _find_axes(
     sure = best.correlation >= MIN_CORRELATION
     pose = replace(about, rotation_rad=best.rotation_rad) if sure else None
     if stated is None:
-        return best.slopes, pose, search.refusal, search.lowest
+        return best.slopes, pose, AxesDoubt(search.refusal), search.lowest
     if best.correlation >= DOUBTFUL_CORRELATION:
-        return best.slopes, pose, "", search.lowest
+        return best.slopes, pose, AxesDoubt(), search.lowest
     # A stated orientation is compared with a free search only if it explains the lowest orders
     # badly: that search tries every orientation and order.
-    doubt = check_stated_orientation(best, search_about(about, None).best)
-    return best.slopes, pose, doubt, search.lowest
+    # Around the start again: a corner that suits a wrong orientation best suits no other one.
+    free = search_about(options.start or instrument.start, None).best
+    doubt = check_stated_orientation(best, free)
+    entry = format_setting(free.slopes) if doubt else ""
+    return best.slopes, pose, AxesDoubt(doubt, entry), search.lowest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -583,7 +595,7 @@ def _make_fit(
     as_in_file: FitModels,
     found: _Found,
     usable: Reference,
-    axes_doubt: str,
+    axes_doubt: AxesDoubt,
     reported: SlopeRecipe,
     options: FitOptions,
 ) -> Fit:
@@ -673,7 +685,7 @@ def _make_fit(
         optics=optics,
         narrow=_find_narrow_pupil(settled),
         with_file_values=without,
-        axes=axes_doubt,
+        axes=axes_doubt.reason,
         passes=usable.passes,
         stroke_known=stroke_known,
         noise_share=noise_share,
@@ -681,7 +693,12 @@ def _make_fit(
     )
     refusal, verdict = judge_fit(findings)
     smeared = () if found.smear is None else (found.smear.words,)
-    columns = tuple(find_strange_columns(solution, target))
+    # Columns are compared with the model at α, which means nothing where the fit found none.
+    columns = (
+        tuple(find_strange_columns(solution, target))
+        if findings.explained and solution.converged
+        else ()
+    )
     found_origins: tuple[Origin, ...] = ()
     if findings.explained:
         found_origins = list_origins(
@@ -750,6 +767,7 @@ def _make_fit(
         structure=structured,
         n_sets=len(sure.subset_steps),
         columns=columns,
+        axes_entry=axes_doubt.entry,
         numbers_share=1.0 if without is None else without.share,
         noise_share=noise_share,
         large_pokes=weakly_modulated and without is not None and without.is_undecided,

@@ -78,9 +78,8 @@ ENTRIES = (
     'modes_kind = "surface"',
     "double_pass = true",
     "double_pass = false",
-    "sign = -1",
 )
-"""Entries of the instrument file that a verdict, or a cause of its gains, advises."""
+"""Entries of the instrument file that a verdict advises."""
 
 _PASS_TOLERANCE = 0.12
 """Largest relative deviation from a factor of two, and scatter, that indicates a forgotten pass."""
@@ -204,8 +203,7 @@ def _check_convergence(findings: FitFindings) -> str:
     noise = "" if findings.explained else "there is too much noise, "
     return (
         f"the fit did not converge: {noise}the modes (basis or order) or the instrument file do "
-        "not match the matrix, or the start is outside the capture range: start closer (--start), "
-        "or leave the start out"
+        "not match the matrix, or a start that was given (--start) is outside the capture range"
     )
 
 

@@ -17,7 +17,7 @@ from service.records.estimates import (
 )
 from service.records.operations import MeasurementRecord, ProbationFinding
 from service.records.products import ExpectedGain, GateVerdict, Judged, ReconstructorRecord
-from service.records.state import Level, TrackerState
+from service.records.state import Level, ModelState, TrackerState
 from service.wire import Acknowledgement, Reply, Status
 from service.wire import Command as Request
 
@@ -385,6 +385,20 @@ class Vibrations:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ModesCommanded:
+    """The RTC has accepted to control another number of modes with the next matrix."""
+
+    n_modes: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelChanged:
+    """A job has changed the optical model: it has measured something or linearised elsewhere."""
+
+    model: ModelState
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MatrixMeasured:
     """A measured interaction matrix is one step further: begun, refused, failed or stored."""
 
@@ -427,6 +441,8 @@ Event = (
     | LoopHeld
     | MatrixMisapplied
     | Vibrations
+    | ModelChanged
+    | ModesCommanded
     | MatrixMeasured
     | JobFailed
 )

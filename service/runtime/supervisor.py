@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import Awaitable, Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -80,6 +80,8 @@ class Supervisor:
         self._engine = Engine(state, policy, self)
         self._bridge = bridge
         self._workers = workers
+        workers.model = lambda: self._engine.state.model
+        workers.changed = lambda model: self._post(ev.ModelChanged(model=model))
         self.archive = archive
         """Products and their history; a call waits for the disk."""
         self.newest_frames: frames.FrameBlock | None = None
@@ -125,7 +127,8 @@ class Supervisor:
     @property
     def instrument(self) -> Instrument:
         """The telescope it works for."""
-        return self._actions.instrument
+        file, mode = self._actions.instrument, self._engine.state.model.sensor_mode
+        return file if mode is None else file.in_mode(mode)
 
     @property
     def policy(self) -> Policy:
@@ -270,7 +273,7 @@ class Supervisor:
             group.create_task(self._writer.save())
             group.create_task(self.recordings.run())
             group.create_task(self._writer.keep_house(self._retention))
-            await self._prepare(partial(self._workers.call, worker.OpticsWorker.describe))
+            await self._prepare()
             for work in (self._listen, self._tick, self._fit, self._fit_passive, self._trends.run):
                 group.create_task(work())
 
@@ -279,8 +282,9 @@ class Supervisor:
         """The model's expectation of telemetry; None: being prepared."""
         return None if self._engine.bank is None else self._engine.bank.loop.description
 
-    async def _prepare(self, describe: Callable[[], Awaitable[Description]]) -> None:
+    async def _prepare(self) -> None:
         """Let the estimators listen to what the model expects; a worker that dies is replaced."""
+        describe = partial(self._workers.call, worker.OpticsWorker.describe)
         config_id = self._engine.state.loop.config_id
         lost = partial(self._note, "worker.lost", level=Level.WARNING)
         description = await with_another_worker(describe, lost)
@@ -486,8 +490,7 @@ class Supervisor:
 
     def sensor_mode_changed(self, config_id: str) -> None:
         """Have the model of another mode of the sensor made."""
-        describe = partial(self._actions.enter_sensor_mode, config_id)
-        self._start("another mode of the sensor", self._prepare(describe))
+        self._start("another mode of the sensor", self._prepare())
 
     def _start(self, what: str, action: Coroutine[Any, Any, None]) -> None:
         """Begin a task; a bug in it costs what it was about, not the service."""

@@ -249,6 +249,7 @@ LASTING: Final[dict[str, Callable[[StepContext], bool]]] = {
     alarms.VANISHED: lambda context: context.rtc is None,
     alarms.SECOND_RTC: partial(_is_repeated, alarms.SECOND_RTC),
     alarms.OTHER_BASIS: partial(_is_repeated, alarms.OTHER_BASIS),
+    alarms.RENAMED: lambda context: context.rtc is not None,
     alarms.UNDECLARED: partial(_is_repeated, alarms.UNDECLARED),
     alarms.NO_DITHER: lambda context: context.dither is None or context.dither.start_seq is None,
     alarms.NOT_AS_ASKED: _is_not_as_asked,

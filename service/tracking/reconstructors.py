@@ -52,7 +52,17 @@ def check_sendable(
         if alarm_blocks(alarm, interlock) and not (of_swap and alarm.name in _OF_A_SWAP):
             return alarm.text
     unread = explain_unread_matrix(state, state.loop.rtc.cm_id)
-    return unread if unread or was_used else check_proven(state, record)
+    return unread if unread or was_used else _check_renaming(state) or check_proven(state, record)
+
+
+def _check_renaming(state: TrackerState) -> str | None:
+    """Return that nothing has shown the sensor to be the same under another name, or None."""
+    if state.loop.renamed_ns_utc is None or state.loop.rtc is None:
+        return None
+    return (
+        f"the RTC's config_id is {state.loop.rtc.config_id}, it was another: no window has shown "
+        "yet that the sensor is the same"
+    )
 
 
 def check_approved(
@@ -224,6 +234,13 @@ def forget_session(context: StepContext) -> None:
         margin=None,
         assessment=None,
         judged_ns_utc=None,
+    )
+
+
+def verify_again(context: StepContext) -> None:
+    """Have the matrix in use read again before anything new is sent."""
+    context.matrices = replace(
+        context.matrices, verified_ids=frozenset(), applied_asked_ns_utc=0, read_back_error=""
     )
 
 

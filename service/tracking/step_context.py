@@ -25,6 +25,7 @@ from service.records.state import (
     LogEntry,
     LoopState,
     MatrixStates,
+    ModelState,
     Operations,
     OperatorState,
     TrackerState,
@@ -116,6 +117,7 @@ class StepContext:
     operations = _Part[Operations]()
     dithers = _Part[DitherState]()
     loop = _Part[LoopState]()
+    model = _Part[ModelState]()
     alarms = _Part[AlarmStates]()
     acquisition = _Part[Acquisition]("operations")
     probation = _Part[Probation | None]("operations")

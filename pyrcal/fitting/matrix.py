@@ -81,6 +81,7 @@ from service.estimation.orientation import (
     LowOrder,
     Search,
     check_stated_orientation,
+    coarse_model,
     find_orientation,
 )
 from service.estimation.reference import Reference, Target, is_by_actuator, target_of
@@ -440,11 +441,11 @@ def _find_axes(
     slopes = replace(instrument.slopes, orientation=stated)
     if stated is not None and options.start is not None:
         return slopes, None, "", None
-    about = options.start or instrument.start
+    about, coarse = options.start or instrument.start, coarse_model(instrument, basis, mapper)
 
     def search_about(place: Misregistration, setting: Orientation | None) -> Search:
         seen = replace(instrument, slopes=replace(slopes, orientation=setting))
-        return find_orientation(seen, usable, basis, mapper=mapper, about=place)
+        return find_orientation(seen, usable, basis, mapper=mapper, about=place, coarse=coarse)
 
     search = search_about(about, stated)
     if options.start is None and search.best.correlation < DOUBTFUL_CORRELATION:

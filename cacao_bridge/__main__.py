@@ -22,7 +22,7 @@ from pyrcal.rtc.background import Background
 from pyrcal.rtc.link import STATUS_PERIOD_S, RtcConnection, RtcLink
 from pyrcal.terminal import print_lines
 from service.config.link_tables import Router, client_security, secret_of
-from service.parser import OneLineParser
+from service.parser import OneLineParser, words
 from service.program import leave, log_to_terminal, status_of, stop_signal
 from service.wire import FrameHeader
 
@@ -36,37 +36,25 @@ _log = structlog.get_logger("cacao")
 
 def arguments_parser() -> OneLineParser:
     """Return the parser of the command line."""
-    parser = OneLineParser(
+    return OneLineParser(
         prog="pyrcal cacao",
         description="Run the bridge between a cacao loop and the service, until it is stopped.",
         epilog="Exit status: 0 done; 2 it cannot be done. docs/howto/cacao.md explains the "
         "settings.",
-        examples=(
-            "pyrcal cacao --config bridge.toml",
-            "pyrcal cacao --config bridge.toml --apply",
+        examples=("--config bridge.toml", "--config bridge.toml --apply"),
+        options=(
+            words("--config FILE", "settings, TOML", type=Path, required=True),
+            words(
+                "--apply ID",
+                "have a running bridge write the waiting matrix",
+                nargs="?",
+                const="waiting",
+            ),
+            words("--bundle FILE", "have a running bridge write a bundle", type=Path),
+            words("--rollback", "have a running bridge restore what was there before"),
+            words("--seconds S", "end after this time", type=float),
         ),
     )
-    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="settings, TOML")
-    parser.add_argument(
-        "--apply",
-        nargs="?",
-        const="waiting",
-        metavar="ID",
-        help="have a running bridge write the waiting matrix",
-    )
-    parser.add_argument(
-        "--bundle",
-        type=Path,
-        metavar="FILE",
-        help="have a running bridge write a bundle",
-    )
-    parser.add_argument(
-        "--rollback",
-        action="store_true",
-        help="have a running bridge restore what was there before",
-    )
-    parser.add_argument("--seconds", type=float, metavar="S", help="end after this time")
-    return parser
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

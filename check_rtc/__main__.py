@@ -11,8 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from pyrcal.fitting.arguments import seconds
-from pyrcal.options import add, words
-from service.parser import OneLineParser
+from service.parser import OneLineParser, words
 from service.program import import_and_run, leave
 
 _EPILOG = """
@@ -25,52 +24,47 @@ is given. Exit status: 0 nothing is wrong; 1 something is; 2 nothing could be ch
 
 def check_parser() -> OneLineParser:
     """Return the parser of the command line."""
-    check = OneLineParser(
+    return OneLineParser(
         prog="pyrcal check-rtc",
-        examples=(
-            "pyrcal check-rtc --instrument flao-lbt",
-            "pyrcal check-rtc --connect tcp/127.0.0.1:7447 --passive",
+        description="Check whether an RTC keeps the contract of docs/rtc.md. The checker takes the "
+        "place of the service: end the service first, or --connect to its router with --passive.",
+        epilog=_EPILOG,
+        examples=("--instrument flao-lbt", "--connect tcp/127.0.0.1:7447 --passive"),
+        options=(
+            words(
+                "--instrument NAME|FILE",
+                "expected instrument; default flao-lbt, with --connect the packaged one of the "
+                "system's name",
+            ),
+            words(
+                "--system NAME",
+                "name of the system in the keys; default that of the instrument, with --connect "
+                "that of the RTC",
+            ),
+            [
+                words(
+                    "--listen ENDPOINT", "zenoh endpoint to listen on, default tcp/127.0.0.1:7447"
+                ),
+                words("--connect ENDPOINT", "zenoh router to connect to"),
+            ],
+            words("--config FILE", "settings of the service, TOML, for a secured link", type=Path),
+            words(
+                "--seconds S",
+                "duration of listening, default %(default)g",
+                type=seconds,
+                default=8.0,
+            ),
+            words(
+                "--wait S", "timeout for the RTC, default %(default)g", type=seconds, default=30.0
+            ),
+            words("--only CHECK,...", "run these checks only", type=_split_names, default=()),
+            words("--passive", "only listen; send no command"),
+            words("--open-loop", "also run checks that open the loop: loop, measure"),
+            words("--move-image", "also run the check that moves the mirror's image: offload"),
+            words("--yes", "consent to all movements beforehand"),
+            words("--json", "print JSON"),
         ),
     )
-    check.description = (
-        "Check whether an RTC keeps the contract of docs/rtc.md. The checker takes the place of "
-        "the service: end the service first, or --connect to its router with --passive."
-    )
-    check.epilog = _EPILOG
-    add(
-        check,
-        words(
-            "--instrument NAME|FILE",
-            "expected instrument; default flao-lbt, with --connect the packaged one of the "
-            "system's name",
-        ),
-        words(
-            "--system NAME",
-            "name of the system in the keys; default that of the instrument, with --connect that "
-            "of the RTC",
-        ),
-    )
-    add(
-        check.add_mutually_exclusive_group(),
-        words("--listen ENDPOINT", "zenoh endpoint to listen on, default tcp/127.0.0.1:7447"),
-        words("--connect ENDPOINT", "zenoh router to connect to"),
-    )
-    secured = "settings of the service, TOML, for a secured link"
-    add(
-        check,
-        words("--config FILE", secured, type=Path),
-        words(
-            "--seconds S", "duration of listening, default %(default)g", type=seconds, default=8.0
-        ),
-        words("--wait S", "timeout for the RTC, default %(default)g", type=seconds, default=30.0),
-        words("--only CHECK,...", "run these checks only", type=_split_names, default=()),
-        words("--passive", "only listen; send no command"),
-        words("--open-loop", "also run checks that open the loop: loop, measure"),
-        words("--move-image", "also run the check that moves the mirror's image: offload"),
-        words("--yes", "consent to all movements beforehand"),
-        words("--json", "print JSON"),
-    )
-    return check
 
 
 def _split_names(text: str) -> tuple[str, ...]:

@@ -46,10 +46,10 @@ def command_line() -> OneLineParser:
         "each command.",
         formatter_class=_Grouped,
         examples=(
-            "pyrcal demo",
-            "pyrcal run --instrument flao-lbt",
-            "pyrcal status",
-            "pyrcal fit flao-lbt matrix.h5 --output fit.h5",
+            "demo",
+            "run --instrument flao-lbt",
+            "status",
+            "fit flao-lbt matrix.h5 --output fit.h5",
         ),
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and commit")

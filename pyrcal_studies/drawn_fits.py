@@ -203,6 +203,49 @@ def _on_the_grid(about: Instrument) -> Instrument:
     return as_told(about, np.zeros((2, 2, 2)))
 
 
+def _listed(order: Callable[[int], Array]) -> Callable[[Instrument], Instrument]:
+    """Return how a file lists the modes that were pushed, in an order of their numbers."""
+
+    def tell(about: Instrument) -> Instrument:
+        mirror = about.analytic_mirror
+        listed = strokes()[:, order(strokes().shape[1])]
+        return replace(about, mirror=replace(mirror, mode_to_actuator=listed))
+
+    return tell
+
+
+def _exchanged(n_modes: int) -> Array:
+    order = np.arange(n_modes)
+    order[[3, 7]] = order[[7, 3]]
+    return order
+
+
+def _without_arms(about: Instrument) -> Instrument:
+    return replace(about, spiders_m=None, spiders_deg=())
+
+
+def _thin_plate(about: Instrument) -> Instrument:
+    shape = InfluenceShape(influence=Influence.THIN_PLATE)
+    return replace(about, mirror=replace(about.analytic_mirror, shape=shape))
+
+
+OUTLINES = (
+    Mistelling(words="no arms", tell=_without_arms),
+    Mistelling(words="arms that are not there", tell=_arms(0.0)),
+    Mistelling(words="thin plate", tell=_thin_plate),
+)
+"""Further wrong files for ``pyrcal_studies.advice_followed``."""
+
+ORDERS = (
+    Mistelling(words="modes in reverse", tell=_listed(lambda n: np.arange(n)[::-1])),
+    Mistelling(words="modes one place off", tell=_listed(lambda n: np.roll(np.arange(n), 1))),
+    Mistelling(words="two modes exchanged", tell=_listed(_exchanged)),
+    Mistelling(words="pairs of modes exchanged", tell=_listed(lambda n: np.arange(n) ^ 1)),
+    Mistelling(words="modes in any order", tell=_listed(np.random.default_rng(39).permutation)),
+)
+"""Orders of the modes that a file may have."""
+
+
 def _other_normalisation(about: Instrument) -> Instrument:
     local = about.slopes.normalisation is Normalisation.LOCAL
     divisor = Normalisation.GLOBAL if local else Normalisation.LOCAL
@@ -251,7 +294,7 @@ def error(alpha: Misregistration, truth: Misregistration, told: Mistelling) -> A
     return np.asarray(min(errors, key=lambda off: float(np.abs(off[:3]).sum())))
 
 
-TOLD = {one.words: one for one in (AS_IT_IS, *MISTELLINGS, *STATED)}
+TOLD = {one.words: one for one in (AS_IT_IS, *MISTELLINGS, *STATED, *ORDERS, *OUTLINES)}
 """Instrument files with one thing wrong."""
 
 
@@ -542,7 +585,7 @@ def _mistold(given: argparse.Namespace) -> Iterator[Condition]:
 
 
 def _stated(given: argparse.Namespace) -> Iterator[Condition]:
-    for words in (AS_IT_IS.words, *(one.words for one in (*MISTELLINGS[:7], *STATED))):
+    for words in (AS_IT_IS.words, *(one.words for one in (*MISTELLINGS[:7], *STATED, *ORDERS))):
         yield Condition(
             arms=True,
             images_px=0.2 if words == "images on the grid" else 0.0,

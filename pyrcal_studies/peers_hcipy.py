@@ -40,11 +40,13 @@ class Hcipy:
         self.wavelength_m = bench.wavelength_m
         self._bench = bench
         self._pupil = hcipy.make_pupil_grid(bench.n_pupil, bench.diameter_m)
-        self._amplitude = hcipy.evaluate_supersampled(
-            hcipy.make_obstructed_circular_aperture(bench.diameter_m, bench.obscuration_ratio),
-            self._pupil,
-            16,
-        )
+        ring = hcipy.make_obstructed_circular_aperture(bench.diameter_m, bench.obscuration_ratio)
+        arm_m = bench.arm_subap * bench.diameter_m / bench.n_subapertures
+
+        def lit(grid: hcipy.Grid) -> hcipy.Field:
+            return ring(grid) * (np.minimum(np.abs(grid.x), np.abs(grid.y)) >= arm_m / 2.0)
+
+        self._amplitude = hcipy.evaluate_supersampled(lit, self._pupil, 16)
         self.move_images(0.0, 0.0)
         light = fold(self.frame(np.zeros((bench.n_pupil, bench.n_pupil))))
         quadrant = light >= _LIGHT_RATIO * np.median(light[light > light.max() / 2])

@@ -1,4 +1,4 @@
-"""Argument parser of all programs of pyrcal: usage, help with examples, errors on one line.
+"""Command lines of all programs of pyrcal: options, usage, help with examples, short errors.
 
 The usage names operands first, in their order, then required options, then the others. An error
 names the closest valid word. Quick to import.
@@ -10,9 +10,31 @@ import argparse
 import shutil
 import textwrap
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from typing_extensions import override
+
+
+class Words(NamedTuple):
+    """An option or an operand: ``--name VALUE``, a flag ``--name``, ``operand VALUE``."""
+
+    form: str
+    purpose: str | None
+    group: str
+    """Title of the options among which it is listed; empty for the command's own."""
+
+    how: dict[str, Any]
+    """Further keyword arguments of argparse."""
+
+
+def words(form: str, purpose: str | None = None, **how: Any) -> Words:  # noqa: ANN401 - argparse's own
+    """Return an option or an operand; one with ``choices`` is not a flag."""
+    return Words(form, purpose, "", how)
+
+
+def in_group(title: str, *every: Words) -> tuple[Words, ...]:
+    """Return options that the help lists under a title of their own."""
+    return tuple(one._replace(group=title) for one in every)
 
 
 class HelpFormatter(argparse.HelpFormatter):
@@ -32,15 +54,44 @@ class OneLineParser(argparse.ArgumentParser):
 
     Parameters
     ----------
+    options
+        Its options and operands; those of a list exclude each other.
     examples
-        Command lines that end the help.
+        Words after the name of the command that make examples, which end the help.
+    module
+        Module whose ``main`` performs the command.
     """
 
-    def __init__(self, *given: Any, examples: Sequence[str] = (), **more: Any) -> None:  # noqa: ANN401 - argparse's own
+    def __init__(
+        self,
+        *given: Any,  # noqa: ANN401 - argparse's own
+        options: Iterable[Words | list[Words]] = (),
+        examples: Iterable[str] = (),
+        module: str = "",
+        **more: Any,  # noqa: ANN401 - argparse's own
+    ) -> None:
         more.setdefault("formatter_class", HelpFormatter)
         super().__init__(*given, **more)
-        self.examples = tuple(examples)
         self._positionals.title = "arguments"
+        self.examples = tuple(f"{self.prog} {words}".rstrip() for words in examples)
+        if module:
+            self.set_defaults(module=module)
+        groups: dict[str, Any] = {"": self}
+        for one in options:
+            if isinstance(one, list):
+                exclusive = self.add_mutually_exclusive_group()
+                for each in one:
+                    _add(exclusive, each)
+            else:
+                if one.group not in groups:
+                    groups[one.group] = self.add_argument_group(one.group)
+                _add(groups[one.group], one)
+
+    def add_commands(self, dest: str, *rows: tuple[str, str, str, Sequence[Words]]) -> None:
+        """Add commands below this one: name, purpose, words of an example, options."""
+        commands = self.add_subparsers(dest=dest, required=True, metavar="COMMAND")
+        for name, purpose, example, options in rows:
+            commands.add_parser(name, help=purpose, examples=[example], options=options)
 
     def usage_parts(self, left_out: Collection[str] = (), *, short: bool = False) -> Iterator[str]:
         """Yield the usage part by part, without the groups of options ``left_out`` by title.
@@ -107,6 +158,14 @@ class OneLineParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """End the program with status 2."""
         self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
+def _add(to: Any, one: Words) -> None:  # noqa: ANN401 - argparse's own, whose type is private
+    """Add an option or an operand to a parser, or to a group of its options."""
+    name, _, value = one.form.partition(" ")
+    flag = name.startswith("-") and not value and "choices" not in one.how
+    named = {"metavar": value} if value else {"action": "store_true"} if flag else {}
+    to.add_argument(name, help=one.purpose, **named, **one.how)
 
 
 def closest(found: str, known: Iterable[str]) -> str:

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple, NoReturn, TypeVar
 
 from service.errors import ConfigurationError, PyrcalError, StorageError, say
 from service.files.durable import lock_file
-from service.parser import OneLineParser
+from service.parser import words
 
 INTERRUPTED = 130
 
@@ -293,65 +293,68 @@ _ENDPOINT = re.compile(r"[\w-]+/\S+")
 
 def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     """Add these commands to a command line."""
-    _describe_run(commands.add_parser("run", help="run the service"))
-    _describe_key(commands.add_parser("key", help="make, list or revoke API keys"))
+    _describe_run(commands)
+    _describe_key(commands)
 
 
-def _describe_run(run: OneLineParser) -> None:
-    run.set_defaults(module="service.cli.commands")
-    run.examples = (
-        "pyrcal run --instrument flao-lbt",
-        "pyrcal run --config /etc/pyrcal/pyrcal.toml --mode hold",
-    )
-    run.description = (
-        "Run the service. Precedence: command line > environment (PYRCAL_<SECTION>__<KEY>) > "
-        "TOML file > defaults."
-    )
+_CONFIG = words("--config FILE", "settings of the service, TOML", type=Path)
+
+
+def _describe_run(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     formats = "auto (default): text on a terminal, else one JSON object a line"
-    modes, logs = ["auto", "propose", "hold"], ["auto", "text", "json"]
-    router = "zenoh router of the observatory to connect to"
-    run.add_argument("--config", metavar="FILE", help="settings, TOML", type=Path)
-    run.add_argument("--instrument", metavar="NAME|FILE", help="packaged name or TOML file")
-    run.add_argument("--mode", help="mode at the start, default propose", choices=modes)
-    run.add_argument(
-        "--data-dir", metavar="DIR", help="folder of archive and audit trail, default var"
-    )
     usual = "zenoh endpoint to listen on, default tcp/127.0.0.1:7447"
-    run.add_argument("--listen", metavar="ENDPOINT", help=usual, type=endpoint)
-    run.add_argument("--connect", metavar="ENDPOINT", help=router, type=endpoint)
-    run.add_argument("--host", metavar="HOST", help="address of the REST API, default 127.0.0.1")
-    run.add_argument("--port", metavar="PORT", help="port of the REST API, default 8080", type=port)
+    router = "zenoh router of the observatory to connect to"
     dask = "tcp://HOST:PORT of a Dask scheduler, whose workers compute large matrices"
-    run.add_argument("--cluster", metavar="ADDRESS", help=dask)
-    run.add_argument("--log-format", help=formats, choices=logs)
-
-
-def _describe_key(key: OneLineParser) -> None:
-    key.set_defaults(module="service.cli.commands")
-    key.description = (
-        "Make, list and revoke API keys, in the data_dir of the service. A running service uses "
-        "the changed keys at once. docs/operate/operating.md says how a client sends its key."
+    modes, logs = ["auto", "propose", "hold"], ["auto", "text", "json"]
+    commands.add_parser(
+        "run",
+        help="run the service",
+        module="service.cli.commands",
+        description="Run the service. Precedence: command line > environment "
+        "(PYRCAL_<SECTION>__<KEY>) > TOML file > defaults.",
+        examples=("--instrument flao-lbt", "--config /etc/pyrcal/pyrcal.toml --mode hold"),
+        options=(
+            words("--config FILE", "settings, TOML", type=Path),
+            words("--instrument NAME|FILE", "packaged name or TOML file"),
+            words("--mode", "mode at the start, default propose", choices=modes),
+            words("--data-dir DIR", "folder of archive and audit trail, default var"),
+            words("--listen ENDPOINT", usual, type=endpoint),
+            words("--connect ENDPOINT", router, type=endpoint),
+            words("--host HOST", "address of the REST API, default 127.0.0.1"),
+            words("--port PORT", "port of the REST API, default 8080", type=port),
+            words("--cluster ADDRESS", dask),
+            words("--log-format", formats, choices=logs),
+        ),
     )
-    key.epilog = "Exit status: 0 done; 2 it cannot be done."
-    settings = "settings of the service, TOML"
+
+
+def _describe_key(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     where = "default: data_dir of the running service, else var"
     scopes = "read: read everything; operate: also give orders; admin: also list and revoke keys"
-    actions = key.add_subparsers(dest="action", required=True, metavar="COMMAND")
-    for action, purpose, example in (
-        ("add", "make a key and print it, only once", "add ada --scope operate"),
-        ("revoke", "revoke a key", "revoke ada"),
-        ("list", "list the keys and their scopes", "list"),
-    ):
-        parser = actions.add_parser(action, help=purpose, examples=[f"pyrcal key {example}"])
-        parser.add_argument("--config", metavar="FILE", help=settings, type=Path)
-        parser.add_argument("--data-dir", metavar="DIR", help=where)
-        if action != "list":
-            parser.add_argument(
-                "name", metavar="NAME", help="name of the person or program that uses it"
-            )
-        if action == "add":
-            choices = ("read", "operate", "admin")
-            parser.add_argument("--scope", help=scopes, choices=choices, required=True)
+    choices = ("read", "operate", "admin")
+    of_service = (_CONFIG, words("--data-dir DIR", where))
+    name = words("name NAME", "name of the person or program that uses it")
+    scope = words("--scope", scopes, choices=choices, required=True)
+    key = commands.add_parser(
+        "key",
+        help="make, list or revoke API keys",
+        module="service.cli.commands",
+        description="Make, list and revoke API keys, in the data_dir of the service. A running "
+        "service uses the changed keys at once. docs/operate/operating.md says how a client sends "
+        "its key.",
+        epilog="Exit status: 0 done; 2 it cannot be done.",
+    )
+    key.add_commands(
+        "action",
+        (
+            "add",
+            "make a key and print it, only once",
+            "ada --scope operate",
+            (*of_service, name, scope),
+        ),
+        ("revoke", "revoke a key", "ada", (*of_service, name)),
+        ("list", "list the keys and their scopes", "", of_service),
+    )
 
 
 def check_settings(options: argparse.Namespace) -> None:

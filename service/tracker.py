@@ -112,7 +112,7 @@ def _on_condition(context: StepContext, event: ev.ConditionChanged) -> None:
     if event.over:
         validity.end_alarm(context, event.name, event.t_ns_utc)
     elif event.name == alarms.MIRROR_SILENT:
-        dither.stop_unanswered(context, event.text)
+        dither.stop_unanswered(context, str(event.text))
     else:
         if event.name == alarms.WORKER_LOST:
             mode_proof.forget_responses(context)
@@ -142,8 +142,7 @@ def _on_answer(context: StepContext, answered: ev.Answered) -> None:
 
 def _on_failure(context: StepContext, failed: ev.JobFailed) -> None:
     """Process the failure of an effect, as ``FAILURES`` says."""
-    effect = failed.effect
-    what = effect.request if isinstance(effect, ev.Ask) else effect
+    what = failed.effect.request if isinstance(failed.effect, ev.Ask) else failed.effect
     for react in FAILURES[type(what)]:
         react(context, what, failed.text)
 
@@ -178,6 +177,8 @@ REACTIONS: Final[Reactions] = {
     ev.LoopHeld: (rtc.on_loop_held,),
     ev.MatrixMisapplied: (reconstructors.on_misapplied,),
     ev.Vibrations: (rtc.on_vibrations,),
+    ev.ModelChanged: (rtc.on_model_changed,),
+    ev.ModesCommanded: (rtc.on_modes_commanded,),
     ev.JobFailed: (_on_failure,),
     cmd.SetMode: (operator.set_mode, probation.on_mode_set, acquisition.on_mode_set),
     cmd.SetPointing: (operator.set_pointing,),
@@ -213,7 +214,7 @@ ANSWERS: Final[Reactions] = {
     wire.DitherStop: (dither.on_stop_answer,),
     wire.MeasureRequest: (measurement.on_answer,),
     wire.OffloadRequest: (offload.on_answer,),
-    wire.LoopRequest: (operator.on_loop_answer, acquisition.on_loop_answer),
+    wire.LoopRequest: (rtc.on_loop_answer, operator.on_loop_answer, acquisition.on_loop_answer),
     wire.RampRequest: (operator.on_loop_answer,),
 }
 """Functions of context, request and reply for each kind of request that the RTC has answered."""
@@ -223,14 +224,18 @@ FAILURES: Final[Reactions] = {
     ev.RepublishMatrix: (reconstructors.on_making_failed, rtc.fail_order, probation.on_copy_failed),
     ev.JudgeMatrix: (reconstructors.on_judging_failed, rtc.log_failure),
     ev.JudgeProposal: (reconstructors.on_judging_failed, rtc.fail_order),
-    ev.SendMatrix: (reconstructors.on_send_failed, rtc.log_failure),
+    ev.SendMatrix: (rtc.on_modes_unknown, reconstructors.on_send_failed, rtc.log_failure),
     ev.FetchMatrix: (reconstructors.on_fetch_failed, rtc.log_failure),
     ev.FinishNoisy: (measurement.on_finish_failed,),
     wire.DitherRequest: (dither.on_failure, rtc.fail_order, measurement.on_dither_failed),
     wire.DitherStop: (rtc.log_failure,),
     wire.MeasureRequest: (measurement.on_failure,),
     wire.OffloadRequest: (offload.on_failure,),
-    wire.LoopRequest: (operator.on_loop_failed, acquisition.on_loop_failed),
+    wire.LoopRequest: (
+        rtc.on_modes_unknown,
+        operator.on_loop_failed,
+        acquisition.on_loop_failed,
+    ),
     wire.RampRequest: (operator.on_loop_failed,),
 }
 """Functions of context, effect and text for each kind of effect, or request, that has failed."""
@@ -276,8 +281,8 @@ class Decider(NamedTuple):
     decide: Callable[[StepContext], None]
 
 
-_FREE: Final = (not_measuring, not_stopped, not_acquiring)
-_READY: Final = (*_FREE, no_noisy_matrix_waits, may_ask, may_decide)
+_UNDISTURBED: Final = (not_measuring, not_acquiring, no_noisy_matrix_waits, may_ask)
+_READY: Final = (*_UNDISTURBED, not_stopped, may_decide)
 
 DECIDERS: Final = (
     Decider("a restored α", (), resume.drop_unconfirmed),
@@ -288,13 +293,11 @@ DECIDERS: Final = (
     Decider("alarms", (), derive_alarms),
     Decider("the RTC's matrix", (not_measuring, may_ask), updates.fetch_in_use),
     Decider("the acquisition", (not_measuring, not_stopped), acquisition.advance),
-    Decider("a noisy matrix", _FREE, measurement.advance_noisy),
-    # Also while everything is stopped, and before another dither is chosen.
     Decider(
-        "unwanted dithers",
-        (not_measuring, not_acquiring, no_noisy_matrix_waits, may_ask),
-        dither.stop_unwanted,
+        "a noisy matrix", (not_measuring, not_stopped, not_acquiring), measurement.advance_noisy
     ),
+    # Also while everything is stopped, and before another dither is chosen.
+    Decider("unwanted dithers", _UNDISTURBED, dither.stop_unwanted),
     Decider("the dither", _READY, dither.choose_dither),
     Decider("reconstructors", _READY, updates.decide_updates),
     Decider("the offload", _READY, offload.request_offload),

@@ -12,9 +12,8 @@ from typing import BinaryIO
 from urllib.parse import quote, urlencode
 
 from pyrcal.client.reading import understood
-from pyrcal.client.remote import DONE, Request
+from pyrcal.client.remote import DONE, Request, collect_arguments
 from pyrcal.client.rest import Document, Service, chunks
-from pyrcal.options import collect_arguments
 from pyrcal.terminal import print_document, print_lines
 from service.errors import ConfigurationError
 

@@ -11,9 +11,8 @@ from typing import NamedTuple
 from urllib.parse import quote
 
 from pyrcal.client.reading import reconstructor_lines, understood
-from pyrcal.client.remote import DONE, NOT_DONE, RECONSTRUCTORS, Request
+from pyrcal.client.remote import DONE, NOT_DONE, RECONSTRUCTORS, Request, collect_arguments
 from pyrcal.client.rest import Document, RefusedError, Service
-from pyrcal.options import collect_arguments
 from pyrcal.terminal import login, print_document, print_lines
 from service.errors import ConfigurationError, say, shown
 

@@ -7,10 +7,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from urllib.parse import quote
 
-from pyrcal.client.remote import DONE, NOT_DONE, Request
+from pyrcal.client.remote import DONE, NOT_DONE, Request, collect_arguments
 from pyrcal.client.rest import Document, Service
 from pyrcal.client.status import alarm_line, registration_lines, status_lines, verdict, worst_first
-from pyrcal.options import collect_arguments
 from pyrcal.terminal import clock, print_document, print_lines, span, table
 
 

@@ -10,12 +10,12 @@ from __future__ import annotations
 import argparse
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from pyrcal.options import Words, add, words
 from service import errors
+from service.parser import Words, in_group, words
 
 DONE, NOT_DONE, UNREACHABLE = 0, 1, 3
 """Exit statuses; 2 is that of a wrong command line."""
@@ -370,49 +370,58 @@ CONNECTION, ORDER = "connection options", "order options"
 """Titles of options that many commands share."""
 
 
+_CONNECTION = in_group(
+    CONNECTION,
+    words("--json", "print the answer of the REST interface"),
+    words("--url URL", f"address of the service; default {URL}, else {USUAL_URL}"),
+    words("--key-file FILE", f"file with the API key; default: the key in {KEY}", type=Path),
+)
+
+
 def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     """Add these commands to a command line."""
     groups: dict[str, Any] = {}
     for request in REQUESTS:
         name, _, word = request.name.partition(" ")
         if word and name not in groups:
+            below = [one for one in REQUESTS if one.name.startswith(f"{name} ")]
             group = commands.add_parser(
-                name, help=GROUPS[name], description=_sentence(GROUPS[name])
+                name,
+                help=GROUPS[name],
+                description=_sentence(GROUPS[name]),
+                examples=[f"{one.name.partition(' ')[2]} {one.example}".rstrip() for one in below],
             )
-            group.examples = [
-                f"pyrcal {r.name} {r.example}".rstrip()
-                for r in REQUESTS
-                if r.name.startswith(f"{name} ")
-            ]
             groups[name] = group.add_subparsers(dest="word", required=True, metavar="COMMAND")
         parser = (groups[name] if word else commands).add_parser(
             word or name,
             help=request.purpose,
             description=_sentence(request.purpose),
             epilog=EPILOG,
-            examples=[f"pyrcal {request.name} {request.example}".rstrip()],
+            examples=[request.example],
+            options=(*request.words, *_order_options(request), *_CONNECTION),
+            module=f"{__package__}.ask",
         )
-        parser.set_defaults(request=request, module=f"{__package__}.ask")
-        add(parser, *request.words)
-        if request.module == "orders":
-            order = parser.add_argument_group(ORDER)
-            required = " (prompted for at a terminal)" if request.needs_why else ""
-            add(
-                order,
-                words("--why WHY", f"reason, kept in the audit trail{required}", default=""),
-                words("--who WHO", "your name; default: the login name"),
-            )
-            if request.asks:
-                add(order, words("--yes", "do it without confirmation"))
-        add(
-            parser.add_argument_group(CONNECTION),
-            words("--json", "print the answer of the REST interface"),
-            words("--url URL", f"address of the service; default {URL}, else {USUAL_URL}"),
-            words(
-                "--key-file FILE", f"file with the API key; default: the key in {KEY}", type=Path
-            ),
-        )
+        parser.set_defaults(request=request)
+
+
+def _order_options(request: Request) -> tuple[Words, ...]:
+    """Return the options that every order has."""
+    if request.module != "orders":
+        return ()
+    required = " (prompted for at a terminal)" if request.needs_why else ""
+    return in_group(
+        ORDER,
+        words("--why WHY", f"reason, kept in the audit trail{required}", default=""),
+        words("--who WHO", "your name; default: the login name"),
+        *([words("--yes", "do it without confirmation")] if request.asks else []),
+    )
 
 
 def _sentence(purpose: str) -> str:
     return f"{purpose[:1].upper()}{purpose[1:]}."
+
+
+def collect_arguments(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
+    """Return those of the named options that were given."""
+    given = {name: getattr(options, name, None) for name in names}
+    return {name: value for name, value in given.items() if value is not None}

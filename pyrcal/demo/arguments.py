@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from pyrcal.options import add, words
-from service.parser import OneLineParser
+from service.parser import OneLineParser, words
 from service.program import such, whole
 
 FORWARDED = {
@@ -31,54 +30,52 @@ REPEATED = {
 
 def demo_parser() -> OneLineParser:
     """Return the parser of the demo's command line."""
-    demo = OneLineParser(
+    return OneLineParser(
         prog="pyrcal demo",
         description="Run the service and a simulated RTC, show what happens, judge the outcome. "
         "Exit status: 0 registration found, margin recovered and wavefront error reduced; "
         "1 one of these failed (the reason is printed); 2 wrong argument.",
-        examples=("pyrcal demo", "pyrcal demo --seconds 120 --jump 60:0.2,0,0,0 --plot demo.png"),
+        examples=("", "--seconds 120 --jump 60:0.2,0,0,0 --plot demo.png"),
+        options=(
+            words(
+                "--seconds N",
+                "end once the outcome is good and has lasted for 5 s, at the latest after N s of "
+                "telemetry (with --jump, --drift or --fault: after N s); default: run until Ctrl-C",
+                type=_seconds,
+            ),
+            *(words(f"--{name} {value}", text) for name, (value, text) in FORWARDED.items()),
+            *(
+                words(f"--{name} {value}", text, action="append")
+                for name, (value, text) in REPEATED.items()
+            ),
+            words(
+                "--instrument NAME|FILE",
+                "packaged instrument or instrument file, default flao-lbt",
+                default="flao-lbt",
+            ),
+            words(
+                "--near",
+                "begin near the nominal registration, where a loop of 400 modes is stable (as with "
+                "--plant or --scene); by default the RTC begins with 120 modes, far from it",
+            ),
+            words("--seed S", "seed of all random numbers, default 1", type=_seed, default=1),
+            words("--json FILE", "write the results there", type=Path),
+            words("--plot FILE", "draw the wavefront error there", type=Path),
+            words("--port PORT", "port of the REST API, default 8080", type=_port, default=8080),
+            words(
+                "--zenoh-port PORT",
+                "port of the link to the RTC, default 7447",
+                type=_port,
+                default=7447,
+            ),
+            words(
+                "--dir DIR",
+                "folder of logs, truth and archive, default var/demo; emptied first",
+                type=Path,
+                default=Path("var/demo"),
+            ),
+        ),
     )
-    add(
-        demo,
-        words(
-            "--seconds N",
-            "end once the outcome is good and has lasted for 5 s, at the latest after N s of "
-            "telemetry (with --jump, --drift or --fault: after N s); default: run until Ctrl-C",
-            type=_seconds,
-        ),
-        *(words(f"--{name} {value}", text) for name, (value, text) in FORWARDED.items()),
-        *(
-            words(f"--{name} {value}", text, action="append")
-            for name, (value, text) in REPEATED.items()
-        ),
-        words(
-            "--instrument NAME|FILE",
-            "packaged instrument or instrument file, default flao-lbt",
-            default="flao-lbt",
-        ),
-        words(
-            "--near",
-            "begin near the nominal registration, where a loop of 400 modes is stable (as with "
-            "--plant or --scene); by default the RTC begins with 120 modes, far from it",
-        ),
-        words("--seed S", "seed of all random numbers, default 1", type=_seed, default=1),
-        words("--json FILE", "write the results there", type=Path),
-        words("--plot FILE", "draw the wavefront error there", type=Path),
-        words("--port PORT", "port of the REST API, default 8080", type=_port, default=8080),
-        words(
-            "--zenoh-port PORT",
-            "port of the link to the RTC, default 7447",
-            type=_port,
-            default=7447,
-        ),
-        words(
-            "--dir DIR",
-            "folder of logs, truth and archive, default var/demo; emptied first",
-            type=Path,
-            default=Path("var/demo"),
-        ),
-    )
-    return demo
 
 
 _seconds = such(float, lambda value: 0.0 < value < math.inf, "a number of seconds > 0")

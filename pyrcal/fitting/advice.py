@@ -59,6 +59,9 @@ class Grounds:
     columns: tuple[str, ...] = ()
     """Sentences on columns with wrong signs or in wrong places."""
 
+    axes_entry: str = ""
+    """Order and orientation of the slopes that explain the matrix better than those stated."""
+
     numbers_share: float = 1.0
     """χ² left with coupling and modulation as fitted, over that with those of the file."""
 
@@ -176,6 +179,8 @@ def _explain_uncertainty(fit: Fit, grounds: Grounds, edge: float, radius: float)
         f"at the pupil's edge the mirror is known to {edge:.3f} subapertures (1 sigma), "
         f"{ENOUGH_SUBAP:g} is enough"
     )
+    if grounds.columns:
+        return f"{known}; {'; '.join(grounds.columns)}"
     found, best = fit.registration, _choose_correction(fit)
     if best is not None:
         return (
@@ -183,18 +188,19 @@ def _explain_uncertainty(fit: Fit, grounds: Grounds, edge: float, radius: float)
             "that and fit again"
         )
     # Averaging and more modes reduce the statistical part only.
-    if found is None or edge_move(found.sigma_statistical, radius) > 0.7 * edge:
-        if grounds.noise_share >= MIN_NOISE_SHARE:
-            return f"{known}; average more, or push more modes"
-        left = (
-            f"{known}; {fit.residual_fraction:.1%} of the signal is left over and hardly any of it "
-            "is noise, so that averaging does not help"
+    statistical = found is None or edge_move(found.sigma_statistical, radius) > 0.7 * edge
+    if statistical and grounds.noise_share >= MIN_NOISE_SHARE:
+        return f"{known}; average more, or push more modes"
+    left = (
+        f"{known}; {fit.residual_fraction:.1%} of the signal is left over and hardly any of it "
+        "is noise, so that averaging does not help"
+    )
+    if grounds.large_pokes and grounds.noise_share < MIN_NOISE_SHARE:
+        return (
+            f"{left}: the sensor may be beyond its linear range; poke with a smaller stroke, "
+            "and push and pull"
         )
-        if grounds.large_pokes:
-            return (
-                f"{left}: the sensor may be beyond its linear range; poke with a smaller stroke, "
-                "and push and pull"
-            )
+    if statistical:
         return f"{left}: the model differs from the bench, and only more modes average that out"
     terms = systematic_terms(fit.alternatives, fit.residual_fraction, fit.sigma)
     most = max(terms, key=lambda term: edge_move(term.sigma, radius), default=None)
@@ -230,7 +236,7 @@ def _advise_refused(fit: Fit, grounds: Grounds) -> _Action:
 def _find_cause(fit: Fit, grounds: Grounds) -> _Action:
     """Return the most likely cause of a refusal; a definite cause precedes the verdict."""
     if grounds.refusal in {Refusal.ANOTHER_BASIS, Refusal.ANOTHER_UNIT} and grounds.gains:
-        return grounds.gains[0], _list_entries(grounds.gains[0])
+        return grounds.gains[0], ()
     # Columns are compared with the model in the axes found, which are in doubt in that case.
     if grounds.columns and grounds.refusal is not Refusal.AXES:
         return "; ".join(grounds.columns), ()
@@ -249,12 +255,9 @@ def _find_cause(fit: Fit, grounds: Grounds) -> _Action:
     left = fit.left_over
     if grounds.refusal is Refusal.DIVIDED and left is not None and left.modes:
         return f"{left.words}; measure these again, or leave them out (--modes)", ()
-    return fit.verdict.removeprefix("refused: "), _list_entries(fit.verdict)
-
-
-def _list_entries(words: str) -> tuple[str, ...]:
-    """Return the entry that a reason with a remedy names, if it is one for the instrument file."""
-    return tuple(entry for entry in ENTRIES if entry in words)
+    named = tuple(entry for entry in ENTRIES if entry in fit.verdict)
+    entries = (grounds.axes_entry,) if grounds.axes_entry else named
+    return fit.verdict.removeprefix("refused: "), entries
 
 
 def _list_corrections(fit: Fit) -> Iterator[str]:

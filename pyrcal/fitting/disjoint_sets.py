@@ -10,10 +10,11 @@ that no model is computed again. The σ of its step has three parts:
   distortion (second and third order) is fitted to the whole matrix. A distorted relay or a
   distorted nominal geometry gives different registrations in different parts of the pupil.
 
-Sets that cover the whole pupil evenly (a checkerboard, alternate sectors, rings, all sets of modes)
-repeat the whole fit, and their scatter enters the σ of the registration. Halves and quadrants do
-not: a distorted mirror moves opposite halves in opposite directions, which cancels over the pupil.
-They are compared and reported only. Bow ties are not used: along one diagonal a rotation looks like
+Sets that cover the whole pupil evenly (a checkerboard, rings, all sets of modes) repeat the whole
+fit, and their scatter enters the σ of the registration. Halves, quadrants and alternate sectors do
+not: a distorted mirror moves opposite halves in opposite directions, and the two sides of an arm
+that the file lacks pull the rotation in opposite directions, which cancels over the pupil. They are
+compared and reported only. Bow ties are not used: along one diagonal a rotation looks like
 a stretch.
 """
 
@@ -45,8 +46,9 @@ mean over all partitions."""
 N_SECTORS = 12
 """Number of sectors; alternate sectors make a set."""
 
-HALVES = ("left and right half", "lower and upper half", "quadrants")
-"""Partitions of the pupil whose sets cover one side of it."""
+PARTS = ("left and right half", "lower and upper half", "quadrants", "alternate sectors")
+"""Partitions of the pupil whose sets cover one side of it, or one side of an arm. With arms that
+the file lacks, alternate sectors made σ of the rotation 50 times the error."""
 
 ACTUATORS = ("alternate sectors of actuators", "inner and outer actuators")
 """Partitions of modes whose responses are in different parts of the pupil."""
@@ -100,7 +102,7 @@ class DisjointSets:
     @property
     def even(self) -> bool:
         """True if each set covers the whole pupil, so that their scatter is that of α."""
-        return self.words not in HALVES
+        return self.words not in PARTS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -354,8 +356,8 @@ def jackknife_sigma(partitions: Sequence[DisjointSets]) -> Array:
     sets differ significantly counts by itself, because it shows an error that the others cannot: a
     distortion that explains the difference leaves the registration uncertain by as much.
     """
-    # A distorted mirror moves opposite halves in opposite directions, which cancels over the pupil,
-    # so halves would overstate the error of α.
+    # A distorted mirror moves opposite halves in opposite directions, and so does an arm its sides.
+    # That cancels over the pupil, so parts of it would overstate the error of α.
     found = [one for one in partitions if one.even]
     if not found:
         return np.zeros(4)
@@ -421,11 +423,11 @@ def pupil_partitions(
     away = np.hypot(x, y)
     found = {
         "checkerboard": (row + column) % 2,
-        "alternate sectors": _sector(x, y) % 2,
+        PARTS[3]: _sector(x, y) % 2,
         "inner and outer rings": away > np.median(away),
-        HALVES[0]: x > 0.0,
-        HALVES[1]: y > 0.0,
-        HALVES[2]: (x > 0.0) * 2 + (y > 0.0),
+        PARTS[0]: x > 0.0,
+        PARTS[1]: y > 0.0,
+        PARTS[2]: (x > 0.0) * 2 + (y > 0.0),
     }
     tiled = {
         words: np.tile(labels.astype(np.intp), n_planes)[rows] for words, labels in found.items()

@@ -49,7 +49,7 @@ def find_gain_causes(settled: Settled, *, passes: int, stroke_known: bool) -> It
         if np.all(gains < 0.0):
             yield (
                 "every mode answers with the wrong sign: commands or slopes have the other sign; "
-                "write sign = -1 into [slopes], or leave orientation to be found"
+                "turn the sign of orientation in [slopes], or leave orientation to be found"
             )
         return
     if stroke_known:

@@ -22,7 +22,7 @@ from pyrcal.importers.frames import Frames, describe_frames, frames_of
 from pyrcal.importers.imported import UNKNOWN, Array, Imported, Signals, in_arrays_file, matrix_of
 from pyrcal.importers.layouts import ROLES, find_lit, maps_of, mask_of, plane_of
 from service.errors import ConfigurationError, MatrixError
-from service.model.aperture import measure_aperture
+from service.model.aperture import OFF_CENTRE_SUBAP, measure_aperture
 from service.model.defects import explain_defects, find_defects
 
 RECORD, DATA, FORMAT = "pyrtc_calibration", "data", 2
@@ -59,6 +59,10 @@ UNITS_M = {"m": 1.0, "um": 1e-6, "nm": 1e-9}
 
 MIN_WIDTH_DIFFERENCE_SUBAP = 0.75
 """Difference of the widths of grid and pupil above which the pupil's width is recorded."""
+
+MIN_SHOWN_SUBAP = 12
+"""Smallest grid whose rows and columns show a narrower pupil: a disc of 8 subapertures that lacks a
+row and a column looks like one of 7."""
 
 MAX_ROWS_DIFFERENCE_SUBAP = 0.5
 """Difference of the diameter by area from the number of rows below which the rows count."""
@@ -285,7 +289,10 @@ def read_slopes(
     across = aperture.diameter_subap
     # Without a dark ring around it a mask may only lack a part of its rim.
     dark_ring = not (valid[[0, -1]].any() or valid[:, [0, -1]].any())
-    if dark_ring or (aperture.is_round and len(valid) - across > MIN_WIDTH_DIFFERENCE_SUBAP):
+    narrower = len(valid) - across > MIN_WIDTH_DIFFERENCE_SUBAP or (
+        len(valid) >= MIN_SHOWN_SUBAP and aperture.n_across < len(valid)
+    )
+    if dark_ring or (aperture.is_round and narrower):
         # A flux threshold changes the area rather than the number of rows.
         if abs(aperture.n_across - across) < MAX_ROWS_DIFFERENCE_SUBAP:
             across = aperture.n_across
@@ -434,6 +441,12 @@ def _sensor(reported: Reported, signals: Signals, notes: list[str]) -> dict[str,
         )
     if table.get("input") != "frames":
         valid = signals.arrays["valid_subapertures"].astype(bool)
+        x, y = measure_aperture(valid).centre
+        if "pupil_diameter_subap" not in table and np.hypot(x, y) > OFF_CENTRE_SUBAP:
+            notes.append(
+                f"pupil_diameter_subap = {len(valid)}: the width of the grid, although the mask is "
+                f"{x:+.2f}, {y:+.2f} off its middle: say --pupil-subap if the pupil is narrower"
+            )
         notes += _check_width(signals.arrays["interaction_matrix"], valid)
     return table
 

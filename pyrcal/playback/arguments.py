@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from pyrcal.fitting.arguments import INSTRUMENT
-from pyrcal.options import add, words
+from service.parser import words
 
 _TRACK = """
 Run the estimators of the service on recorded telemetry, without an RTC. The result is alpha over
@@ -25,19 +25,22 @@ input that cannot be used.
 
 def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     """Add the command to a command line."""
-    track = commands.add_parser("track", help="track the registration in recorded telemetry")
-    track.set_defaults(module="pyrcal.playback.track")
-    track.description, track.epilog = _TRACK, _EPILOG
-    track.examples = (
-        "pyrcal track flao-lbt recording.h5",
-        "pyrcal track bench.toml telemetry.fits --plot alpha.png --output track.h5",
-    )
-    add(
-        track,
-        words("instrument INSTRUMENT", INSTRUMENT),
-        words("telemetry TELEMETRY", "recording, AOT, pyRTC, HDF5, .mat or .npz", type=Path),
-        words("--config FILE", "settings of the service, TOML", type=Path),
-        words("--json", "print JSON"),
-        words("--plot FILE.png", "draw alpha over time", type=Path),
-        words("--output FILE.h5", "write all results", type=Path),
+    commands.add_parser(
+        "track",
+        help="track the registration in recorded telemetry",
+        module="pyrcal.playback.track",
+        description=_TRACK,
+        epilog=_EPILOG,
+        examples=(
+            "flao-lbt recording.h5",
+            "bench.toml telemetry.fits --plot alpha.png --output track.h5",
+        ),
+        options=(
+            words("instrument INSTRUMENT", INSTRUMENT),
+            words("telemetry TELEMETRY", "recording, AOT, pyRTC, HDF5, .mat or .npz", type=Path),
+            words("--config FILE", "settings of the service, TOML", type=Path),
+            words("--json", "print JSON"),
+            words("--plot FILE.png", "draw alpha over time", type=Path),
+            words("--output FILE.h5", "write all results", type=Path),
+        ),
     )

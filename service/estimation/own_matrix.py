@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.control.reconstructor import MAX_CONDITION
+from service.estimation.solver import SETTLED_STEP, Columns, Projection, shorten
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 from service.records.products import UNEVEN_RATIO
@@ -37,14 +38,8 @@ COLUMNS_GROWTH = 3
 MAX_FIT_STEPS = 6
 """Largest number of iterations of each fit."""
 
-SETTLED_STEP = np.array([0.003, 0.003, 3e-4, 3e-4])
-"""A shorter step ends a fit, numeric units."""
-
 LINEAR_RANGE = np.array([0.1, 0.1, np.deg2rad(0.5), 0.005])
 """Distance from its registration beyond which a linearisation is recomputed, numeric units."""
-
-MAX_STEP = np.array([0.7, 0.7, np.deg2rad(4.0), 0.04])
-"""Longest step of one iteration, numeric units."""
 
 MAX_STRANGE_SHARE = 0.3
 """Share of columns that may be no mode of the model before all are taken for another basis."""
@@ -123,9 +118,6 @@ class OwnMatrix:
 
     weights: tuple[float, ...] = ()
     """Weight of each mode of the basis for the measurement of α; empty if all count alike."""
-
-    left_over: LeftOver | None = None
-    """Residual of the matrix in the recognised modes; None if it was not computed."""
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -376,15 +368,13 @@ def _scatter(
     The sandwich estimator with a mode as the unit: a model that is wrong pulls each mode another
     way, and by more than the noise of its slopes would.
     """
-    usable = np.flatnonzero(modes >= 0)
-    if len(usable) <= N_PARAMETERS:
+    n_usable = np.count_nonzero(modes >= 0)
+    if n_usable <= N_PARAMETERS:
         return np.full((4, 4), np.inf)
-    normals, scores = _equations(
-        seen[:, usable], response[:, modes[usable]], near.derivatives[:, :, modes[usable]]
-    )
-    inverse = np.linalg.inv(normals)
+    found = _project(seen, modes, response, near)
+    inverse = np.linalg.inv(found.normal)
     # Corrects for the parameters that were fitted to the same modes.
-    spread = scores @ scores.T * (len(usable) / (len(usable) - N_PARAMETERS))
+    spread = found.scores @ found.scores.T * (n_usable / (n_usable - N_PARAMETERS))
     return np.asarray(inverse @ spread @ inverse.T)
 
 
@@ -401,13 +391,9 @@ def _fit_registration(
             near = linearise(alpha)
         response = near.matrix_at(alpha)
         modes = _recognise_columns(seen, columns, response)
-        usable = np.flatnonzero(modes >= 0)
-        if len(usable) < 3:
+        if np.count_nonzero(modes >= 0) < 3:
             return alpha, near
-        step = _step(
-            seen[:, usable], response[:, modes[usable]], near.derivatives[:, :, modes[usable]]
-        )
-        step = np.clip(step, -MAX_STEP, MAX_STEP)
+        step = shorten(_project(seen, modes, response, near).best_step)
         alpha = alpha.add_step(step)
         if np.all(np.abs(step) < SETTLED_STEP):
             break
@@ -432,21 +418,18 @@ def _recognise_columns(
     return np.where(taken >= MIN_MODE_CORRELATION, modes, -1)
 
 
-def _step(seen: Array, response: Array, derivatives: Array) -> Array:
-    """Return the step ``(4,)`` of α that explains columns of unit length, each with a free gain."""
-    normal, scores = _equations(seen, response, derivatives)
-    return np.asarray(np.linalg.solve(normal, scores.sum(axis=1)))
-
-
-def _equations(seen: Array, response: Array, derivatives: Array) -> tuple[Array, Array]:
-    """Return the normal matrix ``(4, 4)`` and the scores of the modes ``(4, n)`` of that step."""
-    length = np.linalg.norm(response, axis=0)
-    unit, moved = response / length, derivatives / length
-    gains = np.einsum("sm,sm->m", unit, seen)
-    # of every derivative only what is no gain of the mode itself
-    moved = moved - unit * np.einsum("sm,ksm->km", unit, moved)[:, None, :]
-    left = seen / gains - unit
-    return np.einsum("jsm,ksm->jk", moved, moved), np.einsum("jsm,sm->jm", moved, left)
+def _project(
+    seen: Array, modes: NDArray[np.intp], response: Array, near: Linearisation
+) -> Projection:
+    """Return the recognised columns, of unit length, against the model's ``response``."""
+    usable = np.flatnonzero(modes >= 0)
+    columns, model = seen[:, usable], response[:, modes[usable]]
+    # A weak response says as much of the registration as a strong one: each counts as if its
+    # gain were that of all.
+    along = np.einsum("sm,sm->m", model, columns) / np.linalg.norm(model, axis=0)
+    every = np.ones(len(columns), dtype=np.bool_)
+    measured = Columns(matrix=columns, weights=along**-2.0, rows=every)
+    return measured.project(model, near.derivatives[:, :, modes[usable]], np.float32)
 
 
 def _list_in_words(things: Sequence[object] | NDArray[np.intp]) -> str:

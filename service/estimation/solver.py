@@ -197,6 +197,11 @@ def within_limits(vector: Array) -> bool:
     return bool(np.all(np.abs(vector - [0.0, 0.0, 0.0, 1.0]) < MAX_DISTANCE))
 
 
+def shorten(step: Array) -> Array:
+    """Return a step of ``MAX_STEP`` at most; all four by one factor, which keeps its direction."""
+    return step / max(1.0, float(np.max(np.abs(step) / MAX_STEP)))
+
+
 def approach(
     model: InteractionModel,
     columns: Columns,
@@ -222,8 +227,7 @@ def approach(
             break
         damped = seen.normal + 1e-6 * np.diag(np.diag(seen.normal))
         step = np.linalg.solve(damped, seen.scores.sum(axis=1))
-        # All four are shortened by one factor, so that the direction of the step is kept.
-        step /= max(1.0, float(np.max(np.abs(step) / MAX_STEP)))
+        step = shorten(step)
         converged, tried = bool(np.all(np.abs(step) < approached)), step
         for _ in range(_HALVINGS):
             if allowed(vector + tried):

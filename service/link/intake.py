@@ -23,6 +23,7 @@ from service.link.statistics import MALFORMED, USED, Counters, LinkStatistics
 from service.link.telemetry_age import MAX_AGE_S, TelemetryAge
 from service.records import events as ev
 from service.records.alarms import OTHER_BASIS, SECOND_RTC
+from service.records.messages import compose
 from service.records.state import Level
 
 MAX_QUEUED_EVENTS: Final = 1024
@@ -111,6 +112,7 @@ class Intake:
         self._patience_s = endpoint.reorder_s
         self._basis_id: str | None = None
         self._config_id: str | None = None
+        self._may_rename = True
         self._modes: Collection[str] = ()
         self._shape: tuple[int, int] | None = None
         self._counts: Counter[str] = Counter()
@@ -131,10 +133,12 @@ class Intake:
     ) -> None:
         """Use only what names these; None: adopt the first one seen.
 
-        ``modes`` are configurations that the RTC may change between.
+        ``modes`` are configurations that the RTC may change between. Without them, and without a
+        ``config_id``, an RTC may have another one for each set of reference slopes.
         """
         with self._up_to_date():
             self._basis_id, self._config_id, self._modes = basis_id, config_id, modes
+            self._may_rename = config_id is None and not modes
 
     def set_wakeup(self, callback: Callable[[], object] | None, *, for_frames: bool = True) -> None:
         """Call ``callback``, from zenoh's threads, when something new is there."""
@@ -253,7 +257,7 @@ class Intake:
             self._essentials = found
             self._last_status_s = now_s
             self._age.add_status(status, now_s)
-            self._check_ids(status.basis_id, status.config_id, now_s)
+            self._check_ids(status, now_s)
             self._shape = (status.n_slopes, status.n_modes)
             self._put(status)
 
@@ -290,7 +294,7 @@ class Intake:
     def _complain(self, kind: str, error: WireError, now_s: float) -> None:
         self._counters.add(kind, MALFORMED, 1, now_s, str(error))
         if self._is_new(f"malformed {kind}", now_s):
-            text = f"{kind}: {error}"
+            text = compose("message.broken", kind, error=str(error))
             self._put(ev.LogEvent(name="message.malformed", text=text, level=Level.WARNING))
 
     def failed(self, kind: str) -> bool:
@@ -418,9 +422,7 @@ class Intake:
         """Return whether frames are of the session, basis, configuration and shape that count."""
         if not self._admit("frames", header.session, header.n, now_s):
             return False
-        wrong = self._check_ids(header.basis_id, header.config_id, now_s) or self._check_shape(
-            header
-        )
+        wrong = self._check_ids(header, now_s) or self._check_shape(header)
         if wrong:
             reason, text = wrong
             self._counters.add("frames", reason, header.n, now_s, text)
@@ -498,16 +500,22 @@ class Intake:
             self._put(ev.ConditionChanged(name=SECOND_RTC, text=told))
         return admission.accepted
 
-    def _check_ids(self, basis_id: str, config_id: str, now_s: float) -> tuple[str, str] | None:
+    def _check_ids(
+        self, message: wire.FrameHeader | wire.Status, now_s: float
+    ) -> tuple[str, str] | None:
         """Return which id is not the expected one, None: both are; adopt where none is."""
+        basis_id, config_id = message.basis_id, message.config_id
         if self._basis_id is None or self._config_id is None:
             self._basis_id = self._basis_id or basis_id
             self._config_id = self._config_id or config_id
             told = f"basis {self._basis_id}, configuration {self._config_id}"
             self._put(ev.LogEvent(name="ids.adopted", text=told))
         # The RTC may change the sensor's mode during a session; all modes of the instrument file
-        # are expected.
-        if basis_id == self._basis_id and config_id in self._modes:
+        # are expected. An RTC of version 1 may have named its reference slopes by this id: with
+        # other sizes it is another sensor, and else the tracker decides (``tracking/rtc.py``).
+        same_sizes = self._shape in {None, (message.n_slopes, message.n_modes)}
+        known = config_id in self._modes or (self._may_rename and same_sizes)
+        if basis_id == self._basis_id and known:
             self._config_id = config_id
         expected, found = (self._basis_id, self._config_id), (basis_id, config_id)
         if found == expected:

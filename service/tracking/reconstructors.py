@@ -9,6 +9,7 @@ from service.estimation.loop import NO_RTC, extend_gains, last_seq, select_gains
 from service.records import alarms
 from service.records import events as ev
 from service.records.alarms import Interlock, alarm_blocks, blocking_alarm
+from service.records.messages import compose
 from service.records.products import Assessment, MatrixState, ReconstructorRecord
 from service.records.state import Level, Mode, TrackerState
 from service.tracking import update_policy
@@ -52,7 +53,17 @@ def check_sendable(
         if alarm_blocks(alarm, interlock) and not (of_swap and alarm.name in _OF_A_SWAP):
             return alarm.text
     unread = explain_unread_matrix(state, state.loop.rtc.cm_id)
-    return unread if unread or was_used else check_proven(state, record)
+    return unread if unread or was_used else _check_renaming(state) or check_proven(state, record)
+
+
+def _check_renaming(state: TrackerState) -> str | None:
+    """Return that nothing has shown the sensor to be the same under another name, or None."""
+    if state.loop.renamed_ns_utc is None or state.loop.rtc is None:
+        return None
+    return (
+        f"the RTC's config_id is {state.loop.rtc.config_id}, it was another: no window has shown "
+        "yet that the sensor is the same"
+    )
 
 
 def check_approved(
@@ -224,6 +235,13 @@ def forget_session(context: StepContext) -> None:
         margin=None,
         assessment=None,
         judged_ns_utc=None,
+    )
+
+
+def verify_again(context: StepContext) -> None:
+    """Have the matrix in use read again before anything new is sent."""
+    context.matrices = replace(
+        context.matrices, verified_ids=frozenset(), applied_asked_ns_utc=0, read_back_error=""
     )
 
 
@@ -425,8 +443,7 @@ def on_acknowledgement(context: StepContext, event: Acknowledgement) -> None:
         return
     record = context.state.reconstructor(event.id)
     if record is None:
-        text = f"an acknowledgement for {event.id}, which this service never sent"
-        context.warn("acknowledgement.unknown", text)
+        context.warn("acknowledgement.unknown", compose("acknowledgement.not-ours", id=event.id))
         return
     if not _is_old(context.state, record, event):
         with context.because_of(record.cause):

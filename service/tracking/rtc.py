@@ -9,6 +9,7 @@ from service.records import alarms
 from service.records import events as ev
 from service.records.events import Effect
 from service.records.products import MatrixState
+from service.records.state import ModelState
 from service.tracking import (
     dither,
     mode_proof,
@@ -21,7 +22,7 @@ from service.tracking.operator import end_ramp
 from service.tracking.policy import SECOND_NS
 from service.tracking.step_context import StepContext, log_bursts
 from service.wire import Command as Request
-from service.wire import Status
+from service.wire import LoopRequest, Reply, Status
 
 ACKNOWLEDGEMENT_TIMEOUT_S = 3.0
 """An RTC applies within 2 s of the commit, or it has failed."""
@@ -67,14 +68,17 @@ def on_status(context: StepContext, rtc: Status) -> None:
     if registration is not None and bias is not None and bias.looked_ns_utc and elsewhere:
         # it was learnt in another loop, in whichever session
         validity.store_registration(context, replace(registration, bias=None))
+    pending = context.loop.commanded_modes
     context.loop = replace(
         context.loop,
         rtc=rtc,
+        commanded_modes=None if pending == rtc.n_controlled else pending,
         # Pinned by the instrument file or the first status: a later one does not replace them.
         basis_id=context.loop.basis_id or rtc.basis_id,
         config_id=context.loop.config_id or rtc.config_id,
     )
     _note_references(context, rtc)
+    _note_renaming(context, before, rtc)
     validity.note_pointing(context, rtc.pointing)
     _drop_other_basis(context)
     mode_proof.believe_restored(context, rtc)
@@ -98,6 +102,40 @@ def on_loop_held(context: StepContext, event: ev.LoopHeld) -> None:
     context.loop = replace(context.loop, holds=event.holds)
 
 
+def on_modes_commanded(context: StepContext, event: ev.ModesCommanded) -> None:
+    """Store the number of modes until a status shows it: the status lags behind the answer."""
+    context.loop = replace(context.loop, commanded_modes=event.n_modes)
+
+
+def on_loop_answer(context: StepContext, request: LoopRequest, reply: Reply) -> None:
+    """Store the number of modes that an order has set."""
+    if reply.accepted and request.n_controlled is not None:
+        context.loop = replace(context.loop, commanded_modes=request.n_controlled)
+
+
+def on_modes_unknown(context: StepContext, _: Effect | Request, __: str) -> None:
+    """Believe the next status: what failed may have been accepted."""
+    context.loop = replace(context.loop, commanded_modes=None)
+
+
+def on_model_changed(context: StepContext, event: ev.ModelChanged) -> None:
+    """Store what a job of the worker has made of the model."""
+    model = event.model
+    # The job may have begun before the sensor's mode changed: its results belong to that mode.
+    if model.sensor_mode == context.model.sensor_mode:
+        context.model = replace(
+            context.model,
+            slopes=model.slopes,
+            own_matrix_read=model.own_matrix_read,
+            response=model.response,
+            own_residual=model.own_residual,
+            dither_session=model.dither_session,
+            dithered=model.dithered,
+            strength=model.strength,
+            linearised_at=model.linearised_at,
+        )
+
+
 def _log_partial_loop(context: StepContext, before: Status | None, rtc: Status) -> None:
     """Say how many modes are in the loop where it is not all that are controlled."""
     n_before = rtc.n_controlled if before is None else len(before.in_loop)
@@ -117,6 +155,37 @@ def _note_references(context: StepContext, rtc: Status) -> None:
         context.loop = replace(context.loop, reference_since_ns_utc=context.now_ns)
         text = f"the RTC subtracts the reference slopes {name}, they were {before}"
         context.log("references.changed", text)
+
+
+def _note_renaming(context: StepContext, before: Status | None, rtc: Status) -> None:
+    """Let matrix and response show that a sensor is the same under another ``config_id``.
+
+    The link refuses one that the instrument file fixes, and one that comes with other sizes.
+    """
+    loop, registration = context.loop, context.registration
+    known = loop.config_id if before is None else before.config_id
+    if rtc.config_id != known:
+        context.loop = replace(context.loop, renamed_ns_utc=rtc.t_ns)
+        reconstructors.verify_again(context)
+        validity.request_window(context, "the RTC has another config_id")
+        text = (
+            f"the RTC's config_id has changed from {known} to {rtc.config_id} with the same number "
+            "of slopes and modes: R-31 allows that for another mask, slope recipe, binning or "
+            "modulation only. It is taken for new reference slopes: have the RTC name them by "
+            "reference_id"
+        )
+        context.raise_alarm(alarms.RENAMED, context.alarm_text(alarms.RENAMED) or text)
+        return
+    since_ns = loop.renamed_ns_utc
+    if since_ns is None or registration is None or registration.window_began_ns_utc < since_ns:
+        return
+    contradicted = {alarms.WRONG_MATRIX, alarms.WRONG_ANSWER} & {
+        alarm.name for alarm in context.alarms.active
+    }
+    if reconstructors.explain_unread_matrix(context.state, rtc.cm_id) or contradicted:
+        return
+    context.loop = replace(context.loop, renamed_ns_utc=None)
+    context.log("sensor.same", f"matrix and response are the model's with {rtc.config_id}, too")
 
 
 def _drop_other_basis(context: StepContext) -> None:
@@ -141,6 +210,9 @@ def _enter_sensor_mode(context: StepContext, config_id: str) -> None:
     update_policy.forget_limit(context)
     # An RTC that does not name its references is named by its mode: that says nothing of them.
     context.loop = replace(context.loop, config_id=config_id, reference_id=None)
+    # Order and signs of the slopes are those of every mode; all else is measured again.
+    slopes, context.model = context.model.slopes, ModelState()
+    context.model = replace(context.model, sensor_mode=config_id, slopes=slopes)
     pointing_law.begin_law(context)
     kept, scale = "", context.policy.alpha_scale(before, config_id)
     if scale is not None and context.registration is not None:
@@ -168,7 +240,7 @@ def _begin_anew(context: StepContext, because: str) -> None:
     # α belongs to the telescope and is kept, but windows must confirm it.
     validity.require_new_windows(context)
     context.retry_all()
-    context.loop = replace(context.loop, rtc=None, holds=False)
+    context.loop = replace(context.loop, rtc=None, holds=False, commanded_modes=None)
     dither.note_found(context)
     context.clear_alarm(alarms.MIRROR_SILENT)
     dither.forget_unwanted(context)

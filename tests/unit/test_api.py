@@ -46,6 +46,7 @@ from service.records.commands import (
     StopDither,
     UnmuteAlarm,
 )
+from service.records.messages import as_message
 from service.records.operations import (
     Acquisition,
     AcquisitionStage,
@@ -869,7 +870,9 @@ ADA = OperatorNote(by="Ada", reason="known", t_ns_utc=80 * SECOND)
 
 async def test_alarms_are_those_that_last_went_unseen_or_are_muted(client, service):
     service.change(
-        active=(Alarm(name="loop-open", since_ns_utc=70 * SECOND, text="open"),),
+        active=(
+            Alarm(name="loop-open", since_ns_utc=70 * SECOND, message=as_message("x", "open")),
+        ),
         records=(
             AlarmRecord(name="loop-open", worst=Severity.WARNING, acknowledged=ADA),
             AlarmRecord(name="margin", worst=Severity.CRITICAL, text="bad", over_ns_utc=9 * SECOND),

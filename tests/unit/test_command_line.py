@@ -281,9 +281,10 @@ def interrupted_at(module, words, number):
 @pytest.mark.parametrize(
     ("module", "words", "status"),
     [
-        ("pyrcal.options", ["sim", "--seconds", "1"], 0),  # imported before sim_rtc takes over
+        # imported before sim_rtc takes over
+        ("pyrcal.client.remote", ["sim", "--seconds", "1"], 0),
         ("structlog", ["sim", "--seconds", "1"], 0),
-        ("pyrcal.options", ["fit", "flao-lbt", __file__], 130),
+        ("pyrcal.client.remote", ["fit", "flao-lbt", __file__], 130),
     ],
 )
 def test_an_interrupted_import_ends_without_a_traceback(module, words, status, number):

@@ -617,6 +617,34 @@ def test_frames_of_a_known_mode_of_the_sensor_are_used_and_of_another_named(cloc
     )
 
 
+def test_an_rtc_that_names_its_references_by_its_configuration_is_used(intake):
+    send(intake, 0)
+    send(intake, 10, config_id="references-1")
+    send(intake, 20)
+    assert spans(intake.drain()) == [("s1", 0, 10), ("s1", 10, 10), ("s1", 20, 10)]
+    assert not any(intake.statistics().frames_refused.values())
+    assert not [event for event in intake.events() if isinstance(event, ev.ConditionChanged)]
+
+
+def test_a_configuration_with_other_sizes_is_another_sensor(intake):
+    say(intake)
+    send(intake, 0)
+    send(intake, 10, config_id="mask-2", n_slopes=4)
+    assert intake.statistics().frames_refused == {"config": 10}
+    assert [event.name for event in intake.events() if isinstance(event, ev.ConditionChanged)] == [
+        "basis-mismatch"
+    ]
+
+
+@pytest.mark.parametrize("expected", [("b", "c", ()), ("b", None, ("c", "d"))])
+def test_a_configuration_that_the_instrument_file_states_is_the_only_one(clock, expected):
+    intake = Intake(Endpoint(system="bench"), clock)
+    intake.expect(*expected)
+    send(intake, 0)
+    send(intake, 10, config_id="references-1")
+    assert intake.statistics().frames_refused == {"config": 10}
+
+
 def test_a_batch_is_judged_by_what_was_expected_when_it_came(clock):
     intake = Intake(Endpoint(system="bench"), clock)
     send(intake, 0)

@@ -148,11 +148,10 @@ def abort_on_command(context: StepContext, _: cmd.AbortAcquisition) -> None:
 def on_mode_set(context: StepContext, command: cmd.SetMode) -> None:
     """End an acquisition that nobody ordered, unless the mode is auto; hold back none any more."""
     acquisition = context.acquisition
-    if not acquisition.under_way:
-        if acquisition.held_off:
-            text = f"an operator has set the mode, {command.mode}, since the last was ended"
-            _forget(context, text)
-    elif command.mode is not Mode.AUTO and not acquisition.commanded:
+    if acquisition.held_off:
+        text = f"an operator has set the mode, {command.mode}, since the last was ended"
+        _forget(context, text)
+    elif acquisition.under_way and not acquisition.commanded and command.mode is not Mode.AUTO:
         abort_acquisition(context, f"because the mode is {command.mode}")
 
 
@@ -230,7 +229,7 @@ def on_dither_answer(context: StepContext, _: DitherRequest, reply: Reply) -> No
 def on_lost(context: StepContext, event: ev.WindowLost) -> None:
     """Count a window of an open loop that no registration explains."""
     if event.refused.kind is RefusalKind.NOT_FOUND:
-        _note_miss(context, event.refused.reason)
+        _note_miss(context, str(event.refused.reason))
 
 
 def advance(context: StepContext) -> None:

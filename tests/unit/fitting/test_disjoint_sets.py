@@ -82,6 +82,31 @@ def test_halves_of_the_pupil_are_compared_and_do_not_enter_sigma():
     assert np.all(jackknife_sigma([one]) == 0.0)
 
 
+def test_both_sides_of_an_arm_turn_the_mirror_in_opposite_directions_and_not_in_sigma():
+    """Sigma of the rotation stays that of the noise, although alternate sectors are 2 apart."""
+    rng = np.random.default_rng(9)
+    valid = np.hypot(*(np.indices((18, 18)) - 8.5)) < 9.0
+    y, x = np.argwhere(valid).T - 8.5
+    angle, away = np.tile(np.arctan2(y, x), 2), np.tile(np.hypot(x, y), 2)
+    # Arms at 30, 150 and 270 deg are along edges of sectors.
+    off_arm = (angle - np.pi / 6.0 + np.pi / 3.0) % (2.0 * np.pi / 3.0) - np.pi / 3.0
+    wrong = np.where(np.abs(off_arm) < np.pi / 6.0, np.sign(off_arm), 0.0)
+    jacobian = (
+        rng.normal(size=(4, len(angle), N_MODES)) * np.array([1.0, 1.0, 0.0, 1.0])[:, None, None]
+    )
+    jacobian[2] = away[:, None] * rng.normal(size=(len(angle), N_MODES))
+    residual = rng.normal(size=(len(angle), N_MODES)) + wrong[:, None] * jacobian[2]
+    one = np.ones(N_MODES)
+    seen = Projection(gains=one, residual=residual, jacobian=jacobian, weights=one)
+    residual = residual - np.tensordot(seen.best_step, jacobian, axes=1)
+    parts, sets = comparison(replace(seen, residual=residual))
+    labels = pupil_partitions(valid, 2, np.ones(len(angle), dtype=bool))
+    found = list(sets.of_rows(labels, parts))
+    sectors = next(one for one in found if one.words == "alternate sectors")
+    assert np.ptp(sectors.steps[:, 2]) > 1.0
+    assert jackknife_sigma(found)[2] < 0.1
+
+
 def test_partitions_of_a_pupil_list_every_slope_that_counts():
     valid = np.hypot(*(np.indices((10, 10)) - 4.5)) < 5.0
     rows = np.ones(2 * int(valid.sum()), dtype=bool)

@@ -69,6 +69,24 @@ def test_places_of_pupil_images_in_the_file_are_questioned(stated):
         assert named[0].words in found.recommendation
 
 
+@pytest.mark.parametrize("modulation", [0.0, 3.0])
+def test_a_pupil_off_the_middle_is_found_although_the_mask_lacks_columns(modulation):
+    """A pyramid of another code, one subaperture off; without its place 9 to 24 % is left over."""
+    draw = Draw(code="fft", condition=Condition(modulation_lambda_over_d=modulation), seed=3)
+    ((_, measured),) = drawn_matrices([draw])
+    kept = measured.valid & (np.arange(12) < (10 if modulation == 0.0 else 11))
+    planes = measured.matrix.reshape(2, int(measured.valid.sum()), -1)[:, kept[measured.valid]]
+    about = instrument_of(draw, measured)
+    grid = {"n_subapertures": 14, "valid_subapertures": np.pad(kept, ((2, 0), (0, 2)))}
+    about = replace(about, wfs=replace(about.wfs, **grid, pupil_diameter_subap=12.0))
+    found = fit_matrix(about, Reference(matrix=planes.reshape(-1, planes.shape[2])), FitOptions())
+    error = found.alpha.vector - draw.alpha.vector - np.array([-1.0, 1.0, 0.0, 0.0])
+    assert found.accepted
+    assert np.all(np.abs(error) < 3.0 * found.sigma)
+    assert np.all(np.abs(error[:2]) < 0.002)
+    assert found.residual_fraction < 0.02
+
+
 def test_file_values_are_fitted_with_the_images_where_the_fit_displaced_them():
     """The file's values are the true ones, so that fitted ones explain no more."""
     models = FitModels(instrument=instrument(), basis=small_basis())

@@ -190,6 +190,21 @@ def test_the_grid_stays_where_the_file_has_it(way):
     assert any("--pupil-subap" in note for note in imported.notes)
 
 
+@pytest.mark.parametrize(("across", "read"), [(16, 16), (8, None)])
+def test_a_whole_mask_beside_one_line_more_shows_the_width_of_the_pupil(across, read):
+    """A disc of 8 subapertures that lacks a row and a column looks like one of 7."""
+    rows, columns = np.mgrid[:across, :across] - (across - 1) / 2.0
+    valid = np.hypot(rows, columns) <= across / 2.0 + 0.1
+    if read is None:
+        valid[0] = valid[:, 0] = False
+    else:
+        valid = np.pad(valid, ((1, 0), (0, 1)))
+    matrix = np.random.default_rng(1).normal(size=(2 * int(valid.sum()), 5))
+    imported = from_arrays("x", arrays(matrix=matrix, valid=valid), REPORTED)
+    assert imported.tables["wfs"].get("pupil_diameter_subap") == read
+    assert sum("--pupil-subap" in note for note in imported.notes) == 1
+
+
 def test_slopes_of_as_many_modes_as_subapertures_are_no_frames():
     n = int(VALID.sum())
     matrix = np.random.default_rng(1).normal(size=(2 * n, n))

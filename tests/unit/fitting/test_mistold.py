@@ -13,6 +13,7 @@ import pytest
 from pyrcal.fitting.matrix import FitOptions, fit_matrix
 from pyrcal.fitting.models import Optic
 from pyrcal_studies.drawn_fits import Condition, Draw, instrument_of
+from pyrcal_studies.drawn_fits import fitted as drawn_fit
 from pyrcal_studies.drawn_fits import measured as drawn_matrices
 from service.errors import ModelError
 from service.estimation.reference import Reference
@@ -61,6 +62,23 @@ def test_whatever_coupling_is_told_the_registration_is_right_and_the_coupling_fo
     named = any(f"coupling = {width.found:.3g}" in remark for remark in found.remarks)
     assert named == (told != COUPLING)
     assert not any("modulation" in remark for remark in found.remarks)
+
+
+@pytest.mark.parametrize(
+    ("told", "corrections"),
+    [
+        ("order of slopes", {"slopes.order": "xy", "slopes.orientation": {"sign": 1}}),
+        # Single columns named of a fit that has found nothing would be those of chance.
+        ("pairs of modes exchanged", {}),
+    ],
+)
+def test_a_wrong_order_is_refused_and_of_slopes_corrected(told, corrections):
+    draw = Draw(code="fft", condition=Condition(told=told), seed=700)
+    ((_, found),) = drawn_matrices([draw])
+    refused = drawn_fit(draw, found)
+    assert not refused.accepted
+    assert refused.corrections == corrections
+    assert "column" not in refused.recommendation
 
 
 @pytest.mark.parametrize("told", [1.5, 6.0])

@@ -6,11 +6,20 @@ import pytest
 from service.errors import CommandError
 from service.records import commands as cmd
 from service.records import events as ev
+from service.records.alarms import ALARMS, Severity
 from service.records.products import MatrixState
 from service.records.state import Level, Mode
 from service.tracking.dither_request import DEFAULT_DURATION_S
 from service.wire import DitherRequest
-from tests.support.situations import SECOND, Story, dither_answered, of_kind, rtc, stopping
+from tests.support.situations import (
+    SECOND,
+    Story,
+    dither_answered,
+    estimate,
+    of_kind,
+    rtc,
+    stopping,
+)
 from tests.support.states import changed
 
 
@@ -94,6 +103,69 @@ def test_the_first_references_are_no_change_and_those_of_a_new_session_may_be():
     story.tell(ev.SessionStarted(session="s2"))
     story.tell(rtc(session="s2", reference_id="ncpa-1"))
     assert story.state.loop.reference_since_ns_utc == story.now_ns
+
+
+def renamed(story, config_id):
+    """Let the RTC name its configuration otherwise a second later; it does not show its matrix."""
+    story.shows = False
+    story.wait(1.0)
+    return story.tell(rtc(config_id=config_id))
+
+
+def shown(story):
+    story.tell(ev.MatrixFetched(record=story.state.reconstructor("initial")))
+
+
+def test_a_renamed_sensor_is_told_once_and_its_matrix_is_read_again(story):
+    fetched = ev.FetchMatrix(id="initial")
+    assert fetched in renamed(story, "references-1")
+    first = story.state.alarm("sensor-renamed")
+    assert "R-31" in first.text
+    assert ALARMS["sensor-renamed"].severity is Severity.WARNING
+    shown(story)
+    assert fetched in renamed(story, "references-2")
+    assert story.logged.count("sensor-renamed") == 1
+    assert story.state.alarm("sensor-renamed").text == first.text
+    assert story.state.loop.config_id == "pyramid-30"
+    story.tell(ev.SessionStarted(session="s2"))
+    assert "sensor-renamed" not in story.alarms
+
+
+def test_a_renamed_sensor_gets_a_new_matrix_once_matrix_and_window_agree(story):
+    story.make("cm-1")
+    renamed(story, "references-1")
+    with pytest.raises(CommandError, match="being read back"):
+        story.tell(cmd.Approve(id="cm-1"))
+    shown(story)
+    with pytest.raises(CommandError, match="references-1"):
+        story.tell(cmd.Approve(id="cm-1"))
+    story.see(n_windows=1)
+    story.tell(rtc(config_id="references-1"))
+    assert "sensor.same" in story.logged
+    story.tell(cmd.Approve(id="cm-1"))
+    assert story.asked(ev.SendMatrix)
+
+
+def test_a_window_from_before_shows_nothing_of_a_renamed_sensor(story):
+    before_ns = story.now_ns
+    renamed(story, "references-1")
+    shown(story)
+    window = ev.WindowFitted(estimate=estimate(t_ns=story.now_ns), began_ns_utc=before_ns)
+    n_accepted = story.state.windows.accepted
+    story.tell(window)
+    story.tell(rtc(config_id="references-1"))
+    assert story.state.windows.accepted == n_accepted + 1
+    assert "sensor.same" not in story.logged
+
+
+@pytest.mark.parametrize("name", ["matrix-mismatch", "response-mismatch"])
+def test_a_renamed_sensor_that_contradicts_the_model_stays_in_doubt(story, name):
+    renamed(story, "references-1")
+    shown(story)
+    story.see(n_windows=1)
+    story.tell(ev.ConditionChanged(name=name, text="it differs", t_ns_utc=story.now_ns))
+    story.tell(rtc(config_id="references-1"))
+    assert story.state.loop.renamed_ns_utc is not None
 
 
 def test_an_open_loop_is_an_alarm_until_it_is_closed(story):

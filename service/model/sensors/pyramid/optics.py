@@ -309,23 +309,12 @@ class PyramidOptics:
     def images(self, shift: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
         """Return the light at rest ``(2, n, 2, n)``: side, row along y, side, column along x."""
         n, nodes = self.wfs.n_subapertures, Nodes.area(self.n_nodes)
-        images, amplitude = np.empty((2, n, 2, n)), self.pupil.amplitude.astype(self._complex)
+        images = np.empty((2, n, 2, n))
         for grid in self._grids:
             roof_y = self._roof(shift[1] + grid.y, nodes, grid.sides_y)
             roof_x = self._roof(shift[0] + grid.x, nodes, grid.sides_x)
-            modulated_y, modulated_x = self._modulate_roof(roof_y, roof_x)
-            axes = (*modulated_y.shape[1:-1], n, *modulated_x.shape[2:-1])
-            power = np.zeros((math.prod(axes[:3]), math.prod(axes[3:])))
-            # Source by source: without a gradient nobody needs the fields themselves.
-            for left, right in zip(modulated_y, modulated_x.swapaxes(0, 1), strict=True):
-                seen = (
-                    left.reshape(len(power), -1) @ amplitude @ right.reshape(-1, len(amplitude)).T
-                )
-                power += seen.real**2 + seen.imag**2
-            light = np.einsum(
-                "iyajxpb,a,b->yixj", power.reshape(axes), roof_y.weights, roof_x.weights
-            )
-            images[grid.sides_y, :, grid.sides_x] = light / self._all_light
+            fields_at_rest = self._fields(*self._modulate_roof(roof_y, roof_x))
+            images[grid.sides_y, :, grid.sides_x] = self._images(fields_at_rest, roof_y, roof_x)
         return images
 
     @property

@@ -306,5 +306,20 @@ class ModeGainTable:
     relative_sigma: list[float]
     """1 σ of each as a share of it; it grows away from the measured modes."""
 
+    sigma: list[float]
+    """1 σ of each."""
+
     factor: list[float]
     """Factor for one loop gain of all modes, for each mode: mean 1, range 0.5 to 2."""
+
+    t_ns_utc: int | None
+    """End of the last window in which one of them was measured; None if none was."""
+
+    reference_id: str | None
+    """Reference slopes that the RTC used; None if unknown."""
+
+    magnitude: float | None = None
+    """Magnitude of the guide star now; None if unknown, or of an earlier time."""
+
+    frame_rate_hz: float | None = None
+    """Frame rate now; None if of an earlier time."""

@@ -112,7 +112,7 @@ def _on_condition(context: StepContext, event: ev.ConditionChanged) -> None:
     if event.over:
         validity.end_alarm(context, event.name, event.t_ns_utc)
     elif event.name == alarms.MIRROR_SILENT:
-        dither.stop_unanswered(context, event.text)
+        dither.stop_unanswered(context, str(event.text))
     else:
         context.raise_alarm(event.name, event.text)
 

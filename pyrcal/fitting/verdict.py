@@ -39,6 +39,10 @@ MAX_WITHOUT_CAUSE = 0.4
 """Largest RMS share of the signal that may be left over beyond noise where nothing that was tried
 explains any of it."""
 
+MOST_OF_SIGNAL = 0.9
+"""RMS share of the signal left over by a fit that did not converge above which noise may be the
+cause: four times as much noise as signal left 0.94."""
+
 NOTABLE_STRUCTURE = 0.09
 """RMS share of the signal in the structured residual above which a note names a cause."""
 
@@ -200,7 +204,7 @@ def _describe_quality(findings: FitFindings) -> str:
 def _check_convergence(findings: FitFindings) -> str:
     if findings.solution.converged:
         return ""
-    noise = "" if findings.explained else "there is too much noise, "
+    noise = "" if findings.residual_fraction < MOST_OF_SIGNAL else "there is too much noise, "
     return (
         f"the fit did not converge: {noise}the modes (basis or order) or the instrument file do "
         "not match the matrix, or a start that was given (--start) is outside the capture range"

@@ -33,6 +33,7 @@ from service.records.estimates import (
     WindowRefused,
 )
 from service.records.events import Event
+from service.records.messages import compose
 from service.records.operations import MeasurementRecord, MeasureState, NoisyFinding
 from service.records.state import Level, TrackerState
 from service.runtime.ports import StorePort, WorkerPort
@@ -79,8 +80,7 @@ class PendingWindow:
         if waiting is None:
             return None
         return WindowRefused(
-            reason="the worker had no hand free before the dither, the reconstructor or the "
-            f"session changed, or for {MAX_WINDOW_SPAN_S:.0f} s: the window was given up",
+            reason=compose("window.given-up", most_s=MAX_WINDOW_SPAN_S),
             t_ns_utc=waiting.t_end_ns_utc,
         )
 
@@ -146,7 +146,7 @@ async def _outcome(
         found, nominal = state.operations.acquisition.alpha, state.alpha.law.nominal
         return await workers.call(OpticsWorker.find, window, found, flux, nominal)
     if rtc is None:
-        return WindowRefused(reason="the RTC is not known", t_ns_utc=window.t_end_ns_utc)
+        return WindowRefused(reason=compose("window.no-rtc"), t_ns_utc=window.t_end_ns_utc)
     loop = ClosedLoop(
         # In a thread, because a matrix that is not in memory is read from the archive.
         reconstructor=await asyncio.to_thread(_reconstructor, window, state, matrix_of),

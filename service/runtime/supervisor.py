@@ -28,6 +28,7 @@ from service.records import events as ev
 from service.records.alarms import CLOCK_LEAPT, Prerequisite
 from service.records.estimates import RefusalKind
 from service.records.events import Effect, Event
+from service.records.messages import Message, compose
 from service.records.operations import MeasureState
 from service.records.state import Level, TrackerState
 from service.runtime import archiving, command_results, readiness, worker
@@ -97,8 +98,10 @@ class Supervisor:
             audit=self._writer.add,
         )
         """Telemetry kept on request."""
-        self.complaints = {CLOCK_LEAPT: self._clock.complaint}
-        """Functions that return the text of an alarm, empty for none; called each second."""
+        self.complaints: dict[str, Callable[[], str | Message | None]] = {
+            CLOCK_LEAPT: self._clock.complaint
+        }
+        """Functions that return the text of an alarm, or nothing for none; called each second."""
         self._pending_window = PendingWindow()
         self._n_readings = 0
         self._own_matrix_read = asyncio.Event()
@@ -556,7 +559,7 @@ class Supervisor:
         given_up = known is not None and known.state is MeasureState.GIVEN_UP
         if known is not None and (given_up or known.pattern is None):
             why = "it had been given up" if given_up else "a noisy one had this id"
-            text = f"{known.id} came after {why}: it is not kept"
+            text = compose("measurement.late", why, id=known.id)
             self._note("measurement.ignored", text, Level.INFO)
             return
         try:
@@ -566,7 +569,7 @@ class Supervisor:
                 self._writer.failed(error)
             self._note("measurement.not-kept", str(error), Level.WARNING)
 
-    def _note(self, name: str, text: str, level: Level) -> None:
+    def _note(self, name: str, text: str | Message, level: Level) -> None:
         self._post(ev.LogEvent(name=name, text=text, level=level))
 
     def _tell(self, before: TrackerState) -> None:

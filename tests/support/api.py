@@ -14,6 +14,7 @@ from service.link.statistics import LinkStatistics
 from service.model.misregistration import Misregistration
 from service.records.alarms import Alarm
 from service.records.commands import Refit
+from service.records.messages import as_message
 from service.records.operations import (
     Dither,
     DitherPhase,
@@ -179,9 +180,20 @@ STATE = tracker_state(
         consistent=True,
         text="agrees",
     ),
-    active=(Alarm(name="rtc.silent", since_ns_utc=70 * SECOND, text="no status: look at it"),),
+    active=(
+        Alarm(
+            name="rtc.silent",
+            since_ns_utc=70 * SECOND,
+            message=as_message("x", "no status: look at it"),
+        ),
+    ),
     log=tuple(
-        LogEntry(t_ns_utc=k, level=Level.INFO, name="window.accepted", text=f"window {k}")
+        LogEntry(
+            t_ns_utc=k,
+            level=Level.INFO,
+            name="window.accepted",
+            message=as_message("x", f"window {k}"),
+        )
         for k in range(4)
     ),
     accepted=4,

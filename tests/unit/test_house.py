@@ -6,6 +6,7 @@ What is not so yet is listed here by name. No list may grow, and what has been m
 import ast
 import re
 from collections import defaultdict
+from string import Formatter
 from typing import get_args
 
 import grimp
@@ -14,6 +15,7 @@ import pytest
 from service.records.alarms import ALARMS
 from service.records.commands import Instruction
 from service.records.events import Event
+from service.records.messages import ABOUT, SENTENCES
 from tests.support.repository import HELD, ROOT
 
 WORDS_TOO = {"acquisition", "archive-failed", "dither", "margin"}
@@ -44,8 +46,8 @@ def test_records_lie_at_the_ground():
         for imported in imports.find_modules_directly_imported_by(module):
             if imported.startswith("service.") and imported not in ground:
                 assert imported.startswith(("service.records.", "service.wire", "service.files"))
-    assert len(imports.find_upstream_modules("service.records.state")) <= 12
-    assert len(imports.find_upstream_modules("service.link.intake")) <= 26
+    assert len(imports.find_upstream_modules("service.records.state")) <= 13
+    assert len(imports.find_upstream_modules("service.link.intake")) <= 27
 
 
 def test_no_test_module_imports_another():
@@ -152,3 +154,39 @@ def names_imported(module, *, has_children):
                 for part in node.values
             ]
             yield "".join(part or "?" for part in parts)
+
+
+def composed():
+    """Return each code of a message in service, with the names of its values; names of lines."""
+    codes, lines = defaultdict(list), set()
+    for path in (ROOT / "service").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.Call):
+                continue
+            called = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            first = node.args[0] if node.args else None
+            names = [one.value for one in ast.walk(first or node.func) if is_text(one)]
+            if called == "compose":
+                about = {ABOUT} if len(node.args) > 1 else set()
+                for code in names:
+                    codes[code].append(about | {word.arg for word in node.keywords})
+            elif called in {"log", "warn", "logged", "_note", "as_message"}:
+                lines |= set(names)
+    return codes, lines
+
+
+def is_text(node):
+    return isinstance(node, ast.Constant) and isinstance(node.value, str)
+
+
+def test_each_message_has_its_sentence_and_each_sentence_its_values():
+    codes, lines = composed()
+    assert codes.keys() == SENTENCES.keys()
+    for code, sentence in SENTENCES.items():
+        names = {name for _, name, _, _ in Formatter().parse(sentence) if name is not None}
+        # What makes it another message need not be said.
+        assert all(given - {ABOUT} == names - {ABOUT} for given in codes[code]), code
+        assert all(names & {ABOUT} <= given for given in codes[code]), code
+    # A line without a code of its own has its name as code, and its text as the sentence.
+    assert not lines & SENTENCES.keys()
+    assert len(lines) > 60

@@ -18,6 +18,7 @@ from service.records.alarms import (
     Prerequisite,
     Responsible,
 )
+from service.records.messages import as_message
 from service.records.registration import Validity
 from service.runtime.archiving import ids_of
 from tests.support.api import LINK, SECOND, STATE, assert_problem
@@ -72,7 +73,11 @@ UNITS = ("_seconds", "_meters", "_bytes", "_ratio", "_radians", "_subapertures")
 @pytest.fixture
 async def families(client, service):
     """Every metric there is, of a service that knows everything."""
-    service.change(active=tuple(Alarm(name=name, since_ns_utc=0, text="") for name in ALARMS))
+    service.change(
+        active=tuple(
+            Alarm(name=name, since_ns_utc=0, message=as_message("x", "")) for name in ALARMS
+        )
+    )
     text = (await client.get("/metrics")).text
     return {family.name: family for family in text_string_to_metric_families(text)}
 
@@ -127,7 +132,7 @@ def test_a_rule_says_what_is_the_matter_and_what_to_do():
 
 
 def alarm(name, text):
-    return Alarm(name=name, since_ns_utc=70 * SECOND, text=text)
+    return Alarm(name=name, since_ns_utc=70 * SECOND, message=as_message("x", text))
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from service.estimation.random_dither import RandomDither, RandomPlan
 from service.model.misregistration import Misregistration
 from service.records import events as ev
 from service.records.alarms import Alarm
+from service.records.messages import as_message
 from service.records.operations import MeasurementRecord, MeasureState
 from service.runtime.actions import Actions, Publishing
 from service.runtime.estimates import NoisySums
@@ -23,7 +24,7 @@ ALPHA = Misregistration(
 )
 MODES = tuple(range(0, 60, 2))
 TOTAL_M = 5e-9
-DIVERGING = Alarm(name="loop-diverging", since_ns_utc=0, text="it does")
+DIVERGING = Alarm(name="loop-diverging", since_ns_utc=0, message=as_message("x", "it does"))
 N_FRAMES = 1000
 RUNNING = MeasurementRecord(
     id="noisy-1",

@@ -133,8 +133,8 @@ def test_noise_without_a_signal_is_refused_in_words(bench, aligned):
     if not isinstance(outcome, WindowRefused):
         assert np.any(np.sqrt(np.diag(outcome.covariance)) > 0.1)
     else:
-        kinds = {"did not settle": RefusalKind.OUT_OF_REACH, "no fit": RefusalKind.OTHER}
-        assert [outcome.kind] == [kinds[text] for text in kinds if text in outcome.reason]
+        kinds = {"window.unsettled": RefusalKind.OUT_OF_REACH, "window.no-fit": RefusalKind.OTHER}
+        assert outcome.kind is kinds[outcome.reason.code]
 
 
 def test_a_reconstructor_inverts_the_interaction_matrix_of_its_registration(bench):
@@ -328,8 +328,8 @@ def test_slopes_of_the_other_sign_are_named_by_the_answer_to_the_dither():
     window = dithered_window(Sensor(rtc.seen), ALPHA_SMALL)
     refused = rtc.told.fit(window, open_loop(rtc.own), None)
     assert refused.kind is RefusalKind.MISTOLD
-    assert "slopes have the other sign" in refused.reason
-    assert "orientation.sign = -1" in refused.reason
+    assert "slopes have the other sign" in str(refused.reason)
+    assert "orientation.sign = -1" in str(refused.reason)
 
 
 def test_slopes_in_another_order_are_named_by_the_answer_to_the_dither():
@@ -337,7 +337,7 @@ def test_slopes_in_another_order_are_named_by_the_answer_to_the_dither():
     window = dithered_window(Sensor(rtc.seen), ALPHA_SMALL)
     refused = rtc.told.fit(window, open_loop(rtc.own), None)
     assert refused.kind is RefusalKind.MISTOLD
-    assert 'slopes.order = "interleaved"' in refused.reason
+    assert 'slopes.order = "interleaved"' in str(refused.reason)
 
 
 def test_slopes_two_frames_late_are_not_taken_for_slopes_of_the_other_sign():
@@ -401,7 +401,7 @@ def test_commands_in_another_unit_are_named_by_the_answer_to_the_dither():
     in_nm = replace(window, commands=window.commands * 1e9, dither=window.dither * 1e9)
     refused = rtc.told.fit(in_nm, open_loop(rtc.own), None)
     assert refused.kind is RefusalKind.MISTOLD
-    assert "nanometres" in refused.reason
+    assert "nanometres" in str(refused.reason)
 
 
 def test_what_is_as_told_is_not_complained_of():

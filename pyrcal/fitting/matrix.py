@@ -86,6 +86,7 @@ from service.estimation.orientation import (
     LowOrder,
     Search,
     check_stated_orientation,
+    coarse_model,
     find_orientation,
     format_setting,
 )
@@ -485,11 +486,11 @@ def _find_axes(
     slopes = replace(instrument.slopes, orientation=stated)
     if stated is not None and options.start is not None:
         return slopes, None, AxesDoubt(), None
-    about = options.start or instrument.start
+    about, coarse = options.start or instrument.start, coarse_model(instrument, basis, mapper)
 
     def search_about(place: Misregistration, setting: Orientation | None) -> Search:
         seen = replace(instrument, slopes=replace(slopes, orientation=setting))
-        return find_orientation(seen, usable, basis, mapper=mapper, about=place)
+        return find_orientation(seen, usable, basis, mapper=mapper, about=place, coarse=coarse)
 
     search = search_about(about, stated)
     if options.start is None and search.best.correlation < DOUBTFUL_CORRELATION:

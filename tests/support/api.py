@@ -225,7 +225,7 @@ class FakeService:
         if isinstance(command, Refit):
             effect = MakeMatrix(n_modes=command.n_modes or 1, why="", cause=order_id)
             self.refits.begin([effect], self.now.now_ns)
-        return f"{type(command).__name__} is on its way"
+        return as_message("command", f"{type(command).__name__} is on its way")
 
     def audit(self, entry):
         self.trail.append(entry)

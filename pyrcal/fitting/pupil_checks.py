@@ -176,7 +176,7 @@ def _numbers(about: Instrument) -> tuple[PupilNumber, ...]:
         power=1,
         step=0.01 * size,
         range=(0.94 * size, 1.06 * size),
-        notable=0.01 * size,
+        notable=0.015 * size,
     )
     turn = PupilNumber(
         key=TURN,

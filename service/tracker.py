@@ -112,10 +112,8 @@ def _on_condition(context: StepContext, event: ev.ConditionChanged) -> None:
     if event.over:
         validity.end_alarm(context, event.name, event.t_ns_utc)
     elif event.name == alarms.MIRROR_SILENT:
-        dither.stop_unanswered(context, event.text)
+        dither.stop_unanswered(context, str(event.text))
     else:
-        if event.name == alarms.WORKER_LOST:
-            mode_proof.forget_responses(context)
         context.raise_alarm(event.name, event.text)
 
 
@@ -162,7 +160,7 @@ REACTIONS: Final[Reactions] = {
     ev.WindowLost: (window_processing.on_lost, acquisition.on_lost),
     ev.PassiveFitted: (window_processing.process_passive,),
     ev.PassiveUnavailable: (window_processing.on_passive_unavailable,),
-    ev.MatrixMade: (_on_made, acquisition.on_made),
+    ev.MatrixMade: (operator.on_refit_made, _on_made, acquisition.on_made),
     ev.MatrixFetched: (reconstructors.on_fetched,),
     ev.ModesRecognised: (mode_proof.note_recognised,),
     ev.MarginJudged: (reconstructors.on_margin,),
@@ -177,6 +175,8 @@ REACTIONS: Final[Reactions] = {
     ev.LoopHeld: (rtc.on_loop_held,),
     ev.MatrixMisapplied: (reconstructors.on_misapplied,),
     ev.Vibrations: (rtc.on_vibrations,),
+    ev.ModelChanged: (rtc.on_model_changed,),
+    ev.ModesCommanded: (rtc.on_modes_commanded,),
     ev.JobFailed: (_on_failure,),
     cmd.SetMode: (operator.set_mode, probation.on_mode_set, acquisition.on_mode_set),
     cmd.SetPointing: (operator.set_pointing,),
@@ -212,24 +212,28 @@ ANSWERS: Final[Reactions] = {
     wire.DitherStop: (dither.on_stop_answer,),
     wire.MeasureRequest: (measurement.on_answer,),
     wire.OffloadRequest: (offload.on_answer,),
-    wire.LoopRequest: (operator.on_loop_answer, acquisition.on_loop_answer),
+    wire.LoopRequest: (rtc.on_loop_answer, operator.on_loop_answer, acquisition.on_loop_answer),
     wire.RampRequest: (operator.on_loop_answer,),
 }
 """Functions of context, request and reply for each kind of request that the RTC has answered."""
 
 FAILURES: Final[Reactions] = {
-    ev.MakeMatrix: (reconstructors.on_making_failed, rtc.fail_order),
+    ev.MakeMatrix: (operator.on_refit_failed, reconstructors.on_making_failed, rtc.fail_order),
     ev.RepublishMatrix: (reconstructors.on_making_failed, rtc.fail_order, probation.on_copy_failed),
     ev.JudgeMatrix: (reconstructors.on_judging_failed, rtc.log_failure),
     ev.JudgeProposal: (reconstructors.on_judging_failed, rtc.fail_order),
-    ev.SendMatrix: (reconstructors.on_send_failed, rtc.log_failure),
+    ev.SendMatrix: (rtc.on_modes_unknown, reconstructors.on_send_failed, rtc.log_failure),
     ev.FetchMatrix: (reconstructors.on_fetch_failed, rtc.log_failure),
     ev.FinishNoisy: (measurement.on_finish_failed,),
     wire.DitherRequest: (dither.on_failure, rtc.fail_order, measurement.on_dither_failed),
     wire.DitherStop: (rtc.log_failure,),
     wire.MeasureRequest: (measurement.on_failure,),
     wire.OffloadRequest: (offload.on_failure,),
-    wire.LoopRequest: (operator.on_loop_failed, acquisition.on_loop_failed),
+    wire.LoopRequest: (
+        rtc.on_modes_unknown,
+        operator.on_loop_failed,
+        acquisition.on_loop_failed,
+    ),
     wire.RampRequest: (operator.on_loop_failed,),
 }
 """Functions of context, effect and text for each kind of effect, or request, that has failed."""

@@ -30,15 +30,15 @@ from service.link.intake import Intake
 from service.link.matrices import MeasuredMatrix
 from service.link.session import Endpoint
 from service.model.instrument import Instrument
-from service.model.slopes import SlopeRecipe
 from service.records import events as ev
 from service.records.events import Effect, Event
+from service.records.messages import ABOUT
 from service.records.products import ReconstructorRecord
 from service.records.state import LoopState, Mode, OperatorState, TrackerState
 from service.runtime.engine import Engine
 from service.runtime.estimates import fit_passive, fitted, read_own_matrix
 from service.runtime.policy import compute_of, policy_of
-from service.runtime.worker import Done, OpticsWorker
+from service.runtime.worker import OpticsWorker
 from service.tracking.policy import SECOND_NS
 from service.tracking.step_context import new_lines
 from service.wire import DitherRequest, Manifest, Reply, Status, decode
@@ -58,12 +58,6 @@ NOT_CARRIED_OUT: Final = "unsupported: recorded telemetry"
 class Player:
     """Driver of an engine without network, processes and clocks."""
 
-    first: Callable[[], Done[None]] | None = None
-    """Job for new workers, required by the interface; not used here, because the only worker has
-    already run it."""
-
-    found_slopes: SlopeRecipe | None = None
-
     def __init__(self, instrument: Instrument, settings: Settings, system: str) -> None:
         """Prepare the optical model.
 
@@ -74,14 +68,16 @@ class Player:
         """
         # The loop of a recording cannot be opened, so nothing is acquired from nothing.
         policy = replace(policy_of(settings, instrument), acquires=False)
+        self._optics = OpticsWorker(instrument, compute_of(settings))
+        description = self._optics.describe()
         state = TrackerState(
             system=system,
+            model=self._optics.state,
             # A matrix that would be made has no RTC to go to.
             operator=OperatorState(mode=Mode.HOLD),
             loop=LoopState(basis_id=instrument.basis_id, config_id=instrument.config_id),
         )
         self.track = Track(state=state)
-        self._optics = OpticsWorker(instrument, compute_of(settings))
         self._now_s, self._began_ns = 0.0, 0
         self._ticked_s = self._summed_s = 0.0
         self._intake = Intake(Endpoint(system=system), clock=lambda: self._now_s)
@@ -93,7 +89,7 @@ class Player:
         self._random: Correlated | None = None
         self._next: tuple[str, int] | None = None
         self._engine = Engine(state, policy, self)
-        self._engine.set_description(self._optics.describe())
+        self._engine.set_description(description)
 
     async def play(self, messages: Iterable[Message], progress: Callable[[float], None]) -> Track:
         """Play messages in the order of sending; ``progress`` receives the seconds played."""
@@ -234,8 +230,11 @@ class Player:
         if passive is not None and passive is not before.alpha.passive:
             self.track.passive.append(passive)
         # A refused dither is an answer of this program's, which the telemetry does not show.
-        mine = [line for line in new_lines(before, after) if NOT_CARRIED_OUT not in line.text]
-        self.track.lines += mine
+        self.track.lines += [
+            line
+            for line in new_lines(before, after)
+            if line.message.values.get(ABOUT) != NOT_CARRIED_OUT
+        ]
         # Not by their number: the history is limited, and drops its oldest entries.
         seen = set(before.alpha.history)
         self.track.entries += [entry for entry in after.alpha.history if entry not in seen]
@@ -250,7 +249,8 @@ class Player:
 
     def sensor_mode_changed(self, config_id: str) -> None:
         """Build the model of another mode of the sensor."""
-        self._engine.set_description(self._optics.enter_mode(config_id))
+        self._optics.restore(self._engine.state.model, {})
+        self._engine.set_description(self._optics.describe())
         self._unread_matrix = self._engine.state.matrices.in_use
 
     def perform(self, effect: Effect) -> None:
@@ -265,4 +265,8 @@ class Player:
         self, job: Callable[Concatenate[OpticsWorker, P], R], *args: P.args, **kwargs: P.kwargs
     ) -> R:
         """Run a method of the worker synchronously."""
-        return job(self._optics, *args, **kwargs)
+        self._optics.restore(self._engine.state.model, {})
+        result = job(self._optics, *args, **kwargs)
+        if self._optics.state != self._engine.state.model:
+            self._engine.post(ev.ModelChanged(model=self._optics.state))
+        return result

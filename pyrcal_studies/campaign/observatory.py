@@ -39,18 +39,17 @@ from service.estimation.passive import PASSIVE_INTERVAL_S
 from service.estimation.random_dither import Correlated
 from service.instrument import load_instrument
 from service.model.misregistration import Misregistration
-from service.model.slopes import SlopeRecipe
 from service.records import commands
 from service.records import events as ev
 from service.records.events import Effect, Event
 from service.records.operations import MeasurementRecord
 from service.records.products import GateVerdict, MatrixState, ReconstructorRecord
-from service.records.state import LoopState, Mode, OperatorState, TrackerState
+from service.records.state import LoopState, Mode, ModelState, OperatorState, TrackerState
 from service.runtime.actions import Actions, Publishing, present_conditions
 from service.runtime.engine import Engine
 from service.runtime.estimates import PendingWindow, fit_passive, fitted, read_own_matrix
 from service.runtime.ports import StorePort
-from service.runtime.worker import Compute, Done, OpticsWorker, Sampling
+from service.runtime.worker import Compute, OpticsWorker, Sampling
 from service.runtime.worker.records import patience_s
 from service.tracker import step
 from service.tracking.policy import SECOND_NS, Policy
@@ -353,12 +352,21 @@ class OwnHands:
     """A worker that is no process of its own: the workbench itself."""
 
     def __init__(self, workbench: OpticsWorker) -> None:
-        self.first: Callable[[], Done[None]] | None = None
-        self.found_slopes: SlopeRecipe | None = None
+        self.model: Callable[[], ModelState] = lambda: self._known
+        """Returns the model that jobs are done with."""
+
+        self.changed: Callable[[ModelState], object] = self._learn
+        """Called with the model after a job that has changed it."""
+
         self.broken = ""
         """Why no job can be done; empty: all can."""
 
         self._workbench = workbench
+        self._known = ModelState()
+        self._arrays: Mapping[str, Any] = {}
+
+    def _learn(self, model: ModelState) -> None:
+        self._known = model
 
     async def call(
         self, job: Callable[Concatenate[OpticsWorker, P], R], *args: P.args, **kwargs: P.kwargs
@@ -366,12 +374,18 @@ class OwnHands:
         """Run a method of the workbench now; what goes wrong is said as the worker would."""
         if self.broken:
             raise WorkerError(self.broken)
+        bench, model = self._workbench, self.model()
         try:
-            return job(self._workbench, *args, **kwargs)
+            bench.restore(model, self._arrays)
+            result = job(bench, *args, **kwargs)
         except PyrcalError:
             raise
         except Exception as error:
             raise WorkerError(f"{job.__name__} failed in the worker: {error!r}") from error
+        self._arrays = bench.arrays
+        if bench.state != model:
+            self.changed(bench.state)
+        return result
 
 
 class Kept:
@@ -600,6 +614,9 @@ class _Due:
 class Observatory:
     """A night in simulated time; ``advance`` lets it pass."""
 
+    hands: Callable[[OpticsWorker], OwnHands] = OwnHands
+    """What computes for the service."""
+
     def __init__(
         self,
         options: Sequence[str],
@@ -623,20 +640,25 @@ class Observatory:
         self.latencies = latencies or Latencies()
         system = self.dome.computer.identity.system
         about = self.dome.instrument
+        workbench.restore(ModelState(), {})
+        description = workbench.describe()
         state = TrackerState(
             system=system,
+            model=workbench.state,
             operator=OperatorState(mode=mode),
             loop=LoopState(basis_id=about.basis_id, config_id=about.config_id),
         )
         self._engine = Engine(state, policy, self, step=self.step)
-        self._engine.set_description(workbench.describe())
+        self._engine.set_description(description)
         self.glances: list[Glance] = []
         self.swaps: list[Swap] = []
         self.events: list[tuple[float, Event]] = []
         """All that the tracker heard and when, status and ticks left out."""
 
         self._link = link(self.dome)
-        self._workers = OwnHands(workbench)
+        self._workers = self.hands(workbench)
+        self._workers.model = lambda: self.state.model
+        self._workers.changed = lambda model: self._post(ev.ModelChanged(model=model))
         self._shelf: StorePort = archive or Shelf()
         self._publishing = Publishing(
             system=system, chunk_bytes=CHUNK_LIMIT, pole_radius_bound=0.95
@@ -889,7 +911,7 @@ class Observatory:
         """Have the worker model another mode of the sensor, as soon as it has a hand free."""
 
         def begin() -> _Job:
-            description = asyncio.run(self._actions.enter_sensor_mode(config_id))
+            description = asyncio.run(self._workers.call(OpticsWorker.describe))
 
             def done() -> None:
                 if self.state.loop.config_id == config_id:
@@ -899,7 +921,7 @@ class Observatory:
 
             return self.latencies.make_s, done
 
-        self._work(OpticsWorker.enter_mode, begin)
+        self._work(OpticsWorker.describe, begin)
 
     def _hear_out(self, in_use: str) -> None:
         """Watch what the matrix in use does, and learn from it how the RTC speaks."""

@@ -11,6 +11,7 @@ how much of the latter is significant.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,24 +33,45 @@ that the residual follows a response that changes over the night."""
 _TINY = float(np.finfo(np.float32).tiny)
 
 
-class DitheredResponse:
-    """Residual of the model in the response of dithered modes, averaged over their windows."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ModeResidual:
+    """Residual of the model in the response of one dithered mode."""
 
-    def __init__(self) -> None:
-        self._means: dict[int, tuple[Array, float]] = {}
-        # Only modes with a residual: of a good model hardly any has one, and of an ELT all together
-        # would take as much memory as D.
-        self._significant: dict[int, Array] = {}
-        self._session: str | None = None
+    mean: NDArray[np.complex64]
+    """``(n_slopes,)`` slope per metre, the weighted mean of its windows; noise is imaginary."""
+
+    weight: float
+    """Sum of the windows' weights."""
+
+    significant: NDArray[np.float32] | None = None
+    """``(n_slopes,)`` its part above the noise; None if there is none: of a good model hardly any
+    mode has one, and those of all modes of an ELT would take as much memory as D."""
+
+
+class DitheredResponse:
+    """Residual of the model in the response of dithered modes, averaged over their windows.
+
+    ``residuals`` has what ``session`` of the RTC has shown so far, by mode.
+    """
+
+    def __init__(
+        self, session: str | None = None, residuals: Mapping[int, ModeResidual] | None = None
+    ) -> None:
+        self.session = session
+        self.residuals = dict(residuals or {})
+
+    @property
+    def _significant(self) -> dict[int, Array]:
+        return {m: r.significant for m, r in self.residuals.items() if r.significant is not None}
 
     def add(self, spectra: Spectra, estimate: LockInEstimate, response: Array) -> None:
         """Add a window, without the optical gain of each mode: the gate gets it from the tracker.
 
         ``response`` is ``(n_slopes, n_modes)`` without this residual, at unit gain.
         """
-        if estimate.session != self._session:
+        if estimate.session != self.session:
             # An RTC that was restarted may have other modes.
-            self._means, self._significant, self._session = {}, {}, estimate.session
+            self.residuals, self.session = {}, estimate.session
         gains, sigma = estimate.optical_gain, estimate.gain_sigma
         if sigma is None:
             return
@@ -62,10 +84,10 @@ class DitheredResponse:
         # The commands of all modes: the loop answers a dither with every mode that it controls,
         # and those have a residual as well.
         seen = commands.real @ response.T + 1j * (commands.imag @ response.T)
-        known = sorted(self._significant)
-        if known:
+        significant = self._significant
+        if known := sorted(significant):
             others = np.where(np.equal.outer(modes, known), 0.0, commands[:, known])
-            seen += others @ np.array([self._significant[mode] for mode in known])
+            seen += others @ np.array([significant[mode] for mode in known])
         left = (spectra.slopes[lines, 0] / gains[lines, None] - seen) / own[:, None]
         for mode, one in zip(modes.tolist(), left, strict=True):
             self._add_to_mean(mode, one.astype(np.complex64))
@@ -73,9 +95,10 @@ class DitheredResponse:
 
     def _add_to_mean(self, mode: int, left: Array) -> None:
         weight = 1.0 / max(float(np.mean(left.imag**2)), _TINY)
-        mean, total = self._means.get(mode, (np.zeros_like(left), 0.0))
-        total = MEMORY_RATIO * total + weight
-        self._means[mode] = mean + (left - mean) * np.float32(weight / total), total
+        before = self.residuals.get(mode, ModeResidual(mean=np.zeros_like(left), weight=0.0))
+        total = MEMORY_RATIO * before.weight + weight
+        mean = before.mean + (left - before.mean) * np.float32(weight / total)
+        self.residuals[mode] = replace(before, mean=mean, weight=total)
 
     def _find_significant(self, modes: list[int]) -> None:
         """Keep the patterns of these modes' residuals that exceed the noise.
@@ -84,7 +107,7 @@ class DitheredResponse:
         while noise is spread over all: a single mode may be measured poorly, and the error of the
         combination of modes that makes a loop unstable is still known.
         """
-        mean = np.array([self._means[mode][0] for mode in modes])
+        mean = np.array([self.residuals[mode].mean for mode in modes])
         sigma = np.sqrt(np.mean(mean.imag**2, axis=1, keepdims=True))
         sigma = np.maximum(sigma, _TINY)
         noise = float(np.linalg.norm(mean.imag / sigma, ord=2))
@@ -94,9 +117,9 @@ class DitheredResponse:
         size[size < noise] = 0.0
         left = (sigma * ((by_mode * size) @ by_slope)).astype(np.float32)
         for mode, one in zip(modes, left, strict=True):
-            self._significant.pop(mode, None)
-            if size.any():
-                self._significant[mode] = one
+            # A copy, because a row of the window's array would keep all of it in memory.
+            found = one.copy() if size.any() else None
+            self.residuals[mode] = replace(self.residuals[mode], significant=found)
 
     def left_over(self, known: Collection[int] = ()) -> LeftOver | None:
         """Return the significant residual of modes other than ``known`` ones; None: of no mode."""
@@ -109,7 +132,9 @@ class DitheredResponse:
         subtracted; empty if no mode was dithered.
         """
         every = [
-            _of_modes({m: one.real + sign * one.imag for m, (one, _) in self._means.items()}, known)
+            _of_modes(
+                {m: r.mean.real + sign * r.mean.imag for m, r in self.residuals.items()}, known
+            )
             for sign in (0.0, 1.0, -1.0)
         ]
         return tuple(one for one in every if one is not None)

@@ -119,9 +119,6 @@ class OwnMatrix:
     weights: tuple[float, ...] = ()
     """Weight of each mode of the basis for the measurement of α; empty if all count alike."""
 
-    left_over: LeftOver | None = None
-    """Residual of the matrix in the recognised modes; None if it was not computed."""
-
     @property
     def known(self) -> NDArray[np.bool_]:
         """``(n,)`` which columns are the mode that their number says, with the model's sign."""

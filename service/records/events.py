@@ -15,9 +15,10 @@ from service.records.estimates import (
     WideCaptureEstimate,
     WindowRefused,
 )
+from service.records.messages import Message
 from service.records.operations import MeasurementRecord, ProbationFinding
 from service.records.products import ExpectedGain, GateVerdict, Judged, ReconstructorRecord
-from service.records.state import Level, TrackerState
+from service.records.state import Level, ModelState, TrackerState
 from service.wire import Acknowledgement, Reply, Status
 from service.wire import Command as Request
 
@@ -155,7 +156,7 @@ class ConditionChanged:
     """A condition that must be seen while it lasts."""
 
     name: str
-    text: str
+    text: str | Message
     over: bool = False
     """The condition has ended."""
 
@@ -178,7 +179,7 @@ class LogEvent:
     """Something happened that changes nothing but should be on record."""
 
     name: str
-    text: str
+    text: str | Message
     level: Level = Level.INFO
 
 
@@ -385,6 +386,20 @@ class Vibrations:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ModesCommanded:
+    """The RTC has accepted to control another number of modes with the next matrix."""
+
+    n_modes: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelChanged:
+    """A job has changed the optical model: it has measured something or linearised elsewhere."""
+
+    model: ModelState
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MatrixMeasured:
     """A measured interaction matrix is one step further: begun, refused, failed or stored."""
 
@@ -427,6 +442,8 @@ Event = (
     | LoopHeld
     | MatrixMisapplied
     | Vibrations
+    | ModelChanged
+    | ModesCommanded
     | MatrixMeasured
     | JobFailed
 )

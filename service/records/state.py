@@ -1,12 +1,14 @@
-"""The state: ten frozen records, replaced as a whole."""
+"""The state: eleven frozen records, replaced as a whole."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
 from service.model.misregistration import Misregistration
 from service.records.alarms import Alarm, AlarmRecord
+from service.records.messages import Message, Range
 from service.records.operations import (
     Acquisition,
     Dither,
@@ -14,6 +16,7 @@ from service.records.operations import (
     LoopCommand,
     MeasurementRecord,
     Probation,
+    RefitJob,
 )
 from service.records.products import (
     Assessment,
@@ -55,7 +58,7 @@ class LogEntry:
     name: str
     """Machine-readable, like ``reconstructor.applied``."""
 
-    text: str
+    message: Message
 
     times: int = 1
     """Number of occurrences. A line that repeats within a minute is logged once, and again with
@@ -64,12 +67,17 @@ class LogEntry:
     last_ns_utc: int = 0
     """The last time, where it was more than once."""
 
-    ranges: tuple[tuple[str, str], ...] = ()
-    """Smallest and largest value of each number in the text of a counted line."""
+    ranges: Mapping[str, Range] = field(default_factory=dict)
+    """Range of each number in the message of a counted line; empty if it was not counted."""
 
     cause: str = ""
     """Id of the order or event that has led to it: what else that led to has the same; empty: of
     before the service began."""
+
+    @property
+    def text(self) -> str:
+        """Sentence of the message."""
+        return str(self.message)
 
     @property
     def line(self) -> tuple[int, str, str]:
@@ -189,8 +197,8 @@ class WindowCounts:
     run: int = 0
     """Number of consecutive windows accepted; negative if they were rejected."""
 
-    refused_because: str = ""
-    """Why the last of those was; empty: none was yet."""
+    refused_because: Message | None = None
+    """Reason of the last rejection; None if there was none."""
 
     outlying: int = 0
     """Windows that were plausible by themselves but rejected as outliers."""
@@ -271,6 +279,9 @@ class Operations:
     measurements: tuple[MeasurementRecord, ...] = ()
     """Measurements of interaction matrices, oldest first, bounded in number."""
 
+    refits: tuple[RefitJob, ...] = ()
+    """Reconstructors that operators have ordered, oldest first, bounded in number."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DitherState:
@@ -313,6 +324,10 @@ class LoopState:
     """Time by the RTC's clock at which it had another ``config_id``, until its matrix and a window
     have shown that the sensor is the same; None if that is known."""
 
+    commanded_modes: int | None = None
+    """Number of modes that the RTC has accepted to control and no status has shown yet; None if
+    there is none."""
+
     reference_id: str | None = None
     """Name of the reference slopes: the RTC's ``reference_id``, or its ``config_id`` if it sends
     none; None before the first status."""
@@ -333,6 +348,50 @@ class LoopState:
     close_since_ns_utc: int | None = None
     """Time since which the loop should be closed again after an aborted measurement; None if it
     need not."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelState:
+    """What the optical model depends on besides instrument file and settings.
+
+    Every job of the worker is done with it, so that any worker gives the same results. Large arrays
+    are represented by keys of their contents: ``service.runtime.workers`` keeps them.
+    """
+
+    sensor_mode: str | None = None
+    """Mode of the sensor that the rest belongs to; None: the first, or there is only one."""
+
+    slopes: tuple[str, tuple[tuple[str, int], ...]] | None = None
+    """Order of the slopes found in the RTC's own matrix, and the fields of its orientation by name.
+    None if the instrument file has them, or none were found."""
+
+    own_matrix_read: bool = False
+    """True if the RTC's own matrix was compared with the model in this mode of the sensor."""
+
+    response: tuple[float, ...] | None = None
+    """Response of each mode to a command over the nominal one; None if nominal."""
+
+    own_residual: str | None = None
+    """Key of the part of the RTC's own matrix that the model does not explain; None if none was
+    computed."""
+
+    dither_session: str | None = None
+    """Session of the RTC that the dithered responses are of; None if there are none."""
+
+    dithered: tuple[tuple[int, str], ...] = ()
+    """Modes whose response to a dither was measured, each with the key of its residual."""
+
+    strength: float = 1.0
+    """Variance of the loop's residual over that expected at the instrument's r0."""
+
+    linearised_at: Misregistration | None = None
+    """Registration of the last linearisation; None if there is none at this working point."""
+
+    @property
+    def keys(self) -> frozenset[str]:
+        """Keys of the arrays that it consists of."""
+        keys = {key for _, key in self.dithered}
+        return frozenset(keys if self.own_residual is None else keys | {self.own_residual})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -363,6 +422,7 @@ class TrackerState:
     operations: Operations = field(default_factory=Operations)
     dithers: DitherState = field(default_factory=DitherState)
     loop: LoopState = field(default_factory=LoopState)
+    model: ModelState = field(default_factory=ModelState)
     alarms: AlarmStates = field(default_factory=AlarmStates)
 
     log: tuple[LogEntry, ...] = ()

@@ -9,7 +9,6 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,6 @@ from service import wire
 from service.control.gains import gain_table
 from service.control.loop import ControlLoop
 from service.errors import ArchiveError, CommandError, LinkError, StorageError, UnknownIdError
-from service.estimation.description import Description
 from service.estimation.loop import extend_gains, same_gains, select_gains
 from service.link.matrices import MeasuredMatrix
 from service.model.instrument import Instrument
@@ -30,7 +28,7 @@ from service.records.products import GateVerdict
 from service.records.registration import Registration
 from service.records.state import TrackerState
 from service.runtime import estimates, ports
-from service.runtime.worker import Conditions, OpticsWorker, run_job
+from service.runtime.worker import Conditions, OpticsWorker
 from service.tracking.pointing_law import registration_ahead
 from service.version import software_version
 
@@ -78,7 +76,6 @@ class Actions:
         # The cache of matrices is read from threads as well: the archive is waited for off the
         # event loop.
         self._guard = threading.Lock()
-        self._commanded_modes: int | None = None
         self._judging: set[str] = set()
         self.noisy = estimates.NoisySums(workers=workers, archive=archive, instrument=instrument)
         """Sums of the noisy interaction matrix under way."""
@@ -126,22 +123,6 @@ class Actions:
         self._remember(matrix_id, matrix)
         return matrix
 
-    async def enter_sensor_mode(self, config_id: str) -> Description:
-        """Have the worker model another mode of the sensor, and each worker after it.
-
-        Raises
-        ------
-        WorkerError
-            If the worker dies of it.
-        """
-        slopes = self._workers.found_slopes
-        # Before the call: if the worker dies while it makes the models, its successor must start in
-        # the new mode.
-        self._workers.first = partial(run_job, OpticsWorker.adopt, slopes, None, config_id)
-        self._commanded_modes = None
-        self.instrument = self.instrument.in_mode(config_id)
-        return await self._workers.call(OpticsWorker.enter_mode, config_id)
-
     def offer(self, state: TrackerState) -> None:
         """Let an RTC ask for the matrix in use.
 
@@ -177,8 +158,6 @@ class Actions:
 
     async def _ask(self, request: wire.Command) -> Event | None:
         reply = await self._bridge.command(request)
-        if isinstance(request, wire.LoopRequest) and reply.accepted:
-            self._commanded_modes = request.n_controlled or self._commanded_modes
         if isinstance(request, wire.DitherStop) and reply.accepted:
             return None  # the next status tells
         return ev.Answered(request=request, reply=reply)
@@ -330,16 +309,16 @@ class Actions:
         if record is None:
             raise UnknownIdError(f"unknown reconstructor {effect.id}")
         matrix = await asyncio.to_thread(self.matrix, effect.id)
-        # The status lags behind an accepted command, which would then be sent twice.
-        commanded = self._commanded_modes or rtc.n_controlled
-        if effect.gains is not None or commanded != effect.n_modes:
+        commanded = state.loop.commanded_modes or rtc.n_controlled
+        anew = effect.gains is not None or commanded != effect.n_modes
+        if anew:
             # First, because the RTC rejects a matrix with another number of rows than was commanded
             # (R-53).
             await self._command_modes(effect)
         layout = wire.layout_of(matrix, self._publishing.chunk_bytes)
         manifest = record.manifest(layout, rtc, self._publishing.system)
         await self._bridge.publish(manifest, matrix)
-        return None
+        return ev.ModesCommanded(n_modes=effect.n_modes) if anew else None
 
     async def _command_modes(self, effect: ev.SendMatrix) -> None:
         """Command the number of modes and the gains of the next matrix."""
@@ -350,7 +329,6 @@ class Actions:
         )
         if not reply.accepted:
             raise CommandError(f"the RTC will not control {effect.n_modes} modes: {reply.reason}")
-        self._commanded_modes = effect.n_modes
 
     def _record(
         self, n_modes: int, why: str, registration: Registration | None, parent: str | None

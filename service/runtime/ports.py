@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from service.archive.products import NoisyNumbers
 from service.archive.store import Provenance
-from service.model.slopes import SlopeRecipe
 from service.records.operations import MeasurementRecord
 from service.records.products import ReconstructorRecord
-from service.runtime.worker import Done, OpticsWorker
+from service.runtime.worker import OpticsWorker
 from service.wire import Command, Manifest, Reply
 
 P = ParamSpec("P")
@@ -42,13 +41,6 @@ class RtcPort(Protocol):
 
 class WorkerPort(Protocol):
     """Interface of the worker; :class:`service.runtime.workers.WorkerPool` is the real one."""
-
-    first: Callable[[], Done[None]] | None
-    """First job of every new worker; None if there is none."""
-
-    found_slopes: SlopeRecipe | None
-    """Order and signs of the slopes that were found on the sky, for every new worker, whatever the
-    sensor's mode; None if the instrument file has them or none were found."""
 
     async def call(
         self, job: Callable[Concatenate[OpticsWorker, P], R], *args: P.args, **kwargs: P.kwargs

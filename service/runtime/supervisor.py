@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import Awaitable, Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -28,6 +28,7 @@ from service.records import events as ev
 from service.records.alarms import CLOCK_LEAPT, Prerequisite
 from service.records.estimates import RefusalKind
 from service.records.events import Effect, Event
+from service.records.messages import Message, compose
 from service.records.operations import MeasureState
 from service.records.state import Level, TrackerState
 from service.runtime import archiving, command_results, readiness, worker
@@ -80,6 +81,8 @@ class Supervisor:
         self._engine = Engine(state, policy, self)
         self._bridge = bridge
         self._workers = workers
+        workers.model = lambda: self._engine.state.model
+        workers.changed = lambda model: self._post(ev.ModelChanged(model=model))
         self.archive = archive
         """Products and their history; a call waits for the disk."""
         self.newest_frames: frames.FrameBlock | None = None
@@ -95,10 +98,10 @@ class Supervisor:
             audit=self._writer.add,
         )
         """Telemetry kept on request."""
-        self.complaints = {CLOCK_LEAPT: self._clock.complaint}
-        """Functions that return the text of an alarm, empty for none; called each second."""
-        self.refits = command_results.Refits()
-        """Reconstructors that operators have ordered."""
+        self.complaints: dict[str, Callable[[], str | Message | None]] = {
+            CLOCK_LEAPT: self._clock.complaint
+        }
+        """Functions that return the text of an alarm, or nothing for none; called each second."""
         self._pending_window = PendingWindow()
         self._n_readings = 0
         self._own_matrix_read = asyncio.Event()
@@ -125,7 +128,8 @@ class Supervisor:
     @property
     def instrument(self) -> Instrument:
         """The telescope it works for."""
-        return self._actions.instrument
+        file, mode = self._actions.instrument, self._engine.state.model.sensor_mode
+        return file if mode is None else file.in_mode(mode)
 
     @property
     def policy(self) -> Policy:
@@ -229,9 +233,7 @@ class Supervisor:
     async def _result_of(self, order: command_results.GivenCommand) -> str:
         """Do what is asked, and say what the RTC says to it where that takes but a moment."""
         running = set(self._running)
-        effects = self._post(order.command, order.id)
-        if isinstance(order.command, cmd.Refit):
-            self.refits.begin(effects, self._clock.now_ns())
+        self._post(order.command, order.id)
         asked = self._running - running
         # The RTC answers these commands within a moment, and its answer is the result.
         if asked and isinstance(order.command, cmd.Measure | cmd.SetLoop | cmd.Ramp):
@@ -270,7 +272,7 @@ class Supervisor:
             group.create_task(self._writer.save())
             group.create_task(self.recordings.run())
             group.create_task(self._writer.keep_house(self._retention))
-            await self._prepare(partial(self._workers.call, worker.OpticsWorker.describe))
+            await self._prepare()
             for work in (self._listen, self._tick, self._fit, self._fit_passive, self._trends.run):
                 group.create_task(work())
 
@@ -279,8 +281,9 @@ class Supervisor:
         """The model's expectation of telemetry; None: being prepared."""
         return None if self._engine.bank is None else self._engine.bank.loop.description
 
-    async def _prepare(self, describe: Callable[[], Awaitable[Description]]) -> None:
+    async def _prepare(self) -> None:
         """Let the estimators listen to what the model expects; a worker that dies is replaced."""
+        describe = partial(self._workers.call, worker.OpticsWorker.describe)
         config_id = self._engine.state.loop.config_id
         lost = partial(self._note, "worker.lost", level=Level.WARNING)
         description = await with_another_worker(describe, lost)
@@ -486,8 +489,7 @@ class Supervisor:
 
     def sensor_mode_changed(self, config_id: str) -> None:
         """Have the model of another mode of the sensor made."""
-        describe = partial(self._actions.enter_sensor_mode, config_id)
-        self._start("another mode of the sensor", self._prepare(describe))
+        self._start("another mode of the sensor", self._prepare())
 
     def _start(self, what: str, action: Coroutine[Any, Any, None]) -> None:
         """Begin a task; a bug in it costs what it was about, not the service."""
@@ -549,7 +551,6 @@ class Supervisor:
         except Exception as error:  # noqa: BLE001 - a bug in one action must not end the service
             self._log.exception("action.broken", effect=type(effect).__name__)
             event = ev.JobFailed(effect=effect, text=f"internal error: {error!r}")
-        self.refits.end(effect, event)
         if event is not None:
             self._post(event, effect.cause)
 
@@ -558,7 +559,7 @@ class Supervisor:
         given_up = known is not None and known.state is MeasureState.GIVEN_UP
         if known is not None and (given_up or known.pattern is None):
             why = "it had been given up" if given_up else "a noisy one had this id"
-            text = f"{known.id} came after {why}: it is not kept"
+            text = compose("measurement.late", why, id=known.id)
             self._note("measurement.ignored", text, Level.INFO)
             return
         try:
@@ -568,14 +569,15 @@ class Supervisor:
                 self._writer.failed(error)
             self._note("measurement.not-kept", str(error), Level.WARNING)
 
-    def _note(self, name: str, text: str, level: Level) -> None:
+    def _note(self, name: str, text: str | Message, level: Level) -> None:
         self._post(ev.LogEvent(name=name, text=text, level=level))
 
     def _tell(self, before: TrackerState) -> None:
         """Log what is new in the state's log, at its level, and have it recorded."""
-        entries = new_lines(before, self._engine.state)
+        after = self._engine.state
+        entries = new_lines(before, after)
+        ids = archiving.ids_of(after, archiving.find_changed_ids(before, after)) if entries else {}
         for entry in entries:
-            ids = archiving.ids_of(entry.text, self._engine.state)
             told = getattr(self._log, _LEVELS.get(entry.level, entry.level.value))
             told(entry.name, text=entry.text, **ids)
         self._writer.changed(before, self._engine.state, entries)

@@ -11,13 +11,12 @@ from collections import defaultdict, deque
 from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from service.errors import WorkerError
-from service.model.slopes import SlopeRecipe
 from service.records import events as ev
 from service.records.alarms import CLUSTER_LOST, WORKER_BEHIND, WORKER_LOST
-from service.records.state import TrackerState
+from service.records.state import ModelState, TrackerState
 from service.runtime.processes import Worker
 from service.runtime.snapshot import WorkerLoad
 from service.runtime.worker import Done, OpticsWorker, run_job
@@ -56,11 +55,14 @@ class WorkerPool:
     def __init__(self, start: Callable[[], Worker], early: Worker | None = None) -> None:
         self._start = start
         self._worker = early
-        self.first: Callable[[], Done[None]] | None = None
-        """First job of every new worker; None if there is none."""
+        self.model: Callable[[], ModelState] = ModelState
+        """Returns the model that jobs are done with."""
 
-        self.found_slopes: SlopeRecipe | None = None
+        self.changed: Callable[[ModelState], object] = _ignore
+        """Called with the model after a job that has changed it."""
 
+        self._arrays: dict[str, Any] = {}
+        self._sent: frozenset[str] = frozenset()
         self._threads: ThreadPoolExecutor | None = None
         self._waiting: list[tuple[float, int, asyncio.Future[None]]] = []
         self._numbers = itertools.count()
@@ -127,14 +129,11 @@ class WorkerPool:
             If the worker process died, or hung and was killed, and a new one is there for the next
             job; or if the job raised an unexpected exception, which must not end the service.
         """
-        work = partial(run_job, job, *args, **kwargs)
         # The turn is already this task's: another request would wait for itself.
         if self._owner is asyncio.current_task():
-            done = await self._done(job.__name__, work)
-        else:
-            async with self.turn(job):
-                done = await self._done(job.__name__, work)
-        return done.result
+            return await self._done(job, args, kwargs)
+        async with self.turn(job):
+            return await self._done(job, args, kwargs)
 
     def close(self) -> None:
         """End the worker, whatever it is at; the next job finds a new one."""
@@ -152,13 +151,19 @@ class WorkerPool:
                 self._turn = first
                 first.set_result(None)
 
-    async def _done(self, name: str, work: Callable[[], Done[R]]) -> Done[R]:
+    async def _done(
+        self, job: Callable[..., R], args: tuple[object, ...], kwargs: dict[str, object]
+    ) -> R:
+        name, model = job.__name__, self.model()
         worker = self._worker or self._start()
-        first, self._worker = (None if worker is self._worker else self.first), worker
+        if worker is not self._worker:
+            self._worker, self._sent = worker, frozenset()
+        arrays = {key: self._arrays[key] for key in model.keys - self._sent}
+        work = partial(run_job, model, arrays, job, *args, **kwargs)
         # a thread of its own: one that waited for other threads would look like a hung worker
         self._threads = threads = self._threads or ThreadPoolExecutor(1)
         self._busy_since_s = time.monotonic()
-        under_way = asyncio.get_running_loop().run_in_executor(threads, _run, worker, first, work)
+        under_way = asyncio.get_running_loop().run_in_executor(threads, worker.run, work)
         # where nobody waits for it to the end, it says nothing
         under_way.add_done_callback(lambda job: job.cancelled() or job.exception())
         try:
@@ -182,7 +187,14 @@ class WorkerPool:
         self._longest_s[name] = max(self._longest_s[name], done.cpu_s)
         # Limits are of processor time: on a loaded machine a healthy job takes long by the clock.
         self._limit_s[name] = max(MIN_JOB_LIMIT_S, JOB_LIMIT_RATIO * self._longest_s[name])
-        return done
+        self._arrays |= done.arrays
+        self._sent = done.model.keys
+        if done.model != model:
+            self.changed(done.model)
+        # The change may have been refused, or the model may be of another mode by now.
+        kept = self.model().keys
+        self._arrays = {key: one for key, one in self._arrays.items() if key in kept}
+        return done.result
 
     async def _watch(self, name: str, worker: Worker, under_way: asyncio.Future[Done[R]]) -> None:
         """Wait for a job.
@@ -215,7 +227,9 @@ class WorkerPool:
         return text
 
 
-async def with_another_worker(job: Callable[[], Awaitable[R]], lost: Callable[[str], None]) -> R:
+async def with_another_worker(
+    job: Callable[[], Awaitable[R]], lost: Callable[[str], object] = lambda _: None
+) -> R:
     """Return the result of a job, repeated if its worker died; ``lost`` is called with the reason.
 
     Raises
@@ -231,12 +245,8 @@ async def with_another_worker(job: Callable[[], Awaitable[R]], lost: Callable[[s
     return await job()
 
 
-def _run(
-    worker: Worker, first: Callable[[], Done[None]] | None, work: Callable[[], Done[R]]
-) -> Done[R]:
-    if first is not None:
-        worker.run(first)
-    return worker.run(work)
+def _ignore(_model: ModelState) -> None:
+    pass
 
 
 # --- how the work keeps pace with the telemetry: what it costs, and what is said where it does not

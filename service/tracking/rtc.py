@@ -9,6 +9,7 @@ from service.records import alarms
 from service.records import events as ev
 from service.records.events import Effect
 from service.records.products import MatrixState
+from service.records.state import ModelState
 from service.tracking import (
     dither,
     mode_proof,
@@ -21,7 +22,7 @@ from service.tracking.operator import end_ramp
 from service.tracking.policy import SECOND_NS
 from service.tracking.step_context import StepContext, log_bursts
 from service.wire import Command as Request
-from service.wire import Status
+from service.wire import LoopRequest, Reply, Status
 
 ACKNOWLEDGEMENT_TIMEOUT_S = 3.0
 """An RTC applies within 2 s of the commit, or it has failed."""
@@ -67,9 +68,11 @@ def on_status(context: StepContext, rtc: Status) -> None:
     if registration is not None and bias is not None and bias.looked_ns_utc and elsewhere:
         # it was learnt in another loop, in whichever session
         validity.store_registration(context, replace(registration, bias=None))
+    pending = context.loop.commanded_modes
     context.loop = replace(
         context.loop,
         rtc=rtc,
+        commanded_modes=None if pending == rtc.n_controlled else pending,
         # Pinned by the instrument file or the first status: a later one does not replace them.
         basis_id=context.loop.basis_id or rtc.basis_id,
         config_id=context.loop.config_id or rtc.config_id,
@@ -97,6 +100,29 @@ def on_vibrations(context: StepContext, event: ev.Vibrations) -> None:
 def on_loop_held(context: StepContext, event: ev.LoopHeld) -> None:
     """Store whether the loop is stable."""
     context.loop = replace(context.loop, holds=event.holds)
+
+
+def on_modes_commanded(context: StepContext, event: ev.ModesCommanded) -> None:
+    """Store the number of modes until a status shows it: the status lags behind the answer."""
+    context.loop = replace(context.loop, commanded_modes=event.n_modes)
+
+
+def on_loop_answer(context: StepContext, request: LoopRequest, reply: Reply) -> None:
+    """Store the number of modes that an order has set."""
+    if reply.accepted and request.n_controlled is not None:
+        context.loop = replace(context.loop, commanded_modes=request.n_controlled)
+
+
+def on_modes_unknown(context: StepContext, _: Effect | Request, __: str) -> None:
+    """Believe the next status: what failed may have been accepted."""
+    context.loop = replace(context.loop, commanded_modes=None)
+
+
+def on_model_changed(context: StepContext, event: ev.ModelChanged) -> None:
+    """Store what a job of the worker has made of the model."""
+    # The job may have begun before the sensor's mode changed: its results belong to that mode.
+    if event.model.sensor_mode == context.model.sensor_mode:
+        context.model = event.model
 
 
 def _log_partial_loop(context: StepContext, before: Status | None, rtc: Status) -> None:
@@ -173,6 +199,8 @@ def _enter_sensor_mode(context: StepContext, config_id: str) -> None:
     update_policy.forget_limit(context)
     # An RTC that does not name its references is named by its mode: that says nothing of them.
     context.loop = replace(context.loop, config_id=config_id, reference_id=None)
+    # Order and signs of the slopes are those of every mode; all else is measured again.
+    context.model = ModelState(sensor_mode=config_id, slopes=context.model.slopes)
     pointing_law.begin_law(context)
     kept, scale = "", context.policy.alpha_scale(before, config_id)
     if scale is not None and context.registration is not None:
@@ -200,7 +228,7 @@ def _begin_anew(context: StepContext, because: str) -> None:
     # α belongs to the telescope and is kept, but windows must confirm it.
     validity.require_new_windows(context)
     context.retry_all()
-    context.loop = replace(context.loop, rtc=None, holds=False)
+    context.loop = replace(context.loop, rtc=None, holds=False, commanded_modes=None)
     dither.note_found(context)
     context.clear_alarm(alarms.MIRROR_SILENT)
     dither.forget_unwanted(context)

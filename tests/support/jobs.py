@@ -3,8 +3,12 @@
 import os
 import signal
 import time
+from dataclasses import replace
+
+import numpy as np
 
 from service.errors import MatrixError
+from service.estimation.own_matrix import LeftOver
 
 
 def process_id(_bench=None):
@@ -52,9 +56,12 @@ def refusing(*_given):
     raise MatrixError("transposed")
 
 
-def remembering(bench):
-    bench.told = "first"
+def measuring(bench, value):
+    """Change the model as a job does that has measured something."""
+    residual = LeftOver(columns=np.array([7]), slopes=np.full((224, 1), value, np.float32))
+    bench.restore(replace(bench.state, own_residual=bench._keep(residual)), {})
 
 
-def remembered(bench):
-    return getattr(bench, "told", None)
+def measured(bench):
+    """Return what the model has of that."""
+    return [float(one.slopes[0, 0]) for one in bench.arrays.values()]

@@ -10,11 +10,12 @@ import contextlib
 import functools
 import os
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Concatenate, Generic, ParamSpec, TypeVar
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
 from service.model.instrument import Instrument
+from service.records.state import ModelState
 from service.runtime.processes import Worker, return_free_memory
 from service.runtime.worker.optics_worker import OpticsWorker
 from service.runtime.worker.records import Compute, Conditions, Made, Sampling
@@ -45,6 +46,12 @@ class Done(Generic[R]):
     cpu_s: float
     """Processor time of the whole worker process, all its threads, seconds."""
 
+    model: ModelState = field(default_factory=ModelState)
+    """State of the model after the job."""
+
+    arrays: Mapping[str, Any] = field(default_factory=dict)
+    """Arrays of that state that the state before did not have, by their keys."""
+
     cluster_problem: str = ""
     """Problem of the cluster; empty if there is none."""
 
@@ -55,19 +62,33 @@ def start_worker(instrument: Instrument, compute: Compute, early: Worker | None 
 
 
 def run_job(
-    job: Callable[Concatenate[OpticsWorker, P], R], *args: P.args, **kwargs: P.kwargs
+    model: ModelState,
+    arrays: Mapping[str, Any],
+    job: Callable[Concatenate[OpticsWorker, P], R],
+    *args: P.args,
+    **kwargs: P.kwargs,
 ) -> Done[R]:
-    """Run a method of the optics worker in its process."""
+    """Run a method of the optics worker in its process, with the model in this state.
+
+    ``arrays`` are those of the state that this process does not have yet.
+    """
     if _open_worker is None:
         raise RuntimeError("not in a worker process")
     before_s, optics = time.process_time(), _open_worker()
     try:
+        optics.restore(model, arrays)
         result = job(optics, *args, **kwargs)
     finally:
         optics.tidy()
         return_free_memory()  # a linearisation leaves hundreds of megabytes behind
     spent_s = time.process_time() - before_s
-    return Done(result=result, cpu_s=spent_s, cluster_problem=optics.rows.problem)
+    return Done(
+        result=result,
+        cpu_s=spent_s,
+        model=optics.state,
+        arrays={key: optics.arrays[key] for key in optics.state.keys - model.keys},
+        cluster_problem=optics.rows.problem,
+    )
 
 
 def _enter(instrument: Instrument, compute: Compute) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
-from collections.abc import Iterator
-from dataclasses import replace
-from typing import TypeVar
+import pickle
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +25,7 @@ from service.control.loop import ControlLoop
 from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
 from service.estimation import passive
 from service.estimation.description import Description
-from service.estimation.dithered_response import DitheredResponse
+from service.estimation.dithered_response import DitheredResponse, ModeResidual
 from service.estimation.lockin import Spectra, fit_window
 from service.estimation.openloop import WideCaptureSearch, far_starts, find, not_found
 from service.estimation.own_matrix import (
@@ -44,10 +46,11 @@ from service.estimation.windows import ClosedLoop
 from service.files.disk_cache import DiskCache
 from service.model.instrument import Instrument
 from service.model.interaction import Linearisation, RtcInteractionModel
+from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration
 from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import WorkingPoint
-from service.model.slopes import SlopeRecipe
+from service.model.slopes import Orientation
 from service.records.estimates import (
     DitheredEstimate,
     LockInEstimate,
@@ -57,7 +60,9 @@ from service.records.estimates import (
     WideCaptureEstimate,
     WindowRefused,
 )
+from service.records.messages import as_message, compose
 from service.records.products import ExpectedGain, GateVerdict
+from service.records.state import ModelState
 from service.runtime.worker.records import (
     Compute,
     Conditions,
@@ -105,16 +110,50 @@ class OpticsWorker:
         self._disk_cache = DiskCache(compute.cache)
         self.rows = SharedRows(compute.threads, compute.cluster)
         self._compute = compute
-        self._mode_response: NDArray[np.float64] | None = None
-        self._left_over: LeftOver | None = None
+        self._file = instrument
         self._basis = self._disk_cache.basis(instrument)
-        self._equip(instrument)
+        self._state = ModelState()
+        self.arrays: dict[str, Any] = {}
+        """Measured residuals by the keys in the state."""
 
-    def _equip(self, instrument: Instrument) -> None:
-        """Make the models of an instrument, all but its modes."""
-        basis, compute = self._basis, self._compute
-        # Residuals of the models before.
-        self._dithered = DitheredResponse()
+        self._equip(self._state)
+
+    @property
+    def state(self) -> ModelState:
+        """What the results of the next job depend on."""
+        strength, linearised_at = self._sensor.place
+        return replace(self._state, strength=strength, linearised_at=linearised_at)
+
+    def restore(self, state: ModelState, arrays: Mapping[str, Any]) -> None:
+        """Continue from a state of the model, whatever this worker has done before.
+
+        ``arrays`` are those of the state that this worker may not have.
+
+        Raises
+        ------
+        ModelError
+            If the instrument has no such mode of the sensor.
+        """
+        known = self.arrays | dict(arrays)
+        self.arrays = {key: known[key] for key in state.keys}
+        if _parts_of_models(state) != _parts_of_models(self._state):
+            self._equip(state)
+        self._state = state
+        self._sensor.restore(state.strength, state.linearised_at)
+
+    def _equip(self, state: ModelState) -> None:
+        """Make the models for a mode of the sensor, slopes and a response of modes."""
+        compute, instrument = self._compute, self._file
+        if state.sensor_mode not in {None, instrument.config_id}:
+            instrument = instrument.in_mode(state.sensor_mode)
+        if state.slopes is not None:
+            order, axes = SlopeOrder(state.slopes[0]), dict[str, Any](state.slopes[1])
+            found = replace(instrument.slopes, order=order, orientation=Orientation(**axes))
+            instrument = replace(instrument, slopes=found)
+        if state.sensor_mode != self._state.sensor_mode:
+            self._basis = self._disk_cache.basis(instrument)
+        basis = self._basis
+        response = None if state.response is None else np.array(state.response)
 
         def model(sampling: int, nodes: int, at_work: WorkingPoint | None) -> RtcInteractionModel:
             return RtcInteractionModel(
@@ -125,7 +164,7 @@ class OpticsWorker:
                 working_point=at_work,
                 kept_bytes=compute.kept_bytes,
                 mapper=self.rows.map,
-                mode_response=self._mode_response,
+                mode_response=response,
                 anamorphosis=compute.anamorphosis,
                 arrays=compute.arrays,
             )
@@ -153,26 +192,6 @@ class OpticsWorker:
         for model in (*self._sensor.models, *models):
             model.forget()
 
-    def enter_mode(self, config_id: str) -> Description:
-        """Make the models of another mode of the sensor; return the expected telemetry.
-
-        Order and signs of the slopes are kept; the response of modes is measured again on the RTC's
-        own matrix of that mode.
-
-        Raises
-        ------
-        ModelError
-            If the instrument has no such mode.
-        """
-        instrument = self._model.instrument
-        if config_id != instrument.config_id:
-            instrument = instrument.in_mode(config_id)
-            self._basis = self._disk_cache.basis(instrument)
-            # Both were measured on the RTC's matrix of the mode before.
-            self._mode_response = self._left_over = None
-            self._equip(instrument)
-        return self.describe()
-
     def describe(self) -> Description:
         """Return the expected telemetry, and prepare for the first fit."""
         linearisation, model = self._first(), self._model
@@ -194,11 +213,12 @@ class OpticsWorker:
         start = self._start
 
         def computed() -> dict[str, NDArray[np.float32]]:
-            found = self._sensor.linearise(start)
+            found = self._sensor.compute(start)
             return {name: getattr(found, name) for name in names}
 
         names = ("matrix", "derivatives", "stretches")[: 3 if self._compute.anamorphosis else 2]
-        what = ("linearisation", *self._compute.sampling, start.vector.tolist(), *names[2:])
+        of = (start.vector.tolist(), *names[2:], self.state.strength, self.state.response)
+        what = ("linearisation", *self._compute.sampling, *of)
         kept = self._disk_cache.arrays(self._model.instrument, what, computed)
         return Linearisation(alpha=start, **kept, noise_shape=self._model.noise_shape)
 
@@ -217,7 +237,9 @@ class OpticsWorker:
         near = self._sensor.at_hand
         if isinstance(outcome, LockInEstimate) and near is not None:
             at_work = self._with_own_residual(self._sensor.to_unit_gain(near))
-            self._dithered.add(spectra, outcome, at_work.matrix_at(outcome.alpha))
+            dithered = self._dithered
+            dithered.add(spectra, outcome, at_work.matrix_at(outcome.alpha))
+            self._keep_dithered(dithered)
         return outcome
 
     def _fit_recognised(
@@ -241,7 +263,9 @@ class OpticsWorker:
         if not answer.wrong:
             return outcome
         return WindowRefused(
-            reason=answer.wrong, t_ns_utc=spectra.t_end_ns_utc, kind=RefusalKind.MISTOLD
+            reason=compose("window.other-instrument", text=answer.wrong),
+            t_ns_utc=spectra.t_end_ns_utc,
+            kind=RefusalKind.MISTOLD,
         )
 
     def _fit_spectra(
@@ -255,7 +279,9 @@ class OpticsWorker:
             if self._sensor.follow(found.modes, found.optical_gain):
                 estimate = self._refine_fit(spectra, loop, found.alpha)
         except np.linalg.LinAlgError as error:
-            return WindowRefused(reason=f"no fit: {error}", t_ns_utc=spectra.t_end_ns_utc)
+            return WindowRefused(
+                reason=compose("window.no-fit", str(error)), t_ns_utc=spectra.t_end_ns_utc
+            )
         return _refuse_unsettled(spectra) if estimate is None else self._against_flat(estimate)
 
     def read_slope_convention(
@@ -276,41 +302,19 @@ class OpticsWorker:
         )
         if instrument.slopes.orientation is not None or dialect.found is None or dialect.wrong:
             return dialect
-        self.adopt(dialect.found)
+        axes = tuple(asdict(dialect.found.assumed_orientation).items())
+        self._rebuild(replace(self._state, slopes=(dialect.found.order, axes)))
         return replace(dialect, adopted=True)
 
-    def adopt(
-        self,
-        slopes: SlopeRecipe | None,
-        mode_response: NDArray[np.float64] | None = None,
-        config_id: str | None = None,
-        left_over: LeftOver | None = None,
-    ) -> None:
-        """Use this order of slopes from now on, and this response ``(n_modes,)`` of modes.
-
-        ``config_id`` is the sensor's mode that both belong to. ``left_over`` is the model's
-        residual of the RTC's own matrix, which the gate adds to judged loops. None leaves each
-        unchanged.
-        """
-        if self._model.instrument.sensor_modes and config_id is not None:
-            self.enter_mode(config_id)
-        if left_over is not None:
-            self._left_over = left_over
-        instrument, now = self._model.instrument, self._model.instrument.slopes
-        if slopes is not None and replace(now, orientation=now.assumed_orientation) != slopes:
-            instrument = replace(instrument, slopes=slopes)
-        elif mode_response is None:
-            return
-        if mode_response is not None:
-            self._mode_response = mode_response
-        self._equip(instrument)
+    def _rebuild(self, state: ModelState) -> None:
+        """Make the models again with the slopes or the response of modes of a state."""
+        # What dithers have shown is a residual of the models before.
+        self.restore(replace(state, dithered=(), strength=1.0, linearised_at=None), {})
 
     def recognise(
         self, own: NDArray[np.float32], near: Misregistration | None, rotation_rad: float | None
-    ) -> tuple[OwnMatrix | None, NDArray[np.float64] | None]:
-        """Return the modes that the RTC's own matrix controls, and the expected response of modes.
-
-        The first is None if it controls none; the second is None if modes respond nominally.
+    ) -> OwnMatrix | None:
+        """Return the modes that the RTC's own matrix controls; None if it controls none.
 
         ``rotation_rad`` is the rotation found in a coarser search, None without one. If the
         response of a mode differs from the nominal one, though with its own sign and in its own
@@ -321,9 +325,9 @@ class OpticsWorker:
             start = replace(start, rotation_rad=rotation_rad)
         found = recognise_modes(own, self._coarse.linearise, start)
         # A residual of the matrix before must not widen the verdicts on this one.
-        self._left_over = None
+        self._state = replace(self._state, own_matrix_read=True, own_residual=None)
         if found is None or found.wrong or not found.known.any():
-            return found, self._mode_response
+            return found
         power = np.square(self._first().matrix).sum(axis=0)
         found = replace(found, weights=weights_of_modes(found, power))
         response = found.response[found.known]
@@ -332,10 +336,12 @@ class OpticsWorker:
             gains = CalibrationGains.of_modes(response, found.columns[found.known], n_modes).values
             # The matrix was compared with a model that already contains the response found before:
             # the factors multiply.
-            now = 1.0 if self._mode_response is None else self._mode_response
-            self.adopt(None, now * gains)
-        self._left_over = left_over(own, found, self._coarse.interaction_matrix(found.alpha))
-        return replace(found, left_over=self._left_over), self._mode_response
+            now = 1.0 if self._state.response is None else np.array(self._state.response)
+            self._rebuild(replace(self._state, response=tuple((now * gains).tolist())))
+        left = left_over(own, found, self._coarse.interaction_matrix(found.alpha))
+        if left is not None:
+            self._state = replace(self._state, own_residual=self._keep(left))
+        return found
 
     def _refine_fit(
         self, spectra: Spectra, loop: ClosedLoop, start: Misregistration
@@ -368,7 +374,7 @@ class OpticsWorker:
         modes = spectra.plan.modes
         # Kept between attempts of an acquisition, which dither the same modes each time.
         if modes not in self._wide_capture:
-            basis, every = self._model.basis.subset(np.array(modes)), self._mode_response
+            basis, every = self._model.basis.subset(np.array(modes)), self._state.response
             self._wide_capture[modes] = tuple(
                 RtcInteractionModel(
                     self._model.instrument,
@@ -376,7 +382,7 @@ class OpticsWorker:
                     pupil_sampling=sampling,
                     detector_nodes=sampling,
                     mapper=self.rows.map,
-                    mode_response=None if every is None else every[list(modes)],
+                    mode_response=None if every is None else np.array(every)[list(modes)],
                 )
                 for sampling in self._samplings
             )
@@ -389,7 +395,7 @@ class OpticsWorker:
                 WideCaptureSearch(coarse=far, fine=near, nominal=nominal, starts=starts),
             )
         except np.linalg.LinAlgError as error:
-            return not_found(str(error), spectra)
+            return not_found(as_message("not-found.failed", str(error)), spectra)
 
     def fit_random(
         self, window: Correlated, start: Misregistration | None
@@ -407,7 +413,9 @@ class OpticsWorker:
                     break
                 estimate = fit_random(window, self._sensor.linearise(estimate.alpha))
         except np.linalg.LinAlgError as error:
-            return WindowRefused(reason=f"no fit: {error}", t_ns_utc=window.t_end_ns_utc)
+            return WindowRefused(
+                reason=compose("window.no-fit", str(error)), t_ns_utc=window.t_end_ns_utc
+            )
         return _refuse_unsettled(window)
 
     def response(self, alpha: Misregistration | None) -> NDArray[np.float32]:
@@ -527,13 +535,14 @@ class OpticsWorker:
     def _possible_responses(self, alpha: Misregistration) -> Iterator[Linearisation]:
         """Yield the responses at unit gain that agree with what was measured of modes."""
         own, at_work = self._left_over, self._with_own_residual(self._sensor.at_unit_gain(alpha))
+        dithered = self._dithered
         known = () if own is None else own.columns.tolist()
         # A model that is poor where the RTC's own matrix shows it is taken for poor in all modes:
         # what noise may hide in their measured response counts as the model's error.
         if own is not None and own.is_large(at_work.matrix):
-            every = self._dithered.with_noise(known)
+            every = dithered.with_noise(known)
         else:
-            significant = self._dithered.left_over(known)
+            significant = dithered.left_over(known)
             every = () if significant is None else (significant,)
         for left in every:
             yield left.add_to(at_work)
@@ -542,7 +551,34 @@ class OpticsWorker:
 
     def _with_own_residual(self, linearisation: Linearisation) -> Linearisation:
         """Return a linearisation at unit gain with the residual of the RTC's own matrix."""
-        return linearisation if self._left_over is None else self._left_over.add_to(linearisation)
+        left = self._left_over
+        return linearisation if left is None else left.add_to(linearisation)
+
+    @property
+    def _left_over(self) -> LeftOver | None:
+        """The model's residual of the RTC's own matrix, which the gate adds to judged loops."""
+        key = self._state.own_residual
+        return None if key is None else self.arrays[key]
+
+    @property
+    def _dithered(self) -> DitheredResponse:
+        residuals = {mode: self.arrays[key] for mode, key in self._state.dithered}
+        return DitheredResponse(self._state.dither_session, residuals)
+
+    def _keep_dithered(self, found: DitheredResponse) -> None:
+        """Store the measured responses of dithered modes, each under its key."""
+        keys = dict(self._state.dithered)
+        for mode, residual in found.residuals.items():
+            if residual is not self.arrays.get(keys.get(mode, "")):
+                keys[mode] = self._keep(residual)
+        kept = tuple((mode, keys[mode]) for mode in found.residuals)
+        self._state = replace(self._state, dither_session=found.session, dithered=kept)
+
+    def _keep(self, arrays: LeftOver | ModeResidual) -> str:
+        """Store arrays under a key of their contents, and return it."""
+        key = hashlib.blake2b(pickle.dumps(arrays), digest_size=8).hexdigest()
+        self.arrays[key] = arrays
+        return key
 
     @waits(at_most_s=10.0)
     def margin(
@@ -575,10 +611,14 @@ class OpticsWorker:
         return replace(found, optical_gain=gains)
 
 
+def _parts_of_models(state: ModelState) -> tuple[object, ...]:
+    """Return what all models are made for; a change of the rest makes none of them anew."""
+    return state.sensor_mode, state.slopes, state.response
+
+
 def _refuse_unsettled(spectra: Spectra | Correlated) -> WindowRefused:
     return WindowRefused(
-        reason="the fit did not settle: the mirror moved inside the window, the registration is "
-        "outside the capture range, or the instrument file is another's",
+        reason=compose("window.unsettled"),
         t_ns_utc=spectra.t_end_ns_utc,
         kind=RefusalKind.OUT_OF_REACH,
     )

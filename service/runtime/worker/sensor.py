@@ -69,6 +69,10 @@ class SensorAtWork:
         self._sampling = sampling
         self._strength = 1.0
         self._model = self._at_work()
+        self.linearised_at: Misregistration | None = None
+        """Registration of the linearisation at hand; None if there is none since the working point
+        has changed."""
+
         self._linearisation: Linearisation | None = None
         self._ratio: Array | None = None
 
@@ -87,17 +91,30 @@ class SensorAtWork:
         """Variance of the residual over that expected at the instrument's r0."""
         return 0.0 if self.is_flat else self._strength
 
+    def restore(self, strength: float, linearised_at: Misregistration | None) -> None:
+        """Be at this working point and linearisation, which is computed again if it is needed."""
+        if strength != self._strength:
+            self._move(strength)
+        if linearised_at != self.linearised_at:
+            self.linearised_at, self._linearisation, self._ratio = linearised_at, None, None
+
+    @property
+    def place(self) -> tuple[float, Misregistration | None]:
+        """Working point and linearisation, as :meth:`restore` takes them."""
+        return self._strength, self.linearised_at
+
     @property
     def at_hand(self) -> Linearisation | None:
         """The last linearisation; None if there is none since the working point has changed."""
+        if self._linearisation is None and self.linearised_at is not None:
+            self._linearisation = self._model.linearise(self.linearised_at)
         return self._linearisation
 
     def near(self, alpha: Misregistration) -> Linearisation:
         """Return the linearisation at hand if it is close enough, else a new one."""
-        kept = self._linearisation
-        if kept is None or self._apart(alpha, kept.alpha):
-            return self.linearise(alpha)
-        return kept
+        at = self.linearised_at
+        kept = None if at is None or self._apart(alpha, at) else self.at_hand
+        return self.linearise(alpha) if kept is None else kept
 
     def _apart(self, *both: Misregistration) -> bool:
         """Return whether a linearisation at one of two registrations is not for the other."""
@@ -107,12 +124,18 @@ class SensorAtWork:
 
     def linearise(self, alpha: Misregistration) -> Linearisation:
         """Return a new linearisation about ``alpha``, and keep it."""
-        self.keep(self._model.linearise(alpha))
-        return self.near(alpha)
+        found = self.compute(alpha)
+        self.keep(found)
+        return found
+
+    def compute(self, alpha: Misregistration) -> Linearisation:
+        """Return a linearisation at this working point, without keeping it."""
+        return self._model.linearise(alpha)
 
     def keep(self, linearisation: Linearisation) -> None:
         """Take a linearisation of this very sensor, wherever it comes from, as the one at hand."""
         self._linearisation, self._ratio = linearisation, None
+        self.linearised_at = linearisation.alpha
 
     def ratio(self) -> Array:
         """Return ``(n_modes,)`` how much of the flat response is left of each mode at work.
@@ -120,8 +143,8 @@ class SensorAtWork:
         Of the linearisation at hand, projected on the flat response: the optical gain the model
         expects. Ones where there is none.
         """
-        kept = self._linearisation
-        if self.is_flat or kept is None:
+        kept = None if self.is_flat else self.at_hand
+        if kept is None:
             return np.ones(self.flat.basis.n_modes)
         if self._ratio is None:
             flat = self.flat.interaction_matrix(kept.alpha)
@@ -160,13 +183,16 @@ class SensorAtWork:
         expected = float(np.log(self.ratio()[list(modes)]).mean())
         if abs(seen - expected) <= MIN_GAIN_CHANGE:
             return False
-        before = self._strength
-        self._strength = float(np.clip(before * seen / expected, *STRENGTH_RANGE))
-        if self._strength == before:
+        strength = float(np.clip(self._strength * seen / expected, *STRENGTH_RANGE))
+        if strength == self._strength:
             return False
-        self._model = self._at_work()
-        self._linearisation = None
+        self._move(strength)
         return True
+
+    def _move(self, strength: float) -> None:
+        self._strength = strength
+        self._model = self._at_work()
+        self._linearisation = self.linearised_at = None
 
     def _at_work(self) -> RtcInteractionModel:
         if self._n_controlled is None:

@@ -9,6 +9,7 @@ from service.errors import ArchiveError, CommandError, LinkError, StorageError, 
 from service.model.misregistration import Misregistration
 from service.records import events as ev
 from service.records.products import MatrixState, ReconstructorRecord
+from service.tracker import step
 from service.wire import (
     DitherKind,
     DitherRequest,
@@ -19,11 +20,20 @@ from service.wire import (
     layout_of,
 )
 from tests.support.handmade import ALPHA, BROUGHT, N_MODES, N_SLOPES, REGISTRATION, RTC, STATE
-from tests.support.situations import foreign, record, rtc
+from tests.support.situations import POLICY, foreign, record, rtc
 from tests.support.small import N_CONTROLLED, SIGMA
 from tests.support.states import changed
 
 pytestmark = pytest.mark.timeout(60)
+
+
+def stepped(state, event):
+    """Return the state after an event, its matrices as they were."""
+    after, _ = step(state, event, POLICY, 0)
+    return replace(after, matrices=state.matrices)
+
+
+LOST = ev.SendMatrix(id="initial", n_modes=60, gains=None)
 
 
 async def made(actions, n_modes=N_CONTROLLED, state=STATE):
@@ -109,9 +119,28 @@ async def test_an_rtc_that_will_not_control_so_many_modes_gets_no_matrix(actions
 async def test_after_more_modes_were_commanded_in_vain_fewer_are_commanded_again(actions, bridge):
     many, state = await made(actions, 60)
     few, state = await made(actions, N_CONTROLLED, state)
-    await actions.perform(ev.SendMatrix(id=many.id, n_modes=60, gains=(0.4,) * 90), state)
+    told = await actions.perform(ev.SendMatrix(id=many.id, n_modes=60, gains=(0.4,) * 90), state)
+    state = stepped(state, told)
     await actions.perform(ev.SendMatrix(id=few.id, n_modes=N_CONTROLLED, gains=None), state)
     assert [command.n_controlled for command in bridge.commands] == [60, N_CONTROLLED]
+
+
+@pytest.mark.parametrize(
+    "news",
+    [
+        (replace(RTC, n_controlled=60), RTC),
+        (ev.SessionStarted(session="another"), RTC),
+        (ev.JobFailed(effect=LOST, text="cut off"), RTC),
+    ],
+)
+async def test_a_number_of_modes_that_no_longer_holds_is_commanded_again(actions, bridge, news):
+    """An RTC that was restarted, or set by somebody else, would reject the matrix (R-53)."""
+    many, state = await made(actions, 60)
+    told = await actions.perform(ev.SendMatrix(id=many.id, n_modes=60, gains=None), state)
+    for event in filter(None, (told, *news)):
+        state = stepped(state, event)
+    await actions.perform(ev.SendMatrix(id=many.id, n_modes=60, gains=None), state)
+    assert [command.n_controlled for command in bridge.commands] == [60, 60]
 
 
 async def test_nothing_unknown_is_sent(actions):

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from pyrcal_studies.campaign.observatory import Dome, Observatory, OwnHands
+from pyrcal_studies.campaign.observatory import Dome, Observatory
 from service.config import load_settings
 from service.errors import ModelError
 from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE
-from service.model.slopes import Orientation, SlopeRecipe
+from service.model.pupil import rtc_valid_subapertures
+from service.model.slopes import Orientation, SlopeRecipe, to_rtc
 from service.records.estimates import RefusalKind
 from service.records.products import MatrixState
-from service.records.state import LoopState, Mode, TrackerState
-from service.runtime.actions import Actions
-from service.runtime.estimates import fitted, read_own_matrix
+from service.records.state import LoopState, Mode, ModelState, TrackerState
+from service.runtime.estimates import fitted
 from service.runtime.policy import policy_of
 from service.runtime.worker import OpticsWorker
 from service.tracking.reconstructors import check_sendable
@@ -180,7 +180,8 @@ def test_the_mirrors_modes_are_the_same_in_every_mode_of_the_sensor(tmp_path):
     path.write_text(FILE, encoding="utf-8")
     worker = OpticsWorker(load_instrument(path), replace(COMPUTE, cache=None))
     fine = worker._basis
-    told = worker.enter_mode("coarse")
+    worker.restore(ModelState(sensor_mode="coarse"), {})
+    told = worker.describe()
     assert (worker._basis.mode_to_actuator == fine.mode_to_actuator).all()
     points = np.array([[1.3, -2.1], [-4.0, 0.4]])
     assert worker._basis.render(points) == pytest.approx(fine.render(2 * points), abs=1e-9)
@@ -188,60 +189,34 @@ def test_the_mirrors_modes_are_the_same_in_every_mode_of_the_sensor(tmp_path):
     assert len(worker._model.valid) == 12
 
 
-def test_a_worker_that_begins_anew_enters_the_mode_before_anything_else(tmp_path):
+@pytest.mark.parametrize("mode", ["coarse", "fine"])
+def test_a_new_worker_has_mode_and_orientation_of_the_one_before(tmp_path, mode):
+    path = tmp_path / "modes.toml"
+    path.write_text(FILE.replace("[mirror]", '[slopes]\norientation = "auto"\n\n[mirror]'), "utf-8")
+    worker = OpticsWorker(load_instrument(path), COMPUTE)
+    theirs = SlopeRecipe(orientation=Orientation(flip_x=True))
+    matrix = np.linalg.pinv(worker.response(None)[:, :45])
+    mask = rtc_valid_subapertures(worker._model.instrument)
+    flipped = np.ascontiguousarray(to_rtc(matrix.T, theirs, mask).T, np.float32)
+    assert worker.read_slope_convention(flipped, None).adopted
+    state = ModelState(sensor_mode=mode, slopes=worker.state.slopes)
+    another = OpticsWorker(load_instrument(path), COMPUTE)
+    for one in (worker, another):
+        one.restore(state, {})
+        assert one._model.instrument.slopes == theirs
+        assert one._model.instrument.config_id == mode
+    np.testing.assert_array_equal(another.response(None), worker.response(None))
+    if mode == "fine":
+        assert not another.read_slope_convention(flipped, None).adopted
+
+
+def test_a_mode_that_the_instrument_does_not_have_is_refused(tmp_path):
     path = tmp_path / "modes.toml"
     path.write_text(FILE, encoding="utf-8")
     worker = OpticsWorker(load_instrument(path), COMPUTE)
-    worker.adopt(None, None, "coarse")
-    assert worker.describe().n_slopes == worker.enter_mode("coarse").n_slopes
     with pytest.raises(ModelError, match="found mode third, expected one of: fine, coarse"):
-        worker.enter_mode("third")
-
-
-async def test_a_worker_after_a_change_of_mode_has_the_orientation_that_was_found(tmp_path):
-    """A worker that is replaced in the second mode knows how the RTC lists its slopes, too."""
-    path = tmp_path / "modes.toml"
-    path.write_text(FILE.replace("[mirror]", '[slopes]\norientation = "auto"\n\n[mirror]'), "utf-8")
-    instrument = load_instrument(path)
-    found = SlopeRecipe(orientation=Orientation(flip_x=True))
-    workers = OwnHands(OpticsWorker(instrument, COMPUTE))
-    workers.found_slopes = found
-    actions = Actions(
-        bridge=None,
-        workers=workers,
-        archive=SimpleNamespace(measured=None, noisy=None),
-        instrument=instrument,
-        publishing=None,
-        clock_ns=lambda: 0,
-    )
-    await actions.enter_sensor_mode("coarse")
-    job, *given = workers.first.args
-    another = OpticsWorker(instrument, COMPUTE)
-    job(another, *given)
-    assert another._model.instrument.slopes == found
-    assert another._model.instrument.config_id == "coarse"
-
-
-async def test_a_second_matrix_of_the_rtc_does_not_make_workers_forget_the_orientation():
-    """It finds the orientation settled, and names none."""
-    found = SlopeRecipe(orientation=Orientation(flip_x=True))
-
-    class Fake:
-        first = found_slopes = None
-        adopted = True
-
-        async def call(self, job, *_):
-            if job is OpticsWorker.recognise:
-                return None, None
-            slopes = found if self.adopted else None
-            return SimpleNamespace(found=slopes, adopted=self.adopted, wrong="", rotation_rad=None)
-
-    workers, state = Fake(), TrackerState(system="s")
-    record = SimpleNamespace(judged=None, id="own")
-    for adopted in (True, False):
-        workers.adopted = adopted
-        await read_own_matrix(record, np.zeros((1, 1), np.float32), state, workers, None)
-    assert workers.first.args[1] == found
+        worker.restore(ModelState(sensor_mode="third"), {})
+    assert worker.describe().n_slopes == worker._model.n_slopes
 
 
 async def test_a_window_of_an_unknown_dither_is_not_taken_for_sines(night):
@@ -254,5 +229,5 @@ async def test_a_window_of_a_session_before_is_not_fitted(night):
     """The worker has another model by then: of another mode, it could only fail."""
     window = SimpleNamespace(session="before", t_end_ns_utc=7)
     lost = await fitted(window, night.state, workers=None, matrix_of=None)
-    assert (lost.refused.reason, lost.refused.t_ns_utc) == ("the RTC has restarted since", 7)
+    assert (lost.refused.reason.code, lost.refused.t_ns_utc) == ("window.other-session", 7)
     assert lost.refused.kind is RefusalKind.VOID

@@ -17,6 +17,7 @@ from service.archive import Actor, AuditEntry, Channel, Range
 from service.errors import ArchiveError, CommandError, PyrcalError, UnknownIdError
 from service.records import commands as cmd
 from service.records import events as ev
+from service.records.messages import as_message
 from service.records.state import Level, LogEntry, Mode, TrackerState
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime import supervisor as supervising
@@ -212,7 +213,10 @@ async def test_what_is_wrong_in_the_archive_is_on_record_from_the_start(archive)
 
 
 async def test_what_was_restored_is_on_record(supervisor, archive):
-    know(supervisor, log=(LogEntry(t_ns_utc=1, level=Level.INFO, name="old", text="news"),))
+    know(
+        supervisor,
+        log=(LogEntry(t_ns_utc=1, level=Level.INFO, name="old", message=as_message("x", "news")),),
+    )
     async with running(supervisor):
         await until(lambda: any(e.name == "old" for e in archive.audit_trail()))
 

@@ -3,18 +3,18 @@ import multiprocessing
 import os
 import signal
 import time
-from functools import partial
 
 import pytest
 
 from service.errors import WorkerError
 from service.records.alarms import Alarm
-from service.records.state import TrackerState
+from service.records.messages import as_message
+from service.records.state import ModelState, TrackerState
 from service.runtime import workers as crew_module
 from service.runtime import workers as workers_module
 from service.runtime.estimates import work_out
 from service.runtime.processes import Worker
-from service.runtime.worker import OpticsWorker, run_job, start_worker
+from service.runtime.worker import OpticsWorker, start_worker
 from service.runtime.workers import WorkerLoadMeter, WorkerPool
 from tests.support.jobs import (
     asleep,
@@ -22,11 +22,11 @@ from tests.support.jobs import (
     failing,
     interrupted,
     killed,
+    measured,
+    measuring,
     napping,
     niceness,
     process_id,
-    remembered,
-    remembering,
     spinning,
 )
 from tests.support.pace import in_time
@@ -161,15 +161,25 @@ async def test_what_nobody_waits_for_any_more_is_not_finished(workers, hired):
     assert await workers.call(process_id) == hired[1].pid
 
 
-def test_what_every_worker_must_be_told_is_told_to_one_that_takes_a_dead_ones_place(workers):
-    async def jobs():
-        await workers.call(process_id)
-        workers.first = partial(run_job, remembering)
-        with pytest.raises(WorkerError):
-            await workers.call(killed)
-        return await workers.call(remembered)
-
-    assert asyncio.run(jobs()) == "first"
+async def test_a_worker_that_takes_a_dead_ones_place_has_its_model(workers, monkeypatch):
+    states, sent = [ModelState()], []
+    workers.model, workers.changed = lambda: states[-1], states.append
+    run = Worker.run
+    monkeypatch.setattr(Worker, "run", lambda *a: sent.append(len(a[1].args[1])) or run(*a))
+    await workers.call(measuring, 3.0)
+    assert await workers.call(measured) == [3.0]
+    with pytest.raises(WorkerError):
+        await workers.call(killed)
+    assert await workers.call(measured) == [3.0]
+    await workers.call(measuring, 4.0)
+    assert await workers.call(measured) == [4.0]
+    assert len(states) == 3
+    # once to the process that had not measured it, and never to one that has
+    assert sent == [0, 0, 0, 1, 0, 0]
+    # no array of a model that the service has given up is kept
+    states.append(ModelState())
+    assert await workers.call(measured) == []
+    assert workers._arrays == {}
 
 
 async def test_what_is_urgent_goes_first_and_what_waits_long_has_its_turn(workers, monkeypatch):
@@ -268,7 +278,9 @@ QUIET = TrackerState(system="small")
 
 
 def alarmed(name):
-    return tracker_state(system="small", active=(Alarm(name=name, text="", since_ns_utc=1),))
+    return tracker_state(
+        system="small", active=(Alarm(name=name, message=as_message("x", ""), since_ns_utc=1),)
+    )
 
 
 class Clocks:

@@ -1,18 +1,15 @@
-"""Results of orders in one sentence, and of refits by their id."""
+"""Results of orders in one sentence."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
-from enum import StrEnum
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Final
 
-from service.errors import CommandError, LinkError, UnknownIdError
+from service.errors import CommandError, LinkError
 from service.records import commands as cmd
-from service.records import events as ev
 from service.records.alarms import AlarmRecord
 from service.records.commands import Command
-from service.records.events import Effect, Event
 from service.records.operations import CommandState, MeasureState
 from service.records.products import MatrixState, ReconstructorRecord
 from service.records.state import TrackerState
@@ -22,9 +19,6 @@ from service.tracking.dither_request import total_m
 from service.tracking.reconstructors import check_sendable
 
 SILENT = "sent, the RTC has not answered yet"
-
-REFITS_KEPT = 100
-"""Newest jobs that are remembered, until the service ends."""
 
 _ON_ITS_WAY = {
     MatrixState.PROPOSED: "is being judged again before it is sent",
@@ -218,8 +212,7 @@ def _done(  # noqa: C901 - one line for each command
             text = f"the acquisition has {now.operations.acquisition.text}"
         case cmd.GiveUp(id=name):
             record = now.measurement(name)
-            why = "" if record is None else record.reason.removeprefix("given up ")
-            text = f"{name} is given up {why}"
+            text = f"{name} is {record.reason if record else 'given up'}"
         case cmd.SetPointing(elevation_deg=up, azimuth_deg=round_):
             text = f"the telescope points at elevation {up:g} deg, azimuth {round_:g} deg"
         case cmd.SetValue(name=name, value=value, for_s=for_s):
@@ -247,82 +240,3 @@ def _alarm(now: TrackerState, name: str) -> str:
         left_s = ((record.muted.until_ns_utc or 0) - record.muted.t_ns_utc) / 1e9
         said.append(f"muted for {left_s:.0f} s, with {len(muted_records(now))} muted in all")
     return f"{name} is {', '.join(said)}"
-
-
-class RefitState(StrEnum):
-    """States of a refit."""
-
-    RUNNING = "running"
-    """The reconstructor is being computed and judged."""
-
-    MADE = "made"
-    """There is a reconstructor; its own state says what becomes of it."""
-
-    REFUSED = "refused"
-    """There is one, and the gate refuses it."""
-
-    FAILED = "failed"
-    """There is none, for a reason."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RefitJob:
-    """An order to compute a reconstructor for the registration of now."""
-
-    id: str
-    state: RefitState
-    n_modes: int
-    """Number of modes requested."""
-
-    asked_ns_utc: int
-    reconstructor: str | None = None
-    """Id of the one that was made; None: there is none, or not yet."""
-
-    reason: str = ""
-    """Result in words."""
-
-
-class Refits:
-    """The refits that the service remembers; belongs to the event loop."""
-
-    def __init__(self) -> None:
-        self._jobs: dict[str, RefitJob] = {}
-
-    def begin(self, effects: Iterable[Effect], now_ns: int) -> None:
-        """Remember a job from the moment its computation begins; its id is the order's."""
-        made = next(effect for effect in effects if isinstance(effect, ev.MakeMatrix))
-        self._jobs[made.cause] = RefitJob(
-            id=made.cause, state=RefitState.RUNNING, n_modes=made.n_modes, asked_ns_utc=now_ns
-        )
-        while len(self._jobs) > REFITS_KEPT:
-            del self._jobs[next(iter(self._jobs))]
-
-    def end(self, effect: Effect, event: Event | None) -> None:
-        """Note what came of an effect, if a job waits for it."""
-        job = self._jobs.get(effect.cause) if isinstance(effect, ev.MakeMatrix) else None
-        if job is None or job.state is not RefitState.RUNNING:
-            return
-        match event:
-            case ev.MatrixMade(record=record):
-                verdict = record.reason if record.gate is None else record.gate.reason
-                text = f"{record.id}, {record.n_modes} modes: {verdict}"
-                refused = record.state is MatrixState.REFUSED
-                state = RefitState.REFUSED if refused else RefitState.MADE
-                job = replace(job, state=state, reconstructor=record.id, reason=text)
-            case ev.JobFailed(text=text):
-                job = replace(job, state=RefitState.FAILED, reason=text)
-            case _:
-                job = replace(job, state=RefitState.FAILED, reason="it was given up")
-        self._jobs[job.id] = job
-
-    def job(self, refit_id: str) -> RefitJob:
-        """Return what is known of a job.
-
-        Raises
-        ------
-        UnknownIdError
-            If there is none of this id.
-        """
-        if refit_id not in self._jobs:
-            raise UnknownIdError(f"refit {refit_id}: this service has begun no such refit")
-        return self._jobs[refit_id]

@@ -102,8 +102,6 @@ class Supervisor:
             CLOCK_LEAPT: self._clock.complaint
         }
         """Functions that return the text of an alarm, or nothing for none; called each second."""
-        self.refits = command_results.Refits()
-        """Reconstructors that operators have ordered."""
         self._pending_window = PendingWindow()
         self._n_readings = 0
         self._own_matrix_read = asyncio.Event()
@@ -235,9 +233,7 @@ class Supervisor:
     async def _result_of(self, order: command_results.GivenCommand) -> str:
         """Do what is asked, and say what the RTC says to it where that takes but a moment."""
         running = set(self._running)
-        effects = self._post(order.command, order.id)
-        if isinstance(order.command, cmd.Refit):
-            self.refits.begin(effects, self._clock.now_ns())
+        self._post(order.command, order.id)
         asked = self._running - running
         # The RTC answers these commands within a moment, and its answer is the result.
         if asked and isinstance(order.command, cmd.Measure | cmd.SetLoop | cmd.Ramp):
@@ -555,7 +551,6 @@ class Supervisor:
         except Exception as error:  # noqa: BLE001 - a bug in one action must not end the service
             self._log.exception("action.broken", effect=type(effect).__name__)
             event = ev.JobFailed(effect=effect, text=f"internal error: {error!r}")
-        self.refits.end(effect, event)
         if event is not None:
             self._post(event, effect.cause)
 
@@ -579,9 +574,10 @@ class Supervisor:
 
     def _tell(self, before: TrackerState) -> None:
         """Log what is new in the state's log, at its level, and have it recorded."""
-        entries = new_lines(before, self._engine.state)
+        after = self._engine.state
+        entries = new_lines(before, after)
+        ids = archiving.ids_of(after, archiving.find_changed_ids(before, after)) if entries else {}
         for entry in entries:
-            ids = archiving.ids_of(entry.text, self._engine.state)
             told = getattr(self._log, _LEVELS.get(entry.level, entry.level.value))
             told(entry.name, text=entry.text, **ids)
         self._writer.changed(before, self._engine.state, entries)

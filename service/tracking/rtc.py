@@ -121,20 +121,9 @@ def on_modes_unknown(context: StepContext, _: Effect | Request, __: str) -> None
 
 def on_model_changed(context: StepContext, event: ev.ModelChanged) -> None:
     """Store what a job of the worker has made of the model."""
-    model = event.model
     # The job may have begun before the sensor's mode changed: its results belong to that mode.
-    if model.sensor_mode == context.model.sensor_mode:
-        context.model = replace(
-            context.model,
-            slopes=model.slopes,
-            own_matrix_read=model.own_matrix_read,
-            response=model.response,
-            own_residual=model.own_residual,
-            dither_session=model.dither_session,
-            dithered=model.dithered,
-            strength=model.strength,
-            linearised_at=model.linearised_at,
-        )
+    if event.model.sensor_mode == context.model.sensor_mode:
+        context.model = event.model
 
 
 def _log_partial_loop(context: StepContext, before: Status | None, rtc: Status) -> None:
@@ -221,8 +210,7 @@ def _enter_sensor_mode(context: StepContext, config_id: str) -> None:
     # An RTC that does not name its references is named by its mode: that says nothing of them.
     context.loop = replace(context.loop, config_id=config_id, reference_id=None)
     # Order and signs of the slopes are those of every mode; all else is measured again.
-    slopes, context.model = context.model.slopes, ModelState()
-    context.model = replace(context.model, sensor_mode=config_id, slopes=slopes)
+    context.model = ModelState(sensor_mode=config_id, slopes=context.model.slopes)
     pointing_law.begin_law(context)
     kept, scale = "", context.policy.alpha_scale(before, config_id)
     if scale is not None and context.registration is not None:

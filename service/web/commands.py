@@ -23,12 +23,12 @@ from pydantic_core import from_json
 from starlette.datastructures import MutableHeaders
 
 from service.archive import Actor
-from service.errors import StaleError, UntaggedError
+from service.errors import StaleError, UnknownIdError, UntaggedError
 from service.records import commands as instructions
 from service.records.commands import Instruction
 from service.records.events import new_id
+from service.records.operations import RefitJob
 from service.records.state import TrackerState
-from service.runtime.command_results import RefitJob
 from service.runtime.supervisor import Supervisor
 from service.web import keys, matrices, measured, views
 from service.web.authentication import actor_of, needs
@@ -404,4 +404,8 @@ REFIT = views.define_view("RefitView", RefitJob)
 @router.get("/v1/refits/{id}", tags=["orders"], responses={200: views.shows(REFIT), **UNKNOWN})
 async def refit_job(service: views.ServiceDep, refit_id: RefitId) -> Response:
     """Return the progress of a refit, and the reconstructor it has made."""
-    return views.answer(service.refits.job(refit_id))
+    refits = service.snapshot().tracker.operations.refits
+    job = next((job for job in refits if job.id == refit_id), None)
+    if job is None:
+        raise UnknownIdError(f"refit {refit_id}: this service has begun no such refit")
+    return views.answer(job)

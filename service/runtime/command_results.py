@@ -212,8 +212,7 @@ def _done(  # noqa: C901 - one line for each command
             text = f"the acquisition has {now.operations.acquisition.text}"
         case cmd.GiveUp(id=name):
             record = now.measurement(name)
-            why = "" if record is None else record.reason.removeprefix("given up ")
-            text = f"{name} is given up {why}"
+            text = f"{name} is {record.reason if record else 'given up'}"
         case cmd.SetPointing(elevation_deg=up, azimuth_deg=round_):
             text = f"the telescope points at elevation {up:g} deg, azimuth {round_:g} deg"
         case cmd.SetValue(name=name, value=value, for_s=for_s):

@@ -574,9 +574,10 @@ class Supervisor:
 
     def _tell(self, before: TrackerState) -> None:
         """Log what is new in the state's log, at its level, and have it recorded."""
-        entries = new_lines(before, self._engine.state)
+        after = self._engine.state
+        entries = new_lines(before, after)
+        ids = archiving.ids_of(after, archiving.find_changed_ids(before, after)) if entries else {}
         for entry in entries:
-            ids = archiving.ids_of(entry.text, self._engine.state)
             told = getattr(self._log, _LEVELS.get(entry.level, entry.level.value))
             told(entry.name, text=entry.text, **ids)
         self._writer.changed(before, self._engine.state, entries)

@@ -54,7 +54,6 @@ from pyrcal.fitting.origins import Origin, list_origins, list_undetermined_keys
 from pyrcal.fitting.pupil_checks import (
     MIN_PUPIL_EXPLAINED,
     FitSubset,
-    fit_smooth_gain,
     try_pupils,
 )
 from pyrcal.fitting.pupil_width import SeenPupil, compute_responses, measure_pupil
@@ -615,8 +614,6 @@ def _make_fit(
     # The target's columns are divided by the passes, and their noise with them.
     noise = None if usable.noise is None else usable.noise / usable.passes
     structured = measure_structure(seen.residual, power, noise)
-    # The share of the power that a smooth gain over the pupil would explain.
-    by_light = residual_fraction**2 * (1.0 - fit_smooth_gain(few))
     n_planes = slopes.kind.n_planes
     floor_of_size, floor_words = _magnification_floor(models.instrument)
     before = uncertainty(
@@ -674,7 +671,6 @@ def _make_fit(
         solution=solution,
         residual_fraction=residual_fraction,
         structure=structured,
-        after_light=float(np.sqrt(max(structured**2 - by_light, 0.0))),
         uncertainty=sure,
         # A σ that already contains the move of an alternative would always cover that move, so the
         # verdict compares moves with σ before alternatives were added.

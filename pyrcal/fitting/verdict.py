@@ -98,9 +98,6 @@ class FitFindings:
     structure: float
     """RMS share of the signal that is left over and is not noise."""
 
-    after_light: float
-    """The same if a smooth gain over the pupil, as from uneven light, were also fitted."""
-
     uncertainty: Uncertainty
     before: Uncertainty
     """Uncertainty without the alternatives that the data do not exclude."""

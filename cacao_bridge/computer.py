@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -29,6 +30,7 @@ from service.wire import (
     LoopRequest,
     Reply,
     Status,
+    checksum,
 )
 from service.wire.codec import TEXT_LIMIT
 
@@ -102,6 +104,7 @@ class Cacao:
         self._moved_s = {"slopes": time.monotonic(), "commands": time.monotonic()}
         self._clock: tuple[int, int] | None = None
         self._rate_from: tuple[int, float] | None = None
+        self._reference_at: int | None = None
 
     @property
     def unlinked(self) -> bool:
@@ -126,6 +129,7 @@ class Cacao:
         try:
             self._link()
             self._read_slopes()
+            self._read_reference()
             self._read_commands()
             self._look_after_matrices()
             self._complain(self._check_counters() or self._off_rate() or self._law_trouble)
@@ -169,6 +173,8 @@ class Cacao:
             # A bridge that was killed may have left a dither in its channel.
             self._channel().write(np.zeros(n_actuators, dtype=np.float32))
         self._streams = {"slopes": slopes, "commands": commands, "multiplied": multiplied}
+        if self._names.reference:
+            self._streams["reference"] = self._open(self._names.reference)
         self._commands_writer = commands.writer
         for name, stream in self._streams.items():
             _log.info("stream.linked", role=name, name=stream.name, keeps=stream.n_kept)
@@ -194,6 +200,20 @@ class Cacao:
         self._rows.take_slopes(frames.first, values)
         self._moved_s["slopes"] = time.monotonic()
         self._follow_clock(self._slopes_at, slopes.written_ns or time.time_ns())
+
+    def _read_reference(self) -> None:
+        """Name the reference by its numbers when another one was written."""
+        stream = self._streams.get("reference")
+        if stream is None or stream.counter == self._reference_at:
+            return
+        stream.here()
+        # Counted before it is read: one that is written meanwhile is read again.
+        is_first, self._reference_at = self._reference_at is None, stream.counter
+        name = f"reference-{checksum(stream.latest())[:8]}"
+        if name != self.identity.reference_id and not is_first:
+            # Which reference some of these frames had is not known.
+            self._rows.skip(self._rows.newest)
+        self.identity = replace(self.identity, reference_id=name)
 
     def _read_commands(self) -> None:
         slopes, commands = self._streams["slopes"], self._streams["commands"]
@@ -302,6 +322,7 @@ class Cacao:
             cm_id=self.reconstructor.manifest.id,
             basis_id=self.identity.basis_id,
             config_id=self.identity.config_id,
+            reference_id=self.identity.reference_id,
         )
         return header, rows
 
@@ -380,6 +401,7 @@ class Cacao:
             cm_id=self.reconstructor.manifest.id,
             basis_id=self.identity.basis_id,
             config_id=self.identity.config_id,
+            reference_id=self.identity.reference_id,
             dither=None if player is None or player.ended.is_set() else player.status,
             max_dither_m=self._loop.max_dither_m if self._names.dither else 0.0,
             max_dither_modes=self._loop.n_modes if self._names.dither else 0,

@@ -65,7 +65,8 @@ class StreamsTable(Table):
     """Gain of each mode; empty: ``[loop] gain``."""
 
     reference: Optional = ""
-    """Reference subtracted from the slopes, like ``aol1_wfsrefc``; empty if this loop has none."""
+    """Reference subtracted from the slopes, like ``aol1_wfsrefc``; empty if this loop has none. A
+    new one is named to the service (``reference_id``)."""
 
     factors: Optional = "aol1_mmult"
     """Factor of each mode's command in every frame; empty to use ``[loop] leak``."""

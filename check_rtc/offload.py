@@ -243,7 +243,7 @@ def _measure_alpha(
     if not ended:
         return "no complete window of dither has come"
     found = ended[0] if isinstance(ended[0], WindowRefused) else alpha(ended[0])
-    return found.reason if isinstance(found, WindowRefused) else found
+    return str(found.reason) if isinstance(found, WindowRefused) else found
 
 
 def _next_seq(client: RtcClient) -> int:

@@ -59,6 +59,10 @@ class Bridge:
         gains[len(self.reconstructor.matrix) :] = 0.0
         return tuple(gains.tolist())
 
+    @property
+    def reference_id(self):
+        return f"reference-{checksum(self.reference)[:8]}"
+
     def terms(self):
         n_slopes, n_now = self.bench.loop.signal_size, len(self.reconstructor.matrix)
         known = {"session": self.session, "identity": self.identity, "n_slopes": n_slopes}
@@ -195,6 +199,7 @@ class Bridge:
             cm_id=self.reconstructor.manifest.id,
             basis_id=self.identity.basis_id,
             config_id=self.identity.config_id,
+            reference_id=self.reference_id,
             dither=None if self.dither is None else self.dither.status,
             max_dither_m=MAX_DITHER_M,
             max_dither_modes=MAX_DITHER_MODES,
@@ -234,6 +239,7 @@ class Bridge:
                 cm_id=self.reconstructor.manifest.id,
                 basis_id=self.identity.basis_id,
                 config_id=self.identity.config_id,
+                reference_id=self.reference_id,
             )
             rows = [self.bench.frame(dither_m) for dither_m in self._dither_m(self.seq + DELAY)]
             self.seq += BATCH

@@ -21,6 +21,8 @@ _MATRIX = ("npy", "raw", "hdf5", "fits")
 _SOURCES = {
     "alpha": ("/v1/alpha/history", ("csv", "jsonl")),
     "audit": ("/v1/audit", ("csv", "jsonl")),
+    "gains": ("/v1/gains", ("csv", "jsonl")),
+    "reconstructor-gains": ("/v1/reconstructors/{id}/gains", ("csv", "jsonl")),
     "reconstructor": ("/v1/reconstructors/{id}/matrix", _MATRIX),
     "measurement": ("/v1/measurements/{id}/matrix", _MATRIX),
     "noisy-matrix": ("/v1/noisy-matrix/{id}/file", ("hdf5",)),
@@ -66,7 +68,7 @@ def run_command(service: Service, _request: Request, options: argparse.Namespace
         raise ConfigurationError(f"{target}: found a file, expected a new name (--output)")
     if not target.absolute().parent.is_dir():
         raise ConfigurationError(f"{target}: found no folder {target.parent}, expected it to exist")
-    write = _history if options.what == "alpha" else _stream_export
+    write = _WRITERS.get(options.what, _stream_export)
     try:
         with part.open("wb") as file:
             for each in write(service, path, form, query):
@@ -118,6 +120,25 @@ def _history(service: Service, path: str, form: str, query: dict[str, str]) -> I
         after, head = now, False
 
 
+def _gains(service: Service, path: str, form: str, query: dict[str, str]) -> Iterator[bytes]:
+    """Return the optical gain of each mode, as lines or as a table with a head."""
+    table = service.get(path, **query).document
+    with understood(service):
+        when = {one["mode"]: one["t_utc"] for one in table["measured"]}
+        facts = {key: table[key] for key in ("t_utc", "reference_id", "magnitude", "frame_rate_hz")}
+        columns = zip(table["optical_gain"], table["sigma"], table["factor"], strict=True)
+        entries = [
+            {
+                "mode": mode,
+                **{"optical_gain": gain, "sigma": sigma, "loop_gain_factor": factor},
+                "measured_utc": when.get(mode),
+                **facts,
+            }
+            for mode, (gain, sigma, factor) in enumerate(columns)
+        ]
+    yield _format_entries(entries, form, head=True)
+
+
 def _format_entries(entries: list[Document], form: str, *, head: bool) -> bytes:
     if form == "jsonl":
         return "".join(json.dumps(entry) + "\n" for entry in entries).encode()
@@ -139,3 +160,7 @@ def _flat(entry: Document, before: str = "") -> Document:
         inside = isinstance(value, dict)
         found |= _flat(value, f"{before}{name}.") if inside else {f"{before}{name}": value}
     return found
+
+
+_WRITERS = {"alpha": _history, "gains": _gains, "reconstructor-gains": _gains}
+"""Functions for what the service does not send as a file."""

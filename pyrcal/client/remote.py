@@ -191,15 +191,21 @@ REQUESTS = (
     ),
     _reads(
         "export",
-        "write the history of alpha, the audit trail, a matrix or a recording to a file",
+        "write the history of alpha, the audit trail, optical gains, a matrix or a recording to a "
+        "file",
         "",
         words(
             "what",
             "what to write",
-            choices=("alpha", "audit", "reconstructor", "measurement", "noisy-matrix", "recording"),
+            choices=(
+                *("alpha", "audit", "gains", "reconstructor-gains"),
+                *("reconstructor", "measurement", "noisy-matrix", "recording"),
+            ),
         ),
         words("id ID", "id of the matrix or recording; or in-use, previous", nargs="?"),
-        words("--format F", "of alpha, audit: csv, jsonl; of matrices: npy, raw, hdf5, fits"),
+        words(
+            "--format F", "of alpha, audit, gains: csv, jsonl; of matrices: npy, raw, hdf5, fits"
+        ),
         words("--output FILE", "default: a new name in the current folder", type=Path),
         *(_SINCE, _UNTIL),
         by="export",

@@ -48,7 +48,10 @@ class Grounds:
     """Inputs of a recommendation, besides the fit's own numbers."""
 
     refusal: Refusal | None
-    """Reason of the refusal; None if the fit was accepted."""
+    """Kind of the refusal; None if the fit was accepted."""
+
+    reason: str
+    """Reason of the verdict, in one sentence."""
 
     structure: float
     """RMS share of the signal that is left over and is not noise."""
@@ -188,18 +191,19 @@ def _explain_uncertainty(fit: Fit, grounds: Grounds, edge: float, radius: float)
             "that and fit again"
         )
     # Averaging and more modes reduce the statistical part only.
-    if found is None or edge_move(found.sigma_statistical, radius) > 0.7 * edge:
-        if grounds.noise_share >= MIN_NOISE_SHARE:
-            return f"{known}; average more, or push more modes"
-        left = (
-            f"{known}; {fit.residual_fraction:.1%} of the signal is left over and hardly any of it "
-            "is noise, so that averaging does not help"
+    statistical = found is None or edge_move(found.sigma_statistical, radius) > 0.7 * edge
+    if statistical and grounds.noise_share >= MIN_NOISE_SHARE:
+        return f"{known}; average more, or push more modes"
+    left = (
+        f"{known}; {fit.residual_fraction:.1%} of the signal is left over and hardly any of it "
+        "is noise, so that averaging does not help"
+    )
+    if grounds.large_pokes and grounds.noise_share < MIN_NOISE_SHARE:
+        return (
+            f"{left}: the sensor may be beyond its linear range; poke with a smaller stroke, "
+            "and push and pull"
         )
-        if grounds.large_pokes:
-            return (
-                f"{left}: the sensor may be beyond its linear range; poke with a smaller stroke, "
-                "and push and pull"
-            )
+    if statistical:
         return f"{left}: the model differs from the bench, and only more modes average that out"
     terms = systematic_terms(fit.alternatives, fit.residual_fraction, fit.sigma)
     most = max(terms, key=lambda term: edge_move(term.sigma, radius), default=None)
@@ -256,7 +260,7 @@ def _find_cause(fit: Fit, grounds: Grounds) -> _Action:
         return f"{left.words}; measure these again, or leave them out (--modes)", ()
     named = tuple(entry for entry in ENTRIES if entry in fit.verdict)
     entries = (grounds.axes_entry,) if grounds.axes_entry else named
-    return fit.verdict.removeprefix("refused: "), entries
+    return grounds.reason, entries
 
 
 def _list_corrections(fit: Fit) -> Iterator[str]:

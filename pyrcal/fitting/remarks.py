@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from pyrcal.fitting.alternatives import LIGHT_KEY
 from pyrcal.fitting.instrument_checks import FileValuesFit
 from pyrcal.fitting.origins import MAX_LOG_SIGMA, is_determined
 from pyrcal.fitting.verdict import NOTABLE_STRUCTURE, FitFindings, factor_of_passes
@@ -121,10 +122,20 @@ def _advice(without: FileValuesFit) -> str:
 
 
 def _note_light(findings: FitFindings) -> Iterator[str]:
-    """Yield that uneven light explains the residual."""
-    if findings.structure > NOTABLE_STRUCTURE >= findings.after_light:
+    """Yield that uneven light explains the residual, unless a value of the file explains more."""
+    # A gain over the pupil follows part of what another stop, hole or modulation does.
+    shares = {
+        one.key: one.share
+        for one in findings.alternatives
+        if one.share is not None and (one.preferred or one.key == LIGHT_KEY)
+    }
+    if min(shares, key=lambda key: shares[key], default=LIGHT_KEY) != LIGHT_KEY:
+        return
+    # Not ``structure``: a gain over the pupil spreads what it leaves over all directions.
+    left = findings.residual_fraction * float(np.sqrt(1.0 - findings.noise_share))
+    if left > NOTABLE_STRUCTURE >= left * np.sqrt(shares.get(LIGHT_KEY, 1.0)):
         yield (
-            f"{findings.structure:.0%} of the signal is left over and is not noise; a smooth gain "
+            f"{left:.0%} of the signal is left over and is not noise; a smooth gain "
             "over the pupil explains it: uneven light, which sigma allows for; give the light "
             "(--flux-map), or have the gain fitted (--gain-map)"
         )

@@ -39,6 +39,10 @@ MAX_WITHOUT_CAUSE = 0.4
 """Largest RMS share of the signal that may be left over beyond noise where nothing that was tried
 explains any of it."""
 
+MOST_OF_SIGNAL = 0.9
+"""RMS share of the signal left over by a fit that did not converge above which noise may be the
+cause: four times as much noise as signal left 0.94."""
+
 NOTABLE_STRUCTURE = 0.09
 """RMS share of the signal in the structured residual above which a note names a cause."""
 
@@ -93,9 +97,6 @@ class FitFindings:
     residual_fraction: float
     structure: float
     """RMS share of the signal that is left over and is not noise."""
-
-    after_light: float
-    """The same if a smooth gain over the pupil, as from uneven light, were also fitted."""
 
     uncertainty: Uncertainty
     before: Uncertainty
@@ -169,7 +170,7 @@ class Refusal(StrEnum):
 
 
 def judge_fit(findings: FitFindings) -> tuple[Refusal | None, str]:
-    """Return the reason of a refusal, or None, and the verdict in one line."""
+    """Return the kind of a refusal, or None, and the reason of the verdict in one sentence."""
     for reason, refusal in (
         (Refusal.AXES, findings.axes),
         (Refusal.ANOTHER_PUPIL, _check_pupil(findings)),
@@ -184,8 +185,8 @@ def judge_fit(findings: FitFindings) -> tuple[Refusal | None, str]:
         (Refusal.WITHOUT_CAUSE, _check_cause(findings)),
     ):
         if refusal:
-            return reason, f"refused: {refusal}"
-    return None, f"accepted: {_describe_quality(findings)}"
+            return reason, refusal
+    return None, _describe_quality(findings)
 
 
 def _describe_quality(findings: FitFindings) -> str:
@@ -200,7 +201,7 @@ def _describe_quality(findings: FitFindings) -> str:
 def _check_convergence(findings: FitFindings) -> str:
     if findings.solution.converged:
         return ""
-    noise = "" if findings.explained else "there is too much noise, "
+    noise = "" if findings.residual_fraction < MOST_OF_SIGNAL else "there is too much noise, "
     return (
         f"the fit did not converge: {noise}the modes (basis or order) or the instrument file do "
         "not match the matrix, or a start that was given (--start) is outside the capture range"

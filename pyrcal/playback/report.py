@@ -190,7 +190,10 @@ def _explain_failure(track: Track) -> str:
             track.passive[-1].text
         )
     reasons = (track.state.windows.refused_because, track.state.alpha.passive_unavailable_reason)
-    return "; ".join(filter(None, reasons)) or "it is too short, or holds no dither"
+    return (
+        "; ".join(str(reason) for reason in reasons if reason)
+        or "it is too short, or holds no dither"
+    )
 
 
 def _cells(values: Array) -> list[str]:

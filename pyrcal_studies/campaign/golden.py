@@ -14,7 +14,7 @@ import base64
 import json
 import lzma
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, Field, fields, is_dataclass, replace
 from enum import Enum
@@ -52,7 +52,7 @@ LEFT_OUT = frozenset({("Status", "flux")})
 class and field."""
 
 
-def encoded(value: object) -> Json:
+def encoded(value: object) -> Json:  # noqa: C901 - one case for each kind of value
     """Return a value as JSON, every digit of its numbers kept.
 
     Raises
@@ -71,6 +71,8 @@ def encoded(value: object) -> Json:
             return {"bytes": base64.b64encode(value).decode()}
         case np.ndarray():
             return _array_encoded(value)
+        case dict():
+            return {name: encoded(item) for name, item in value.items()}
         case tuple() | list():
             return [item if type(item) in _PLAIN else encoded(item) for item in value]
         case _ if is_dataclass(value):
@@ -107,7 +109,7 @@ def decoded(hint: object, value: Json) -> Value:
         )
     if isinstance(hint, type) and issubclass(hint, Enum):
         return hint(value)
-    if hint is float:
+    if hint is float and not isinstance(value, str):
         return float(value)
     if origin is Literal or (hint in (bool, int, str) and isinstance(value, hint)):
         return value
@@ -143,6 +145,8 @@ def _of_mapping(hint: object, value: dict[str, Json]) -> Value:
         return _array_decoded(value)
     if "bytes" in value:
         return base64.b64decode(value["bytes"])
+    if get_origin(hint) is Mapping:
+        return {name: decoded(get_args(hint)[1], item) for name, item in value.items()}
     raise TypeError(f"found {sorted(value)}; expected {hint}")
 
 

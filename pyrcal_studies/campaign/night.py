@@ -205,7 +205,7 @@ def loop_of(dome: Dome) -> ClosedLoop:
 
 def _row(outcome: Outcome, true: Misregistration) -> Row:
     if isinstance(outcome, WindowRefused):
-        return {"refused": outcome.reason}
+        return {"refused": str(outcome.reason)}
     difference = outcome.alpha.vector - true.vector
     return {
         "refused": None,

@@ -19,6 +19,7 @@ from service.estimation.description import ActuatorWatch, Description, EdgeWatch
 from service.estimation.frames import FrameBlock
 from service.estimation.loop import build_loop
 from service.estimation.windows import ClosedLoop, ExpectedDither, Telemetry
+from service.records.messages import Message
 from service.wire import Status
 
 
@@ -206,6 +207,6 @@ class Streaming:
         """Return for each of its alarms what is wrong and what to do, or None."""
         return ()
 
-    def vet(self, window: Telemetry, loop: LoopContext) -> tuple[Self, str | None]:
+    def vet(self, window: Telemetry, loop: LoopContext) -> tuple[Self, Message | None]:
         """Return why a window that has ended must not be used; None: it may."""
         return self, None

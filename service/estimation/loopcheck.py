@@ -24,6 +24,7 @@ from service.estimation.frames import FrameBlock, join_frames
 from service.estimation.loop import last_seq
 from service.estimation.windows import ClosedLoop, Telemetry
 from service.model.defects import list_ranges
+from service.records.messages import Message, compose
 
 Array = NDArray[Any]
 
@@ -138,7 +139,7 @@ class LoopCheck(Streaming):
         return replace(check, residual=found)
 
     @override
-    def vet(self, window: Telemetry, loop: LoopContext) -> tuple[LoopCheck, str | None]:
+    def vet(self, window: Telemetry, loop: LoopContext) -> tuple[LoopCheck, Message | None]:
         """Return why the commands of a window are not what the loop makes of its slopes."""
         terms = loop.terms(window.cm_id)
         if terms is None:
@@ -148,7 +149,7 @@ class LoopCheck(Streaming):
         if found is None:
             return check, None
         if not found.holds:
-            return check, found.text
+            return check, compose("window.off-loop", text=found.text)
         if n_frames / terms.frame_rate_hz >= MIN_SAMPLES / SAMPLES_PER_S:
             # what a long window shows need not be asked again
             check = replace(check, obeyed_seq=max(last, check.obeyed_seq))

@@ -32,6 +32,7 @@ from service.records.estimates import (
     WideCaptureEstimate,
     WindowRefused,
 )
+from service.records.messages import Message, compose
 
 Array = NDArray[Any]
 
@@ -94,13 +95,13 @@ def find(spectra: Spectra, search: WideCaptureSearch) -> WideCaptureEstimate | W
     alone = replace(
         spectra, commands=spectra.commands[:, :, modes], dither=spectra.dither[:, modes]
     )
-    reason = "no start was given"
+    reason = compose("not-found.no-start")
     for tried, start in enumerate(search.starts, start=1):
         landed = solver.approach(
             search.coarse, columns, start, approached=WIDE_STEP_LIMIT, allowed=search.contains
         )
         if not landed.converged:
-            reason = f"steps from {start} do not converge"
+            reason = compose("not-found.no-convergence", start=str(start))
             continue
         there = search.fine.linearise(landed.alpha)
         estimate = fit_window(alone, there, loop)
@@ -113,10 +114,10 @@ def find(spectra: Spectra, search: WideCaptureSearch) -> WideCaptureEstimate | W
     return not_found(reason, spectra)
 
 
-def not_found(reason: str, spectra: Spectra) -> WindowRefused:
+def not_found(reason: Message, spectra: Spectra) -> WindowRefused:
     """Return the refusal of a window of an open loop that led nowhere."""
     return WindowRefused(
-        reason=f"registration not found: {reason}",
+        reason=compose("window.not-found", reason.key, reason=str(reason)),
         t_ns_utc=spectra.t_end_ns_utc,
         kind=RefusalKind.NOT_FOUND,
     )
@@ -155,25 +156,27 @@ def _unexplained_share(columns: Columns, noise: Array, matrix: Array) -> float:
     return float(np.mean(left / np.maximum(total - noise, 0.1 * total)))
 
 
-def _why_not(found: WideCaptureEstimate, search: WideCaptureSearch) -> str | None:
+def _why_not(found: WideCaptureEstimate, search: WideCaptureSearch) -> Message | None:
     """Return the reason why an estimate is rejected, or None."""
     estimate = found.estimate
     gains = np.abs(estimate.optical_gain)
     if estimate.gain_sigma is not None and np.any(gains < MIN_LINE_SIGMA * estimate.gain_sigma):
-        return "the dither is not seen in the slopes: raise its amplitude or the window's length"
+        return compose("not-found.dither-not-seen")
     if gains.max() > MAX_GAIN:
-        return f"optical gains up to {gains.max():.1f}: the instrument file is another's"
+        return compose("not-found.gains", most=float(gains.max()))
     lag = float(np.median(estimate.lag_frames))
     if abs(lag) > MAX_LAG_FRAMES:
-        return f"columns misaligned: slopes lag commands by {lag:+.2f} frame, 0 is expected"
+        return compose("not-found.misaligned", lag_frames=lag)
     if not search.contains(estimate.alpha.vector):
-        return f"{estimate.alpha} is out of range"
+        return compose("not-found.out-of-range", alpha=str(estimate.alpha))
     if np.any(np.abs(estimate.step) > MAX_STEP):
-        return f"the finer model leads away from {estimate.alpha}"
+        return compose("not-found.leads-away", alpha=str(estimate.alpha))
     if found.unexplained > MAX_UNEXPLAINED_SHARE:
-        return (
-            f"{estimate.alpha} leaves {found.unexplained:.0%} of the response unexplained, "
-            f"expected at most {MAX_UNEXPLAINED_SHARE:.0%}"
+        return compose(
+            "not-found.unexplained",
+            alpha=str(estimate.alpha),
+            left=found.unexplained,
+            most=MAX_UNEXPLAINED_SHARE,
         )
     return None
 

@@ -163,29 +163,32 @@ def find_orientation(
     *,
     mapper: Mapper = map,
     about: Misregistration = NOMINAL,
+    coarse: CoarseModel | None = None,
 ) -> Search:
     """Return the orientation and rough rotation that explain the lowest orders best.
 
     ``basis`` holds the columns of ``reference``. Shift and magnification are those of ``about``:
-    the lowest orders hardly feel less than a subaperture.
+    the lowest orders hardly feel less than a subaperture. ``coarse`` is ``coarse_model`` of
+    instrument and basis for several searches; None to make it.
     """
     stated = instrument.slopes
     settings = [stated] if stated.orientation is not None else list(_settings(stated))
-    poses, lowest = poses_of(instrument, reference, basis, settings, mapper=mapper, about=about)
+    coarse = coarse or coarse_model(instrument, basis, mapper)
+    poses, lowest = poses_of(coarse, instrument, reference, settings, mapper=mapper, about=about)
     return _judge_classes(poses, instrument.mirror.nominal_rotation_rad, lowest)
 
 
 def poses_of(
+    coarse: CoarseModel,
     instrument: Instrument,
     reference: Reference,
-    basis: Basis,
     settings: Sequence[SlopeRecipe],
     *,
     mapper: Mapper = map,
     about: Misregistration = NOMINAL,
 ) -> tuple[list[Pose], LowOrder]:
     """Return how well each of these orders and orientations explains the lowest orders."""
-    turned = _Turned.of(_any_way_round(instrument, basis, mapper), mapper, about)
+    turned = _Turned.of(coarse, mapper, about)
     low = replace(
         reference,
         matrix=turned.lowest.combine_columns(reference.matrix),
@@ -199,8 +202,17 @@ def poses_of(
     return poses, turned.lowest
 
 
-def _any_way_round(instrument: Instrument, basis: Basis, mapper: Mapper) -> InteractionModel:
-    """Return a coarse model of every subaperture that some orientation calls valid."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CoarseModel:
+    """A coarse model of every subaperture that some orientation calls valid."""
+
+    model: InteractionModel
+    lowest: LowOrder
+    """Smooth combinations of the model's modes."""
+
+
+def coarse_model(instrument: Instrument, basis: Basis, mapper: Mapper = map) -> CoarseModel:
+    """Return the coarse model of an instrument, whatever orientation it states."""
     mask = rtc_valid_subapertures(instrument)
     flags = (False, True)
     turned = [
@@ -212,9 +224,10 @@ def _any_way_round(instrument: Instrument, basis: Basis, mapper: Mapper) -> Inte
     plain = replace(instrument.slopes, order=order, orientation=Orientation())
     seen = replace(instrument, wfs=every, slopes=plain)
     sampling = coarse_sampling(instrument)
-    return InteractionModel(
+    model = InteractionModel(
         seen, basis, pupil_sampling=sampling, detector_nodes=sampling, mapper=mapper
     )
+    return CoarseModel(model=model, lowest=low_order_of(model))
 
 
 def _settings(reported: SlopeRecipe) -> Iterator[SlopeRecipe]:
@@ -265,9 +278,9 @@ class _Turned:
     """``(n, n)`` [y, x] subapertures of these slopes."""
 
     @classmethod
-    def of(cls, model: InteractionModel, mapper: Mapper, about: Misregistration) -> _Turned:
+    def of(cls, coarse: CoarseModel, mapper: Mapper, about: Misregistration) -> _Turned:
         """Turn the smoothest shapes of a model's modes round."""
-        lowest = low_order_of(model)
+        model, lowest = coarse.model, coarse.lowest
         points = (model.pupil.points - about.vector[:2]) / about.magnification
         angles = ANGLES_RAD[:: _SMOOTH_STEP if lowest.is_smooth else 1]
         turned = np.concatenate([points @ rotation(angle) for angle in angles])

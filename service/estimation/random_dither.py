@@ -26,6 +26,7 @@ from service.records.estimates import (
     Why,
     WindowRefused,
 )
+from service.records.messages import compose
 
 Array = NDArray[Any]
 
@@ -148,8 +149,7 @@ class RandomDither(WindowCutter[RandomPlan, Correlations | None, Correlated]):
         """Return the finished window, or the reason why its dither differs from the request."""
         sums = window.sums
         if sums is None:
-            reason = "no two frames of the window came one after the other: check the link"
-            return WindowRefused(reason=reason, t_ns_utc=window.next_t_ns)
+            return WindowRefused(reason=compose("window.no-pairs"), t_ns_utc=window.next_t_ns)
         power = np.diag(sums.dither_power.sum(axis=0)) / max(sums.n_pairs, 1)
         refusal = self.plan.refusal(np.sqrt(power))
         if refusal is not None:
@@ -358,11 +358,9 @@ def _answers(
     if late > RESPONSE_SIGMA:
         return lag, (
             RefusalKind.MISALIGNED,
-            "columns misaligned: the slopes answer the dither one frame late "
-            f"({late:.0f} sigma, {seen:.0f} in the same row)",
+            compose("window.answered-late", late_sigma=late, same_row_sigma=seen),
         )
-    text = f"the dither is not seen in the slopes ({seen:.1f} sigma): raise its amplitude"
-    return lag, (RefusalKind.OTHER, f"{text} or the window's length")
+    return lag, (RefusalKind.OTHER, compose("window.dither-not-seen", seen_sigma=seen))
 
 
 def _noise_variance(sums: Correlations) -> Array:

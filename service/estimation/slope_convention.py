@@ -21,6 +21,7 @@ from service.estimation.orientation import (
     MIN_CORRELATION,
     MIN_CORRELATION_LEAD,
     Pose,
+    coarse_model,
     format_setting,
     poses_of,
     settings_of,
@@ -105,9 +106,9 @@ def identify_from_reconstructor(
     unit = _unit_of_matrix(ratio, instrument)
     try:
         poses, _ = poses_of(
+            coarse_model(instrument, basis.subset(used), mapper),
             instrument,
             Reference(matrix=measured, modes=used),
-            basis.subset(used),
             list(settings_of(instrument.slopes, instrument.slopes.kind.orders)),
             mapper=mapper,
         )

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from service.control.loop import ControlLoop
 from service.estimation.frames import FrameBlock, join_frames
 from service.records.estimates import RefusalKind, Why, WindowRefused
+from service.records.messages import Message, compose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -27,7 +28,7 @@ class ClosedLoop(ControlLoop):
 DITHER_SETTLING_S = 0.3
 """Settling time of the loop after a dither has begun, before the first window."""
 
-OTHER_SESSION = "the RTC has restarted since"
+OTHER_SESSION = compose("window.other-session")
 """Why a window is of no use: what it holds belongs to the session before."""
 
 CHUNK_FRAMES = 512
@@ -59,7 +60,7 @@ class WindowPlan:
     first_seq: int
     """No window starts before this frame: the dither is on and the loop has settled."""
 
-    def refusal(self, applied_m: NDArray[Any], lines: tuple[str, ...] = ()) -> str | None:
+    def refusal(self, applied_m: NDArray[Any], lines: tuple[str, ...] = ()) -> Message | None:
         """Return the reason why a dither differs from the request, or None.
 
         ``applied_m`` ``(n_modes,)`` is its RMS; ``lines`` gives, for every mode, the frequencies
@@ -70,11 +71,12 @@ class WindowPlan:
         if not weak and ratio.max() <= AMPLITUDE_RATIO_RANGE[1]:
             return None
         worst = int(ratio.argmin() if weak else ratio.argmax())
-        see = "see whether the RTC clips it" if weak else "see the RTC's units"
-        place = f" at {lines[worst]}" if lines else ""
-        return (
-            f"mode {self.modes[worst]} carries {applied_m[worst] * 1e9:.2f} nm of dither{place}, "
-            f"{self.amplitude_m[worst] * 1e9:.2f} nm were requested: {see}"
+        return compose(
+            "window.dither-weak" if weak else "window.dither-strong",
+            mode=self.modes[worst],
+            found_nm=float(applied_m[worst] * 1e9),
+            place=f" at {lines[worst]}" if lines else "",
+            requested_nm=self.amplitude_m[worst] * 1e9,
         )
 
 
@@ -209,25 +211,25 @@ class Window(Generic[S]):
         """Return why a window of ``n_frames`` cannot take this block, or None."""
         expected_ns = self.next_t_ns + (block.first_seq - self.next_seq) * block.dt_ns
         if block.session != self.session:
-            return RefusalKind.OTHER, "the RTC started a new session inside the window"
+            return RefusalKind.OTHER, compose("window.new-session")
         if block.cm_id != self.cm_id:
             changed = f"{self.cm_id} -> {block.cm_id}"
-            return RefusalKind.CUT_SHORT, f"the reconstructor changed inside the window: {changed}"
+            return RefusalKind.CUT_SHORT, compose("window.matrix-changed", changed)
         if block.reference_name != self.reference_name:
             changed = f"{self.reference_name} -> {block.reference_name}"
-            text = f"the reference slopes changed inside the window: {changed}"
-            return RefusalKind.CUT_SHORT, text
+            return RefusalKind.CUT_SHORT, compose("window.reference-changed", changed)
         if block.dither_m is None:
-            return RefusalKind.CUT_SHORT, "the dither ended inside the window"
+            return RefusalKind.CUT_SHORT, compose("window.dither-ended")
         if abs(block.t0_ns_utc - expected_ns) > block.dt_ns / 2:
-            return RefusalKind.OTHER, "the RTC's clock stepped or it paused inside the window"
+            return RefusalKind.OTHER, compose("window.clock-stepped")
         end_seq = self.first_seq + n_frames
         # A gap that goes beyond the end counts only as far as the window reaches.
         missing = self.n_missing + min(block.first_seq, end_seq) - self.next_seq
         if missing > MAX_MISSING_FRACTION * n_frames:
-            share = f"more than {MAX_MISSING_FRACTION:.0%}"
-            text = f"{missing} of {n_frames} frames missing, {share}: check the link to the RTC"
-            return RefusalKind.OTHER, text
+            most = MAX_MISSING_FRACTION
+            return RefusalKind.OTHER, compose(
+                "window.frames-missing", missing=missing, n_frames=n_frames, most=most
+            )
         return None
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import re
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -21,6 +21,7 @@ import structlog
 import zenoh
 
 from service.link.statistics import EndingCertificate, Refusal
+from service.records.messages import Message, compose
 from service.wire.access import DAY_S, LinkSecurity
 
 REFUSAL_REPORT_DURATION_S: Final = 60.0
@@ -145,33 +146,42 @@ def count_waiting(listen: Sequence[str], tables: Sequence[Path] = _SOCKET_TABLES
     return found
 
 
-def describe_flood(waiting: Mapping[int, int]) -> str:
-    """Return which port keeps programs out, and for how long; empty: none does."""
-    return "; ".join(
+def describe_flood(waiting: Mapping[int, int]) -> Message | None:
+    """Return which port keeps programs out, and for how long, or None."""
+    flooded = [port for port, n in sorted(waiting.items()) if n >= MIN_ALARM_CONNECTIONS]
+    text = "; ".join(
         f"{n} connections to port {port} were closed before a handshake. A program that connects "
         f"there, an RTC that restarts among them, is let in after about "
         f"{n / HANDSHAKE_FAILURES_HZ:.0f} s, or when they end. Let the firewall admit few new "
         "connections of each address, or give the RTC a port of its own"
-        for port, n in sorted(waiting.items())
-        if n >= MIN_ALARM_CONNECTIONS
+        for port, n in ((port, waiting[port]) for port in flooded)
     )
+    return compose("link.flooded", _join(flooded), text=text) if flooded else None
 
 
-def describe_refusals(refusals: Sequence[Refusal]) -> str:
-    """Return the recent refusals in words; empty if there are none."""
+def describe_refusals(refusals: Sequence[Refusal]) -> Message | None:
+    """Return the recent refusals in words, or None."""
     if not refusals:
-        return ""
+        return None
     details = "; ".join(
         f"{one.who}: {one.what} ({one.where}), {one.n} times" for one in refusals[:3]
     )
     more = len(refusals) - 3
-    return f"refused on the link: {details}{f'; and {more} more' if more > 0 else ''}"
+    text = f"{details}{f'; and {more} more' if more > 0 else ''}"
+    return compose("link.refused", _join(sorted({one.who for one in refusals})), text=text)
 
 
-def describe_expiry(certificates: Sequence[EndingCertificate]) -> str:
-    """Return which certificates end soon or have ended; empty: none."""
-    return "; ".join(
+def describe_expiry(certificates: Sequence[EndingCertificate]) -> Message | None:
+    """Return which certificates end soon or have ended, or None."""
+    if not certificates:
+        return None
+    text = "; ".join(
         f"the certificate of {one.name} ({one.path}) "
         + ("has ended" if one.remaining_s <= 0.0 else f"ends in {one.remaining_s / DAY_S:.0f} days")
         for one in certificates
     )
+    return compose("link.certificates", _join(one.path for one in certificates), text=text)
+
+
+def _join(items: Iterable[object]) -> str:
+    return ", ".join(map(str, items))

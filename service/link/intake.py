@@ -23,6 +23,7 @@ from service.link.statistics import MALFORMED, USED, Counters, LinkStatistics
 from service.link.telemetry_age import MAX_AGE_S, TelemetryAge
 from service.records import events as ev
 from service.records.alarms import OTHER_BASIS, SECOND_RTC
+from service.records.messages import compose
 from service.records.state import Level
 
 MAX_QUEUED_EVENTS: Final = 1024
@@ -293,7 +294,7 @@ class Intake:
     def _complain(self, kind: str, error: WireError, now_s: float) -> None:
         self._counters.add(kind, MALFORMED, 1, now_s, str(error))
         if self._is_new(f"malformed {kind}", now_s):
-            text = f"{kind}: {error}"
+            text = compose("message.broken", kind, error=str(error))
             self._put(ev.LogEvent(name="message.malformed", text=text, level=Level.WARNING))
 
     def failed(self, kind: str) -> bool:

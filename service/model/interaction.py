@@ -404,7 +404,7 @@ class InteractionModel:
         ways += more
         # With more ways than axes the gradient along both axes is cheaper than a rendering for each
         # way.
-        if len(ways) > _AXES and isinstance(self._render_modes(alpha), np.ndarray):
+        if len(ways) > _AXES:
             return self._along(alpha, ways)
         return [self._move_modes(alpha, way) for way in ways]
 
@@ -426,10 +426,13 @@ class InteractionModel:
         return [partial(_stretch_rate, by=by) for by in (along, askew)]
 
     def _along(self, alpha: Misregistration, ways: list[Way]) -> list[Shapes]:
-        """Return the rates of modes that are arrays along several ways, from their gradient."""
+        """Return the rates of the modes along several ways, from their gradient."""
         # Two renderings give the gradient, of which every way is a combination point by point.
         steps = [partial(_shift_rate, step=step) for step in np.eye(_AXES)]
         along_x, along_y = (self._move_modes(alpha, step) for step in steps)
+        if isinstance(along_x, LocalShapes) and isinstance(along_y, LocalShapes) and self._local:
+            gradient = along_x, along_y
+            return [self._by_tiles(self._local, alpha, way, gradient) for way in ways]
         points = self._mirror_points(alpha)
         found: list[Shapes] = []
         for way in ways:
@@ -439,7 +442,8 @@ class InteractionModel:
 
     def _measure_shapes(self, alpha: Misregistration, shapes: list[Shapes]) -> list[Array]:
         """Return the signals of each of some shapes, with one response for all if none is kept."""
-        if self.sensor.keeps_gradient:
+        # The tiles of a kept one are read once for all local shapes.
+        if self.sensor.keeps_gradient and not isinstance(shapes[0], LocalShapes):
             return [self.measure_signals(alpha, one) for one in shapes]
         return np.split(self.measure_signals(alpha, beside(shapes)), len(shapes), axis=1)
 
@@ -453,12 +457,24 @@ class InteractionModel:
         both = np.hstack([points, way(points)])
         return self._by_rows(lambda p: self.basis.render_slope(p[:, :2], p[:, 2:]), both)
 
-    def _by_tiles(self, basis: LocalBasis, alpha: Misregistration, way: Way | None) -> Shapes:
+    def _by_tiles(
+        self,
+        basis: LocalBasis,
+        alpha: Misregistration,
+        way: Way | None,
+        gradient: tuple[LocalShapes, LocalShapes] | None = None,
+    ) -> Shapes:
+        """Return local modes, or their rates along a way, of their ``gradient`` if it is known."""
         kept = basis.in_single if self._dtype is np.float32 else basis
 
         def patch(number: int) -> Patch:
             tile = self._tiles[number]
             at = self._on_mirror(alpha, tile.points)
+            if way is not None and gradient is not None:
+                x, y = way(at).astype(self._dtype).T
+                along_x, along_y = (rates.patches[number] for rates in gradient)
+                weights = along_x.weights * x[:, None] + along_y.weights * y[:, None]
+                return replace(along_x, weights=weights)
             functions, weights = basis.patch(at, None if way is None else way(at))
             return Patch(tile=tile, functions=functions, weights=weights.astype(self._dtype))
 

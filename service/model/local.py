@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -202,6 +202,7 @@ def _made_beside(model: object, *, each: Sequence[Callable[[Any], Shapes]]) -> S
     return beside([make(model) for make in each])
 
 
+@lru_cache(maxsize=16)
 def tiles_of(pupil: PupilGrid) -> tuple[Tile, ...]:
     """Return the tiles of a pupil that see any light, row after row."""
     lit, side = pupil.lit, TILE_SUBAP * pupil.sampling

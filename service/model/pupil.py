@@ -155,6 +155,7 @@ def _outline(instrument: Instrument) -> _Outline:
     )
 
 
+@lru_cache(maxsize=16)
 def _drawn(outline: _Outline, sampling: int) -> PupilGrid:
     if outline.own is not None:
         return _pupil_from_map(outline, outline.own, sampling)

@@ -143,9 +143,8 @@ def _edges(light: Array, centre: Array, radius: float, typical: float) -> Array:
     distances = np.arange(0.0, 1.5 * radius + 2.0, _RAY_STEP_PX)
     directions, rays = _rays(light, centre, distances)
     inside = (distances > 0.6 * radius) & (distances < 0.95 * radius)
-    edges = []
-    for direction, ray in zip(directions, rays, strict=True):
-        plateau = float(np.median(ray[inside]))
+    plateaus, edges = np.median(rays[:, inside], axis=1), []
+    for direction, ray, plateau in zip(directions, rays, plateaus, strict=True):
         if plateau < _HALF * typical:
             continue  # this ray lies in the shadow of a vane
         lit = np.flatnonzero(ray > _HALF * plateau)

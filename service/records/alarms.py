@@ -15,6 +15,8 @@ from typing import Final
 
 import msgspec
 
+from service.records.messages import Message
+
 VANISHED = "rtc-vanished"
 LOOP_OPEN = "loop-open"
 RTC_CLOCK = "rtc-clock"
@@ -183,7 +185,7 @@ class Alarm:
 
     name: str
     since_ns_utc: int
-    text: str
+    message: Message
     """Finding, and the remedy."""
 
     seen_ns_utc: int = 0
@@ -195,6 +197,11 @@ class Alarm:
 
     own: AlarmDefinition | None = None
     """Definition that replaces the one of the table; None to use the table's."""
+
+    @property
+    def text(self) -> str:
+        """Sentence of the message."""
+        return str(self.message)
 
     @property
     def definition(self) -> AlarmDefinition:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.model.misregistration import Determination
+from service.records.messages import Message
 
 Array = NDArray[np.float64]
 
@@ -194,15 +195,15 @@ class RefusalKind(StrEnum):
     """It shows that slopes or commands are not what the instrument file says."""
 
 
-Why = tuple[RefusalKind, str]
-"""Kind of a rejection, and its text."""
+Why = tuple[RefusalKind, Message]
+"""Kind of a rejection, and its reason."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WindowRefused:
     """A window that gave no estimate."""
 
-    reason: str
+    reason: str | Message
     """Description of the cause, and what to do about it."""
 
     t_ns_utc: int

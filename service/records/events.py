@@ -15,6 +15,7 @@ from service.records.estimates import (
     WideCaptureEstimate,
     WindowRefused,
 )
+from service.records.messages import Message
 from service.records.operations import MeasurementRecord, ProbationFinding
 from service.records.products import ExpectedGain, GateVerdict, Judged, ReconstructorRecord
 from service.records.state import Level, ModelState, TrackerState
@@ -155,7 +156,7 @@ class ConditionChanged:
     """A condition that must be seen while it lasts."""
 
     name: str
-    text: str
+    text: str | Message
     over: bool = False
     """The condition has ended."""
 
@@ -178,7 +179,7 @@ class LogEvent:
     """Something happened that changes nothing but should be on record."""
 
     name: str
-    text: str
+    text: str | Message
     level: Level = Level.INFO
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
 from service.model.misregistration import Misregistration
 from service.records.alarms import Alarm, AlarmRecord
+from service.records.messages import Message, Range
 from service.records.operations import (
     Acquisition,
     Dither,
@@ -14,6 +16,7 @@ from service.records.operations import (
     LoopCommand,
     MeasurementRecord,
     Probation,
+    RefitJob,
 )
 from service.records.products import (
     Assessment,
@@ -55,7 +58,7 @@ class LogEntry:
     name: str
     """Machine-readable, like ``reconstructor.applied``."""
 
-    text: str
+    message: Message
 
     times: int = 1
     """Number of occurrences. A line that repeats within a minute is logged once, and again with
@@ -64,12 +67,17 @@ class LogEntry:
     last_ns_utc: int = 0
     """The last time, where it was more than once."""
 
-    ranges: tuple[tuple[str, str], ...] = ()
-    """Smallest and largest value of each number in the text of a counted line."""
+    ranges: Mapping[str, Range] = field(default_factory=dict)
+    """Range of each number in the message of a counted line; empty if it was not counted."""
 
     cause: str = ""
     """Id of the order or event that has led to it: what else that led to has the same; empty: of
     before the service began."""
+
+    @property
+    def text(self) -> str:
+        """Sentence of the message."""
+        return str(self.message)
 
     @property
     def line(self) -> tuple[int, str, str]:
@@ -189,8 +197,8 @@ class WindowCounts:
     run: int = 0
     """Number of consecutive windows accepted; negative if they were rejected."""
 
-    refused_because: str = ""
-    """Why the last of those was; empty: none was yet."""
+    refused_because: Message | None = None
+    """Reason of the last rejection; None if there was none."""
 
     outlying: int = 0
     """Windows that were plausible by themselves but rejected as outliers."""
@@ -270,6 +278,9 @@ class Operations:
 
     measurements: tuple[MeasurementRecord, ...] = ()
     """Measurements of interaction matrices, oldest first, bounded in number."""
+
+    refits: tuple[RefitJob, ...] = ()
+    """Reconstructors that operators have ordered, oldest first, bounded in number."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import assert_never
 
 import numpy as np
@@ -32,11 +33,13 @@ from service.records.estimates import (
     WindowRefused,
 )
 from service.records.events import Event
+from service.records.messages import compose
 from service.records.operations import MeasurementRecord, MeasureState, NoisyFinding
 from service.records.state import Level, TrackerState
 from service.runtime.ports import StorePort, WorkerPort
 from service.runtime.worker import OpticsWorker
 from service.runtime.worker.records import waits
+from service.runtime.workers import with_another_worker
 from service.tracking.pointing_law import start_of_fit
 from service.tracking.window_processing import fit_begins_at
 from service.wire import checksum
@@ -77,8 +80,7 @@ class PendingWindow:
         if waiting is None:
             return None
         return WindowRefused(
-            reason="the worker had no hand free before the dither, the reconstructor or the "
-            f"session changed, or for {MAX_WINDOW_SPAN_S:.0f} s: the window was given up",
+            reason=compose("window.given-up", most_s=MAX_WINDOW_SPAN_S),
             t_ns_utc=waiting.t_end_ns_utc,
         )
 
@@ -144,7 +146,7 @@ async def _outcome(
         found, nominal = state.operations.acquisition.alpha, state.alpha.law.nominal
         return await workers.call(OpticsWorker.find, window, found, flux, nominal)
     if rtc is None:
-        return WindowRefused(reason="the RTC is not known", t_ns_utc=window.t_end_ns_utc)
+        return WindowRefused(reason=compose("window.no-rtc"), t_ns_utc=window.t_end_ns_utc)
     loop = ClosedLoop(
         # In a thread, because a matrix that is not in memory is read from the archive.
         reconstructor=await asyncio.to_thread(_reconstructor, window, state, matrix_of),
@@ -218,11 +220,16 @@ async def read_own_matrix(
     registration = state.alpha.registration
     near = state.alpha.law.nominal if registration is None else registration.alpha
     try:
-        dialect = await workers.call(OpticsWorker.read_slope_convention, matrix, near)
+        # Repeated if the worker dies of something else: nothing reads this matrix again.
+        dialect = await with_another_worker(
+            partial(workers.call, OpticsWorker.read_slope_convention, matrix, near)
+        )
         own = None
         # The modes can only be compared once order and signs of the slopes are right.
         if not dialect.wrong:
-            own = await workers.call(OpticsWorker.recognise, matrix, near, dialect.rotation_rad)
+            own = await with_another_worker(
+                partial(workers.call, OpticsWorker.recognise, matrix, near, dialect.rotation_rad)
+            )
     except PyrcalError as error:
         return [*unread, ev.LogEvent(name="slopes.unknown", text=str(error), level=Level.WARNING)]
     return [*unread, *_report_own_matrix(record, dialect, own, state)]
@@ -353,7 +360,8 @@ class NoisySums:
             raise CommandError("no window of its dither was whole: see the log for the reasons")
         self._id = self._total = None
         start = None if registration is None else registration.alpha
-        record, numbers = await self._workers.call(work_out, record, total, start)
+        job = partial(self._workers.call, work_out, record, total, start)
+        record, numbers = await with_another_worker(job)
         store = self._archive.noisy.store
         await asyncio.to_thread(store, record, numbers, self._instrument.name)
         return ev.MatrixMeasured(record=record)

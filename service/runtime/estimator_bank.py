@@ -22,6 +22,7 @@ from service.estimation.loop import last_seq, same_loop, same_rate
 from service.estimation.passive import Passive
 from service.estimation.windows import DITHER_SETTLING_S
 from service.records.estimates import WindowRefused
+from service.records.messages import Message
 from service.records.operations import Dither
 from service.runtime.registry import REGISTRY, Entry
 from service.tracking.dither_request import expected_dither, lock_in_plan, random_plan
@@ -249,7 +250,7 @@ def _with_windows(bank: EstimatorBank, members: list[Streaming]) -> Fed:
         if isinstance(window, WindowRefused):
             windows.append(window)
             continue
-        reasons: list[str] = []
+        reasons: list[Message] = []
         for k, member in enumerate(members):
             members[k], reason = member.vet(window, bank.loop)
             reasons += [] if reason is None else [reason]

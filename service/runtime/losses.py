@@ -7,6 +7,7 @@ from typing import Final
 
 from service.link.statistics import LinkStatistics
 from service.records.alarms import FRAMES_LOST, NO_FRAMES
+from service.records.messages import Message, compose
 from service.wire import Status
 
 LOSS_PERIOD_S: Final = 5.0
@@ -31,15 +32,14 @@ Counts = deque[tuple[float, LinkStatistics]]
 """Times with the counters at each."""
 
 
-def silence(rtc: Status | None, frame_age_s: float | None) -> dict[str, str]:
-    """Return, by alarm, that frames stay away though the loop is closed; empty: they come.
+def silence(rtc: Status | None, frame_age_s: float | None) -> dict[str, Message | None]:
+    """Return, by alarm, that frames stay away though the loop is closed; None: they come.
 
     A matrix made of what was known before is not sent then.
     """
     if rtc is None or not rtc.in_loop or frame_age_s is None or frame_age_s < FRAMES_TIMEOUT_S:
-        return {NO_FRAMES: ""}
-    text = f"no frame could be used for {frame_age_s:.0f} s, though the RTC's loop is closed"
-    return {NO_FRAMES: f"{text}: nothing is made or sent until frames come; {REMEDY}"}
+        return {NO_FRAMES: None}
+    return {NO_FRAMES: compose("link.no-frames", silent_s=frame_age_s, remedy=REMEDY)}
 
 
 class Losses:
@@ -52,8 +52,8 @@ class Losses:
         self._raised = False
         self._slowness = _Slowness()
 
-    def complaint(self, link: LinkStatistics, now_s: float) -> dict[str, str]:
-        """Return, by alarm, what is lost, where it is more than chance; empty: next to nothing.
+    def complaint(self, link: LinkStatistics, now_s: float) -> dict[str, Message | None]:
+        """Return, by alarm, what is lost, where it is more than chance; None: next to nothing.
 
         ``now_s`` is of a clock that does not leap.
         """
@@ -67,7 +67,7 @@ class Losses:
 
     def _lost(
         self, since_s: float, before: LinkStatistics, link: LinkStatistics, now_s: float
-    ) -> str:
+    ) -> Message | None:
         # The counter falls when a lost frame is recovered after all.
         never_came = max(link.frames_lost - before.frames_lost, 0)
         not_finite = link.frames_nonfinite - before.frames_nonfinite
@@ -81,7 +81,7 @@ class Losses:
         enough = now_s - since_s >= LOSS_PERIOD_S
         self._raised = share > (0.5 if self._raised else 1.0) * MAX_LOST_SHARE and enough
         if not self._raised:
-            return ""
+            return None
         found = [
             f"{n} {how}"
             for n, how in (
@@ -91,9 +91,13 @@ class Losses:
             )
             if n
         ]
-        return (
-            f"frames are lost: of {n_frames} in the last {now_s - since_s:.0f} s {', '.join(found)}"
-            f" ({100.0 * share:.1f} %): {REMEDY}"
+        return compose(
+            "link.frames-lost",
+            n_frames=n_frames,
+            period_s=now_s - since_s,
+            details=", ".join(found),
+            percent=100.0 * share,
+            remedy=REMEDY,
         )
 
 
@@ -106,14 +110,14 @@ class _Slowness:
         self._before_hz: float | None = None
         """The rate before they became slow; None: they are not."""
 
-    def complaint(self, counts: Counts) -> str:
-        """Return how slowly they come; empty: as before, or not at all, which others name."""
+    def complaint(self, counts: Counts) -> Message | None:
+        """Return how slowly they come; None: as before, or not at all, which others name."""
         now_s, now = counts[-1]
         recent = next((at for at in reversed(counts) if now_s - at[0] >= RATE_PERIOD_S), None)
         # Frames that stopped have the alarm no-frames; a rate of zero is no slowness.
         if recent is None or now.frames_received == counts[-2][1].frames_received:
             self._before_hz = None
-            return ""
+            return None
         rate_hz = _rate_hz(recent, counts[-1])
         if self._before_hz is not None:
             slow = rate_hz < 2.0 * MIN_RATE_SHARE * self._before_hz
@@ -124,10 +128,13 @@ class _Slowness:
             slow = rate_hz < MIN_RATE_SHARE * self._before_hz
         if not slow:
             self._before_hz = None
-            return ""
-        return (
-            f"frames come slowly: {rate_hz:.0f} a second in the last {RATE_PERIOD_S:.0f} s, "
-            f"{self._before_hz:.0f} before, and ever later: {REMEDY}"
+            return None
+        return compose(
+            "link.frames-slow",
+            rate_hz=rate_hz,
+            period_s=RATE_PERIOD_S,
+            before_hz=self._before_hz,
+            remedy=REMEDY,
         )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -22,6 +21,7 @@ from service.model.misregistration import at_boundary
 from service.records import alarms
 from service.records import events as ev
 from service.records.alarms import Alarm, Interlock, Prerequisite, Responsible, alarm_blocks
+from service.records.messages import Message, as_message, compose
 from service.records.operations import AcquisitionStage
 from service.records.products import MatrixState, ReconstructorRecord
 from service.records.state import Mode, TrackerState
@@ -77,12 +77,10 @@ DERIVED_EACH_SECOND: Final = frozenset(
 """Alarms that are derived each second, and end when they are not derived any more."""
 
 
-NOTHING_ELSE: Final[Mapping[str, str]] = {}
-
-_NUMBER: Final = re.compile(r"[0-9]+")
+NOTHING_ELSE: Final[Mapping[str, str | Message | None]] = {}
 
 
-def complaints(link: LinkStatistics) -> dict[str, str]:
+def complaints(link: LinkStatistics) -> dict[str, Message]:
     """Return the alarms of what came in the last seconds, by name."""
     made = {
         alarms.FRAMES_UNUSED: _explain_unused(link),
@@ -93,11 +91,11 @@ def complaints(link: LinkStatistics) -> dict[str, str]:
         alarms.LINK_REFUSED: describe_refusals(link.refusals),
         alarms.CERTIFICATE_ENDING: describe_expiry(link.ending_certificates),
     }
-    return {name: text for name, text in made.items() if text}
+    return {name: message for name, message in made.items() if message is not None}
 
 
-def _explain_unused(link: LinkStatistics) -> str:
-    """Return which frames come and are not used, and why; empty: all is well."""
+def _explain_unused(link: LinkStatistics) -> Message | None:
+    """Return which frames come and are not used, and why, or None."""
     frames = [disposition for disposition in link.dispositions if disposition.kind == "frames"]
     came, used = sum(f.n for f in frames), sum(f.n for f in frames if f.outcome == USED)
     lost = [f for f in frames if f.outcome not in OUTCOMES_WITH_ALARM and _is_lost(f, link, used)]
@@ -107,24 +105,23 @@ def _explain_unused(link: LinkStatistics) -> str:
         lost = faults
     lost = [f for f in lost if f.n or f in faults]
     if not lost:
-        return ""
-    reasons = ", ".join(sorted(f.outcome for f in lost))
-    details = "; ".join(f"{f.n} {f.outcome} ({f.text})" for f in lost[:3])
-    return (
-        f"the RTC's frames are not used ({reasons}): {details}; of {came} in the last "
-        f"{STATISTICS_PERIOD_S:.0f} s {used} were used: check the RTC's telemetry"
+        return None
+    return compose(
+        "link.frames-unused",
+        ", ".join(sorted(f.outcome for f in lost)),
+        details="; ".join(f"{f.n} {f.outcome} ({f.text})" for f in lost[:3]),
+        n_frames=came,
+        period_s=STATISTICS_PERIOD_S,
+        n_used=used,
     )
 
 
-def _explain_age(link: LinkStatistics) -> str:
-    """Return that the frames that come are old; empty: they are not, or none come."""
+def _explain_age(link: LinkStatistics) -> Message | None:
+    """Return that the frames that come are old, or None if they are not or none come."""
     come = link.frame_age_s is not None and link.frame_age_s < FRAMES_TIMEOUT_S
     if not come or link.telemetry_age_s <= MAX_AGE_S:
-        return ""
-    return (
-        f"telemetry is {link.telemetry_age_s:.0f} s old, expected at most {MAX_AGE_S:g} s: it is "
-        "not used, and no matrix is made, sent or judged; check the network and the RTC's publisher"
-    )
+        return None
+    return compose("link.telemetry-old", age_s=link.telemetry_age_s, most_s=MAX_AGE_S)
 
 
 def _is_lost(disposition: Disposition, link: LinkStatistics, used: int) -> bool:
@@ -140,36 +137,36 @@ def _is_lost(disposition: Disposition, link: LinkStatistics, used: int) -> bool:
             return True
 
 
-def _explain_refused(link: LinkStatistics) -> str:
-    """Return which messages besides frames broke the contract; empty: none of late."""
+def _explain_refused(link: LinkStatistics) -> Message | None:
+    """Return which messages besides frames broke the contract of late, or None."""
     bad = [f for f in link.dispositions if f.outcome == MALFORMED and f.kind != "frames"]
     bad = [f for f in bad if f.age_s < FAULT_REPORT_DURATION_S]
     if not bad:
-        return ""
-    kinds = ", ".join(sorted(f.kind for f in bad))
+        return None
     details = "; ".join(f"{f.kind}: {f.text}" for f in bad)
-    return f"messages of the RTC are not used ({kinds}): {details}: mend the RTC"
+    kinds = ", ".join(sorted(f.kind for f in bad))
+    return compose("link.messages-refused", kinds, details=details)
 
 
-def _flood(link: LinkStatistics) -> str:
+def _flood(link: LinkStatistics) -> Message | None:
     rate_hz = sum(f.n for f in link.dispositions if f.kind == "status") / STATISTICS_PERIOD_S
     if rate_hz <= MAX_STATUSES_HZ:
-        return ""
+        return None
     spared = any(f.outcome == COALESCED and f.n for f in link.dispositions)
     taken = "the latest is taken twice a second" if spared else "each says something else"
-    return (
-        f"the RTC floods the service with statuses: {rate_hz:.0f} a second, 1 to 10 are expected; "
-        f"{taken}: slow them down"
-    )
+    return compose("link.status-flood", taken, rate_hz=rate_hz)
 
 
 def detect_link_changes(
-    link: LinkStatistics, state: TrackerState, now_ns: int, also: Mapping[str, str] = NOTHING_ELSE
+    link: LinkStatistics,
+    state: TrackerState,
+    now_ns: int,
+    also: Mapping[str, str | Message | None] = NOTHING_ELSE,
 ) -> list[ev.Event]:
     """Return the alarms of the link that begin, continue or end.
 
-    ``also`` are alarms of other sources by name; empty text for none. A text that differs in its
-    numbers only is kept, because it is no news.
+    ``also`` are alarms of other sources by name; None or an empty text for none. A message that
+    differs in its numbers only is kept, because it is no news.
     """
     made, found = complaints(link), []
     if not any(
@@ -179,15 +176,16 @@ def detect_link_changes(
         # Frames of another basis or configuration do come: their own alarms name the cause, and "no
         # frames" would hide it.
         also = silence(state.loop.rtc, link.frame_age_s) | dict(also)
-    made |= {name: text for name, text in also.items() if text}
+    made |= {name: as_message(name, text) for name, text in also.items() if text}
     raised = {
         alarm.name: alarm for alarm in state.alarms.active if alarm.name in DERIVED_EACH_SECOND
     }
-    for name, text in made.items():
+    for name, message in made.items():
         before = raised.get(name)
-        # Counters in a text change every second: they must not make a new line in the log.
-        same = before is not None and _NUMBER.sub("", before.text) == _NUMBER.sub("", text)
-        found.append(ev.ConditionChanged(name=name, text=before.text if before and same else text))
+        # Counters in a message change every second: they must not make it news each time.
+        same = before is not None and before.message.key == message.key
+        text = before.message if before is not None and same else message
+        found.append(ev.ConditionChanged(name=name, text=text))
     for name, alarm in raised.items():
         # An alarm that came and went each second would hide the others.
         if name not in made and now_ns - alarm.seen_ns_utc > COMPLAINT_TIMEOUT_NS:
@@ -301,10 +299,12 @@ def _for_messages(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
 
 
 def _for_frames(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
-    text, fates = _explain_unused(inputs.link), inputs.link.dispositions
-    if text and not any(f.n for f in fates if f.kind == "frames" and f.outcome == USED):
+    message, fates = _explain_unused(inputs.link), inputs.link.dispositions
+    if message is not None and not any(
+        f.n for f in fates if f.kind == "frames" and f.outcome == USED
+    ):
         yield Prerequisite(
-            name=alarms.FRAMES_UNUSED, responsible=Responsible.RTC, text=text, blocks=True
+            name=alarms.FRAMES_UNUSED, responsible=Responsible.RTC, text=str(message), blocks=True
         )
 
 

@@ -11,8 +11,16 @@ from numpy.typing import NDArray
 
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import COVARIANCE_SCALE, PARAMETERS, Misregistration
-from service.records.alarms import ALARMS, AlarmDefinition, AlarmRecord, Prerequisite, Severity
+from service.records.alarms import (
+    ALARMS,
+    Alarm,
+    AlarmDefinition,
+    AlarmRecord,
+    Prerequisite,
+    Severity,
+)
 from service.records.commands import GainGroup
+from service.records.messages import Value
 from service.records.registration import ModeGain, Registration
 from service.records.state import LogEntry, TrackerState
 from service.tracking.alarm_records import muted_records, record_of, stale_records, worst_severity
@@ -125,7 +133,7 @@ class Snapshot:
         """Active alarms, in the order in which they were raised."""
         raised = self.tracker.alarms.active
         return tuple(
-            AlarmStatus(record=record_of(self.tracker, a), definition=a.definition) for a in raised
+            AlarmStatus(record=record_of(self.tracker, alarm), alarm=alarm) for alarm in raised
         )
 
     @property
@@ -166,13 +174,23 @@ class AlarmStatus:
     """An alarm that lasts, or went unseen: how much it matters, what to do, who knows of it."""
 
     record: AlarmRecord
-    definition: AlarmDefinition | None = None
+    alarm: Alarm | None = None
     """None: it does not last."""
 
     @property
     def severity(self) -> Severity | None:
         """Null: it does not last."""
-        return None if self.definition is None else self.definition.severity
+        return None if self.alarm is None else self.alarm.definition.severity
+
+    @property
+    def code(self) -> str | None:
+        """Code of the message; null if the alarm does not last."""
+        return None if self.alarm is None else self.alarm.message.code
+
+    @property
+    def values(self) -> Mapping[str, Value]:
+        """Values in the message; empty if the alarm does not last."""
+        return {} if self.alarm is None else self.alarm.message.values
 
     @property
     def cause(self) -> str:
@@ -186,7 +204,7 @@ class AlarmStatus:
 
     @property
     def _known(self) -> AlarmDefinition | None:
-        return self.definition or ALARMS.get(self.record.name)
+        return self.alarm.definition if self.alarm else ALARMS.get(self.record.name)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -288,5 +306,20 @@ class ModeGainTable:
     relative_sigma: list[float]
     """1 σ of each as a share of it; it grows away from the measured modes."""
 
+    sigma: list[float]
+    """1 σ of each."""
+
     factor: list[float]
     """Factor for one loop gain of all modes, for each mode: mean 1, range 0.5 to 2."""
+
+    t_ns_utc: int | None
+    """End of the last window in which one of them was measured; None if none was."""
+
+    reference_id: str | None
+    """Reference slopes that the RTC used; None if unknown."""
+
+    magnitude: float | None = None
+    """Magnitude of the guide star now; None if unknown, or of an earlier time."""
+
+    frame_rate_hz: float | None = None
+    """Frame rate now; None if of an earlier time."""

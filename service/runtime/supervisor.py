@@ -28,6 +28,7 @@ from service.records import events as ev
 from service.records.alarms import CLOCK_LEAPT, Prerequisite
 from service.records.estimates import RefusalKind
 from service.records.events import Effect, Event
+from service.records.messages import Message, compose
 from service.records.operations import MeasureState
 from service.records.state import Level, TrackerState
 from service.runtime import archiving, command_results, readiness, worker
@@ -97,10 +98,10 @@ class Supervisor:
             audit=self._writer.add,
         )
         """Telemetry kept on request."""
-        self.complaints = {CLOCK_LEAPT: self._clock.complaint}
-        """Functions that return the text of an alarm, empty for none; called each second."""
-        self.refits = command_results.Refits()
-        """Reconstructors that operators have ordered."""
+        self.complaints: dict[str, Callable[[], str | Message | None]] = {
+            CLOCK_LEAPT: self._clock.complaint
+        }
+        """Functions that return the text of an alarm, or nothing for none; called each second."""
         self._pending_window = PendingWindow()
         self._n_readings = 0
         self._own_matrix_read = asyncio.Event()
@@ -188,7 +189,7 @@ class Supervisor:
 
     async def submit(
         self, command: cmd.Command, actor: Actor = OPERATOR, order_id: str = ""
-    ) -> str:
+    ) -> Message:
         """Carry out an operator's command; return one sentence on what came of it.
 
         It is on record before it is done, and so is why it is refused. What it leads to has its
@@ -225,16 +226,14 @@ class Supervisor:
         except PyrcalError as error:
             self._writer.refused(order, actor, error)
             raise
-        self._writer.answered(order, actor, answer)
+        self._writer.answered(order, actor, str(answer))
         await self._writer.keep_orders(state)
         return answer
 
-    async def _result_of(self, order: command_results.GivenCommand) -> str:
+    async def _result_of(self, order: command_results.GivenCommand) -> Message:
         """Do what is asked, and say what the RTC says to it where that takes but a moment."""
         running = set(self._running)
-        effects = self._post(order.command, order.id)
-        if isinstance(order.command, cmd.Refit):
-            self.refits.begin(effects, self._clock.now_ns())
+        self._post(order.command, order.id)
         asked = self._running - running
         # The RTC answers these commands within a moment, and its answer is the result.
         if asked and isinstance(order.command, cmd.Measure | cmd.SetLoop | cmd.Ramp):
@@ -243,7 +242,7 @@ class Supervisor:
         while True:
             answer = order.result(self._engine.state)
             if answer.final or time.monotonic() > until_s:
-                return answer.text
+                return answer.message
             await asyncio.sleep(RESULT_POLL_INTERVAL_S)
 
     def matrix(self, matrix_id: str) -> NDArray[np.float32]:
@@ -552,7 +551,6 @@ class Supervisor:
         except Exception as error:  # noqa: BLE001 - a bug in one action must not end the service
             self._log.exception("action.broken", effect=type(effect).__name__)
             event = ev.JobFailed(effect=effect, text=f"internal error: {error!r}")
-        self.refits.end(effect, event)
         if event is not None:
             self._post(event, effect.cause)
 
@@ -561,7 +559,7 @@ class Supervisor:
         given_up = known is not None and known.state is MeasureState.GIVEN_UP
         if known is not None and (given_up or known.pattern is None):
             why = "it had been given up" if given_up else "a noisy one had this id"
-            text = f"{known.id} came after {why}: it is not kept"
+            text = compose("measurement.late", why, id=known.id)
             self._note("measurement.ignored", text, Level.INFO)
             return
         try:
@@ -571,14 +569,15 @@ class Supervisor:
                 self._writer.failed(error)
             self._note("measurement.not-kept", str(error), Level.WARNING)
 
-    def _note(self, name: str, text: str, level: Level) -> None:
+    def _note(self, name: str, text: str | Message, level: Level) -> None:
         self._post(ev.LogEvent(name=name, text=text, level=level))
 
     def _tell(self, before: TrackerState) -> None:
         """Log what is new in the state's log, at its level, and have it recorded."""
-        entries = new_lines(before, self._engine.state)
+        after = self._engine.state
+        entries = new_lines(before, after)
+        ids = archiving.ids_of(after, archiving.find_changed_ids(before, after)) if entries else {}
         for entry in entries:
-            ids = archiving.ids_of(entry.text, self._engine.state)
             told = getattr(self._log, _LEVELS.get(entry.level, entry.level.value))
             told(entry.name, text=entry.text, **ids)
         self._writer.changed(before, self._engine.state, entries)

@@ -22,6 +22,7 @@ from service.model.pointing_law import ANGLES
 from service.records import alarms
 from service.records import commands as cmd
 from service.records.alarms import RULE_PREFIX, AlarmDefinition
+from service.records.messages import Message
 from service.records.operations import AcquisitionStage
 from service.records.products import MatrixState
 from service.records.state import ObservatoryValue, TrackerState
@@ -60,14 +61,17 @@ def derive_alarms(context: StepContext) -> None:
 
 
 def _update(
-    context: StepContext, name: str, text: str | None, definition: AlarmDefinition | None
+    context: StepContext,
+    name: str,
+    text: str | Message | None,
+    definition: AlarmDefinition | None,
 ) -> None:
     """Raise an alarm with this text, or end it; one that goes on as it is is let be."""
     raised = context.state.alarm(name)
     if text is None:
         if raised is not None:
             validity.end_alarm(context, name)
-    elif raised is None or (raised.text, raised.own) != (text, definition):
+    elif raised is None or (raised.text, raised.own) != (str(text), definition):
         context.raise_alarm(name, text, definition)
 
 
@@ -186,7 +190,7 @@ def _jump_suspected(context: StepContext) -> str | None:
     return registration.doubt if jump is None else jump.text
 
 
-RULES: Final[dict[str, Callable[[StepContext], str | None]]] = {
+RULES: Final[dict[str, Callable[[StepContext], str | Message | None]]] = {
     "stopped": _stopped,
     alarms.LOOP_OPEN: _loop_open,
     alarms.RTC_CLOCK: _clock,

@@ -15,6 +15,7 @@ from service.records import alarms
 from service.records import commands as cmd
 from service.records import events as ev
 from service.records.estimates import RandomEstimate
+from service.records.messages import Message, compose
 from service.records.operations import Dither, DitherPhase, DitherPurpose, Precision
 from service.records.state import Level, TrackerState
 from service.tracking import dither_plan, dither_request, mode_proof
@@ -142,9 +143,9 @@ def on_answer(context: StepContext, request: DitherRequest, reply: Reply) -> Non
         return
     context.put_off(dither_s=10.0)
     context.dither = None
-    text = f"the RTC refused the dither: {reply.reason}"
-    context.raise_alarm(alarms.NO_DITHER, text)
-    context.fail(text)
+    refused = compose("dither.refused", reply.reason)
+    context.raise_alarm(alarms.NO_DITHER, refused)
+    context.fail(str(refused))
 
 
 def on_failure(context: StepContext, _: DitherRequest, __: str) -> None:
@@ -156,7 +157,7 @@ def on_failure(context: StepContext, _: DitherRequest, __: str) -> None:
 def on_stop_answer(context: StepContext, _: DitherStop, reply: Reply) -> None:
     """Put on record that the RTC goes on; it is asked again for as long as it must be."""
     if not reply.accepted:
-        context.warn("job.failed", f"the RTC did not stop the dither: {reply.reason}")
+        context.warn("job.failed", compose("dither.not-stopped", reply.reason))
 
 
 def follow_status(context: StepContext, rtc: Status) -> None:
@@ -187,10 +188,7 @@ def follow_status(context: StepContext, rtc: Status) -> None:
     # The first loss is retried at once; an RTC that begins late needs more time.
     if context.dithers.losses:
         context.put_off(dither_s=_patience_s(context.state))
-    text = (
-        f"the RTC's status shows no {dither.id} although the RTC accepted it: it is requested again"
-    )
-    _note_lost(context, dither, text)
+    _note_lost(context, dither, compose("dither.not-shown", id=dither.id))
 
 
 def on_silence(context: StepContext, event: ev.DitherSilent) -> None:
@@ -202,7 +200,7 @@ def on_silence(context: StepContext, event: ev.DitherSilent) -> None:
     dither = context.dither
     if dither is None or dither.id != event.id:
         return
-    text = f"the RTC accepted {dither.id}: its frames held none of it for {event.silent_s:.1f} s"
+    text = compose("dither.not-in-frames", id=dither.id, silent_s=event.silent_s)
     if event.silent_s < _patience_s(context.state):
         context.raise_alarm(alarms.DITHER_LOST, text)
     else:
@@ -463,7 +461,7 @@ def _take_over_played(context: StepContext, asked: Dither, shown: DitherStatus) 
     context.warn("dither.other", text)
 
 
-def _note_lost(context: StepContext, dither: Dither, text: str) -> None:
+def _note_lost(context: StepContext, dither: Dither, text: Message) -> None:
     context.raise_alarm(alarms.DITHER_LOST, text)
     context.warn("dither.lost", text)
     context.dither = None

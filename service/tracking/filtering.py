@@ -16,6 +16,7 @@ from service.estimation.windows import OTHER_SESSION
 from service.model.misregistration import Misregistration
 from service.records.alarms import Interlock, blocking_alarm
 from service.records.estimates import DitheredEstimate, RandomEstimate, RefusalKind, Why
+from service.records.messages import as_message, compose
 from service.records.registration import (
     HistoryEntry,
     KnownStretches,
@@ -409,34 +410,30 @@ def check_window(context: StepContext, estimate: DitheredEstimate, began_ns_utc:
     """Return why a window's estimate must not be used, or None."""
     if context.rtc is None or estimate.session != context.rtc.session:
         return RefusalKind.VOID, OTHER_SESSION
-    reason = check_measurable(context.state, began_ns_utc)
-    if reason is not None:
-        return RefusalKind.VOID, reason
+    void = check_measurable(context.state, began_ns_utc)
+    if void is not None:
+        return RefusalKind.VOID, as_message("window.void", void)
     odd = mode_proof.check_information(context, estimate)
     if odd is not None:
-        return RefusalKind.VOID, odd
+        return RefusalKind.VOID, as_message("window.modes", odd)
     lag = float(np.median(estimate.lag_frames))
     if abs(lag) > MAX_LAG_FRAMES:
-        late = f"slopes lag commands by {lag:+.2f} frame, 0 is expected"
-        return RefusalKind.MISALIGNED, f"columns misaligned: {late}"
+        return RefusalKind.MISALIGNED, compose("window.misaligned", lag_frames=lag)
     gains = strong_gains(estimate)
     if gains.min() < GAIN_RANGE[0] or gains.max() > GAIN_RANGE[1]:
-        return RefusalKind.OTHER, (
-            f"optical gains of {gains.min():.2f} to {gains.max():.2f}, expected {GAIN_RANGE[0]} "
-            f"to {GAIN_RANGE[1]}: wrong instrument file, or the dither is not on the mirror"
-        )
+        least, most = float(gains.min()), float(gains.max())
+        expected = "{} to {}".format(*GAIN_RANGE)
+        return RefusalKind.OTHER, compose("window.gains", least=least, most=most, expected=expected)
     if np.any(estimate.sigma > context.policy.useless_sigma):
-        return (
-            RefusalKind.OTHER,
-            "too uncertain: raise the dither's amplitude or the window's length",
-        )
+        return RefusalKind.OTHER, compose("window.uncertain")
     near = context.start_of_fits if context.registration is None else context.registration.alpha
     step, leap = estimate.alpha.vector - near.vector, context.alpha.law.leap
     sides = np.abs([step] if leap is None else [step, step - leap.other_side])
     if np.all(np.any(sides > CAPTURE_RANGE, axis=1)) and not _far_windows_agree(context, estimate):
-        return RefusalKind.OUT_OF_REACH, (
-            f"outside the capture range: {estimate.alpha.to_boundary()}, "
-            f"the fit began at {near.to_boundary()}"
+        return RefusalKind.OUT_OF_REACH, compose(
+            "window.far",
+            alpha=str(estimate.alpha.to_boundary()),
+            start=str(near.to_boundary()),
         )
     return None
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from service.errors import ModelError
 from service.model.misregistration import Misregistration, step_text
 from service.model.pointing_law import ANGLES, PointingLaw, Reported
+from service.records.messages import Message, compose
 from service.records.registration import (
     LawLeap,
     LawState,
@@ -163,7 +164,9 @@ def _rate(state: TrackerState) -> Array:
     return np.asarray(np.sign(halves[1]) * slower * (2.0 * SECOND_NS / length_ns))
 
 
-def check_pointing_motion(state: TrackerState, began_ns_utc: int, ended_ns_utc: int) -> str | None:
+def check_pointing_motion(
+    state: TrackerState, began_ns_utc: int, ended_ns_utc: int
+) -> Message | None:
     """Return why a window belongs to no single registration (the law moved within it), or None."""
     first, last = validity.law_at(state, began_ns_utc), validity.law_at(state, ended_ns_utc)
     if first is None or last is None:
@@ -171,7 +174,7 @@ def check_pointing_motion(state: TrackerState, began_ns_utc: int, ended_ns_utc: 
     step = first.step_to(last)
     if np.all(np.abs(step) <= MAX_WINDOW_MOTION):
         return None
-    return f"the law of pointing moved α inside the window, by {step_text(step)}"
+    return compose("window.law-moved", step=step_text(step))
 
 
 def _nominal(context: StepContext, law: PointingLaw, reported: Reported) -> Misregistration | str:

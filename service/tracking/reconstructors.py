@@ -9,6 +9,7 @@ from service.estimation.loop import NO_RTC, extend_gains, last_seq, select_gains
 from service.records import alarms
 from service.records import events as ev
 from service.records.alarms import Interlock, alarm_blocks, blocking_alarm
+from service.records.messages import compose
 from service.records.products import Assessment, MatrixState, ReconstructorRecord
 from service.records.state import Level, Mode, TrackerState
 from service.tracking import update_policy
@@ -442,8 +443,7 @@ def on_acknowledgement(context: StepContext, event: Acknowledgement) -> None:
         return
     record = context.state.reconstructor(event.id)
     if record is None:
-        text = f"an acknowledgement for {event.id}, which this service never sent"
-        context.warn("acknowledgement.unknown", text)
+        context.warn("acknowledgement.unknown", compose("acknowledgement.not-ours", id=event.id))
         return
     if not _is_old(context.state, record, event):
         with context.because_of(record.cause):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,6 +13,7 @@ from service.estimation.loop import NO_RTC
 from service.model.misregistration import Misregistration
 from service.records.alarms import Alarm, AlarmDefinition, Interlock, blocking_alarm
 from service.records.events import Effect
+from service.records.messages import Message, as_message, compose, widen
 from service.records.operations import Acquisition, Dither, DitherPolicyState, Probation
 from service.records.registration import Registration
 from service.records.state import (
@@ -54,18 +54,13 @@ REPEATING = frozenset(
         "window.refused",
     }
 )
-"""Lines that say the same though their numbers differ: what becomes of telemetry, and of actions
-that are tried again."""
+"""Lines that repeat though their numbers differ: what becomes of telemetry, and of actions that are
+tried again."""
 
 LOOKED_BACK = 30
 """So many lines back the beginning of a burst is looked for."""
 
 PartT = TypeVar("PartT")
-
-_NUMBERS = re.compile(r"[-+]?[0-9][0-9.e+-]*")
-
-_VALUE = re.compile(r"(?<![\w.-])[-+]?[0-9]+(?:\.[0-9]+)?(?:e[-+]?[0-9]+)?(?![\w-])")
-"""A number that is no part of a name or of a date."""
 
 
 class _Part(Generic[PartT]):
@@ -194,31 +189,34 @@ class StepContext:
         self.dithers = replace(self.dithers, no_dither_before_ns_utc=dither_ns)
         self.matrices = replace(self.matrices, no_making_before_ns_utc=make_ns)
 
-    def log(self, name: str, text: str, level: Level = Level.INFO) -> LogEntry:
+    def log(self, name: str, text: str | Message, level: Level = Level.INFO) -> LogEntry:
         """Add a line to the log, and return it; one that repeats is counted instead."""
         self.state = logged(self.state, name, text, self.now_ns, level, self.cause)
         # The line may not be the last one: a repeated one is counted where it was first logged.
         lines = (line for line in reversed(self.state.log) if line.name == name)
         return max(lines, key=lambda line: line.last_ns_utc or line.t_ns_utc)
 
-    def warn(self, name: str, text: str) -> None:
+    def warn(self, name: str, text: str | Message) -> None:
         """Add a warning to the log."""
         self.log(name, text, Level.WARNING)
 
-    def raise_alarm(self, name: str, text: str, own: AlarmDefinition | None = None) -> None:
+    def raise_alarm(
+        self, name: str, text: str | Message, own: AlarmDefinition | None = None
+    ) -> None:
         """Raise an alarm; one already raised keeps its beginning.
 
         ``own``: what is to be known of it, where it is not as the table has it.
         """
         before = self.state.alarm(name)
         t_ns = 0 if self.rtc is None else self.rtc.t_ns
-        first = before or Alarm(name=name, since_ns_utc=self.now_ns, text=text, t_ns_utc=t_ns)
+        message = as_message(name, text)
+        first = before or Alarm(name=name, since_ns_utc=self.now_ns, message=message, t_ns_utc=t_ns)
         others = tuple(alarm for alarm in self.state.alarms.active if alarm.name != name)
-        raised = replace(first, text=text, seen_ns_utc=self.now_ns, own=own)
+        raised = replace(first, message=message, seen_ns_utc=self.now_ns, own=own)
         self.alarms = replace(self.alarms, active=(*others, raised))
         # One that goes on changes its text many times a minute: only its beginning is logged.
         if before is None:
-            self.log(name, text, Level.ALARM)
+            self.log(name, message, Level.ALARM)
 
     def clear_alarm(self, name: str) -> None:
         """End an alarm, if it is raised."""
@@ -231,20 +229,24 @@ class StepContext:
 def logged(
     state: TrackerState,
     name: str,
-    text: str,
+    text: str | Message,
     now_ns: int,
     level: Level = Level.INFO,
     cause: str = "",
 ) -> TrackerState:
     """Return the state with one more line in its log; one that repeats is counted instead."""
-    entry = LogEntry(t_ns_utc=now_ns, level=level, name=name, text=text, cause=cause)
+    message = as_message(name, text)
+    entry = LogEntry(t_ns_utc=now_ns, level=level, name=name, message=message, cause=cause)
     for back, before in enumerate(reversed(state.log[-LOOKED_BACK:]), start=1):
         # the very last line may be any; what lies between makes a story of two equal ones
         if (back == 1 or name in REPEATING) and _same(before, entry):
             log = list(state.log)
-            ranges = _widen_ranges(before.ranges or _ranges(before.text), _ranges(text))
-            times = before.times + 1
-            log[-back] = replace(before, times=times, last_ns_utc=now_ns, ranges=ranges)
+            log[-back] = replace(
+                before,
+                times=before.times + 1,
+                last_ns_utc=now_ns,
+                ranges=widen(before.ranges or widen({}, before.message), message),
+            )
             return replace(state, log=tuple(log))
     return replace(state, log=(*state.log, entry)[-LOG_LENGTH:])
 
@@ -252,48 +254,24 @@ def logged(
 def _same(before: LogEntry, entry: LogEntry) -> bool:
     if before.name != entry.name or entry.t_ns_utc - before.t_ns_utc >= BURST_NS:
         return False
-    if entry.name not in REPEATING:
-        return before.text == entry.text
-    return same_but_for_numbers(before.text, entry.text)
+    if entry.name in REPEATING:
+        return before.message.key == entry.message.key
+    return before.text == entry.text
 
 
-def same_but_for_numbers(one: str, other: str) -> bool:
-    """Return whether two texts differ in nothing but numbers."""
-    return _NUMBERS.sub("", one) == _NUMBERS.sub("", other)
-
-
-def _ranges(text: str) -> tuple[tuple[str, str], ...]:
-    """Return the numbers of a line, each as the smallest and the largest there was."""
-    return tuple((found, found) for found in _VALUE.findall(text))
-
-
-def _widen_ranges(
-    before: tuple[tuple[str, str], ...], new: tuple[tuple[str, str], ...]
-) -> tuple[tuple[str, str], ...]:
-    """Return the ranges of both lines; for a line of another form the first ranges are kept."""
-    if len(before) != len(new):
-        return before
-    pairs = zip(before, new, strict=True)
-    return tuple(
-        (min(low, one, key=float), max(high, one, key=float)) for (low, high), (one, _) in pairs
-    )
-
-
-def _burst_text(entry: LogEntry) -> str:
+def _burst_message(entry: LogEntry) -> Message:
     """Return what a burst has said in all: the range of each number, how often, and when."""
-    left = iter(entry.ranges)
-
-    def spread(found: re.Match[str]) -> str:
-        low, high = next(left, (found.group(), found.group()))
-        return low if low == high else f"{low} to {high}"
-
-    text = _VALUE.sub(spread, entry.text)
     first, last = (
         datetime.fromtimestamp(t / SECOND_NS, UTC) for t in (entry.t_ns_utc, entry.last_ns_utc)
     )
-    lasted_s = (entry.last_ns_utc - entry.t_ns_utc) / SECOND_NS
-    return (
-        f"{text} ({entry.times} times in {lasted_s:.0f} s, {first:%H:%M:%S} to {last:%H:%M:%S} UTC)"
+    return compose(
+        "log.burst",
+        entry.message.key,
+        text=entry.message.format_ranges(entry.ranges),
+        times=entry.times,
+        lasted_s=(entry.last_ns_utc - entry.t_ns_utc) / SECOND_NS,
+        first=f"{first:%H:%M:%S}",
+        last=f"{last:%H:%M:%S}",
     )
 
 
@@ -304,10 +282,9 @@ def log_bursts(context: StepContext) -> None:
     """
     for entry in context.state.log:
         if entry.times > 1 and context.now_ns - entry.t_ns_utc >= BURST_NS:
-            line = replace(
-                entry, t_ns_utc=entry.last_ns_utc, text=_burst_text(entry), times=1, ranges=()
-            )
-            log = (replace(e, times=1, ranges=()) if e is entry else e for e in context.state.log)
+            message = _burst_message(entry)
+            line = replace(entry, t_ns_utc=entry.last_ns_utc, message=message, times=1, ranges={})
+            log = (replace(e, times=1, ranges={}) if e is entry else e for e in context.state.log)
             context.state = replace(context.state, log=(*log, line)[-LOG_LENGTH:])
 
 

@@ -23,6 +23,7 @@ from service.records import alarms
 from service.records import events as ev
 from service.records.alarms import Interlock
 from service.records.estimates import PassiveEstimate, RandomEstimate, RefusalKind
+from service.records.messages import Message, as_message, compose
 from service.records.registration import (
     Bias,
     HistoryEntry,
@@ -46,7 +47,7 @@ from service.tracking.operations.acquisition import count_miss
 from service.tracking.operations.measurement import MEASURING
 from service.tracking.operations.running import running_ramp
 from service.tracking.policy import SECOND_NS
-from service.tracking.step_context import StepContext, same_but_for_numbers
+from service.tracking.step_context import StepContext
 from service.tracking.validity import BOTH_SIDES, without_previous
 
 Array = NDArray[Any]
@@ -121,8 +122,11 @@ def on_lost(context: StepContext, event: ev.WindowLost) -> None:
     reject_window(context, event.refused.reason, event.refused.kind)
 
 
-def reject_window(context: StepContext, reason: str, kind: RefusalKind = RefusalKind.OTHER) -> None:
+def reject_window(
+    context: StepContext, reason: str | Message, kind: RefusalKind = RefusalKind.OTHER
+) -> None:
     """Count a window that gave nothing, and say why."""
+    reason = as_message("window.failed", reason)
     count_miss(context, kind)
     if kind is RefusalKind.MISALIGNED:
         context.raise_alarm(alarms.MISALIGNED, reason)
@@ -137,7 +141,7 @@ def reject_window(context: StepContext, reason: str, kind: RefusalKind = Refusal
         context.windows = replace(context.windows, run=run, refused_because=reason)
 
 
-def _note_refusal(context: StepContext, reason: str, level: Level = Level.INFO) -> None:
+def _note_refusal(context: StepContext, reason: Message, level: Level = Level.INFO) -> None:
     line, n_refused = context.log("window.refused", reason, level), context.windows.refused + 1
     context.windows = replace(context.windows, refusal=line, refused=n_refused)
 
@@ -165,16 +169,17 @@ def process_window(context: StepContext, measured: WindowEstimate) -> None:
     # A window that began before the doubt and agrees with the old α cannot end the doubt. If it
     # disagrees, it counts.
     if too_early is not None and not far.is_outlier:
-        _note_refusal(context, too_early)
+        _note_refusal(context, as_message("window.void", too_early))
         return
     if registration.suspected_jump is not None:
-        text = (
-            f"the window {_distance_text(registration.suspected_jump, registration)} from α was "
-            f"not confirmed: the next one is {_distance_text(measured, registration)} away"
-        )
         n_outlying = context.windows.outlying + 1
         context.windows = replace(context.windows, outlying=n_outlying)
-        context.warn("window.outlier", text)
+        message = compose(
+            "window.not-confirmed",
+            first=_distance_text(registration.suspected_jump, registration),
+            second=_distance_text(measured, registration),
+        )
+        context.warn("window.outlier", message)
         # The rejected window shows that windows scatter: it counts with the most that one may.
         registration = replace(
             registration, scatter=kalman.learnt(registration.scatter, kalman.JUMP_THRESHOLD)
@@ -289,23 +294,24 @@ def reset_run(context: StepContext) -> None:
         context.windows = replace(context.windows, run=0)
 
 
-def explain_refusals(context: StepContext) -> str | None:
+def explain_refusals(context: StepContext) -> str | Message | None:
     """Return why windows are refused one after the other, or none comes; None: they are not.
 
     As many in a row as raise the alarm end it. One that is expected and does not come is as good as
     refused.
     """
-    raised, run = context.alarm_text(alarms.WINDOWS_REFUSED), context.windows.run
-    if run <= -N_CONSECUTIVE_WINDOWS:
-        because = context.windows.refused_because
-        text = f"windows are refused one after the other: {because}; α is not measured meanwhile"
-        if raised is not None and same_but_for_numbers(raised, text):
-            text = raised  # one cause is one text: of each window the log tells the numbers
+    alarm, run = context.state.alarm(alarms.WINDOWS_REFUSED), context.windows.run
+    raised, because = None if alarm is None else alarm.message, context.windows.refused_because
+    found: str | Message
+    if run <= -N_CONSECUTIVE_WINDOWS and because is not None:
+        found = compose("window.refused-in-a-row", because.key, reason=str(because))
+        if raised is not None and raised.key == found.key:
+            found = raised  # One cause has one text: the log has the numbers of each window.
     elif raised is not None and run < N_CONSECUTIVE_WINDOWS:
-        text = raised
+        found = raised
     else:
-        text = _explain_missing_windows(context)
-    return None if not text or _is_excused(context) else text
+        found = _explain_missing_windows(context)
+    return None if not found or _is_excused(context) else found
 
 
 def _explain_missing_windows(context: StepContext) -> str:

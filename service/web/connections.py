@@ -30,6 +30,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.server import ServerState
 
 from service.errors import PyrcalError, TooLargeError, TooSlowError
+from service.records import messages
 from service.web.problems import known_problem, problem
 
 MAX_BODY_BYTES = 1_000_000
@@ -199,16 +200,13 @@ class Crowd(ServerState):
                 self._ended[address] += 1
             self._last_s = time.monotonic()
 
-    def complaint(self) -> str:
-        """Return whose connections had to end lately; empty if none had to."""
+    def complaint(self) -> messages.Message | None:
+        """Return whose connections had to end lately, or None if none had to."""
         if time.monotonic() - self._last_s > CROWD_REPORT_S:
             self._ended.clear()
-            return ""
+            return None
         address, n = self._ended.most_common(1)[0]
-        return (
-            f"more than {MAX_CONNECTIONS} connections to REST at once: {n} of {address} were "
-            "ended, the oldest first: end the program there, or limit connections by a firewall"
-        )
+        return messages.compose("rest.crowded", address, most=MAX_CONNECTIONS, n=n)
 
 
 class Connection(H11Protocol):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import pathlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Annotated, Any
 
@@ -257,7 +257,10 @@ async def gains(service: views.ServiceDep) -> Response:
         raise CommandError("gains: no RTC is there: the number of modes is not known")
     current = tracker.alpha.registration
     measured = () if current is None else current.optical_gains
-    return _gain_table(None, measured, tracker.loop.rtc.n_modes)
+    rtc, references = tracker.loop.rtc, tracker.loop.reference_id
+    table = _gain_table(None, measured, rtc.n_modes, references)
+    now = replace(table, magnitude=rtc.magnitude, frame_rate_hz=rtc.frame_rate_hz)
+    return views.answer(now)
 
 
 @router.get("/reconstructors/{id}/gains", responses={200: views.shows(views.GAINS), **UNKNOWN})
@@ -265,19 +268,23 @@ async def reconstructor_gains(service: views.ServiceDep, matrix_id: MatrixId) ->
     """Return the optical gains when a reconstructor was made."""
     found = service.snapshot().tracker.reconstructor(matrix_id)
     record = views.found_or_refuse(found, f"unknown reconstructor {matrix_id}")
-    return _gain_table(record.id, record.optical_gains, record.n_modes)
+    table = _gain_table(record.id, record.optical_gains, record.n_modes, record.reference_id)
+    return views.answer(table)
 
 
-def _gain_table(matrix_id: str | None, measured: tuple[ModeGain, ...], n_modes: int) -> Response:
+def _gain_table(
+    matrix_id: str | None, measured: tuple[ModeGain, ...], n_modes: int, references: str | None
+) -> ModeGainTable:
     table = gain_table(measured, n_modes)
-    return views.answer(
-        ModeGainTable(
-            reconstructor=matrix_id,
-            measured=measured,
-            optical_gain=table.optical_gain.tolist(),
-            relative_sigma=table.relative_sigma.tolist(),
-            factor=table.factors.tolist(),
-        )
+    return ModeGainTable(
+        reconstructor=matrix_id,
+        measured=measured,
+        optical_gain=table.optical_gain.tolist(),
+        relative_sigma=table.relative_sigma.tolist(),
+        sigma=(table.optical_gain * table.relative_sigma).tolist(),
+        factor=table.factors.tolist(),
+        t_ns_utc=max((gain.t_ns_utc for gain in measured), default=None),
+        reference_id=references,
     )
 
 

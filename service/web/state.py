@@ -328,6 +328,11 @@ def _of_registration(snapshot: Snapshot) -> Iterator[Metric]:
     yield _gauge("dither_due", "1 while a dithered window is wanted first", due)
     gain = "Mean optical gain of the dithered modes"
     yield _gauge("optical_gain_ratio", gain, registration.optical_gain)
+    dithered = {str(one.mode): one for one in registration.optical_gains}
+    gains, sigma = ({mode: one.gain for mode, one in dithered.items()}, "1 sigma of each")
+    yield _gauge("mode_optical_gain_ratio", "Optical gain of each dithered mode", gains, "mode")
+    sigmas = {mode: one.sigma for mode, one in dithered.items()}
+    yield _gauge("mode_optical_gain_sigma_ratio", sigma, sigmas, "mode")
 
 
 def _of_the_dither(tracker: TrackerState) -> Iterator[Metric]:

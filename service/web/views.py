@@ -393,14 +393,18 @@ define_view(
     "AlarmView",
     AlarmStatus,
     "record.name severity worst_severity=record.worst record.alarm_state record.since_ns_utc "
-    "record.text cause "
+    "record.text code values cause "
     "do record.over_ns_utc record.acknowledged record.muted",
 )
-define_view("RaisedView", alarms.Alarm, "name since_ns_utc text")
+define_view("RaisedView", alarms.Alarm, "name since_ns_utc text message.code message.values")
 define_view("MutedView", alarms.AlarmRecord, "name muted")
 define_view("OperatingView", Operating)
 define_view("ObservatoryValueView", ObservatoryValue)
-define_view("LogEntryView", LogEntry, "t_ns_utc level name text n_times=times cause")
+define_view(
+    "LogEntryView",
+    LogEntry,
+    "t_ns_utc level name text message.code message.values n_times=times cause",
+)
 EVENTS = define_view(
     "EventsView", TrackerState, "alarms=alarms.active log", "What happened, and what is wrong now."
 )

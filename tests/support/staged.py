@@ -14,6 +14,7 @@ from service.archive import Archive
 from service.instrument import packaged_instrument
 from service.model.misregistration import Misregistration
 from service.records.alarms import Alarm
+from service.records.messages import as_message
 from service.records.products import MatrixState, ReconstructorRecord
 from service.records.registration import HistoryEntry
 from service.runtime.snapshot import Snapshot
@@ -38,7 +39,9 @@ class StagedService(FakeService):
 
     def alarm(self, name, text):
         """Raise an alarm as if it had been found just now."""
-        raised = Alarm(name=name, since_ns_utc=time.time_ns() - 12 * SECOND, text=text)
+        raised = Alarm(
+            name=name, since_ns_utc=time.time_ns() - 12 * SECOND, message=as_message("x", text)
+        )
         self.change(active=(*self.now.tracker.alarms.active, raised))
         self._note()
 

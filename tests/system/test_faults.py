@@ -237,6 +237,26 @@ def refused(night, reason):
     return night.state["link"]["frames_refused"].get(reason, 0)
 
 
+@pytest.mark.parametrize("named_by", ["reference_id", "config_id"])
+def test_reference_slopes_may_change_in_either_way(night, named_by):
+    """A window of 1 s fits between two changes; none raises an alarm that stops anything."""
+    service = night.service("auto")
+    rtc = night.rtc("--references", "60,6", "--references-named-by", named_by)
+    night.wait_for_modes(N_TARGET)
+    for name in ("references-3", "references-4", "references-5"):
+        wait_for(lambda name=name: night.state["reference_id"] == name, 60.0, name)
+        n_accepted = night.state["windows_accepted"]
+        more = f"a window with {name}; {service.log_path}"
+        wait_for(lambda n=n_accepted: night.state["windows_accepted"] > n, 20.0, more)
+    state = night.state
+    check_registration(state["registration"])
+    assert state["reference_since_ns_utc"] is not None
+    assert state["link"]["frames_refused"] == {}
+    night.check_alarms(*(["sensor-renamed"] if named_by == "config_id" else []))
+    assert night.n_modes_in_use() == N_TARGET
+    assert "Traceback" not in service.log + rtc.log
+
+
 def test_a_mute_rtc_is_believed_by_its_status_and_another_basis_is_an_alarm(night, late):
     service = night.service("auto")
     rtc = night.rtc(*faults("mute@0:1000", f"basis@{late(20)}:8"))

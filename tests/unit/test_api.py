@@ -46,6 +46,7 @@ from service.records.commands import (
     StopDither,
     UnmuteAlarm,
 )
+from service.records.messages import as_message
 from service.records.operations import (
     Acquisition,
     AcquisitionStage,
@@ -691,6 +692,15 @@ async def test_metrics_show_what_the_service_knows(client):
     assert (found["archive_failures_total",], found["archive_waiting",]) == (3, 2)
 
 
+async def test_metrics_show_the_optical_gain_of_each_dithered_mode(client, service):
+    known = service.now.tracker.alpha.registration
+    gain = ModeGain(mode=20, gain=0.5, sigma=0.01, scatter=0.02, t_ns_utc=SECOND)
+    service.change(registration=replace(known, optical_gains=(gain,)))
+    found = await metrics_of(client)
+    assert found["mode_optical_gain_ratio", "20"] == 0.5
+    assert found["mode_optical_gain_sigma_ratio", "20"] == 0.01
+
+
 MEASURING = MeasurementRecord(
     id="im-1",
     state=MeasureState.RUNNING,
@@ -869,7 +879,9 @@ ADA = OperatorNote(by="Ada", reason="known", t_ns_utc=80 * SECOND)
 
 async def test_alarms_are_those_that_last_went_unseen_or_are_muted(client, service):
     service.change(
-        active=(Alarm(name="loop-open", since_ns_utc=70 * SECOND, text="open"),),
+        active=(
+            Alarm(name="loop-open", since_ns_utc=70 * SECOND, message=as_message("x", "open")),
+        ),
         records=(
             AlarmRecord(name="loop-open", worst=Severity.WARNING, acknowledged=ADA),
             AlarmRecord(name="margin", worst=Severity.CRITICAL, text="bad", over_ns_utc=9 * SECOND),

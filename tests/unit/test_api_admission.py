@@ -218,14 +218,15 @@ async def held(port, *sent, local="127.0.0.1"):
 async def test_for_more_connections_than_there_may_be_the_oldest_end(service, monkeypatch, sent):
     monkeypatch.setattr(connections, "MAX_CONNECTIONS", 3)
     async with serving(service) as port, held(port, *[sent] * 3) as lines:
-        assert service.crowd.complaint() == ""
+        assert service.crowd.complaint() is None
         async with held(port, sent):
             assert await ended(lines[0])
             assert (await state_of(port)).status_code == 200
-            assert "1 of 127.0.0.1" in service.crowd.complaint()
+            assert service.crowd.complaint().key == "rest.crowded: 127.0.0.1"
+            assert service.crowd.complaint().values["n"] == 1
             assert not any(reader.at_eof() for reader, _ in lines[1:])
             monkeypatch.setattr(connections, "CROWD_REPORT_S", 0.0)
-            assert service.crowd.complaint() == ""
+            assert service.crowd.complaint() is None
 
 
 async def test_connections_without_a_request_end_before_those_that_are_answered(

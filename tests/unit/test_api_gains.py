@@ -35,6 +35,22 @@ async def test_the_present_table_is_of_every_mode_of_the_basis(client):
     assert table["factor"][20] > table["factor"][509]
 
 
+async def test_the_present_table_has_its_sigma_time_and_conditions(client, service):
+    table = (await client.get("/v1/gains")).json()
+    for gain, relative, sigma in zip(
+        table["optical_gain"], table["relative_sigma"], table["sigma"], strict=True
+    ):
+        assert sigma == pytest.approx(gain * relative)
+    # A measured mode is known to 2 %, because the response of the sensor is not diagonal.
+    assert 0.008 < table["sigma"][20] < 0.02 < table["sigma"][300]
+    assert table["t_ns_utc"] == str(START_NS) or table["t_ns_utc"] == START_NS
+    assert (table["magnitude"], table["frame_rate_hz"]) == (8.0, 1000.0)
+    service.change(reference_id="ncpa-2")
+    assert (await client.get("/v1/gains")).json()["reference_id"] == "ncpa-2"
+    alone = (await client.get("/v1/reconstructors/cm-2/gains")).json()
+    assert (alone["t_ns_utc"], alone["magnitude"], alone["reference_id"]) == (None, None, None)
+
+
 async def test_a_reconstructors_table_is_of_its_own_modes_and_time(client):
     table = (await client.get("/v1/reconstructors/cm-1/gains")).json()
     assert table["reconstructor"] == "cm-1"

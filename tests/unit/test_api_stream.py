@@ -10,6 +10,7 @@ import httpx
 import pytest
 
 from service.api import create_app
+from service.records.messages import as_message
 from service.records.state import Level, LogEntry
 from service.tracking.step_context import LOG_LENGTH
 from service.web import page
@@ -88,7 +89,9 @@ async def serving(service):
 
 
 def line(k):
-    return LogEntry(t_ns_utc=1000 + k, level=Level.INFO, name="mode", text=f"line {k}")
+    return LogEntry(
+        t_ns_utc=1000 + k, level=Level.INFO, name="mode", message=as_message("mode", f"line {k}")
+    )
 
 
 async def test_who_begins_to_listen_gets_the_state_and_is_told_to_read_the_log(service):
@@ -125,6 +128,8 @@ async def test_lines_of_the_log_come_one_by_one_as_events_shows_them(service):
         "level": "info",
         "name": "mode",
         "text": "line 1",
+        "code": "mode",
+        "values": {"about": "line 1"},
         "n_times": 1,
         "cause": "",
     }

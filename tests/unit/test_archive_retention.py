@@ -20,6 +20,7 @@ from service.archive.nights import DAY_NS
 from service.archive.retention import RetentionPolicy, due, items
 from service.errors import UnknownIdError
 from service.records.alarms import Alarm
+from service.records.messages import as_message
 from service.records.products import MatrixState
 from service.records.state import TrackerState
 from service.runtime import archiving
@@ -159,7 +160,9 @@ async def test_little_room_is_an_alarm_until_there_is_more(archive, quick, monke
     told, _ = await kept_for_a_moment(archive, RetentionPolicy(reserve_gb=2.0), state, monkeypatch)
     assert "1.9 GB are free" in told[0].text
     assert (told[0].name, told[0].over) == ("disk-low", False)
-    raised = changed(state, active=(Alarm(name="disk-low", since_ns_utc=1, text=""),))
+    raised = changed(
+        state, active=(Alarm(name="disk-low", since_ns_utc=1, message=as_message("x", "")),)
+    )
     usage.free = 2_100_000_000  # not a tenth more: it would come and go
     told, _ = await kept_for_a_moment(archive, RetentionPolicy(reserve_gb=2.0), raised, monkeypatch)
     assert not told[0].over

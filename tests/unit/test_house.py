@@ -6,6 +6,7 @@ What is not so yet is listed here by name. No list may grow, and what has been m
 import ast
 import re
 from collections import defaultdict
+from string import Formatter
 from typing import get_args
 
 import grimp
@@ -14,6 +15,7 @@ import pytest
 from service.records.alarms import ALARMS
 from service.records.commands import Instruction
 from service.records.events import Event
+from service.records.messages import ABOUT, SENTENCES
 from tests.support.repository import HELD, ROOT
 
 WORDS_TOO = {"acquisition", "archive-failed", "dither", "margin"}
@@ -44,8 +46,8 @@ def test_records_lie_at_the_ground():
         for imported in imports.find_modules_directly_imported_by(module):
             if imported.startswith("service.") and imported not in ground:
                 assert imported.startswith(("service.records.", "service.wire", "service.files"))
-    assert len(imports.find_upstream_modules("service.records.state")) <= 12
-    assert len(imports.find_upstream_modules("service.link.intake")) <= 26
+    assert len(imports.find_upstream_modules("service.records.state")) <= 13
+    assert len(imports.find_upstream_modules("service.link.intake")) <= 27
 
 
 def test_no_test_module_imports_another():
@@ -152,3 +154,123 @@ def names_imported(module, *, has_children):
                 for part in node.values
             ]
             yield "".join(part or "?" for part in parts)
+
+
+def composed():
+    """Return names of values by code of a message in service, all texts, and names of lines."""
+    codes, texts, lines = defaultdict(list), set(), set()
+    for path in (ROOT / "service").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            texts |= {node.value} if is_text(node) else set()
+            if not isinstance(node, ast.Call):
+                continue
+            called = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            first = node.args[0] if node.args else None
+            names = [one.value for one in ast.walk(first or node.func) if is_text(one)]
+            if called == "compose":
+                about = {ABOUT} if len(node.args) > 1 else set()
+                for code in names:
+                    codes[code].append(about | {word.arg for word in node.keywords})
+            elif called in {"log", "warn", "logged", "_note", "as_message"}:
+                lines |= set(names)
+    return codes, texts, lines
+
+
+def is_text(node):
+    return isinstance(node, ast.Constant) and isinstance(node.value, str)
+
+
+def test_each_message_has_its_sentence_and_each_sentence_its_values():
+    codes, texts, lines = composed()
+    assert codes.keys() <= SENTENCES.keys() <= texts
+    for code, sentence in SENTENCES.items():
+        names = {name for _, name, _, _ in Formatter().parse(sentence) if name is not None}
+        # What makes it another message need not be said.
+        assert all(given - {ABOUT} == names - {ABOUT} for given in codes[code]), code
+        assert all(names & {ABOUT} <= given for given in codes[code]), code
+    # A line without a code of its own has its name as code, and its text as the sentence.
+    assert not lines & SENTENCES.keys()
+    assert len(lines) > 60
+
+
+CUTS = {"startswith", "endswith", "removeprefix", "removesuffix", "partition", "rpartition"}
+
+WORDS = {"text", "reason", "verdict", "message", "detail", "note", "line", "error", "words", "id"}
+
+WORDS_READ = {
+    "service/files/toml.py": "messages of msgspec, which has no codes",
+    "service/link/session.py": "messages of zenoh and of the operating system, which have no codes",
+    "service/runtime/cluster.py": "the first line of an error of Dask is shown",
+    "service/tracking/dither_request.py": "only the id is known of a dither that nobody follows",
+    "service/tracking/transitions.py": "a table in the source, written as text",
+    "pyrcal/fitting/advice.py": "the verdict names the alternatives and the entries of the file",
+    "pyrcal/fitting/alternatives.py": "names of what may be another instrument's",
+    "pyrcal/fitting/arguments.py": "words of the command line",
+    "pyrcal/fitting/fit_file.py": "an error begins with the name of its file",
+    "pyrcal/fitting/fit_table.py": "notes of importers repeat what a fit has found",
+    "pyrcal/fitting/gain_causes.py": "names of what may be another instrument's",
+    "pyrcal/maintenance/archive.py": "an error begins with the name of its file",
+    "pyrcal/maintenance/commission_page.py": "the audit trail keeps sentences only",
+}
+
+READERS = {
+    "service/config/link_tables.py": "addresses",
+    "service/config/settings.py": "names of environment variables",
+    "service/files/__init__.py": "ranges of rows that a user writes",
+    "service/files/toml.py": "places in a file",
+    "service/link/guard.py": "addresses",
+    "service/link/leader_election.py": "pattern of names of services",
+    "service/link/session.py": "messages of zenoh, which have no codes",
+    "service/program.py": "addresses in messages of zenoh",
+    "service/records/events.py": "names of classes",
+    "service/web/authentication.py": "addresses",
+    "service/web/commands.py": "routes",
+    "service/web/connections.py": "pattern of ids of requests",
+    "service/web/keys.py": "pattern of names of keys",
+    "service/web/page.py": "JSON",
+    "service/wire/keys.py": "pattern of ids",
+    "pyrcal/arguments.py": "negative numbers on the command line",
+    "pyrcal/client/orders.py": "routes",
+    "pyrcal/client/remote.py": "names of classes",
+    "pyrcal/importers/cacao.py": "names of files, and scripts",
+    "pyrcal/importers/layouts.py": "names of files",
+}
+
+
+def last_name(node):
+    """Return the name at the end of an expression, of what a call is made on or with."""
+    while isinstance(node, ast.Call):
+        if isinstance(node.func, ast.Attribute):
+            node = node.func.value
+        else:
+            node = node.args[0] if getattr(node.func, "id", "") == "str" else node.func
+    return getattr(node, "attr", getattr(node, "id", ""))
+
+
+def reads_words(node):
+    """Return True if an expression cuts, or looks into, an id or a sentence."""
+    if isinstance(node, ast.Call) and getattr(node.func, "attr", "") in CUTS:
+        name = last_name(node.func.value)
+    elif isinstance(node, ast.Compare) and isinstance(node.ops[0], ast.In | ast.NotIn):
+        name = last_name(node.comparators[0])
+    else:
+        return False
+    return name in WORDS or name.endswith("_id")
+
+
+def test_nothing_but_people_reads_sentences_and_ids():
+    """Codes, values and fields say what a program has to know."""
+    readers, patterns = set(), set()
+    for top in ("service", "pyrcal"):
+        for path in (ROOT / top).rglob("*.py"):
+            if "manual" in path.parts:
+                continue
+            name = path.relative_to(ROOT).as_posix()
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            if any(reads_words(node) for node in ast.walk(tree)):
+                readers.add(name)
+            imported = (n for n in ast.walk(tree) if isinstance(n, ast.Import))
+            if any(one.name == "re" for n in imported for one in n.names):
+                patterns.add(name)
+    assert readers == WORDS_READ.keys()
+    assert patterns == READERS.keys()

@@ -60,6 +60,7 @@ from service.records.estimates import (
     WideCaptureEstimate,
     WindowRefused,
 )
+from service.records.messages import as_message, compose
 from service.records.products import ExpectedGain, GateVerdict
 from service.records.state import ModelState
 from service.runtime.worker.records import (
@@ -262,7 +263,9 @@ class OpticsWorker:
         if not answer.wrong:
             return outcome
         return WindowRefused(
-            reason=answer.wrong, t_ns_utc=spectra.t_end_ns_utc, kind=RefusalKind.MISTOLD
+            reason=compose("window.other-instrument", text=answer.wrong),
+            t_ns_utc=spectra.t_end_ns_utc,
+            kind=RefusalKind.MISTOLD,
         )
 
     def _fit_spectra(
@@ -276,7 +279,9 @@ class OpticsWorker:
             if self._sensor.follow(found.modes, found.optical_gain):
                 estimate = self._refine_fit(spectra, loop, found.alpha)
         except np.linalg.LinAlgError as error:
-            return WindowRefused(reason=f"no fit: {error}", t_ns_utc=spectra.t_end_ns_utc)
+            return WindowRefused(
+                reason=compose("window.no-fit", str(error)), t_ns_utc=spectra.t_end_ns_utc
+            )
         return _refuse_unsettled(spectra) if estimate is None else self._against_flat(estimate)
 
     def read_slope_convention(
@@ -390,7 +395,7 @@ class OpticsWorker:
                 WideCaptureSearch(coarse=far, fine=near, nominal=nominal, starts=starts),
             )
         except np.linalg.LinAlgError as error:
-            return not_found(str(error), spectra)
+            return not_found(as_message("not-found.failed", str(error)), spectra)
 
     def fit_random(
         self, window: Correlated, start: Misregistration | None
@@ -408,7 +413,9 @@ class OpticsWorker:
                     break
                 estimate = fit_random(window, self._sensor.linearise(estimate.alpha))
         except np.linalg.LinAlgError as error:
-            return WindowRefused(reason=f"no fit: {error}", t_ns_utc=window.t_end_ns_utc)
+            return WindowRefused(
+                reason=compose("window.no-fit", str(error)), t_ns_utc=window.t_end_ns_utc
+            )
         return _refuse_unsettled(window)
 
     def response(self, alpha: Misregistration | None) -> NDArray[np.float32]:
@@ -611,8 +618,7 @@ def _parts_of_models(state: ModelState) -> tuple[object, ...]:
 
 def _refuse_unsettled(spectra: Spectra | Correlated) -> WindowRefused:
     return WindowRefused(
-        reason="the fit did not settle: the mirror moved inside the window, the registration is "
-        "outside the capture range, or the instrument file is another's",
+        reason=compose("window.unsettled"),
         t_ns_utc=spectra.t_end_ns_utc,
         kind=RefusalKind.OUT_OF_REACH,
     )

@@ -229,7 +229,7 @@ def on_dither_answer(context: StepContext, _: DitherRequest, reply: Reply) -> No
 def on_lost(context: StepContext, event: ev.WindowLost) -> None:
     """Count a window of an open loop that no registration explains."""
     if event.refused.kind is RefusalKind.NOT_FOUND:
-        _note_miss(context, event.refused.reason)
+        _note_miss(context, str(event.refused.reason))
 
 
 def advance(context: StepContext) -> None:

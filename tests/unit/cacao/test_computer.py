@@ -17,12 +17,17 @@ ROWS, GAIN, MULT = 3, 0.4, 0.9
 class Loops:
     """A loop of cacao's, frame by frame, and the bridge that looks at it."""
 
-    def __init__(self, folder, **law):
+    def __init__(self, folder, reference=None, **law):
         def stream(name, *size, **more):
             return Milk(folder / f"{name}.im.shm", size, **more)
 
         settings = settings_in(folder)
         settings = settings.model_copy(update={"loop": settings.loop.model_copy(update=law)})
+        if reference is not None:
+            named = settings.streams.model_copy(update={"reference": "aol1_wfsrefc"})
+            settings = settings.model_copy(update={"streams": named})
+            self.reference = stream("aol1_wfsrefc", *SHAPE[::-1])
+            self.reference.put(np.full(SHAPE, reference))
         stream("aol1_modesWFS", *SHAPE[::-1], ROWS).put(np.ones((ROWS, *SHAPE)))
         for name, value in (("aol1_mgain", GAIN), ("aol1_mmult", MULT)):
             stream(name, ROWS, 1).put(np.full(ROWS, value))
@@ -84,6 +89,32 @@ def test_rows_hold_the_slopes_and_the_command_on_the_mirror(loop):
     np.testing.assert_array_equal(rows[:, 0], np.arange(81 - len(rows), 81))
     np.testing.assert_allclose(rows[1:, len(INDEX) : len(INDEX) + ROWS], 0.5e-6)
     assert not loop.rtc.complaint
+
+
+def test_a_new_reference_has_a_name_and_rows_of_neither_are_left_out(tmp_path):
+    loop = Loops(tmp_path, reference=0.1)
+    loop.rows(0.5)
+    first, session = loop.rtc.status().reference_id, loop.rtc.session
+    loop.reference.put(np.full(SHAPE, 0.1))  # written again, with the same numbers
+    loop.rows(0.5)
+    assert loop.rtc.status().reference_id == first
+    loop.frame(0.5, 5)
+    loop.reference.put(np.full(SHAPE, 0.2))
+    n_known = loop.rtc.n_unpaired
+    loop.rtc.poll()
+    before = loop.rtc.n_unpaired
+    assert before > n_known
+    sent = []
+    for _ in range(4):
+        loop.frame(0.5, 20)
+        sent += loop.rtc.poll()
+    second = loop.rtc.status().reference_id
+    assert second != first
+    assert {header.reference_id for header, _ in sent} == {second}
+    assert (loop.rtc.n_unpaired, loop.rtc.session) == (before, session)
+    loop.reference.put(np.full(SHAPE, 0.1))
+    loop.rtc.poll()
+    assert loop.rtc.status().reference_id == first
 
 
 def test_a_loop_switched_off_is_open_and_goes_on_in_its_session(loop):

@@ -20,14 +20,17 @@ from pyrcal.client.remote import REQUESTS
 from service.api import create_app
 from service.archive import AuditEntry, Channel
 from service.archive.products import RecordingRecord
+from service.control.gains import gain_table
 from service.errors import CommandError
-from service.records.events import MakeMatrix, MatrixMade
+from service.records.events import MatrixMade
 from service.records.operations import AcquisitionStage
 from service.records.products import MatrixState, ReconstructorRecord
+from service.records.registration import ModeGain
 from service.records.state import Mode
+from service.tracker import step
 from service.web.connections import Server
 from tests.support.api import MATRIX, SECOND, STATE, FakeService, a_snapshot
-from tests.support.situations import ALL_SHOWN
+from tests.support.situations import ALL_SHOWN, POLICY, rtc
 from tests.support.states import changed
 
 BEFORE = ReconstructorRecord(
@@ -335,9 +338,11 @@ def test_a_refit_is_followed_until_there_is_a_reconstructor(
     )
 
     def happens():
-        (job,) = service.refits._jobs
-        effect = MakeMatrix(n_modes=300, why="", cause=job)
-        service.refits.end(effect, MatrixMade(record=made, wanted=True))
+        tracker = changed(service.now.tracker, rtc=rtc())
+        (job,) = tracker.operations.refits
+        event = MatrixMade(record=made, wanted=True)
+        after, _ = step(tracker, event, POLICY, service.now.now_ns, job.id)
+        service.now = replace(service.now, tracker=after)
 
     at_the_next_look(monkeypatch, happens)
     assert main(["reconstructors", "compute"]) == status
@@ -394,10 +399,25 @@ def test_history_trail_and_matrix_become_files(capsys, service, tmp_path, monkey
     assert [json.loads(line)["misfit"] for line in lines] == [1.2] * 4
     assert main(["export", "audit"]) == 0
     assert (tmp_path / "audit.csv").read_text(encoding="utf-8").count("clouds") == 2
+    gain = ModeGain(mode=20, gain=0.5, sigma=0.01, scatter=0.02, t_ns_utc=SECOND)
+    known, rtc = service.now.tracker.alpha.registration, service.now.tracker.loop.rtc
+    service.change(registration=replace(known, optical_gains=(gain,)))
+    assert main(["export", "gains"]) == 0
+    rows = list(csv.DictReader((tmp_path / "gains.csv").read_text(encoding="utf-8").splitlines()))
+    table = gain_table((gain,), rtc.n_modes)
+    assert [k for k, row in enumerate(rows) if row["measured_utc"]] == [20]
+    assert {row["t_utc"] for row in rows} == {rows[20]["measured_utc"]}
+    assert [int(row["mode"]) for row in rows] == list(range(len(table.optical_gain)))
+    given = [[float(row[name]) for name in ("optical_gain", "loop_gain_factor")] for row in rows]
+    np.testing.assert_allclose(given, np.transpose([table.optical_gain, table.factors]))
+    assert main(["export", "reconstructor-gains", "candidate", "--format", "jsonl"]) == 0
+    lines = (tmp_path / "reconstructor-gains-candidate.jsonl").read_text(encoding="utf-8")
+    assert len(lines.splitlines()) == 400
     assert main(["export", "reconstructor", "candidate"]) == 0
     np.testing.assert_array_equal(np.load(tmp_path / "reconstructor-candidate.npy"), MATRIX)
     assert sorted(file.name for file in tmp_path.iterdir()) == [
-        "a.jsonl", "alpha.csv", "audit.csv", "reconstructor-candidate.npy"
+        "a.jsonl", "alpha.csv", "audit.csv", "gains.csv", "reconstructor-candidate.npy",
+        "reconstructor-gains-candidate.jsonl",
     ]  # fmt: skip
     capsys.readouterr()
     assert main(["export", "audit"]) == 2

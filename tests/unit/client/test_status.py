@@ -10,6 +10,7 @@ import pytest
 
 from pyrcal.__main__ import main
 from pyrcal.client.status import status_lines
+from service.records.messages import as_message
 from service.records.state import Level, LogEntry
 from tests.support.api import SECOND, STATE
 from tests.support.states import tracker_state
@@ -46,7 +47,7 @@ def test_it_says_why_the_last_window_was_refused():
         t_ns_utc=70 * SECOND,
         level=Level.WARNING,
         name="window.refused",
-        text="38 % of its frames were lost",
+        message=as_message("x", "38 % of its frames were lost"),
         times=3,
         last_ns_utc=88 * SECOND,
     )

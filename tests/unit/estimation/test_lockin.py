@@ -24,6 +24,7 @@ from service.estimation.lockin import (
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 from service.records.estimates import LockInEstimate, RefusalKind, WindowRefused
+from service.records.messages import compose
 from tests.support.lockin import N_FRAMES, N_SLOPES, N_SMALL_MODES, PLAN, plan, run, telemetry
 from tests.support.numerics import (
     DT_NS,
@@ -177,33 +178,34 @@ def test_five_per_cent_missing_is_the_most_a_window_takes():
     assert isinstance(spectra, Spectra)
     assert spectra.n_missing == 50
     refused = run(*without(telemetry(1600), 500, 551))[0]
-    assert "51 of 1000 frames missing" in refused.reason
+    assert refused.reason == compose("window.frames-missing", missing=51, n_frames=1000, most=0.05)
 
 
 def test_many_small_gaps_add_up_to_a_refusal():
     block = telemetry(1100)
     ended = run(*(part(block, start, start + 9) for start in range(0, 1100, 10)))
-    assert "51 of 1000 frames missing" in ended[0].reason
+    assert ended[0].reason.code == "window.frames-missing"
+    assert ended[0].reason.values["missing"] == 51
 
 
 # --- windows that are given up
 
 
 @pytest.mark.parametrize(
-    ("change", "text"),
+    ("change", "key"),
     [
-        ({"session": "night-2"}, "the RTC started a new session inside the window"),
-        ({"cm_id": "cm-2"}, "the reconstructor changed inside the window: cm-1 -> cm-2"),
-        ({"cm_id": None}, "the reconstructor changed inside the window: cm-1 -> None"),
-        ({"reference_name": "ncpa-2"}, "the reference slopes changed inside the window"),
-        ({"t0_ns_utc": T0_NS + 600 * DT_NS + 600_000}, "clock stepped or it paused"),
-        ({"t0_ns_utc": T0_NS + 600 * DT_NS - 600_000}, "clock stepped or it paused"),
+        ({"session": "night-2"}, "window.new-session"),
+        ({"cm_id": "cm-2"}, "window.matrix-changed: cm-1 -> cm-2"),
+        ({"cm_id": None}, "window.matrix-changed: cm-1 -> None"),
+        ({"reference_name": "ncpa-2"}, "window.reference-changed: None -> ncpa-2"),
+        ({"t0_ns_utc": T0_NS + 600 * DT_NS + 600_000}, "window.clock-stepped"),
+        ({"t0_ns_utc": T0_NS + 600 * DT_NS - 600_000}, "window.clock-stepped"),
     ],
 )
-def test_a_window_is_not_continued_across_a_change(change, text):
+def test_a_window_is_not_continued_across_a_change(change, key):
     block = telemetry(1100)
     refused = only_refusal(part(block, 0, 600), replace(part(block, 600, 1100), **change))
-    assert text in refused.reason
+    assert refused.reason.key == key
     assert refused.t_ns_utc == T0_NS + 600 * DT_NS
 
 
@@ -226,7 +228,7 @@ def test_a_dither_that_ends_inside_a_window_is_named():
     block = telemetry(1100)
     ended = replace(part(block, 600, 1100), dither_m=None)
     refused = only_refusal(part(block, 0, 600), ended, replace(ended, first_seq=1100))
-    assert "the dither ended inside the window" in refused.reason
+    assert refused.reason.code == "window.dither-ended"
     assert refused.kind is RefusalKind.CUT_SHORT
 
 
@@ -246,7 +248,10 @@ def test_a_dither_weaker_than_half_its_request_is_named_with_both_numbers():
     block = telemetry(1100)
     weak = replace(block, dither_m=block.dither_m * np.float32([1, 0.4, 1, 1, 1]))
     reason = only_refusal(weak).reason
-    assert "mode 1 carries 3.20 nm of dither at 270.0 Hz, 8.00 nm were requested" in reason
+    assert (reason.code, reason.values["mode"]) == ("window.dither-weak", 1)
+    found_nm, requested_nm = (reason.values[name] for name in ("found_nm", "requested_nm"))
+    assert (found_nm, requested_nm) == pytest.approx((3.2, 8.0), rel=1e-3)
+    assert "3.20 nm of dither at 270.0 Hz" in str(reason)
 
 
 def test_a_dither_a_little_weaker_than_its_request_is_used():

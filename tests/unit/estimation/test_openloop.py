@@ -124,7 +124,7 @@ def test_another_mirrors_response_is_refused():
     swapped = np.roll(np.arange(len(spectra.plan.modes)), 1)
     found = look(replace(spectra, slopes=spectra.slopes[swapped]))
     assert isinstance(found, WindowRefused)
-    assert found.reason.startswith("registration not found")
+    assert found.reason.code == "window.not-found"
     assert found.kind is RefusalKind.NOT_FOUND
 
 
@@ -136,7 +136,7 @@ def test_a_dither_below_the_noise_is_refused():
 def test_columns_a_frame_apart_are_refused():
     found = look(window(FAR, late_frames=1))
     assert isinstance(found, WindowRefused)
-    assert "lag" in found.reason or "unexplained" in found.reason
+    assert found.reason.values["about"] in {"not-found.misaligned", "not-found.unexplained"}
 
 
 def test_without_a_start_nothing_is_found():

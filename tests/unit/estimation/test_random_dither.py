@@ -198,7 +198,7 @@ def test_slopes_that_answer_one_frame_late_are_refused_as_misaligned():
     late = block_of(block.slopes[:-1], block.commands_m[1:], block.dither_m[1:])
     refused = fit_random(only_window(RandomDither(plan=plan()), late), near_somewhere())
     assert isinstance(refused, WindowRefused)
-    assert refused.reason.startswith("columns misaligned")
+    assert refused.reason.code == "window.answered-late"
     assert refused.kind is RefusalKind.MISALIGNED
 
 
@@ -207,7 +207,7 @@ def test_a_dither_that_never_reached_the_mirror_is_not_seen():
     pretended = replace(loop_only, dither_m=signs(FREE, 2001).astype(np.float32))
     refused = fit_random(only_window(RandomDither(plan=plan()), pretended), near_somewhere())
     assert isinstance(refused, WindowRefused)
-    assert refused.reason.startswith("the dither is not seen")
+    assert refused.reason.code == "window.dither-not-seen"
     assert refused.kind is RefusalKind.OTHER
 
 
@@ -217,7 +217,9 @@ def test_a_clipped_dither_is_refused_with_the_mode_and_both_amplitudes():
     dither[:, 35] *= 0.2
     refused = only_window(RandomDither(plan=plan()), replace(block, dither_m=dither))
     assert isinstance(refused, WindowRefused)
-    assert "mode 35 carries 1.00 nm of dither, 5.00 nm were requested" in refused.reason
+    assert refused.reason.code == "window.dither-weak"
+    assert refused.reason.values["mode"] == 35
+    assert "carries 1.00 nm of dither, 5.00 nm were requested" in str(refused.reason)
 
 
 def test_another_reconstructor_inside_the_window_ends_it():
@@ -225,7 +227,7 @@ def test_another_reconstructor_inside_the_window_ends_it():
     swapped = replace(part(block, 1000, 2001), cm_id="cm-2")
     refused = only_window(RandomDither(plan=plan()), part(block, 0, 1000), swapped)
     assert isinstance(refused, WindowRefused)
-    assert "cm-1 -> cm-2" in refused.reason
+    assert refused.reason.key == "window.matrix-changed: cm-1 -> cm-2"
 
 
 def test_a_window_too_short_for_its_modes_is_refused_before_it_begins():

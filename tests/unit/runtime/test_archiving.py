@@ -9,6 +9,7 @@ from service.archive import AuditEntry
 from service.errors import StorageError
 from service.records import commands as cmd
 from service.records import events as ev
+from service.records.messages import as_message
 from service.records.registration import OffloadState
 from service.records.state import Level, LogEntry, Mode, TrackerState
 from service.runtime import archiving
@@ -51,7 +52,7 @@ async def test_estimates_wait_for_one_write_and_are_written_once(recorder, archi
 
 async def test_what_comes_and_goes_all_night_is_in_no_audit_trail(recorder, archive):
     lines = [
-        LogEntry(t_ns_utc=NOON + k, level=level, name=f"a.{level}", text="x")
+        LogEntry(t_ns_utc=NOON + k, level=level, name=f"a.{level}", message=as_message("x", "x"))
         for k, level in enumerate(Level)
     ]
     recorder.changed(EMPTY, EMPTY, lines)

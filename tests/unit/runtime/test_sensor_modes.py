@@ -229,5 +229,5 @@ async def test_a_window_of_a_session_before_is_not_fitted(night):
     """The worker has another model by then: of another mode, it could only fail."""
     window = SimpleNamespace(session="before", t_end_ns_utc=7)
     lost = await fitted(window, night.state, workers=None, matrix_of=None)
-    assert (lost.refused.reason, lost.refused.t_ns_utc) == ("the RTC has restarted since", 7)
+    assert (lost.refused.reason.code, lost.refused.t_ns_utc) == ("window.other-session", 7)
     assert lost.refused.kind is RefusalKind.VOID

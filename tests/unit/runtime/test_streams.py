@@ -15,6 +15,7 @@ from service.estimation.random_dither import Correlated
 from service.records import events as ev
 from service.records.alarms import Alarm
 from service.records.estimates import WindowRefused
+from service.records.messages import as_message
 from service.records.operations import DitherPurpose
 from service.records.products import MatrixState, ModeSet
 from service.runtime.engine import (
@@ -546,7 +547,8 @@ class TestStrengthOfTheDither:
         _, windows = play(streams, 0, 20)
         assert windows
         assert all(isinstance(window, WindowRefused) for window in windows)
-        assert "0.25 nm were requested" in windows[0].reason
+        assert windows[0].reason.code == "window.dither-strong"
+        assert windows[0].reason.values["requested_nm"] == pytest.approx(0.25)
 
     def test_it_is_news_once_and_again_when_it_is_over(self, streams):
         state = tracker_state(system="s", rtc=RTC)
@@ -619,7 +621,7 @@ def test_frames_wait_only_while_alpha_is_followed_and_nothing_else_happens():
 
     assert gathered_s() == gathered_s(dither=DITHER) == IDLE_GATHER_S
     sent = replace(foreign(), id="cm-2", state=MatrixState.PUBLISHED)
-    alarm = Alarm(name="edge-slip", since_ns_utc=START_NS, text="")
+    alarm = Alarm(name="edge-slip", since_ns_utc=START_NS, message=as_message("x", ""))
     for changes in (
         {"registration": None},
         {"active": (alarm,)},

@@ -13,6 +13,7 @@ from service.errors import CommandError
 from service.model.misregistration import Misregistration
 from service.records import events as ev
 from service.records.alarms import Alarm
+from service.records.messages import as_message
 from service.records.products import MatrixState
 from service.records.registration import ModeGain
 from service.runtime.actions import (
@@ -59,7 +60,12 @@ def make_in(bench, loop, fewer=()):
 
 
 def slip_alarm():
-    return Alarm(name="edge-slip", since_ns_utc=START_NS, text="found", seen_ns_utc=START_NS)
+    return Alarm(
+        name="edge-slip",
+        since_ns_utc=START_NS,
+        message=as_message("x", "found"),
+        seen_ns_utc=START_NS,
+    )
 
 
 class TestFewer:

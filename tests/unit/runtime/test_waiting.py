@@ -8,6 +8,7 @@ import pytest
 
 from service.link.statistics import Counters
 from service.records.alarms import Alarm, Prerequisite, Responsible
+from service.records.messages import as_message
 from service.records.products import MatrixState
 from service.records.state import Mode, TrackerState
 from service.runtime.readiness import (
@@ -35,6 +36,11 @@ def waits(link, state=None, *, preparing=False):
 # ---------------------------------------------------------------- complaints
 
 
+def unused(*came):
+    """Return which frames are not used."""
+    return complaints(link(*came))["frames-unused"].values["about"]
+
+
 def test_nothing_is_complained_of_while_all_is_well():
     assert complaints(link(*WELL)) == {}
     assert complaints(link()) == {}
@@ -45,20 +51,19 @@ def test_nothing_is_complained_of_while_all_is_well():
     ["late", "nonfinite", "shape", "leap", "sequence", "malformed", "session", "of-tomorrow"],
 )
 def test_frames_that_come_and_are_not_used_are_named_whatever_the_reason(outcome):
-    text = complaints(link(disposition(outcome, 900, text="found x, expected y")))["frames-unused"]
-    assert outcome in text.partition(":")[0]
-    assert "0 were used" in text
+    made = complaints(link(disposition(outcome, 900, text="found x, expected y")))["frames-unused"]
+    assert (made.values["about"], made.values["n_used"]) == (outcome, 0)
 
 
 def test_duplicates_are_missed_only_where_they_are_all_that_comes():
     assert complaints(link(*WELL, disposition("duplicate", 2000))) == {}
-    assert "duplicate" in complaints(link(disposition("duplicate", 2000)))["frames-unused"]
+    assert unused(disposition("duplicate", 2000)) == "duplicate"
 
 
 def test_a_few_late_or_unfinite_frames_are_no_alarm_and_one_broken_batch_is():
     assert complaints(link(*WELL, disposition("late", 100), disposition("nonfinite", 100))) == {}
-    assert "leap" in complaints(link(*WELL, disposition("leap", 1)))["frames-unused"]
-    assert "leap" in complaints(link(*WELL, disposition("leap", 0, age_s=9.0)))["frames-unused"]
+    assert unused(*WELL, disposition("leap", 1)) == "leap"
+    assert unused(*WELL, disposition("leap", 0, age_s=9.0)) == "leap"
     assert complaints(link(*WELL, disposition("leap", 0, age_s=11.0))) == {}
 
 
@@ -66,25 +71,30 @@ def test_while_another_session_waits_to_be_taken_its_frames_are_not_missed():
     frames = disposition("session", 900)
     assert complaints(link(frames, session_waiting="s2")) == {}
     assert complaints(link(*WELL, frames)) == {}
-    assert "session" in complaints(link(frames))["frames-unused"]
+    assert unused(frames) == "session"
 
 
 def test_messages_that_broke_the_contract_are_named_with_what_was_found():
     bad = disposition("malformed", 1, "status", "range: leak is 2")
-    assert "range: leak is 2" in complaints(link(*WELL, bad))["messages-refused"]
+    made = complaints(link(*WELL, bad))["messages-refused"]
+    assert made.key == "link.messages-refused: status"
+    assert "range: leak is 2" in made.values["details"]
     assert complaints(link(*WELL, replace(bad, n=0, age_s=11.0))) == {}
 
 
 def test_a_flood_of_statuses_is_named_with_its_rate():
-    text = complaints(link(*WELL, disposition("spared", 990, "status")))["status-flood"]
-    assert "500 a second" in text
+    made = complaints(link(*WELL, disposition("spared", 990, "status")))["status-flood"]
+    assert made.values["rate_hz"] == pytest.approx(500.0, rel=0.02)
 
 
 def test_a_complaint_that_lasts_keeps_its_text_and_ends_some_seconds_after_the_last():
     state = TrackerState(system="small")
     (made,) = detect_link_changes(link(disposition("late", 900, text="x 1")), state, START_NS)
     alarm = Alarm(
-        name=made.name, since_ns_utc=START_NS, text=made.text, seen_ns_utc=START_NS + SECOND
+        name=made.name,
+        since_ns_utc=START_NS,
+        message=made.text,
+        seen_ns_utc=START_NS + SECOND,
     )
     state = changed(state, active=(alarm,))
     (again,) = detect_link_changes(
@@ -94,7 +104,7 @@ def test_a_complaint_that_lasts_keeps_its_text_and_ends_some_seconds_after_the_l
     (other,) = detect_link_changes(
         link(disposition("shape", 950, text="y")), state, START_NS + SECOND
     )
-    assert "shape" in other.text
+    assert other.text.key == "link.frames-unused: shape"
     assert detect_link_changes(link(*WELL), state, START_NS + 3 * SECOND) == []
     (over,) = detect_link_changes(link(*WELL), state, START_NS + 5 * SECOND)
     assert (over.name, over.over) == ("frames-unused", True)
@@ -199,7 +209,7 @@ def test_a_matrix_without_a_name_or_without_its_numbers_is_waited_for():
     ],
 )
 def test_alarms_that_keep_the_service_from_its_job_are_waits(name, party, hinders):
-    alarm = Alarm(name=name, since_ns_utc=0, text="as the alarm says")
+    alarm = Alarm(name=name, since_ns_utc=0, message=as_message("x", "as the alarm says"))
     wait = waits(link(*WELL), tracker_state(system="s", active=(alarm,)))[name]
     assert (wait.responsible, wait.blocks, wait.text) == (party, hinders, "as the alarm says")
 
@@ -242,7 +252,7 @@ def test_a_wait_is_on_record_once_it_lasts_and_not_again_and_again():
         present = (wait,) if k % 10 else ()
         lines.append(told.due_lines(present, (), k * SECOND))
     assert len([k for k, found in enumerate(lines) if found and k > 99]) <= 2
-    alarm = Alarm(name="status", since_ns_utc=0, text="")
+    alarm = Alarm(name="status", since_ns_utc=0, message=as_message("x", ""))
     fresh = ReadinessLog()
     assert not any(fresh.due_lines((wait,), (alarm,), k * SECOND) for k in range(10))
 
@@ -304,7 +314,10 @@ def test_what_keeps_a_matrix_from_being_made_is_waited_for():
 
 
 def test_what_kept_a_matrix_is_not_said_while_an_alarm_forbids_all_decisions():
-    hindrance, alarm = "Raise [dither] budget_m.", Alarm(name="no-frames", since_ns_utc=0, text="")
+    hindrance, alarm = (
+        "Raise [dither] budget_m.",
+        Alarm(name="no-frames", since_ns_utc=0, message=as_message("x", "")),
+    )
     state = tracker_state(system="s", rtc=rtc(), hindrance=hindrance)
     assert "new-matrix" in waits(link(*WELL), state)
     assert "new-matrix" not in waits(link(*WELL), changed(state, active=(alarm,)))

@@ -8,6 +8,7 @@ import pytest
 
 from service.errors import WorkerError
 from service.records.alarms import Alarm
+from service.records.messages import as_message
 from service.records.state import ModelState, TrackerState
 from service.runtime import workers as crew_module
 from service.runtime import workers as workers_module
@@ -277,7 +278,9 @@ QUIET = TrackerState(system="small")
 
 
 def alarmed(name):
-    return tracker_state(system="small", active=(Alarm(name=name, text="", since_ns_utc=1),))
+    return tracker_state(
+        system="small", active=(Alarm(name=name, message=as_message("x", ""), since_ns_utc=1),)
+    )
 
 
 class Clocks:

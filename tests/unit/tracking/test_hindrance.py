@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from service.records import events as ev
+from service.records.messages import compose
 from service.records.products import ModeProof
 from service.records.state import Mode
 from service.tracking.mode_proof import awaits_proof
@@ -64,12 +65,12 @@ def test_a_stronger_dither_is_no_remedy_where_no_window_is_accepted(refused):
     known = story.state.alpha.registration
     wide = replace(known, covariance=np.diag(POLICY.useless_sigma**2) * 4.0)
     run = -5 if refused else 0
-    windows = replace(story.state.windows, run=run, refused_because="frames are missing")
+    windows = replace(story.state.windows, run=run, refused_because=compose("window.no-rtc"))
     story.state = changed(story.state, registration=wide, windows=windows)
     story.now_ns += 600 * 10**9 * (not refused)
     story.tell(ev.Tick(), after_s=1.0)
     assert "budget_m" not in hindrance(story)
-    assert ("frames are missing" if refused else "No window comes any more") in hindrance(story)
+    assert ("the RTC is not known" if refused else "No window comes any more") in hindrance(story)
 
 
 class Unseen(Story):

@@ -1,8 +1,12 @@
+from dataclasses import replace
+
+from service.records.messages import Range, compose, widen
 from service.records.state import Level, TrackerState
 from service.tracking.step_context import LOG_LENGTH, StepContext, log_bursts, logged
 from tests.support.situations import turned
 
 STATE = TrackerState(system="flao")
+WEAK = compose("window.dither-weak", mode=3, found_nm=2.5, place=" at 211.0 Hz", requested_nm=5.0)
 
 
 def counted(state, now_ns):
@@ -30,32 +34,48 @@ def test_a_burst_of_refused_windows_is_one_line_and_then_one_with_a_count():
     """Eleven windows a second were refused; their texts differ in their numbers."""
     state = STATE
     for k in range(600):
-        text = f"mode 3 carries {0.1 * k:.2f} nm of dither"
-        state = logged(state, "window.refused", text, k * SECOND_NS // 11)
+        weak = replace(WEAK, values=WEAK.values | {"found_nm": 0.1 * k})
+        state = logged(state, "window.refused", weak, k * SECOND_NS // 11)
         state = logged(state, "other", str(k), k * SECOND_NS // 11) if k % 50 == 0 else state
         state = counted(state, k * SECOND_NS // 11)
     lines = [entry for entry in state.log if entry.name == "window.refused"]
     assert [entry.times for entry in lines] == [600]
     state = counted(state, 61 * SECOND_NS)
     lines = [entry for entry in state.log if entry.name == "window.refused"]
-    assert lines[-1].text == (
-        "mode 3 carries 0.00 to 59.90 nm of dither (600 times in 54 s, 00:00:00 to 00:00:54 UTC)"
-    )
+    whole = WEAK.format_ranges({"found_nm": Range(0.0, 59.9)})
+    assert lines[-1].message.key == "log.burst: window.dither-weak"
+    assert lines[-1].text == f"{whole} (600 times in 54 s, 00:00:00 to 00:00:54 UTC)"
+    assert "carries 0.00 to 59.90 nm" in lines[-1].text
     assert lines[-1].t_ns_utc == 599 * SECOND_NS // 11, "and has the time of its end"
     assert [entry.times for entry in lines] == [1, 1]
     assert counted(state, 200 * SECOND_NS) is state
 
 
-def test_the_names_in_a_burst_are_no_numbers():
+def test_the_first_id_of_a_burst_stands_for_all():
     state = STATE
     for k in range(3):
-        text = f"cm-20270115T08000{k}.350-45 -> dither-18{k}: {5 - 2 * k} of 2e-09 m"
-        state = logged(state, "window.refused", text, k * SECOND_NS)
+        lost = compose("dither.not-in-frames", id=f"dither-18{k}", silent_s=5.0 - 2 * k)
+        state = logged(state, "dither.lost", lost, k * SECOND_NS)
     state = counted(state, 61 * SECOND_NS)
-    assert state.log[-1].text == (
-        "cm-20270115T080000.350-45 -> dither-180: 1 to 5 of 2e-09 m (3 times in 2 s, 00:00:00 to "
-        "00:00:02 UTC)"
-    )
+    assert [entry.text for entry in state.log] == [
+        "the RTC accepted dither-180: its frames held none of it for 5.0 s",
+        "the RTC accepted dither-180: its frames held none of it for 1.0 to 5.0 s (3 times in 2 s, "
+        "00:00:00 to 00:00:02 UTC)",
+    ]
+
+
+def test_a_number_in_a_text_without_a_code_is_news():
+    state = logged(STATE, "job.failed", "no answer in 2 s", 1)
+    state = logged(state, "job.failed", "no answer in 3 s", 2)
+    state = logged(state, "job.failed", "no answer in 2 s", 3)
+    assert [entry.times for entry in state.log] == [2, 1]
+
+
+def test_a_range_is_one_number_if_both_look_alike():
+    assert f"{Range(1.0, 1.04):.1f}" == "1.0"
+    assert f"{Range(1, 3)}" == "1 to 3"
+    widened = widen(widen({}, WEAK), replace(WEAK, values=WEAK.values | {"mode": 1}))
+    assert widened == {"mode": (1, 3), "found_nm": (2.5, 2.5), "requested_nm": (5.0, 5.0)}
 
 
 def test_after_a_minute_a_repeated_line_is_told_again():

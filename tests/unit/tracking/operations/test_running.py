@@ -7,6 +7,7 @@ import pytest
 from service.records import commands as cmd
 from service.records import events as ev
 from service.records.alarms import Alarm
+from service.records.messages import as_message
 from service.records.operations import Acquisition, AcquisitionStage, MeasureState
 from service.records.state import Mode
 from service.tracking.operations.running import (
@@ -162,7 +163,9 @@ def found(state, hindered="", now_ns=0):
 
 
 def alarmed(state, *names):
-    raised = tuple(Alarm(name=name, since_ns_utc=1, text=f"{name} found") for name in names)
+    raised = tuple(
+        Alarm(name=name, since_ns_utc=1, message=as_message("x", f"{name} found")) for name in names
+    )
     return changed(state, active=raised)
 
 

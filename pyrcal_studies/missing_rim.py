@@ -5,7 +5,8 @@ registration. The slopes there are absent from mask and matrix, or 0, or NaN. Th
 of ``failing/`` in the folder of public data; they are arrays for ``pyrcal import files``, which
 read the mask as it is. With ``--off`` all of the mask is there, on a grid that is larger on two
 sides, and the width of the pupil is given.
-Run: ``python -m pyrcal_studies.missing_rim --data PATH``, and the same with ``--off 1 2 4 6``.
+Run: ``python -m pyrcal_studies.missing_rim --data PATH``, the same with ``--off 1 2 4 6``, and with
+``--others``: 20 further shapes, each in the middle of the grid and one subaperture off.
 """
 
 from __future__ import annotations
@@ -73,6 +74,46 @@ SHAPES: dict[str, Shape] = {
 "ring wider" has a dark ring around it, as an RTC's window may have."""
 
 
+def _turned(x: Array, y: Array) -> Array:
+    """Return the angle of each subaperture, degrees from 0 to 360."""
+    return np.asarray(np.rad2deg(np.arctan2(y, x)) % 360.0)
+
+
+def _spots(*places: tuple[float, float], size: float = 0.09) -> Shape:
+    """Return the shape of spots of a radius at the places."""
+    return lambda x, y: np.any([np.hypot(x - u, y - v) < size for u, v in places], axis=0)
+
+
+OTHERS: dict[str, Shape] = {
+    "left and right tenth": lambda x, y: np.abs(x) > 0.8,
+    "top column, left tenth": lambda x, y: (y < -0.999) | (x < -0.8),
+    "all four sides": lambda x, y: np.maximum(np.abs(x), np.abs(y)) > 0.9,
+    "three sides": lambda x, y: (np.abs(x) > 0.9) | (y > 0.9),
+    "a fifth at the right": lambda x, y: x > 0.6,
+    "a quarter at the bottom": lambda x, y: y > 0.5,
+    "a wedge of 20 deg": lambda x, y: np.abs(_turned(x, y) - 200.0) < 10.0,
+    "a wedge of 45 deg": lambda x, y: np.abs(_turned(x, y) - 70.0) < 22.5,
+    "a quadrant": lambda x, y: (x > 0.0) & (y > 0.0),
+    "two wedges": lambda x, y: np.abs(_turned(x, y) % 180.0 - 30.0) < 12.0,
+    "a hole of a third": lambda x, y: np.hypot(x, y) < 0.33,
+    "a hole of a half": lambda x, y: np.hypot(x, y) < 0.5,
+    "a hole off the middle": lambda x, y: np.hypot(x - 0.15, y + 0.1) < 0.35,
+    "a ring inside": lambda x, y: np.abs(np.hypot(x, y) - 0.6) < 0.08,
+    "a dead subaperture": _spots((0.4, 0.3)),
+    "five dead subapertures": _spots(
+        (0.4, 0.3), (-0.5, 0.1), (0.0, -0.6), (-0.2, 0.5), (0.6, -0.2)
+    ),
+    "a dead patch": _spots((-0.3, -0.4), size=0.22),
+    "a row inside": lambda x, y: np.abs(y - 0.3) < 0.06,
+    "two columns inside": lambda x, y: np.abs(np.abs(x) - 0.45) < 0.06,
+    "every fifth": lambda x, y: np.arange(len(x)) % 5 == 0,
+}
+"""Further shapes, none of which was looked at while the code was written."""
+
+OFF_LINES = 2
+"""Lines more on two sides of the grid of a mask of ``OTHERS``: its pupil is one subaperture off."""
+
+
 def read_bench(data: Path, name: str) -> tuple[dict[str, Array], Reported, dict[str, float]]:
     """Return the arrays of a bench by role, what they do not say, and the true registration."""
     with np.load(data / "failing" / f"{name}.npz") as stored:
@@ -112,7 +153,7 @@ def without(arrays: dict[str, Array], shape: str, way: str) -> dict[str, Array]:
     planes = arrays["matrix"].reshape(2, int(valid.sum()), -1)
     places = np.argwhere(valid) - (len(valid) - 1) / 2.0
     y, x = (places / np.abs(places).max(axis=0)).T
-    gone = SHAPES[shape](x, y)
+    gone = (SHAPES | OTHERS)[shape](x, y)
     if way == "absent":
         planes, valid = planes[:, ~gone], valid.copy()
         valid[tuple(np.argwhere(arrays["valid"])[gone].T)] = False
@@ -144,15 +185,27 @@ def main(words: list[str]) -> int:
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS)
     parser.add_argument("--off", nargs="+", type=int, help="lines more on two sides of a grid")
+    parser.add_argument("--others", action="store_true", help="further shapes, also off the middle")
     options = parser.parse_args(words)
     found = []
-    for k, shape in enumerate(SHAPES if options.off is None else ()):
+    for k, shape in enumerate(() if options.off or options.others else SHAPES):
         name = BENCHES[k % len(BENCHES)]
         arrays, reported, truth = read_bench(options.data, name)
         expected = np.array([truth[one] for one in PARAMETERS])
         for way in options.ways:
             cut = without(arrays, shape, way)
             found.append(compare(name, f"{shape}, {way}", cut, reported, expected))
+    for (k, shape), lines in product(enumerate(OTHERS), (0, OFF_LINES) if options.others else ()):
+        name = BENCHES[k % len(BENCHES)]
+        arrays, reported, truth = read_bench(options.data, name)
+        if lines:
+            width = float(len(arrays["valid"]))
+            reported = replace(reported, pupil_diameter_subap=width)
+        cut = without(arrays, shape, "absent")
+        cut["valid"] = np.pad(cut["valid"], ((lines, 0), (0, lines)))
+        expected = np.array([truth[one] for one in PARAMETERS])
+        expected[:2] += np.array([-0.5, 0.5]) * lines
+        found.append(compare(name, f"{shape}, {lines} lines off", cut, reported, expected))
     for name, lines in product(BENCHES[:4], options.off or ()):
         arrays, reported, truth = read_bench(options.data, name)
         wide = replace(reported, pupil_diameter_subap=float(len(arrays["valid"])))

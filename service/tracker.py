@@ -114,8 +114,6 @@ def _on_condition(context: StepContext, event: ev.ConditionChanged) -> None:
     elif event.name == alarms.MIRROR_SILENT:
         dither.stop_unanswered(context, str(event.text))
     else:
-        if event.name == alarms.WORKER_LOST:
-            mode_proof.forget_responses(context)
         context.raise_alarm(event.name, event.text)
 
 
@@ -162,7 +160,7 @@ REACTIONS: Final[Reactions] = {
     ev.WindowLost: (window_processing.on_lost, acquisition.on_lost),
     ev.PassiveFitted: (window_processing.process_passive,),
     ev.PassiveUnavailable: (window_processing.on_passive_unavailable,),
-    ev.MatrixMade: (_on_made, acquisition.on_made),
+    ev.MatrixMade: (operator.on_refit_made, _on_made, acquisition.on_made),
     ev.MatrixFetched: (reconstructors.on_fetched,),
     ev.ModesRecognised: (mode_proof.note_recognised,),
     ev.MarginJudged: (reconstructors.on_margin,),
@@ -220,7 +218,7 @@ ANSWERS: Final[Reactions] = {
 """Functions of context, request and reply for each kind of request that the RTC has answered."""
 
 FAILURES: Final[Reactions] = {
-    ev.MakeMatrix: (reconstructors.on_making_failed, rtc.fail_order),
+    ev.MakeMatrix: (operator.on_refit_failed, reconstructors.on_making_failed, rtc.fail_order),
     ev.RepublishMatrix: (reconstructors.on_making_failed, rtc.fail_order, probation.on_copy_failed),
     ev.JudgeMatrix: (reconstructors.on_judging_failed, rtc.log_failure),
     ev.JudgeProposal: (reconstructors.on_judging_failed, rtc.fail_order),

@@ -18,12 +18,20 @@ _ALPHA = {
 
 def status_lines(state: Document) -> list[str]:
     """Return the screen: whether all is well, alarms with what to do, then the details."""
+    return [line for line, _ in mark_urgent(state)]
+
+
+def mark_urgent(state: Document) -> list[tuple[str, bool]]:
+    """Return the lines of the screen, each with True if it must be seen first."""
     ready = "READY" if state["ready"] else f"NOT READY: {state['ready_reason']}"
     does, up = state["operating"], span(state["uptime_s"])
     doing = f"{does['service_state']}, {does['current_operation']}"
-    lines = [f"{state['system']}: {ready}", f"{doing}; {_mode_text(state['mode'])}; up {up}"]
+    urgent = [(f"{state['system']}: {ready}", not state["ready"])]
+    urgent.append((f"{doing}; {_mode_text(state['mode'])}; up {up}", False))
     for alarm in worst_first(state):
-        lines += [f"ALARM {alarm_line(alarm, state)}", f"      To do: {alarm['do']}"]
+        urgent.append((f"ALARM {alarm_line(alarm, state)}", True))
+        urgent.append((f"      To do: {alarm['do']}", False))
+    lines = []
     for alarm in state["stale_alarms"]:
         name = alarm["name"]
         lines.append(f"over, not acknowledged: {name} (pyrcal alarms ack {name})")
@@ -34,7 +42,8 @@ def status_lines(state: Document) -> list[str]:
         # An alarm with this name is on the screen already.
         if wait["name"] not in alarms
     ]
-    return [*lines, "", *_rtc(state), *_alpha(state), *_matrix(state), *_activity_lines(state)]
+    lines += ["", *_rtc(state), *_alpha(state), *_matrix(state), *_activity_lines(state)]
+    return [*urgent, *((line, False) for line in lines)]
 
 
 _MODES = {

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from pyrcal.client.reading import understood
 from pyrcal.client.remote import DONE, Request
 from pyrcal.client.rest import Document, RefusedError, Service, UnreachableError
-from pyrcal.client.status import status_lines
+from pyrcal.client.status import mark_urgent
 from pyrcal.terminal import clock, print_document, print_lines, span
 from service.errors import say, shown
 
@@ -182,17 +182,22 @@ def screen(latest: Latest, now_s: float) -> Group:
         old = f"; what is below is {span(age_s)} old" if latest.state else ""
         head = Text(shown(f"DISCONNECTED: {lost}; trying again{old}"), style="bold white on red")
     try:
-        status = [] if latest.state is None else status_lines(_add_age(latest.state, age_s))
+        status = [] if latest.state is None else mark_urgent(_add_age(latest.state, age_s))
         log = [
             (_format_log_line(line)[11:], _LEVELS.get(line["level"], ""))
             for line in reversed(latest.log)
         ]
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         # A state with other fields comes from another version of the service.
-        status, log = [f"NOT this version of pyrcal: {error!r}"], []
+        status, log = [(f"NOT this version of pyrcal: {error!r}", True)], []
     return Group(
         head,
-        *(Text(shown(line), style=_style(line, lost)) for line in ["", *status, ""]),
+        Text(),
+        *(
+            Text(shown(line), style="dim" if lost else "bold red" if urgent else "")
+            for line, urgent in status
+        ),
+        Text(),
         *(
             Text(shown(line), style="dim" if lost else style, no_wrap=True, overflow="ellipsis")
             for line, style in log
@@ -201,12 +206,6 @@ def screen(latest: Latest, now_s: float) -> Group:
 
 
 _LEVELS = {"warning": "yellow", "alarm": "bold red"}
-
-
-def _style(line: str, lost: str) -> str:
-    if lost:
-        return "dim"
-    return "bold red" if line.startswith("ALARM") or "NOT READY" in line else ""
 
 
 def _add_age(value: Any, by_s: float) -> Any:  # noqa: ANN401 - as JSON has it

@@ -48,7 +48,10 @@ class Grounds:
     """Inputs of a recommendation, besides the fit's own numbers."""
 
     refusal: Refusal | None
-    """Reason of the refusal; None if the fit was accepted."""
+    """Kind of the refusal; None if the fit was accepted."""
+
+    reason: str
+    """Reason of the verdict, in one sentence."""
 
     structure: float
     """RMS share of the signal that is left over and is not noise."""
@@ -257,7 +260,7 @@ def _find_cause(fit: Fit, grounds: Grounds) -> _Action:
         return f"{left.words}; measure these again, or leave them out (--modes)", ()
     named = tuple(entry for entry in ENTRIES if entry in fit.verdict)
     entries = (grounds.axes_entry,) if grounds.axes_entry else named
-    return fit.verdict.removeprefix("refused: "), entries
+    return grounds.reason, entries
 
 
 def _list_corrections(fit: Fit) -> Iterator[str]:

@@ -54,7 +54,6 @@ from pyrcal.fitting.origins import Origin, list_origins, list_undetermined_keys
 from pyrcal.fitting.pupil_checks import (
     MIN_PUPIL_EXPLAINED,
     FitSubset,
-    fit_smooth_gain,
     try_pupils,
 )
 from pyrcal.fitting.pupil_width import SeenPupil, compute_responses, measure_pupil
@@ -615,8 +614,6 @@ def _make_fit(
     # The target's columns are divided by the passes, and their noise with them.
     noise = None if usable.noise is None else usable.noise / usable.passes
     structured = measure_structure(seen.residual, power, noise)
-    # The share of the power that a smooth gain over the pupil would explain.
-    by_light = residual_fraction**2 * (1.0 - fit_smooth_gain(few))
     n_planes = slopes.kind.n_planes
     floor_of_size, floor_words = _magnification_floor(models.instrument)
     before = uncertainty(
@@ -674,7 +671,6 @@ def _make_fit(
         solution=solution,
         residual_fraction=residual_fraction,
         structure=structured,
-        after_light=float(np.sqrt(max(structured**2 - by_light, 0.0))),
         uncertainty=sure,
         # A σ that already contains the move of an alternative would always cover that move, so the
         # verdict compares moves with σ before alternatives were added.
@@ -692,7 +688,7 @@ def _make_fit(
         noise_share=noise_share,
         radius_subap=models.instrument.wfs.pupil_diameter / 2.0,
     )
-    refusal, verdict = judge_fit(findings)
+    refusal, reason = judge_fit(findings)
     smeared = () if found.smear is None else (found.smear.words,)
     # Columns are compared with the model at α, which means nothing where the fit found none.
     columns = (
@@ -719,7 +715,7 @@ def _make_fit(
         subset_scatter=sure.subset_scatter,
         accepted=refusal is None,
         converged=solution.converged,
-        verdict=verdict,
+        verdict=f"{'accepted' if refusal is None else 'refused'}: {reason}",
         remarks=(
             *collect_remarks(findings, reported=reported, found=slopes, about=models.instrument),
             *columns,
@@ -746,7 +742,7 @@ def _make_fit(
         alternatives=tried,
         registration=Registration(
             determined=refusal is None,
-            reason=verdict.partition(": ")[2],
+            reason=reason,
             sigma_statistical=sure.sigma_statistical,
             sigma_systematic=sure.sigma_systematic,
             sets=sure.sets,
@@ -765,6 +761,7 @@ def _make_fit(
     )
     grounds = Grounds(
         refusal=refusal,
+        reason=reason,
         structure=structured,
         n_sets=len(sure.subset_steps),
         columns=columns,

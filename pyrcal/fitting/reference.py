@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from service.errors import MatrixError
 from service.estimation.reference import Reference
-from service.model.defects import COPY, find_defects
+from service.model.defects import find_defects
 from service.model.misregistration import unit_like
 from service.model.slopes import likely_kind
 
@@ -140,7 +140,7 @@ def _remove_dead_rows(reference: Reference) -> tuple[Reference, tuple[str, ...]]
     rows = np.where(unknown, 0.0, reference.matrix)
     rows[dead] = 0.0
     kinds = find_defects(rows) if rows.shape[1] >= MIN_COMPARED_COLUMNS else {}
-    copies = {row: reason for row, reason in kinds.items() if reason.startswith(COPY)}
+    copies = {row: first for row, first in kinds.items() if isinstance(first, int)}
     silent = ~rows.any(axis=1) & ~dead
     if not (dead.any() or copies or silent.any()):
         return reference, ()
@@ -175,9 +175,9 @@ def _find_usable(reference: Reference) -> tuple[NDArray[np.bool_], tuple[str, ..
     # Only usable columns, so that none is listed as a copy of a column that is left out itself.
     equal = find_defects(np.ascontiguousarray(reference.matrix.T[kept])) if len(places) else {}
     copies = {
-        int(places[column]): f"{COPY}{places[int(reason.removeprefix(COPY))]}"
-        for column, reason in equal.items()
-        if reason.startswith(COPY)
+        int(places[column]): int(places[first])
+        for column, first in equal.items()
+        if isinstance(first, int)
     }
     if copies:
         kept[list(copies)] = False
@@ -191,10 +191,10 @@ def _find_usable(reference: Reference) -> tuple[NDArray[np.bool_], tuple[str, ..
 
 
 def _describe_copies(
-    copies: Mapping[int, str], numbers: NDArray[np.intp], what: str = "mode"
+    copies: Mapping[int, int], numbers: NDArray[np.intp], what: str = "mode"
 ) -> str:
     """Return a text on entries that repeat an earlier one."""
-    first = numbers[[int(reason.removeprefix(COPY)) for reason in copies.values()]]
+    first = numbers[list(copies.values())]
     listed = _format_numbers(numbers[list(copies)], what)
     return f"{listed} (of {', '.join(str(number) for number in first[:8])})"
 

@@ -131,9 +131,11 @@ def _note_light(findings: FitFindings) -> Iterator[str]:
     }
     if min(shares, key=lambda key: shares[key], default=LIGHT_KEY) != LIGHT_KEY:
         return
-    if findings.structure > NOTABLE_STRUCTURE >= findings.after_light:
+    # Not ``structure``: a gain over the pupil spreads what it leaves over all directions.
+    left = findings.residual_fraction * float(np.sqrt(1.0 - findings.noise_share))
+    if left > NOTABLE_STRUCTURE >= left * np.sqrt(shares.get(LIGHT_KEY, 1.0)):
         yield (
-            f"{findings.structure:.0%} of the signal is left over and is not noise; a smooth gain "
+            f"{left:.0%} of the signal is left over and is not noise; a smooth gain "
             "over the pupil explains it: uneven light, which sigma allows for; give the light "
             "(--flux-map), or have the gain fitted (--gain-map)"
         )

@@ -52,9 +52,9 @@ class SystemReport:
     def refused(self) -> tuple[str, ...]:
         """Pairs whose own fit was refused, with its verdict."""
         return tuple(
-            f"{' x '.join(self.system.names(pair))}: {one.fit.verdict.removeprefix('refused: ')}"
+            f"{' x '.join(self.system.names(pair))}: {one.fit.registration.reason}"
             for pair, one in zip(self.system.pairs, self.fits, strict=True)
-            if not one.fit.accepted
+            if one.fit.registration is not None and not one.fit.accepted
         )
 
     @property

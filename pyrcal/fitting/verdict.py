@@ -98,9 +98,6 @@ class FitFindings:
     structure: float
     """RMS share of the signal that is left over and is not noise."""
 
-    after_light: float
-    """The same if a smooth gain over the pupil, as from uneven light, were also fitted."""
-
     uncertainty: Uncertainty
     before: Uncertainty
     """Uncertainty without the alternatives that the data do not exclude."""
@@ -173,7 +170,7 @@ class Refusal(StrEnum):
 
 
 def judge_fit(findings: FitFindings) -> tuple[Refusal | None, str]:
-    """Return the reason of a refusal, or None, and the verdict in one line."""
+    """Return the kind of a refusal, or None, and the reason of the verdict in one sentence."""
     for reason, refusal in (
         (Refusal.AXES, findings.axes),
         (Refusal.ANOTHER_PUPIL, _check_pupil(findings)),
@@ -188,8 +185,8 @@ def judge_fit(findings: FitFindings) -> tuple[Refusal | None, str]:
         (Refusal.WITHOUT_CAUSE, _check_cause(findings)),
     ):
         if refusal:
-            return reason, f"refused: {refusal}"
-    return None, f"accepted: {_describe_quality(findings)}"
+            return reason, refusal
+    return None, _describe_quality(findings)
 
 
 def _describe_quality(findings: FitFindings) -> str:

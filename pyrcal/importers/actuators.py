@@ -11,7 +11,7 @@ import numpy as np
 from pyrcal.importers.imported import UNKNOWN, Array, in_arrays_file, orient_matrix
 from pyrcal.importers.layouts import cube_of
 from service.errors import MatrixError
-from service.model.defects import COPY, explain_defects, find_defects
+from service.model.defects import Defect, explain_defects, find_defects
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -27,7 +27,7 @@ class Mirror:
     per_mode: tuple[str, ...] = ()
     """Arrays with one entry for each mode along their first axis."""
 
-    defects: dict[int, str] = field(default_factory=dict)
+    defects: dict[int, Defect] = field(default_factory=dict)
     """Unusable modes by number, with the reason."""
 
     @property
@@ -80,9 +80,9 @@ def _read_positions(given: Array, notes: list[str]) -> Mirror:
     places = orient_matrix(given, longer, 2, "positions", "(n_actuators, 2)", notes)
     for number, reason in find_defects(places).items():
         # A place of zeros is no defect: it is the actuator in the middle.
-        if reason.startswith(COPY):
+        if isinstance(reason, int):
             raise MatrixError(
-                f"positions: found actuator {number} where {reason.removeprefix(COPY)} is, "
+                f"positions: found actuator {number} where {reason} is, "
                 "expected a place of its own for each"
             )
     # On a line every rotation about it fits: a registration cannot be measured.

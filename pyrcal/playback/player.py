@@ -32,6 +32,7 @@ from service.link.session import Endpoint
 from service.model.instrument import Instrument
 from service.records import events as ev
 from service.records.events import Effect, Event
+from service.records.messages import ABOUT
 from service.records.products import ReconstructorRecord
 from service.records.state import LoopState, Mode, OperatorState, TrackerState
 from service.runtime.engine import Engine
@@ -229,8 +230,11 @@ class Player:
         if passive is not None and passive is not before.alpha.passive:
             self.track.passive.append(passive)
         # A refused dither is an answer of this program's, which the telemetry does not show.
-        mine = [line for line in new_lines(before, after) if NOT_CARRIED_OUT not in line.text]
-        self.track.lines += mine
+        self.track.lines += [
+            line
+            for line in new_lines(before, after)
+            if line.message.values.get(ABOUT) != NOT_CARRIED_OUT
+        ]
         # Not by their number: the history is limited, and drops its oldest entries.
         seen = set(before.alpha.history)
         self.track.entries += [entry for entry in after.alpha.history if entry not in seen]

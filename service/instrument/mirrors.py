@@ -12,7 +12,7 @@ from service.errors import ConfigurationError
 from service.files.toml import refuse
 from service.instrument.crops import local_functions, modes_of_crops, remarks_on_crops
 from service.instrument.schema import MirrorTable, Section
-from service.model.defects import COPY, NOT_FINITE, ZERO, explain_defects, find_defects
+from service.model.defects import NOT_FINITE, ZERO, Defect, explain_defects, find_defects
 from service.model.instrument import Mirror, TabulatedModes
 from service.model.kinds import BasisKind, Influence, InfluenceShape
 from service.model.misregistration import rotation, unit_like
@@ -471,12 +471,13 @@ def _without_defects(
     # Outside the pupil all functions are undefined: only more than that is a fault.
     unknown = np.mean(~np.isfinite(cube), axis=(1, 2))
     broken = unknown > np.median(unknown) + _BROKEN_SHARE
-    defects = {int(number): NOT_FINITE for number in np.flatnonzero(broken)}
+    defects: dict[int, Defect] = {int(number): NOT_FINITE for number in np.flatnonzero(broken)}
     usable = np.flatnonzero(~broken)
     for place, reason in find_defects(cube[usable] if broken.any() else cube).items():
-        if reason == ZERO or (reason.startswith(COPY) and file.said.influence_origin is None):
-            copied = int(usable[int(reason.removeprefix(COPY))]) if reason != ZERO else 0
-            defects[int(usable[place])] = reason if reason == ZERO else f"{COPY}{copied}"
+        if reason == ZERO:
+            defects[int(usable[place])] = ZERO
+        elif isinstance(reason, int) and file.said.influence_origin is None:
+            defects[int(usable[place])] = int(usable[reason])
     if not defects:
         return cube, ()
     mended = np.array(cube)

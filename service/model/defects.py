@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 NOT_FINITE, ZERO = "NaN", "zero"
 """Reasons of entries that hold no numbers, and nothing but zeros."""
 
-COPY = "equal to "
-"""Begins the reason of an entry that repeats an earlier one, whose number follows."""
+Defect = str | int
+"""Reason why an entry cannot be used; a number is that of the earlier entry that it repeats."""
 
 _LISTED = 12
 """Numbers that a message lists."""
 
 
-def find_defects(values: NDArray[Any]) -> dict[int, str]:
+def find_defects(values: NDArray[Any]) -> dict[int, Defect]:
     """Return the entries along the first axis that cannot be used, with the reason.
 
     An entry is unusable if it holds a NaN that not all others have at the same place (outside a
@@ -35,7 +35,7 @@ def find_defects(values: NDArray[Any]) -> dict[int, str]:
     n_unknown = unknown.sum(axis=1)
     # The entry with the fewest: what it lacks, as outside a pupil, all others may lack.
     usual = unknown[int(np.argmin(n_unknown))] if len(flat) else np.zeros(0, bool)
-    found: dict[int, str] = {}
+    found: dict[int, Defect] = {}
     seen: dict[bytes, int] = {}
     for number, entry in enumerate(flat):
         if n_unknown[number] == flat.shape[1] or np.any(unknown[number] & ~usual):
@@ -47,12 +47,12 @@ def find_defects(values: NDArray[Any]) -> dict[int, str]:
         # a digest, for the entries of a large table would double the memory
         first = seen.setdefault(hashlib.blake2b(entry.tobytes()).digest(), number)
         if first != number:
-            found[number] = f"{COPY}{first}"
+            found[number] = first
     return found
 
 
 def explain_defects(
-    defects: Mapping[int, str], what: str, numbers: NDArray[Any] | None = None
+    defects: Mapping[int, Defect], what: str, numbers: NDArray[Any] | None = None
 ) -> list[str]:
     """Return one note for each kind of defect: ``columns 3, 7 are zero: left out``.
 
@@ -64,9 +64,8 @@ def explain_defects(
 
     listed: dict[str, list[str]] = {"not finite": [], "zero": [], "copies": []}
     for entry, reason in sorted(defects.items()):
-        if reason.startswith(COPY):
-            of = known(int(reason.removeprefix(COPY)))
-            listed["copies"].append(f"{known(entry)} (of {of})")
+        if isinstance(reason, int):
+            listed["copies"].append(f"{known(entry)} (of {known(reason)})")
         else:
             listed["not finite" if reason == NOT_FINITE else "zero"].append(str(known(entry)))
     notes = []

@@ -753,3 +753,36 @@ class LoopCommand:
 
     cause: str = field(default="", compare=False)
     """Id of the order or event that requested it."""
+
+
+class RefitState(StrEnum):
+    """States of a refit."""
+
+    RUNNING = "running"
+    """The reconstructor is being computed and judged."""
+
+    MADE = "made"
+    """There is a reconstructor; its own state says what becomes of it."""
+
+    REFUSED = "refused"
+    """There is one, and the gate refuses it."""
+
+    FAILED = "failed"
+    """There is none, for a reason."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RefitJob:
+    """An order to compute a reconstructor for the registration of now."""
+
+    id: str
+    state: RefitState
+    n_modes: int
+    """Number of modes requested."""
+
+    asked_ns_utc: int
+    reconstructor: str | None = None
+    """Id of the one that was made; None: there is none, or not yet."""
+
+    reason: str = ""
+    """Result in words."""

@@ -16,6 +16,7 @@ from service.records.operations import (
     LoopCommand,
     MeasurementRecord,
     Probation,
+    RefitJob,
 )
 from service.records.products import (
     Assessment,
@@ -277,6 +278,9 @@ class Operations:
 
     measurements: tuple[MeasurementRecord, ...] = ()
     """Measurements of interaction matrices, oldest first, bounded in number."""
+
+    refits: tuple[RefitJob, ...] = ()
+    """Reconstructors that operators have ordered, oldest first, bounded in number."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

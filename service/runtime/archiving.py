@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import fields, replace
 from functools import partial
 from itertools import takewhile
@@ -25,6 +25,7 @@ from service.records import events as ev
 from service.records.alarms import ARCHIVE_FAILED, DISK_LOW
 from service.records.commands import Command, makes_safer
 from service.records.events import Effect
+from service.records.operations import MeasurementRecord
 from service.records.products import ReconstructorRecord
 from service.records.registration import HistoryEntry
 from service.records.state import Level, LogEntry, TrackerState
@@ -163,7 +164,10 @@ class ArchiveWriter:
         entry = replace(entry, answer=answer, cause=order.id)
         self.add(entry)
         said = {key: getattr(entry, key) for key in _LOGGED_FIELDS if getattr(entry, key)}
-        self._log.info(entry.name, **said, **ids_of(f"{entry.text} {answer}", self._state()))
+        state = self._state()
+        led_to = {one.id for one in _records(state) if one.cause == order.id}
+        ids = ids_of(state, led_to | {getattr(command, "id", "")})
+        self._log.info(entry.name, **said, **ids)
 
     async def before(self, effect: Effect) -> None:
         """Wait until the causes of an effect are on the disk.
@@ -377,17 +381,24 @@ class ArchiveWriter:
                         del self._records[name]
 
 
-def ids_of(text: str, state: TrackerState) -> dict[str, object]:
-    """Return what a line of the log is to be found by: frame, matrix in use, matrices it names."""
-    known = [r.id for r in state.matrices.reconstructors] + [
-        m.id for m in state.operations.measurements
-    ]
+def ids_of(state: TrackerState, matrices: Collection[str]) -> dict[str, object]:
+    """Return what a line of the log is to be found by: frame, matrix in use, its matrices."""
     ids = {
         "frame": None if state.loop.rtc is None else state.loop.rtc.seq,
         "in_use": state.matrices.in_use,
-        "matrices": [name for name in known if name in text],
+        "matrices": [one.id for one in _records(state) if one.id in matrices],
     }
     return {name: found for name, found in ids.items() if found}
+
+
+def find_changed_ids(before: TrackerState, after: TrackerState) -> set[str]:
+    """Return the ids of the matrices, made or measured, that a step has changed."""
+    known = _records(before)
+    return {one.id for one in _records(after) if one not in known}
+
+
+def _records(state: TrackerState) -> tuple[ReconstructorRecord | MeasurementRecord, ...]:
+    return (*state.matrices.reconstructors, *state.operations.measurements)
 
 
 def command_json(command: Command, actor: Actor) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import assert_never
 
 import numpy as np
@@ -38,6 +39,7 @@ from service.records.state import Level, TrackerState
 from service.runtime.ports import StorePort, WorkerPort
 from service.runtime.worker import OpticsWorker
 from service.runtime.worker.records import waits
+from service.runtime.workers import with_another_worker
 from service.tracking.pointing_law import start_of_fit
 from service.tracking.window_processing import fit_begins_at
 from service.wire import checksum
@@ -218,11 +220,16 @@ async def read_own_matrix(
     registration = state.alpha.registration
     near = state.alpha.law.nominal if registration is None else registration.alpha
     try:
-        dialect = await workers.call(OpticsWorker.read_slope_convention, matrix, near)
+        # Repeated if the worker dies of something else: nothing reads this matrix again.
+        dialect = await with_another_worker(
+            partial(workers.call, OpticsWorker.read_slope_convention, matrix, near)
+        )
         own = None
         # The modes can only be compared once order and signs of the slopes are right.
         if not dialect.wrong:
-            own = await workers.call(OpticsWorker.recognise, matrix, near, dialect.rotation_rad)
+            own = await with_another_worker(
+                partial(workers.call, OpticsWorker.recognise, matrix, near, dialect.rotation_rad)
+            )
     except PyrcalError as error:
         return [*unread, ev.LogEvent(name="slopes.unknown", text=str(error), level=Level.WARNING)]
     return [*unread, *_report_own_matrix(record, dialect, own, state)]
@@ -353,7 +360,8 @@ class NoisySums:
             raise CommandError("no window of its dither was whole: see the log for the reasons")
         self._id = self._total = None
         start = None if registration is None else registration.alpha
-        record, numbers = await self._workers.call(work_out, record, total, start)
+        job = partial(self._workers.call, work_out, record, total, start)
+        record, numbers = await with_another_worker(job)
         store = self._archive.noisy.store
         await asyncio.to_thread(store, record, numbers, self._instrument.name)
         return ev.MatrixMeasured(record=record)

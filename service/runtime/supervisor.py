@@ -102,8 +102,6 @@ class Supervisor:
             CLOCK_LEAPT: self._clock.complaint
         }
         """Functions that return the text of an alarm, or nothing for none; called each second."""
-        self.refits = command_results.Refits()
-        """Reconstructors that operators have ordered."""
         self._pending_window = PendingWindow()
         self._n_readings = 0
         self._own_matrix_read = asyncio.Event()
@@ -191,7 +189,7 @@ class Supervisor:
 
     async def submit(
         self, command: cmd.Command, actor: Actor = OPERATOR, order_id: str = ""
-    ) -> str:
+    ) -> Message:
         """Carry out an operator's command; return one sentence on what came of it.
 
         It is on record before it is done, and so is why it is refused. What it leads to has its
@@ -228,16 +226,14 @@ class Supervisor:
         except PyrcalError as error:
             self._writer.refused(order, actor, error)
             raise
-        self._writer.answered(order, actor, answer)
+        self._writer.answered(order, actor, str(answer))
         await self._writer.keep_orders(state)
         return answer
 
-    async def _result_of(self, order: command_results.GivenCommand) -> str:
+    async def _result_of(self, order: command_results.GivenCommand) -> Message:
         """Do what is asked, and say what the RTC says to it where that takes but a moment."""
         running = set(self._running)
-        effects = self._post(order.command, order.id)
-        if isinstance(order.command, cmd.Refit):
-            self.refits.begin(effects, self._clock.now_ns())
+        self._post(order.command, order.id)
         asked = self._running - running
         # The RTC answers these commands within a moment, and its answer is the result.
         if asked and isinstance(order.command, cmd.Measure | cmd.SetLoop | cmd.Ramp):
@@ -246,7 +242,7 @@ class Supervisor:
         while True:
             answer = order.result(self._engine.state)
             if answer.final or time.monotonic() > until_s:
-                return answer.text
+                return answer.message
             await asyncio.sleep(RESULT_POLL_INTERVAL_S)
 
     def matrix(self, matrix_id: str) -> NDArray[np.float32]:
@@ -555,7 +551,6 @@ class Supervisor:
         except Exception as error:  # noqa: BLE001 - a bug in one action must not end the service
             self._log.exception("action.broken", effect=type(effect).__name__)
             event = ev.JobFailed(effect=effect, text=f"internal error: {error!r}")
-        self.refits.end(effect, event)
         if event is not None:
             self._post(event, effect.cause)
 
@@ -579,9 +574,10 @@ class Supervisor:
 
     def _tell(self, before: TrackerState) -> None:
         """Log what is new in the state's log, at its level, and have it recorded."""
-        entries = new_lines(before, self._engine.state)
+        after = self._engine.state
+        entries = new_lines(before, after)
+        ids = archiving.ids_of(after, archiving.find_changed_ids(before, after)) if entries else {}
         for entry in entries:
-            ids = archiving.ids_of(entry.text, self._engine.state)
             told = getattr(self._log, _LEVELS.get(entry.level, entry.level.value))
             told(entry.name, text=entry.text, **ids)
         self._writer.changed(before, self._engine.state, entries)

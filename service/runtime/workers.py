@@ -227,7 +227,9 @@ class WorkerPool:
         return text
 
 
-async def with_another_worker(job: Callable[[], Awaitable[R]], lost: Callable[[str], None]) -> R:
+async def with_another_worker(
+    job: Callable[[], Awaitable[R]], lost: Callable[[str], object] = lambda _: None
+) -> R:
     """Return the result of a job, repeated if its worker died; ``lost`` is called with the reason.
 
     Raises

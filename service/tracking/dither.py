@@ -143,9 +143,9 @@ def on_answer(context: StepContext, request: DitherRequest, reply: Reply) -> Non
         return
     context.put_off(dither_s=10.0)
     context.dither = None
-    text = f"the RTC refused the dither: {reply.reason}"
-    context.raise_alarm(alarms.NO_DITHER, text)
-    context.fail(text)
+    refused = compose("dither.refused", reply.reason)
+    context.raise_alarm(alarms.NO_DITHER, refused)
+    context.fail(str(refused))
 
 
 def on_failure(context: StepContext, _: DitherRequest, __: str) -> None:
@@ -157,7 +157,7 @@ def on_failure(context: StepContext, _: DitherRequest, __: str) -> None:
 def on_stop_answer(context: StepContext, _: DitherStop, reply: Reply) -> None:
     """Put on record that the RTC goes on; it is asked again for as long as it must be."""
     if not reply.accepted:
-        context.warn("job.failed", f"the RTC did not stop the dither: {reply.reason}")
+        context.warn("job.failed", compose("dither.not-stopped", reply.reason))
 
 
 def follow_status(context: StepContext, rtc: Status) -> None:

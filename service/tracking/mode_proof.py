@@ -373,9 +373,12 @@ def proof_to_keep(state: TrackerState) -> ModeProof | None:
     Modes of the matrix in use are not kept as suspected, because after a restart the service does
     not know that matrix at first.
     """
-    proof, proven = _without_responses(state.matrices.mode_proof), proven_modes(state)
+    proof, proven = state.matrices.mode_proof, proven_modes(state)
     kept = replace(
         proof,
+        # The measured responses of modes end with the service. Where the model explains the RTC's
+        # own matrix well, sign and size of a mode are enough; else the gate needs its response.
+        proven=frozenset() if proof.own_weights else proof.proven,
         contrary=shunned_modes(state),
         suspected=proof.suspected - proven,
         shown=frozenset(),
@@ -383,21 +386,6 @@ def proof_to_keep(state: TrackerState) -> ModeProof | None:
         n_tries=0,
     )
     return None if kept == ModeProof() else kept
-
-
-def forget_responses(context: StepContext) -> None:
-    """Have modes dithered again after the worker was lost, if the gate needs their response."""
-    proof = _without_responses(context.matrices.mode_proof)
-    context.matrices = replace(context.matrices, mode_proof=proof)
-
-
-def _without_responses(proof: ModeProof) -> ModeProof:
-    """Return the results without the measured responses, which end with the worker.
-
-    Where the model explains the RTC's own matrix well, sign and size of a mode are enough. Where
-    it does not, the gate needs the measured response of each mode that is newly controlled.
-    """
-    return replace(proof, proven=frozenset()) if proof.own_weights else proof
 
 
 def restore_proof(context: StepContext, proof: ModeProof, session: str) -> None:

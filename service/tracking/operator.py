@@ -11,7 +11,14 @@ from service.records import commands as cmd
 from service.records import events as ev
 from service.records.alarms import PROBATION
 from service.records.commands import GainGroup, ModeGroup
-from service.records.operations import CommandState, Dither, DitherPurpose, LoopCommand
+from service.records.operations import (
+    CommandState,
+    Dither,
+    DitherPurpose,
+    LoopCommand,
+    RefitJob,
+    RefitState,
+)
 from service.records.products import MatrixState, ModeSet
 from service.records.state import Level, Mode
 from service.tracking import dither_request, reconstructors
@@ -72,6 +79,36 @@ def refit(context: StepContext, command: cmd.Refit) -> None:
     if not 0 < asked <= rtc.n_modes:
         raise CommandError(f"found {asked} modes; expected 1 to {rtc.n_modes}")
     reconstructors.request_matrix(context, ev.MakeMatrix(n_modes=asked, why="the operator asked"))
+    job = RefitJob(
+        id=context.cause, state=RefitState.RUNNING, n_modes=asked, asked_ns_utc=context.now_ns
+    )
+    refits = (*context.operations.refits, job)[-REFITS_KEPT:]
+    context.operations = replace(context.operations, refits=refits)
+
+
+def on_refit_made(context: StepContext, made: ev.MatrixMade) -> None:
+    """Note that a refit has made its reconstructor, and what the gate says of it."""
+    record = made.record
+    verdict = record.reason if record.gate is None else record.gate.reason
+    refused = record.state is MatrixState.REFUSED
+    state = RefitState.REFUSED if refused else RefitState.MADE
+    text = f"{record.id}, {record.n_modes} modes: {verdict}"
+    _end_refit(context, state, text, record.id)
+
+
+def on_refit_failed(context: StepContext, _: ev.MakeMatrix, text: str) -> None:
+    """Note that a refit has made no reconstructor."""
+    _end_refit(context, RefitState.FAILED, text)
+
+
+def _end_refit(context: StepContext, state: RefitState, text: str, made: str | None = None) -> None:
+    refits = tuple(
+        replace(job, state=state, reconstructor=made, reason=text)
+        if job.id == context.cause and job.state is RefitState.RUNNING
+        else job
+        for job in context.operations.refits
+    )
+    context.operations = replace(context.operations, refits=refits)
 
 
 def start_dither(context: StepContext, command: cmd.StartDither) -> None:
@@ -164,6 +201,9 @@ def change_mode(context: StepContext, mode: Mode) -> None:
     other = None if mode is of_settings else of_settings
     context.operator = replace(context.operator, mode=mode, settings_mode=other)
 
+
+REFITS_KEPT = 100
+"""Newest refits whose results are remembered, until the service ends."""
 
 RAMP_GROUPS = ((0, 1), (2, 99), (100, None))
 """Tip and tilt, to mode 100, the rest: the paper's groups (Heritier et al. 2018, section 5)."""

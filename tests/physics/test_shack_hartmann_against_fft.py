@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pyrcal.fitting.matrix import FitOptions, fit_matrix
+from service.estimation.reference import Reference
 from service.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
@@ -42,8 +44,11 @@ def shapes(basis):
     return sampled(basis, 8)
 
 
-def by_brute_force(instrument, shapes, alpha, counted):
-    """Return slopes ``(2, n, n, n_modes)`` of the mirror's modes at a registration."""
+def by_brute_force(instrument, shapes, alpha, counted, width=1):
+    """Return slopes ``(2, n, n, n_modes)`` of the mirror's modes at a registration.
+
+    Pixels are ``width`` λ/d wide.
+    """
     moved = instrument.stop is Stop.MIRROR
     shift = alpha.vector[:2]
 
@@ -51,7 +56,7 @@ def by_brute_force(instrument, shapes, alpha, counted):
         on_pupil = points if moved else points - shift
         return shapes(on_pupil @ rotation(alpha.rotation_rad) / alpha.magnification)
 
-    return pushed(instrument, opd_at, shift if moved else (0.0, 0.0), counted)
+    return pushed(instrument, opd_at, shift if moved else (0.0, 0.0), counted, width=width)
 
 
 def errors(model, ours, brute, lit):
@@ -107,3 +112,24 @@ def test_derivatives_are_the_differences_of_spots_transformed(lenslets, basis, s
         )
         found = errors(model, ours, (more - less) / (2.0 * STEPS[k]), full)
         assert np.all(found < [0.006, 0.006, 0.016, 0.045]), (k, found)
+
+
+@pytest.mark.parametrize("lenslets", [Stop.TELESCOPE], indirect=True)
+def test_a_spot_half_a_pixel_wide_is_fitted_to_a_thousandth_and_accepted(lenslets):
+    """Sets of modes are 6 sigma apart, and 0.001 subaperture: once refused."""
+    modes = np.arange(0, 60, 3)
+    basis = modal_basis(lenslets)
+    x, y, turn, size = np.random.default_rng([36, 2, 6, 16]).uniform(-1.0, 1.0, 4)
+    vector = np.array([0.6 * x, 0.6 * y, np.deg2rad(3.0 * turn), 1.0 + 0.02 * size])
+    alpha = Misregistration.from_vector(vector)
+    found = by_brute_force(lenslets, sampled(basis.subset(modes), 8), alpha, np.ones_like, width=2)
+    pixel = 2.0 * lenslets.wfs.wavelength_m / lenslets.subaperture_m
+    about = replace(
+        lenslets, wfs=replace(lenslets.wfs, pixel_scale_arcsec=np.rad2deg(pixel) * 3600.0)
+    )
+    matrix = found[:, InteractionModel(about, basis).valid].reshape(-1, len(modes))
+    fit = fit_matrix(about, Reference(matrix=matrix, modes=modes), FitOptions(), basis=basis)
+    error = np.abs(fit.alpha.vector - vector)
+    assert fit.accepted
+    assert np.all(error < 3.0 * fit.sigma)
+    assert np.all(error < [0.001, 0.001, 1e-4, 3e-4])

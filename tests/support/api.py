@@ -14,7 +14,6 @@ from service.link.statistics import LinkStatistics
 from service.model.misregistration import Misregistration
 from service.records.alarms import Alarm
 from service.records.commands import Refit
-from service.records.events import MakeMatrix
 from service.records.messages import as_message
 from service.records.operations import (
     Dither,
@@ -22,11 +21,12 @@ from service.records.operations import (
     DitherPlan,
     DitherPolicyState,
     DitherPurpose,
+    RefitJob,
+    RefitState,
 )
 from service.records.products import GateVerdict, MatrixState, ReconstructorRecord
 from service.records.registration import HistoryEntry, PassiveState, Registration
 from service.records.state import Level, LogEntry, Mode
-from service.runtime.command_results import Refits
 from service.runtime.snapshot import Snapshot
 from service.wire import DitherKind, DitherRequest, DitherStatus, Loop, Status
 from tests.support.situations import POLICY
@@ -212,7 +212,6 @@ class FakeService:
     refusal: Exception | None = None
     thread: int | None = None
     archive: Archive | None = None
-    refits: Refits = field(default_factory=Refits)
 
     def snapshot(self):
         return self.now
@@ -223,9 +222,14 @@ class FakeService:
         self.commands.append(command)
         self.callers.append(caller)
         if isinstance(command, Refit):
-            effect = MakeMatrix(n_modes=command.n_modes or 1, why="", cause=order_id)
-            self.refits.begin([effect], self.now.now_ns)
-        return f"{type(command).__name__} is on its way"
+            job = RefitJob(
+                id=order_id,
+                state=RefitState.RUNNING,
+                n_modes=command.n_modes or 1,
+                asked_ns_utc=self.now.now_ns,
+            )
+            self.now = replace(self.now, tracker=changed(self.now.tracker, refits=(job,)))
+        return as_message("command", f"{type(command).__name__} is on its way")
 
     def audit(self, entry):
         self.trail.append(entry)

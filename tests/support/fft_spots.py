@@ -25,25 +25,26 @@ def fine_points(n, shift):
 
 
 @cache
-def _transform(n_pixels):
-    """Return the matrix ``(n_pixels * FINE, SAMPLES)`` of the padded transform's middle points.
+def _transform(n_points):
+    """Return the matrix ``(n_points, SAMPLES)`` of the padded transform's middle points.
 
     Most of a padded transform is light that no pixel counts; this is the rest, to rounding.
     """
     # half a step aside: a pixel then holds whole numbers of them, and lies as the field does
-    places = np.arange(n_pixels * FINE) - n_pixels * FINE / 2 + 0.5
+    places = np.arange(n_points) - n_points / 2 + 0.5
     return np.exp(-2j * np.pi / PADDED * np.outer(places, np.arange(SAMPLES)))
 
 
-def spots(field, n_pixels):
-    """Return pixels ``(..., n_pixels, n_pixels)``, λ/d wide, of fields ``(..., y, x)``."""
-    transform = _transform(n_pixels)
+def spots(field, n_pixels, width=1):
+    """Return pixels ``(..., n_pixels, n_pixels)`` of ``width`` λ/d, for fields ``(..., y, x)``."""
+    fine = width * FINE
+    transform = _transform(n_pixels * fine)
     light = np.abs(transform @ (field @ transform.T)) ** 2
-    return light.reshape(*light.shape[:-2], n_pixels, FINE, n_pixels, FINE).sum((-3, -1))
+    return light.reshape(*light.shape[:-2], n_pixels, fine, n_pixels, fine).sum((-3, -1))
 
 
 def centroids(light):
-    """Return ``(2, ...)`` in λ/d: pixels times their places over pixels; 0 where it is dark."""
+    """Return ``(2, ...)`` in pixels: pixels times their places over pixels; 0 where it is dark."""
     places = np.arange(light.shape[-1]) - (light.shape[-1] - 1) / 2
     total = np.maximum(light.sum((-2, -1)), 1e-12)
     return np.stack([light.sum(-2) @ places, light.sum(-1) @ places]) / total
@@ -68,21 +69,22 @@ def sampled(basis, reach):
     return render
 
 
-def pushed(instrument, opd_at, shift, counted, n_pixels=6):
-    """Return slopes ``(2, n, n, n_shapes)`` per metre: half the push less half the pull.
+def pushed(instrument, opd_at, shift, counted, n_pixels=6, width=1):
+    """Return slopes ``(2, n, n, n_shapes)`` in λ/d per metre: half the push less half the pull.
 
     ``opd_at(points)`` are wavefronts ``(n_points, n_shapes)`` at places in the pupil; ``counted``
     makes of a spot of a full lenslet what its pixels count.
     """
     wave = 2j * np.pi / instrument.wfs.wavelength_m
-    counts = counted(spots(np.ones((SAMPLES, SAMPLES)), n_pixels))
+    counts = counted(spots(np.ones((SAMPLES, SAMPLES)), n_pixels, width))
     rows = []
     for points in fine_points(instrument.wfs.n_subapertures, shift):
         radius = np.hypot(points[..., 0], points[..., 1]) / (instrument.wfs.pupil_diameter / 2)
         amplitude = (radius <= 1.0) & (radius >= instrument.obscuration_ratio)
         opd = np.moveaxis(opd_at(points.reshape(-1, 2)).reshape(*radius.shape, -1), -1, 0)
         push, pull = (
-            centroids(counts * spots(amplitude * np.exp(step * wave * opd), n_pixels))
+            width
+            * centroids(counts * spots(amplitude * np.exp(step * wave * opd), n_pixels, width))
             for step in (PUSH_M, -PUSH_M)
         )
         rows.append((push - pull) / (2.0 * PUSH_M))

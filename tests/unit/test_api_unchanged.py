@@ -1,6 +1,7 @@
 """What is not sent twice, where to look for what was begun, and what became of a refit."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,10 @@ import pytest
 from service.records import commands as cmd
 from service.records import events as ev
 from service.records.products import MatrixState, ReconstructorRecord
+from service.tracker import step
 from tests.support.api import SECOND, STATE, assert_problem, entry
+from tests.support.situations import POLICY, rtc
+from tests.support.states import changed
 
 DESCRIBED = json.loads(
     (Path(__file__).parents[2] / "docs" / "openapi.json").read_text(encoding="utf-8")
@@ -112,22 +116,27 @@ async def test_a_refit_is_a_job_that_tells_what_it_has_made(client, service):
 MADE = ReconstructorRecord(
     id="cm-2", state=MatrixState.REFUSED, n_modes=300, created_ns_utc=3, reason="unstable"
 )
+MAKE = ev.MakeMatrix(n_modes=300, why="")
 
 
 @pytest.mark.parametrize(
     ("event", "state", "made", "reason"),
     [
         (ev.MatrixMade(record=MADE, wanted=True), "refused", "cm-2", "unstable"),
-        (ev.JobFailed(effect=None, text="no model"), "failed", None, "no model"),
-        (None, "failed", None, "given up"),
+        (ev.JobFailed(effect=MAKE, text="no model"), "failed", None, "no model"),
     ],
 )
 async def test_how_a_refit_ends_is_kept(client, service, event, state, made, reason):
-    effect = ev.MakeMatrix(n_modes=300, why="", cause="refit-1")
-    service.refits.begin([effect], SECOND)
-    service.refits.end(ev.MakeMatrix(n_modes=300, why="", cause="refit-2"), None)
-    service.refits.end(ev.JudgeMatrix(id="cm-1", cause="refit-1"), None)  # what else it led to
-    service.refits.end(effect, event)
+    begun = changed(service.now.tracker, rtc=rtc())
+    for told, cause in (
+        (cmd.Refit(n_modes=300), "refit-1"),
+        (ev.JobFailed(effect=MAKE, text="another"), "refit-2"),
+        (ev.JobFailed(effect=ev.JudgeMatrix(id="cm-1"), text="what else it led to"), "refit-1"),
+        (event, "refit-1"),
+        (ev.JobFailed(effect=MAKE, text="again"), "refit-1"),
+    ):
+        begun, _ = step(begun, told, POLICY, service.now.now_ns, cause)
+    service.now = replace(service.now, tracker=begun)
     job = (await client.get("/v1/refits/refit-1")).json()
     assert (job["state"], job["reconstructor"]) == (state, made)
     assert reason in job["reason"]

@@ -157,10 +157,11 @@ def names_imported(module, *, has_children):
 
 
 def composed():
-    """Return each code of a message in service, with the names of its values; names of lines."""
-    codes, lines = defaultdict(list), set()
+    """Return names of values by code of a message in service, all texts, and names of lines."""
+    codes, texts, lines = defaultdict(list), set(), set()
     for path in (ROOT / "service").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            texts |= {node.value} if is_text(node) else set()
             if not isinstance(node, ast.Call):
                 continue
             called = getattr(node.func, "attr", getattr(node.func, "id", ""))
@@ -172,7 +173,7 @@ def composed():
                     codes[code].append(about | {word.arg for word in node.keywords})
             elif called in {"log", "warn", "logged", "_note", "as_message"}:
                 lines |= set(names)
-    return codes, lines
+    return codes, texts, lines
 
 
 def is_text(node):
@@ -180,8 +181,8 @@ def is_text(node):
 
 
 def test_each_message_has_its_sentence_and_each_sentence_its_values():
-    codes, lines = composed()
-    assert codes.keys() == SENTENCES.keys()
+    codes, texts, lines = composed()
+    assert codes.keys() <= SENTENCES.keys() <= texts
     for code, sentence in SENTENCES.items():
         names = {name for _, name, _, _ in Formatter().parse(sentence) if name is not None}
         # What makes it another message need not be said.
@@ -190,3 +191,86 @@ def test_each_message_has_its_sentence_and_each_sentence_its_values():
     # A line without a code of its own has its name as code, and its text as the sentence.
     assert not lines & SENTENCES.keys()
     assert len(lines) > 60
+
+
+CUTS = {"startswith", "endswith", "removeprefix", "removesuffix", "partition", "rpartition"}
+
+WORDS = {"text", "reason", "verdict", "message", "detail", "note", "line", "error", "words", "id"}
+
+WORDS_READ = {
+    "service/files/toml.py": "messages of msgspec, which has no codes",
+    "service/link/session.py": "messages of zenoh and of the operating system, which have no codes",
+    "service/runtime/cluster.py": "the first line of an error of Dask is shown",
+    "service/tracking/dither_request.py": "only the id is known of a dither that nobody follows",
+    "service/tracking/transitions.py": "a table in the source, written as text",
+    "pyrcal/fitting/advice.py": "the verdict names the alternatives and the entries of the file",
+    "pyrcal/fitting/alternatives.py": "names of what may be another instrument's",
+    "pyrcal/fitting/arguments.py": "words of the command line",
+    "pyrcal/fitting/fit_file.py": "an error begins with the name of its file",
+    "pyrcal/fitting/fit_table.py": "notes of importers repeat what a fit has found",
+    "pyrcal/fitting/gain_causes.py": "names of what may be another instrument's",
+    "pyrcal/maintenance/archive.py": "an error begins with the name of its file",
+    "pyrcal/maintenance/commission_page.py": "the audit trail keeps sentences only",
+}
+
+READERS = {
+    "service/config/link_tables.py": "addresses",
+    "service/config/settings.py": "names of environment variables",
+    "service/files/__init__.py": "ranges of rows that a user writes",
+    "service/files/toml.py": "places in a file",
+    "service/link/guard.py": "addresses",
+    "service/link/leader_election.py": "pattern of names of services",
+    "service/link/session.py": "messages of zenoh, which have no codes",
+    "service/program.py": "addresses in messages of zenoh",
+    "service/records/events.py": "names of classes",
+    "service/web/authentication.py": "addresses",
+    "service/web/commands.py": "routes",
+    "service/web/connections.py": "pattern of ids of requests",
+    "service/web/keys.py": "pattern of names of keys",
+    "service/web/page.py": "JSON",
+    "service/wire/keys.py": "pattern of ids",
+    "pyrcal/arguments.py": "negative numbers on the command line",
+    "pyrcal/client/orders.py": "routes",
+    "pyrcal/client/remote.py": "names of classes",
+    "pyrcal/importers/cacao.py": "names of files, and scripts",
+    "pyrcal/importers/layouts.py": "names of files",
+}
+
+
+def last_name(node):
+    """Return the name at the end of an expression, of what a call is made on or with."""
+    while isinstance(node, ast.Call):
+        if isinstance(node.func, ast.Attribute):
+            node = node.func.value
+        else:
+            node = node.args[0] if getattr(node.func, "id", "") == "str" else node.func
+    return getattr(node, "attr", getattr(node, "id", ""))
+
+
+def reads_words(node):
+    """Return True if an expression cuts, or looks into, an id or a sentence."""
+    if isinstance(node, ast.Call) and getattr(node.func, "attr", "") in CUTS:
+        name = last_name(node.func.value)
+    elif isinstance(node, ast.Compare) and isinstance(node.ops[0], ast.In | ast.NotIn):
+        name = last_name(node.comparators[0])
+    else:
+        return False
+    return name in WORDS or name.endswith("_id")
+
+
+def test_nothing_but_people_reads_sentences_and_ids():
+    """Codes, values and fields say what a program has to know."""
+    readers, patterns = set(), set()
+    for top in ("service", "pyrcal"):
+        for path in (ROOT / top).rglob("*.py"):
+            if "manual" in path.parts:
+                continue
+            name = path.relative_to(ROOT).as_posix()
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            if any(reads_words(node) for node in ast.walk(tree)):
+                readers.add(name)
+            imported = (n for n in ast.walk(tree) if isinstance(n, ast.Import))
+            if any(one.name == "re" for n in imported for one in n.names):
+                patterns.add(name)
+    assert readers == WORDS_READ.keys()
+    assert patterns == READERS.keys()

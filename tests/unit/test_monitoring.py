@@ -20,7 +20,7 @@ from service.records.alarms import (
 )
 from service.records.messages import as_message
 from service.records.registration import Validity
-from service.runtime.archiving import ids_of
+from service.runtime.archiving import find_changed_ids, ids_of
 from tests.support.api import LINK, SECOND, STATE, assert_problem
 from tests.support.repository import ROOT
 from tests.support.states import changed
@@ -235,12 +235,17 @@ async def test_a_request_is_found_in_the_log_by_the_id_of_its_answer(client, ser
 
 def test_a_line_has_the_frame_and_the_matrices_it_is_about():
     state = changed(STATE, rtc=replace(STATE.loop.rtc, seq=81_234))
-    assert ids_of("cm-1 applied", state) == {
+    assert ids_of(state, {"cm-1", "cm-9"}) == {
         "frame": 81_234,
         "in_use": "rtc-0",
         "matrices": ["cm-1"],
     }
-    assert ids_of("nothing", STATE) == {"in_use": "rtc-0"}
+    assert ids_of(STATE, ()) == {"in_use": "rtc-0"}
+    proposed = replace(state.matrices.reconstructors[0])
+    others = state.matrices.reconstructors[1:]
+    after = changed(state, reconstructors=(proposed, *others))
+    assert find_changed_ids(state, after) == {proposed.id}
+    assert find_changed_ids(state, state) == set()
 
 
 def test_what_alpha_is_worth_is_a_label_of_a_rule():

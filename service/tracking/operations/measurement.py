@@ -97,7 +97,7 @@ def give_up(context: StepContext, measurement_id: str) -> None:
         return
     given_up = replace(record, state=MeasureState.GIVEN_UP)
     if record.pattern is None:
-        store_measurement(context, replace(given_up, reason="by the operator"))
+        store_measurement(context, replace(given_up, reason="given up by the operator"))
         context.log("noisy-matrix.given-up", record.id)
         if context.dither is not None and context.dither.id == record.id:
             stop_running_dither(context)

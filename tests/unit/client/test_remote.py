@@ -22,14 +22,15 @@ from service.archive import AuditEntry, Channel
 from service.archive.products import RecordingRecord
 from service.control.gains import gain_table
 from service.errors import CommandError
-from service.records.events import MakeMatrix, MatrixMade
+from service.records.events import MatrixMade
 from service.records.operations import AcquisitionStage
 from service.records.products import MatrixState, ReconstructorRecord
 from service.records.registration import ModeGain
 from service.records.state import Mode
+from service.tracker import step
 from service.web.connections import Server
 from tests.support.api import MATRIX, SECOND, STATE, FakeService, a_snapshot
-from tests.support.situations import ALL_SHOWN
+from tests.support.situations import ALL_SHOWN, POLICY, rtc
 from tests.support.states import changed
 
 BEFORE = ReconstructorRecord(
@@ -337,9 +338,11 @@ def test_a_refit_is_followed_until_there_is_a_reconstructor(
     )
 
     def happens():
-        (job,) = service.refits._jobs
-        effect = MakeMatrix(n_modes=300, why="", cause=job)
-        service.refits.end(effect, MatrixMade(record=made, wanted=True))
+        tracker = changed(service.now.tracker, rtc=rtc())
+        (job,) = tracker.operations.refits
+        event = MatrixMade(record=made, wanted=True)
+        after, _ = step(tracker, event, POLICY, service.now.now_ns, job.id)
+        service.now = replace(service.now, tracker=after)
 
     at_the_next_look(monkeypatch, happens)
     assert main(["reconstructors", "compute"]) == status

@@ -17,6 +17,8 @@ import pytest
 from pyrcal.__main__ import main
 from pyrcal.fitting.advice import Advice
 from pyrcal.fitting.matrix import FitOptions, Method, fit_matrix
+from pyrcal_studies.advice_followed import PROVOCATIONS, follow, measure
+from pyrcal_studies.drawn_fits import Draw
 from pyrcal_studies.fft_pyramid import FftPyramid
 from service.errors import MatrixError, ModelError
 from service.estimation.reference import Reference
@@ -501,3 +503,21 @@ def check_right(found, scale=1.0):
     true = ALPHA.vector * [1.0, 1.0, 1.0, scale]
     assert found.accepted, found.verdict
     assert np.all(np.abs(found.alpha.vector - true) < 3.0 * found.sigma)
+
+
+@pytest.mark.parametrize(
+    ("provocation", "seed", "advice"),
+    [
+        # Found on the coarse grid, a turn was 0.4 to 0.8 deg beyond the right one.
+        ("arms turned by 1 deg", 701, "spiders_deg"),
+        ("map turned by 6 deg", 707, "pupil"),
+        # Light that fades outwards was a narrower pupil.
+        ("uneven light", 701, "--gain-map"),
+    ],
+)
+def test_advice_on_a_drawn_matrix_followed_once_is_accepted_and_right(provocation, seed, advice):
+    draw = Draw(code="fft", condition=PROVOCATIONS[provocation].condition, seed=seed)
+    (row,) = follow(provocation, draw, measure(draw))
+    assert row["advice"] == advice
+    assert row["followed"]["accepted"]
+    assert row["followed"]["worst"] < 3.0

@@ -4,7 +4,7 @@ import h5py
 import numpy as np
 import pytest
 
-from service.errors import CommandError, UnknownIdError
+from service.errors import CommandError, UnknownIdError, WorkerError
 from service.estimation.frames import FrameBlock
 from service.estimation.random_dither import RandomDither, RandomPlan
 from service.model.misregistration import Misregistration
@@ -132,6 +132,23 @@ async def test_what_came_before_the_rtc_restarted_does_not_count(desk, workers):
     desk.take(before, STATE)
     made = await finish(desk, workers, n=1, session="s2")
     assert (made.record.finding.session, made.record.finding.n_frames) == ("s2", 999)
+
+
+async def test_a_worker_that_dies_of_the_last_job_takes_no_window_with_it(archive, workers):
+    class Dying(NearCrew):
+        n_jobs = 0
+
+        async def call(self, job, *args):
+            self.n_jobs += 1
+            if self.n_jobs == 1:
+                raise WorkerError("the worker process died during work_out")
+            return await super().call(job, *args)
+
+    dying = Dying()
+    desk = NoisySums(workers=dying, archive=archive, instrument=small_instrument())
+    made = await finish(desk, dying)
+    assert (made.record.state, made.record.finding.n_frames) == (MeasureState.STORED, 1998)
+    assert dying.n_jobs == 2
 
 
 async def test_a_matrix_nobody_can_fit_is_kept_and_says_so(desk, workers):

@@ -10,7 +10,7 @@ import pytest
 
 from pyrcal_studies.campaign.observatory import OwnHands
 from service.control.dither import COARSE_BAND, FINE_BAND
-from service.errors import ModelError, UnknownIdError
+from service.errors import ModelError, UnknownIdError, WorkerError
 from service.estimation import passive
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import LockIn, LockInPlan
@@ -581,6 +581,32 @@ async def test_after_a_restart_the_rtcs_own_matrix_is_read_and_not_the_one_made_
         raise UnknownIdError(name)
 
     assert (await read(lost)).misfit < 0.02
+
+
+async def test_a_worker_that_dies_of_the_rtcs_own_matrix_takes_no_slope_order_with_it():
+    """The next one recognises the modes, by the order that the dead one has found."""
+    rtc = Mistold(order="yx", flip_y=True, sign_x=-1)
+    record = ReconstructorRecord(
+        id="own", state=MatrixState.APPLIED, n_modes=N_CONTROLLED, created_ns_utc=0
+    )
+    state = tracker_state(system="small", reconstructors=(record,), in_use="own")
+
+    class Dying(OwnHands):
+        died = False
+
+        async def call(self, job, *args, **kwargs):
+            if job is OpticsWorker.recognise and not self.died:
+                self.died = True
+                self._workbench = OpticsWorker(rtc.auto._file, COMPUTE)
+                raise WorkerError("the worker process died during recognise")
+            return await super().call(job, *args, **kwargs)
+
+    workers = Dying(rtc.auto)
+    found = await read_own_matrix(record, rtc.own, state, workers, None)
+    (recognised,) = (event for event in found if isinstance(event, ModesRecognised))
+    assert (recognised.strange, recognised.misfit < 0.05) == ((), True)
+    assert workers.model().slopes[0] == "yx"
+    assert workers.model().own_matrix_read
 
 
 N_MORE = 79

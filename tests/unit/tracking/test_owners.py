@@ -42,6 +42,9 @@ def written(tree):
                 yield from (keyword.arg or "" for keyword in keywords)
             case ast.Assign([ast.Attribute(ast.Name("context"), name)]) if name in ATTRIBUTES:
                 yield ATTRIBUTES[name]
+            case ast.Assign([ast.Attribute(ast.Name("context"), "model")]):
+                # the worker changes it as a whole
+                yield from (part for part in PARTS if part.startswith("model."))
             case _:
                 continue
 
@@ -54,6 +57,7 @@ def written(tree):
         ("replace(state.windows, run=run + 1)", 1),
         ("replace(self.state.alarms, active=())", 1),
         ("replace(state, log=())", 1),
+        ("context.model = event.model", len(fields(BLANK.model))),
         ("context.dither_policy = replace(context.dither_policy, phase=phase)", 1),
         ("replace(record, state=done)", 0),
         ("state.alpha.history", 0),

@@ -197,7 +197,8 @@ def locate_images(
     """Return the instrument with its pupil images located in a mean frame, remarks, and σ.
 
     Positions in the instrument file are kept, and a remark states how far the light is from them.
-    The last value is 1 σ of the middle of the images, subapertures.
+    The last value is 1 σ of the middle of the images, subapertures; the distance of the light from
+    positions in the file is part of it.
 
     Raises
     ------
@@ -207,13 +208,18 @@ def locate_images(
     windows = instrument.frames
     if not isinstance(windows, FrameWindows):
         return instrument, (), 0.0
-    light = flux_frame.astype(np.float64)
-    sigma = _place_sigma(instrument, light, windows.pixels_per_subaperture)
+    light, pixels = flux_frame.astype(np.float64), windows.pixels_per_subaperture
+    sigma = _place_sigma(instrument, light, pixels)
     if windows.centres_px is not None:
-        moving = instrument.stop is Stop.MIRROR  # the images move with the mirror
-        expected = by_quadrant(windows.centres_px).reshape(4, 2)
-        remarks = () if moving else _beside_the_light(instrument, windows, expected, light)
-        return instrument, remarks, sigma
+        seen = image_centres(instrument, light)
+        # the images move with the mirror if that is the stop
+        if seen is None or instrument.stop is Stop.MIRROR:
+            return instrument, (), sigma
+        away = (seen - by_quadrant(windows.centres_px).reshape(4, 2)) / pixels
+        middle = float(np.abs(away.mean(axis=0)).max())
+        if middle * pixels > _EVEN_SIGMA_PX:
+            sigma = float(np.hypot(sigma, middle))
+        return instrument, _beside_the_light(seen, float(np.hypot(*away.T).max())), sigma
     centres = frame_windows(instrument, light).centres_px.reshape(4, 2)
     found = _format_centres(centres)
     remark = f"shifts count from the pupil images as found: pupil_centres_px = [{found}]"
@@ -236,20 +242,12 @@ def _place_sigma(instrument: Instrument, light: Array, pixels: int) -> float:
     return sigma / pixels if sigma > _EVEN_SIGMA_PX else 0.0
 
 
-def _beside_the_light(
-    instrument: Instrument, windows: FrameWindows, expected: Array, light: Array
-) -> tuple[str, ...]:
+def _beside_the_light(found: Array, away_subap: float) -> tuple[str, ...]:
     """Return a remark if the centres of the file differ from the pupil images of the flux frame."""
-    pixels = windows.pixels_per_subaperture
-    try:
-        found = found_centres(light, instrument.wfs.pupil_diameter * pixels).reshape(4, 2)
-    except ModelError:
-        return ()
-    away = float(np.hypot(*(found - expected).T).max()) / pixels
-    if away <= _REMARK_DISTANCE_SUBAP:
+    if away_subap <= _REMARK_DISTANCE_SUBAP:
         return ()
     return (
-        f"wfs.pupil_centres_px are up to {away:.2f} subapertures from the pupil images of "
+        f"wfs.pupil_centres_px are up to {away_subap:.2f} subapertures from the pupil images of "
         f"the flux frame, which are centred at [{_format_centres(found)}]: correct the key",
     )
 

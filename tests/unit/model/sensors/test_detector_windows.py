@@ -178,6 +178,13 @@ def test_centres_half_a_subaperture_beside_the_light_are_said():
     assert locate_images(replace(moved, stop=Stop.MIRROR), light)[1] == ()
 
 
+def test_the_place_of_the_images_is_as_unsure_as_centres_in_the_file_are_beside_the_light():
+    about = replace(bench(RECTANGLE + np.array([0.3, -0.1])), stop=Stop.TELESCOPE)
+    light = four_discs(60, RECTANGLE, about.wfs.pupil_diameter * 2)
+    assert locate_images(about, light)[2] == pytest.approx(0.3 / 2, abs=0.01)
+    assert locate_images(replace(about, stop=Stop.MIRROR), light)[2] == 0.0
+
+
 def test_uneven_light_makes_the_place_of_the_images_unsure():
     about = bench(RECTANGLE)
     light = four_discs(60, RECTANGLE, about.wfs.pupil_diameter * 2)

@@ -9,6 +9,7 @@ from service.records import alarms
 from service.records import events as ev
 from service.records.events import Effect
 from service.records.products import MatrixState
+from service.records.registration import Source
 from service.records.state import ModelState
 from service.tracking import (
     dither,
@@ -151,22 +152,31 @@ def _note_renaming(context: StepContext, before: Status | None, rtc: Status) -> 
 
     The link refuses one that the instrument file fixes, and one that comes with other sizes.
     """
-    loop, registration = context.loop, context.registration
-    known = loop.config_id if before is None else before.config_id
-    if rtc.config_id != known:
-        context.loop = replace(context.loop, renamed_ns_utc=rtc.t_ns)
-        reconstructors.verify_again(context)
-        validity.request_window(context, "the RTC has another config_id")
-        text = (
-            f"the RTC's config_id has changed from {known} to {rtc.config_id} with the same number "
-            "of slopes and modes: R-31 allows that for another mask, slope recipe, binning or "
-            "modulation only. It is taken for new reference slopes: have the RTC name them by "
-            "reference_id"
-        )
-        context.raise_alarm(alarms.RENAMED, context.alarm_text(alarms.RENAMED) or text)
+    known = context.loop.config_id if before is None else before.config_id
+    if rtc.config_id == known:
+        _prove_sensor(context, rtc)
         return
-    since_ns = loop.renamed_ns_utc
-    if since_ns is None or registration is None or registration.window_began_ns_utc < since_ns:
+    context.loop = replace(context.loop, renamed_ns_utc=rtc.t_ns)
+    reconstructors.verify_again(context)
+    validity.request_window(context, "the RTC has another config_id")
+    text = (
+        f"the RTC's config_id has changed from {known} to {rtc.config_id} with the same number of "
+        "slopes and modes: R-31 allows that for another mask, slope recipe, binning or modulation "
+        "only. It is taken for new reference slopes: have the RTC name them by reference_id"
+    )
+    context.raise_alarm(alarms.RENAMED, context.alarm_text(alarms.RENAMED) or text)
+
+
+def _prove_sensor(context: StepContext, rtc: Status) -> None:
+    """Take a renamed sensor for the same once matrix and response have shown it."""
+    renamed_ns = context.loop.renamed_ns_utc
+    windows = (
+        entry.t_ns_utc
+        for entry in reversed(context.alpha.history)
+        if entry.entered and entry.source is not Source.PASSIVE
+    )
+    # A window that ended later began later, too: it is cut where the name changes.
+    if renamed_ns is None or next(windows, 0) <= renamed_ns:
         return
     contradicted = {alarms.WRONG_MATRIX, alarms.WRONG_ANSWER} & {
         alarm.name for alarm in context.alarms.active

@@ -232,12 +232,15 @@ def _advise(context: StepContext) -> str:
 
 
 def _is_busy(context: StepContext) -> bool:
-    """Return True if a reconstructor is on its way, or one awaits an operator.
+    """Return True if a reconstructor is on its way, awaits an operator, or could not be sent.
 
+    None can after the RTC has renamed its sensor, until that is shown to be the same.
     In auto a proposal left from another mode or an absent RTC awaits no decision, unless there is
     no matrix to return to.
     """
     state = context.state
+    if state.loop.renamed_ns_utc is not None:
+        return True
     awaited = state.operator.mode is not Mode.AUTO or reconstructors.check_return(state) is not None
     return any(
         r.on_its_way

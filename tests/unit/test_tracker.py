@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from service import wire
+from service.records import alarms
 from service.records import events as ev
 from service.records.events import Event
 from service.records.products import MatrixState
@@ -14,6 +15,15 @@ from service.records.state import Mode
 from service.tracker import ANSWERS, DECIDERS, FAILURES, REACTIONS, step
 from service.tracking.step_context import StepContext
 from service.wire import DitherRequest
+from tests.support.activities import (
+    acquiring,
+    gathering,
+    idle,
+    measuring,
+    ramping,
+    stopped,
+    waiting_for_a_noisy_one,
+)
 from tests.support.situations import ALPHA, POLICY, Story, dither_answered, moved, of_kind, rtc
 from tests.support.states import tracker_state
 
@@ -126,3 +136,41 @@ def test_deciders_and_guards_are_not_given_the_event():
         assert list(get_type_hints(decide).values()) == [StepContext, NoneType], name
         for guard in guards:
             assert list(get_type_hints(guard).values()) == [StepContext, bool], name
+
+
+ALWAYS = {"a restored α", "the pointing law", "windows in a row", "the probation", "alarms"}
+ALWAYS |= {"alarms of what was decided"}
+OF_SERVICE = {"the dither", "reconstructors", "the offload"}
+REST = {"the RTC's matrix", "the acquisition", "a noisy matrix", "unwanted dithers"}
+
+
+STANDBY = ev.ServicesMet(drives=False, others=("the service on pyrcal-2",))
+DIVERGING = ev.ConditionChanged(name=alarms.DIVERGING, text="the loop diverges")
+
+
+@pytest.mark.parametrize(
+    ("activity", "event", "decided"),
+    [
+        (idle, ev.Tick(), REST | OF_SERVICE),
+        (idle, STANDBY, {"the acquisition", "a noisy matrix"}),
+        (idle, ev.RtcVanished(), {"the acquisition", "a noisy matrix"}),
+        (idle, DIVERGING, REST),
+        (measuring, ev.Tick(), set()),
+        (stopped, ev.Tick(), {"the RTC's matrix", "unwanted dithers"}),
+        (acquiring, ev.Tick(), {"the RTC's matrix", "the acquisition"}),
+        (
+            waiting_for_a_noisy_one,
+            ev.Tick(),
+            {"the RTC's matrix", "the acquisition", "a noisy matrix"},
+        ),
+        (gathering, ev.Tick(), REST | OF_SERVICE),
+        (ramping, ev.Tick(), REST),
+    ],
+)
+def test_what_is_decided_during_an_operation(activity, event, decided):
+    world = activity()
+    world.tell(event)
+    context = StepContext(world.state, POLICY, world.now_ns)
+    found = {one.name for one in DECIDERS if all(guard(context) for guard in one.guards)}
+    assert found - ALWAYS == decided
+    assert found >= ALWAYS

@@ -68,6 +68,9 @@ def test_ordinary_telemetry_is_looked_at_and_agrees(night):
 def test_matrices_and_session_stay(night):
     assert len(night.swaps) == 1
     assert night.swaps[0].id == night.state.matrices.in_use
+    made = night.state.reconstructor(night.swaps[0].id)
+    # The RTC had no name for its references before the first change but that of its sensor.
+    assert made.reference_id == made.config_id == night.state.loop.config_id
     assert night.state.operations.probation.state.value == "passed"
     assert night.state.loop.renamed_ns_utc is None
     started = [entry for entry in night.state.log if entry.name == "rtc.session"]

@@ -12,6 +12,7 @@ from service.tracking.interlocks import ALLOWS
 from service.tracking.operations.running import running_operations
 from service.tracking.resume import resumed, saved_of
 from service.wire import DitherStop, Loop, LoopRequest
+from tests.support.acquiring import DIVERGING, Acquiring
 from tests.support.activities import (
     ACTIVITIES,
     acquiring,
@@ -78,6 +79,16 @@ def test_an_acquisition_gives_back_the_loop_and_does_not_begin_again():
     assert world.state.operations.acquisition.stage is AcquisitionStage.ABORTED
     assert world.state.operations.acquisition.held_off
     assert world.loop == "closed"
+
+
+def test_a_loop_that_diverges_is_acquired_only_once_it_is_released():
+    story = Acquiring()
+    story.tell(STOP)
+    story.tell(DIVERGING)
+    story.wait(10)
+    assert story.stage is AcquisitionStage.IDLE
+    story.tell(cmd.Resume())
+    assert story.stage is AcquisitionStage.OPENING
 
 
 def test_measurements_are_given_up():

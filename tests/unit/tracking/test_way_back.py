@@ -231,6 +231,16 @@ def test_an_operator_who_sets_a_mode_meanwhile_has_taken_over():
     assert told.state.operator.mode is Mode.PROPOSE
 
 
+def test_one_who_does_so_while_the_loop_is_being_opened_has_taken_over():
+    told = gone_back(story())
+    told.tell(found(after="cm-2"), after_s=2.0)
+    assert trial(told).state is ProbationState.OPENING
+    told.tell(cmd.SetMode(mode=Mode.PROPOSE), after_s=0.1)
+    assert trial(told).state is ProbationState.KEPT
+    told.wait(20)
+    assert len(opened(told)) == 1
+
+
 @pytest.mark.parametrize(("after_s", "again"), [(60.0, False), (700.0, True)])
 def test_the_service_goes_on_by_itself_once_in_ten_minutes(after_s, again):
     """A matrix that is wrong, and spoils the loop for the next one too, is not sent for ever."""

@@ -11,7 +11,7 @@ from service.records.estimates import RefusalKind, WideCaptureEstimate
 from service.records.operations import AcquisitionStage
 from service.records.products import MatrixState
 from service.records.state import Mode
-from service.tracking.dither_request import lock_in_plan
+from service.tracking.dither_request import lock_in_plan, total_m
 from service.tracking.operations.acquisition import (
     MAX_ATTEMPTS,
     MAX_DIVERGENCE_S,
@@ -30,6 +30,7 @@ from tests.support.situations import (
     estimate,
     loop_answered,
     moved,
+    of_kind,
     rtc,
     verdict,
 )
@@ -373,6 +374,27 @@ class TestTrouble:
             story.wait(1)
         assert len(story.far_dithers) == 2
 
+    def test_dithers_that_are_refused_again_and_again_begin_it_anew(self):
+        story = Acquiring()
+        story.tell(cmd.Acquire())
+        story.open()
+        for n_refused in range(1, MAX_STAGE_MISSES + 1):
+            dither = story.state.dithers.dither
+            story.tell(dither_answered(dither.id, accepted=False, reason="busy", start_seq=None))
+            attempt = story.state.operations.acquisition.attempt
+            assert attempt == (1 if n_refused < MAX_STAGE_MISSES else 2)
+            for _ in range(11):
+                story.still_open()
+                story.wait(1)
+
+    def test_a_request_to_open_the_loop_without_an_answer_begins_it_anew(self):
+        story = Acquiring()
+        story.tell(cmd.Acquire())
+        (request,) = story.asked(LoopRequest)
+        story.tell(ev.JobFailed(effect=ev.Ask(request=request), text="no answer came"))
+        assert story.state.operations.acquisition.attempt == 2
+        assert len(story.asked(LoopRequest)) == 2
+
     def test_a_reconstructor_the_rtc_rejects_begins_it_anew(self):
         story = Acquiring().to_partial()
         story.make("cm-150", n_modes=150)
@@ -461,6 +483,21 @@ def test_one_whose_dither_cannot_be_read_ends_and_says_why():
     story.tell(ev.DitherUnusable(text="600 frames cut a period"))
     assert story.stage is AcquisitionStage.FAILED
     assert "600 frames cut a period" in story.text
+
+
+@pytest.mark.parametrize(("ratio", "stage"), [(3.0, "failed"), (1.05, "coarse")])
+def test_one_whose_dither_is_too_strong_ends(ratio, stage):
+    story = Acquiring()
+    story.tell(cmd.Acquire())
+    story.open()
+    dither = story.state.dithers.dither
+    asked_m = total_m(dither.request)
+    found = ev.DitherMeasured(
+        id=dither.id, found_m=ratio * asked_m, asked_m=asked_m, text="other than requested"
+    )
+    effects = story.tell(found)
+    assert story.stage == stage
+    assert bool(of_kind(effects, DitherStop)) is (stage == "failed")
 
 
 def test_one_in_whose_dithers_no_window_ever_ends_comes_to_an_end():

@@ -137,6 +137,19 @@ def test_a_dither_that_never_begins_is_a_failure_with_its_reason(story, event, w
     assert story.state.measurement("noisy-1").reason == words
 
 
+@pytest.mark.parametrize(
+    ("ratio", "state"), [(1.05, MeasureState.RUNNING), (30.0, MeasureState.FAILED)]
+)
+def test_a_dither_that_is_too_strong_ends_it(story, ratio, state):
+    begun(story)
+    found = ev.DitherMeasured(
+        id="noisy-1", found_m=ratio * 5e-9, asked_m=5e-9, text="other than requested"
+    )
+    effects = story.tell(found)
+    assert state_of(story) is state
+    assert bool(of_kind(effects, DitherStop)) is (state is MeasureState.FAILED)
+
+
 def test_a_fit_that_fails_is_a_failure_with_its_reason(story):
     begun(story)
     (finish,) = of_kind(status(story, dither_id=None, seq=1100 + 31_000), ev.FinishNoisy)

@@ -405,6 +405,7 @@ def _with_nearest_images(settled: Settled) -> tuple[FitModels, Nuisances]:
     modes = spread(settled.target.n_modes)
     few = settled.target.column_subset(modes)
     subset = replace(models, basis=models.basis.subset(modes))
+    own = subset.cheap
     blurring = np.array([is_blurring(pattern) for pattern in nuisances.images])
     # derivatives by a blur, evaluated without blur, would fit any residual
     free = np.ones(len(solution.nuisance_derivatives), dtype=bool)
@@ -422,8 +423,10 @@ def _with_nearest_images(settled: Settled) -> tuple[FitModels, Nuisances]:
         if improbable > seen.chi:
             return np.inf
         models.counter.n += 1
-        matrix = subset.with_displaced_images(displaced).cheap.interaction_matrix(solution.alpha)
-        return few.project(matrix, every).chi_at_best + improbable
+        moved = subset.with_displaced_images(displaced)
+        model = moved.model(models.cheap_sampling, once=True)
+        model.share_modes(own)
+        return few.project(model.interaction_matrix(solution.alpha), every).chi_at_best + improbable
 
     def blurred(displaced: Array, pattern: Array, size: float) -> float:
         return left(displaced + size * pattern)

@@ -111,15 +111,17 @@ class FitModels:
     ) -> InteractionModel:
         """Return a model of this sampling, for ``basis`` or the models' own modes.
 
-        A model that is used ``once`` for few modes does not compute the sensor's response to every
-        point of the pupil.
+        With few modes, a model that is used ``once`` or the fine one does not compute the sensor's
+        response to every point of the pupil.
         """
         known = self.made.get(sampling)
         # ``replace`` passes the same dictionary on to models of other instruments.
         if known is not None and known.instrument is self.instrument:
             return known.of_modes(basis or self.basis)
-        # with more modes the response to every point costs less, even if it is used once
+        # With more modes the response to every point costs less, even if it is used once. The fine
+        # model has no derivatives to share it.
         few = (basis or self.basis).n_modes < self.instrument.wfs.n_subapertures
+        once_each = once or sampling > self.cheap_sampling
         model = InteractionModel(
             self.instrument,
             basis or self.basis,
@@ -127,7 +129,7 @@ class FitModels:
             detector_nodes=sampling,
             illumination=self.illumination,
             mapper=self.mapper,
-            kept_bytes=0.0 if once and few else KEPT_BYTES,
+            kept_bytes=0.0 if few and once_each else KEPT_BYTES,
         )
         if known is not None:
             model.share_modes(known)

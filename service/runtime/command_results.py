@@ -10,6 +10,7 @@ from service.errors import CommandError, LinkError
 from service.records import commands as cmd
 from service.records.alarms import AlarmRecord
 from service.records.commands import Command
+from service.records.messages import Message, compose
 from service.records.operations import CommandState, MeasureState
 from service.records.products import MatrixState, ReconstructorRecord
 from service.records.state import TrackerState
@@ -18,20 +19,19 @@ from service.tracking.alarm_rules import format_value
 from service.tracking.dither_request import total_m
 from service.tracking.reconstructors import check_sendable
 
-SILENT = "sent, the RTC has not answered yet"
-
 _ON_ITS_WAY = {
-    MatrixState.PROPOSED: "is being judged again before it is sent",
-    MatrixState.PUBLISHED: SILENT,
-    MatrixState.STAGED: "sent, the RTC holds it and has not applied it yet",
+    MatrixState.PROPOSED: "command.judged-again",
+    MatrixState.PUBLISHED: "command.sent",
+    MatrixState.STAGED: "command.staged",
 }
+"""Codes of results while a matrix is on its way."""
 
 
 @dataclass(frozen=True, slots=True)
 class CommandResult:
-    """Text and id of an order's result."""
+    """Result of an order, as far as it is known."""
 
-    text: str
+    message: Message
     final: bool = True
     """True if waiting for the RTC or for a verdict would not change the result."""
 
@@ -74,13 +74,19 @@ def _report_republished(
     copies = [each for each in now.matrices.reconstructors if each.cause == cause]
     if not copies:
         source = command.id if isinstance(command, cmd.Publish) else now.previous
-        return CommandResult(f"{source} is being judged before it is sent again", final=False)
+        return CommandResult(compose("command.judged-first", id=source or ""), final=False)
     copy = copies[-1]
     if copy.state is MatrixState.REFUSED and isinstance(command, cmd.Rollback):
         raise CommandError(f"{_why_not(copy)}; ordered with anyway, it goes out all the same")
     sent = _of_matrix(now, copy.id)
-    text = f"{sent.text}; it is {copy.parent} again; mode is {now.operator.mode}"
-    return CommandResult(text, sent.final)
+    again = compose(
+        "command.again",
+        sent.message.key,
+        sent=str(sent.message),
+        parent=copy.parent or "",
+        mode=now.operator.mode,
+    )
+    return CommandResult(again, sent.final)
 
 
 def _of_matrix(now: TrackerState, name: str) -> CommandResult:
@@ -89,15 +95,16 @@ def _of_matrix(now: TrackerState, name: str) -> CommandResult:
         raise CommandError(f"{name} is not known any more")
     held = check_sendable(now, record) if record.state is MatrixState.PROPOSED else None
     if held is not None and not now.failure(record.cause):
-        return CommandResult(f"{name} is proposed and not sent: {held}")
-    words = _ON_ITS_WAY.get(record.state)
-    if words is not None:
-        return CommandResult(f"{name} {words}", final=False)
+        return CommandResult(compose("command.not-sent", id=name, reason=held))
+    code = _ON_ITS_WAY.get(record.state)
+    if code is not None:
+        return CommandResult(compose(code, id=name), final=False)
     if record.state is MatrixState.FAILED:
         raise LinkError(record.reason)
     if not record.was_used:
         raise CommandError(_why_not(record))
-    return CommandResult(f"{name} sent, applied at frame {record.applied_frame_seq}")
+    frame_seq = record.applied_frame_seq or 0
+    return CommandResult(compose("command.applied", id=name, frame_seq=frame_seq))
 
 
 def _why_not(record: ReconstructorRecord) -> str:
@@ -114,22 +121,29 @@ def _dither(_: cmd.StartDither, cause: str, now: TrackerState) -> CommandResult:
     if dither is None or dither.cause != cause:
         gone = "the dither is not followed any more: see the events"
         raise CommandError(now.failure(cause) or gone)
-    cost = f"{1e9 * total_m(dither.request):.3g} nm RMS in all"
-    cost = f"{cost}, budget {1e9 * now.dithers.policy.budget_m:.3g} nm"
+    found_nm, budget_nm = 1e9 * total_m(dither.request), 1e9 * now.dithers.policy.budget_m
     if dither.start_seq is None:
-        return CommandResult(f"{dither.id} {SILENT}: {cost}", final=False)
-    return CommandResult(f"{dither.id} plays from frame {dither.start_seq}: {cost}")
+        sent = compose("command.dither-sent", id=dither.id, found_nm=found_nm, budget_nm=budget_nm)
+        return CommandResult(sent, final=False)
+    plays = compose(
+        "command.dither-plays",
+        id=dither.id,
+        frame_seq=dither.start_seq,
+        found_nm=found_nm,
+        budget_nm=budget_nm,
+    )
+    return CommandResult(plays)
 
 
 def _loop(_: cmd.SetLoop | cmd.Ramp, cause: str, now: TrackerState) -> CommandResult:
     found = now.loop.command
     if found is None or found.cause != cause:
-        return CommandResult(f"{SILENT}: another change of the loop came after it")
+        return CommandResult(compose("command.loop-overtaken"))
     match found.state:
         case CommandState.ASKED:
-            return CommandResult(f"{found.text}: {SILENT}", final=False)
+            return CommandResult(compose("command.loop-sent", found.text), final=False)
         case CommandState.ACCEPTED:
-            return CommandResult(f"the RTC has accepted: {found.text}")
+            return CommandResult(compose("command.loop-accepted", found.text))
         case CommandState.REFUSED:
             raise CommandError(f"the RTC refused: {found.reason}")
         case CommandState.FAILED:
@@ -149,31 +163,29 @@ def _measurement(
         case MeasureState.FAILED:
             raise LinkError(record.reason)
         case MeasureState.WAITING:
-            return CommandResult(f"{name} waits for the dither that plays to end", final=False)
+            return CommandResult(compose("command.measurement-waits", id=name), final=False)
         case MeasureState.ASKED:
-            return CommandResult(f"{name} {SILENT}", final=False)
-        case _ if record.start_seq is None:
-            return CommandResult(f"{name} is {record.state}")
-        case _:
-            return CommandResult(f"{name} is {record.state}, from frame {record.start_seq}")
+            return CommandResult(compose("command.sent", id=name), final=False)
+        case state if record.start_seq is None:
+            return CommandResult(compose("command.measurement", state, id=name))
+        case state:
+            seq = record.start_seq
+            return CommandResult(compose("command.measures", state, id=name, frame_seq=seq))
 
 
 def _stopped(_: cmd.StopEverything, __: str, now: TrackerState) -> CommandResult:
     playing = None if now.loop.rtc is None else now.loop.rtc.dither_id
-    text = f"{now.operator.stopped_because}; nothing is dithered, made or sent until it is released"
+    because = now.operator.stopped_because
     if playing is None:
-        return CommandResult(text)
-    shows = f"the RTC's status still shows {playing}, it was asked to stop it"
-    return CommandResult(f"{text}; {shows}", final=False)
+        return CommandResult(compose("command.stopped", because))
+    return CommandResult(compose("command.stopping", because, playing=playing), final=False)
 
 
 def _no_dither(_: cmd.StopDither, __: str, now: TrackerState) -> CommandResult:
     playing = None if now.loop.rtc is None else now.loop.rtc.dither_id
-    off = "no dither starts until one is ordered"
     if playing is None:
-        return CommandResult(f"no dither plays; {off}")
-    asked = f"the RTC was asked to stop {playing}, its status still shows it"
-    return CommandResult(f"{asked}; {off}", final=False)
+        return CommandResult(compose("command.no-dither"))
+    return CommandResult(compose("command.dither-stopping", playing=playing), final=False)
 
 
 _TOLD_LATER: Final[dict[type, Callable[[Any, str, TrackerState], CommandResult]]] = {
@@ -196,38 +208,41 @@ def _done(  # noqa: C901 - one line for each command
     command: Command, _: str, now: TrackerState
 ) -> CommandResult:
     """Report the state after a command that the service carries out by itself."""
+    mode, doing = now.operator.mode, now.operations.acquisition.text
     match command:
         case cmd.SetMode():
-            text = f"mode is {now.operator.mode}"
+            message = compose("command.mode", mode)
+        case cmd.Resume() if now.dithers.stopped:
+            message = compose("command.released-without-dither", mode)
         case cmd.Resume():
-            off = "; no dither starts until one is ordered" if now.dithers.stopped else ""
-            text = f"released: mode is {now.operator.mode}{off}"
+            message = compose("command.released", mode)
         case cmd.Refit():
-            text = f"a reconstructor is being computed; mode is {now.operator.mode}"
+            message = compose("command.refit", mode=mode)
         case cmd.Reject(id=name):
-            text = f"{name} is discarded"
+            message = compose("command.discarded", id=name)
         case cmd.Acquire():
-            text = f"an acquisition is under way: {now.operations.acquisition.text}"
+            message = compose("command.acquires", doing)
         case cmd.AbortAcquisition():
-            text = f"the acquisition has {now.operations.acquisition.text}"
+            message = compose("command.acquisition-ended", doing)
         case cmd.GiveUp(id=name):
             record = now.measurement(name)
-            text = f"{name} is {record.reason if record else 'given up'}"
+            reason = record.reason if record else "given up"
+            message = compose("command.given-up", reason, id=name)
         case cmd.SetPointing(elevation_deg=up, azimuth_deg=round_):
-            text = f"the telescope points at elevation {up:g} deg, azimuth {round_:g} deg"
+            message = compose("command.pointing", elevation_deg=up, azimuth_deg=round_)
         case cmd.SetValue(name=name, value=value, for_s=for_s):
-            text = f"{name} is {format_value(value)} for {for_s:g} s"
+            message = compose("command.value", name, value=format_value(value), for_s=for_s)
         case cmd.UnmuteAlarm(name=name):
-            text = f"{name} is not muted any more"
+            message = compose("command.unmuted", name)
         case cmd.AcknowledgeAlarm(name=name) | cmd.MuteAlarm(name=name):
-            text = _alarm(now, name)
+            message = compose("command.alarm", name, state=_describe_alarm(now, name))
         case _:
             raise TypeError(f"found {type(command).__name__}; expected it in _TOLD_LATER")
-    return CommandResult(text)
+    return CommandResult(message)
 
 
-def _alarm(now: TrackerState, name: str) -> str:
-    """Report an alarm that was acknowledged or muted."""
+def _describe_alarm(now: TrackerState, name: str) -> str:
+    """Return the state of an alarm that was acknowledged or muted."""
     record = next(
         (record for record in now.alarms.records if record.name == name), AlarmRecord(name=name)
     )
@@ -239,4 +254,4 @@ def _alarm(now: TrackerState, name: str) -> str:
     if record.muted is not None:
         left_s = ((record.muted.until_ns_utc or 0) - record.muted.t_ns_utc) / 1e9
         said.append(f"muted for {left_s:.0f} s, with {len(muted_records(now))} muted in all")
-    return f"{name} is {', '.join(said)}"
+    return ", ".join(said)

@@ -189,7 +189,7 @@ class Supervisor:
 
     async def submit(
         self, command: cmd.Command, actor: Actor = OPERATOR, order_id: str = ""
-    ) -> str:
+    ) -> Message:
         """Carry out an operator's command; return one sentence on what came of it.
 
         It is on record before it is done, and so is why it is refused. What it leads to has its
@@ -226,11 +226,11 @@ class Supervisor:
         except PyrcalError as error:
             self._writer.refused(order, actor, error)
             raise
-        self._writer.answered(order, actor, answer)
+        self._writer.answered(order, actor, str(answer))
         await self._writer.keep_orders(state)
         return answer
 
-    async def _result_of(self, order: command_results.GivenCommand) -> str:
+    async def _result_of(self, order: command_results.GivenCommand) -> Message:
         """Do what is asked, and say what the RTC says to it where that takes but a moment."""
         running = set(self._running)
         self._post(order.command, order.id)
@@ -242,7 +242,7 @@ class Supervisor:
         while True:
             answer = order.result(self._engine.state)
             if answer.final or time.monotonic() > until_s:
-                return answer.text
+                return answer.message
             await asyncio.sleep(RESULT_POLL_INTERVAL_S)
 
     def matrix(self, matrix_id: str) -> NDArray[np.float32]:

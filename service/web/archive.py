@@ -23,6 +23,7 @@ from service.archive.products import RecordingRecord
 from service.archive.retention import Item, items
 from service.errors import PyrcalError
 from service.records.commands import Instruction
+from service.records.messages import compose
 from service.runtime.archiving import needed
 from service.runtime.telemetry_recorder import RecordingChoice
 from service.web.commands import AcceptedView, Client, ClientDep, Said, body
@@ -86,7 +87,7 @@ async def pin(client: ClientDep, product_id: ProductId, instruction: Said) -> Ac
     made = Pin(id=product_id, who=entry.who, why=entry.why)
     await run_in_threadpool(client.service.archive.pin, made)
     await client.service.audited(entry)
-    return client.accepted(f"{product_id} is kept for ever", archive="/v1/archive")
+    return client.accepted(compose("archive.pinned", id=product_id), archive="/v1/archive")
 
 
 @router.delete("/archive/{id}/pin", status_code=202, responses=UNKNOWN)
@@ -98,7 +99,7 @@ async def unpin(client: ClientDep, product_id: ProductId, instruction: Said) -> 
             "archive.unpinned", product_id, by=instruction.by, why=instruction.reason
         )
     )
-    return client.accepted(f"{product_id} goes when it is old", archive="/v1/archive")
+    return client.accepted(compose("archive.unpinned", id=product_id), archive="/v1/archive")
 
 
 # --- the audit trail: who ordered what, when, why and from where, and what it was answered
@@ -272,8 +273,8 @@ async def begin(
     begun = recordings.begin(choice.duration_s, who, choice.reason, choice.before_s)
     made = await _await_order(client, "recording.begin", choice, begun)
     past = f"the last {made.before_s:.1f} s, and " if choice.before_s else ""
-    text = f"{made.id} keeps {past}telemetry for {made.duration_s:g} s"
-    accepted = client.accepted(text, recording=f"/v1/recordings/{made.id}")
+    message = compose("archive.records", id=made.id, past=past, duration_s=made.duration_s)
+    accepted = client.accepted(message, recording=f"/v1/recordings/{made.id}")
     return RecordingAcceptedView(id=made.id, **accepted.model_dump())
 
 
@@ -299,8 +300,8 @@ async def end(client: ClientDep, recording_id: RecordingId, instruction: Said) -
     record = await _await_order(
         client, "recording.end", instruction, recordings.end(reason, recording_id)
     )
-    text = f"{recording_id} has ended: {record.n_bytes / 1e6:.0f} MB"
-    return client.accepted(text, recording=f"/v1/recordings/{recording_id}")
+    message = compose("archive.recorded", id=recording_id, size_mb=record.n_bytes / 1e6)
+    return client.accepted(message, recording=f"/v1/recordings/{recording_id}")
 
 
 @router.delete("/recordings/{id}", status_code=202, responses={**COMMAND, **UNKNOWN})
@@ -308,7 +309,7 @@ async def remove(client: ClientDep, recording_id: RecordingId, instruction: Said
     """Remove a recording for good."""
     removed = client.service.recordings.remove(recording_id)
     await _await_order(client, "recording.remove", instruction, removed)
-    return client.accepted(f"{recording_id} is removed", recordings="/v1/recordings")
+    return client.accepted(compose("archive.removed", id=recording_id), recordings="/v1/recordings")
 
 
 @router.get(

@@ -27,6 +27,7 @@ from service.errors import StaleError, UnknownIdError, UntaggedError
 from service.records import commands as instructions
 from service.records.commands import Instruction
 from service.records.events import new_id
+from service.records.messages import Message
 from service.records.operations import RefitJob
 from service.records.state import TrackerState
 from service.runtime.supervisor import Supervisor
@@ -226,6 +227,12 @@ class AcceptedView(BaseModel):
     text: str
     """Result of the command, and the RTC's reply if it came within some seconds."""
 
+    code: str
+    """Code of the result."""
+
+    values: dict[str, float | int | str]
+    """Values in the text."""
+
     links: dict[str, str]
     """Paths where the consequences appear."""
 
@@ -279,12 +286,13 @@ class Client:
             # The name is only a claim; the key is known.
             by = f"{command.by} ({actor.key})" if command.by else actor.key
             command = replace(command, by=by)
-        text = await self.service.submit(command, actor, made)
+        message = await self.service.submit(command, actor, made)
         about = {order.named or "id": name or made}
         links = {what: where.format(**about) for what, where in order.follows.items()}
         self.headers["Location"] = next(iter((links | _ALWAYS).values()))
-        answered = {"text": text, "links": _ALWAYS | links, "id": made}
-        return _ANSWERS.get(order.makes, AcceptedView).model_validate(answered)
+        kind = _ANSWERS.get(order.makes, AcceptedView)
+        answered = _shown(message) | {"links": _ALWAYS | links, "id": made}
+        return kind.model_validate(answered)
 
     def _check(self, decides_on: Sequence[str], name: str) -> None:
         if self.seen is None:
@@ -297,10 +305,14 @@ class Client:
             told = " or ".join(now)
             raise StaleError(f"found If-Match {self.seen:.80}, it is {told} now: read it again")
 
-    def accepted(self, text: str, **links: str) -> AcceptedView:
+    def accepted(self, message: Message, **links: str) -> AcceptedView:
         """Return the result of an order; the first link is to the work begun."""
         self.headers["Location"] = next(iter(links.values()))
-        return AcceptedView(text=text, links=links)
+        return AcceptedView.model_validate(_shown(message) | {"links": links})
+
+
+def _shown(message: Message) -> dict[str, object]:
+    return {"text": str(message), "code": message.code, "values": message.values}
 
 
 async def _client_of(request: Request, response: Response, service: views.ServiceDep) -> Client:

@@ -13,6 +13,7 @@ from pydantic import AfterValidator, AwareDatetime, BeforeValidator, Field, mode
 
 from service.archive import Archive, Mark, Night
 from service.archive.nights import FOREVER_NS, TREND_S, Annotation, TrendSample
+from service.records.messages import compose
 from service.records.registration import HistoryEntry
 from service.runtime.supervisor import Supervisor
 from service.runtime.telemetry_recorder import AnnotationChoice
@@ -309,5 +310,5 @@ async def annotate(
     number = await run_in_threadpool(client.service.archive.nights.add_note, note)
     await client.service.audited(replace(entry, answer=f"note {number}"))
     where = f"/v1/annotations?since_ns={t_ns}&until_ns={t_ns}"
-    accepted = client.accepted("it is kept, in the history of that time", annotation=where)
+    accepted = client.accepted(compose("archive.annotated"), annotation=where)
     return AnnotationAcceptedView(id=number, **accepted.model_dump())

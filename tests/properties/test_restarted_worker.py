@@ -66,7 +66,11 @@ def played(name, seconds, compute, hands):
 
 @pytest.mark.parametrize(
     ("name", "seconds", "sampling"),
-    [("jump", 11.0, AT_WORK), ("acquire-ordered", 22.0, Sampling())],
+    [
+        ("jump", 11.0, AT_WORK),
+        ("acquire-ordered", 22.0, Sampling()),
+        ("hold", 13.0, Sampling()),  # two refits, one of them sent
+    ],
 )
 def test_a_night_in_which_the_worker_dies_before_every_job_is_the_same(name, seconds, sampling):
     compute = Compute(threads=1, cache=usual_folder(os.environ), sampling=sampling)

@@ -229,7 +229,7 @@ class FakeService:
                 asked_ns_utc=self.now.now_ns,
             )
             self.now = replace(self.now, tracker=changed(self.now.tracker, refits=(job,)))
-        return f"{type(command).__name__} is on its way"
+        return as_message("command", f"{type(command).__name__} is on its way")
 
     def audit(self, entry):
         self.trail.append(entry)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 
 from service.errors import CommandError, StorageError
+from service.records.messages import as_message
 from service.records.products import MatrixState, ReconstructorRecord
 from service.web import connections
 from tests.support.api import FakeService, a_snapshot
@@ -21,7 +22,7 @@ class Slow(FakeService):
         await asyncio.sleep(0.01)
         caller.check()
         await super().submit(command, caller, order_id)
-        return f"order {len(self.commands)}"
+        return as_message("command", f"order {len(self.commands)}")
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ import pytest
 
 from service.api import create_app
 from service.records.commands import Refit
+from service.records.messages import as_message
 from service.tracker import step
 from service.tracking.interlocks import ORDERS
 from tests.support.api import FakeService, a_snapshot
@@ -44,7 +45,7 @@ class AtOneMoment(FakeService):
         step(self.tracker, command, self.now.policy, self.now.now_ns)
         if isinstance(command, Refit):
             return await super().submit(command, caller, order_id)
-        return "done"
+        return as_message("command", "done")
 
 
 @pytest.mark.parametrize("moment", MOMENTS, ids=lambda moment: moment.__name__)

@@ -24,9 +24,10 @@ def given(world, command):
 
 def told(order, world):
     answer = order.result(world.state)
-    assert answer.text
-    assert "\n" not in answer.text
-    return answer.text, answer.final
+    text = str(answer.message)
+    assert text
+    assert "\n" not in text
+    return text, answer.final
 
 
 @pytest.mark.parametrize(

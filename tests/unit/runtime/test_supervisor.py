@@ -17,7 +17,7 @@ from service.archive import Actor, AuditEntry, Channel, Range
 from service.errors import ArchiveError, CommandError, PyrcalError, UnknownIdError
 from service.records import commands as cmd
 from service.records import events as ev
-from service.records.messages import as_message
+from service.records.messages import as_message, compose
 from service.records.state import Level, LogEntry, Mode, TrackerState
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime import supervisor as supervising
@@ -78,7 +78,7 @@ async def test_what_the_instrument_leaves_out_is_known_at_any_moment(supervisor,
 
 async def test_a_command_changes_the_state_and_enters_the_audit_trail(supervisor, archive):
     text = await supervisor.submit(cmd.SetMode(mode=Mode.AUTO))
-    assert text == "mode is auto"
+    assert text == compose("command.mode", Mode.AUTO)
     assert supervisor.snapshot().tracker.operator.mode is Mode.AUTO
     (entry,) = archive.audit_trail()  # the answer's own line may take its time
     assert (entry.who, entry.name) == ("operator", "SetMode")
@@ -97,7 +97,7 @@ async def test_the_audit_trail_says_who_why_from_where_and_what_was_answered(sup
         assert (entry.who, entry.address, entry.channel) == ("Ada", "10.0.0.7", "page")
         assert (entry.why, entry.text) == ("clouds have gone", '{"mode":"auto"}')
     assert (asked.name, asked.answer) == ("SetMode", "")
-    assert (answered.name, answered.answer) == ("SetMode.answered", answer)
+    assert (answered.name, answered.answer) == ("SetMode.answered", str(answer))
     assert anonymous.who == "10.0.0.7"
 
 
@@ -351,7 +351,9 @@ async def test_an_order_is_carried_out_while_frames_are_looked_at(supervisor, br
         monkeypatch.setattr(bridge, "drain", lambda **_: [blocks.pop()] if blocks else [])
         await until(looking.is_set, 20.0)
         know(supervisor, rtc=Story(Mode.HOLD).meet().state.loop.rtc)
-        assert await supervisor.submit(cmd.SetMode(mode=Mode.AUTO)) == "mode is auto"
+        assert await supervisor.submit(cmd.SetMode(mode=Mode.AUTO)) == compose(
+            "command.mode", Mode.AUTO
+        )
         assert supervisor._engine.bank.loop.received_ns_utc != 1
         go_on.set()
         await until(lambda: supervisor._engine.bank.loop.received_ns_utc == 1, 20.0)

@@ -432,10 +432,13 @@ def try_pupils(few: FitSubset) -> tuple[TriedPupil, ...]:
         if not little and lead.share < EXCLUDED_SHARE:
             value, lead, moved = number.far(few, rate)
             if number.key in {ARMS, TURN}:
-                other = number.with_value(about, value)
-                rate = number.rate(few, value, few.matrix(few.of(other)))
-                step, share, moved = few.fit_again(other, rate)
-                value, lead = number.limit(value + step), replace(lead, share=share)
+                for _ in range(_N_STEPS):
+                    other = number.with_value(about, value)
+                    rate = number.rate(few, value, few.matrix(few.of(other)))
+                    step, share, moved = few.fit_again(other, rate)
+                    value, lead = number.limit(value + step), replace(lead, share=share)
+                    if abs(step) < number.notable:
+                        break
         explained = few.residual_fraction * np.sqrt(max(1.0 - lead.share, 0.0))
         notable = abs(value - number.reported) >= number.notable and explained >= number.explained
         found.append(

@@ -327,7 +327,7 @@ def test_slopes_of_the_other_sign_are_named_by_the_answer_to_the_dither():
     rtc = Mistold(sign_x=-1, sign_y=-1)
     window = dithered_window(Sensor(rtc.seen), ALPHA_SMALL)
     refused = rtc.told.fit(window, open_loop(rtc.own), None)
-    assert refused.kind is RefusalKind.MISTOLD
+    assert refused.kind is RefusalKind.MISDESCRIBED
     assert "slopes have the other sign" in str(refused.reason)
     assert "orientation.sign = -1" in str(refused.reason)
 
@@ -336,7 +336,7 @@ def test_slopes_in_another_order_are_named_by_the_answer_to_the_dither():
     rtc = Mistold(order="interleaved")
     window = dithered_window(Sensor(rtc.seen), ALPHA_SMALL)
     refused = rtc.told.fit(window, open_loop(rtc.own), None)
-    assert refused.kind is RefusalKind.MISTOLD
+    assert refused.kind is RefusalKind.MISDESCRIBED
     assert 'slopes.order = "interleaved"' in str(refused.reason)
 
 
@@ -346,7 +346,7 @@ def test_slopes_two_frames_late_are_not_taken_for_slopes_of_the_other_sign():
     turns = 2 * np.pi * np.array(window.plan.bins_hz) / window.plan.frame_rate_hz
     late = window.slopes * np.exp(-2j * turns)[:, :, None]
     outcome = rtc.told.fit(replace(window, slopes=late), open_loop(rtc.own), None)
-    assert getattr(outcome, "kind", None) is not RefusalKind.MISTOLD
+    assert getattr(outcome, "kind", None) is not RefusalKind.MISDESCRIBED
 
 
 def test_an_orientation_left_open_is_found_in_the_rtcs_own_matrix_and_taken_over():
@@ -400,7 +400,7 @@ def test_commands_in_another_unit_are_named_by_the_answer_to_the_dither():
     window = dithered_window(Sensor(rtc.seen), ALPHA_SMALL)
     in_nm = replace(window, commands=window.commands * 1e9, dither=window.dither * 1e9)
     refused = rtc.told.fit(in_nm, open_loop(rtc.own), None)
-    assert refused.kind is RefusalKind.MISTOLD
+    assert refused.kind is RefusalKind.MISDESCRIBED
     assert "nanometres" in str(refused.reason)
 
 

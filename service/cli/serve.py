@@ -162,7 +162,7 @@ async def _until_stopped(
     work = asyncio.create_task(supervisor.run())
     web = asyncio.create_task(answer())
     asked = asyncio.create_task(ending.asked.wait())
-    told = asyncio.create_task(
+    informer = asyncio.create_task(
         keep_informed(
             lambda: supervisor.snapshot().stalled, lambda: supervisor.snapshot().ready_reason
         )
@@ -171,9 +171,9 @@ async def _until_stopped(
     failed = work.done() or web.done()
     notify("STOPPING=1")
     ending.begin()
-    for task in (work, asked, told):
+    for task in (work, asked, informer):
         task.cancel()
-    outcomes = await asyncio.gather(work, web, told, return_exceptions=True)
+    outcomes = await asyncio.gather(work, web, informer, return_exceptions=True)
     await desk.close()
     for outcome in outcomes:
         _explain(outcome)
@@ -367,7 +367,7 @@ class _Forgiving:
 
 
 def _harmless(_logger: object, _method: str, event: EventDict) -> EventDict:
-    """Write out the control characters in what the RTC, files and clients have said."""
+    """Write out the control characters in text from the RTC, files and clients."""
     return {
         key: shown(value, keep="\n" if key == "exception" else "")
         if isinstance(value, str)

@@ -12,6 +12,12 @@ Three tables say what the service does:
 :data:`service.tracking.alarm_rules.RULES`
     Which alarms follow from what is known. ``derive_alarms`` applies them before the reactions, and
     where it is among the deciders. The table is next to the functions that it names.
+
+An order is checked by ``interlocks`` first, against the alarms that the last event left. A failure
+leaves the state as it was. The functions of one step share only the context: what an earlier one
+has done is the difference between ``context.state`` and ``context.before``, by which
+``dither.learn_precision`` knows that the window was accepted, and ``probation.advance`` that the
+matrix was swapped.
 """
 
 from __future__ import annotations
@@ -118,7 +124,7 @@ def _on_condition(context: StepContext, event: ev.ConditionChanged) -> None:
 
 
 def _on_made(context: StepContext, made: ev.MatrixMade) -> None:
-    """Propose a new reconstructor; send it if nobody has to approve it, or for a rollback."""
+    """Propose a new reconstructor; send it without approval, or as the way back of a probation."""
     if context.acquisition.under_way:
         reconstructors.propose(context, made.record)
     elif probation.is_way_back(context.state, made):

@@ -14,7 +14,7 @@ from pyrcal.fitting.methods import ScanStep
 from pyrcal.fitting.report import FitReport, orientation_words
 from service.errors import shown
 from service.model.defects import list_ranges
-from service.model.misregistration import BOUNDARY_SCALE
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 
 _ROWS = (
     ("shift x", "subapertures", 4),
@@ -208,11 +208,14 @@ def _extra_lines(fit: Fit) -> Iterator[str]:
 
 def paper_lines(steps: tuple[ScanStep, ...]) -> Iterator[str]:
     """Yield the paper's Table 1: parameter, range and step of each scan, and the value found."""
-    yield f"{'step':>4s}  {'parameter':15s}{'from':>11s}{'to':>11s}{'by':>9s}{'value':>11s}"
+    yield f"{'step':>4s}  {'parameter':15s}{'from':>11s}{'to':>11s}{'by':>9s}{'value':>11s}  unit"
+    rows = dict(zip(PARAMETERS, _ROWS, strict=True))
     for number, scan in enumerate(steps, start=1):
+        name, unit, _ = rows[scan.parameter]
         yield (
-            f"{number:4d}  {scan.parameter:15s}{scan.samples.min():11.4f}"
-            f"{scan.samples.max():11.4f}{scan.step:9.4f}{scan.minimum:11.4f}"
+            f"{number:4d}  {name:15s}{scan.samples.min():11.4f}"
+            f"{scan.samples.max():11.4f}{scan.step:9.4f}{scan.minimum:11.4f}  "
+            f"{unit.partition(',')[0]}"
         )
 
 

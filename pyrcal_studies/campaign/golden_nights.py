@@ -3,17 +3,20 @@
 Run: ``python -m pyrcal_studies.campaign.golden_nights [--only jump,steady]``. Recorded twice on one
 machine they are the same but for the names of the RTC's sessions, drawn at random; another
 processor may round otherwise. With ``--retell`` the events stay as they were recorded, and only
-what the tracker makes of them is written anew: the first difference of each night is printed.
+what the tracker makes of them is written anew: the first difference of each night is printed. With
+``--alarms`` nothing is recorded: after how long each event of a recorded night raised an alarm, and
+what was sent meanwhile, is printed as a table.
 """
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -1123,12 +1126,18 @@ def main() -> int:
     parser = study_parser("pyrcal_studies.campaign.golden_nights", __doc__)
     parser.add_argument("--folder", type=Path, default=FOLDER)
     parser.add_argument("--retell", action="store_true", help="keep the events")
+    parser.add_argument("--alarms", action="store_true", help="print when alarms were raised")
     parser.add_argument("--only", default="", metavar="NAME,NAME", help="default: all nights")
     given = parser.parse_args()
     names = given.only.split(",") if given.only else [plan.name for plan in NIGHTS]
     with threadpool_limits(1):
         for plan in NIGHTS:
             if plan.name not in names:
+                continue
+            if given.alarms:
+                sys.stdout.writelines(
+                    _alarm_lines(plan, read(given.folder / f"{plan.name}.jsonl.xz"))
+                )
                 continue
             if given.retell:
                 _retell(given.folder, plan.name)
@@ -1147,6 +1156,27 @@ def main() -> int:
             )
             sys.stdout.flush()
     return 0
+
+
+def _alarm_lines(plan: Plan, night: Sequence[Entry]) -> Iterator[str]:
+    """Yield a line for each event of a night: first alarms after it, and matrices sent."""
+    _, *entries = night
+    moments_s = [time_s for time_s, _ in plan.deeds]
+    for start_s, end_s in pairwise([*moments_s, plan.seconds]):
+        known: set[str] = set()
+        raised, n_sent = [], 0
+        for entry in entries:
+            time_s = (entry["t"] - entries[0]["t"]) * 1e-9
+            active = set(entry.get("seen", {}).get("alarms", known))
+            if start_s <= time_s < end_s:
+                raised += [f"`{name}` {time_s - start_s:.1f} s" for name in active - known]
+                n_sent += sum(effect["is"] in SENDING for effect in entry.get("effects", ()))
+            known = active
+        yield f"| {plan.name} | {start_s:g} | {', '.join(raised) or '-'} | {n_sent} |\n"
+
+
+SENDING = ("SendMatrix", "RepublishMatrix")
+"""Effects that send a matrix."""
 
 
 def _retell(folder: Path, name: str) -> None:

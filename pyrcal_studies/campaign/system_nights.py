@@ -43,6 +43,7 @@ from pyrcal_studies.campaign.rows import (
     words,
 )
 from service.config import load_settings
+from service.estimation.passive import PASSIVE_INTERVAL_S
 from service.instrument import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE
 from service.program import status_of
@@ -78,6 +79,9 @@ class Case(StrEnum):
     LOST = "lost"
     """A jump of 0.3 subapertures and 1 deg, which no loop of many modes survives."""
 
+    PASSIVE = "passive"
+    """No dither: how wrong is the estimate from ordinary telemetry of a mirror at rest?"""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
@@ -97,6 +101,7 @@ class Plan:
     """Between two things that happen; the first comes after it, when all should have settled."""
 
     instrument: str = "flao-lbt"
+    wind_m_s: float = 12.0
     settings: tuple[str, ...] = ()
     """Of the service, ``dither.window_s=5``, where they are not the defaults."""
 
@@ -122,7 +127,7 @@ class Plan:
             "seed": self.seed,
             "gain": self.gain,
             "n-controlled": self.n_controlled,
-            "wind": f"12,{37 + 61 * self.seed % 360}",
+            "wind": f"{self.wind_m_s:g},{37 + 61 * self.seed % 360}",
         }
         return [f"--{name}={value}" for name, value in options.items()] + self._motion()
 
@@ -144,7 +149,7 @@ class Plan:
                 return [f"--jump={self.period_s}:0.3,0,1,0"]
             case Case.BUSY:
                 return [drift, *jumps]
-            case Case.BUDGET:
+            case Case.BUDGET | Case.PASSIVE:
                 return []
 
 
@@ -218,6 +223,24 @@ def recovery_of(night: Observatory, jump_s: float) -> Row:
 
 def _after(time_s: float | None, jump_s: float) -> float | None:
     return None if time_s is None else round(time_s - jump_s, 2)
+
+
+def passive_of(night: Observatory, seconds: float) -> Row:
+    """Play a night and return its passive estimates: errors in boundary units, and over σ.
+
+    The first is not counted: its telemetry holds the start of the loop.
+    """
+    estimates: dict[int, tuple[list[float], list[float]]] = {}
+    while night.time_s < seconds:
+        night.advance(PASSIVE_INTERVAL_S / 2)
+        passive = night.state.alpha.passive
+        if passive is not None:
+            error = passive.alpha.vector - night.dome.moments[-1].alpha.vector
+            estimates[passive.t_ns_utc] = (
+                (error * BOUNDARY_SCALE).tolist(),
+                (error / passive.sigma).tolist(),
+            )
+    return {"passive": [list(pair) for pair in list(estimates.values())[1:]]}
 
 
 def first_good_s(night: Observatory) -> float | None:
@@ -317,7 +340,7 @@ def _name(row: Row) -> str:
     words = [
         f"**{row['case']}**, {row['plant']} {row['truth']}, mag {row['magnitude']:g}",
         f"{row['n_controlled']} modes g {row['gain']:g}",
-        f"{row['seconds']:g} s",
+        f"{row['seconds']:g} s, wind {row['wind_m_s']:g} m/s",
         *row["settings"],
     ]
     if row["instrument"] != "flao-lbt":
@@ -326,7 +349,11 @@ def _name(row: Row) -> str:
 
 
 def _tracking(rows: list[Row]) -> str:
-    """Return the RMS over all nights."""
+    """Return the RMS over all nights; of passive estimates with the largest error over σ."""
+    passive = np.array([pair for row in rows for pair in row.get("passive", ())])
+    if len(passive):
+        rms = np.sqrt(np.mean(np.square(passive[:, 0]), axis=0))
+        return f"{four(rms * UNITS)} ({np.max(np.abs(passive[:, 1])):.2f} σ, {len(passive)})"
     found = [row["tracking_rms"] for row in rows if row["tracking_rms"] is not None]
     if not found:
         return "-"
@@ -384,8 +411,12 @@ def play(plan: Plan) -> Row:
             ),
         )
         night = Observatory(plan.words, policy_of(settings), Mode.AUTO, bench)
-        night.advance(plan.seconds)
-        row = row_of(night, plan.jump_times_s)
+        passive = {}
+        if plan.case is Case.PASSIVE:
+            passive = passive_of(night, plan.seconds)
+        else:
+            night.advance(plan.seconds)
+        row = passive | row_of(night, plan.jump_times_s)
         if plan.case is Case.LOST:
             row |= recovery_of(night, plan.period_s)
         if plan.case is Case.BUDGET:
@@ -396,6 +427,8 @@ def play(plan: Plan) -> Row:
 def _settings(plan: Plan) -> dict[str, object]:
     """Return the service's settings: as many modes as at the start, and what was asked for."""
     given: dict[str, object] = {"control.n_modes_target": plan.n_controlled}
+    if plan.case is Case.PASSIVE:
+        given["dither.enabled"] = False
     for text in plan.settings:
         key, _, value = text.partition("=")
         given[key] = json.loads(value)
@@ -416,6 +449,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--seeds", type=range_of, default=range(2), metavar="FIRST:END")
     parser.add_argument("--magnitudes", type=floats, default=(10.0,), metavar="R,R...")
+    parser.add_argument("--winds", type=floats, default=(12.0,), metavar="M_S,M_S...")
     parser.add_argument("--truths", type=words, default=("ideal",), metavar="NAME,NAME...")
     parser.add_argument("--plant", choices=("linear", "diffractive"), default="linear")
     parser.add_argument("--instrument", default="flao-lbt", metavar="NAME|FILE")
@@ -437,8 +471,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def _plans(given: argparse.Namespace) -> Iterator[Plan]:
     """Yield every night of the grid."""
-    grid = itertools.product(given.seeds, given.cases, given.truths, given.magnitudes)
-    for seed, case, truth, magnitude in grid:
+    grid = itertools.product(given.seeds, given.cases, given.truths, given.magnitudes, given.winds)
+    for seed, case, truth, magnitude, wind_m_s in grid:
         yield Plan(
             case=Case(case),
             plant=given.plant,
@@ -450,6 +484,7 @@ def _plans(given: argparse.Namespace) -> Iterator[Plan]:
             seconds=given.seconds,
             period_s=given.period,
             instrument=given.instrument,
+            wind_m_s=wind_m_s,
             settings=tuple(given.settings),
         )
 

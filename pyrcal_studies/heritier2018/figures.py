@@ -122,9 +122,9 @@ def sensitivity(budget: Budget, store: Store) -> Figure:
             axes.plot(
                 found.values, found.errors_nm, "o-", ms=4, color=colour, label=f"{n_modes} modes"
             )
-            drop = found.drop()
-            if n_modes == plan.N_BASIS and drop is not None:
-                axes.axvline(drop, color=colour, linestyle=":", label=f"ours: {drop:.2g}")
+            after = found.first_after()
+            if n_modes == plan.N_BASIS and after is not None:
+                axes.axvline(after, color=colour, linestyle=":", label=f"ours: {after:g}")
         if sweep.name in marks:
             axes.axvline(
                 marks[sweep.name],

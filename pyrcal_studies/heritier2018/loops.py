@@ -208,20 +208,29 @@ def _piston_free(opd_m: NDArray[np.floating], weights: Array) -> Array:
     return np.asarray(opd_m - (opd_m @ weights)[:, None])
 
 
-def wavefront_error_nm(record: Record, *, without_first: int = 0, over: Over = Over.PUPIL) -> float:
+def wavefront_error_nm(
+    record: Record,
+    *,
+    without_first: int = 0,
+    over: Over = Over.PUPIL,
+    n_modes: int | None = None,
+) -> float:
     """Return the RMS over time, nm, the first modes left out, of what the residual is taken over.
 
-    ``PUPIL`` has all of the wavefront; the others have the modes that were controlled.
+    ``PUPIL`` has all of the wavefront; the others have the first ``n_modes``, by default the modes
+    that were controlled.
     """
     modal = record["modal_nm2"]
+    end = n_modes
+    if n_modes is None and over is not Over.PUPIL:
+        end = int(record["n_controlled"])
     match over:
         case Over.PUPIL:
             variance = float(record["total_nm2"]) - float(modal[:without_first].sum())
         case Over.CONTROLLED:
-            variance = float(modal[without_first : int(record["n_controlled"])].sum())
+            variance = float(modal[without_first:end].sum())
         case Over.MIRROR:
-            shown = record["mirror_nm2"][without_first : int(record["n_controlled"])]
-            variance = float(shown.sum())
+            variance = float(record["mirror_nm2"][without_first:end].sum())
     return float(np.sqrt(max(variance, 0.0)))
 
 

@@ -411,9 +411,23 @@ def once_run(budget: Budget) -> LoopRun:
     return closed_run(budget, budget.seeds[0], inverse)
 
 
+LOW_GAIN = 0.4
+"""Gain of all modes by day at which 500 modes are compared with 400 once more."""
+
+
+def low_gain_run(budget: Budget, seed: int, variant: Variant) -> LoopRun:
+    """Return the loop of a variant of Table 2 with one low gain for all modes."""
+    return replace(variant_run(budget, seed, variant), gain=LOW_GAIN)
+
+
 def closed_tasks(budget: Budget) -> list[Task]:
-    """Return the loops of Table 2, and two that show what its columns depend on."""
+    """Return the loops of Table 2, and those that show what its columns depend on."""
     tasks: list[Task] = [variant_run(budget, s, v) for s in budget.seeds for v in Variant]
+    tasks += [
+        low_gain_run(budget, seed, variant)
+        for seed in budget.seeds
+        for variant in (Variant.SYNTHETIC, Variant.MORE)
+    ]
     return [*tasks, shaken_run(budget), once_run(budget)]
 
 
@@ -453,17 +467,21 @@ def simulator_pair(budget: Budget, seed: int) -> tuple[LoopRun, LoopRun]:
     return in_simulator(budget, synthetic, fit), in_simulator(budget, measured, fit)
 
 
+AROUND_STEPS = (-8, -4, -2, -1, 0, 1, 2, 4, 8)
+"""Places of a sweep about the optimum, in units of its finest step."""
+
+
+def around(sweep: Sweep, step: float) -> Sweep:
+    """Return a sweep to both sides of the registration that was found, by its finest step."""
+    values = sorted((step * n for n in AROUND_STEPS), key=abs)
+    return replace(sweep, values=tuple(values), marked=(-8 * step, 8 * step))
+
+
 AROUND = (
-    replace(ROTATION, values=(0.0, -2.0, -1.0, 1.0, 2.0), marked=(-2.0, 2.0)),
-    replace(SHIFT, values=(0.0, -40.0, -20.0, 20.0, 40.0), marked=(-40.0, 40.0)),
-    replace(
-        SHIFT,
-        name="shift_y_subap",
-        symbol="α_y",
-        values=(0.0, -40.0, -20.0, 20.0, 40.0),
-        marked=(-40.0, 40.0),
-    ),
-    replace(MAGNIFICATION, values=(0.0, -4.0, -2.0, 2.0, 4.0), marked=(-4.0, 4.0)),
+    around(ROTATION, 0.25),
+    around(SHIFT, 5.0),
+    around(replace(SHIFT, name="shift_y_subap", symbol="α_y"), 5.0),
+    around(MAGNIFICATION, 0.5),
 )
 """Sweeps to both sides of the registration that was found."""
 
@@ -475,16 +493,18 @@ def around_run(budget: Budget, sweep: Sweep, value: float) -> LoopRun:
     return in_simulator(budget, measured, paper_fit(budget, seed), sweep.step(value))
 
 
-REGISTERED = (-20.0, 0.0, 20.0)
-"""Shifts along x, %, at which the simulator runs with the reconstructor of that place."""
+REGISTERED = {AROUND[1]: (-20.0, 0.0, 20.0), AROUND[3]: (-4.0, -2.0, 0.0, 2.0, 4.0)}
+"""Shifts along x and magnifications, %, at which the simulator runs with the reconstructor of that
+place."""
 
 
-def registered_run(budget: Budget, value: float) -> LoopRun:
-    """Return the simulator at so much shift along x, with the reconstructor of that place.
+def registered_run(budget: Budget, sweep: Sweep, value: float) -> LoopRun:
+    """Return the simulator a step away, with the reconstructor of that place.
 
-    Nothing is misregistered: only the place of the light on the sensor's mask changes.
+    Nothing is misregistered: only the place of the light on the sensor's mask changes, and how far
+    it reaches beyond the actuators.
     """
-    fit, step = paper_fit(budget, budget.seeds[0]), AROUND[1].step(value)
+    fit, step = paper_fit(budget, budget.seeds[0]), sweep.step(value)
     registered = ModelReconstructor(
         occasion=SIMULATOR, alpha=Found(fit=fit, step=step), n_modes=N_MEASURED
     )
@@ -557,7 +577,8 @@ def simulator_tasks(budget: Budget) -> list[Task]:
     tasks += [change_run(budget, change) for change in changes]
     for sweep in AROUND:
         tasks += [around_run(budget, sweep, value) for value in sweep.at(budget)]
-    tasks += [registered_run(budget, value) for value in REGISTERED]
+    for sweep, values in REGISTERED.items():
+        tasks += [registered_run(budget, sweep, value) for value in values]
     return tasks
 
 

@@ -247,7 +247,7 @@ def curve(budget: Budget, store: Store, sweep: Sweep, n_modes: int) -> Curve:
 
 
 def rule_costs_nm(budget: Budget, store: Store) -> dict[tuple[str, int], float]:
-    """Return what 0.1 deg and 10 % add to the wavefront error, nm, by sweep and modes."""
+    """Return what 0.1 deg and 10 % add in quadrature to the wavefront error, nm, by sweep."""
     costs = {}
     for sweep, value in plan.RULES:
         for n_modes in plan.INFLUENCE_MODES:
@@ -255,7 +255,7 @@ def rule_costs_nm(budget: Budget, store: Store) -> dict[tuple[str, int], float]:
                 wavefront_error_nm(store.read(plan.influence_run(budget, alpha, n_modes)))
                 for alpha in (sweep.alpha(value), Misregistration())
             )
-            costs[sweep.symbol, n_modes] = off - at_rest
+            costs[sweep.symbol, n_modes] = added_nm(off, at_rest)
     return costs
 
 
@@ -403,9 +403,32 @@ def best_at_zero(budget: Budget, store: Store) -> list[str]:
     return [symbol for symbol, one in found.items() if one[0.0] - min(one.values()) <= FLAT_NM]
 
 
-def columns_nm(record: Record, over: Over) -> Array:
-    """Return the three columns of Table 2, nm."""
-    return np.array([wavefront_error_nm(record, without_first=n, over=over) for n in LEFT_OUT])
+def columns_nm(record: Record, over: Over, n_modes: int | None = None) -> Array:
+    """Return the three columns of Table 2, nm, over the controlled modes or the first few."""
+    return np.array(
+        [wavefront_error_nm(record, without_first=n, over=over, n_modes=n_modes) for n in LEFT_OUT]
+    )
+
+
+def more_modes_nm(budget: Budget, store: Store) -> dict[str, Array]:
+    """Return what 500 modes leave less what 400 leave, true, without 50 KL, nm by telescope.
+
+    By gains: those of the ramp, and one low gain; over the controlled modes of each loop, and over
+    the first 400 of both.
+    """
+    runs = {"ramp": plan.variant_run, "low": plan.low_gain_run}
+    found = {}
+    for name, run in runs.items():
+        for n_modes in (None, plan.N_MEASURED):
+            few, many = (
+                [
+                    columns_nm(store.read(run(budget, seed, variant)), Over.CONTROLLED, n_modes)[2]
+                    for seed in budget.seeds
+                ]
+                for variant in (Variant.SYNTHETIC, Variant.MORE)
+            )
+            found[f"{name}, {'same' if n_modes else 'own'}"] = np.array(many) - np.array(few)
+    return found
 
 
 def table_2_nm(budget: Budget, store: Store, variant: Variant, over: Over) -> Array:

@@ -170,6 +170,7 @@ async def _until_stopped(
     await asyncio.wait({work, web, asked}, return_when=asyncio.FIRST_COMPLETED)
     failed = work.done() or web.done()
     notify("STOPPING=1")
+    ending.failures = [e for task in (work, web) if task.done() and (e := task.exception())]
     ending.begin()
     for task in (work, asked, informer):
         task.cancel()
@@ -188,13 +189,18 @@ def _explain(outcome: BaseException | None) -> None:
     PyrcalError
         The refusal itself.
     """
-    # Task groups wrap even a single exception.
-    while isinstance(outcome, BaseExceptionGroup):
-        outcome = outcome.exceptions[0]
+    outcome = outcome and _first_of(outcome)
     if isinstance(outcome, PyrcalError):
         raise outcome
     if isinstance(outcome, Exception):
         structlog.get_logger().error("service.failed", exc_info=outcome)
+
+
+def _first_of(failure: BaseException) -> BaseException:
+    """Return the exception itself: task groups wrap even a single one."""
+    while isinstance(failure, BaseExceptionGroup):
+        failure = failure.exceptions[0]
+    return failure
 
 
 class _Ending:
@@ -202,6 +208,9 @@ class _Ending:
 
     def __init__(self) -> None:
         self.asked = asyncio.Event()
+        self.failures: list[BaseException] = []
+        """Failures that end the service; a forced end must name them as well."""
+
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: loop.call_soon_threadsafe(self.begin))
@@ -214,17 +223,18 @@ class _Ending:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)
         # A thread of its own can end the process even if the event loop hangs.
-        guard = threading.Timer(END_WITHIN_S, _leave_behind)
+        guard = threading.Timer(END_WITHIN_S, self._leave_behind)
         # A daemon, so that it does not itself keep an orderly end waiting.
         guard.daemon = True
         guard.start()
 
-
-def _leave_behind() -> None:
-    """End the process with what still holds it up; what is on the disk is whole at any moment."""
-    held = [thread.name for thread in threading.enumerate() if not thread.daemon]
-    structlog.get_logger().error("service.ended-late", threads=held)
-    leave(1)
+    def _leave_behind(self) -> None:
+        """End the process with what still holds it up; what is on the disk is always whole."""
+        for failure in self.failures:
+            structlog.get_logger().error("service.failed", text=str(_first_of(failure)))
+        held = [thread.name for thread in threading.enumerate() if not thread.daemon]
+        structlog.get_logger().error("service.ended-late", threads=held)
+        leave(1)
 
 
 async def _listener(

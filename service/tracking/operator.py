@@ -55,12 +55,15 @@ def reject(context: StepContext, command: cmd.Reject) -> None:
 
 
 def publish(context: StepContext, command: cmd.Publish) -> None:
-    """Offer a reconstructor again; a new one only if the gate can judge it."""
+    """Have a reconstructor judged and sent again; the mode becomes hold, as in a rollback."""
     _republish(context, command.id, f"the operator publishes {command.id} again")
 
 
 def roll_back(context: StepContext, command: cmd.Rollback) -> None:
-    """Offer the previous reconstructor again."""
+    """Have the previous reconstructor judged and sent, without approval.
+
+    The mode becomes hold, because the service would replace it at once.
+    """
     earlier = context.state.previous
     if earlier is not None:
         _republish(context, earlier, f"the operator goes back to {earlier}", anyway=command.anyway)

@@ -300,8 +300,8 @@ def request_verdict(context: StepContext, matrix_id: str) -> None:
 def on_matrix(context: StepContext, made: ev.MatrixMade) -> None:
     """Keep a new reconstructor; send it if it passed the gate and needs no approval.
 
-    One that an operator ordered is sent in any case; others are sent only to a closed loop without
-    alarms, and if α is valid.
+    One that an operator published or went back to needs no approval and no mode auto; others,
+    a refit among them, are sent only to a closed loop without alarms, and if α is valid.
     """
     record, wanted = made.record, made.wanted
     # A matrix that was being made when a jump was confirmed is for the registration before it. One

@@ -56,7 +56,11 @@ def give_up_overdue(context: StepContext) -> None:
 
 
 def on_status(context: StepContext, rtc: Status) -> None:
-    """Store the RTC's report."""
+    """Take over the RTC's report and what follows from it.
+
+    That is a new sensor mode, basis or set of references, the matrix that it names as applied, and
+    the dither that it shows.
+    """
     # First, because all below takes α to be in the subapertures of the present mode.
     if rtc.config_id != context.loop.config_id and rtc.config_id in context.policy.sensor_modes:
         _enter_sensor_mode(context, rtc.config_id)

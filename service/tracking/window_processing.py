@@ -66,7 +66,10 @@ HARMLESS_REFUSALS = (RefusalKind.CUT_SHORT, RefusalKind.VOID)
 
 
 def on_window(context: StepContext, event: ev.WindowFitted) -> None:
-    """Fold one window's estimate into the registration, or refuse it with its reason."""
+    """Fold one window's estimate into the registration, or refuse it with its reason.
+
+    An acquisition counts a refused window as a miss.
+    """
     if context.state.measuring is not None:
         reject_window(context, MEASURING)
         return

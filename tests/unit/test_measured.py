@@ -71,6 +71,17 @@ def test_every_number_that_is_quoted_has_an_entry(line, section):
     assert numbers(quoted) - known == set()
 
 
+def test_a_quotation_states_what_its_entry_says_must_be_stated():
+    lines = [(param.values[0], param.values[1]) for param in quotes()]
+    for name, entry in ENTRIES.items():
+        in_section = section_text(entry["section"])
+        quoting = [line for line, section in lines if section == entry["section"]]
+        for text in entry.get("stated", ()):
+            assert text in in_section, (name, text)
+            assert quoting, name
+            assert all(text in line for line in quoting), (name, text)
+
+
 def test_each_table_of_measured_values_is_quoted():
     linked = {param.values[1] for param in quotes()}
     for entry in ENTRIES.values():

@@ -111,3 +111,19 @@ async def test_a_port_that_this_user_may_not_have_is_refused(monkeypatch):
     monkeypatch.setattr(socket, "create_server", refuse)
     with pytest.raises(ConfigurationError, match=r"127\.0\.0\.1:80: Permission denied.*--port"):
         await serve._listener(ApiTable(port=80), Waiting(), asyncio.Event())
+
+
+async def test_a_failure_is_named_even_if_the_end_takes_too_long(monkeypatch):
+    left = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    monkeypatch.setattr(serve, "END_WITHIN_S", 0.01)
+    monkeypatch.setattr(serve, "leave", lambda _: loop.call_soon_threadsafe(left.set))
+    monkeypatch.setattr(serve.signal, "signal", lambda *_: None)
+    with capture_logs() as lines:
+        ending = serve._Ending()
+        refusal = ConfigurationError("mirror.stroke: found unknown")
+        ending.failures = [ExceptionGroup("tasks", [refusal])]
+        ending.begin()
+        async with asyncio.timeout(patience(10.0)):
+            await left.wait()
+    assert [line["text"] for line in lines if line["event"] == "service.failed"] == [str(refusal)]

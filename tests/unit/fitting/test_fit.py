@@ -120,8 +120,14 @@ def test_every_method_comes_to_the_same_place(run, method):
 
 def test_the_papers_method_prints_its_table(run):
     _, out, _ = run(MATRIX, "--method", "paper")
-    assert "step  parameter" in out
-    assert "rotation_deg" in out
+    lines = out[out.index("step  parameter") :].splitlines()[1:11]
+    units = {(line[6:21].strip(), line.split()[-1]) for line in lines}
+    assert units == {
+        ("shift x", "subapertures"),
+        ("shift y", "subapertures"),
+        ("rotation", "deg"),
+        ("magnification", "ratio"),
+    }
 
 
 def test_a_start_may_begin_with_a_negative_number(run):

@@ -389,7 +389,7 @@ def _fill(
     numbers: NoisyNumbers,
     instrument: str,
 ) -> None:
-    # beside the matrix and its modes, pyrcal fit reads the noise of the columns
+    # pyrcal fit reads the noise of the columns with the matrix and its modes
     power = np.einsum("ij,ij->j", numbers.noise, numbers.noise, dtype=np.float64)
     file["noise"] = np.sqrt(power / len(numbers.noise))
     file["noise"].attrs["description"] = "(n_modes,), RMS over slopes of element_noise"

@@ -430,7 +430,7 @@ def _read_table(file: MirrorSection, pupil: Pupil) -> tuple[TabulatedModes, tupl
         file.refuse(key, f"shape {cube.shape}", "(n, ny, nx), one table for each")
     of_functions = key == "influence_functions"
     strokes, of_strokes = _strokes(file, len(cube)) if of_functions else (None, ())
-    # Kept beside the modes: whether crops were cut too close is judged before they are combined.
+    # Kept with the modes: whether crops were cut too close is judged before they are combined.
     crops, broken = _without_defects(file, key, cube)
     cube, local = crops, None
     whole = None if file.table.influence_origin is not None else known_samples(cube)

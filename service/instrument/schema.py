@@ -105,7 +105,7 @@ class LawTable(Read):
     α is tracked as the deviation from it. Each parameter is a number, an expression of `azimuth`
     and `elevation` (degrees) and of names of the observatory's values, or a table `{ of =
     "elevation", at = [20, 80], values = [0.1, -0.1] }` with linear interpolation; `period = 360`
-    beside `at` makes the table repeat itself, as that of a derotator's angle must. A whole turn of
+    next to `at` makes the table repeat itself, as that of a derotator's angle must. A whole turn of
     azimuth must not change it, except by whole turns of the rotation.
     """
 

@@ -186,7 +186,7 @@ class Cluster:
         # Scattered data has no recipe: if the workers that had it died, it must be sent again.
         there = {id(part): future for part, future in self._parts if future.status == "finished"}
         found = [there.get(id(part)) or self._scatter(part) for part in parts]
-        # The part itself is kept beside its future: while it is alive its id cannot be reused by
+        # The part itself is kept with its future: while it is alive its id cannot be reused by
         # another object.
         self._parts = list(zip(parts, found, strict=True))
         return found

@@ -237,7 +237,7 @@ def _done(  # noqa: C901 - one line for each command
         case cmd.AcknowledgeAlarm(name=name) | cmd.MuteAlarm(name=name):
             message = compose("command.alarm", name, state=_describe_alarm(now, name))
         case _:
-            raise TypeError(f"found {type(command).__name__}; expected it in _TOLD_LATER")
+            raise TypeError(f"found {type(command).__name__}; expected it in _REPORTED_LATER")
     return CommandResult(message)
 
 

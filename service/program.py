@@ -46,9 +46,9 @@ def status_of(task: Callable[[], int], name: str = "pyrcal") -> int:
         if limit_mb is None:
             raise
         # a library that finds no room says so in its own way: no thread, no mapping, no memory
-        said = str(error).splitlines()[-1:] or [type(error).__name__]
+        lines = str(error).splitlines()[-1:] or [type(error).__name__]
         expected = "expected a gigabyte at least, or none (ulimit -v unlimited)"
-        say(f"{name}: found a limit of {limit_mb:.0f} MB of memory, {expected}: {said[0]}")
+        say(f"{name}: found a limit of {limit_mb:.0f} MB of memory, {expected}: {lines[0]}")
         return 2
 
 
@@ -249,8 +249,8 @@ def find_running_services() -> tuple[RunningService, ...]:
             try:
                 lock_file(note, path, shared=True)
             except BlockingIOError:
-                told = json.load(note)
-                found.append(RunningService(Path(told["data_dir"]), told["url"]))
+                content = json.load(note)
+                found.append(RunningService(Path(content["data_dir"]), content["url"]))
             else:
                 path.unlink(missing_ok=True)
     return tuple(found)
@@ -368,7 +368,7 @@ def check_settings(options: argparse.Namespace) -> None:
     if getattr(options, "instrument", None) is not None:
         from service.instrument import instrument_path
 
-        instrument_path(options.instrument)  # a wrong name is told without the schema
+        instrument_path(options.instrument)  # a wrong name is refused without the schema
     config = getattr(options, "config", None)
     if config is not None and not config.exists():
         raise ConfigurationError(f"{config}: cannot be read: no such file")

@@ -106,9 +106,9 @@ def _alarms(state: Document) -> Iterator[str]:
 def _audit(document: Document) -> Iterator[str]:
     for one in document["entries"]:
         why = f" (because: {one['why']})" if one["why"] else ""
-        whence = f", {one['channel']}" if one["channel"] else ""
+        channel = f", {one['channel']}" if one["channel"] else ""
         yield (
-            f"{clock(one['t_utc'])}  {one['who']}{whence}: {one['name']}: "
+            f"{clock(one['t_utc'])}  {one['who']}{channel}: {one['name']}: "
             f"{one['answer'] or one['text']}{why}"
         )
 

@@ -164,12 +164,12 @@ class _Telescope(NamedTuple):
     def read(cls, name_or_path: str) -> Self:
         """Read an instrument file."""
         file = read_instrument_file(name_or_path)
-        across_subap = float(file.section(file.kind.table).said.pupil_diameter)
-        n_planes = file.section(SlopesTable).said.kind.n_planes
-        n_modes = int(file.section(KarhunenLoeve).said.n_modes)
-        rate_hz = file.section(LoopFacts).said.frame_rate_hz or 0.0
+        across_subap = float(file.section(file.kind.table).table.pupil_diameter)
+        n_planes = file.section(SlopesTable).table.kind.n_planes
+        n_modes = int(file.section(KarhunenLoeve).table.n_modes)
+        rate_hz = file.section(LoopFacts).table.frame_rate_hz or 0.0
         return cls(
-            diameter_m=float(file.section(AboutTable).said.diameter_m),
+            diameter_m=float(file.section(AboutTable).table.diameter_m),
             across_subap=across_subap,
             n_modes=n_modes,
             rate_hz=rate_hz,

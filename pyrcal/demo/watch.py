@@ -164,7 +164,7 @@ class TelemetryObserver:
         self._first_applied_s: float | None = None
         self._right_since_s: float | None = None
         self._behind = False
-        self._said: set[str] = set()
+        self._shown_lines: set[str] = set()
 
     def run(self) -> None:
         """Wait for the preparation, then watch until all criteria are met or time is up."""
@@ -311,8 +311,8 @@ class TelemetryObserver:
         return tuple(ending for child in self._children if (ending := child.ended) is not None)
 
     def _say_once(self, line: str) -> None:
-        if line not in self._said:
-            self._said.add(line)
+        if line not in self._shown_lines:
+            self._shown_lines.add(line)
             self._say(line)
 
 

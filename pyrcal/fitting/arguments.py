@@ -458,7 +458,7 @@ _DESCRIBED = in_group(
 
 
 def _role_and_path(text: str) -> tuple[str | None, Path]:
-    """Return what a file is for, where that is said, and the file."""
+    """Return what a file is for, if that is stated, and the file."""
     role, sign, path = text.partition("=")
     return (role, Path(path)) if sign else (None, Path(text))
 

@@ -159,7 +159,7 @@ def fit_upload(folder: Path, request: FitRequest) -> None:
     Raises
     ------
     MatrixError
-        If something in the upload cannot be used, said without the service's own paths.
+        If something in the upload cannot be used; the message has none of the service's own paths.
     """
     unpacked = folder / "unpacked"
     unpacked.mkdir()

@@ -1,4 +1,4 @@
-"""The record of a measured matrix beside the model's: what the figures of a fit show."""
+"""The record of a measured matrix and the model's: what the figures of a fit show."""
 
 from __future__ import annotations
 

@@ -223,7 +223,7 @@ def _list_problems(track: Track) -> list[str]:
     lines += [
         f"alarm {alarm.name}: {alarm.text}"
         for alarm in track.state.alarms.active
-        # What misaligned streams lead to is not listed beside its cause.
+        # Consequences of misaligned streams are not listed with their cause.
         if alarm.name not in led_to
     ]
     names: Counter[str] = Counter()

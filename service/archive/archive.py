@@ -104,38 +104,38 @@ class Archive:
             self.close()
             raise ArchiveError(f"{self.directory}: cannot be used: {error}") from error
         try:
-            told = self._take_in()
+            lines = self._take_in()
         except StorageError as error:
-            told = self._take_into_memory(error)
+            lines = self._take_into_memory(error)
         except ArchiveError:
             self.close()
             raise
-        self.wrong = tuple(told)
+        self.wrong = tuple(lines)
         return self.wrong
 
     def _take_in(self) -> list[str]:
         """Bring folders and index up to date with each other; return a line for what is wrong."""
         try:
-            told = [line for folder in self.stores for line in folder.prepare()]
+            lines = [line for folder in self.stores for line in folder.prepare()]
         except OSError as error:
             raise StorageError(f"{self.directory}: cannot be used: {error}") from error
         anew = self.index.open()
-        told += [line for folder in self.stores for line in folder.adopt(anew=anew)]
+        lines += [line for folder in self.stores for line in folder.adopt(anew=anew)]
         # A new archive has neither index nor products; products without an index mean a loss.
         if anew and (n_products := len(self.reconstructors.records())):
             lost = self.directory / "index.sqlite"
             text = f"missing; rebuilt from {n_products} products; the audit trail begins here"
-            told.append(f"{lost}: {text}")
+            lines.append(f"{lost}: {text}")
         self._on_disk = True
-        return told
+        return lines
 
     def _take_into_memory(self, error: StorageError) -> list[str]:
         """Do the same in memory, for as long as the disk refuses to be written."""
         anew = self.index.open_copy()
-        told = [line for folder in self.stores for line in folder.adopt(anew=anew)]
+        lines = [line for folder in self.stores for line in folder.adopt(anew=anew)]
         # After the adoption, which changes the copy.
         self.index.forbid_writing()
-        return [*told, f"{error}: the service runs on what it could read, and records nothing yet"]
+        return [*lines, f"{error}: the service runs on what it could read, and records nothing yet"]
 
     def look(self) -> None:
         """Open the archive to read it, even while a service uses it; nothing is updated.

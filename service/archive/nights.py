@@ -131,7 +131,7 @@ class MarkKind(StrEnum):
     """An operator has noted something."""
 
     START = "start"
-    """The service started: alarms of the run before ended with it, untold."""
+    """The service started: alarms of the run before ended with it, without a report."""
 
 
 _KINDS = {

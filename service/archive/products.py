@@ -119,7 +119,7 @@ class ReconstructorArchive(Store[ReconstructorRecord]):
         # A record without a stored matrix is in the index only.
         if not path.exists():
             return
-        _write_beside(path, to_json(record).encode())
+        _write_sidecar(path, to_json(record).encode())
 
     @override
     def _became(self, record: ReconstructorRecord, *, anew: bool) -> ReconstructorRecord:
@@ -343,7 +343,7 @@ class Recordings(Folder):
         StorageError
             If the disk refuses.
         """
-        _write_beside(self.path_of(record.id), msgspec.json.encode(record))
+        _write_sidecar(self.path_of(record.id), msgspec.json.encode(record))
 
     @override
     def kept(self, records: Iterable[RecordingRecord]) -> dict[str, str]:
@@ -367,7 +367,7 @@ class Recordings(Folder):
             raise ArchiveError(f"{self.path_of(recording_id)}: damaged: {error}") from error
 
 
-def _write_beside(path: Path, text: bytes) -> None:
+def _write_sidecar(path: Path, text: bytes) -> None:
     """Write JSON next to a product; concurrent readers find the previous text, complete.
 
     Raises
@@ -375,11 +375,11 @@ def _write_beside(path: Path, text: bytes) -> None:
     StorageError
         If the disk refuses.
     """
-    beside = path.with_suffix(".json")
+    sidecar = path.with_suffix(".json")
     try:
-        replace_file(beside, text)
+        replace_file(sidecar, text)
     except OSError as error:
-        raise StorageError(f"{beside}: cannot be written: {error}") from error
+        raise StorageError(f"{sidecar}: cannot be written: {error}") from error
 
 
 def _fill(
@@ -389,7 +389,7 @@ def _fill(
     numbers: NoisyNumbers,
     instrument: str,
 ) -> None:
-    # beside the matrix and its modes, pyrcal fit reads the noise of the columns
+    # pyrcal fit reads the noise of the columns with the matrix and its modes
     power = np.einsum("ij,ij->j", numbers.noise, numbers.noise, dtype=np.float64)
     file["noise"] = np.sqrt(power / len(numbers.noise))
     file["noise"].attrs["description"] = "(n_modes,), RMS over slopes of element_noise"

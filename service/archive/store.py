@@ -60,13 +60,13 @@ class Folder:
             If the folder cannot be made.
         """
         self.directory.mkdir(mode=FOLDER_MODE, parents=True, exist_ok=True)
-        told = []
+        lines = []
         for leftover in sorted(self.directory.glob("*.part")):
             try:
                 leftover.unlink()
             except OSError as error:
-                told.append(f"{leftover}: cannot be removed and is left alone: {error.strerror}")
-        return tuple(told)
+                lines.append(f"{leftover}: cannot be removed and is left alone: {error.strerror}")
+        return tuple(lines)
 
     def remove(self, product_id: str) -> None:
         """Remove one.
@@ -136,14 +136,14 @@ class Store(Folder, Generic[Record]):
         -------
         A line for each missing or damaged file, and for each unreadable record.
         """
-        known, told = self._index.checksums(self._table), []
+        known, lines = self._index.checksums(self._table), []
         for path in sorted(self.directory.glob("*.h5")):
             # Written before its row in the index: a service killed in between left it without one.
             if path.stem not in known:
                 try:
                     record, matrix = self._record(path.stem), self._matrix(path.stem)
                 except ArchiveError as error:
-                    told.append(str(error))
+                    lines.append(str(error))
                 else:
                     became = self._became(record, anew=anew)
                     self._index.add(self._table, became, checksum(matrix))
@@ -156,7 +156,7 @@ class Store(Folder, Generic[Record]):
             # A product that is damaged as well is reported by its file.
             with contextlib.suppress(ArchiveError):
                 self._stand_ins[name] = self._became(self._record(name), anew=False)
-        return [*told, *self._unsound.values(), *wrong.values()]
+        return [*lines, *self._unsound.values(), *wrong.values()]
 
     def records(self) -> tuple[Record, ...]:
         """Return the records of all products, oldest first.

@@ -70,7 +70,7 @@ def _run(options: argparse.Namespace) -> int:
 
     read_instrument_file(settings.service.instrument)
     _check_that_a_key_can_operate(settings)
-    # from here on each import takes its time: the worker's first, so that it imports beside them
+    # from here on each import takes its time: the worker comes first and imports in parallel
     from service.runtime.processes import Worker
 
     early = Worker("service.runtime.worker")

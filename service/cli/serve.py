@@ -162,7 +162,7 @@ async def _until_stopped(
     work = asyncio.create_task(supervisor.run())
     web = asyncio.create_task(answer())
     asked = asyncio.create_task(ending.asked.wait())
-    told = asyncio.create_task(
+    informer = asyncio.create_task(
         keep_informed(
             lambda: supervisor.snapshot().stalled, lambda: supervisor.snapshot().ready_reason
         )
@@ -172,9 +172,9 @@ async def _until_stopped(
     notify("STOPPING=1")
     ending.failures = [e for task in (work, web) if task.done() and (e := task.exception())]
     ending.begin()
-    for task in (work, asked, told):
+    for task in (work, asked, informer):
         task.cancel()
-    outcomes = await asyncio.gather(work, web, told, return_exceptions=True)
+    outcomes = await asyncio.gather(work, web, informer, return_exceptions=True)
     await desk.close()
     for outcome in outcomes:
         _explain(outcome)
@@ -377,7 +377,7 @@ class _Forgiving:
 
 
 def _harmless(_logger: object, _method: str, event: EventDict) -> EventDict:
-    """Write out the control characters in what the RTC, files and clients have said."""
+    """Write out the control characters in text from the RTC, files and clients."""
     return {
         key: shown(value, keep="\n" if key == "exception" else "")
         if isinstance(value, str)

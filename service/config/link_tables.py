@@ -245,9 +245,9 @@ def link_security(zenoh: ZenohTable, system: str) -> LinkSecurity:
     ConfigurationError
         If a file is missing, or others can read what is secret.
     """
-    told: dict[str, object] = {**client_security(zenoh)}
+    settings: dict[str, object] = {**client_security(zenoh)}
     secret = secret_of(zenoh)
-    if not told:
+    if not settings:
         return LinkSecurity(secret=secret)
     access = zenoh.access
     names = {
@@ -258,12 +258,12 @@ def link_security(zenoh: ZenohTable, system: str) -> LinkSecurity:
     # Only a router needs the passwords of all users; a client sends its own.
     if zenoh.users is not None and not zenoh.connect:
         known = {"dictionary_file": _users_file(zenoh.users)}
-        told[USERS] = {**_own_user(zenoh.users), **known}
+        settings[USERS] = {**_own_user(zenoh.users), **known}
     if not zenoh.connect:
         subject_kind = "usernames" if zenoh.tls is None else "cert_common_names"
-        told["access_control"] = access_control(Keys(system), names, subject_kind=subject_kind)
+        settings["access_control"] = access_control(Keys(system), names, subject_kind=subject_kind)
     return LinkSecurity(
-        zenoh=told,
+        zenoh=settings,
         roles={name: str(role) for role, every in names.items() for name in every},
         certificates=() if zenoh.tls is None else _certificates_of(zenoh.tls),
         secret=secret,

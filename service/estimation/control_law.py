@@ -4,7 +4,7 @@ A few modes are followed, on every frame. An RTC that does what it says leaves n
 commands follow from slopes and commands before them to the last digit. So the leak, the gain and
 the delay that a few modes show are known far better than they need be, whatever turbulence and
 noise are; where something is left over (clipping, turbulence played on the mirror, another matrix)
-nothing is said here.
+nothing is reported here.
 """
 
 from __future__ import annotations

@@ -259,16 +259,16 @@ def _powers(monitor: DitherMonitor) -> tuple[float, float, float]:
 
     Earlier seconds are included if they were not sufficient for a decision.
     """
-    asked, heard, before = monitor.asked, monitor.asked.audible, monitor.powers
-    if not heard or monitor.n_repeated > MAX_REPEATED_SHARE * monitor.n_frames:
+    asked, audible, before = monitor.asked, monitor.asked.audible, monitor.powers
+    if not audible or monitor.n_repeated > MAX_REPEATED_SHARE * monitor.n_frames:
         return before
     parts = np.einsum("ks,ks->k", monitor.slopes, monitor.slopes).astype(float)
-    power = parts.reshape(2, len(heard), -1).sum(axis=0)
+    power = parts.reshape(2, len(audible), -1).sum(axis=0)
     sides = power[:, 1:]
     beyond = np.sum(power[:, 0] - sides.mean(axis=1))
     # The second term is the error of the mean of the side bins, which was subtracted.
     variance = np.sum(sides.var(axis=1, ddof=1)) * (1.0 + 1.0 / sides.shape[1])
-    expected = np.sum(np.abs(monitor.lines[0][heard]) ** 2 * np.array(asked.response)[heard])
+    expected = np.sum(np.abs(monitor.lines[0][audible]) ** 2 * np.array(asked.response)[audible])
     return before[0] + beyond, before[1] + variance, before[2] + expected
 
 
@@ -295,29 +295,29 @@ def _found(monitor: DitherMonitor) -> tuple[DitherMeasurement, bool]:
     rms = np.sqrt(monitor.squares / monitor.n_frames)
     wanted, modes = np.array(asked.amplitude_m), list(asked.modes)
     # A sine of RMS a has the amplitude √2 a, of which half appears in the sum over n frames.
-    told, moved = np.abs(monitor.lines) * np.sqrt(2.0) / monitor.n_frames
+    reported_m, moved = np.abs(monitor.lines) * np.sqrt(2.0) / monitor.n_frames
     carried, own, doubted = rms[modes], np.array(asked.own), False
     if asked.frequency_hz:
         fraction = np.array(asked.frequency_hz) / asked.frame_rate_hz
         # Undoes the difference from frame to frame, which multiplies a sine by this factor.
         moved = moved / np.abs(2.0 * np.sin(np.pi * fraction))
-        beyond = own & (moved > MAX_AMPLITUDE_RATIO * told)
-        doubted = bool(np.any(beyond & (moved <= MAX_AMPLIFICATION_RATIO * told)))
+        beyond = own & (moved > MAX_AMPLITUDE_RATIO * reported_m)
+        doubted = bool(np.any(beyond & (moved <= MAX_AMPLIFICATION_RATIO * reported_m)))
         if doubted and not monitor.doubted:
-            own = own & (moved > MAX_AMPLIFICATION_RATIO * told)
+            own = own & (moved > MAX_AMPLIFICATION_RATIO * reported_m)
         # a mode of the loop answers the dither: there its column alone tells how strong it is
         carried = np.maximum(carried, np.where(own, moved, 0.0))
     stray = rms.copy()
     stray[modes] = 0.0
     total = float(np.sqrt(np.sum(carried**2) + np.sum(stray**2)))
     wanted_total = float(np.sqrt(np.sum(wanted**2)))
-    said = [
-        *_outside_tolerance(asked, carried, wanted, told),
+    findings = [
+        *_outside_tolerance(asked, carried, wanted, reported_m),
         *_strays(stray, wanted_total),
-        *_find_hidden_modes(asked, own, told, moved),
+        *_find_hidden_modes(asked, own, reported_m, moved),
     ]
     head = f"the frames hold {1e9 * total:.3g} nm RMS of dither in total, requested were"
-    text = f"{head} {1e9 * wanted_total:.3g} nm: {'; '.join(said)}" if said else ""
+    text = f"{head} {1e9 * wanted_total:.3g} nm: {'; '.join(findings)}" if findings else ""
     return DitherMeasurement(found_m=total, asked_m=wanted_total, text=text), doubted
 
 
@@ -327,18 +327,18 @@ def _outside_tolerance(
     """Return requested modes with a wrong amplitude or frequency."""
     ratio = carried / wanted
     wrong = (ratio > MAX_AMPLITUDE_RATIO) | (ratio < MIN_AMPLITUDE_RATIO)
-    said = [
+    findings = [
         f"mode {asked.modes[k]} carries {1e9 * carried[k]:.3g} nm "
         f"instead of {1e9 * wanted[k]:.3g} nm"
         for k in np.flatnonzero(wrong)[:_MAX_LISTED_MODES]
     ]
     if asked.frequency_hz:
         elsewhere = (ratio >= MIN_AMPLITUDE_RATIO) & (reported_m < MIN_AMPLITUDE_RATIO * carried)
-        said += [
+        findings += [
             f"mode {asked.modes[k]} moves at another frequency than {asked.frequency_hz[k]:g} Hz"
             for k in np.flatnonzero(elsewhere)[:_MAX_LISTED_MODES]
         ]
-    return said
+    return findings
 
 
 def _strays(stray: Array, wanted_m: float) -> list[str]:

@@ -42,7 +42,7 @@ class Change(Flag):
 
     DITHER = auto()
     OPEN = auto()
-    """No mode is in the loop; said of every block."""
+    """No mode is in the loop; reported for every block."""
 
     MATRIX = auto()
     """Another matrix multiplied the slopes of this block than those of the one before."""

@@ -403,8 +403,8 @@ def _answers_as(spectra: Spectra, matrix: Array) -> tuple[int, ...]:
     for line in np.flatnonzero(size[lines, best] > OTHER_MODE_POWER_RATIO * size[lines, own]):
         # Turbulence resembles low modes at all frequencies: the resemblance must be one of the
         # line.
-        beside = np.abs(slopes[line, 1:] @ unit[:, best[line]])
-        if size[line, best[line]] < IDENTIFICATION_RATIO * np.sqrt(np.mean(beside**2)):
+        side_bins = np.abs(slopes[line, 1:] @ unit[:, best[line]])
+        if size[line, best[line]] < IDENTIFICATION_RATIO * np.sqrt(np.mean(side_bins**2)):
             best[line] = own[line]
     clear = size[lines, best] > OTHER_MODE_POWER_RATIO * size[lines, own]
     return tuple(np.where(clear, best, own).tolist())

@@ -41,7 +41,7 @@ MIN_SAMPLES = 20
 """Fewer judge nothing."""
 
 WINDOW_SAMPLES = 5
-"""Frames of a window that must have been looked at before it can be said to be off the loop."""
+"""Frames of a window that must have been looked at before it can be reported as off the loop."""
 
 RECHECK_INTERVAL_S = 1.3
 """A loop that was found correct is not checked again for this time."""

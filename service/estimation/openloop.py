@@ -131,7 +131,7 @@ def _columns(spectra: Spectra) -> tuple[Columns, Array]:
     """
     lines = np.arange(len(spectra.plan.modes))
     known = spectra.dither[lines, list(spectra.plan.modes)].astype(complex)
-    beside = np.sum(np.abs(spectra.slopes[:, 1:]) ** 2, axis=2).mean(axis=1)
+    noise = np.sum(np.abs(spectra.slopes[:, 1:]) ** 2, axis=2).mean(axis=1)
     # The real part: columns of an interaction matrix are real, and the phase of the dither was
     # divided out.
     measured = (spectra.slopes[:, 0] / known[:, None]).real.T
@@ -143,7 +143,7 @@ def _columns(spectra: Spectra) -> tuple[Columns, Array]:
         signed=False,
     )
     # half of a complex bin's noise is in its real part
-    return columns, 0.5 * beside / np.abs(known) ** 2
+    return columns, 0.5 * noise / np.abs(known) ** 2
 
 
 def _unexplained_share(columns: Columns, noise: Array, matrix: Array) -> float:

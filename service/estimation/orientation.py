@@ -144,16 +144,16 @@ def check_stated_orientation(stated: Pose, found: Pose) -> str:
     """Return why a stated orientation cannot be the RTC's; empty: it may be."""
     if found.correlation < stated.correlation + 2.0 * MIN_CORRELATION_LEAD:
         return ""
-    told = (
+    text = (
         f"with {format_setting(stated.slopes)} the lowest orders correlate with the model by "
         f"{stated.correlation:.2f}, with {found.describe_orientation()} by {found.correlation:.2f}"
     )
     if found.is_mirrored is not stated.is_mirrored:
         return (
-            f"{told}: the slopes' grid is mirrored, or the actuators' coordinates are (parity = "
+            f"{text}: the slopes' grid is mirrored, or the actuators' coordinates are (parity = "
             "-1) or are exchanged"
         )
-    return f"{told}: correct [slopes]"
+    return f"{text}: correct [slopes]"
 
 
 def find_orientation(

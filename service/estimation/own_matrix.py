@@ -49,7 +49,7 @@ N_NEIGHBOURS = 10
 """Number of neighbours that a mode's response is compared with."""
 
 MIN_ROLLED_SHARE = 0.8
-"""Share of misplaced modes that are so by as many places, when all are said to be rolled."""
+"""Share of misplaced modes that are so by as many places, when all are reported as rolled."""
 
 MAX_UNWEIGHTED_MISFIT = 0.08
 """Median misfit of the RTC's own modes, in norm, below which all modes count alike for α. Matrices
@@ -228,8 +228,8 @@ class OwnMatrix:
         if 2 * len(pairs) == len(columns):
             exchanged = _list_in_words([f"{one} and {to}" for one, to in pairs])
             return f"modes {exchanged} are exchanged by the RTC's own matrix"
-        told = _list_in_words([f"{one} is the instrument file's {to}" for one, to in place.items()])
-        return f"modes have other places by the RTC's own matrix: {told}"
+        text = _list_in_words([f"{one} is the instrument file's {to}" for one, to in place.items()])
+        return f"modes have other places by the RTC's own matrix: {text}"
 
 
 def find_neighbours(modes: NDArray[np.intp], k: int) -> NDArray[np.intp]:
@@ -238,9 +238,9 @@ def find_neighbours(modes: NDArray[np.intp], k: int) -> NDArray[np.intp]:
 
 
 def compare_strength(
-    gain: NDArray[np.floating], explained: NDArray[np.floating], k: int, beside: NDArray[np.intp]
+    gain: NDArray[np.floating], explained: NDArray[np.floating], k: int, others: NDArray[np.intp]
 ) -> float:
-    """Return the strength of the response of mode ``k`` over the median of modes ``beside`` it.
+    """Return the strength of the response of mode ``k`` over the median of the ``others``.
 
     Where the model explains a mode's response only in part, the gain is the projection on the
     model, and too small: the norm of the response is ``gain / sqrt(explained)``. But noise raises
@@ -252,11 +252,11 @@ def compare_strength(
         ``(n,)`` response over the model's.
     explained
         ``(n,)`` share of the power of each response that the model explains.
-    k, beside
+    k, others
         Indices of the mode and of its neighbours.
     """
     ratios = [
-        float(size[k] / np.median(size[beside])) for size in (gain, gain / np.sqrt(explained))
+        float(size[k] / np.median(size[others])) for size in (gain, gain / np.sqrt(explained))
     ]
     return min(ratios, key=lambda ratio: abs(np.log(max(ratio, np.finfo(float).tiny))))
 

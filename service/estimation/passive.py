@@ -295,13 +295,13 @@ class Passive(Streaming):
         is skipped, more if windows have recently measured α; the reason is then None. The pause
         ends early when they stop.
         """
-        beside, now_ns, sums = Mark.WINDOWS in marks, loop.received_ns_utc, self
+        dithered, now_ns, sums = Mark.WINDOWS in marks, loop.received_ns_utc, self
         ahead_ns = self.since_ns_utc - now_ns
         # A rest that would last longer than any: the clock went back.
         oversleeps = ahead_ns > 2 * LONG_RESTS * PASSIVE_INTERVAL_S * 1e9
-        if ahead_ns > 0 and (oversleeps or not (has_windows and beside)):
+        if ahead_ns > 0 and (oversleeps or not (has_windows and dithered)):
             sums = replace(self, from_seq=0, since_ns_utc=now_ns)
-        since_ns = sums.since_ns_utc if beside else 0
+        since_ns = sums.since_ns_utc if dithered else 0
         if now_ns - since_ns < MIN_PASSIVE_S * 1e9 and since_ns:
             return sums, None
         why = sums.check_fittable(loop)
@@ -309,7 +309,7 @@ class Passive(Streaming):
             return sums, why
         rate_hz = loop.rtc.frame_rate_hz
         begun = replace(sums, sums=(), n_effective=0.0)
-        if not beside or sums.tail is None:
+        if not dithered or sums.tail is None:
             # Frames that wait are kept for the next estimate, which therefore began earlier.
             waiting_ns = round(sums.n_waiting * 1e9 / rate_hz)
             return replace(begun, since_ns_utc=now_ns - waiting_ns), sums
@@ -352,7 +352,7 @@ def accumulate(state: Passive, block: FrameBlock) -> Passive:
     """
     if state.why_unusable is not None or block.first_seq < state.from_seq:
         return state
-    n_columns, block = block.commands_m.shape[1], _with_dither_beside(state, block)
+    n_columns, block = block.commands_m.shape[1], _append_dither_columns(state, block)
     tail = state.tail
     n_moved = block.commands_m.shape[1]
     if tail is not None and not (block.follows(tail) and n_moved == tail.commands_m.shape[1]):
@@ -374,7 +374,7 @@ def accumulate(state: Passive, block: FrameBlock) -> Passive:
     return replace(state, waiting=(frames.last(_FILTER_SPAN_FRAMES + TAPER_FRAMES),), begun=True)
 
 
-def _with_dither_beside(state: Passive, block: FrameBlock) -> FrameBlock:
+def _append_dither_columns(state: Passive, block: FrameBlock) -> FrameBlock:
     """Return a block whose commands have the dither of controlled modes as further columns."""
     dither, block = block.dither_m, replace(block, dither_m=None)
     if dither is None:

@@ -65,7 +65,7 @@ MIN_PART_FRAMES = 50
 """Frames: fewer scatter too much to be looked at."""
 
 MIN_HISTORY_S = 0.8
-"""Telemetry with the matrix before; with less nothing is said."""
+"""Telemetry with the matrix before; with less nothing is reported."""
 
 SWAP_SETTLING_S = 0.03
 """Time after a swap in which the loop changes from one equilibrium to the other."""
@@ -82,7 +82,7 @@ looked at in a row (``RUNAWAY_FRAMES``): nothing but a loop that is lost does th
 RUNAWAY_FRAMES = 4
 
 RETURN_PERIOD_S = 1.0
-"""With the matrix before in use again, until the loop is said to be as it was, or lost."""
+"""With the matrix before in use again, until the loop is reported to be as it was, or lost."""
 
 N_RETURN_PARTS = 10
 """Number of the last parts that decide if the loop has returned."""

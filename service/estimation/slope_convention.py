@@ -130,7 +130,7 @@ def identify_from_response(
     slopes
         ``(n_lines, n_slopes)`` complex, at the lines of the dither, as the RTC lists them.
     expected
-        The same by the model for the commands at those lines, as the RTC is said to list them.
+        The same by the model for the commands at those lines, as the RTC is stated to list them.
     turns_rad
         ``(n_lines,)`` phase by which each line advances in a frame: slopes that lag by half a
         period are no slopes of the other sign.

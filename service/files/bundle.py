@@ -117,17 +117,17 @@ def read_bundle(path: str | Path) -> Bundle:
             raise MatrixError(f"{path}: found {container.listing()}, expected a bundle's manifest")
         manifest = _read_manifest(path, stored.pop(MANIFEST).read())
         arrays = {}
-        for name, told in manifest["arrays"].items():
+        for name, expected in manifest["arrays"].items():
             if name not in stored:
                 raise MatrixError(f"{path}: {name} is missing, which its manifest has")
             # FITS is big-endian: the checksum is of the little-endian numbers.
             values = _plain(stored[name].read())
             found = {"dtype": values.dtype.str, "shape": list(values.shape), **_sum_of(values)}
-            if found != told:
+            if found != expected:
                 raise MatrixError(
                     f"{path}: {name} is not as it was written: found {found['dtype']} "
-                    f"{found['shape']} {found['sha256'][:12]}, expected {told.get('dtype')} "
-                    f"{told.get('shape')} {str(told.get('sha256'))[:12]}"
+                    f"{found['shape']} {found['sha256'][:12]}, expected {expected.get('dtype')} "
+                    f"{expected.get('shape')} {str(expected.get('sha256'))[:12]}"
                 )
             arrays[name] = values
         # What the manifest does not name has no checksum.
@@ -161,10 +161,10 @@ def why_not(bundle: Bundle, place: Place) -> str:
     Half of a calibration is another loop: what has no place is a reason, unless it changes nothing.
     """
     n_modes, n_slopes = bundle.arrays[RECONSTRUCTOR].shape
-    told = bundle.facts.get("instrument")
+    instrument = bundle.facts.get("instrument")
     config_id = (bundle.facts.get("record") or {}).get("config_id")
-    if told not in {None, place.system}:
-        return f"found a bundle of {told}, expected one of {place.system}"
+    if instrument not in {None, place.system}:
+        return f"found a bundle of {instrument}, expected one of {place.system}"
     if config_id not in {None, place.config_id}:
         return f"found a bundle of configuration {config_id}, expected {place.config_id}"
     if n_slopes != place.n_slopes or n_modes > len(place.modes):
@@ -214,7 +214,7 @@ def _read_manifest(path: Path, stored: Array) -> dict[str, Any]:
         raise refused
     try:
         manifest = json.loads(stored.astype(np.uint8).tobytes())
-        told = manifest.pop("sha256")
+        checksum = manifest.pop("sha256")
         if manifest["format"] != FORMAT or manifest["version"] != VERSION:
             raise MatrixError(
                 f"{path}: found {manifest['format']} of version {manifest['version']}, expected "
@@ -222,7 +222,7 @@ def _read_manifest(path: Path, stored: Array) -> dict[str, Any]:
             )
         arrays = manifest["arrays"]
         whole = all(isinstance(one, dict) for one in (arrays, manifest["facts"], *arrays.values()))
-        if not whole or not isinstance(manifest["id"], str) or told != _digest(manifest):
+        if not whole or not isinstance(manifest["id"], str) or checksum != _digest(manifest):
             raise refused
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise refused from error

@@ -226,8 +226,8 @@ def _fits(path: Path) -> Iterator[Container]:
                     known[str(number)] = array
             facts = {str(key).lower(): value for key, value in file[0].header.items()}
         except (*FITS_DAMAGE, fits.VerifyError) as error:
-            said = str(error).replace("\n", " ")
-            raise MatrixError(f"{path}: damaged FITS file: {said}") from error
+            reason = str(error).replace("\n", " ")
+            raise MatrixError(f"{path}: damaged FITS file: {reason}") from error
         yield Container(
             path=path,
             arrays=arrays,
@@ -290,8 +290,8 @@ def _numpy(path: Path) -> Iterator[Container]:
         # Unpickling would execute code of the file's author.
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except NUMPY_DAMAGE as error:
-        said = str(error).replace("\n", " ")
-        raise MatrixError(f"{path}: damaged NumPy file: {said}") from error
+        reason = str(error).replace("\n", " ")
+        raise MatrixError(f"{path}: damaged NumPy file: {reason}") from error
     stored = StoredArray(
         where=str(path),
         shape=array.shape,

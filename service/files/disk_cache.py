@@ -42,9 +42,9 @@ _ABANDONED_S = 3600.0
 
 def usual_folder(environment: Mapping[str, str]) -> Path:
     """Return the default cache folder."""
-    told = environment.get(VARIABLE)
-    if told:
-        return Path(told)
+    configured = environment.get(VARIABLE)
+    if configured:
+        return Path(configured)
     home = environment.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     return Path(home) / "pyrcal"
 

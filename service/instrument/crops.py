@@ -106,7 +106,7 @@ def modes_of_crops(
 
 def _table_of(file: Section[MirrorTable], crops: NDArray[np.floating]) -> tuple[int, int]:
     """Return the shape of the table that finite crops are part of."""
-    shape = file.said.influence_table
+    shape = file.table.influence_table
     if shape is None:
         raise ConfigurationError(
             f"{file.where('influence_table')}: missing; mirror.influence_origin requires it"
@@ -118,7 +118,7 @@ def _table_of(file: Section[MirrorTable], crops: NDArray[np.floating]) -> tuple[
 
 def remarks_on_crops(file: Section[MirrorTable], crops: NDArray[np.floating]) -> tuple[str, ...]:
     """Return a note where functions are cut before they have come down to nothing."""
-    if file.said.influence_origin is None:
+    if file.table.influence_origin is None:
         return ()
     rim = np.abs(crops)
     # Never zero, so that crops of nothing but zeros do not divide by it.

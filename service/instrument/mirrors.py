@@ -83,7 +83,7 @@ def read_mirror(
         One line: a key that contradicts another, is missing, or whose array cannot be used.
     """
     _check_keys(file)
-    if file.said.layout is not None:
+    if file.table.layout is not None:
         mirror, notes = _analytic(file)
         _check_width(file, mirror.positions_m, pupil)
         return mirror, (*notes, *_about_segments(file, mirror))
@@ -108,7 +108,7 @@ def own_modes(mirror: Mirror | TabulatedModes) -> int | None:
 
 
 def _check_keys(file: MirrorSection) -> None:
-    table, given = file.said, file.given
+    table, given = file.table, file.given
     # One source of the surface: two would contradict each other.
     kinds = [kind for kind in _KINDS if getattr(table, kind) is not None]
     if len(kinds) != 1:
@@ -133,14 +133,14 @@ def _mount(table: MirrorTable) -> dict[str, Any]:
 
 def _opd(file: MirrorSection, heights: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return what a wavefront sees of these heights: twice a surface."""
-    return heights * heights.dtype.type(2) if file.said.modes_kind == "surface" else heights
+    return heights * heights.dtype.type(2) if file.table.modes_kind == "surface" else heights
 
 
 # --- analytic
 
 
 def _analytic(file: MirrorSection) -> tuple[Mirror, tuple[str, ...]]:
-    table = file.said
+    table = file.table
     _check_layout_keys(file)
     positions = _LAYOUTS[str(table.layout)](file)
     if len(positions) < 4:
@@ -187,7 +187,7 @@ def _check_width(file: MirrorSection, positions_m: NDArray[np.float64], pupil: P
         return
     unit = unit_like(width, _UNIT_DECADES)
     hint = f": they look like {unit}" if unit else ""
-    key = "positions" if file.said.layout == "positions" else "pitch_m"
+    key = "positions" if file.table.layout == "positions" else "pitch_m"
     file.refuse(
         key,
         f"actuators over {width * pupil.diameter_m:.3g} m, {width:.3g} pupil diameters{hint}",
@@ -196,7 +196,7 @@ def _check_width(file: MirrorSection, positions_m: NDArray[np.float64], pupil: P
 
 
 def _check_layout_keys(file: MirrorSection) -> None:
-    table = file.said
+    table = file.table
     foreign = set().union(*_LAYOUT_KEYS.values()) - _LAYOUT_KEYS[str(table.layout)]
     for key in sorted(foreign & file.given):
         owners = [f'"{name}"' for name, keys in _LAYOUT_KEYS.items() if key in keys]
@@ -215,21 +215,21 @@ def _check_layout_keys(file: MirrorSection) -> None:
 def _segments(file: MirrorSection, positions_m: NDArray[np.float64]) -> tuple[float, ...]:
     """Return where the gaps between segments are, in order; refuse a segment without actuators."""
     # Ascending, because the segment of a point is found by bisection.
-    gaps_deg = tuple(sorted(angle % 360.0 for angle in file.said.segments_deg))
+    gaps_deg = tuple(sorted(angle % 360.0 for angle in file.table.segments_deg))
     if not gaps_deg:
         return ()
     n_in_each = np.unique(segment_of(positions_m, gaps_deg), return_counts=True)[1]
     if len(gaps_deg) < 2 or len(n_in_each) < len(gaps_deg):
         file.refuse(
             "segments_deg",
-            f"gaps at {list(file.said.segments_deg)}, actuators in {len(n_in_each)} segments",
+            f"gaps at {list(file.table.segments_deg)}, actuators in {len(n_in_each)} segments",
             "at least two gaps, each in a place of its own, and actuators between them",
         )
     return gaps_deg
 
 
 def _rings(file: MirrorSection) -> NDArray[np.float64]:
-    table = file.said
+    table = file.table
     if table.ring_actuators is not None or table.ring_radii_m is not None:
         return _read_rings(file)
     if table.last_ring < table.first_ring:
@@ -251,18 +251,18 @@ def _read_rings(file: MirrorSection) -> NDArray[np.float64]:
 
 def _grid(file: MirrorSection) -> NDArray[np.float64]:
     n_across, pitch_m, diameter_m = _mandatory(file, ("n_across", "pitch_m", "diameter_m"))
-    return _beside_gaps(file, grid(n_across, pitch_m, diameter_m))
+    return _avoid_gaps(file, grid(n_across, pitch_m, diameter_m))
 
 
 def _hexagonal(file: MirrorSection) -> NDArray[np.float64]:
     pitch_m, diameter_m = _mandatory(file, ("pitch_m", "diameter_m"))
-    return _beside_gaps(file, hexagonal(pitch_m, diameter_m, file.said.hole_m or 0.0))
+    return _avoid_gaps(file, hexagonal(pitch_m, diameter_m, file.table.hole_m or 0.0))
 
 
-def _beside_gaps(file: MirrorSection, positions_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def _avoid_gaps(file: MirrorSection, positions_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the points of a grid that are not on a gap between segments."""
     kept = np.ones(len(positions_m), dtype=np.bool_)
-    for angle in np.deg2rad(file.said.segments_deg):
+    for angle in np.deg2rad(file.table.segments_deg):
         along, across = (positions_m @ rotation(angle)).T
         # A gap is a ray from the centre: the opposite half of its line is not one.
         kept &= (np.abs(across) > _ON_A_GAP * np.abs(positions_m).max()) | (along < 0.0)
@@ -290,19 +290,20 @@ _LAYOUTS: dict[str, Callable[[MirrorSection], NDArray[np.float64]]] = {
 
 
 def _mandatory(file: MirrorSection, keys: tuple[str, ...]) -> tuple[Any, ...]:
+    table = file.table
     for key in keys:
-        if getattr(file.said, key) is None:
+        if getattr(table, key) is None:
             raise ConfigurationError(
-                f'{file.where(key)}: missing, layout = "{file.said.layout}" needs {", ".join(keys)}'
+                f'{file.where(key)}: missing, layout = "{table.layout}" needs {", ".join(keys)}'
             )
-    return tuple(getattr(file.said, key) for key in keys)
+    return tuple(getattr(table, key) for key in keys)
 
 
 def _mode_to_actuator(
     file: MirrorSection, n_actuators: int
 ) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
     """Return strokes ``(n_actuators, n_modes)``, those of unusable modes 0, and notes of them."""
-    if file.said.mode_to_actuator is None:
+    if file.table.mode_to_actuator is None:
         return None, ()
     where = file.where("mode_to_actuator")
     values = _read(file, "mode_to_actuator")
@@ -419,8 +420,8 @@ def _nearest(positions_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDA
 
 
 def _read_table(file: MirrorSection, pupil: Pupil) -> tuple[TabulatedModes, tuple[str, ...]]:
-    key = "modes" if file.said.modes is not None else "influence_functions"
-    if file.said.modes_pitch_m is None:
+    key = "modes" if file.table.modes is not None else "influence_functions"
+    if file.table.modes_pitch_m is None:
         raise ConfigurationError(
             f"{file.where('modes_pitch_m')}: missing, mirror.{key} needs the step of its grid"
         )
@@ -429,10 +430,10 @@ def _read_table(file: MirrorSection, pupil: Pupil) -> tuple[TabulatedModes, tupl
         file.refuse(key, f"shape {cube.shape}", "(n, ny, nx), one table for each")
     of_functions = key == "influence_functions"
     strokes, of_strokes = _strokes(file, len(cube)) if of_functions else (None, ())
-    # Kept beside the modes: whether crops were cut too close is judged before they are combined.
+    # Kept with the modes: whether crops were cut too close is judged before they are combined.
     crops, broken = _without_defects(file, key, cube)
     cube, local = crops, None
-    whole = None if file.said.influence_origin is not None else known_samples(cube)
+    whole = None if file.table.influence_origin is not None else known_samples(cube)
     ending = local_functions(file, _opd(file, cube), strokes, whole) if of_functions else None
     if ending is not None:
         local, known = ending
@@ -446,15 +447,15 @@ def _read_table(file: MirrorSection, pupil: Pupil) -> tuple[TabulatedModes, tupl
     remarks = (
         *of_strokes,
         *broken,
-        *_check_table(file, pupil, key, known, file.said.modes_pitch_m),
+        *_check_table(file, pupil, key, known, file.table.modes_pitch_m),
         *remarks_on_crops(file, crops),
     )
     modes = TabulatedModes(
         cube=None if local is not None else _opd(file, cube),
         local=local,
-        pitch_m=file.said.modes_pitch_m,
+        pitch_m=file.table.modes_pitch_m,
         known=known,
-        **_mount(file.said),
+        **_mount(file.table),
     )
     return modes, remarks
 
@@ -476,7 +477,7 @@ def _without_defects(
     for place, reason in find_defects(cube[usable] if broken.any() else cube).items():
         if reason == ZERO:
             defects[int(usable[place])] = ZERO
-        elif isinstance(reason, int) and file.said.influence_origin is None:
+        elif isinstance(reason, int) and file.table.influence_origin is None:
             defects[int(usable[place])] = int(usable[reason])
     if not defects:
         return cube, ()
@@ -493,7 +494,7 @@ def _strokes(
 
     None: each makes a mode by itself.
     """
-    if file.said.basis is BasisKind.ZONAL:
+    if file.table.basis is BasisKind.ZONAL:
         return None, ()
     strokes, notes = _mode_to_actuator(file, n_actuators)
     if strokes is None:

@@ -53,7 +53,7 @@ def read_pupil(file: Section[AboutTable], subaperture_m: float) -> PupilMap | No
     ConfigurationError
         One line: a key that contradicts another, or a map that is no pupil of this telescope.
     """
-    about = file.said
+    about = file.table
     if (about.spiders_m is None) != (not about.spiders_deg):
         missing, other = ("spiders_m", "spiders_deg")
         if about.spiders_m is not None:
@@ -70,7 +70,7 @@ def read_pupil(file: Section[AboutTable], subaperture_m: float) -> PupilMap | No
 
 
 def _read_pupil_map(file: Section[AboutTable], subaperture_m: float) -> PupilMap:
-    where, diameter_m = file.where("pupil"), file.said.diameter_m
+    where, diameter_m = file.where("pupil"), file.table.diameter_m
     lit = np.asarray(file.array("pupil"), dtype=np.float64)
     if lit.ndim != 2 or min(lit.shape) < 2:
         refuse(where, f"shape {lit.shape}", "(ny, nx), a map of the pupil")
@@ -80,7 +80,7 @@ def _read_pupil_map(file: Section[AboutTable], subaperture_m: float) -> PupilMap
     rows, columns = (np.flatnonzero((lit > _LIT_FRACTION).any(axis=axis)) for axis in (1, 0))
     if not rows.size:
         refuse(where, "no lit point", f"a pupil of {diameter_m:g} m")
-    pitch_m = file.said.pupil_pitch_m or diameter_m / max(lit.shape)
+    pitch_m = file.table.pupil_pitch_m or diameter_m / max(lit.shape)
     if pitch_m > subaperture_m:
         file.refuse(
             "pupil_pitch_m",
@@ -90,7 +90,7 @@ def _read_pupil_map(file: Section[AboutTable], subaperture_m: float) -> PupilMap
     x_m, y_m = ((place[-1] - place[0] + 1) * pitch_m for place in (columns, rows))
     longer_m, ratio = max(x_m, y_m), min(x_m, y_m) / max(x_m, y_m)
     if not _WIDTHS[0] <= longer_m / diameter_m <= _WIDTHS[1] or ratio < _MIN_AXIS_RATIO:
-        stated = file.said.pupil_pitch_m is not None
+        stated = file.table.pupil_pitch_m is not None
         refuse(
             where,
             f"light over {x_m:.3g} m along x and {y_m:.3g} m along y",
@@ -122,15 +122,15 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
         One line with the file and the key: unknown, missing, of the wrong type, out of range, or
         in contradiction to another.
     """
-    said = schema.read_instrument_file(name_or_path)
-    section, kind = said.section, said.kind
-    about, wfs = section(schema.AboutTable).said, section(kind.table)
-    told = asdict(about)
-    del told["pupil"], told["pupil_pitch_m"]
+    file = schema.read_instrument_file(name_or_path)
+    section, kind = file.section, file.kind
+    about, wfs = section(schema.AboutTable).table, section(kind.table)
+    values = asdict(about)
+    del values["pupil"], values["pupil_pitch_m"]
     instrument = Instrument(
-        **told,
-        **_made(_parts(said)),
-        unknown=tuple(one for one in schema.unknown_values(kind) if one in said.unknown),
+        **values,
+        **_made(_parts(file)),
+        unknown=tuple(one for one in schema.unknown_values(kind) if one in file.unknown),
     )
     # A remark, not a refusal: light and flux threshold of a real sensor may well cut another mask.
     difference = check_mask(instrument)
@@ -144,11 +144,11 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
         raise ConfigurationError(f"{wfs.path}: {error}") from error
 
 
-def _parts(said: schema.InstrumentFile) -> Mapping[str, Callable[[], Any]]:
+def _parts(file: schema.InstrumentFile) -> Mapping[str, Callable[[], Any]]:
     """Return how each part of an instrument is made; what one needs of another is made once."""
-    section, kind = said.section, said.kind
+    section, kind = file.section, file.kind
     about, wfs = section(schema.AboutTable), section(kind.table)
-    pupil = Pupil(about.said.diameter_m, about.said.diameter_m / wfs.said.pupil_diameter)
+    pupil = Pupil(about.table.diameter_m, about.table.diameter_m / wfs.table.pupil_diameter)
     sensor = cache(lambda: _sensor(wfs, kind, pupil))
     mirror = cache(lambda: read_mirror(section(schema.MirrorTable), pupil))
     modes = cache(lambda: _modes(section(KarhunenLoeve), mirror()[0]))
@@ -156,14 +156,14 @@ def _parts(said: schema.InstrumentFile) -> Mapping[str, Callable[[], Any]]:
     @cache
     def frames() -> object | None:
         with schema.refused_at(wfs.path, wfs.name):
-            return kind.model.frames(wfs.said, wfs.given)
+            return kind.model.frames(wfs.table, wfs.given)
 
     return {
         "wfs": sensor,
         "mirror": lambda: mirror()[0],
         "modes": modes,
         "frames": frames,
-        "law": lambda: law_of(section(LawTable).said),
+        "law": lambda: law_of(section(LawTable).table),
         "pupil": lambda: read_pupil(about, pupil.subaperture_m),
         "slopes": lambda: _slopes(
             section(schema.SlopesTable), kind, has_frames=frames() is not None
@@ -171,7 +171,7 @@ def _parts(said: schema.InstrumentFile) -> Mapping[str, Callable[[], Any]]:
         "loop": lambda: _loop(section(LoopFacts), modes().n_modes),
         "remarks": lambda: (
             *mirror()[1],
-            *_list_assumptions(said, sensor(), mirror()[0]),
+            *_list_assumptions(file, sensor(), mirror()[0]),
             *remarks_on_law(section(LawTable)),
         ),
     }
@@ -203,7 +203,7 @@ def _in_first_mode(
 ) -> Instrument:
     """Return the instrument with the modes of its sensor, in the first of them."""
     with schema.refused_at(file.path, file.name):
-        modes = kind.model.in_modes(file.said, instrument.wfs)
+        modes = kind.model.in_modes(file.table, instrument.wfs)
     if not modes:
         return instrument
     if instrument.config_id is not None:
@@ -247,20 +247,20 @@ def _complete_mode(
             f"{at}: missing; a mask of the finest subapertures (wfs.valid_subapertures) says "
             "nothing of binned ones"
         )
-    told = replace(loop, frame_rate_hz=rate_hz, n_controlled=n_controlled)
-    return replace(mode, wfs=wfs, loop=told)
+    mode_loop = replace(loop, frame_rate_hz=rate_hz, n_controlled=n_controlled)
+    return replace(mode, wfs=wfs, loop=mode_loop)
 
 
 def _list_assumptions(
-    said: schema.InstrumentFile, sensor: SensorDescription, mirror: Mirror | TabulatedModes
+    file: schema.InstrumentFile, sensor: SensorDescription, mirror: Mirror | TabulatedModes
 ) -> Iterator[str]:
     """Yield what the file does not say, and what is taken instead."""
-    wfs = said.section(said.kind.table)
-    for key, text in said.kind.list_assumptions(wfs.said, wfs.given):
+    wfs = file.section(file.kind.table)
+    for key, text in file.kind.list_assumptions(wfs.table, wfs.given):
         yield f"{wfs.where(key)}: {text}"
-    values = {f"wfs.{key}": getattr(sensor, key, None) for key in said.kind.unknown}
+    values = {f"wfs.{key}": getattr(sensor, key, None) for key in file.kind.unknown}
     values["mirror.coupling"] = mirror.shape.coupling if isinstance(mirror, Mirror) else None
-    for key in sorted(said.unknown):
+    for key in sorted(file.unknown):
         taken = values.get(key)
         words = "allows for it in its uncertainty" if taken is None else f"takes {taken:g}"
         yield (
@@ -282,7 +282,7 @@ def packaged_instrument(name: str) -> Instrument:
 
 def _modes(file: schema.Section[KarhunenLoeve], mirror: Mirror | TabulatedModes) -> KarhunenLoeve:
     """Return the turbulence, and as many modes as the user's basis or ``[modes]`` has."""
-    where, own, table = file.where("n_modes"), own_modes(mirror), file.said
+    where, own, table = file.where("n_modes"), own_modes(mirror), file.table
     if own is not None:
         if "n_modes" in file.given:
             refuse(where, f"it together with an own basis of {own} modes", "it for KL modes only")
@@ -304,7 +304,7 @@ def _modes(file: schema.Section[KarhunenLoeve], mirror: Mirror | TabulatedModes)
 def _slopes(
     file: schema.Section[schema.SlopesTable], sensor: SensorKind, *, has_frames: bool
 ) -> SlopeRecipe:
-    table = file.said
+    table = file.table
     if table.kind not in sensor.signals:
         file.refuse("kind", f"{table.kind} of a {sensor.name}", " or ".join(sensor.signals))
     if not sensor.normalised:
@@ -327,7 +327,7 @@ def _slopes(
 def _loop(file: schema.Section[LoopFacts], n_modes: int) -> LoopFacts | None:
     if not file.given:
         return None
-    table = file.said
+    table = file.table
     if table.n_controlled is not None and table.n_controlled > n_modes:
         file.refuse(
             "n_controlled", str(table.n_controlled), f"at most the {n_modes} modes of the basis"
@@ -337,13 +337,13 @@ def _loop(file: schema.Section[LoopFacts], n_modes: int) -> LoopFacts | None:
 
 def _sensor(file: schema.Section[Any], kind: SensorKind, pupil: Pupil) -> SensorDescription:
     with schema.refused_at(file.path, file.name):
-        sensor = kind.model.read_sensor(file.said, file.given, pupil.subaperture_m)
+        sensor = kind.model.read_sensor(file.table, file.given, pupil.subaperture_m)
     # The mask of the RTC decides if there is one: its slopes are listed by it.
-    if file.said.valid_subapertures == "auto":
+    if file.table.valid_subapertures == "auto":
         return sensor
     file.refuse_useless(["flux_threshold"], "together with a mask file (wfs.valid_subapertures)")
     where = file.where("valid_subapertures")
-    mask = _mask(file.array("valid_subapertures"), where, file.said.n_subapertures)
+    mask = _mask(file.array("valid_subapertures"), where, file.table.n_subapertures)
     return replace(sensor, valid_subapertures=mask)
 
 

@@ -105,7 +105,7 @@ class LawTable(Read):
     α is tracked as the deviation from it. Each parameter is a number, an expression of `azimuth`
     and `elevation` (degrees) and of names of the observatory's values, or a table `{ of =
     "elevation", at = [20, 80], values = [0.1, -0.1] }` with linear interpolation; `period = 360`
-    beside `at` makes the table repeat itself, as that of a derotator's angle must. A whole turn of
+    next to `at` makes the table repeat itself, as that of a derotator's angle must. A whole turn of
     azimuth must not change it, except by whole turns of the rotation.
     """
 
@@ -125,7 +125,7 @@ class LawTable(Read):
 def remarks_on_law(file: Section[LawTable]) -> tuple[str, ...]:
     """Return a remark on each table whose ends are the same place and do not agree."""
     largest = (NORTH_STEP_SUBAP, NORTH_STEP_SUBAP, NORTH_STEP_DEG, NORTH_STEP_MAGNIFICATION)
-    terms = [(field.name, getattr(file.said, field.name)) for field in fields(LawTable)]
+    terms = [(field.name, getattr(file.table, field.name)) for field in fields(LawTable)]
     return tuple(
         f"{file.where(name)}: the table ends with {term.values[-1]:g} and begins with "
         f"{term.values[0]:g}, a whole turn of {term.expression} apart: when it returns, α becomes "
@@ -308,14 +308,14 @@ def unknown_values(kind: SensorKind) -> dict[str, float | None]:
     return {**of_sensor, "mirror.coupling": 0.35}
 
 
-Said = TypeVar("Said")
+ReadTable = TypeVar("ReadTable")
 
 
 @dataclass(frozen=True, slots=True)
-class Section(Generic[Said]):
+class Section(Generic[ReadTable]):
     """A table of a file, as it is read and as it is written."""
 
-    said: Said
+    table: ReadTable
     given: frozenset[str]
     """Keys that are written."""
 
@@ -332,14 +332,14 @@ class Section(Generic[Said]):
         """Refuse the value of a key that the schema alone cannot judge."""
         refuse(self.where(key), found, expected)
 
-    def refuse_useless(self, keys: Iterable[str], beside: str) -> None:
+    def refuse_useless(self, keys: Iterable[str], context: str) -> None:
         """Refuse each of these keys if it is given, because another setting makes it useless."""
         for key in sorted(self.given.intersection(keys)):
-            raise ConfigurationError(f"{self.where(key)}: has no effect {beside}; remove it")
+            raise ConfigurationError(f"{self.where(key)}: has no effect {context}; remove it")
 
     def array(self, key: str) -> NDArray[Any]:
         """Return the array that a key refers to."""
-        return read_dataset(getattr(self.said, key), self.path.parent, self.where(key))
+        return read_dataset(getattr(self.table, key), self.path.parent, self.where(key))
 
 
 @dataclass(frozen=True, slots=True)
@@ -351,11 +351,11 @@ class InstrumentFile:
     """Kind of its sensor."""
 
     unknown: frozenset[str] = frozenset()
-    """Keys, with their tables, that are said to be unknown."""
+    """Keys, with their tables, that the file states as unknown."""
 
-    def section(self, kind: type[Said]) -> Section[Said]:
+    def section(self, kind: type[ReadTable]) -> Section[ReadTable]:
         """Return the table that is read into this."""
-        return next(section for section in self.sections if isinstance(section.said, kind))
+        return next(section for section in self.sections if isinstance(section.table, kind))
 
 
 def read_instrument_file(name_or_path: str | Path) -> InstrumentFile:
@@ -382,10 +382,10 @@ def read_instrument_file(name_or_path: str | Path) -> InstrumentFile:
         with refused_at(path, "wfs"):
             tables["wfs"] = kind.as_read(tables["wfs"])
     whole = whole_of(kind)
-    said = validated(whole, tables, in_file(path))
+    parsed = validated(whole, tables, in_file(path))
     return InstrumentFile(
         tuple(
-            Section(getattr(said, name), frozenset(written.get(name, ())), path, name)
+            Section(getattr(parsed, name), frozenset(written.get(name, ())), path, name)
             for name in whole.model_fields
         ),
         kind,

@@ -496,8 +496,8 @@ class Intake:
             self._counters.add(kind, "session", n, now_s, text)
         rival = admission.other_session
         if rival is not None and current and self._is_new(f"second {rival}", now_s):
-            told = f"two RTCs send at once, sessions {current} and {rival}: stop one of them"
-            self._put(ev.ConditionChanged(name=SECOND_RTC, text=told))
+            trouble = f"two RTCs send at once, sessions {current} and {rival}: stop one of them"
+            self._put(ev.ConditionChanged(name=SECOND_RTC, text=trouble))
         return admission.accepted
 
     def _check_ids(
@@ -508,8 +508,8 @@ class Intake:
         if self._basis_id is None or self._config_id is None:
             self._basis_id = self._basis_id or basis_id
             self._config_id = self._config_id or config_id
-            told = f"basis {self._basis_id}, configuration {self._config_id}"
-            self._put(ev.LogEvent(name="ids.adopted", text=told))
+            text = f"basis {self._basis_id}, configuration {self._config_id}"
+            self._put(ev.LogEvent(name="ids.adopted", text=text))
         # The RTC may change the sensor's mode during a session; all modes of the instrument file
         # are expected. An RTC of version 1 may have named its reference slopes by this id: with
         # other sizes it is another sensor, and else the tracker decides (``tracking/rtc.py``).
@@ -521,16 +521,16 @@ class Intake:
         if found == expected:
             return None
         if self._is_new("ids", now_s):
-            told = (
+            text = (
                 f"the RTC's basis and configuration are {' and '.join(found)}, expected "
                 f"{' and '.join(expected)}: no estimate, no publication until they agree"
             )
             if self._modes and config_id not in self._modes:
-                told += (
+                text += (
                     f"; the instrument file has the modes {', '.join(self._modes)}: set the RTC to "
                     f"one of them, or add [[wfs.mode]] config_id = {config_id!r} to the file"
                 )
-            self._put(ev.ConditionChanged(name=OTHER_BASIS, text=told))
+            self._put(ev.ConditionChanged(name=OTHER_BASIS, text=text))
         which = "basis" if basis_id != self._basis_id else "config"
         return which, f"{' and '.join(found)}, expected {' and '.join(expected)}"
 

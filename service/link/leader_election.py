@@ -91,7 +91,7 @@ class SessionWatch:
         return SessionDecision(accepted=False)
 
     def leave(self) -> None:
-        """Note that the RTC has said goodbye: unless it speaks again, its session is over."""
+        """Note that the RTC has announced its end: unless it speaks again, its session is over."""
         self._left = True
 
     def waiting(self, now_s: float) -> str | None:
@@ -161,8 +161,8 @@ class LeaderElection:
     def others(self, now_s: float) -> tuple[str, ...]:
         """Return the other services that are there, in words, the first one first."""
         names = tuple(_words(name) for name in sorted(self._names, key=_rank))
-        heard = self._received_s is not None and now_s - self._received_s < NAMELESS_TIMEOUT_S
-        nameless = heard or (self.contract_held and not self.drives)
+        received = self._received_s is not None and now_s - self._received_s < NAMELESS_TIMEOUT_S
+        nameless = received or (self.contract_held and not self.drives)
         return names if names or not nameless else ("one that gives no name",)
 
 

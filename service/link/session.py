@@ -381,9 +381,9 @@ def fetch_applied(
     LinkError
         If the RTC does not answer or has none.
     """
-    told = _request(session, keys.applied)
-    signatures.check(keys.applied, told)
-    manifest = wire.decode(wire.Manifest, told)
+    reply = _request(session, keys.applied)
+    signatures.check(keys.applied, reply)
+    manifest = wire.decode(wire.Manifest, reply)
     assembler = wire.ChunkAssembler()
     assembler.announce(manifest.layout)
     for index in range(manifest.layout.n_chunks):

@@ -22,7 +22,7 @@ from typing_extensions import override
 from service.model.arrays import NUMPY, Arrays
 from service.model.instrument import Instrument
 from service.model.kinds import Stop
-from service.model.local import LocalShapes, MadeElsewhere, Patch, Shapes, beside, tiles_of
+from service.model.local import LocalShapes, MadeElsewhere, Patch, Shapes, stack_shapes, tiles_of
 from service.model.misregistration import Misregistration, rotation, stretch_matrix
 from service.model.modes import Basis, LocalBasis, local_of
 from service.model.pupil import Illumination, instrument_pupil
@@ -347,8 +347,8 @@ class InteractionModel:
     def _image_shift(self, alpha: Misregistration) -> tuple[float, float]:
         """Shift of the pupil images: with the telescope as stop they stay where they are."""
         if self.instrument.stop is Stop.TELESCOPE:
-            told = kind_of(self.instrument).pupil_offset(self.instrument)
-            return self.instrument.pupil_shift_subap or told or (0.0, 0.0)
+            offset = kind_of(self.instrument).pupil_offset(self.instrument)
+            return self.instrument.pupil_shift_subap or offset or (0.0, 0.0)
         return (alpha.shift_x_subap, alpha.shift_y_subap)
 
     def _mirror_points(self, alpha: Misregistration) -> NDArray[np.float64]:
@@ -361,8 +361,8 @@ class InteractionModel:
         """Return the positions of pupil points on the mirror, ``(n_points, 2)``."""
         # Zero with the mirror as stop, whose image carries the pupil's points along; minus the
         # shift with a fixed pupil.
-        beside = np.array(self._image_shift(alpha)) - alpha.vector[:2]
-        return self.instrument.with_anamorphosis(alpha).on_mirror(points + beside)
+        displacement = np.array(self._image_shift(alpha)) - alpha.vector[:2]
+        return self.instrument.with_anamorphosis(alpha).on_mirror(points + displacement)
 
     def _render_modes(self, alpha: Misregistration) -> Shapes:
         shift = self._image_shift(alpha)
@@ -445,7 +445,7 @@ class InteractionModel:
         # The tiles of a kept one are read once for all local shapes.
         if self.sensor.keeps_gradient and not isinstance(shapes[0], LocalShapes):
             return [self.measure_signals(alpha, one) for one in shapes]
-        return np.split(self.measure_signals(alpha, beside(shapes)), len(shapes), axis=1)
+        return np.split(self.measure_signals(alpha, stack_shapes(shapes)), len(shapes), axis=1)
 
     def _move_modes(self, alpha: Misregistration, way: Way | None) -> Shapes:
         """Return the modes where α puts them or, with a way, their rates along it."""

@@ -171,7 +171,7 @@ Shapes = Array | LocalShapes
 """Wavefronts at the lit points of a pupil: ``(n_points, n_shapes)``, or what makes them."""
 
 
-def beside(shapes: Sequence[Shapes]) -> Shapes:
+def stack_shapes(shapes: Sequence[Shapes]) -> Shapes:
     """Return shapes of one pupil as one, their columns one after another: one response for all.
 
     Local ones are the same functions, their heights or rates, in one combination.
@@ -194,12 +194,12 @@ def beside(shapes: Sequence[Shapes]) -> Shapes:
     recipes, there = [one.elsewhere for one in local if one.elsewhere is not None], None
     if len(recipes) == len(local):
         each = tuple(recipe.make for recipe in recipes)
-        there = replace(recipes[0], make=partial(_made_beside, each=each))
+        there = replace(recipes[0], make=partial(_make_stacked, each=each))
     return replace(local[0], patches=patches, n_layers=len(local), elsewhere=there)
 
 
-def _made_beside(model: object, *, each: Sequence[Callable[[Any], Shapes]]) -> Shapes:
-    return beside([make(model) for make in each])
+def _make_stacked(model: object, *, each: Sequence[Callable[[Any], Shapes]]) -> Shapes:
+    return stack_shapes([make(model) for make in each])
 
 
 @lru_cache(maxsize=16)

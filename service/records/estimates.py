@@ -191,7 +191,7 @@ class RefusalKind(StrEnum):
     NOT_FOUND = "not-found"
     """It was good, of an open loop, and no registration explains it."""
 
-    MISTOLD = "mistold"
+    MISDESCRIBED = "mistold"
     """It shows that slopes or commands are not what the instrument file says."""
 
 

@@ -83,7 +83,7 @@ def _read() -> dict[str, str]:
     text = files(__package__).joinpath("messages.toml").read_text(encoding="utf-8")
     tables: dict[str, dict[str, str]] = tomllib.loads(text)
     return {
-        f"{table}.{name}": said for table, texts in tables.items() for name, said in texts.items()
+        f"{table}.{name}": line for table, texts in tables.items() for name, line in texts.items()
     }
 
 

@@ -248,10 +248,10 @@ class DitherPolicyState:
     loud_text: str = ""
     """Measured excess of that dither; empty if its status showed it."""
 
-    amiss_id: str | None = None
+    mismatched_id: str | None = None
     """Id of the last dither that differed from its request in the frames."""
 
-    amiss_m: float = 0.0
+    mismatched_m: float = 0.0
     """RMS of all its lines together, metres OPD."""
 
     mean_square_m2: float = 0.0

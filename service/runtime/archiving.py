@@ -131,8 +131,8 @@ class ArchiveWriter:
                 self._lost += len(found[room:])
         for entry in lines:
             if entry.level is not Level.DEBUG:
-                said = {key: getattr(entry, key) for key in ("t_ns_utc", "name", "text", "cause")}
-                self.add(AuditEntry(who="service", **said))
+                values = {key: getattr(entry, key) for key in ("t_ns_utc", "name", "text", "cause")}
+                self.add(AuditEntry(who="service", **values))
 
     async def ordered(self, order: GivenCommand, actor: Actor) -> None:
         """Write down what an operator asks for, before it is done.
@@ -163,11 +163,11 @@ class ArchiveWriter:
         entry = actor.entry(name, asked, by=command.by, why=command.reason)
         entry = replace(entry, answer=answer, cause=order.id)
         self.add(entry)
-        said = {key: getattr(entry, key) for key in _LOGGED_FIELDS if getattr(entry, key)}
+        values = {key: getattr(entry, key) for key in _LOGGED_FIELDS if getattr(entry, key)}
         state = self._state()
         led_to = {one.id for one in _records(state) if one.cause == order.id}
         ids = ids_of(state, led_to | {getattr(command, "id", "")})
-        self._log.info(entry.name, **said, **ids)
+        self._log.info(entry.name, **values, **ids)
 
     async def before(self, effect: Effect) -> None:
         """Wait until the causes of an effect are on the disk.
@@ -293,7 +293,7 @@ class ArchiveWriter:
                 if time.monotonic() >= next_s:
                     next_s = time.monotonic() + PRUNE_INTERVAL_S
                     await self._prune(retention)
-            except (OSError, ArchiveError) as error:  # a disk that refuses is told of elsewhere
+            except (OSError, ArchiveError) as error:  # a disk that refuses is reported elsewhere
                 self._log.warning("archive.not-looked-after", text=str(error))
             except Exception:  # noqa: BLE001 - a bug must not end the service
                 self._log.exception("archive.not-looked-after")
@@ -357,11 +357,11 @@ class ArchiveWriter:
                 estimates, samples = tuple(self._estimates), tuple(self._samples)
                 lost = self._lost
             # The gap is recorded in the trail itself, or a reader would take it for complete.
-            told = _loss_text(lost) if lost else ()
+            loss = _loss_text(lost) if lost else ()
             try:
-                entries_told = (*entries, *told)
-                if records or entries_told or estimates or samples:
-                    self._archive.record(tuple(records.values()), entries_told, estimates, samples)
+                all_entries = (*entries, *loss)
+                if records or all_entries or estimates or samples:
+                    self._archive.record(tuple(records.values()), all_entries, estimates, samples)
             except StorageError:
                 raise
             except ArchiveError as error:  # a damaged index is a disk that refuses, too
@@ -406,13 +406,13 @@ def command_json(command: Command, actor: Actor) -> str:
 
     With a key, the name in the command is only what its sender calls himself.
     """
-    told = {"reason"} | ({"by"} if command.by == actor.key or not actor.key else set())
-    said = {
+    left_out = {"reason"} | ({"by"} if command.by == actor.key or not actor.key else set())
+    values = {
         field.name: getattr(command, field.name)
         for field in fields(command)
-        if field.name not in told and getattr(command, field.name) != field.default
+        if field.name not in left_out and getattr(command, field.name) != field.default
     }
-    return msgspec.json.encode(said).decode()
+    return msgspec.json.encode(values).decode()
 
 
 def _loss_text(lost: int) -> tuple[AuditEntry]:

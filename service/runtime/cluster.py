@@ -186,7 +186,7 @@ class Cluster:
         # Scattered data has no recipe: if the workers that had it died, it must be sent again.
         there = {id(part): future for part, future in self._parts if future.status == "finished"}
         found = [there.get(id(part)) or self._scatter(part) for part in parts]
-        # The part itself is kept beside its future: while it is alive its id cannot be reused by
+        # The part itself is kept with its future: while it is alive its id cannot be reused by
         # another object.
         self._parts = list(zip(parts, found, strict=True))
         return found
@@ -256,10 +256,10 @@ class Cluster:
 
     def _check_versions(self) -> None:
         try:
-            told = self._client.run_on_scheduler(own_versions)
+            versions = self._client.run_on_scheduler(own_versions)
         except Exception as error:
             raise ClusterError(_other_version(self.address, "the scheduler", error)) from error
-        self._compare({"the scheduler": told})
+        self._compare({"the scheduler": versions})
         self._check_workers()
         if not self._checked:
             raise ClusterError(f"{self.address}: found a scheduler without workers; {self._start}")
@@ -272,11 +272,11 @@ class Cluster:
         came = sorted(set(self._workers()) - self._checked)
         if came:
             try:
-                told = self._client.run(own_versions, workers=came, on_error="return")
+                versions = self._client.run(own_versions, workers=came, on_error="return")
             except Exception as error:
                 raise self._lost(error) from error
-            self._compare(told)
-            self._checked |= set(told)
+            self._compare(versions)
+            self._checked |= set(versions)
 
     def _compare(self, versions: Mapping[str, object]) -> None:
         for who, found in versions.items():
@@ -331,17 +331,17 @@ def _other_version(where: str, who: str, found: object, expected: Versions | Non
         names = [name for name in here if found.get(name) != here[name]]
         what = ", ".join(f"{name} {found.get(name)}" for name in names)
         meant = ", ".join(f"{name} {here[name]}" for name in names)
-        told = f"found {what}, expected {meant}"
+        difference = f"found {what}, expected {meant}"
     else:
-        told = f"found no pyrcal that reports its version ({shown(str(found))})"
-    return f"{where}: {who}: {told}; start scheduler and workers from this very installation"
+        difference = f"found no pyrcal that reports its version ({shown(str(found))})"
+    return f"{where}: {who}: {difference}; start scheduler and workers from this very installation"
 
 
 def _connect_client(address: str) -> Client:
     try:
         import dask.config
 
-        # what is wrong is told in our one line; theirs would be tracebacks beside it
+        # Our message is one line about the failure; these loggers would add tracebacks to it.
         quiet = dict.fromkeys(("distributed", "distributed.client"), "critical")
         dask.config.set({"logging": quiet})
         from distributed import Client

@@ -54,7 +54,7 @@ class GivenCommand:
         LinkError
             If the RTC did not answer in its time.
         """
-        tell = _TOLD_LATER.get(type(self.command), _done)
+        tell = _REPORTED_LATER.get(type(self.command), _done)
         result = tell(self.command, self.id, now)
         failure = "" if result.final else now.failure(self.id)
         if failure:
@@ -188,7 +188,7 @@ def _no_dither(_: cmd.StopDither, __: str, now: TrackerState) -> CommandResult:
     return CommandResult(compose("command.dither-stopping", playing=playing), final=False)
 
 
-_TOLD_LATER: Final[dict[type, Callable[[Any, str, TrackerState], CommandResult]]] = {
+_REPORTED_LATER: Final[dict[type, Callable[[Any, str, TrackerState], CommandResult]]] = {
     cmd.Approve: _sent,
     cmd.Publish: _report_republished,
     cmd.Rollback: _report_republished,
@@ -237,7 +237,7 @@ def _done(  # noqa: C901 - one line for each command
         case cmd.AcknowledgeAlarm(name=name) | cmd.MuteAlarm(name=name):
             message = compose("command.alarm", name, state=_describe_alarm(now, name))
         case _:
-            raise TypeError(f"found {type(command).__name__}; expected it in _TOLD_LATER")
+            raise TypeError(f"found {type(command).__name__}; expected it in _REPORTED_LATER")
     return CommandResult(message)
 
 
@@ -246,12 +246,12 @@ def _describe_alarm(now: TrackerState, name: str) -> str:
     record = next(
         (record for record in now.alarms.records if record.name == name), AlarmRecord(name=name)
     )
-    said = []
+    parts = []
     if record.acknowledged is not None:
-        said.append("acknowledged; it stays until it is over")
+        parts.append("acknowledged; it stays until it is over")
     elif record.worst is None:
-        said.append("over and done with")
+        parts.append("over and done with")
     if record.muted is not None:
         left_s = ((record.muted.until_ns_utc or 0) - record.muted.t_ns_utc) / 1e9
-        said.append(f"muted for {left_s:.0f} s, with {len(muted_records(now))} muted in all")
-    return ", ".join(said)
+        parts.append(f"muted for {left_s:.0f} s, with {len(muted_records(now))} muted in all")
+    return ", ".join(parts)

@@ -149,10 +149,10 @@ class Engine:
 
     def _weigh_modes(self) -> None:
         """Let modes that the model explains badly count less where those to dither are chosen."""
-        told, weights = self._mode_information, self.state.matrices.mode_proof.own_weights
-        if told is not None and len(weights) == len(told):
-            told = told * np.array(weights)[:, None, None]
-        self.policy = replace(self.policy, mode_information=told)
+        information, weights = self._mode_information, self.state.matrices.mode_proof.own_weights
+        if information is not None and len(weights) == len(information):
+            information = information * np.array(weights)[:, None, None]
+        self.policy = replace(self.policy, mode_information=information)
 
     def _note_sensor_mode(self, before: TrackerState) -> None:
         """Stop listening where the sensor's mode has changed, until its model is there."""
@@ -232,12 +232,12 @@ class Engine:
         if self.bank is None:
             return "no passive estimate: the optical model is being prepared"
         registration, now_ns = self.state.alpha.registration, self._driver.now_ns()
-        told = (
+        has_windows = (
             registration is not None
             and not registration.doubt
             and now_ns - registration.window_ns_utc < RECENT_WINDOW_S * SECOND_NS
         )
-        self.bank, sums = close_sums(self.bank, has_windows=told)
+        self.bank, sums = close_sums(self.bank, has_windows=has_windows)
         return sums
 
     def learn(self, matrix_id: str, matrix: NDArray[np.float32]) -> None:

@@ -221,18 +221,18 @@ async def read_own_matrix(
     near = state.alpha.law.nominal if registration is None else registration.alpha
     try:
         # Repeated if the worker dies of something else: nothing reads this matrix again.
-        dialect = await with_another_worker(
+        convention = await with_another_worker(
             partial(workers.call, OpticsWorker.read_slope_convention, matrix, near)
         )
         own = None
         # The modes can only be compared once order and signs of the slopes are right.
-        if not dialect.wrong:
+        if not convention.wrong:
             own = await with_another_worker(
-                partial(workers.call, OpticsWorker.recognise, matrix, near, dialect.rotation_rad)
+                partial(workers.call, OpticsWorker.recognise, matrix, near, convention.rotation_rad)
             )
     except PyrcalError as error:
         return [*unread, ev.LogEvent(name="slopes.unknown", text=str(error), level=Level.WARNING)]
-    return [*unread, *_report_own_matrix(record, dialect, own, state)]
+    return [*unread, *_report_own_matrix(record, convention, own, state)]
 
 
 async def _brought(
@@ -255,16 +255,16 @@ async def _brought(
 
 def _report_own_matrix(
     record: products.ReconstructorRecord,
-    dialect: SlopeConvention,
+    convention: SlopeConvention,
     own: OwnMatrix | None,
     state: TrackerState,
 ) -> list[Event]:
     """Return how the RTC lists its slopes and which modes the model has recognised, as events."""
     events: list[Event] = []
-    if dialect.adopted and dialect.found is not None:
-        text = f'orientation "auto": found {orientation.format_setting(dialect.found)}'
+    if convention.adopted and convention.found is not None:
+        text = f'orientation "auto": found {orientation.format_setting(convention.found)}'
         events.append(ev.LogEvent(name="slopes.adopted", text=f"{text} by {record.id}"))
-    wrong = dialect.wrong or (own.wrong if own is not None else "")
+    wrong = convention.wrong or (own.wrong if own is not None else "")
     if wrong or state.alarm(alarms.WRONG_MATRIX) is not None:
         text = f"{record.id}: {wrong}" if wrong else f"{record.id} agrees with the instrument file"
         events.append(ev.ConditionChanged(name=alarms.WRONG_MATRIX, text=text, over=not wrong))

@@ -131,7 +131,7 @@ def _is_lost(disposition: Disposition, link: LinkStatistics, used: int) -> bool:
             return False
         case "duplicate":
             return not used
-        case "session":  # another may be taking over; beside one that sends it is a second RTC
+        case "session":  # another may be taking over; next to one that sends it is a second RTC
             return not used and link.session_waiting is None
         case _:
             return True
@@ -443,10 +443,10 @@ class Revival:
     def due(self, link: LinkStatistics, now_s: float) -> bool:
         """Return whether it is time; each time in vain, it is twice as long to the next."""
         # Any message counts, even a malformed one: it proves that the connection works.
-        heard = any(disposition.age_s < STATUS_TIMEOUT_S for disposition in link.dispositions)
-        if heard:
+        received = any(disposition.age_s < STATUS_TIMEOUT_S for disposition in link.dispositions)
+        if received:
             self._wait_s = FIRST_REOPENING_DELAY_S
-        if heard or not link.rtc_alive:
+        if received or not link.rtc_alive:
             self._since_s = None
             return False
         if self._since_s is None:
@@ -479,10 +479,10 @@ class ReadinessLog:
         return [f"{wait.responsible}: {wait.text}" for wait in due]
 
     def _due(self, name: str, now_ns: int) -> bool:
-        since_ns, told_ns = self._since_ns[name], self._logged_ns.get(name)
+        since_ns, logged_ns = self._since_ns[name], self._logged_ns.get(name)
         if now_ns - since_ns < MIN_LOGGED_DURATION_NS:
             return False
-        return told_ns is None or (told_ns < since_ns and now_ns - told_ns >= LOG_INTERVAL_NS)
+        return logged_ns is None or (logged_ns < since_ns and now_ns - logged_ns >= LOG_INTERVAL_NS)
 
 
 def state_message(

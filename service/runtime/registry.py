@@ -54,10 +54,10 @@ def _other_dither(
     dither_id: str, measurement: DitherMeasurement, state: TrackerState
 ) -> list[Event]:
     """Return a finding on the dither when it is new or over."""
-    told = state.dithers.policy
+    policy = state.dithers.policy
     raised = state.alarm(alarms.NOT_AS_ASKED) or state.alarm(alarms.OVER_BUDGET)
-    louder = measurement.found_m > MAX_AMPLITUDE_RATIO * told.amiss_m
-    news = told.amiss_id != dither_id or louder if measurement.text else raised
+    louder = measurement.found_m > MAX_AMPLITUDE_RATIO * policy.mismatched_m
+    news = policy.mismatched_id != dither_id or louder if measurement.text else raised
     if not news:
         return []
     return [
@@ -127,7 +127,7 @@ class Entry:
     """Returns its other events."""
 
     def conditions(self, member: Streaming) -> list[tuple[str, str | None, str]]:
-        """Return name, text (None: all is well) and what is said when it is over, of each alarm."""
+        """Return name, text (None: all is well) and its text when it is over, of each alarm."""
         found = zip(self.alarms.items(), member.conditions, strict=True)
         return [(name, text, over) for (name, over), text in found]
 

@@ -377,7 +377,7 @@ class Supervisor:
 
     async def _tick(self) -> None:
         alarms: frozenset[tuple[str, str]] = frozenset()
-        told, losses = readiness.ReadinessLog(), Losses()
+        readiness_log, losses = readiness.ReadinessLog(), Losses()
         while True:
             self._heartbeat.beat("the tick")
             link = self._bridge.statistics()
@@ -392,7 +392,7 @@ class Supervisor:
             for event in readiness.detect_link_changes(link, self._engine.state, now_ns, also):
                 self._post(event)
             waiting = self._waiting_for(link)
-            for text in told.due_lines(waiting, self._engine.state.alarms.active, now_ns):
+            for text in readiness_log.due_lines(waiting, self._engine.state.alarms.active, now_ns):
                 self._note("waiting", text, Level.INFO)
             self._bridge.publish_state(readiness.state_message(self._engine.state, now_ns, waiting))
             raised = frozenset((a.name, a.text) for a in self._engine.state.alarms.active)
@@ -554,8 +554,8 @@ class Supervisor:
         if event is not None:
             self._post(event, effect.cause)
 
-    async def _keep_measured(self, heard: matrices.MeasuredMatrix) -> None:
-        known = self._engine.state.measurement(heard.manifest.id)
+    async def _keep_measured(self, received: matrices.MeasuredMatrix) -> None:
+        known = self._engine.state.measurement(received.manifest.id)
         given_up = known is not None and known.state is MeasureState.GIVEN_UP
         if known is not None and (given_up or known.pattern is None):
             why = "it had been given up" if given_up else "a noisy one had this id"
@@ -563,7 +563,7 @@ class Supervisor:
             self._note("measurement.ignored", text, Level.INFO)
             return
         try:
-            self._post(await self._actions.keep_measured(heard))
+            self._post(await self._actions.keep_measured(received))
         except PyrcalError as error:
             if isinstance(error, StorageError):
                 self._writer.failed(error)
@@ -578,8 +578,8 @@ class Supervisor:
         entries = new_lines(before, after)
         ids = archiving.ids_of(after, archiving.find_changed_ids(before, after)) if entries else {}
         for entry in entries:
-            told = getattr(self._log, _LEVELS.get(entry.level, entry.level.value))
-            told(entry.name, text=entry.text, **ids)
+            write = getattr(self._log, _LEVELS.get(entry.level, entry.level.value))
+            write(entry.name, text=entry.text, **ids)
         self._writer.changed(before, self._engine.state, entries)
 
 

@@ -408,7 +408,7 @@ async def run_program(words: Sequence[str], *, limit_s: float) -> None:
     assert process.stderr is not None  # noqa: S101 - asked for above
     try:
         async with asyncio.timeout(limit_s):
-            said = await process.stderr.read()
+            stderr = await process.stderr.read()
             status = await process.wait()
     except TimeoutError as error:
         raise errors.WorkerError(f"took longer than {limit_s:g} s and was stopped") from error
@@ -420,6 +420,6 @@ async def run_program(words: Sequence[str], *, limit_s: float) -> None:
     if status < 0:
         raise errors.WorkerError("the process of the job died; out of memory?")
     if status > 0:
-        lines = said.decode(errors="replace").split("\n")
+        lines = stderr.decode(errors="replace").split("\n")
         last = next((line for line in reversed(lines) if line.strip()), "without a message")
         raise errors.WorkerError(last)

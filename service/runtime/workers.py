@@ -249,7 +249,7 @@ def _ignore(_model: ModelState) -> None:
     pass
 
 
-# --- how the work keeps pace with the telemetry: what it costs, and what is said where it does not
+# --- how the work keeps pace with the telemetry: what it costs, and what is reported if it does not
 
 
 LOAD_AVERAGING_TIME_S = 60.0

@@ -225,7 +225,7 @@ def _not_used_since(context: StepContext) -> bool:
 
 def _is_not_as_asked(context: StepContext) -> bool:
     """Return True if the last dither is still the one that differed from its request."""
-    return context.dither_policy.amiss_id is not None and not _is_given_up(context)
+    return context.dither_policy.mismatched_id is not None and not _is_given_up(context)
 
 
 def _is_over_budget(context: StepContext) -> bool:

@@ -238,11 +238,13 @@ def on_measured(context: StepContext, event: ev.DitherMeasured) -> None:
     """
     rtc, dither = context.rtc, context.dither
     if not event.text:
-        context.dither_policy = replace(context.dither_policy, loud_text="", amiss_id=None)
+        context.dither_policy = replace(context.dither_policy, loud_text="", mismatched_id=None)
         return
     if rtc is None or dither is None or dither.id != event.id:
         return
-    context.dither_policy = replace(context.dither_policy, amiss_id=event.id, amiss_m=event.found_m)
+    context.dither_policy = replace(
+        context.dither_policy, mismatched_id=event.id, mismatched_m=event.found_m
+    )
     most_m = dither_plan.budget_m(rtc, context.policy)
     # An operator may have allowed more than the budget.
     if event.found_m <= MAX_MEASURED_AMPLITUDE_RATIO * max(event.asked_m, most_m):
@@ -384,8 +386,8 @@ def _adopt(context: StepContext, rtc: Status) -> bool:
     )
     asked_to_stop = running.id == dithering.stopped_id
     # a recorded night stops nothing: what it goes on playing is read all the same
-    heard_ns = dithering.stopped_ns_utc + round(STOP_TIMEOUT_S * SECOND_NS)
-    if context.now_ns < heard_ns if asked_to_stop else over:
+    deadline_ns = dithering.stopped_ns_utc + round(STOP_TIMEOUT_S * SECOND_NS)
+    if context.now_ns < deadline_ns if asked_to_stop else over:
         return False
     for window_s in dither_plan.window_lengths_s(context.policy):
         dither = Dither(

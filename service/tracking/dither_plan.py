@@ -181,7 +181,7 @@ def _with_others(context: StepContext, rtc: Status, choice: DitherParameters) ->
         for line in mode_proof.lines_clear(context, rtc, choice.window_s)
         if min(abs(line - other) for other in strong) >= apart_hz
     ]
-    others = mode_proof.modes_beside(context, rtc, telling)
+    others = mode_proof.find_weak_line_modes(context, rtc, telling)
     others = others[: min(len(free), rtc.max_dither_modes - len(telling))]
     if not others:
         return choice

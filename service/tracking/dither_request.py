@@ -309,8 +309,8 @@ def clear_lines(rtc: Status, n_lines: int, choice: DitherParameters) -> tuple[fl
     # rounded to a whole period.
     edge = float(SIDE_OFFSETS_HZ.max()) + step
     near = [abs(line - vibration) for line in last for vibration in choice.avoid_hz]
-    told = all(edge <= line <= rate / 2 - edge for line in last)
-    if len(last) == n_lines and told and min(near, default=np.inf) >= VIBRATION_CLEARANCES_HZ[-1]:
+    usable = all(edge <= line <= rate / 2 - edge for line in last)
+    if len(last) == n_lines and usable and min(near, default=np.inf) >= VIBRATION_CLEARANCES_HZ[-1]:
         return last
     fractions = LINE_FRACTIONS[:n_lines]
     if n_lines > N_LINES:

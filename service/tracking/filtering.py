@@ -384,11 +384,11 @@ def model_error_of(
     # Noise in the misfit of such a window, times its own σ, would exceed any model error.
     if np.any(np.diag(estimate.covariance) > (policy.tolerance * policy.dither_sigma) ** 2):
         return before
-    told = model_error(estimate.covariance, estimate.misfit)
+    error = model_error(estimate.covariance, estimate.misfit)
     if own is not None:
-        told = np.maximum(told, own)
+        error = np.maximum(error, own)
     # The model error does not average down with the number of windows.
-    squared = policy.floor**2 + told**2
+    squared = policy.floor**2 + error**2
     share = 1.0 if registration is None else 1.0 / min(registration.n_windows + 1, MISFIT_WINDOWS)
     return np.asarray(np.sqrt(before**2 + share * (squared - before**2)))
 

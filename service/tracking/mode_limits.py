@@ -36,12 +36,12 @@ def compare(
     if len(modes) <= N_NEIGHBOURS:
         return found
     for k, mode in enumerate(modes.tolist()):
-        beside = find_neighbours(modes, k)
-        usual = float(np.median(gains[beside]))
+        neighbours = find_neighbours(modes, k)
+        usual = float(np.median(gains[neighbours]))
         # A ratio to neighbours that do not respond, or that are far away in the basis, means
         # nothing.
-        if usual > 0.0 and abs(modes[beside[-1]] - mode) <= MAX_NEIGHBOUR_DISTANCE:
-            ratio = compare_strength(gains, explained, k, beside)
+        if usual > 0.0 and abs(modes[neighbours[-1]] - mode) <= MAX_NEIGHBOUR_DISTANCE:
+            ratio = compare_strength(gains, explained, k, neighbours)
             found[mode] = ModeRatio(mode=mode, ratio=ratio, sigma=float(sigma[k]) / usual)
     return found
 

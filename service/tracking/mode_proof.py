@@ -181,7 +181,7 @@ def modes_to_show(context: StepContext, rtc: Status, window_s: float) -> tuple[i
     return tuple(sorted([*shown, *spare[: max(room, 0)]]))
 
 
-def modes_beside(context: StepContext, rtc: Status, telling: tuple[int, ...]) -> list[int]:
+def find_weak_line_modes(context: StepContext, rtc: Status, telling: tuple[int, ...]) -> list[int]:
     """Return the free modes that weak lines verify during the first dither for α.
 
     After a rejected window there are none: a dither with few lines is recovered soonest.

@@ -128,7 +128,7 @@ def _was_in_use(state: TrackerState, record: ReconstructorRecord) -> bool:
 
 
 MAX_SWAP_DELAY_S = 0.5
-"""A status of a frame that is so much later than the one from which a matrix is said to be applied
+"""A status of a frame that is so much later than the one from which a matrix is reported applied
 must name it (R-69); one before may have been made while the matrices were swapped."""
 
 RECONSTRUCTORS_KEPT = 200
@@ -645,7 +645,7 @@ def _has_jumped_since(state: TrackerState, record: ReconstructorRecord) -> bool:
 
 
 def _explain_missing_verdict(record: ReconstructorRecord) -> str:
-    """Return why the gate has said nothing of one on its way to the RTC; empty: it has."""
+    """Return why the gate has reported nothing on one on its way to the RTC; empty: it has."""
     going = record.on_its_way or record.state is MatrixState.PROPOSED
     return record.reason if record.gate is None and going else ""
 

@@ -80,7 +80,7 @@ def orders_of(state: TrackerState) -> Orders:
 def obey_orders(context: StepContext, orders: Orders) -> None:
     """Take over what was ordered before a restart, the mode being the settings' so far.
 
-    What was said last counts: an order outlives the service, and ends with the next one, or when
+    The last order counts: an order outlives the service, and ends with the next one, or when
     the settings say something else than they did when it was given.
     """
     if orders.dither_stopped:

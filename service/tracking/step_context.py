@@ -260,7 +260,7 @@ def _same(before: LogEntry, entry: LogEntry) -> bool:
 
 
 def _burst_message(entry: LogEntry) -> Message:
-    """Return what a burst has said in all: the range of each number, how often, and when."""
+    """Return the summary of a burst: the range of each number, how often, and when."""
     first, last = (
         datetime.fromtimestamp(t / SECOND_NS, UTC) for t in (entry.t_ns_utc, entry.last_ns_utc)
     )

@@ -29,7 +29,7 @@ REFUSED_JUDGE_INTERVAL_S = 15.0
 """The same where the margin is short, or no answer came: a smaller σ may let it pass."""
 
 MAX_REFUSED_WINDOWS = 2
-"""Windows refused in a row from which on it is said that α stays unknown."""
+"""Windows refused in a row after which α is reported to stay unknown."""
 
 MIN_JUDGE_INTERVAL_S = 2.0
 """Least time between two looks when the last one holds no longer."""
@@ -139,7 +139,7 @@ def explain_hindrance(context: StepContext, rtc: Status) -> str:
     """Return what keeps a wanted reconstructor from being made for good, and what to change.
 
     Empty while nothing does, and while it is a matter of a few windows. What the operator has
-    ordered, and alarms that forbid all decisions, are said elsewhere.
+    ordered, and alarms that forbid all decisions, are reported elsewhere.
     """
     state, registration, in_use = context.state, context.registration, context.state.used
     busy = state.operations.acquisition.under_way or state.on_probation

@@ -133,7 +133,7 @@ def reject_window(
     count_miss(context, kind)
     if kind is RefusalKind.MISALIGNED:
         context.raise_alarm(alarms.MISALIGNED, reason)
-    if kind is RefusalKind.MISTOLD:
+    if kind is RefusalKind.MISDESCRIBED:
         context.raise_alarm(alarms.WRONG_ANSWER, reason)
     # The end of a dither cuts its last window: that is no fault.
     level = Level.INFO if kind is RefusalKind.CUT_SHORT else Level.WARNING

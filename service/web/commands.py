@@ -2,7 +2,7 @@
 
 The routes are made of the table of orders, ``service/commands.toml``. A body is read straight into
 the record that the tracker obeys, all faults at once. Each answer is 202 and says in one sentence
-what was done and, where an RTC answers within some seconds, what it said. What takes longer is seen
+what was done and, where an RTC replies within some seconds, its reply. What takes longer is seen
 in the state and in the events.
 """
 
@@ -198,16 +198,16 @@ class OrderRoute:
         """Type of the body: the command without what path or service fills in."""
         if len(self.kinds) > 1:
             return Annotated[Union[self.kinds], Discriminator("action")]  # noqa: UP007
-        told = {self.named, "id" if self.makes else ""}
+        filled_in = {self.named, "id" if self.makes else ""}
         bases = self.kinds[0].__mro__
         # The base class without these fields, so that a client that sends them is refused.
-        return next(base for base in bases if told.isdisjoint(f.name for f in fields(base)))
+        return next(base for base in bases if filled_in.isdisjoint(f.name for f in fields(base)))
 
-    def commanded(self, said: Instruction, **given: str) -> Instruction:
+    def commanded(self, instruction: Instruction, **given: str) -> Instruction:
         """Return the command of a body, and what path and service say besides."""
         known = {field.name for field in fields(self.kinds[0])}
         more = {name: value for name, value in given.items() if name in known}
-        return self.kinds[0](**said.as_fields(), **more) if more else said
+        return self.kinds[0](**instruction.as_fields(), **more) if more else instruction
 
 
 ORDERS: Final = TypeAdapter(dict[str, OrderRoute]).validate_python(
@@ -271,13 +271,13 @@ class Client:
     headers: MutableHeaders
     """Headers of the response."""
 
-    async def gives(self, order: OrderRoute, said: Any, name: str) -> AcceptedView:  # noqa: ANN401
+    async def gives(self, order: OrderRoute, instruction: Any, name: str) -> AcceptedView:  # noqa: ANN401
         """Pass an order on; return its result, and the address of its progress.
 
         An order that decides on something is refused if that has changed since the client read it.
         """
         made = new_id(order.makes, self.service.snapshot().now_ns) if order.makes else ""
-        command: Any = order.commanded(said, **{order.named or "id": name or made})
+        command: Any = order.commanded(instruction, **{order.named or "id": name or made})
         actor = self.actor
         if order.decides_on:
             # Checked later, in the same step of the event loop in which the tracker gets the order.
@@ -302,8 +302,8 @@ class Client:
         state = self.service.snapshot().tracker
         now = [_SHOWN[what](state, name).headers["ETag"] for what in decides_on]
         if self.seen != "*" and not {tag.strip() for tag in self.seen.split(",")} & {*now}:
-            told = " or ".join(now)
-            raise StaleError(f"found If-Match {self.seen:.80}, it is {told} now: read it again")
+            current = " or ".join(now)
+            raise StaleError(f"found If-Match {self.seen:.80}, it is {current} now: read it again")
 
     def accepted(self, message: Message, **links: str) -> AcceptedView:
         """Return the result of an order; the first link is to the work begun."""
@@ -375,10 +375,10 @@ router = APIRouter(responses={**INVALID})
 def _endpoint(order: OrderRoute) -> Callable[..., Awaitable[AcceptedView]]:
     """Return what answers an order, with the parameters that FastAPI is to read."""
 
-    async def give(client: Client, said: Instruction, name: str = "") -> AcceptedView:
-        return await client.gives(order, said, name)
+    async def give(client: Client, instruction: Instruction, name: str = "") -> AcceptedView:
+        return await client.gives(order, instruction, name)
 
-    taken = {"client": ClientDep, "said": Annotated[Any, body(order.read)]}
+    taken = {"client": ClientDep, "instruction": Annotated[Any, body(order.read)]}
     if order.named:
         taken["name"] = _NAMED[order.path.split("/")[2]]
     signature = Signature(

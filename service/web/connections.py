@@ -376,16 +376,16 @@ class Idempotency(Middleware):
         """Hand a request on, and remember what it is answered."""
         given = _StoredAnswer(print_)
         self._given[name] = given
-        heard: list[Message] = []
+        messages: list[Message] = []
 
         async def noted(message: Message) -> None:
-            heard.append(message)
+            messages.append(message)
             await send(message)
 
         try:
             await self._app(scope, receive, noted)
-            if _lasts(heard):
-                given.answer = heard
+            if _lasts(messages):
+                given.answer = messages
         finally:
             if not given.answer and self._given.get(name) is given:
                 del self._given[name]
@@ -440,8 +440,8 @@ class RequestId(Middleware):
 
     @override
     async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
-        told = Headers(scope=scope).get(REQUEST_ID, "")
-        name = told if _USABLE.fullmatch(told) else uuid4().hex
+        requested_id = Headers(scope=scope).get(REQUEST_ID, "")
+        name = requested_id if _USABLE.fullmatch(requested_id) else uuid4().hex
 
         async def named(message: Message) -> None:
             if message["type"] == "http.response.start":

@@ -27,7 +27,7 @@ Points = Annotated[int, Field(ge=8, le=2000)]
 Nanoseconds = Annotated[int, Field(ge=0, le=(1 << 63) - 1)]
 
 
-def _said_as_a_clock_does(value: object) -> object:
+def _require_clock_time(value: object) -> object:
     if isinstance(value, str) and "T" not in value.upper():  # "2026" would be seconds since 1970
         raise ValueError(f"found {value!r:.40}, expected a time such as 2026-03-01T21:14:03Z")
     return value
@@ -45,7 +45,7 @@ def _in_nanoseconds(time: datetime) -> datetime:
 
 
 Clock = Annotated[
-    AwareDatetime, BeforeValidator(_said_as_a_clock_does), AfterValidator(_in_nanoseconds)
+    AwareDatetime, BeforeValidator(_require_clock_time), AfterValidator(_in_nanoseconds)
 ]
 
 
@@ -128,11 +128,11 @@ def _history(request: Request, service: Supervisor, asked: RangeParameters) -> R
         # Only what is older than memory is read from the disk, or entries would come twice.
         last_ns = min([last_ns, *(entry.t_ns_utc - 1 for entry in tracker.alpha.history)])
         found = (*_older(service.archive, first_ns, last_ns, asked), *found)
-    told = answer(
+    response = answer(
         replace(tracker, alpha=replace(tracker.alpha, history=_cut(found, asked))), views.HISTORY
     )
-    told.headers["ETag"] = tag
-    return told
+    response.headers["ETag"] = tag
+    return response
 
 
 History = tuple[HistoryEntry, ...]

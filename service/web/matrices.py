@@ -36,7 +36,7 @@ _ALIASES = {
     "previous": "no earlier reconstructor has been in use",
     "candidate": "no reconstructor is proposed",
 }
-"""Names for what changes, and what is said where there is none."""
+"""Names for what changes, and the text where there is none."""
 
 
 async def _resolve_id(
@@ -155,9 +155,9 @@ async def numbers_of(
 def _parts(head: bytes, numbers: Numbers) -> Iterator[bytes]:
     """Yield a file's header, and its numbers as raw memory."""
     yield head
-    lying = numbers.reshape(-1).view(np.uint8)
-    for first in range(0, len(lying), RESPONSE_PART_BYTES):
-        yield lying[first : first + RESPONSE_PART_BYTES].tobytes()
+    raw = numbers.reshape(-1).view(np.uint8)
+    for first in range(0, len(raw), RESPONSE_PART_BYTES):
+        yield raw[first : first + RESPONSE_PART_BYTES].tobytes()
 
 
 def _npy_head(numbers: Numbers) -> bytes:

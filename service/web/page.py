@@ -343,7 +343,7 @@ class Stream:
         self.n_listeners = 0
         """Streams that are open."""
 
-    async def listen(self, heard: str) -> AsyncIterator[bytes]:
+    async def listen(self, received_id: str) -> AsyncIterator[bytes]:
         """Yield server-sent events that follow the log line with this id, the last one received."""
         ids: list[str] | None = None
         version, quiet_since = 0, 0
@@ -357,8 +357,8 @@ class Stream:
             # The list is made anew only when the log has changed.
             if self._ids is not ids:
                 ids = self._ids
-                news += self._since(heard)
-                heard = ids[-1]
+                news += self._since(received_id)
+                received_id = ids[-1]
             if news:
                 quiet_since = now
                 yield news
@@ -391,11 +391,11 @@ class Stream:
             async with asyncio.timeout(rest_s + 1e-3):
                 await self._over.wait()
 
-    def _since(self, heard: str) -> bytes:
+    def _since(self, received_id: str) -> bytes:
         """Return the events after a log line."""
-        if heard not in self._ids:
+        if received_id not in self._ids:
             return _event("reset", b'{"log":"/v1/events"}', self._ids[-1])
-        first = self._ids.index(heard)
+        first = self._ids.index(received_id)
         lines = zip(self._ids[first + 1 :], (self._log or ())[first:], strict=True)
         return b"".join(_event("log", as_json(e).encode(), k) for k, e in lines)
 
@@ -430,10 +430,10 @@ class _EventStream(StreamingResponse):
 
     media_type = "text/event-stream"
 
-    def __init__(self, stream: Stream, heard: str) -> None:
+    def __init__(self, stream: Stream, received_id: str) -> None:
         # The second header keeps nginx from holding the events back.
         headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-        super().__init__(stream.listen(heard), headers=headers)
+        super().__init__(stream.listen(received_id), headers=headers)
         self._stream = stream
 
     @override

@@ -193,7 +193,7 @@ def _manifest_fields(values: codec.Map, where: str) -> codec.Map:
 
 def _measured_manifest_fields(values: codec.Map, where: str) -> codec.Map:
     values = _nest_layout(values, where, may_fail=True)
-    # A reason beside a matrix is ignored, not refused.
+    # A reason sent with a matrix is ignored, not refused.
     return values | {"reason": None} if values["layout"]["n_chunks"] else values
 
 

@@ -265,7 +265,7 @@ class OpticsWorker:
         return WindowRefused(
             reason=compose("window.other-instrument", text=answer.wrong),
             t_ns_utc=spectra.t_end_ns_utc,
-            kind=RefusalKind.MISTOLD,
+            kind=RefusalKind.MISDESCRIBED,
         )
 
     def _fit_spectra(
@@ -292,7 +292,7 @@ class OpticsWorker:
         Where the file leaves the orientation open, what is found is taken over.
         """
         at, instrument = near or self._start, self._model.instrument
-        dialect = identify_from_reconstructor(
+        result = identify_from_reconstructor(
             in_use,
             instrument,
             self._basis,
@@ -300,11 +300,11 @@ class OpticsWorker:
             response=self._sensor.at_unit_gain(at).matrix,
             mapper=self.rows.map,
         )
-        if instrument.slopes.orientation is not None or dialect.found is None or dialect.wrong:
-            return dialect
-        axes = tuple(asdict(dialect.found.assumed_orientation).items())
-        self._rebuild(replace(self._state, slopes=(dialect.found.order, axes)))
-        return replace(dialect, adopted=True)
+        if instrument.slopes.orientation is not None or result.found is None or result.wrong:
+            return result
+        axes = tuple(asdict(result.found.assumed_orientation).items())
+        self._rebuild(replace(self._state, slopes=(result.found.order, axes)))
+        return replace(result, adopted=True)
 
     def _rebuild(self, state: ModelState) -> None:
         """Make the models again with the slopes or the response of modes of a state."""

@@ -132,7 +132,7 @@ def on_copy_failed(context: StepContext, _: ev.RepublishMatrix, text: str) -> No
 def on_compared(context: StepContext, event: ev.Compared) -> None:
     """Process the verdict of a probation; a worse matrix is replaced.
 
-    What was said of other matrices than the two on record is not meant.
+    Statements about other matrices than the two on record do not count.
     """
     trial, found = context.probation, event.finding
     if trial is None or not trial.awaits(found.before, found.after):
@@ -398,8 +398,8 @@ def _explain_missing_probation(
     context: StepContext, record: ReconstructorRecord, last: Probation | None
 ) -> str:
     """Return why a matrix just applied is not put on probation; empty: it is."""
-    said = None if last is None or last.before != record.id else last.id
-    named = context.state.reconstructor(said)
+    candidate_id = None if last is None or last.before != record.id else last.id
+    named = context.state.reconstructor(candidate_id)
     if context.matrices.misapplied and named is not None and named.state is MatrixState.FAILED:
         return "it never was out of use"
     if record.published_ns_utc is None:

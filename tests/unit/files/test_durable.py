@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from service.archive.products import _write_beside
+from service.archive.products import _write_sidecar
 from service.errors import StorageError
 from service.files.durable import replace_file
 from service.files.whole import write_whole
@@ -62,7 +62,7 @@ def _keys(path):
 
 WRITERS = {
     "any file": ("it.json", lambda path: replace_file(path, b"new and longer")),
-    "a record beside its matrix": ("it.json", lambda path: _write_beside(path, b"new")),
+    "a record beside its matrix": ("it.json", lambda path: _write_sidecar(path, b"new")),
     "a matrix": (
         "it.h5",
         lambda path: write_whole(path, lambda file: file.create_dataset("x", data=[1.0, 2.0])),
@@ -108,7 +108,7 @@ def test_a_disk_that_refuses_keeps_the_file_before_and_nothing_beside_it(tmp_pat
     with pytest.raises(OSError, match="No space left"):
         replace_file(path, b"new")
     with pytest.raises(StorageError, match=r"it\.json: cannot be written"):
-        _write_beside(path, b"new")
+        _write_sidecar(path, b"new")
     assert [one.name for one in tmp_path.iterdir()] == ["it.json"]
     assert path.read_bytes() == b"old"
 

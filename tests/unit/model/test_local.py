@@ -11,7 +11,7 @@ import scipy
 from service.errors import ModelError
 from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
-from service.model.local import LocalShapes, beside, tiles_of
+from service.model.local import LocalShapes, stack_shapes, tiles_of
 from service.model.modes import ModalBasis
 from service.model.pupil import instrument_pupil
 from service.model.sensors.shack_hartmann.description import ShackHartmann
@@ -72,13 +72,13 @@ def test_shapes_beside_one_another_are_seen_as_each_alone():
     pupil, model, shapes = local_shapes()
     turned = model._move_modes(SOMEWHERE, lambda at: at[:, ::-1] * [1.0, -1.0])
     rows = np.random.default_rng(2).normal(size=(5, len(pupil.points)))
-    both = beside([shapes, turned])
+    both = stack_shapes([shapes, turned])
     apart = np.hstack([rows @ shapes, rows @ turned])
     assert both.shape == (len(pupil.points), 2 * shapes.shape[1])
     np.testing.assert_allclose(rows @ both, apart, atol=1e-11)
     np.testing.assert_allclose(scipy.sparse.csr_array(rows) @ both, apart, atol=1e-11)
     arrays = [shapes.array(), turned.array()]
-    np.testing.assert_allclose(rows @ beside(arrays), apart, atol=1e-11)
+    np.testing.assert_allclose(rows @ stack_shapes(arrays), apart, atol=1e-11)
 
 
 def test_few_modes_are_cheaper_as_an_array():

@@ -559,7 +559,7 @@ class TestStrengthOfTheDither:
             e for e in detect_changes(streams, streams, state) if isinstance(e, ev.DitherMeasured)
         ]
         assert told.found_m == pytest.approx(5e-9, rel=0.01)
-        told_of = replace(state.dithers.policy, amiss_id=told.id, amiss_m=told.found_m)
+        told_of = replace(state.dithers.policy, mismatched_id=told.id, mismatched_m=told.found_m)
         state = changed(state, policy=told_of)
         assert not [
             e for e in detect_changes(streams, streams, state) if isinstance(e, ev.DitherMeasured)

@@ -317,17 +317,17 @@ class Mistold:
 )
 def test_another_listing_of_the_slopes_than_told_is_named_by_the_rtcs_own_matrix(axes, named):
     rtc = Mistold(**axes)
-    dialect = rtc.told.read_slope_convention(rtc.own, None)
-    assert named in dialect.wrong
-    assert dialect.found == rtc.setting
-    assert not dialect.adopted
+    convention = rtc.told.read_slope_convention(rtc.own, None)
+    assert named in convention.wrong
+    assert convention.found == rtc.setting
+    assert not convention.adopted
 
 
 def test_slopes_of_the_other_sign_are_named_by_the_answer_to_the_dither():
     rtc = Mistold(sign_x=-1, sign_y=-1)
     window = dithered_window(Sensor(rtc.seen), ALPHA_SMALL)
     refused = rtc.told.fit(window, open_loop(rtc.own), None)
-    assert refused.kind is RefusalKind.MISTOLD
+    assert refused.kind is RefusalKind.MISDESCRIBED
     assert "slopes have the other sign" in str(refused.reason)
     assert "orientation.sign = -1" in str(refused.reason)
 
@@ -336,7 +336,7 @@ def test_slopes_in_another_order_are_named_by_the_answer_to_the_dither():
     rtc = Mistold(order="interleaved")
     window = dithered_window(Sensor(rtc.seen), ALPHA_SMALL)
     refused = rtc.told.fit(window, open_loop(rtc.own), None)
-    assert refused.kind is RefusalKind.MISTOLD
+    assert refused.kind is RefusalKind.MISDESCRIBED
     assert 'slopes.order = "interleaved"' in str(refused.reason)
 
 
@@ -346,14 +346,14 @@ def test_slopes_two_frames_late_are_not_taken_for_slopes_of_the_other_sign():
     turns = 2 * np.pi * np.array(window.plan.bins_hz) / window.plan.frame_rate_hz
     late = window.slopes * np.exp(-2j * turns)[:, :, None]
     outcome = rtc.told.fit(replace(window, slopes=late), open_loop(rtc.own), None)
-    assert getattr(outcome, "kind", None) is not RefusalKind.MISTOLD
+    assert getattr(outcome, "kind", None) is not RefusalKind.MISDESCRIBED
 
 
 def test_an_orientation_left_open_is_found_in_the_rtcs_own_matrix_and_taken_over():
     rtc = Mistold(order="yx", flip_y=True, sign_x=-1)
-    dialect = rtc.auto.read_slope_convention(rtc.own, None)
-    assert dialect.adopted
-    assert dialect.found == rtc.setting
+    convention = rtc.auto.read_slope_convention(rtc.own, None)
+    assert convention.adopted
+    assert convention.found == rtc.setting
     made = rtc.auto.make(conditions(ALPHA_SMALL, np.diag(SIGMA**2), loop_settings(), 0.95))
     product = made.matrix @ rtc.seen[:, :N_CONTROLLED]
     np.testing.assert_allclose(product, np.eye(N_CONTROLLED), atol=1e-3)
@@ -362,9 +362,9 @@ def test_an_orientation_left_open_is_found_in_the_rtcs_own_matrix_and_taken_over
 def test_a_matrix_that_no_orientation_explains_leaves_nothing_to_take_over():
     rtc = Mistold()
     noise = np.random.default_rng(1).normal(size=rtc.own.shape).astype(np.float32)
-    dialect = rtc.auto.read_slope_convention(noise * np.abs(rtc.own).mean(), None)
-    assert "no orientation explains" in dialect.wrong
-    assert dialect.found is None
+    convention = rtc.auto.read_slope_convention(noise * np.abs(rtc.own).mean(), None)
+    assert "no orientation explains" in convention.wrong
+    assert convention.found is None
 
 
 @pytest.mark.parametrize(
@@ -373,8 +373,8 @@ def test_a_matrix_that_no_orientation_explains_leaves_nothing_to_take_over():
 )
 def test_commands_in_another_unit_are_named_by_the_rtcs_own_matrix(metres, named):
     rtc = Mistold()
-    dialect = rtc.told.read_slope_convention((rtc.own / metres).astype(np.float32), None)
-    assert named in dialect.wrong
+    convention = rtc.told.read_slope_convention((rtc.own / metres).astype(np.float32), None)
+    assert named in convention.wrong
 
 
 @pytest.mark.parametrize(
@@ -400,7 +400,7 @@ def test_commands_in_another_unit_are_named_by_the_answer_to_the_dither():
     window = dithered_window(Sensor(rtc.seen), ALPHA_SMALL)
     in_nm = replace(window, commands=window.commands * 1e9, dither=window.dither * 1e9)
     refused = rtc.told.fit(in_nm, open_loop(rtc.own), None)
-    assert refused.kind is RefusalKind.MISTOLD
+    assert refused.kind is RefusalKind.MISDESCRIBED
     assert "nanometres" in str(refused.reason)
 
 

@@ -202,7 +202,7 @@ def test_a_window_that_is_as_it_should_be_ends_the_alarm_of_one_that_was_not():
     story = Story(Mode.AUTO).meet()
     story.see(n_windows=3)
     wrong = WindowRefused(
-        reason="slopes have the other sign", t_ns_utc=story.now_ns, kind=RefusalKind.MISTOLD
+        reason="slopes have the other sign", t_ns_utc=story.now_ns, kind=RefusalKind.MISDESCRIBED
     )
     story.tell(ev.WindowLost(refused=wrong))
     assert "response-mismatch" in story.alarms

@@ -56,10 +56,10 @@ def stated_offsets(instrument: Instrument) -> NDArray[np.float64] | None:
 
     In subapertures and in the axes of conventions.md; None if they are unknown.
     """
-    told = pyramid_in(instrument).image_offsets_subap
-    if told is None:
+    offsets = pyramid_in(instrument).image_offsets_subap
+    if offsets is None:
         return None
-    return orient_offsets(np.array(told).reshape(2, 2, 2), instrument.slopes.assumed_orientation)
+    return orient_offsets(np.array(offsets).reshape(2, 2, 2), instrument.slopes.assumed_orientation)
 
 
 def orient_offsets(

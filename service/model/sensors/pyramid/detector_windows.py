@@ -97,14 +97,14 @@ def frame_windows(instrument: Instrument, flux_frame: Array) -> Windows:
     ModelError
         If the images cannot be found, or a window leaves the frame.
     """
-    told = instrument.frames
-    if not isinstance(told, FrameWindows):
+    windows = instrument.frames
+    if not isinstance(windows, FrameWindows):
         raise ModelError(f"{instrument.name}: found wfs.input = slopes, expected frames")
-    pixels = told.pixels_per_subaperture
-    if told.centres_px is None:
+    pixels = windows.pixels_per_subaperture
+    if windows.centres_px is None:
         centres = _refine_centres(instrument, flux_frame, pixels)
     else:
-        centres = by_quadrant(told.centres_px)
+        centres = by_quadrant(windows.centres_px)
     return _windows_at(instrument, centres, flux_frame, pixels)
 
 
@@ -219,7 +219,7 @@ def locate_images(
         middle = float(np.abs(away.mean(axis=0)).max())
         if middle * pixels > _EVEN_SIGMA_PX:
             sigma = float(np.hypot(sigma, middle))
-        return instrument, _beside_the_light(seen, float(np.hypot(*away.T).max())), sigma
+        return instrument, _remark_on_centres(seen, float(np.hypot(*away.T).max())), sigma
     centres = frame_windows(instrument, light).centres_px.reshape(4, 2)
     found = _format_centres(centres)
     remark = f"shifts count from the pupil images as found: pupil_centres_px = [{found}]"
@@ -242,7 +242,7 @@ def _place_sigma(instrument: Instrument, light: Array, pixels: int) -> float:
     return sigma / pixels if sigma > _EVEN_SIGMA_PX else 0.0
 
 
-def _beside_the_light(found: Array, away_subap: float) -> tuple[str, ...]:
+def _remark_on_centres(found: Array, away_subap: float) -> tuple[str, ...]:
     """Return a remark if the centres of the file differ from the pupil images of the flux frame."""
     if away_subap <= _REMARK_DISTANCE_SUBAP:
         return ()

@@ -55,8 +55,8 @@ class PyramidKind(SensorKind):
     def list_assumptions(
         self, table: PyramidTable, given: frozenset[str]
     ) -> Iterator[tuple[str, str]]:
-        told = table.input == "frames" and table.pupil_centres_px is not None
-        if "pupil_separation_subap" not in given and not told:
+        has_centres = table.input == "frames" and table.pupil_centres_px is not None
+        if "pupil_separation_subap" not in given and not has_centres:
             yield (
                 "pupil_separation_subap",
                 f"not given, taken as {table.image_separation_subap:g} ({USUAL_SEPARATION:g} pupil "

@@ -26,7 +26,7 @@ from service.records.commands import Instruction
 from service.records.messages import compose
 from service.runtime.archiving import needed
 from service.runtime.telemetry_recorder import RecordingChoice
-from service.web.commands import AcceptedView, Client, ClientDep, Said, body
+from service.web.commands import AcceptedView, BodyDep, Client, ClientDep, body
 from service.web.connections import not_modified, tag_of
 from service.web.history import TimeParameters
 from service.web.problems import COMMAND, INVALID, UNKNOWN
@@ -79,11 +79,9 @@ def _kept(kept: Archive, in_use: frozenset[str]) -> Kept:
 
 
 @router.put("/archive/{id}/pin", status_code=202, responses=UNKNOWN)
-async def pin(client: ClientDep, product_id: ProductId, instruction: Said) -> AcceptedView:
+async def pin(client: ClientDep, product_id: ProductId, command: BodyDep) -> AcceptedView:
     """Keep a matrix for ever."""
-    entry = client.actor.entry(
-        "archive.pinned", product_id, by=instruction.by, why=instruction.reason
-    )
+    entry = client.actor.entry("archive.pinned", product_id, by=command.by, why=command.reason)
     made = Pin(id=product_id, who=entry.who, why=entry.why)
     await run_in_threadpool(client.service.archive.pin, made)
     await client.service.audited(entry)
@@ -91,13 +89,11 @@ async def pin(client: ClientDep, product_id: ProductId, instruction: Said) -> Ac
 
 
 @router.delete("/archive/{id}/pin", status_code=202, responses=UNKNOWN)
-async def unpin(client: ClientDep, product_id: ProductId, instruction: Said) -> AcceptedView:
+async def unpin(client: ClientDep, product_id: ProductId, command: BodyDep) -> AcceptedView:
     """Let a matrix go when it is old."""
     await run_in_threadpool(client.service.archive.unpin, product_id)
     await client.service.audited(
-        client.actor.entry(
-            "archive.unpinned", product_id, by=instruction.by, why=instruction.reason
-        )
+        client.actor.entry("archive.unpinned", product_id, by=command.by, why=command.reason)
     )
     return client.accepted(compose("archive.unpinned", id=product_id), archive="/v1/archive")
 
@@ -293,22 +289,22 @@ async def recording(service: ServiceDep, recording_id: RecordingId) -> Response:
 
 
 @router.post("/recordings/{id}/end", status_code=202, responses={**COMMAND, **UNKNOWN})
-async def end(client: ClientDep, recording_id: RecordingId, instruction: Said) -> AcceptedView:
+async def end(client: ClientDep, recording_id: RecordingId, command: BodyDep) -> AcceptedView:
     """End a recording early."""
     recordings = client.service.recordings
-    reason = f"{instruction.by or client.actor.key or 'an operator'} has ended it"
+    reason = f"{command.by or client.actor.key or 'an operator'} has ended it"
     record = await _await_order(
-        client, "recording.end", instruction, recordings.end(reason, recording_id)
+        client, "recording.end", command, recordings.end(reason, recording_id)
     )
     message = compose("archive.recorded", id=recording_id, size_mb=record.n_bytes / 1e6)
     return client.accepted(message, recording=f"/v1/recordings/{recording_id}")
 
 
 @router.delete("/recordings/{id}", status_code=202, responses={**COMMAND, **UNKNOWN})
-async def remove(client: ClientDep, recording_id: RecordingId, instruction: Said) -> AcceptedView:
+async def remove(client: ClientDep, recording_id: RecordingId, command: BodyDep) -> AcceptedView:
     """Remove a recording for good."""
     removed = client.service.recordings.remove(recording_id)
-    await _await_order(client, "recording.remove", instruction, removed)
+    await _await_order(client, "recording.remove", command, removed)
     return client.accepted(compose("archive.removed", id=recording_id), recordings="/v1/recordings")
 
 

@@ -89,7 +89,7 @@ def body(kind: Any) -> Any:  # noqa: ANN401  as FastAPI has it
     return Depends(Body(kind))
 
 
-Said = Annotated[Instruction, body(Instruction)]
+BodyDep = Annotated[Instruction, body(Instruction)]
 """The body of a request whose path says all the rest."""
 
 Where = tuple[int | str, ...]

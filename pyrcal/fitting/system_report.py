@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 
 from pyrcal.fitting import report as fit_report
+from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.report import FitReport
 from pyrcal.fitting.system import ARCSEC_RAD, STAR, System
 from pyrcal.fitting.system_fit import SystemFit, fit_system
@@ -52,9 +53,9 @@ class SystemReport:
     def refused(self) -> tuple[str, ...]:
         """Pairs whose own fit was refused, with its verdict."""
         return tuple(
-            f"{' x '.join(self.system.names(pair))}: {one.fit.registration.reason}"
+            f"{' x '.join(self.system.names(pair))}: {_explain(one.fit)}"
             for pair, one in zip(self.system.pairs, self.fits, strict=True)
-            if one.fit.registration is not None and not one.fit.accepted
+            if not one.fit.accepted
         )
 
     @property
@@ -163,6 +164,11 @@ class _Row:
     sigma: float | None
     nominal: float | None
     unseen_share: float
+
+
+def _explain(fit: Fit) -> str:
+    """Return the reason of a fit's verdict; a fit by hand has its verdict alone."""
+    return fit.verdict if fit.registration is None else fit.registration.reason
 
 
 def _rows(report: SystemReport) -> Iterator[_Row]:

@@ -428,17 +428,22 @@ class InteractionModel:
     def _along(self, alpha: Misregistration, ways: list[Way]) -> list[Shapes]:
         """Return the rates of the modes along several ways, from their gradient."""
         # Two renderings give the gradient, of which every way is a combination point by point.
-        steps = [partial(_shift_rate, step=step) for step in np.eye(_AXES)]
-        along_x, along_y = (self._move_modes(alpha, step) for step in steps)
+        along_x, along_y = self._gradient(alpha)
         if isinstance(along_x, LocalShapes) and isinstance(along_y, LocalShapes) and self._local:
-            gradient = along_x, along_y
-            return [self._by_tiles(self._local, alpha, way, gradient) for way in ways]
+            return [self._by_tiles(self._local, alpha, way, (along_x, along_y)) for way in ways]
         points = self._mirror_points(alpha)
         found: list[Shapes] = []
         for way in ways:
             x, y = way(points).astype(self._dtype).T
             found.append(along_x * x[:, None] + along_y * y[:, None])
         return found
+
+    def _gradient(self, alpha: Misregistration) -> tuple[Shapes, Shapes]:
+        """Return the rates of the modes along both axes of the mirror."""
+        along_x, along_y = (
+            self._move_modes(alpha, partial(_shift_rate, step=step)) for step in np.eye(_AXES)
+        )
+        return along_x, along_y
 
     def _measure_shapes(self, alpha: Misregistration, shapes: list[Shapes]) -> list[Array]:
         """Return the signals of each of some shapes, with one response for all if none is kept."""
@@ -486,7 +491,7 @@ class InteractionModel:
             elsewhere=MadeElsewhere(
                 parts=(self._again, kept),
                 prepare=operator.call,
-                make=partial(_moved_modes, alpha=alpha, way=way),
+                make=partial(_moved_modes, alpha=alpha, way=way, combined=gradient is not None),
             ),
         )
         return shapes if shapes.is_cheaper else shapes.array()
@@ -501,8 +506,13 @@ class InteractionModel:
         )
 
 
-def _moved_modes(model: InteractionModel, *, alpha: Misregistration, way: Way | None) -> Shapes:
-    return model._move_modes(alpha, way)  # noqa: SLF001 - its own, in another process
+def _moved_modes(
+    model: InteractionModel, *, alpha: Misregistration, way: Way | None, combined: bool
+) -> Shapes:
+    """Return the shapes that the model of another process has made, equal to the bit."""
+    if combined and way is not None:
+        return model._along(alpha, [way])[0]  # noqa: SLF001 - its own, in another process
+    return model._move_modes(alpha, way)  # noqa: SLF001
 
 
 def _rotation_rate(at: Array) -> Array:

@@ -9,6 +9,7 @@ import pytest
 
 from pyrcal.__main__ import main
 from pyrcal.fitting.fit_system import fit_pairs, locate_matrices
+from pyrcal.fitting.fitted import Registration
 from pyrcal.fitting.system import ARCSEC_RAD, STAR
 from pyrcal.fitting.system_file import load_system
 from pyrcal.fitting.system_report import document, fill_system, table
@@ -201,8 +202,13 @@ def test_a_refused_pair_is_left_out_and_named(folder):
     def one_refused(pair, about):
         report = fit(pair, about)
         if pair == system.pairs[1]:
-            refused = {"accepted": False, "verdict": "refused: too much noise"}
-            refused["alpha"] = Misregistration(shift_x_subap=0.8)
+            refused = {"accepted": False, "alpha": Misregistration(shift_x_subap=0.8)}
+            refused["registration"] = Registration(
+                determined=False,
+                reason="too much noise",
+                sigma_statistical=np.ones(4),
+                sigma_systematic=np.ones(4),
+            )
             report = replace(report, fit=replace(report.fit, **refused))
         return report
 

@@ -240,11 +240,12 @@ def test_the_papers_table_has_a_line_for_every_step():
     text = table(a_report(a_fit(paper_table=(SCAN, SCAN))))
     assert line(text, "   2").split() == [
         "2",
-        "rotation_deg",
+        "rotation",
         "64.5000",
         "65.5000",
         "0.5000",
         "65.0000",
+        "deg",
     ]
 
 

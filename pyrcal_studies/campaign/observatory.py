@@ -15,7 +15,7 @@ from __future__ import annotations
 import asyncio
 import heapq
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -657,8 +657,10 @@ class Observatory:
 
         self._link = link(self.dome)
         self._workers = self.hands(workbench)
-        self._workers.model = lambda: self.state.model
-        self._workers.changed = lambda model: self._post(ev.ModelChanged(model=model))
+        # A job may change the model while a coroutine runs, within which no effect can begin.
+        self._changes: list[ModelState] = []
+        self._workers.model = lambda: self._changes[-1] if self._changes else self.state.model
+        self._workers.changed = self._changes.append
         self._shelf: StorePort = archive or Shelf()
         self._publishing = Publishing(
             system=system, chunk_bytes=CHUNK_LIMIT, pole_radius_bound=0.95
@@ -858,7 +860,7 @@ class Observatory:
         if window is None:
             self._fitting = False
             return 0.0, _nothing
-        event = asyncio.run(fitted(window, self.state, self._workers, self._actions.matrix))
+        event = self._run(fitted(window, self.state, self._workers, self._actions.matrix))
 
         def done() -> None:
             self._post(event)
@@ -866,12 +868,20 @@ class Observatory:
 
         return self.latencies.fit_s, done
 
+    def _run(self, coroutine: Coroutine[Any, Any, T]) -> T:
+        """Run a coroutine to its end, then post how its jobs changed the model."""
+        result = asyncio.run(coroutine)
+        changes, self._changes[:] = tuple(self._changes), []
+        for model in changes:
+            self._post(ev.ModelChanged(model=model))
+        return result
+
     def _watch(self) -> None:
         self._work(OpticsWorker.fit_passive, self._look_at_sums)
 
     def _look_at_sums(self) -> _Job:
         sums = self._engine.take_sums()
-        events = asyncio.run(fit_passive(sums, self.state, self._workers))
+        events = self._run(fit_passive(sums, self.state, self._workers))
 
         def done() -> None:
             for event in events:
@@ -911,7 +921,7 @@ class Observatory:
         """Have the worker model another mode of the sensor, as soon as it has a hand free."""
 
         def begin() -> _Job:
-            description = asyncio.run(self._workers.call(OpticsWorker.describe))
+            description = self._run(self._workers.call(OpticsWorker.describe))
 
             def done() -> None:
                 if self.state.loop.config_id == config_id:
@@ -929,7 +939,7 @@ class Observatory:
         self._engine.learn(in_use, matrix)
         if record is not None:
             read = read_own_matrix(record, matrix, self.state, self._workers, self._actions.matrix)
-            for event in asyncio.run(read):
+            for event in self._run(read):
                 self._in(self.latencies.listen_s, partial(self._post, event))
 
     def _do(self, effect: Effect, state: TrackerState) -> None:
@@ -950,7 +960,7 @@ class Observatory:
         try:
             if isinstance(effect, ev.SendMatrix):
                 self._engine.learn(effect.id, self._actions.matrix(effect.id))
-            event = asyncio.run(self._actions.perform(effect, state))
+            event = self._run(self._actions.perform(effect, state))
         except PyrcalError as error:
             event = ev.JobFailed(effect=effect, text=str(error))
         while self._link.sent:

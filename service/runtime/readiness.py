@@ -180,12 +180,8 @@ def detect_link_changes(
     raised = {
         alarm.name: alarm for alarm in state.alarms.active if alarm.name in DERIVED_EACH_SECOND
     }
-    for name, message in made.items():
-        before = raised.get(name)
-        # Counters in a message change every second: they must not make it news each time.
-        same = before is not None and before.message.key == message.key
-        text = before.message if before is not None and same else message
-        found.append(ev.ConditionChanged(name=name, text=text))
+    # The text of an alarm follows its counters and its present cause; only its beginning is logged.
+    found += [ev.ConditionChanged(name=name, text=message) for name, message in made.items()]
     for name, alarm in raised.items():
         # An alarm that came and went each second would hide the others.
         if name not in made and now_ns - alarm.seen_ns_utc > COMPLAINT_TIMEOUT_NS:

@@ -512,7 +512,7 @@ def test_an_rtc_that_does_not_sign_is_named_where_signatures_are_asked_for():
             assert not deadline.passed
             rtc.send_status()
             time.sleep(0.1)
-        assert "signature: none" in complaints(bridge.statistics())["messages-refused"]
+        assert "signature: none" in str(complaints(bridge.statistics())["messages-refused"])
         order = LoopRequest(id="a", leak=0.98)
         with pytest.raises(LinkError, match="signature: none"):
             asyncio.run(bridge.command(order))

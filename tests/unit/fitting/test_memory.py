@@ -12,14 +12,23 @@ from pyrcal.fitting.memory import bytes_of_fit, bytes_of_reconstruction, check_r
 from service.control.reconstructor import invert
 from service.errors import ModelError
 from service.estimation.reference import Reference
+from service.model import pupil
 from service.model.interaction import InteractionModel
 from service.model.kinds import Influence
+from service.model.local import tiles_of
 from service.model.memory import PROGRAM_BYTES
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from service.model.slopes import Orientation, SlopeRecipe
 from tests.support.memory import instrument_of
 from tests.support.reconstruct import TINY
+
+
+@pytest.fixture(autouse=True)
+def _cold():
+    """Forget pupils and tiles of earlier tests, which a peak would leave out."""
+    pupil._drawn.cache_clear()
+    tiles_of.cache_clear()
 
 
 @pytest.mark.parametrize("n_modes", [400, 60])

@@ -44,8 +44,7 @@ ARMS, TURN = "spiders_m", "spiders_deg"
 degrees."""
 
 WITHOUT_ARMS, MAP_WORDS = "no spider", "the pupil map "
-"""What stands for an entry of the instrument file where the arms are to be removed, and the
-beginning of what a turned or mirrored map is called."""
+"""Name of the explanation without arms, and first words of one with a turned or mirrored map."""
 
 MIN_OUTLINE_EXPLAINED = 0.01
 """RMS share of the signal that turned or wider arms must explain. Arms of one subaperture

@@ -218,8 +218,8 @@ def _around(budget: Budget, store: Store) -> str:
     return (
         "The simulator at the registration found, by night, with the measured reconstructor.\n\n"
         f"Table: wavefront error [nm] by distance from the registration found.\n\n{lines}\n\n"
-        f"Within {results.FLAT_NM:g} nm of the smallest error: {'; '.join(flat)}. This is how "
-        "sharply the loop tells an optimum. Added in quadrature in figures 5 and 12: "
+        f"Within {results.FLAT_NM:g} nm of the smallest error: {'; '.join(flat)}. The loop "
+        "shows the optimum no better than that. Added in quadrature in figures 5 and 12: "
         f"{alike or 'not compared'} nm; the paper says the sensitivity is the same. Figure 5 has "
         "the reconstructor of α = 0 without imperfections, figure 12 the measured one at 98 % of "
         "magnification. **Cause** of the difference in part: the light moves over the sensor's "

@@ -112,7 +112,7 @@ def on_answer(context: StepContext, request: OffloadRequest, reply: Reply) -> No
 
 
 def on_failure(context: StepContext, request: OffloadRequest, text: str) -> None:
-    """Note that nobody knows whether the image has moved: no reply came."""
+    """Record that the RTC did not reply, so that the image may or may not have moved."""
     offload, limits = context.alpha.offload, context.policy.offloading
     if offload is not None and limits is not None and offload.id == request.id:
         _note_failure(context, offload, limits, text)

@@ -119,7 +119,7 @@ def on_loop_answer(context: StepContext, request: LoopRequest, reply: Reply) -> 
 
 
 def on_modes_unknown(context: StepContext, _: Effect | Request, __: str) -> None:
-    """Believe the next status: what failed may have been accepted."""
+    """Take the number of modes from the next status: the RTC may have accepted what failed."""
     context.loop = replace(context.loop, commanded_modes=None)
 
 

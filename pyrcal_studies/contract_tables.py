@@ -24,6 +24,7 @@ from service.wire import (
     DitherStatus,
     DitherStop,
     FrameHeader,
+    GainsMessage,
     LoopRequest,
     Manifest,
     MatrixLayout,
@@ -59,6 +60,7 @@ MESSAGES: Final[dict[str, type]] = {
     "ack": Acknowledgement,
     "im-commit": MeasuredManifest,
     "state": StateMessage,
+    "gains": GainsMessage,
     "alarm": AlarmMessage,
 }
 """Records that are messages, each with its ``v``."""

@@ -48,6 +48,7 @@ from service.wire.telemetry import (
     DitherStatus,
     FrameBatch,
     FrameHeader,
+    GainsMessage,
     Pointing,
     StateMessage,
     Status,

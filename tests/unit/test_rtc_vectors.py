@@ -31,6 +31,7 @@ KINDS = {
     "reply": wire.Reply,
     "im-commit": wire.MeasuredManifest,
     "state": wire.StateMessage,
+    "gains": wire.GainsMessage,
     "alarm": wire.AlarmMessage,
 }
 

@@ -58,6 +58,7 @@ from service.wire import (
     Acknowledgement,
     Command,
     Manifest,
+    ReferencesInUse,
     Reply,
     Status,
     checksum,
@@ -314,6 +315,10 @@ class ShortLink:
         """Return the matrix the RTC uses."""
         active = self._dome.computer.reconstructor
         return active.manifest, active.matrix
+
+    async def fetch_references(self) -> ReferencesInUse:
+        """Return the offset of the RTC's reference slopes."""
+        return self._dome.computer.references_in_use()
 
     def offer(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
         """Do nothing: the RTC is never late."""

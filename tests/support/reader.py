@@ -161,6 +161,7 @@ class Reader:
 def runs_beside(words):
     """True if a command runs until it is ended, or as long as it is asked to."""
     lasting = {"run", "demo"} | ({"sim"} if "--write-instrument" not in words else set())
+    lasting |= {"cacao"} if len(words) == 3 else set()  # more: an order to the one that runs
     return words[0] in lasting and "--record" not in words and "--help" not in words
 
 

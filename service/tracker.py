@@ -168,6 +168,7 @@ REACTIONS: Final[Reactions] = {
     ev.PassiveUnavailable: (window_processing.on_passive_unavailable,),
     ev.MatrixMade: (operator.on_refit_made, _on_made, acquisition.on_made),
     ev.MatrixFetched: (reconstructors.on_fetched,),
+    ev.ReferencesFetched: (rtc.log_references,),
     ev.ModesRecognised: (mode_proof.note_recognised,),
     ev.MarginJudged: (reconstructors.on_margin,),
     ev.ProposalJudged: (reconstructors.on_proposal_judged,),
@@ -220,6 +221,7 @@ ANSWERS: Final[Reactions] = {
     wire.OffloadRequest: (offload.on_answer,),
     wire.LoopRequest: (rtc.on_loop_answer, operator.on_loop_answer, acquisition.on_loop_answer),
     wire.RampRequest: (operator.on_loop_answer,),
+    wire.ReferencesRequest: (rtc.log_reply,),
 }
 """Functions of context, request and reply for each kind of request that the RTC has answered."""
 
@@ -230,6 +232,7 @@ FAILURES: Final[Reactions] = {
     ev.JudgeProposal: (reconstructors.on_judging_failed, rtc.fail_order),
     ev.SendMatrix: (rtc.on_modes_unknown, reconstructors.on_send_failed, rtc.log_failure),
     ev.FetchMatrix: (reconstructors.on_fetch_failed, rtc.log_failure),
+    ev.FetchReferences: (rtc.log_failure,),
     ev.FinishNoisy: (measurement.on_finish_failed,),
     wire.DitherRequest: (dither.on_failure, rtc.fail_order, measurement.on_dither_failed),
     wire.DitherStop: (rtc.log_failure,),
@@ -241,6 +244,7 @@ FAILURES: Final[Reactions] = {
         acquisition.on_loop_failed,
     ),
     wire.RampRequest: (operator.on_loop_failed,),
+    wire.ReferencesRequest: (rtc.log_failure,),
 }
 """Functions of context, effect and text for each kind of effect, or request, that has failed."""
 

@@ -58,6 +58,7 @@ from service.wire import (
     Acknowledgement,
     Command,
     Manifest,
+    ReferencesInUse,
     Reply,
     Status,
     checksum,
@@ -218,7 +219,9 @@ class Dome:
     def _moment(self, batches: list[Batch]) -> Moment:
         last = batches[-1]
         errors_nm = [
-            error for part in _alike(batches, _optics_of) for error in self._error.rms_nm(part)
+            error
+            for part in _alike(batches, _optics_of)
+            for error in self._error.rms_nm(self._error.residual_m(part))
         ]
         return Moment(
             time_s=self.time_s,
@@ -314,6 +317,10 @@ class ShortLink:
         """Return the matrix the RTC uses."""
         active = self._dome.computer.reconstructor
         return active.manifest, active.matrix
+
+    async def fetch_references(self) -> ReferencesInUse:
+        """Return the offset of the RTC's reference slopes."""
+        return self._dome.computer.references_in_use()
 
     def offer(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
         """Do nothing: the RTC is never late."""

@@ -19,7 +19,7 @@ from service.records.messages import Message
 from service.records.operations import MeasurementRecord, ProbationFinding
 from service.records.products import ExpectedGain, GateVerdict, Judged, ReconstructorRecord
 from service.records.state import Level, ModelState, TrackerState
-from service.wire import Acknowledgement, Reply, Status
+from service.wire import Acknowledgement, ReferencesInUse, Reply, Status
 from service.wire import Command as Request
 
 
@@ -96,6 +96,11 @@ class FetchMatrix(Caused):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FetchReferences(Caused):
+    """Ask the RTC for the offset of its reference slopes."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Ask(Caused):
     """Ask something of the RTC."""
 
@@ -118,6 +123,7 @@ Effect = (
     | JudgeProposal
     | SendMatrix
     | FetchMatrix
+    | FetchReferences
     | Ask
     | FinishNoisy
 )
@@ -262,6 +268,13 @@ class MatrixFetched:
     """The matrix the RTC uses, which the service did not make, is known now."""
 
     record: ReconstructorRecord
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReferencesFetched:
+    """The RTC has reported the offset of its reference slopes."""
+
+    in_use: ReferencesInUse
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -430,6 +443,7 @@ Event = (
     | PassiveUnavailable
     | MatrixMade
     | MatrixFetched
+    | ReferencesFetched
     | ModesRecognised
     | MarginJudged
     | ProposalJudged

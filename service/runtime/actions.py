@@ -99,6 +99,8 @@ class Actions:
                 return await self._judge(effect, state)
             case ev.FetchMatrix(id=matrix_id):
                 return await self._fetch(matrix_id, state)
+            case ev.FetchReferences():
+                return ev.ReferencesFetched(in_use=await self._bridge.fetch_references())
             case ev.SendMatrix():
                 return await self._send(effect, state)
             case ev.FinishNoisy(record=record):

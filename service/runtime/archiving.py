@@ -34,7 +34,13 @@ from service.tracking.mode_proof import proof_to_keep
 from service.tracking.policy import Policy
 from service.tracking.resume import orders_of, resumed, saved_of, with_orders
 from service.tracking.step_context import logged
-from service.wire import DitherRequest, MeasureRequest, OffloadRequest, RampRequest
+from service.wire import (
+    DitherRequest,
+    MeasureRequest,
+    OffloadRequest,
+    RampRequest,
+    ReferencesRequest,
+)
 
 DISK_RETRY_INTERVAL_S = 2.0
 """Interval between two attempts while the disk refuses."""
@@ -56,7 +62,7 @@ MAX_WAITING_LINES = 10_000
 """Lines of the audit trail, and estimates, that wait for a disk; newer ones are counted and
 dropped."""
 
-RECORDED_REQUESTS = (DitherRequest, MeasureRequest, RampRequest)
+RECORDED_REQUESTS = (DitherRequest, MeasureRequest, RampRequest, ReferencesRequest)
 """Effects that are executed only after their cause is on the disk. What ends something never waits.
 """
 

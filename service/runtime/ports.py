@@ -13,7 +13,7 @@ from service.archive.store import Provenance
 from service.records.operations import MeasurementRecord
 from service.records.products import ReconstructorRecord
 from service.runtime.worker import OpticsWorker
-from service.wire import Command, Manifest, Reply
+from service.wire import Command, Manifest, ReferencesInUse, Reply
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -31,6 +31,9 @@ class RtcPort(Protocol):
 
     async def fetch_applied(self) -> tuple[Manifest, NDArray[np.float32]]:
         """Return the reconstructor the RTC uses."""
+
+    async def fetch_references(self) -> ReferencesInUse:
+        """Return the offset of the RTC's reference slopes."""
 
     def offer(self, manifest: Manifest, matrix: NDArray[np.float32], /) -> None:
         """Let an RTC ask for a reconstructor without sending it."""

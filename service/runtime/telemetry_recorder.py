@@ -32,6 +32,7 @@ from service.files.recording import RecordingWriter
 from service.records.commands import Instruction
 from service.records.events import new_id
 from service.records.state import TrackerState
+from service.runtime.snapshot import present_gains
 
 MAX_RECORDING_S = 3600.0
 
@@ -318,6 +319,7 @@ class TrendSampler:
         self._matrix = matrix
         self._keep = keep
         self._seen_ns: int | None = None
+        self._gains_ns: int | None = None
         self._cm_id: str | None = None
         self._pieces: list[NDArray[np.float32]] = []
         """Slopes of the loop that this matrix closes, since the last sample."""
@@ -359,7 +361,11 @@ class TrendSampler:
             # None if nobody has its numbers
             with suppress(PyrcalError):
                 residual_m = residual_of(np.concatenate(pieces), self._matrix(self._cm_id))
-        return sample_of(state, time.time_ns(), end_ns if is_new else None, residual_m)
+        found = present_gains(state)
+        # The same gains are not kept again, or a dither's end would fill the archive.
+        gains_ns, self._gains_ns = self._gains_ns, None if found is None else found.t_ns_utc
+        sample = sample_of(state, time.time_ns(), end_ns if is_new else None, residual_m)
+        return replace(sample, gains=None if self._gains_ns == gains_ns else found)
 
 
 def sample_of(

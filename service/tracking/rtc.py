@@ -294,6 +294,19 @@ def fail_order(context: StepContext, effect: Effect | Request, text: str) -> Non
     log_failure(context, effect, text)
 
 
+def log_references(context: StepContext, fetched: ev.ReferencesFetched) -> None:
+    """Log which reference slopes the RTC has in use."""
+    context.log("references.read", fetched.in_use.reference_id)
+
+
+def log_reply(context: StepContext, request: Request, reply: Reply) -> None:
+    """Log whether the RTC has accepted a request."""
+    if reply.accepted:
+        context.log("request.accepted", request.id)
+    else:
+        context.warn("request.refused", f"{request.id}: {reply.reason}")
+
+
 def log_failure(context: StepContext, _: Effect | Request, text: str) -> None:
     """Log the failure; what is still needed is asked for again."""
     context.warn("job.failed", text)

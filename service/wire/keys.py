@@ -45,9 +45,11 @@ class Encodings(StrEnum):
     ACKNOWLEDGEMENT = "application/msgpack;ao.v1.ack"
     COMMAND = "application/msgpack;ao.v1.command"
     REPLY = "application/msgpack;ao.v1.reply"
+    REFERENCES = "application/msgpack;ao.v1.references"
     MEASURED_COMMIT = "application/msgpack;ao.v1.im-commit"
     STATE = "application/msgpack;ao.v1.state"
     ALARM = "application/msgpack;ao.v1.alarm"
+    GAINS = "application/msgpack;ao.v1.gains"
 
 
 class Keys:
@@ -72,12 +74,18 @@ class Keys:
         """Acknowledgements of reconstructors."""
         self.applied = f"{self.root}/rtc/cm/applied"
         """Queryable of the RTC: the matrix in use."""
+        self.references_in_use = f"{self.root}/rtc/references"
+        """Queryable of the RTC: the offset of its reference slopes."""
+        self.references = f"{self.root}/references"
+        """Reference slopes that the RTC should use, for programs that apply them in its place."""
         self.all_measured = f"{self.root}/im/**"
         """Every :meth:`measured_chunk` and :meth:`measured_commit`."""
         self.state = f"{self.root}/state"
         """State messages of the service, for all subscribers."""
         self.alarm = f"{self.root}/alarm"
         """Alarms of the service, for all subscribers."""
+        self.gains = f"{self.root}/gains"
+        """Optical gains of all modes, for all subscribers."""
         self.all_ranks = f"{self.root}/alive/{Role.SERVICE}/*"
         """Every :meth:`rank`."""
 

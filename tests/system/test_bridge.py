@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import zenoh.ext
 
+from pyrcal.rtc.replies import answer_references
 from service.errors import LinkError, UnknownIdError, WireError
 from service.link.matrices import MeasuredMatrix
 from service.records.events import LogEvent, RtcVanished, ServicesMet, SessionStarted
@@ -22,15 +23,19 @@ from service.wire import (
     AlarmMessage,
     DitherKind,
     DitherRequest,
+    GainsMessage,
     Keys,
     LoopRequest,
     Manifest,
     MeasuredManifest,
     Pattern,
+    ReferencesInUse,
+    ReferencesRequest,
     Reply,
     Role,
     StateMessage,
     Status,
+    checksum,
     decode,
     encode,
     encode_frames,
@@ -579,13 +584,40 @@ async def test_no_rtc_at_all_is_a_link_error_within_seconds(bridge):
     assert time.monotonic() - begin < patience(3.0)
 
 
-def test_state_and_alarm_reach_those_who_listen_and_those_who_come_late(bridge, rtc):
+def test_state_gains_and_alarm_reach_those_who_listen_and_those_who_come_late(bridge, rtc):
     state = StateMessage(system=SYSTEM, t_ns=1, mode="auto", alpha=None, sigma=None, in_use="r-1")
     alarm = AlarmMessage(system=SYSTEM, t_ns=2, name="rtc.vanished", active=True, text="gone")
     bridge.publish_state(state)
+    gains = GainsMessage(
+        system=SYSTEM,
+        t_ns=3,
+        modes=(1,),
+        optical_gain=np.array([0.5, 0.6], "<f4").tobytes(),
+        sigma=np.array([0.1, 0.01], "<f4").tobytes(),
+        reference_id=None,
+        magnitude=8.0,
+        frame_rate_hz=1000.0,
+    )
     bridge.publish_alarm(alarm)
+    bridge.publish_gains(gains)
     assert decode(StateMessage, _last_value(rtc, rtc.keys.state)) == state
     assert decode(AlarmMessage, _last_value(rtc, rtc.keys.alarm)) == alarm
+    assert decode(GainsMessage, _last_value(rtc, rtc.keys.gains)) == gains
+
+
+async def test_references_are_sent_put_on_their_topic_and_read_back(bridge, rtc):
+    """More slopes than another command may have: 40,000, in 160 KB."""
+    slopes = np.arange(40_000, dtype="<f4")
+    offset = {"slopes": slopes.tobytes(), "sha256": checksum(slopes)}
+    request = ReferencesRequest(
+        id="q-1", reference_id="ncpa", config_id="mask-1", ramp_s=1.0, **offset
+    )
+    assert (await bridge.command(request)).accepted
+    assert rtc.commands == [request]
+    assert decode(ReferencesRequest, _last_value(rtc, rtc.keys.references)) == request
+    in_use = ReferencesInUse(reference_id="ncpa~", **offset)
+    answer_references(rtc.zenoh, rtc.keys, lambda: in_use)
+    assert await bridge.fetch_references() == in_use
 
 
 def _last_value(rtc, key):

@@ -25,7 +25,7 @@ from service.errors import CommandError
 from service.records.events import MatrixMade
 from service.records.operations import AcquisitionStage
 from service.records.products import MatrixState, ReconstructorRecord
-from service.records.registration import ModeGain
+from service.records.registration import MeasuredGains, ModeGain
 from service.records.state import Mode
 from service.tracker import step
 from service.web.connections import Server
@@ -413,10 +413,21 @@ def test_history_trail_and_matrix_become_files(capsys, service, tmp_path, monkey
     assert main(["export", "reconstructor-gains", "candidate", "--format", "jsonl"]) == 0
     lines = (tmp_path / "reconstructor-gains-candidate.jsonl").read_text(encoding="utf-8")
     assert len(lines.splitlines()) == 400
+    kept = [
+        MeasuredGains(measured=(replace(gain, t_ns_utc=k * SECOND),), n_modes=30, magnitude=8.0)
+        for k in range(1, 131)
+    ]
+    service.archive.nights.gains = lambda first_ns, last_ns, n_most, **_: tuple(
+        one for one in kept if first_ns <= one.t_ns_utc <= last_ns
+    )[:n_most]
+    assert main(["export", "gains-history"]) == 0
+    lines = (tmp_path / "gains-history.jsonl").read_text(encoding="utf-8").splitlines()
+    assert [json.loads(line)["t_ns_utc"] for line in lines] == [one.t_ns_utc for one in kept]
     assert main(["export", "reconstructor", "candidate"]) == 0
     np.testing.assert_array_equal(np.load(tmp_path / "reconstructor-candidate.npy"), MATRIX)
     assert sorted(file.name for file in tmp_path.iterdir()) == [
-        "a.jsonl", "alpha.csv", "audit.csv", "gains.csv", "reconstructor-candidate.npy",
+        "a.jsonl", "alpha.csv", "audit.csv", "gains-history.jsonl", "gains.csv",
+        "reconstructor-candidate.npy",
         "reconstructor-gains-candidate.jsonl",
     ]  # fmt: skip
     capsys.readouterr()

@@ -69,7 +69,7 @@ POKE_M = 10e-9
 POKE_FRAMES = 150
 """Frames from one residual that is poked to the next."""
 
-CALM_ARCSEC, RISE_S = 0.6, 1.0
+CALM_ARCSEC, RISE_S, AFTERWARDS_S = 0.6, 1.0, 1.0
 LOST_M = 500e-9
 """RMS wavefront of a lost loop; the largest seeing leaves 0.2 µm."""
 LOST_BATCHES = 10
@@ -158,7 +158,7 @@ def run(plan: Plan, references: Array | None, *, poked: bool = False) -> Held:
     if plan.case == "jump":
         settled_s, seeing = SETTLING_FRAMES / 1000.0, f"{CALM_ARCSEC}"
         if not poked:
-            n_frames += round(1000.0 * RISE_S)
+            n_frames += round(1000.0 * (RISE_S + AFTERWARDS_S))
             seeing += f" --seeing-at {settled_s}:{CALM_ARCSEC}"
             seeing += f" --seeing-at {settled_s + RISE_S}:{plan.seeing_arcsec}"
     options = parse_options(

@@ -142,8 +142,11 @@ def shape_of(plan: Plan) -> Array:
 class Held:
     """What a loop left."""
 
+    modes_m: Array
+    """``(n_batches, n_controlled)`` wavefront in the first frame of each batch."""
+
     mean_m: Array
-    """``(n_controlled,)`` mean wavefront."""
+    """``(n_controlled,)`` its mean once the loop has settled."""
 
     gain: Array
     """``(n_controlled,)`` true optical gains of the modes that were poked, 1 of others."""
@@ -184,15 +187,17 @@ def run(plan: Plan, references: Array | None, *, poked: bool = False) -> Held:
             n_lost = n_lost + 1 if np.sqrt(telescope.weights @ lefts[-1] ** 2) > LOST_M else 0
         if len(lefts) * BATCH_FRAMES >= n_frames or n_lost >= LOST_BATCHES:
             break
-    settled = np.array(lefts[SETTLING_FRAMES // BATCH_FRAMES :])
     modes = optics.opd_per_command[:, : len(matrix)].astype(np.float64)
     weighted = (modes - telescope.weights @ modes).T * telescope.weights
+    modes_m = np.linalg.solve(weighted @ modes, weighted @ np.array(lefts).T).T
+    n_settling = SETTLING_FRAMES // BATCH_FRAMES
     gain = np.ones(len(matrix))
     if poked:
-        apart = POKE_FRAMES // BATCH_FRAMES
-        gain[_poked(len(matrix))] = poke(optics, settled[::apart], matrix)
+        residuals = np.array(lefts[n_settling :: POKE_FRAMES // BATCH_FRAMES])
+        gain[_poked(len(matrix))] = poke(optics, residuals, matrix)
     return Held(
-        mean_m=np.linalg.solve(weighted @ modes, weighted @ settled.mean(axis=0)),
+        modes_m=modes_m,
+        mean_m=modes_m[n_settling:].mean(axis=0),
         gain=gain,
         lost_s=len(lefts) * BATCH_FRAMES / 1000.0 if n_lost >= LOST_BATCHES else None,
     )
@@ -295,6 +300,9 @@ def plans() -> Iterable[Plan]:
         yield replace(one, shape="flat")
         if seed == 1:
             yield replace(one, references="strong")
+        small = replace(one, instrument="tests/system/small.toml")
+        for references, shape in product(("holding", "pokes", "static"), ("steep", "flat")):
+            yield replace(small, references=references, shape=shape, rms_nm=60.0)
     moved = product((0.6, 0.9), ("1,0,0,1", "0,0,2,1"), ("holding", "nominal"))
     for seeing, alpha, references in moved:
         one = Plan(case="moved", seeing_arcsec=seeing, seed=1, references=references)

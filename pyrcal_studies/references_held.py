@@ -189,7 +189,7 @@ def run(plan: Plan, references: Array | None, *, poked: bool = False) -> Held:
             break
     modes = optics.opd_per_command[:, : len(matrix)].astype(np.float64)
     weighted = (modes - telescope.weights @ modes).T * telescope.weights
-    modes_m = np.linalg.solve(weighted @ modes, weighted @ np.array(lefts).T).T
+    modes_m = np.asarray(np.linalg.solve(weighted @ modes, weighted @ np.array(lefts).T).T)
     n_settling = SETTLING_FRAMES // BATCH_FRAMES
     gain = np.ones(len(matrix))
     if poked:

@@ -285,6 +285,13 @@ class Bridge:
             read_back, self._require_session(), self._keys, self._signatures
         )
 
+    async def fetch_references(self) -> wire.ReferencesInUse:
+        """Return the offset in use; see :func:`service.link.session.fetch_references`."""
+        read_back = link.fetch_references
+        return await asyncio.to_thread(
+            read_back, self._require_session(), self._keys, self._signatures
+        )
+
     def publish_state(self, message: wire.StateMessage) -> None:
         """Publish the service's state; it is dropped if the network is congested or not there."""
         self._publish_last(self._keys.state, wire.encode(message), wire.Encodings.STATE)
@@ -295,7 +302,7 @@ class Bridge:
 
     def _declare(self, session: zenoh.Session) -> None:
         keys = self._keys
-        for key in (keys.state, keys.alarm):
+        for key in (keys.state, keys.alarm, keys.references):
             self._publishers[key] = link.last_value(session, key)
         self._held += self._standby.join(
             session, self._catch_errors, wait=bool(self._endpoint.connect)
@@ -425,6 +432,11 @@ class Bridge:
         self._log.info("reconstructor.sent", id=manifest.id, n_chunks=len(offer.parts))
 
     def _command(self, command: wire.Command) -> wire.Reply:
+        if isinstance(command, wire.ReferencesRequest):
+            # For a program that applies references in the place of an RTC that cannot.
+            key = self._keys.references
+            signed = self._signatures.sign(key, wire.encode(command))
+            self._publish_last(key, signed, wire.Encodings.REFERENCES)
         answer = link.send_command(self._require_lead(), self._endpoint, command, self._signatures)
         try:
             reply = wire.decode(wire.Reply, answer)

@@ -17,9 +17,15 @@ from service.records.estimates import (
 )
 from service.records.messages import Message
 from service.records.operations import MeasurementRecord, ProbationFinding
-from service.records.products import ExpectedGain, GateVerdict, Judged, ReconstructorRecord
+from service.records.products import (
+    ExpectedGain,
+    GateVerdict,
+    Judged,
+    ReconstructorRecord,
+    ReferencesRecord,
+)
 from service.records.state import Level, ModelState, TrackerState
-from service.wire import Acknowledgement, Reply, Status
+from service.wire import Acknowledgement, ReferencesInUse, Reply, Status
 from service.wire import Command as Request
 
 
@@ -96,12 +102,37 @@ class FetchMatrix(Caused):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FetchReferences(Caused):
+    """Ask the RTC for the offset of its reference slopes."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Ask(Caused):
     """Ask something of the RTC."""
 
     request: Request
     judged: bool = False
     """Only if the gate lets the matrix in use run with the gains of the request."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MakeReferences(Caused):
+    """Compute reference slopes for the shape, at the current α and optical gains."""
+
+    id: str
+    """Id of the references."""
+
+    worst_seeing_arcsec: float
+    """Seeing in which the loop must survive with them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SendReferences(Caused):
+    """Have the RTC subtract these references."""
+
+    id: str
+    ramp_s: float
+    """Duration of the ramp to them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -118,8 +149,11 @@ Effect = (
     | JudgeProposal
     | SendMatrix
     | FetchMatrix
+    | FetchReferences
     | Ask
     | FinishNoisy
+    | MakeReferences
+    | SendReferences
 )
 
 
@@ -265,6 +299,13 @@ class MatrixFetched:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ReferencesFetched:
+    """The RTC has reported the offset of its reference slopes."""
+
+    in_use: ReferencesInUse
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ModesRecognised:
     """The model has recognised the modes of the matrix in use."""
 
@@ -370,6 +411,13 @@ class MatrixMisapplied:
     id: str
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ReferencesMade:
+    """Reference slopes were computed, and their size was checked."""
+
+    record: ReferencesRecord
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopHeld:
     """Telemetry says that the loop holds well, or that it does so no longer."""
@@ -430,6 +478,7 @@ Event = (
     | PassiveUnavailable
     | MatrixMade
     | MatrixFetched
+    | ReferencesFetched
     | ModesRecognised
     | MarginJudged
     | ProposalJudged
@@ -441,6 +490,7 @@ Event = (
     | Compared
     | LoopHeld
     | MatrixMisapplied
+    | ReferencesMade
     | Vibrations
     | ModelChanged
     | ModesCommanded

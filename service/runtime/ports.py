@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from service.archive.products import NoisyNumbers
 from service.archive.store import Provenance
 from service.records.operations import MeasurementRecord
-from service.records.products import ReconstructorRecord
+from service.records.products import ReconstructorRecord, ReferencesRecord
 from service.runtime.worker import OpticsWorker
-from service.wire import Command, Manifest, Reply
+from service.wire import Command, Manifest, ReferencesInUse, Reply
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -31,6 +31,9 @@ class RtcPort(Protocol):
 
     async def fetch_applied(self) -> tuple[Manifest, NDArray[np.float32]]:
         """Return the reconstructor the RTC uses."""
+
+    async def fetch_references(self) -> ReferencesInUse:
+        """Return the offset of the RTC's reference slopes."""
 
     def offer(self, manifest: Manifest, matrix: NDArray[np.float32], /) -> None:
         """Let an RTC ask for a reconstructor without sending it."""
@@ -72,12 +75,26 @@ class ReconstructorPort(Protocol):
         """Return a reconstructor that was kept; UnknownIdError if there is none."""
 
 
+class ReferencesPort(Protocol):
+    """Store of reference slopes."""
+
+    def store(self, record: ReferencesRecord, offset: NDArray[np.float32], /) -> None:
+        """Keep an offset ``(n_slopes,)``."""
+
+    def matrix(self, reference_id: str, /) -> NDArray[np.float32]:
+        """Return an offset that was kept; UnknownIdError if there is none."""
+
+
 class StorePort(Protocol):
     """Stores of matrices; :class:`service.archive.Archive` is the real one."""
 
     @property
     def reconstructors(self) -> ReconstructorPort:
         """Reconstructors."""
+
+    @property
+    def references(self) -> ReferencesPort:
+        """Reference slopes."""
 
     @property
     def measured(self) -> MeasuredPort[NDArray[np.float32]]:

@@ -16,6 +16,7 @@ from service.tracking import (
     mode_proof,
     pointing_law,
     reconstructors,
+    references,
     update_policy,
     validity,
 )
@@ -83,6 +84,7 @@ def on_status(context: StepContext, rtc: Status) -> None:
         config_id=context.loop.config_id or rtc.config_id,
     )
     _note_references(context, rtc)
+    references.follow_status(context, rtc, returned=before is None)
     _note_renaming(context, before, rtc)
     validity.note_pointing(context, rtc.pointing)
     _drop_other_basis(context)
@@ -235,6 +237,7 @@ def on_new_session(context: StepContext, started: ev.SessionStarted) -> None:
 def _begin_anew(context: StepContext, because: str) -> None:
     """Void what belonged to the loop until now."""
     reconstructors.forget_session(context)
+    references.forget_session(context)
     mode_proof.forget_session(context)
     validity.invalidate_telemetry(context, because)
     dither.forget_dither(context)

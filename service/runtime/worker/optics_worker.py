@@ -23,6 +23,12 @@ from service.control.gains import CalibrationGains
 from service.control.gate import judge
 from service.control.loop import ControlLoop
 from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
+from service.control.references import (
+    compute_references,
+    holding_gain,
+    limit_shape,
+    shape_in_modes,
+)
 from service.estimation import passive
 from service.estimation.description import Description
 from service.estimation.dithered_response import DitheredResponse, ModeResidual
@@ -61,12 +67,13 @@ from service.records.estimates import (
     WindowRefused,
 )
 from service.records.messages import as_message, compose
-from service.records.products import ExpectedGain, GateVerdict
+from service.records.products import ExpectedGain, GateVerdict, Shape, ShapeKind
 from service.records.state import ModelState
 from service.runtime.worker.records import (
     Compute,
     Conditions,
     Made,
+    MadeReferences,
     actuators_of,
     check_controllable,
     largest_passing,
@@ -506,6 +513,39 @@ class OpticsWorker:
             return predict_gain(in_use, fresh, seen, loop, sky)
         except np.linalg.LinAlgError:
             return None
+
+    def make_references(
+        self,
+        shape: Shape,
+        alpha: Misregistration,
+        optical_gain: NDArray[np.float64],
+        worst_seeing_arcsec: float,
+    ) -> MadeReferences:
+        """Compute the reference slopes that hold a shape, and check its size.
+
+        ``optical_gain`` ``(n_controlled,)`` is that of the modes in the loop, which hold it. Slopes
+        are split into what these modes explain and the rest, which is scaled by their mean gain.
+        """
+        matrix, values = self._model.interaction_matrix(alpha), np.array(shape.values)
+        matrix = matrix[:, : len(optical_gain)]
+        left = np.zeros(len(matrix))
+        if shape.kind is ShapeKind.SLOPES:
+            coefficients = reconstruct(matrix, self._recipe(len(optical_gain))).matrix @ values
+            left = values - matrix @ coefficients
+            unexplained = float(np.linalg.norm(left) / np.linalg.norm(values))
+        else:
+            found = shape_in_modes(self._model, shape.kind, values, alpha, len(optical_gain))
+            coefficients, unexplained = found.coefficients_m, found.unexplained
+        limit = limit_shape(self._model, coefficients, optical_gain, worst_seeing_arcsec)
+        offset = compute_references(matrix, optical_gain, coefficients)
+        power = np.cumsum(np.square(coefficients))
+        n_kept = int(np.searchsorted(power, 0.999 * power[-1])) + 1
+        return MadeReferences(
+            offset=(offset + holding_gain(optical_gain).mean() * left).astype(np.float32),
+            coefficients_m=tuple(coefficients[:n_kept].tolist()),
+            unexplained=unexplained,
+            refusal="" if limit.accepted else limit.reason,
+        )
 
     def _recipe(self, n_modes: int) -> Recipe:
         prior = None

@@ -25,9 +25,10 @@ def expose(computer, telescope, commands_m):
     n_controlled = len(matrix)
     if not computer.closed:
         commands_m[:] = 0.0
-    for frame_m in dither_m:
+    for frame_m, offset in zip(dither_m, computer.reference_offset(), strict=True):
         played_m.append(commands_m[0] + frame_m)
-        slopes.append(telescope.expose(played_m[-1]))
+        # The service may set reference slopes: the offset is subtracted beyond the RTC's own.
+        slopes.append(telescope.expose(played_m[-1]) - offset)
         answer_m = computer.leak * commands_m[1]
         answer_m[n_controlled:] = 0.0
         if computer.closed:

@@ -240,10 +240,10 @@ FAILURES: Final[Reactions] = {
     ev.JudgeProposal: (reconstructors.on_judging_failed, rtc.fail_order),
     ev.SendMatrix: (rtc.on_modes_unknown, reconstructors.on_send_failed, rtc.log_failure),
     ev.FetchMatrix: (reconstructors.on_fetch_failed, rtc.log_failure),
+    ev.FetchReferences: (rtc.log_failure,),
     ev.FinishNoisy: (measurement.on_finish_failed,),
     ev.MakeReferences: (references.on_making_failed, rtc.log_failure),
     ev.SendReferences: (references.on_sending_failed,),
-    ev.FetchReferences: (rtc.log_failure,),
     wire.DitherRequest: (dither.on_failure, rtc.fail_order, measurement.on_dither_failed),
     wire.DitherStop: (rtc.log_failure,),
     wire.MeasureRequest: (measurement.on_failure,),
@@ -254,6 +254,7 @@ FAILURES: Final[Reactions] = {
         acquisition.on_loop_failed,
     ),
     wire.RampRequest: (operator.on_loop_failed,),
+    wire.ReferencesRequest: (rtc.log_failure,),
 }
 """Functions of context, effect and text for each kind of effect, or request, that has failed."""
 

@@ -59,6 +59,8 @@ class FaultKind(StrEnum):
     DITHER_LOST = "dither-lost"
     DITHER_LATE = "dither-late"
     MIRROR_SILENT = "mirror-silent"
+    REFERENCES_SCALED = "references-scaled"
+    REFERENCES_KEPT = "references-kept"
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +76,7 @@ class Argument:
 _FOREVER = 1e9
 _SHARE: Final = Argument("SHARE", 1.0, 0.0, 1.0)
 _SECONDS: Final = Argument("SECONDS", 1.0, 0.001, _FOREVER)
+_HIDDEN: Final = Argument("HIDDEN", 0.0, 0.0, 1.0)
 _DELAY: Final = Argument("DELAY", 0.3, 0.001, 60.0)
 
 FORMS: Final[dict[FaultKind, tuple[tuple[Argument, ...], str]]] = {
@@ -125,6 +128,14 @@ FORMS: Final[dict[FaultKind, tuple[tuple[Argument, ...], str]]] = {
     FaultKind.MIRROR_SILENT: (
         (_SECONDS,),
         "dithers are in the telemetry and never reach the mirror",
+    ),
+    FaultKind.REFERENCES_SCALED: (
+        (Argument("FACTOR", -1.0, -10.0, 10.0), _HIDDEN, _SECONDS),
+        "reference offsets are applied times FACTOR; HIDDEN 1 reads back what was requested",
+    ),
+    FaultKind.REFERENCES_KEPT: (
+        (_HIDDEN, _SECONDS),
+        "reference offsets are accepted and named, and the old one stays",
     ),
 }
 
@@ -294,6 +305,10 @@ class ComputerFaults:
                 self._target.delay_dithers(n_frames if begins else 0)
             case FaultKind.MIRROR_SILENT:
                 self._target.hide_dithers(hidden=begins)
+            case FaultKind.REFERENCES_SCALED | FaultKind.REFERENCES_KEPT:
+                hidden = bool(fault.value("HIDDEN"))
+                spoil = _spoil_references(fault) if begins else None
+                self._target.spoil_references(spoil, hidden=hidden)
             case _:
                 pass
 
@@ -308,6 +323,14 @@ class ComputerFaults:
         stopped.wait(seconds)
         self._clock.step(round(1e9 * seconds))
         self._pace.forgive(seconds)
+
+
+def _spoil_references(fault: Fault) -> Callable[[Array32, Array32], Array32]:
+    """Return the offset that is applied, as a function of the present and the requested one."""
+    if fault.kind is FaultKind.REFERENCES_KEPT:
+        return lambda present, _: present
+    factor = np.float32(fault.value("FACTOR"))
+    return lambda _, requested: factor * requested
 
 
 Sendable = tuple[bytes, bytes]

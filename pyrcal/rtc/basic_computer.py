@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pyrcal.rtc.dither import Dither, check_dither
 from pyrcal.rtc.identity import Identity, Reconstructor, new_session
+from pyrcal.rtc.references import ReferenceOffset
 from pyrcal.rtc.replies import FinishedMeasurement
 from pyrcal.rtc.staging import Terms
 from service.wire import (
@@ -19,6 +21,8 @@ from service.wire import (
     FrameHeader,
     Loop,
     LoopRequest,
+    ReferencesInUse,
+    ReferencesRequest,
     Reply,
     Status,
 )
@@ -41,7 +45,9 @@ class BasicComputer:
         header, rows = computer.end_batch(slopes, commands_m, dither_m)
 
     Between the two calls it reads :attr:`reconstructor`, :attr:`gains`, :attr:`leak` and
-    :attr:`closed`. All other methods are called by the link, from other threads.
+    :attr:`closed`. A program that lets the service set reference slopes also reads
+    :meth:`reference_offset` in each batch. All other methods are called by the link, from other
+    threads.
 
     Parameters
     ----------
@@ -102,6 +108,10 @@ class BasicComputer:
         self._staged: Reconstructor | None = None
         self._swaps: list[tuple[str, int]] = []
         self._n_exposing = 0
+        self._offset = ReferenceOffset(self.n_slopes)
+        self._offsets: Array32 | None = None
+        self._named: str | None = None
+        self._subtracts_offset = False
         self._lock = threading.Lock()
 
     @property
@@ -148,8 +158,29 @@ class BasicComputer:
             if self._dither is not None and self.seq >= self._dither.stop_seq:
                 self._dither = None
             self._n_exposing = n_frames
+            self._offsets = self._offset.advance(self.seq, n_frames)
+            if self._offset.name is not None and self._offset.name != self._named:
+                self._named = self._offset.name
+                self.identity = replace(self.identity, reference_id=self._named)
             played = None if self._dither is None else self._dither.commands(self.seq, n_frames)
         return np.zeros((n_frames, self.n_modes), dtype=np.float32) if played is None else played
+
+    def reference_offset(self) -> Array32:
+        """Return what to subtract from the slopes of these frames, ``(n_frames, n_slopes)``.
+
+        It comes on top of the program's own reference slopes, and is zero until the service
+        requests references. Such requests are refused until this method has been called, because
+        the service must not be told of references that are not subtracted.
+        """
+        if self._offsets is None:
+            raise RuntimeError("reference_offset: expected a call of begin_batch before it")
+        self._subtracts_offset = True
+        return self._offsets
+
+    def references_in_use(self) -> ReferencesInUse:
+        """Return the offset that is subtracted now."""
+        with self._lock:
+            return self._offset.in_use(self.identity.reference_id or self.identity.config_id)
 
     def end_batch(
         self, slopes: ArrayLike, commands_m: ArrayLike, dither_m: ArrayLike
@@ -257,6 +288,8 @@ class BasicComputer:
                 self._dither = None
             case LoopRequest():
                 return self._change_loop(command), None
+            case ReferencesRequest() if self._subtracts_offset:
+                return self._change_references(command)
             case _:
                 return "unsupported: this RTC has no such command", None
         return "", None
@@ -282,6 +315,14 @@ class BasicComputer:
             n_modes=self.n_modes,
             frame_rate_hz=self._frame_rate_hz,
         )
+        return "", start_seq
+
+    def _change_references(self, request: ReferencesRequest) -> tuple[str, int | None]:
+        refusal = self._offset.check(request, self.identity.config_id)
+        if refusal:
+            return refusal, None
+        start_seq = self.seq + self._n_exposing
+        self._offset.begin(request, start_seq, self._frame_rate_hz)
         return "", start_seq
 
     def _change_loop(self, request: LoopRequest) -> str:

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import structlog
@@ -25,6 +25,7 @@ from service.wire import (
     Encodings,
     Keys,
     MeasuredManifest,
+    ReferencesInUse,
     Reply,
     command_id,
     decode_command,
@@ -79,6 +80,14 @@ class Computer(Protocol):
         """Execute a command and return the reply; a refusal carries its reason."""
 
 
+@runtime_checkable
+class HoldsReferences(Protocol):
+    """A :class:`Computer` that subtracts the reference offset that the service requests."""
+
+    def references_in_use(self) -> ReferencesInUse:
+        """Return the offset that is subtracted now."""
+
+
 class Replies:
     """Queryables of the RTC. They answer in zenoh's threads."""
 
@@ -92,6 +101,9 @@ class Replies:
         """Declare the queryables in a session."""
         answer_commands(session, self._keys, self._reply, self._signatures)
         answer_applied(session, self._keys, self._applied, self._signatures)
+        if isinstance(self._computer, HoldsReferences):
+            in_use = self._computer.references_in_use
+            answer_references(session, self._keys, in_use, self._signatures)
 
     def _reply(self, kind: CommandKind, data: bytes) -> Reply:
         try:
@@ -157,6 +169,22 @@ def answer_applied(
                 query.reply_err(f"range: chunk {wanted}, expected 0 to {len(chunks) - 1}")
 
     session.declare_queryable(keys.applied, answer)
+
+
+def answer_references(
+    session: zenoh.Session,
+    keys: Keys,
+    in_use: Callable[[], ReferencesInUse],
+    signatures: Signatures = UNSIGNED,
+) -> None:
+    """Declare the queryable of the reference offset in use."""
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            signed = signatures.sign(keys.references_in_use, encode(in_use()))
+            query.reply(keys.references_in_use, signed, encoding=Encodings.REFERENCES)
+
+    session.declare_queryable(keys.references_in_use, answer)
 
 
 _REPLY_LIFETIME_S = 600.0

@@ -49,7 +49,7 @@ RETRY_OPTIONS = {"period_init_ms": 200, "period_increase_factor": 1.5, "period_m
 ABSENT_PAUSE_S: Final = 0.3
 """Pause before a command is repeated: a query to an absent RTC ends at once."""
 
-OPTIONAL_COMMANDS: Final = (wire.CommandKind.RAMP,)
+OPTIONAL_COMMANDS: Final = (wire.CommandKind.RAMP, wire.CommandKind.REFERENCES)
 """Commands that an RTC need not know."""
 
 MATRIX_TIMEOUT_S: Final = 2.0
@@ -389,6 +389,23 @@ def fetch_applied(
     for index in range(manifest.layout.n_chunks):
         assembler.add(index, _request(session, f"{keys.applied}?chunk={index}"))
     return manifest, assembler.matrix()
+
+
+def fetch_references(
+    session: zenoh.Session, keys: wire.Keys, signatures: Signatures
+) -> wire.ReferencesInUse:
+    """Return the offset that the RTC subtracts from its slopes now.
+
+    Raises
+    ------
+    WireError
+        If what comes breaks the contract, or is not signed as it must be.
+    LinkError
+        If the RTC does not answer.
+    """
+    reply = _request(session, keys.references_in_use)
+    signatures.check(keys.references_in_use, reply)
+    return wire.decode(wire.ReferencesInUse, reply)
 
 
 def _request(session: zenoh.Session, selector: str) -> bytes:

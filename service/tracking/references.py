@@ -144,9 +144,7 @@ def load_shape(context: StepContext, command: cmd.LoadShape) -> None:
         loaded_ns_utc=context.now_ns,
     )
     _discard_proposals(context, f"{shape.id} was loaded")
-    context.references = replace(
-        context.references, shape=shape, paused="", not_before_ns_utc=0
-    )
+    context.references = replace(context.references, shape=shape, paused="", not_before_ns_utc=0)
     context.log("references.shape", f"{shape.id} loaded {command.signed}: {_describe(command)}")
 
 

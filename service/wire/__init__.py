@@ -8,6 +8,7 @@ it as the ``reason`` of a reply. The package does not use zenoh and never unpick
 
 from service.wire.codec import MESSAGE_LIMIT, TEXT_LIMIT, VERSION, decode, encode
 from service.wire.commands import (
+    REFERENCES_LIMIT,
     Command,
     CommandKind,
     DitherKind,
@@ -20,6 +21,8 @@ from service.wire.commands import (
     OffloadRequest,
     Pattern,
     RampRequest,
+    ReferencesInUse,
+    ReferencesRequest,
     Reply,
     command_id,
     command_kind,

@@ -48,10 +48,11 @@ class Rights:
 def list_rights(keys: Keys) -> Mapping[LinkRole, Rights]:
     """Return the rights of each role on the keys of one system."""
     advanced_frames, all_commands = keys.frames + ADVANCED_SUFFIX, keys.command("*")
-    frames, public = (keys.frames, advanced_frames), (keys.state, keys.alarm)
+    frames, public = (keys.frames, advanced_frames), (keys.state, keys.alarm, keys.references)
     # A late subscriber fetches the last message from the publisher's cache, whose reply carries
     # the key of the message itself: publishers need the right to answer on that key as well.
     history = (*public, *(key + ADVANCED_SUFFIX for key in public))
+    in_use = (keys.applied, keys.references_in_use)
     matrices = (keys.all_chunks, keys.all_commits)
     return {
         LinkRole.RTC: Rights(
@@ -63,7 +64,7 @@ def list_rights(keys: Keys) -> Mapping[LinkRole, Rights]:
             ),
             subscribes=(*matrices, *public),
             queries=(keys.all_matrices, *history),
-            answers=(all_commands, keys.applied, *frames),
+            answers=(all_commands, *in_use, *frames),
             holds=(keys.alive(Role.RTC), advanced_frames),
             watches=(keys.alive(Role.SERVICE),),
         ),
@@ -76,7 +77,7 @@ def list_rights(keys: Keys) -> Mapping[LinkRole, Rights]:
                 keys.all_measured,
                 *public,
             ),
-            queries=(all_commands, keys.applied, *frames),
+            queries=(all_commands, *in_use, *frames),
             answers=(keys.all_matrices, *history),
             holds=(keys.alive(Role.SERVICE), keys.all_ranks),
             watches=(

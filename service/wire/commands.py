@@ -6,12 +6,15 @@ checks that do not depend on the RTC. docs/rtc.md lists the keys.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
+from hashlib import sha256
 from itertools import pairwise
 from typing import Annotated, Final
 
+import numpy as np
 from msgspec import Meta
+from numpy.typing import NDArray
 
 from service.errors import WireError
 from service.wire import codec
@@ -22,6 +25,9 @@ AVERAGE_LIMIT: Final = 10_000
 
 RAMP_LIMIT: Final = 1_000_000
 """Largest number of frames at one gain of a ramp."""
+
+REFERENCES_LIMIT: Final = 4_100_000
+"""Largest message with reference slopes, in bytes: as many slopes as a row of frames may have."""
 
 _Duration = Annotated[float, codec.above(0.0, 86_400.0)]
 _Pair = Annotated[tuple[codec.Count, codec.Count], Meta(description="pairs of integers")]
@@ -35,6 +41,7 @@ class CommandKind(StrEnum):
     MEASURE = "measure"
     RAMP = "ramp"
     OFFLOAD = "offload"
+    REFERENCES = "references"
 
 
 class Loop(StrEnum):
@@ -189,7 +196,60 @@ class OffloadRequest(codec.RegistrationNumbers):
     """Id of the command."""
 
 
-Command = DitherRequest | DitherStop | LoopRequest | MeasureRequest | RampRequest | OffloadRequest
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SlopeOffset:
+    """Slopes that are subtracted beyond the RTC's own reference slopes."""
+
+    slopes: bytes = field(repr=False)
+    """Offset of the slopes, little-endian float32, ``n_slopes`` numbers."""
+
+    sha256: codec.Sha256
+    """SHA-256 of ``slopes``."""
+
+    @property
+    def offset(self) -> NDArray[np.float32]:
+        """The offset as a read-only array ``(n_slopes,)``, dimensionless."""
+        return np.frombuffer(self.slopes, dtype="<f4")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReferencesRequest(SlopeOffset):
+    """Command to subtract another offset from the slopes, in place of an earlier one.
+
+    The offset is added to the RTC's own reference slopes, those that it started with; all zeros
+    return to them. It holds a shape on the mirror, for example against non-common-path aberrations.
+    """
+
+    id: codec.Id
+    """Id of the command."""
+
+    reference_id: codec.Id
+    """Name of the reference slopes from the end of the ramp on; before, with ``~`` appended."""
+
+    config_id: codec.Opaque
+    """Sensor configuration whose slopes these are."""
+
+    ramp_s: Annotated[float, codec.number(0.0, 60.0)]
+    """Duration of the linear ramp from what is subtracted at present."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReferencesInUse(SlopeOffset):
+    """Offset that the RTC subtracts now, read back from it."""
+
+    reference_id: codec.Opaque
+    """Name of the reference slopes in frames and status."""
+
+
+Command = (
+    DitherRequest
+    | DitherStop
+    | LoopRequest
+    | MeasureRequest
+    | RampRequest
+    | OffloadRequest
+    | ReferencesRequest
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -216,6 +276,7 @@ _KINDS: dict[type[Command], CommandKind] = {
     MeasureRequest: CommandKind.MEASURE,
     RampRequest: CommandKind.RAMP,
     OffloadRequest: CommandKind.OFFLOAD,
+    ReferencesRequest: CommandKind.REFERENCES,
 }
 # Two commands share the key of the dither: its "action" tells them apart.
 _STARTING = {kind: command for command, kind in _KINDS.items() if command is not DitherStop}
@@ -230,7 +291,7 @@ def command_kind(command: Command) -> CommandKind:
 def command_id(data: bytes) -> str | None:
     """Return the id in the bytes of a command, for a reply that refuses it; None if unreadable."""
     try:
-        return validate_id(codec.unpack(data, "a command").get("id"), "a command")
+        return validate_id(_unpack_references(data, "a command").get("id"), "a command")
     except WireError:
         return None
 
@@ -293,6 +354,23 @@ def _check_ramp(command: RampRequest, where: str) -> None:
         raise codec.refusal("gains", command.gains, "one or more gains to try", where)
 
 
+def _unpack_references(data: bytes, where: str) -> codec.Map:
+    return codec.unpack(data, where, REFERENCES_LIMIT)
+
+
+def _check_offset(record: SlopeOffset, where: str) -> None:
+    """Raise a ``WireError`` for a wrong length or checksum, or numbers that are not finite."""
+    n_bytes, found = len(record.slopes), sha256(record.slopes).hexdigest()
+    if not n_bytes or n_bytes % 4:
+        raise codec.refusal("slopes", record.slopes, "one float32 of 4 bytes or more", where)
+    if found != record.sha256:
+        raise codec.refusal("sha256", record.sha256, f"{found}, that of slopes", where)
+    # A checksum does not exclude NaN, which would reach all actuators within one frame.
+    n_bad = int(np.sum(~np.isfinite(record.offset)))
+    if n_bad:
+        raise WireError(f"range: {n_bad} slopes in {where} are not finite, expected none")
+
+
 codec.register(
     DitherRequest,
     "a dither command",
@@ -311,4 +389,18 @@ codec.register(
 )
 codec.register(RampRequest, "a ramp command", check=_check_ramp)
 codec.register(OffloadRequest, "an offload command")
+codec.register(
+    ReferencesRequest,
+    "a references command",
+    first=("id", "reference_id", "config_id"),
+    unpack=_unpack_references,
+    check=_check_offset,
+)
+codec.register(
+    ReferencesInUse,
+    "the references in use",
+    first=("reference_id",),
+    unpack=_unpack_references,
+    check=_check_offset,
+)
 codec.register(Reply, "a reply", fields=codec.nil_reason_to_text)

@@ -60,12 +60,12 @@ class Activities:
         """Return the operation that needs the loop unchanged, in the wire's words; empty: none."""
         if self._ramp is not None:
             return f"busy: gain ramp {self._ramp.name} is under way; open the loop to end it"
-        return self._explain_measuring()
+        return self.explain_measuring()
 
     def forbids(self, request: LoopRequest) -> str:
         """Return why the loop must not be changed so now; a ramp lets it be opened."""
         if request.loop is Loop.OPEN:
-            return self._explain_measuring()
+            return self.explain_measuring()
         return self.in_the_loops_way()
 
     def on_the_mirror(self) -> str:
@@ -75,9 +75,10 @@ class Activities:
                 f"busy: dither {self._dither.request.id} is on until frame "
                 f"{self._dither.stop_seq}; stop it first"
             )
-        return self._explain_measuring()
+        return self.explain_measuring()
 
-    def _explain_measuring(self) -> str:
+    def explain_measuring(self) -> str:
+        """Return the measurement under way, in the wire's words; empty: none."""
         if self._measurement is None:
             return ""
         name, stop_seq = self._measurement.request.id, self._measurement.stop_seq

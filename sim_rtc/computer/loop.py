@@ -46,7 +46,8 @@ class LoopTerms:
     four times the product."""
 
     references: Array32 | None = None
-    """Reference slopes ``(n_slopes,)``, subtracted from the sensor's; None: they are zero."""
+    """Reference slopes ``(n_slopes,)``, or of each frame ``(n_frames, n_slopes)``, subtracted from
+    the sensor's; None: they are zero."""
 
     @classmethod
     def of(
@@ -168,7 +169,7 @@ class ModalLoop:
         if open_modes is None:
             open_modes = open_slopes @ terms.reconstructor.T
         if terms.references is not None:
-            open_modes = open_modes - terms.reconstructor @ terms.references
+            open_modes = open_modes - terms.references @ terms.reconstructor.T
         block = LoopBlock.of(open_slopes, dither_m, played_m, self._decided.shape[1])
         added = dither_m is not None or played_m is not None
         moved = self._count_movable_modes(block.commands_m if added else None, len(terms.gains))
@@ -205,11 +206,12 @@ class ModalLoop:
     ) -> LoopBlock:
         """Run frames one by one, each with the slopes that ``sense`` says it makes."""
         slopes = np.empty((n_frames, terms.reconstructor.shape[1]), dtype=np.float32)
-        references = 0.0 if terms.references is None else terms.references
+        references = np.zeros(1, np.float32) if terms.references is None else terms.references
+        references = np.broadcast_to(references, slopes.shape)
 
         def estimate(first: int, commands: Array32) -> Array32:
             for k, command in enumerate(commands, first):
-                slopes[k] = sense(k, command) - references
+                slopes[k] = sense(k, command) - references[k]
             return np.asarray(slopes[first : first + len(commands)] @ terms.reconstructor.T)
 
         block = LoopBlock.of(slopes, dither_m, played_m, self._decided.shape[1])

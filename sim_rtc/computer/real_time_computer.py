@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pyrcal.rtc.dither import check_dither
 from pyrcal.rtc.identity import Identity, Reconstructor, new_session
+from pyrcal.rtc.references import RAMP_SUFFIX, ReferenceOffset
 from pyrcal.rtc.staging import Terms
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.wire import (
@@ -27,8 +28,11 @@ from service.wire import (
     MeasureRequest,
     OffloadRequest,
     RampRequest,
+    ReferencesInUse,
+    ReferencesRequest,
     Reply,
     Status,
+    checksum,
 )
 from sim_rtc.computer.activities import (
     MAX_DITHER_AMPLITUDE_M,
@@ -79,8 +83,11 @@ class RealTimeComputer:
         self._blocks = blocks
         self._schedule = references
         self._move = move
-        self.identity = identity
+        self.identity = self._first_identity = identity
         self._references: Array32 | None = None
+        self._ramp: Array32 | None = None
+        """Offset of the reference slopes, ``(n_slopes,)``, or of each frame; None: zero."""
+        self._hides_references = False
         self._settings = settings
         self._n_slopes, self._n_modes = optics.n_slopes, optics.opd_per_command.shape[1]
         self._loop = ModalLoop(
@@ -90,6 +97,9 @@ class RealTimeComputer:
             drive=drive,
             reports_asked=reports_asked,
         )
+        self._offset = ReferenceOffset(self._n_slopes)
+        self._spoil_references: Callable[[Array32, Array32], Array32] | None = None
+        self._reported_references: ReferencesRequest | None = None
         self._lock = threading.Lock()
         self._session = new_session()
         self._seq = 0
@@ -127,6 +137,7 @@ class RealTimeComputer:
             self.use_references(due[0], **due[1])
         with self._lock:
             self._swap()
+            self._follow_references(n_frames)
             terms = self._current_terms(block.optics)
             activities = self._activities
             added = activities.commands(self._seq, n_frames)
@@ -173,11 +184,38 @@ class RealTimeComputer:
                 config_id=config_id or self.identity.config_id,
             )
 
+    def references_in_use(self) -> ReferencesInUse:
+        """Return the offset that the service has set, as it is subtracted now."""
+        with self._lock:
+            name = self.identity.reference_id or self.identity.config_id
+            in_use, reported = self._offset.in_use(name), self._reported_references
+        if reported is None:
+            return in_use
+        return replace(in_use, slopes=reported.slopes, sha256=reported.sha256)
+
+    def spoil_references(
+        self, spoil: Callable[[Array32, Array32], Array32] | None, *, hidden: bool = False
+    ) -> None:
+        """Subtract another offset than requested from the next request on.
+
+        Parameters
+        ----------
+        spoil
+            Function of the offset that is subtracted and the one requested, ``(n_slopes,)`` each;
+            None to obey again.
+        hidden
+            True to read back the offset requested.
+        """
+        with self._lock:
+            self._spoil_references, self._hides_references = spoil, hidden
+
     def restart(self) -> None:
         """Begin a session from frame 0 with the matrix of the start, as a new process would."""
         with self._lock:
             self._start_over()
             self._seq, self._active, self._terms = 0, self._first, None
+            self._offset, self._reported_references = ReferenceOffset(self._n_slopes), None
+            self.identity, self._references, self._ramp = self._first_identity, None, None
             n_controlled = len(self._first.matrix)
             self._set(replace(self._settings, closed=True, n_controlled_next=n_controlled))
             self._swaps.clear()
@@ -295,6 +333,8 @@ class RealTimeComputer:
                 return self._start_ramp(command)
             case OffloadRequest():
                 return self._offload(command)
+            case ReferencesRequest():
+                return self._change_references(command)
 
     def _next_rows(self) -> tuple[Block, int]:
         if self._block is None or self._row >= self._block.n_frames:
@@ -316,10 +356,28 @@ class RealTimeComputer:
             self._set(self._activities.end_ramp(self._settings, "fewer modes are controlled"))
         self._swaps.append((self._active.manifest.id, self._seq))
 
+    def _follow_references(self, n_frames: int) -> None:
+        """Subtract the offset that the next frames have."""
+        if self._offset.is_steady(self._seq):
+            return
+        offsets = self._offset.advance(self._seq, n_frames)
+        name = self._offset.name
+        if name != self.identity.reference_id:
+            self.identity = replace(self.identity, reference_id=name)
+        self._ramp = offsets if name is not None and name.endswith(RAMP_SUFFIX) else offsets[-1]
+        if self._terms is not None:
+            self._terms = replace(self._terms, references=self._subtracted())
+
+    def _subtracted(self) -> Array32 | None:
+        """Return what is subtracted from the slopes, ``(n_slopes,)`` or of each frame."""
+        if self._references is None or self._ramp is None:
+            return self._references if self._ramp is None else self._ramp
+        return self._references + self._ramp
+
     def _current_terms(self, optics: Optics) -> LoopTerms:
         matrix = self._active.matrix
         if self._terms is None or self._optics is not optics:
-            leak, references = self._settings.leak, self._references
+            leak, references = self._settings.leak, self._subtracted()
             self._terms = LoopTerms.of(optics, matrix, self._gains(), leak, references)
             self._optics = optics
         return self._terms
@@ -412,6 +470,24 @@ class RealTimeComputer:
         there_s = self._move(np.array(asked) / BOUNDARY_SCALE)
         there = round(there_s * self._settings.frame_rate_hz)
         return accept(request.id, there + BLOCK_FRAMES)  # the block that is under way then ends
+
+    def _change_references(self, request: ReferencesRequest) -> Reply:
+        with self._lock:
+            offset = self._offset
+            reason = (
+                offset.check(request, self.identity.config_id)
+                or self._activities.explain_measuring()
+            )
+            if reason:
+                return refuse(request.id, reason)
+            start_seq = self._seq + _LEAD_BATCHES * self.batch_frames
+            played, self._reported_references = request, None
+            if self._spoil_references is not None:
+                slopes = self._spoil_references(offset.slopes, request.offset).astype("<f4")
+                played = replace(request, slopes=slopes.tobytes(), sha256=checksum(slopes))
+                self._reported_references = request if self._hides_references else None
+            offset.begin(played, start_seq, self._settings.frame_rate_hz)
+            return accept(request.id, start_seq)
 
     def _change_loop(self, request: LoopRequest) -> Reply:
         reason = loop_refusal(request, self._n_modes)

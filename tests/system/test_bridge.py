@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import zenoh.ext
 
+from pyrcal.rtc.replies import answer_references
 from service.errors import LinkError, UnknownIdError, WireError
 from service.link.matrices import MeasuredMatrix
 from service.records.events import LogEvent, RtcVanished, ServicesMet, SessionStarted
@@ -27,10 +28,13 @@ from service.wire import (
     Manifest,
     MeasuredManifest,
     Pattern,
+    ReferencesInUse,
+    ReferencesRequest,
     Reply,
     Role,
     StateMessage,
     Status,
+    checksum,
     decode,
     encode,
     encode_frames,
@@ -586,6 +590,21 @@ def test_state_and_alarm_reach_those_who_listen_and_those_who_come_late(bridge, 
     bridge.publish_alarm(alarm)
     assert decode(StateMessage, _last_value(rtc, rtc.keys.state)) == state
     assert decode(AlarmMessage, _last_value(rtc, rtc.keys.alarm)) == alarm
+
+
+async def test_references_are_sent_put_on_their_topic_and_read_back(bridge, rtc):
+    """More slopes than another command may have: 40,000, in 160 KB."""
+    slopes = np.arange(40_000, dtype="<f4")
+    offset = {"slopes": slopes.tobytes(), "sha256": checksum(slopes)}
+    request = ReferencesRequest(
+        id="q-1", reference_id="ncpa", config_id="mask-1", ramp_s=1.0, **offset
+    )
+    assert (await bridge.command(request)).accepted
+    assert rtc.commands == [request]
+    assert decode(ReferencesRequest, _last_value(rtc, rtc.keys.references)) == request
+    in_use = ReferencesInUse(reference_id="ncpa~", **offset)
+    answer_references(rtc.zenoh, rtc.keys, lambda: in_use)
+    assert await bridge.fetch_references() == in_use
 
 
 def _last_value(rtc, key):

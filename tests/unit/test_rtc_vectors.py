@@ -30,6 +30,7 @@ KINDS = {
     "ack": wire.Acknowledgement,
     "reply": wire.Reply,
     "im-commit": wire.MeasuredManifest,
+    "references-in-use": wire.ReferencesInUse,
     "state": wire.StateMessage,
     "alarm": wire.AlarmMessage,
 }
@@ -231,7 +232,15 @@ def test_a_status_of_64_subapertures_with_light_and_800_modes_is_read():
 
 def test_the_page_has_every_key_and_every_word():
     page = PAGE.read_text(encoding="utf-8")
-    for key in (KEYS.frames, KEYS.status, KEYS.current, KEYS.acknowledgement, KEYS.applied):
+    for key in (
+        KEYS.frames,
+        KEYS.status,
+        KEYS.current,
+        KEYS.acknowledgement,
+        KEYS.applied,
+        KEYS.references_in_use,
+        KEYS.references,
+    ):
         assert f"`{key.removeprefix(KEYS.root + '/')}`" in page, key
     for kind in CommandKind:
         assert f"`cmd/rtc/{kind}`" in page, kind

@@ -7,7 +7,7 @@ import pytest
 
 from pyrcal import rtc
 from pyrcal.rtc.identity import Reconstructor
-from service.wire import DitherKind, Loop, LoopRequest
+from service.wire import DitherKind, Loop, LoopRequest, ReferencesRequest, checksum
 
 N_MODES, N_SLOPES = 6, 10
 
@@ -74,3 +74,43 @@ def test_new_references_are_named_in_the_next_batch_and_status_and_nothing_else_
         names.append((header.reference_id, loop.status().reference_id))
         assert (header.session, header.config_id) == (loop.status().session, "mask-1")
     assert names == [(None, None), ("ncpa-1", "ncpa-1"), ("ncpa-2", "ncpa-2")]
+
+
+def run(loop, n_batches, n_frames=10):
+    """Play batches of a program that subtracts the offset; return header and offset of each."""
+    played = []
+    for _ in range(n_batches):
+        dither_m = loop.begin_batch(n_frames)
+        offset = loop.reference_offset()
+        header, _ = loop.end_batch(np.zeros((n_frames, N_SLOPES)), dither_m, dither_m)
+        played.append((header, offset))
+    return played
+
+
+def test_references_are_refused_until_the_program_subtracts_them_and_then_ramped():
+    loop = computer()
+    slopes = np.full(N_SLOPES, 0.5, "<f4")
+    request = ReferencesRequest(
+        id="r-1",
+        reference_id="ncpa",
+        config_id="mask-1",
+        slopes=slopes.tobytes(),
+        sha256=checksum(slopes),
+        ramp_s=0.03,
+    )
+    assert loop.execute(request).reason.startswith("unsupported: ")
+    ((_, offset),) = run(loop, 1)
+    assert offset.shape == (10, N_SLOPES)
+    assert not offset.any()
+    assert loop.references_in_use().reference_id == "mask-1"
+    reply = loop.execute(request)
+    assert (reply.accepted, reply.start_seq) == (True, 10)
+    # 15 frames at 500 Hz: the ramp ends within its second batch, and the name is new in the third
+    played = run(loop, 3)
+    assert [header.reference_id for header, _ in played] == ["ncpa~", "ncpa~", "ncpa"]
+    offsets = np.concatenate([offset for _, offset in played])[:, 0]
+    np.testing.assert_allclose(offsets, np.minimum(np.arange(1, 31) / 15, 1.0) * 0.5, rtol=1e-6)
+    assert loop.status().reference_id == "ncpa"
+    in_use = loop.references_in_use()
+    assert (in_use.reference_id, in_use.sha256) == ("ncpa", request.sha256)
+    assert loop.status().session == played[0][0].session

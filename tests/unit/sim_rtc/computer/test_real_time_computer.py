@@ -8,7 +8,11 @@ from service.wire import (
     DitherStop,
     Loop,
     LoopRequest,
+    MeasureRequest,
     OffloadRequest,
+    Pattern,
+    ReferencesRequest,
+    checksum,
 )
 from sim_rtc.computer.feed import OpenLoopBlock
 from sim_rtc.computer.real_time_computer import RealTimeComputer
@@ -197,3 +201,98 @@ def test_new_references_put_their_shape_on_the_mirror_from_the_batch_that_names_
     moved = (after[-1].commands_m - before.commands_m)[-1]
     np.testing.assert_allclose(moved, shape_m, atol=3e-11)
     np.testing.assert_allclose((after[-1].slopes @ RESPONSE)[-1, :3], 0.0, atol=1e-10)
+
+
+def references(name, slopes, **changes):
+    slopes = np.asarray(slopes, "<f4")
+    told = {"id": f"ask-{name}", "reference_id": name, "config_id": "sensor", "ramp_s": 0.05}
+    told |= {"slopes": slopes.tobytes(), "sha256": checksum(slopes)}
+    return ReferencesRequest(**told | changes)
+
+
+def offset_of(computer):
+    return computer.references_in_use().offset
+
+
+def test_an_offset_is_reached_by_a_ramp_named_on_its_way_and_read_back(computer):
+    """A ramp of 50 frames in batches of 10; the slopes are linear in the offset."""
+    before = run(computer, 30)[-1]
+    shape_m = np.array([0.0, 3e-8, -2e-8, 0.0], np.float32)
+    request = references("ncpa", RESPONSE @ shape_m)
+    reply = computer.execute(request)
+    assert (reply.accepted, reply.start_seq) == (True, 310)
+    after = run(computer, 40)
+    names = [batch.identity.reference_id for batch in after]
+    assert names[:8] == [None, *["ncpa~"] * 5, "ncpa", "ncpa"]
+    # A loop behind a ramp of constant rate: the zero point moves on by 1/50 in each frame.
+    first = before.slopes[-1] - after[1].slopes[0]
+    np.testing.assert_allclose(first, RESPONSE @ shape_m / 50, atol=2e-11)
+    moved = (after[-1].commands_m - before.commands_m)[-1]
+    np.testing.assert_allclose(moved, shape_m, atol=3e-11)
+    assert computer.references_in_use().sha256 == request.sha256
+    assert computer.status().reference_id == "ncpa"
+    assert {batch.session for batch in after} == {before.session}
+
+
+def test_a_second_offset_replaces_the_first_from_where_its_ramp_is(computer):
+    computer.execute(references("a", np.full(8, 1e-9)))
+    run(computer, 3)
+    np.testing.assert_allclose(offset_of(computer), 0.4e-9, rtol=1e-5)
+    computer.execute(references("b", np.full(8, -1e-9)))
+    batches = run(computer, 3)
+    assert [batch.identity.reference_id for batch in batches] == ["a~", "b~", "b~"]
+    # from 0.4, which stays until the second ramp begins, 20 of 50 frames towards -1
+    np.testing.assert_allclose(offset_of(computer), (0.4 - 1.4 * 0.4) * 1e-9, rtol=1e-3)
+
+
+def test_an_offset_stays_when_the_loop_opens_and_ends_with_the_rtc(computer):
+    computer.execute(references("a", np.full(8, 1e-9), ramp_s=0.0))
+    batches = run(computer, 3)
+    assert [batch.identity.reference_id for batch in batches] == [None, "a", "a"]
+    computer.execute(loop_request("open", loop=Loop.OPEN))
+    assert run(computer, 1)[0].identity.reference_id == "a"
+    np.testing.assert_allclose(offset_of(computer), 1e-9)
+    computer.restart()
+    assert run(computer, 1)[0].identity.reference_id is None
+    assert not offset_of(computer).any()
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"config_id": "other"}, "range: config_id other, expected sensor"),
+        ({"slopes": np.zeros(7)}, "range: 7 slopes, expected 8"),
+    ],
+)
+def test_an_offset_for_another_sensor_is_refused(computer, changes, reason):
+    slopes = changes.pop("slopes", np.zeros(8))
+    refused = computer.execute(references("a", slopes, **changes))
+    assert (refused.accepted, refused.reason) == (False, reason)
+
+
+def test_an_offset_waits_for_the_end_of_a_measurement(computer):
+    modes, amplitudes = (0, 1), (1e-8, 1e-8)
+    computer.execute(
+        MeasureRequest(
+            id="im",
+            pattern=Pattern.PUSH_PULL_MODAL,
+            modes=modes,
+            amplitude_m=amplitudes,
+            n_average=1,
+        )
+    )
+    refused = computer.execute(references("a", np.zeros(8)))
+    assert refused.reason.startswith("busy: matrix im is being measured")
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_an_rtc_at_fault_applies_what_it_likes_and_may_deny_it(computer, hidden):
+    computer.spoil_references(lambda _, requested: -requested, hidden=hidden)
+    shape_m = np.array([0.0, 3e-8, 0.0, 0.0], np.float32)
+    before = run(computer, 30)[-1]
+    request = references("ncpa", RESPONSE @ shape_m)
+    assert computer.execute(request).accepted
+    after = run(computer, 40)[-1]
+    assert after.identity.reference_id == "ncpa"
+    np.testing.assert_allclose((after.commands_m - before.commands_m)[-1], -shape_m, atol=3e-11)
+    assert (computer.references_in_use().sha256 == request.sha256) is hidden

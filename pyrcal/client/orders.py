@@ -10,9 +10,10 @@ import uuid
 from typing import NamedTuple
 from urllib.parse import quote
 
-from pyrcal.client.reading import reconstructor_lines, understood
+from pyrcal.client.reading import reconstructor_lines, reference_lines, understood
 from pyrcal.client.remote import DONE, NOT_DONE, RECONSTRUCTORS, Request, collect_arguments
 from pyrcal.client.rest import Document, RefusedError, Service
+from pyrcal.client.shape_file import read_shape
 from pyrcal.terminal import login, print_document, print_lines
 from service.errors import ConfigurationError, say, shown
 
@@ -71,6 +72,8 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
     # An empty name is a name, too: who orders may choose to give none.
     who = login() if options.who is None else options.who
     given = collect_arguments(options, request.body)
+    if "file" in options:
+        given = read_shape(options)
     body = {**given, **request.always, "reason": why, "by": who}
     answer = service.order(request.method, path_of(request.path, options), body, headers).document
     with understood(service):
@@ -109,7 +112,9 @@ def _show(service: Service, request: Request, options: argparse.Namespace) -> st
     document, tag = service.get(path_of(request.decides_on, options))
     options.known = _reconstructors(service) if request.follows == RECONSTRUCTORS else {}
     with understood(service):
-        lines = list(reconstructor_lines(document))
+        lines = list(
+            reference_lines(document) if "shape" in document else reconstructor_lines(document)
+        )
         options.source = str(document["id"])
         if "id" in options:
             options.id = str(document["id"])

@@ -290,7 +290,7 @@ def on_answer(context: StepContext, request: ReferencesRequest, reply: Reply) ->
         return
     text = f"the RTC refused {record.id}: {reply.reason}"
     if reply.reason.startswith("unsupported"):
-        text += ". Another program can apply them: pyrcal references export, or topic references"
+        text += ". Another program can apply them: pyrcal export references, or topic references"
         context.references = replace(context.references, unsupported=text)
     _store(context, replace(record, state=MatrixState.REJECTED, reason=text))
     context.warn("references.rejected", text)

@@ -25,6 +25,7 @@ from service.wire import (
     DitherStatus,
     DitherStop,
     FrameHeader,
+    GainsMessage,
     LoopRequest,
     Manifest,
     MatrixLayout,
@@ -64,6 +65,7 @@ MESSAGES: Final[dict[str, type]] = {
     "ack": Acknowledgement,
     "im-commit": MeasuredManifest,
     "state": StateMessage,
+    "gains": GainsMessage,
     "alarm": AlarmMessage,
 }
 """Records that are messages, each with its ``v``."""

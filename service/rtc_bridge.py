@@ -300,9 +300,13 @@ class Bridge:
         """Publish an alarm that began or ended; it is dropped like a state."""
         self._publish_last(self._keys.alarm, wire.encode(message), wire.Encodings.ALARM)
 
+    def publish_gains(self, message: wire.GainsMessage) -> None:
+        """Publish the optical gains; they are dropped like a state."""
+        self._publish_last(self._keys.gains, wire.encode(message), wire.Encodings.GAINS)
+
     def _declare(self, session: zenoh.Session) -> None:
         keys = self._keys
-        for key in (keys.state, keys.alarm, keys.references):
+        for key in (keys.state, keys.alarm, keys.gains, keys.references):
             self._publishers[key] = link.last_value(session, key)
         self._held += self._standby.join(
             session, self._catch_errors, wait=bool(self._endpoint.connect)

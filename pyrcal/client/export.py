@@ -22,6 +22,7 @@ _SOURCES = {
     "alpha": ("/v1/alpha/history", ("csv", "jsonl")),
     "audit": ("/v1/audit", ("csv", "jsonl")),
     "gains": ("/v1/gains", ("csv", "jsonl")),
+    "gains-history": ("/v1/gains/history", ("jsonl",)),
     "reconstructor-gains": ("/v1/reconstructors/{id}/gains", ("csv", "jsonl")),
     "reconstructor": ("/v1/reconstructors/{id}/matrix", _MATRIX),
     "references": ("/v1/references/{id}/slopes", _MATRIX),
@@ -33,7 +34,7 @@ _SOURCES = {
 
 _ENDINGS = {"hdf5": "h5", "raw": "f4"}
 
-_PAGE_ENTRIES = 1000
+_PAGE_ENTRIES = {"/v1/alpha/history": 1000, "/v1/gains/history": 100}
 
 MATRIX_TIMEOUT_S = 60.0
 """Timeout of a matrix, seconds: the service reads it from its disk before it sends a byte."""
@@ -106,10 +107,10 @@ def _stream_export(
 
 
 def _history(service: Service, path: str, form: str, query: dict[str, str]) -> Iterator[bytes]:
-    """Yield the history of alpha, page by page, as lines or as a table with a head."""
+    """Yield a history, page by page, as lines or as a table with a head."""
     after, head = 0, True
     while True:
-        document = service.get(path, **query, after=after, limit=_PAGE_ENTRIES).document
+        document = service.get(path, **query, after=after, limit=_PAGE_ENTRIES[path]).document
         with understood(service):
             entries = [dict(entry) for entry in document["entries"]]
             lines = _format_entries(entries, form, head=head)
@@ -163,5 +164,10 @@ def _flat(entry: Document, before: str = "") -> Document:
     return found
 
 
-_WRITERS = {"alpha": _history, "gains": _gains, "reconstructor-gains": _gains}
+_WRITERS = {
+    "alpha": _history,
+    "gains": _gains,
+    "gains-history": _history,
+    "reconstructor-gains": _gains,
+}
 """Functions for what the service does not send as a file."""

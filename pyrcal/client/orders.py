@@ -7,13 +7,12 @@ import re
 import sys
 import time
 import uuid
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 from pyrcal.client.reading import reconstructor_lines, reference_lines, understood
 from pyrcal.client.remote import DONE, NOT_DONE, RECONSTRUCTORS, Request, collect_arguments
 from pyrcal.client.rest import Document, RefusedError, Service
-from pyrcal.client.shape_file import read_shape
 from pyrcal.terminal import login, print_document, print_lines
 from service.errors import ConfigurationError, say, shown
 
@@ -71,10 +70,7 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
         headers["Idempotency-Key"] = str(uuid.uuid4())
     # An empty name is a name, too: who orders may choose to give none.
     who = login() if options.who is None else options.who
-    given = collect_arguments(options, request.body)
-    if "file" in options:
-        given = read_shape(options)
-    body = {**given, **request.always, "reason": why, "by": who}
+    body = {**_given(request, options), **request.always, "reason": why, "by": who}
     answer = service.order(request.method, path_of(request.path, options), body, headers).document
     with understood(service):
         text = str(answer["text"])
@@ -88,6 +84,15 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
     if request.then:
         say(request.then)
     return _follow(service, request, options) if follows else DONE
+
+
+def _given(request: Request, options: argparse.Namespace) -> dict[str, Any]:
+    """Return what the command line says of an order, or the file that it names."""
+    if "file" not in options:
+        return collect_arguments(options, request.body)
+    from pyrcal.client.shape_file import read_shape  # imports numpy, which other orders need not
+
+    return read_shape(options)
 
 
 def _refuse_early(service: Service, request: Request) -> None:
@@ -112,9 +117,8 @@ def _show(service: Service, request: Request, options: argparse.Namespace) -> st
     document, tag = service.get(path_of(request.decides_on, options))
     options.known = _reconstructors(service) if request.follows == RECONSTRUCTORS else {}
     with understood(service):
-        lines = list(
-            reference_lines(document) if "shape" in document else reconstructor_lines(document)
-        )
+        describe = reference_lines if "shape" in document else reconstructor_lines
+        lines = list(describe(document))
         options.source = str(document["id"])
         if "id" in options:
             options.id = str(document["id"])

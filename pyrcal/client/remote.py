@@ -202,13 +202,15 @@ REQUESTS = (
             "what",
             "what to write",
             choices=(
-                *("alpha", "audit", "gains", "reconstructor-gains"),
+                *("alpha", "audit", "gains", "gains-history", "reconstructor-gains"),
                 *("reconstructor", "references", "measurement", "noisy-matrix", "recording"),
             ),
         ),
         words("id ID", "id of the matrix or recording; or in-use, previous", nargs="?"),
         words(
-            "--format F", "of alpha, audit, gains: csv, jsonl; of matrices: npy, raw, hdf5, fits"
+            "--format F",
+            "of alpha, audit, gains: csv, jsonl; of gains-history: jsonl; of matrices: npy, raw, "
+            "hdf5, fits",
         ),
         words("--output FILE", "default: a new name in the current folder", type=Path),
         *(_SINCE, _UNTIL),

@@ -34,10 +34,7 @@ def read_shape(options: argparse.Namespace) -> dict[str, Any]:
         If it is damaged.
     """
     path: Path = options.file
-    if path.suffix.lower() == ".json":
-        found = _read_json(path)
-    else:
-        found = _read_array(path)
+    found = _read_json(path) if path.suffix.lower() == ".json" else _read_array(path)
     found |= {name: getattr(options, name) for name in _SAID if getattr(options, name)}
     values = np.asarray(found["values"], dtype=np.float64)
     if values.ndim == 2:

@@ -334,6 +334,7 @@ class Index:
             )
             connection.executemany(nights.INSERT_ESTIMATE, nights.rows_of_estimates(estimates))
             connection.executemany(nights.INSERT_SAMPLE, nights.rows_of_samples(samples))
+            connection.executemany(nights.INSERT_GAINS, nights.rows_of_gains(samples))
             connection.execute("COMMIT")
 
     def add_row(self, insertion: str, values: tuple[str | int, ...]) -> int:

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service.archive.serialisation import from_json, to_json
 from service.errors import TooLargeError
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.records.alarms import ALARMS
-from service.records.registration import HistoryEntry, Source
+from service.records.registration import HistoryEntry, MeasuredGains, Source
 
 Values = Sequence[object] | Mapping[str, object]
 """Values of a query's placeholders."""
@@ -70,9 +71,14 @@ class TrendSample:
 
     elevation_deg: float | None = None
     azimuth_deg: float | None = None
+    gains: MeasuredGains | None = None
+    """Optical gains by mode; None if none was measured since the sample before."""
 
 
-_PLAIN = tuple(field.name for field in fields(TrendSample) if field.name not in {"alpha", "sigma"})
+CHARTED = tuple(field.name for field in fields(TrendSample) if field.name != "gains")
+"""Fields of a sample that go into a chart of the trends."""
+
+_PLAIN = tuple(name for name in CHARTED if name not in {"alpha", "sigma"})
 _OF_SAMPLE = (*_PLAIN, *(f"{four}_{name}" for four in ("alpha", "sigma") for name in PARAMETERS))
 _INTEGERS = ("t_ns_utc", "telemetry_ns_utc", "n_controlled")
 
@@ -87,6 +93,8 @@ CREATE TABLE IF NOT EXISTS trend (
     {", ".join(f"{name} {'INTEGER' if name in _INTEGERS else 'REAL'}" for name in _OF_SAMPLE)}
 );
 CREATE INDEX IF NOT EXISTS trend_by_time ON trend (t_ns_utc);
+CREATE TABLE IF NOT EXISTS gains (t_ns_utc INTEGER NOT NULL, record TEXT NOT NULL);
+CREATE INDEX IF NOT EXISTS gains_by_time ON gains (t_ns_utc);
 CREATE TABLE IF NOT EXISTS annotation (
     t_ns_utc INTEGER NOT NULL, written_ns_utc INTEGER NOT NULL,
     who TEXT NOT NULL, note TEXT NOT NULL
@@ -101,6 +109,7 @@ INSERT_ESTIMATE = (
 INSERT_SAMPLE = (
     f"INSERT INTO trend ({', '.join(_OF_SAMPLE)}) VALUES ({', '.join('?' * len(_OF_SAMPLE))})"
 )
+INSERT_GAINS = "INSERT INTO gains VALUES (?, ?)"
 
 HOUR_NS = 3_600_000_000_000
 DAY_NS = 24 * HOUR_NS
@@ -341,6 +350,18 @@ class Nights:
         )
         return tuple(map(_sample, rows))
 
+    def gains(
+        self, first_ns: int, last_ns: int, n_most: int, *, newest: bool = True
+    ) -> tuple[MeasuredGains, ...]:
+        """Return the newest or the oldest measured gains of a time, both ends included."""
+        rows = self._asked(
+            "SELECT record FROM gains WHERE t_ns_utc BETWEEN ? AND ?"
+            f" ORDER BY t_ns_utc {'DESC' if newest else 'ASC'} LIMIT ?",
+            (first_ns, last_ns, n_most),
+        )
+        found = tuple(from_json(text, MeasuredGains) for (text,) in rows)
+        return found[::-1] if newest else found
+
     def add_note(self, made: Annotation) -> int:
         """Keep a note, on the disk when it returns; return its id.
 
@@ -409,6 +430,12 @@ def rows_of_samples(samples: Iterable[TrendSample]) -> list[tuple[object, ...]]:
         )
         for sample in samples
     ]
+
+
+def rows_of_gains(samples: Iterable[TrendSample]) -> list[tuple[object, ...]]:
+    """Return the rows that :data:`INSERT_GAINS` takes."""
+    found = (one.gains for one in samples if one.gains is not None)
+    return [(gains.t_ns_utc, to_json(gains)) for gains in found if gains.measured]
 
 
 def _with_names(four: NDArray[np.float64] | None) -> list[float | None]:

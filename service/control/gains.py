@@ -204,7 +204,9 @@ def gain_table(measured: Sequence[ModeGain], n_modes: int) -> GainTable:
     passes = 2.0 if len(found) and np.median(found) > MAX_SINGLE_PASS_GAIN else 1.0
     expected = _reference_log_gain(everywhere) + np.log(passes)
     covariance = _prior_covariance(everywhere, modes)
-    variance = np.diag(_prior_covariance(everywhere, everywhere)).copy()
+    variance = (
+        STRENGTH_SIGMA**2 * _reference_log_gain(everywhere) ** 2 + COMMON_SIGMA**2 + SHAPE_SIGMA**2
+    )
     # Conditioning of the Gaussian process on the measured modes, in the logarithm of the gain,
     # where a stronger residual is a multiple of the same shape.
     if len(modes):

@@ -34,6 +34,31 @@ class ModeGain:
     """End of the last window in which the mode was dithered, ns since the Unix epoch, UTC."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeasuredGains:
+    """Optical gains of the dithered modes at one moment, and the conditions then."""
+
+    measured: tuple[ModeGain, ...]
+    """Gain of every mode that was dithered, in mode order."""
+
+    n_modes: int
+    """Modes of the basis."""
+
+    reference_id: str | None = None
+    """Reference slopes that the RTC used; None if unknown."""
+
+    magnitude: float | None = None
+    """Magnitude of the guide star; None if unknown."""
+
+    frame_rate_hz: float | None = None
+    """Frame rate; None if unknown."""
+
+    @property
+    def t_ns_utc(self) -> int | None:
+        """End of the last window in which a mode was dithered, the RTC's clock; None if none."""
+        return max((gain.t_ns_utc for gain in self.measured), default=None)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Bias:
     """State of the bias of the passive estimate, besides mean and covariance."""

@@ -336,7 +336,8 @@ class Actions:
             OpticsWorker.make_references,
             shape,
             registration.alpha,
-            expected_gains(registration, rtc.n_modes)[: rtc.n_controlled],
+            expected_gains(registration, rtc.n_modes),
+            rtc.n_controlled,
             effect.worst_seeing_arcsec,
         )
         record = products.ReferencesRecord(

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import lru_cache
 from typing import Final
+
+import numpy as np
 
 from service.link.guard import describe_expiry, describe_flood, describe_refusals
 from service.link.intake import COALESCED, OLD
@@ -24,13 +27,15 @@ from service.records.alarms import Alarm, Interlock, Prerequisite, Responsible, 
 from service.records.messages import Message, as_message, compose
 from service.records.operations import AcquisitionStage
 from service.records.products import MatrixState, ReconstructorRecord
+from service.records.registration import MeasuredGains
 from service.records.state import Mode, TrackerState
 from service.runtime.losses import FRAMES_TIMEOUT_S, silence
+from service.runtime.snapshot import ModeGainTable, present_gains
 from service.tracking.operations.running import operating
 from service.tracking.policy import SECOND_NS
 from service.tracking.reconstructors import check_return, explain_unread_matrix
 from service.tracking.update_policy import MIN_PROPOSAL_LIFETIME_S, is_outdated
-from service.wire import TEXT_LIMIT, AlarmMessage, StateMessage
+from service.wire import TEXT_LIMIT, AlarmMessage, GainsMessage, StateMessage
 
 AlarmTexts = frozenset[tuple[str, str]]
 
@@ -497,6 +502,27 @@ def state_message(
         validity=None if registration is None else registration.validity.level.value,
         waiting_for=tuple(f"{w.responsible}: {w.text}"[:TEXT_LIMIT] for w in waiting),
         operation=operating(state, hindered, now_ns).words,
+    )
+
+
+def gains_message(state: TrackerState) -> GainsMessage | None:
+    """Return the optical gains that are published on the network; None if none was measured."""
+    found = present_gains(state)
+    return None if found is None or not found.measured else _gains_message(state.system, found)
+
+
+@lru_cache(maxsize=1)  # it is published every second, and changes with each dithered window
+def _gains_message(system: str, found: MeasuredGains) -> GainsMessage:
+    table = ModeGainTable.of(found)
+    return GainsMessage(
+        system=system,
+        t_ns=found.t_ns_utc or 0,
+        modes=tuple(gain.mode for gain in found.measured),
+        optical_gain=np.array(table.optical_gain, "<f4").tobytes(),
+        sigma=np.array(table.sigma, "<f4").tobytes(),
+        reference_id=found.reference_id,
+        magnitude=found.magnitude,
+        frame_rate_hz=found.frame_rate_hz,
     )
 
 

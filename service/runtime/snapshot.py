@@ -9,6 +9,7 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
+from service.control.gains import gain_table
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import COVARIANCE_SCALE, PARAMETERS, Misregistration
 from service.records.alarms import (
@@ -22,7 +23,7 @@ from service.records.alarms import (
 from service.records.commands import GainGroup
 from service.records.messages import Value
 from service.records.products import ReferencesRecord
-from service.records.registration import ModeGain, Registration
+from service.records.registration import MeasuredGains, ModeGain, Registration
 from service.records.state import LogEntry, ReferenceStates, TrackerState
 from service.tracking.alarm_records import muted_records, record_of, stale_records, worst_severity
 from service.tracking.interlocks import Permission, permissions
@@ -357,8 +358,39 @@ class ModeGainTable:
     reference_id: str | None
     """Reference slopes that the RTC used; None if unknown."""
 
-    magnitude: float | None = None
-    """Magnitude of the guide star now; None if unknown, or of an earlier time."""
+    magnitude: float | None
+    """Magnitude of the guide star then; None if unknown."""
 
-    frame_rate_hz: float | None = None
-    """Frame rate now; None if of an earlier time."""
+    frame_rate_hz: float | None
+    """Frame rate then; None if unknown."""
+
+    @classmethod
+    def of(cls, gains: MeasuredGains, matrix_id: str | None = None) -> ModeGainTable:
+        """Infer the gains of all modes from the measured ones."""
+        table = gain_table(gains.measured, gains.n_modes)
+        return cls(
+            reconstructor=matrix_id,
+            measured=gains.measured,
+            optical_gain=table.optical_gain.tolist(),
+            relative_sigma=table.relative_sigma.tolist(),
+            sigma=(table.optical_gain * table.relative_sigma).tolist(),
+            factor=table.factors.tolist(),
+            t_ns_utc=gains.t_ns_utc,
+            reference_id=gains.reference_id,
+            magnitude=gains.magnitude,
+            frame_rate_hz=gains.frame_rate_hz,
+        )
+
+
+def present_gains(state: TrackerState) -> MeasuredGains | None:
+    """Return the measured gains with the present conditions; None without an RTC."""
+    rtc, registration = state.loop.rtc, state.alpha.registration
+    if rtc is None:
+        return None
+    return MeasuredGains(
+        measured=() if registration is None else registration.optical_gains,
+        n_modes=rtc.n_modes,
+        reference_id=state.loop.reference_id,
+        magnitude=rtc.magnitude,
+        frame_rate_hz=rtc.frame_rate_hz,
+    )

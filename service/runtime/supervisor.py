@@ -395,6 +395,9 @@ class Supervisor:
             for text in readiness_log.due_lines(waiting, self._engine.state.alarms.active, now_ns):
                 self._note("waiting", text, Level.INFO)
             self._bridge.publish_state(readiness.state_message(self._engine.state, now_ns, waiting))
+            gains = readiness.gains_message(self._engine.state)
+            if gains is not None:
+                self._bridge.publish_gains(gains)
             raised = frozenset((a.name, a.text) for a in self._engine.state.alarms.active)
             for message in readiness.alarm_messages(
                 self._engine.state.system, alarms, raised, now_ns

@@ -32,6 +32,7 @@ from service.files.recording import RecordingWriter
 from service.records.commands import Instruction
 from service.records.events import new_id
 from service.records.state import TrackerState
+from service.runtime.snapshot import present_gains
 
 MAX_RECORDING_S = 3600.0
 
@@ -314,6 +315,7 @@ class TrendSampler:
         self._matrix = matrix
         self._keep = keep
         self._seen_ns: int | None = None
+        self._gains_ns: int | None = None
 
     async def run(self) -> None:
         """Take samples until cancelled."""
@@ -341,7 +343,11 @@ class TrendSampler:
                 residual_m = residual_of(frames, self._matrix(frames.cm_id))
             except PyrcalError:  # nobody has its numbers
                 residual_m = None
-        return sample_of(state, time.time_ns(), end_ns if is_new else None, residual_m)
+        found = present_gains(state)
+        # The same gains are not kept again, or a dither's end would fill the archive.
+        gains_ns, self._gains_ns = self._gains_ns, None if found is None else found.t_ns_utc
+        sample = sample_of(state, time.time_ns(), end_ns if is_new else None, residual_m)
+        return replace(sample, gains=None if self._gains_ns == gains_ns else found)
 
 
 def sample_of(

@@ -12,9 +12,10 @@ from fastapi.concurrency import run_in_threadpool
 from pydantic import AfterValidator, AwareDatetime, BeforeValidator, Field, model_validator
 
 from service.archive import Archive, Mark, Night
-from service.archive.nights import FOREVER_NS, TREND_S, Annotation, TrendSample
+from service.archive.nights import CHARTED, FOREVER_NS, TREND_S, Annotation, TrendSample
 from service.records.messages import compose
 from service.records.registration import HistoryEntry
+from service.runtime.snapshot import ModeGainTable
 from service.runtime.supervisor import Supervisor
 from service.runtime.telemetry_recorder import AnnotationChoice
 from service.web import commands, connections, problems, views
@@ -247,7 +248,7 @@ class TrendParameters(TimeParameters):
     """At most so many of the whole time: of more, the last and the worst in each part of it."""
 
 
-define_view("TrendSampleView", TrendSample)
+define_view("TrendSampleView", TrendSample, " ".join(CHARTED))
 TRENDS = define_view("TrendsView", TrendList)
 
 
@@ -267,6 +268,48 @@ async def trends(service: ServiceDep, parameters: Annotated[TrendParameters, Que
         # Each part of the time has two samples, the last and the worst.
         interval_s = max(TREND_S, 2.0 * span_s / parameters.points)
     return answer(TrendList(interval_s=interval_s, samples=found))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GainHistory:
+    """Optical gains of all modes at some times."""
+
+    entries: tuple[ModeGainTable, ...]
+    """Oldest first."""
+
+
+class GainParameters(TimeParameters):
+    """Which gains to return."""
+
+    limit: int = Field(default=50, ge=1, le=200)
+    """At most so many entries, the newest ones."""
+
+    after: Nanoseconds | None = None
+    """``t_ns_utc`` of the last entry of the page before: the ``limit`` entries that follow it."""
+
+
+GAIN_HISTORY = define_view("GainHistoryView", GainHistory)
+
+
+@router.get("/gains/history", responses={200: shows(GAIN_HISTORY)})
+async def gain_history(
+    service: ServiceDep, parameters: Annotated[GainParameters, Query()]
+) -> Response:
+    """Return the optical gains of all modes of a time, oldest first.
+
+    An entry is kept every few seconds in which a dithered window was measured. Its curve is
+    inferred from the measured modes by the present rules.
+    """
+    first_ns, last_ns = parameters.between
+    after = parameters.after
+    found = await run_in_threadpool(
+        service.archive.nights.gains,
+        first_ns if after is None else max(first_ns, after + 1),
+        last_ns,
+        parameters.limit,
+        newest=after is None,
+    )
+    return answer(GainHistory(entries=tuple(map(ModeGainTable.of, found))))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

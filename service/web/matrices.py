@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import pathlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Any
 
@@ -14,11 +14,10 @@ from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from fastapi.responses import FileResponse, StreamingResponse
 from numpy.typing import NDArray
 
-from service.control.gains import gain_table
 from service.errors import CommandError
 from service.records.products import MatrixState
-from service.records.registration import ModeGain
-from service.runtime.snapshot import ModeGainTable
+from service.records.registration import MeasuredGains
+from service.runtime.snapshot import ModeGainTable, present_gains
 from service.runtime.supervisor import Supervisor
 from service.web import views
 from service.web.connections import tag_of, unless_kept
@@ -312,15 +311,10 @@ async def gains(service: views.ServiceDep) -> Response:
 
     ``POST /v1/loop`` with ``effective_gain`` sets the loop gains by it, if the gate agrees.
     """
-    tracker = service.snapshot().tracker
-    if tracker.loop.rtc is None:
+    found = present_gains(service.snapshot().tracker)
+    if found is None:
         raise CommandError("gains: no RTC is there: the number of modes is not known")
-    current = tracker.alpha.registration
-    measured = () if current is None else current.optical_gains
-    rtc, references = tracker.loop.rtc, tracker.loop.reference_id
-    table = _gain_table(None, measured, rtc.n_modes, references)
-    now = replace(table, magnitude=rtc.magnitude, frame_rate_hz=rtc.frame_rate_hz)
-    return views.answer(now)
+    return views.answer(ModeGainTable.of(found))
 
 
 @router.get("/reconstructors/{id}/gains", responses={200: views.shows(views.GAINS), **UNKNOWN})
@@ -328,24 +322,10 @@ async def reconstructor_gains(service: views.ServiceDep, matrix_id: MatrixId) ->
     """Return the optical gains when a reconstructor was made."""
     found = service.snapshot().tracker.reconstructor(matrix_id)
     record = views.found_or_refuse(found, f"unknown reconstructor {matrix_id}")
-    table = _gain_table(record.id, record.optical_gains, record.n_modes, record.reference_id)
-    return views.answer(table)
-
-
-def _gain_table(
-    matrix_id: str | None, measured: tuple[ModeGain, ...], n_modes: int, references: str | None
-) -> ModeGainTable:
-    table = gain_table(measured, n_modes)
-    return ModeGainTable(
-        reconstructor=matrix_id,
-        measured=measured,
-        optical_gain=table.optical_gain.tolist(),
-        relative_sigma=table.relative_sigma.tolist(),
-        sigma=(table.optical_gain * table.relative_sigma).tolist(),
-        factor=table.factors.tolist(),
-        t_ns_utc=max((gain.t_ns_utc for gain in measured), default=None),
-        reference_id=references,
+    gains = MeasuredGains(
+        measured=record.optical_gains, n_modes=record.n_modes, reference_id=record.reference_id
     )
+    return views.answer(ModeGainTable.of(gains, record.id))
 
 
 # --- what the page draws of them

@@ -142,7 +142,7 @@ class Packed(Middleware):
 
 
 _PACKED: Final = re.compile(
-    r"/|/dashboard/.*|/v1/(alpha/history|trends|marks|annotations|gains|mirror|events|reconstructors)"
+    r"/|/dashboard/.*|/v1/(alpha/history|trends|marks|annotations|gains(/history)?|mirror|events|reconstructors)"
     r"|/v1/fits/[^/]*/figures"
 )
 

@@ -51,6 +51,7 @@ from service.wire.telemetry import (
     DitherStatus,
     FrameBatch,
     FrameHeader,
+    GainsMessage,
     Pointing,
     StateMessage,
     Status,

@@ -48,7 +48,8 @@ class Rights:
 def list_rights(keys: Keys) -> Mapping[LinkRole, Rights]:
     """Return the rights of each role on the keys of one system."""
     advanced_frames, all_commands = keys.frames + ADVANCED_SUFFIX, keys.command("*")
-    frames, public = (keys.frames, advanced_frames), (keys.state, keys.alarm, keys.references)
+    frames = (keys.frames, advanced_frames)
+    public = (keys.state, keys.alarm, keys.gains, keys.references)
     # A late subscriber fetches the last message from the publisher's cache, whose reply carries
     # the key of the message itself: publishers need the right to answer on that key as well.
     history = (*public, *(key + ADVANCED_SUFFIX for key in public))

@@ -49,6 +49,7 @@ class Encodings(StrEnum):
     MEASURED_COMMIT = "application/msgpack;ao.v1.im-commit"
     STATE = "application/msgpack;ao.v1.state"
     ALARM = "application/msgpack;ao.v1.alarm"
+    GAINS = "application/msgpack;ao.v1.gains"
 
 
 class Keys:
@@ -83,6 +84,8 @@ class Keys:
         """State messages of the service, for all subscribers."""
         self.alarm = f"{self.root}/alarm"
         """Alarms of the service, for all subscribers."""
+        self.gains = f"{self.root}/gains"
+        """Optical gains of all modes, for all subscribers."""
         self.all_ranks = f"{self.root}/alive/{Role.SERVICE}/*"
         """Every :meth:`rank`."""
 

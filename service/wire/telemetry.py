@@ -1,4 +1,4 @@
-"""Messages that are sent continuously: frames and status of the RTC, state and alarms of pyrcal.
+"""Messages sent continuously: frames and status of the RTC; state, gains and alarms of pyrcal.
 
 A batch of frames is a payload of raw float32 rows with a msgpack attachment that describes them.
 The other messages are msgpack maps.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from itertools import compress
 from typing import Annotated, Final
 
@@ -384,6 +385,35 @@ class AlarmMessage:
     """Finding and remedy."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GainsMessage:
+    """Optical gains of all modes, for all subscribers; an RTC may ignore it."""
+
+    system: codec.Id
+    """The ``{system}`` of the keys."""
+
+    t_ns: codec.Count
+    """End of the last window in which a mode was dithered, the RTC's clock."""
+
+    modes: tuple[codec.Count, ...]
+    """0-based indices of the modes that were measured; the others are inferred from them."""
+
+    optical_gain: bytes = field(repr=False)
+    """Measured over modelled response of each mode of the basis, ``<f4`` ``[n_modes]``."""
+
+    sigma: bytes = field(repr=False)
+    """1 σ of each, ``<f4`` ``[n_modes]``."""
+
+    reference_id: codec.Opaque | None
+    """Reference slopes in use; nil if unknown."""
+
+    magnitude: codec.Finite | None
+    """Magnitude of the guide star; nil if unknown."""
+
+    frame_rate_hz: codec.Positive | None
+    """Frame rate; nil if unknown."""
+
+
 def essentials(data: bytes) -> tuple[object, ...]:
     """Return the values of :data:`ESSENTIAL_KEYS` in the bytes of a status, unchecked.
 
@@ -459,6 +489,12 @@ codec.register(
     "a state message",
     optional_keys=("validity", "waiting_for", "operation"),
     fields=_state_fields,
+    checked_when_sent=False,
+)
+codec.register(
+    GainsMessage,
+    "a gains message",
+    unpack=partial(codec.unpack, limit=STATUS_LIMIT),
     checked_when_sent=False,
 )
 codec.register(AlarmMessage, "an alarm message", checked_when_sent=False)

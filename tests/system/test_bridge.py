@@ -23,6 +23,7 @@ from service.wire import (
     AlarmMessage,
     DitherKind,
     DitherRequest,
+    GainsMessage,
     Keys,
     LoopRequest,
     Manifest,
@@ -583,13 +584,25 @@ async def test_no_rtc_at_all_is_a_link_error_within_seconds(bridge):
     assert time.monotonic() - begin < patience(3.0)
 
 
-def test_state_and_alarm_reach_those_who_listen_and_those_who_come_late(bridge, rtc):
+def test_state_gains_and_alarm_reach_those_who_listen_and_those_who_come_late(bridge, rtc):
     state = StateMessage(system=SYSTEM, t_ns=1, mode="auto", alpha=None, sigma=None, in_use="r-1")
     alarm = AlarmMessage(system=SYSTEM, t_ns=2, name="rtc.vanished", active=True, text="gone")
     bridge.publish_state(state)
+    gains = GainsMessage(
+        system=SYSTEM,
+        t_ns=3,
+        modes=(1,),
+        optical_gain=np.array([0.5, 0.6], "<f4").tobytes(),
+        sigma=np.array([0.1, 0.01], "<f4").tobytes(),
+        reference_id=None,
+        magnitude=8.0,
+        frame_rate_hz=1000.0,
+    )
     bridge.publish_alarm(alarm)
+    bridge.publish_gains(gains)
     assert decode(StateMessage, _last_value(rtc, rtc.keys.state)) == state
     assert decode(AlarmMessage, _last_value(rtc, rtc.keys.alarm)) == alarm
+    assert decode(GainsMessage, _last_value(rtc, rtc.keys.gains)) == gains
 
 
 async def test_references_are_sent_put_on_their_topic_and_read_back(bridge, rtc):

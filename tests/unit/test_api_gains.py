@@ -4,7 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from service.records.registration import ModeGain
+from service.archive import Archive
+from service.archive.nights import TrendSample
+from service.records.registration import MeasuredGains, ModeGain
 from tests.support.api import FakeService, a_snapshot
 from tests.support.handmade import REGISTRATION
 from tests.support.situations import START_NS, record, rtc
@@ -62,6 +64,34 @@ async def test_where_nothing_was_measured_the_table_says_so(client):
     table = (await client.get("/v1/reconstructors/cm-2/gains")).json()
     assert table["measured"] == []
     assert min(table["relative_sigma"]) > 0.1
+
+
+async def test_the_gains_of_a_night_are_kept_with_their_conditions(client, service, tmp_path):
+    night = [
+        MeasuredGains(
+            measured=tuple(replace(one, t_ns_utc=START_NS + k) for one in MEASURED),
+            n_modes=594,
+            reference_id="ncpa-2",
+            magnitude=8.0 + k,
+            frame_rate_hz=500.0,
+        )
+        for k in range(5)
+    ]
+    with Archive(tmp_path) as service.archive:
+        service.archive.open()
+        samples = [TrendSample(t_ns_utc=k, gains=gains) for k, gains in enumerate([*night, None])]
+        service.archive.record((), (), (), samples)
+        newest = (await client.get("/v1/gains/history?limit=2")).json()["entries"]
+        oldest = (await client.get("/v1/gains/history?limit=2&after=0")).json()["entries"]
+        later = f"/v1/gains/history?after={oldest[-1]['t_ns_utc']}"
+        rest = (await client.get(later)).json()["entries"]
+    assert [one["magnitude"] for one in newest] == [11.0, 12.0]
+    assert [one["magnitude"] for one in (*oldest, *rest)] == [8.0, 9.0, 10.0, 11.0, 12.0]
+    assert (newest[0]["reference_id"], newest[0]["frame_rate_hz"]) == ("ncpa-2", 500.0)
+    now = (await client.get("/v1/gains")).json()
+    assert [len(one["sigma"]) for one in newest] == [594, 594]
+    assert newest[0]["optical_gain"] == now["optical_gain"]
+    assert [one["mode"] for one in newest[0]["measured"]] == [20, 509]
 
 
 async def test_a_table_of_nothing_is_a_problem(client, service):

@@ -38,7 +38,7 @@ from service.records.products import (
     ModeProof,
     ReconstructorRecord,
 )
-from service.records.registration import ModeGain, Registration
+from service.records.registration import MeasuredGains, ModeGain, Registration
 from service.records.state import Mode, Orders
 from service.runtime import telemetry_recorder as of_moments
 from service.runtime.telemetry_recorder import TrendSampler, residual_of, sample_of
@@ -884,6 +884,11 @@ FULL = TrendSample(
     flux=3.25,
     elevation_deg=61.0,
     azimuth_deg=-12.0,
+    gains=MeasuredGains(
+        measured=(ModeGain(mode=3, gain=0.5, sigma=0.01, scatter=0.02, t_ns_utc=7),),
+        n_modes=600,
+        magnitude=11.5,
+    ),
 )
 
 
@@ -897,7 +902,8 @@ def test_a_sample_comes_back_as_it_was(archive):
     full, bare = archive.nights.samples(0, 2 * SECOND, 10)
     assert isinstance(full.n_controlled, int)
     assert bare == nothing or bare.alpha is bare.sigma is bare.residual_m is None
-    for field in fields(TrendSample):
+    assert archive.nights.gains(0, SECOND, 10) == (FULL.gains,)
+    for field in (field for field in fields(TrendSample) if field.name != "gains"):
         ours, theirs = getattr(full, field.name), getattr(FULL, field.name)
         if isinstance(theirs, Misregistration):
             ours, theirs = ours.vector, theirs.vector
@@ -959,15 +965,20 @@ def test_what_is_known_is_in_the_sample():
     assert sample_of(another, 9, 8, None).wavefront_m is None, "it is of another matrix"
 
 
-async def test_telemetry_that_stands_is_none(monkeypatch):
+async def test_telemetry_and_gains_that_stand_are_none(monkeypatch):
     monkeypatch.setattr(of_moments, "TREND_S", 0.001)
     taken, frames = [], block(np.ones((4, 3)), cm_id="cm-1")
+    gain = ModeGain(mode=3, gain=0.5, sigma=0.01, scatter=0.02, t_ns_utc=7)
+    known = replace(STATE.alpha.registration, optical_gains=(gain,))
 
     def unknown(_):
         raise ArchiveError("nobody has its numbers")
 
     sampler = TrendSampler(
-        state=lambda: STATE, frames=lambda: frames, matrix=unknown, keep=taken.append
+        state=lambda: changed(STATE, registration=known),
+        frames=lambda: frames,
+        matrix=unknown,
+        keep=taken.append,
     )
     running = asyncio.create_task(sampler.run())
     async with asyncio.timeout(5.0):
@@ -979,6 +990,7 @@ async def test_telemetry_that_stands_is_none(monkeypatch):
     ends = [one.telemetry_ns_utc for one in taken[:3]]
     assert ends == [5 * SECOND + 4_000_000, None, None]
     assert taken[0].residual_m is None
+    assert [one.gains and one.gains.measured for one in taken[:3]] == [(gain,), None, None]
 
 
 async def test_the_trends_are_answered_with_how_far_apart_they_are(client, service):

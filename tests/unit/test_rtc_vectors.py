@@ -32,6 +32,7 @@ KINDS = {
     "im-commit": wire.MeasuredManifest,
     "references-in-use": wire.ReferencesInUse,
     "state": wire.StateMessage,
+    "gains": wire.GainsMessage,
     "alarm": wire.AlarmMessage,
 }
 

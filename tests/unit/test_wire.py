@@ -458,6 +458,7 @@ def test_keys_are_those_of_the_contract():
     assert keys.measured_chunk("m", 0) == f"{root}/im/m/chunk/0"
     assert keys.measured_commit("m") == f"{root}/im/m/commit"
     assert (keys.state, keys.alarm) == (f"{root}/state", f"{root}/alarm")
+    assert keys.gains == f"{root}/gains"
     assert keys.alive(Role.RTC) == f"{root}/alive/rtc"
 
 

@@ -24,6 +24,7 @@ from service.control.gate import judge
 from service.control.loop import ControlLoop
 from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
 from service.control.references import (
+    ShapeFrame,
     compute_references,
     holding_gain,
     limit_shape,
@@ -519,29 +520,44 @@ class OpticsWorker:
         shape: Shape,
         alpha: Misregistration,
         optical_gain: NDArray[np.float64],
+        n_controlled: int,
         worst_seeing_arcsec: float,
     ) -> MadeReferences:
         """Compute the reference slopes that hold a shape, and check its size.
 
-        ``optical_gain`` ``(n_controlled,)`` is that of the modes in the loop, which hold it. Slopes
-        are split into what these modes explain and the rest, which is scaled by their mean gain.
+        ``optical_gain`` is that of all modes of the basis, of which the controlled ones hold the
+        shape. Slopes are split into what these explain and the rest, scaled by their mean gain.
         """
-        matrix, values = self._model.interaction_matrix(alpha), np.array(shape.values)
-        matrix = matrix[:, : len(optical_gain)]
+        model, values = self._model, np.array(shape.values)
+        matrix = model.interaction_matrix(alpha)
         left = np.zeros(len(matrix))
         if shape.kind is ShapeKind.SLOPES:
-            coefficients = reconstruct(matrix, self._recipe(len(optical_gain))).matrix @ values
+            coefficients = np.zeros(model.basis.n_modes)
+            inverse = reconstruct(matrix, self._recipe(n_controlled)).matrix
+            coefficients[:n_controlled] = inverse @ values
             left = values - matrix @ coefficients
             unexplained = float(np.linalg.norm(left) / np.linalg.norm(values))
         else:
-            found = shape_in_modes(self._model, shape.kind, values, alpha, len(optical_gain))
+            if shape.kind is ShapeKind.MAP:
+                values = values.reshape(round(len(values) ** 0.5), -1)
+            found = shape_in_modes(
+                model, alpha, values, ShapeFrame(shape.frame.value), n_modes=n_controlled
+            )
             coefficients, unexplained = found.coefficients_m, found.unexplained
-        limit = limit_shape(self._model, coefficients, optical_gain, worst_seeing_arcsec)
+        limit = limit_shape(
+            model.instrument,
+            model.basis,
+            coefficients,
+            optical_gain=optical_gain,
+            n_controlled=n_controlled,
+            worst_seeing_arcsec=worst_seeing_arcsec,
+        )
         offset = compute_references(matrix, optical_gain, coefficients)
+        offset = offset + holding_gain(optical_gain)[:n_controlled].mean() * left
         power = np.cumsum(np.square(coefficients))
         n_kept = int(np.searchsorted(power, 0.999 * power[-1])) + 1
         return MadeReferences(
-            offset=(offset + holding_gain(optical_gain).mean() * left).astype(np.float32),
+            offset=offset.astype(np.float32),
             coefficients_m=tuple(coefficients[:n_kept].tolist()),
             unexplained=unexplained,
             refusal="" if limit.accepted else limit.reason,

@@ -20,9 +20,10 @@ export class Lines {
   }
 
   // least: half of the narrowest range of y, so that what is the same looks the same.
-  show({ x, lines, log = false, label = "", least = 0 }) {
-    const data = [x, ...lines.map((line) => line.values)];
-    const shape = JSON.stringify([lines.map((line) => [line.name, line.dots]), log]);
+  // band: the lower and the upper edge of what lies around a line.
+  show({ x, lines, band = [], log = false, label = "", least = 0 }) {
+    const data = [x, ...lines.map((line) => line.values), ...band];
+    const shape = JSON.stringify([lines.map((line) => [line.name, line.dots]), band.length, log]);
     if (shape === this.#shape) return this.#chart.setData(data);
     this.#shape = shape;
     this.#chart?.destroy();
@@ -39,8 +40,9 @@ export class Lines {
       series: [{}, ...lines.map(({ dots }, k) => ({
         stroke: dots ? "transparent" : () => colour(STROKES[k]),
         width: 1.5,
-        points: { show: Boolean(dots), size: 4, fill: () => colour(STROKES[k]), stroke: "transparent" },
-      }))],
+        points: { show: Boolean(dots), size: 6, fill: () => colour(STROKES[k]), stroke: "transparent" },
+      })), ...band.map(() => ({ stroke: "transparent", points: { show: false } }))],
+      bands: band.length ? [{ series: [lines.length + 2, lines.length + 1], fill: () => colour("band") }] : [],
     }, data, this.#root);
     this.#root.setAttribute("role", "img");
     this.#root.setAttribute("aria-label", `${label}: ${lines.map((line) => line.name).join(", ")}`);

@@ -1,7 +1,7 @@
 // Small figures beside the reconstructors: singular values, gain per mode, the last slopes. Read only while they are seen.
 
 import { Lines, grid, keyOf } from "./figures.js";
-import { number, present, put } from "./words.js";
+import { clock, make, milliseconds, number, present, put } from "./words.js";
 
 const GAINS_MS = 30_000;
 const SLOPES_MS = 1000;
@@ -69,11 +69,17 @@ export class Glance {
   }
 
   async #readGains() {
-    const { optical_gain: gains, measured } = await this.#service.get("v1/gains");
+    const table = await this.#service.get("v1/gains");
+    const { optical_gain: gains, sigma, measured } = table;
     const at = new Map(measured.map((one) => [one.mode, one.gain]));
-    this.lines.gains.show({ x: gains.map((_, mode) => mode), label: "Optical gain of each mode",
-      lines: [{ name: "expected", values: gains }, { name: "measured", values: gains.map((_, mode) => at.get(mode) ?? null), dots: true }] });
-    this.root.querySelector(".gains-said").replaceChildren(keyOf(measured.length ? ["interpolated", "measured"] : ["expected; none measured"]));
+    this.lines.gains.show({ x: gains.map((_, mode) => mode), label: "Optical gain of each mode, with 1 sigma",
+      lines: [{ name: "expected", values: gains }, { name: "measured", values: gains.map((_, mode) => at.get(mode) ?? null), dots: true }],
+      band: [-1, 1].map((side) => gains.map((gain, mode) => gain + side * sigma[mode])) });
+    const key = keyOf(measured.length ? ["± 1 σ", "measured"] : ["expected ± 1 σ; none measured"]);
+    const conditions = [present(table.magnitude) && `magnitude ${number(table.magnitude, 1)}`, `${number(table.frame_rate_hz, 0)} Hz`].filter(Boolean).join(", ");
+    key.append(make("span", { text: conditions }));
+    this.root.querySelector(".gains-said").replaceChildren(key);
+    put(this.root.querySelector(".gains-time"), table.t_ns_utc ? `, ${clock(milliseconds(table.t_ns_utc))} UTC` : "");
   }
 
   async #readSlopes() {

@@ -6,10 +6,12 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
+from service.control.gains import gain_table
 from service.link.statistics import Counters
 from service.records.alarms import Alarm, Prerequisite, Responsible
 from service.records.messages import as_message
 from service.records.products import MatrixState
+from service.records.registration import ModeGain
 from service.records.state import Mode, TrackerState
 from service.runtime.readiness import (
     DERIVED_EACH_SECOND,
@@ -18,9 +20,11 @@ from service.runtime.readiness import (
     Revival,
     complaints,
     detect_link_changes,
+    gains_message,
     state_message,
     waiting_for,
 )
+from service.wire import GainsMessage, decode, encode
 from tests.support.situations import ALPHA, START_NS, Story, moved, record, rtc
 from tests.support.states import changed, tracker_state
 from tests.support.waiting import SECOND, WELL, disposition, link
@@ -302,6 +306,25 @@ def test_the_state_on_the_network_is_short_and_in_boundary_units():
     assert (message.mode, message.in_use, message.t_ns) == ("hold", "initial", 5)
     assert message.alpha == pytest.approx(ALPHA.to_boundary())
     assert message.sigma["shift_x_subap"] == pytest.approx(np.hypot(0.002, 0.003))
+
+
+def test_the_gains_on_the_network_are_of_all_modes_once_one_was_dithered():
+    story = Story(Mode.HOLD).meet()
+    assert gains_message(TrackerState(system="small")) is gains_message(story.state) is None
+    story.see()
+    assert gains_message(story.state) is None
+    measured = (ModeGain(mode=20, gain=0.5, sigma=0.01, scatter=0.02, t_ns_utc=START_NS),)
+    known = replace(story.state.alpha.registration, optical_gains=measured)
+    message = gains_message(changed(story.state, registration=known))
+    assert decode(GainsMessage, encode(message)) == message
+    assert message.modes == tuple(one.mode for one in measured)
+    gains, sigma = (np.frombuffer(data, "<f4") for data in (message.optical_gain, message.sigma))
+    n_modes = story.state.loop.rtc.n_modes
+    table = gain_table(measured, n_modes)
+    np.testing.assert_allclose(gains, table.optical_gain, rtol=1e-6)
+    np.testing.assert_allclose(sigma, table.optical_gain * table.relative_sigma, rtol=1e-6)
+    assert message.t_ns == START_NS
+    assert (message.frame_rate_hz, message.magnitude) == (1000.0, 8.0)
 
 
 # ---------------------------------------------------------------- losses

@@ -183,6 +183,7 @@ REACTIONS: Final[Reactions] = {
     ev.LoopHeld: (rtc.on_loop_held,),
     ev.MatrixMisapplied: (reconstructors.on_misapplied,),
     ev.ReferencesMade: (references.on_made,),
+    ev.ShapeHeld: (references.on_held,),
     ev.ReferencesFetched: (references.on_fetched,),
     ev.Vibrations: (rtc.on_vibrations,),
     ev.ModelChanged: (rtc.on_model_changed,),

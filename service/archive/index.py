@@ -263,11 +263,18 @@ class Index:
             self._connection = sqlite3.connect(name, uri=True, isolation_level=None)
             try:
                 self._version(self._connection)
+                self._add_missing_tables(self._connection)
             except BaseException:
                 # SQLite removes its shared-memory file when the last connection is closed
                 self._connection.close()
                 self._connection = None
                 raise
+
+    def _add_missing_tables(self, connection: sqlite3.Connection) -> None:
+        """Add tables that an earlier service of this version did not have, in memory only."""
+        known = {name for (name,) in connection.execute("SELECT name FROM sqlite_master")}
+        for table in (name for name in _TABLES if name not in known):
+            connection.execute(_PRODUCTS.format(table).replace("CREATE", "CREATE TEMP"))
 
     def _version(self, connection: sqlite3.Connection) -> int:
         version: int = connection.execute("PRAGMA user_version").fetchone()[0]

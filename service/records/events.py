@@ -419,6 +419,20 @@ class ReferencesMade:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ShapeHeld:
+    """The mean of the commands has shown how much of a change of references the mirror holds."""
+
+    id: str
+    """Id of the references in use."""
+
+    ratio: float
+    """1 if they are applied as they were sent."""
+
+    sigma: float
+    """1 σ of it, by the turbulence."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LoopHeld:
     """Telemetry says that the loop holds well, or that it does so no longer."""
 
@@ -491,6 +505,7 @@ Event = (
     | LoopHeld
     | MatrixMisapplied
     | ReferencesMade
+    | ShapeHeld
     | Vibrations
     | ModelChanged
     | ModesCommanded

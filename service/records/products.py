@@ -501,6 +501,13 @@ class ReferencesRecord:
     applied_ns_utc: int | None = None
     """Time at which the RTC was first seen to use them; None if it was not."""
 
+    held_ratio: float | None = None
+    """Change of the mean command, as a share of what they should add to the mirror; None if it was
+    not measured."""
+
+    held_sigma: float | None = None
+    """1 σ of it."""
+
     cause: str = field(default="", compare=False)
     """Id of the order or event that made or sent them."""
 

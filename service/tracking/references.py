@@ -51,6 +51,12 @@ CONFIRMATION_TIMEOUT_S = 10.0
 COMPUTATION_TIMEOUT_S = 60.0
 """References that take longer to compute were lost with their worker."""
 
+HELD_RATIO_RANGE = (0.5, 1.7)
+"""Plausible range of what the mirror holds of a change: seeing that doubles makes it 1.45."""
+
+HELD_SIGMAS = 4.0
+"""References are applied otherwise if the range is left by so many σ."""
+
 RECORDS_KEPT = 50
 
 OWN = "the RTC's own references"
@@ -314,6 +320,24 @@ def on_fetched(context: StepContext, fetched: ev.ReferencesFetched) -> None:
     elif context.references.verified_id != record.id:
         context.references = replace(context.references, verified_id=record.id, difference="")
         context.log("references.verified", f"the RTC subtracts {record.id} as they were sent")
+
+
+def on_held(context: StepContext, held: ev.ShapeHeld) -> None:
+    """Keep how much of the shape the mirror holds; name references that are applied otherwise."""
+    record = context.state.references_of(held.id)
+    if record is None or record.id != context.references.used_id:
+        return
+    record = replace(record, held_ratio=held.ratio, held_sigma=held.sigma)
+    _store(context, record)
+    least, most = HELD_RATIO_RANGE
+    spare = HELD_SIGMAS * held.sigma
+    outside = held.ratio + spare < least or held.ratio - spare > most
+    if outside and not context.references.difference:
+        text = (
+            f"the mirror holds {held.ratio:.2f} ± {held.sigma:.2f} times the change that "
+            f"{record.id} should make, by the mean of the commands"
+        )
+        _distrust(context, record, text)
 
 
 def follow_status(context: StepContext, rtc: Status, *, returned: bool) -> None:

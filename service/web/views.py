@@ -378,7 +378,7 @@ REFERENCES_RECORD = define_view(
     "ReferencesRecordView",
     products.ReferencesRecord,
     "id state created_ns_utc shape rms_m alpha gain size unexplained sha256 parent reason by "
-    "published_ns_utc applied_ns_utc",
+    "published_ns_utc applied_ns_utc held_ratio held_sigma",
 )
 define_view(
     "HeldShapeView",

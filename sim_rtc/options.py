@@ -247,6 +247,12 @@ class Options:
     ncpa_nm: float | None = option(
         "--ncpa NM", "static wavefront only the sensor sees, RMS", within(0.0, 300.0)
     )
+    ncpa_zernike: int | None = option(
+        "--ncpa-zernike NOLL",
+        "Noll's number of the polynomial that it consists of, 5 and 6 for astigmatism (default: "
+        "random, focus to fourth order)",
+        count(2, 66),
+    )
     image_offsets_px: tuple[float, ...] | None = several(
         "--image-offsets X1,Y1,X2,Y2,X3,Y3,X4,Y4",
         "displacement of each pupil image of a pyramid from its place on the pixel grid, detector "

@@ -85,6 +85,7 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
             truth_recorder = TruthRecorder(
                 options.truth,
                 weights=telescope.weights,
+                points_m=telescope.plant.points_m,
                 clock=clock,
                 options=options,
                 image_offsets_px=telescope.plant.image_offsets_px,

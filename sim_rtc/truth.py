@@ -17,6 +17,7 @@ from pyrcal.rtc.background import Background
 from service.model.misregistration import PARAMETERS
 from sim_rtc.computer.telemetry import Batch, FrameClock
 from sim_rtc.options import Options
+from sim_rtc.telescope.imperfections import low_orders
 
 if TYPE_CHECKING:
     pass
@@ -28,6 +29,12 @@ _SWAP_S = 1.0
 """Stretch before and after a swap in which the largest wavefront error is sought."""
 
 _BACKLOG_BATCHES = 400
+
+LOW_ORDER = 5
+"""Highest order of the polynomials in which static aberrations are sought: 20 without piston."""
+
+_STATIC_LINES = 20
+"""Lines over which the wavefront is averaged, 10 s: turbulence leaves some nanometres."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -42,13 +49,34 @@ class _Swap:
 
 
 class WavefrontError:
-    """RMS of the residual wavefront over the pupil, piston removed."""
+    """Residual wavefront of the science path over the pupil, piston removed."""
 
-    def __init__(self, weights: NDArray[np.float64]) -> None:
+    def __init__(self, weights: Array, points_m: Array | None = None) -> None:
+        """Take the pupil's ``weights`` ``(n_points,)``; ``points_m`` are for `low_orders_nm`."""
         self._weights = weights.astype(np.float32)
+        self._low_orders: NDArray[np.float32] | None = None
+        if points_m is not None:
+            shapes = weights[:, None] * low_orders(points_m, weights, LOW_ORDER)[:, 1:]
+            self._low_orders = shapes.astype(np.float32)
 
-    def rms_nm(self, batches: list[Batch]) -> list[float]:
-        """Return the error during the first frame of each batch, nm; all share their optics."""
+    def rms_nm(self, residual_m: NDArray[np.float32]) -> list[float]:
+        """Return the RMS of each wavefront ``(n, n_points)`` of :meth:`residual_m`, nm."""
+        return [float(rms) * 1e9 for rms in np.sqrt(residual_m**2 @ self._weights)]
+
+    def low_orders_nm(self, residual_m: NDArray[np.float32]) -> Array | None:
+        """Return the mean of the wavefronts in each low order ``(20,)``, nm RMS.
+
+        None if the points of the pupil are not known.
+        """
+        if self._low_orders is None:
+            return None
+        return np.asarray(1e9 * (residual_m.mean(axis=0) @ self._low_orders), dtype=np.float64)
+
+    def residual_m(self, batches: list[Batch]) -> NDArray[np.float32]:
+        """Return the wavefront ``(n_batches, n_points)`` of the first frame of each batch, metres.
+
+        All batches have the same optics.
+        """
         modes = batches[0].optics.opd_per_command
         commands = np.array([batch.commands_m[0] for batch in batches])
         n_moved = int(np.flatnonzero(commands.any(axis=0))[-1]) + 1 if commands.any() else 0
@@ -57,7 +85,7 @@ class WavefrontError:
         residual += np.array([batch.phase_m for batch in batches])
         # Piston is no wavefront error: no image shows it.
         residual -= (residual @ self._weights)[:, None]
-        return [float(rms) * 1e9 for rms in np.sqrt(residual**2 @ self._weights)]
+        return residual
 
 
 class TruthRecorder(Background):
@@ -67,12 +95,13 @@ class TruthRecorder(Background):
         self,
         path: Path,
         *,
-        weights: NDArray[np.float64],
+        weights: Array,
+        points_m: Array | None = None,
         clock: FrameClock,
         options: Options | None = None,
         image_offsets_px: NDArray[np.float64] | None = None,
     ) -> None:
-        """Take the pupil's ``weights`` ``(n_points,)``, and the options to be recorded.
+        """Take the pupil's ``weights`` ``(n_points,)`` and points, and the options to be recorded.
 
         ``image_offsets_px`` ``(4, 2)`` are the displacements of the pupil images, if there are any.
         """
@@ -80,7 +109,8 @@ class TruthRecorder(Background):
         self._path = path
         self._options = options
         self._image_offsets_px = None if image_offsets_px is None else image_offsets_px.tolist()
-        self._error = WavefrontError(weights)
+        self._error = WavefrontError(weights, points_m)
+        self._static_nm: deque[Array] = deque(maxlen=_STATIC_LINES)
         self._clock = clock
         self._line_frames = round(_LINE_S * 1e9 / clock.dt_ns)
         self._swap_frames = round(_SWAP_S * 1e9 / clock.dt_ns)
@@ -132,10 +162,12 @@ class TruthRecorder(Background):
             or batch.optics is not first.optics
             or batch.cm_id != first.cm_id
             or batch.session != first.session
+            or batch.identity != first.identity
         )
 
     def _write_interval(self, batches: list[Batch], overruns: int, behind_s: float) -> None:
-        errors_nm = self._error.rms_nm(batches)
+        residual_m = self._error.residual_m(batches)
+        errors_nm = self._error.rms_nm(residual_m)
         first, last = batches[0], batches[-1]
         self._note_swap(first)
         for batch, error_nm in zip(batches, errors_nm, strict=True):
@@ -153,6 +185,7 @@ class TruthRecorder(Background):
                 "seeing_arcsec": self._seeing_arcsec(end_seq),
                 "wavefront_error_nm": round(float(np.sqrt(np.mean(np.square(errors_nm)))), 3),
                 "wavefront_error_peak_nm": round(max(errors_nm), 3),
+                **self._static(first, self._error.low_orders_nm(residual_m)),
                 "cm_id": last.cm_id,
                 "n_controlled": last.n_controlled,
                 "loop": "closed" if last.closed else "open",
@@ -166,6 +199,23 @@ class TruthRecorder(Background):
         while self._recent and self._recent[0][0] < end_seq - self._swap_frames:
             self._recent.popleft()
         self._last = last
+
+    def _static(self, batch: Batch, low_orders_nm: Array | None) -> dict[str, Any]:
+        """Return the mean wavefront of this line in each low order, and the static error.
+
+        The static error is the RMS of the mean since the references changed, over 10 s at most.
+        """
+        if low_orders_nm is None:
+            return {}
+        if self._last is None or self._last.identity != batch.identity:
+            self._static_nm.clear()
+        self._static_nm.append(low_orders_nm)
+        static_nm = float(np.linalg.norm(np.mean(self._static_nm, axis=0)))
+        return {
+            "reference_id": batch.identity.reference_id,
+            "static_error_nm": round(static_nm, 3),
+            "low_orders_nm": [round(float(each), 3) for each in low_orders_nm],
+        }
 
     def _alpha(self, batch: Batch) -> dict[str, float | None]:
         """Return the true registration; None for each parameter that is not known."""

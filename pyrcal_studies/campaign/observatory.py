@@ -224,7 +224,9 @@ class Dome:
     def _moment(self, batches: list[Batch]) -> Moment:
         last = batches[-1]
         errors_nm = [
-            error for part in _alike(batches, _optics_of) for error in self._error.rms_nm(part)
+            error
+            for part in _alike(batches, _optics_of)
+            for error in self._error.rms_nm(self._error.residual_m(part))
         ]
         return Moment(
             time_s=self.time_s,

@@ -360,6 +360,7 @@ _LATER_FIELDS = frozenset(
         "local",
         "image_offsets_subap",
         "position_error_pitch",
+        "normalised",
     }
 )
 """Fields without which an instrument has the digest that it has always had."""

@@ -7,6 +7,7 @@ simulate a bench with a poor model, and displaced pupil images.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -61,6 +62,9 @@ class Imperfections:
 
     ncpa_nm: float = 0.0
     """Static wavefront that only the sensor sees, nm RMS."""
+
+    ncpa_zernike: int = 0
+    """Noll's number of the polynomial that it consists of; 0 if it is random."""
 
     model_error: float = 0.0
     """Error of every mode's shape, a smooth pattern of its own: RMS gradient over the mode's."""
@@ -279,13 +283,41 @@ def non_common_path(
 ) -> Array32:
     """Return the static wavefront of the sensor's own optics, ``(n_points,)`` metres.
 
-    Focus to fourth order, random, weaker as the order rises.
+    One Zernike polynomial, or focus to fourth order, random, weaker as the order rises.
     """
+    if imperfections.ncpa_zernike:
+        shape = zernike(points / np.abs(points).max(), imperfections.ncpa_zernike)
+        shape -= weights @ shape
+        rms = np.sqrt(weights @ shape**2)
+        return np.asarray(shape * imperfections.ncpa_nm * 1e-9 / rms, dtype=np.float32)
     shapes = low_orders(points, weights, _NCPA_ORDER)
     strength = rng.standard_normal(shapes.shape[1]) / np.arange(1, shapes.shape[1] + 1)
     strength[:_NCPA_FIRST_SHAPE] = 0.0
     strength *= imperfections.ncpa_nm * 1e-9 / np.linalg.norm(strength)
     return np.asarray(shapes @ strength, dtype=np.float32)
+
+
+def zernike(points: Array, number: int) -> Array:
+    """Return the polynomial of Noll's ``number`` at ``points`` ``(n_points, 2)`` of the unit disc.
+
+    Noll 1976 (JOSA 66, 207), equations 1 and 2; RMS 1 over the full disc.
+    """
+    order = (math.isqrt(8 * number - 7) - 1) // 2
+    place = number - order * (order + 1) // 2 - 1
+    azimuthal = order % 2 + 2 * ((place + (order + 1) % 2) // 2)
+    radius, angle = np.hypot(*points.T), np.arctan2(points[:, 1], points[:, 0])
+    above, below = (order + azimuthal) // 2, (order - azimuthal) // 2
+    factorial = math.factorial
+    shape = sum(
+        (-1.0) ** k
+        * (factorial(order - k) // (factorial(k) * factorial(above - k) * factorial(below - k)))
+        * radius ** (order - 2 * k)
+        for k in range(below + 1)
+    ) * np.sqrt(order + 1.0)
+    if azimuthal:
+        turned = np.sin if number % 2 else np.cos
+        shape = shape * np.sqrt(2.0) * turned(azimuthal * angle)
+    return np.asarray(shape)
 
 
 TIP, TILT, FOCUS = 1, 2, 3

@@ -40,6 +40,22 @@ class FrameWindows:
     pixels_per_subaperture: int = 1
     """Detector pixels along a side of a subaperture."""
 
+    normalised: bool = False
+    """True if the frames are divided by their sum over the detector."""
+
+    @property
+    def off_grid_subap(self) -> NDArray[np.float64]:
+        """Displacement (x, y) of each window from a square around their middle, ``(4, 2)``.
+
+        Subapertures, in the detector's own axes; 0 where the images are still to be found.
+        """
+        if self.centres_px is None:
+            return np.zeros((4, 2))
+        sides = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) / 2.0
+        off = by_quadrant(self.centres_px).reshape(4, 2) - self.centres_px.mean(axis=0)
+        square = sides * 2.0 * float(np.mean(off * sides * 2.0))
+        return np.asarray((off - square)[:, ::-1] / self.pixels_per_subaperture)
+
 
 def image_offsets(instrument: Instrument) -> NDArray[np.float64] | None:
     """Return displacements of the images from their places ``(2, 2, 2)``: side y, side x, (x, y).

@@ -55,7 +55,7 @@ class PyramidKind(SensorKind):
     def list_assumptions(
         self, table: PyramidTable, given: frozenset[str]
     ) -> Iterator[tuple[str, str]]:
-        has_centres = table.input == "frames" and table.pupil_centres_px is not None
+        has_centres = table.input != "slopes" and table.pupil_centres_px is not None
         if "pupil_separation_subap" not in given and not has_centres:
             yield (
                 "pupil_separation_subap",

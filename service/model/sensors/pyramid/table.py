@@ -99,8 +99,9 @@ class PyramidTable(PyramidNumbers):
     valid_subapertures: str = "auto"
     """"auto": by ``flux_threshold``; or a mask ``path:/dataset``."""
 
-    input: Literal["slopes", "frames"] = "slopes"
-    """Signals that the RTC sends."""
+    input: Literal["slopes", "frames", "normalised-frames"] = "slopes"
+    """Signals that the RTC sends. A measured matrix of frames comes with a mean frame in the same
+    counts; "normalised-frames" are divided by their sum over the detector, and need none."""
 
     pupil_centres_px: Centres | None = None
     """Frames only: centres of the four pupil images, row and column; "auto": found in a flux

@@ -54,7 +54,7 @@ def test_the_realistic_mix_has_every_imperfection_but_these():
         for f in fields(Imperfections)
         if getattr(ideal, f.name) == getattr(realistic, f.name)
     ]
-    assert same == ["model_error", "image_offsets_px", "image_offset_rms_px"]
+    assert same == ["ncpa_zernike", "model_error", "image_offsets_px", "image_offset_rms_px"]
     assert SETS["usual"] == Imperfections()
 
 
@@ -216,6 +216,31 @@ def test_the_non_common_path_has_its_rms_and_no_tilt(pupil):
     moments = [pupil.weights @ (opd * shape) for shape in (1.0, *pupil.points.T)]
     assert np.sqrt(pupil.weights @ opd**2) == pytest.approx(30e-9, rel=1e-5)
     assert np.abs(moments).max() < 1e-13
+
+
+POLYNOMIALS = {
+    2: lambda r, t: 2.0 * r * np.cos(t),
+    3: lambda r, t: 2.0 * r * np.sin(t),
+    4: lambda r, t: np.sqrt(3.0) * (2.0 * r**2 - 1.0),
+    5: lambda r, t: np.sqrt(6.0) * r**2 * np.sin(2.0 * t),
+    6: lambda r, t: np.sqrt(6.0) * r**2 * np.cos(2.0 * t),
+    8: lambda r, t: np.sqrt(8.0) * (3.0 * r**3 - 2.0 * r) * np.cos(t),
+    9: lambda r, t: np.sqrt(8.0) * r**3 * np.sin(3.0 * t),
+    11: lambda r, t: np.sqrt(5.0) * (6.0 * r**4 - 6.0 * r**2 + 1.0),
+    12: lambda r, t: np.sqrt(10.0) * (4.0 * r**4 - 3.0 * r**2) * np.cos(2.0 * t),
+}
+"""Of Noll 1976, table 1."""
+
+
+@pytest.mark.parametrize("number", POLYNOMIALS)
+def test_a_non_common_path_of_one_zernike_is_that_polynomial(pupil, number):
+    flawed = replace(IDEAL, ncpa_nm=60.0, ncpa_zernike=number)
+    opd = non_common_path(pupil.points, pupil.weights, flawed, np.random.default_rng(1))
+    x, y = pupil.points.T / np.abs(pupil.points).max()
+    expected = POLYNOMIALS[number](np.hypot(x, y), np.arctan2(y, x))
+    expected -= pupil.weights @ expected
+    expected *= 60e-9 / np.sqrt(pupil.weights @ expected**2)
+    np.testing.assert_allclose(opd, expected, atol=1e-13)
 
 
 @pytest.mark.parametrize("error", [0.1, 0.3])

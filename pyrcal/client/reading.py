@@ -84,8 +84,8 @@ def reference_lines(one: Document) -> Iterator[str]:
     held = f"{1e9 * one['rms_m']:.3g} nm RMS" if one["shape"] else "the RTC's own references"
     gain = f", scaled with {one['gain']:.2f}" if one["gain"] else ""
     yield f"{one['id']}: {one['state']}, {held}{gain}, made {clock(one['created_utc'])}"
-    if one["unexplained"]:
-        yield f"unexplained  {one['unexplained']:.0%} of the shape"
+    if one["unexplained_ratio"]:
+        yield f"unexplained  {one['unexplained_ratio']:.0%} of the shape"
     if one["reason"]:
         yield f"reason       {one['reason']}"
 

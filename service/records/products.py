@@ -477,10 +477,10 @@ class ReferencesRecord:
     gain: float | None = None
     """Mean gain that they were scaled with, weighted by the power of the shape in each mode."""
 
-    size: float = 0.0
+    offset_rms: float = 0.0
     """RMS of the offset over all slopes."""
 
-    unexplained: float = 0.0
+    unexplained_ratio: float = 0.0
     """Share of the shape that no controlled mode explains, in norm."""
 
     sha256: str = ""

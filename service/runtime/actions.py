@@ -348,8 +348,8 @@ class Actions:
             coefficients_m=made.coefficients_m,
             alpha=registration.alpha,
             gain=mean_gain(made.coefficients_m, registration.optical_gains),
-            size=float(np.sqrt(np.mean(np.square(made.offset)))),
-            unexplained=made.unexplained,
+            offset_rms=float(np.sqrt(np.mean(np.square(made.offset)))),
+            unexplained_ratio=made.unexplained,
             sha256=wire.checksum(made.offset),
             reason=made.refusal,
         )

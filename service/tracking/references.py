@@ -272,7 +272,11 @@ def on_made(context: StepContext, made: ev.ReferencesMade) -> None:
         context.warn("references.refused", f"{record.id}: {record.reason}")
     else:
         text = f"{1e9 * record.rms_m:.0f} nm RMS, scaled with {record.gain or 1.0:.2f}"
-        left = f", {record.unexplained:.0%} unexplained" if record.unexplained > 0.01 else ""
+        left = (
+            f", {record.unexplained_ratio:.0%} unexplained"
+            if record.unexplained_ratio > 0.01
+            else ""
+        )
         context.log("references.made", f"{record.id} {record.state}: {text}{left}")
 
 

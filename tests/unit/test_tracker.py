@@ -140,8 +140,14 @@ def test_deciders_and_guards_are_not_given_the_event():
 
 ALWAYS = {"a restored α", "the pointing law", "windows in a row", "the probation", "alarms"}
 ALWAYS |= {"alarms of what was decided"}
-OF_SERVICE = {"the dither", "reconstructors", "the offload"}
-REST = {"the RTC's matrix", "the acquisition", "a noisy matrix", "unwanted dithers"}
+OF_SERVICE = {"the dither", "reconstructors", "references", "the offload"}
+REST = {
+    "the RTC's matrix",
+    "references in use",
+    "the acquisition",
+    "a noisy matrix",
+    "unwanted dithers",
+}
 
 
 STANDBY = ev.ServicesMet(drives=False, others=("the service on pyrcal-2",))

@@ -121,7 +121,7 @@ def service(served, monkeypatch):
                 shape=SHAPE.id,
                 coefficients_m=(0.0, 6e-8),
                 gain=0.6,
-                unexplained=0.08,
+                unexplained_ratio=0.08,
                 reason="waits",
             ),
         ),

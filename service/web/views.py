@@ -377,8 +377,8 @@ define_view("ShapeView", products.Shape, "id kind frame source by loaded_ns_utc"
 REFERENCES_RECORD = define_view(
     "ReferencesRecordView",
     products.ReferencesRecord,
-    "id state created_ns_utc shape rms_m alpha gain offset_rms unexplained_ratio sha256 parent reason by "
-    "published_ns_utc applied_ns_utc held_ratio held_sigma",
+    "id state created_ns_utc shape rms_m alpha gain offset_rms unexplained_ratio sha256 parent "
+    "reason by published_ns_utc applied_ns_utc held_ratio held_sigma",
 )
 define_view(
     "HeldShapeView",

@@ -141,9 +141,9 @@ def test_deciders_and_guards_are_not_given_the_event():
 ALWAYS = {"a restored α", "the pointing law", "windows in a row", "the probation", "alarms"}
 ALWAYS |= {"alarms of what was decided"}
 OF_SERVICE = {"the dither", "reconstructors", "references", "the offload"}
+IN_USE = {"the RTC's matrix", "references in use"}
 REST = {
-    "the RTC's matrix",
-    "references in use",
+    *IN_USE,
     "the acquisition",
     "a noisy matrix",
     "unwanted dithers",
@@ -162,12 +162,12 @@ DIVERGING = ev.ConditionChanged(name=alarms.DIVERGING, text="the loop diverges")
         (idle, ev.RtcVanished(), {"the acquisition", "a noisy matrix"}),
         (idle, DIVERGING, REST),
         (measuring, ev.Tick(), set()),
-        (stopped, ev.Tick(), {"the RTC's matrix", "unwanted dithers"}),
-        (acquiring, ev.Tick(), {"the RTC's matrix", "the acquisition"}),
+        (stopped, ev.Tick(), {*IN_USE, "unwanted dithers"}),
+        (acquiring, ev.Tick(), {*IN_USE, "the acquisition"}),
         (
             waiting_for_a_noisy_one,
             ev.Tick(),
-            {"the RTC's matrix", "the acquisition", "a noisy matrix"},
+            {*IN_USE, "the acquisition", "a noisy matrix"},
         ),
         (gathering, ev.Tick(), REST | OF_SERVICE),
         (ramping, ev.Tick(), REST),

@@ -7,7 +7,7 @@ import re
 import sys
 import time
 import uuid
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from urllib.parse import quote
 
 from pyrcal.client.reading import reconstructor_lines, reference_lines, understood
@@ -70,7 +70,9 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
         headers["Idempotency-Key"] = str(uuid.uuid4())
     # An empty name is a name, too: who orders may choose to give none.
     who = login() if options.who is None else options.who
-    body = {**_given(request, options), **request.always, "reason": why, "by": who}
+    # What a file says was read before: this package imports nothing that could.
+    given = getattr(options, "content", None) or collect_arguments(options, request.body)
+    body = {**given, **request.always, "reason": why, "by": who}
     answer = service.order(request.method, path_of(request.path, options), body, headers).document
     with understood(service):
         text = str(answer["text"])
@@ -84,15 +86,6 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
     if request.then:
         say(request.then)
     return _follow(service, request, options) if follows else DONE
-
-
-def _given(request: Request, options: argparse.Namespace) -> dict[str, Any]:
-    """Return what the command line says of an order, or the file that it names."""
-    if "file" not in options:
-        return collect_arguments(options, request.body)
-    from pyrcal.client.shape_file import read_shape  # imports numpy, which other orders need not
-
-    return read_shape(options)
 
 
 def _refuse_early(service: Service, request: Request) -> None:

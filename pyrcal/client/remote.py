@@ -454,6 +454,7 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
                 examples=[f"{one.name.partition(' ')[2]} {one.example}".rstrip() for one in below],
             )
             groups[name] = group.add_subparsers(dest="word", required=True, metavar="COMMAND")
+        forms = {one.form.partition(" ")[0] for one in request.words}
         parser = (groups[name] if word else commands).add_parser(
             word or name,
             help=request.purpose,
@@ -461,7 +462,7 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
             epilog=EPILOG,
             examples=[request.example],
             options=(*request.words, *_order_options(request), *_CONNECTION),
-            module=f"{__package__}.ask",
+            module="pyrcal.shapes" if "file" in forms else f"{__package__}.ask",
         )
         parser.set_defaults(request=request)
 

@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import numpy as np
+
 from service.records import commands as cmd
 from service.records import events as ev
 from service.records.products import Frame, MatrixState, ReferencesRecord, ShapeKind
@@ -93,6 +95,9 @@ class ShapedStory(Story):
     def show_references(self, sha256=None, name=None):
         """Let the RTC show what it subtracts."""
         used = self.state.references.used_id
-        sha256 = sha256 or self.state.references_of(used).sha256
-        shown = ReferencesInUse(reference_id=name or used, slopes=b"", sha256=sha256)
+        record = self.state.references_of(used)
+        offset = np.full(4, -0.0 if record.shape is None else 0.1, "<f4")
+        shown = ReferencesInUse(
+            reference_id=name or used, slopes=offset.tobytes(), sha256=sha256 or record.sha256
+        )
         return self.tell(ev.ReferencesFetched(in_use=shown))

@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 import pytest
 
-from pyrcal.client.shape_file import read_shape
+from pyrcal.shapes import read_shape
 from service.errors import ConfigurationError
 
 fits = pytest.importorskip("astropy.io.fits")

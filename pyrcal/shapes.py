@@ -1,4 +1,4 @@
-"""Read a shape from a file, for ``pyrcal references load``."""
+"""``pyrcal references load``: read a shape from a file, and have a running service hold it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pyrcal.client import ask
 from service.errors import ConfigurationError
 from service.files.container import opened
 
@@ -17,6 +18,18 @@ UNITS = {"meter": "m", "micron": "um", "nanometer": "nm"}
 
 _SAID = ("kind", "frame", "unit")
 _DESCRIBED = (*_SAID, "basis_id", "config_id")
+
+
+def main(options: argparse.Namespace) -> int:
+    """Read the file, then load its shape; return the exit status.
+
+    Raises
+    ------
+    PyrcalError
+        As :func:`read_shape`, and where the command line is wrong.
+    """
+    options.content = read_shape(options)
+    return ask.main(options)
 
 
 def read_shape(options: argparse.Namespace) -> dict[str, Any]:

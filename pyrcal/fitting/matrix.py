@@ -69,7 +69,7 @@ from pyrcal.fitting.uncertainty import (
     nonlinearity_sigma,
 )
 from pyrcal.fitting.verdict import FitFindings, judge_fit
-from service.errors import ModelError
+from service.errors import ModelError, list_first
 from service.estimation.orientation import (
     DOUBTFUL_CORRELATION,
     MIN_CORRELATION,
@@ -379,16 +379,9 @@ def _remove_smear(
 
 def _remove_noise(usable: Reference, noisy: NDArray[np.bool_]) -> Reference:
     """Return the reference without the columns that hold noise only; these are listed."""
-    named = ", ".join(str(mode) for mode in usable.columns[noisy][:_MAX_LISTED])
-    more = f" and {int(noisy.sum()) - _MAX_LISTED} more" if noisy.sum() > _MAX_LISTED else ""
-    left_out = f"{int(noisy.sum())} of {len(noisy)} columns hold noise only: modes {named}{more}"
-    return replace(
-        usable,
-        matrix=usable.matrix[:, ~noisy],
-        modes=usable.columns[~noisy],
-        noise=None if usable.noise is None else usable.noise[~noisy],
-        left_out=(*usable.left_out, left_out),
-    )
+    named = list_first(usable.columns[noisy], _MAX_LISTED)
+    left_out = f"{int(noisy.sum())} of {len(noisy)} columns hold noise only: modes {named}"
+    return usable.column_subset(~noisy, left_out)
 
 
 def _stroke_known(instrument: Instrument) -> bool:
@@ -419,13 +412,7 @@ def _select_modes(reference: Reference, modes: NDArray[np.intp] | None) -> Refer
             f"modes: {missing[0]} is requested and was not measured; expected some of the "
             f"{len(place)} that were ({min(place)} to {max(place)})"
         )
-    columns = np.array([place[int(mode)] for mode in modes], dtype=np.intp)
-    return replace(
-        reference,
-        matrix=reference.matrix[:, columns],
-        modes=reference.columns[columns],
-        noise=None if reference.noise is None else reference.noise[columns],
-    )
+    return reference.column_subset(np.array([place[int(mode)] for mode in modes], dtype=np.intp))
 
 
 def _remove_shapeless(reference: Reference, instrument: Instrument) -> Reference:
@@ -434,18 +421,9 @@ def _remove_shapeless(reference: Reference, instrument: Instrument) -> Reference
     # A matrix of another shape is left to ``check_reference``, which reports it.
     if not flat.any() or flat.all() or reference.matrix.shape[1:] != flat.shape:
         return reference
-    named = ", ".join(str(mode) for mode in reference.columns[flat][:_MAX_LISTED])
-    more = f" and {int(flat.sum()) - _MAX_LISTED} more" if flat.sum() > _MAX_LISTED else ""
-    noise = reference.noise
-    return replace(
-        reference,
-        matrix=reference.matrix[:, ~flat],
-        modes=reference.columns[~flat],
-        noise=noise[~flat] if noise is not None and noise.shape == flat.shape else noise,
-        left_out=(
-            *reference.left_out,
-            f"without a usable shape in the instrument file: modes {named}{more}",
-        ),
+    named = list_first(reference.columns[flat], _MAX_LISTED)
+    return reference.column_subset(
+        ~flat, f"without a usable shape in the instrument file: modes {named}"
     )
 
 

@@ -8,7 +8,7 @@ columns is held against every mode of the model, at the registration that explai
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.control.reconstructor import MAX_CONDITION
+from service.errors import list_first
 from service.estimation.solver import SETTLED_STEP, Columns, Projection, shorten
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
@@ -180,7 +181,8 @@ class OwnMatrix:
         ]
         if not odd:
             return ""
-        return f"by the RTC's own matrix {_list_in_words(odd)} as strongly as its neighbours"
+        listed = list_first(odd, _MAX_LISTED_MODES)
+        return f"by the RTC's own matrix {listed} as strongly as its neighbours"
 
     @property
     def typical_response(self) -> float | None:
@@ -207,7 +209,8 @@ class OwnMatrix:
             return ""
         if len(turned) == 1:
             return f"mode {turned[0]} has the other sign by the RTC's own matrix"
-        return f"modes {_list_in_words(turned)} have the other sign by the RTC's own matrix"
+        listed = list_first(turned, _MAX_LISTED_MODES)
+        return f"modes {listed} have the other sign by the RTC's own matrix"
 
     def _order(self) -> str:
         elsewhere = (self.modes >= 0) & (self.modes != self.columns)
@@ -226,9 +229,11 @@ class OwnMatrix:
         # one < to lists each pair once.
         pairs = [(one, to) for one, to in place.items() if place.get(to) == one and one < to]
         if 2 * len(pairs) == len(columns):
-            exchanged = _list_in_words([f"{one} and {to}" for one, to in pairs])
+            exchanged = list_first([f"{one} and {to}" for one, to in pairs], _MAX_LISTED_MODES)
             return f"modes {exchanged} are exchanged by the RTC's own matrix"
-        text = _list_in_words([f"{one} is the instrument file's {to}" for one, to in place.items()])
+        text = list_first(
+            [f"{one} is the instrument file's {to}" for one, to in place.items()], _MAX_LISTED_MODES
+        )
         return f"modes have other places by the RTC's own matrix: {text}"
 
 
@@ -430,10 +435,3 @@ def _project(
     every = np.ones(len(columns), dtype=np.bool_)
     measured = Columns(matrix=columns, weights=along**-2.0, rows=every)
     return measured.project(model, near.derivatives[:, :, modes[usable]], np.float32)
-
-
-def _list_in_words(things: Sequence[object] | NDArray[np.intp]) -> str:
-    """Return the first of some things in words, and how many more there are."""
-    first = [str(thing) for thing in things[:_MAX_LISTED_MODES]]
-    more = len(things) - len(first)
-    return ", ".join(first) + (f" and {more} more" if more else "")

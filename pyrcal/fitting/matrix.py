@@ -642,7 +642,7 @@ def _make_fit(
         subset_scatter=sure.subset_scatter,
         accepted=determined,
         converged=solution.converged,
-        verdict=f"{'accepted' if determined else 'refused'}: {grounds.reason}",
+        verdict=f"{'accepted' if determined else 'refused'}: {grounds.reason.words}",
         remarks=(),
         left_out=(*usable.left_out, *_rows_left_out(target, about)),
         n_evaluations=settled.models.counter.n,
@@ -660,7 +660,7 @@ def _make_fit(
         alternatives=findings.alternatives,
         registration=Registration(
             determined=determined,
-            reason=grounds.reason,
+            reason=grounds.reason.words,
             sigma_statistical=sure.sigma_statistical,
             sigma_systematic=sure.sigma_systematic,
             sets=sure.sets,

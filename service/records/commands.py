@@ -14,7 +14,6 @@ from annotated_types import Ge, Gt, Le, Len, MaxLen
 from typing_extensions import override
 
 from service.errors import shown
-from service.files import MAX_MODES
 from service.records.alarms import Severity
 from service.records.products import ModeSet
 from service.records.state import Mode
@@ -26,6 +25,9 @@ MAX_NOISY_MEASUREMENT_S = 3600.0
 MAX_MUTE_S = 43_200.0
 MAX_VALUE_LIFETIME_S = 86_400.0
 MAX_TEXT_LENGTH = 200
+
+MAX_MODES = 100_000
+"""Largest number of modes that an order may list."""
 
 Value = bool | float | str
 """Type of a value that operators' own alarm rules compare."""

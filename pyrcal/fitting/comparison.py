@@ -132,8 +132,7 @@ class FitSubset:
         self.target = settled.target.column_subset(self.modes)
         self.here = solution.alpha
         self._images = settled.nuisances.images
-        known = np.concatenate([solution.derivatives, solution.nuisance_derivatives])
-        self.derivatives = known[:, :, self.modes]
+        self.derivatives = solution.derivatives[:, :, self.modes]
         """Derivatives of the unchanged instrument; they hardly depend on the alternative."""
 
         self._last: tuple[tuple[Array, ...], Projection] | None = None
@@ -191,8 +190,8 @@ class FitSubset:
         settled = self.settled
         models, own = replace(settled.models, instrument=about), settled.solution
         there = refine(models, settled.target, own.alpha, settled.nuisances)
-        known = np.concatenate([there.derivatives, there.nuisance_derivatives])[:, :, self.modes]
-        seen = self.target.project(there.matrix[:, self.modes], np.concatenate([known, rate[None]]))
+        known = np.concatenate([there.derivatives[:, :, self.modes], rate[None]])
+        seen = self.target.project(there.matrix[:, self.modes], known)
         share = there.projection.chi / own.projection.chi * seen.chi_at_best / seen.chi
         step = seen.best_step
         return float(step[-1]), float(share), there.vector + step[:4] - own.vector

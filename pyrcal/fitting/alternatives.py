@@ -23,7 +23,7 @@ from pyrcal.fitting.instrument_checks import (
 from pyrcal.fitting.left_over import find_arms, find_border
 from pyrcal.fitting.methods import Settled
 from pyrcal.fitting.models import FAR_PREFERRED_SHARE, PREFERRED_SHARE, Optic
-from pyrcal.fitting.pupil_checks import gain_maps, try_pupils
+from pyrcal.fitting.pupil_checks import try_pupils
 from pyrcal.fitting.solver import refine
 from pyrcal.fitting.uncertainty import Uncertainty
 from service.model.kinds import SignalKind, Stop
@@ -229,9 +229,8 @@ def _try_separate_gains(few: FitSubset) -> Iterator[Alternative]:
 
 def _try_uneven_light(few: FitSubset) -> Iterator[Alternative]:
     """Yield the alternative with a smooth gain over the pupil, common to all modes."""
-    maps = [pattern[:, None] * few.own for pattern in gain_maps(few)]
     words = f"uneven light ({LIGHT_KEY})"
-    yield few.judge(few.compare(few.own, *maps), words, key=LIGHT_KEY, is_number=True)
+    yield few.judge(few.uneven_light, words, key=LIGHT_KEY, is_number=True)
 
 
 def _try_spiders(few: FitSubset) -> Iterator[Alternative]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pyrcal.fitting.disjoint_sets import SIGNIFICANT
 from pyrcal.fitting.methods import Settled, spread
 from pyrcal.fitting.models import FitModels
-from pyrcal.fitting.solver import pupil_regions, refine
+from pyrcal.fitting.solver import nuisances_of, pupil_regions, refine
 from service.estimation.solver import Projection
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
@@ -168,6 +168,13 @@ class FitSubset:
     def matrix_of(self, about: Instrument) -> Array:
         """Return D of another instrument with the same modes, ``(n_slopes, n_few)``."""
         return self.matrix(replace(self.models, instrument=about))
+
+    @cached_property
+    def uneven_light(self) -> Alternative:
+        """The fit with a smooth gain over the pupil that is common to all modes."""
+        kind = self.models.instrument.slopes.kind
+        maps = nuisances_of(self.target.valid, kind, gain_map=True).maps
+        return self.compare(self.own, *(pattern[:, None] * self.own for pattern in maps))
 
     def fit_again(self, about: Instrument, rate: Array) -> tuple[float, float, Array]:
         """Return the fit with another instrument and one further number of it.

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from pyrcal.fitting.comparison import MIN_EXPLAINED, Alternative, FitSubset
 from pyrcal.fitting.models import FAR_PREFERRED_SHARE, PREFERRED_SHARE
-from pyrcal.fitting.solver import nuisances_of
 from service.model.instrument import Instrument
 from service.model.kinds import Stop
 from service.model.pupil import light_per_subaperture
@@ -203,7 +202,7 @@ def try_pupils(few: FitSubset) -> Iterator[Alternative]:
     """
     about = few.models.instrument
     # Light that fades outwards looks like a narrower pupil as well, and explains more then.
-    most = min(PREFERRED_SHARE, fit_smooth_gain(few))
+    most = min(PREFERRED_SHARE, few.uneven_light.misfit)
     for number in _numbers(about):
         rate = number.rate(few, number.reported**number.power, few.own)
         # To first order first, because each further value takes the matrix of another sensor model.
@@ -290,15 +289,3 @@ def _light(few: FitSubset, about: Instrument) -> Array:
     x, y = few.here.vector[:2] if about.stop is Stop.MIRROR else (0.0, 0.0)
     seen = scipy.ndimage.shift(light_per_subaperture(about), (y, x), order=1)
     return np.tile(seen[few.target.valid], about.slopes.kind.n_planes)
-
-
-def fit_smooth_gain(few: FitSubset) -> float:
-    """Return χ² with a smooth gain over the pupil, common to all modes, over that without."""
-    own = few.own
-    return few.left(own, *(pattern[:, None] * own for pattern in gain_maps(few))) / few.left(own)
-
-
-def gain_maps(few: FitSubset) -> Array:
-    """Return the shapes of a smooth gain over the pupil, ``(n_maps, n_slopes)``."""
-    kind = few.models.instrument.slopes.kind
-    return nuisances_of(few.target.valid, kind, gain_map=True).maps

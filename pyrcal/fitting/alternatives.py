@@ -187,7 +187,7 @@ def _try_off_centre(few: FitSubset) -> Iterator[Alternative]:
         return  # the fit itself displaced the pupil
     rates = few.pupil_rates
     # Where the border cuts no subaperture, a displaced pupil changes no slope.
-    if not all(few.tells(few.own, rate) for rate in rates):
+    if not all(few.depends_on(few.own, rate) for rate in rates):
         return
     found = few.compare(few.own, *rates)
     x, y = few.step(few.own, *rates)[-2:]
@@ -244,7 +244,7 @@ def _try_spiders(few: FitSubset) -> Iterator[Alternative]:
         return
     width_m = ARM_SUBAP * about.subaperture_m
     rate = few.matrix_of(replace(about, spiders_m=width_m, spiders_deg=arms_deg)) - few.own
-    if not few.tells(few.own, rate):
+    if not few.depends_on(few.own, rate):
         return
     width = few.step(few.own, rate)[-1]
     if width <= 0.0:

@@ -282,8 +282,8 @@ class FitSubset:
         left = seen.residual - np.tensordot(step, seen.jacobian, axes=1)
         return np.asarray(left**2 * seen.weights)
 
-    def tells(self, matrix: Array, rate: Array) -> bool:
-        """Return True if the measurement depends on a quantity; it may cut no subaperture."""
+    def depends_on(self, matrix: Array, rate: Array) -> bool:
+        """Return True if a quantity changes the slopes; a border may cut no subaperture."""
         return bool(self.target.project(matrix, rate[None]).normal[0, 0] > 0.0)
 
     def step(self, matrix: Array, *more: Array) -> Array:
@@ -298,14 +298,14 @@ class FitSubset:
         """
         if matrix is self.own and not more:
             return self._own_seen
-        asked = (matrix, *more)
+        given = (matrix, *more)
         if self._last is not None:
             known, seen = self._last
-            if len(known) == len(asked) and all(map(operator.is_, known, asked)):
+            if len(known) == len(given) and all(map(operator.is_, known, given)):
                 return seen
         self._last = None  # its memory is needed for the next one
         seen = self.target.project(matrix, self._with(more), np.float32)
-        self._last = asked, seen
+        self._last = given, seen
         return seen
 
     @cached_property

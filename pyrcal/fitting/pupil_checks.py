@@ -116,7 +116,7 @@ class PupilNumber:
 
     def near(self, few: FitSubset, rate: Array) -> tuple[float, Alternative]:
         """Return the best value and how it compares, to first order."""
-        if few.tells(few.own, rate):
+        if few.depends_on(few.own, rate):
             light = self.reported**self.power
             value = self.limit(light + few.step(few.own, rate)[-1])
             if value != light:
@@ -138,7 +138,7 @@ class PupilNumber:
         for _ in range(_N_STEPS):
             # At a new value the border may cut no subaperture, and then nothing determines a
             # further step.
-            if not few.tells(matrix, rate):
+            if not few.depends_on(matrix, rate):
                 break
             before, left = light, matrix
             light = self.limit(light + float(few.step(matrix, rate)[-1]))
@@ -274,7 +274,7 @@ def _try_other_ways_round(few: FitSubset) -> Iterator[Alternative]:
     for words, way in ways.items():
         other = replace(about, pupil=replace(about.pupil, lit=way))
         rate = (_light(few, other) / own - 1.0)[:, None] * few.own
-        if few.tells(few.own, rate) and few.step(few.own, rate)[-1] > 0.0:
+        if few.depends_on(few.own, rate) and few.step(few.own, rate)[-1] > 0.0:
             share = few.compare(few.own, rate).misfit
             best = min(best, (words, other, share), key=lambda one: one[2])
     words, other, _ = best

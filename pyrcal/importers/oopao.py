@@ -110,6 +110,7 @@ SAVED = {
         "n_pix_separation": _ANY._replace(sensor=PYRAMID),
         "binning": _count(1)._replace(sensor=PYRAMID),
         "postProcessing": _WORD._replace(sensor=PYRAMID),
+        "user_modulation_path": _array(2)._replace(needed=False),
         "validI4Q": _array(2)._replace(needed=False),
         "validSignal": _array(1, 2)._replace(needed=False),
         "referenceSignal_2D": _array(2)._replace(needed=False),
@@ -130,6 +131,12 @@ _LIT_SHARE = 0.5
 
 _MAX_SEEMING_PX = 0.6
 """How much closer to the middle unmodulated pupil images seem by the strength of their response."""
+
+_MAX_PATH_DEVIATION = 0.02
+"""Largest distance of a point of a modulation path from an ellipse, relative to its semi-axis."""
+
+_SAME_AXES = 1e-3
+"""Relative difference of the semi-axes of a modulation below which it is a circle."""
 
 _SAMPLED_ACTUATORS = 24
 """Number of influence functions that are compared with the Gaussian."""
@@ -260,9 +267,12 @@ def _lit_pupil(
     share = (side - 2 * rim) / side
     diameter_m = float(tel.D) * share
     sensor["pupil_diameter_subap"] = sensor["n_subapertures"] * share
+    # Modulations are counted in wavelengths over tel.D, which is the array's width.
     if "modulation_lambda_over_d" in sensor:
-        # It is counted in wavelengths over tel.D, which is the array's width.
         sensor["modulation_lambda_over_d"] *= share
+    if "modulation_ellipse" in sensor:
+        ellipse = sensor["modulation_ellipse"]
+        ellipse["axes_lambda_over_d"] = [axis * share for axis in ellipse["axes_lambda_over_d"]]
     notes.append(
         f"tel.D = {float(tel.D):g} m is that of a padded array: a dark rim of {rim} points is cut, "
         f"so that the pupil is {diameter_m:.4g} m wide, {sensor['pupil_diameter_subap']:.4g} of "
@@ -301,8 +311,6 @@ def _pyramid(tel: Oopao, wfs: Oopao, notes: list[str]) -> _Sensor:
             f"wfs.postProcessing = {wfs.postProcessing!r} normalises by a constant: gains of all "
             "modes differ from 1 alike"
         )
-    if getattr(wfs, "user_modulation_path", None) is not None:
-        notes.append("wfs.user_modulation_path is taken as a circle of the radius wfs.modulation")
     if getattr(wfs, "rooftop", None) or getattr(wfs, "theta_rotation", 0):
         notes.append("a rooftop, and faces that are turned, are not in pyrcal's model")
     binning = int(wfs.binning)
@@ -316,8 +324,38 @@ def _pyramid(tel: Oopao, wfs: Oopao, notes: list[str]) -> _Sensor:
         valid = _numpy(_needed(wfs, "validI4Q")).astype(bool)
         slopes["order"] = "xy"
     sensor["n_subapertures"] = len(valid)
-    sensor["modulation_lambda_over_d"] = float(wfs.modulation) / _steps(tel)
-    return sensor, valid, slopes
+    return sensor | _modulation(tel, wfs, notes), valid, slopes
+
+
+def _modulation(tel: Oopao, wfs: Oopao, notes: list[str]) -> dict[str, Any]:
+    """Return the keys of the modulation: a circle, or the ellipse of the user's own path."""
+    own = getattr(wfs, "user_modulation_path", None)
+    if own is None:
+        return {"modulation_lambda_over_d": float(wfs.modulation) / _steps(tel)}
+    path = np.asarray(own, dtype=float).T / _steps(tel)
+    if len(path) != 2 or not np.any(path):
+        raise ConfigurationError(
+            f"wfs.user_modulation_path: found shape {path.T.shape}, expected pairs [x, y] that are "
+            "not all 0"
+        )
+    # Over an ellipse the mean square of a coordinate is half that of its semi-axis.
+    squares, axes = np.linalg.eigh(2.0 * path @ path.T / path.shape[1])
+    lengths = np.sqrt(np.maximum(squares, np.finfo(float).tiny))
+    off = np.linalg.norm(axes.T @ path / lengths[:, None], axis=0)
+    if np.abs(off - 1.0).max() > _MAX_PATH_DEVIATION:
+        notes.append(
+            "wfs.user_modulation_path is no ellipse about the axis: that of the same mean squares "
+            "is taken"
+        )
+    if lengths[1] / lengths[0] - 1.0 < _SAME_AXES:
+        return {"modulation_lambda_over_d": float(np.sqrt(lengths.prod()))}
+    angle_deg = float(np.rad2deg(np.arctan2(axes[1, 1], axes[0, 1])))
+    return {
+        "modulation_ellipse": {
+            "axes_lambda_over_d": [float(lengths[1]), float(lengths[0])],
+            "angle_deg": round(angle_deg, 6) % 180.0,
+        }
+    }
 
 
 def _needed(owner: Oopao, name: str) -> Array:

@@ -361,6 +361,7 @@ _LATER_FIELDS = frozenset(
         "image_offsets_subap",
         "position_error_pitch",
         "normalised",
+        "modulation_stretch",
     }
 )
 """Fields without which an instrument has the digest that it has always had."""

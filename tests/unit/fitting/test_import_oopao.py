@@ -193,6 +193,34 @@ def test_valid_pixels_of_a_whole_detector_are_put_in_their_places(saved):
     assert not cube[:, ~lit].any()
 
 
+def modulated_on(saved, *axes, angle_deg=0.0, middle=0.0):
+    t = np.arange(24) * np.pi / 12
+    path = np.exp(1j * np.deg2rad(angle_deg)) * (axes[0] * np.cos(t) + 1j * axes[1] * np.sin(t))
+    own = np.column_stack([path.real + middle, path.imag])
+    return imported_of(saved, wfs__user_modulation_path=own)
+
+
+def test_an_elliptic_path_is_an_elliptic_modulation(saved, tmp_path):
+    found = modulated_on(saved, 4.0, 5.0, angle_deg=30.0)
+    ellipse = found.tables["wfs"]["modulation_ellipse"]
+    np.testing.assert_allclose(ellipse["axes_lambda_over_d"], [5.0 * 32 / 31, 4.0 * 32 / 31])
+    assert ellipse["angle_deg"] == pytest.approx(120.0)
+    assert not any("user_modulation_path" in note for note in found.notes)
+    longer, shorter, _ = pyrcal.load_instrument(
+        found.save(tmp_path / "bench").instrument
+    ).wfs.modulation_axes
+    assert (longer, shorter) == pytest.approx((5.0 * 32 / 31, 4.0 * 32 / 31))
+
+
+def test_a_round_path_is_a_circle_and_another_one_is_said_to_be_none(saved):
+    assert modulated_on(saved, 3.0, 3.0).tables["wfs"]["modulation_lambda_over_d"] == pytest.approx(
+        3.0 * 32 / 31
+    )
+    assert any("no ellipse" in note for note in modulated_on(saved, 3.0, 4.0, middle=0.5).notes)
+    with pytest.raises(ConfigurationError, match="expected pairs"):
+        modulated_on(saved, 0.0, 0.0)
+
+
 def test_what_was_not_saved_is_named(saved):
     left_out = {name: v for name, v in saved.items() if name not in {"tel.D", "wfs.modulation"}}
     with pytest.raises(ConfigurationError, match=r"it: found no tel\.D, wfs\.modulation"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields, replace
 from typing import Any
 
@@ -15,7 +16,14 @@ from service.model.kinds import LoopFacts, Normalisation
 from service.model.pupil import PupilGrid, valid_subapertures
 from service.model.sensors.model import SensorModel, Term
 from service.model.sensors.pyramid import description, detector_windows, signals, working_point
-from service.model.sensors.pyramid.description import FrameWindows, Pyramid, by_quadrant, pyramid_in
+from service.model.sensors.pyramid.description import (
+    FrameWindows,
+    Pyramid,
+    by_quadrant,
+    oriented_pyramid,
+    pyramid_in,
+    stretch_of,
+)
 from service.model.sensors.pyramid.light import PyramidLight
 from service.model.sensors.pyramid.optics import PyramidOptics, enough_modulation_points
 from service.model.sensors.pyramid.table import IMAGE_KEY, PyramidMode, PyramidNumbers, PyramidTable
@@ -95,9 +103,13 @@ class PyramidModel(SensorModel):
         offsets: tuple[tuple[float, float], ...] | None = None
         if table.image_offsets_px is not None:
             offsets = tuple((x / pixels, y / pixels) for x, y in table.image_offsets_px)
+        ellipse, stretch = table.modulation_ellipse, None
+        if ellipse is not None:
+            stretch = stretch_of(ellipse.axes_lambda_over_d, math.radians(ellipse.angle_deg))
         return Pyramid(
             **optics | {"pupil_separation_subap": separation},
             image_offsets_subap=offsets,
+            modulation_stretch=stretch,
         )
 
     @override
@@ -189,7 +201,8 @@ class PyramidModel(SensorModel):
     @override
     def identity(self, sensor: Pyramid) -> tuple[float, ...]:
         separation = sensor.image_separation_subap
-        return (sensor.wavelength_m, sensor.modulation_lambda_over_d, separation)
+        stretch = sensor.modulation_stretch or ()
+        return (sensor.wavelength_m, sensor.modulation_lambda_over_d, separation, *stretch)
 
     def bin_sensor(self, sensor: Pyramid, binning: int) -> Pyramid:
         """Return the sensor with so many subapertures made one along each axis."""
@@ -220,7 +233,7 @@ class PyramidModel(SensorModel):
         fineness: Fineness,
         working_point: WorkingPoint | None = None,
     ) -> signals.PyramidSensor:
-        wfs = pyramid_in(instrument)
+        wfs = oriented_pyramid(instrument)
         if not isinstance(working_point, Halo | None):
             raise ModelError(f"pyramid: found {working_point!r}, expected a halo")
         optics = PyramidOptics(
@@ -257,7 +270,7 @@ class PyramidModel(SensorModel):
     @override
     def coarsest_sampling(self, sensor: Pyramid) -> int:
         # The phase of a modulation that is wide for its subapertures turns too fast for one point.
-        wide = 2.0 * sensor.modulation_lambda_over_d + 3.0 >= sensor.pupil_diameter
+        wide = 2.0 * sensor.largest_modulation + 3.0 >= sensor.pupil_diameter
         return 2 if wide else 1
 
     @override

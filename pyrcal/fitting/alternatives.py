@@ -22,7 +22,7 @@ from pyrcal.fitting.instrument_checks import (
     FoundOptic,
 )
 from pyrcal.fitting.methods import Settled
-from pyrcal.fitting.models import FAR_PREFERRED_SHARE, PREFERRED_SHARE, Optic
+from pyrcal.fitting.models import FAR_PREFERRED_SHARE, PREFERRED_SHARE, Optic, moved_sensor_number
 from pyrcal.fitting.pupil_checks import FitSubset, Lead, TriedPupil, gain_maps
 from pyrcal.fitting.solver import refine
 from pyrcal.fitting.uncertainty import OTHER_SHARE, Uncertainty
@@ -455,7 +455,8 @@ def _try_file_optics(
             yield Alternative(words=words, share=share, moved=moved, undecided=near)
         if one.optic is Optic.SENSOR and one.found is not None:
             share, moved = _fix_nuisances(settled, {place: float(np.log1p(MODULATION_STEP))})
-            words = f"{one.key} = {one.found * (1.0 + MODULATION_STEP):.3g}"
+            wider = moved_sensor_number(one.found, float(np.log1p(MODULATION_STEP)))
+            words = f"{one.key} = {wider:.3g}"
             near = share < 1.0 / PREFERRED_SHARE
             yield Alternative(words=words, share=share, moved=moved, undecided=near)
 

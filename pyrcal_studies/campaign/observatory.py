@@ -345,7 +345,7 @@ class ShortLink:
         self.sent.clear()
         self._staging = self._new_staging()
 
-    def _carry_out(self, outcome: staging.Outcome) -> list[Acknowledgement]:
+    def _carry_out(self, outcome: staging.Replies) -> list[Acknowledgement]:
         for reconstructor in outcome.staged:
             self._dome.stage(reconstructor)
         return [self._told(one) for one in outcome.acknowledgements]

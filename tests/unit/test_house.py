@@ -204,7 +204,6 @@ WORDS_READ = {
     "service/tracking/dither_request.py": "only the id is known of a dither that nobody follows",
     "service/tracking/transitions.py": "a table in the source, written as text",
     "pyrcal/fitting/advice.py": "the verdict names the alternatives and the entries of the file",
-    "pyrcal/fitting/alternatives.py": "names of what may be another instrument's",
     "pyrcal/fitting/arguments.py": "words of the command line",
     "pyrcal/fitting/fit_file.py": "an error begins with the name of its file",
     "pyrcal/fitting/fit_table.py": "notes of importers repeat what a fit has found",

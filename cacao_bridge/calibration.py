@@ -72,7 +72,8 @@ class Parts:
             if reference.size <= self._index.max():
                 found = f"{self._names.reference}: found {reference.size} values"
                 raise StreamError(f"{found}, expected at least {self._index.max() + 1}")
-            reference.reshape(-1)[self._index] = bundle.arrays[REFERENCE]
+            values = bundle.arrays[REFERENCE] / self._loop.slope_per_value
+            reference.reshape(-1)[self._index] = values
             kept[self._names.reference] = reference
         self._keep(name, kept)
 
@@ -135,7 +136,8 @@ class Calibration:
     def __init__(self, settings: Settings, identity: Identity) -> None:
         """Raise ``ConfigurationError`` if a file of the settings is not what it should be."""
         self._settings, self._identity = settings, identity
-        self._unit = np.float32(settings.loop.metre_per_unit)
+        self._unit = np.float32(settings.loop.metre_per_unit / settings.loop.slope_per_value)
+        """Metres per slope for a command of 1 per value."""
         self.index, self.dm_modes = load_index(settings), load_modes(settings)
         self._folder = Path(settings.calibration.folder)
         self._parts = Parts(settings, self.index)

@@ -197,6 +197,7 @@ class Cacao:
             _log.warning("frames.lost", n=frames.n_lost, before=frames.first, keeps=slopes.n_kept)
         self._slopes_at = frames.first + len(frames.values) - 1
         values = frames.values if self._whole else frames.values[:, self._calibration.index]
+        values = values * np.float32(self._loop.slope_per_value)
         self._rows.take_slopes(frames.first, values)
         self._moved_s["slopes"] = time.monotonic()
         self._follow_clock(self._slopes_at, slopes.written_ns or time.time_ns())
@@ -454,7 +455,7 @@ class Cacao:
             case LoopRequest():
                 reason = self._change_loop(command)
             case _:
-                reason = "unsupported: cacao measures and tunes by its own programs"
+                reason = "unsupported: cacao's own programs measure, tune and set references"
         start_seq = None if reason else start_seq
         return Reply(id=command.id, accepted=not reason, reason=reason, start_seq=start_seq)
 

@@ -89,6 +89,10 @@ class LoopTable(Table):
     metre_per_unit: Positive
     """OPD of a mode whose command is 1, metres; cacao's mirrors count in micrometres."""
 
+    slope_per_value: Positive = 1.0
+    """Slope or normalised pixel, as the instrument file has it, of a value of 1 in a frame. Frames
+    of cacao whose sum is 1 need the number of valid subapertures: there the mean is 1."""
+
     commands_are: Literal["modes", "actuators"] = "modes"
     counter_offset: int | None = None
     """Counter of a frame of ``slopes`` minus that of the ``commands`` that answer it. If left out,

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from typing import Final
 
 import msgpack
@@ -28,6 +29,7 @@ from service.wire import (
     DitherRequest,
     DitherStop,
     LoopRequest,
+    ReferencesRequest,
     Reply,
     Status,
     decode,
@@ -137,6 +139,23 @@ def _invalid_commands(client: RtcClient, status: Status) -> list[_InvalidCommand
     ramp = {"v": 1, "id": new("ramp"), "groups": [[1, 0]], "gains": [0.1], "frames_per_gain": 1}
     offload = {"v": 1, "id": new("offload"), "rotation_deg": 0.0, "magnification": 0.0}
     offload |= {"shift_x_subap": 0.0}
+    no_slopes = b"\0" * 4 * status.n_slopes
+    references = ReferencesRequest(
+        id=new("references"),
+        reference_id="no-references",
+        config_id=status.config_id,
+        slopes=no_slopes + b"\0" * 4,
+        sha256=sha256(no_slopes + b"\0" * 4).hexdigest(),
+        ramp_s=0.0,
+    )
+    wrong_sum = msgpack.unpackb(encode(references)) | {"slopes": no_slopes, "id": new("sum")}
+    elsewhere = replace(
+        references,
+        id=new("sensor"),
+        config_id="no-configuration-of-this-rtc",
+        slopes=no_slopes,
+        sha256=sha256(no_slopes).hexdigest(),
+    )
     dithering = CommandKind.DITHER
     # One frame of a sine, whose first value is 0: the mirror does not move if it is accepted.
     frame = replace(dither, modes=(0,), duration_s=1.0 / status.frame_rate_hz)
@@ -200,6 +219,16 @@ def _invalid_commands(client: RtcClient, status: Status) -> list[_InvalidCommand
             ("missing", "unsupported"),
             optional=True,
         ),
+        *(
+            _InvalidCommand(
+                CommandKind.REFERENCES, payload, what, ("range", "unsupported"), optional=True
+            )
+            for what, payload in (
+                ("references of one slope too many", encode(references)),
+                ("references with another checksum", msgpack.packb(wrong_sum)),
+                ("references of another configuration", encode(elsewhere)),
+            )
+        ),
     ]
 
 
@@ -226,7 +255,8 @@ def check_replies(client: RtcClient, status: Status) -> CheckResult:
     if problems:
         return wrong("replies", "; ".join(problems))
     found = f"{len(commands) - len(absent)} refusals with their codes within {slowest_s:.2f} s"
-    without = f"; it offers no {' and no '.join(absent)}" if absent else ""
+    kinds = " and no ".join(dict.fromkeys(absent))
+    without = f"; it offers no {kinds}" if absent else ""
     return fine("replies", f"{found}, and the same reply for a repeated id{without}")
 
 

@@ -23,6 +23,7 @@ from service.wire import (
     Encodings,
     Keys,
     Manifest,
+    ReferencesInUse,
     Reply,
     Role,
     decode,
@@ -228,6 +229,18 @@ class RtcConnection:
             If there is no answer.
         """
         return link.fetch_applied(self._require_session, self.keys, self._signatures)
+
+    def fetch_references(self) -> ReferencesInUse:
+        """Return the offset of the reference slopes, as the RTC reports it.
+
+        Raises
+        ------
+        WireError
+            If the answer breaks the contract.
+        LinkError
+            If there is no answer.
+        """
+        return link.fetch_references(self._require_session, self.keys, self._signatures)
 
     def offer(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
         """Answer queries for this matrix from now on, and for no other one.

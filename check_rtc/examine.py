@@ -30,6 +30,7 @@ from check_rtc.moving import (
     check_rejection,
 )
 from check_rtc.offload import STEP_SUBAP, RegistrationFit, check_offload
+from check_rtc.references import check_references
 from check_rtc.requirements import REQUIREMENTS, CheckResult, Moves, skipped, wrong
 from check_rtc.telemetry_checks import ImageOffsets, TelemetryContext, run_telemetry_checks
 from service.errors import LinkError, WireError
@@ -208,26 +209,30 @@ def list_moves(names: list[str], status: Status) -> tuple[str, ...]:
             "commit, chunks, rejection: matrices with the same numbers as the one in use are sent, "
             "most under new ids, and two of them are swapped in"
         )
-    if "reconnect" in names:
-        lines.append("reconnect: the link only; the RTC loses its router for a second")
-    if "loop" in names:
-        lines.append(f"loop: THE LOOP IS OPENED for about {OPEN_LOOP_S:.0f} s and closed again")
-    if "finite" in names:
-        lines.append(
-            "finite: THE LOOP IS OPENED for a few seconds, and matrices with NaN and infinity are "
-            "sent, which the RTC must reject; then it is closed again"
-        )
-    if "measure" in names:
-        lines.append(
-            "measure: the RTC opens THE LOOP, pushes and pulls two modes by "
-            f"{1e9 * STROKE_M:.0f} nm RMS, and closes it again"
-        )
-    if "offload" in names:
-        lines.append(
-            f"offload: THE MIRROR'S IMAGE is moved by {STEP_SUBAP:g} subap along x and back, with "
-            f"{1e9 * DITHER_RMS_M:.0f} nm RMS of dither"
-        )
-    return tuple(lines)
+    return (*lines, *(text for name, text in _MOVES_OF_CHECKS.items() if name in names))
+
+
+_MOVES_OF_CHECKS: Final = {
+    "references": (
+        "references: an offset of the reference slopes, which the matrix in use does not see, is "
+        "set for some seconds; afterwards the references have another name"
+    ),
+    "reconnect": "reconnect: the link only; the RTC loses its router for a second",
+    "loop": f"loop: THE LOOP IS OPENED for about {OPEN_LOOP_S:.0f} s and closed again",
+    "finite": (
+        "finite: THE LOOP IS OPENED for a few seconds, and matrices with NaN and infinity are "
+        "sent, which the RTC must reject; then it is closed again"
+    ),
+    "measure": (
+        "measure: the RTC opens THE LOOP, pushes and pulls two modes by "
+        f"{1e9 * STROKE_M:.0f} nm RMS, and closes it again"
+    ),
+    "offload": (
+        f"offload: THE MIRROR'S IMAGE is moved by {STEP_SUBAP:g} subap along x and back, with "
+        f"{1e9 * DITHER_RMS_M:.0f} nm RMS of dither"
+    ),
+}
+"""Lines of the checks that move something of their own, in the order of the report."""
 
 
 def _run_active_checks(
@@ -239,6 +244,8 @@ def _run_active_checks(
         yield from check_dither(client, status, client.observer.loop.matrix)
     if any(examination.includes(name) for name in _MATRIX_CHECKS):
         yield from _run_matrix_checks(client, examination)
+    if examination.includes("references"):
+        yield check_references(client, client.observer.status or status)
     if examination.includes("reconnect"):
         yield check_reconnect(client)
     if examination.includes("loop"):

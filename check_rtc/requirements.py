@@ -43,6 +43,9 @@ class Moves(StrEnum):
     MIRROR = "mirror"
     """The check plays a small dither."""
 
+    REFERENCES = "references"
+    """The check subtracts an offset from the slopes that the matrix in use does not see."""
+
     LOOP = "loop"
     """The check opens the loop for some seconds and closes it again."""
 
@@ -92,7 +95,7 @@ REQUIREMENTS: Final[dict[str, Requirement]] = {
         (26,), "t0_ns is UTC and increases by dt_ns per frame", "sessions-sequence-time"
     ),
     "delivery": Requirement(
-        (19,), "a batch is sent as soon as its last frame is complete", "timing"
+        (19,), "a batch is sent as soon as its last frame is complete", "frames"
     ),
     "session": Requirement(
         (5, 22, 23),
@@ -131,7 +134,7 @@ REQUIREMENTS: Final[dict[str, Requirement]] = {
         (74,), "cm/current is queried once a session, when alive/service appears", "reconstructors"
     ),
     "replies": Requirement(
-        (42, 43, 44, 49),
+        (42, 43, 44, 49, 87),
         "every command has a reply within 1 s, refusals begin with their code, and a repeated id "
         "has the same reply",
         "commands",
@@ -175,6 +178,13 @@ REQUIREMENTS: Final[dict[str, Requirement]] = {
         "commit is acknowledged again",
         "reconstructors",
         Moves.MATRIX,
+    ),
+    "references": Requirement(
+        (83, 84, 85, 86),
+        "an offset of the reference slopes is subtracted after a ramp, named in frames and status, "
+        "and read back; session, gains and matrix stay",
+        "references",
+        Moves.REFERENCES,
     ),
     "reconnect": Requirement(
         (1, 23),

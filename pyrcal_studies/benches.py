@@ -399,8 +399,8 @@ def _of_bench(bench: Bench, fit: Fit) -> list[str]:
     )
     left = "" if fit.left_over is None else fit.left_over.words
     terms = "; ".join(
-        f"{term.alternative.words} ({float(np.max(term.sigma / fit.sigma)):.1f} of σ)"
-        for term in systematic_terms(fit.alternatives, fit.residual_fraction, fit.sigma)[:3]
+        f"{one.words} ({float(np.max(sigma / fit.sigma)):.1f} of σ)"
+        for one, sigma in systematic_terms(fit.alternatives, fit.residual_fraction, fit.sigma)[:3]
     )
     return [
         f"## {bench.name}",

@@ -136,10 +136,13 @@ class FftPyramid:
         to_focus = self.roof()[:, None] * focus
         seen_y = self._detector_transform(shift[1]) @ to_focus
         seen_x = self._detector_transform(shift[0]) @ to_focus
+        u = 2j * np.pi * self.coordinates / self.n_subapertures
+        return [(seen_y * np.exp(u * y), seen_x * np.exp(u * x)) for x, y in self.modulation()]
+
+    def modulation(self) -> NDArray[np.float64]:
+        """Return the points of the modulation ``(n_modulation, 2)``, x and y in λ/D."""
         angle = 2 * np.pi * (np.arange(self.n_modulation) + 0.5) / self.n_modulation
-        k = 2 * np.pi * self.modulation_lambda_over_d / self.n_subapertures
-        u = 1j * k * self.coordinates
-        return [(seen_y * np.exp(u * np.sin(t)), seen_x * np.exp(u * np.cos(t))) for t in angle]
+        return self.modulation_lambda_over_d * np.column_stack([np.cos(angle), np.sin(angle)])
 
     def _detector_transform(self, shift: float) -> NDArray[np.complex128]:
         """Inverse Fourier sum at the detector points of one axis."""
@@ -172,3 +175,22 @@ class DisplacedPyramid(FftPyramid):
         for y, x in np.ndindex(2, 2):
             images[y, :, x] = super(DisplacedPyramid, self)._images(opd_m, paths[y][x])[y, :, x]
         return images
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EllipticPyramid(FftPyramid):
+    """The same, modulated on an ellipse."""
+
+    axes_lambda_over_d: tuple[float, float]
+    """Semi-axes."""
+
+    angle_deg: float
+    """Direction of the first one, from +x towards +y."""
+
+    @override
+    def modulation(self) -> NDArray[np.float64]:
+        t = 2 * np.pi * np.arange(self.n_modulation) / self.n_modulation
+        first, second = self.axes_lambda_over_d
+        turned = np.exp(1j * np.deg2rad(self.angle_deg))
+        path = turned * (first * np.cos(t) + 1j * second * np.sin(t))
+        return np.column_stack([path.real, path.imag])

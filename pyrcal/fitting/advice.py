@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from pyrcal.fitting.alternatives import (
     CENTRED_KEY,
-    Alternative,
     describe_preference,
     format_move,
     systematic_terms,
 )
+from pyrcal.fitting.comparison import Alternative
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.left_over import locate_residual
 from pyrcal.fitting.origins import Origin
@@ -94,11 +94,11 @@ _BY_ANOTHER_INSTRUMENT = {Refusal.ANOTHER_INSTRUMENT, Refusal.UNSETTLED, Refusal
 """Reasons of a refusal that a wrong value of the instrument file also causes."""
 
 
-def add_explanations(fit: Fit, tried: tuple[Alternative, ...], grounds: Grounds) -> Fit:
-    """Return the fit with alternatives, residual analysis and recommendation filled in."""
+def add_explanations(fit: Fit, grounds: Grounds) -> Fit:
+    """Return the fit with preferred alternatives, residual analysis and recommendation."""
     preferred = (
         describe_preference(one, fit.sigma)
-        for one in tried
+        for one in fit.alternatives
         # The verdict already names the alternative that led to a refusal.
         if one.preferred and one.words not in fit.verdict
     )
@@ -107,7 +107,7 @@ def add_explanations(fit: Fit, tried: tuple[Alternative, ...], grounds: Grounds)
     left = locate_residual(
         fit.residual_map, fit.residual_by_mode, valid=fit.valid, modes=fit.modes, size=size
     )
-    fit = replace(fit, alternatives=tried, remarks=sentences, left_over=left)
+    fit = replace(fit, remarks=sentences, left_over=left)
     return add_recommendation(fit, grounds)
 
 
@@ -206,10 +206,10 @@ def _explain_uncertainty(fit: Fit, grounds: Grounds, edge: float, radius: float)
     if statistical:
         return f"{left}: the model differs from the bench, and only more modes average that out"
     terms = systematic_terms(fit.alternatives, fit.residual_fraction, fit.sigma)
-    most = max(terms, key=lambda term: edge_move(term.sigma, radius), default=None)
-    if most is None or edge_move(most.sigma, radius) < 0.5 * edge:
+    most = max(terms, key=lambda term: edge_move(term[1], radius), default=None)
+    if most is None or edge_move(most[1], radius) < 0.5 * edge:
         return f"{known}; the model differs from the bench, and more averaging does not help"
-    other = most.alternative
+    other, _ = most
     return (
         f"{known}; the matrix does not exclude {other.words}, which would move the registration "
         f"by {format_move(other.moved)}"

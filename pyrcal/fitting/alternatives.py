@@ -7,25 +7,25 @@ free are fixed to the file's values, and quantities that it fixed are fitted.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.fitting.disjoint_sets import SIGNIFICANT
+from pyrcal.fitting.comparison import MIN_EXPLAINED, OTHER_SHARE, Alternative, FitSubset
 from pyrcal.fitting.instrument_checks import (
-    MIN_EXPLAINED,
-    UNKNOWN_IMAGES,
-    AlternativeInstrument,
-    FileValuesFit,
     FoundOptic,
+    may_compensate,
+    try_free_images,
+    try_instruments,
 )
+from pyrcal.fitting.left_over import find_arms, find_border
 from pyrcal.fitting.methods import Settled
 from pyrcal.fitting.models import FAR_PREFERRED_SHARE, PREFERRED_SHARE, Optic
-from pyrcal.fitting.pupil_checks import FitSubset, Lead, TriedPupil, gain_maps
+from pyrcal.fitting.pupil_checks import gain_maps, try_pupils
 from pyrcal.fitting.solver import refine
-from pyrcal.fitting.uncertainty import OTHER_SHARE, Uncertainty
+from pyrcal.fitting.uncertainty import Uncertainty
 from service.model.kinds import SignalKind, Stop
 from service.model.misregistration import BOUNDARY_SCALE
 from service.model.sensors.registry import kind_of
@@ -38,17 +38,6 @@ NOTABLE_OFFSET_SUBAP = 0.05
 NOTABLE_OFFSET_SHARE = 0.2
 """Smallest pupil offset that is reported, over the shift. If the mirror is the stop, on the
 diffractive telescope a tenth of the shift looks like an offset."""
-
-MIN_OFFSET_EXPLAINED = 0.01
-"""RMS share of the signal that a pupil offset must explain to be preferred."""
-
-EXCLUSION_SIGMA = 3.0
-"""Number of σ by which an alternative must be worse to be excluded."""
-
-EXCLUSION_RATIO = 10.0
-"""χ² over that of the fit above which an alternative is excluded whatever its scatter. Misfit that
-is concentrated in a few modes or at one side scatters as much as it grows: Gaussian influence
-functions left 94 times the χ² of a matrix of HCIPy, and with 2.9 σ they made σ ten times wider."""
 
 NOTABLE_GAIN_RATIO = 0.02
 """Smallest reported ratio of the gains of Sx and Sy, less 1."""
@@ -76,68 +65,29 @@ _WORST_SHARE = 0.1
 """Share of the modes, those with the largest residual, that one alternative leaves out."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Alternative:
-    """Another explanation of the matrix, or another weighting of it."""
+def find_alternatives(
+    few: FitSubset, optics: Sequence[FoundOptic], without: Alternative | None
+) -> tuple[Alternative, ...]:
+    """Return every alternative that was tried, preferred ones first.
 
-    words: str
-    """Description of the change, in the notation of the instrument file if it has a key."""
-
-    share: float | None
-    """χ² that it leaves over that of the fit, to first order; None if weights or modes differ, so
-    that the two are not comparable."""
-
-    moved: Array
-    """``(4,)`` change of the registration, numeric units."""
-
-    preferred: bool = False
-    """True if it explains the matrix better, by χ²."""
-
-    undecided: bool = False
-    """True if the matrix does not distinguish it from the fit."""
-
-    key: str = ""
-    """Entry for the instrument file, or option of the command; empty if there is none."""
-
-    counts: bool = False
-    """True if its change of α is an error of the registration until it is excluded; False for other
-    weights and sets of modes."""
-
-    is_number: bool = False
-    """True if it is a number at its best-fitting value, for which the fit has another value."""
-
-    def weight(self, residual_fraction: float) -> float:
-        """Return the weight of the square of its change of α in σ, 0 to 1.
-
-        An explanation that the matrix prefers counts in full, one that is not excluded by its
-        probability, which is smaller the larger its misfit is. Models of one instrument differ by
-        ``MIN_EXPLAINED`` of the signal, and any additional fitted number explains some of that by
-        coincidence: smaller improvements are no evidence for it.
-        """
-        if not self.counts or not (self.preferred or self.undecided):
-            return 0.0
-        explained = residual_fraction
-        if self.is_number and self.share is not None:
-            explained *= float(np.sqrt(max(1.0 - self.share, 0.0)))
-        worse = 1.0 if self.share is None else max(self.share, 1.0)
-        probability = 1.0 if self.preferred else OTHER_SHARE / worse**2
-        return probability * min(1.0, explained / MIN_EXPLAINED) ** 2
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SigmaTerm:
-    """An alternative that counts in the systematic part of σ."""
-
-    alternative: Alternative
-
-    sigma: Array
-    """``(4,)`` 1 σ that it adds, numeric units."""
+    Parameters
+    ----------
+    few
+        A subset of the fit's modes on the coarse grid.
+    optics, without
+        Fitted optical quantities, and the fit with the file's values if they differ.
+    """
+    found = [one for trial in TRIALS for one in _yield_determined(trial(few))]
+    found += _yield_determined(_try_file_optics(few.settled, optics, without))
+    # A nearly singular alternative gives no finite step and would make σ infinite.
+    sure = [one for one in found if np.all(np.isfinite(one.moved))]
+    return tuple(sorted(sure, key=lambda one: (not one.preferred, not one.undecided, one.misfit)))
 
 
 def systematic_terms(
     tried: Sequence[Alternative], residual_fraction: float, sigma: Array
-) -> tuple[SigmaTerm, ...]:
-    """Return the alternatives that enter σ, the largest contribution first.
+) -> list[tuple[Alternative, Array]]:
+    """Return the alternatives that enter σ and what each adds, the largest contribution first.
 
     Parameters
     ----------
@@ -147,57 +97,17 @@ def systematic_terms(
         RMS of the residual over the RMS of the measurement.
     sigma
         ``(4,)`` 1 σ of the registration.
+
+    Returns
+    -------
+    Each alternative with the ``(4,)`` 1 σ that it adds, numeric units.
     """
     terms = [
-        SigmaTerm(alternative=one, sigma=np.sqrt(weight) * np.abs(one.moved))
+        (one, np.sqrt(weight) * np.abs(one.moved))
         for one in tried
         if (weight := one.weight(residual_fraction)) > 0.0
     ]
-    return tuple(sorted(terms, key=lambda term: -float(np.max(term.sigma / sigma))))
-
-
-def find_alternatives(
-    settled: Settled,
-    few: FitSubset,
-    others: tuple[AlternativeInstrument, ...],
-    pupils: tuple[TriedPupil, ...],
-    optics: tuple[FoundOptic, ...],
-    without: FileValuesFit | None,
-    arms_deg: tuple[float, ...] = (),
-) -> tuple[Alternative, ...]:
-    """Return every alternative that was tried, preferred ones first.
-
-    Parameters
-    ----------
-    settled, few
-        The fit, and a subset of its modes on the coarse grid.
-    others
-        Other instruments, as tried for the verdict.
-    pupils
-        Other obscurations and diameters.
-    optics, without
-        Fitted optical quantities, and the fit with the file's values if they differ.
-    arms_deg
-        Directions of lines in the residual, degrees.
-    """
-    pupil_alternatives = (_describe_pupil(one, others) for one in pupils)
-    found = [
-        *(_describe_rival(one, pupils) for one in others),
-        *(one for one in pupil_alternatives if one is not None),
-        *_yield_determined(_try_off_centre(few)),
-        *_yield_determined(_try_separate_gains(few)),
-        *_yield_determined(_try_uneven_light(few)),
-        *_yield_determined(_try_spiders(few, arms_deg)),
-        *_yield_determined(_try_file_optics(settled, optics, without)),
-        *_yield_determined(_try_fixed_nuisances(settled)),
-        *_yield_determined(_try_images_in_place(settled)),
-        *_yield_determined(_try_equal_weights(settled)),
-        *_yield_determined(_try_mode_subsets(settled)),
-        *_yield_determined(_try_without_border(few)),
-    ]
-    # A nearly singular alternative gives no finite step and would make σ infinite.
-    sure = [one for one in found if np.all(np.isfinite(one.moved))]
-    return tuple(sorted(sure, key=lambda one: (not one.preferred, not one.undecided, _share(one))))
+    return sorted(terms, key=lambda term: -float(np.max(term[1] / sigma)))
 
 
 def add_alternatives(
@@ -206,7 +116,7 @@ def add_alternatives(
     residual_fraction: float,
     *,
     width: Array,
-    without: FileValuesFit | None,
+    without: Alternative | None,
 ) -> Uncertainty:
     """Return the uncertainty including all alternatives that the data do not exclude.
 
@@ -228,22 +138,19 @@ def add_alternatives(
     moves = [width, *(one.moved for one in tried)]
     shares = [open_share, *(one.weight(residual_fraction) for one in tried)]
     # If the fitted values explain clearly more, the file's values are excluded and add nothing.
-    if without is not None and without.is_undecided:
+    if without is not None and may_compensate(without):
         moves.append(without.moved)
         shares.append(open_share)
     return before.with_moves(np.array(moves), np.array(shares))
 
 
-def find_decentred_pupil(
-    tried: Sequence[Alternative], others: tuple[AlternativeInstrument, ...]
-) -> Alternative | None:
+def find_decentred_pupil(tried: Sequence[Alternative]) -> Alternative | None:
     """Return the preferred alternative with a decentred pupil, or None.
 
     It is only considered if another stop is preferred, because that displaces the pupil as well.
     """
-    if not any(one.preferred and "stop" in one.change.words for one in others):
-        return None
-    return next((one for one in tried if one.preferred and one.key == CENTRED_KEY), None)
+    preferred = {one.key: one for one in tried if one.preferred}
+    return preferred.get(CENTRED_KEY) if any(key.startswith("stop") for key in preferred) else None
 
 
 def _yield_determined(rivals: Iterator[Alternative]) -> Iterator[Alternative]:
@@ -252,10 +159,6 @@ def _yield_determined(rivals: Iterator[Alternative]) -> Iterator[Alternative]:
         yield from rivals
     except np.linalg.LinAlgError:
         return
-
-
-def _share(one: Alternative) -> float:
-    return float("inf") if one.share is None else one.share
 
 
 def describe_preference(one: Alternative, sigma: Array) -> str:
@@ -274,44 +177,7 @@ def format_move(moved: Array) -> str:
     return f"{x:+.2g}, {y:+.2g} subapertures, {turn:+.2g} deg, {size:+.2g}"
 
 
-# --- other instruments
-
-
-def _describe_rival(rival: AlternativeInstrument, pupils: tuple[TriedPupil, ...]) -> Alternative:
-    return Alternative(
-        words=rival.change.words,
-        share=rival.share,
-        moved=rival.moved,
-        preferred=rival.preferred,
-        undecided=not rival.preferred and is_open(rival.lead),
-        key=rival.change.words,
-        counts=True,
-        is_number=rival.change.words in {UNKNOWN_IMAGES, *(one.words for one in pupils)},
-    )
-
-
-def _describe_pupil(
-    one: TriedPupil, others: tuple[AlternativeInstrument, ...]
-) -> Alternative | None:
-    """Return an alternative with another pupil, or None if it is already in ``others``."""
-    # Listed once, or its change of α would enter σ twice.
-    if any(one.words == rival.change.words for rival in others):
-        return None
-    # Never preferred here: a pupil that explains enough is among the other instruments.
-    return Alternative(
-        words=one.words,
-        share=one.lead.share,
-        moved=one.moved,
-        undecided=is_open(one.lead),
-        key=one.words,
-        counts=True,
-        is_number=True,
-    )
-
-
-def is_open(lead: Lead) -> bool:
-    """Return True if an alternative is not excluded: it is not significantly worse."""
-    return lead.share < EXCLUSION_RATIO and lead.significance > -EXCLUSION_SIGMA
+# --- other numbers of the instrument
 
 
 def _try_off_centre(few: FitSubset) -> Iterator[Alternative]:
@@ -323,27 +189,20 @@ def _try_off_centre(few: FitSubset) -> Iterator[Alternative]:
     # Where the border cuts no subaperture, a displaced pupil changes no slope.
     if not all(few.tells(few.own, rate) for rate in rates):
         return
-    (x, y), lead, moved = _fit_with_rates(few, *rates)
-    explained = few.residual_fraction * float(np.sqrt(max(1.0 - lead.share, 0.0)))
-    off = float(np.hypot(x, y))
+    found = few.compare(few.own, *rates)
+    x, y = few.step(few.own, *rates)[-2:]
     # With the mirror as stop the pupil moves with it, and part of that shift looks like an offset.
-    shift = float(np.hypot(*alpha.vector[:2])) if about.stop is Stop.MIRROR else 0.0
-    notable = max(NOTABLE_OFFSET_SUBAP, NOTABLE_OFFSET_SHARE * shift)
-    middle = "mirror's" if about.stop is Stop.MIRROR else "sensor's"
-    yield Alternative(
-        words=f"the pupil {x:+.2f}, {y:+.2f} subapertures off the {middle} middle",
-        share=lead.share,
-        moved=moved,
-        preferred=bool(
-            lead.share < FAR_PREFERRED_SHARE
-            and lead.significance > SIGNIFICANT
-            and off > notable
-            and explained > MIN_OFFSET_EXPLAINED
-        ),
-        undecided=is_open(lead),
+    is_mirror = about.stop is Stop.MIRROR
+    shift = float(np.hypot(*alpha.vector[:2])) if is_mirror else 0.0
+    words = f"the pupil {x:+.2f}, {y:+.2f} subapertures off the"
+    yield few.judge(
+        found,
+        f"{words} {'mirror' if is_mirror else 'sensor'}'s middle",
+        FAR_PREFERRED_SHARE,
         # With the mirror as stop the pupil is where the mirror is: nothing can be centred.
-        key="" if about.stop is Stop.MIRROR else CENTRED_KEY,
-        counts=True,
+        key="" if is_mirror else CENTRED_KEY,
+        notable=np.hypot(x, y) > max(NOTABLE_OFFSET_SUBAP, NOTABLE_OFFSET_SHARE * shift),
+        min_explained=MIN_EXPLAINED,
         is_number=True,
     )
 
@@ -355,21 +214,15 @@ def _try_separate_gains(few: FitSubset) -> Iterator[Alternative]:
         return
     half = len(few.own) // 2
     rate = np.concatenate([few.own[:half], -few.own[half:]])
-    (value,), lead, moved = _fit_with_rates(few, rate)
+    value = few.step(few.own, rate)[-1]
     # The unknown raises Sx and lowers Sy by the same share, so the ratio has it twice.
     apart = float((1.0 + value) / (1.0 - value)) - 1.0
     side = "stronger" if apart > 0.0 else "weaker"
-    yield Alternative(
-        words=f"Sx {abs(apart):.1%} {side} than Sy",
-        share=lead.share,
-        moved=moved,
-        preferred=bool(
-            lead.share < PREFERRED_SHARE
-            and lead.significance > SIGNIFICANT
-            and abs(apart) > NOTABLE_GAIN_RATIO
-        ),
-        undecided=is_open(lead),
-        counts=True,
+    yield few.judge(
+        few.compare(few.own, rate),
+        f"Sx {abs(apart):.1%} {side} than Sy",
+        PREFERRED_SHARE,
+        notable=abs(apart) > NOTABLE_GAIN_RATIO,
         is_number=True,
     )
 
@@ -377,110 +230,71 @@ def _try_separate_gains(few: FitSubset) -> Iterator[Alternative]:
 def _try_uneven_light(few: FitSubset) -> Iterator[Alternative]:
     """Yield the alternative with a smooth gain over the pupil, common to all modes."""
     maps = [pattern[:, None] * few.own for pattern in gain_maps(few)]
-    _, lead, moved = _fit_with_rates(few, *maps)
-    yield Alternative(
-        words=f"uneven light ({LIGHT_KEY})",
-        share=lead.share,
-        moved=moved,
-        undecided=is_open(lead),
-        key=LIGHT_KEY,
-        counts=True,
-        is_number=True,
-    )
+    words = f"uneven light ({LIGHT_KEY})"
+    yield few.judge(few.compare(few.own, *maps), words, key=LIGHT_KEY, is_number=True)
 
 
-def _try_spiders(few: FitSubset, arms_deg: tuple[float, ...]) -> Iterator[Alternative]:
+def _try_spiders(few: FitSubset) -> Iterator[Alternative]:
     """Yield the alternative with spider arms, if the residual shows lines like arms."""
     about = few.models.instrument
     # A file with spiders or with a pupil map already contains the shadows.
-    if not arms_deg or about.spiders_deg or about.pupil is not None:
+    if about.spiders_deg or about.pupil is not None:
+        return
+    arms_deg = tuple(arm.angle_deg for arm in find_arms(few.settled.residual_map))
+    if not arms_deg:
         return
     width_m = ARM_SUBAP * about.subaperture_m
-    shaded = few.matrix(few.of(replace(about, spiders_m=width_m, spiders_deg=arms_deg)))
-    rate = shaded - few.own
+    rate = few.matrix_of(replace(about, spiders_m=width_m, spiders_deg=arms_deg)) - few.own
     if not few.tells(few.own, rate):
         return
-    (width,), lead, moved = _fit_with_rates(few, rate)
+    width = few.step(few.own, rate)[-1]
     if width <= 0.0:
         return  # a negative width means brighter lines, which are no shadows
     angles = ", ".join(f"{angle:.0f}" for angle in arms_deg)
     words = f"spiders_m = {width * width_m:.2g}, spiders_deg = [{angles}]"
-    yield Alternative(
-        words=words,
-        share=lead.share,
-        moved=moved,
-        preferred=bool(lead.share < PREFERRED_SHARE and lead.significance > SIGNIFICANT),
-        undecided=is_open(lead),
-        key=words,
-        counts=True,
-        is_number=True,
-    )
-
-
-def _fit_with_rates(few: FitSubset, *rates: Array) -> tuple[Array, Lead, Array]:
-    """Return the values of further unknowns, their improvement, and the change of α."""
-    # Both steps are from the same grid, so that its error cancels in their difference.
-    step = few.step(few.own, *rates)
-    return step[-len(rates) :], few.lead(few.own, *rates), step[:4] - few.step(few.own)[:4]
-
-
-def _ratio(chi: float, own: float) -> float:
-    """Return χ² over that of the fit; 1 if the fit leaves no residual."""
-    return chi / own if own > 0.0 else 1.0
+    found = few.compare(few.own, rate)
+    yield few.judge(found, words, PREFERRED_SHARE, key=words, is_number=True)
 
 
 # --- nuisances of the fit, fixed
 
 
 def _try_file_optics(
-    settled: Settled, optics: tuple[FoundOptic, ...], without: FileValuesFit | None
+    settled: Settled, optics: Sequence[FoundOptic], without: Alternative | None
 ) -> Iterator[Alternative]:
     """Yield coupling and modulation as in the file, and a 10 % larger modulation."""
-    # Values marked as unknown in the file cannot be restored, so only stated ones are named.
-    stated = [one for one in optics if one.reported is not None]
     if without is not None:
-        words = (
-            " and ".join(f"{one.key} = {one.reported:.3g}" for one in stated)
-            or "the values of the file"
-        )
-        yield Alternative(words=words, share=1.0 / max(without.share, 1e-12), moved=without.moved)
-    first = settled.nuisances.first_optic
-    for place, one in enumerate(optics, first):
+        yield without
+    for place, one in enumerate(optics, settled.nuisances.first_optic):
         # The file's values were not fitted if none differs notably. To first order they are then
         # reached along the valley of χ², which takes no matrix.
         if without is None and one.reported is not None:
-            share, moved = _fix_nuisances(settled, {place: -one.change})
-            near = share < 1.0 / PREFERRED_SHARE
             words = f"{one.key} = {one.reported:.3g}, not fitted"
-            yield Alternative(words=words, share=share, moved=moved, undecided=near)
+            yield _fix_nuisances(settled, words, {place: -one.change})
         if one.optic is Optic.SENSOR and one.found is not None:
-            share, moved = _fix_nuisances(settled, {place: float(np.log1p(MODULATION_STEP))})
             words = f"{one.key} = {one.found * (1.0 + MODULATION_STEP):.3g}"
-            near = share < 1.0 / PREFERRED_SHARE
-            yield Alternative(words=words, share=share, moved=moved, undecided=near)
+            yield _fix_nuisances(settled, words, {place: float(np.log1p(MODULATION_STEP))})
 
 
-def _try_fixed_nuisances(settled: Settled) -> Iterator[Alternative]:
+def _try_fixed_nuisances(few: FitSubset) -> Iterator[Alternative]:
     """Yield alternatives with nominal slope axes and without anamorphosis."""
-    nuisances, values = settled.nuisances, settled.solution.nuisances
-    distance = nuisances.from_prior(values)
-    groups = [("the slopes' axes not turned", [0])]
+    nuisances, settled = few.settled.nuisances, few.settled
+    distance = nuisances.from_prior(settled.solution.nuisances)
+    yield _fix_nuisances(settled, "the slopes' axes not turned", {0: -float(distance[0])})
     if nuisances.anamorphosis:
         # Both stretches together, because one alone depends on the direction of the axes.
-        groups.append(("no anamorphosis fitted", [1, 2]))
-    for words, places in groups:
-        share, moved = _fix_nuisances(settled, {place: -float(distance[place]) for place in places})
-        near = share < 1.0 / PREFERRED_SHARE
-        yield Alternative(words=words, share=share, moved=moved, undecided=near)
+        steps = {place: -float(distance[place]) for place in (1, 2)}
+        yield _fix_nuisances(settled, "no anamorphosis fitted", steps)
 
 
-def _try_images_in_place(settled: Settled) -> Iterator[Alternative]:
+def _try_images_in_place(few: FitSubset) -> Iterator[Alternative]:
     """Yield pupil images that are not displaced, where the fit displaced them beyond belief.
 
     Such displacements make up for errors of the model, and there are several that do so about as
     well: on AO188 they reach 3 pixels, explain 3 % of the misfit and move a shift by 0.03
     subapertures.
     """
+    settled = few.settled
     nuisances, solution, about = settled.nuisances, settled.solution, settled.models.instrument
     if not len(nuisances.images):
         return
@@ -503,8 +317,13 @@ def _try_images_in_place(settled: Settled) -> Iterator[Alternative]:
     )
 
 
-def _fix_nuisances(settled: Settled, steps: dict[int, float]) -> tuple[float, Array]:
-    """Return χ² over that of the fit, and the change of α, with nuisances fixed at offsets."""
+def _ratio(chi: float, own: float) -> float:
+    """Return χ² over that of the fit; 1 if the fit leaves no residual."""
+    return chi / own if own > 0.0 else 1.0
+
+
+def _fix_nuisances(settled: Settled, words: str, steps: dict[int, float]) -> Alternative:
+    """Return the alternative with nuisances fixed at offsets."""
     seen = settled.solution.projection
     noise = seen.chi / max(seen.residual.size - len(seen.gains), 1)
     normal = seen.normal
@@ -518,36 +337,32 @@ def _fix_nuisances(settled: Settled, steps: dict[int, float]) -> tuple[float, Ar
         held[np.ix_(free, free)], held[np.ix_(free, places)] @ step[places]
     )
     # Near the minimum χ² grows by the quadratic form. The prior shapes the step but is no misfit.
-    return 1.0 + _ratio(float(step @ normal @ step), seen.chi), step[:4]
+    share = 1.0 + _ratio(float(step @ normal @ step), seen.chi)
+    near = share < 1.0 / PREFERRED_SHARE
+    return Alternative(words=words, share=share, moved=step[:4], undecided=near)
 
 
 # --- other weights, modes and slopes
 
 
-def _try_equal_weights(settled: Settled) -> Iterator[Alternative]:
-    """Yield the alternative in which every slope has the same noise at the same stroke."""
-    alike = np.full(len(settled.target.weights), np.mean(settled.target.weights))
-    yield Alternative(
-        words="every slope with the same weight",
-        share=None,
-        moved=_move_with_weights(settled, alike),
-    )
-
-
-def _try_mode_subsets(settled: Settled) -> Iterator[Alternative]:
-    """Yield each half of the modes, and all modes but those with the largest residual."""
-    n_modes = settled.target.n_modes
+def _try_other_weights(few: FitSubset) -> Iterator[Alternative]:
+    """Yield equal weights of all slopes, each half of the modes, and the modes that fit best."""
+    settled = few.settled
+    target, n_modes = settled.target, settled.target.n_modes
+    # Every slope has the same noise at the same stroke.
+    alike = np.full(n_modes, np.mean(target.weights))
+    found = {"every slope with the same weight": alike}
     # Halves by mode number, because columns may be in any order.
-    order, numbers = np.argsort(settled.target.modes), np.arange(n_modes)
-    worst = np.argsort(settled.by_mode)[: n_modes - int(np.ceil(_WORST_SHARE * n_modes))]
+    order = np.argsort(target.modes)
+    best = np.argsort(settled.by_mode)[: n_modes - int(np.ceil(_WORST_SHARE * n_modes))]
     for words, kept in (
         ("the lower half of the modes", order[: (n_modes + 1) // 2]),
         ("the upper half of the modes", order[n_modes // 2 :]),
-        ("without the tenth of the modes that fits worst", worst),
+        ("without the tenth of the modes that fits worst", best),
     ):
-        if len(kept) < _MIN_MODES:
-            continue
-        weights = np.where(np.isin(numbers, kept), settled.target.weights, 0.0)
+        if len(kept) >= _MIN_MODES:
+            found[words] = np.where(np.isin(np.arange(n_modes), kept), target.weights, 0.0)
+    for words, weights in found.items():
         yield Alternative(words=words, share=None, moved=_move_with_weights(settled, weights))
 
 
@@ -579,9 +394,17 @@ def _try_without_border(few: FitSubset) -> Iterator[Alternative]:
     yield Alternative(words="without the border of the pupil", share=None, moved=moved[:4])
 
 
-def find_border(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the valid subapertures ``(n, n)`` that have an invalid neighbour."""
-    # Padded with False: subapertures at the edge of the grid are at the border.
-    wide = np.pad(valid, 1)
-    inside = wide[:-2, 1:-1] & wide[2:, 1:-1] & wide[1:-1, :-2] & wide[1:-1, 2:]
-    return np.asarray(valid & ~inside)
+TRIALS: tuple[Callable[[FitSubset], Iterator[Alternative]], ...] = (
+    try_pupils,
+    try_instruments,
+    try_free_images,
+    _try_off_centre,
+    _try_separate_gains,
+    _try_uneven_light,
+    _try_spiders,
+    _try_fixed_nuisances,
+    _try_images_in_place,
+    _try_other_weights,
+    _try_without_border,
+)
+"""What is tried on every fit; each yields none, one or several alternatives."""

@@ -268,11 +268,13 @@ def _slopes(
         raise MatrixError(
             f'{found}, expected detector frames (n_modes, ny, nx): wfs.input is "frames"'
         )
-    if recorded.flux_frame is None:
-        raise MatrixError(
-            f"{recorded.where}: found no {FLUX_FRAME} next to it, expected a mean detector frame "
-            "(ny, nx) in the same counts"
-        )
     kind, flux_frame = kind_of(instrument), recorded.flux_frame
+    if flux_frame is None:
+        if not kind.knows_mean_light(instrument):
+            raise MatrixError(
+                f"{recorded.where}: found no {FLUX_FRAME} next to it, expected a mean detector "
+                "frame (ny, nx) in the same counts"
+            )
+        return kind.signals_of_frames(instrument, recorded.values, None), (), 0.0
     located, remarks, sigma = kind.locate_images(instrument, flux_frame)
     return kind.signals_of_frames(located, recorded.values, flux_frame), remarks, sigma

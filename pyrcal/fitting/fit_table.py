@@ -139,8 +139,7 @@ def _alternative_lines(fit: Fit) -> Iterator[str]:
     yield f"{'alternatives':20s}{len(tried)} tried, {named}"
     open_ = [one for one in tried if one.undecided]
     weights = [one for one in tried if one.share is None]
-    for term in systematic_terms(tried, fit.residual_fraction, sigma)[:_MAX_TERMS]:
-        one = term.alternative
+    for one, _ in systematic_terms(tried, fit.residual_fraction, sigma)[:_MAX_TERMS]:
         yield f"{'  in systematic':20s}{one.words}: {format_move(one.moved)}"
     for words, group in (
         ("not excluded: would move alpha by up to", open_),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.fitting.alternatives import Alternative
+from pyrcal.fitting.comparison import Alternative
 from pyrcal.fitting.control_check import ReconstructorVerdict
 from pyrcal.fitting.disjoint_sets import DisjointSets, Distortion
 from pyrcal.fitting.fitted_matrix import FittedMatrix

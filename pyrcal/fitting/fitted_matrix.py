@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.fitting.left_over import LeftOver
+from pyrcal.fitting.left_over import ResidualLocation
 from pyrcal.fitting.methods import ScanStep
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import Determination
@@ -55,7 +55,7 @@ class FittedMatrix(Determination):
     valid: NDArray[np.bool_]
     """``(n, n)`` [y, x] mask of the subapertures in both, in the axes of conventions.md."""
 
-    left_over: LeftOver | None = None
+    left_over: ResidualLocation | None = None
     """Location of the residual in pupil and modes; None if it was not computed."""
 
     recommendation: str = ""

@@ -7,16 +7,15 @@ and so are other pupils.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.fitting.disjoint_sets import SIGNIFICANT
+from pyrcal.fitting.comparison import MIN_EXPLAINED, Alternative, FitSubset
 from pyrcal.fitting.methods import SEARCH_RESIDUAL, Settled, settle
-from pyrcal.fitting.models import FAR_PREFERRED_SHARE, FitModels, InstrumentChange, Optic
-from pyrcal.fitting.pupil_checks import FitSubset, Lead, TriedPupil
+from pyrcal.fitting.models import FAR_PREFERRED_SHARE, FitModels, Optic
 from pyrcal.fitting.solver import image_patterns, is_blurring, refine
 from pyrcal.fitting.uncertainty import Uncertainty
 from service.model.sensors.registry import kind_of
@@ -32,11 +31,6 @@ UNKNOWN_IMAGES = 'image_offsets_px = "unknown"'
 NOTABLE_CHANGE = 0.03
 """Smallest difference of a logarithm from the file's value that is reported."""
 
-MIN_EXPLAINED = 0.01
-"""RMS share of the signal that another instrument must explain to be preferred. Models of one
-instrument differ by about as much: with HCIPy's lenslets 1.0 % is left over, and another stop
-explains 0.7 % by coincidence with model errors."""
-
 UNDECIDED_SHARE = 0.3
 """Share of χ² left by another coupling or modulation above which it may compensate something else.
 With a wrong modulation in the file less than 0.05 was left; with push-only pokes of 200 nm 0.6 was
@@ -47,41 +41,6 @@ NO_SENSOR_NUMBER_LIMIT = 0.1
 
 NOTABLE_SIGMA = 3.0
 """Smallest such difference that is reported, in units of its own σ."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class AlternativeInstrument:
-    """An alternative instrument that might explain the matrix."""
-
-    change: InstrumentChange
-    """Change of the instrument file."""
-
-    lead: Lead
-    """Improvement of the misfit over the instrument of the file."""
-
-    moved: Array
-    """``(4,)`` change of the registration with this instrument, numeric units."""
-
-    explained: float
-    """RMS share of the signal that it explains and the file's instrument does not."""
-
-    @property
-    def share(self) -> float:
-        """χ² that it leaves, over that of the file's instrument."""
-        return self.lead.share
-
-    @property
-    def preferred(self) -> bool:
-        """True if the matrix prefers it to the instrument of the file.
-
-        Its residual must be clearly smaller, by more than chance and by more than models of one
-        instrument differ.
-        """
-        return (
-            self.share < self.change.max_misfit_ratio
-            and self.lead.significance > SIGNIFICANT
-            and self.explained > MIN_EXPLAINED
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,62 +99,25 @@ class FoundOptic:
         return not unknown and abs(self.change) > max(NOTABLE_CHANGE, NOTABLE_SIGMA * self.sigma)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FileValuesFit:
-    """The fit with coupling and modulation fixed to the values of the instrument file."""
-
-    share: float
-    """χ² with fitted values, over that with the file's values."""
-
-    moved: Array
-    """``(4,)`` change of the registration with the file's values, numeric units."""
-
-    @property
-    def is_undecided(self) -> bool:
-        """True if the fitted values explain too little to justify a correction of the file.
-
-        Pokes of a tenth of a wavelength, or push-only pokes, look like another modulation.
-        """
-        return self.share > UNDECIDED_SHARE
-
-
-def compare_instruments(
-    settled: Settled, few: FitSubset, pupils: tuple[TriedPupil, ...]
-) -> tuple[AlternativeInstrument, ...]:
-    """Return alternative instruments, sorted by how well each explains the matrix.
+def try_instruments(few: FitSubset) -> Iterator[Alternative]:
+    """Yield other stops, normalisations and kinds of influence functions.
 
     Each has its own registration, coupling and sensor number, fitted to first order.
     """
-
-    def share_explained(lead: Lead) -> float:
-        return float(settled.share * np.sqrt(max(1.0 - lead.share, 0.0)))
-
-    found = [
-        AlternativeInstrument(
-            change=InstrumentChange(words=one.words, max_misfit_ratio=FAR_PREFERRED_SHARE),
-            lead=one.lead,
-            moved=one.moved,
-            explained=share_explained(one.lead),
+    for words, (max_share, models) in few.models.other_instruments.items():
+        yield few.judge(
+            few.compare(few.matrix(models)),
+            words,
+            max_share,
+            key=words,
+            min_explained=MIN_EXPLAINED,
+            is_instrument=True,
         )
-        for one in pupils
-        if one.explains
-    ]
-    for change, other in settled.models.other_instruments.items():
-        matrix = few.matrix(other)
-        lead = few.lead(matrix)
-        moved = few.step(matrix)[:4] - few.step(few.own)[:4]
-        found.append(
-            AlternativeInstrument(
-                change=change, lead=lead, moved=moved, explained=share_explained(lead)
-            )
-        )
-    found += _try_free_images(settled, few)
-    # Changes have different limits, so each is ranked by its own.
-    return tuple(sorted(found, key=lambda one: one.share / one.change.max_misfit_ratio))
 
 
-def _try_free_images(settled: Settled, few: FitSubset) -> Iterator[AlternativeInstrument]:
+def try_free_images(few: FitSubset) -> Iterator[Alternative]:
     """Yield the fit with fitted pupil images, if the file states where they are."""
+    settled = few.settled
     about = settled.models.instrument
     other = kind_of(about).without_image_places(about)
     if other is None or len(settled.nuisances.images):
@@ -209,30 +131,33 @@ def _try_free_images(settled: Settled, few: FitSubset) -> Iterator[AlternativeIn
     rates = nuisances.combine_images(few.model.image_derivatives(few.here), few.derivatives)
     # To first order first. Blurs have no effect to first order, and displacements never only blur.
     seen = [rate for one, rate in zip(patterns, rates, strict=True) if not is_blurring(one)]
-    lead = few.lead(few.own, *seen)
-    moved = few.step(few.own, *seen)[:4] - few.step(few.own)[:4]
-    if settled.share * np.sqrt(max(1.0 - lead.share, 0.0)) > MIN_EXPLAINED:
+    found = few.compare(few.own, *seen)
+    if found.explained(settled.share) > MIN_EXPLAINED:
         models, before = replace(settled.models, instrument=other), settled.solution
         after = settle(models, settled.target, before.alpha, nuisances).solution
         share = after.projection.chi / before.projection.chi
         # the fit may end where a blur has the wrong sign
-        if after.converged and share < lead.share:
-            lead, moved = replace(lead, share=share), after.vector - before.vector
-    yield AlternativeInstrument(
-        change=InstrumentChange(words=UNKNOWN_IMAGES, max_misfit_ratio=FAR_PREFERRED_SHARE),
-        lead=lead,
-        moved=moved,
-        explained=settled.share * float(np.sqrt(max(1.0 - lead.share, 0.0))),
+        if after.converged and share < found.misfit:
+            found = replace(found, share=share, moved=after.vector - before.vector)
+    yield few.judge(
+        found,
+        UNKNOWN_IMAGES,
+        FAR_PREFERRED_SHARE,
+        key=UNKNOWN_IMAGES,
+        min_explained=MIN_EXPLAINED,
+        is_number=True,
+        is_instrument=True,
     )
 
 
-def estimate_width_effect(settled: Settled, few: FitSubset) -> Array:
+def estimate_width_effect(few: FitSubset) -> Array:
     """Return the change of α for a width of influence functions that is not fitted, ``(4,)``.
 
     Influence functions from a table or of a thin plate have no coupling. The change enters σ only
     and does not correct α: on the diffractive telescope, whose mirror is of another kind, the
     correction was not closer to the truth.
     """
+    settled = few.settled
     # A fitted coupling already follows the width.
     if Optic.WIDTH in settled.models.optics:
         return np.zeros(4)
@@ -268,7 +193,9 @@ def list_optics(models: FitModels, settled: Settled, sure: Uncertainty) -> tuple
     return tuple(found)
 
 
-def fit_file_values(models: FitModels, settled: Settled) -> FileValuesFit:
+def fit_file_values(
+    models: FitModels, settled: Settled, optics: Sequence[FoundOptic]
+) -> Alternative:
     """Return the fit with coupling and modulation fixed to those of the file's ``models``.
 
     Both are compared on the coarse grid, unless so little is left over that its own error counts.
@@ -296,6 +223,19 @@ def fit_file_values(models: FitModels, settled: Settled) -> FileValuesFit:
         nothing,
         decides=models.cheap if coarse else models.fine,
     )
-    return FileValuesFit(
-        share=found.projection.chi / there.projection.chi, moved=there.vector - found.vector
+    # Values marked as unknown in the file cannot be restored, so only stated ones are named.
+    stated = [f"{one.key} = {one.reported:.3g}" for one in optics if one.reported is not None]
+    left = there.projection.chi
+    return Alternative(
+        words=" and ".join(stated) or "the values of the file",
+        share=left / max(found.projection.chi, 1e-12 * left),
+        moved=there.vector - found.vector,
     )
+
+
+def may_compensate(with_file_values: Alternative) -> bool:
+    """Return True if fitted values explain too little to justify a correction of the file.
+
+    Pokes of a tenth of a wavelength, or push-only pokes, look like another modulation.
+    """
+    return with_file_values.misfit * UNDECIDED_SHARE < 1.0

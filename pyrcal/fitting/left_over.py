@@ -8,8 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.fitting.alternatives import find_border
-
 Array = NDArray[np.float64]
 
 OUTLIER_RATIO = 5.0
@@ -69,7 +67,7 @@ class Arm:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LeftOver:
+class ResidualLocation:
     """Location of the residual of a fit."""
 
     border: float | None
@@ -140,7 +138,7 @@ class LeftOver:
 
 def locate_residual(
     planes: Array, by_mode: Array, *, valid: NDArray[np.bool_], modes: NDArray[np.intp], size: Array
-) -> LeftOver:
+) -> ResidualLocation:
     """Return the location of a fit's residual.
 
     Parameters
@@ -162,7 +160,7 @@ def locate_residual(
     by_place[known] = np.sqrt(np.mean(squares, axis=0))[known]
     border = find_border(valid)
     at_border, inside = by_place[known & border], by_place[known & ~border]
-    return LeftOver(
+    return ResidualLocation(
         border=float(_rms(at_border) / _rms(inside)) if inside.any() and at_border.any() else None,
         subapertures=tuple(_find_outlying_places(by_place, border)),
         modes=tuple(_find_outlying_modes(by_mode, size, modes)),
@@ -171,6 +169,14 @@ def locate_residual(
         planes=_by_plane(planes),
         gradient=_gradient(by_place),
     )
+
+
+def find_border(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the valid subapertures ``(n, n)`` that have an invalid neighbour."""
+    # Padded with False: subapertures at the edge of the grid are at the border.
+    wide = np.pad(valid, 1)
+    inside = wide[:-2, 1:-1] & wide[2:, 1:-1] & wide[1:-1, :-2] & wide[1:-1, 2:]
+    return np.asarray(valid & ~inside)
 
 
 def _by_plane(planes: Array) -> tuple[float, ...]:

@@ -17,7 +17,7 @@ from pyrcal.fitting.advice import (
     add_explanations,
     add_recommendation,
 )
-from pyrcal.fitting.alternatives import add_alternatives, find_alternatives, find_decentred_pupil
+from pyrcal.fitting.alternatives import add_alternatives, find_alternatives
 from pyrcal.fitting.columns import (
     MAX_SMEAR,
     Smear,
@@ -27,17 +27,16 @@ from pyrcal.fitting.columns import (
     measure_smear,
     remove_smear,
 )
+from pyrcal.fitting.comparison import FitSubset
 from pyrcal.fitting.control_check import GAIN, check_control
-from pyrcal.fitting.disjoint_sets import mode_partitions, pupil_partitions
 from pyrcal.fitting.fitted import Fit, Registration
 from pyrcal.fitting.gain_causes import find_gain_causes
 from pyrcal.fitting.instrument_checks import (
-    compare_instruments,
     estimate_width_effect,
     fit_file_values,
     list_optics,
+    may_compensate,
 )
-from pyrcal.fitting.left_over import find_arms
 from pyrcal.fitting.methods import (
     Landing,
     ScanStep,
@@ -51,16 +50,11 @@ from pyrcal.fitting.methods import (
 from pyrcal.fitting.models import FAR_PREFERRED_SHARE, FitModels
 from pyrcal.fitting.noise import bound_noise_share, measure_structure
 from pyrcal.fitting.origins import Origin, list_origins, list_undetermined_keys
-from pyrcal.fitting.pupil_checks import (
-    MIN_PUPIL_EXPLAINED,
-    FitSubset,
-    try_pupils,
-)
+from pyrcal.fitting.pupil_checks import MIN_PUPIL_EXPLAINED
 from pyrcal.fitting.pupil_width import SeenPupil, compute_responses, measure_pupil
 from pyrcal.fitting.reference import check_reference
 from pyrcal.fitting.remarks import collect_remarks
 from pyrcal.fitting.solver import (
-    STRETCHES,
     Nuisances,
     Solution,
     image_patterns,
@@ -70,11 +64,9 @@ from pyrcal.fitting.uncertainty import (
     LOCAL_MAGNIFICATION_FLOOR,
     MAGNIFICATION_FLOOR,
     WEAK_MODULATION_FLOOR,
+    estimate_uncertainty,
     misplacement_sigma,
     nonlinearity_sigma,
-    pupil_places,
-    pupil_regions,
-    uncertainty,
 )
 from pyrcal.fitting.verdict import FitFindings, judge_fit
 from service.errors import ModelError
@@ -273,7 +265,11 @@ def _fit_usable(
             models, instrument, found, usable, smear, options, report_stage
         )
     report_stage("verdict")
-    fit = _make_fit(models, found, usable, axes_doubt, reported, options)
+    findings = _weigh(models, found, usable, axes_doubt)
+    grounds = _gather_grounds(findings, found, axes_doubt, explain=options.explain)
+    fit = _make_fit(found, usable, findings, grounds, options.gain)
+    fit = _add_notes(fit, found, findings, grounds, models.instrument, reported)
+    fit = (add_explanations if options.explain else add_recommendation)(fit, grounds)
     place = models.instrument.pupil_shift_subap
     if place is not None and instrument.pupil_shift_subap is None:
         words = (
@@ -591,158 +587,102 @@ def _unknown_images(models: FitModels) -> dict[str, Any]:
     }
 
 
-def _make_fit(
-    as_in_file: FitModels,
-    found: _Found,
-    usable: Reference,
-    axes_doubt: AxesDoubt,
-    reported: SlopeRecipe,
-    options: FitOptions,
-) -> Fit:
-    settled = found.settled
-    solution, target, models = settled.solution, settled.target, settled.models
-    nuisances, slopes = settled.nuisances, models.instrument.slopes
-    seen = solution.projection
-    # The registration has no prior, so its distance from one is 0.
-    values = np.concatenate([np.zeros(4), nuisances.from_prior(solution.nuisances)])
-    regions = pupil_regions(target.valid, slopes.kind.n_planes)[target.rows]
-    residual_fraction = settled.share
-    few = FitSubset(settled)
-    pupils = try_pupils(few)
-    others = compare_instruments(settled, few, pupils)
+def _weigh(as_in_file: FitModels, found: _Found, usable: Reference, axes: AxesDoubt) -> FitFindings:
+    """Return what the verdict rests on: σ with all its parts, and other explanations."""
+    settled, solution = found.settled, found.settled.solution
+    target, about, seen = settled.target, settled.models.instrument, solution.projection
     power = np.sum(target.matrix[target.rows] ** 2, axis=0)
-    # The target's columns are divided by the passes, and their noise with them.
-    noise = None if usable.noise is None else usable.noise / usable.passes
-    structured = measure_structure(seen.residual, power, noise)
-    n_planes = slopes.kind.n_planes
-    floor_of_size, floor_words = _magnification_floor(models.instrument)
-    before = uncertainty(
-        seen,
-        values,
-        settled.prior,
-        regions,
-        pupil_places(target.valid, n_planes, models.instrument.wfs.pupil_diameter / 2.0)[
-            target.rows
-        ],
-        dispersed=solution.dispersion,
-        shift_subap=float(np.hypot(*solution.vector[:2])),
-        radius_subap=models.instrument.wfs.pupil_diameter / 2.0,
-        magnification_floor=floor_of_size,
-        residual_fraction=residual_fraction,
-        noise_share=_noise_share(residual_fraction, structured),
-        mode_sets=mode_partitions(target, n_planes, by_actuator=is_by_actuator(models.instrument)),
-        pupil_sets=pupil_partitions(target.valid, n_planes, target.rows),
-        stretches=STRETCHES if nuisances.anamorphosis else None,
-    )
+    structure = measure_structure(seen.residual, power, usable.noise_per_pass)
+    before = estimate_uncertainty(settled, structure, _magnification_floor(about)[0])
     optics = list_optics(as_in_file, settled, before)
-    stroke_known = _stroke_known(models.instrument)
     # This takes further fits, so only if a fitted value differs notably from the file.
-    without = fit_file_values(as_in_file, settled) if any(one.notable for one in optics) else None
-    left_map = _residual_map(found)
-    arms_deg = tuple(arm.angle_deg for arm in find_arms(left_map))
-    tried = find_alternatives(settled, few, others, pupils, optics, without, arms_deg)
+    notable = any(one.notable for one in optics)
+    without = fit_file_values(as_in_file, settled, optics) if notable else None
+    few = FitSubset(settled)
+    tried = find_alternatives(few, optics, without)
     sure = add_alternatives(
-        before, tried, residual_fraction, width=estimate_width_effect(settled, few), without=without
+        before, tried, settled.share, width=estimate_width_effect(few), without=without
     )
-    if found.smear is not None and found.before is not None:
-        by_smear = solution.vector - found.before.vector
-        # The registration moves in proportion to the share that is removed.
-        error = by_smear * found.smear.sigma / found.smear.share
-        sure = sure.with_moves(error[np.newaxis], np.ones(1))
-    # From the structured part of the residual, because noise says nothing about positions.
-    misplaced = _misplacement_sigma(models.instrument, structured)
-    images = nuisances.images.T @ solution.nuisances[nuisances.image_places]
-    # Tilted faces of a pyramid displace its images and also turn the edges between the faces. The
-    # model contains the displacement only.
-    turned = kind_of(models.instrument).turned_edge_sigma(models.instrument, images.reshape(2, 4).T)
-    shifted = usable.place_sigma_subap * np.eye(4)[:2]
-    sure = sure.with_moves(np.array([misplaced, turned, *shifted]), np.ones(4))
-    noise_share = bound_noise_share(seen.residual, solution.matrix[target.rows] * seen.gains)
-    # large pokes look like a wider modulation, which the fit may have taken for the true one
-    weakly_modulated = any(
-        kind_of(about).is_weakly_modulated(about.wfs)
-        for about in (models.instrument, as_in_file.instrument)
-    )
-    if weakly_modulated:
-        beyond = nonlinearity_sigma(residual_fraction, noise_share)
-        sure = sure.with_moves(beyond[np.newaxis], np.ones(1))
-    stretch_sigma = nuisances.stretch_sigma(sure.nuisance_sigma)
     findings = FitFindings(
-        solution=solution,
-        residual_fraction=residual_fraction,
-        structure=structured,
+        settled=settled,
+        structure=structure,
+        noise_share=bound_noise_share(seen.residual, solution.matrix[target.rows] * seen.gains),
         uncertainty=sure,
-        # A σ that already contains the move of an alternative would always cover that move, so the
-        # verdict compares moves with σ before alternatives were added.
         before=before,
-        alternatives=tried,
         landing=found.landing,
-        rivals=others,
-        off_centre=find_decentred_pupil(tried, others),
+        alternatives=tried,
         optics=optics,
         narrow=_find_narrow_pupil(settled),
         with_file_values=without,
-        axes=axes_doubt.reason,
+        axes=axes.reason,
         passes=usable.passes,
-        stroke_known=stroke_known,
-        noise_share=noise_share,
-        radius_subap=models.instrument.wfs.pupil_diameter / 2.0,
+        stroke_known=_stroke_known(about),
+        # large pokes look like a wider modulation, which the fit may have taken for the true one
+        weakly_modulated=any(
+            kind_of(one).is_weakly_modulated(one.wfs) for one in (about, as_in_file.instrument)
+        ),
     )
-    refusal, reason = judge_fit(findings)
-    smeared = () if found.smear is None else (found.smear.words,)
-    # Columns are compared with the model at α, which means nothing where the fit found none.
-    columns = (
-        tuple(find_strange_columns(solution, target))
-        if findings.explained and solution.converged
-        else ()
-    )
-    found_origins: tuple[Origin, ...] = ()
-    if findings.explained:
-        found_origins = list_origins(
-            as_in_file.instrument, reported, slopes, optics, without, structured, seen.gains
-        )
-    fit = Fit(
+    moves = np.array([*_list_moves(findings, found), *usable.place_sigma_subap * np.eye(4)[:2]])
+    return replace(findings, uncertainty=sure.with_moves(moves, np.ones(len(moves))))
+
+
+def _list_moves(findings: FitFindings, found: _Found) -> Iterator[Array]:
+    """Yield 1 σ of the registration ``(4,)`` from each error that no alternative stands for."""
+    settled, solution = found.settled, found.settled.solution
+    about, nuisances = settled.models.instrument, settled.nuisances
+    if found.smear is not None and found.before is not None:
+        # The registration moves in proportion to the share that is removed.
+        yield (solution.vector - found.before.vector) * found.smear.sigma / found.smear.share
+    yield _misplacement_sigma(about, findings.structure)
+    # Tilted faces of a pyramid displace its images and also turn the edges between the faces. The
+    # model contains the displacement only.
+    images = nuisances.images.T @ solution.nuisances[nuisances.image_places]
+    yield kind_of(about).turned_edge_sigma(about, images.reshape(2, 4).T)
+    if findings.weakly_modulated:
+        yield nonlinearity_sigma(settled.share, findings.noise_share)
+
+
+def _make_fit(
+    found: _Found, usable: Reference, findings: FitFindings, grounds: Grounds, gain: float
+) -> Fit:
+    settled, solution = found.settled, found.settled.solution
+    target, about, seen = settled.target, settled.models.instrument, solution.projection
+    nuisances, sure = settled.nuisances, findings.uncertainty
+    stretch_sigma = nuisances.stretch_sigma(sure.nuisance_sigma)
+    determined = grounds.refusal is None
+    return Fit(
         alpha=solution.alpha,
         covariance=sure.covariance,
         gains=seen.gains,
-        residual_fraction=residual_fraction,
-        residual_map=left_map,
+        residual_fraction=settled.share,
+        residual_map=settled.residual_map,
         residual_by_mode=settled.by_mode,
         condition_number=_condition_number(solution.matrix),
         modes=target.modes,
-        orientation=slopes.assumed_orientation,
-        order=slopes.order,
+        orientation=about.slopes.assumed_orientation,
+        order=about.slopes.order,
         subset_scatter=sure.subset_scatter,
-        accepted=refusal is None,
+        accepted=determined,
         converged=solution.converged,
-        verdict=f"{'accepted' if refusal is None else 'refused'}: {reason}",
-        remarks=(
-            *collect_remarks(findings, reported=reported, found=slopes, about=models.instrument),
-            *columns,
-            *smeared,
-            *(
-                (floor_words,)
-                if floor_words and floor_of_size**2 > sure.covariance[3, 3] / 2.0
-                else ()
-            ),
-        ),
-        left_out=(*usable.left_out, *_rows_left_out(target, models.instrument)),
-        n_evaluations=models.counter.n,
+        verdict=f"{'accepted' if determined else 'refused'}: {grounds.reason}",
+        remarks=(),
+        left_out=(*usable.left_out, *_rows_left_out(target, about)),
+        n_evaluations=settled.models.counter.n,
         synthetic=solution.matrix,
         measured=target.matrix,
         valid=target.valid,
         gain_map=nuisances.gain_map(solution.nuisances, target.valid),
         # misplaced actuators stretch the image as much as they turn it
-        anamorphosis_sigma=None if stretch_sigma is None else np.hypot(stretch_sigma, misplaced[2]),
-        image_offsets_px=_image_offsets(models.instrument, nuisances, solution),
+        anamorphosis_sigma=None
+        if stretch_sigma is None
+        else np.hypot(stretch_sigma, _misplacement_sigma(about, findings.structure)[2]),
+        image_offsets_px=_image_offsets(about, nuisances, solution),
         # values fitted to noise are not reported
-        optics=optics if findings.explained else (),
-        origins=found_origins,
-        unknown_not_found=list_undetermined_keys(as_in_file.instrument, found_origins),
-        alternatives=tried,
+        optics=findings.optics if findings.explained else (),
+        alternatives=findings.alternatives,
         registration=Registration(
-            determined=refusal is None,
-            reason=reason,
+            determined=determined,
+            reason=grounds.reason,
             sigma_statistical=sure.sigma_statistical,
             sigma_systematic=sure.sigma_systematic,
             sets=sure.sets,
@@ -754,26 +694,71 @@ def _make_fit(
             seen.gains,
             target.modes,
             target.rows,
-            gain=options.gain,
-            noise=noise,
+            gain=gain,
+            noise=usable.noise_per_pass,
         ),
         paper_table=found.table,
     )
-    grounds = Grounds(
+
+
+def _gather_grounds(
+    findings: FitFindings, found: _Found, axes: AxesDoubt, *, explain: bool
+) -> Grounds:
+    """Return the verdict, and what a recommendation needs besides the fit's numbers."""
+    settled, without = found.settled, findings.with_file_values
+    refusal, reason = judge_fit(findings)
+    # Columns are compared with the model at α, which means nothing where the fit found none.
+    compared = findings.explained and settled.solution.converged
+    causes = find_gain_causes(settled, passes=findings.passes, stroke_known=findings.stroke_known)
+    return Grounds(
         refusal=refusal,
         reason=reason,
-        structure=structured,
-        n_sets=len(sure.subset_steps),
-        columns=columns,
-        axes_entry=axes_doubt.entry,
-        numbers_share=1.0 if without is None else without.share,
-        noise_share=noise_share,
-        large_pokes=weakly_modulated and without is not None and without.is_undecided,
+        structure=findings.structure,
+        n_sets=len(findings.uncertainty.subset_steps),
+        columns=tuple(find_strange_columns(settled.solution, settled.target)) if compared else (),
+        axes_entry=axes.entry,
+        numbers_share=1.0 if without is None else 1.0 / without.misfit,
+        gains=tuple(causes) if explain else (),
+        noise_share=findings.noise_share,
+        large_pokes=findings.weakly_modulated and without is not None and may_compensate(without),
     )
-    if not options.explain:
-        return add_recommendation(fit, grounds)
-    causes = find_gain_causes(settled, passes=usable.passes, stroke_known=stroke_known)
-    return add_explanations(fit, tried, replace(grounds, gains=tuple(causes)))
+
+
+def _add_notes(
+    fit: Fit,
+    found: _Found,
+    findings: FitFindings,
+    grounds: Grounds,
+    about: Instrument,
+    reported: SlopeRecipe,
+) -> Fit:
+    """Return the fit with its notes, and with the values of the file that it determined.
+
+    ``about`` is the instrument as the file describes it, ``reported`` its slopes as requested.
+    """
+    slopes = found.settled.models.instrument.slopes
+    floor, words = _magnification_floor(found.settled.models.instrument)
+    remarks = (
+        *collect_remarks(
+            findings, reported=reported, found=slopes, about=found.settled.models.instrument
+        ),
+        *grounds.columns,
+        *(() if found.smear is None else (found.smear.words,)),
+        *((words,) if words and floor**2 > fit.covariance[3, 3] / 2.0 else ()),
+    )
+    origins: tuple[Origin, ...] = ()
+    if findings.explained:
+        origins = list_origins(
+            about,
+            reported,
+            slopes,
+            findings.optics,
+            findings.with_file_values,
+            findings.structure,
+            fit.gains,
+        )
+    unknown = list_undetermined_keys(about, origins)
+    return replace(fit, remarks=remarks, origins=origins, unknown_not_found=unknown)
 
 
 def _magnification_floor(instrument: Instrument) -> tuple[float, str]:
@@ -799,11 +784,6 @@ def _misplacement_sigma(instrument: Instrument, structured: float) -> Array:
         return np.zeros(4)
     radius_m = instrument.wfs.pupil_diameter / 2.0 * instrument.subaperture_m
     return misplacement_sigma(mirror, radius_m, instrument.subaperture_m, structured)
-
-
-def _noise_share(residual: float, structured: float) -> float:
-    """Return the share of the residual's power that is noise."""
-    return max(1.0 - (structured / residual) ** 2, 0.0) if residual > 0.0 else 0.0
 
 
 def _image_offsets(
@@ -842,20 +822,6 @@ def _rows_left_out(target: Target, instrument: Instrument) -> Iterator[str]:
         n_left_out -= n
     if n_left_out > 0:
         yield f"{n_left_out} of {n_all} slopes: silent, or seen against unknown surface"
-
-
-def _residual_map(found: _Found) -> Array:
-    """Return the RMS residual of every slope over the RMS of all, modes counted alike."""
-    target, seen = found.settled.target, found.settled.solution.projection
-    scale = np.sqrt(target.weights)
-    # Weighted as the fit weighs them, or the modes with the largest strokes would decide.
-    typical = np.sqrt(np.mean((target.matrix[target.rows] * scale) ** 2))
-    by_slope = np.full(len(target.rows), np.nan)
-    by_slope[target.rows] = np.sqrt(np.mean((seen.residual * scale) ** 2, axis=1)) / typical
-    planes = by_slope.reshape(-1, int(target.valid.sum()))
-    maps = np.full((len(planes), *target.valid.shape), np.nan)
-    maps[:, target.valid] = planes
-    return maps
 
 
 def _condition_number(matrix: NDArray[np.float32]) -> float:

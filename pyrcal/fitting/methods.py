@@ -227,6 +227,24 @@ class Settled:
         """RMS of the residual, with all modes weighted equally."""
         return float(np.sqrt(np.mean(self.by_mode**2)))
 
+    @property
+    def residual_map(self) -> Array:
+        """RMS residual of each slope over the RMS of all, ``(n_planes, n, n)``.
+
+        All modes count alike. NaN where no slope is used.
+        """
+        target = self.target
+        scale = np.sqrt(target.weights)
+        # Weighted as the fit weighs them, or the modes with the largest strokes would decide.
+        typical = np.sqrt(np.mean((target.matrix[target.rows] * scale) ** 2))
+        by_slope = np.full(len(target.rows), np.nan)
+        left = self.solution.projection.residual * scale
+        by_slope[target.rows] = np.sqrt(np.mean(left**2, axis=1)) / typical
+        planes = by_slope.reshape(-1, int(target.valid.sum()))
+        maps = np.full((len(planes), *target.valid.shape), np.nan)
+        maps[:, target.valid] = planes
+        return maps
+
 
 def settle(
     models: FitModels, target: Target, start: Misregistration, nuisances: Nuisances

@@ -61,17 +61,6 @@ class Counter:
     n: int = 0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class InstrumentChange:
-    """A change of the instrument file."""
-
-    words: str
-    """Key and value in the notation of the file."""
-
-    max_misfit_ratio: float
-    """Largest χ² over the file's at which this change is preferred."""
-
-
 def choose_sampling(instrument: Instrument) -> int:
     """Return the pupil points per subaperture of the model that determines a fit.
 
@@ -252,22 +241,22 @@ class FitModels:
         return found
 
     @property
-    def other_instruments(self) -> dict[InstrumentChange, FitModels]:
-        """Models of instruments with which this one may be confused."""
+    def other_instruments(self) -> dict[str, tuple[float, FitModels]]:
+        """Models of instruments with which this one may be confused, by their entry of the file.
+
+        Each with the share of χ² below which it is preferred.
+        """
         about = self.instrument
         stop = Stop.TELESCOPE if about.stop is Stop.MIRROR else Stop.MIRROR
-        others = {f'stop = "{stop}"': replace(about, stop=stop)}
+        others = {f'stop = "{stop}"': (PREFERRED_SHARE, replace(about, stop=stop))}
         for words, recipe in kind_of(about).other_recipes(about.slopes).items():
-            others[words] = replace(about, slopes=recipe)
-        found = {
-            InstrumentChange(words=words, max_misfit_ratio=PREFERRED_SHARE): replace(
-                self, instrument=other
-            )
-            for words, other in others.items()
-        }
+            others[words] = PREFERRED_SHARE, replace(about, slopes=recipe)
         for words, sensor in kind_of(about).other_sensors(about.wfs).items():
-            other = InstrumentChange(words=words, max_misfit_ratio=FAR_PREFERRED_SHARE)
-            found[other] = replace(self, instrument=replace(about, wfs=sensor))
+            others[words] = FAR_PREFERRED_SHARE, replace(about, wfs=sensor)
+        found = {
+            words: (share, replace(self, instrument=other))
+            for words, (share, other) in others.items()
+        }
         if isinstance(self.basis, ModalBasis):
             gaussian = isinstance(self.basis.surface, ThinPlate)
             mirror = about.analytic_mirror
@@ -275,8 +264,6 @@ class FitModels:
             surface = mirror_surface(
                 replace(mirror, shape=replace(mirror.shape, influence=shape)), about.subaperture_m
             )
-            other = InstrumentChange(
-                words=f'influence = "{shape}"', max_misfit_ratio=FAR_PREFERRED_SHARE
-            )
-            found[other] = replace(self, basis=self.basis.of_surface(surface))
+            models = replace(self, basis=self.basis.of_surface(surface))
+            found[f'influence = "{shape}"'] = FAR_PREFERRED_SHARE, models
         return found

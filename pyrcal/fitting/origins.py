@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.fitting.instrument_checks import FileValuesFit, FoundOptic
+from pyrcal.fitting.comparison import Alternative
+from pyrcal.fitting.instrument_checks import FoundOptic, may_compensate
 from service.model.instrument import Instrument
 from service.model.slopes import FLIPS, Orientation, SlopeRecipe
 
@@ -62,7 +63,7 @@ def list_origins(
     reported: SlopeRecipe,
     found: SlopeRecipe,
     optics: tuple[FoundOptic, ...],
-    with_file_values: FileValuesFit | None,
+    with_file_values: Alternative | None,
     structure: float,
     gains: NDArray[np.float64],
 ) -> tuple[Origin, ...]:
@@ -122,9 +123,7 @@ def format_orientation(orientation: Orientation) -> str:
     return f"{{ {flips}, sign = {both[0] if both[0] == both[1] else both} }}"
 
 
-def is_determined(
-    one: FoundOptic, with_file_values: FileValuesFit | None, structure: float
-) -> bool:
+def is_determined(one: FoundOptic, with_file_values: Alternative | None, structure: float) -> bool:
     """Return True if a fitted number is reliable, rather than compensating model errors.
 
     A number of the file is corrected if the file's value leaves several times the residual. A
@@ -136,7 +135,7 @@ def is_determined(
         return False
     if one.reported is None or with_file_values is None:
         return structure < MAX_STRUCTURE
-    return not with_file_values.is_undecided
+    return not may_compensate(with_file_values)
 
 
 def list_undetermined_keys(about: Instrument, found: tuple[Origin, ...]) -> tuple[str, ...]:

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from pyrcal.fitting.alternatives import LIGHT_KEY
-from pyrcal.fitting.instrument_checks import FileValuesFit
+from pyrcal.fitting.comparison import Alternative
+from pyrcal.fitting.instrument_checks import may_compensate
 from pyrcal.fitting.origins import MAX_LOG_SIGMA, is_determined
 from pyrcal.fitting.verdict import NOTABLE_STRUCTURE, FitFindings, factor_of_passes
 from service.model.instrument import Instrument
@@ -105,15 +106,15 @@ def _note_optics(findings: FitFindings) -> Iterator[str]:
     there = findings.with_file_values
     moved = there.moved * BOUNDARY_SCALE
     yield (
-        f"with {found} the misfit is {there.share:.0%} of what it would be: the "
+        f"with {found} the misfit is {1.0 / there.misfit:.0%} of what it would be: the "
         f"registration allows for it, which moved it by {moved[0]:.2g}, {moved[1]:.2g} "
         f"subaperture, {moved[2]:.2g} deg, {moved[3]:.2g}; {_advice(there)}"
     )
 
 
-def _advice(without: FileValuesFit) -> str:
+def _advice(without: Alternative) -> str:
     """Return what to do about an instrument that was found unlike its file."""
-    if not without.is_undecided:
+    if not may_compensate(without):
         return "correct the instrument file"
     return (
         "large pokes, pushes without pulls or other errors of the model do the same, so sigma "
@@ -125,9 +126,9 @@ def _note_light(findings: FitFindings) -> Iterator[str]:
     """Yield that uneven light explains the residual, unless a value of the file explains more."""
     # A gain over the pupil follows part of what another stop, hole or modulation does.
     shares = {
-        one.key: one.share
+        one.key: one.misfit
         for one in findings.alternatives
-        if one.share is not None and (one.preferred or one.key == LIGHT_KEY)
+        if one.preferred or one.key == LIGHT_KEY
     }
     if min(shares, key=lambda key: shares[key], default=LIGHT_KEY) != LIGHT_KEY:
         return

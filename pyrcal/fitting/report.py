@@ -13,10 +13,10 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pyrcal.fitting.alternatives import Alternative
+from pyrcal.fitting.comparison import Alternative
 from pyrcal.fitting.fitted import Fit, Registration
 from pyrcal.fitting.instrument_checks import NOTABLE_CHANGE, NOTABLE_SIGMA
-from pyrcal.fitting.left_over import LeftOver
+from pyrcal.fitting.left_over import ResidualLocation
 from service.control.gains import CalibrationGains
 from service.control.reconstructor import Inversion, Recipe
 from service.errors import MatrixError
@@ -139,7 +139,7 @@ def _alternative(one: Alternative, fit: Fit) -> dict[str, Any]:
     }
 
 
-def _left_over(left: LeftOver) -> dict[str, Any]:
+def _left_over(left: ResidualLocation) -> dict[str, Any]:
     return {
         "border": left.border,
         "subapertures": [

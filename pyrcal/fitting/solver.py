@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.fitting.models import FitModels, Optic
-from pyrcal.fitting.uncertainty import dispersion, pupil_regions
 from service.estimation.solver import (
     MAX_STEP,
     SETTLED_STEP,
@@ -79,6 +78,9 @@ be 0.18 or 0.53."""
 
 UNKNOWN_SIGMA = 1.0
 """Prior 1 σ of the logarithm of a value that the instrument file marks as unknown."""
+
+N_SECTORS, N_RINGS = 12, 3
+"""Numbers of sectors and of rings of equal area that the regions of the pupil are made of."""
 
 LONGEST_OPTIC_STEP = 0.4
 """Longest step of such a logarithm; the derivatives hold no further."""
@@ -545,3 +547,44 @@ def _limit_step(seen: Projection, values: Array, nuisances: Nuisances, counts: f
     optics = np.abs(step[first : first + len(nuisances.optics)]) / LONGEST_OPTIC_STEP
     longest = [*excess, *optics, *(np.abs(stretches) / LONGEST_STRETCH)]
     return np.asarray(step / max(1.0, *longest))
+
+
+def dispersion(projection: Projection, regions: NDArray[np.intp]) -> float:
+    """Return how many correlated slopes count as one independent slope, at least 1.
+
+    Modes, or regions of the pupil ``(n_rows,)``, each contribute a gradient by the unknowns. If
+    slopes were independent, the squares of these gradients would add up to the variance of the
+    residual times the normal matrix; errors common to a mode or region increase the sum.
+    """
+    n_unknowns = len(projection.jacobian)
+    noise = projection.chi / max(projection.residual.size - len(projection.gains), 1)
+    # A fit without residual has no correlations to measure.
+    if not noise > 0.0:
+        return 1.0
+    # pinv, because unknowns without effect make the matrix singular; here they count nothing.
+    spread = np.linalg.pinv(projection.normal, hermitian=True) / (noise * n_unknowns)
+    found = 1.0
+    for scores in (projection.scores, regional_scores(projection, regions)):
+        found = max(found, float(np.einsum("kc,kl,lc->", scores, spread, scores)))
+    return found
+
+
+def pupil_regions(valid: NDArray[np.bool_], n_planes: int) -> NDArray[np.intp]:
+    """Return the region of every signal ``(n_slopes,)``: sector, and ring of equal area."""
+    n = len(valid)
+    y, x = np.stack(np.nonzero(valid)) - (n - 1) / 2
+    sector = np.floor((np.arctan2(y, x) / (2 * np.pi) + 0.5) * N_SECTORS).astype(np.intp)
+    radius = np.hypot(x, y)
+    # The square of the radius makes rings of equal area; 1e-9 keeps the outermost inside.
+    ring = np.floor((radius / (radius.max() + 1e-9)) ** 2 * N_RINGS).astype(np.intp)
+    return np.tile(np.minimum(sector, N_SECTORS - 1) * N_RINGS + ring, n_planes)
+
+
+def regional_scores(projection: Projection, regions: NDArray[np.intp]) -> Array:
+    """Return the gradient by the unknowns from each region ``(n_unknowns, n_regions)``."""
+    weighted = projection.residual * projection.weights
+    # In the Jacobian's precision: with two precisions einsum would convert the Jacobian, the
+    # largest array of a fit.
+    single = weighted.astype(projection.jacobian.dtype, copy=False)
+    by_slope = np.einsum("ksm,sm->ks", projection.jacobian, single)
+    return np.array([np.bincount(regions, row) for row in by_slope])

@@ -11,7 +11,6 @@ matrix that the data do not exclude would move the registration.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,8 +22,12 @@ from pyrcal.fitting.disjoint_sets import (
     Normals,
     SetComparison,
     jackknife_sigma,
+    mode_partitions,
+    pupil_partitions,
 )
-from service.estimation.solver import Projection
+from pyrcal.fitting.methods import Settled
+from pyrcal.fitting.solver import STRETCHES, regional_scores
+from service.estimation.reference import is_by_actuator
 from service.model.instrument import Mirror
 
 Array = NDArray[np.float64]
@@ -93,13 +96,9 @@ FEW_MODES_EXCESS = 5.0
 FEW_MODES_POWER = np.array([1.0, 1.0, 1.0, 0.5])
 """Power of that increase for each parameter: the magnification is less affected."""
 
-OTHER_SHARE = 0.5
-"""Probability of an instrument that explains a matrix as well as the file's."""
-
 UNINFORMATIVE_RATIO = 5.0
 """1 σ of a parameter in a set of modes, over the median of all sets, above which it is ignored."""
 
-N_SECTORS, N_RINGS = 12, 3
 MAX_SETS = 8
 MIN_PER_SET = 3
 
@@ -181,59 +180,28 @@ class Uncertainty:
         return float(np.max(np.abs(self.subset_steps) / sigma))
 
 
-def uncertainty(
-    projection: Projection,
-    values: Array,
-    prior: Array,
-    regions: NDArray[np.intp],
-    places: Array,
-    *,
-    dispersed: float,
-    shift_subap: float,
-    radius_subap: float,
-    magnification_floor: float,
-    residual_fraction: float,
-    noise_share: float,
-    mode_sets: Mapping[str, NDArray[np.intp]],
-    pupil_sets: Mapping[str, NDArray[np.intp]],
-    stretches: slice | None = None,
+def estimate_uncertainty(
+    settled: Settled, structure: float, magnification_floor: float
 ) -> Uncertainty:
-    """Return the uncertainty of the first four unknowns of a projection at its solution.
+    """Return the uncertainty of a fit's registration, without that of alternatives.
 
     Parameters
     ----------
-    projection
-        Projection at the solution.
-    values
-        ``(n_unknowns,)`` values of the nuisances at the solution; 0 for the registration, which has
-        no prior.
-    prior
-        ``(n_unknowns,)`` weight of the prior of each unknown: its reciprocal variance times
-        ``dispersed``.
-    regions
-        ``(n_rows,)`` region of the pupil of each slope.
-    places
-        ``(n_rows, 2)`` position of each slope, pupil radii.
-    dispersed
-        Number of correlated slopes that count as one, see ``dispersion``.
-    shift_subap
-        Length of the shift at the solution, subapertures: part of the model's error is proportional
-        to it.
-    radius_subap
-        Radius of the pupil, subapertures.
+    settled
+        The fit.
+    structure
+        RMS share of the signal that is left over and is no noise.
     magnification_floor
         Smallest 1 σ of the magnification.
-    residual_fraction
-        RMS of the residual over RMS of the measurement; it limits the difference between mirror and
-        model.
-    noise_share
-        Share of the residual's power that is noise, 0 to 1.
-    mode_sets, pupil_sets
-        Partitions into disjoint sets: the set of each mode ``(n_modes,)``, of each slope
-        ``(n_rows,)``.
-    stretches
-        Places of the anamorphosis among the nuisances; None if it is not fitted.
     """
+    solution, target, nuisances = settled.solution, settled.target, settled.nuisances
+    projection, prior, instrument = solution.projection, settled.prior, settled.models.instrument
+    regions, n_planes = nuisances.regions[target.rows], instrument.slopes.kind.n_planes
+    radius_subap = instrument.wfs.pupil_diameter / 2.0
+    # The registration has no prior, so its distance from one is 0.
+    values = np.concatenate([np.zeros(4), nuisances.from_prior(solution.nuisances)])
+    mode_sets = mode_partitions(target, n_planes, by_actuator=is_by_actuator(instrument))
+    pupil_sets = pupil_partitions(target.valid, n_planes, target.rows)
     n_modes = len(projection.gains)
     n_sets = min(MAX_SETS, n_modes // MIN_PER_SET)
     by_mode = Normals.of_modes(projection)
@@ -246,28 +214,31 @@ def uncertainty(
     every = _sandwich(spread, scores) * n_modes / max(n_modes - 1, 1)
     # A few modes may agree by chance: σ is never below that of white noise.
     from_modes = _at_least(every[:4, :4], (spread * noise)[:4, :4])
-    by_region = _sandwich(spread, _regional_scores(projection, regions))
+    by_region = _sandwich(spread, regional_scores(projection, regions))
     # noise also scatters between regions, but the statistical part already includes it
-    white = np.diag(spread) * noise * noise_share
+    noise_power = max(settled.share**2 - structure**2, 0.0)
+    white = np.diag(spread) * noise * (noise_power / settled.share**2 if noise_power else 0.0)
     regional = np.sqrt(np.maximum(np.diag(by_region) - white, 0.0))
     few = (1.0 + FEW_MODES_EXCESS * np.exp(-n_modes / FEW_MODES)) ** FEW_MODES_POWER
     share = few * REGIONAL_SHARE * regional[:4]
     # ``REGIONAL_SHARE`` is known for the registration only, so nuisances have the whole scatter.
     model_error = np.sqrt(np.diag(by_region))[4:]
-    if stretches is not None:
+    if nuisances.anamorphosis:
         # an anamorphosis is a magnification along one axis and its inverse along the other
-        model_error[stretches] = few[3] * REGIONAL_SHARE[3] * regional[4:][stretches]
-    kind_share = min(1.0, residual_fraction / STRANGE_RESIDUAL)
-    far = kind_share * FAR_SHARE * shift_subap
+        model_error[STRETCHES] = few[3] * REGIONAL_SHARE[3] * regional[4:][STRETCHES]
+    # The residual limits how much mirror and model differ.
+    kind_share = min(1.0, settled.share / STRANGE_RESIDUAL)
+    far = kind_share * FAR_SHARE * float(np.hypot(*solution.vector[:2]))
     # A rotation moves the pupil's edge by the radius times as much.
     floor = np.array(
         [FLOOR_SUBAP, FLOOR_SUBAP, EDGE_FLOOR_SUBAP / radius_subap, magnification_floor]
     )
     # a quantity fixed by its prior may have any value within that prior
-    held_back = (spread * np.diag(held) @ spread)[:4, :4] * noise * dispersed
+    held_back = (spread * np.diag(held) @ spread)[:4, :4] * noise * solution.dispersion
     from_model = np.diag(share**2 + floor**2 + far**2) + held_back
     pull = prior * noise * values
     by_row = Normals.of_rows(projection, regions)
+    places = _pupil_places(target.valid, n_planes, radius_subap)[target.rows]
     distortion = by_row.fit_distortion(places, held, pull, projection.chi, noise)
     comparison = SetComparison(
         seen=projection,
@@ -348,41 +319,10 @@ def nonlinearity_sigma(residual: float, noise_share: float) -> Array:
     return np.array([shift, shift, 0.0, 0.0])
 
 
-def pupil_places(valid: NDArray[np.bool_], n_planes: int, radius_subap: float) -> Array:
+def _pupil_places(valid: NDArray[np.bool_], n_planes: int, radius_subap: float) -> Array:
     """Return the position of every signal ``(n_slopes, 2)`` along x and y, pupil radii."""
     y, x = np.stack(np.nonzero(valid)) - (len(valid) - 1) / 2
     return np.tile(np.column_stack([x, y]) / radius_subap, (n_planes, 1))
-
-
-def dispersion(projection: Projection, regions: NDArray[np.intp]) -> float:
-    """Return how many correlated slopes count as one independent slope, at least 1.
-
-    Modes, or regions of the pupil ``(n_rows,)``, each contribute a gradient by the unknowns. If
-    slopes were independent, the squares of these gradients would add up to the variance of the
-    residual times the normal matrix; errors common to a mode or region increase the sum.
-    """
-    n_unknowns = len(projection.jacobian)
-    noise = projection.chi / max(projection.residual.size - len(projection.gains), 1)
-    # A fit without residual has no correlations to measure.
-    if not noise > 0.0:
-        return 1.0
-    # pinv, because unknowns without effect make the matrix singular; here they count nothing.
-    spread = np.linalg.pinv(projection.normal, hermitian=True) / (noise * n_unknowns)
-    found = 1.0
-    for scores in (projection.scores, _regional_scores(projection, regions)):
-        found = max(found, float(np.einsum("kc,kl,lc->", scores, spread, scores)))
-    return found
-
-
-def pupil_regions(valid: NDArray[np.bool_], n_planes: int) -> NDArray[np.intp]:
-    """Return the region of every signal ``(n_slopes,)``: sector, and ring of equal area."""
-    n = len(valid)
-    y, x = np.stack(np.nonzero(valid)) - (n - 1) / 2
-    sector = np.floor((np.arctan2(y, x) / (2 * np.pi) + 0.5) * N_SECTORS).astype(np.intp)
-    radius = np.hypot(x, y)
-    # The square of the radius makes rings of equal area; 1e-9 keeps the outermost inside.
-    ring = np.floor((radius / (radius.max() + 1e-9)) ** 2 * N_RINGS).astype(np.intp)
-    return np.tile(np.minimum(sector, N_SECTORS - 1) * N_RINGS + ring, n_planes)
 
 
 def _sandwich(spread: Array, scores: Array) -> Array:
@@ -399,16 +339,6 @@ def _at_least(covariance: Array, other: Array) -> Array:
         return other
     grown = np.maximum(own, least) / own
     return np.asarray(covariance * np.outer(grown, grown))
-
-
-def _regional_scores(projection: Projection, regions: NDArray[np.intp]) -> Array:
-    """Return the gradient by the unknowns from each region ``(n_unknowns, n_regions)``."""
-    weighted = projection.residual * projection.weights
-    # In the Jacobian's precision: with two precisions einsum would convert the Jacobian, the
-    # largest array of a fit.
-    single = weighted.astype(projection.jacobian.dtype, copy=False)
-    by_slope = np.einsum("ksm,sm->ks", projection.jacobian, single)
-    return np.array([np.bincount(regions, row) for row in by_slope])
 
 
 def _subsets(

@@ -17,9 +17,10 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.fitting.alternatives import LIGHT_KEY, Alternative
-from pyrcal.fitting.instrument_checks import AlternativeInstrument, FileValuesFit, FoundOptic
-from pyrcal.fitting.methods import Landing
+from pyrcal.fitting.alternatives import LIGHT_KEY, find_decentred_pupil
+from pyrcal.fitting.comparison import Alternative
+from pyrcal.fitting.instrument_checks import FoundOptic
+from pyrcal.fitting.methods import Landing, Settled
 from pyrcal.fitting.pupil_width import SeenPupil
 from pyrcal.fitting.solver import OPTIC_SIGMA, UNKNOWN_SIGMA, Solution
 from pyrcal.fitting.uncertainty import Uncertainty
@@ -93,8 +94,7 @@ _PASS_TOLERANCE = 0.12
 class FitFindings:
     """All inputs of a verdict."""
 
-    solution: Solution
-    residual_fraction: float
+    settled: Settled
     structure: float
     """RMS share of the signal that is left over and is not noise."""
 
@@ -105,13 +105,6 @@ class FitFindings:
     landing: Landing | None
     """Result of the coarse search; None for methods without one."""
 
-    rivals: tuple[AlternativeInstrument, ...]
-    """Other instruments, the best explanation first."""
-
-    off_centre: Alternative | None
-    """Preferred alternative with a decentred pupil, if another stop would displace the pupil as
-    well."""
-
     alternatives: tuple[Alternative, ...]
     """Every alternative that was tried."""
 
@@ -121,7 +114,7 @@ class FitFindings:
     narrow: SeenPupil | None
     """Pupil image that is narrower than in the file; None if it is as wide."""
 
-    with_file_values: FileValuesFit | None
+    with_file_values: Alternative | None
     """Fit with the file's values of ``optics``; None if none differs significantly."""
 
     axes: str
@@ -135,8 +128,30 @@ class FitFindings:
     noise_share: float
     """Largest share of the residual's power that is noise, 0 to 1."""
 
-    radius_subap: float
-    """Radius of the pupil, subapertures."""
+    weakly_modulated: bool
+    """True for a pyramid with hardly any modulation, by the file or by the fit."""
+
+    @property
+    def solution(self) -> Solution:
+        """Minimum on the fine grid."""
+        return self.settled.solution
+
+    @property
+    def residual_fraction(self) -> float:
+        """RMS of the residual over RMS of the measurement, with all modes weighted equally."""
+        return self.settled.share
+
+    @property
+    def radius_subap(self) -> float:
+        """Radius of the pupil, subapertures."""
+        return self.settled.models.instrument.wfs.pupil_diameter / 2.0
+
+    @property
+    def instruments(self) -> list[Alternative]:
+        """Other instruments that the matrix prefers, the best explanation first."""
+        found = [one for one in self.alternatives if one.is_instrument and one.preferred]
+        # Changes have different limits, so each is ranked by its own.
+        return sorted(found, key=lambda one: one.misfit / one.max_share)
 
     @property
     def sigma_of_sets(self) -> Array:
@@ -231,8 +246,8 @@ def _check_explanation(findings: FitFindings) -> str:
 
 def _check_cause(findings: FitFindings) -> str:
     # Uneven light is a cause as well, although it is no correction of the instrument file.
-    light = [one.share for one in findings.alternatives if one.key == LIGHT_KEY]
-    share = min((one for one in light if one is not None), default=1.0)
+    light = (one.misfit for one in findings.alternatives if one.key == LIGHT_KEY)
+    share = min(light, default=1.0)
     left = findings.residual_fraction * float(np.sqrt(share * (1.0 - findings.noise_share)))
     if left < MAX_WITHOUT_CAUSE or any(one.preferred and one.key for one in findings.alternatives):
         return ""
@@ -265,8 +280,8 @@ def _check_pupil(findings: FitFindings) -> str:
 
 
 def _check_instrument(findings: FitFindings) -> str:
-    for rival in findings.rivals:
-        if rival.preferred and _moves_registration(findings, rival.moved):
+    for rival in findings.instruments:
+        if _moves_registration(findings, rival.moved):
             other = _describe_instrument(findings, rival)
             return f"another instrument explains the matrix better: {other}"
     for optic in findings.optics:
@@ -291,19 +306,19 @@ def edge_move(step: Array, radius_subap: float) -> float:
     return float(np.sqrt(np.max(step[:2] ** 2) + radius_subap**2 * np.sum(step[2:] ** 2)))
 
 
-def _describe_instrument(findings: FitFindings, rival: AlternativeInstrument) -> str:
+def _describe_instrument(findings: FitFindings, rival: Alternative) -> str:
     """Return the other instrument, or both if the matrix does not distinguish them."""
-    of_rival = f"with {rival.change.words} the misfit is {rival.share:.0%} of what it is now"
-    off = findings.off_centre
-    if off is None or off.share is None or off.share > EQUAL_MISFIT_RATIO * rival.share:
+    of_rival = f"with {rival.words} the misfit is {rival.misfit:.0%} of what it is now"
+    off = find_decentred_pupil(findings.alternatives)
+    if off is None or off.misfit > EQUAL_MISFIT_RATIO * rival.misfit:
         return f"{of_rival}; correct the instrument file"
-    if rival.share > EQUAL_MISFIT_RATIO * off.share:
+    if rival.misfit > EQUAL_MISFIT_RATIO * off.misfit:
         return (
-            f"with {off.words} the misfit is {off.share:.0%} of what it is now; centre the pupil, "
+            f"with {off.words} the misfit is {off.misfit:.0%} of what it is now; centre the pupil, "
             "or correct the mask of valid subapertures"
         )
     return (
-        f"{of_rival}, with {off.words} {off.share:.0%}: {UNDECIDED_WORDS}; check the pupil's "
+        f"{of_rival}, with {off.words} {off.misfit:.0%}: {UNDECIDED_WORDS}; check the pupil's "
         "position and correct the file"
     )
 

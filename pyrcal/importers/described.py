@@ -75,7 +75,7 @@ def from_described(
     changed["mirror"] = mirror.table
     changed["wfs"] |= signals.table
     slopes = changed.setdefault("slopes", {})
-    if changed["wfs"].get("input") == "frames":
+    if changed["wfs"].get("input", "slopes") != "slopes":
         # Both follow from the positions of the images on the frames.
         changed["wfs"].pop("pupil_separation_subap", None)
         slopes.pop("order", None)
@@ -158,7 +158,9 @@ def _signals(
         # Frames can be fitted although the RTC of this instrument computes slopes from them.
         table = _locate_windows(source, instrument, frames, notes)
     arrays_found = {"interaction_matrix": frames.cube, "flux_frame": frames.light}
-    return Signals(table=table, arrays=arrays_found, columns=0)
+    return Signals(
+        table=table, arrays=arrays_found, columns=0, has_mean_frame=frames.has_mean_frame
+    )
 
 
 def _locate_windows(

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.fitting.pupil_width import compute_responses, measure_pupil
+from pyrcal.fitting.recorded import FLUX_FRAME
 from pyrcal.importers.actuators import Mirror, read_mirror
 from pyrcal.importers.frames import Frames, describe_frames, frames_of
 from pyrcal.importers.imported import UNKNOWN, Array, Imported, Signals, in_arrays_file, matrix_of
@@ -191,6 +192,14 @@ def apply_unit(unit: str | None, signals: Signals, mirror: Mirror, notes: list[s
         mirror.table["stroke"] = UNKNOWN
         notes.append("the unit of the commands is unknown: only shapes are compared")
     else:
+        if not signals.has_mean_frame:
+            # A mask has no counts that the frames could be divided by.
+            signals.table["input"] = "normalised-frames"
+            del signals.arrays[FLUX_FRAME]
+            notes.append(
+                "no mean frame (light=FILE): the frames are taken as divided by the sum of the "
+                "whole detector"
+            )
         # Not in place: the matrix may be that of the caller.
         signals.arrays["interaction_matrix"] = signals.arrays["interaction_matrix"] / UNITS_M[unit]
 
@@ -434,12 +443,12 @@ def _sensor(reported: Reported, signals: Signals, notes: list[str]) -> dict[str,
     # A stated diameter is not questioned.
     if reported.pupil_diameter_subap is not None:
         return {**table, "pupil_diameter_subap": reported.pupil_diameter_subap}
-    if "pupil_diameter_subap" in table and table.get("input") != "frames":
+    if "pupil_diameter_subap" in table and table.get("input", "slopes") == "slopes":
         notes.append(
             f"pupil_diameter_subap = {table['pupil_diameter_subap']:g}: read from the mask, to "
             "half a subaperture; the magnification is relative to it: say --pupil-subap if known"
         )
-    if table.get("input") != "frames":
+    if table.get("input", "slopes") == "slopes":
         valid = signals.arrays["valid_subapertures"].astype(bool)
         x, y = measure_aperture(valid).centre
         if "pupil_diameter_subap" not in table and np.hypot(x, y) > OFF_CENTRE_SUBAP:

@@ -25,6 +25,8 @@ that the finest influence functions stay sampled while the model stays small."""
 MARGIN_SUBAP = 1.0
 """Width by which the grid of subapertures exceeds the pupil image."""
 
+MEAN_FRAME = "the mean frame"
+
 LIT_SHARE = 0.5
 """Smallest light in a valid subaperture, relative to the median lit one."""
 
@@ -42,6 +44,11 @@ class Frames:
     light_name: str
     """Source of ``light``, for messages."""
 
+    @property
+    def has_mean_frame(self) -> bool:
+        """True if the light was recorded in the counts of the frames."""
+        return self.light_name == MEAN_FRAME
+
 
 def frames_of(matrix: Array, light: Array | None, valid: Array | None) -> Frames | None:
     """Return a response as frames, or None if its shape is that of slopes.
@@ -57,7 +64,7 @@ def frames_of(matrix: Array, light: Array | None, valid: Array | None) -> Frames
         Mask of lit pixels ``(ny, nx)``, or of valid subapertures; None if there is none.
     """
     light_map = light if light is not None else valid
-    name = "the mean frame" if light is not None else "the mask of lit pixels"
+    name = MEAN_FRAME if light is not None else "the mask of lit pixels"
     if light_map is not None and light_map.ndim == 2:
         cube = _cube_of(matrix, light_map, valid)
         light_map = np.asarray(light_map, np.float64)
@@ -127,6 +134,7 @@ def describe_frames(
         },
         obscuration_ratio=images.obscuration_ratio,
         columns=0,
+        has_mean_frame=frames.has_mean_frame,
     )
 
 

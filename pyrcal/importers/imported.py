@@ -57,6 +57,9 @@ class Signals:
     columns: int
     """Axis of the matrix that enumerates the modes."""
 
+    has_mean_frame: bool = True
+    """False if the matrix is of frames, and their light is only a mask or the response itself."""
+
     @property
     def n_columns(self) -> int:
         """Number of columns of the matrix."""
@@ -150,7 +153,7 @@ class Imported:
             try:
                 instrument = load_instrument(draft.instrument)
                 self._check(instrument)
-                if self.centres_found:
+                if self.centres_found and FLUX_FRAME in self.arrays:
                     refined = self._with_refined_centres(instrument)
                     draft.instrument.write_text(refined.instrument_text(), encoding="utf-8")
             except ConfigurationError as error:

@@ -22,11 +22,15 @@ from numpy.typing import NDArray
 
 from pyrcal.importers.imported import Array, Imported, in_arrays_file, matrix_of, orient_matrix
 from pyrcal.importers.registration import decompose
-from service.errors import ConfigurationError
+from service.errors import ConfigurationError, MatrixError
 from service.model.misregistration import Misregistration, rotation
+from service.model.pupil_images import find_pupil_images
 
 _Sensor = tuple[dict[str, Any], NDArray[np.bool_], dict[str, Any]]
 """``[wfs]``, its valid subapertures, and ``[slopes]``."""
+
+_FULL_FRAME = "fullFrame"
+"""Beginning of the names of OOPAO's processings whose signal is the whole detector."""
 
 Oopao = Any
 """An object of OOPAO's own classes, which are known by their attributes."""
@@ -106,7 +110,10 @@ SAVED = {
         "n_pix_separation": _ANY._replace(sensor=PYRAMID),
         "binning": _count(1)._replace(sensor=PYRAMID),
         "postProcessing": _WORD._replace(sensor=PYRAMID),
-        "validI4Q": _array(2)._replace(sensor=PYRAMID),
+        "user_modulation_path": _array(2)._replace(needed=False),
+        "validI4Q": _array(2)._replace(needed=False),
+        "validSignal": _array(1, 2)._replace(needed=False),
+        "referenceSignal_2D": _array(2)._replace(needed=False),
         "valid_subapertures": _array(2)._replace(sensor=LENSLETS),
         "pixel_scale": _POSITIVE._replace(sensor=LENSLETS),
         "n_pix_subap": _count(1)._replace(sensor=LENSLETS),
@@ -118,6 +125,18 @@ SAVED = {
 
 _MAX_SHAPE_DEVIATION = 1e-3
 """Largest accepted deviation of an influence function from its Gaussian, relative to its height."""
+
+_LIT_SHARE = 0.5
+"""Share of a subaperture that the pupil must fill, where the signal is the whole detector."""
+
+_MAX_SEEMING_PX = 0.6
+"""How much closer to the middle unmodulated pupil images seem by the strength of their response."""
+
+_MAX_PATH_DEVIATION = 0.02
+"""Largest distance of a point of a modulation path from an ellipse, relative to its semi-axis."""
+
+_SAME_AXES = 1e-3
+"""Relative difference of the semi-axes of a modulation below which it is a circle."""
 
 _SAMPLED_ACTUATORS = 24
 """Number of influence functions that are compared with the Gaussian."""
@@ -175,9 +194,12 @@ def from_oopao(
         mirror["mode_to_actuator"] = in_arrays_file("mode_to_actuator")
         arrays["mode_to_actuator"] = strokes
     if calib is not None:
-        arrays["interaction_matrix"] = matrix_of(
-            _numpy(getattr(calib, "D", calib)), 2 * valid.sum(), n_modes, notes=notes
-        )
+        measured = _numpy(getattr(calib, "D", calib))
+        if sensor.get("input") is None:
+            n_slopes = 2 * int(valid.sum())
+            arrays["interaction_matrix"] = matrix_of(measured, n_slopes, n_modes, notes=notes)
+        else:
+            arrays |= _frames(wfs, measured, n_modes, sensor, notes)
     arrays |= {"valid_subapertures": valid.astype(np.uint8), "pupil": pupil}
     return Imported(
         source="OOPAO",
@@ -245,9 +267,12 @@ def _lit_pupil(
     share = (side - 2 * rim) / side
     diameter_m = float(tel.D) * share
     sensor["pupil_diameter_subap"] = sensor["n_subapertures"] * share
+    # Modulations are counted in wavelengths over tel.D, which is the array's width.
     if "modulation_lambda_over_d" in sensor:
-        # It is counted in wavelengths over tel.D, which is the array's width.
         sensor["modulation_lambda_over_d"] *= share
+    if "modulation_ellipse" in sensor:
+        ellipse = sensor["modulation_ellipse"]
+        ellipse["axes_lambda_over_d"] = [axis * share for axis in ellipse["axes_lambda_over_d"]]
     notes.append(
         f"tel.D = {float(tel.D):g} m is that of a padded array: a dark rim of {rim} points is cut, "
         f"so that the pupil is {diameter_m:.4g} m wide, {sensor['pupil_diameter_subap']:.4g} of "
@@ -275,28 +300,126 @@ def _sensor(tel: Oopao, wfs: Oopao, notes: list[str]) -> _Sensor:
 
 
 def _pyramid(tel: Oopao, wfs: Oopao, notes: list[str]) -> _Sensor:
-    if not wfs.postProcessing.startswith("slopesMaps"):
+    whole = wfs.postProcessing.startswith(_FULL_FRAME)
+    if not whole and not wfs.postProcessing.startswith("slopesMaps"):
         raise ConfigurationError(
-            f"wfs.postProcessing: found {wfs.postProcessing!r}, expected 'slopesMaps' or another "
-            "one that makes slopes; or give its frames: docs/howto/fitting.md"
+            f"wfs.postProcessing: found {wfs.postProcessing!r}, expected 'slopesMaps', 'fullFrame' "
+            "or a name that begins with one of them"
         )
-    if wfs.postProcessing != "slopesMaps":
+    if wfs.postProcessing not in {"slopesMaps", _FULL_FRAME, f"{_FULL_FRAME}_sum_flux"}:
         notes.append(
             f"wfs.postProcessing = {wfs.postProcessing!r} normalises by a constant: gains of all "
             "modes differ from 1 alike"
         )
-    if getattr(wfs, "user_modulation_path", None) is not None:
-        notes.append("wfs.user_modulation_path is taken as a circle of the radius wfs.modulation")
     if getattr(wfs, "rooftop", None) or getattr(wfs, "theta_rotation", 0):
         notes.append("a rooftop, and faces that are turned, are not in pyrcal's model")
-    valid, binning = _numpy(wfs.validI4Q).astype(bool), int(wfs.binning)
-    sensor = {
-        "kind": "pyramid",
-        "n_subapertures": len(valid),
-        "pupil_separation_subap": (int(wfs.nSubap) + float(wfs.n_pix_separation)) / binning,
-        "modulation_lambda_over_d": float(wfs.modulation) / _steps(tel),
+    binning = int(wfs.binning)
+    separation = (int(wfs.nSubap) + float(wfs.n_pix_separation)) / binning
+    sensor: dict[str, Any] = {"kind": "pyramid", "pupil_separation_subap": separation}
+    slopes = {"orientation": "auto", "normalisation": "global"}
+    if whole:
+        valid = _lit_subapertures(_numpy(tel.pupil), int(wfs.nSubap) // binning)
+        sensor["input"] = "normalised-frames"
+    else:
+        valid = _numpy(_needed(wfs, "validI4Q")).astype(bool)
+        slopes["order"] = "xy"
+    sensor["n_subapertures"] = len(valid)
+    return sensor | _modulation(tel, wfs, notes), valid, slopes
+
+
+def _modulation(tel: Oopao, wfs: Oopao, notes: list[str]) -> dict[str, Any]:
+    """Return the keys of the modulation: a circle, or the ellipse of the user's own path."""
+    own = getattr(wfs, "user_modulation_path", None)
+    if own is None:
+        return {"modulation_lambda_over_d": float(wfs.modulation) / _steps(tel)}
+    path = np.asarray(own, dtype=float).T / _steps(tel)
+    if len(path) != 2 or not np.any(path):
+        raise ConfigurationError(
+            f"wfs.user_modulation_path: found shape {path.T.shape}, expected pairs [x, y] that are "
+            "not all 0"
+        )
+    # Over an ellipse the mean square of a coordinate is half that of its semi-axis.
+    squares, axes = np.linalg.eigh(2.0 * path @ path.T / path.shape[1])
+    lengths = np.sqrt(np.maximum(squares, np.finfo(float).tiny))
+    off = np.linalg.norm(axes.T @ path / lengths[:, None], axis=0)
+    if np.abs(off - 1.0).max() > _MAX_PATH_DEVIATION:
+        notes.append(
+            "wfs.user_modulation_path is no ellipse about the axis: that of the same mean squares "
+            "is taken"
+        )
+    if lengths[1] / lengths[0] - 1.0 < _SAME_AXES:
+        return {"modulation_lambda_over_d": float(np.sqrt(lengths.prod()))}
+    angle_deg = float(np.rad2deg(np.arctan2(axes[1, 1], axes[0, 1])))
+    return {
+        "modulation_ellipse": {
+            "axes_lambda_over_d": [float(lengths[1]), float(lengths[0])],
+            "angle_deg": round(angle_deg, 6) % 180.0,
+        }
     }
-    return sensor, valid, {"order": "xy", "orientation": "auto", "normalisation": "global"}
+
+
+def _needed(owner: Oopao, name: str) -> Array:
+    """Return an attribute that only some processings of the signal have."""
+    values = getattr(owner, name, None)
+    if values is None:
+        raise ConfigurationError(
+            f"wfs.{name}: missing; expected it with wfs.postProcessing = {owner.postProcessing!r}"
+        )
+    return _numpy(values)
+
+
+def _lit_subapertures(pupil: Array, n: int) -> NDArray[np.bool_]:
+    """Return the subapertures ``(n, n)`` that the pupil ``(n_points, n_points)`` half fills."""
+    points = len(pupil) // n
+    light = pupil[: n * points, : n * points].reshape(n, points, n, points).mean(axis=(1, 3))
+    return np.asarray(light >= _LIT_SHARE)
+
+
+def _frames(
+    wfs: Oopao, measured: Array, n_modes: int, sensor: dict[str, Any], notes: list[str]
+) -> dict[str, Array]:
+    """Return a matrix of the whole detector as frames; add their windows to ``[wfs]``.
+
+    OOPAO divides frames by their sum, and keeps the mean frame as the reference signal. Without it
+    the images are located by the strength of the response.
+    """
+    mean = getattr(wfs, "referenceSignal_2D", None)
+    lit = getattr(wfs, "validSignal", None if mean is None else np.ones_like(_numpy(mean)))
+    if lit is None or _numpy(lit).ndim != 2:
+        side = math.isqrt(max(measured.shape))
+        lit = np.ones((side, side)) if side**2 in measured.shape else _needed(wfs, "validSignal")
+    lit = _numpy(lit).astype(bool)
+    response = matrix_of(measured, int(lit.sum()), n_modes, notes=notes)
+    cube = np.zeros((response.shape[1], *lit.shape), dtype=response.dtype)
+    cube[:, lit] = response.T
+    arrays = {"interaction_matrix": cube}
+    if mean is not None:
+        arrays["flux_frame"] = _numpy(mean)
+        sensor["pupil_centres_px"] = "auto"
+        return arrays
+    sensor["pupil_centres_px"] = _image_centres(cube, sensor, notes)
+    return arrays
+
+
+def _image_centres(cube: Array, sensor: dict[str, Any], notes: list[str]) -> list[list[float]]:
+    """Return windows of whole pixels around the pupil images, by the strength of the response.
+
+    Light between the images responds as well, so that unmodulated images seem up to half a pixel
+    too close to one another: so much of what all four have in common is not believed.
+    """
+    sides = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) / 2.0
+    nominal = (len(cube[0]) - 1) / 2.0 + sides * sensor["pupil_separation_subap"]
+    strength = np.sqrt(np.mean(np.square(cube, dtype=float), axis=0))
+    try:
+        off = find_pupil_images(strength, "calib.D").centres_px - nominal
+    except MatrixError:
+        off = np.zeros((4, 2))
+    inwards = np.clip(-2.0 * float(np.mean(off * sides)), 0.0, _MAX_SEEMING_PX)
+    moved = np.round(off + 2.0 * inwards * sides)
+    centres: list[list[float]] = (nominal + moved).tolist()
+    if np.any(moved):
+        notes.append(f"pupil images off OOPAO's own quadrants, as the response shows: {centres}")
+    return centres
 
 
 def _lenslets(wfs: Oopao, notes: list[str]) -> _Sensor:

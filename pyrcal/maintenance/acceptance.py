@@ -56,7 +56,7 @@ MIN_SAMPLES: Final = 2
 """Smallest number of trend samples (one in 15 s) on either side of the swaps."""
 
 
-class Outcome(StrEnum):
+class Judgement(StrEnum):
     """Outcome of one criterion."""
 
     PASS = "pass"
@@ -77,7 +77,7 @@ class Criterion:
     """Part of the commissioning: RTC, Fit, Tracking, Matrices, Alarms or Wavefront."""
 
     name: str
-    outcome: Outcome
+    outcome: Judgement
     found: str
     """Measured number with its unit, or why there is none."""
 
@@ -142,7 +142,7 @@ def judge(data: Commissioning) -> tuple[Criterion, ...]:
         "Alarms": _judge_alarms,
         "Wavefront": _judge_wavefront,
     }
-    outcomes = {True: Outcome.PASS, False: Outcome.FAIL, None: Outcome.MISSING}
+    outcomes = {True: Judgement.PASS, False: Judgement.FAIL, None: Judgement.MISSING}
     return tuple(
         Criterion(
             group=group,

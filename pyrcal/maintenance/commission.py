@@ -13,7 +13,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
-from pyrcal.maintenance.acceptance import Commissioning, Outcome, judge
+from pyrcal.maintenance.acceptance import Commissioning, Judgement, judge
 from pyrcal.maintenance.archive import open_archive, read_settings
 from pyrcal.maintenance.commission_page import write_page
 from service.archive import Archive
@@ -49,7 +49,7 @@ def main(options: argparse.Namespace) -> int:
     else:
         for one in criteria:
             print(f"{one.outcome:8}{one.group:10} {one.name}: {one.found} (limit: {one.limit})")
-    open_ones = [one for one in criteria if one.outcome is not Outcome.PASS]
+    open_ones = [one for one in criteria if one.outcome is not Judgement.PASS]
     verdict = f"not accepted: {len(open_ones)} not passed" if open_ones else "accepted"
     say(f"{options.output}: {len(criteria)} criteria, {verdict}")
     return NOT_ACCEPTED if open_ones else ACCEPTED

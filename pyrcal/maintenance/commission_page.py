@@ -15,7 +15,7 @@ from pyrcal.fitting.figures import check_plots, new_figure
 from pyrcal.maintenance.acceptance import (
     Commissioning,
     Criterion,
-    Outcome,
+    Judgement,
     compare_residuals,
     residuals_per_mode,
 )
@@ -69,7 +69,7 @@ def write_page(data: Commissioning, criteria: Sequence[Criterion], path: Path) -
 
 def format_page(data: Commissioning, criteria: Sequence[Criterion]) -> str:
     """Return the report as HTML that needs no other file."""
-    n_passed = sum(one.outcome is Outcome.PASS for one in criteria)
+    n_passed = sum(one.outcome is Judgement.PASS for one in criteria)
     accepted = n_passed == len(criteria)
     verdict = "ACCEPTED" if accepted else "NOT ACCEPTED"
     parts = [
@@ -122,7 +122,7 @@ def _criteria_table(criteria: Sequence[Criterion]) -> str:
             one.found,
             one.limit,
             _mark(one.outcome, one.outcome),
-            "" if one.outcome is Outcome.PASS else one.remedy,
+            "" if one.outcome is Judgement.PASS else one.remedy,
         )
         for one in criteria
     )

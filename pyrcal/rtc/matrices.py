@@ -14,7 +14,7 @@ from typing_extensions import override
 from pyrcal.rtc.background import Background
 from pyrcal.rtc.identity import Reconstructor
 from pyrcal.rtc.replies import Computer, FinishedMeasurement
-from pyrcal.rtc.staging import Outcome, Staging
+from pyrcal.rtc.staging import Replies, Staging
 from service.errors import WireError
 from service.wire import (
     CHUNK_LIMIT,
@@ -216,7 +216,7 @@ class Matrices(Background):
             _log.info("query.refused", selector=selector, reason=text)
         return None
 
-    def _execute(self, outcome: Outcome) -> None:
+    def _execute(self, outcome: Replies) -> None:
         for acknowledgement in outcome.acknowledgements:
             self._acknowledge(acknowledgement)
         for reconstructor in outcome.staged:

@@ -63,7 +63,7 @@ class _Collection:
 
 
 @dataclass(slots=True, kw_only=True)
-class Outcome:
+class Replies:
     """Actions for the link after a message or a timeout."""
 
     acknowledgements: list[Acknowledgement] = field(default_factory=list)
@@ -95,17 +95,17 @@ class Staging:
         self._collected: OrderedDict[str, _Collection] = OrderedDict()
         self._answers: OrderedDict[str, Acknowledgement] = OrderedDict()
 
-    def chunk(self, matrix_id: str, index: int, data: bytes) -> Outcome:
+    def chunk(self, matrix_id: str, index: int, data: bytes) -> Replies:
         """Add one chunk. An invalid chunk is dropped and requested again after the timeout."""
         # Late or repeated chunks of a matrix that is settled. A new collection for them would never
         # be completed, and could displace one in progress.
         if matrix_id in self._answers:
-            return Outcome()
+            return Replies()
         with suppress(WireError):
             self._collection(matrix_id).parts.add(index, data)
         return self._complete(matrix_id)
 
-    def commit(self, manifest: Manifest, now_s: float) -> Outcome:
+    def commit(self, manifest: Manifest, now_s: float) -> Replies:
         """Add the manifest, which is the order to stage the matrix and swap it in."""
         known = self._answers.get(manifest.id)
         if known is not None:
@@ -113,7 +113,7 @@ class Staging:
         collection = self._collection(manifest.id)
         # A repeated commit must not extend the deadline.
         if collection.manifest is not None:
-            return Outcome()
+            return Replies()
         collection.manifest = manifest
         refusal = self._terms().refusal(manifest)
         if refusal:
@@ -125,9 +125,9 @@ class Staging:
             collection.parts.announce(manifest.layout)
         return self._complete(manifest.id)
 
-    def poll(self, now_s: float) -> Outcome:
+    def poll(self, now_s: float) -> Replies:
         """Request missing chunks after the first timeout; reject the matrix after the second."""
-        outcome = Outcome()
+        outcome = Replies()
         # Without a manifest the deadline is infinite. _reject() changes the dictionary.
         for matrix_id, collection in list(self._collected.items()):
             if now_s < collection.deadline_s:
@@ -166,38 +166,38 @@ class Staging:
                 self._collected.popitem(last=False)
         return self._collected[matrix_id]
 
-    def _complete(self, matrix_id: str) -> Outcome:
+    def _complete(self, matrix_id: str) -> Replies:
         collection = self._collected[matrix_id]
         if collection.manifest is None or not collection.parts.complete:
-            return Outcome()
+            return Replies()
         try:
             matrix = collection.parts.matrix()
         except WireError as error:
             return self._reject(matrix_id, str(error))
         manifest = collection.manifest
         del self._collected[matrix_id]
-        return Outcome(
+        return Replies(
             acknowledgements=[self._remember(self.answer(manifest, AckState.STAGED))],
             staged=[Reconstructor(manifest=manifest, matrix=matrix)],
         )
 
-    def _reject(self, matrix_id: str, reason: str) -> Outcome:
+    def _reject(self, matrix_id: str, reason: str) -> Replies:
         manifest = self._collected.pop(matrix_id).manifest
         # Without a manifest there is no order to answer.
         if manifest is None:
-            return Outcome()
-        return Outcome(
+            return Replies()
+        return Replies(
             acknowledgements=[self._remember(self.answer(manifest, AckState.REJECTED, reason))]
         )
 
-    def _repeat_answer(self, manifest: Manifest, known: Acknowledgement) -> Outcome:
+    def _repeat_answer(self, manifest: Manifest, known: Acknowledgement) -> Replies:
         """Repeat the answer to a repeated commit; reject an id that belongs to another matrix."""
         if manifest.layout.sha256 == known.sha256:
             # In the present session, because the service ignores acknowledgements of others.
-            return Outcome(acknowledgements=[replace(known, session=self._terms().session)])
+            return Replies(acknowledgements=[replace(known, session=self._terms().session)])
         # This rejection is not remembered: the first matrix keeps its answer under the id.
         reason = f"id: {manifest.id} was used with sha256 {known.sha256}, expected a new id"
-        return Outcome(acknowledgements=[self.answer(manifest, AckState.REJECTED, reason)])
+        return Replies(acknowledgements=[self.answer(manifest, AckState.REJECTED, reason)])
 
     def answer(self, manifest: Manifest, state: AckState, reason: str = "") -> Acknowledgement:
         """Return an acknowledgement for a matrix in the present session."""

@@ -52,8 +52,9 @@ pitch_m = 0.18182
 diameter_m = 2.3
 influence = "gaussian"
 coupling = 0.3
-basis = "zonal"
 """
+
+MODES_CACAO = 60
 
 CACAO_VARIABLES = """
 export CACAO_LOOPNAME="bench"
@@ -111,22 +112,31 @@ def _write_papyrus(folder: Path) -> None:
 
 def _write_cacao(folder: Path) -> None:
     """Write a ``conf`` folder: response of a mirror of 12 x 12 actuators on 64 x 64 pixels."""
-    # An instrument is read from a file only.
-    with NamedTemporaryFile("w", suffix=".toml") as file:
-        file.write(CACAO)
-        file.flush()
-        instrument = load_instrument(file.name)
-    positions = instrument.analytic_mirror.positions_m
-    frames, lit = _compute_frames(instrument, None, ((17, 17), (17, 47), (47, 17), (47, 47)), 64, 1)
+    zonal, modal = (_described(f'{CACAO}basis = "{basis}"\n') for basis in ("zonal", "KL"))
+    positions = zonal.analytic_mirror.positions_m
+    frames, lit = _compute_frames(zonal, None, ((17, 17), (17, 47), (47, 17), (47, 47)), 64, 1)
     # cacao lists actuators row by row over the whole grid.
-    at = np.rint(positions / instrument.analytic_mirror.pitch_m + 5.5).astype(int)
+    column, row = np.rint(positions / zonal.analytic_mirror.pitch_m + 5.5).astype(int).T
     cube, mask = np.zeros((144, 64, 64), np.float32), np.zeros((12, 12), np.float32)
-    cube[at[:, 1] * 12 + at[:, 0]] = frames
-    mask[at[:, 1], at[:, 0]] = 1.0
+    # The sum of a frame of cacao is 1, and a command of 1 moves the mirror by a micrometre.
+    cube[row * 12 + column] = frames * 4.0 / lit.sum() * 2e-6
+    mask[row, column] = 1.0
+    strokes: Any = modal_basis(modal)  # of an analytic mirror: it has actuators
+    modes = np.zeros((MODES_CACAO, 12, 12), np.float32)
+    modes[:, row, column] = strokes.mode_to_actuator[:, :MODES_CACAO].T
     fits.writeto(folder / "zrespM-H.fits", cube, overwrite=True)
-    fits.writeto(folder / "wfsref.fits", lit.astype(np.float32), overwrite=True)
+    fits.writeto(folder / "wfsref.fits", (lit / lit.sum()).astype(np.float32), overwrite=True)
     fits.writeto(folder / "dmmask.fits", mask, overwrite=True)
+    fits.writeto(folder / "CMmodesDM.fits", modes, overwrite=True)
     (folder / "cacaovars.bash").write_text(CACAO_VARIABLES)
+
+
+def _described(text: str) -> Instrument:
+    """Return an instrument of which there is no file; it is read from a file only."""
+    with NamedTemporaryFile("w", suffix=".toml") as file:
+        file.write(text)
+        file.flush()
+        return load_instrument(file.name)
 
 
 def _copy(pattern: str, folder: Path) -> None:

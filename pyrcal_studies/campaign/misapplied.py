@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 from typing_extensions import override
 
 from pyrcal.rtc.identity import Reconstructor
-from pyrcal.rtc.staging import Outcome
+from pyrcal.rtc.staging import Replies
 from pyrcal_studies.campaign.observatory import (
     SETTINGS,
     SMALL,
@@ -93,7 +93,7 @@ class FalseLink(ShortLink):
         return self._kind in {"never swapped", "swapped late"}
 
     @override
-    def _carry_out(self, outcome: Outcome) -> list[Acknowledgement]:
+    def _carry_out(self, outcome: Replies) -> list[Acknowledgement]:
         for matrix in outcome.staged:
             if self._dome.time_s >= self.from_s:
                 self._take(matrix)

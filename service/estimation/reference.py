@@ -53,6 +53,11 @@ class Reference:
         """Number of times the light met the mirror."""
         return 2 if self.double_pass else 1
 
+    @property
+    def noise_per_pass(self) -> NDArray[np.float64] | None:
+        """``noise`` of the columns with the passes divided out."""
+        return None if self.noise is None else self.noise / self.passes
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Target(Columns):
@@ -111,9 +116,9 @@ def target_of(reference: Reference, instrument: Instrument) -> Target:
     if left_out is not None:
         rows &= ~np.tile(left_out.subapertures[valid], instrument.slopes.kind.n_planes)
     power = np.sum(matrix[rows] ** 2, axis=0)
-    if reference.noise is not None:
+    if reference.noise_per_pass is not None:
         # a noise-free column would otherwise count alone
-        power = power * 1e-4 + rows.sum() * (reference.noise / reference.passes) ** 2
+        power = power * 1e-4 + rows.sum() * reference.noise_per_pass**2
     elif is_by_actuator(instrument):
         # an actuator behind the edge is seen by the border alone, where models are least true:
         # weighed by its share it pulls a far shift by 0.0015 subapertures

@@ -360,6 +360,8 @@ _LATER_FIELDS = frozenset(
         "local",
         "image_offsets_subap",
         "position_error_pitch",
+        "normalised",
+        "modulation_stretch",
     }
 )
 """Fields without which an instrument has the digest that it has always had."""

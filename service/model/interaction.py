@@ -322,6 +322,13 @@ class InteractionModel:
         """
         return self._at(self._image_shift(alpha)).apply(shapes)
 
+    def render_modes(self, alpha: Misregistration) -> Array:
+        """Return the modes where α puts them, ``(n_points, n_modes)`` at the points of ``pupil``.
+
+        OPD per unit command.
+        """
+        return np.asarray(self.basis.render(self._mirror_points(alpha)))
+
     def unknown_rows(self, alpha: Misregistration) -> NDArray[np.bool_]:
         """Return which slopes are within one subaperture of unknown surface, ``(n_slopes,)``.
 

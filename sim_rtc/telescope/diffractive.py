@@ -216,7 +216,7 @@ def _quadrature(wfs: Pyramid, binning: int) -> Quadrature:
     """Return 24 modulation points at 3 λ/D, more on a larger circle, and nodes for the binning."""
     return Quadrature(
         n_nodes=2 * binning,
-        n_modulation=max(24, 2 * int(np.ceil(4 * wfs.modulation_lambda_over_d))),
+        n_modulation=max(24, 2 * int(np.ceil(4 * wfs.largest_modulation))),
     )
 
 
@@ -422,12 +422,26 @@ class DiffractivePyramid:
     def _tilts(self) -> tuple[Array, Array]:
         """Return modulation phasors ``(M/2, N)`` along y and ``(M/2, 2, N)`` along x."""
         n_modulation = self._quadrature.n_modulation
-        # Half a step off the axes: every point then has a partner with the opposite x.
+        # Half a step off the axes: every point then has a partner of the same y.
         angle = 2 * np.pi * (np.arange(n_modulation // 2) + 0.5) / n_modulation
-        radius = 2 * np.pi * self._wfs.modulation_lambda_over_d / self._wfs.pupil_diameter
+        first, second, direction = self._wfs.modulation_axes
+        axes = np.exp(1j * direction) * np.array([first, 1j * second])
+        # Of the conjugate diameters of an ellipse one is chosen along x.
+        turn = np.exp(1j * np.arctan2(axes[1].imag, axes[0].imag))
+        diameters = (
+            2
+            * np.pi
+            / self._wfs.pupil_diameter
+            * axes
+            @ [[turn.real, turn.imag], [turn.imag, -turn.real]]
+        )
         u = self._pupil.coordinates
-        along_y = np.exp(1j * radius * np.cos(angle)[:, None] * u)
-        along_x = np.exp(1j * radius * np.sin(angle)[:, None, None] * _SIDES[:, None] * u)
+        along_y = np.exp(1j * diameters[0].imag * np.cos(angle)[:, None] * u)
+        x = (
+            diameters[0].real * np.cos(angle)[:, None]
+            + diameters[1].real * np.sin(angle)[:, None] * _SIDES
+        )
+        along_x = np.exp(1j * x[..., None] * u)
         return along_y, along_x
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pyrcal_studies.fft_pyramid import FftPyramid
+from service.errors import ModelError
 from service.model.interaction import InteractionModel
 from service.model.kinds import Normalisation
 from service.model.misregistration import Misregistration
@@ -145,3 +146,20 @@ def test_images_are_found_in_the_light_to_a_tenth_of_a_pixel(pixels):
     unknown = replace(bench, frames=replace(bench.frames, centres_px=None))
     found = frame_windows(unknown, rest).centres_px.reshape(4, 2)
     np.testing.assert_allclose(found, bench.frames.centres_px, atol=0.1)
+
+
+def test_frames_over_their_sum_need_no_mean_frame():
+    """The model's own light stands in for it, to a factor of 0.995: some light falls beside this
+    detector, or is wrapped around by so small an FFT.
+    """
+    camera = Camera(2, offsets=np.zeros((4, 2)))
+    side = 2 * camera.sensor.n_subapertures
+    rest, differential = (
+        images.reshape(-1, side, side) for images in (camera.rest(), camera.differential())
+    )
+    bench = instrument(2, offsets=np.zeros((4, 2)))
+    expected = slopes_from_frames(bench, differential, rest[0])
+    found = slopes_from_frames(bench, differential / rest.sum(), None)
+    assert relative(found, expected) < 0.01
+    with pytest.raises(ModelError, match="neither a mean frame nor"):
+        slopes_from_frames(replace(bench, frames=FrameWindows()), differential, None)

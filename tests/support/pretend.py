@@ -15,6 +15,7 @@ from check_rtc.connection import ReceivedMessage, Topic
 from check_rtc.watch import TelemetryObserver
 from pyrcal.rtc.dither import Dither, check_dither
 from pyrcal.rtc.identity import Identity
+from pyrcal.rtc.references import ReferenceOffset
 from pyrcal.rtc.replies import ReplyCache
 from pyrcal.rtc.staging import Staging, Terms
 from service.errors import LinkError, WireError
@@ -34,8 +35,10 @@ from service.wire import (
     MeasuredManifest,
     MeasureRequest,
     OffloadRequest,
+    ReferencesRequest,
     Reply,
     Status,
+    checksum,
     command_id,
     decode,
     decode_command,
@@ -71,6 +74,7 @@ class Pretend:
         self.commands, self.quiet = [], True
         self.heard, self.due, self.offers, self.away = [], [], {}, False
         self.identity = Identity(system="bench", basis_id="kl-1", config_id="mask-1")
+        self.references = ReferenceOffset(N_SLOPES)
         self.staging = Staging(self._terms, limit_bytes=10**6)
         self.cache = ReplyCache(self._execute)
         self._ids, self._status_s, self._asked_current = itertools.count(), 0.0, False
@@ -126,6 +130,16 @@ class Pretend:
         if "applied" in self.twists:
             raise self.twists["applied"]
         return self.manifest, self.matrix
+
+    def fetch_references(self):
+        if "read_back" in self.twists:
+            raise self.twists["read_back"]
+        in_use = self.references.in_use(self._name(self.references.name) or "mask-1")
+        slopes = self.twists.get("denied", 1.0) * in_use.offset
+        return replace(in_use, slopes=slopes.tobytes(), sha256=checksum(slopes))
+
+    def _name(self, name):
+        return self.twists.get("named", lambda name: name)(name)
 
     def offer(self, manifest, matrix):
         self.offers[manifest.id] = split(matrix, manifest.layout.chunk_bytes)
@@ -191,6 +205,7 @@ class Pretend:
             basis_id="kl-1",
             config_id="mask-1",
             dither=self.told_dither,
+            reference_id=self._name(self.references.name),
             max_dither_m=5e-8,
             max_dither_modes=8,
             magnitude=None,
@@ -227,6 +242,9 @@ class Pretend:
             self._run(slopes, commands, dithers)
         if self.quiet:
             RECORDED[self.seq] = slopes, commands, self.next, self.turbulence
+        offsets = self.references.advance(self.seq, BATCH)
+        # The checker's offset is one that the matrix does not see: the loop is as without it.
+        slopes = slopes - self.twists.get("subtracted", lambda now: now)(offsets)
         header = FrameHeader(
             session=self.session,
             seq0=self.seq,
@@ -239,6 +257,7 @@ class Pretend:
             cm_id=self.manifest.id,
             basis_id="kl-1",
             config_id="mask-1",
+            reference_id=self._name(self.references.name),
         )
         self.seq += BATCH
         rows = np.hstack([slopes, commands, dithers]).astype(np.float32)
@@ -272,10 +291,11 @@ class Pretend:
                 return self._start_dither(command)
             case LoopRequest():
                 return self._change_loop(command)
-            case MeasureRequest():
-                return self._measure(command)
-            case OffloadRequest():
-                return self._offload(command)
+            case ReferencesRequest() if not self.twists.get("own_references"):
+                return self._change_references(command)
+        others = {MeasureRequest: self._measure, OffloadRequest: self._offload}
+        if type(command) in others:
+            return others[type(command)](command)
         return Reply(id=command.id, accepted=False, reason="unsupported: no", start_seq=None)
 
     def _start_dither(self, command):
@@ -314,6 +334,14 @@ class Pretend:
         self.image = self.image + self.twists["stage"] * command.shift_x_subap
         start_seq = self.twists.get("stands", lambda seq: seq + 500)(self.seq)
         return Reply(id=command.id, accepted=True, reason="", start_seq=start_seq)
+
+    def _change_references(self, command):
+        reason = self.references.check(command, "mask-1")
+        if reason:
+            return Reply(id=command.id, accepted=False, reason=reason, start_seq=None)
+        command = self.twists.get("references", lambda command, _: command)(command, self)
+        self.references.begin(command, self.seq, RATE_HZ)
+        return Reply(id=command.id, accepted=True, reason="", start_seq=self.seq)
 
     def fit_registration(self, _window, _loop):
         """What somebody who knows the optics makes of a window; a window is of some second."""

@@ -1,9 +1,10 @@
 """A loop as cacao runs one, on streams alone: ``python -m tests.system.milk_loop DIR PLANT.npz``.
 
-PLANT.npz: ``response`` (n_slopes, n_modes) slope per metre, ``sigma_m`` (n_modes,) of the
-turbulence, and the ``matrix`` (n_controlled, n_slopes) of the start. A mirror's unit is a
-micrometre, its actuators are the modes. What it multiplies with it copies when it starts; it starts
-again, as another process, when somebody has made ``aol1_modesWFS`` anew.
+PLANT.npz: ``modes`` (n_modes, ny, nx), strokes of the actuators; ``response`` (rows, columns,
+n_actuators) of a frame per metre of each actuator; ``sigma_m`` (n_modes,) of the turbulence; the
+``matrix`` (n_controlled, rows * columns) of the start; ``noise`` of each value; ``hz`` frames a
+second. A unit of the mirror is two micrometres of optical path. The loop copies the matrix when it
+starts, and starts again, as another process, when somebody has made ``aol1_modesWFS`` anew.
 """
 
 import sys
@@ -14,7 +15,7 @@ import numpy as np
 
 from tests.support.milk import Milk
 
-HZ, GAIN, MULT, UNIT, RING = 500.0, 0.4, 0.99, 1e-6, 128
+HZ, GAIN, MULT, UNIT, RING = 500.0, 0.4, 0.99, 2e-6, 128
 
 
 def path_of(folder, name):
@@ -29,39 +30,40 @@ def values_in(path):
 
 
 def main(folder, plant):
-    response, sigma_m = plant["response"], plant["sigma_m"]
-    n_slopes, n_modes = response.shape
-    rows = len(plant["matrix"])
+    sigma_m, grid = plant["sigma_m"], plant["modes"].shape[1:]
+    modes = plant["modes"].reshape(len(sigma_m), -1)
+    size = plant["response"].shape[1::-1]  # as cacao has it, x first
+    response = plant["response"].reshape(size[0] * size[1], -1)
+    noise, hz = float(plant["noise"]), float(plant["hz"])
+    n_slopes, n_modes, rows = len(response), len(modes), len(plant["matrix"])
     modes_wfs = path_of(folder, "aol1_modesWFS")
-    Milk(modes_wfs, (n_slopes, 1, rows)).put(plant["matrix"] / UNIT)
+    Milk(modes_wfs, (*size, rows)).put(plant["matrix"] / UNIT)
     for name, value in (("aol1_mgain", GAIN), ("aol1_mmult", MULT)):
         Milk(path_of(folder, name), (rows, 1)).put(np.full(rows, value))
-    channel = Milk(path_of(folder, "dm01disp05"), (n_modes,))
-    slopes = Milk(path_of(folder, "aol1_imWFS2"), (n_slopes, 1), n_ring=RING, pid=1000)
+    channel = Milk(path_of(folder, "dm01disp05"), grid[::-1])
+    slopes = Milk(path_of(folder, "aol1_imWFS2"), size, n_ring=RING, pid=1000)
     values = Milk(path_of(folder, "aol1_modevalWFS"), (rows, 1), n_ring=RING, pid=2000)
     mirror = Milk(path_of(folder, "aol1_modevalDM"), (rows, 1), n_ring=RING, pid=3000)
     copied, inode = values_in(modes_wfs).reshape(rows, n_slopes), modes_wfs.stat().st_ino
     rng, turbulence = np.random.default_rng(1), np.zeros(n_modes)
-    answer, on_way = np.zeros(rows, np.float32), [np.zeros(n_modes)] * 2
+    answer, on_way = np.zeros(rows, np.float32), [np.zeros(modes.shape[1])] * 2
     start_s, k = time.monotonic(), 0
     sys.stdout.write("runs\n")
     sys.stdout.flush()
     while True:
         on_way[1] = on_way[1] + UNIT * channel.data[0]
         turbulence = 0.998 * turbulence + 0.063 * sigma_m * rng.standard_normal(n_modes)
-        seen = response @ (on_way[0] + turbulence) + 2e-3 * rng.standard_normal(n_slopes)
+        seen = response @ (on_way[0] + turbulence @ modes) + noise * rng.standard_normal(n_slopes)
         slopes.put(seen)
         values.put(copied @ seen, slopes)
         answer = np.float32(MULT) * answer - np.float32(GAIN) * values.data[0]
         mirror.put(answer, values, slopes)
-        command = np.zeros(n_modes)
-        command[:rows] = UNIT * answer
-        on_way = [on_way[1], command]
+        on_way = [on_way[1], UNIT * answer @ modes[:rows]]
         k += 1
         if k % 25 == 0 and modes_wfs.stat().st_ino != inode:
             copied, inode = values_in(modes_wfs).reshape(rows, n_slopes), modes_wfs.stat().st_ino
             values.pid += 1
-        late_s = start_s + k / HZ - time.monotonic()
+        late_s = start_s + k / hz - time.monotonic()
         if late_s > 0:
             time.sleep(late_s)
 

@@ -53,8 +53,10 @@ def test_the_loop_is_registered_and_takes_up_a_matrix_and_what_is_wrong_is_said(
     n_slopes, n_modes = response.shape
     plant, folder = tmp_path / "plant.npz", tmp_path
     matrix = np.linalg.pinv(assumed[:, :N_START])
-    np.savez(plant, response=response, sigma_m=np.sqrt(variance_m2), matrix=matrix)
-    np.save(folder / "modes.npy", np.eye(n_modes))
+    modes = np.eye(n_modes)[:, None]  # a mirror whose actuators are its modes
+    one = {"response": response[None], "sigma_m": np.sqrt(variance_m2), "modes": modes}
+    np.savez(plant, **one, matrix=matrix, noise=2e-3, hz=HZ)
+    np.save(folder / "modes.npy", modes[:, 0])
     with a_night(tmp_path) as night:
         same = nights.SETTINGS.replace(
             f"n_modes_target = {N_TARGET}", f"n_modes_target = {N_START}"

@@ -37,6 +37,8 @@ LINES = {
     "dither-lost@0:100": {"dither"},
     "dither-late@0:0.3,100": {"dither"},
     "mirror-silent@0:100": {"columns"},
+    "references-scaled@0:-1,1,100": {"references"},
+    "references-kept@0:1,100": {"references"},
 }
 """Each fault, and the lines that name it."""
 
@@ -57,7 +59,7 @@ def test_a_healthy_rtc_keeps_the_contract_and_is_told_what_was_moved(tmp_path):
     status, checks, text = checked(tmp_path, "--yes", "--open-loop", "--seconds", "4")
     assert status == 0, text
     assert {name: one for name, one in checks.items() if one["outcome"] != "ok"} == {}
-    assert len(checks) == 27
+    assert len(checks) == 28
     assert "will move: loop: THE LOOP IS OPENED" in text
     assert all(one["where"].startswith("docs/rtc.md#") for one in checks.values())
 
@@ -70,7 +72,7 @@ def test_a_healthy_rtc_keeps_the_contract_and_is_told_what_was_moved(tmp_path):
 )
 def test_faults_are_named_by_their_lines_and_by_no_others(tmp_path, faults):
     lines = set().union(*(LINES[fault] for fault in faults))
-    asking = lines & {"columns", "commit", "dither"}
+    asking = lines & {"columns", "commit", "dither", "references"}
     only = ",".join(sorted(asking))
     options = ["--yes", "--seconds", "1", "--only", only] if asking else ["--passive"]
     status, checks, text = checked(tmp_path, *options, faults=faults)

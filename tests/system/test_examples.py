@@ -97,7 +97,10 @@ def test_the_rtc_joins_a_secured_link_and_takes_what_is_signed_alone(tmp_path, p
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("module", "expected"),
-    [("examples.rtc", {"late-join", "images"}), ("examples.rtc_with_library", {"images"})],
+    [
+        ("examples.rtc", {"late-join", "images", "references"}),
+        ("examples.rtc_with_library", {"images"}),
+    ],
 )
 def test_the_rtc_keeps_the_contract(tmp_path, plant, module, expected):
     status, checks, text = checked_beside(

@@ -15,6 +15,7 @@ import sys
 import h5py
 import numpy as np
 import pytest
+from astropy.io import fits
 
 from pyrcal.samples.__main__ import main as write_sample
 from service.instrument import load_instrument
@@ -23,11 +24,13 @@ from service.model.misregistration import PARAMETERS, Misregistration
 from service.model.modes import modal_basis
 from tests.data.tiny.make import push_pull
 from tests.support import systems
+from tests.support.checker import write_plant
 from tests.support.manual import PAGES, blocks_of, commands
-from tests.support.night import ROOT, a_night, wait_for
+from tests.support.night import INSTRUMENT, ROOT, a_night, wait_for
 from tests.support.pace import patience
 from tests.support.reader import Reader
 from tests.support.tutorial_blocks import steps
+from tests.system import milk_loop
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(600)]
 
@@ -162,7 +165,41 @@ def write_system(folder, _):
     systems.recorded(folder / "all.h5", matrices, system)
 
 
+def run_cacao(folder, reader):
+    """A loop on streams, whose response is that of the ``conf`` folder; the page's two files."""
+    write_sample(["cacao", str(folder / "there")])
+    modes, pokes = (
+        fits.getdata(folder / "there" / f"{name}.fits") for name in ("CMmodesDM", "zrespM-H")
+    )
+    response = pokes.reshape(len(pokes), -1).T / milk_loop.UNIT
+    matrix = np.linalg.pinv(response @ modes.reshape(len(modes), -1).T)
+    frames = response.reshape(*pokes.shape[1:], -1)
+    turbulence_m = 1e-7 * np.arange(1, len(modes) + 1) ** -0.9
+    plant, streams = folder / "plant.npz", folder / "streams"
+    loop = {"response": frames, "modes": modes, "matrix": matrix, "sigma_m": turbulence_m}
+    np.savez(plant, **loop, noise=4e-6, hz=200.0)
+    streams.mkdir()
+    live, bridge = (text for text, _ in blocks_of(DOCS / "tutorials" / "cacao.md", "toml"))
+    (folder / "live.toml").write_text(live, encoding="utf-8")
+    bridge = bridge.replace("tcp/127.0.0.1:7447", reader.night.zenoh)
+    here = bridge.replace("[streams]", f'[streams]\ndirectory = "{streams}"')
+    (folder / "cacao.toml").write_text(here, encoding="utf-8")
+    loop = reader.night.start("loop", ["tests.system.milk_loop", str(streams), str(plant)])
+    wait_for(lambda: "runs" in loop.log, 20.0, lambda: loop.log)
+
+
+def run_an_rtc(folder, reader):
+    """The example that the page names, a telescope for it, and its instrument file."""
+    small = INSTRUMENT.read_text("utf-8").replace('name = "small"', 'name = "bench"')
+    (folder / "bench.toml").write_text(small, encoding="utf-8")
+    plant = str(write_plant(folder / "plant.npz"))
+    words = ["examples.rtc_with_library", reader.night.zenoh, "bench", plant]
+    reader.night.start("rtc", words)
+
+
 PREPARED = {
+    "tutorials/rtc": run_an_rtc,
+    "tutorials/cacao": run_cacao,
     "fitting": write_bench_and_serve,
     "importing": write_imports,
     "pyrtc": write_pyrtc,
@@ -188,7 +225,8 @@ def test_a_page_runs_and_prints_what_it_says(page, tmp_path, monkeypatch):
     monkeypatch.chdir(folder)
     with a_night(tmp_path) as night:
         reader = Reader(folder, night)
-        PREPARED.get(page.stem, lambda *_: None)(folder, reader)
+        name = page.stem if page.parent.name != "tutorials" else f"tutorials/{page.stem}"
+        PREPARED.get(name, lambda *_: None)(folder, reader)
         reader.read(page)
         for command in list(reader.beside):
             reader.end(command)

@@ -43,6 +43,9 @@ WFS = (
 APART = WFS + "pupil_separation_subap = 24\n"
 
 
+ROUND = APART.replace("modulation_lambda_over_d = 3.0", "modulation_ellipse = {}")
+
+
 @pytest.fixture
 def write(tmp_path):
     def _write(text, name="bench.toml"):
@@ -936,6 +939,18 @@ def test_without_astropy_a_fits_file_is_refused_with_what_to_install(write, tmp_
             "slopes.orientation.sign: found 0, expected 1, -1 or two of them",
         ),
         (WFS + MIRROR + "parity = 2\n" + MODES, "mirror.parity: found 2, expected -1 or 1"),
+        (
+            WFS + "modulation_ellipse = { axes_lambda_over_d = [4, 5] }\n" + MIRROR + MODES,
+            "wfs.modulation_ellipse: found modulation_lambda_over_d as well, expected one of them",
+        ),
+        (
+            ROUND.format("{ axes_lambda_over_d = [4.0, 0.0] }") + MIRROR + MODES,
+            "wfs.modulation_ellipse.axes_lambda_over_d.1: found 0.0, expected",
+        ),
+        (
+            ROUND.format("{ angle_deg = 30.0 }") + MIRROR + MODES,
+            "wfs.modulation_ellipse.axes_lambda_over_d: missing",
+        ),
     ],
 )
 def test_what_contradicts_itself_or_its_arrays_is_refused_in_one_line(
@@ -1091,6 +1106,19 @@ def test_a_separation_that_is_not_told_is_that_of_no_other_telescope_and_is_said
     bench = load_instrument(write(ABOUT + WFS + MIRROR + MODES))
     assert bench.wfs.pupil_separation_subap == 24.0
     assert "pupil_separation_subap: not given, taken as 24 (1.2 pupil diam" in bench.remarks[0]
+
+
+def test_an_elliptic_modulation_is_two_axes_and_an_angle(write):
+    ellipse = ROUND.format("{ axes_lambda_over_d = [4, 5.0], angle_deg = 30 }")
+    bench = load_instrument(write(ABOUT + ellipse + MIRROR + MODES))
+    assert bench.wfs.modulation_lambda_over_d == pytest.approx(np.sqrt(20.0))
+    longer, shorter, angle_rad = bench.wfs.modulation_axes
+    assert (longer, shorter) == pytest.approx((5.0, 4.0))
+    assert np.degrees(angle_rad) % 180.0 == pytest.approx(120.0)
+    circle = load_instrument(write(ABOUT + APART + MIRROR + MODES))
+    assert circle.wfs.modulation_stretch is None
+    wfs = replace(circle.wfs, modulation_stretch=(0.1, 0.0))
+    assert instrument_sha256(replace(circle, wfs=wfs)) != instrument_sha256(circle)
 
 
 def test_what_is_unknown_is_where_a_fit_begins_and_is_said(write):

@@ -66,6 +66,18 @@ TESTS = {
         f"{COMPUTER}/test_real_time_computer.py",
         "test_the_image_is_moved_by_who_can_and_refused_by_who_cannot",
     ),
+    83: (
+        f"{COMPUTER}/test_real_time_computer.py",
+        "test_a_second_offset_replaces_the_first_from_where_its_ramp_is",
+    ),
+    85: (
+        f"{COMPUTER}/test_real_time_computer.py",
+        "test_an_offset_stays_when_the_loop_opens_and_ends_with_the_rtc",
+    ),
+    87: (
+        f"{COMPUTER}/test_real_time_computer.py",
+        "test_an_offset_waits_for_the_end_of_a_measurement",
+    ),
     73: (f"{COMPUTER}/test_real_time_computer.py", "test_modes_that_are_given_up_go_to_zero"),
     77: ("unit/test_wire.py", "test_a_measured_manifest_names_its_columns_or_why_there_are_none"),
     78: ("unit/test_signing.py", "test_each_side_takes_what_the_other_signs"),

@@ -94,12 +94,12 @@ class SensorModel(ABC):
         return None
 
     def signals_of_frames(
-        self, instrument: Instrument, frames: NDArray[Any], flux_frame: NDArray[Any]
+        self, instrument: Instrument, frames: NDArray[Any], flux_frame: NDArray[Any] | None
     ) -> Array:
         """Return the signals ``(n_signals, n_modes)`` of frames ``(n_modes, ny, nx)``.
 
         They are changes per unit of each mode, relative to a mean frame ``(ny, nx)``; see
-        ``frames``.
+        ``frames``. Without a mean frame they are divided by their sum.
 
         Raises
         ------
@@ -107,6 +107,10 @@ class SensorModel(ABC):
             If the frames do not fit the sensor.
         """
         raise ModelError(f"{instrument.name}: found frames; expected signals of a {self.name}")
+
+    def knows_mean_light(self, instrument: Instrument) -> bool:
+        """Return whether signals can be made of frames without a mean frame."""
+        return False
 
     def locate_images(
         self, instrument: Instrument, flux_frame: NDArray[Any]

@@ -89,6 +89,21 @@ def test_all_of_it_is_there_once_cacao_has_restarted_and_nothing_acts_before(
     np.testing.assert_array_equal(calibration.in_use.matrix, arrays()["reconstructor"])
 
 
+def test_frames_in_another_unit_get_matrix_and_reference_in_theirs(settings, tmp_path):
+    begun(settings, tmp_path)
+    loop = settings.loop.model_copy(update={"slope_per_value": 4.0})
+    settings = settings.model_copy(update={"loop": loop})
+    calibration = Calibration(settings, IDENTITY)
+    apply(settings, bundle_in(tmp_path))
+    calibration.look(100, SHAPE)
+    cube = in_stream(tmp_path).latest().reshape(3, -1)
+    np.testing.assert_allclose(cube[:, INDEX] * UNIT, 4.0 * arrays()["reconstructor"], rtol=1e-6)
+    calibration.look(101, SHAPE)
+    reference = live(tmp_path)["aol1_wfsrefc"].ravel()[INDEX]
+    np.testing.assert_allclose(4.0 * reference, REFERENCE)
+    np.testing.assert_array_equal(calibration.in_use.matrix, arrays()["reconstructor"])
+
+
 def test_what_was_there_goes_back_bit_for_bit_and_forth_again(settings, calibration, tmp_path):
     own, before = calibration.in_use.manifest.id, live(tmp_path)
     slices = in_stream(tmp_path).latest()

@@ -9,8 +9,9 @@ import pytest
 from check_rtc import moving
 from check_rtc.examine import Examination, examine
 from check_rtc.requirements import REQUIREMENTS, Moves, Outcome
-from service.wire import AckState, CommandKind
-from tests.support.pretend import Pretend
+from service.errors import LinkError
+from service.wire import AckState, CommandKind, ReferencesRequest, checksum
+from tests.support.pretend import N_SLOPES, Pretend
 
 ASKING = frozenset(
     name
@@ -72,6 +73,73 @@ def test_the_same_id_answered_otherwise_is_named():
         replace(reply, reason=f"{reply.reason} {next(answers)}") if reply.reason else reply
     )
     wrong(asked(rtc, "replies")["replies"], "a repeated id")
+
+
+# --- references
+
+
+def added(command, rtc):
+    """An RTC that adds an offset to the one in use."""
+    slopes = (rtc.references.slopes + command.offset).astype("<f4")
+    return replace(command, slopes=slopes.tobytes(), sha256=checksum(slopes))
+
+
+def restarted(command, rtc):
+    rtc.session = "s-references"
+    return command
+
+
+def louder(command, rtc):
+    rtc.gains = 1.1 * rtc.gains
+    return command
+
+
+@pytest.mark.parametrize(
+    ("twists", "words"),
+    [
+        ({"subtracted": lambda now: -now}, "a wrong sign"),
+        ({"subtracted": lambda now: 0.7 * now}, "a wrong scale"),
+        ({"subtracted": lambda now: 0.0 * now}, "named and not applied"),
+        ({"references": added}, "is left after the return: it was added"),
+        ({"references": lambda command, _: replace(command, ramp_s=0.0)}, "have the names"),
+        ({"references": lambda command, _: replace(command, ramp_s=1.5)}, "takes 1.50 s"),
+        ({"references": restarted}, "session or cm_id changed"),
+        ({"references": louder}, "gains or leak changed"),
+        ({"named": lambda name: name and name.rstrip("~")}, "have the names"),
+        ({"named": lambda _: "mine"}, "no frame names check-references"),
+        ({"status": {"reference_id": "old"}}, "the status does not name"),
+        ({"denied": -1.0}, "has other numbers than were sent"),
+        ({"read_back": LinkError("no answer")}, "the command is offered, and rtc/references not"),
+        ({"reply": lambda _, reply: replace(reply, accepted=False, reason="range")}, "refused"),
+    ],
+)
+def test_references_that_are_not_as_the_contract_says_are_named(twists, words):
+    wrong(asked(Pretend(**twists), "references")["references"], words)
+
+
+@pytest.mark.parametrize(
+    ("twists", "words"),
+    [
+        ({"own_references": True, "read_back": LinkError("no answer")}, "unsupported: no"),
+        ({"no_command": ("references",), "read_back": LinkError("no answer")}, "is optional"),
+        ({"applied": LinkError("no answer")}, "no matrix in use is known"),
+    ],
+)
+def test_who_sets_its_references_alone_is_left_alone(twists, words):
+    check = asked(Pretend(**twists), "references")["references"]
+    assert check.outcome is Outcome.SKIPPED
+    assert words in check.found
+
+
+def test_the_offset_that_was_there_is_there_afterwards():
+    rtc = Pretend()
+    slopes = np.full(N_SLOPES, 1e-3, "<f4")
+    offset = {"slopes": slopes.tobytes(), "sha256": checksum(slopes)}
+    names = {"id": "r-1", "reference_id": "ncpa", "config_id": "mask-1"}
+    rtc.command(ReferencesRequest(**names, **offset, ramp_s=0.0))
+    check = asked(rtc, "references")["references"]
+    assert check.outcome is Outcome.OK, check.found
+    np.testing.assert_array_equal(rtc.references.slopes, slopes)
 
 
 # --- the dither

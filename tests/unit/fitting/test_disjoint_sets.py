@@ -11,7 +11,7 @@ from pyrcal.fitting.disjoint_sets import (
     jackknife_sigma,
     pupil_partitions,
 )
-from pyrcal.fitting.uncertainty import dispersion
+from pyrcal.fitting.solver import dispersion
 from service.estimation.solver import Projection
 
 N_ROWS, N_MODES, N_REGIONS = 120, 32, 12

@@ -11,13 +11,14 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
-from pyrcal.fitting import alternatives, instrument_checks, models, pupil_checks
+from pyrcal.fitting import alternatives, comparison, instrument_checks, models, pupil_checks
 from pyrcal.fitting.advice import Grounds, add_recommendation
-from pyrcal.fitting.alternatives import CENTRED_KEY, Alternative
+from pyrcal.fitting.alternatives import CENTRED_KEY
+from pyrcal.fitting.comparison import Alternative
 from pyrcal.fitting.control_check import check_control
 from pyrcal.fitting.fit_table import table
 from pyrcal.fitting.fitted import Fit
-from pyrcal.fitting.left_over import LeftOver
+from pyrcal.fitting.left_over import ResidualLocation
 from pyrcal.fitting.matrix import FitOptions, fit_matrix
 from pyrcal.fitting.report import document, fill_fit, read_fit
 from pyrcal.fitting.verdict import Refusal
@@ -319,7 +320,7 @@ def test_a_mode_that_was_measured_badly_is_named():
 
 
 def test_modes_that_fit_badly_are_the_cause_where_sets_of_modes_disagree():
-    bad = LeftOver(border=None, subapertures=(), modes=((67, 0.71),))
+    bad = ResidualLocation(border=None, subapertures=(), modes=((67, 0.71),))
     divided = a_fit(accepted=False, verdict="refused: sets of modes disagree", left_over=bad)
     grounds = Grounds(refusal=Refusal.DIVIDED, reason="", structure=0.05, n_sets=8)
     assert add_recommendation(divided, grounds).recommendation == (
@@ -396,18 +397,13 @@ def test_a_fit_that_nobody_asked_to_explain_is_advised_all_the_same():
 
 def test_a_fit_is_written_whichever_alternative_is_preferred(monkeypatch, tmp_path):
     """Each passes its tests by limits that all pass, so its own numbers come to its flags."""
-    for module in (alternatives, instrument_checks, models, pupil_checks):
+    for module in (alternatives, comparison, instrument_checks, models, pupil_checks):
         for name in ("PREFERRED_SHARE", "FAR_PREFERRED_SHARE"):
             monkeypatch.setattr(module, name, np.inf, raising=False)
-        monkeypatch.setattr(module, "SIGNIFICANT", -np.inf, raising=False)
-    for name in (
-        "NOTABLE_OFFSET_SUBAP",
-        "NOTABLE_OFFSET_SHARE",
-        "MIN_OFFSET_EXPLAINED",
-        "NOTABLE_GAIN_RATIO",
-    ):
+        monkeypatch.setattr(module, "MIN_EXPLAINED", -1.0, raising=False)
+    monkeypatch.setattr(comparison, "SIGNIFICANT", -np.inf)
+    for name in ("NOTABLE_OFFSET_SUBAP", "NOTABLE_OFFSET_SHARE", "NOTABLE_GAIN_RATIO"):
         monkeypatch.setattr(alternatives, name, -1.0)
-    monkeypatch.setattr(instrument_checks, "MIN_EXPLAINED", -1.0)
     monkeypatch.setattr(pupil_checks, "MIN_PUPIL_EXPLAINED", -1.0)
     about = modal_bench()
     # where the images are unknown, the fit itself places the pupil

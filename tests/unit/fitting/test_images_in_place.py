@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import pyrcal.fitting.alternatives as alternatives
+from pyrcal.fitting.comparison import Alternative
 from pyrcal.fitting.instrument_checks import fit_file_values
 from pyrcal.fitting.matrix import FitOptions, fit_matrix
 from pyrcal.fitting.methods import settle_at
 from pyrcal.fitting.models import FitModels
-from pyrcal.fitting.pupil_checks import Lead
 from pyrcal.fitting.solver import image_patterns, nuisances_of
 from pyrcal_studies.benches import coarse_bench, fit_bench, some_columns
 from pyrcal_studies.drawn_fits import Condition, Draw, instrument_of
@@ -37,7 +37,8 @@ def test_images_that_are_displaced_as_pyramids_have_them_are_no_alternative():
 )
 def test_an_alternative_that_leaves_many_times_as_much_is_excluded(share, sigma, is_open):
     """The last one is a matrix of HCIPy with Gaussian influence functions."""
-    assert alternatives.is_open(Lead(share=share, sigma=sigma)) is is_open
+    one = Alternative(share=share, share_sigma=sigma, moved=np.zeros(4))
+    assert one.is_open is is_open
 
 
 def test_images_displaced_beyond_belief_are_tried_in_their_places(monkeypatch):
@@ -104,7 +105,7 @@ def test_file_values_are_fitted_with_the_images_where_the_fit_displaced_them():
         image_sigma=0.2,
     )
     settled = settle_at(there, target, ELSEWHERE, replace(nuisances, displaced=displaced))
-    found = fit_file_values(models, settled)
+    found = fit_file_values(models, settled, ())
     assert found.share == pytest.approx(1.0, abs=0.05)
     assert np.all(np.abs(found.moved) < 1e-3)
 

@@ -122,7 +122,8 @@ def test_a_mirror_that_oopao_drew_flipped_is_drawn_flipped(saved):
         ({"calib__D": np.ones((7, 30))}, "found shape (7, 30), expected (n_slopes, n_modes)"),
         ({"M2C": np.ones((7, 30))}, "M2C: found shape (7, 30), expected (n_actuators, n_modes)"),
         ({"calib__D": np.full((104, 30), np.nan)}, "expected finite numbers"),
-        ({"wfs__postProcessing": np.array("fullFrame")}, "expected 'slopesMaps'"),
+        ({"wfs__postProcessing": np.array("quadCell")}, "expected 'slopesMaps', 'fullFrame'"),
+        ({"wfs__postProcessing": np.array("fullFrame")}, "wfs.validSignal: missing"),
         ({"wfs__tag": np.array("bioEdge")}, "found 'bioEdge', expected 'pyramid'"),
         ({"dm__altitude": np.array(8e3)}, "expected None: a mirror in the pupil"),
         ({"dm__modes": np.ones((7, 68))}, "expected (tel.resolution ** 2, n_actuators)"),
@@ -131,6 +132,93 @@ def test_a_mirror_that_oopao_drew_flipped_is_drawn_flipped(saved):
 def test_what_does_not_belong_together_is_refused_with_its_name(saved, other, says):
     with pytest.raises((ConfigurationError, MatrixError), match=re.escape(says)):
         imported_of(saved, **other)
+
+
+def whole_detector(saved, moved=((0, 0), (0, 0), (0, 0), (0, 0)), **other):
+    """Save four discs of light that respond, on a detector of 24 pixels, as of the whole detector.
+
+    ``moved`` are rows and columns of the images at -y -x, -y +x, +y -x, +y +x.
+    """
+    row, column = np.mgrid[:24, :24]
+    lit = np.zeros((24, 24))
+    for (y, x), (down, right) in zip(np.ndindex(2, 2), moved, strict=True):
+        lit += np.hypot(row - 5.5 - 12 * y - down, column - 5.5 - 12 * x - right) < 4.0
+    response = np.random.default_rng(3).normal(size=(576, 30)) * lit.reshape(-1, 1)
+    kept = {name: values for name, values in saved.items() if name != "wfs.validI4Q"}
+    return imported_of(
+        kept,
+        wfs__postProcessing=np.array("fullFrame_sum_flux"),
+        wfs__n_pix_separation=np.array(4),
+        **{"calib__D": response} | other,
+    )
+
+
+def test_a_signal_of_the_whole_detector_becomes_frames_over_their_sum(saved, tmp_path):
+    found = whole_detector(saved)
+    sensor = found.tables["wfs"]
+    assert (sensor["input"], sensor["n_subapertures"]) == ("normalised-frames", 8)
+    assert sensor["pupil_centres_px"] == [[5.5, 5.5], [5.5, 17.5], [17.5, 5.5], [17.5, 17.5]]
+    assert found.arrays["interaction_matrix"].shape == (30, 24, 24)
+    assert "flux_frame" not in found.arrays
+    instrument = pyrcal.load_instrument(found.save(tmp_path / "whole").instrument)
+    assert instrument.frames.normalised
+    assert instrument.wfs.valid_subapertures.sum() == 52
+
+
+def test_pupil_images_off_their_quadrants_are_cut_where_the_response_is(saved):
+    moved = ((1, 2), (0, 2), (1, 0), (0, 0))
+    found = whole_detector(saved, moved)
+    assert found.tables["wfs"]["pupil_centres_px"] == [
+        [6.5, 7.5],
+        [5.5, 19.5],
+        [18.5, 5.5],
+        [17.5, 17.5],
+    ]
+    assert any("off OOPAO's own quadrants" in note for note in found.notes)
+
+
+def test_the_reference_signal_of_a_whole_detector_is_its_mean_frame(saved):
+    mean = np.random.default_rng(4).uniform(size=(24, 24))
+    found = whole_detector(saved, wfs__referenceSignal_2D=mean)
+    np.testing.assert_array_equal(found.arrays["flux_frame"], mean)
+    assert found.tables["wfs"]["pupil_centres_px"] == "auto"
+
+
+def test_valid_pixels_of_a_whole_detector_are_put_in_their_places(saved):
+    lit = np.random.default_rng(5).uniform(size=(24, 24)) < 0.5
+    response = np.random.default_rng(6).normal(size=(int(lit.sum()), 30))
+    found = whole_detector(saved, calib__D=response, wfs__validSignal=lit.astype(int))
+    cube = found.arrays["interaction_matrix"]
+    np.testing.assert_array_equal(cube[:, lit], response.T)
+    assert not cube[:, ~lit].any()
+
+
+def modulated_on(saved, *axes, angle_deg=0.0, middle=0.0):
+    t = np.arange(24) * np.pi / 12
+    path = np.exp(1j * np.deg2rad(angle_deg)) * (axes[0] * np.cos(t) + 1j * axes[1] * np.sin(t))
+    own = np.column_stack([path.real + middle, path.imag])
+    return imported_of(saved, wfs__user_modulation_path=own)
+
+
+def test_an_elliptic_path_is_an_elliptic_modulation(saved, tmp_path):
+    found = modulated_on(saved, 4.0, 5.0, angle_deg=30.0)
+    ellipse = found.tables["wfs"]["modulation_ellipse"]
+    np.testing.assert_allclose(ellipse["axes_lambda_over_d"], [5.0 * 32 / 31, 4.0 * 32 / 31])
+    assert ellipse["angle_deg"] == pytest.approx(120.0)
+    assert not any("user_modulation_path" in note for note in found.notes)
+    longer, shorter, _ = pyrcal.load_instrument(
+        found.save(tmp_path / "bench").instrument
+    ).wfs.modulation_axes
+    assert (longer, shorter) == pytest.approx((5.0 * 32 / 31, 4.0 * 32 / 31))
+
+
+def test_a_round_path_is_a_circle_and_another_one_is_said_to_be_none(saved):
+    assert modulated_on(saved, 3.0, 3.0).tables["wfs"]["modulation_lambda_over_d"] == pytest.approx(
+        3.0 * 32 / 31
+    )
+    assert any("no ellipse" in note for note in modulated_on(saved, 3.0, 4.0, middle=0.5).notes)
+    with pytest.raises(ConfigurationError, match="expected pairs"):
+        modulated_on(saved, 0.0, 0.0)
 
 
 def test_what_was_not_saved_is_named(saved):

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pyrcal.fitting.comparison import Alternative
 from pyrcal.fitting.fit_table import table
-from pyrcal.fitting.instrument_checks import FileValuesFit, FoundOptic
+from pyrcal.fitting.instrument_checks import FoundOptic
 from pyrcal.fitting.models import Optic
 from pyrcal.fitting.origins import is_determined, list_origins, list_undetermined_keys
 from pyrcal.fitting.report import document
@@ -26,7 +27,8 @@ UNKNOWN = replace(TEN, reported=None)
 
 
 def file_values(share):
-    return FileValuesFit(share=share, moved=np.zeros(4))
+    """Return the fit with the file's values, of whose misfit the fitted ones leave a share."""
+    return Alternative(share=1.0 / share, moved=np.zeros(4))
 
 
 def test_a_number_that_explains_little_of_the_misfit_does_not_correct_the_file():

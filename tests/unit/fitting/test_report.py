@@ -6,10 +6,10 @@ import h5py
 import numpy as np
 import pytest
 
-from pyrcal.fitting.alternatives import Alternative
+from pyrcal.fitting.comparison import Alternative
 from pyrcal.fitting.fit_table import table
 from pyrcal.fitting.instrument_checks import FoundOptic
-from pyrcal.fitting.left_over import Arm, LeftOver
+from pyrcal.fitting.left_over import Arm, ResidualLocation
 from pyrcal.fitting.models import Optic
 from pyrcal.fitting.origins import Origin
 from pyrcal.fitting.report import document, fill_fit, read_fit
@@ -174,7 +174,7 @@ def test_what_was_found_is_said_once_and_its_key_whole():
 
 
 def test_where_something_is_left_over_is_told():
-    left = LeftOver(
+    left = ResidualLocation(
         border=2.5,
         subapertures=((1, 2, 0.4),),
         modes=((4, 0.3),),

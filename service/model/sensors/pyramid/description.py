@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -24,9 +25,46 @@ class Pyramid(PyramidNumbers):
     """Mask ``(n_subapertures, n_subapertures)``, [y, x] in the RTC's own axes, as its slopes are
     listed; None: by ``flux_threshold`` at α = 0."""
 
+    modulation_stretch: tuple[float, float] | None = None
+    """What makes an ellipse of the circle, ``(e, f)`` in the RTC's own axes: the path is that of
+    the circle times the exponential of ``[[e, f], [f, -e]]``. None for a circle."""
+
     image_offsets_subap: tuple[tuple[float, float], ...] | None = None
     """Displacement (x, y) of the images at -x -y, +x -y, -x +y and +x +y from their places on the
     pixel grid, subapertures, in the RTC's own axes; None if unknown."""
+
+    @property
+    def largest_modulation(self) -> float:
+        """Radius of the modulation, or the longer semi-axis, λ/D."""
+        return self.modulation_lambda_over_d * math.exp(
+            math.hypot(*self.modulation_stretch or (0,))
+        )
+
+    @property
+    def modulation_path(self) -> tuple[float, float, float]:
+        """``(a, b, c)`` of the path ``x = b cos t + c sin t``, ``y = a cos t``, λ/D.
+
+        Every ellipse has this form, whose points t and -t have the same y.
+        """
+        radius, (e, f) = self.modulation_lambda_over_d, self.modulation_stretch or (0.0, 0.0)
+        size = 2.0 * math.hypot(e, f)
+        # the square of the exponential of a traceless symmetric matrix
+        slant = math.sinh(size) / size * 2.0 if size else 2.0
+        along_y = math.sqrt(math.cosh(size) - slant * e)
+        return radius * along_y, radius * slant * f / along_y, radius / along_y
+
+    @property
+    def modulation_axes(self) -> tuple[float, float, float]:
+        """Semi-axes of the modulation, λ/D, and the angle of the first, radians, the RTC's axes."""
+        e, f = self.modulation_stretch or (0.0, 0.0)
+        radius, ratio = self.modulation_lambda_over_d, math.exp(math.hypot(e, f))
+        return radius * ratio, radius / ratio, math.atan2(f, e) / 2.0
+
+
+def stretch_of(axes: tuple[float, float], angle_rad: float) -> tuple[float, float]:
+    """Return ``Pyramid.modulation_stretch`` of an ellipse; the first axis is at the angle."""
+    size = math.log(axes[0] / axes[1]) / 2.0
+    return size * math.cos(2.0 * angle_rad), size * math.sin(2.0 * angle_rad)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -39,6 +77,22 @@ class FrameWindows:
 
     pixels_per_subaperture: int = 1
     """Detector pixels along a side of a subaperture."""
+
+    normalised: bool = False
+    """True if the frames are divided by their sum over the detector."""
+
+    @property
+    def off_grid_subap(self) -> NDArray[np.float64]:
+        """Displacement (x, y) of each window from a square around their middle, ``(4, 2)``.
+
+        Subapertures, in the detector's own axes; 0 where the images are still to be found.
+        """
+        if self.centres_px is None:
+            return np.zeros((4, 2))
+        sides = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) / 2.0
+        off = by_quadrant(self.centres_px).reshape(4, 2) - self.centres_px.mean(axis=0)
+        square = sides * 2.0 * float(np.mean(off * sides * 2.0))
+        return np.asarray((off - square)[:, ::-1] / self.pixels_per_subaperture)
 
 
 def image_offsets(instrument: Instrument) -> NDArray[np.float64] | None:
@@ -92,6 +146,22 @@ def pyramid_in(instrument: Instrument) -> Pyramid:
         If its sensor is another.
     """
     return sensor_of_kind(instrument, Pyramid)
+
+
+def oriented_pyramid(instrument: Instrument) -> Pyramid:
+    """Return the pyramid with its modulation in the axes of conventions.md.
+
+    Raises
+    ------
+    ModelError
+        If the sensor is another.
+    """
+    wfs = pyramid_in(instrument)
+    if wfs.modulation_stretch is None:
+        return wfs
+    orientation, (e, f) = instrument.slopes.assumed_orientation, wfs.modulation_stretch
+    turned = -e if orientation.swap_xy else e, -f if orientation.flip_x != orientation.flip_y else f
+    return replace(wfs, modulation_stretch=turned)
 
 
 def by_quadrant(centres_px: NDArray[np.float64]) -> NDArray[np.float64]:

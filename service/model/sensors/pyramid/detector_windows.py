@@ -45,6 +45,9 @@ _EVEN_SIGMA_PX = 0.03
 """σ of the middle below which light counts as even: there it is up to 0.023 pixel with images of 12
 pixels, 0.01 with 40."""
 
+_SAMPLING_WITHOUT_LIGHT = 3
+"""Pupil points along a subaperture of the light that stands in for a mean frame."""
+
 _REMARK_DISTANCE_SUBAP = 0.25
 """Distance of the centres of the file from the light that is mentioned."""
 
@@ -257,7 +260,7 @@ def _format_centres(centres: Array) -> str:
 
 
 def slopes_from_frames(
-    instrument: Instrument, frames: NDArray[np.floating], flux_frame: NDArray[np.floating]
+    instrument: Instrument, frames: NDArray[np.floating], flux_frame: NDArray[np.floating] | None
 ) -> Array:
     """Return the slopes ``(n_slopes, n_modes)`` of differential frames.
 
@@ -268,7 +271,8 @@ def slopes_from_frames(
     frames
         ``(n_modes, rows, columns)`` change of every pixel per unit of each mode.
     flux_frame
-        ``(rows, columns)`` mean frame in the same counts.
+        ``(rows, columns)`` mean frame in the same counts. None: frames are divided by their sum,
+        and the mean light is the model's for an evenly lit pupil.
 
     Returns
     -------
@@ -282,14 +286,17 @@ def slopes_from_frames(
         If the frames do not fit one another, the pupil images are not found in them, or a valid
         subaperture is dark.
     """
-    if flux_frame.ndim != 2 or frames.ndim != 3 or frames.shape[1:] != flux_frame.shape:
+    valid = rtc_valid_subapertures(instrument)
+    if flux_frame is None:
+        windows, rest = _windows_without_light(instrument, frames)
+    elif flux_frame.ndim != 2 or frames.ndim != 3 or frames.shape[1:] != flux_frame.shape:
         raise ModelError(
             f"frames: found shape {frames.shape} and a flux frame of {flux_frame.shape}; "
             "expected (n_modes, rows, columns) and (rows, columns)"
         )
-    windows = frame_windows(instrument, flux_frame.astype(np.float64))
-    valid = rtc_valid_subapertures(instrument)
-    rest = windows.cut(flux_frame)
+    else:
+        windows = frame_windows(instrument, flux_frame.astype(np.float64))
+        rest = windows.cut(flux_frame)
     slopes = [
         slopes_per_unit(
             rest, windows.cut(frames[start : start + _FRAMES_AT_ONCE]), valid, instrument.slopes
@@ -297,6 +304,29 @@ def slopes_from_frames(
         for start in range(0, len(frames), _FRAMES_AT_ONCE)
     ]
     return np.concatenate(slopes, axis=1)
+
+
+def _windows_without_light(
+    instrument: Instrument, frames: NDArray[np.floating]
+) -> tuple[Windows, Array]:
+    """Return the windows of frames that are divided by their sum, and the model's images in them.
+
+    The images ``(2, n, 2, n)`` are shares of the light on the whole detector.
+    """
+    from service.model.sensors.pyramid.light import build_even_optics
+
+    places = instrument.frames
+    if not isinstance(places, FrameWindows) or places.centres_px is None:
+        raise ModelError(
+            f"{instrument.name}: found neither a mean frame nor wfs.pupil_centres_px; expected one "
+            "of them, to know where the pupil images are"
+        )
+    centres = by_quadrant(places.centres_px)
+    optics = build_even_optics(instrument, _SAMPLING_WITHOUT_LIGHT)
+    # The pyramid absorbs nothing: its images and what it scatters beside them share this light.
+    whole = float(np.sum(optics.pupil.amplitude**2)) / _SAMPLING_WITHOUT_LIGHT**2
+    windows = _windows_at(instrument, centres, frames[0], places.pixels_per_subaperture)
+    return windows, optics.images() / whole
 
 
 def slopes_per_unit(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -38,6 +39,7 @@ class PyramidKind(SensorKind):
 
     @override
     def as_read(self, written: Mapping[str, Any]) -> Mapping[str, Any]:
+        written = _with_radius(written)
         centres = written.get("pupil_centres_px")
         if centres is None:
             return written
@@ -55,10 +57,27 @@ class PyramidKind(SensorKind):
     def list_assumptions(
         self, table: PyramidTable, given: frozenset[str]
     ) -> Iterator[tuple[str, str]]:
-        has_centres = table.input == "frames" and table.pupil_centres_px is not None
+        has_centres = table.input != "slopes" and table.pupil_centres_px is not None
         if "pupil_separation_subap" not in given and not has_centres:
             yield (
                 "pupil_separation_subap",
                 f"not given, taken as {table.image_separation_subap:g} ({USUAL_SEPARATION:g} pupil "
                 "diameters)",
             )
+
+
+def _with_radius(written: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return ``[wfs]`` with the radius of the circle that has the area of a stated ellipse."""
+    ellipse = written.get("modulation_ellipse")
+    if not isinstance(ellipse, dict):
+        return written
+    if "modulation_lambda_over_d" in written:
+        raise ModelError(
+            "modulation_ellipse: found modulation_lambda_over_d as well, expected one of them: "
+            "remove the radius of the circle"
+        )
+    found = ellipse.get("axes_lambda_over_d")
+    axes = found if isinstance(found, list) else []
+    # Axes that are not two positive numbers are refused with the table.
+    usable = len(axes) == 2 and all(isinstance(one, int | float) and one > 0 for one in axes)
+    return {**written, "modulation_lambda_over_d": math.sqrt(math.prod(axes)) if usable else 0.0}

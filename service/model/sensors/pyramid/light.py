@@ -26,7 +26,11 @@ from numpy.typing import NDArray
 from service.errors import ModelError
 from service.model.instrument import Instrument
 from service.model.pupil import Illumination, instrument_pupil
-from service.model.sensors.pyramid.description import image_offsets, pyramid_in
+from service.model.sensors.pyramid.description import (
+    image_offsets,
+    oriented_pyramid,
+    pyramid_in,
+)
 from service.model.sensors.pyramid.optics import PyramidOptics, enough_modulation_points
 from service.model.sensors.sensor import CannotTell, ImageOffsets, PupilPosition
 from service.model.slopes import orient_mask
@@ -277,11 +281,12 @@ def _other_light(residual: float) -> CannotTell:
 
 def build_even_optics(instrument: Instrument, sampling: int = 2) -> PyramidOptics:
     """Return the sensor with an evenly lit pupil, as finely as light needs it."""
+    wfs = oriented_pyramid(instrument)
     return PyramidOptics(
-        wfs=pyramid_in(instrument),
+        wfs=wfs,
         pupil=instrument_pupil(instrument, sampling),
         n_nodes=sampling,
-        n_modulation=enough_modulation_points(pyramid_in(instrument)),
+        n_modulation=enough_modulation_points(wfs),
         offsets=image_offsets(instrument),
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields, replace
 from typing import Any
 
@@ -15,7 +16,14 @@ from service.model.kinds import LoopFacts, Normalisation
 from service.model.pupil import PupilGrid, valid_subapertures
 from service.model.sensors.model import SensorModel, Term
 from service.model.sensors.pyramid import description, detector_windows, signals, working_point
-from service.model.sensors.pyramid.description import FrameWindows, Pyramid, by_quadrant, pyramid_in
+from service.model.sensors.pyramid.description import (
+    FrameWindows,
+    Pyramid,
+    by_quadrant,
+    oriented_pyramid,
+    pyramid_in,
+    stretch_of,
+)
 from service.model.sensors.pyramid.light import PyramidLight
 from service.model.sensors.pyramid.optics import PyramidOptics, enough_modulation_points
 from service.model.sensors.pyramid.table import IMAGE_KEY, PyramidMode, PyramidNumbers, PyramidTable
@@ -95,15 +103,19 @@ class PyramidModel(SensorModel):
         offsets: tuple[tuple[float, float], ...] | None = None
         if table.image_offsets_px is not None:
             offsets = tuple((x / pixels, y / pixels) for x, y in table.image_offsets_px)
+        ellipse, stretch = table.modulation_ellipse, None
+        if ellipse is not None:
+            stretch = stretch_of(ellipse.axes_lambda_over_d, math.radians(ellipse.angle_deg))
         return Pyramid(
             **optics | {"pupil_separation_subap": separation},
             image_offsets_subap=offsets,
+            modulation_stretch=stretch,
         )
 
     @override
     def in_modes(self, table: PyramidTable, sensor: Pyramid) -> tuple[tuple[SensorMode, str], ...]:
-        if table.mode and table.input == "frames":
-            raise ModelError('mode: belongs to input = "slopes", found input = "frames"')
+        if table.mode and table.input != "slopes":
+            raise ModelError(f'mode: belongs to input = "slopes", found input = "{table.input}"')
         names = [mode.config_id for mode in table.mode]
         for k, mode in enumerate(table.mode):
             if mode.config_id in names[:k]:
@@ -153,19 +165,30 @@ class PyramidModel(SensorModel):
                     raise ModelError(f'{key}: belongs to input = "frames", found input = "slopes"')
             return None
         centres = None if table.pupil_centres_px is None else _centres(table).reshape(4, 2)
-        return FrameWindows(centres_px=centres, pixels_per_subaperture=table.pixels_per_subaperture)
+        return FrameWindows(
+            centres_px=centres,
+            pixels_per_subaperture=table.pixels_per_subaperture,
+            normalised=table.input == "normalised-frames",
+        )
 
     @override
     def signals_of_frames(
-        self, instrument: Instrument, frames: NDArray[Any], flux_frame: NDArray[Any]
+        self, instrument: Instrument, frames: NDArray[Any], flux_frame: NDArray[Any] | None
     ) -> Array:
         return detector_windows.slopes_from_frames(instrument, frames, flux_frame)
+
+    @override
+    def knows_mean_light(self, instrument: Instrument) -> bool:
+        return isinstance(instrument.frames, FrameWindows) and instrument.frames.normalised
 
     @override
     def locate_images(
         self, instrument: Instrument, flux_frame: NDArray[Any]
     ) -> tuple[Instrument, tuple[str, ...], float]:
-        return detector_windows.locate_images(instrument, flux_frame)
+        located, remarks, sigma = detector_windows.locate_images(instrument, flux_frame)
+        if located is not instrument:  # places of the file have their part in ``turned_edge_sigma``
+            sigma = float(np.hypot(sigma, _turned_edge_shift(located, np.zeros((4, 2)))))
+        return located, remarks, sigma
 
     @override
     def measure_image_offsets(self, instrument: Instrument, light: Array) -> Array | CannotTell:
@@ -178,7 +201,8 @@ class PyramidModel(SensorModel):
     @override
     def identity(self, sensor: Pyramid) -> tuple[float, ...]:
         separation = sensor.image_separation_subap
-        return (sensor.wavelength_m, sensor.modulation_lambda_over_d, separation)
+        stretch = sensor.modulation_stretch or ()
+        return (sensor.wavelength_m, sensor.modulation_lambda_over_d, separation, *stretch)
 
     def bin_sensor(self, sensor: Pyramid, binning: int) -> Pyramid:
         """Return the sensor with so many subapertures made one along each axis."""
@@ -209,7 +233,7 @@ class PyramidModel(SensorModel):
         fineness: Fineness,
         working_point: WorkingPoint | None = None,
     ) -> signals.PyramidSensor:
-        wfs = pyramid_in(instrument)
+        wfs = oriented_pyramid(instrument)
         if not isinstance(working_point, Halo | None):
             raise ModelError(f"pyramid: found {working_point!r}, expected a halo")
         optics = PyramidOptics(
@@ -246,7 +270,7 @@ class PyramidModel(SensorModel):
     @override
     def coarsest_sampling(self, sensor: Pyramid) -> int:
         # The phase of a modulation that is wide for its subapertures turns too fast for one point.
-        wide = 2.0 * sensor.modulation_lambda_over_d + 3.0 >= sensor.pupil_diameter
+        wide = 2.0 * sensor.largest_modulation + 3.0 >= sensor.pupil_diameter
         return 2 if wide else 1
 
     @override
@@ -299,10 +323,8 @@ class PyramidModel(SensorModel):
     def turned_edge_sigma(self, instrument: Instrument, displaced_subap: Array) -> Array:
         stated = self.image_offsets(instrument)
         offsets = displaced_subap + (0.0 if stated is None else stated)
-        apart = offsets - offsets.mean(axis=0)
-        wfs = pyramid_in(instrument)
-        shift = EDGE_SHIFT * float(np.mean(apart**2)) / wfs.image_separation_subap
-        turn = EDGE_TURN * shift / (wfs.pupil_diameter / 2.0)
+        shift = _turned_edge_shift(instrument, offsets)
+        turn = EDGE_TURN * shift / (instrument.wfs.pupil_diameter / 2.0)
         if isinstance(instrument.frames, FrameWindows):
             shift = float(np.hypot(shift, LOCATED_SIGMA_PX / _pixels(instrument)))
         return np.array([shift, shift, turn, 0.0])
@@ -345,6 +367,14 @@ class PyramidModel(SensorModel):
     @override
     def light(self, instrument: Instrument) -> PyramidLight:
         return PyramidLight(instrument=instrument)
+
+
+def _turned_edge_shift(instrument: Instrument, offsets: Array) -> float:
+    """Return 1 σ of a shift by images displaced by ``offsets`` ``(4, 2)`` from their windows."""
+    if isinstance(instrument.frames, FrameWindows):
+        offsets = offsets + instrument.frames.off_grid_subap
+    apart, wfs = offsets - offsets.mean(axis=0), pyramid_in(instrument)
+    return EDGE_SHIFT * float(np.mean(apart**2)) / wfs.image_separation_subap
 
 
 def _pixels(instrument: Instrument) -> int:

@@ -134,7 +134,7 @@ class PyramidOptics:
         if self.n_modulation % 2 or self.n_modulation < least:
             raise ModelError(
                 f"pyramid: found {self.n_modulation} modulation points; expected an even number "
-                f">= {least} for a radius of {self.wfs.modulation_lambda_over_d} λ/D"
+                f">= {least} for a radius of {self.wfs.largest_modulation} λ/D"
             )
 
     def response(
@@ -304,7 +304,7 @@ class PyramidOptics:
     @property
     def n_pairs(self) -> int:
         """Pairs of source points."""
-        return len(self._source()[2])
+        return len(self._source()[1])
 
     def images(self, shift: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
         """Return the light at rest ``(2, n, 2, n)``: side, row along y, side, column along x."""
@@ -345,25 +345,30 @@ class PyramidOptics:
             weights=nodes.weights,
         )
 
-    def _source(self) -> tuple[Array, Array, Array]:
-        """Return radius, angle and weight of every pair of source points, ``(M/2,)`` each.
+    def _source(self) -> tuple[Array, Array]:
+        """Return tilt ``(3, M/2)`` and weight ``(M/2,)`` of every pair of source points.
 
-        Without a halo the source is the modulation circle. A pair shares its component along y.
+        The tilt is that of both along y, then half the sum and half the difference of those along
+        x. Without a halo the source is the path of the modulation. The halo of an ellipse is taken
+        as that of the circle of the same area.
         """
-        circle = 2 * np.pi * self.wfs.modulation_lambda_over_d / self.wfs.pupil_diameter
-        rings = [(circle, 1.0 if self.halo is None else self.halo.core_weight, self.n_modulation)]
+        path = tuple(2 * np.pi * a / self.wfs.pupil_diameter for a in self.wfs.modulation_path)
+        rings = [(path, 1.0 if self.halo is None else self.halo.core_weight, self.n_modulation)]
         if self.halo is not None:
             halo = self.halo
             rings += [
-                (float(radius), float(weight), n)
+                ((float(radius), 0.0, float(radius)), float(weight), n)
                 for radius, weight, n in zip(halo.radii, halo.weights, halo.n_points, strict=True)
             ]
-        radii = np.concatenate([np.full(n // 2, radius) for radius, _, n in rings])
-        # Half of a circle and half a step off the axes: every point then has a partner with the
-        # opposite x.
-        angles = np.concatenate([2 * np.pi * (np.arange(n // 2) + 0.5) / n for _, _, n in rings])
-        weights = np.concatenate([np.full(n // 2, weight / n) for _, weight, n in rings])
-        return radii, angles, weights
+        tilts, weights = [], []
+        for (along_y, middle_x, half_x), weight, n in rings:
+            # Half of a ring and half a step off its ends: every point then has a partner that
+            # differs along x only.
+            angles = 2 * np.pi * (np.arange(n // 2) + 0.5) / n
+            cosine, sine = np.cos(angles), np.sin(angles)
+            tilts.append(np.array([along_y * cosine, middle_x * cosine, half_x * sine]))
+            weights.append(np.full(n // 2, weight / n))
+        return np.concatenate(tilts, axis=1), np.concatenate(weights)
 
     def _tilts(self) -> tuple[Array, Array]:
         """Return source phasors ``(M/2, N)`` along y and ``(M/2, 2, N)`` along x.
@@ -371,10 +376,10 @@ class PyramidOptics:
         The second index along x is the pair of points that share their y component. The phasor
         along y carries the root of the point's weight: it enters every product twice.
         """
-        radii, angles, weights = self._source()
+        (y, middle_x, half_x), weights = self._source()
         u = self.pupil.coordinates
-        along_y = np.sqrt(weights)[:, None] * np.exp(1j * (radii * np.cos(angles))[:, None] * u)
-        x = (radii * np.sin(angles))[:, None, None] * _SIDES[:, None]
+        along_y = np.sqrt(weights)[:, None] * np.exp(1j * y[:, None] * u)
+        x = middle_x[:, None, None] + half_x[:, None, None] * _SIDES[:, None]
         return along_y.astype(self._complex), np.exp(1j * x * u).astype(self._complex)
 
     def _modulate_roof(self, roof_y: _Roof, roof_x: _Roof) -> tuple[Array, Array]:
@@ -421,7 +426,7 @@ class PyramidOptics:
 
         What the halo loses beyond the grid still falls on the detector, only without signal.
         """
-        return float(2.0 * self._source()[2].sum())
+        return float(2.0 * self._source()[1].sum())
 
     def _plane_signs(self, grid: _Grid) -> Array:
         """Return the sign of each image in every plane of signals ``(n_planes, n_sides, n_sides)``.
@@ -622,7 +627,7 @@ def enough_modulation_points(wfs: Pyramid) -> int:
 
     With 16 points at 3 λ/D tip is wrong by 45 %, with 20 by 5 %, with 24 by 2e-3.
     """
-    least = int(np.ceil(6 * wfs.modulation_lambda_over_d)) + 10
+    least = int(np.ceil(6 * wfs.largest_modulation)) + 10
     return least + least % 2
 
 

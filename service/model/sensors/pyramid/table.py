@@ -21,6 +21,7 @@ pixels belong into the windows that cut the images."""
 
 Across = Annotated[int, Ge(4), Le(1000)]
 Modulation = Annotated[float, Ge(0.0), Le(100.0)]
+Axis = Annotated[float, Gt(0.0), Le(100.0)]
 Pixel = Annotated[float, Ge(0.0)]
 Centre = tuple[Pixel, Pixel]
 Centres = tuple[Centre, Centre, Centre, Centre]
@@ -65,6 +66,17 @@ class PyramidNumbers(Read):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Ellipse(Read):
+    """``modulation_ellipse``: an elliptic modulation."""
+
+    axes_lambda_over_d: tuple[Axis, Axis]
+    """Semi-axes, λ/D."""
+
+    angle_deg: float = 0.0
+    """Direction of the first one, from +x towards +y in the RTC's axes."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PyramidMode(Read):
     """``[[wfs.mode]]``: a configuration that the RTC may use instead, such as a binning."""
 
@@ -96,11 +108,17 @@ class PyramidTable(PyramidNumbers):
 
     kind: Literal["pyramid"]
 
+    modulation_ellipse: Ellipse | None = None
+    """Elliptic modulation ``{ axes_lambda_over_d = [4.0, 5.0], angle_deg = 30.0 }``, instead of
+    ``modulation_lambda_over_d``: its semi-axes, and the direction of the first one from +x towards
+    +y in the RTC's axes. None: a circle."""
+
     valid_subapertures: str = "auto"
     """"auto": by ``flux_threshold``; or a mask ``path:/dataset``."""
 
-    input: Literal["slopes", "frames"] = "slopes"
-    """Signals that the RTC sends."""
+    input: Literal["slopes", "frames", "normalised-frames"] = "slopes"
+    """Signals that the RTC sends. A measured matrix of frames comes with a mean frame in the same
+    counts; "normalised-frames" are divided by their sum over the detector, and need none."""
 
     pupil_centres_px: Centres | None = None
     """Frames only: centres of the four pupil images, row and column; "auto": found in a flux

@@ -139,7 +139,7 @@ def test_a_fit_has_no_number_of_it_to_find(write):
     bench = load_instrument(write(WFS))
     models = FitModels(instrument=bench, basis=None)
     assert Optic.SENSOR not in models.optics
-    assert [one.words for one in models.other_instruments] == ['stop = "mirror"']
+    assert list(models.other_instruments) == ['stop = "mirror"']
 
 
 def test_at_work_it_answers_as_to_a_flat_wavefront(write):

@@ -455,7 +455,7 @@ class Cacao:
             case LoopRequest():
                 reason = self._change_loop(command)
             case _:
-                reason = "unsupported: cacao measures and tunes by its own programs"
+                reason = "unsupported: cacao's own programs measure, tune and set references"
         start_seq = None if reason else start_seq
         return Reply(id=command.id, accepted=not reason, reason=reason, start_seq=start_seq)
 

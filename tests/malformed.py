@@ -41,6 +41,7 @@ from service.wire import (
     CommandKind,
     Manifest,
     MeasuredManifest,
+    ReferencesInUse,
     Reply,
     Status,
     command_id,
@@ -76,7 +77,7 @@ def messages():
 
 READERS = (
     *(partial(decode, kind) for kind in (Status, Acknowledgement, Manifest, MeasuredManifest)),
-    partial(decode, Reply),
+    *(partial(decode, kind) for kind in (Reply, ReferencesInUse)),
     *(partial(decode_command, kind) for kind in CommandKind),
     command_id,
 )

@@ -99,7 +99,7 @@ class Bridge:
         elif isinstance(command, LoopRequest):
             return self._change_loop(command), None
         else:
-            return "unsupported: pyRTC measures and tunes by its own means", None
+            return "unsupported: pyRTC measures, tunes and sets references by its own means", None
         return "", None
 
     def _refusal(self, request):

@@ -24,9 +24,12 @@ from service.wire import (
     Manifest,
     MeasuredManifest,
     RampRequest,
+    ReferencesInUse,
+    ReferencesRequest,
     Reply,
     StateMessage,
     Status,
+    checksum,
     command_id,
     decode,
     decode_command,
@@ -163,10 +166,25 @@ def test_ramp_commands_come_out_as_they_went_in(name, edges, order, gains, frame
     assert decode_command(CommandKind.RAMP, encode(command)) == command
 
 
+@given(matrix=MATRICES, name=IDS, own=OPAQUE, ramp_s=st.floats(0.0, 60.0))
+def test_references_come_out_as_they_went_in(matrix, name, own, ramp_s):
+    slopes = matrix.ravel().astype("<f4")
+    offset = {"slopes": slopes.tobytes(), "sha256": checksum(slopes)}
+    command = ReferencesRequest(id=name, reference_id=name, config_id=own, ramp_s=ramp_s, **offset)
+    received = decode_command(CommandKind.REFERENCES, encode(command))
+    assert received == command
+    assert np.array_equal(received.offset.view(np.uint32), slopes.view(np.uint32))
+    in_use = ReferencesInUse(reference_id=own, **offset)
+    assert decode(ReferencesInUse, encode(in_use)) == in_use
+
+
 LEAVES = (
     st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text()
 ) | st.binary()
-RECORDS = (FrameHeader, Manifest, LoopRequest, RampRequest, Acknowledgement, Status)
+RECORDS = (
+    *(FrameHeader, Manifest, LoopRequest, RampRequest, Acknowledgement, Status),
+    ReferencesRequest,
+)
 KEYS = st.sampled_from(
     [f.name for record in RECORDS for f in fields(record)]
     + ["v", "shape", "dtype", "n_chunks", "chunk_bytes", "action", "kind", "modes", "accepted"]
@@ -189,6 +207,7 @@ DECODERS = st.sampled_from(
                 GainsMessage,
                 Manifest,
                 MeasuredManifest,
+                ReferencesInUse,
                 Reply,
             )
         ),

@@ -85,7 +85,7 @@ class CommandLine(OneLineParser):
             return super().explain_choice(action, value)
         known = {name: name for name in action.choices or ()}
         # A word of a group alone, such as "ack", is answered with the whole command.
-        known |= {request.name.split()[-1]: request.name for request in remote.REQUESTS}
+        known |= {request.name.split()[-1]: request.name for request in remote.REQUESTS[::-1]}
         near = closest(value, known)
         return f"found {value!r}, which is no command" + near.replace(
             word := near.rpartition(" ")[2], known.get(word, word)

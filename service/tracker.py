@@ -44,6 +44,7 @@ from service.tracking import (
     operator,
     pointing_law,
     reconstructors,
+    references,
     resume,
     rtc,
     updates,
@@ -104,6 +105,7 @@ def _on_tick(context: StepContext, _: ev.Tick) -> None:
     """Update what depends on time: what is overdue, age of α, a loop to close again."""
     measurement.give_up_overdue(context)
     rtc.give_up_overdue(context)
+    references.give_up_overdue(context)
     validity.age_registration(context)
     operator.close_again(context)
 
@@ -168,7 +170,6 @@ REACTIONS: Final[Reactions] = {
     ev.PassiveUnavailable: (window_processing.on_passive_unavailable,),
     ev.MatrixMade: (operator.on_refit_made, _on_made, acquisition.on_made),
     ev.MatrixFetched: (reconstructors.on_fetched,),
-    ev.ReferencesFetched: (rtc.log_references,),
     ev.ModesRecognised: (mode_proof.note_recognised,),
     ev.MarginJudged: (reconstructors.on_margin,),
     ev.ProposalJudged: (reconstructors.on_proposal_judged,),
@@ -181,6 +182,9 @@ REACTIONS: Final[Reactions] = {
     ev.Compared: (probation.on_compared,),
     ev.LoopHeld: (rtc.on_loop_held,),
     ev.MatrixMisapplied: (reconstructors.on_misapplied,),
+    ev.ReferencesMade: (references.on_made,),
+    ev.ShapeHeld: (references.on_held,),
+    ev.ReferencesFetched: (references.on_fetched,),
     ev.Vibrations: (rtc.on_vibrations,),
     ev.ModelChanged: (rtc.on_model_changed,),
     ev.ModesCommanded: (rtc.on_modes_commanded,),
@@ -207,6 +211,11 @@ REACTIONS: Final[Reactions] = {
     cmd.Reject: (operator.reject,),
     cmd.Publish: (operator.publish,),
     cmd.Rollback: (operator.roll_back,),
+    cmd.LoadShape: (references.load_shape,),
+    cmd.ClearShape: (references.clear_shape,),
+    cmd.ApproveReferences: (references.approve,),
+    cmd.RejectReferences: (references.reject,),
+    cmd.RollBackReferences: (references.roll_back,),
 }
 """Functions of context and event that update the state for each kind of event and command."""
 
@@ -221,7 +230,7 @@ ANSWERS: Final[Reactions] = {
     wire.OffloadRequest: (offload.on_answer,),
     wire.LoopRequest: (rtc.on_loop_answer, operator.on_loop_answer, acquisition.on_loop_answer),
     wire.RampRequest: (operator.on_loop_answer,),
-    wire.ReferencesRequest: (rtc.log_reply,),
+    wire.ReferencesRequest: (references.on_answer,),
 }
 """Functions of context, request and reply for each kind of request that the RTC has answered."""
 
@@ -234,6 +243,8 @@ FAILURES: Final[Reactions] = {
     ev.FetchMatrix: (reconstructors.on_fetch_failed, rtc.log_failure),
     ev.FetchReferences: (rtc.log_failure,),
     ev.FinishNoisy: (measurement.on_finish_failed,),
+    ev.MakeReferences: (references.on_making_failed, rtc.log_failure),
+    ev.SendReferences: (references.on_sending_failed,),
     wire.DitherRequest: (dither.on_failure, rtc.fail_order, measurement.on_dither_failed),
     wire.DitherStop: (rtc.log_failure,),
     wire.MeasureRequest: (measurement.on_failure,),
@@ -300,6 +311,7 @@ DECIDERS: Final = (
     # Before all that an alarm forbids: a reaction may have raised one.
     Decider("alarms", (), derive_alarms),
     Decider("the RTC's matrix", (not_measuring, may_ask), updates.fetch_in_use),
+    Decider("references in use", (not_measuring, may_ask), references.read_back),
     Decider("the acquisition", (not_measuring, not_stopped), acquisition.advance),
     Decider(
         "a noisy matrix", (not_measuring, not_stopped, not_acquiring), measurement.advance_noisy
@@ -308,6 +320,7 @@ DECIDERS: Final = (
     Decider("unwanted dithers", _UNDISTURBED, dither.stop_unwanted),
     Decider("the dither", _READY, dither.choose_dither),
     Decider("reconstructors", _READY, updates.decide_updates),
+    Decider("references", _READY, references.decide_references),
     Decider("the offload", _READY, offload.request_offload),
     Decider("alarms of what was decided", (), derive_alarms),
 )

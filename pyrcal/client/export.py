@@ -25,6 +25,7 @@ _SOURCES = {
     "gains-history": ("/v1/gains/history", ("jsonl",)),
     "reconstructor-gains": ("/v1/reconstructors/{id}/gains", ("csv", "jsonl")),
     "reconstructor": ("/v1/reconstructors/{id}/matrix", _MATRIX),
+    "references": ("/v1/references/{id}/slopes", _MATRIX),
     "measurement": ("/v1/measurements/{id}/matrix", _MATRIX),
     "noisy-matrix": ("/v1/noisy-matrix/{id}/file", ("hdf5",)),
     "recording": ("/v1/recordings/{id}/file", ("hdf5",)),

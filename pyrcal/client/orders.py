@@ -10,7 +10,7 @@ import uuid
 from typing import NamedTuple
 from urllib.parse import quote
 
-from pyrcal.client.reading import reconstructor_lines, understood
+from pyrcal.client.reading import reconstructor_lines, reference_lines, understood
 from pyrcal.client.remote import DONE, NOT_DONE, RECONSTRUCTORS, Request, collect_arguments
 from pyrcal.client.rest import Document, RefusedError, Service
 from pyrcal.terminal import login, print_document, print_lines
@@ -70,7 +70,8 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
         headers["Idempotency-Key"] = str(uuid.uuid4())
     # An empty name is a name, too: who orders may choose to give none.
     who = login() if options.who is None else options.who
-    given = collect_arguments(options, request.body)
+    # What a file says was read before: this package imports nothing that could.
+    given = getattr(options, "content", None) or collect_arguments(options, request.body)
     body = {**given, **request.always, "reason": why, "by": who}
     answer = service.order(request.method, path_of(request.path, options), body, headers).document
     with understood(service):
@@ -109,7 +110,8 @@ def _show(service: Service, request: Request, options: argparse.Namespace) -> st
     document, tag = service.get(path_of(request.decides_on, options))
     options.known = _reconstructors(service) if request.follows == RECONSTRUCTORS else {}
     with understood(service):
-        lines = list(reconstructor_lines(document))
+        describe = reference_lines if "shape" in document else reconstructor_lines
+        lines = list(describe(document))
         options.source = str(document["id"])
         if "id" in options:
             options.id = str(document["id"])

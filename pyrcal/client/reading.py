@@ -79,6 +79,26 @@ def _reconstructors(document: Document) -> Iterator[str]:
     yield "* in use" if any(row[0] for row in rows) else "it is not known which one is in use"
 
 
+def reference_lines(one: Document) -> Iterator[str]:
+    """Yield all that an operator needs to decide about references."""
+    held = f"{1e9 * one['rms_m']:.3g} nm RMS" if one["shape"] else "the RTC's own references"
+    gain = f", scaled with {one['gain']:.2f}" if one["gain"] else ""
+    yield f"{one['id']}: {one['state']}, {held}{gain}, made {clock(one['created_utc'])}"
+    if one["unexplained_ratio"]:
+        yield f"unexplained  {one['unexplained_ratio']:.0%} of the shape"
+    if one["reason"]:
+        yield f"reason       {one['reason']}"
+
+
+def _references(document: Document) -> Iterator[str]:
+    shape = document["shape"]
+    yield f"shape: {shape['id']} from {shape['source'] or shape['kind']}" if shape else "no shape"
+    for one in document["records"]:
+        first, *more = reference_lines(one)
+        yield f"{'*' if one['id'] == document['used_id'] else ' '} {first}"
+        yield from (f"    {line}" for line in more)
+
+
 def _alpha(document: Document) -> Iterator[str]:
     why = f": {document['validity_reason']}" if document["validity_reason"] else ""
     yield f"{document['validity']}{why}"
@@ -133,6 +153,7 @@ SCREENS = {
     "alpha": _alpha,
     "reconstructors list": _reconstructors,
     "reconstructors show": reconstructor_lines,
+    "references list": _references,
     "alarms list": _alarms,
     "recordings list": _recordings,
     "audit": _audit,

@@ -87,7 +87,7 @@ class Request(NamedTuple):
     def body(self) -> list[str]:
         """Options that the body of an order says; ``reason`` and ``by`` are of every one."""
         forms = (one.form.partition(" ")[0].lstrip("-").replace("-", "_") for one in self.words)
-        return [name for name in forms if name not in {"id", "no_wait"}]
+        return [name for name in forms if name not in {"id", "no_wait", "file"}]
 
 
 def _reads(
@@ -140,6 +140,9 @@ def _numbers(kind: type[int] | type[float]) -> Any:  # noqa: ANN401 - argparse's
 _ID = words("id ID", "id of a reconstructor, or in-use, previous, candidate")
 _ALARM = words("id ALARM", "name of an alarm")
 _CANDIDATE = words("id ID", "default: the one proposed last", nargs="?", default="candidate")
+_OFFERED = words(
+    "id ID", "id of references; default: those proposed", nargs="?", default="candidate"
+)
 _MODES = words("--modes N,...|controlled|all", "modes of the basis", type=_numbers(int))
 _RECORDING = words("id ID", "id of a recording")
 _LASTS = words("--duration-s S", "duration", type=float)
@@ -156,6 +159,7 @@ RECONSTRUCTORS = "/v1/reconstructors"
 GROUPS = {
     "alarms": "list, acknowledge or mute alarms",
     "reconstructors": "list, compute, approve, send or roll back reconstructors",
+    "references": "load a shape that the loop holds; list, approve or roll back references",
     "loop": "open or close the loop; acquire the registration from nothing",
     "dither": "start or stop the dither",
     "measure": "measure an interaction matrix",
@@ -199,7 +203,7 @@ REQUESTS = (
             "what to write",
             choices=(
                 *("alpha", "audit", "gains", "gains-history", "reconstructor-gains"),
-                *("reconstructor", "measurement", "noisy-matrix", "recording"),
+                *("reconstructor", "references", "measurement", "noisy-matrix", "recording"),
             ),
         ),
         words("id ID", "id of the matrix or recording; or in-use, previous", nargs="?"),
@@ -278,6 +282,56 @@ REQUESTS = (
         needs_why=True,
         then="pyrcal mode propose, or auto, ends mode hold",
         example="--why 'image is elongated'",
+    ),
+    _orders(
+        "references load",
+        "load a shape that the loop is to hold, from a JSON, FITS, HDF5 or NumPy file",
+        words("file FILE", "its numbers, with kind, frame and unit where it has them", type=Path),
+        words(
+            "--kind",
+            "modes of the basis, Zernike coefficients (Noll), a map on the pupil, or slopes",
+            choices=("modes", "zernike", "map", "slopes"),
+        ),
+        words(
+            "--frame",
+            "mirror: of modes, which move with the mirror; instrument: all others",
+            choices=("mirror", "instrument"),
+        ),
+        words("--unit", "unit of the numbers, RMS of OPD", choices=("m", "um", "nm")),
+        operation="load_shape",
+        example="ncpa.fits --kind zernike --frame instrument --unit nm",
+    ),
+    _reads("references list", "list the references; * marks those in use", "/v1/references"),
+    _orders(
+        "references approve",
+        "send the proposed references to the RTC",
+        *(_OFFERED, _NO_WAIT),
+        operation="approve_references",
+        asks="send them to the RTC",
+        example="--why 'shape checked'",
+    ),
+    _orders(
+        "references reject",
+        "discard the proposed references",
+        _OFFERED,
+        operation="reject_references",
+        needs_why=True,
+        example="--why 'sign is not sure'",
+    ),
+    _orders(
+        "references rollback",
+        "send the references in use before; no others are made until a shape is loaded",
+        operation="roll_back_references",
+        asks="go back to the references in use before",
+        needs_why=True,
+        example="--why 'image got worse'",
+    ),
+    _orders(
+        "references clear",
+        "hold no shape any more; the RTC returns to its own references",
+        operation="clear_shape",
+        asks="return to the RTC's own references",
+        example="--why 'end of the night'",
     ),
     _orders(
         "loop open",
@@ -400,6 +454,7 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
                 examples=[f"{one.name.partition(' ')[2]} {one.example}".rstrip() for one in below],
             )
             groups[name] = group.add_subparsers(dest="word", required=True, metavar="COMMAND")
+        forms = {one.form.partition(" ")[0] for one in request.words}
         parser = (groups[name] if word else commands).add_parser(
             word or name,
             help=request.purpose,
@@ -407,7 +462,7 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
             epilog=EPILOG,
             examples=[request.example],
             options=(*request.words, *_order_options(request), *_CONNECTION),
-            module=f"{__package__}.ask",
+            module="pyrcal.shapes" if "file" in forms else f"{__package__}.ask",
         )
         parser.set_defaults(request=request)
 

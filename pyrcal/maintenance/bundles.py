@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,11 @@ def _bundle_of(options: argparse.Namespace, settings: Settings, instrument: Inst
         # Reading it refuses one that is damaged.
         archive.reconstructors.matrix(record.id)
         path = archive.reconstructors.path_of(record.id)
-        return _read_product(options, instrument, path, record)
+        bundle = _read_product(options, instrument, path, record)
+        if record.reference_id in archive.references.stored():
+            offset = archive.references.matrix(record.reference_id)
+            bundle = replace(bundle, arrays={**bundle.arrays, "reference_offset": offset})
+        return bundle
 
 
 def _read_product(

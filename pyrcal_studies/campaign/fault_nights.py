@@ -51,7 +51,13 @@ from service.records import commands as cmd
 from service.records import events as ev
 from service.records.operations import DitherPhase
 from service.records.products import MatrixState
-from service.records.state import MatrixStates, Mode, OperatorState, TrackerState
+from service.records.state import (
+    MatrixStates,
+    Mode,
+    OperatorState,
+    ReferenceStates,
+    TrackerState,
+)
 from service.runtime.archiving import (
     SAVE_INTERVAL_S,
     is_unsaved,
@@ -64,7 +70,7 @@ from service.runtime.policy import policy_of
 from service.tracking.invariants import find_violations
 from service.tracking.operations.running import OperationKind, running_operations
 from service.tracking.policy import SECOND_NS
-from service.tracking.resume import restored
+from service.tracking.resume import restored, restored_references
 from service.wire import Acknowledgement, Command, Manifest, Reply
 
 STEP_S = 0.25
@@ -208,6 +214,9 @@ class FaultNight(Observatory):
             system=self.state.system,
             operator=OperatorState(mode=self._mode),
             matrices=MatrixStates(reconstructors=restored(self._archive.reconstructors.records())),
+            references=ReferenceStates(
+                records=restored_references(self._archive.references.records())
+            ),
         )
         self._engine.state = restore_tracking(self._archive, state, self._policy, self.now_ns())
         self._engine.begin_anew()

@@ -30,12 +30,18 @@ from service.config import load_settings
 from service.errors import PyrcalError
 from service.model.misregistration import Misregistration
 from service.records.events import Effect, Event
-from service.records.state import MatrixStates, Mode, OperatorState, TrackerState
+from service.records.state import (
+    MatrixStates,
+    Mode,
+    OperatorState,
+    ReferenceStates,
+    TrackerState,
+)
 from service.runtime.policy import policy_of
 from service.tracker import step
 from service.tracking.operations.running import running_operations
 from service.tracking.policy import Policy
-from service.tracking.resume import restored, resumed, saved_of
+from service.tracking.resume import restored, restored_references, resumed, saved_of
 from service.tracking.step_context import new_lines
 
 Json = Any
@@ -237,6 +243,7 @@ class Teller:
             system=before.system,
             operator=OperatorState(mode=mode),
             matrices=MatrixStates(reconstructors=restored(before.matrices.reconstructors)),
+            references=ReferenceStates(records=restored_references(before.references.records)),
         )
         self.state = fresh if saved is None else resumed(fresh, saved, self._policy, now_ns)
         self._note({"t": now_ns, "restart": mode.value}, fresh, now_ns, ())

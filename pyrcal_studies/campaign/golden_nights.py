@@ -59,7 +59,7 @@ from service.records import events as ev
 from service.records.commands import Command
 from service.records.events import Effect, Event
 from service.records.operations import MeasurementRecord, MeasureState, NoisyFinding
-from service.records.products import MatrixState, ModeSet
+from service.records.products import Frame, MatrixState, ModeSet, ShapeKind
 from service.records.state import Level, Mode, TrackerState
 from service.runtime.policy import policy_of
 from service.runtime.worker import Compute, OpticsWorker
@@ -75,6 +75,7 @@ from service.wire import (
     MeasureRequest,
     Pattern,
     RampRequest,
+    ReferencesRequest,
     Reply,
     Status,
     layout_of,
@@ -1118,7 +1119,53 @@ FAULTS = (
 )
 
 
-NIGHTS = (*TRACKING, *ACQUIRING, *COMMANDED, *MEASURING, *FAULTS)
+def spoil(factor: float, *, hidden: bool) -> Do:
+    """Return an RTC that applies offsets of its references times a factor, and may hide it."""
+
+    def begin_spoiling(night: GoldenNight) -> None:
+        night.dome.computer.spoil_references(
+            lambda _, requested: np.float32(factor) * requested, hidden=hidden
+        )
+
+    return begin_spoiling
+
+
+def approve_references(night: GoldenNight) -> None:
+    """Approve the references made last."""
+    night.ask(cmd.ApproveReferences(id=night.state.references.records[-1].id))
+
+
+LOAD = cmd.LoadShape(
+    kind=ShapeKind.MODES,
+    frame=Frame.MIRROR,
+    values=(0.0, 0.0, 30.0, 0.0, 15.0, 10.0),
+    unit="nm",
+    by="Ada",
+)
+HOLDING = (
+    plan_night(
+        "references",
+        115.0,
+        (8.0, ask(LOAD)),
+        (12.0, approve_references),
+        (24.0, ask(cmd.SetMode(mode=Mode.AUTO))),
+        (26.0, ask(replace(LOAD, values=(0.0, 0.0, 400.0)))),
+        (32.0, ask(LOAD)),
+        (44.0, ask(cmd.RollBackReferences(reason="image got worse"))),
+        (50.0, ask(LOAD)),
+        (56.0, restart()),
+        (68.0, lambda night: night.restart_rtc()),
+        (86.0, spoil(-1.0, hidden=False)),
+        (87.0, ask(LOAD)),
+        (96.0, ask(cmd.ClearShape())),
+        (102.0, refuse(ReferencesRequest)),
+        (103.0, ask(LOAD)),
+        (112.0, ask(cmd.ClearShape())),
+        mode=Mode.PROPOSE,
+    ),
+)
+
+NIGHTS = (*HOLDING, *TRACKING, *ACQUIRING, *COMMANDED, *MEASURING, *FAULTS)
 
 
 def main() -> int:

@@ -43,7 +43,12 @@ from service.records import commands
 from service.records import events as ev
 from service.records.events import Effect, Event
 from service.records.operations import MeasurementRecord
-from service.records.products import GateVerdict, MatrixState, ReconstructorRecord
+from service.records.products import (
+    GateVerdict,
+    MatrixState,
+    ReconstructorRecord,
+    ReferencesRecord,
+)
 from service.records.state import LoopState, Mode, ModelState, OperatorState, TrackerState
 from service.runtime.actions import Actions, Publishing, present_conditions
 from service.runtime.engine import Engine
@@ -440,11 +445,35 @@ class KeptReconstructors:
         return self._matrices[matrix_id]
 
 
+class KeptReferences:
+    """Keeps reference slopes in memory."""
+
+    def __init__(self) -> None:
+        self._offsets: dict[str, NDArray[np.float32]] = {}
+
+    def store(self, record: ReferencesRecord, offset: NDArray[np.float32]) -> None:
+        """Keep the numbers."""
+        self._offsets[record.id] = offset
+
+    def matrix(self, reference_id: str) -> NDArray[np.float32]:
+        """Return an offset ``(n_slopes,)``.
+
+        Raises
+        ------
+        UnknownIdError
+            If it was never stored here.
+        """
+        if reference_id not in self._offsets:
+            raise UnknownIdError(f"no references {reference_id}")
+        return self._offsets[reference_id]
+
+
 class Shelf:
     """Keeps matrices in memory: a simulated night is over when its program ends."""
 
     def __init__(self) -> None:
         self.reconstructors = KeptReconstructors()
+        self.references = KeptReferences()
         self.measured, self.noisy = Kept(), Kept()
 
 
@@ -1001,8 +1030,12 @@ class Observatory:
                 return OpticsWorker.margin, wait.judge_s
             case ev.RepublishMatrix(judged=True) | ev.JudgeProposal():
                 return OpticsWorker.judge, wait.judge_s
-            case ev.FetchMatrix():
+            case ev.MakeReferences():
+                return OpticsWorker.make_references, wait.make_s
+            case ev.FetchMatrix() | ev.FetchReferences():
                 return None, wait.fetch_s
+            case ev.SendReferences():
+                return None, wait.command_s
             case ev.RepublishMatrix() | ev.SendMatrix() | ev.Ask() | ev.FinishNoisy():
                 return None, wait.command_s
             case _:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any, Self
 
-from service.archive.index import AuditEntry, Index, Pin, Range, begun_ns_utc
+from service.archive.index import AuditEntry, Index, Pin, Range, Sent, begun_ns_utc
 from service.archive.nights import Nights, TrendSample
 from service.archive.products import (
     PROBE_BYTES,
@@ -15,6 +15,7 @@ from service.archive.products import (
     NoisyArchive,
     ReconstructorArchive,
     Recordings,
+    ReferencesArchive,
 )
 from service.archive.serialisation import TrackingFile
 from service.archive.store import FOLDER_MODE, Store
@@ -47,6 +48,8 @@ class Archive:
         """Index: state of each product, and the audit trail."""
         self.reconstructors = ReconstructorArchive(directory / "reconstructors", self.index)
         """Reconstructors made here or read from the RTC, and the fate of each."""
+        self.references = ReferencesArchive(directory / "reference_slopes", self.index)
+        """Offsets of reference slopes made here, and the fate of each."""
         self.measured = MeasuredArchive(directory / "interaction_matrices", self.index)
         """Interaction matrices the RTC has measured."""
         self.noisy = NoisyArchive(directory / "noisy_matrices", self.index)
@@ -55,6 +58,7 @@ class Archive:
         """Recordings of telemetry that somebody requested."""
         self.stores: tuple[Store[Any] | Recordings, ...] = (
             self.reconstructors,
+            self.references,
             self.measured,
             self.noisy,
             self.recordings,
@@ -187,12 +191,12 @@ class Archive:
 
     def record(
         self,
-        records: Sequence[ReconstructorRecord],
+        records: Sequence[Sent],
         entries: Sequence[AuditEntry],
         estimates: Sequence[HistoryEntry] = (),
         samples: Sequence[TrendSample] = (),
     ) -> None:
-        """Remember where reconstructors are, add to audit trail and history: all or nothing.
+        """Remember where products sent are, add to audit trail and history: all or nothing.
 
         Raises
         ------
@@ -204,7 +208,10 @@ class Archive:
             self._take_in()
         for record in records:
             # Files before the index: the index can be rebuilt from them.
-            self.reconstructors.write_state(record)
+            if isinstance(record, ReconstructorRecord):
+                self.reconstructors.write_state(record)
+            else:
+                self.references.write_state(record)
         self.index.record(records, entries, estimates, samples)
 
     def measurements(self) -> tuple[MeasurementRecord, ...]:

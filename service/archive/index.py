@@ -19,13 +19,19 @@ from service.archive.nights import TrendSample, Values
 from service.archive.serialisation import NOT_UNDERSTOOD, from_json, to_json
 from service.errors import ArchiveError, StorageError, shown
 from service.records.operations import MeasurementRecord
-from service.records.products import ReconstructorRecord
+from service.records.products import ReconstructorRecord, ReferencesRecord
 from service.records.registration import HistoryEntry
 
-Product = ReconstructorRecord | MeasurementRecord
+Sent = ReconstructorRecord | ReferencesRecord
+"""Records of products whose state changes on the way to the RTC and after."""
+
+Product = Sent | MeasurementRecord
 Indexed = TypeVar("Indexed", bound=Product)
 
 _VERSION = 5
+
+_SENT = {"reconstructor": ReconstructorRecord, "reference_slopes": ReferencesRecord}
+"""Kinds of records whose state changes, by their tables."""
 
 _PRODUCTS = """
 CREATE TABLE IF NOT EXISTS {} (
@@ -37,8 +43,10 @@ CREATE TABLE IF NOT EXISTS {} (
 """
 """A table for each kind."""
 
+_TABLES = ("reconstructor", "measurement", "noisy_matrix", "reference_slopes")
+
 _SCHEMA = f"""
-{"".join(map(_PRODUCTS.format, ("reconstructor", "measurement", "noisy_matrix")))}
+{"".join(map(_PRODUCTS.format, _TABLES))}
 CREATE TABLE IF NOT EXISTS pin (
     id TEXT PRIMARY KEY, who TEXT NOT NULL, why TEXT NOT NULL
 );
@@ -255,11 +263,18 @@ class Index:
             self._connection = sqlite3.connect(name, uri=True, isolation_level=None)
             try:
                 self._version(self._connection)
+                self._add_missing_tables(self._connection)
             except BaseException:
                 # SQLite removes its shared-memory file when the last connection is closed
                 self._connection.close()
                 self._connection = None
                 raise
+
+    def _add_missing_tables(self, connection: sqlite3.Connection) -> None:
+        """Add tables that an earlier service of this version did not have, in memory only."""
+        known = {name for (name,) in connection.execute("SELECT name FROM sqlite_master")}
+        for table in (name for name in _TABLES if name not in known):
+            connection.execute(_PRODUCTS.format(table).replace("CREATE", "CREATE TEMP"))
 
     def _version(self, connection: sqlite3.Connection) -> int:
         version: int = connection.execute("PRAGMA user_version").fetchone()[0]
@@ -301,24 +316,25 @@ class Index:
 
     def record(
         self,
-        records: Sequence[ReconstructorRecord],
+        records: Sequence[Sent],
         entries: Sequence[AuditEntry],
         estimates: Sequence[HistoryEntry] = (),
         samples: Sequence[TrendSample] = (),
     ) -> None:
-        """Replace what is known of reconstructors, add to trail and history: all or nothing.
+        """Replace what is known of matrices and references, add to trail and history, or nothing.
 
-        A reconstructor that has no product here is entered.
+        One that has no product here is entered.
         """
         with self._use() as connection:
             # Takes the write lock at once: a deferred transaction may fail half-way with "database
             # is locked".
             connection.execute("BEGIN IMMEDIATE")
-            connection.executemany(
-                "INSERT INTO reconstructor VALUES (?, ?, ?, NULL)"
-                " ON CONFLICT (id) DO UPDATE SET record = excluded.record",
-                [(r.id, r.created_ns_utc, to_json(r)) for r in records],
-            )
+            for table, kind in _SENT.items():
+                connection.executemany(
+                    f"INSERT INTO {table} VALUES (?, ?, ?, NULL)"
+                    " ON CONFLICT (id) DO UPDATE SET record = excluded.record",
+                    [(r.id, r.created_ns_utc, to_json(r)) for r in records if isinstance(r, kind)],
+                )
             connection.executemany(
                 f"INSERT INTO audit ({_COLUMNS}) VALUES ({', '.join('?' * _N_COLUMNS)})",
                 [tuple(map(_storable, astuple(entry)[:_N_COLUMNS])) for entry in entries],

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 import h5py
 import msgspec
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from service.archive.index import Sent
 from service.archive.serialisation import from_json, to_json
 from service.archive.store import DAMAGE, Folder, Provenance, Store
 from service.control.gains import gain_table
@@ -22,7 +23,7 @@ from service.files.durable import replace_file
 from service.files.recording import Recording
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.records.operations import MeasurementRecord, MeasureState, NoisyFinding
-from service.records.products import MatrixState, ReconstructorRecord
+from service.records.products import MatrixState, ReconstructorRecord, ReferencesRecord
 from service.wire import checksum
 
 PROBE_BYTES = 1 << 20
@@ -32,6 +33,8 @@ RUNNING: Final = "running"
 STORED: Final = "stored"
 """States of a recording."""
 
+SentT = TypeVar("SentT", bound=Sent)
+
 _ALIVE = {
     MatrixState.PROPOSED: "waits for an operator",
     MatrixState.PUBLISHED: "on its way to the RTC",
@@ -40,23 +43,73 @@ _ALIVE = {
 }
 
 
-class ReconstructorArchive(Store[ReconstructorRecord]):
-    """Reconstructors, each with a file of its fate, from which a lost index is rebuilt."""
+class SentArchive(Store[SentT]):
+    """Products that go to the RTC, each with a file of its fate, for a lost index."""
 
-    kind = ReconstructorRecord
-    noun = dataset = "reconstructor"
-    described = "(n_modes, n_slopes), metres OPD per slope"
     lost_with_it = "it cannot be sent, nor gone back to; what is known of it is in the index"
 
-    largest_bytes = PROBE_BYTES
-    """Size of the largest matrix so far: this much must fit on the disk."""
-
     @override
-    def kept(self, records: Iterable[ReconstructorRecord]) -> dict[str, str]:
+    def kept(self, records: Iterable[SentT]) -> dict[str, str]:
         """Return what is in use, or on its way, and what it was made from."""
         alive = [record for record in records if record.state in _ALIVE]
         parents = {r.parent: f"{r.id} was made from it" for r in alive if r.parent}
         return {**parents, **{record.id: _ALIVE[record.state] for record in alive}}
+
+    @override
+    def records(self) -> tuple[SentT, ...]:
+        """Return what is known of each, oldest first.
+
+        One whose product was missing or damaged at the start has failed, with the reason.
+        """
+        return tuple(self._judged(record) for record in super().records())
+
+    def write_state(self, record: SentT) -> None:
+        """Write the present state of a stored product to the file next to it.
+
+        Raises
+        ------
+        StorageError
+            If the disk refuses.
+        """
+        path = self.path_of(record.id)
+        # A record without a stored matrix is in the index only.
+        if not path.exists():
+            return
+        _write_sidecar(path, to_json(record).encode())
+
+    @override
+    def _became(self, record: SentT, *, anew: bool) -> SentT:
+        try:
+            text = self.path_of(record.id).with_suffix(".json").read_text(encoding="utf-8")
+            fate = from_json(text, self.kind)
+        except DAMAGE:
+            fate = None
+        if fate is not None and fate.id == record.id:
+            return fate
+        # Without the index nobody knows whether it was ever sent: it must not wait for approval
+        # again.
+        if anew:
+            reason = "what became of it was lost with the index"
+            return replace(record, state=MatrixState.DISCARDED, reason=reason)
+        return record
+
+    def _judged(self, record: SentT) -> SentT:
+        wrong = self._unsound.get(record.id)
+        if wrong is None:
+            return record
+        reason = f"it was {record.state}; {wrong}"
+        return replace(record, state=MatrixState.FAILED, reason=reason)
+
+
+class ReconstructorArchive(SentArchive[ReconstructorRecord]):
+    """Reconstructors."""
+
+    kind = ReconstructorRecord
+    noun = dataset = "reconstructor"
+    described = "(n_modes, n_slopes), metres OPD per slope"
+
+    largest_bytes = PROBE_BYTES
+    """Size of the largest matrix so far: this much must fit on the disk."""
 
     def store(
         self,
@@ -99,50 +152,33 @@ class ReconstructorArchive(Store[ReconstructorRecord]):
         self.largest_bytes = max(self.largest_bytes, matrix.nbytes)
         self._write(record, matrix, (record.n_modes, matrix.shape[-1]), record.sha256, fill)
 
-    @override
-    def records(self) -> tuple[ReconstructorRecord, ...]:
-        """Return what is known of each, oldest first.
 
-        One whose product was missing or damaged at the start has failed, with the reason.
-        """
-        return tuple(self._judged(record) for record in super().records())
+class ReferencesArchive(SentArchive[ReferencesRecord]):
+    """Offsets of reference slopes."""
 
-    def write_state(self, record: ReconstructorRecord) -> None:
-        """Write the present state of a stored product to the file next to it.
+    kind = ReferencesRecord
+    noun = "reference slopes"
+    dataset = "reference_offset"
+    described = "(n_slopes,), to be subtracted beyond the RTC's own reference slopes"
+
+    def store(self, record: ReferencesRecord, offset: NDArray[np.float32]) -> None:
+        """Write an offset ``(n_slopes,)`` for good.
 
         Raises
         ------
-        StorageError
-            If the disk refuses.
+        ArchiveError
+            If the id is taken, the offset is not what the record says, or the disk refuses.
+        WireError
+            If the id is not one.
         """
-        path = self.path_of(record.id)
-        # A record without a stored matrix is in the index only.
-        if not path.exists():
-            return
-        _write_sidecar(path, to_json(record).encode())
-
-    @override
-    def _became(self, record: ReconstructorRecord, *, anew: bool) -> ReconstructorRecord:
-        try:
-            text = self.path_of(record.id).with_suffix(".json").read_text(encoding="utf-8")
-            fate = from_json(text, ReconstructorRecord)
-        except DAMAGE:
-            fate = None
-        if fate is not None and fate.id == record.id:
-            return fate
-        # Without the index nobody knows whether it was ever sent: it must not wait for approval
-        # again.
-        if anew:
-            reason = "what became of it was lost with the index"
-            return replace(record, state=MatrixState.DISCARDED, reason=reason)
-        return record
-
-    def _judged(self, record: ReconstructorRecord) -> ReconstructorRecord:
-        wrong = self._unsound.get(record.id)
-        if wrong is None:
-            return record
-        reason = f"it was {record.state}; {wrong}"
-        return replace(record, state=MatrixState.FAILED, reason=reason)
+        of_modes = np.array(record.coefficients_m)
+        self._write(
+            record,
+            offset,
+            offset.shape,
+            record.sha256,
+            lambda file: file.attrs.update({"coefficients_m": of_modes}),
+        )
 
 
 class MeasuredArchive(Store[MeasurementRecord]):

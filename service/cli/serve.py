@@ -38,6 +38,7 @@ from service.records.state import (
     Mode,
     Operations,
     OperatorState,
+    ReferenceStates,
     TrackerState,
 )
 from service.rtc_bridge import Bridge, Endpoint
@@ -50,7 +51,7 @@ from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitLimits, FitQueue
 from service.runtime.workers import WorkerPool
 from service.tracking.operations.measurement import MEASUREMENTS_KEPT
-from service.tracking.resume import restored
+from service.tracking.resume import restored, restored_references
 from service.web.keys import KeyFile
 
 LARGE_BYTES = 2_500_000
@@ -294,6 +295,7 @@ def _supervisor(
         system=system,
         operator=OperatorState(mode=Mode(settings.service.mode)),
         matrices=MatrixStates(reconstructors=restored(archive.reconstructors.records())),
+        references=ReferenceStates(records=restored_references(archive.references.records())),
         operations=Operations(measurements=archive.measurements()[-MEASUREMENTS_KEPT:]),
         loop=LoopState(basis_id=instrument.basis_id, config_id=instrument.config_id),
     )

@@ -304,6 +304,17 @@ class FitsTable(Table):
     """Largest memory of a fit."""
 
 
+class ReferencesTable(Table):
+    """``[references]``: reference slopes for a shape that the loop holds."""
+
+    worst_seeing_arcsec: float = Field(default=1.2, ge=0.3, le=5.0)
+    """Worst seeing expected in the night: a shape with which the loop would not survive it is
+    refused."""
+
+    ramp_s: float = Field(default=1.0, ge=0.0, le=60.0)
+    """Duration of the ramp to other references."""
+
+
 class ArchiveTable(Table):
     """``[archive]``: retention."""
 
@@ -391,6 +402,7 @@ class Settings(Table):
     offload: OffloadTable = Field(default_factory=OffloadTable)
     compute: ComputeTable = Field(default_factory=ComputeTable)
     fits: FitsTable = Field(default_factory=FitsTable)
+    references: ReferencesTable = Field(default_factory=ReferencesTable)
     archive: ArchiveTable = Field(default_factory=ArchiveTable)
     rules: tuple[RuleTable, ...] = ()
 

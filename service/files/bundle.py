@@ -38,6 +38,7 @@ DESCRIBED: Final = {
     RECONSTRUCTOR: "(n_modes, n_slopes) metres of OPD per slope",
     "interaction_matrix": "(n_slopes, n_modes) slope per metre of OPD, at alpha",
     "reference_slopes": "(n_slopes,) what was subtracted from the slopes",
+    "reference_offset": "(n_slopes,) what was subtracted beyond these, to hold a shape",
     "optical_gain": "(n_modes,) of each mode when it was made; 1: not measured",
     "gain_factor": "(n_modes,) what multiplies one loop gain of all modes",
     "mode_to_actuator": "(n_actuators, n_modes) strokes of each mode of the basis",

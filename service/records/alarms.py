@@ -74,6 +74,7 @@ SLOPES_STAND = "slopes-stand"
 NOT_FOUND = "registration-not-found"
 UNDECLARED = "undeclared-transition"
 MISAPPLIED = "matrix-misapplied"
+REFERENCES_MISAPPLIED = "references-misapplied"
 
 
 RULE_PREFIX = "rule."

@@ -10,12 +10,13 @@ from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
 from annotated_types import Ge, Gt, Le, Len, MaxLen
 from typing_extensions import override
 
 from service.errors import shown
 from service.records.alarms import Severity
-from service.records.products import ModeSet
+from service.records.products import Frame, ModeSet, ShapeKind
 from service.records.state import Mode
 from service.wire import DitherKind, Pattern
 
@@ -28,6 +29,13 @@ MAX_TEXT_LENGTH = 200
 
 MAX_MODES = 100_000
 """Largest number of modes that an order may list."""
+
+MAX_SHAPE_VALUES = 1_000_000
+SHAPE_RANGE_M = (1e-11, 5e-6)
+"""Smallest and largest RMS of a shape, metres OPD: beyond them its unit is another one."""
+
+UNITS_M = {"m": 1.0, "um": 1e-6, "nm": 1e-9}
+"""Metres in each unit of a shape."""
 
 Value = bool | float | str
 """Type of a value that operators' own alarm rules compare."""
@@ -178,6 +186,86 @@ class Rollback(Instruction):
 
     anyway: bool = False
     """Send it though the gate refuses it for the α of now: α may be what is wrong."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoadShape(Instruction):
+    """Load a shape that the loop is to hold; references for it are made and offered from now on."""
+
+    kind: ShapeKind
+    """"modes", "zernike", "map" or "slopes"."""
+
+    frame: Frame
+    """"mirror" for modes; "instrument" for all others, which are fixed on the pupil."""
+
+    values: Annotated[tuple[float, ...], Len(1, MAX_SHAPE_VALUES)]
+    """Modes from mode 0 on, Zernike coefficients from Noll index 1 on (both RMS of OPD), a square
+    map of OPD over the pupil row by row, or slopes measured at optical gain 1."""
+
+    unit: Literal["m", "um", "nm"] | None = None
+    """Unit of the values; null for slopes, which have none."""
+
+    basis_id: str | None = None
+    """Modal basis of the modes, if known: another one than the RTC's is refused."""
+
+    config_id: str | None = None
+    """Sensor configuration of the slopes, if known: another one than the RTC's is refused."""
+
+    source: Annotated[str, MaxLen(MAX_TEXT_LENGTH)] = ""
+    """File or measurement that it came from."""
+
+    @override
+    def __post_init__(self) -> None:
+        Instruction.__post_init__(self)
+        if self.frame is not self.kind.frame:
+            raise ValueError(f"frame {self.kind.frame} with {self.kind}: found {self.frame}")
+        slopes = self.kind is ShapeKind.SLOPES
+        if slopes is not (self.unit is None):
+            raise ValueError("no unit with slopes" if slopes else "a unit: m, um or nm")
+        if self.kind is ShapeKind.MAP and round(len(self.values) ** 0.5) ** 2 != len(self.values):
+            raise ValueError(f"a square map: found {len(self.values)} values")
+        least, most = SHAPE_RANGE_M
+        if not slopes and not least <= self.rms_m <= most:
+            raise ValueError(
+                f"a shape of {least:g} to {most:g} m RMS: found {self.rms_m:.3g} m, is the unit "
+                f"{self.unit}? (pyrcal references clear ends the shape)"
+            )
+        if slopes and not any(self.values):
+            raise ValueError("slopes that are not all 0")
+
+    @property
+    def values_m(self) -> tuple[float, ...]:
+        """Return the values in metres; those of slopes as they are."""
+        metres = UNITS_M[self.unit or "m"]
+        return tuple(metres * value for value in self.values)
+
+    @property
+    def rms_m(self) -> float:
+        """RMS of the shape, metres OPD; piston does not count."""
+        values = np.array(self.values_m)
+        if self.kind is ShapeKind.MAP:
+            return float(values.std())
+        return float(np.linalg.norm(values[1:] if self.kind is ShapeKind.ZERNIKE else values))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClearShape(Instruction):
+    """Hold no shape any more: the RTC returns to its own references."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ApproveReferences(OfMatrix):
+    """Send proposed references."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RejectReferences(OfMatrix):
+    """Discard proposed references; no others are made before a shape is loaded."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RollBackReferences(Instruction):
+    """Go back to the references in use before; no others are made before a shape is loaded."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -473,6 +561,11 @@ Command = (
     | SetPointing
     | SetValue
     | Ramp
+    | LoadShape
+    | ClearShape
+    | ApproveReferences
+    | RejectReferences
+    | RollBackReferences
 )
 
 
@@ -511,4 +604,5 @@ def makes_safer(command: Command, gains: tuple[float, ...] = ()) -> bool:
     if isinstance(command, SetMode):
         return command.mode is Mode.HOLD
     enders = StopEverything | StopDither | Rollback | AbortAcquisition | GiveUp | Reject
+    enders |= ClearShape | RejectReferences | RollBackReferences
     return isinstance(command, enders)

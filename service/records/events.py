@@ -17,7 +17,13 @@ from service.records.estimates import (
 )
 from service.records.messages import Message
 from service.records.operations import MeasurementRecord, ProbationFinding
-from service.records.products import ExpectedGain, GateVerdict, Judged, ReconstructorRecord
+from service.records.products import (
+    ExpectedGain,
+    GateVerdict,
+    Judged,
+    ReconstructorRecord,
+    ReferencesRecord,
+)
 from service.records.state import Level, ModelState, TrackerState
 from service.wire import Acknowledgement, ReferencesInUse, Reply, Status
 from service.wire import Command as Request
@@ -109,6 +115,26 @@ class Ask(Caused):
     """Only if the gate lets the matrix in use run with the gains of the request."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MakeReferences(Caused):
+    """Compute reference slopes for the shape, at the current α and optical gains."""
+
+    id: str
+    """Id of the references."""
+
+    worst_seeing_arcsec: float
+    """Seeing in which the loop must survive with them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SendReferences(Caused):
+    """Have the RTC subtract these references."""
+
+    id: str
+    ramp_s: float
+    """Duration of the ramp to them."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FinishNoisy(Caused):
     """Fit and archive what has been summed of a noisy interaction matrix."""
@@ -126,6 +152,8 @@ Effect = (
     | FetchReferences
     | Ask
     | FinishNoisy
+    | MakeReferences
+    | SendReferences
 )
 
 
@@ -383,6 +411,27 @@ class MatrixMisapplied:
     id: str
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ReferencesMade:
+    """Reference slopes were computed, and their size was checked."""
+
+    record: ReferencesRecord
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShapeHeld:
+    """The mean of the commands has shown how much of a change of references the mirror holds."""
+
+    id: str
+    """Id of the references in use."""
+
+    ratio: float
+    """1 if they are applied as they were sent."""
+
+    sigma: float
+    """1 σ of it, by the turbulence."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopHeld:
     """Telemetry says that the loop holds well, or that it does so no longer."""
@@ -455,6 +504,8 @@ Event = (
     | Compared
     | LoopHeld
     | MatrixMisapplied
+    | ReferencesMade
+    | ShapeHeld
     | Vibrations
     | ModelChanged
     | ModesCommanded

@@ -401,6 +401,127 @@ class ReconstructorRecord:
         )
 
 
+class Frame(StrEnum):
+    """Frames in which a shape is given."""
+
+    MIRROR = "mirror"
+    """Fixed on the mirror: it turns and moves on the sensor with the registration."""
+
+    INSTRUMENT = "instrument"
+    """Fixed on the pupil as the sensor and the science camera see it."""
+
+
+class ShapeKind(StrEnum):
+    """Kinds of numbers that describe a shape."""
+
+    MODES = "modes"
+    """Coefficients of the modes of the basis from mode 0 on, RMS of OPD."""
+
+    ZERNIKE = "zernike"
+    """Coefficients of Zernike polynomials from Noll index 1 on, RMS of OPD."""
+
+    MAP = "map"
+    """OPD on a square grid over the pupil, row by row."""
+
+    SLOPES = "slopes"
+    """Slopes that were measured at optical gain 1, in the RTC's own order."""
+
+    @property
+    def frame(self) -> Frame:
+        """The frame in which numbers of this kind are given."""
+        return Frame.MIRROR if self is ShapeKind.MODES else Frame.INSTRUMENT
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shape:
+    """A shape that the loop is to hold, for example against non-common-path aberrations."""
+
+    id: str
+    kind: ShapeKind
+    frame: Frame
+    values: tuple[float, ...]
+    """Metres of OPD; slopes are dimensionless."""
+
+    source: str
+    """File or measurement that it came from; empty if not known."""
+
+    by: str
+    """Name of the person who loaded it; empty if not known."""
+
+    loaded_ns_utc: int
+    """Time of loading, by the service's clock."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ReferencesRecord:
+    """Everything known of one set of reference slopes except its numbers."""
+
+    id: str
+    """The RTC's ``reference_id`` while it uses them; never reused."""
+
+    state: MatrixState
+    """State on the way to the RTC, as of a reconstructor."""
+
+    created_ns_utc: int
+    """Time of computation."""
+
+    shape: str | None = None
+    """Id of the shape that they hold; None for the RTC's own references."""
+
+    coefficients_m: tuple[float, ...] = ()
+    """Coefficients of the modes from mode 0 on that the mirror is to hold, metres RMS of OPD."""
+
+    alpha: Misregistration | None = None
+    """Registration that they were computed for; None for the RTC's own."""
+
+    gain: float | None = None
+    """Mean gain that they were scaled with, weighted by the power of the shape in each mode."""
+
+    offset_rms: float = 0.0
+    """RMS of the offset over all slopes."""
+
+    unexplained_ratio: float = 0.0
+    """Share of the shape that no controlled mode explains, in norm."""
+
+    sha256: str = ""
+    """Checksum of the offset as it is sent, 64 lower-case hexadecimal digits; empty if zeros."""
+
+    parent: str | None = None
+    """References whose numbers these are, when they were sent again; None if computed."""
+
+    reason: str = ""
+    """Reason for the state, in the RTC's, the service's or an operator's words."""
+
+    by: str = ""
+    """Person who ordered to send them; empty if the service did it by itself."""
+
+    published_ns_utc: int | None = None
+    """Time at which they were sent; None if they were not."""
+
+    applied_ns_utc: int | None = None
+    """Time at which the RTC was first seen to use them; None if it was not."""
+
+    held_ratio: float | None = None
+    """Change of the mean command, as a share of what they should add to the mirror; None if it was
+    not measured."""
+
+    held_sigma: float | None = None
+    """1 σ of it."""
+
+    cause: str = field(default="", compare=False)
+    """Id of the order or event that made or sent them."""
+
+    @property
+    def rms_m(self) -> float:
+        """RMS of the shape, metres OPD."""
+        return float(np.sqrt(np.sum(np.square(self.coefficients_m))))
+
+    @property
+    def on_its_way(self) -> bool:
+        """Return True if they were sent and the RTC does not use or refuse them yet."""
+        return self.state in _ON_ITS_WAY
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Assessment:
     """Loss of the reconstructor in use against a new one, at one registration."""

@@ -1,4 +1,4 @@
-"""The state: eleven frozen records, replaced as a whole."""
+"""The state: twelve frozen records, replaced as a whole."""
 
 from __future__ import annotations
 
@@ -25,6 +25,8 @@ from service.records.products import (
     ModeLimit,
     ModeProof,
     ReconstructorRecord,
+    ReferencesRecord,
+    Shape,
 )
 from service.records.registration import (
     HistoryEntry,
@@ -267,6 +269,41 @@ class MatrixStates:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ReferenceStates:
+    """The shape that the loop is to hold, and the reference slopes for it."""
+
+    shape: Shape | None = None
+    """Shape to hold; None for the RTC's own references."""
+
+    records: tuple[ReferencesRecord, ...] = ()
+    """References of the service, oldest first, bounded; those in use are always among them."""
+
+    used_id: str | None = None
+    """Id of the references that the RTC uses; None if it uses none of the service."""
+
+    verified_id: str | None = None
+    """Id of those whose numbers the RTC has shown; None if it has shown none."""
+
+    asked_ns_utc: int = 0
+    """Time of the last request to show them."""
+
+    computing_since_ns_utc: int | None = None
+    """Time at which those now being computed were requested; None if none are computed."""
+
+    not_before_ns_utc: int = 0
+    """Time before which no others are computed."""
+
+    paused: str = ""
+    """Reason why none are made or sent unless ordered; empty if there is none."""
+
+    unsupported: str = ""
+    """Reason why the RTC cannot be sent references; empty if it can, or was not asked."""
+
+    difference: str = ""
+    """Difference between what was sent and what the RTC applies; empty if there is none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Operations:
     """Operations with the loop or the mirror to themselves: each under way, or the last one."""
 
@@ -419,6 +456,7 @@ class TrackerState:
     alpha: AlphaState = field(default_factory=AlphaState)
     windows: WindowCounts = field(default_factory=WindowCounts)
     matrices: MatrixStates = field(default_factory=MatrixStates)
+    references: ReferenceStates = field(default_factory=ReferenceStates)
     operations: Operations = field(default_factory=Operations)
     dithers: DitherState = field(default_factory=DitherState)
     loop: LoopState = field(default_factory=LoopState)
@@ -431,6 +469,10 @@ class TrackerState:
     def reconstructor(self, matrix_id: str | None) -> ReconstructorRecord | None:
         """Return the record of this id, or None."""
         return next((r for r in reversed(self.matrices.reconstructors) if r.id == matrix_id), None)
+
+    def references_of(self, reference_id: str | None) -> ReferencesRecord | None:
+        """Return the record of these reference slopes, or None."""
+        return next((r for r in reversed(self.references.records) if r.id == reference_id), None)
 
     @property
     def used(self) -> ReconstructorRecord | None:
@@ -512,6 +554,12 @@ class Orders:
 
     seen: tuple[AlarmRecord, ...] = ()
     """Alarms with and without an operator's acknowledgement."""
+
+    shape: Shape | None = None
+    """Shape that the loop is to hold; None if none was loaded."""
+
+    references_paused: str = ""
+    """Reason why no references are made for it; empty if there is none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

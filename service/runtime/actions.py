@@ -30,6 +30,7 @@ from service.records.state import TrackerState
 from service.runtime import estimates, ports
 from service.runtime.worker import Conditions, OpticsWorker
 from service.tracking.pointing_law import registration_ahead
+from service.tracking.references import mean_gain
 from service.version import software_version
 
 UNKNOWN_PARENT = "unknown"
@@ -103,6 +104,10 @@ class Actions:
                 return ev.ReferencesFetched(in_use=await self._bridge.fetch_references())
             case ev.SendMatrix():
                 return await self._send(effect, state)
+            case ev.MakeReferences():
+                return await self._make_references(effect, state)
+            case ev.SendReferences():
+                return await self._send_references(effect, state)
             case ev.FinishNoisy(record=record):
                 return await self.noisy.finish(record, state)
             case ev.Ask(request=wire.LoopRequest() as request, judged=True):
@@ -321,6 +326,58 @@ class Actions:
         manifest = record.manifest(layout, rtc, self._publishing.system)
         await self._bridge.publish(manifest, matrix)
         return ev.ModesCommanded(n_modes=effect.n_modes) if anew else None
+
+    async def _make_references(self, effect: ev.MakeReferences, state: TrackerState) -> Event:
+        rtc, registration = _there(state), _registration_to_use(state)
+        shape = state.references.shape
+        if shape is None:
+            raise CommandError("no shape is loaded")
+        made = await self._workers.call(
+            OpticsWorker.make_references,
+            shape,
+            registration.alpha,
+            expected_gains(registration, rtc.n_modes),
+            rtc.n_controlled,
+            effect.worst_seeing_arcsec,
+        )
+        record = products.ReferencesRecord(
+            id=effect.id,
+            state=products.MatrixState.REFUSED if made.refusal else products.MatrixState.PROPOSED,
+            created_ns_utc=self._clock_ns(),
+            shape=shape.id,
+            coefficients_m=made.coefficients_m,
+            alpha=registration.alpha,
+            gain=mean_gain(made.coefficients_m, registration.optical_gains),
+            offset_rms=float(np.sqrt(np.mean(np.square(made.offset)))),
+            unexplained_ratio=made.unexplained,
+            sha256=wire.checksum(made.offset),
+            reason=made.refusal,
+        )
+        await asyncio.to_thread(self._archive.references.store, record, made.offset)
+        return ev.ReferencesMade(record=record)
+
+    async def _send_references(self, effect: ev.SendReferences, state: TrackerState) -> Event:
+        rtc, record = _there(state), state.references_of(effect.id)
+        if record is None:
+            raise UnknownIdError(f"unknown references {effect.id}")
+        store, copied = self._archive.references, record.shape is None or record.parent is not None
+        if record.shape is None:
+            offset = np.zeros(rtc.n_slopes, np.float32)
+        else:
+            offset = await asyncio.to_thread(store.matrix, record.parent or record.id)
+        if copied:
+            # A full disk must not stand in the way of a rollback.
+            with contextlib.suppress(StorageError):
+                await asyncio.to_thread(store.store, record, offset)
+        request = wire.ReferencesRequest(
+            id=f"references-{self._clock_ns()}",
+            reference_id=record.id,
+            config_id=rtc.config_id,
+            slopes=offset.astype("<f4").tobytes(),
+            sha256=record.sha256,
+            ramp_s=effect.ramp_s,
+        )
+        return ev.Answered(request=request, reply=await self._bridge.command(request))
 
     async def _command_modes(self, effect: ev.SendMatrix) -> None:
         """Command the number of modes and the gains of the next matrix."""

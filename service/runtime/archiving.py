@@ -18,6 +18,7 @@ import msgspec
 import structlog
 
 from service.archive import Actor, Archive, AuditEntry
+from service.archive.index import Sent
 from service.archive.nights import TrendSample
 from service.archive.retention import RetentionPolicy, due, items, low_on_space, remove
 from service.errors import ArchiveError, StorageError
@@ -26,12 +27,12 @@ from service.records.alarms import ARCHIVE_FAILED, DISK_LOW
 from service.records.commands import Command, makes_safer
 from service.records.events import Effect
 from service.records.operations import MeasurementRecord
-from service.records.products import ReconstructorRecord
 from service.records.registration import HistoryEntry
 from service.records.state import Level, LogEntry, TrackerState
 from service.runtime.command_results import GivenCommand
 from service.tracking.mode_proof import proof_to_keep
 from service.tracking.policy import Policy
+from service.tracking.references import find_previous
 from service.tracking.resume import orders_of, resumed, saved_of, with_orders
 from service.tracking.step_context import logged
 from service.wire import (
@@ -95,7 +96,7 @@ class ArchiveWriter:
         self._archive = archive
         self._state = state
         self._post = post
-        self._records: dict[str, ReconstructorRecord] = {}
+        self._records: dict[str, Sent] = {}
         self._entries: list[AuditEntry] = []
         self._estimates: list[HistoryEntry] = []
         self._samples: list[TrendSample] = []
@@ -116,11 +117,17 @@ class ArchiveWriter:
 
     def changed(self, before: TrackerState, after: TrackerState, lines: Iterable[LogEntry]) -> None:
         """Take what a step has changed, to be written soon."""
-        if after.matrices.reconstructors is not before.matrices.reconstructors:
-            old = {record.id: record for record in before.matrices.reconstructors}
+        pairs: tuple[tuple[tuple[Sent, ...], tuple[Sent, ...]], ...] = (
+            (before.matrices.reconstructors, after.matrices.reconstructors),
+            (before.references.records, after.references.records),
+        )
+        for was, now in pairs:
+            if now is was:
+                continue
+            old = {record.id: record for record in was}
             # Records are immutable, so identity finds the changed ones without comparing their
             # arrays.
-            new = {r.id: r for r in after.matrices.reconstructors if old.get(r.id) is not r}
+            new = {r.id: r for r in now if old.get(r.id) is not r}
             with self._guard:
                 self._records |= new
             if new:
@@ -403,8 +410,9 @@ def find_changed_ids(before: TrackerState, after: TrackerState) -> set[str]:
     return {one.id for one in _records(after) if one not in known}
 
 
-def _records(state: TrackerState) -> tuple[ReconstructorRecord | MeasurementRecord, ...]:
-    return (*state.matrices.reconstructors, *state.operations.measurements)
+def _records(state: TrackerState) -> tuple[Sent | MeasurementRecord, ...]:
+    made: tuple[Sent, ...] = (*state.matrices.reconstructors, *state.references.records)
+    return (*made, *state.operations.measurements)
 
 
 def command_json(command: Command, actor: Actor) -> str:
@@ -499,5 +507,7 @@ def needed(state: TrackerState) -> frozenset[str]:
         state.previous,
         state.operations.acquisition.matrix,
         state.operations.acquisition.applied,
+        state.references.used_id,
+        getattr(find_previous(state), "id", None),
     )
     return frozenset(one for one in ids if one is not None)

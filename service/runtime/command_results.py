@@ -18,6 +18,7 @@ from service.tracking.alarm_records import muted_records
 from service.tracking.alarm_rules import format_value
 from service.tracking.dither_request import total_m
 from service.tracking.reconstructors import check_sendable
+from service.tracking.references import explain_waiting
 
 _ON_ITS_WAY = {
     MatrixState.PROPOSED: "command.judged-again",
@@ -87,6 +88,25 @@ def _report_republished(
         mode=now.operator.mode,
     )
     return CommandResult(again, sent.final)
+
+
+def _of_references(
+    _: cmd.ApproveReferences | cmd.RollBackReferences | cmd.ClearShape,
+    cause: str,
+    now: TrackerState,
+) -> CommandResult:
+    """Report the way of references to the RTC."""
+    sent = [record for record in now.references.records if record.cause == cause]
+    if not sent:
+        return CommandResult(compose("command.no-references"))
+    record = sent[-1]
+    if record.on_its_way:
+        return CommandResult(compose("command.sent", id=record.id), final=False)
+    if record.state is MatrixState.FAILED:
+        raise LinkError(record.reason)
+    if record.state is MatrixState.REJECTED:
+        raise CommandError(record.reason)
+    return CommandResult(compose("command.references-used", id=record.id))
 
 
 def _of_matrix(now: TrackerState, name: str) -> CommandResult:
@@ -192,6 +212,9 @@ _REPORTED_LATER: Final[dict[type, Callable[[Any, str, TrackerState], CommandResu
     cmd.Approve: _sent,
     cmd.Publish: _report_republished,
     cmd.Rollback: _report_republished,
+    cmd.ApproveReferences: _of_references,
+    cmd.RollBackReferences: _of_references,
+    cmd.ClearShape: _of_references,
     cmd.StartDither: _dither,
     cmd.StopDither: _no_dither,
     cmd.SetLoop: _loop,
@@ -218,7 +241,11 @@ def _done(  # noqa: C901 - one line for each command
             message = compose("command.released", mode)
         case cmd.Refit():
             message = compose("command.refit", mode=mode)
-        case cmd.Reject(id=name):
+        case cmd.LoadShape():
+            shape = now.references.shape
+            waiting = explain_waiting(now) or "references are being made"
+            message = compose("command.shape", waiting, id=shape.id if shape else "")
+        case cmd.Reject(id=name) | cmd.RejectReferences(id=name):
             message = compose("command.discarded", id=name)
         case cmd.Acquire():
             message = compose("command.acquires", doing)

@@ -137,6 +137,8 @@ def policy_of(settings: Settings, instrument: Instrument | None = None) -> Polic
         update_gain_m=control.update_gain_nm * 1e-9,
         update_margin=control.update_margin,
         minimum_interval_s=control.minimum_interval_s,
+        worst_seeing_arcsec=settings.references.worst_seeing_arcsec,
+        references_ramp_s=settings.references.ramp_s,
         opens_lost_loop=control.open_lost_loop,
         rules=tuple(
             Rule(

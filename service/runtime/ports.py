@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from service.archive.products import NoisyNumbers
 from service.archive.store import Provenance
 from service.records.operations import MeasurementRecord
-from service.records.products import ReconstructorRecord
+from service.records.products import ReconstructorRecord, ReferencesRecord
 from service.runtime.worker import OpticsWorker
 from service.wire import Command, Manifest, ReferencesInUse, Reply
 
@@ -75,12 +75,26 @@ class ReconstructorPort(Protocol):
         """Return a reconstructor that was kept; UnknownIdError if there is none."""
 
 
+class ReferencesPort(Protocol):
+    """Store of reference slopes."""
+
+    def store(self, record: ReferencesRecord, offset: NDArray[np.float32], /) -> None:
+        """Keep an offset ``(n_slopes,)``."""
+
+    def matrix(self, reference_id: str, /) -> NDArray[np.float32]:
+        """Return an offset that was kept; UnknownIdError if there is none."""
+
+
 class StorePort(Protocol):
     """Stores of matrices; :class:`service.archive.Archive` is the real one."""
 
     @property
     def reconstructors(self) -> ReconstructorPort:
         """Reconstructors."""
+
+    @property
+    def references(self) -> ReferencesPort:
+        """Reference slopes."""
 
     @property
     def measured(self) -> MeasuredPort[NDArray[np.float32]]:

@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+import numpy as np
+
 from service.estimation.control_law import ControlLawCheck
 from service.estimation.dither_monitor import MAX_AMPLITUDE_RATIO, DitherMeasurement, DitherWatch
 from service.estimation.dither_windows import DitherWindows
@@ -20,6 +22,7 @@ from service.estimation.health import (
     Standstill,
     VibrationMonitor,
 )
+from service.estimation.held_shape import MeanCommands
 from service.estimation.loopcheck import LoopCheck
 from service.estimation.passive import Passive
 from service.estimation.probation import Comparison
@@ -115,6 +118,24 @@ def _report_comparison(
     return [ev.Compared(finding=judged)] if judged is not None and awaited else []
 
 
+def _report_held(
+    before: MeanCommands, now: MeanCommands, loop: LoopContext, state: TrackerState
+) -> list[Event]:
+    """Return how much of a change of references the mirror holds."""
+    record = state.references_of(now.name)
+    if record is None or not now.is_due(before):
+        return []
+    earlier = state.references_of(now.before[0])
+    change_m = np.zeros(loop.description.n_modes)
+    change_m[: len(record.coefficients_m)] = record.coefficients_m
+    if earlier is not None:
+        change_m[: len(earlier.coefficients_m)] -= earlier.coefficients_m
+    found = now.measure(change_m)
+    if found is None:
+        return []
+    return [ev.ShapeHeld(id=record.id, ratio=found.ratio, sigma=found.sigma)]
+
+
 @dataclass(frozen=True, slots=True)
 class Entry:
     """One estimator or detector."""
@@ -152,6 +173,7 @@ REGISTRY: Final = (
     Entry(LoopCheck, {alarms.OFF_LOOP: "commands obey the loop equation again"}, _report_opposite),
     Entry(Rejection, events=_held),
     Entry(Comparison, events=_report_comparison),
+    Entry(MeanCommands, events=_report_held),
     Entry(Passive),
     Entry(DitherWindows),
 )

@@ -22,13 +22,15 @@ from service.records.alarms import (
 )
 from service.records.commands import GainGroup
 from service.records.messages import Value
+from service.records.products import ReferencesRecord
 from service.records.registration import MeasuredGains, ModeGain, Registration
-from service.records.state import LogEntry, TrackerState
+from service.records.state import LogEntry, ReferenceStates, TrackerState
 from service.tracking.alarm_records import muted_records, record_of, stale_records, worst_severity
 from service.tracking.interlocks import Permission, permissions
 from service.tracking.operations.running import Operating, operating
 from service.tracking.policy import Policy
 from service.tracking.reconstructors import check_return
+from service.tracking.references import explain_waiting
 from service.wire import Status
 
 IMAGES_LIMIT = "measure the places of the pupil images: pyrcal instrument check FILE --light FRAME"
@@ -164,6 +166,11 @@ class Snapshot:
         return check_return(self.tracker)
 
     @property
+    def references(self) -> References:
+        """The shape that the loop is to hold, and the references for it."""
+        return References(tracker=self.tracker)
+
+    @property
     def rtc(self) -> Rtc | None:
         """Null: no RTC has been seen, or it has vanished."""
         known = self.tracker.loop.rtc
@@ -272,6 +279,38 @@ class Alpha:
         """1 σ of it."""
         bias = self.registration.bias
         return None if bias is None else np.sqrt(np.diag(bias.covariance))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class References:
+    """The shape that the loop is to hold, and the references for it."""
+
+    tracker: TrackerState
+
+    @property
+    def kept(self) -> ReferenceStates:
+        """All that is known of them."""
+        return self.tracker.references
+
+    @property
+    def used(self) -> ReferencesRecord | None:
+        """References of the service that the RTC uses; null if it uses none of them."""
+        return self.tracker.references_of(self.kept.used_id)
+
+    @property
+    def newest(self) -> ReferencesRecord | None:
+        """References made last, such as those that wait for approval; null if none were made."""
+        return next(iter(self.kept.records[::-1]), None)
+
+    @property
+    def verified(self) -> bool:
+        """True if the RTC has shown that it subtracts what was sent."""
+        return self.kept.used_id is not None and self.kept.used_id == self.kept.verified_id
+
+    @property
+    def waiting(self) -> str:
+        """Reason why no references are made or followed now; empty if they are."""
+        return explain_waiting(self.tracker)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

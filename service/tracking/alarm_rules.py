@@ -198,6 +198,7 @@ RULES: Final[dict[str, Callable[[StepContext], str | Message | None]]] = {
     alarms.NOT_FOUND: _not_found,
     alarms.OTHER_SUM: _other_numbers,
     alarms.MISAPPLIED: lambda context: context.matrices.misapplied or None,
+    alarms.REFERENCES_MISAPPLIED: lambda context: context.references.difference or None,
     alarms.SHORT_MARGIN: _margin,
     alarms.LOOP_OPENED: explain_opening,
     alarms.NOT_STOPPED: _not_stopped,

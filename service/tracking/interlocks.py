@@ -26,6 +26,7 @@ from service.tracking.operations.acquisition import check_acquisition
 from service.tracking.operations.running import OperationKind, RunningOperation, running_operations
 from service.tracking.policy import Policy
 from service.tracking.reconstructors import beyond_judging, check_approved, require_record
+from service.tracking.references import check_sending, require_references
 from service.tracking.update_policy import is_left_behind
 
 
@@ -60,6 +61,7 @@ _ALWAYS = _SEEN | frozenset[type](
         cmd.AbortAcquisition,
         cmd.GiveUp,
         cmd.Reject,
+        cmd.RejectReferences,
         cmd.Resume,
         cmd.SetMode,
         cmd.SetPointing,
@@ -70,11 +72,16 @@ _ALWAYS = _SEEN | frozenset[type](
 )
 """Orders that end something, or disturb nothing."""
 
+_SWAPS = frozenset[type](
+    {cmd.Approve, cmd.Publish, cmd.Rollback, cmd.ApproveReferences, cmd.RollBackReferences}
+) | {cmd.LoadShape, cmd.ClearShape}
+"""Orders that swap a matrix or references."""
+
 ALLOWS: Final[dict[OperationKind, frozenset[type]]] = {
     OperationKind.STOPPED: _ALWAYS,
     OperationKind.MEASURING: _ALWAYS,
     # a swap costs it a window, and must not wait for minutes
-    OperationKind.GATHERING: _ALWAYS | {cmd.Refit, cmd.Approve, cmd.Publish, cmd.Rollback},
+    OperationKind.GATHERING: _ALWAYS | _SWAPS | {cmd.Refit},
     OperationKind.RAMPING: _ALWAYS,
     OperationKind.ACQUIRING: _ALWAYS,
     # it makes way for what needs the loop, and an RTC measures under no dither
@@ -242,6 +249,34 @@ def _not_proposed(record: ReconstructorRecord | None) -> str:
     return f"{record.id} is {record.state}, not proposed"
 
 
+def _references(moment: Moment, reference_id: str, *, sent: bool) -> str | None:
+    """Return why proposed references may not be sent, or not be discarded."""
+    state, proposed = moment.state, MatrixState.PROPOSED
+    records = state.references.records
+    record = next((one for one in reversed(records) if one.state is proposed), None)
+    if reference_id:
+        record = require_references(state, reference_id)
+    if record is None:
+        return "no references are proposed"
+    if record.state is not proposed:
+        return f"{record.id} are {record.state}, not proposed"
+    reason = check_sending(state, record) if sent else None
+    return f"{record.id} cannot be sent: {reason}" if reason else None
+
+
+def _roll_back_references(moment: Moment, _: str) -> str | None:
+    if moment.state.references.used_id is None:
+        return "the RTC uses its own references"
+    return _needs_rtc(moment) or moment.state.references.unsupported or None
+
+
+def _clear(moment: Moment, _: str) -> str | None:
+    kept = moment.state.references
+    if kept.shape is None and kept.used_id is None:
+        return "no shape is loaded"
+    return _needs_rtc(moment)
+
+
 def _publish(moment: Moment, matrix_id: str) -> str | None:
     state = moment.state
     if matrix_id:
@@ -307,6 +342,11 @@ INTERLOCKS: Final[dict[type, Callable[[Moment, str], str | None]]] = {
     cmd.Reject: _reject,
     cmd.Publish: _publish,
     cmd.Rollback: _rollback,
+    cmd.LoadShape: _needs_rtc,
+    cmd.ClearShape: _clear,
+    cmd.ApproveReferences: partial(_references, sent=True),
+    cmd.RejectReferences: partial(_references, sent=False),
+    cmd.RollBackReferences: _roll_back_references,
     cmd.Measure: _needs_rtc,
     cmd.MeasureNoisy: partial(_needs_loop, why="a noisy matrix is measured in the closed loop"),
     cmd.GiveUp: _give_up,

@@ -33,6 +33,7 @@ def _applied(state: TrackerState) -> list[str]:
 def _ids_are_unique(state: TrackerState) -> object:
     return (
         _repeated(r.id for r in state.matrices.reconstructors)
+        + _repeated(r.id for r in state.references.records)
         + _repeated(r.id for r in state.operations.measurements)
         + _repeated(alarm.name for alarm in state.alarms.active)
     )
@@ -50,6 +51,13 @@ def _used_is_applied(state: TrackerState) -> object:
 def _applied_is_used(state: TrackerState) -> object:
     used = state.matrices.in_use
     return used is not None and [one for one in _applied(state) if one != used]
+
+
+def _references_in_use_are_applied(state: TrackerState) -> object:
+    kept = state.references
+    return [
+        r.id for r in kept.records if (r.state is MatrixState.APPLIED) is not (r.id == kept.used_id)
+    ]
 
 
 def _one_measures(state: TrackerState) -> object:
@@ -85,6 +93,7 @@ def _is_in_order(state: TrackerState) -> object:
 def _what_waits_can_go_on(state: TrackerState) -> object:
     operations = state.operations
     waiting: list[StrEnum] = [r.state for r in state.matrices.reconstructors if r.on_its_way]
+    waiting += [r.state for r in state.references.records if r.on_its_way]
     waiting += [r.state for r in operations.measurements if r.under_way]
     waiting += [operations.acquisition.stage] if operations.acquisition.under_way else []
     if operations.probation is not None and operations.probation.under_way:
@@ -93,10 +102,11 @@ def _what_waits_can_go_on(state: TrackerState) -> object:
 
 
 INVARIANTS: Final[dict[str, Callable[[TrackerState], object]]] = {
-    "a reconstructor, a measurement and an alarm each have an id of their own": _ids_are_unique,
+    "reconstructors, references, measurements and alarms have an id of their own": _ids_are_unique,
     "at most one matrix is applied": _one_is_applied,
     "the matrix in use is applied or, with other numbers, failed": _used_is_applied,
     "no matrix but the one in use is applied": _applied_is_used,
+    "references are applied if, and only if, they are in use": _references_in_use_are_applied,
     "at most one interaction matrix is measured at a time": _one_measures,
     "an acquisition and a measurement by the RTC exclude each other": _one_has_the_mirror,
     "only an acquisition has the service dither an open loop": _open_loop_is_not_dithered,

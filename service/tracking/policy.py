@@ -169,6 +169,12 @@ class Policy:
     minimum_interval_s: float
     """Least time between two reconstructors."""
 
+    worst_seeing_arcsec: float = 1.2
+    """Seeing in which the loop must survive with the references of a shape."""
+
+    references_ramp_s: float = 1.0
+    """Duration of the ramp to other references."""
+
     rules: tuple[Rule, ...]
     """Operators' own."""
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TypeVar
 
 from service.records import commands as cmd
 from service.records.alarms import NOT_RESTORED, Interlock
-from service.records.products import MatrixState, ReconstructorRecord
+from service.records.products import MatrixState, ReconstructorRecord, ReferencesRecord
 from service.records.state import Orders, Saved, TrackerState
-from service.tracking import dither, mode_proof, offload, validity
+from service.tracking import dither, mode_proof, offload, references, validity
 from service.tracking.alarm_records import restore_records
 from service.tracking.alarm_rules import derive_alarms
 from service.tracking.operations.acquisition import (
@@ -27,6 +28,8 @@ from service.tracking.validity import without_previous
 
 MAX_CLOCK_DIFFERENCE_S = 60.0
 """A state from further in the future than this was saved under another clock."""
+
+Sent = TypeVar("Sent", ReconstructorRecord, ReferencesRecord)
 
 _RESTARTED = {
     MatrixState.PUBLISHED: MatrixState.FAILED,
@@ -74,6 +77,8 @@ def orders_of(state: TrackerState) -> Orders:
         dither_stopped=state.dithers.stopped,
         stopped=state.operator.stopped_because,
         seen=state.alarms.records,
+        shape=state.references.shape,
+        references_paused=state.references.paused,
     )
 
 
@@ -110,13 +115,29 @@ def restored(records: tuple[ReconstructorRecord, ...]) -> tuple[ReconstructorRec
     Operations that were under way have failed, and the verdict of a proposal is out of date. A
     matrix that the RTC brought can be restored, and is read again, because it may have changed.
     """
-    taken_over = [
+    return prune(_after_restart(records), None)
+
+
+def restored_references(records: tuple[ReferencesRecord, ...]) -> tuple[ReferencesRecord, ...]:
+    """Return the references that a restarted service takes over from its archive.
+
+    Those in use are known again when the RTC names them.
+    """
+    return tuple(
+        replace(record, state=MatrixState.SUPERSEDED, reason="the service restarted")
+        if record.state is MatrixState.APPLIED
+        else record
+        for record in _after_restart(records)[-references.RECORDS_KEPT :]
+    )
+
+
+def _after_restart(records: tuple[Sent, ...]) -> list[Sent]:
+    return [
         replace(record, state=_RESTARTED[record.state], reason="the service restarted")
         if record.state in _RESTARTED
         else record
         for record in records
     ]
-    return prune(taken_over, None)
 
 
 def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
@@ -170,6 +191,7 @@ def resumed(state: TrackerState, saved: Saved, policy: Policy, now_ns: int) -> T
         stopped = saved.orders.stopped
         context.operator = replace(context.operator, stopped_because=stopped)
         restore_records(context, saved.orders)
+        references.restore_shape(context, saved.orders)
     if saved.system == state.system:
         validity.restore_intervals(context, saved.void_intervals)
     _take_over_alpha(context, saved, now_ns)

@@ -16,6 +16,7 @@ from service.tracking import (
     mode_proof,
     pointing_law,
     reconstructors,
+    references,
     update_policy,
     validity,
 )
@@ -83,6 +84,7 @@ def on_status(context: StepContext, rtc: Status) -> None:
         config_id=context.loop.config_id or rtc.config_id,
     )
     _note_references(context, rtc)
+    references.follow_status(context, rtc, returned=before is None)
     _note_renaming(context, before, rtc)
     validity.note_pointing(context, rtc.pointing)
     _drop_other_basis(context)
@@ -235,6 +237,7 @@ def on_new_session(context: StepContext, started: ev.SessionStarted) -> None:
 def _begin_anew(context: StepContext, because: str) -> None:
     """Void what belonged to the loop until now."""
     reconstructors.forget_session(context)
+    references.forget_session(context)
     mode_proof.forget_session(context)
     validity.invalidate_telemetry(context, because)
     dither.forget_dither(context)
@@ -292,19 +295,6 @@ def fail_order(context: StepContext, effect: Effect | Request, text: str) -> Non
     """Log the failure, and note it under the id of the order that led to it."""
     context.fail(text)
     log_failure(context, effect, text)
-
-
-def log_references(context: StepContext, fetched: ev.ReferencesFetched) -> None:
-    """Log which reference slopes the RTC has in use."""
-    context.log("references.read", fetched.in_use.reference_id)
-
-
-def log_reply(context: StepContext, request: Request, reply: Reply) -> None:
-    """Log whether the RTC has accepted a request."""
-    if reply.accepted:
-        context.log("request.accepted", request.id)
-    else:
-        context.warn("request.refused", f"{request.id}: {reply.reason}")
 
 
 def log_failure(context: StepContext, _: Effect | Request, text: str) -> None:

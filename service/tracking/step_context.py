@@ -28,6 +28,7 @@ from service.records.state import (
     ModelState,
     Operations,
     OperatorState,
+    ReferenceStates,
     TrackerState,
     WindowCounts,
 )
@@ -109,6 +110,7 @@ class StepContext:
     alpha = _Part[AlphaState]()
     windows = _Part[WindowCounts]()
     matrices = _Part[MatrixStates]()
+    references = _Part[ReferenceStates]()
     operations = _Part[Operations]()
     dithers = _Part[DitherState]()
     loop = _Part[LoopState]()

@@ -19,10 +19,10 @@ from service.records.operations import (
     Probation,
     ProbationState,
 )
-from service.records.products import MatrixState, ReconstructorRecord
+from service.records.products import MatrixState, ReconstructorRecord, ReferencesRecord
 from service.tracking.step_context import StepContext
 
-Record = Acquisition | MeasurementRecord | Probation | ReconstructorRecord
+Record = Acquisition | MeasurementRecord | Probation | ReconstructorRecord | ReferencesRecord
 RecordT = TypeVar("RecordT", bound=Record)
 
 

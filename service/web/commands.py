@@ -335,6 +335,12 @@ def _all(state: TrackerState, _: str = "") -> Response:
     return views.tagged(state, views.RECONSTRUCTORS)
 
 
+def _references(state: TrackerState, name: str) -> Response:
+    return views.tagged(
+        views.found_or_refuse(state.references_of(name), f"unknown references {name}")
+    )
+
+
 def _before(state: TrackerState, _: str) -> Response:
     """Return what shows the reconstructor that was in use before; where there is none, all.
 
@@ -348,6 +354,7 @@ _SHOWN: Mapping[str, Callable[[TrackerState, str], Response]] = {
     "/v1/reconstructors/{id}": _one,
     "/v1/reconstructors": _all,
     "/v1/reconstructors/previous": _before,
+    "/v1/references/{id}": _references,
 }
 """Resources that an order may be decided on."""
 
@@ -359,6 +366,7 @@ _AlarmName = Annotated[str, Path(alias="name", max_length=128)]
 
 _NAMED: Mapping[str, Any] = {
     "reconstructors": matrices.MatrixId,
+    "references": matrices.ReferencesId,
     "alarms": _AlarmName,
     "values": _AlarmName,
     "measurements": measured.MeasurementId,

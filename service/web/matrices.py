@@ -62,6 +62,25 @@ MatrixId = Annotated[str, Depends(_resolve_id)]
 """Reconstructor named in a path."""
 
 
+async def _resolve_references(
+    service: views.ServiceDep,
+    reference_id: Annotated[
+        str, Path(alias="id", description="Id of references, or in-use, candidate")
+    ],
+) -> str:
+    """Return the id that is meant."""
+    kept = service.snapshot().tracker.references
+    proposed = [r.id for r in kept.records if r.state is MatrixState.PROPOSED]
+    aliases = {"in-use": kept.used_id, "candidate": proposed[-1] if proposed else None}
+    if reference_id not in aliases:
+        return reference_id
+    return views.found_or_refuse(aliases[reference_id], f"{reference_id}: there are no references")
+
+
+ReferencesId = Annotated[str, Depends(_resolve_references)]
+"""Reference slopes named in a path."""
+
+
 async def _other(
     service: views.ServiceDep,
     other: Annotated[str, Path(description="Id of another, or in-use, previous, candidate")],
@@ -243,6 +262,47 @@ async def reconstructor_matrix(
         service.matrix,
         lambda name: service.archive.reconstructors.file(name),
     )
+
+
+@router.get("/references", tags=["references"], responses={200: views.shows(views.REFERENCES)})
+async def references(service: views.ServiceDep) -> Response:
+    """Return the shape, and the references, oldest first."""
+    return views.answer(service.snapshot().tracker, views.REFERENCES)
+
+
+@router.get(
+    "/references/{id}",
+    tags=["references"],
+    responses={200: views.shows(views.REFERENCES_RECORD), **UNKNOWN},
+)
+async def reference_record(service: views.ServiceDep, reference_id: ReferencesId) -> Response:
+    """Return the record of references."""
+    record = service.snapshot().tracker.references_of(reference_id)
+    return views.tagged(views.found_or_refuse(record, f"unknown references {reference_id}"))
+
+
+@router.get(
+    "/references/{id}/slopes",
+    tags=["references"],
+    response_class=Response,
+    responses={
+        200: describes_numbers(
+            "The offset of the slopes, to be subtracted beyond the RTC's own references",
+            "Number of slopes",
+            "1384",
+        ),
+        **UNKNOWN,
+    },
+)
+async def reference_slopes(
+    request: Request,
+    service: views.ServiceDep,
+    reference_id: ReferencesId,
+    parameters: Annotated[MatrixParameters, Query()],
+) -> Response:
+    """Return the offset of references ``(n_slopes,)``, for a program that applies it."""
+    store = service.archive.references
+    return await numbers_of(request, reference_id, parameters.format, store.matrix, store.file)
 
 
 @router.get("/gains", responses={200: views.shows(views.GAINS), **COMMAND})

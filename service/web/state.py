@@ -236,6 +236,13 @@ class SnapshotCollector(Collector):
         unchanged = "Since the RTC changed its reference slopes; NaN: it has not"
         age_s = None if since_ns is None else (snapshot.now_ns - since_ns) / 1e9
         yield _gauge("reference_age_seconds", unchanged, age_s)
+        used = snapshot.references.used
+        ours = "1 while the RTC uses reference slopes of the service"
+        yield _gauge("references_in_use", ours, used is not None)
+        held = "RMS of the shape that they hold; NaN: none"
+        yield _gauge("references_shape_meters", held, None if used is None else used.rms_m)
+        scaled = "Mean gain that they were scaled with; NaN: none"
+        yield _gauge("references_gain_ratio", scaled, None if used is None else used.gain)
         yield from _of_registration(snapshot)
         yield from _of_the_dither(tracker)
         yield from _of_reconstructors(tracker)

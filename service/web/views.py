@@ -61,7 +61,15 @@ from service.records.operations import (
 from service.records.products import ExpectedGain, GateVerdict, ModeLimit, ModeProof
 from service.records.registration import HistoryEntry, ModeGain, Offload, PassiveState
 from service.records.state import LogEntry, ObservatoryValue, TrackerState
-from service.runtime.snapshot import AlarmStatus, Alpha, ModeGainTable, Rtc, Snapshot, WorkerLoad
+from service.runtime.snapshot import (
+    AlarmStatus,
+    Alpha,
+    ModeGainTable,
+    References,
+    Rtc,
+    Snapshot,
+    WorkerLoad,
+)
 from service.runtime.supervisor import Supervisor
 from service.tracking import interlocks
 from service.tracking.operations.running import Operating
@@ -365,6 +373,24 @@ RECONSTRUCTORS = define_view(
     "The reconstructors the service remembers.",
 )
 GAINS = define_view("GainTableView", ModeGainTable)
+define_view("ShapeView", products.Shape, "id kind frame source by loaded_ns_utc")
+REFERENCES_RECORD = define_view(
+    "ReferencesRecordView",
+    products.ReferencesRecord,
+    "id state created_ns_utc shape rms_m alpha gain offset_rms unexplained_ratio sha256 parent "
+    "reason by published_ns_utc applied_ns_utc held_ratio held_sigma",
+)
+define_view(
+    "HeldShapeView",
+    References,
+    "kept.shape used newest verified waiting kept.unsupported misapplied=kept.difference",
+)
+REFERENCES = define_view(
+    "ReferencesView",
+    TrackerState,
+    "references.shape references.used_id references.records",
+    "The shape that the loop is to hold, and the references that the service remembers.",
+)
 
 MEASUREMENT = define_view(
     "MeasurementView",
@@ -426,7 +452,7 @@ STATE = define_view(
     "tracker.matrices.assessment tracker.matrices.mode_limit tracker.matrices.mode_proof "
     "tracker.operations.probation rtc instrument_remarks tracker.alpha.pointing "
     "tracker.loop.basis_id tracker.loop.config_id tracker.loop.reference_id "
-    "tracker.loop.reference_since_ns_utc tracker.dithers.dither "
+    "tracker.loop.reference_since_ns_utc references tracker.dithers.dither "
     "dither_policy=tracker.dithers.policy tracker.loop.vibrations_hz tracker.measuring "
     "tracker.noisy_measurement tracker.operations.acquisition tracker.alpha.offload "
     "loop_command=tracker.loop.command tracker.alpha.dither_due_since_ns_utc "

@@ -9,6 +9,7 @@ from service.records.products import MatrixState
 from service.records.registration import ModeGain
 from service.records.state import Mode
 from tests.support.activities import ACTIVITIES
+from tests.support.shaped import LOADED, ShapedStory
 from tests.support.situations import POLICY, Story, moved, rtc
 from tests.support.states import changed
 
@@ -62,6 +63,16 @@ def gains_measured():
     known = replace(story.state.alpha.registration, optical_gains=(gain,))
     story.state = changed(story.state, registration=known)
     return story
+
+
+def references_proposed():
+    """A shape is loaded, and references for it wait for an approval."""
+    return ShapedStory(Mode.PROPOSE).load().make_references()
+
+
+def references_used():
+    """References are in use."""
+    return ShapedStory(Mode.PROPOSE).load().use_references()
 
 
 def gains_without_matrix():
@@ -157,6 +168,8 @@ MOMENTS = [
     in_use,
     gains_measured,
     gains_without_matrix,
+    references_proposed,
+    references_used,
     refused_since,
     left_behind,
     suspected,
@@ -173,6 +186,7 @@ def meant(state, order):
     """The command that an operator would give now; None: there is nothing that it could name."""
     proposals = [r.id for r in state.matrices.reconstructors if r.state is MatrixState.PROPOSED]
     used = [r.id for r in state.matrices.reconstructors if r.was_used]
+    offered = [r.id for r in state.references.records if r.state is MatrixState.PROPOSED]
     work = state.measuring or state.noisy_measurement
     unseen = [
         n.name for n in state.alarms.records if n.worst is not None and n.acknowledged is None
@@ -183,6 +197,8 @@ def meant(state, order):
         "reject": (cmd.Reject, proposals),
         "publish": (cmd.Publish, used),
         "give_up": (cmd.GiveUp, [work.id] if work else []),
+        "approve_references": (cmd.ApproveReferences, offered),
+        "reject_references": (cmd.RejectReferences, offered),
     }
     if order in named:
         kind, ids = named[order]
@@ -215,5 +231,8 @@ PLAIN = {
     "compensate_gains": cmd.SetLoop(effective_gain=0.5),
     "set_pointing": cmd.SetPointing(elevation_deg=60.0, azimuth_deg=0.0),
     "ramp": cmd.Ramp(),
+    "load_shape": LOADED,
+    "clear_shape": cmd.ClearShape(),
+    "roll_back_references": cmd.RollBackReferences(),
 }
 """Those that name nothing; what the observatory tells needs a rule, see test_rules."""

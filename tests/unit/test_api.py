@@ -830,6 +830,7 @@ DIMENSIONLESS = {
     "gain",
     "gain_scatter",
     "gain_sigma",
+    "held_sigma",  # of a ratio
     "id",
     "innovation",
     "last",
@@ -841,6 +842,7 @@ DIMENSIONLESS = {
     "max_dither_modes",
     "misfit",
     "mode",
+    "offset_rms",  # of slopes
     "optical_gain",
     "residual_fraction",  # RMS over RMS
     "residual_limit",  # of a ratio

@@ -27,6 +27,8 @@ TOGETHER = {
     "POST /v1/measurements": "no n_average with a sine|no frequency_hz and no duration_s with|"
     "one frequency_hz for each|any of them twice",
     "POST /v1/noisy-matrix": "any of them twice",
+    "POST /v1/references": "frame (mirror|instrument) with|no unit with slopes|a unit: m, um or nm|"
+    "a square map|a shape of|slopes that are not all 0",
     "POST /v1/loop": "at least one of loop|gains or effective_gain|no mode in two groups|first <=",
     "POST /v1/loop/ramp": "no mode in two groups|first <=",
     "POST /v1/fits": r"query\.(modes|start|instrument): found|unusable-matrix ",

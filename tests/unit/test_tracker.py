@@ -140,8 +140,14 @@ def test_deciders_and_guards_are_not_given_the_event():
 
 ALWAYS = {"a restored α", "the pointing law", "windows in a row", "the probation", "alarms"}
 ALWAYS |= {"alarms of what was decided"}
-OF_SERVICE = {"the dither", "reconstructors", "the offload"}
-REST = {"the RTC's matrix", "the acquisition", "a noisy matrix", "unwanted dithers"}
+OF_SERVICE = {"the dither", "reconstructors", "references", "the offload"}
+IN_USE = {"the RTC's matrix", "references in use"}
+REST = {
+    *IN_USE,
+    "the acquisition",
+    "a noisy matrix",
+    "unwanted dithers",
+}
 
 
 STANDBY = ev.ServicesMet(drives=False, others=("the service on pyrcal-2",))
@@ -156,12 +162,12 @@ DIVERGING = ev.ConditionChanged(name=alarms.DIVERGING, text="the loop diverges")
         (idle, ev.RtcVanished(), {"the acquisition", "a noisy matrix"}),
         (idle, DIVERGING, REST),
         (measuring, ev.Tick(), set()),
-        (stopped, ev.Tick(), {"the RTC's matrix", "unwanted dithers"}),
-        (acquiring, ev.Tick(), {"the RTC's matrix", "the acquisition"}),
+        (stopped, ev.Tick(), {*IN_USE, "unwanted dithers"}),
+        (acquiring, ev.Tick(), {*IN_USE, "the acquisition"}),
         (
             waiting_for_a_noisy_one,
             ev.Tick(),
-            {"the RTC's matrix", "the acquisition", "a noisy matrix"},
+            {*IN_USE, "the acquisition", "a noisy matrix"},
         ),
         (gathering, ev.Tick(), REST | OF_SERVICE),
         (ramping, ev.Tick(), REST),

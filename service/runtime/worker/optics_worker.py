@@ -23,6 +23,13 @@ from service.control.gains import CalibrationGains
 from service.control.gate import judge
 from service.control.loop import ControlLoop
 from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
+from service.control.references import (
+    ShapeFrame,
+    compute_references,
+    holding_gain,
+    limit_shape,
+    shape_in_modes,
+)
 from service.estimation import passive
 from service.estimation.description import Description
 from service.estimation.dithered_response import DitheredResponse, ModeResidual
@@ -61,12 +68,13 @@ from service.records.estimates import (
     WindowRefused,
 )
 from service.records.messages import as_message, compose
-from service.records.products import ExpectedGain, GateVerdict
+from service.records.products import ExpectedGain, GateVerdict, Shape, ShapeKind
 from service.records.state import ModelState
 from service.runtime.worker.records import (
     Compute,
     Conditions,
     Made,
+    MadeReferences,
     actuators_of,
     check_controllable,
     largest_passing,
@@ -506,6 +514,54 @@ class OpticsWorker:
             return predict_gain(in_use, fresh, seen, loop, sky)
         except np.linalg.LinAlgError:
             return None
+
+    def make_references(
+        self,
+        shape: Shape,
+        alpha: Misregistration,
+        optical_gain: NDArray[np.float64],
+        n_controlled: int,
+        worst_seeing_arcsec: float,
+    ) -> MadeReferences:
+        """Compute the reference slopes that hold a shape, and check its size.
+
+        ``optical_gain`` is that of all modes of the basis, of which the controlled ones hold the
+        shape. Slopes are split into what these explain and the rest, scaled by their mean gain.
+        """
+        model, values = self._model, np.array(shape.values)
+        matrix = model.interaction_matrix(alpha)
+        left = np.zeros(len(matrix))
+        if shape.kind is ShapeKind.SLOPES:
+            coefficients = np.zeros(model.basis.n_modes)
+            inverse = reconstruct(matrix, self._recipe(n_controlled)).matrix
+            coefficients[:n_controlled] = inverse @ values
+            left = values - matrix @ coefficients
+            unexplained = float(np.linalg.norm(left) / np.linalg.norm(values))
+        else:
+            if shape.kind is ShapeKind.MAP:
+                values = values.reshape(round(len(values) ** 0.5), -1)
+            found = shape_in_modes(
+                model, alpha, values, ShapeFrame(shape.frame.value), n_modes=n_controlled
+            )
+            coefficients, unexplained = found.coefficients_m, found.unexplained
+        limit = limit_shape(
+            model.instrument,
+            model.basis,
+            coefficients,
+            optical_gain=optical_gain,
+            n_controlled=n_controlled,
+            worst_seeing_arcsec=worst_seeing_arcsec,
+        )
+        offset = compute_references(matrix, optical_gain, coefficients)
+        offset = offset + holding_gain(optical_gain)[:n_controlled].mean() * left
+        power = np.cumsum(np.square(coefficients))
+        n_kept = int(np.searchsorted(power, 0.999 * power[-1])) + 1
+        return MadeReferences(
+            offset=offset.astype(np.float32),
+            coefficients_m=tuple(coefficients[:n_kept].tolist()),
+            unexplained=unexplained,
+            refusal="" if limit.accepted else limit.reason,
+        )
 
     def _recipe(self, n_modes: int) -> Recipe:
         prior = None

@@ -118,6 +118,23 @@ class Compute:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MadeReferences:
+    """An offset of reference slopes, and what it holds."""
+
+    offset: NDArray[np.float32]
+    """``(n_slopes,)`` to be subtracted beyond the RTC's own references."""
+
+    coefficients_m: tuple[float, ...]
+    """Coefficients of the modes from mode 0 on with all but 0.1 % of the shape's power, metres."""
+
+    unexplained: float
+    """Share of the shape that no controlled mode explains, in norm."""
+
+    refusal: str
+    """Reason why they must not be sent; empty if they may."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Conditions(Determination):
     """Conditions a reconstructor must hold in.
 

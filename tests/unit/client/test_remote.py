@@ -8,6 +8,7 @@ import json
 import socket
 import threading
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -24,9 +25,16 @@ from service.control.gains import gain_table
 from service.errors import CommandError
 from service.records.events import MatrixMade
 from service.records.operations import AcquisitionStage
-from service.records.products import MatrixState, ReconstructorRecord
+from service.records.products import (
+    Frame,
+    MatrixState,
+    ReconstructorRecord,
+    ReferencesRecord,
+    Shape,
+    ShapeKind,
+)
 from service.records.registration import MeasuredGains, ModeGain
-from service.records.state import Mode
+from service.records.state import Mode, ReferenceStates
 from service.tracker import step
 from service.web.connections import Server
 from tests.support.api import MATRIX, SECOND, STATE, FakeService, a_snapshot
@@ -35,6 +43,16 @@ from tests.support.states import changed
 
 BEFORE = ReconstructorRecord(
     id="cm-0", state=MatrixState.SUPERSEDED, n_modes=300, created_ns_utc=SECOND
+)
+NCPA = str(Path(__file__).parents[2] / "data" / "ncpa.json")
+SHAPE = Shape(
+    id="shape-1",
+    kind=ShapeKind.ZERNIKE,
+    frame=Frame.INSTRUMENT,
+    values=(0.0, 3e-9, 6e-8),
+    source="ncpa.json",
+    by="Ada",
+    loaded_ns_utc=SECOND,
 )
 TRAIL = tuple(
     AuditEntry(t_ns_utc=k * SECOND, who="Ada", name="Stop", text="a\x1b[2Jb", why="clouds", id=k)
@@ -91,7 +109,24 @@ def service(served, monkeypatch):
         verified_ids=frozenset({STATE.loop.rtc.cm_id}),
         mode_proof=ALL_SHOWN,
     )
-    service.now = a_snapshot(tracker)
+    offered = ReferenceStates(
+        shape=SHAPE,
+        used_id="ref-1",
+        records=(
+            ReferencesRecord(id="ref-1", state=MatrixState.APPLIED, created_ns_utc=SECOND),
+            ReferencesRecord(
+                id="ref-2",
+                state=MatrixState.PROPOSED,
+                created_ns_utc=SECOND,
+                shape=SHAPE.id,
+                coefficients_m=(0.0, 6e-8),
+                gain=0.6,
+                unexplained_ratio=0.08,
+                reason="waits",
+            ),
+        ),
+    )
+    service.now = a_snapshot(replace(tracker, references=offered))
     service.commands, service.callers, service.refusal = [], [], None
     return service
 
@@ -134,6 +169,12 @@ ORDERS = [
     (["alarms", "mute", "margin", "600"], "MuteAlarm", {"name": "margin", "for_s": 600.0}),
     (["alarms", "unmute", "margin"], "UnmuteAlarm", {"name": "margin"}),
     (["measure", "cancel", "im-1"], "GiveUp", {"id": "im-1"}),
+    (["references", "load", NCPA, "--unit", "nm"], "LoadShape",
+     {"kind": "zernike", "frame": "instrument", "values": (0.0, 3.0, 60.0), "unit": "nm"}),
+    (["references", "approve", "--yes", "--no-wait"], "ApproveReferences", {"id": "ref-2"}),
+    (["references", "reject"], "RejectReferences", {"id": "ref-2"}),
+    (["references", "rollback", "--yes"], "RollBackReferences", {}),
+    (["references", "clear", "--yes"], "ClearShape", {}),
 ]  # fmt: skip
 
 
@@ -453,3 +494,15 @@ def test_what_cannot_be_exported_leaves_no_file(
     assert main(["export", *words]) == status
     assert named in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_references_are_listed_with_their_shape_and_gain(capsys, service):
+    assert main(["references", "list"]) == 0
+    shape, used, proposed, *more = capsys.readouterr().out.splitlines()
+    assert shape == "shape: shape-1 from ncpa.json"
+    assert used.startswith("* ref-1: applied, the RTC's own references")
+    assert proposed.startswith("  ref-2: proposed, 60 nm RMS, scaled with 0.60")
+    assert [line.split(None, 1) for line in more] == [
+        ["unexplained", "8% of the shape"],
+        ["reason", "waits"],
+    ]

@@ -13,11 +13,12 @@ from service.records.operations import (
     MeasurementRecord,
     MeasureState,
 )
-from service.records.products import MatrixState
+from service.records.products import MatrixState, ReferencesRecord
+from service.records.state import ReferenceStates
 from service.tracking import transitions
 from service.tracking.invariants import INVARIANTS, find_violations
 from service.wire import Loop, Pattern
-from tests.support.situations import Story, dither_request, record, rtc
+from tests.support.situations import START_NS, Story, dither_request, record, rtc
 from tests.support.states import changed
 
 
@@ -66,6 +67,14 @@ WRONG = {
     ),
     "no matrix but the one in use": lambda state: changed(
         state, reconstructors=(record("cm-1", MatrixState.APPLIED),)
+    ),
+    "references are applied if": lambda state: replace(
+        state,
+        references=ReferenceStates(
+            records=(
+                ReferencesRecord(id="ref-1", state=MatrixState.APPLIED, created_ns_utc=START_NS),
+            )
+        ),
     ),
     "at most one interaction matrix": lambda state: changed(
         state, measurements=(measured("im-1"), measured("im-2"))

@@ -265,7 +265,7 @@ def _fit_usable(
             models, instrument, found, usable, smear, options, report_stage
         )
     report_stage("verdict")
-    findings = _weigh(models, found, usable, axes_doubt)
+    findings = _gather_findings(models, found, usable, axes_doubt)
     grounds = _gather_grounds(findings, found, axes_doubt, explain=options.explain)
     fit = _make_fit(found, usable, findings, grounds, options.gain)
     fit = _add_notes(fit, found, findings, grounds, models.instrument, reported)
@@ -565,7 +565,9 @@ def _unknown_images(models: FitModels) -> dict[str, Any]:
     }
 
 
-def _weigh(as_in_file: FitModels, found: _Found, usable: Reference, axes: AxesDoubt) -> FitFindings:
+def _gather_findings(
+    as_in_file: FitModels, found: _Found, usable: Reference, axes: AxesDoubt
+) -> FitFindings:
     """Return what the verdict rests on: σ with all its parts, and other explanations."""
     settled, solution = found.settled, found.settled.solution
     target, about, seen = settled.target, settled.models.instrument, solution.projection
@@ -600,11 +602,11 @@ def _weigh(as_in_file: FitModels, found: _Found, usable: Reference, axes: AxesDo
             kind_of(one).is_weakly_modulated(one.wfs) for one in (about, as_in_file.instrument)
         ),
     )
-    moves = np.array([*_list_moves(findings, found), *usable.place_sigma_subap * np.eye(4)[:2]])
+    moves = np.array([*_list_errors(findings, found), *usable.place_sigma_subap * np.eye(4)[:2]])
     return replace(findings, uncertainty=sure.with_moves(moves, np.ones(len(moves))))
 
 
-def _list_moves(findings: FitFindings, found: _Found) -> Iterator[Array]:
+def _list_errors(findings: FitFindings, found: _Found) -> Iterator[Array]:
     """Yield 1 σ of the registration ``(4,)`` from each error that no alternative stands for."""
     settled, solution = found.settled, found.settled.solution
     about, nuisances = settled.models.instrument, settled.nuisances

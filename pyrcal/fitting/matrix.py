@@ -49,7 +49,7 @@ from pyrcal.fitting.methods import (
 )
 from pyrcal.fitting.models import FAR_PREFERRED_SHARE, FitModels
 from pyrcal.fitting.noise import bound_noise_share, measure_structure
-from pyrcal.fitting.origins import Origin, list_origins, list_undetermined_keys
+from pyrcal.fitting.origins import Origin, find_ellipse, list_origins, list_undetermined_keys
 from pyrcal.fitting.pupil_checks import MIN_PUPIL_EXPLAINED
 from pyrcal.fitting.pupil_width import SeenPupil, compute_responses, measure_pupil
 from pyrcal.fitting.reference import check_reference
@@ -757,6 +757,11 @@ def _add_notes(
             findings.structure,
             fit.gains,
         )
+        settled, sigma = found.settled, findings.uncertainty.nuisance_sigma
+        ellipse = tuple(find_ellipse(settled, sigma, findings.structure))
+        # The two axes take the place of the radius.
+        radius = settled.models.sensor_key if ellipse else None
+        origins = (*(one for one in origins if one.key != radius), *ellipse)
     unknown = list_undetermined_keys(about, origins)
     return replace(fit, remarks=remarks, origins=origins, unknown_not_found=unknown)
 

@@ -7,8 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pyrcal.fitting.fit_file import fit
 from service.model.interaction import InteractionModel
+from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
+from service.model.sensors.pyramid.description import FrameWindows
 from service.model.sensors.pyramid.table import FftGrid
 from tests.support.numerics import small_basis, small_instrument
 
@@ -88,3 +91,34 @@ def test_a_matrix_of_an_fft_is_that_of_the_model_on_its_grid(modulation, n_point
     real = InteractionModel(plain, small_basis(), pupil_sampling=4, detector_nodes=4)
     off = real.interaction_matrix(Misregistration())[:, MODES] - expected
     assert np.linalg.norm(off) / np.linalg.norm(expected) > 0.02
+
+
+@pytest.mark.parametrize("rotation_deg", [0.0, 180.0])
+def test_frames_of_an_unmodulated_pyramid_have_a_unit_although_its_modulation_is_unknown(
+    rotation_deg,
+):
+    """With the light of the usual 3 λ/D gains were 0.6, and no orientation was found at 180 deg."""
+    about = bench(0.0)
+    pupil = InteractionModel(about, small_basis(), pupil_sampling=POINTS, detector_nodes=POINTS)
+    turned = np.array([[1.0, 0.0], [0.0, 1.0]]) * (-1.0 if rotation_deg else 1.0)
+    points = (pupil.pupil.points - [0.3, -0.4]) @ turned / 1.1
+    maps = np.zeros((40, *pupil.pupil.amplitude.shape))
+    maps[:, pupil.pupil.lit] = STROKE_M * small_basis().render(points).T
+    push, pull = (
+        simulated_frames(pupil.pupil.amplitude, sign * maps, about.wfs, 2) for sign in (1.0, -1.0)
+    )
+    middle, half = (WIDTH - 1) / 2, about.wfs.image_separation_subap / 2
+    centres = middle + half * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+    unknown = replace(
+        about,
+        stop=Stop.TELESCOPE,
+        wfs=replace(about.wfs, modulation_lambda_over_d=3.0),
+        frames=FrameWindows(centres_px=centres, normalised=True),
+        unknown=("wfs.modulation_lambda_over_d",),
+    )
+    found = fit(unknown, (push - pull) / (2 * STROKE_M) / push.sum(axis=(1, 2))[:, None, None])
+    assert found.accepted
+    error = found.alpha.vector - [0.3, -0.4, np.deg2rad(rotation_deg), 1.1]
+    error[2] = np.angle(np.exp(1j * error[2]))
+    assert np.all(np.abs(error) < [0.002, 0.002, np.deg2rad(0.02), 0.002])
+    assert np.median(found.gains) == pytest.approx(1.0, abs=0.02)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
 
-from pyrcal.fitting.matrix import FitOptions, fit_matrix
+from pyrcal.fitting import matrix as fit_matrix_module
+from pyrcal.fitting.matrix import AxesDoubt, FitOptions, fit_matrix
 from pyrcal.fitting.models import LOGARITHM_ABOVE, moved_sensor_number, sensor_coordinate
 from pyrcal_studies.drawn_fits import Condition, Draw, instrument_of, model_of
 from pyrcal_studies.drawn_fits import measured as drawn_matrices
@@ -123,3 +124,27 @@ def test_a_circle_that_is_none_is_named():
 def test_a_circle_is_not_taken_for_an_ellipse():
     found, _, _ = fitted(3.0, 3.0)
     assert not any("ellipse" in one.key for one in found.alternatives)
+
+
+def test_axes_are_searched_with_other_modulations_where_an_unknown_one_shows_none(monkeypatch):
+    """So a bench of 36 subapertures, unmodulated and turned by half a turn, was refused."""
+    _, about, reference = elliptic()
+    searched = []
+
+    def find_axes(about, *_):
+        searched.append(about.wfs.modulation_lambda_over_d)
+        return about.slopes, None, AxesDoubt("none" if searched[-1] else ""), None
+
+    monkeypatch.setattr(fit_matrix_module, "_find_axes", find_axes)
+    find = partial(
+        fit_matrix_module._find_axes_and_sensor,
+        usable=reference,
+        basis=None,
+        options=FitOptions(),
+        mapper=map,
+    )
+    found, _ = find(replace(about, unknown=(f"wfs.{KEY}",)))
+    assert found.wfs.modulation_lambda_over_d == 0.0
+    assert searched == [3.0, 0.0]
+    assert find(about)[0] is about
+    assert searched[2:] == [3.0]

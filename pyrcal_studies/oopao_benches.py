@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,7 +93,7 @@ CASES = {
 }
 
 
-def measure(case: Case) -> dict[str, object]:
+def measure(case: Case) -> dict[str, Any]:
     """Return what the tutorial saves of a bench: its objects, its modes and its matrix."""
     n_points = case.subapertures * POINTS
     telescope = Telescope(resolution=n_points, diameter=DIAMETER_M)
@@ -146,7 +147,7 @@ def measure(case: Case) -> dict[str, object]:
         "wfs": "tag nSubap modulation user_modulation_path n_pix_separation n_pix_edge binning"
         " postProcessing validI4Q validSignal",
     }
-    kept: dict[str, object] = {"calib.D": matrix.astype(np.float32), "M2C": modes}
+    kept: dict[str, Any] = {"calib.D": matrix.astype(np.float32), "M2C": modes}
     for owner, listed in names.items():
         for name in listed.split():
             value = getattr(owners[owner], name, None)

@@ -19,7 +19,7 @@ export class References {
     this.#service = service;
     this.#orders = orders;
     this.root = root;
-    orders.learn(ORDERS);
+    orders.learn(REFERENCE_ORDERS);
     const [button, file] = [root.querySelector("[name=load]"), root.querySelector("input[type=file]")];
     button.addEventListener("click", () => file.click());
     file.addEventListener("change", () => this.#load(file));
@@ -90,7 +90,7 @@ function factsOf(record, used) {
   ];
 }
 
-const ORDERS = {
+export const REFERENCE_ORDERS = {
   "load-shape": {
     title: "Load a shape",
     permitted: "load_shape",

@@ -420,7 +420,7 @@ class ReferencesMade:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShapeHeld:
-    """The mean of the commands has shown how much of a change of references the mirror holds."""
+    """The mean of the commands has shown how much of a shape the mirror holds."""
 
     id: str
     """Id of the references in use."""

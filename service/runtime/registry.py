@@ -121,16 +121,15 @@ def _report_comparison(
 def _report_held(
     before: MeanCommands, now: MeanCommands, loop: LoopContext, state: TrackerState
 ) -> list[Event]:
-    """Return how much of a change of references the mirror holds."""
+    """Return how much of the shape of new references the mirror holds."""
     record = state.references_of(now.name)
     if record is None or not now.is_due(before):
         return []
-    earlier = state.references_of(now.before[0])
-    change_m = np.zeros(loop.description.n_modes)
-    change_m[: len(record.coefficients_m)] = record.coefficients_m
-    if earlier is not None:
-        change_m[: len(earlier.coefficients_m)] -= earlier.coefficients_m
-    found = now.measure(change_m)
+    shapes = np.zeros((2, loop.description.n_modes))
+    for shape_m, one in zip(shapes, (record, state.references_of(now.before[0])), strict=True):
+        if one is not None:
+            shape_m[: len(one.coefficients_m)] = one.coefficients_m
+    found = now.measure(*shapes)
     if found is None:
         return []
     return [ev.ShapeHeld(id=record.id, ratio=found.ratio, sigma=found.sigma)]

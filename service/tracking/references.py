@@ -54,7 +54,7 @@ COMPUTATION_TIMEOUT_S = 60.0
 HELD_RATIO_RANGE = (0.5, 1.7)
 """Plausible range of what the mirror holds of a change: seeing that doubles makes it 1.45."""
 
-HELD_SIGMAS = 4.0
+HELD_SIGMAS = 3.0
 """References are applied otherwise if the range is left by so many σ."""
 
 RECORDS_KEPT = 50
@@ -331,7 +331,8 @@ def on_fetched(context: StepContext, fetched: ev.ReferencesFetched) -> None:
 def on_held(context: StepContext, held: ev.ShapeHeld) -> None:
     """Keep how much of the shape the mirror holds; name references that are applied otherwise."""
     record = context.state.references_of(held.id)
-    if record is None or record.id != context.references.used_id:
+    # After wrong ones the way back to the RTC's own changes the mirror by another shape.
+    if record is None or record.id != context.references.used_id or record.shape is None:
         return
     record = replace(record, held_ratio=held.ratio, held_sigma=held.sigma)
     _store(context, record)
@@ -340,8 +341,8 @@ def on_held(context: StepContext, held: ev.ShapeHeld) -> None:
     outside = held.ratio + spare < least or held.ratio - spare > most
     if outside and not context.references.difference:
         text = (
-            f"the mirror holds {held.ratio:.2f} ± {held.sigma:.2f} times the change that "
-            f"{record.id} should make, by the mean of the commands"
+            f"the mirror holds {held.ratio:.2f} ± {held.sigma:.2f} times the shape of {record.id}, "
+            "by the mean of the commands"
         )
         _distrust(context, record, text)
 

@@ -53,9 +53,10 @@ def read_shape(options: argparse.Namespace) -> dict[str, Any]:
     if values.ndim == 2:
         found.setdefault("kind", "map")
     needed = _SAID[: 2 if found.get("kind") == "slopes" else 3]
-    missing = [f"--{name}" for name in needed if not found.get(name)]
+    missing = [name for name in needed if not found.get(name)]
     if missing:
-        raise ConfigurationError(f"{path}: says no {', no '.join(missing)}: give {missing[0]}")
+        text = f"found no {' and no '.join(missing)}: give --{' --'.join(missing)}"
+        raise ConfigurationError(f"{path}: {text}")
     if not np.isfinite(values).all():
         n_bad = int(np.sum(~np.isfinite(values)))
         raise ConfigurationError(f"{path}: found {n_bad} values that are not finite, expected none")

@@ -431,6 +431,9 @@ class ShapeHeld:
     sigma: float
     """1 σ of it, by the turbulence."""
 
+    change: tuple[float, float] | None = None
+    """The same of the change from the shape before, with 1 σ; None if that is small."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopHeld:

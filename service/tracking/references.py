@@ -337,14 +337,16 @@ def on_held(context: StepContext, held: ev.ShapeHeld) -> None:
     record = replace(record, held_ratio=held.ratio, held_sigma=held.sigma)
     _store(context, record)
     least, most = HELD_RATIO_RANGE
-    spare = HELD_SIGMAS * held.sigma
-    outside = held.ratio + spare < least or held.ratio - spare > most
-    if outside and not context.references.difference:
-        text = (
-            f"the mirror holds {held.ratio:.2f} ± {held.sigma:.2f} times the shape of {record.id}, "
-            "by the mean of the commands"
-        )
-        _distrust(context, record, text)
+    for what, found in (("the shape", (held.ratio, held.sigma)), ("the change", held.change)):
+        if found is None or context.references.difference:
+            continue
+        ratio, sigma = found
+        if ratio + HELD_SIGMAS * sigma < least or ratio - HELD_SIGMAS * sigma > most:
+            text = (
+                f"the mirror holds {ratio:.2f} ± {sigma:.2f} times {what} of {record.id}, by the "
+                "mean of the commands"
+            )
+            _distrust(context, record, text)
 
 
 def follow_status(context: StepContext, rtc: Status, *, returned: bool) -> None:
@@ -368,8 +370,14 @@ def follow_status(context: StepContext, rtc: Status, *, returned: bool) -> None:
         asked_ns_utc=0,
     )
     if record is not None:
-        applied_ns = record.applied_ns_utc or context.now_ns
-        _store(context, replace(record, state=MatrixState.APPLIED, applied_ns_utc=applied_ns))
+        used = replace(
+            record,
+            state=MatrixState.APPLIED,
+            # What ended an earlier use of them is over.
+            reason=record.reason if record.on_its_way else "",
+            applied_ns_utc=record.applied_ns_utc or context.now_ns,
+        )
+        _store(context, used)
         with context.because_of(record.cause):
             context.log("references.applied", f"the RTC uses {record.id}")
     elif kept.used_id is not None and not returned:

@@ -227,6 +227,14 @@ def test_what_the_mirror_holds_is_named_where_it_is_certainly_another_shape(
     assert (auto.last.shape is None) is wrong
 
 
+def test_old_references_are_named_by_a_large_change_that_is_not_held(auto):
+    auto.use_references()
+    auto.show_references()
+    auto.tell(ev.ShapeHeld(id=auto.last.id, ratio=0.45, sigma=0.1, change=(0.0, 0.12)))
+    assert alarms.REFERENCES_MISAPPLIED in auto.alarms
+    assert "times the change" in auto.state.references.difference
+
+
 def test_the_return_to_the_rtcs_own_references_is_not_judged(auto):
     auto.use_references()
     auto.tell(ev.ShapeHeld(id=auto.last.id, ratio=-1.0, sigma=0.1))
@@ -287,6 +295,7 @@ def test_a_restarted_service_knows_those_in_use_by_their_name(auto):
     after.state = replace(after.state, references=left)
     after.name_references()
     assert after.state.references.used_id == auto.last.id
+    assert after.last.reason == ""
     after.wait(FOLLOW_INTERVAL_S)
     assert not after.asked(ev.MakeReferences)
 

@@ -2,12 +2,12 @@
 
 Run: ``python -m pyrcal_studies.campaign.held_references --seeds 0:20 --output
 var/held_references.jsonl --table table.md``. Each draw is a night of 110 s (of 65 s with a fault)
-on the simulator's small telescope of 3 m in mode auto. From 10 s on a shape is loaded every 20 s:
-amplitudes that fall as order to the power -2 in modes 2 to 21 with random signs, 30 to 60 nm RMS.
-The RTC applies the references as it should, or from 25 s on with the sign turned, twice as large,
-or keeps the old ones; it shows what it applies, or hides it and shows what was sent. A row
-has the changes, the alarms, the matrices taken back, when a fault was named, and what the mirror
-was measured to hold.
+on the simulator's small telescope of 3 m in mode auto, for a worst seeing of 0.9 arcsec. From 10 s
+on a shape is loaded every 20 s: amplitudes that fall as order to the power -2 in modes 2 to 21 with
+random signs, 30 to 60 nm RMS. The RTC applies the references as it should, or from 25 s on with the
+sign turned, twice as large, or keeps the old ones; it shows what it applies, or hides it and shows
+what was sent. A row has the changes, the alarms, the matrices taken back, when a fault was named,
+and how much of each shape the mirror was measured to hold.
 """
 
 from __future__ import annotations
@@ -88,6 +88,7 @@ def play(draw: Draw) -> Row:
         *("--optical-gain=0.7,0.9", "--n-controlled=45", f"--seed={draw.seed}"),
     ]
     given = {"dither.budget_m": 20e-9, "dither.amplitude_m": 10e-9, "control.n_modes_target": 45}
+    given["references.worst_seeing_arcsec"] = 0.9
     policy = policy_of(load_settings(None, {}, {**SETTINGS, **given}))
     spoil = spoil_of(draw.kind)
     night_s = NIGHT_S if spoil is None else FAULTY_NIGHT_S

@@ -172,6 +172,11 @@ class Nuisances:
         first = self.first_optic + len(self.optics)
         return slice(first, first + len(self.images))
 
+    def with_sensor_moved(self, change: float) -> Nuisances:
+        """Return the same for models whose sensor number is changed, see ``sensor_coordinate``."""
+        moved = [(optic, at + change * (optic is Optic.SENSOR)) for optic, at in self.optics]
+        return replace(self, optics=tuple(moved))
+
     def from_prior(self, values: Array) -> Array:
         """Return values ``(n_nuisances,)`` as offsets from their expected values."""
         distance = values.astype(float)
@@ -335,11 +340,8 @@ class Solution:
     """Registration at which the derivatives were computed."""
 
     derivatives: Array
-    """``(4, n_slopes, n_modes)`` derivatives of the model with the gain map applied, taken nearby.
-    """
-
-    nuisance_derivatives: Array
-    """``(n_nuisances, n_slopes, n_modes)`` derivatives with respect to the nuisances."""
+    """``(n_unknowns, n_slopes, n_modes)`` derivatives of the model by the registration, then by the
+    nuisances, with the gain map applied, taken nearby."""
 
     projection: Projection
     dispersion: float
@@ -445,8 +447,7 @@ def refine(
         matrix=matrix,
         near=rates,
         near_alpha=near_alpha,
-        derivatives=every[:4],
-        nuisance_derivatives=every[4:],
+        derivatives=every,
         projection=seen,
         dispersion=counts,
         converged=converged,

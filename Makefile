@@ -97,7 +97,7 @@ clean: ## remove what make made; never var/, which holds calibration products
 	    .import_linter_cache .coverage
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-$(MANUAL): $(STAMP) docs/conf.py $(wildcard docs/static/* docs/templates/* docs/*.md docs/*/*.md docs/*/*.png docs/*/*/*.png docs/*/*.svg)
+$(MANUAL): $(STAMP) docs/conf.py $(wildcard docs/static/* docs/templates/* docs/templates/*/* examples/reference/*.py examples/notebooks/* docs/*.md docs/*/*.md docs/*/*.png docs/*/*/*.png docs/*/*.svg)
 	@$(PY) -m sphinx -q -W --keep-going -d build/manual docs $(@D) && touch $@
 
 # A working environment is brought up to date in place; one made elsewhere or broken is made anew.

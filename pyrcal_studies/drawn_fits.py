@@ -9,8 +9,9 @@ simulated telescope of ``tests/data/tiny`` with its usual imperfections. Both ki
 ``python -m pyrcal_studies.drawn_fits images --codes fft oopao --rms 0.05 --draws 40`` appends a
 line of JSON for each fit to ``var/drawn``; fits that are there already are not made again. With
 ``--table`` it prints the tables of all that is there. Campaigns: images, actuators,
-noise, modulations, mistold (instrument files with one thing wrong), stated (the same behind a
-spider, with all that a file states), small (the telescope).
+noise, modulations, far (registrations 2.5 times as far from nominal), moving (the mirror's image
+moves from the first column to the last), mistold (instrument files with one thing wrong), stated
+(the same behind a spider, with all that a file states), small (the telescope).
 """
 
 from __future__ import annotations
@@ -80,9 +81,22 @@ TINY_MODES, TINY_NOISE = 40, 5e-5
 
 
 @cache
-def strokes() -> Array:
-    """Return the modes that are pushed as strokes of the actuators ``(n_actuators, n_modes)``."""
+def strokes(moving: str | None = None) -> Array:
+    """Return the modes that are pushed as strokes of the actuators ``(n_actuators, n_modes)``.
+
+    The image of a mirror that moves is met by modes, or by single actuators.
+    """
+    if moving in POKES:
+        return np.eye(len(bench(Stop.TELESCOPE).analytic_mirror.positions_m))
     return karhunen_loeve_basis(bench(Stop.MIRROR)).mode_to_actuator[:, ::EVERY]
+
+
+POKES = ("actuators row by row", "actuators in random order")
+MOVEMENT = np.array([0.05, 0.0, np.deg2rad(0.2), 0.0])
+"""Of α from the first column to the last: x, y in subapertures, rotation, magnification."""
+
+FAR = 2.5
+"""Registrations of the campaign ``far`` over those of the others; magnification is the same."""
 
 
 _POINTS = 80
@@ -320,6 +334,12 @@ class Condition:
     modulation_lambda_over_d: float = 3.0
     """Radius of the modulation circle."""
 
+    far: bool = False
+    """True with registrations ``FAR`` times as far from nominal."""
+
+    moving: str | None = None
+    """What is pushed, and in which order, while the mirror's image moves; None: it rests."""
+
     arms: bool = False
     """True with the four arms of a spider."""
 
@@ -343,19 +363,20 @@ class Draw:
     @property
     def stop(self) -> Stop:
         """Telescope and mirror in turn."""
-        return list(Stop)[self.seed % 2]
+        return Stop.TELESCOPE if self.condition.moving else list(Stop)[self.seed % 2]
 
     @property
     def alpha(self) -> Misregistration:
-        """Truth, within 0.6 subapertures, 3 deg and 2 %."""
+        """Truth, within 0.6 subapertures, 3 deg and 2 %; that of the middle if it moves."""
         if self.condition.images == "frames":
             return TRUTH
         x, y, turned, size = np.random.default_rng([36, self.seed]).uniform(-1.0, 1.0, size=4)
-        shift = np.array([0.6 * x, 0.6 * y])
+        reach = FAR if self.condition.far else 1.0
+        shift = 0.6 * reach * np.array([x, y])
         if self.code in LISTINGS:
             shift = np.rint(4.0 * shift) / 4.0  # SPECULA's images move by whole samples
         return Misregistration.from_vector(
-            np.array([*shift, np.deg2rad(3.0 * turned), 1.0 + 0.02 * size])
+            np.array([*shift, np.deg2rad(3.0 * reach * turned), 1.0 + 0.02 * size])
         )
 
     @property
@@ -393,7 +414,8 @@ class Draw:
     @property
     def product(self) -> Path:
         """File with the matrix of a peer, its name made of all that the matrix depends on."""
-        asked = json.dumps([asdict(self.bench), self.condition.position_error])
+        drawn = [self.condition.position_error, *([FAR] if self.condition.far else [])]
+        asked = json.dumps([asdict(self.bench), *drawn])
         digest = hashlib.sha256(asked.encode()).hexdigest()[:10]
         return FOLDER / self.code / f"{self.seed:04d}-{digest}.npz"
 
@@ -404,11 +426,25 @@ class Draw:
         rng = np.random.default_rng([37, self.seed])
         moved = misplace_actuators(mirror, self.condition.position_error, rng)
         told = self.bench
-        points = mirror_points(told, self.alpha, self.stop) * (told.diameter_m / N)
-        apart = np.linalg.norm(points[:, None] - moved.positions_m, axis=2)
-        heights = mirror.shape.coupling ** ((apart / mirror.pitch_m) ** 2)
-        shapes = heights @ strokes()
-        return np.asarray(shapes.T.reshape(-1, told.n_pupil, told.n_pupil))
+        pushed = strokes(self.condition.moving)
+
+        def seen(alpha: Misregistration, columns: Array) -> Array:
+            points = mirror_points(told, alpha, self.stop) * (told.diameter_m / N)
+            apart = np.linalg.norm(points[:, None] - moved.positions_m, axis=2)
+            heights = mirror.shape.coupling ** ((apart / mirror.pitch_m) ** 2)
+            return np.asarray((heights @ columns).T.reshape(-1, told.n_pupil, told.n_pupil))
+
+        if self.condition.moving is None:
+            return seen(self.alpha, pushed)
+        parts = np.linspace(-0.5, 0.5, pushed.shape[1])
+        if self.condition.moving == POKES[1]:
+            parts = rng.permutation(parts)
+        vectors = self.alpha.vector + parts[:, None] * MOVEMENT
+        each = (
+            seen(Misregistration.from_vector(vector), column[:, None])
+            for vector, column in zip(vectors, pushed.T, strict=True)
+        )
+        return np.concatenate(list(each))
 
 
 def measured(draws: list[Draw]) -> Iterator[tuple[Draw, Measured]]:
@@ -511,9 +547,8 @@ def instrument_of(draw: Draw, found: Measured) -> Instrument:
         valid_subapertures=found.valid,
     )
     # strokes, so that a wrong mirror changes the influence functions alone
-    about = replace(
-        about, wfs=wfs, mirror=replace(about.analytic_mirror, mode_to_actuator=strokes())
-    )
+    pushed = strokes(draw.condition.moving)
+    about = replace(about, wfs=wfs, mirror=replace(about.analytic_mirror, mode_to_actuator=pushed))
     listing = LISTINGS.get(draw.code)
     if listing is not None:
         about = replace(
@@ -580,6 +615,14 @@ def _modulations(given: argparse.Namespace) -> Iterator[Condition]:
         yield Condition(modulation_lambda_over_d=radius)
 
 
+def _far(given: argparse.Namespace) -> Iterator[Condition]:
+    yield Condition(far=True)
+
+
+def _moving(given: argparse.Namespace) -> Iterator[Condition]:
+    yield from (Condition(moving=order) for order in ("modes in order", *POKES))
+
+
 def _mistold(given: argparse.Namespace) -> Iterator[Condition]:
     yield from (Condition(told=words) for words in TOLD)
 
@@ -600,6 +643,8 @@ CAMPAIGNS: dict[str, Callable[[argparse.Namespace], Iterator[Condition]]] = {
     "noise": _noise,
     "modulations": _modulations,
     "small": _modulations,
+    "far": _far,
+    "moving": _moving,
     "mistold": _mistold,
     "stated": _stated,
 }

@@ -96,6 +96,7 @@ PAGES: Final[dict[str, Callable[[], str]]] = {
     "reference/instruments.md": packaged,
     "reference/system.md": reference.system,
     "reference/cli.md": reference.commands,
+    **{f"reference/cli/{name}.md": partial(reference.command, name) for name in reference.COMMANDS},
     "developer/tracker.md": reference.tracker_page,
     **{f"developer/{one.picture}": partial(state_machines.draw, one) for one in MACHINES},
     "reference/rest.md": rest,
@@ -136,4 +137,6 @@ def _lower(text: str) -> str:
 
 if __name__ == "__main__":
     for name, page in PAGES.items():
-        (ROOT / "docs" / name).write_text(page(), encoding="utf-8")
+        path = ROOT / "docs" / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(page(), encoding="utf-8")

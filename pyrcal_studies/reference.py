@@ -7,18 +7,18 @@ alarms, and what the tracker does with each event and decides after it.
 from __future__ import annotations
 
 import argparse
+import os
 import re
-import textwrap
-from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import fields
+from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, Final, NamedTuple, get_args
+from unittest import mock
 
 from cacao_bridge.__main__ import arguments_parser
 from check_rtc.__main__ import check_parser
 from pyrcal.arguments import HEADINGS, command_line
-from pyrcal.client import remote
 from pyrcal.demo.arguments import demo_parser
 from pyrcal.fitting import arguments as offline_arguments
 from pyrcal.fitting.system_file import SystemFile
@@ -30,7 +30,7 @@ from service.files.toml import Table
 from service.instrument.schema import whole_of
 from service.model.sensors.kind import SensorKind
 from service.model.sensors.registry import KINDS
-from service.parser import OneLineParser, operand_text, option_text, wrap_usage
+from service.parser import OneLineParser
 from service.records.alarms import ALARMS
 from service.records.commands import Command
 from service.records.events import Event
@@ -181,153 +181,73 @@ def _brackets(key: KeyText, *, below: bool) -> str:
 
 # --- the command line
 
+_SubCommands = argparse._SubParsersAction  # noqa: SLF001 - argparse tells its commands nowhere else
 
-def commands() -> str:
-    """Return docs/reference/cli.md: every command of every program, with usage and options."""
-    root = command_line()
-    others: dict[str, OneLineParser] = {
+
+@cache
+def _parsers() -> dict[str, OneLineParser]:
+    """Return the parser of each command."""
+    (action,) = (a for a in command_line()._actions if isinstance(a, _SubCommands))  # noqa: SLF001
+    return {
+        **action.choices,
         "demo": demo_parser(),
         "sim": sim_parser(),
         "check-rtc": check_parser(),
         "cacao": arguments_parser(),
     }
-    (action,) = (a for a in root._actions if isinstance(a, argparse._SubParsersAction))  # noqa: SLF001
-    parsers = dict(_below(action)) | others
-    leaves = {name: list(_leaves(parser)) for name, parser in parsers.items()}
-    shared = _shared_groups([leaf for each in leaves.values() for leaf in each])
-    repeated = _repeated_rows(leaves.values(), shared)
+
+
+COMMANDS: Final = tuple(_parsers())
+"""Commands with a page of their own."""
+
+
+def commands() -> str:
+    """Return docs/reference/cli.md: what each command is for, with a link to its page."""
     parts = [
-        "`--help` of each command has examples. What a usage shows without brackets is required. "
-        "Exit status: 0 done; 2 wrong command line or unusable input; 130 interrupted; others at "
-        f"each command. INSTRUMENT is an {offline_arguments.INSTRUMENT}.",
-        "## Options of several commands",
+        "Each command has a page with its options and examples: the text of its `--help`. What a "
+        "usage shows without brackets is required. Exit status: 0 done; 2 wrong command line or "
+        "unusable input; 130 interrupted; others at each command. INSTRUMENT is an "
+        f"{offline_arguments.INSTRUMENT}. Shells complete commands and options: `pyrcal completion "
+        "--help`.",
     ]
-    for title, group in shared.items():
-        parts += [f"**{title[:1].upper()}{title[1:]}** {_TAKEN_BY[title]}:"]
-        parts += [_block([], dict(map(_row, group)).items())]
-    parts += ["**Other options** of the commands whose usage names them:", _block([], repeated)]
-    for name, parser in parsers.items():
-        parts += (
-            [f"## {HEADINGS[name][:1].upper()}{HEADINGS[name][1:]}"] if name in HEADINGS else []
-        )
-        parts += [f"### pyrcal {name}", *_describe(parser, leaves[name], shared, repeated)]
-    return page("The command line", *parts)
+    for name, parser in _parsers().items():
+        if name in HEADINGS:
+            parts.append(f"## {HEADINGS[name][:1].upper()}{HEADINGS[name][1:]}")
+        first = " ".join((parser.description or "").split()).partition(". ")[0].rstrip(".")
+        row = f"- [`pyrcal {name}`](cli/{name}.md): {_escaped(first)}."
+        parts[-1] += f"\n{row}" if parts[-1].startswith("- ") else ""
+        parts += [] if parts[-1].startswith("- ") else [row]
+    entries = "\n".join(f"cli/{name}" for name in _parsers())
+    return page("The command line", *parts, f"```{{toctree}}\n:hidden:\n\n{entries}\n```")
 
 
-def _repeated_rows(
-    commands: Iterable[Iterable[OneLineParser]], shared: Mapping[str, Group]
-) -> list[Row]:
-    """Return the options that two commands or more explain in the same words."""
-    hidden = {_row(action) for group in shared.values() for action in group}
-    count = Counter(
-        row
-        for leaves in commands
-        for row in {
-            _row(action)
-            for leaf in leaves
-            if leaf.prog not in _WITH_A_MANUAL
-            for action in leaf.shown_actions()
-            if action.option_strings and not action.required
-        }
-        if row not in hidden
-    )
-    return sorted(row for row, n in count.items() if n > 1)
+def command(name: str) -> str:
+    """Return the page of a command: the help of it, or of all commands of its group."""
+    with mock.patch.dict(os.environ, COLUMNS="80"):  # argparse asks the terminal
+        parser = _parsers()[name]
+        leaves = list(_leaves(parser))
+        texts = [(leaf.prog, leaf.format_help().rstrip()) for leaf in leaves]
+    if leaves == [parser]:
+        return page(f"pyrcal {name}", f"```text\n{texts[0][1]}\n```")
+    parts = [_escaped(" ".join((parser.description or "").split()))]
+    for prog, text in texts:
+        parts += [f"## {prog}", f"```text\n{text}\n```"]
+    return page(f"pyrcal {name}", *parts)
 
 
-Group = list[argparse.Action]
-
-_TAKEN_BY = {
-    remote.CONNECTION: "of all commands that ask or operate a service; exit status 1: refused, "
-    "not done, or not all is well; 3: the service cannot be reached",
-    remote.ORDER: "of all commands that change something in a service",
-    offline_arguments.ARCHIVE: "of `pyrcal archive`, `commission`, `bundle write`",
-    offline_arguments.DESCRIPTION: "of `pyrcal import`, except from OOPAO",
-}
-"""Titles of the groups of options that many commands share, and which commands these are."""
-
-
-def _describe(
-    parser: OneLineParser,
-    leaves: list[OneLineParser],
-    shared: Mapping[str, Group],
-    repeated: Collection[Row],
-) -> Iterator[str]:
-    """Yield purpose, usage and options of a command, or of all commands of a group."""
-    alone = leaves == [parser]
-    yield " ".join((parser.description or "").split())
-    if parser.prog in _WITH_A_MANUAL:
-        names = ", ".join(action.option_strings[0] for action in parser.shown_actions())
-        yield f"Options, which `--help` explains: {names}."
-        return
-    usages = [list(leaf.usage_parts(shared, short=alone)) for leaf in leaves]
-    hidden = {_row(action) for group in shared.values() for action in group} | {_INSTRUMENT}
-    rows = [_row(action) for leaf in leaves for action in leaf.shown_actions()]
-    own = [
-        row for row in dict.fromkeys(rows) if row[1] and row not in hidden and row not in repeated
-    ]
-    others = [word.split()[0] for word, text in rows if alone and (word, text) in repeated]
-    if others:
-        own.append(("and", ", ".join(others)))
-    if own or usages != [[parser.prog]]:
-        yield _block(usages, own)
-    status = " ".join((parser.epilog or "").split()).partition("Exit status: ")[2].partition(".")[0]
-    if "; 1 " in status and parser.epilog != remote.EPILOG:
-        yield f"Exit status: {status.partition('; 2 ')[0]}."
-
-
-_INSTRUMENT = ("INSTRUMENT", offline_arguments.INSTRUMENT)
-
-_WITH_A_MANUAL = {"pyrcal demo", "sim_rtc"}
-"""Programs whose many options are explained by ``--help`` alone."""
-
-
-def _block(usages: Iterable[list[str]], rows: Iterable[Row]) -> str:
-    """Return usages and explained options as preformatted text, as ``--help`` shows them."""
-    lines = [line for parts in usages for line in wrap_usage(parts, 100)]
-    for name, text in rows:
-        first, *others = textwrap.wrap(text, 68) or [""]
-        lines += (
-            [f"  {name:26}  {first}".rstrip()]
-            if len(name) <= 26
-            else [f"  {name}", f"{'':30}{first}"]
-        )
-        lines += [f"{'':30}{other}" for other in others]
-    return "\n".join(["```text", *lines, "```"])
+def _escaped(text: str) -> str:
+    """Return text whose ``<`` is no HTML."""
+    return text.replace("<", r"\<")
 
 
 def _leaves(parser: OneLineParser) -> Iterator[OneLineParser]:
     """Yield the commands below a parser, or the parser itself if there are none."""
-    below = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]  # noqa: SLF001
-    if not below:  # argparse tells its arguments nowhere else
+    below = [a for a in parser._actions if isinstance(a, _SubCommands)]  # noqa: SLF001
+    if not below:
         yield parser
     for action in below:
-        for _, each in _below(action):
+        for each in action.choices.values():
             yield from _leaves(each)
-
-
-def _below(action: argparse._SubParsersAction[Any]) -> Iterator[tuple[str, OneLineParser]]:
-    """Yield the commands of a group, by name."""
-    yield from action.choices.items()
-
-
-def _shared_groups(parsers: Iterable[OneLineParser]) -> dict[str, Group]:
-    """Return the groups of options that several commands have, by title."""
-    found: dict[str, dict[Row, argparse.Action]] = {}
-    for parser in parsers:
-        for group in parser._action_groups:  # noqa: SLF001
-            if group.title in _TAKEN_BY:
-                rows = {_row(action): action for action in group._group_actions}  # noqa: SLF001
-                found.setdefault(str(group.title), {}).update(rows)
-    return {title: list(rows.values()) for title, rows in found.items()}
-
-
-def _row(action: argparse.Action) -> Row:
-    """Return an argument as the usage writes it, and its meaning."""
-    word = option_text(action) if action.option_strings else operand_text(action)
-    text = action.help or ""
-    if action.dest != "threads":  # its default is that of the machine that writes the page
-        text %= {**vars(action), "prog": ""}
-    return word, f"{text} (required)" if action.option_strings and action.required else text
 
 
 # --- REST

@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import shutil
 import textwrap
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple, NoReturn
 
 from typing_extensions import override
@@ -93,22 +93,14 @@ class OneLineParser(argparse.ArgumentParser):
         for name, purpose, example, options in rows:
             commands.add_parser(name, help=purpose, examples=[example], options=options)
 
-    def usage_parts(self, left_out: Collection[str] = (), *, short: bool = False) -> Iterator[str]:
-        """Yield the usage part by part, without the groups of options ``left_out`` by title.
-
-        ``short``: options that are not required become one part.
-        """
+    def usage_parts(self) -> Iterator[str]:
+        """Yield the usage part by part."""
         yield self.prog
-        groups = [group for group in self._action_groups if group.title in left_out]
-        hidden = {id(action) for group in groups for action in group._group_actions}  # noqa: SLF001
         shown = self.shown_actions()
         yield from (operand_text(action) for action in shown if not action.option_strings)
-        options = [a for a in shown if a.option_strings and id(a) not in hidden]
+        options = [action for action in shown if action.option_strings]
         yield from (option_text(action) for action in options if action.required)
         exclusive = [group._group_actions for group in self._mutually_exclusive_groups]  # noqa: SLF001
-        if short and not all(action.required for action in options):
-            yield "[options]"
-            return
         for action in options:
             among = next((each for each in exclusive if action in each), [action])
             if not action.required and action is among[0]:

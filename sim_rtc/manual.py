@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from typing_extensions import override
@@ -112,6 +112,10 @@ examples
   pyrcal sim --plant diffractive --influence p45.h5:/influence --dead-actuators 14,222
       measured influence functions, two dead actuators
 
+examples
+  pyrcal sim --instrument flao-lbt --seconds 60
+  pyrcal sim --instrument flao-lbt --plant diffractive --record night.h5 --seconds 60
+
 exit status
   0 ended as requested (time is up, SIGINT, SIGTERM); 2 wrong option.
 """
@@ -143,7 +147,7 @@ class Parser(OneLineParser):
         return vars(self.parse_args(joined))
 
     @override
-    def usage_parts(self, left_out: Collection[str] = (), *, short: bool = False) -> Iterator[str]:
+    def usage_parts(self) -> Iterator[str]:
         yield _USAGE
 
 

@@ -22,7 +22,7 @@ from pyrcal.fitting.instrument_checks import (
 )
 from pyrcal.fitting.left_over import find_arms, find_border
 from pyrcal.fitting.methods import Settled
-from pyrcal.fitting.models import FAR_PREFERRED_SHARE, PREFERRED_SHARE, Optic
+from pyrcal.fitting.models import FAR_PREFERRED_SHARE, PREFERRED_SHARE, Optic, moved_sensor_number
 from pyrcal.fitting.pupil_checks import gain_maps, try_pupils
 from pyrcal.fitting.solver import refine
 from pyrcal.fitting.uncertainty import Uncertainty
@@ -272,8 +272,9 @@ def _try_file_optics(
             words = f"{one.key} = {one.reported:.3g}, not fitted"
             yield _fix_nuisances(settled, words, {place: -one.change})
         if one.optic is Optic.SENSOR and one.found is not None:
-            words = f"{one.key} = {one.found * (1.0 + MODULATION_STEP):.3g}"
-            yield _fix_nuisances(settled, words, {place: float(np.log1p(MODULATION_STEP))})
+            step = float(np.log1p(MODULATION_STEP))
+            words = f"{one.key} = {moved_sensor_number(one.found, step):.3g}"
+            yield _fix_nuisances(settled, words, {place: step})
 
 
 def _try_fixed_nuisances(few: FitSubset) -> Iterator[Alternative]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pyrcal.fitting.comparison import MIN_EXPLAINED, Alternative, FitSubset
 from pyrcal.fitting.methods import SEARCH_RESIDUAL, Settled, settle
-from pyrcal.fitting.models import FAR_PREFERRED_SHARE, FitModels, Optic
+from pyrcal.fitting.models import FAR_PREFERRED_SHARE, FitModels, Optic, moved_sensor_number
 from pyrcal.fitting.solver import image_patterns, is_blurring, refine
 from pyrcal.fitting.uncertainty import Uncertainty
 from service.model.sensors.registry import kind_of
@@ -72,7 +72,8 @@ class FoundOptic:
         if self.found is None:
             return self.sigma
         if self.optic is Optic.SENSOR:
-            return self.found * self.sigma
+            # Upwards, because of no modulation there is no other side.
+            return moved_sensor_number(self.found, self.sigma) - self.found
         # The derivative of coupling ** exp(-2 change) by the change.
         return -2.0 * self.found * float(np.log(self.found)) * self.sigma
 
@@ -174,7 +175,7 @@ def list_optics(models: FitModels, settled: Settled, sure: Uncertainty) -> tuple
     number, sensor_key = models.sensor_number, models.sensor_key
     found = []
     for k, (optic, change) in enumerate(changes.items(), nuisances.first_optic):
-        stated, value = number, number * float(np.exp(change))
+        stated, value = number, moved_sensor_number(number, change)
         if optic is Optic.WIDTH and models.coupling is not None:
             stated, value = models.coupling, float(models.coupling ** np.exp(-2.0 * change))
         elif optic is Optic.SENSOR and value < NO_SENSOR_NUMBER_LIMIT:

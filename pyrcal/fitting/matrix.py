@@ -41,9 +41,9 @@ from pyrcal.fitting.methods import (
     Landing,
     ScanStep,
     Settled,
+    land,
     project_on_sensitivities,
     scan,
-    search_minimum,
     settle,
     settle_at,
 )
@@ -554,7 +554,7 @@ def _run_method(
     )
     match options.method:
         case Method.JOINT:
-            landing = search_minimum(models, target, start)
+            landing, models, nuisances = land(models, target, start, nuisances)
             settled = settle(models, target, landing.best.alpha, nuisances)
             return _Found(settled=settled, landing=landing)
         case Method.SENSITIVITY:

@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.fitting.models import FitModels, Optic
+from pyrcal.fitting.models import FitModels, Optic, sensor_coordinate
 from pyrcal.fitting.solver import (
     LONGEST_OPTIC_STEP,
     Nuisances,
@@ -122,8 +122,9 @@ MAX_MODES = 60
 SENSOR_CHANGES = np.arange(-4, 5) * 0.3
 """Logarithms of the factors of the sensor number that are tried, from a third to three."""
 
-NO_SENSOR_NUMBER = 0.02
-"""Modulation, λ/D, that represents none, because a logarithm has no value for 0."""
+OTHER_SENSOR_NUMBERS = (0.0, 1.0)
+"""Modulations, λ/D, at which a fit begins that finds little of the smooth shapes explained with an
+unknown one at its usual value."""
 
 SEARCH_RESIDUAL = 0.05
 """RMS residual share of the signal above which the sensor number is searched over a wide range."""
@@ -192,6 +193,28 @@ def search_minimum(models: FitModels, target: Target, start: Misregistration) ->
         and np.any(np.abs(one.alpha.vector - best.alpha.vector) > SAME_MINIMUM)
     ]
     return Landing(best=best, rivals=tuple(rivals))
+
+
+def land(
+    models: FitModels, target: Target, start: Misregistration, nuisances: Nuisances
+) -> tuple[Landing, FitModels, Nuisances]:
+    """Return the result of the coarse steps, with models of the sensor number that suits them.
+
+    From an unknown modulation of 3 λ/D a fit of an unmodulated matrix ended at 9, because α had
+    made up for the difference. The smooth shapes show the difference before that.
+    """
+    landing = search_minimum(models, target, start)
+    found = [(landing, models, nuisances)]
+    explained = landing.best.converged and landing.best.misfit < GOOD_MISFIT
+    if explained or Optic.SENSOR not in nuisances.unknown:
+        return found[0]
+    for number in OTHER_SENSOR_NUMBERS:
+        change = sensor_coordinate(number) - sensor_coordinate(models.sensor_number)
+        other = models.with_optic(Optic.SENSOR, change)
+        found.append(
+            (search_minimum(other, target, start), other, nuisances.with_sensor_moved(change))
+        )
+    return min(found, key=lambda one: (not one[0].best.converged, one[0].best.misfit))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -364,25 +387,22 @@ def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
         matrix = changed.model(models.cheap_sampling, once=True).interaction_matrix(solution.alpha)
         return few.project(matrix, every).chi_at_best
 
-    found = _scan_outwards(left, SENSOR_CHANGES, left(0.0))
+    nothing = sensor_coordinate(0.0) - sensor_coordinate(models.sensor_number)
+    changes = np.maximum(SENSOR_CHANGES, nothing)
+    found = _scan_outwards(left, changes, left(0.0))
     # The scan stops where χ² grows, so the rest is infinite and never the minimum.
     best = int(np.argmin(found))
-    change = SENSOR_CHANGES[best]
-    nothing = float(np.log(NO_SENSOR_NUMBER / models.sensor_number))
-    # The scan of logarithms ends at a third of the number and never reaches a sensor without
-    # modulation, which is therefore tried separately.
-    if best == 0 and left(nothing) < found[0]:
+    change = changes[best]
+    # The scan ends at a third of the number, and a sensor without modulation may be beyond.
+    if best == 0 and changes[0] > nothing and left(nothing) < found[0]:
         change = nothing
     # The vertex of a parabola needs a sample on both sides; at an end the sample itself is used.
-    elif 0 < best < len(found) - 1:
-        change += vertex(*found[best - 1 : best + 2]) * (SENSOR_CHANGES[1] - SENSOR_CHANGES[0])
+    elif 0 < best < len(found) - 1 and changes[best - 1] > nothing:
+        change += vertex(*found[best - 1 : best + 2]) * (changes[best + 1] - change)
     if abs(change) < LINEAR_CHANGE:
         return models, nuisances
-    optics = [
-        (optic, offset + change * (optic is Optic.SENSOR)) for optic, offset in nuisances.optics
-    ]
     moved = models.with_optic(Optic.SENSOR, float(change))
-    return moved, replace(nuisances, optics=tuple(optics))
+    return moved, nuisances.with_sensor_moved(float(change))
 
 
 def _scan_outwards(
@@ -476,6 +496,9 @@ def _update_models(settled: Settled, *, move_images: bool) -> tuple[FitModels, N
     optics = []
     for k, (optic, offset) in enumerate(nuisances.optics, nuisances.first_optic):
         change = float(settled.solution.nuisances[k])
+        if optic is Optic.SENSOR:  # beyond no modulation there is none to be built
+            nothing = sensor_coordinate(0.0) - sensor_coordinate(models.sensor_number)
+            change = max(change, nothing)
         # Smaller changes are described by the derivative. The models, with the matrices already
         # computed, are then kept, which also ends the repetitions.
         if abs(change) > LINEAR_CHANGE and models.exact(optic):

@@ -44,8 +44,32 @@ SENSOR_STEP = 0.03
 of the model's number, so the error of the derivative is negligible."""
 
 
+LOGARITHM_ABOVE = 1.0
+"""Modulation, λ/D, above which its logarithm is fitted, and below which its square is. The star is
+as wide, so that narrower modulations change a matrix by their square, and 0 is within reach."""
+
+
+def sensor_coordinate(number: float) -> float:
+    """Return the fitted coordinate of a sensor number: logarithm, or square of a small one.
+
+    Both have one value and one slope at ``LOGARITHM_ABOVE``.
+    """
+    ratio = number / LOGARITHM_ABOVE
+    return float(np.log(ratio)) if ratio > 1.0 else (ratio**2 - 1.0) / 2.0
+
+
+def moved_sensor_number(number: float, change: float) -> float:
+    """Return a sensor number whose coordinate is changed; 0 if the change leads beyond it."""
+    coordinate = sensor_coordinate(number) + change
+    ratio = np.exp(coordinate) if coordinate > 0.0 else np.sqrt(max(2.0 * coordinate + 1.0, 0.0))
+    return LOGARITHM_ABOVE * float(ratio)
+
+
 class Optic(StrEnum):
-    """An optical quantity that a matrix can determine, fitted as its logarithm."""
+    """An optical quantity that a matrix can determine, fitted as its logarithm.
+
+    That of the sensor is fitted as its ``sensor_coordinate``.
+    """
 
     WIDTH = "width"
     """Width of the influence functions: their coupling, if they have one."""
@@ -201,7 +225,7 @@ class FitModels:
     def with_optic(self, optic: Optic, change: float) -> FitModels:
         """Return the models of an instrument with a quantity changed by a logarithm."""
         if optic is Optic.SENSOR and self.sensor_key is not None:
-            number = self.sensor_number * float(np.exp(change))
+            number = moved_sensor_number(self.sensor_number, change)
             wfs = replace(self.instrument.wfs, **{self.sensor_key: number})
             return replace(self, instrument=replace(self.instrument, wfs=wfs))
         if not isinstance(self.basis, ModalBasis) or not isinstance(self.basis.surface, Gaussian):

@@ -172,6 +172,11 @@ class Nuisances:
         first = self.first_optic + len(self.optics)
         return slice(first, first + len(self.images))
 
+    def with_sensor_moved(self, change: float) -> Nuisances:
+        """Return the same for models whose sensor number is changed, see ``sensor_coordinate``."""
+        moved = [(optic, at + change * (optic is Optic.SENSOR)) for optic, at in self.optics]
+        return replace(self, optics=tuple(moved))
+
     def from_prior(self, values: Array) -> Array:
         """Return values ``(n_nuisances,)`` as offsets from their expected values."""
         distance = values.astype(float)

@@ -7,6 +7,7 @@ import asyncio
 import os
 import sys
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -149,7 +150,13 @@ def _play(
 ) -> Track:
     show_progress("preparing the optical model")
     player = Player(instrument, settings, system)
-    return asyncio.run(player.play(messages, _counter()))
+    run = partial(asyncio.run, player.play(messages, _counter()))
+    try:
+        asyncio.get_running_loop()
+    except RuntimeError:
+        return run()
+    with ThreadPoolExecutor(1) as pool:  # a notebook runs a loop, in which there is no other
+        return pool.submit(run).result()
 
 
 def _counter() -> Callable[[float], None]:

@@ -47,8 +47,8 @@ from service.runtime.policy import floor_of
 from service.runtime.worker import Compute, OpticsWorker, Sampling
 from service.wire import DitherKind, DitherRequest
 
-LINE_FRACTIONS = (0.211, 0.239, 0.283, 0.331)
-"""Of the frame rate: what the service dithers at by itself."""
+LINE_FRACTIONS = (0.211, 0.239, 0.283, 0.331, 0.389)
+"""Of the frame rate: what the service dithers at by itself; the fifth is of a low mode."""
 
 SETTLING_S = 0.5
 BLOCK_BATCHES = 20
@@ -92,6 +92,11 @@ class Night:
     def dithered(self) -> tuple[int, ...]:
         """The modes a dither moves."""
         return self.modes or tuple(self.n_controlled + step for step in (9, 27, 45, 63))
+
+    @property
+    def amplitudes_nm(self) -> tuple[float, ...]:
+        """RMS of each of them, nm."""
+        return (self.amplitude_nm,) * len(self.dithered)
 
     @property
     def words(self) -> list[str]:
@@ -164,8 +169,9 @@ def _rms(values: list[float]) -> float | None:
 def start_dither(night: Night, dome: Dome) -> LockInPlan:
     """Ask for the dither, and return how it is to be read."""
     rate_hz = dome.rate_hz
-    amplitude_m = (night.amplitude_nm * 1e-9,) * len(night.dithered)
-    lines = tuple(round(f * rate_hz * night.window_s) / night.window_s for f in LINE_FRACTIONS)
+    amplitude_m = tuple(1e-9 * size for size in night.amplitudes_nm)
+    fractions = LINE_FRACTIONS[: len(night.dithered)]
+    lines = tuple(round(f * rate_hz * night.window_s) / night.window_s for f in fractions)
     reply = dome.order(
         DitherRequest(
             id="campaign",

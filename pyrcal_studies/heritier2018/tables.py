@@ -423,8 +423,8 @@ def open_questions(budget: Budget, store: Store) -> str:
         for line in [
             f"**Number of signals**: {of_few}in operation four dithered modes "
             "[are enough](tracking.md#windows-of-5-s).",
-            "**Noise**, **illumination**: a matrix that is mostly noise, and measured light in the "
-            "model, [were tried](accuracy.md#diffractive-telescopes-by-day).",
+            "**Noise**, **illumination**: [reconstructors of a matrix]"
+            "(#why-147-nm-are-not-reached) with noise, or with less light in parts of the pupil.",
             "**Tracking**: with a dither of 1 to 5 nm; without, the wind "
             "[biases shifts](tracking.md#ordinary-telemetry-without-a-dither).",
             "**Many actuators**: [a telescope of 39 m](scale.md#a-telescope-of-39-m).",

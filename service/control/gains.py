@@ -15,10 +15,12 @@ has another cause and goes somewhere else:
 The optical gain of all modes is inferred from that of the few that were dithered. A pyramid in a
 residual with structure function D responds as to an incoherent source of mutual coherence
 ``exp(-D/2)``. The logarithm of a mode's optical gain is therefore the strength of the residual
-times a shape that depends on the modulation and the mode's spatial frequency. The shape was
-measured on the simulated diffractive telescope (docs/results/tracking.md). The strength, a
-common factor and a smooth departure from the shape are fitted as a Gaussian process, whose
-uncertainty grows with the distance from the dithered modes.
+times a shape that depends on the modulation and the mode's spatial frequency; it is largest near
+the modulation radius. What noise and wind leave in the controlled modes has a steeper shape than
+what lies beyond them, so a second shape is added. Both are the first two principal components of
+true gains on the simulated diffractive telescope (docs/results/tracking.md); they leave 0.5 %
+there. Their coefficients, a common factor and a smooth departure are fitted as a Gaussian process,
+whose uncertainty grows with the distance from the dithered modes.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from service.errors import ModelError
 from service.records.registration import ModeGain
@@ -112,14 +114,21 @@ def _nearby_median(mode: int, known: NDArray[np.intp], gains: Array) -> float:
     return float(np.median(gains[nearest]))
 
 
-REFERENCE_MODES = (0, 12, 20, 36, 64, 112, 150, 195, 257, 340, 449, 501, 593)
+REFERENCE_MODES = (0, 7, 16, 26, 42, 64, 110, 200, 330, 450, 593)
 REFERENCE_GAINS = (
-    0.516, 0.511, 0.504, 0.502, 0.543, 0.578, 0.608, 0.628, 0.648, 0.681, 0.710, 0.722, 0.787,
+    0.517, 0.502, 0.480, 0.463, 0.494, 0.518, 0.573, 0.629, 0.664, 0.692, 0.730,
 )  # fmt: skip
 """Optical gains of FLAO's ``REFERENCE_MODES`` at 1" of seeing, which define the shape.
 
-Measured on the simulated diffractive telescope (docs/results/tracking.md).
+First principal component of the logarithms of true gains on the simulated diffractive telescope at
+magnitudes 8 and 11, 0.6 to 1.2" (docs/results/tracking.md).
 """
+
+CONTRAST = (0.34, 0.46, 0.72, 1.00, 0.49, 0.25, -0.29, -0.75, -0.94, -0.93, -0.96)
+"""Second component at ``REFERENCE_MODES``: log gain of low against high modes, 1 at its largest."""
+
+CONTRAST_SIGMA = 0.05
+"""Prior 1 σ of its coefficient; 0.015 to 0.034 were found."""
 
 STRENGTH_SIGMA = 0.5
 """Prior 1 σ of the strength of the residual; the reference has strength 1."""
@@ -127,14 +136,14 @@ STRENGTH_SIGMA = 0.5
 COMMON_SIGMA = 0.05
 """Prior 1 σ of a factor common to all modes: mirror stroke, absolute scale of the model."""
 
-SHAPE_SIGMA = 0.06
-"""Prior 1 σ of a smooth departure from the shape, far from any measured mode."""
+SHAPE_SIGMA = 0.02
+"""Prior 1 σ of a smooth departure from both shapes, far from any measured mode."""
 
 SHAPE_SCALE = 0.7
 """Correlation length of that departure, in the natural logarithm of the mode number."""
 
-MIN_RELATIVE_SIGMA = 0.02
-"""Smallest relative 1 σ of a measured gain, because the response of the sensor is not diagonal."""
+MIN_RELATIVE_SIGMA = 0.015
+"""1 σ by which the gain of a single mode departs from the smooth curve, relative."""
 
 MAX_SINGLE_PASS_GAIN = 1.1
 """Largest median optical gain in single pass; above it the light has met the mirror twice."""
@@ -205,7 +214,10 @@ def gain_table(measured: Sequence[ModeGain], n_modes: int) -> GainTable:
     expected = _reference_log_gain(everywhere) + np.log(passes)
     covariance = _prior_covariance(everywhere, modes)
     variance = (
-        STRENGTH_SIGMA**2 * _reference_log_gain(everywhere) ** 2 + COMMON_SIGMA**2 + SHAPE_SIGMA**2
+        (STRENGTH_SIGMA * _reference_log_gain(everywhere)) ** 2
+        + (CONTRAST_SIGMA * _interpolate(CONTRAST, everywhere)) ** 2
+        + COMMON_SIGMA**2
+        + SHAPE_SIGMA**2
     )
     # Conditioning of the Gaussian process on the measured modes, in the logarithm of the gain,
     # where a stronger residual is a multiple of the same shape.
@@ -216,20 +228,30 @@ def gain_table(measured: Sequence[ModeGain], n_modes: int) -> GainTable:
             np.log(found) - np.log(passes) - _reference_log_gain(modes)
         )
         variance -= np.einsum("ij,ij->i", weights, covariance)
+    # Single modes depart from any smooth curve.
+    variance = np.maximum(variance, 0.0) + MIN_RELATIVE_SIGMA**2
     return GainTable(
         optical_gain=np.exp(expected),
-        relative_sigma=np.sqrt(np.maximum(variance, 0.0)),
+        relative_sigma=np.sqrt(variance),
     )
 
 
 def _reference_log_gain(modes: NDArray[np.intp]) -> Array:
     """Return the logarithm of the reference's optical gain of these modes, interpolated."""
+    return _interpolate(np.log(REFERENCE_GAINS), modes)
+
+
+def _interpolate(values: ArrayLike, modes: NDArray[np.intp]) -> Array:
     place = np.log1p(np.array(REFERENCE_MODES))
-    return np.asarray(np.interp(np.log1p(modes), place, np.log(REFERENCE_GAINS)))
+    return np.asarray(np.interp(np.log1p(modes), place, np.asarray(values)))
 
 
 def _prior_covariance(one: NDArray[np.intp], other: NDArray[np.intp]) -> Array:
     """Return the prior covariance of log optical gains, ``(len(one), len(other))``."""
     strength = STRENGTH_SIGMA**2 * np.outer(_reference_log_gain(one), _reference_log_gain(other))
+    contrast = CONTRAST_SIGMA**2 * np.outer(
+        _interpolate(CONTRAST, one), _interpolate(CONTRAST, other)
+    )
     apart = (np.log1p(one)[:, None] - np.log1p(other)) / SHAPE_SCALE
-    return np.asarray(strength + COMMON_SIGMA**2 + SHAPE_SIGMA**2 * np.exp(-0.5 * apart**2))
+    smooth = COMMON_SIGMA**2 + SHAPE_SIGMA**2 * np.exp(-0.5 * apart**2)
+    return np.asarray(strength + contrast + smooth)

@@ -205,10 +205,19 @@ def _read_map(values: Array, places: Array) -> Array:
     return np.asarray(scipy.interpolate.RegularGridInterpolator((pixels, pixels), values)(inside))
 
 
-MAX_SLOPE_SHARE = 0.60
-"""Largest reference slope over the optical gain in the worst seeing.
+MAX_SLOPE = 0.7
+"""Largest reference slope in any seeing. A slope of a pyramid cannot exceed 1."""
 
-A slope of a pyramid cannot exceed 1, and the turbulence needs a part of it.
+SAFE_SLOPE = 0.15
+"""Reference slope with which no loop was lost in any seeing up to 1.5 arcsec."""
+
+LEAST_COHERENCE = 0.2
+SLOPE_PER_COHERENCE = 3.0
+"""Above ``SAFE_SLOPE`` the largest reference slope is ``3 (coherence - 0.2)`` in the worst seeing.
+
+Turbulence needs a part of the sensor's range. Measured on the simulated diffractive telescope
+(docs/results/references.md): loops were lost with reference slopes from 0.22 on at a coherence of
+0.25, and from 0.9 on at 0.42.
 """
 
 
@@ -273,16 +282,12 @@ def limit_shape(
             largest_m=np.inf,
             reason="no limit: the sensor responds to every size alike, or the shape is flat",
         )
-    # The references as the only mode of a basis: one column is enough of either matrix.
+    # The references as the only mode of a basis: one column of the matrix is enough.
     one = basis.combine_modes(held[:, None])
-    references, worst = (
-        InteractionModel(instrument, one, pupil_sampling=_SAMPLING, working_point=point)
-        .interaction_matrix(instrument.start)[:, 0]
-        .astype(np.float64)
-        for point in (None, at_work)
-    )
-    gain = float(worst @ references) / float(references @ references)
-    largest_m = rms_m * MAX_SLOPE_SHARE * gain / float(np.abs(references).max())
+    model = InteractionModel(instrument, one, pupil_sampling=_SAMPLING)
+    peak = float(np.abs(model.interaction_matrix(instrument.start)).max())
+    allowed = SLOPE_PER_COHERENCE * (at_work.coherence - LEAST_COHERENCE)
+    largest_m = rms_m * float(np.clip(allowed, SAFE_SLOPE, MAX_SLOPE)) / peak
     return ShapeLimit(
         accepted=rms_m <= largest_m,
         largest_m=largest_m,

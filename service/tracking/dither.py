@@ -219,7 +219,7 @@ def learn_precision(context: StepContext, event: ev.WindowFitted) -> None:
     accepted = context.windows.accepted > context.before.windows.accepted
     if isinstance(estimate, RandomEstimate) or not accepted or rtc is None:
         return
-    if len(estimate.modes) > dither_request.N_LINES:
+    if len(estimate.modes) > dither_request.N_LINES + 1:
         return  # not the modes that tell most of α
     if estimate.dither_m > 0.0:
         ratio = compute_precision_ratio(

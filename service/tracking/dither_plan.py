@@ -19,6 +19,7 @@ from service.tracking import mode_proof
 from service.tracking.dither_request import (
     DEFAULT_DURATION_S,
     DITHER_MARGIN_S,
+    LOW_MODE,
     N_LINES,
     DitherParameters,
     choose_modes,
@@ -220,6 +221,7 @@ def _parameters(
         avoid_hz=(*context.policy.dither_avoid_hz, *context.loop.vibrations_hz),
         last_hz=context.dither_policy.lines_hz,
         shunned=mode_proof.shunned_modes(context.state),
+        low_mode=mode_proof.answers_well(context.state, LOW_MODE),
     )
 
 
@@ -288,7 +290,8 @@ def check_dithered_modes(
         return (
             f"mode {min(odd)} has not answered as the instrument file says: others are used for α"
         )
-    inside = controlled(dither.request.modes, rtc)
+    # The low mode, which comes last, is one of the loop's on purpose.
+    inside = controlled(dither.request.modes[:N_LINES], rtc)
     if not inside:
         return ""
     if has_free_modes(rtc, policy, n_inside=len(inside)):

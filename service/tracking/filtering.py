@@ -42,8 +42,9 @@ MODES_KEPT = 64
 GAIN_RATE = 0.05 / np.sqrt(60.0)
 """Random walk of a gain, relative, 1 σ after one second: seeing changes it by 5 % in a minute."""
 
-PRIOR_SCATTER = 0.1
-"""Relative 1 σ of one window before any two were compared."""
+PRIOR_SCATTER, PRIOR_FLUCTUATION = 0.1, 0.03
+"""Relative 1 σ of one window before any two were compared: all of it where the window does not know
+its own noise, and besides that noise."""
 
 SCATTER_WEIGHT = 0.1
 """Weight of the newest window in the scatter: ten windows are remembered."""
@@ -109,7 +110,8 @@ def _update_gain(
     A window's own σ describes the noise next to the lines, not the fluctuation of the gain itself.
     """
     if gain is None:
-        scatter = max(noise, PRIOR_SCATTER * measured)
+        unknown = PRIOR_FLUCTUATION if noise else PRIOR_SCATTER
+        scatter = float(np.hypot(noise, unknown * measured))
         return ModeGain(mode=mode, gain=measured, sigma=scatter, scatter=scatter, t_ns_utc=t_ns)
     elapsed_s = max((t_ns - gain.t_ns_utc) / SECOND_NS, 0.0)
     prior = gain.sigma**2 + (GAIN_RATE * gain.gain) ** 2 * elapsed_s

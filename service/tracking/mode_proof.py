@@ -102,6 +102,12 @@ def shunned_modes(state: TrackerState) -> frozenset[int]:
     return state.matrices.mode_proof.contrary - proven_modes(state)
 
 
+def answers_well(state: TrackerState, mode: int) -> bool:
+    """Return whether a mode is proven and no window contradicts it."""
+    proof = state.matrices.mode_proof
+    return mode in proven_modes(state) - proof.contrary - proof.suspected
+
+
 def check_information(context: StepContext, estimate: DitheredEstimate) -> str | None:
     """Return why a window of these modes does not determine α, or None.
 

@@ -1,12 +1,14 @@
 """``import pyrcal``: what there is, and that it costs nothing before it is used."""
 
 import inspect
+import re
 import subprocess
 import sys
 
 import pytest
 
 import pyrcal
+from tests.support.repository import ROOT
 
 
 def test_everything_that_is_offered_is_there_and_nothing_else():
@@ -50,3 +52,23 @@ def test_what_may_be_relied_on_is_called_as_before():
     functions = {name for name in pyrcal.__all__ if inspect.isfunction(getattr(pyrcal, name))}
     found = {name: inspect.signature(getattr(pyrcal, name)).parameters for name in functions}
     assert {name: ", ".join(parameters) for name, parameters in found.items()} == SIGNATURES
+
+
+EXAMPLES = sorted((ROOT / "examples" / "reference").glob("*.py"))
+REFERENCE = ROOT / "docs" / "reference" / "python.md"
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_the_example_of_an_object_runs(path, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    exec(compile(path.read_text("utf-8"), path.name, "exec"), {"__name__": "example"})
+
+
+def test_every_object_of_the_library_has_a_page_and_an_example():
+    lists = re.findall(r":nosignatures:\n\n((?:   \S+\n)+)", REFERENCE.read_text("utf-8"))
+    named = [name for text in lists for name in text.split()]
+    assert set(pyrcal.__all__) - {"Settings", "__version__"} <= set(named)
+    assert sorted(name.rpartition(".")[2] for name in named) == sorted(
+        path.stem.partition("_")[2] for path in EXAMPLES
+    )

@@ -42,10 +42,15 @@ class RowTask(ABC):
         return None
 
 
-class WorkingPoint:
+class WorkingPoint(ABC):
     """Effect of a loop's residual on the source; its content is private to its kind."""
 
     __slots__ = ()
+
+    @property
+    @abstractmethod
+    def coherence(self) -> float:
+        """Share of the light that stays where a flat wavefront puts it, 0..1."""
 
 
 KEPT_BYTES = 1e9

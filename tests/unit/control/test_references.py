@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.control.references import (
-    MAX_SLOPE_SHARE,
+    MAX_SLOPE,
     ShapeFrame,
     compute_references,
     holding_gain,
@@ -198,11 +198,8 @@ def test_a_worse_seeing_permits_less():
 
 
 def test_in_good_seeing_the_largest_reference_slope_is_the_limit():
-    # at 0.01 arcsec the sensor responds as on a flat wavefront
     peak = np.abs(small_matrix(Misregistration())[:, 2]).max()
-    assert astigmatism_limit(1e-8, 0.01).largest_m == pytest.approx(
-        MAX_SLOPE_SHARE / peak, rel=0.01
-    )
+    assert astigmatism_limit(1e-8, 0.01).largest_m == pytest.approx(MAX_SLOPE / peak, rel=0.01)
 
 
 def test_a_flat_shape_is_always_accepted():

@@ -125,7 +125,8 @@ def test_sines_in_an_npz_give_alpha(answer):
         assert file["measured"].shape == (len(found["entries"]), 4)
 
 
-def test_the_library_takes_names_and_gives_arrays(telemetry, tmp_path):
+async def test_the_library_takes_names_and_gives_arrays(telemetry, tmp_path):
+    """In a running event loop, as in a notebook."""
     found = pyrcal.track(str(saved(tmp_path, telemetry)), str(SMALL))
     assert found.t.shape == (len(found.entries),)
     assert found.alpha.shape == found.sigma.shape == (len(found.entries), 4)

@@ -27,6 +27,9 @@ from service.tracking.dither_plan import (
 )
 from service.tracking.dither_request import (
     LINE_RANGE,
+    LOW_MODE,
+    LOW_MODE_SHARE,
+    N_LINES,
     DitherParameters,
     choose_modes,
     clear_lines,
@@ -34,8 +37,10 @@ from service.tracking.dither_request import (
     expected_amplification,
     infer_purpose,
     name_dither,
+    plan_dither,
     total_m,
 )
+from service.tracking.mode_proof import answers_well
 from service.tracking.operations.running import OperationKind, running_operations
 from service.wire import DitherRequest, DitherStop
 from tests.support.dithered import DitheredNight
@@ -267,14 +272,59 @@ def test_modes_of_the_loop_are_amplified_as_its_gain_leak_and_delay_say():
 def test_modes_that_come_into_the_loop_are_left_for_free_ones_at_once():
     night = DitheredNight(POLICY).live(20.0)
     first = night.playing.request
-    assert min(first.modes) >= POLICY.n_modes_target
+    assert min(first.modes[:N_LINES]) >= POLICY.n_modes_target
     raised(night, max(first.modes) + 1).live(4.0)
     assert "dither.stopped" in night.logged
-    assert min(night.requests[-1].modes) > max(first.modes)
+    assert min(night.requests[-1].modes[:N_LINES]) > max(first.modes)
     n_asked = len(night.requests)
     night.live(20.0)
     assert len(night.requests) == n_asked, "and it stays there"
     assert not night.alarms
+
+
+def test_a_low_mode_of_the_loop_is_dithered_besides_the_free_ones_for_the_optical_gains():
+    night = DitheredNight(POLICY).live(60.0)
+    request = night.requests[-1]
+    assert (len(request.modes), request.modes[N_LINES:]) == (N_LINES + 1, (LOW_MODE,))
+    *strong, low = request.amplitude_m
+    assert low**2 == pytest.approx(LOW_MODE_SHARE * total_m(request) ** 2)
+    np.testing.assert_allclose(strong, strong[0])
+    plan = night.state.dithers.policy.plan
+    assert total_m(request) == pytest.approx(plan.total_m), "it costs no more than four modes"
+    lines = np.array(request.frequency_hz)
+    assert np.abs(lines[:-1] - lines[-1]).min() > 20.0
+    assert "dither.stopped" not in night.logged, "it is of the loop on purpose"
+
+
+@pytest.mark.parametrize(
+    ("policy", "changes"),
+    [
+        ({"dither_modes": (501, 502, 503, 504)}, {}),
+        ({"dither_amplitude_m": 2e-9}, {}),
+        ({"dither_frequencies_hz": (210.0, 240.0, 280.0, 330.0)}, {}),
+        ({}, {"max_dither_modes": 4}),
+        ({}, {"n_controlled": 10}),
+        ({"dither_avoid_hz": (261.0, *np.arange(345.0, 450.0, 15.0))}, {}),
+    ],
+)
+def test_there_is_no_low_mode_where_the_settings_fix_the_dither_or_nothing_has_room(
+    policy, changes
+):
+    night = DitheredNight(replace(POLICY, **policy), **changes)
+    assert night.requests
+    assert LOW_MODE not in night.requests[0].modes
+
+
+def test_a_low_mode_that_a_window_contradicts_is_dithered_no_more():
+    night = DitheredNight(POLICY)
+    view, state = night.view, night.state
+    choice = DitherParameters(total_m=8e-9, window_s=1.0, n_windows=1, low_mode=True)
+    assert LOW_MODE in plan_dither(view, POLICY, 1, choice=choice).request.modes
+    doubted = replace(choice, low_mode=False)
+    assert LOW_MODE not in plan_dither(view, POLICY, 1, choice=doubted).request.modes
+    assert answers_well(state, LOW_MODE)
+    proof = replace(state.matrices.mode_proof, suspected=frozenset({LOW_MODE}))
+    assert not answers_well(changed(state, mode_proof=proof), LOW_MODE)
 
 
 def test_where_none_is_free_the_dither_is_weaker_by_what_the_loop_makes_of_it():

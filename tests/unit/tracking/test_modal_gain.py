@@ -5,7 +5,13 @@ import pytest
 
 from service.records import events as ev
 from service.records.state import Mode
-from service.tracking.filtering import GAIN_RATE, MODES_KEPT, PRIOR_SCATTER, update_gains
+from service.tracking.filtering import (
+    GAIN_RATE,
+    MODES_KEPT,
+    PRIOR_FLUCTUATION,
+    PRIOR_SCATTER,
+    update_gains,
+)
 from tests.support.situations import SECOND, START_NS, Story, estimate
 
 
@@ -17,9 +23,13 @@ def windows(gains, mode=501, every_s=2.0, sigma=0.001):
     return table[0]
 
 
-def test_a_first_window_is_worth_a_tenth_whatever_its_own_sigma_says():
-    found = windows([0.6])
-    assert (found.mode, found.gain, found.sigma) == (501, 0.6, PRIOR_SCATTER * 0.6)
+def test_a_first_window_is_worth_its_own_noise_and_what_the_gain_fluctuates():
+    found = windows([0.6], sigma=0.05)
+    assert (found.mode, found.gain) == (501, 0.6)
+    assert found.sigma == pytest.approx(np.hypot(0.05, PRIOR_FLUCTUATION * 0.6))
+    assert windows([0.6]).sigma == pytest.approx(PRIOR_FLUCTUATION * 0.6, rel=0.01)
+    (unknown,) = update_gains((), (501,), np.array([0.6]), None, START_NS)
+    assert unknown.sigma == PRIOR_SCATTER * 0.6
 
 
 def test_windows_that_scatter_tell_how_precise_one_is_and_their_mean_is_better():

@@ -13,7 +13,7 @@ from service.records import events as ev
 from service.records.estimates import WindowRefused
 from service.records.products import MAX_COMPARED_WINDOWS, MatrixState, ModeProof, ModeRatio
 from service.records.state import Mode
-from service.tracking.dither_request import PROVING_LINE_RANGE
+from service.tracking.dither_request import LOW_MODE, PROVING_LINE_RANGE
 from service.tracking.mode_limits import compare
 from service.tracking.mode_proof import (
     MAX_PROOF_TRIES,
@@ -459,7 +459,7 @@ def test_the_first_matrix_is_asked_for_as_soon_as_with_four_lines():
     for world in (few, many):
         while not world.made:
             world.pass_(0.5)
-    assert len(few.asked(DitherRequest)[0].modes) == 4
+    assert len(few.asked(DitherRequest)[0].modes) == 5, "four for α, and a low one"
     assert few.now_ns == many.now_ns
 
 
@@ -470,7 +470,7 @@ def test_the_first_matrix_is_asked_for_as_soon_as_with_four_lines():
 def test_no_weak_lines_are_asked_for_where(changes):
     """Nothing is made; the RTC plays no more; a faint star."""
     first = Shown(policy=informed(), **changes).asked(DitherRequest)[0]
-    assert len(first.modes) == 4
+    assert first.modes == (*range(460, 500, 10), LOW_MODE)[: changes.get("max_dither_modes", 5)]
 
 
 def test_the_modes_beside_one_that_may_be_uneven_are_shown_with_it():

@@ -285,7 +285,7 @@ class PyramidModel(SensorModel):
 
     @override
     def find_fitted_key(self, sensor: Pyramid) -> str | None:
-        return "modulation_lambda_over_d" if sensor.modulation_lambda_over_d > 0.0 else None
+        return "modulation_lambda_over_d"
 
     @override
     def other_recipes(self, recipe: SlopeRecipe) -> dict[str, SlopeRecipe]:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from service.errors import ModelError
 from service.model.instrument import Instrument
@@ -53,6 +54,11 @@ class Halo(WorkingPoint):
 
     n_points: tuple[int, ...]
     """Points on each ring, all even."""
+
+    @property
+    @override
+    def coherence(self) -> float:
+        return self.core_weight
 
 
 def working_point(

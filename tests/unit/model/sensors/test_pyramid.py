@@ -325,11 +325,17 @@ def test_work_grows_with_shapes_by_one_product():
     assert more == pytest.approx(2.0 * 100 * sensor.n_signals * n_points, rel=0.1)
 
 
+class SteadySpot(WorkingPoint):
+    """The working point of a sensor that is no pyramid."""
+
+    coherence = 1.0
+
+
 def test_the_working_point_of_another_sensor_is_refused():
     instrument = small_instrument()
     with pytest.raises(ModelError, match="expected a halo"):
         kind_of(instrument).sensor(
-            instrument, instrument_pupil(instrument, 2), Fineness(), WorkingPoint()
+            instrument, instrument_pupil(instrument, 2), Fineness(), SteadySpot()
         )
 
 

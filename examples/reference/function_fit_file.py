@@ -1,0 +1,15 @@
+import h5py
+
+import pyrcal
+
+with h5py.File("measured.h5", "w") as file:
+    file["interaction_matrix"] = pyrcal.interaction_matrix("canary")[
+        :, :20
+    ]
+report = pyrcal.fit_file(
+    pyrcal.load_instrument("canary"),
+    "measured.h5",
+    pyrcal.FitOptions(explain=True),
+)
+print(report.fit.verdict)
+print(report.notes)

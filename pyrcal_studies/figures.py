@@ -23,10 +23,11 @@ from matplotlib.patches import FancyBboxPatch, Rectangle
 from numpy.typing import NDArray
 
 import pyrcal
-from pyrcal_studies import small_loop, tutorial_figures
+from pyrcal_studies import references_held, small_loop, tutorial_figures
 from pyrcal_studies.shared import save_picture, study_parser
 from service.control.gate import judge
 from service.control.loop import ControlLoop, pole_radius
+from service.control.references import compute_references, holding_gain
 from service.instrument import packaged_instrument
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
@@ -34,6 +35,7 @@ from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import karhunen_loeve_basis
 from service.model.pupil import valid_subapertures
 from service.model.slopes import as_maps
+from sim_rtc.computer.feed import BATCH_FRAMES
 
 OFF = (0.4, -0.1, 2.5, 1.01)
 """Subapertures, degrees, ratio: rotated more than in a night, so that it is visible."""
@@ -643,6 +645,44 @@ def pupils() -> Figure:
     return figure
 
 
+def references() -> Figure:
+    """Draw what fixed references hold at each optical gain, and loops that the seeing surprises."""
+    figure = Figure(figsize=(8.4, 3.4), layout="constrained")
+    held, jump = figure.subplots(1, 2)
+    gain = np.linspace(0.3, 1.0, 71)
+    for factor, label in (
+        (1.0 / holding_gain(gain), "D c: static"),
+        (gain / holding_gain(gain), "D G c: the gain of fast dithers"),
+        (np.ones_like(gain), "D G c: the gain that holds"),
+    ):
+        held.plot(gain, factor, label=label)
+    held.set(xlabel="optical gain G", ylabel="shape held over shape wanted", ylim=(0.8, 3.6))
+    for rms_nm in (25.0, 80.0):
+        plan = references_held.Plan(
+            case="jump",
+            seeing_arcsec=1.2,
+            seed=1,
+            references="holding",
+            shape="flat",
+            rms_nm=rms_nm,
+            instrument="tests/system/small.toml",
+        )
+        shape = references_held.shape_of(plan)
+        matrix = references_held.matrix_of(plan.instrument, plan.alpha)
+        offset = compute_references(matrix, np.full(len(shape), 0.85), 1e-9 * rms_nm * shape)
+        along = references_held.run(plan, offset).modes_m @ shape * 1e9
+        smooth = np.convolve(along, np.full(10, 0.1), "valid")
+        time_s = (np.arange(len(smooth)) + 5.0) * BATCH_FRAMES / 1000.0
+        jump.plot(time_s, smooth, lw=1.0, label=f"{rms_nm:.0f} nm wanted")
+    jump.axvspan(0.3, 1.3, color="0.92", zorder=0)
+    jump.text(0.35, 0.92, "0.6 to 1.2 arcsec", transform=jump.get_xaxis_transform())
+    jump.set(xlabel="time (s)", ylabel="shape held (nm RMS)", ylim=(-100.0, 800.0))
+    for axes in (held, jump):
+        axes.legend(fontsize="small")
+        axes.grid(alpha=0.3)
+    return figure
+
+
 FIGURES: dict[str, Callable[[], Figure]] = {
     "pictures/misregistration": misregistration,
     "start/four_numbers": four_numbers,
@@ -662,6 +702,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "explanation/sigma_of_a_dither": sigma_of_a_dither,
     "explanation/disjoint_sets": disjoint_sets,
     "explanation/pupils": pupils,
+    "explanation/references": references,
     **tutorial_figures.FIGURES,
 }
 

@@ -319,9 +319,14 @@ def main() -> None:
     parser.prog = "python -m pyrcal_studies.references_held"
     parser.add_argument("--only", type=words, default=("held", "moved", "jump"))
     parser.add_argument("--instrument", type=words, default=tuple(TELESCOPES))
+    parser.add_argument("--jump-nm", type=float, default=0.0, help="size instead of the limit's")
     given = parser.parse_args()
     with threadpool_limits(1):
-        chosen = [p for p in plans() if p.case in given.only and p.instrument in given.instrument]
+        chosen = [
+            replace(plan, rms_nm=given.jump_nm) if plan.case == "jump" else plan
+            for plan in plans()
+            if plan.case in given.only and plan.instrument in given.instrument
+        ]
         rows = complete(play, chosen, given)
     text = heading(
         "loop", "seeing, arcsec", "gain", "shape, nm", "held", "error, nm", "limit, nm", "lost"

@@ -1,7 +1,7 @@
 """Figures of the pages of results that are drawn from the pages' own tables.
 
-Run: ``python -m pyrcal_studies.result_figures``, which writes ``faults.png``, ``elt.png`` and
-``shack_hartmann.png`` into docs/results.
+Run: ``python -m pyrcal_studies.result_figures``, which writes ``faults.png``, ``elt.png``,
+``shack_hartmann.png`` and ``references.png`` into docs/results.
 """
 
 from __future__ import annotations
@@ -73,6 +73,19 @@ def draw_lenslets(axes: Axes) -> None:
     axes.grid(axis="x", alpha=0.4)
 
 
+def draw_references(axes: Axes) -> None:
+    """Draw the error of the shape held, by kind of references and seeing."""
+    rows = read_table("references.md", "Shapes held")[:4]
+    for k, seeing in enumerate(("0.6", "0.9", "1.2")):
+        found = [NUMBER.match(row[1 + k]) for row in rows]
+        height = [200.0 if number is None else float(number[0]) for number in found]
+        axes.bar(np.arange(len(rows)) + 0.27 * (k - 1), height, 0.25, label=f"{seeing} arcsec")
+    axes.set_xticks(np.arange(len(rows)), [row[0].replace(", ", ",\n") for row in rows], fontsize=7)
+    axes.set(yscale="log", ylim=(1.0, 200.0), ylabel="error, nm (to the top: lost)")
+    axes.legend(fontsize=8)
+    axes.grid(axis="y", alpha=0.4)
+
+
 def _seconds(cell: str) -> list[str]:
     """Return the numbers of a cell that are seconds: not those of a name or a kind of answer."""
     return NUMBER.findall(re.sub(r"`[^`]*`", "", cell))
@@ -84,6 +97,7 @@ def write_figures(folder: Path) -> None:
         ("faults", draw_faults, 5.5),
         ("elt", draw_elt, 3.2),
         ("shack_hartmann", draw_lenslets, 3.6),
+        ("references", draw_references, 3.2),
     ):
         figure = Figure(figsize=(8.0, height), layout="constrained")
         draw(figure.subplots())

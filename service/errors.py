@@ -29,9 +29,17 @@ characters in them before they are printed.
 
 import sys
 import unicodedata
+from collections.abc import Iterable
 
 _UNSAFE_CATEGORIES = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}
 """Unicode categories of characters that move the cursor, reverse the text, or are invisible."""
+
+
+def list_first(things: Iterable[object], most: int, between: str = ", ") -> str:
+    """Return the first of some things as text, and how many more there are."""
+    words = [str(one) for one in things]
+    more = f" and {len(words) - most} more" if len(words) > most else ""
+    return between.join(words[:most]) + more
 
 
 def shown(text: str, keep: str = "") -> str:

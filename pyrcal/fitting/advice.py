@@ -22,7 +22,7 @@ from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.left_over import locate_residual
 from pyrcal.fitting.origins import Origin
 from pyrcal.fitting.pupil_checks import MAP_WORDS, WITHOUT_ARMS
-from pyrcal.fitting.verdict import ENTRIES, UNDECIDED_WORDS, Refusal, edge_move
+from pyrcal.fitting.verdict import Reason, Refusal, edge_move
 from service.instrument.schema import AboutTable, MirrorTable, SlopesTable
 
 Array = NDArray[np.float64]
@@ -50,8 +50,7 @@ class Grounds:
     refusal: Refusal | None
     """Kind of the refusal; None if the fit was accepted."""
 
-    reason: str
-    """Reason of the verdict, in one sentence."""
+    reason: Reason
 
     structure: float
     """RMS share of the signal that is left over and is not noise."""
@@ -100,7 +99,7 @@ def add_explanations(fit: Fit, grounds: Grounds) -> Fit:
         describe_preference(one, fit.sigma)
         for one in fit.alternatives
         # The verdict already names the alternative that led to a refusal.
-        if one.preferred and one.words not in fit.verdict
+        if one.preferred and one.words not in grounds.reason.named
     )
     sentences = (*fit.remarks, *grounds.gains, *preferred)
     size = np.linalg.norm(np.asarray(fit.measured, dtype=np.float64), axis=0)
@@ -249,8 +248,8 @@ def _find_cause(fit: Fit, grounds: Grounds) -> _Action:
         if number is not None and grounds.numbers_share < (best.share or 0.0):
             return f"{number.words}; correct that and fit again", (number.entry,)
         # The verdict names both explanations if the matrix does not distinguish them.
-        if UNDECIDED_WORDS in fit.verdict:
-            return fit.verdict.rpartition("better: ")[2], ()
+        if grounds.reason.undecided:
+            return grounds.reason.undecided, ()
         return (
             f"with {best.words} the misfit is {best.share:.0%} of what it is; correct that and fit "
             "again"
@@ -258,9 +257,8 @@ def _find_cause(fit: Fit, grounds: Grounds) -> _Action:
     left = fit.left_over
     if grounds.refusal is Refusal.DIVIDED and left is not None and left.modes:
         return f"{left.words}; measure these again, or leave them out (--modes)", ()
-    named = tuple(entry for entry in ENTRIES if entry in fit.verdict)
-    entries = (grounds.axes_entry,) if grounds.axes_entry else named
-    return grounds.reason, entries
+    entries = (grounds.axes_entry,) if grounds.axes_entry else grounds.reason.entries
+    return grounds.reason.words, entries
 
 
 def _list_corrections(fit: Fit) -> Iterator[str]:

@@ -23,7 +23,7 @@ from pyrcal.fitting.instrument_checks import (
 from pyrcal.fitting.left_over import find_arms, find_border
 from pyrcal.fitting.methods import Settled
 from pyrcal.fitting.models import FAR_PREFERRED_SHARE, PREFERRED_SHARE, Optic, moved_sensor_number
-from pyrcal.fitting.pupil_checks import gain_maps, try_pupils
+from pyrcal.fitting.pupil_checks import try_pupils
 from pyrcal.fitting.solver import refine
 from pyrcal.fitting.uncertainty import Uncertainty
 from service.model.kinds import SignalKind, Stop
@@ -187,7 +187,7 @@ def _try_off_centre(few: FitSubset) -> Iterator[Alternative]:
         return  # the fit itself displaced the pupil
     rates = few.pupil_rates
     # Where the border cuts no subaperture, a displaced pupil changes no slope.
-    if not all(few.tells(few.own, rate) for rate in rates):
+    if not all(few.depends_on(few.own, rate) for rate in rates):
         return
     found = few.compare(few.own, *rates)
     x, y = few.step(few.own, *rates)[-2:]
@@ -229,9 +229,8 @@ def _try_separate_gains(few: FitSubset) -> Iterator[Alternative]:
 
 def _try_uneven_light(few: FitSubset) -> Iterator[Alternative]:
     """Yield the alternative with a smooth gain over the pupil, common to all modes."""
-    maps = [pattern[:, None] * few.own for pattern in gain_maps(few)]
     words = f"uneven light ({LIGHT_KEY})"
-    yield few.judge(few.compare(few.own, *maps), words, key=LIGHT_KEY, is_number=True)
+    yield few.judge(few.uneven_light, words, key=LIGHT_KEY, is_number=True)
 
 
 def _try_spiders(few: FitSubset) -> Iterator[Alternative]:
@@ -245,7 +244,7 @@ def _try_spiders(few: FitSubset) -> Iterator[Alternative]:
         return
     width_m = ARM_SUBAP * about.subaperture_m
     rate = few.matrix_of(replace(about, spiders_m=width_m, spiders_deg=arms_deg)) - few.own
-    if not few.tells(few.own, rate):
+    if not few.depends_on(few.own, rate):
         return
     width = few.step(few.own, rate)[-1]
     if width <= 0.0:

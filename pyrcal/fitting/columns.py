@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.fitting.solver import Solution
+from service.errors import list_first
 from service.estimation.orientation import find_orientation
 from service.estimation.reference import Reference, Target
 from service.model.instrument import Instrument
@@ -114,7 +115,7 @@ def find_strange_columns(solution: Solution, target: Target) -> Iterator[str]:
     own = np.diag(alike)
     turned = target.modes[own < OPPOSITE_CORRELATION]
     if len(turned):
-        yield f"columns of the wrong sign: {_format_list(turned)}"
+        yield f"columns of the wrong sign: {list_first(turned, _MAX_LISTED)}"
     likest = np.argmax(np.abs(alike), axis=1)
     columns = np.arange(len(own))
     foreign = (np.abs(alike[columns, likest]) > OTHER_MODE_CORRELATION) & (
@@ -132,9 +133,9 @@ def find_strange_columns(solution: Solution, target: Target) -> Iterator[str]:
             signs = sign or alike[other, column] < 0.0
             exchanged.append(f"{pair[0]} and {pair[1]}{' with other signs' if signs else ''}")
     if exchanged:
-        yield f"columns that have changed places: {_format_list(exchanged, '; ')}"
+        yield f"columns that have changed places: {list_first(exchanged, _MAX_LISTED, '; ')}"
     if moved:
-        yield f"columns that are another mode's: {_format_list(moved, '; ')}"
+        yield f"columns that are another mode's: {list_first(moved, _MAX_LISTED, '; ')}"
 
 
 def find_displaced_columns(
@@ -241,8 +242,3 @@ def remove_smear(usable: Reference, share: float) -> Reference:
 
 def _unit(columns: Array) -> Array:
     return np.asarray(columns / np.linalg.norm(columns, axis=0))
-
-
-def _format_list(what: Sequence[object] | NDArray[np.intp], between: str = ", ") -> str:
-    more = f" and {len(what) - _MAX_LISTED} more" if len(what) > _MAX_LISTED else ""
-    return between.join(str(one) for one in what[:_MAX_LISTED]) + more

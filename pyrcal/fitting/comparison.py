@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pyrcal.fitting.disjoint_sets import SIGNIFICANT
 from pyrcal.fitting.methods import Settled, spread
 from pyrcal.fitting.models import FitModels
-from pyrcal.fitting.solver import pupil_regions, refine
+from pyrcal.fitting.solver import nuisances_of, pupil_regions, refine
 from service.estimation.solver import Projection
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
@@ -132,8 +132,7 @@ class FitSubset:
         self.target = settled.target.column_subset(self.modes)
         self.here = solution.alpha
         self._images = settled.nuisances.images
-        known = np.concatenate([solution.derivatives, solution.nuisance_derivatives])
-        self.derivatives = known[:, :, self.modes]
+        self.derivatives = solution.derivatives[:, :, self.modes]
         """Derivatives of the unchanged instrument; they hardly depend on the alternative."""
 
         self._last: tuple[tuple[Array, ...], Projection] | None = None
@@ -170,6 +169,13 @@ class FitSubset:
         """Return D of another instrument with the same modes, ``(n_slopes, n_few)``."""
         return self.matrix(replace(self.models, instrument=about))
 
+    @cached_property
+    def uneven_light(self) -> Alternative:
+        """The fit with a smooth gain over the pupil that is common to all modes."""
+        kind = self.models.instrument.slopes.kind
+        maps = nuisances_of(self.target.valid, kind, gain_map=True).maps
+        return self.compare(self.own, *(pattern[:, None] * self.own for pattern in maps))
+
     def fit_again(self, about: Instrument, rate: Array) -> tuple[float, float, Array]:
         """Return the fit with another instrument and one further number of it.
 
@@ -191,8 +197,8 @@ class FitSubset:
         settled = self.settled
         models, own = replace(settled.models, instrument=about), settled.solution
         there = refine(models, settled.target, own.alpha, settled.nuisances)
-        known = np.concatenate([there.derivatives, there.nuisance_derivatives])[:, :, self.modes]
-        seen = self.target.project(there.matrix[:, self.modes], np.concatenate([known, rate[None]]))
+        known = np.concatenate([there.derivatives[:, :, self.modes], rate[None]])
+        seen = self.target.project(there.matrix[:, self.modes], known)
         share = there.projection.chi / own.projection.chi * seen.chi_at_best / seen.chi
         step = seen.best_step
         return float(step[-1]), float(share), there.vector + step[:4] - own.vector
@@ -276,8 +282,8 @@ class FitSubset:
         left = seen.residual - np.tensordot(step, seen.jacobian, axes=1)
         return np.asarray(left**2 * seen.weights)
 
-    def tells(self, matrix: Array, rate: Array) -> bool:
-        """Return True if the measurement depends on a quantity; it may cut no subaperture."""
+    def depends_on(self, matrix: Array, rate: Array) -> bool:
+        """Return True if a quantity changes the slopes; a border may cut no subaperture."""
         return bool(self.target.project(matrix, rate[None]).normal[0, 0] > 0.0)
 
     def step(self, matrix: Array, *more: Array) -> Array:
@@ -292,14 +298,14 @@ class FitSubset:
         """
         if matrix is self.own and not more:
             return self._own_seen
-        asked = (matrix, *more)
+        given = (matrix, *more)
         if self._last is not None:
             known, seen = self._last
-            if len(known) == len(asked) and all(map(operator.is_, known, asked)):
+            if len(known) == len(given) and all(map(operator.is_, known, given)):
                 return seen
         self._last = None  # its memory is needed for the next one
         seen = self.target.project(matrix, self._with(more), np.float32)
-        self._last = asked, seen
+        self._last = given, seen
         return seen
 
     @cached_property

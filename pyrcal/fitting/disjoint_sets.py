@@ -20,7 +20,7 @@ a stretch.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -289,22 +289,18 @@ class SetComparison:
     def of_modes(self, partitions: Mapping[str, Labels], parts: Normals) -> Iterator[DisjointSets]:
         """Yield partitions of the modes; ``parts`` are the normal equations of each mode."""
         every = np.ones(len(self.regions), dtype=bool)
+
+        def by_region(_set: int, inside: NDArray[np.bool_]) -> tuple[Array, Array]:
+            by_row = Normals.of_rows(self.seen, self.regions, inside)
+            _, sigma = by_row.leave_one_out(every, self.held, self.pull)
+            return sigma, by_row.solve_displacement(every, self.held, self.distortion.field)
+
         for words, labels in partitions.items():
             with suppress(np.linalg.LinAlgError):  # skip sets that do not determine a registration
-                sets = []
-                for number in np.unique(labels):
-                    inside = labels == number
-                    step, sigma = parts.leave_one_out(inside, self.held, self.pull)
-                    moved = np.zeros(4)
-                    # sets of actuators respond in different parts of the pupil, so errors of one
-                    # region and a distortion of the mirror move them apart
-                    if words in ACTUATORS:
-                        by_row = Normals.of_rows(self.seen, self.regions, inside)
-                        _, common = by_row.leave_one_out(every, self.held, self.pull)
-                        sigma = np.hypot(sigma, common)
-                        moved = by_row.solve_displacement(every, self.held, self.distortion.field)
-                    sets.append((step, self._at_least_noise(sigma, parts, inside), moved))
-                yield self._make_sets(words, labels, sets, parts)
+                # sets of actuators respond in different parts of the pupil, so errors of one
+                # region and a distortion of the mirror move them apart
+                apart = by_region if words in ACTUATORS else None
+                yield self._make_sets(words, labels, parts, apart)
 
     def of_rows(self, partitions: Mapping[str, Labels], parts: Normals) -> Iterator[DisjointSets]:
         """Yield partitions of the slopes; ``parts`` are the normal equations of each slope."""
@@ -317,35 +313,50 @@ class SetComparison:
         )
         by_group = Normals.of_modes_in_groups(self.seen, groups.ravel())
         for column, (words, labels) in enumerate(partitions.items()):
-            with suppress(np.linalg.LinAlgError):
-                sets = []
-                for number in np.unique(labels):
-                    inside = labels == number
-                    step, sigma = parts.leave_one_out(inside, self.held, self.pull)
-                    members = np.flatnonzero(labels_of[:, column] == number)
-                    own = Normals.add([by_group[k] for k in members])
-                    # Leaving out regions does not show errors of single modes, which all slopes of
-                    # a set share.
-                    _, single = own.leave_one_out(every, self.held, self.pull)
-                    sigma = self._at_least_noise(np.hypot(sigma, single), parts, inside)
-                    moved = parts.solve_displacement(inside, self.held, self.distortion.field)
-                    sets.append((step, sigma, moved))
-                yield self._make_sets(words, labels, sets, parts)
 
-    def _at_least_noise(self, sigma: Array, parts: Normals, inside: NDArray[np.bool_]) -> Array:
-        # With few clusters the jackknife may be small by chance.
-        spread = np.linalg.inv(parts.normals[inside].sum(axis=0) + self.held)
-        return np.maximum(sigma, np.sqrt(np.diag(spread)[:4] * self.noise))
+            def by_mode(
+                number: int, inside: NDArray[np.bool_], of_group: Labels = labels_of[:, column]
+            ) -> tuple[Array, Array]:
+                own = Normals.add([by_group[k] for k in np.flatnonzero(of_group == number)])
+                # Leaving out regions does not show errors of single modes, which all slopes of a
+                # set share.
+                _, sigma = own.leave_one_out(every, self.held, self.pull)
+                return sigma, parts.solve_displacement(inside, self.held, self.distortion.field)
+
+            with suppress(np.linalg.LinAlgError):
+                yield self._make_sets(words, labels, parts, by_mode)
 
     def _make_sets(
-        self, words: str, labels: Labels, sets: list[tuple[Array, Array, Array]], parts: Normals
+        self,
+        words: str,
+        labels: Labels,
+        parts: Normals,
+        others: Callable[[int, NDArray[np.bool_]], tuple[Array, Array]] | None,
     ) -> DisjointSets:
-        steps, sigma, distorted = (np.array(values) for values in zip(*sets, strict=True))
-        blocks = Normals(normals=parts.normals, scores=parts.scores, clusters=labels)
+        """Return a partition of ``parts`` ``(n_parts,)``.
+
+        ``others`` returns 1 σ of a set, and its change by the distortion, that its own parts do not
+        show; None if there is neither.
+        """
+        steps, sigmas, distorted = [], [], []
+        for number in np.unique(labels):
+            inside = labels == number
+            step, sigma = parts.leave_one_out(inside, self.held, self.pull)
+            more, moved = (np.zeros(4), np.zeros(4)) if others is None else others(number, inside)
+            # With few clusters the jackknife may be small by chance: it is at least the noise.
+            spread = np.linalg.inv(parts.normals[inside].sum(axis=0) + self.held)
+            noise = np.sqrt(np.diag(spread)[:4] * self.noise)
+            steps.append(step)
+            sigmas.append(np.maximum(np.hypot(sigma, more), noise))
+            distorted.append(moved)
         every = np.ones(len(labels), dtype=bool)
-        _, jackknife = blocks.leave_one_out(every, self.held, self.pull)
+        _, jackknife = replace(parts, clusters=labels).leave_one_out(every, self.held, self.pull)
         return DisjointSets(
-            words=words, steps=steps, sigma=sigma, distorted=distorted, jackknife=jackknife
+            words=words,
+            steps=np.array(steps),
+            sigma=np.array(sigmas),
+            distorted=np.array(distorted),
+            jackknife=jackknife,
         )
 
 

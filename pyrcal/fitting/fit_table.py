@@ -12,7 +12,7 @@ from pyrcal.fitting.alternatives import PLAUSIBLE_DISPLACEMENT_PX, format_move, 
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.methods import ScanStep
 from pyrcal.fitting.report import FitReport, orientation_words
-from service.errors import shown
+from service.errors import list_first, shown
 from service.model.defects import list_ranges
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 
@@ -223,7 +223,5 @@ def _format_gains(fit: Fit) -> str:
     text = f"median {middle:.3g}, 90 % of them within {low:.3g} to {high:.3g}"
     far = fit.modes[np.abs(fit.gains / middle - 1.0) > _FAR_GAIN]
     if len(far):
-        named = ", ".join(str(mode) for mode in far[:_MAX_LISTED])
-        more = f" and {len(far) - _MAX_LISTED} more" if len(far) > _MAX_LISTED else ""
-        text += f"; more than {100 * _FAR_GAIN:.0f} % off: mode {named}{more}"
+        text += f"; more than {100 * _FAR_GAIN:.0f} % off: mode {list_first(far, _MAX_LISTED)}"
     return text

@@ -35,6 +35,8 @@ DIMMED_GAIN = 0.9
 UNIT_TOLERANCE = 0.03
 """Relative distance from a unit's factor within which the unit is reported."""
 
+_SLOPE_SIZE = "the size of their slopes, as normalised columns do"
+
 _N_POINTS = 4000
 """Approximate number of pupil points at which modes are evaluated."""
 
@@ -64,7 +66,7 @@ def find_gain_causes(settled: Settled, *, passes: int, stroke_known: bool) -> It
         middle = float(np.median(gains * sizes[words]))
         times = (
             ""
-            if abs(middle - 1.0) < UNIT_TOLERANCE or "normalised" in words
+            if abs(middle - 1.0) < UNIT_TOLERANCE or words == _SLOPE_SIZE
             else f", times {middle:.3g}"
         )
         yield (
@@ -116,9 +118,7 @@ def _compute_norms(settled: Settled) -> Mapping[str, Array]:
         "the modes' peak to valley": np.ptp(shapes, axis=0),
         "the modes' largest value": np.abs(shapes).max(axis=0),
         "the modes' RMS": shapes.std(axis=0),
-        "the size of their slopes, as normalised columns do": np.linalg.norm(
-            np.asarray(settled.solution.matrix, dtype=np.float64), axis=0
-        ),
+        _SLOPE_SIZE: np.linalg.norm(np.asarray(settled.solution.matrix, dtype=np.float64), axis=0),
     }
     if isinstance(basis, ModalBasis):
         sizes["the largest stroke of their actuators"] = np.abs(basis.mode_to_actuator).max(axis=0)

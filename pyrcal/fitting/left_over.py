@@ -154,11 +154,8 @@ def locate_residual(
     size
         ``(n_used,)`` norms of the measured columns.
     """
-    known = np.isfinite(planes).any(axis=0)
-    squares = np.where(np.isfinite(planes), planes, 0.0) ** 2
-    by_place = np.full(known.shape, np.nan)
-    by_place[known] = np.sqrt(np.mean(squares, axis=0))[known]
-    border = find_border(valid)
+    by_place = _combine_planes(planes)
+    known, border = np.isfinite(by_place), find_border(valid)
     at_border, inside = by_place[known & border], by_place[known & ~border]
     return ResidualLocation(
         border=float(_rms(at_border) / _rms(inside)) if inside.any() and at_border.any() else None,
@@ -198,13 +195,18 @@ def _gradient(by_place: Array) -> tuple[float, float]:
     return float(x), float(y)
 
 
+def _combine_planes(planes: Array) -> Array:
+    """Return the RMS residual of each subaperture ``(n, n)``, of all signal planes."""
+    known = np.isfinite(planes)
+    rms = np.sqrt(np.mean(np.where(known, planes, 0.0) ** 2, axis=0))
+    return np.where(known.any(axis=0), rms, np.nan)
+
+
 def find_arms(planes: Array) -> tuple[Arm, ...]:
     """Return the arms in a residual map ``(n_planes, n, n)``, the clearest first."""
-    known = np.isfinite(planes).any(axis=0)
-    by_place = np.full(known.shape, np.nan)
-    squares = np.where(np.isfinite(planes), planes, 0.0) ** 2
-    by_place[known] = np.sqrt(np.mean(squares, axis=0))[known]
-    return tuple(_find_arms(by_place)) if _rms(by_place[known]) > MIN_RESIDUAL else ()
+    by_place = _combine_planes(planes)
+    level = _rms(by_place[np.isfinite(by_place)])
+    return tuple(_find_arms(by_place)) if level > MIN_RESIDUAL else ()
 
 
 def _find_arms(by_place: Array) -> list[Arm]:

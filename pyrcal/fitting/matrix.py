@@ -69,7 +69,7 @@ from pyrcal.fitting.uncertainty import (
     nonlinearity_sigma,
 )
 from pyrcal.fitting.verdict import FitFindings, judge_fit
-from service.errors import ModelError
+from service.errors import ModelError, list_first
 from service.estimation.orientation import (
     DOUBTFUL_CORRELATION,
     MIN_CORRELATION,
@@ -265,7 +265,7 @@ def _fit_usable(
             models, instrument, found, usable, smear, options, report_stage
         )
     report_stage("verdict")
-    findings = _weigh(models, found, usable, axes_doubt)
+    findings = _gather_findings(models, found, usable, axes_doubt)
     grounds = _gather_grounds(findings, found, axes_doubt, explain=options.explain)
     fit = _make_fit(found, usable, findings, grounds, options.gain)
     fit = _add_notes(fit, found, findings, grounds, models.instrument, reported)
@@ -379,16 +379,9 @@ def _remove_smear(
 
 def _remove_noise(usable: Reference, noisy: NDArray[np.bool_]) -> Reference:
     """Return the reference without the columns that hold noise only; these are listed."""
-    named = ", ".join(str(mode) for mode in usable.columns[noisy][:_MAX_LISTED])
-    more = f" and {int(noisy.sum()) - _MAX_LISTED} more" if noisy.sum() > _MAX_LISTED else ""
-    left_out = f"{int(noisy.sum())} of {len(noisy)} columns hold noise only: modes {named}{more}"
-    return replace(
-        usable,
-        matrix=usable.matrix[:, ~noisy],
-        modes=usable.columns[~noisy],
-        noise=None if usable.noise is None else usable.noise[~noisy],
-        left_out=(*usable.left_out, left_out),
-    )
+    named = list_first(usable.columns[noisy], _MAX_LISTED)
+    left_out = f"{int(noisy.sum())} of {len(noisy)} columns hold noise only: modes {named}"
+    return usable.column_subset(~noisy, left_out)
 
 
 def _stroke_known(instrument: Instrument) -> bool:
@@ -419,13 +412,7 @@ def _select_modes(reference: Reference, modes: NDArray[np.intp] | None) -> Refer
             f"modes: {missing[0]} is requested and was not measured; expected some of the "
             f"{len(place)} that were ({min(place)} to {max(place)})"
         )
-    columns = np.array([place[int(mode)] for mode in modes], dtype=np.intp)
-    return replace(
-        reference,
-        matrix=reference.matrix[:, columns],
-        modes=reference.columns[columns],
-        noise=None if reference.noise is None else reference.noise[columns],
-    )
+    return reference.column_subset(np.array([place[int(mode)] for mode in modes], dtype=np.intp))
 
 
 def _remove_shapeless(reference: Reference, instrument: Instrument) -> Reference:
@@ -434,18 +421,9 @@ def _remove_shapeless(reference: Reference, instrument: Instrument) -> Reference
     # A matrix of another shape is left to ``check_reference``, which reports it.
     if not flat.any() or flat.all() or reference.matrix.shape[1:] != flat.shape:
         return reference
-    named = ", ".join(str(mode) for mode in reference.columns[flat][:_MAX_LISTED])
-    more = f" and {int(flat.sum()) - _MAX_LISTED} more" if flat.sum() > _MAX_LISTED else ""
-    noise = reference.noise
-    return replace(
-        reference,
-        matrix=reference.matrix[:, ~flat],
-        modes=reference.columns[~flat],
-        noise=noise[~flat] if noise is not None and noise.shape == flat.shape else noise,
-        left_out=(
-            *reference.left_out,
-            f"without a usable shape in the instrument file: modes {named}{more}",
-        ),
+    named = list_first(reference.columns[flat], _MAX_LISTED)
+    return reference.column_subset(
+        ~flat, f"without a usable shape in the instrument file: modes {named}"
     )
 
 
@@ -587,7 +565,9 @@ def _unknown_images(models: FitModels) -> dict[str, Any]:
     }
 
 
-def _weigh(as_in_file: FitModels, found: _Found, usable: Reference, axes: AxesDoubt) -> FitFindings:
+def _gather_findings(
+    as_in_file: FitModels, found: _Found, usable: Reference, axes: AxesDoubt
+) -> FitFindings:
     """Return what the verdict rests on: σ with all its parts, and other explanations."""
     settled, solution = found.settled, found.settled.solution
     target, about, seen = settled.target, settled.models.instrument, solution.projection
@@ -622,11 +602,11 @@ def _weigh(as_in_file: FitModels, found: _Found, usable: Reference, axes: AxesDo
             kind_of(one).is_weakly_modulated(one.wfs) for one in (about, as_in_file.instrument)
         ),
     )
-    moves = np.array([*_list_moves(findings, found), *usable.place_sigma_subap * np.eye(4)[:2]])
+    moves = np.array([*_list_errors(findings, found), *usable.place_sigma_subap * np.eye(4)[:2]])
     return replace(findings, uncertainty=sure.with_moves(moves, np.ones(len(moves))))
 
 
-def _list_moves(findings: FitFindings, found: _Found) -> Iterator[Array]:
+def _list_errors(findings: FitFindings, found: _Found) -> Iterator[Array]:
     """Yield 1 σ of the registration ``(4,)`` from each error that no alternative stands for."""
     settled, solution = found.settled, found.settled.solution
     about, nuisances = settled.models.instrument, settled.nuisances
@@ -664,7 +644,7 @@ def _make_fit(
         subset_scatter=sure.subset_scatter,
         accepted=determined,
         converged=solution.converged,
-        verdict=f"{'accepted' if determined else 'refused'}: {grounds.reason}",
+        verdict=f"{'accepted' if determined else 'refused'}: {grounds.reason.words}",
         remarks=(),
         left_out=(*usable.left_out, *_rows_left_out(target, about)),
         n_evaluations=settled.models.counter.n,
@@ -682,7 +662,7 @@ def _make_fit(
         alternatives=findings.alternatives,
         registration=Registration(
             determined=determined,
-            reason=grounds.reason,
+            reason=grounds.reason.words,
             sigma_statistical=sure.sigma_statistical,
             sigma_systematic=sure.sigma_systematic,
             sets=sure.sets,

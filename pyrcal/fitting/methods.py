@@ -379,7 +379,7 @@ def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
     modes = spread(settled.target.n_modes)
     few = settled.target.column_subset(modes)
     subset = replace(models, basis=models.basis.subset(modes))
-    every = np.concatenate([solution.derivatives, solution.nuisance_derivatives])[:, :, modes]
+    every = solution.derivatives[:, :, modes]
 
     def left(change: float) -> float:
         models.counter.n += 1
@@ -446,10 +446,9 @@ def _with_nearest_images(settled: Settled) -> tuple[FitModels, Nuisances]:
     own = subset.cheap
     blurring = np.array([is_blurring(pattern) for pattern in nuisances.images])
     # derivatives by a blur, evaluated without blur, would fit any residual
-    free = np.ones(len(solution.nuisance_derivatives), dtype=bool)
-    free[nuisances.image_places] = ~blurring
-    every = np.concatenate([solution.derivatives, solution.nuisance_derivatives[free]])
-    every = every[:, :, modes]
+    free = np.ones(len(solution.derivatives), dtype=bool)
+    free[4:][nuisances.image_places] = ~blurring
+    every = solution.derivatives[:, :, modes][free]
     seen = solution.projection
     noise = seen.chi / max(seen.residual.size - len(seen.gains), 1)
     unlikely = solution.dispersion * noise / nuisances.image_sigma**2

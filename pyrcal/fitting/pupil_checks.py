@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from pyrcal.fitting.comparison import MIN_EXPLAINED, Alternative, FitSubset
 from pyrcal.fitting.models import FAR_PREFERRED_SHARE, PREFERRED_SHARE
-from pyrcal.fitting.solver import nuisances_of
 from service.model.instrument import Instrument
 from service.model.kinds import Stop
 from service.model.pupil import light_per_subaperture
@@ -117,7 +116,7 @@ class PupilNumber:
 
     def near(self, few: FitSubset, rate: Array) -> tuple[float, Alternative]:
         """Return the best value and how it compares, to first order."""
-        if few.tells(few.own, rate):
+        if few.depends_on(few.own, rate):
             light = self.reported**self.power
             value = self.limit(light + few.step(few.own, rate)[-1])
             if value != light:
@@ -139,7 +138,7 @@ class PupilNumber:
         for _ in range(_N_STEPS):
             # At a new value the border may cut no subaperture, and then nothing determines a
             # further step.
-            if not few.tells(matrix, rate):
+            if not few.depends_on(matrix, rate):
                 break
             before, left = light, matrix
             light = self.limit(light + float(few.step(matrix, rate)[-1]))
@@ -203,7 +202,7 @@ def try_pupils(few: FitSubset) -> Iterator[Alternative]:
     """
     about = few.models.instrument
     # Light that fades outwards looks like a narrower pupil as well, and explains more then.
-    most = min(PREFERRED_SHARE, fit_smooth_gain(few))
+    most = min(PREFERRED_SHARE, few.uneven_light.misfit)
     for number in _numbers(about):
         rate = number.rate(few, number.reported**number.power, few.own)
         # To first order first, because each further value takes the matrix of another sensor model.
@@ -275,7 +274,7 @@ def _try_other_ways_round(few: FitSubset) -> Iterator[Alternative]:
     for words, way in ways.items():
         other = replace(about, pupil=replace(about.pupil, lit=way))
         rate = (_light(few, other) / own - 1.0)[:, None] * few.own
-        if few.tells(few.own, rate) and few.step(few.own, rate)[-1] > 0.0:
+        if few.depends_on(few.own, rate) and few.step(few.own, rate)[-1] > 0.0:
             share = few.compare(few.own, rate).misfit
             best = min(best, (words, other, share), key=lambda one: one[2])
     words, other, _ = best
@@ -290,15 +289,3 @@ def _light(few: FitSubset, about: Instrument) -> Array:
     x, y = few.here.vector[:2] if about.stop is Stop.MIRROR else (0.0, 0.0)
     seen = scipy.ndimage.shift(light_per_subaperture(about), (y, x), order=1)
     return np.tile(seen[few.target.valid], about.slopes.kind.n_planes)
-
-
-def fit_smooth_gain(few: FitSubset) -> float:
-    """Return χ² with a smooth gain over the pupil, common to all modes, over that without."""
-    own = few.own
-    return few.left(own, *(pattern[:, None] * own for pattern in gain_maps(few))) / few.left(own)
-
-
-def gain_maps(few: FitSubset) -> Array:
-    """Return the shapes of a smooth gain over the pupil, ``(n_maps, n_slopes)``."""
-    kind = few.models.instrument.slopes.kind
-    return nuisances_of(few.target.valid, kind, gain_map=True).maps

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import MatrixError
+from service.errors import MatrixError, list_first
 from service.estimation.reference import Reference
 from service.model.defects import find_defects
 from service.model.misregistration import unit_like
@@ -82,17 +82,10 @@ def check_reference(
     # Before the columns: a dead subaperture would make each of them not finite.
     reference, silenced = _remove_dead_rows(reference)
     kept, left_out = _find_usable(reference)
-    left_out = (*reference.left_out, *silenced, *left_out)
-    matrix = np.asarray(reference.matrix, dtype=np.float64)[:, kept]
-    usable = replace(
-        reference,
-        matrix=matrix,
-        modes=np.asarray(reference.columns)[kept],
-        noise=None if reference.noise is None else np.asarray(reference.noise)[kept],
-        left_out=left_out,
-    )
+    exact = replace(reference, matrix=np.asarray(reference.matrix, dtype=np.float64))
+    usable = exact.column_subset(kept, *silenced, *left_out)
     if stroke_known:
-        _check_unit(matrix, wavelength_m)
+        _check_unit(usable.matrix, wavelength_m)
     return usable
 
 
@@ -200,9 +193,7 @@ def _describe_copies(
 
 
 def _format_numbers(numbers: NDArray[np.intp], what: str = "mode") -> str:
-    named = ", ".join(str(number) for number in numbers[:8])
-    more = f" and {len(numbers) - 8} more" if len(numbers) > 8 else ""
-    return f"{what}{'s' if len(numbers) > 1 else ''} {named}{more}"
+    return f"{what}{'s' if len(numbers) > 1 else ''} {list_first(numbers, 8)}"
 
 
 def _check_unit(matrix: Array, wavelength_m: float) -> None:

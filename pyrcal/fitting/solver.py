@@ -340,11 +340,8 @@ class Solution:
     """Registration at which the derivatives were computed."""
 
     derivatives: Array
-    """``(4, n_slopes, n_modes)`` derivatives of the model with the gain map applied, taken nearby.
-    """
-
-    nuisance_derivatives: Array
-    """``(n_nuisances, n_slopes, n_modes)`` derivatives with respect to the nuisances."""
+    """``(n_unknowns, n_slopes, n_modes)`` derivatives of the model by the registration, then by the
+    nuisances, with the gain map applied, taken nearby."""
 
     projection: Projection
     dispersion: float
@@ -450,8 +447,7 @@ def refine(
         matrix=matrix,
         near=rates,
         near_alpha=near_alpha,
-        derivatives=every[:4],
-        nuisance_derivatives=every[4:],
+        derivatives=every,
         projection=seen,
         dispersion=counts,
         converged=converged,

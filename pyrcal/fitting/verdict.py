@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,16 +76,6 @@ MIN_EDGE_MOVE_SUBAP = 0.01
 modes, makes the registration undetermined, subapertures. A smaller one is part of σ and changes no
 reconstructor: with a matrix of HCIPy's lenslets, fitted to 0.0004 subaperture, the wrong stop left
 half of the misfit of 1 %."""
-
-UNDECIDED_WORDS = "the matrix does not show which"
-
-ENTRIES = (
-    'stroke = "unknown"',
-    'modes_kind = "surface"',
-    "double_pass = true",
-    "double_pass = false",
-)
-"""Entries of the instrument file that a verdict advises."""
 
 _PASS_TOLERANCE = 0.12
 """Largest relative deviation from a factor of two, and scatter, that indicates a forgotten pass."""
@@ -184,24 +175,40 @@ class Refusal(StrEnum):
     WITHOUT_CAUSE = "without cause"
 
 
-def judge_fit(findings: FitFindings) -> tuple[Refusal | None, str]:
-    """Return the kind of a refusal, or None, and the reason of the verdict in one sentence."""
-    for reason, refusal in (
-        (Refusal.AXES, findings.axes),
-        (Refusal.ANOTHER_PUPIL, _check_pupil(findings)),
-        (Refusal.UNSETTLED, _check_convergence(findings)),
-        (Refusal.UNDETERMINED, _check_determination(findings)),
-        (Refusal.UNEXPLAINED, _check_explanation(findings)),
-        (Refusal.ANOTHER_MINIMUM, _check_minimum(findings)),
+class Reason(NamedTuple):
+    """Reason of a verdict."""
+
+    words: str = ""
+    """One sentence; empty if there is nothing to refuse."""
+
+    entries: tuple[str, ...] = ()
+    """Entries of the instrument file that it advises."""
+
+    named: tuple[str, ...] = ()
+    """Alternatives that it names, by their ``words``."""
+
+    undecided: str = ""
+    """What to check where it names two alternatives that the matrix does not distinguish."""
+
+
+def judge_fit(findings: FitFindings) -> tuple[Refusal | None, Reason]:
+    """Return the kind of a refusal, or None, and the reason of the verdict."""
+    for refusal, reason in (
+        (Refusal.AXES, Reason(findings.axes)),
+        (Refusal.ANOTHER_PUPIL, Reason(_check_pupil(findings))),
+        (Refusal.UNSETTLED, Reason(_check_convergence(findings))),
+        (Refusal.UNDETERMINED, Reason(_check_determination(findings))),
+        (Refusal.UNEXPLAINED, Reason(_check_explanation(findings))),
+        (Refusal.ANOTHER_MINIMUM, Reason(_check_minimum(findings))),
         (Refusal.ANOTHER_INSTRUMENT, _check_instrument(findings)),
         (Refusal.ANOTHER_BASIS, _check_basis(findings)),
         (Refusal.ANOTHER_UNIT, _check_unit(findings)),
-        (Refusal.DIVIDED, _check_agreement(findings)),
-        (Refusal.WITHOUT_CAUSE, _check_cause(findings)),
+        (Refusal.DIVIDED, Reason(_check_agreement(findings))),
+        (Refusal.WITHOUT_CAUSE, Reason(_check_cause(findings))),
     ):
-        if refusal:
-            return reason, refusal
-    return None, _describe_quality(findings)
+        if reason.words:
+            return refusal, reason
+    return None, Reason(_describe_quality(findings))
 
 
 def _describe_quality(findings: FitFindings) -> str:
@@ -279,20 +286,19 @@ def _check_pupil(findings: FitFindings) -> str:
     )
 
 
-def _check_instrument(findings: FitFindings) -> str:
+def _check_instrument(findings: FitFindings) -> Reason:
     for rival in findings.instruments:
         if _moves_registration(findings, rival.moved):
-            other = _describe_instrument(findings, rival)
-            return f"another instrument explains the matrix better: {other}"
+            return _describe_instrument(findings, rival)
     for optic in findings.optics:
         usual = OPTIC_SIGMA[optic.optic] if optic.reported is not None else UNKNOWN_SIGMA
         # the logarithm of a fitted modulation of 0 is meaningless
         if abs(optic.change) > MAX_OPTIC_DEVIATION * usual and optic.found != 0.0:
-            return (
+            return Reason(
                 f"only {optic.found_words} would explain the matrix, {optic.file_words}: the "
                 "mirror, the sensor or the modes are not those of the instrument file"
             )
-    return ""
+    return Reason()
 
 
 def _moves_registration(findings: FitFindings, moved: Array) -> bool:
@@ -306,24 +312,27 @@ def edge_move(step: Array, radius_subap: float) -> float:
     return float(np.sqrt(np.max(step[:2] ** 2) + radius_subap**2 * np.sum(step[2:] ** 2)))
 
 
-def _describe_instrument(findings: FitFindings, rival: Alternative) -> str:
+def _describe_instrument(findings: FitFindings, rival: Alternative) -> Reason:
     """Return the other instrument, or both if the matrix does not distinguish them."""
+    better = "another instrument explains the matrix better:"
     of_rival = f"with {rival.words} the misfit is {rival.misfit:.0%} of what it is now"
     off = find_decentred_pupil(findings.alternatives)
     if off is None or off.misfit > EQUAL_MISFIT_RATIO * rival.misfit:
-        return f"{of_rival}; correct the instrument file"
+        return Reason(f"{better} {of_rival}; correct the instrument file", named=(rival.words,))
     if rival.misfit > EQUAL_MISFIT_RATIO * off.misfit:
-        return (
-            f"with {off.words} the misfit is {off.misfit:.0%} of what it is now; centre the pupil, "
-            "or correct the mask of valid subapertures"
+        return Reason(
+            f"{better} with {off.words} the misfit is {off.misfit:.0%} of what it is now; centre "
+            "the pupil, or correct the mask of valid subapertures",
+            named=(off.words,),
         )
-    return (
-        f"{of_rival}, with {off.words} {off.misfit:.0%}: {UNDECIDED_WORDS}; check the pupil's "
-        "position and correct the file"
+    both = (
+        f"{of_rival}, with {off.words} {off.misfit:.0%}: the matrix does not show which; check the "
+        "pupil's position and correct the file"
     )
+    return Reason(f"{better} {both}", named=(rival.words, off.words), undecided=both)
 
 
-def _check_basis(findings: FitFindings) -> str:
+def _check_basis(findings: FitFindings) -> Reason:
     gains = findings.solution.projection.gains
     # Medians, because a few columns with other strokes do not make another basis.
     middle = float(np.median(gains))
@@ -331,41 +340,52 @@ def _check_basis(findings: FitFindings) -> str:
     negative = int(np.sum(gains <= 0.0))
     # With unknown strokes gains may scatter freely, but their signs still belong to the basis.
     if negative == 0 and (scatter <= MAX_SCATTER or not findings.stroke_known):
-        return ""
+        return Reason()
     if negative:
-        return (
+        return Reason(
             f"{negative} of {len(gains)} modes answer with the wrong sign: signs of single modes, "
             "or the basis, are another's"
         )
-    return (
+    entry = 'stroke = "unknown"'
+    return Reason(
         f"the gains of the modes scatter by {scatter:.0%} about {middle:.3g}: the modes are scaled "
-        'another way or are another basis; say stroke = "unknown" if only their shapes are known'
+        f"another way or are another basis; say {entry} if only their shapes are known",
+        (entry,),
     )
 
 
-def _check_unit(findings: FitFindings) -> str:
+def _check_unit(findings: FitFindings) -> Reason:
     if not findings.stroke_known:
-        return ""
+        return Reason()
     gains = findings.solution.projection.gains
     middle = float(np.median(gains))
     if not 1.0 / MAX_GAIN_RATIO < middle < MAX_GAIN_RATIO:
-        return (
+        return Reason(
             f"the measured slopes are {middle:.1e} times the model's: the matrix is in another "
             "unit than slope per metre of OPD (per nanometre would be 1e-09)"
         )
     factor = factor_of_passes(findings)
     # A pass is a factor common to all modes, so gains that scatter have another cause.
     if factor is None or float(np.std(gains) / middle) >= _PASS_TOLERANCE:
-        return ""
-    words = "twice" if factor > 1.0 else "half"
-    cause = (
-        "the matrix is per metre of the mirror's surface, which is half the OPD: divide it by two, "
-        'or write modes_kind = "surface" where the modes were measured'
-        if (findings.passes, factor) == (2, 2.0)
-        else f"the light met the mirror {'twice' if factor > 1.0 else 'once'}; set double_pass = "
-        f"{'true' if factor > 1.0 else 'false'}, or correct the unit (surface for OPD)"
+        return Reason()
+    twice = factor > 1.0
+    if (findings.passes, factor) == (2, 2.0):
+        entry = 'modes_kind = "surface"'
+        cause = (
+            "the matrix is per metre of the mirror's surface, which is half the OPD: divide it by "
+            f"two, or write {entry} where the modes were measured"
+        )
+    else:
+        entry = f"double_pass = {str(twice).lower()}"
+        cause = (
+            f"the light met the mirror {'twice' if twice else 'once'}; set {entry}, or correct the "
+            "unit (surface for OPD)"
+        )
+    return Reason(
+        f"the measured slopes are {'twice' if twice else 'half'} the model's in every mode "
+        f"({middle:.2f}): {cause}",
+        (entry,),
     )
-    return f"the measured slopes are {words} the model's in every mode ({middle:.2f}): {cause}"
 
 
 def factor_of_passes(findings: FitFindings) -> float | None:

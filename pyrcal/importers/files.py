@@ -22,7 +22,7 @@ from pyrcal.importers.actuators import Mirror, read_mirror
 from pyrcal.importers.frames import Frames, describe_frames, frames_of
 from pyrcal.importers.imported import UNKNOWN, Array, Imported, Signals, in_arrays_file, matrix_of
 from pyrcal.importers.layouts import ROLES, find_lit, maps_of, mask_of, plane_of
-from service.errors import ConfigurationError, MatrixError
+from service.errors import ConfigurationError, MatrixError, list_first
 from service.model.aperture import OFF_CENTRE_SUBAP, measure_aperture
 from service.model.defects import explain_defects, find_defects
 
@@ -328,11 +328,9 @@ def _remove_dead_rows(
     if not dead.any() or dead.all():
         return matrix, valid
     places = np.argwhere(valid)[dead]
-    listed = ", ".join(f"({row}, {column})" for row, column in places[:12])
-    more = f" and {len(places) - 12} more" if len(places) > 12 else ""
+    listed = list_first((f"({row}, {column})" for row, column in places), 12)
     notes.append(
-        f"valid: the subapertures at (row, column) {listed}{more} give NaN or 0 in all columns: "
-        "left out"
+        f"valid: the subapertures at (row, column) {listed} give NaN or 0 in all columns: left out"
     )
     kept = valid.copy()
     kept[tuple(places.T)] = False

@@ -208,16 +208,18 @@ def _read_map(values: Array, places: Array) -> Array:
 MAX_SLOPE = 0.7
 """Largest reference slope in any seeing. A slope of a pyramid cannot exceed 1."""
 
-SAFE_SLOPE = 0.15
-"""Reference slope with which no loop was lost in any seeing up to 1.5 arcsec."""
+SAFE_SLOPE = 0.12
+"""Largest reference slope where the sensor's coherence is lower than ``LEAST_COHERENCE``."""
 
 LEAST_COHERENCE = 0.2
-SLOPE_PER_COHERENCE = 3.0
-"""Above ``SAFE_SLOPE`` the largest reference slope is ``3 (coherence - 0.2)`` in the worst seeing.
+SLOPE_PER_COHERENCE = 2.5
+"""Largest reference slope above ``SAFE_SLOPE``: ``2.5 (coherence - 0.2)`` in the worst seeing.
 
-Turbulence needs a part of the sensor's range. Measured on the simulated diffractive telescope
-(docs/results/references.md): loops were lost with reference slopes from 0.22 on at a coherence of
-0.25, and from 0.9 on at 0.42.
+A loop without a shape needs most of the sensor's range in strong turbulence: it is lost by an
+excursion after which the references hold so much that the response falls further. Measured on the
+simulated diffractive telescope (docs/results/references.md): 6 turbulences of a telescope of 3 m
+lost their loops with reference slopes from 0.22 to 0.62 on at a coherence of 0.25, and with 0.9 at
+0.42. Neither the optical gain nor the mean response to the shape explains this.
 """
 
 

@@ -230,7 +230,7 @@ def compare_telemetry(
     *,
     decides: bool,
 ) -> ProbationFinding:
-    """Return what telemetry of a matrix says of it; ``modes`` are in the loop with both.
+    """Return the judgement on a matrix from its telemetry; ``modes`` are in the loop with both.
 
     Every quantity is a series of power ratios. ``decides`` compares the median of all groups of
     parts with a limit that includes the measured noise; otherwise only what has lasted in most

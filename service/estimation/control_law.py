@@ -1,10 +1,9 @@
 """Fit the loop to the commands: ``c[k+1] = leak c[k] - sum_d h_d (R s)[k+1-d]``.
 
-A few modes are followed, on every frame. An RTC that does what it says leaves nothing over: its
-commands follow from slopes and commands before them to the last digit. So the leak, the gain and
-the delay that a few modes show are known far better than they need be, whatever turbulence and
-noise are; where something is left over (clipping, turbulence played on the mirror, another matrix)
-nothing is reported here.
+A few modes are followed, on every frame. If the RTC's law is as it reports, its commands follow
+exactly from earlier slopes and commands. A few modes then determine leak, gain and delay far better
+than necessary, whatever turbulence and noise are. If there is a residual (clipping, turbulence
+played on the mirror, another matrix), nothing is reported here.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ KEPT_FRAMES = 640
 """Frames remembered."""
 
 MIN_FRAMES = 240
-"""Frames with all before them that they follow from; fewer say nothing."""
+"""Smallest number of usable frames: those with all frames before them that they follow from."""
 
 VERDICT_INTERVAL_FRAMES = 200
 """Frames between two verdicts."""
@@ -168,7 +167,7 @@ def follow(law: ControlLawCheck, block: FrameBlock, loop: ClosedLoop) -> Control
 def judge_frames(
     law: ControlLawCheck, loop: ClosedLoop, last_seq: int
 ) -> tuple[ControlLawCheck, IdentifiedLaw | None]:
-    """Return what the frames up to one say of the loop; None: nothing, or nothing new."""
+    """Return the law of the frames up to one; None if there is none, or no new one."""
     if last_seq - law.judged_seq < VERDICT_INTERVAL_FRAMES:
         return law, None
     n_taps = int(loop.delay_frames) + N_EXTRA_TAPS

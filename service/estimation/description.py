@@ -97,7 +97,7 @@ def edge_watch(
     in_loop: NDArray[np.intp],
     diameter_m: float = EDGE_MEMORY_OF_M,
 ) -> EdgeWatch | None:
-    """Return what to watch in a loop of these modes; None when they are too few to say.
+    """Return what to watch in a loop of these modes; None if they are too few.
 
     The same when nothing is known of the turbulence in the modes.
     """

@@ -140,7 +140,7 @@ class DitherWatch(Streaming):
         return cls(monitor=monitor, seen_seq=max(dither.first_seq, last_seq(rtc)))
 
     @override
-    def begun_anew(self, loop: LoopContext, why: Change) -> DitherWatch:
+    def restart(self, loop: LoopContext, why: Change) -> DitherWatch:
         """Return it for another dither, or for modes that have come into the loop, or left it."""
         if why != Change.LOOP:
             return self.begin(loop)

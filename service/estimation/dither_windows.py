@@ -47,7 +47,7 @@ class DitherWindows(Streaming):
         return cls(cutter=RandomDither(plan=plan) if isinstance(plan, RandomPlan) else None)
 
     @override
-    def begun_anew(self, loop: LoopContext, why: Change) -> DitherWindows:
+    def restart(self, loop: LoopContext, why: Change) -> DitherWindows:
         """Give up the open window; the next begins when the changed loop has settled.
 
         Counted from the status' own frame, not from when it was read, so that a recorded night is
@@ -55,7 +55,7 @@ class DitherWindows(Streaming):
         """
         if why & (Change.GONE | Change.RATE | Change.DITHER):
             return self.begin(loop)
-        cutter = None if self.cutter is None else self.cutter.begun_anew(loop.settled_seq)
+        cutter = None if self.cutter is None else self.cutter.restart(loop.settled_seq)
         return DitherWindows(cutter=cutter)
 
     @override

@@ -1,8 +1,7 @@
 """One estimate of the registration, from any estimator.
 
-Every estimator cuts telemetry into windows, or forgets the old of it, in constant memory. Its fit
-says what it found of α, how sure it is by the scatter of the data themselves, and how well the
-model explains them.
+Every estimator cuts telemetry into windows, or forgets old telemetry, in constant memory. Its fit
+gives α, a covariance from the scatter of the data themselves, and how well the model explains them.
 """
 
 from __future__ import annotations

@@ -182,7 +182,7 @@ class Streaming:
         """Return one that has seen nothing of this loop."""
         return cls()
 
-    def begun_anew(self, loop: LoopContext, why: Change) -> Self:
+    def restart(self, loop: LoopContext, why: Change) -> Self:
         """Return it after changes that it has declared: with nothing, unless some of it lasts."""
         return self.begin(loop)
 

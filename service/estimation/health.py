@@ -186,8 +186,8 @@ class LoopHealth(Streaming):
     """True if that lasted for ``LOST_S`` since the loop began to diverge."""
 
     @override
-    def begun_anew(self, loop: LoopContext, why: Change) -> LoopHealth:
-        """Return it with nothing; what another matrix made of the loop says nothing of this one.
+    def restart(self, loop: LoopContext, why: Change) -> LoopHealth:
+        """Return an empty record: the loop of another matrix does not describe this one.
 
         The power before stays the reference of another matrix: turbulence is the same.
         """
@@ -341,7 +341,7 @@ class EdgeHealth(Streaming):
     slipped: bool = False
 
     @override
-    def begun_anew(self, loop: LoopContext, why: Change) -> EdgeHealth:
+    def restart(self, loop: LoopContext, why: Change) -> EdgeHealth:
         """Return the health, without history if the loop is open."""
         return EdgeHealth() if loop.edge is None else self
 
@@ -548,7 +548,7 @@ LINE_RATIO = 8.0
 it, so that a peak which does justifies moving a dither."""
 
 LINE_SEARCH_SEGMENTS = 4
-"""Spectra between two looks for lines: a look costs as much as hundreds of frames."""
+"""Spectra between two searches for lines: a search costs as much as hundreds of frames."""
 
 _NEIGHBOURHOOD_BINS = 20
 _MEMORY_SEGMENTS = 32.0

@@ -37,7 +37,8 @@ STRETCH_RATE = 1e-4 / np.sqrt(60.0)
 they are mounted, not in the course of a night."""
 
 SCATTER_LEARNING = 0.05
-"""Weight of the newest in how much windows, and looks, scatter: twenty are remembered."""
+"""Weight of the newest estimate in the scatter of windows, and of passive estimates: about the last
+twenty count."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -175,7 +176,7 @@ def predict_state(
         # A first-order process: what has faded of the variance returns as the floor, so that the
         # variance of an unobserved bias tends to the floor and does not vanish.
         growth[joint.place] = np.square(BIAS_FLOOR) * (1.0 - fading**2)
-        # what fades of the excess the next look that tells of it brings back
+        # The next passive estimate with an excess restores what fades here.
         bias = replace(bias, excess=fading**2 * bias.excess)
     covariance = joint.covariance * np.outer(keep, keep) + np.diag(growth)
     return replace(joint, mean=keep * joint.mean, covariance=covariance, bias=bias)
@@ -218,7 +219,7 @@ def _update(prior: Joint, sees: Array, measured: Array, noise: Array) -> Joint:
 def update_scatter(joint: Joint, innovation: float) -> Joint:
     """Return the estimate after an innovation, 4 expected, with ``scatter`` learnt from it.
 
-    In fast wind the bias swings from look to look, and looks scatter by more than they say.
+    In fast wind the bias changes between estimates, which then scatter by more than their σ.
     """
     known = joint.bias or Bias()
     return replace(joint, bias=replace(known, scatter=learnt(known.scatter, innovation)))
@@ -240,7 +241,7 @@ def learnt(scatter: float, innovation: float) -> float:
 
 
 def widen_after_jump(prior: Joint, noise: Array) -> Joint:
-    """Return the state after a jump of α; the next measurement must say how far.
+    """Return the state after a jump of α, whose size the next measurement determines.
 
     The bias is kept: the wind has not moved with the mirror.
     """

@@ -289,7 +289,7 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
         modes=spectra.plan.modes,
         gain_sigma=_modulus_sigma(gains, every[n:, n:]),
         weak=tuple(np.array(spectra.plan.modes)[size < WEAK_LINE_RATIO * size.max()].tolist()),
-        answers_as=_answers_as(window, every_mode),
+        answers_as=_match_modes(window, every_mode),
         dither_m=float(np.sqrt(np.sum(rms_m**2))),
         window_s=spectra.window_s,
     )
@@ -387,7 +387,7 @@ def _modulus_sigma(gains: Array, covariance: Array) -> Array:
     return np.array(found)
 
 
-def _answers_as(spectra: Spectra, matrix: Array) -> tuple[int, ...]:
+def _match_modes(spectra: Spectra, matrix: Array) -> tuple[int, ...]:
     """Return the mode of the model that the slopes of each line resemble most.
 
     A mode other than the line's own is returned only if it explains far more, and far more than

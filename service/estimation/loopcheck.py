@@ -151,7 +151,7 @@ class LoopCheck(Streaming):
         if not found.holds:
             return check, compose("window.off-loop", text=found.text)
         if n_frames / terms.frame_rate_hz >= MIN_SAMPLES / SAMPLES_PER_S:
-            # what a long window shows need not be asked again
+            # what a long window has shown is not checked again
             check = replace(check, obeyed_seq=max(last, check.obeyed_seq))
         return check, None
 
@@ -179,7 +179,7 @@ class _Sample:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Batch:
-    """Samples with what the loop asks for."""
+    """Samples with the commands that the loop requests."""
 
     seq: Array
     """``(n_samples,)``."""
@@ -334,7 +334,7 @@ def _judge(asked: Array, taken: Array, held: Array, loop: ClosedLoop) -> Command
 
 
 def _shares(asked: Array, taken: Array, weights: Array) -> tuple[Array, Array, Array]:
-    """Return regressions of what was taken on what was asked, 1 σ, and the power that was asked.
+    """Return regressions of the steps taken on those requested, 1 σ, and the power requested.
 
     ``(n_controlled,)`` each, for frames with these ``weights``.
     """

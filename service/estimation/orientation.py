@@ -97,15 +97,15 @@ class Pose:
 
 
 def format_setting(slopes: SlopeRecipe) -> str:
-    """Return order and orientation of slopes as the instrument file says them."""
+    """Return order and orientation of slopes in the notation of the instrument file."""
     axes = slopes.assumed_orientation
     flags = [f"{name} = true" for name in FLIPS if getattr(axes, name)]
-    words = ", ".join([*flags, sign_written(axes)])
+    words = ", ".join([*flags, format_sign(axes)])
     return f'order = "{slopes.order}", orientation = {{ {words} }}'
 
 
-def sign_written(axes: Orientation) -> str:
-    """Return the signs of an orientation as the instrument file says them."""
+def format_sign(axes: Orientation) -> str:
+    """Return the signs of an orientation in the notation of the instrument file."""
     if axes.sign_x == axes.sign_y:
         return f"sign = {axes.sign_x}"
     return f"sign = [{axes.sign_x}, {axes.sign_y}]"
@@ -231,7 +231,7 @@ def coarse_model(instrument: Instrument, basis: Basis, mapper: Mapper = map) -> 
 
 
 def _settings(reported: SlopeRecipe) -> Iterator[SlopeRecipe]:
-    """Yield every orientation, and the components exchanged where the order can say that."""
+    """Yield every orientation, and with exchanged components if the order has them."""
     order = reported.order
     plain, exchanged = order.kind.orders[:2]
     others = {plain: [exchanged], exchanged: [plain]}

@@ -1,14 +1,15 @@
 """Recognise the modes in the RTC's own matrix: order, sign, strength.
 
 An RTC whose mode 10 has the other sign, or whose modes 3 and 40 are exchanged, closes its own loop
-as well as any other: its matrix knows. A matrix made by the model would drive that one mode apart.
-The pseudo-inverse of the RTC's matrix is the interaction matrix as that RTC knows it. Each of its
-columns is held against every mode of the model, at the registration that explains most of them.
+as well as any other, because its matrix was measured with them. With a matrix made by the model
+these modes would diverge. The pseudo-inverse of the RTC's matrix is the interaction matrix that it
+was made from. Each of its columns is compared with every mode of the model, at the registration
+that explains most of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.control.reconstructor import MAX_CONDITION
+from service.errors import list_first
 from service.estimation.solver import SETTLED_STEP, Columns, Projection, shorten
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
@@ -63,7 +65,7 @@ N_DITHERED = 4
 """Modes of a dither that measures α."""
 
 N_PARAMETERS = 4
-"""Parameters of a registration: so many modes say nothing of their own scatter."""
+"""Number of parameters of a registration: so few modes have no scatter about the fit."""
 
 _MAX_LISTED_MODES = 8
 """Modes that a sentence names at most."""
@@ -114,14 +116,14 @@ class OwnMatrix:
     """``(n,)`` norm of the residual over that of the model's column; NaN: not recognised."""
 
     covariance: NDArray[np.float64]
-    """``(4, 4)`` of ``alpha``, numeric units, from the scatter of what single modes say of it."""
+    """``(4, 4)`` covariance of ``alpha``, numeric units, from the scatter between modes."""
 
     weights: tuple[float, ...] = ()
     """Weight of each mode of the basis for the measurement of α; empty if all count alike."""
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """``(n,)`` which columns are the mode that their number says, with the model's sign."""
+        """``(n,)`` True for columns that are the mode of their number, with the model's sign."""
         return np.asarray((self.modes == self.columns) & (np.nan_to_num(self.response) > 0.0))
 
     @property
@@ -180,7 +182,8 @@ class OwnMatrix:
         ]
         if not odd:
             return ""
-        return f"by the RTC's own matrix {_list_in_words(odd)} as strongly as its neighbours"
+        listed = list_first(odd, _MAX_LISTED_MODES)
+        return f"by the RTC's own matrix {listed} as strongly as its neighbours"
 
     @property
     def typical_response(self) -> float | None:
@@ -207,7 +210,8 @@ class OwnMatrix:
             return ""
         if len(turned) == 1:
             return f"mode {turned[0]} has the other sign by the RTC's own matrix"
-        return f"modes {_list_in_words(turned)} have the other sign by the RTC's own matrix"
+        listed = list_first(turned, _MAX_LISTED_MODES)
+        return f"modes {listed} have the other sign by the RTC's own matrix"
 
     def _order(self) -> str:
         elsewhere = (self.modes >= 0) & (self.modes != self.columns)
@@ -226,9 +230,11 @@ class OwnMatrix:
         # one < to lists each pair once.
         pairs = [(one, to) for one, to in place.items() if place.get(to) == one and one < to]
         if 2 * len(pairs) == len(columns):
-            exchanged = _list_in_words([f"{one} and {to}" for one, to in pairs])
+            exchanged = list_first([f"{one} and {to}" for one, to in pairs], _MAX_LISTED_MODES)
             return f"modes {exchanged} are exchanged by the RTC's own matrix"
-        text = _list_in_words([f"{one} is the instrument file's {to}" for one, to in place.items()])
+        text = list_first(
+            [f"{one} is the instrument file's {to}" for one, to in place.items()], _MAX_LISTED_MODES
+        )
         return f"modes have other places by the RTC's own matrix: {text}"
 
 
@@ -264,7 +270,7 @@ def compare_strength(
 def recognise_modes(
     reconstructor: NDArray[np.float32], linearise: LineariseAt, start: Misregistration
 ) -> OwnMatrix | None:
-    """Return what a reconstructor ``(n_controlled, n_slopes)``, metres per slope, says of modes.
+    """Return the modes of a reconstructor ``(n_controlled, n_slopes)``, metres per slope.
 
     The registration is found from the lowest columns first, then from more and more of them, with
     a free gain for each; columns that are recognised as no mode or as another one do not spoil it.
@@ -285,7 +291,7 @@ def recognise_modes(
     if not len(columns):
         return None
     inverse = _inverse_of(reconstructor[columns])
-    # Columns of unit length: gains differ by mode and say nothing of the registration.
+    # Columns of unit length: gains differ by mode and contain nothing about the registration.
     seen = inverse / np.maximum(np.linalg.norm(inverse, axis=0), np.finfo(float).tiny)
     alpha, near = start, linearise(start)
     n = min(N_FIRST_COLUMNS, len(columns))
@@ -424,16 +430,9 @@ def _project(
     """Return the recognised columns, of unit length, against the model's ``response``."""
     usable = np.flatnonzero(modes >= 0)
     columns, model = seen[:, usable], response[:, modes[usable]]
-    # A weak response says as much of the registration as a strong one: each counts as if its
-    # gain were that of all.
+    # A weak response determines the registration as well as a strong one: each is weighted as if
+    # its gain were that of all.
     along = np.einsum("sm,sm->m", model, columns) / np.linalg.norm(model, axis=0)
     every = np.ones(len(columns), dtype=np.bool_)
     measured = Columns(matrix=columns, weights=along**-2.0, rows=every)
     return measured.project(model, near.derivatives[:, :, modes[usable]], np.float32)
-
-
-def _list_in_words(things: Sequence[object] | NDArray[np.intp]) -> str:
-    """Return the first of some things in words, and how many more there are."""
-    first = [str(thing) for thing in things[:_MAX_LISTED_MODES]]
-    more = len(things) - len(first)
-    return ", ".join(first) + (f" and {more} more" if more else "")

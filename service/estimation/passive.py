@@ -241,7 +241,7 @@ class Passive(Streaming):
         )
 
     @override
-    def begun_anew(self, loop: LoopContext, why: Change) -> Passive:
+    def restart(self, loop: LoopContext, why: Change) -> Passive:
         """Return sums that have begun with nothing, for another loop or after a standstill."""
         from_seq = loop.settled_seq if Change.STANDSTILL in why else 0
         return replace(self.begin(loop), since_ns_utc=loop.received_ns_utc, from_seq=from_seq)
@@ -257,8 +257,8 @@ class Passive(Streaming):
         return max(sum(block.n_frames for block in self.waiting) - _FILTER_SPAN_FRAMES, 0)
 
     @property
-    def why_unusable(self) -> str | None:
-        """Return why this loop's telemetry says nothing, or None."""
+    def explain_unusable(self) -> str | None:
+        """Return the reason for which this loop's telemetry cannot be used, or None."""
         if self.delay_frames >= N_TAPS:
             return f"no passive estimate: the delay of {self.delay_frames:g} frames is too long"
         if self.delay_frames < MIN_DELAY_FRAMES:
@@ -331,8 +331,8 @@ class Passive(Streaming):
             return "no passive estimate: there is no telemetry that could be used"
         if not loop.rtc.in_loop:
             return f"no passive estimate: {explain_open_loop(loop.rtc)}"
-        if self.why_unusable is not None:
-            return self.why_unusable
+        if self.explain_unusable is not None:
+            return self.explain_unusable
         n_instruments = len(self.instruments)
         least = MIN_FRAMES_PER_MODE * n_instruments
         if self.n_effective >= least:
@@ -350,7 +350,7 @@ def accumulate(state: Passive, block: FrameBlock) -> Passive:
     that of controlled modes; and so is a dither of sines of modes in the loop. Windows read that,
     and a look that did so too would have another bias than one of the loop's own noise.
     """
-    if state.why_unusable is not None or block.first_seq < state.from_seq:
+    if state.explain_unusable is not None or block.first_seq < state.from_seq:
         return state
     n_columns, block = block.commands_m.shape[1], _append_dither_columns(state, block)
     tail = state.tail
@@ -517,7 +517,7 @@ def fit(state: Passive, linearisation: Linearisation) -> PassiveEstimate | None:
     )
     whole = found.matrix
     if len(carried):
-        # of one frame the others are not what they are in the mean: the model says what they do
+        # the responses of the other modes in one frame differ from their mean: they are modelled
         gain = float(np.mean(estimate.optical_gain))
         whole = gain * linearisation.matrix[:, : state.n_modes].astype(np.float64)
         whole[:, some] = found.matrix - np.delete(whole, some, axis=1) @ carried

@@ -156,7 +156,7 @@ class Comparison(Streaming):
     """The loop that both must be of, but for how many modes are controlled."""
 
     @override
-    def begun_anew(self, loop: LoopContext, why: Change) -> Comparison:
+    def restart(self, loop: LoopContext, why: Change) -> Comparison:
         """Return it with nothing; new references are no swap, and settle as after one."""
         return replace(self, n_skipped=0) if why == Change.REFERENCES else self.begin(loop)
 
@@ -165,7 +165,7 @@ class Comparison(Streaming):
         """Compare only what one loop does, under two matrices; gains may follow the seeing."""
         before, rtc = self.of_loop, loop.rtc
         if rtc is None or before is None or not same_but_for_modes(before, rtc):
-            begun = begun_anew(self, "the loop was changed after the swap")
+            begun = restart(self, "the loop was changed after the swap")
             return replace(begun, of_loop=rtc)
         return self if self.before is not None else replace(self, of_loop=rtc)
 
@@ -177,8 +177,8 @@ class Comparison(Streaming):
         return observe(self, frames.block, loop.in_loop, frames.lines_hz, loop.edge, matrix)
 
 
-def begun_anew(state: Comparison, why: str) -> Comparison:
-    """Return a comparison that knows nothing; one that was under way ends without a verdict."""
+def restart(state: Comparison, why: str) -> Comparison:
+    """Return an empty comparison; one that was under way ends without a verdict."""
     found = state.found
     if state.before is not None and state.cm_id is not None:
         found = not_compared(state.before.id, state.cm_id, why)
@@ -378,7 +378,7 @@ def _add_sums(state: Comparison, part: Part, block: FrameBlock) -> Comparison:
 
 
 def _judge_parts(state: Comparison, block: FrameBlock) -> Comparison:
-    """Judge what there is, at the end of each part; say nothing before there is enough."""
+    """Judge the data at the end of each part, if there are enough."""
     before = state.before
     if before is None or block.cm_id is None:
         return state

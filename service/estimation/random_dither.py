@@ -41,7 +41,7 @@ MIN_MODES_WITHOUT_BATCHES = 96
 the sums of batches need not be kept apart."""
 
 N_DELAY_MODES = 16
-"""Modes on which a mirror that answers a frame late is looked for; more say nothing more."""
+"""Number of modes with which a response one frame late is searched for; more add nothing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -198,7 +198,7 @@ def join_random_windows(one: Correlated, other: Correlated) -> Correlated:
 
 
 def _empty_sums(plan: RandomPlan, slopes: Array) -> Correlations:
-    """Return empty sums; these first rows say how the slopes remember the frame before."""
+    """Return empty sums, with the lag-1 correlation of these first rows of slopes."""
     n_slopes, n_dithered = slopes.shape[1], len(plan.modes)
     power = float(np.vdot(slopes, slopes))
     together = float(np.vdot(slopes[1:], slopes[:-1]))
@@ -274,8 +274,8 @@ def fit_random(window: Correlated, linearisation: Linearisation) -> RandomEstima
 
     Variable projection (Kaufman 1975) on the noisy matrix, each slope weighted by its noise. The
     covariance is from the scatter of the scores of the window's batches or, where there are many
-    modes, of the modes: turbulence correlated over slopes then counts for what it is. Refused when
-    the mirror answers a frame late: the columns are then misaligned and the matrix is not clean.
+    modes, of the modes, which includes turbulence that is correlated over slopes. The window is
+    refused if the mirror responds one frame late, because the columns are then misaligned.
     """
     noisy, sums = noisy_matrix(window), window.sums
     columns = list(noisy.modes)
@@ -288,7 +288,7 @@ def fit_random(window: Correlated, linearisation: Linearisation) -> RandomEstima
     measured = Columns(
         matrix=noisy.matrix / noise, weights=power, rows=np.ones(len(noise), dtype=np.bool_)
     )
-    lag_frames, trouble = _answers(window, measured, matrix, noise)
+    lag_frames, trouble = _measure_lag(window, measured, matrix, noise)
     if trouble is not None:
         kind, reason = trouble
         return WindowRefused(reason=reason, t_ns_utc=window.t_end_ns_utc, kind=kind)
@@ -331,14 +331,14 @@ def fit_random(window: Correlated, linearisation: Linearisation) -> RandomEstima
     )
 
 
-def _answers(
+def _measure_lag(
     window: Correlated, measured: Columns, matrix: Array, noise: Array
 ) -> tuple[float, Why | None]:
-    """Return by how much of a frame the slopes answer late, and why that is no answer, or None.
+    """Return the lag of the response in frames, and the reason if there is no usable response.
 
-    Answers in the dither's own row and in the next are compared, on a few of the modes. A loop of
-    less than two frames answers the next row itself, against the mirror: a negative share is its
-    reply, and no lag.
+    Responses in the dither's own row and in the next are compared, on a few of the modes. A loop
+    with less than two frames of delay counteracts the dither in the next row: a negative share is
+    the loop's, and no lag.
     """
     sums, some = window.sums, window.plan.late_columns
     along = measured.weights * matrix
@@ -398,7 +398,7 @@ def _scatter(scores: Array, normal: Array) -> Array:
 def _gain_sigma(parts: list[Array], response: Array, power: Array) -> Array:
     """Return 1 σ of each mode's gain, ``(n_dithered,)``.
 
-    Turbulence looks like modes: it is louder along a mode's own slopes than its white part says.
+    Turbulence looks like modes: along a mode's own slopes it is stronger than its white part.
     The noise of every column is of the same kind, so all of them show how loud it is there.
     """
     root = np.sqrt(power)

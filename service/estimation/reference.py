@@ -48,6 +48,19 @@ class Reference:
             return np.arange(self.matrix.shape[1])
         return self.modes
 
+    def column_subset(self, columns: NDArray[Any], *left_out: str) -> Reference:
+        """Return a reference of these columns only, with notes on the others."""
+        noise = self.noise
+        # Noise of another length is left to the check of the reference, which reports it.
+        is_by_column = noise is not None and noise.shape == self.columns.shape
+        return replace(
+            self,
+            matrix=self.matrix[:, columns],
+            modes=self.columns[columns],
+            noise=noise[columns] if noise is not None and is_by_column else noise,
+            left_out=(*self.left_out, *left_out),
+        )
+
     @property
     def passes(self) -> int:
         """Number of times the light met the mirror."""

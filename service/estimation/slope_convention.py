@@ -23,9 +23,9 @@ from service.estimation.orientation import (
     Pose,
     coarse_model,
     format_setting,
+    format_sign,
     poses_of,
     settings_of,
-    sign_written,
 )
 from service.estimation.reference import Reference
 from service.model.instrument import Instrument
@@ -90,10 +90,10 @@ def identify_from_reconstructor(
     response: NDArray[np.floating],
     mapper: Mapper = map,
 ) -> SlopeConvention:
-    """Return what the matrix an RTC runs with, ``(n_controlled, n_slopes)``, says of its slopes.
+    """Return the slope convention that the RTC's matrix in use ``(n_controlled, n_slopes)`` shows.
 
-    ``near`` is where the mirror is thought to be and ``response`` ``(n_slopes, n_modes)`` the
-    model's answer there: only the size of its columns counts.
+    ``near`` is the expected registration and ``response`` ``(n_slopes, n_modes)`` the model's
+    response there: only the size of its columns counts.
     """
     used = np.flatnonzero(np.any(reconstructor != 0.0, axis=1))
     if not len(used) or not np.isfinite(reconstructor).all():
@@ -123,7 +123,7 @@ def identify_from_reconstructor(
 def identify_from_response(
     slopes: Array, expected: Array, turns_rad: Array, instrument: Instrument
 ) -> SlopeConvention:
-    """Return what the slopes that answer a dither say.
+    """Return the slope convention that the response to a dither shows.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def identify_from_response(
     ):
         unit = (
             f"slopes answer commands {ratio:.2g} times as the model does: "
-            f"{_unit_named(ratio, instrument)}"
+            f"{_name_unit(ratio, instrument)}"
         )
     every = {
         setting: _resemblance(_planes(slopes, setting, mask), model)
@@ -230,7 +230,7 @@ def _axes_named(witness: str, found: SlopeRecipe, reported: SlopeRecipe) -> str:
     flips = [name for name in FLIPS if getattr(axes, name) != getattr(stated_axes, name)]
     differ += [f"orientation.{name} = {str(getattr(axes, name)).lower()}" for name in flips]
     if (axes.sign_x, axes.sign_y) != (stated_axes.sign_x, stated_axes.sign_y):
-        differ.append(f"orientation.{sign_written(axes)} ({sign_written(stated_axes)} in the file)")
+        differ.append(f"orientation.{format_sign(axes)} ({format_sign(stated_axes)} in the file)")
     turned = replace(stated_axes, sign_x=-stated_axes.sign_x, sign_y=-stated_axes.sign_y)
     only_the_sign = found == replace(reported, orientation=turned)
     other = "slopes have the other sign" if only_the_sign else "slopes lie otherwise"
@@ -257,7 +257,7 @@ def _unit_of_matrix(ratio: float, instrument: Instrument) -> str:
         return ""
     return (
         f"the RTC's own matrix expects {ratio:.2g} times the model's slopes: "
-        f"{_unit_named(ratio, instrument)}"
+        f"{_name_unit(ratio, instrument)}"
     )
 
 
@@ -268,8 +268,8 @@ def _optic_named(ratio: float, instrument: Instrument) -> str:
     return f"[wfs] {keys} is too {'large' if ratio > 1.0 else 'small'}"
 
 
-def _unit_named(ratio: float, instrument: Instrument) -> str:
-    """Return what makes commands answer so many times as metres of OPD would."""
+def _name_unit(ratio: float, instrument: Instrument) -> str:
+    """Return the unit of commands whose response is so many times that of metres of OPD."""
     unit = unit_like(1.0 / max(ratio, 1e-30), _UNIT_DECADES)
     if unit:
         return (

@@ -1,13 +1,13 @@
 """Fit the registration to measured columns: variable projection.
 
-Every mode has a gain of its own, which is linear and therefore known once the rest is:
-``g_j = D_j·Y_j / D_j·D_j``. What remains is a problem in the registration alone, with the Jacobian
-``J_jk = g_j (1 - P_j) dD_j/dα_k``, P_j the projection on D_j. Matrices that were measured and those
-that telemetry shows are fitted alike.
+Every mode has a gain of its own. The fit is linear in the gains, so they follow from the other
+unknowns: ``g_j = D_j·Y_j / D_j·D_j``. What remains is a problem in the registration alone, with the
+Jacobian ``J_jk = g_j (1 - P_j) dD_j/dα_k``, P_j the projection on D_j. Measured matrices and the
+responses in telemetry are fitted alike.
 
-All four parameters move together: far steps on few modes and a coarse grid, near ones on all. The
-lowest modes lead from afar, for their slopes change smoothly over more than a subaperture; high
-modes are precise, and blind beyond half their own wavelength.
+All four parameters are fitted together: first on few modes and a coarse grid, then on all modes.
+The slopes of the lowest modes change smoothly over more than a subaperture, which gives them a wide
+capture range. High modes are precise, and cannot be used beyond half their own wavelength.
 
 References
 ----------
@@ -30,13 +30,13 @@ from service.model.misregistration import Misregistration
 Array = NDArray[np.float64]
 
 MAX_STEP = np.array([0.8, 0.8, np.deg2rad(4.0), 0.04])
-"""A step further than this trusts the derivatives too far (numeric units)."""
+"""Longest step; the derivatives do not hold beyond it (numeric units)."""
 
 COARSE_STEP_LIMIT = np.array([0.02, 0.02, np.deg2rad(0.05), 1e-3])
-"""A coarse step shorter than this leaves the rest to the fine grid."""
+"""Step on the coarse grid below which the fit has converged there."""
 
 SETTLED_STEP = np.array([5e-4, 5e-4, np.deg2rad(5e-4), 1e-5])
-"""A fine step shorter than this is the last."""
+"""Step on the fine grid below which the fit has converged."""
 
 MAX_DISTANCE = np.array([4.0, 4.0, np.inf, 0.25])
 """Largest distance from the nominal registration (numeric units; rotation is not limited)."""
@@ -56,10 +56,10 @@ class Columns:
     """``(n_slopes, n_columns)`` slope per unit command."""
 
     weights: Array
-    """``(n_columns,)`` each column's share in χ²."""
+    """``(n_columns,)`` weight of each column in χ²."""
 
     rows: NDArray[np.bool_]
-    """``(n_slopes,)`` slopes that count."""
+    """``(n_slopes,)`` True for slopes that are used."""
 
     signed: bool = True
     """True if a gain may be negative. Otherwise such a column has no response in common with the
@@ -101,9 +101,9 @@ class Columns:
         )
 
     def misfit(self, model: NDArray[Any]) -> float:
-        """Return χ² per unit weight at the best gains: 0 is perfect, 1 nothing in common.
+        """Return the share of χ² that is left at the best gains, 0 to 1.
 
-        A column whose best gain is negative has nothing in common with the model.
+        A column whose best gain is negative counts as not explained at all.
         """
         matrix = np.asarray(model[self.rows], dtype=np.float64)
         measured = self.matrix[self.rows]
@@ -123,19 +123,20 @@ def _power(matrix: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Projection:
-    """The measurement against the model at one registration, to first order about it."""
+    """Residual and Jacobian of the measurement at one registration: the problem to first order."""
 
     gains: Array
     """``(n_modes,)`` best gain of each mode."""
 
     residual: Array
-    """``(n_rows, n_modes)`` measurement less model, its gains applied."""
+    """``(n_rows, n_modes)`` measurement less the model with its gains."""
 
     jacobian: Array
-    """``(n_unknowns, n_rows, n_modes)`` change of the model, its part along the mode removed."""
+    """``(n_unknowns, n_rows, n_modes)`` derivatives of the model with its gains, without the part
+    along the mode that the free gain describes."""
 
     weights: Array
-    """``(n_modes,)`` of each mode in χ²."""
+    """``(n_modes,)`` weight of each mode in χ²."""
 
     @property
     def chi(self) -> float:
@@ -149,14 +150,14 @@ class Projection:
 
     @cached_property
     def best_step(self) -> Array:
-        """``(n_unknowns,)`` the step to where least is left, to first order."""
-        # A ridge far below noise, for unknowns that the columns cannot tell apart.
+        """``(n_unknowns,)`` step to the minimum of χ², to first order."""
+        # A ridge far below noise keeps unknowns apart that the columns do not distinguish.
         held = self.normal + 1e-9 * np.diag(np.diag(self.normal))
         return np.linalg.solve(held, self.scores.sum(axis=1))
 
     @cached_property
     def scores(self) -> Array:
-        """``(n_unknowns, n_modes)`` what each mode says each unknown should do."""
+        """``(n_unknowns, n_modes)`` negative half gradient of χ² by each unknown, of each mode."""
         residual = self.residual.astype(self.jacobian.dtype, copy=False)
         along = np.einsum("ksm,sm->km", self.jacobian, residual)
         return np.asarray(along * self.weights)
@@ -185,20 +186,20 @@ class Approach:
 
     alpha: Misregistration
     misfit: float
-    """Share of χ² not explained, 0..1."""
+    """Share of χ² that is left, 0..1."""
 
     converged: bool
     n_matrices: int = 0
-    """Interaction matrices computed on the way, those for derivatives included."""
+    """Number of interaction matrices computed, those for derivatives included."""
 
 
 def within_limits(vector: Array) -> bool:
-    """Return whether a registration is one that an instrument could have."""
+    """Return True if a registration is plausible."""
     return bool(np.all(np.abs(vector - [0.0, 0.0, 0.0, 1.0]) < MAX_DISTANCE))
 
 
 def shorten(step: Array) -> Array:
-    """Return a step of ``MAX_STEP`` at most; all four by one factor, which keeps its direction."""
+    """Return a step limited to ``MAX_STEP``; one factor for all four keeps its direction."""
     return step / max(1.0, float(np.max(np.abs(step) / MAX_STEP)))
 
 
@@ -210,10 +211,10 @@ def approach(
     approached: Array = COARSE_STEP_LIMIT,
     allowed: Callable[[Array], bool] = within_limits,
 ) -> Approach:
-    """Return where Gauss-Newton steps on few modes lead from a start.
+    """Return the minimum that Gauss-Newton steps on few modes reach from a start.
 
-    A step that makes the misfit worse is halved; a start from which none makes it better has
-    failed, as has one at which no column has anything in common with the model.
+    A step that increases the misfit is halved. The fit has not converged if no step decreases the
+    misfit, or if the model explains no column at the start.
     """
     vector = start.vector
     matrix = model.interaction_matrix(start)
@@ -247,9 +248,9 @@ def approach(
 
 
 def vertex(before: float, at: float, after: float) -> float:
-    """Return where a parabola through three equidistant values turns, in steps from the middle.
+    """Return the vertex of a parabola through three equidistant values, in steps from the middle.
 
-    0 where it does not bend.
+    0 for a straight line.
     """
     bend = before + after - 2.0 * at
     return float((before - after) / (2.0 * bend)) if bend else 0.0

@@ -261,7 +261,7 @@ class WindowCutter(Generic[P, S, F]):
         """Return the result of a window, or the reason why its dither differs from the request."""
         raise NotImplementedError
 
-    def begun_anew(self, first_seq: int) -> Self:
+    def restart(self, first_seq: int) -> Self:
         """Return it without the window under way; none begins before this frame."""
         first_seq = max(self.plan.first_seq, first_seq)
         return replace(self, plan=replace(self.plan, first_seq=first_seq), window=None)

@@ -100,7 +100,7 @@ def _other_kind(begins: bytes) -> tuple[str, str]:
 
 
 MAX_MODES = 100_000
-"""Largest number of modes that a request may list."""
+"""Number that the modes of a request must be below."""
 
 _PART = re.compile(r"(\d+)(?::(\d+)(?::(\d+))?)?")
 

@@ -21,7 +21,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from service.errors import MatrixError
+from service.errors import MatrixError, list_first
 from service.files import FileKind, kind_of
 from service.files.whole import open_hdf5
 from service.model.misregistration import COVARIANCE_SCALE, PARAMETERS
@@ -120,9 +120,7 @@ class Container:
         """Return what is in the file, in words."""
         if not self.arrays:
             return "no array at all"
-        names = [f"{name} {a.shape}" for name, a in list(self.arrays.items())[:_LISTED]]
-        left = len(self.arrays) - len(names)
-        return ", ".join(names) + (f" and {left} more" if left else "")
+        return list_first((f"{name} {a.shape}" for name, a in self.arrays.items()), _LISTED)
 
 
 class _ImageHdu(Protocol):

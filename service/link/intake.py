@@ -19,8 +19,14 @@ from service.link.leader_election import SessionWatch
 from service.link.matrices import LinkEvent
 from service.link.ring import FRAME_OUTCOMES, LEAP, FrameRing
 from service.link.session import Endpoint
-from service.link.statistics import MALFORMED, USED, Counters, LinkStatistics
-from service.link.telemetry_age import MAX_AGE_S, TelemetryAge
+from service.link.statistics import (
+    MALFORMED,
+    MAX_AGE_S,
+    USED,
+    Counters,
+    LinkStatistics,
+    TelemetryAge,
+)
 from service.records import events as ev
 from service.records.alarms import OTHER_BASIS, SECOND_RTC
 from service.records.messages import compose

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service.errors import list_first
+
 NOT_FINITE, ZERO = "NaN", "zero"
 """Reasons of entries that hold no numbers, and nothing but zeros."""
 
@@ -70,8 +72,7 @@ def explain_defects(
             listed["not finite" if reason == NOT_FINITE else "zero"].append(str(known(entry)))
     notes = []
     for kind, entries in listed.items():
-        more = f" and {len(entries) - _LISTED} more" if len(entries) > _LISTED else ""
-        text = ", ".join(entries[:_LISTED]) + more
+        text = list_first(entries, _LISTED)
         if len(entries) == 1:
             notes.append(f"{what} {text} is {'a copy' if kind == 'copies' else kind}: left out")
         elif entries:

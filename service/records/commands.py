@@ -15,7 +15,6 @@ from annotated_types import Ge, Gt, Le, Len, MaxLen
 from typing_extensions import override
 
 from service.errors import shown
-from service.files import MAX_MODES
 from service.records.alarms import Severity
 from service.records.products import Frame, ModeSet, ShapeKind
 from service.records.state import Mode
@@ -27,6 +26,9 @@ MAX_NOISY_MEASUREMENT_S = 3600.0
 MAX_MUTE_S = 43_200.0
 MAX_VALUE_LIFETIME_S = 86_400.0
 MAX_TEXT_LENGTH = 200
+
+MAX_MODES = 100_000
+"""Largest number of modes that an order may list."""
 
 MAX_SHAPE_VALUES = 1_000_000
 SHAPE_RANGE_M = (1e-11, 5e-6)

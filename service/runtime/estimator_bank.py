@@ -136,7 +136,7 @@ def _of_modes(loop: LoopContext, rtc: Status) -> LoopContext:
 def _reset_members(bank: EstimatorBank, loop: LoopContext, changes: Change) -> EstimatorBank:
     """Return the bank for a changed loop: members that declare one of the changes are reset."""
     members = tuple(
-        member.begun_anew(loop, why) if (why := changes & member.resets) else member
+        member.restart(loop, why) if (why := changes & member.resets) else member
         for member in bank.members
     )
     return replace(bank, loop=loop, members=members)
@@ -219,7 +219,7 @@ def process_block(bank: EstimatorBank, block: FrameBlock) -> Fed:
     members: list[Streaming] = []
     for member in bank.members:
         if why := changes & member.resets:
-            member = member.begun_anew(frames.loop, why)
+            member = member.restart(frames.loop, why)
         if (closed or not member.only_closed) and not frames.marks & member.unless:
             member = member.update(frames)
         # Later members of the registry see the mark with this very block, and skip it if they

@@ -14,12 +14,12 @@ from service.link.guard import describe_expiry, describe_flood, describe_refusal
 from service.link.intake import COALESCED, OLD
 from service.link.statistics import (
     MALFORMED,
+    MAX_AGE_S,
     STATISTICS_PERIOD_S,
     USED,
     Disposition,
     LinkStatistics,
 )
-from service.link.telemetry_age import MAX_AGE_S
 from service.model.misregistration import at_boundary
 from service.records import alarms
 from service.records import events as ev

@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from service.errors import list_first
 from service.estimation.own_matrix import N_NEIGHBOURS, compare_strength, find_neighbours
 from service.records.products import ModeRatio
 
@@ -74,6 +75,4 @@ def format_modes(modes: Iterable[int]) -> str:
             runs[-1] = [runs[-1][0], mode]
         else:
             runs.append([mode])
-    parts = [" to ".join(map(str, run)) for run in runs]
-    more = f" and {len(parts) - MAX_LISTED_MODES} more" if len(parts) > MAX_LISTED_MODES else ""
-    return ", ".join(parts[:MAX_LISTED_MODES]) + more
+    return list_first((" to ".join(map(str, run)) for run in runs), MAX_LISTED_MODES)

@@ -375,7 +375,7 @@ def test_two_services_cannot_share_a_directory(archive):
 # --- what is wrong is told at the start, and costs no more than itself
 
 
-def begun_anew(archive):
+def restart(archive):
     """Close it, as after a restart, and return what the next start tells."""
     archive.close()
     return archive.open()
@@ -389,7 +389,7 @@ def test_a_missing_and_a_cut_product_are_told_at_the_start(archive):
     cut = product(archive, "cm-2")
     cut.chmod(0o644)
     cut.write_bytes(cut.read_bytes()[:-100])
-    told = begun_anew(archive)
+    told = restart(archive)
     assert len(told) == 2
     assert "cm-1.h5: missing, although it was stored" in told[0]
     assert "cm-2.h5: damaged" in told[1]
@@ -403,9 +403,9 @@ def test_a_missing_and_a_cut_product_are_told_at_the_start(archive):
 def test_a_product_that_is_there_again_is_what_it_was(archive, tmp_path):
     archive.reconstructors.store(record_of(), MATRIX, None, {})
     product(archive).rename(tmp_path / "away.h5")
-    assert begun_anew(archive)
+    assert restart(archive)
     (tmp_path / "away.h5").rename(product(archive))
-    assert begun_anew(archive) == ()
+    assert restart(archive) == ()
     assert_same(archive.reconstructors.records()[0], record_of())
 
 
@@ -413,7 +413,7 @@ def test_a_record_nobody_understands_is_taken_from_its_product(archive):
     archive.reconstructors.store(record_of(), MATRIX, None, {})
     archive.reconstructors.store(record_of("cm-2", created_ns_utc=2_000), MATRIX, None, {})
     archive.index._connection.execute("UPDATE reconstructor SET record = '{' WHERE id = 'cm-1'")
-    (told,) = begun_anew(archive)
+    (told,) = restart(archive)
     assert "record of reconstructor cm-1 not understood" in told
     assert [record.id for record in archive.reconstructors.records()] == ["cm-1", "cm-2"]
 
@@ -422,7 +422,7 @@ def test_a_record_nobody_understands_and_without_a_product_is_left_out_and_told(
     archive.record((record_of(),), ())
     archive.reconstructors.store(record_of("cm-2"), MATRIX, None, {})
     archive.index._connection.execute("UPDATE reconstructor SET record = '{' WHERE id = 'cm-1'")
-    (told,) = begun_anew(archive)
+    (told,) = restart(archive)
     assert "record of reconstructor cm-1 not understood" in told
     assert [record.id for record in archive.reconstructors.records()] == ["cm-2"]
 
@@ -432,7 +432,7 @@ def test_a_record_nobody_understands_and_without_a_product_is_left_out_and_told(
 def test_a_folder_where_a_file_should_be_is_told_and_left_alone(archive, folder, name):
     made = archive.directory / folder / name
     made.mkdir()
-    (told,) = begun_anew(archive)
+    (told,) = restart(archive)
     assert str(made) in told
     assert made.is_dir()
 
@@ -475,7 +475,7 @@ def test_of_a_matrix_whose_fate_is_lost_with_the_index_it_is_said(archive):
 
 def test_a_measurement_nobody_understands_does_not_refuse_the_start(archive):
     archive.index._connection.execute("INSERT INTO measurement VALUES ('im-1', 1, '{', 'x')")
-    (told,) = begun_anew(archive)
+    (told,) = restart(archive)
     assert "record of measurement im-1 not understood" in told
     assert archive.measured.records() == ()
 

@@ -40,14 +40,15 @@ def test_the_name_of_an_alarm_is_written_once():
 
 def test_records_lie_at_the_ground():
     """Who names the state imports neither the planner of dithers nor an estimator."""
-    imports = grimp.build_graph("service")
+    # Without its cache, which two sets of packages share: it keeps modules that are gone.
+    imports = grimp.build_graph("service", cache_dir=None)
     ground = {"numpy", "service.errors", "service.model.misregistration"}
     for module in imports.find_descendants("service.records"):
         for imported in imports.find_modules_directly_imported_by(module):
             if imported.startswith("service.") and imported not in ground:
-                assert imported.startswith(("service.records.", "service.wire", "service.files"))
+                assert imported.startswith(("service.records.", "service.wire"))
     assert len(imports.find_upstream_modules("service.records.state")) <= 13
-    assert len(imports.find_upstream_modules("service.link.intake")) <= 27
+    assert len(imports.find_upstream_modules("service.link.intake")) <= 25
 
 
 def test_no_test_module_imports_another():
@@ -121,7 +122,7 @@ PACKAGES = ("service", "pyrcal", "check_rtc", "sim_rtc", "cacao_bridge")
 
 def test_no_import_by_name_closes_a_circle():
     """A name handed to ``import_module`` is an import that the contracts do not see."""
-    imports = grimp.build_graph(*PACKAGES)
+    imports = grimp.build_graph(*PACKAGES, cache_dir=None)
     by_name = {
         (module, name)
         for module in imports.modules
@@ -204,11 +205,9 @@ WORDS_READ = {
     "service/tracking/dither_request.py": "only the id is known of a dither that nobody follows",
     "service/tracking/references.py": "codes of refusals, and the mark of a ramp (R-83)",
     "service/tracking/transitions.py": "a table in the source, written as text",
-    "pyrcal/fitting/advice.py": "the verdict names the alternatives and the entries of the file",
     "pyrcal/fitting/arguments.py": "words of the command line",
     "pyrcal/fitting/fit_file.py": "an error begins with the name of its file",
     "pyrcal/fitting/fit_table.py": "notes of importers repeat what a fit has found",
-    "pyrcal/fitting/gain_causes.py": "names of what may be another instrument's",
     "pyrcal/maintenance/archive.py": "an error begins with the name of its file",
     "pyrcal/maintenance/commission_page.py": "the audit trail keeps sentences only",
 }

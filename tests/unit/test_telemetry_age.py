@@ -5,7 +5,7 @@ import pytest
 
 from service.link.intake import Intake
 from service.link.session import Endpoint
-from service.link.telemetry_age import MAX_AGE_S
+from service.link.statistics import MAX_AGE_S
 from service.records import events as ev
 from service.records.alarms import Interlock, blocking_alarm
 from service.records.state import Mode

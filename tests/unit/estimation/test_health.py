@@ -162,12 +162,12 @@ def test_few_modes_and_a_short_history_show_no_commands_that_run_away():
 
 def test_another_gain_or_reference_drops_the_history_and_another_matrix_keeps_it():
     quiet, loop = after_parts(LoopHealth(), (0.8, 40)), LoopContext(description=None)
-    assert not after_parts(quiet.begun_anew(loop, Change.LOOP), (2.4, 5)).diverging
-    assert not after_parts(quiet.begun_anew(loop, Change.REFERENCES), (2.4, 5)).diverging
-    assert after_parts(quiet.begun_anew(loop, Change.MATRIX), (2.4, 5)).diverging
+    assert not after_parts(quiet.restart(loop, Change.LOOP), (2.4, 5)).diverging
+    assert not after_parts(quiet.restart(loop, Change.REFERENCES), (2.4, 5)).diverging
+    assert after_parts(quiet.restart(loop, Change.MATRIX), (2.4, 5)).diverging
     lost = after_parts(quiet, (2.4, 5))
-    assert lost.begun_anew(loop, Change.LOOP).diverging
-    assert not lost.begun_anew(loop, Change.OPEN).diverging
+    assert lost.restart(loop, Change.LOOP).diverging
+    assert not lost.restart(loop, Change.OPEN).diverging
 
 
 def test_a_dither_is_none_of_the_commands_that_run_away():

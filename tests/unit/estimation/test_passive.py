@@ -427,8 +427,8 @@ def test_a_loop_without_two_frames_of_delay_is_not_summed_and_says_why():
     state = accumulate(young(delay_frames=1.4), random_block(2000))
     assert not state.sums
     assert state.n_effective == 0.0
-    assert "1.4 frames" in state.why_unusable
-    assert young().why_unusable is None
+    assert "1.4 frames" in state.explain_unusable
+    assert young().explain_unusable is None
 
 
 def test_of_more_modes_than_its_memory_can_tell_some_are_summed_evenly_spread():
@@ -436,7 +436,7 @@ def test_of_more_modes_than_its_memory_can_tell_some_are_summed_evenly_spread():
     telling = Passive(n_modes=1000, memory_frames=5000.0)
     np.testing.assert_array_equal(telling.instruments, np.arange(1000))
     extreme = Passive(n_modes=4300, memory_frames=5000.0)
-    assert extreme.why_unusable is None
+    assert extreme.explain_unusable is None
     assert len(extreme.instruments) == 200
     steps = np.diff(extreme.instruments)
     assert extreme.instruments[0] == 0

@@ -12,7 +12,7 @@ from service.estimation import probation
 from service.estimation.comparison import PRIOR_SCATTER, measure_sigma
 from service.estimation.estimator import Change, LoopContext
 from service.estimation.frames import FrameBlock
-from service.estimation.probation import MAX_PROBATION_S, Comparison, begun_anew, observe
+from service.estimation.probation import MAX_PROBATION_S, Comparison, observe, restart
 from service.records.operations import Verdict
 
 N_MODES, BLOCK, DT_NS = 60, 50, 1_000_000
@@ -149,7 +149,7 @@ def test_new_references_are_no_swap_and_the_frames_in_which_the_loop_follows_do_
     for block in blocks([("a", residual(rng, BEFORE_S))]):
         state = observe(state, block, np.arange(N_MODES))
     parts = state.parts
-    state = state.begun_anew(LoopContext(description=None), Change.REFERENCES)
+    state = state.restart(LoopContext(description=None), Change.REFERENCES)
     (follows, after) = blocks([("a", 10.0 * residual(rng, 0.03))]), residual(rng, 0.5)
     for block in follows:
         state = observe(state, block, np.arange(N_MODES))
@@ -171,7 +171,7 @@ def test_another_loop_ends_a_comparison_without_a_verdict():
     for block in blocks([("a", residual(rng, BEFORE_S)), ("b", residual(rng, 1.0))]):
         state = observe(state, block, np.arange(N_MODES))
     assert state.before is not None
-    state = begun_anew(state, "the gains changed")
+    state = restart(state, "the gains changed")
     assert (state.found.verdict, state.found.text) == (Verdict.UNKNOWN, "the gains changed")
     assert state.before is None
     assert not state.parts

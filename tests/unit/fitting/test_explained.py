@@ -21,7 +21,7 @@ from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.left_over import ResidualLocation
 from pyrcal.fitting.matrix import FitOptions, fit_matrix
 from pyrcal.fitting.report import document, fill_fit, read_fit
-from pyrcal.fitting.verdict import Refusal
+from pyrcal.fitting.verdict import Reason, Refusal
 from service.estimation.reference import Reference
 from service.files.documents import json_text
 from service.files.whole import write_whole
@@ -322,7 +322,7 @@ def test_a_mode_that_was_measured_badly_is_named():
 def test_modes_that_fit_badly_are_the_cause_where_sets_of_modes_disagree():
     bad = ResidualLocation(border=None, subapertures=(), modes=((67, 0.71),))
     divided = a_fit(accepted=False, verdict="refused: sets of modes disagree", left_over=bad)
-    grounds = Grounds(refusal=Refusal.DIVIDED, reason="", structure=0.05, n_sets=8)
+    grounds = Grounds(refusal=Refusal.DIVIDED, reason=Reason(), structure=0.05, n_sets=8)
     assert add_recommendation(divided, grounds).recommendation == (
         "do not use it: modes that fit worse than the others: 67 (71%) left over; measure these "
         "again, or leave them out (--modes)"
@@ -348,13 +348,13 @@ def test_modes_that_fit_badly_are_the_cause_where_sets_of_modes_disagree():
 def test_a_recommended_correction_is_also_given_as_keys_with_their_values(entry, values):
     better = Alternative(words=entry, key=entry, share=0.2, moved=np.zeros(4), preferred=True)
     found = a_fit(accepted=False, verdict="refused: another", alternatives=(better,))
-    grounds = Grounds(refusal=Refusal.ANOTHER_INSTRUMENT, reason="", structure=0.1, n_sets=8)
+    grounds = Grounds(refusal=Refusal.ANOTHER_INSTRUMENT, reason=Reason(), structure=0.1, n_sets=8)
     assert add_recommendation(found, grounds).corrections == values
 
 
 def test_a_sigma_next_to_what_is_enough_is_said_to_its_third_place():
     known = a_fit(covariance=np.diag([0.0304**2, 1e-6, 1e-12, 1e-12]))
-    grounds = Grounds(refusal=None, reason="", structure=0.0, n_sets=8)
+    grounds = Grounds(refusal=None, reason=Reason(), structure=0.0, n_sets=8)
     words = add_recommendation(known, grounds).recommendation
     assert "known to 0.030 subapertures (1 sigma), 0.03 is enough" in words
 
@@ -364,7 +364,7 @@ def test_a_stable_reconstructor_recommends_no_sigma_beyond_a_tenth(sigma_subap, 
     stable = check_control(MODES, MODES, np.ones(MODES.shape[1]), *every(MODES))
     assert stable.holds
     known = a_fit(covariance=np.diag([sigma_subap**2, 1e-6, 1e-12, 1e-12]), reconstructor=stable)
-    grounds = Grounds(refusal=None, reason="", structure=0.0, n_sets=8)
+    grounds = Grounds(refusal=None, reason=Reason(), structure=0.0, n_sets=8)
     assert add_recommendation(known, grounds).recommendation.startswith(f"{action}: ")
 
 

@@ -25,7 +25,7 @@ class Counter(Streaming):
     n_begun: int = 0
 
     @override
-    def begun_anew(self, loop, why):
+    def restart(self, loop, why):
         return Counter(n_begun=self.n_begun + 1)
 
     @override

@@ -135,6 +135,8 @@ def _read_entries(entries: Iterable[str]) -> Mapping[str, Any]:
             values["pupil"] = entry.removeprefix(MAP_WORDS)
         elif entry != CENTRED_KEY:  # no key of a file moves a pupil
             values |= tomllib.loads(f"it = {{ {entry} }}")["it"]
+    if isinstance(values.get("modulation_ellipse"), dict):
+        values["modulation_lambda_over_d"] = None
     tables = {
         "instrument": {field.name for field in fields(AboutTable)},
         "mirror": {field.name for field in fields(MirrorTable)},

@@ -29,6 +29,9 @@ from service.model.sensors.sensor import CannotTell, Mapper
 
 Progress = Callable[[str], None]
 
+_SAME_LIGHT = 0.1
+"""Modulation, λ/D, that changes the light in the pupil images by less than a per cent or two."""
+
 MIN_LIGHT_EXPLAINED = 0.03
 """RMS share of the signal that uneven light must explain for a note that the file has the light."""
 
@@ -193,6 +196,11 @@ def _fit_recorded(
             found = fit_matrix(
                 instrument, reference, options, basis=basis, mapper=mapper, progress=report_stage
             )
+            lit = _with_found_light(instrument, recorded, found)
+            if lit is not None:
+                report_stage("fit")
+                again, _ = make_reference(recorded, lit)
+                found = fit_matrix(lit, again, options, basis=basis, mapper=mapper)
         except MatrixError as error:
             text = str(error).removeprefix("reference: ")
             raise MatrixError(f"{recorded.where}: {text}") from error
@@ -200,6 +208,23 @@ def _fit_recorded(
     if recorded.flux_frame is None or options.illumination is not None or no_map:
         return found
     return replace(found, remarks=(*found.remarks, *_note_flux_frame(found)))
+
+
+def _with_found_light(instrument: Instrument, recorded: Recorded, found: Fit) -> Instrument | None:
+    """Return the instrument whose light normalises frames without a mean frame as it should.
+
+    That light is the model's, and depends on the modulation: with none as little as half of it is
+    in the pupil images. None if slopes are normalised by measured light, or rightly.
+    """
+    key = kind_of(instrument).find_fitted_key(instrument.wfs)
+    if recorded.values.ndim == 2 or recorded.flux_frame is not None:
+        return None
+    if f"wfs.{key}" not in instrument.unknown:
+        return None
+    number = next((one.found for one in found.optics if one.key == key), None)
+    if number is None or abs(number - getattr(instrument.wfs, str(key))) < _SAME_LIGHT:
+        return None
+    return replace(instrument, wfs=replace(instrument.wfs, **{str(key): number}))
 
 
 def _note_flux_frame(found: Fit) -> Iterator[str]:

@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 
 from pyrcal.fitting.comparison import MIN_EXPLAINED, Alternative, FitSubset
 from pyrcal.fitting.methods import SEARCH_RESIDUAL, Settled, settle
-from pyrcal.fitting.models import FAR_PREFERRED_SHARE, FitModels, Optic, moved_sensor_number
+from pyrcal.fitting.models import (
+    ELLIPSE,
+    FAR_PREFERRED_SHARE,
+    LOGARITHM_ABOVE,
+    SENSOR_STEP,
+    FitModels,
+    Optic,
+    moved_sensor_number,
+)
 from pyrcal.fitting.solver import image_patterns, is_blurring, refine
 from pyrcal.fitting.uncertainty import Uncertainty
 from service.model.sensors.registry import kind_of
@@ -24,6 +32,9 @@ Array = NDArray[np.float64]
 
 COUPLING_KEY = "coupling"
 """Key of the instrument file for the width of influence functions."""
+
+UNKNOWN_ELLIPSE = 'modulation_ellipse = "unknown"'
+"""Entry of the instrument file by which an elliptic modulation is fitted."""
 
 UNKNOWN_IMAGES = 'image_offsets_px = "unknown"'
 """Entry of the instrument file by which the places of the pupil images are fitted."""
@@ -116,6 +127,33 @@ def try_instruments(few: FitSubset) -> Iterator[Alternative]:
         )
 
 
+def try_ellipse(few: FitSubset) -> Iterator[Alternative]:
+    """Yield an elliptic modulation, if the matrix prefers it to the file's circle.
+
+    Only then, because a bench is aligned to a circle unless a matrix shows otherwise.
+    """
+    about = few.models.instrument
+    if kind_of(about).stretch_modulation(about.wfs, (0.0, 0.0)) is None:
+        return
+    if Optic.STRETCH in few.models.optics or few.models.sensor_number < LOGARITHM_ABOVE:
+        return
+    rates = [
+        (few.matrix(few.models.with_optic(one, SENSOR_STEP)) - few.own) / SENSOR_STEP
+        for one in ELLIPSE
+    ]
+    found = few.judge(
+        few.compare(few.own, *rates),
+        UNKNOWN_ELLIPSE,
+        FAR_PREFERRED_SHARE,
+        key=UNKNOWN_ELLIPSE,
+        min_explained=MIN_EXPLAINED,
+        is_number=True,
+        is_instrument=True,
+    )
+    if found.preferred:
+        yield found
+
+
 def try_free_images(few: FitSubset) -> Iterator[Alternative]:
     """Yield the fit with fitted pupil images, if the file states where they are."""
     settled = few.settled
@@ -175,6 +213,8 @@ def list_optics(models: FitModels, settled: Settled, sure: Uncertainty) -> tuple
     number, sensor_key = models.sensor_number, models.sensor_key
     found = []
     for k, (optic, change) in enumerate(changes.items(), nuisances.first_optic):
+        if optic in ELLIPSE:
+            continue  # two axes and an angle, which no single number says: ``find_ellipse``
         stated, value = number, moved_sensor_number(number, change)
         if optic is Optic.WIDTH and models.coupling is not None:
             stated, value = models.coupling, float(models.coupling ** np.exp(-2.0 * change))

@@ -38,6 +38,7 @@ from pyrcal.fitting.instrument_checks import (
     may_compensate,
 )
 from pyrcal.fitting.methods import (
+    OTHER_SENSOR_NUMBERS,
     Landing,
     ScanStep,
     Settled,
@@ -49,7 +50,7 @@ from pyrcal.fitting.methods import (
 )
 from pyrcal.fitting.models import FAR_PREFERRED_SHARE, FitModels
 from pyrcal.fitting.noise import bound_noise_share, measure_structure
-from pyrcal.fitting.origins import Origin, list_origins, list_undetermined_keys
+from pyrcal.fitting.origins import Origin, find_ellipse, list_origins, list_undetermined_keys
 from pyrcal.fitting.pupil_checks import MIN_PUPIL_EXPLAINED
 from pyrcal.fitting.pupil_width import SeenPupil, compute_responses, measure_pupil
 from pyrcal.fitting.reference import check_reference
@@ -219,7 +220,9 @@ def _fit_usable(
     reported = replace(
         instrument.slopes, orientation=options.orientation or instrument.slopes.orientation
     )
-    slopes, pose, axes_doubt, lowest = _find_axes(instrument, usable, used, options, mapper)
+    instrument, (slopes, pose, axes_doubt, lowest) = _find_axes_and_sensor(
+        instrument, usable, used, options, mapper
+    )
     instrument = replace(instrument, slopes=slopes)
     target = target_of(usable, instrument)
     models = FitModels(
@@ -436,6 +439,26 @@ EQUAL_CORRELATION = 0.02
 """Largest difference of two correlations that rounding of the angles causes."""
 
 
+def _find_axes_and_sensor(
+    instrument: Instrument, usable: Reference, basis: Basis, options: FitOptions, mapper: Mapper
+) -> tuple[Instrument, _Axes]:
+    """Return the axes of the slopes, and the instrument with the sensor number that shows them.
+
+    An unmodulated matrix resembles a modulated one little, and in no orientation: where none is
+    found with the usual value of an unknown modulation, others are tried.
+    """
+    usual = _find_axes(instrument, usable, basis, options, mapper)
+    key = kind_of(instrument).find_fitted_key(instrument.wfs)
+    if not usual[2].reason or f"wfs.{key}" not in instrument.unknown:
+        return instrument, usual
+    for number in OTHER_SENSOR_NUMBERS:
+        other = replace(instrument, wfs=replace(instrument.wfs, **{str(key): number}))
+        found = _find_axes(other, usable, basis, options, mapper)
+        if not found[2].reason:
+            return other, found
+    return instrument, usual
+
+
 class AxesDoubt(NamedTuple):
     """Reason why the axes of the slopes are uncertain; empty if they are not."""
 
@@ -446,7 +469,7 @@ class AxesDoubt(NamedTuple):
 
 def _find_axes(
     instrument: Instrument, usable: Reference, basis: Basis, options: FitOptions, mapper: Mapper
-) -> tuple[SlopeRecipe, Misregistration | None, AxesDoubt, LowOrder | None]:
+) -> _Axes:
     """Return the slope recipe, the start pose, and the reason if the axes are uncertain.
 
     The last are the smooth combinations of modes that the search compared.
@@ -497,6 +520,10 @@ def _find_axes(
     doubt = check_stated_orientation(best, free)
     entry = format_setting(free.slopes) if doubt else ""
     return best.slopes, pose, AxesDoubt(doubt, entry), search.lowest
+
+
+_Axes = tuple[SlopeRecipe, Misregistration | None, AxesDoubt, LowOrder | None]
+"""What ``_find_axes`` returns."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -737,6 +764,11 @@ def _add_notes(
             findings.structure,
             fit.gains,
         )
+        settled, sigma = found.settled, findings.uncertainty.nuisance_sigma
+        ellipse = tuple(find_ellipse(settled, sigma, findings.structure))
+        # The two axes take the place of the radius.
+        radius = settled.models.sensor_key if ellipse else None
+        origins = (*(one for one in origins if one.key != radius), *ellipse)
     unknown = list_undetermined_keys(about, origins)
     return replace(fit, remarks=remarks, origins=origins, unknown_not_found=unknown)
 

@@ -65,6 +65,9 @@ def moved_sensor_number(number: float, change: float) -> float:
     return LOGARITHM_ABOVE * float(ratio)
 
 
+ELLIPSE_KEY = "wfs.modulation_ellipse"
+
+
 class Optic(StrEnum):
     """An optical quantity that a matrix can determine, fitted as its logarithm.
 
@@ -76,6 +79,17 @@ class Optic(StrEnum):
 
     SENSOR = "sensor"
     """Fitted number of the sensor's kind: a pyramid's modulation."""
+
+    STRETCH = "stretch"
+    """Stretch of an elliptic modulation along x and y, see ``SensorModel.stretch_modulation``."""
+
+    SLANT = "slant"
+    """The same along 45 and 135 degrees."""
+
+
+ELLIPSE = (Optic.STRETCH, Optic.SLANT)
+"""What makes a modulation elliptic; fitted together, where ``wfs.modulation_ellipse`` is unknown.
+"""
 
 
 @dataclass(slots=True)
@@ -91,6 +105,9 @@ def choose_sampling(instrument: Instrument) -> int:
     It is that of a binary pupil map, as simulators use, if that is at most ``MAX_POINTS_ACROSS``
     points in all: with fewer points its edges become grey.
     """
+    simulated = kind_of(instrument).fine_sampling_of(instrument.wfs)
+    if simulated is not None:
+        return simulated
     usual, pupil = kind_of(instrument).fine_sampling, instrument.pupil
     # A grey map has no sharp edge that another sampling would blur.
     if pupil is None or np.any((pupil.lit > 0.0) & (pupil.lit < 1.0)):
@@ -193,12 +210,18 @@ class FitModels:
             found.append(Optic.WIDTH)
         if self.sensor_key is not None:
             found.append(Optic.SENSOR)
+        if ELLIPSE_KEY in self.instrument.unknown:
+            found += ELLIPSE
         return tuple(found)
 
     @property
     def unknown(self) -> frozenset[Optic]:
         """Optical quantities that the instrument file marks as unknown."""
-        keys = {Optic.WIDTH: "mirror.coupling", Optic.SENSOR: f"wfs.{self.sensor_key}"}
+        keys = {
+            Optic.WIDTH: "mirror.coupling",
+            Optic.SENSOR: f"wfs.{self.sensor_key}",
+            **dict.fromkeys(ELLIPSE, ELLIPSE_KEY),
+        }
         return frozenset(one for one in self.optics if keys[one] in self.instrument.unknown)
 
     @property
@@ -220,10 +243,16 @@ class FitModels:
 
     def exact(self, optic: Optic) -> bool:
         """Return True if a model with another value can be built, not only a derivative."""
-        return optic is Optic.SENSOR or self.coupling is not None
+        return optic is not Optic.WIDTH or self.coupling is not None
 
     def with_optic(self, optic: Optic, change: float) -> FitModels:
         """Return the models of an instrument with a quantity changed by a logarithm."""
+        if optic in ELLIPSE:
+            along = (change, 0.0) if optic is Optic.STRETCH else (0.0, change)
+            sensor = kind_of(self.instrument).stretch_modulation(self.instrument.wfs, along)
+            if sensor is None:
+                raise ModelError("fit: found no modulation to be stretched, expected a pyramid's")
+            return replace(self, instrument=replace(self.instrument, wfs=sensor))
         if optic is Optic.SENSOR and self.sensor_key is not None:
             number = moved_sensor_number(self.sensor_number, change)
             wfs = replace(self.instrument.wfs, **{self.sensor_key: number})

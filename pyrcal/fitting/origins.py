@@ -10,7 +10,10 @@ from numpy.typing import NDArray
 
 from pyrcal.fitting.comparison import Alternative
 from pyrcal.fitting.instrument_checks import FoundOptic, may_compensate
+from pyrcal.fitting.methods import Settled
+from pyrcal.fitting.models import ELLIPSE, ELLIPSE_KEY, Optic
 from service.model.instrument import Instrument
+from service.model.sensors.registry import kind_of
 from service.model.slopes import FLIPS, Orientation, SlopeRecipe
 
 MAX_STRUCTURE = 0.09
@@ -156,6 +159,35 @@ def _describe_optic(one: FoundOptic, *, determined: bool) -> Origin:
         reported='"unknown"' if unknown else f"{one.reported:.3g}",
         how=f"fitted, 1 sigma {one.found_sigma:.1g}{doubt if unknown or one.notable else ''}",
         correct=determined and (unknown or one.notable),
+    )
+
+
+def find_ellipse(
+    settled: Settled, sigma: NDArray[np.float64], structure: float
+) -> Iterator[Origin]:
+    """Yield the elliptic modulation, if it was fitted.
+
+    ``sigma`` ``(n_nuisances,)`` is 1 σ of all nuisances, ``structure`` that of ``list_origins``.
+    """
+    models, nuisances = settled.models, settled.nuisances
+    places = [
+        (k, optic)
+        for k, (optic, _) in enumerate(nuisances.optics, nuisances.first_optic)
+        if optic is not Optic.WIDTH
+    ]
+    if not any(optic in ELLIPSE for _, optic in places):
+        return
+    # The models have all but the last, linear steps.
+    for k, optic in places:
+        models = models.with_optic(optic, float(settled.solution.nuisances[k]))
+    about, determined = models.instrument, structure < MAX_STRUCTURE
+    doubt = "" if determined else ", may compensate errors of the model"
+    yield Origin(
+        key=ELLIPSE_KEY.removeprefix("wfs."),
+        found=kind_of(about).modulation_entry(about.wfs),
+        reported='"unknown"',
+        how=f"fitted, 1 sigma of an axis {max(sigma[k] for k, _ in places):.1%}{doubt}",
+        correct=determined,
     )
 
 

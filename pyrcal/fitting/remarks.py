@@ -9,6 +9,7 @@ import numpy as np
 from pyrcal.fitting.alternatives import LIGHT_KEY
 from pyrcal.fitting.comparison import Alternative
 from pyrcal.fitting.instrument_checks import may_compensate
+from pyrcal.fitting.models import Optic
 from pyrcal.fitting.origins import MAX_LOG_SIGMA, is_determined
 from pyrcal.fitting.verdict import NOTABLE_STRUCTURE, FitFindings, factor_of_passes
 from service.model.instrument import Instrument
@@ -88,7 +89,10 @@ def _note_mirrored(reported: SlopeRecipe, found: SlopeRecipe) -> Iterator[str]:
 
 def _note_optics(findings: FitFindings) -> Iterator[str]:
     """Yield coupling and modulation that differ from the file, or that it left unknown."""
+    elliptic = Optic.STRETCH in findings.settled.models.optics
     for optic in findings.optics:
+        if elliptic and optic.optic is Optic.SENSOR:
+            continue  # the file has the two axes instead
         if optic.found is None or optic.reported is not None or optic.sigma > MAX_LOG_SIGMA:
             continue
         found = f"{optic.found_words} was found, 1 sigma {optic.found_sigma:.2g}"

@@ -110,6 +110,7 @@ SAVED = {
         "n_pix_separation": _ANY._replace(sensor=PYRAMID),
         "binning": _count(1)._replace(sensor=PYRAMID),
         "postProcessing": _WORD._replace(sensor=PYRAMID),
+        "n_pix_edge": _OPTIONAL._replace(sensor=PYRAMID),
         "user_modulation_path": _array(2)._replace(needed=False),
         "validI4Q": _array(2)._replace(needed=False),
         "validSignal": _array(1, 2)._replace(needed=False),
@@ -200,6 +201,7 @@ def from_oopao(
             arrays["interaction_matrix"] = matrix_of(measured, n_slopes, n_modes, notes=notes)
         else:
             arrays |= _frames(wfs, measured, n_modes, sensor, notes)
+            sensor |= _fft_grid(tel, wfs, float(arrays["interaction_matrix"].shape[-1]))
     arrays |= {"valid_subapertures": valid.astype(np.uint8), "pupil": pupil}
     return Imported(
         source="OOPAO",
@@ -324,7 +326,26 @@ def _pyramid(tel: Oopao, wfs: Oopao, notes: list[str]) -> _Sensor:
         valid = _numpy(_needed(wfs, "validI4Q")).astype(bool)
         slopes["order"] = "xy"
     sensor["n_subapertures"] = len(valid)
+    margin = getattr(wfs, "n_pix_edge", None)
+    if margin is not None:
+        across = 2.0 * (int(wfs.nSubap) + float(margin)) + float(wfs.n_pix_separation)
+        sensor |= _fft_grid(tel, wfs, across)
     return sensor | _modulation(tel, wfs, notes), valid, slopes
+
+
+def _fft_grid(tel: Oopao, wfs: Oopao, width_px: float) -> dict[str, Any]:
+    """Return the key of the grid of OOPAO's FFT, so many pixels of its detector wide."""
+    points, left = divmod(int(tel.resolution), int(wfs.nSubap))
+    # A padded telescope is cut to its light, and a binned detector has other points.
+    if left or int(wfs.binning) > 1 or not _is_filled(tel):
+        return {}
+    return {"fft_grid": {"points_per_subaperture": points, "width_subap": width_px}}
+
+
+def _is_filled(tel: Oopao) -> bool:
+    """Return True if the pupil reaches the edge of its array."""
+    lit = np.argwhere(_numpy(tel.pupil) > 0)
+    return bool(len(lit)) and int(lit.min()) == 0 and int(lit.max()) == int(tel.resolution) - 1
 
 
 def _modulation(tel: Oopao, wfs: Oopao, notes: list[str]) -> dict[str, Any]:

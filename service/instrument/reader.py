@@ -263,6 +263,8 @@ def _list_assumptions(
     for key in sorted(file.unknown):
         taken = values.get(key)
         words = "allows for it in its uncertainty" if taken is None else f"takes {taken:g}"
+        if key == "wfs.modulation_ellipse":
+            words = "takes a circle"
         yield (
             f"{wfs.path}: {key}: unknown; a fit of a measured matrix finds it, everything else "
             f"{words}"

@@ -361,6 +361,7 @@ _LATER_FIELDS = frozenset(
         "image_offsets_subap",
         "position_error_pitch",
         "normalised",
+        "fft_grid",
         "modulation_stretch",
     }
 )

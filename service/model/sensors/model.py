@@ -218,6 +218,13 @@ class SensorModel(ABC):
         """
         return None
 
+    def fine_sampling_of(self, sensor: Any) -> int | None:  # noqa: ANN401 - its own
+        """Return how many pupil points along a subaperture made a matrix; None for a real sensor.
+
+        The model that decides a fit then has the same, and the simulation's errors with it.
+        """
+        return None
+
     def coarsest_sampling(self, sensor: Any) -> int:  # noqa: ANN401 - its own
         """Return how many pupil points along a subaperture the smoothest shapes need."""
         return 1
@@ -233,6 +240,22 @@ class SensorModel(ABC):
         parameter.
         """
         return None
+
+    def stretch_modulation(
+        self,
+        sensor: Any,  # noqa: ANN401 - its own
+        change: tuple[float, float],
+    ) -> SensorDescription | None:
+        """Return the sensor with its modulation stretched further; None if it has none.
+
+        ``change`` are half the logarithms of the ratio of two axes: those along x and y, and those
+        along 45 and 135 degrees.
+        """
+        return None
+
+    def modulation_entry(self, sensor: Any) -> str:  # noqa: ANN401 - its own
+        """Return the value of ``wfs.modulation_ellipse`` for a sensor with such a modulation."""
+        raise ModelError(f"a {self.name}: found an elliptic modulation, expected a pyramid's")
 
     def other_recipes(self, recipe: SlopeRecipe) -> dict[str, SlopeRecipe]:
         """Return recipes that this one may be taken for, by what a file would say of them."""

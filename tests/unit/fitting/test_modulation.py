@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import replace
+from functools import cache, partial
 
 import numpy as np
 import pytest
 
-from pyrcal.fitting.matrix import FitOptions, fit_matrix
+from pyrcal.fitting import matrix as fit_matrix_module
+from pyrcal.fitting.matrix import AxesDoubt, FitOptions, fit_matrix
 from pyrcal.fitting.models import LOGARITHM_ABOVE, moved_sensor_number, sensor_coordinate
-from pyrcal_studies.drawn_fits import Condition, Draw, instrument_of
+from pyrcal_studies.drawn_fits import Condition, Draw, instrument_of, model_of
 from pyrcal_studies.drawn_fits import measured as drawn_matrices
+from pyrcal_studies.fft_pyramid import EllipticPyramid
+from pyrcal_studies.image_offsets import SEPARATION, N
 from service.estimation.reference import Reference
 
 KEY = "modulation_lambda_over_d"
@@ -62,3 +67,84 @@ def test_the_coordinate_is_the_logarithm_or_the_square_and_ends_at_none():
         for side in (-1.0, 1.0)
     )
     assert -below == pytest.approx(above, rel=1e-5)
+
+
+AXES, ANGLE_DEG = (3.0, 4.0), 25.0
+
+
+@cache
+def elliptic():
+    """A bench modulated on an ellipse, and its matrix of the FFT pyramid."""
+    draw = Draw(code="fft", condition=Condition(), seed=3)
+    model, told = model_of(draw.telescope), draw.bench
+    pyramid = EllipticPyramid(
+        amplitude=model.pupil.amplitude,
+        sampling=4,
+        wavelength_m=told.wavelength_m,
+        n_subapertures=N,
+        image_separation_subap=SEPARATION,
+        axes_lambda_over_d=AXES,
+        angle_deg=ANGLE_DEG,
+        n_modulation=40,
+        n_nodes=3,
+        padded_subap=6 * N,
+    )
+    matrix = pyramid.jacobian(draw.shapes_m, model.valid, told.image_shift_subap)
+    ((_, round_one),) = drawn_matrices([draw])
+    return draw, instrument_of(draw, round_one), Reference(matrix=matrix)
+
+
+def test_an_elliptic_modulation_is_found_where_the_file_calls_it_unknown():
+    draw, about, reference = elliptic()
+    wfs = replace(about.wfs, **{KEY: 4.0})
+    unknown = (f"wfs.{KEY}", "wfs.modulation_ellipse")
+    found = fit_matrix(replace(about, wfs=wfs, unknown=unknown), reference, FitOptions())
+    assert found.accepted
+    assert np.all(np.abs(found.alpha.vector - draw.alpha.vector) < 3.0 * found.sigma)
+    assert found.residual_fraction < 0.02
+    (entry,) = (one.entry for one in found.origins if one.key == "modulation_ellipse")
+    assert not any(one.key == KEY for one in found.origins)
+    ellipse = tomllib.loads(entry)["modulation_ellipse"]
+    assert ellipse["axes_lambda_over_d"] == pytest.approx([4.0, 3.0], rel=0.01)
+    assert ellipse["angle_deg"] == pytest.approx(ANGLE_DEG + 90.0, abs=1.0)
+    # what is advised is a file that can be read
+    assert found.corrections["wfs.modulation_ellipse"] == ellipse
+    assert found.corrections[f"wfs.{KEY}"] is None
+
+
+def test_a_circle_that_is_none_is_named():
+    _, about, reference = elliptic()
+    found = fit_matrix(about, reference, FitOptions())
+    (named,) = (one for one in found.alternatives if one.key == 'modulation_ellipse = "unknown"')
+    assert named.preferred
+    assert named.misfit < 0.2
+    assert named.key in found.recommendation
+
+
+def test_a_circle_is_not_taken_for_an_ellipse():
+    found, _, _ = fitted(3.0, 3.0)
+    assert not any("ellipse" in one.key for one in found.alternatives)
+
+
+def test_axes_are_searched_with_other_modulations_where_an_unknown_one_shows_none(monkeypatch):
+    """So a bench of 36 subapertures, unmodulated and turned by half a turn, was refused."""
+    _, about, reference = elliptic()
+    searched = []
+
+    def find_axes(about, *_):
+        searched.append(about.wfs.modulation_lambda_over_d)
+        return about.slopes, None, AxesDoubt("none" if searched[-1] else ""), None
+
+    monkeypatch.setattr(fit_matrix_module, "_find_axes", find_axes)
+    find = partial(
+        fit_matrix_module._find_axes_and_sensor,
+        usable=reference,
+        basis=None,
+        options=FitOptions(),
+        mapper=map,
+    )
+    found, _ = find(replace(about, unknown=(f"wfs.{KEY}",)))
+    assert found.wfs.modulation_lambda_over_d == 0.0
+    assert searched == [3.0, 0.0]
+    assert find(about)[0] is about
+    assert searched[2:] == [3.0]

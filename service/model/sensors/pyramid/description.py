@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.model.instrument import Instrument, sensor_of_kind
-from service.model.sensors.pyramid.table import PyramidNumbers
+from service.model.sensors.pyramid.table import FftGrid, PyramidNumbers
 from service.model.slopes import Orientation
 
 
@@ -28,6 +28,9 @@ class Pyramid(PyramidNumbers):
     modulation_stretch: tuple[float, float] | None = None
     """What makes an ellipse of the circle, ``(e, f)`` in the RTC's own axes: the path is that of
     the circle times the exponential of ``[[e, f], [f, -e]]``. None for a circle."""
+
+    fft_grid: FftGrid | None = None
+    """Grid of the simulation that made a matrix; None for a real sensor."""
 
     image_offsets_subap: tuple[tuple[float, float], ...] | None = None
     """Displacement (x, y) of the images at -x -y, +x -y, -x +y and +x +y from their places on the

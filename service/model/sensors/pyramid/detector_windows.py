@@ -18,7 +18,7 @@ from service.model.instrument import Instrument
 from service.model.kinds import Stop
 from service.model.pupil import rtc_valid_subapertures
 from service.model.pupil_images import find_pupil_images
-from service.model.sensors.pyramid.description import FrameWindows, by_quadrant
+from service.model.sensors.pyramid.description import FrameWindows, by_quadrant, pyramid_in
 from service.model.sensors.pyramid.signals import signals_of
 from service.model.sensors.sensor import CannotTell
 from service.model.slopes import SlopeRecipe
@@ -322,9 +322,11 @@ def _windows_without_light(
             "of them, to know where the pupil images are"
         )
     centres = by_quadrant(places.centres_px)
-    optics = build_even_optics(instrument, _SAMPLING_WITHOUT_LIGHT)
+    grid = pyramid_in(instrument).fft_grid
+    sampling = _SAMPLING_WITHOUT_LIGHT if grid is None else grid.points_per_subaperture
+    optics = build_even_optics(instrument, sampling)
     # The pyramid absorbs nothing: its images and what it scatters beside them share this light.
-    whole = float(np.sum(optics.pupil.amplitude**2)) / _SAMPLING_WITHOUT_LIGHT**2
+    whole = float(np.sum(optics.pupil.amplitude**2)) / sampling**2
     windows = _windows_at(instrument, centres, frames[0], places.pixels_per_subaperture)
     return windows, optics.images() / whole
 

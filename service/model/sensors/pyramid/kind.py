@@ -11,7 +11,12 @@ from typing_extensions import override
 from service.errors import ModelError
 from service.model.kinds import SignalKind
 from service.model.sensors.kind import SensorKind
-from service.model.sensors.pyramid.table import IMAGE_KEY, USUAL_SEPARATION, PyramidTable
+from service.model.sensors.pyramid.table import (
+    ELLIPSE_KEY,
+    IMAGE_KEY,
+    USUAL_SEPARATION,
+    PyramidTable,
+)
 
 if TYPE_CHECKING:
     from service.model.sensors.pyramid.model import PyramidModel
@@ -26,6 +31,7 @@ class PyramidKind(SensorKind):
         "wavelength_m": 750e-9,
         "modulation_lambda_over_d": 3.0,
         IMAGE_KEY: None,
+        ELLIPSE_KEY: None,
     }
     signals = (SignalKind.XY, SignalKind.INTENSITY)
     normalised = True
@@ -68,7 +74,7 @@ class PyramidKind(SensorKind):
 
 def _with_radius(written: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return ``[wfs]`` with the radius of the circle that has the area of a stated ellipse."""
-    ellipse = written.get("modulation_ellipse")
+    ellipse = written.get(ELLIPSE_KEY)
     if not isinstance(ellipse, dict):
         return written
     if "modulation_lambda_over_d" in written:

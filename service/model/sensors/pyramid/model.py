@@ -110,6 +110,7 @@ class PyramidModel(SensorModel):
             **optics | {"pupil_separation_subap": separation},
             image_offsets_subap=offsets,
             modulation_stretch=stretch,
+            fft_grid=table.fft_grid,
         )
 
     @override
@@ -153,6 +154,7 @@ class PyramidModel(SensorModel):
             modulation_lambda_over_d=(
                 sensor.modulation_lambda_over_d if modulation is None else modulation
             ),
+            fft_grid=None,
         )
         loop = LoopFacts(frame_rate_hz=mode.frame_rate_hz, n_controlled=mode.n_controlled)
         return SensorMode(config_id=mode.config_id, binning=binning, wfs=wfs, loop=loop)
@@ -268,6 +270,10 @@ class PyramidModel(SensorModel):
         )
 
     @override
+    def fine_sampling_of(self, sensor: Pyramid) -> int | None:
+        return None if sensor.fft_grid is None else sensor.fft_grid.points_per_subaperture
+
+    @override
     def coarsest_sampling(self, sensor: Pyramid) -> int:
         # The phase of a modulation that is wide for its subapertures turns too fast for one point.
         wide = 2.0 * sensor.largest_modulation + 3.0 >= sensor.pupil_diameter
@@ -286,6 +292,19 @@ class PyramidModel(SensorModel):
     @override
     def find_fitted_key(self, sensor: Pyramid) -> str | None:
         return "modulation_lambda_over_d"
+
+    @override
+    def stretch_modulation(self, sensor: Pyramid, change: tuple[float, float]) -> Pyramid:
+        e, f = sensor.modulation_stretch or (0.0, 0.0)
+        return replace(sensor, modulation_stretch=(e + change[0], f + change[1]))
+
+    @override
+    def modulation_entry(self, sensor: Pyramid) -> str:
+        longer, shorter, angle_rad = sensor.modulation_axes
+        return (
+            f"{{ axes_lambda_over_d = [{longer:#.4g}, {shorter:#.4g}], "
+            f"angle_deg = {math.degrees(angle_rad) % 180.0:.2f} }}"
+        )
 
     @override
     def other_recipes(self, recipe: SlopeRecipe) -> dict[str, SlopeRecipe]:

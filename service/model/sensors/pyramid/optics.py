@@ -24,6 +24,7 @@ from service.model.local import LocalShapes, MadeElsewhere, Shapes
 from service.model.pupil import PupilGrid, gauss_legendre
 from service.model.sensors.pyramid.description import Pyramid
 from service.model.sensors.pyramid.few import respond_to_few
+from service.model.sensors.pyramid.table import FftGrid
 from service.model.sensors.pyramid.tiles import TiledResponse
 from service.model.sensors.pyramid.working_point import Halo
 from service.model.sensors.sensor import Mapper, RowTask
@@ -50,6 +51,11 @@ class Nodes:
         """Return ``n`` Gauss-Legendre nodes: the light that falls on the subaperture."""
         offsets, weights = gauss_legendre(n)
         return cls(offsets=offsets / 2, weights=weights / 2)
+
+    @classmethod
+    def points(cls, n: int) -> Nodes:
+        """Return ``n`` points that a simulation adds up to the light of a pixel."""
+        return cls(offsets=(np.arange(n) - (n - 1) / 2) / n, weights=np.full(n, 1.0 / n))
 
     @classmethod
     def edges(cls) -> Nodes:
@@ -154,7 +160,7 @@ class PyramidOptics:
         With ``shapes`` it is the response to them, and the gradient exists for one row of
         subapertures at a time.
         """
-        nodes = nodes_y or Nodes.area(self.n_nodes), nodes_x or Nodes.area(self.n_nodes)
+        nodes = nodes_y or self._nodes, nodes_x or self._nodes
         if isinstance(shapes, np.ndarray) and self.are_few(shapes.shape[1]):
             return self._respond_to_few(shapes, valid, shift, nodes, mapper)
         of_row = RowResponse(
@@ -308,7 +314,7 @@ class PyramidOptics:
 
     def images(self, shift: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
         """Return the light at rest ``(2, n, 2, n)``: side, row along y, side, column along x."""
-        n, nodes = self.wfs.n_subapertures, Nodes.area(self.n_nodes)
+        n, nodes = self.wfs.n_subapertures, self._nodes
         images = np.empty((2, n, 2, n))
         for grid in self._grids:
             roof_y = self._roof(shift[1] + grid.y, nodes, grid.sides_y)
@@ -316,6 +322,19 @@ class PyramidOptics:
             fields_at_rest = self._fields(*self._modulate_roof(roof_y, roof_x))
             images[grid.sides_y, :, grid.sides_x] = self._images(fields_at_rest, roof_y, roof_x)
         return images
+
+    @property
+    def _fft_grid(self) -> FftGrid | None:
+        """Grid of the simulation that made a matrix, if the pupil has its points."""
+        grid = self.wfs.fft_grid
+        same = grid is not None and grid.points_per_subaperture == self.pupil.sampling
+        return grid if same else None
+
+    @property
+    def _nodes(self) -> Nodes:
+        """Quadrature over a subaperture."""
+        grid = self._fft_grid
+        return Nodes.area(self.n_nodes) if grid is None else Nodes.points(self.pupil.sampling)
 
     @property
     def _grids(self) -> tuple[_Grid, ...]:
@@ -339,7 +358,8 @@ class PyramidOptics:
         centres = np.arange(n) - (n - 1) / 2
         x = _SIDES[sides, None, None] * half + centres[:, None] + nodes.offsets - shift
         distance = x[..., None] - self.pupil.coordinates
-        kernel = _roof_kernel(distance, half, self.pupil.sampling)
+        width = math.inf if self._fft_grid is None else self._fft_grid.width_subap
+        kernel = _roof_kernel(distance, half, self.pupil.sampling, width)
         return _Roof(
             kernel=np.ascontiguousarray(kernel.swapaxes(0, 1), self._complex),
             weights=nodes.weights,
@@ -649,12 +669,19 @@ def _weight_parts(modulated: Array, roof: _Roof, axis: int) -> Array:
 
 
 def _roof_kernel(
-    distance: NDArray[np.float64], half_separation: float, sampling: int
+    distance: NDArray[np.float64], half_separation: float, sampling: int, width: float = math.inf
 ) -> NDArray[np.complex128]:
-    """Return the band-limited kernel of one pyramid edge between two points of an axis."""
-    plus = (distance + half_separation) * sampling
-    minus = (distance - half_separation) * sampling
-    return np.asarray(0.5 * (np.sinc(minus) + np.sinc(plus)) + 0.5j * (_edge(plus) - _edge(minus)))
+    """Return the band-limited kernel of one pyramid edge between two points of an axis.
+
+    ``width`` is that of the grid of an FFT, subapertures, which sums over frequencies: at half
+    integers, with the tip of the pyramid between four of them. Its sum differs from the integral by
+    the ratio of a distance to its sine, and repeats itself.
+    """
+    plus, minus = distance + half_separation, distance - half_separation
+    sum_plus, sum_minus = (1.0 / np.sinc(part / width) for part in (plus, minus))
+    real = np.sinc(minus * sampling) * sum_minus + np.sinc(plus * sampling) * sum_plus
+    imaginary = _edge(plus * sampling) * sum_plus - _edge(minus * sampling) * sum_minus
+    return np.asarray(0.5 * real + 0.5j * imaginary)
 
 
 def _edge(n: NDArray[np.float64]) -> NDArray[np.float64]:

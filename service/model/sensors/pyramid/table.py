@@ -15,6 +15,9 @@ USUAL_SEPARATION = 1.2
 IMAGE_KEY = "image_offsets_px"
 """Key of the displacements of the pupil images."""
 
+ELLIPSE_KEY = "modulation_ellipse"
+"""Key of an elliptic modulation."""
+
 MAX_OFFSET_PX = 4.0
 """Largest displacement of a pupil image from its place on the pixel grid, detector pixels. Whole
 pixels belong into the windows that cut the images."""
@@ -77,6 +80,18 @@ class Ellipse(Read):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FftGrid(Read):
+    """``fft_grid``: the grid on which a simulation with an FFT has made the matrix."""
+
+    points_per_subaperture: Annotated[int, Ge(1), Le(64)]
+    """Points of the pupil along a subaperture, and of the detector along its pixel."""
+
+    width_subap: Positive
+    """Width of the whole grid, zeros around the pupil included; light that leaves it on one side
+    comes back on the other."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PyramidMode(Read):
     """``[[wfs.mode]]``: a configuration that the RTC may use instead, such as a binning."""
 
@@ -111,7 +126,7 @@ class PyramidTable(PyramidNumbers):
     modulation_ellipse: Ellipse | None = None
     """Elliptic modulation ``{ axes_lambda_over_d = [4.0, 5.0], angle_deg = 30.0 }``, instead of
     ``modulation_lambda_over_d``: its semi-axes, and the direction of the first one from +x towards
-    +y in the RTC's axes. None: a circle."""
+    +y in the RTC's axes. None: a circle; "unknown" beside a radius: fitted to a measured matrix."""
 
     valid_subapertures: str = "auto"
     """"auto": by ``flux_threshold``; or a mask ``path:/dataset``."""
@@ -119,6 +134,11 @@ class PyramidTable(PyramidNumbers):
     input: Literal["slopes", "frames", "normalised-frames"] = "slopes"
     """Signals that the RTC sends. A measured matrix of frames comes with a mean frame in the same
     counts; "normalised-frames" are divided by their sum over the detector, and need none."""
+
+    fft_grid: FftGrid | None = None
+    """Of a matrix that a simulation has made with an FFT: its grid ``{ points_per_subaperture = 2,
+    width_subap = 52.0 }``, on which it differs by per cents from a real sensor. None: a real
+    sensor, or a grid that is not known."""
 
     pupil_centres_px: Centres | None = None
     """Frames only: centres of the four pupil images, row and column; "auto": found in a flux

@@ -1,0 +1,175 @@
+"""Benches that OOPAO simulates, saved as docs/tutorials/oopao.md says, with a known registration.
+
+Run by an interpreter that has OOPAO, from the repository's root: ``python -m
+pyrcal_studies.oopao_benches FOLDER [CASE ...]``; then ``pyrcal import oopao`` and ``pyrcal fit``.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from OOPAO.DeformableMirror import DeformableMirror
+from OOPAO.MisRegistration import MisRegistration
+from OOPAO.Pyramid import Pyramid
+from OOPAO.Source import Source
+from OOPAO.Telescope import Telescope
+
+Array = NDArray[np.float64]
+
+DIAMETER_M, POINTS, N_MODES = 0.6, 2, 40
+"""Of the pupil; points along a subaperture; modes, the smoothest of the mirror."""
+
+STROKE_M = 1e-9
+COUPLING = 0.36
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Case:
+    """One bench."""
+
+    modulation: float
+    """λ/D in OOPAO's unit: 1 - 1 / n of that of a pupil of n points."""
+
+    ellipse: tuple[float, float, float] | None = None
+    """Semi-axes, and degrees from +x to the first one, instead of the circle."""
+
+    processing: str = "slopesMaps"
+    subapertures: int = 18
+    actuators: int = 9
+    """Along a diameter."""
+
+    separation_px: int = 8
+    """Pixels between the pupil images."""
+
+    alpha: tuple[float, float, float, float] = (0.3, -0.2, 1.0, 1.02)
+    """Shift x and y, subapertures, rotation, degrees, magnification."""
+
+    noise: float = 0.0
+    """RMS of the noise over that of the signal of each mode."""
+
+
+WHOLE = "fullFrame_sum_flux"
+
+CASES = {
+    "unmodulated": Case(modulation=0.0),
+    "half": Case(modulation=0.5),
+    "one": Case(modulation=1.0),
+    "three": Case(modulation=3.0),
+    "ellipse-4-5": Case(modulation=4.0, ellipse=(4.0, 5.0, 30.0)),
+    "ellipse-3-4": Case(modulation=3.0, ellipse=(3.0, 4.0, 0.0)),
+    "whole-unmodulated": Case(modulation=0.0, processing=WHOLE),
+    "whole-three": Case(modulation=3.0, processing=WHOLE),
+    "whole-five-noise": Case(
+        modulation=5.0,
+        processing=WHOLE,
+        subapertures=20,
+        actuators=17,
+        alpha=(0.4, 0.33, 90.0, 0.9),
+        noise=0.1,
+    ),
+    "whole-unmodulated-noise": Case(
+        modulation=0.0,
+        processing="fullFrame",
+        subapertures=36,
+        actuators=11,
+        separation_px=16,
+        alpha=(0.0, -1.2, 180.0, 1.12),
+        noise=0.1,
+    ),
+    "whole-ellipse-noise": Case(
+        modulation=4.0,
+        ellipse=(4.0, 5.0, 20.0),
+        processing=WHOLE,
+        subapertures=20,
+        actuators=11,
+        alpha=(0.3, 0.0, 2.0, 1.05),
+        noise=0.1,
+    ),
+}
+
+
+def measure(case: Case) -> dict[str, Any]:
+    """Return what the tutorial saves of a bench: its objects, its modes and its matrix."""
+    n_points = case.subapertures * POINTS
+    telescope = Telescope(resolution=n_points, diameter=DIAMETER_M)
+    star = Source(optBand="R", magnitude=0)
+    star**telescope
+    subaperture_m = DIAMETER_M / case.subapertures * n_points / (n_points - 1)
+    x_subap, y_subap, rotation_deg, magnification = case.alpha
+    moved = MisRegistration()
+    moved.shiftX, moved.shiftY = -x_subap * subaperture_m, -y_subap * subaperture_m
+    moved.rotationAngle = rotation_deg
+    moved.radialScaling = moved.tangentialScaling = magnification - 1.0
+    plain, mirror = (
+        DeformableMirror(
+            telescope=telescope,
+            nSubap=case.actuators - 1,
+            mechCoupling=COUPLING,
+            misReg=where,
+            print_dm_properties=False,
+        )
+        for where in (MisRegistration(), moved)
+    )
+    sensor = Pyramid(
+        nSubap=case.subapertures,
+        telescope=telescope,
+        modulation=case.modulation,
+        lightRatio=0.0 if case.processing.startswith("full") else 0.3,
+        postProcessing=case.processing,
+        n_pix_separation=case.separation_px,
+        user_modulation_path=None if case.ellipse is None else _path(*case.ellipse),
+    )
+    _, _, axes = np.linalg.svd(plain.modes, full_matrices=False)
+    modes = axes[:N_MODES].T / (plain.modes @ axes[:N_MODES].T).std(axis=0)
+    columns = []
+    for shape in (mirror.modes @ modes).T:
+        phase = 2 * np.pi / star.wavelength * STROKE_M * shape.reshape(n_points, n_points)
+        signals = []
+        for sign in (1.0, -1.0):
+            sensor.wfs_measure(phase_in=sign * phase)
+            signals.append(np.array(sensor.signal, dtype=float))
+        columns.append((signals[0] - signals[1]) / (2 * STROKE_M))
+    matrix = np.stack(columns, axis=1)
+    noise = np.random.default_rng(7).standard_normal(matrix.shape)
+    matrix += case.noise * matrix.std(axis=0) * noise
+    owners = {"tel": telescope, "ngs": star, "dm": plain, "dm.misReg": plain.misReg, "wfs": sensor}
+    names = {
+        "tel": "D resolution pupil pupilReflectivity",
+        "ngs": "wavelength",
+        "dm": "modes initial_coordinates nActAlongDiameter mechCoupling sign flip_ flip_lr",
+        "dm.misReg": "rotationAngle shiftX shiftY anamorphosisAngle radialScaling"
+        " tangentialScaling",
+        "wfs": "tag nSubap modulation user_modulation_path n_pix_separation n_pix_edge binning"
+        " postProcessing validI4Q validSignal",
+    }
+    kept: dict[str, Any] = {"calib.D": matrix.astype(np.float32), "M2C": modes}
+    for owner, listed in names.items():
+        for name in listed.split():
+            value = getattr(owners[owner], name, None)
+            if value is not None:
+                kept[f"{owner}.{name}"] = value
+    return kept
+
+
+def _path(first: float, second: float, angle_deg: float) -> list[list[float]]:
+    """Return as many points on an ellipse as OOPAO takes on a circle of its longer axis."""
+    n_points = 4 * int(np.ceil(2 * np.pi * max(first, second) / 4))
+    t = 2 * np.pi * np.arange(n_points) / n_points
+    path = np.exp(1j * np.deg2rad(angle_deg)) * (first * np.cos(t) + 1j * second * np.sin(t))
+    return [[float(point.real), float(point.imag)] for point in path]
+
+
+def main() -> None:
+    """Write the dumps of all benches, or of those that are named."""
+    folder, *named = sys.argv[1:]
+    for name in named or CASES:
+        np.savez(Path(folder) / f"{name}.npz", **measure(CASES[name]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,7 +1,7 @@
 # Nothing is assumed but make and a Python >= 3.11; everything else goes into .venv.
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo docs test test-long fuzz faults nights restarts check paper bench soak load wheel lint lock sbom audit clean FORCE
+.PHONY: help setup demo docs test test-long fuzz faults nights restarts check paper bench registration-benchmark soak load wheel lint lock sbom audit clean FORCE
 
 PYTHON ?= python3
 PY := .venv/bin/python
@@ -65,6 +65,9 @@ paper: $(STAMP) ## the seed paper beside pyrcal: docs/results/heritier2018.md an
 
 bench: $(STAMP) ## pyrcal beside OOPAO, HCIPy and SPECULA, each from its package: docs/results/speed.md; a quarter of an hour
 	@$(PY) -m benchmarks.bench $(ARGS)
+
+registration-benchmark: $(STAMP) ## twenty matrices of three codes with a known registration, fitted; a minute, ARGS=--make measures them anew
+	@$(PY) -m benchmarks.registration $(ARGS)
 
 soak: $(STAMP) ## an hour at 1 kHz with company, for what grows or is lost; ARGS="--minutes 5" rehearses
 	@$(PY) -m benchmarks.soak $(ARGS)

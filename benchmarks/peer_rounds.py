@@ -3,8 +3,9 @@
 Run by an interpreter that has the peer, from the repository's root:
 ``python -m benchmarks.peer_rounds oopao job.npz``. ``{"do": "push", "modes": [0, 50]}`` pushes and
 pulls modes of the job; ``{"do": "sprint", "alpha": [x, y, deg, magnification]}`` has OOPAO's SPRINT
-find a registration of its own mirror. Both write the matrix to the file that ``matrix`` names. What
-they took is processor time.
+find a registration of its own mirror. Both write the matrix to the file that ``matrix`` names.
+``{"do": "estimate"}`` has SPRINT estimate the registration of the matrix in that file. What they
+took is processor time.
 """
 
 from __future__ import annotations
@@ -52,7 +53,12 @@ def main() -> None:
             answer = _pushed(peer, arrays["shapes_m"], bench, asked)
         else:
             sprint = sprint or Sprint(peer, arrays, bench)
-            answer = sprint.found(asked["alpha"], Path(asked["matrix"]))
+            matrix = Path(asked["matrix"])
+            if asked["do"] == "sprint":
+                answer = sprint.found(asked["alpha"], matrix)
+            else:
+                with np.load(matrix) as product:
+                    answer = sprint.estimated(product["matrix"])
         print(json.dumps(answer), file=answers)
 
 
@@ -102,6 +108,10 @@ class Sprint:
             self.ngs, self.tel, self.dm.apply_mis_registration(moved), self.wfs, self._basis.modes
         ).D
         np.savez(matrix, matrix=measured, valid=self._valid, wavelength_m=self.ngs.wavelength)
+        return self.estimated(measured)
+
+    def estimated(self, measured: Array) -> dict[str, Any]:
+        """Return where SPRINT finds the mirror by a matrix of this sensor."""
         seconds, out = cpu_s(
             lambda: self._sprint.estimate(
                 self,

@@ -338,11 +338,13 @@ def packaged() -> str:
     ]
     common = {one[:3] for one in everywhere}
     intro = (
-        "Each is a file in `service/instrument/packaged`, used by its name, which is `name` in "
-        "`[instrument]`: `pyrcal demo --instrument papyrus`. A value is public, with its source, "
-        f"or {ASSUMED}: chosen by the authors of pyrcal because no public source was found. Check "
-        "assumed values before you use a file on the real telescope. An `r0_m` of 0.126 is a "
-        "seeing of 0.8 arcseconds at 500 nm. Equal in all, and assumed where no source is named: "
+        "Each instrument is a file in `service/instrument/packaged`. You use it by its name, as in "
+        "`pyrcal demo --instrument papyrus`; the name is also `name` in `[instrument]`. The tables "
+        "below list every value of each file. A value is either public, and then its source is "
+        f"given in brackets, or {ASSUMED}: the authors of pyrcal chose it because they found no "
+        "public source. Check the assumed values before you use a file on the real telescope. An "
+        "`r0_m` of 0.126 is a seeing of 0.8 arcseconds at 500 nm. These values are the same in all "
+        "files, and assumed where no source is named: "
         f"{', '.join(f'`{one.key}` {one.value} in `[{one.table}]`' for one in everywhere)}."
     )
     parts = [

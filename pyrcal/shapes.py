@@ -53,13 +53,16 @@ def read_shape(options: argparse.Namespace) -> dict[str, Any]:
     if values.ndim == 2:
         found.setdefault("kind", "map")
     needed = _SAID[: 2 if found.get("kind") == "slopes" else 3]
-    missing = [f"--{name}" for name in needed if not found.get(name)]
+    missing = [name for name in needed if not found.get(name)]
     if missing:
-        raise ConfigurationError(f"{path}: says no {', no '.join(missing)}: give {missing[0]}")
+        text = f"found no {' and no '.join(missing)}: give --{' --'.join(missing)}"
+        raise ConfigurationError(f"{path}: {text}")
     if not np.isfinite(values).all():
         n_bad = int(np.sum(~np.isfinite(values)))
         raise ConfigurationError(f"{path}: found {n_bad} values that are not finite, expected none")
-    return {**found, "values": values.ravel().tolist(), "source": path.name}
+    # Seven digits, as the float32 that is sent to the RTC: a request has at most 1 MB.
+    rounded = [float(f"{value:.7g}") for value in values.ravel().tolist()]
+    return {**found, "values": rounded, "source": path.name}
 
 
 def _read_json(path: Path) -> dict[str, Any]:

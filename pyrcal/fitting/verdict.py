@@ -291,7 +291,8 @@ def _check_instrument(findings: FitFindings) -> Reason:
         if _moves_registration(findings, rival.moved):
             return _describe_instrument(findings, rival)
     for optic in findings.optics:
-        usual = OPTIC_SIGMA[optic.optic] if optic.reported is not None else UNKNOWN_SIGMA
+        # any usual modulation is far from a stated 0
+        usual = OPTIC_SIGMA[optic.optic] if optic.reported else UNKNOWN_SIGMA
         # the logarithm of a fitted modulation of 0 is meaningless
         if abs(optic.change) > MAX_OPTIC_DEVIATION * usual and optic.found != 0.0:
             return Reason(

@@ -17,7 +17,8 @@ from pyrcal.rtc.dither import Dither, check_dither
 from pyrcal.rtc.identity import Identity, Reconstructor, new_session
 from pyrcal.rtc.link import STATUS_PERIOD_S, RtcConnection, RtcLink
 from pyrcal.rtc.matrices import Matrices
-from pyrcal.rtc.replies import Computer, FinishedMeasurement
+from pyrcal.rtc.references import ReferenceOffset
+from pyrcal.rtc.replies import Computer, FinishedMeasurement, HoldsReferences
 from pyrcal.rtc.staging import Terms
 from service.config.link_tables import Router
 from service.wire import (
@@ -26,6 +27,8 @@ from service.wire import (
     FrameHeader,
     Loop,
     LoopRequest,
+    ReferencesInUse,
+    ReferencesRequest,
     Reply,
     Status,
 )
@@ -39,11 +42,15 @@ __all__ = [
     "DitherStop",
     "FinishedMeasurement",
     "FrameHeader",
+    "HoldsReferences",
     "Identity",
     "Loop",
     "LoopRequest",
     "Matrices",
     "Reconstructor",
+    "ReferenceOffset",
+    "ReferencesInUse",
+    "ReferencesRequest",
     "Reply",
     "Router",
     "RtcConnection",

@@ -1,9 +1,9 @@
 """Compare the mean of the commands before and after a change of reference slopes.
 
 A wrong offset looks perfect in the slopes, from which the RTC has subtracted it: only the commands
-tell. Their mean over the turbulence changes by what the mirror holds in addition. Its ratio to the
-shape that was sent is 1 where sign, scale and numbers are as sent. Turbulence moves the mean as
-well: σ is taken from the scatter of blocks on both sides.
+tell. Their mean over the turbulence changes by what the mirror holds in addition to the shape
+before. What it holds, over the shape that was sent, is 1 where sign, scale and numbers are as sent.
+Turbulence moves the mean as well: σ is taken from the scatter of blocks on both sides.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ SETTLING_S = 0.3
 
 
 class HeldRatio(NamedTuple):
-    """What the mirror holds of a change of its shape."""
+    """What the mirror holds of a shape."""
 
     ratio: float
     """1 if it was applied as it was sent."""
@@ -97,22 +97,27 @@ class MeanCommands(Streaming):
         new = n_blocks != len(earlier.blocks) or self.name != earlier.name
         return new and bool(n_blocks) and not n_blocks % REPORT_BLOCKS and bool(self.before[1])
 
-    def measure(self, change_m: Array) -> HeldRatio | None:
-        """Return what the mirror holds of a change of its shape ``(n,)``; None if unknown."""
+    def measure(self, shape_m: Array, shape_before_m: Array) -> HeldRatio | None:
+        """Return how much of a shape ``(n_modes,)`` the mirror holds; None if unknown.
+
+        It is taken to have held all of the shape before. So the change of the mean would be minus
+        the sum of both shapes if the sign of the new one alone were turned.
+        """
         after, before = np.array(self.blocks[:BLOCKS_AFTER]), np.array(self.before[1])
-        n_modes = min(len(change_m), after.shape[1])
-        change_m = change_m[:n_modes]
-        if min(len(before), len(after)) < REPORT_BLOCKS or not change_m.any():
+        if min(len(before), len(after)) < REPORT_BLOCKS or not shape_m[:MAX_MODES].any():
             return None
+        n_modes = min(len(shape_m), after.shape[1])
+        shape_m, shape_before_m = shape_m[:n_modes], shape_before_m[:n_modes]
         after, before = after[:, :n_modes], before[-BLOCKS_BEFORE:, :n_modes]
         apart = np.concatenate([part - part.mean(axis=0) for part in (before, after)])
-        weights = change_m / np.maximum(apart.var(axis=0), np.finfo(float).tiny)
-        weights /= weights @ change_m
+        weights = shape_m / np.maximum(apart.var(axis=0), np.finfo(float).tiny)
+        weights /= weights @ shape_m
         spread = apart @ weights
         # Blocks of the lowest modes are not independent: neighbours tell how much.
         memory = float(np.clip((spread[1:] @ spread[:-1]) / (spread @ spread), 0.0, 0.9))
         n_free = len(spread) - 2
         variance = spread @ spread / n_free * (1.0 + memory) / (1.0 - memory)
         sigma = np.sqrt(variance * (1.0 / len(before) + 1.0 / len(after)))
-        ratio = float((after.mean(axis=0) - before.mean(axis=0)) @ weights)
+        held_m = after.mean(axis=0) - before.mean(axis=0) + shape_before_m
+        ratio = float(held_m @ weights)
         return HeldRatio(ratio=ratio, sigma=float(sigma))

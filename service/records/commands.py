@@ -30,7 +30,9 @@ MAX_TEXT_LENGTH = 200
 MAX_MODES = 100_000
 """Largest number of modes that an order may list."""
 
-MAX_SHAPE_VALUES = 1_000_000
+MAX_SHAPE_VALUES = 65_536
+"""A map of 256 x 256, or the pixels of a large sensor: the shape is saved with every α."""
+
 SHAPE_RANGE_M = (1e-11, 5e-6)
 """Smallest and largest RMS of a shape, metres OPD: beyond them its unit is another one."""
 

@@ -420,7 +420,7 @@ class ReferencesMade:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShapeHeld:
-    """The mean of the commands has shown how much of a change of references the mirror holds."""
+    """The mean of the commands has shown how much of a shape the mirror holds."""
 
     id: str
     """Id of the references in use."""
@@ -430,6 +430,9 @@ class ShapeHeld:
 
     sigma: float
     """1 σ of it, by the turbulence."""
+
+    change: tuple[float, float] | None = None
+    """The same of the change from the shape before, with 1 σ; None if that is small."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -502,8 +502,8 @@ class ReferencesRecord:
     """Time at which the RTC was first seen to use them; None if it was not."""
 
     held_ratio: float | None = None
-    """Change of the mean command, as a share of what they should add to the mirror; None if it was
-    not measured."""
+    """Share of the shape that the mirror holds, by the mean of the commands; None if not measured.
+    """
 
     held_sigma: float | None = None
     """1 σ of it."""

@@ -200,7 +200,10 @@ class ArchiveWriter:
             await self._save_now()
 
     def _sends_new_numbers(self, effect: Effect) -> bool:
-        """Return True if an effect sends a matrix, and not the numbers of an earlier one again."""
+        """Return True if an effect sends a matrix or references, and not earlier numbers again."""
+        if isinstance(effect, ev.SendReferences):
+            made = self._state().references_of(effect.id)
+            return made is not None and made.shape is not None and made.parent is None
         if not isinstance(effect, ev.SendMatrix):
             return False
         # A rollback makes the loop safer, and the archive has its numbers under the earlier id.

@@ -6,7 +6,7 @@ The order is that in which they are fed: what one marks in a block, those after 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -118,22 +118,29 @@ def _report_comparison(
     return [ev.Compared(finding=judged)] if judged is not None and awaited else []
 
 
+MIN_CHANGE_RATIO = 0.7
+"""Change of a shape over its size from which the change is judged, too."""
+
+
 def _report_held(
     before: MeanCommands, now: MeanCommands, loop: LoopContext, state: TrackerState
 ) -> list[Event]:
-    """Return how much of a change of references the mirror holds."""
+    """Return how much of the shape of new references the mirror holds."""
     record = state.references_of(now.name)
     if record is None or not now.is_due(before):
         return []
-    earlier = state.references_of(now.before[0])
-    change_m = np.zeros(loop.description.n_modes)
-    change_m[: len(record.coefficients_m)] = record.coefficients_m
-    if earlier is not None:
-        change_m[: len(earlier.coefficients_m)] -= earlier.coefficients_m
-    found = now.measure(change_m)
+    shapes = np.zeros((2, loop.description.n_modes))
+    for shape_m, one in zip(shapes, (record, state.references_of(now.before[0])), strict=True):
+        if one is not None:
+            shape_m[: len(one.coefficients_m)] = one.coefficients_m
+    found, change_m = now.measure(*shapes), shapes[0] - shapes[1]
     if found is None:
         return []
-    return [ev.ShapeHeld(id=record.id, ratio=found.ratio, sigma=found.sigma)]
+    held = ev.ShapeHeld(id=record.id, ratio=found.ratio, sigma=found.sigma)
+    # The smaller the change, the more another gain or seeing on both sides counts in it.
+    large = np.linalg.norm(change_m) >= MIN_CHANGE_RATIO * np.linalg.norm(shapes[0])
+    change = now.measure(change_m, np.zeros_like(change_m)) if large else None
+    return [held if change is None else replace(held, change=(change.ratio, change.sigma))]
 
 
 @dataclass(frozen=True, slots=True)

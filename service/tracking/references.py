@@ -54,7 +54,7 @@ COMPUTATION_TIMEOUT_S = 60.0
 HELD_RATIO_RANGE = (0.5, 1.7)
 """Plausible range of what the mirror holds of a change: seeing that doubles makes it 1.45."""
 
-HELD_SIGMAS = 4.0
+HELD_SIGMAS = 3.0
 """References are applied otherwise if the range is left by so many σ."""
 
 RECORDS_KEPT = 50
@@ -331,19 +331,22 @@ def on_fetched(context: StepContext, fetched: ev.ReferencesFetched) -> None:
 def on_held(context: StepContext, held: ev.ShapeHeld) -> None:
     """Keep how much of the shape the mirror holds; name references that are applied otherwise."""
     record = context.state.references_of(held.id)
-    if record is None or record.id != context.references.used_id:
+    # After wrong ones the way back to the RTC's own changes the mirror by another shape.
+    if record is None or record.id != context.references.used_id or record.shape is None:
         return
     record = replace(record, held_ratio=held.ratio, held_sigma=held.sigma)
     _store(context, record)
     least, most = HELD_RATIO_RANGE
-    spare = HELD_SIGMAS * held.sigma
-    outside = held.ratio + spare < least or held.ratio - spare > most
-    if outside and not context.references.difference:
-        text = (
-            f"the mirror holds {held.ratio:.2f} ± {held.sigma:.2f} times the change that "
-            f"{record.id} should make, by the mean of the commands"
-        )
-        _distrust(context, record, text)
+    for what, found in (("the shape", (held.ratio, held.sigma)), ("the change", held.change)):
+        if found is None or context.references.difference:
+            continue
+        ratio, sigma = found
+        if ratio + HELD_SIGMAS * sigma < least or ratio - HELD_SIGMAS * sigma > most:
+            text = (
+                f"the mirror holds {ratio:.2f} ± {sigma:.2f} times {what} of {record.id}, by the "
+                "mean of the commands"
+            )
+            _distrust(context, record, text)
 
 
 def follow_status(context: StepContext, rtc: Status, *, returned: bool) -> None:
@@ -367,8 +370,14 @@ def follow_status(context: StepContext, rtc: Status, *, returned: bool) -> None:
         asked_ns_utc=0,
     )
     if record is not None:
-        applied_ns = record.applied_ns_utc or context.now_ns
-        _store(context, replace(record, state=MatrixState.APPLIED, applied_ns_utc=applied_ns))
+        used = replace(
+            record,
+            state=MatrixState.APPLIED,
+            # What ended an earlier use of them is over.
+            reason=record.reason if record.on_its_way else "",
+            applied_ns_utc=record.applied_ns_utc or context.now_ns,
+        )
+        _store(context, used)
         with context.because_of(record.cause):
             context.log("references.applied", f"the RTC uses {record.id}")
     elif kept.used_id is not None and not returned:

@@ -65,13 +65,15 @@ MatrixId = Annotated[str, Depends(_resolve_id)]
 async def _resolve_references(
     service: views.ServiceDep,
     reference_id: Annotated[
-        str, Path(alias="id", description="Id of references, or in-use, candidate")
+        str, Path(alias="id", description="Id of references, or in-use, candidate, newest")
     ],
 ) -> str:
     """Return the id that is meant."""
     kept = service.snapshot().tracker.references
     proposed = [r.id for r in kept.records if r.state is MatrixState.PROPOSED]
-    aliases = {"in-use": kept.used_id, "candidate": proposed[-1] if proposed else None}
+    newest = kept.records[-1].id if kept.records else None
+    offered = proposed[-1] if proposed else None
+    aliases = {"in-use": kept.used_id, "candidate": offered, "newest": newest}
     if reference_id not in aliases:
         return reference_id
     return views.found_or_refuse(aliases[reference_id], f"{reference_id}: there are no references")

@@ -1,5 +1,6 @@
 """The operator's page in a real browser, before a real service and a simulated RTC."""
 
+import json
 import re
 import time
 from pathlib import Path
@@ -164,6 +165,50 @@ def test_what_was_decided_on_a_state_that_has_changed_is_not_done(page):
     page.says("#order", f"in place of {theirs}")
     assert page.night.state["in_use"] == theirs
     page.click("#order [value=cancel]")
+
+
+def load_shape(page, path, amplitude_nm):
+    """Have the page load Noll's astigmatism, and the dialog say how large it is."""
+    values = [0, 0, 0, 0, 0, amplitude_nm]
+    path.write_text(json.dumps({"kind": "zernike", "unit": "nm", "values": values}))
+    page.driver.find_element("css selector", "#held input[type=file]").send_keys(str(path))
+    page.says("#order", f"{amplitude_nm} nm RMS")
+    page.click("#order [value=send]")
+    page.says("#answer", "is loaded", 20.0)
+    page.says("#held .shape", path.name)
+
+
+def test_a_shape_is_loaded_approved_refused_with_its_limit_and_taken_back(page, tmp_path):
+    page.open()
+    page.until("document.querySelector('#held [name=load]').ariaDisabled === 'false'", 20.0)
+    page.night.client.put("/v1/mode", json={"mode": "propose"}).raise_for_status()
+    load_shape(page, tmp_path / "ncpa.json", 40)
+    page.until("!document.querySelector('#held .decide').hidden", 60.0)
+    page.says("#held .newest", "proposed: 40 nm RMS, scaled with the optical gain")
+    page.click("[data-order=approve-references]")
+    page.says("#order", "In use: the RTC's own references")
+    assert page.faults_of_access() == []
+    page.click("#order [value=send]")
+    page.says("#held .used", "40 nm RMS", 30.0)
+    page.says("#held .used", "read back", 30.0)
+    used = page.night.state["references"]["used"]["id"]
+    load_shape(page, tmp_path / "large.json", 4000)
+    page.says("#held .newest", "refused: 4", 60.0)
+    page.says("#held .newest", "with at most")
+    assert page.night.state["references"]["used"]["id"] == used
+    page.click("[data-order=clear-shape]")
+    page.send("the image was better before")
+    page.says("#held .shape", "none", 30.0)
+    page.says("#held .used", "the RTC's own references", 30.0)
+
+
+def test_a_file_that_holds_no_shape_is_refused_before_anything_is_sent(page, tmp_path):
+    page.open()
+    (tmp_path / "odd.json").write_text('{"values": [1, "x"]}')
+    file = page.driver.find_element("css selector", "#held input[type=file]")
+    file.send_keys(str(tmp_path / "odd.json"))
+    page.says("#answer", "odd.json: expected a list of numbers, values; the references in use stay")
+    assert not page.js("document.querySelector('#order').open")
 
 
 def test_a_file_is_fitted_and_what_was_found_is_drawn(page):

@@ -3,6 +3,7 @@
 import hashlib
 import io
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import h5py
@@ -10,8 +11,8 @@ import numpy as np
 import pytest
 
 from service.archive import Archive
-from service.records.products import MatrixState, ReconstructorRecord
-from service.records.state import TrackerState
+from service.records.products import MatrixState, ReconstructorRecord, ReferencesRecord
+from service.records.state import ReferenceStates, TrackerState
 from service.wire import checksum
 from tests.support.api import FakeService, a_snapshot
 from tests.support.states import tracker_state
@@ -115,3 +116,20 @@ async def test_without_its_package_a_fits_image_is_refused_by_name(client, monke
     answer = await client.get("/v1/reconstructors/cm-3/matrix?format=fits")
     assert answer.status_code == 409
     assert "pip install astropy" in answer.json()["detail"]
+
+
+async def test_an_offset_of_references_leaves_for_a_program_that_applies_it(client, service):
+    offset = np.linspace(-0.1, 0.1, 24).astype(np.float32)
+    made = ReferencesRecord(
+        id="ref-1", state=MatrixState.PROPOSED, created_ns_utc=1, sha256=checksum(offset)
+    )
+    service.archive.references.store(made, offset)
+    known = replace(service.now.tracker, references=ReferenceStates(records=(made,)))
+    service.now = a_snapshot(known)
+    for alias in ("ref-1", "candidate", "newest"):
+        answer = await client.get(f"/v1/references/{alias}/slopes?format=raw")
+        assert answer.headers["X-Shape"] == "24"
+        np.testing.assert_array_equal(np.frombuffer(answer.content, "<f4"), offset)
+    assert (await client.get("/v1/references/in-use/slopes")).status_code == 404
+    listed = (await client.get("/v1/references")).json()
+    assert [one["id"] for one in listed["records"]] == ["ref-1"]

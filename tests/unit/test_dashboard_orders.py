@@ -29,9 +29,11 @@ def said_of(states):
       globalThis.localStorage = {{}};
       const {{ Orders, usable }} = await import('{(FILES / "orders.js").as_uri()}');
       const {{ HISTORY_ORDERS }} = await import('{(FILES / "history_orders.js").as_uri()}');
+      const {{ REFERENCE_ORDERS }} = await import('{(FILES / "references.js").as_uri()}');
       const service = {{ forbidden: "", fresh: true, reconstructors: [] }};
       const orders = new Orders(service);
       orders.learn(HISTORY_ORDERS);
+      orders.learn(REFERENCE_ORDERS);
       const buttons = {json.dumps(sorted(buttons()))};
       console.log(JSON.stringify({json.dumps(states)}.map((state) => {{
         service.state = state;

@@ -63,8 +63,12 @@ def test_slopes_need_no_unit(tmp_path):
 @pytest.mark.parametrize(
     ("content", "given", "text"),
     [
-        ({"values": [60.0]}, {}, "says no --kind, no --frame, no --unit"),
-        ({"values": [60.0]}, {"kind": "modes", "frame": "mirror"}, "says no --unit"),
+        (
+            {"values": [60.0]},
+            {},
+            "found no kind and no frame and no unit: give --kind --frame --unit",
+        ),
+        ({"values": [60.0]}, {"kind": "modes", "frame": "mirror"}, "found no unit: give --unit"),
         ({"values": [60.0, float("nan")]}, {"kind": "slopes", "frame": "instrument"}, "1 values"),
         ({"numbers": [60.0]}, {}, "expected a JSON object with a list"),
         ({"values": ["a"]}, {}, "expected a JSON object with a list"),

@@ -103,7 +103,7 @@ export function showLoop(service, mirror) {
   const limit = mirror?.edge_limit_m;
   gauge($("#edge"), present(edge) && limit ? edge / limit : null, present(edge) ? `${nanometres(edge)} of ${nanometres(limit)}` : DASH);
   const since = state?.reference_since_ns_utc;
-  put($("#references"), state?.reference_id ? `${state.reference_id}, ${present(since) ? `since ${when(since, service.now)}` : "unchanged"}` : DASH);
+  put($("#references"), state?.reference_id ? `${state.reference_id}${state.references?.used ? "" : present(since) ? `, since ${when(since, service.now)}` : ", unchanged"}` : DASH);
   const dither = state?.dither_policy;
   put($("#dither"), !rtc && dither ? `${dither.phase}: ${dither.reason}` : dither ? `${dither.phase}, ${nanometres(dither.mean_cost_m)} of ${nanometres(dither.budget_m)}: ${dither.reason}` : DASH);
   const link = state?.link;

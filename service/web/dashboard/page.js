@@ -6,6 +6,7 @@ import { Events } from "./events.js";
 import { Large } from "./large.js";
 import { MirrorOnSensor } from "./mirror.js";
 import { Orders } from "./orders.js";
+import { References } from "./references.js";
 import { Registration } from "./registration.js";
 import { choose, scheme } from "./scheme.js";
 import { Session } from "./session.js";
@@ -21,6 +22,7 @@ const mirror = new MirrorOnSensor(service, document.querySelector("#mirror"));
 new Events(service, orders, document.querySelector("#events"));
 const $ = (selector) => document.querySelector(selector);
 const banner = new CriticalBanner(service, orders);
+new References(service, orders, $("#held"));
 const large = new Large(service, orders, $("#large"));
 const help = $("#help");
 

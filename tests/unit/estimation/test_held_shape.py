@@ -11,6 +11,7 @@ from tests.support.streams import block
 RATE_HZ = 100.0
 N_MODES = 12
 SHAPE_M = np.array([0.0, 0.0, 40e-9, 30e-9, 20e-9])
+NONE = np.zeros(5)
 
 
 def commands(n_frames, seed, rms_m, memory_s=0.3):
@@ -24,10 +25,11 @@ def commands(n_frames, seed, rms_m, memory_s=0.3):
     return rms_m * total
 
 
-def fed(factor, *, seconds=25.0, rms_m=40e-9, seed=1):
-    """Feed telemetry with a change of references that is applied times a factor."""
+def fed(factor, *, seconds=25.0, rms_m=40e-9, seed=1, before_m=NONE):
+    """Feed telemetry in which a shape follows another one and is applied times a factor."""
     n_frames = round(seconds * RATE_HZ)
     both = commands(2 * n_frames, seed, rms_m)
+    both[:n_frames, : len(SHAPE_M)] += before_m
     both[n_frames:, : len(SHAPE_M)] += factor * SHAPE_M
     estimator, due = MeanCommands(), 0
     names = ["ref-1"] * n_frames + ["ref-2~"] * 50 + ["ref-2"] * n_frames
@@ -45,14 +47,22 @@ def fed(factor, *, seconds=25.0, rms_m=40e-9, seed=1):
 def test_the_ratio_is_the_factor_within_its_sigma(factor):
     estimator, due = fed(factor)
     assert (estimator.name, estimator.before[0]) == ("ref-2", "ref-1")
-    found = estimator.measure(SHAPE_M)
+    found = estimator.measure(SHAPE_M, NONE)
     assert found.ratio == pytest.approx(factor, abs=4.0 * found.sigma)
     assert found.sigma < 0.3
     assert due == 9
 
 
+@pytest.mark.parametrize("factor", [1.0, -1.0, 2.0])
+def test_a_shape_that_replaces_another_one_is_measured_as_a_whole(factor):
+    before_m = np.array([0.0, 0.0, -40e-9, 30e-9, 25e-9])
+    estimator, _ = fed(factor, before_m=before_m)
+    found = estimator.measure(SHAPE_M, before_m)
+    assert found.ratio == pytest.approx(factor, abs=4.0 * found.sigma)
+
+
 def test_sigma_is_the_scatter_of_the_ratio():
-    found = [fed(1.0, seed=seed)[0].measure(SHAPE_M) for seed in range(40)]
+    found = [fed(1.0, seed=seed)[0].measure(SHAPE_M, NONE) for seed in range(40)]
     errors = np.array([one.ratio - 1.0 for one in found])
     sigmas = np.array([one.sigma for one in found])
     # 40 values have a scatter of 11 %; sigma is itself measured from some ten blocks that count.
@@ -62,14 +72,14 @@ def test_sigma_is_the_scatter_of_the_ratio():
 
 def test_a_small_change_in_strong_turbulence_has_a_large_sigma():
     estimator, _ = fed(1.0, rms_m=400e-9)
-    assert estimator.measure(SHAPE_M).sigma > 0.8
-    assert estimator.measure(np.zeros(5)) is None
+    assert estimator.measure(SHAPE_M, NONE).sigma > 0.8
+    assert estimator.measure(NONE, SHAPE_M) is None
 
 
 def test_nothing_is_found_before_enough_telemetry_on_both_sides():
     estimator, due = fed(1.0, seconds=2.0)
     assert due == 0
-    assert estimator.measure(SHAPE_M) is None
+    assert estimator.measure(SHAPE_M, NONE) is None
 
 
 def test_blocks_are_bounded():

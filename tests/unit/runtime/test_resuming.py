@@ -22,6 +22,7 @@ from service.runtime.policy import policy_of
 from service.runtime.worker import Compute, OpticsWorker
 from service.tracking.resume import restored
 from tests.support.acquiring import Acquiring
+from tests.support.shaped import ShapedStory
 from tests.support.situations import START_NS
 from tests.support.states import changed, tracker_state
 
@@ -130,6 +131,19 @@ def test_orders_are_left_where_nothing_else_is_and_taken_back_there(tmp_path):
             leave(archive, changed(fresh, stopped=stopped), START_NS)
             state = restore_tracking(archive, fresh, story.policy, START_NS)
             assert state.dithers.stopped is stopped
+
+
+def test_a_shape_and_its_references_are_taken_over_by_the_next_service(tmp_path):
+    with Archive(tmp_path) as archive:
+        archive.open()
+        story = ShapedStory(Mode.AUTO).load().use_references()
+        story.tell(cmd.RollBackReferences(by="Ada"))
+        leave(archive, story.state, story.now_ns)
+        fresh = tracker_state(system="flao", mode=Mode.AUTO)
+        state = restore_tracking(archive, fresh, story.policy, story.now_ns)
+    kept, left = state.references, story.state.references
+    assert kept.shape == left.shape is not None
+    assert kept.paused == left.paused != ""
 
 
 def test_what_another_system_has_left_is_neither_read_nor_kept(tmp_path):

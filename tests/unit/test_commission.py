@@ -218,5 +218,5 @@ def test_an_archive_of_another_instrument_is_refused(commissioned, tmp_path):
 
 
 def test_the_required_checks_are_the_checkers_own():
-    optional = {"images", "late-join", "signatures", "measure", "offload"}
+    optional = {"images", "late-join", "signatures", "measure", "offload", "references"}
     assert set(REQUIRED_CHECKS) == set(REQUIREMENTS) - optional

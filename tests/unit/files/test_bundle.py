@@ -17,6 +17,7 @@ ARRAYS = {
     "reconstructor": RNG.normal(size=(6, 20)).astype(np.float32),
     "interaction_matrix": RNG.normal(size=(20, 6)).astype(np.float32),
     "reference_slopes": RNG.normal(size=20).astype(np.float32),
+    "reference_offset": RNG.normal(size=20).astype(np.float32),
     "optical_gain": RNG.uniform(0.5, 1.0, 6),
     "gain_factor": RNG.uniform(1.0, 2.0, 6),
     "mode_to_actuator": RNG.normal(size=(9, 6)),

@@ -41,7 +41,9 @@ def telemetry():
     computer.prepare()
     sines = {
         "dither_modes": np.array(MODES),
-        "dither_frequencies_hz": np.array([round(f * RATE_HZ) for f in LINE_FRACTIONS], float),
+        "dither_frequencies_hz": np.array(
+            [round(f * RATE_HZ) for f in LINE_FRACTIONS[: len(MODES)]], float
+        ),
         "dither_amplitude_m": np.full(len(MODES), AMPLITUDE_M),
     }
     start_seq = dithered(computer, sines)

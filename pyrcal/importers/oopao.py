@@ -384,7 +384,7 @@ def _needed(owner: Oopao, name: str) -> Array:
     values = getattr(owner, name, None)
     if values is None:
         raise ConfigurationError(
-            f"wfs.{name}: missing; expected it with wfs.postProcessing = {owner.postProcessing!r}"
+            f"found no wfs.{name}; expected it with wfs.postProcessing = {owner.postProcessing!r}"
         )
     return _numpy(values)
 

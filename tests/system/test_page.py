@@ -204,6 +204,7 @@ def test_a_shape_is_loaded_approved_refused_with_its_limit_and_taken_back(page, 
 
 def test_a_file_that_holds_no_shape_is_refused_before_anything_is_sent(page, tmp_path):
     page.open()
+    page.until("document.querySelector('#held [name=load]').ariaDisabled === 'false'", 20.0)
     (tmp_path / "odd.json").write_text('{"values": [1, "x"]}')
     file = page.driver.find_element("css selector", "#held input[type=file]")
     file.send_keys(str(tmp_path / "odd.json"))

@@ -59,6 +59,7 @@ NO_UNIT = {
     "pole_radius_bound",
     "ready",
     "reconstructors",
+    "references_in_use",
     "rtc_alive",
     "stability_margin",
     "waiting_for",

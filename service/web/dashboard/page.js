@@ -6,7 +6,6 @@ import { Events } from "./events.js";
 import { Large } from "./large.js";
 import { MirrorOnSensor } from "./mirror.js";
 import { Orders } from "./orders.js";
-import { References } from "./references.js";
 import { Registration } from "./registration.js";
 import { choose, scheme } from "./scheme.js";
 import { Session } from "./session.js";
@@ -22,7 +21,6 @@ const mirror = new MirrorOnSensor(service, document.querySelector("#mirror"));
 new Events(service, orders, document.querySelector("#events"));
 const $ = (selector) => document.querySelector(selector);
 const banner = new CriticalBanner(service, orders);
-new References(service, orders, $("#held"));
 const large = new Large(service, orders, $("#large"));
 const help = $("#help");
 
@@ -148,8 +146,9 @@ document.addEventListener("keydown", (event) => {
   act();
 });
 
-// What is only glanced at comes after what is looked for.
+// What is only glanced at, and what many telescopes do not have, comes after what is looked for.
 service.addEventListener("reconstructors", async () => new (await import("./glance.js")).Glance(service, orders, $("#glance")), { once: true });
+service.addEventListener("state", async () => new (await import("./references.js")).References(service, orders, $("#held")), { once: true });
 
 window.addEventListener("hashchange", () => {
   turnTo();

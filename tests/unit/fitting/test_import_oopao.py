@@ -123,7 +123,7 @@ def test_a_mirror_that_oopao_drew_flipped_is_drawn_flipped(saved):
         ({"M2C": np.ones((7, 30))}, "M2C: found shape (7, 30), expected (n_actuators, n_modes)"),
         ({"calib__D": np.full((104, 30), np.nan)}, "expected finite numbers"),
         ({"wfs__postProcessing": np.array("quadCell")}, "expected 'slopesMaps', 'fullFrame'"),
-        ({"wfs__postProcessing": np.array("fullFrame")}, "wfs.validSignal: missing"),
+        ({"wfs__postProcessing": np.array("fullFrame")}, "found no wfs.validSignal"),
         ({"wfs__tag": np.array("bioEdge")}, "found 'bioEdge', expected 'pyramid'"),
         ({"dm__altitude": np.array(8e3)}, "expected None: a mirror in the pupil"),
         ({"dm__modes": np.ones((7, 68))}, "expected (tel.resolution ** 2, n_actuators)"),

@@ -37,7 +37,7 @@ def test_the_pages_have_the_sections_of_the_benchmarks():
 def test_figures_are_drawn_from_the_tables_of_the_pages(tmp_path):
     write_figures(tmp_path)
     names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"faults.png", "elt.png", "shack_hartmann.png"}
+    assert names == {"faults.png", "elt.png", "shack_hartmann.png", "references.png"}
     assert all((RESULTS / name).is_file() for name in names)
     with pytest.raises(ValueError, match="no table"):
         read_table("speed.md", "No such section")

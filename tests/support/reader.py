@@ -169,7 +169,8 @@ def runs_beside(words):
 
 def only_asks(text):
     """True if a block only asks a running service, so that it may be repeated."""
-    asking = {("status",), ("alpha",), ("audit",), ("alarms", "list"), ("reconstructors", "list")}
+    asking = {("status",), ("alpha",), ("audit",)}
+    asking |= {(name, "list") for name in ("alarms", "reconstructors", "references")}
     typed = list(commands(text))
     return all(
         words[0].endswith("pyrcal") and any(tuple(words[1:])[: len(a)] == a for a in asking)

@@ -612,11 +612,12 @@ async def test_references_are_sent_put_on_their_topic_and_read_back(bridge, rtc)
     request = ReferencesRequest(
         id="q-1", reference_id="ncpa", config_id="mask-1", ramp_s=1.0, **offset
     )
+    in_use = ReferencesInUse(reference_id="ncpa~", **offset)
+    # Before the reply to the command, which comes the same way: then the service knows it as well.
+    answer_references(rtc.zenoh, rtc.keys, lambda: in_use)
     assert (await bridge.command(request)).accepted
     assert rtc.commands == [request]
     assert decode(ReferencesRequest, _last_value(rtc, rtc.keys.references)) == request
-    in_use = ReferencesInUse(reference_id="ncpa~", **offset)
-    answer_references(rtc.zenoh, rtc.keys, lambda: in_use)
     assert await bridge.fetch_references() == in_use
 
 

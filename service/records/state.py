@@ -275,6 +275,10 @@ class ReferenceStates:
     shape: Shape | None = None
     """Shape to hold; None for the RTC's own references."""
 
+    former: tuple[Shape | None, str] = (None, "")
+    """Shape before the present one, and why its references were paused: it returns if the present
+    one is refused."""
+
     records: tuple[ReferencesRecord, ...] = ()
     """References of the service, oldest first, bounded; those in use are always among them."""
 

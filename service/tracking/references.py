@@ -150,7 +150,10 @@ def load_shape(context: StepContext, command: cmd.LoadShape) -> None:
         loaded_ns_utc=context.now_ns,
     )
     _discard_proposals(context, f"{shape.id} was loaded")
-    context.references = replace(context.references, shape=shape, paused="", not_before_ns_utc=0)
+    kept = context.references
+    context.references = replace(
+        kept, shape=shape, former=(kept.shape, kept.paused), paused="", not_before_ns_utc=0
+    )
     context.log("references.shape", f"{shape.id} loaded {command.signed}: {_describe(command)}")
 
 
@@ -267,9 +270,14 @@ def on_made(context: StepContext, made: ev.ReferencesMade) -> None:
         record = replace(record, state=MatrixState.DISCARDED, reason="the shape is held no longer")
     if record.state is not MatrixState.DISCARDED:
         _discard_proposals(context, f"{record.id} replaces them")
+    first = not any(other.shape == record.shape for other in context.references.records)
     _store(context, record)
     if record.state is MatrixState.REFUSED:
         context.warn("references.refused", f"{record.id}: {record.reason}")
+        if first:
+            # Else it would be sent unasked once the gain makes its slopes small enough.
+            former, paused = context.references.former
+            context.references = replace(context.references, shape=former, paused=paused)
     else:
         text = f"{1e9 * record.rms_m:.0f} nm RMS, scaled with {record.gain or 1.0:.2f}"
         left = (

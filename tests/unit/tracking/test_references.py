@@ -166,6 +166,30 @@ def test_a_shape_that_is_too_large_is_refused_and_those_in_use_stay(auto):
     assert len(auto.asked(ev.SendReferences)) == 1
 
 
+def test_after_a_refusal_the_shape_before_is_followed_and_the_refused_one_is_not_sent(auto):
+    auto.use_references()
+    held = auto.state.references.shape
+    auto.load()
+    auto.make_references(MatrixState.REFUSED, reason="100 nm, at most 70 nm")
+    assert auto.state.references.shape == held
+    auto.wait(FOLLOW_INTERVAL_S)
+    auto.see(n_windows=3)
+    auto.measure_gain(0.5).wait(1.0)
+    auto.make_references()
+    assert auto.last.shape == held.id
+    assert len(auto.asked(ev.SendReferences)) == 2
+
+
+def test_a_refusal_does_not_end_the_pause_of_the_shape_before(auto):
+    auto.use_references()
+    auto.tell(cmd.RollBackReferences(reason="the image is worse"))
+    auto.name_references().wait(1.0)
+    paused = auto.state.references.paused
+    auto.load()
+    auto.make_references(MatrixState.REFUSED, reason="100 nm, at most 70 nm")
+    assert auto.state.references.paused == paused != ""
+
+
 def test_references_without_an_answer_are_given_up_and_made_again_later(auto):
     auto.make_references()
     auto.wait(15.0)

@@ -150,9 +150,9 @@ def load_shape(context: StepContext, command: cmd.LoadShape) -> None:
         loaded_ns_utc=context.now_ns,
     )
     _discard_proposals(context, f"{shape.id} was loaded")
-    kept = context.references
+    former = (context.references.shape, context.references.paused)
     context.references = replace(
-        kept, shape=shape, former=(kept.shape, kept.paused), paused="", not_before_ns_utc=0
+        context.references, shape=shape, former=former, paused="", not_before_ns_utc=0
     )
     context.log("references.shape", f"{shape.id} loaded {command.signed}: {_describe(command)}")
 

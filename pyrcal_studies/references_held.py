@@ -37,7 +37,6 @@ from service.control.expected_gain import compute_radial_orders
 from service.control.gains import gain_table
 from service.control.reconstructor import invert
 from service.control.references import (
-    ShapeFrame,
     compute_references,
     limit_shape,
     shape_in_modes,
@@ -46,6 +45,7 @@ from service.files import parse_alpha
 from service.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.modes import karhunen_loeve_basis
+from service.records.products import Frame
 from service.records.registration import ModeGain
 from sim_rtc.assembly import build_telescope
 from sim_rtc.computer.feed import BATCH_FRAMES
@@ -133,7 +133,7 @@ def shape_of(plan: Plan) -> Array:
     given[SHAPED] = orders ** EXPONENTS[plan.shape] * drawn
     alpha = parse_alpha(plan.alpha)
     found = shape_in_modes(
-        model_of(plan.instrument), alpha, given, ShapeFrame.MIRROR, n_modes=n_controlled
+        model_of(plan.instrument), alpha, given, Frame.MIRROR, n_modes=n_controlled
     ).coefficients_m[:n_controlled]
     return found / np.linalg.norm(found)
 

@@ -11,7 +11,6 @@ seeing that is expected, and not by today's.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -25,6 +24,7 @@ from service.model.misregistration import Misregistration
 from service.model.modes import Basis
 from service.model.sensors.registry import kind_of
 from service.model.turbulence import REFERENCE_WAVELENGTH_M
+from service.records.products import Frame
 
 Array = NDArray[np.float64]
 
@@ -103,16 +103,6 @@ def _check_shape(coefficients_m: NDArray[Any]) -> Array:
     return shape
 
 
-class ShapeFrame(StrEnum):
-    """What a shape is fixed to."""
-
-    MIRROR = "mirror"
-    """The mirror's modes: they turn and move with α."""
-
-    INSTRUMENT = "instrument"
-    """The pupil and the axes of the sensor: the mirror moves beneath it."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ModalShape:
     """A shape on the sensor, as modes of the mirror."""
@@ -155,7 +145,7 @@ def shape_in_modes(
     model: InteractionModel,
     alpha: Misregistration,
     given: NDArray[Any],
-    frame: ShapeFrame,
+    frame: Frame,
     *,
     n_modes: int,
 ) -> ModalShape:
@@ -173,7 +163,7 @@ def shape_in_modes(
     """
     given = np.asarray(given, dtype=np.float64)
     coefficients_m = np.zeros(model.basis.n_modes)
-    if frame is ShapeFrame.MIRROR:
+    if frame is Frame.MIRROR:
         if given.ndim != 1 or np.any(given[n_modes:]):
             raise ModelError(
                 f"shape: found {given.shape} coefficients in the frame of the mirror; expected "

@@ -503,9 +503,9 @@ def _send_again(
 
 
 def _distrust(context: StepContext, record: ReferencesRecord, text: str) -> None:
-    """Name references that are applied otherwise than sent; in auto return to the RTC's own.
+    """Report references that are applied otherwise than sent; in auto return to the RTC's own.
 
-    An offset of zeros is right with any sign and scale.
+    The RTC's own references are an offset of zeros, which no wrong sign or scale changes.
     """
     context.references = replace(context.references, difference=text, verified_id=None)
     _pause(context, f"{text}. Mend the RTC, then load the shape again")

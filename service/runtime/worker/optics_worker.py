@@ -24,7 +24,6 @@ from service.control.gate import judge
 from service.control.loop import ControlLoop
 from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
 from service.control.references import (
-    ShapeFrame,
     compute_references,
     holding_gain,
     limit_shape,
@@ -540,9 +539,7 @@ class OpticsWorker:
         else:
             if shape.kind is ShapeKind.MAP:
                 values = values.reshape(round(len(values) ** 0.5), -1)
-            found = shape_in_modes(
-                model, alpha, values, ShapeFrame(shape.frame.value), n_modes=n_controlled
-            )
+            found = shape_in_modes(model, alpha, values, shape.frame, n_modes=n_controlled)
             coefficients, unexplained = found.coefficients_m, found.unexplained
         limit = limit_shape(
             model.instrument,

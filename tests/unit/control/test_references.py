@@ -9,7 +9,6 @@ import pytest
 
 from service.control.references import (
     MAX_SLOPE,
-    ShapeFrame,
     compute_references,
     holding_gain,
     limit_shape,
@@ -20,6 +19,7 @@ from service.errors import ModelError
 from service.instrument import load_instrument
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
+from service.records.products import Frame
 from tests.support.numerics import (
     N_CONTROLLED,
     N_MODES,
@@ -99,7 +99,7 @@ def test_zernikes_have_the_numbers_of_noll(noll, shape):
 
 def test_a_shape_of_the_mirror_stays_as_it_is():
     given = np.arange(5) * 1e-9
-    found = shape_in_modes(small_model(), SOMEWHERE, given, ShapeFrame.MIRROR, n_modes=N_CONTROLLED)
+    found = shape_in_modes(small_model(), SOMEWHERE, given, Frame.MIRROR, n_modes=N_CONTROLLED)
     assert found.coefficients_m.tolist() == [*given, *np.zeros(N_MODES - 5)]
     assert found.unexplained == 0.0
 
@@ -107,7 +107,7 @@ def test_a_shape_of_the_mirror_stays_as_it_is():
 @pytest.mark.parametrize("alpha", [Misregistration(), SOMEWHERE, QUARTER])
 def test_a_shape_of_the_instrument_does_not_turn_with_the_mirror(alpha):
     model, astigmatism = small_model(), np.array([0, 0, 0, 0, 0, 60e-9])
-    found = shape_in_modes(model, alpha, astigmatism, ShapeFrame.INSTRUMENT, n_modes=N_CONTROLLED)
+    found = shape_in_modes(model, alpha, astigmatism, Frame.INSTRUMENT, n_modes=N_CONTROLLED)
     points, weights = model.pupil.points, model.pupil.weights
     expected = zernikes(astigmatism, points / 6.0)
     made = model.render_modes(alpha) @ found.coefficients_m
@@ -124,7 +124,7 @@ def test_a_quarter_turn_of_the_mirror_reverses_the_coefficients_of_astigmatism()
             small_model(),
             alpha,
             np.array([0, 0, 0, 0, 0, 60e-9]),
-            ShapeFrame.INSTRUMENT,
+            Frame.INSTRUMENT,
             n_modes=N_CONTROLLED,
         ).coefficients_m
         for alpha in (Misregistration(), QUARTER)
@@ -140,7 +140,7 @@ def test_a_map_is_the_same_shape_as_its_zernikes():
     drawn = zernikes(coma, np.column_stack([x.ravel(), y.ravel()])).reshape(120, 120)
     by_map, by_number = (
         shape_in_modes(
-            small_model(), SOMEWHERE, given, ShapeFrame.INSTRUMENT, n_modes=N_CONTROLLED
+            small_model(), SOMEWHERE, given, Frame.INSTRUMENT, n_modes=N_CONTROLLED
         ).coefficients_m
         for given in (drawn, coma)
     )
@@ -151,20 +151,18 @@ def test_a_map_is_the_same_shape_as_its_zernikes():
 def test_a_shape_that_no_mode_makes_is_unexplained():
     ripple = np.zeros(120)
     ripple[105:] = 10e-9
-    found = shape_in_modes(
-        small_model(), SOMEWHERE, ripple, ShapeFrame.INSTRUMENT, n_modes=N_CONTROLLED
-    )
+    found = shape_in_modes(small_model(), SOMEWHERE, ripple, Frame.INSTRUMENT, n_modes=N_CONTROLLED)
     assert found.unexplained > 0.8
 
 
 @pytest.mark.parametrize(
     ("given", "frame", "message"),
     [
-        (np.ones(N_CONTROLLED + 1), ShapeFrame.MIRROR, "30 modes that the loop controls"),
-        (np.ones((3, 3)), ShapeFrame.MIRROR, "30 modes that the loop controls"),
-        (np.ones((3, 4)), ShapeFrame.INSTRUMENT, "square"),
-        (np.full((3, 3), np.nan), ShapeFrame.INSTRUMENT, "finite"),
-        (np.array([0.0, np.nan]), ShapeFrame.MIRROR, "finite"),
+        (np.ones(N_CONTROLLED + 1), Frame.MIRROR, "30 modes that the loop controls"),
+        (np.ones((3, 3)), Frame.MIRROR, "30 modes that the loop controls"),
+        (np.ones((3, 4)), Frame.INSTRUMENT, "square"),
+        (np.full((3, 3), np.nan), Frame.INSTRUMENT, "finite"),
+        (np.array([0.0, np.nan]), Frame.MIRROR, "finite"),
     ],
 )
 def test_what_is_no_shape_is_refused(given, frame, message):

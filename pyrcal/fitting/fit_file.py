@@ -232,15 +232,18 @@ def _with_found_light(instrument: Instrument, recorded: Recorded, found: Fit) ->
 
 def _note_flux_frame(found: Fit) -> Iterator[str]:
     """Yield that the light in the file of the matrix would lower σ, if it would."""
+    cut = (
+        f"the light is in the same file: cut the four pupil images out of {FLUX_FRAME}, "
+        "save their counts as flux (4, n, n) and give them (--flux-map)"
+    )
+    if found.gain_map is not None:
+        yield f"a gain over the pupil is fitted in place of the light; {cut}"
     for one in found.alternatives:
         gained = 1.0 - (1.0 if one.share is None else min(one.share, 1.0))
         explained = found.residual_fraction * float(np.sqrt(gained))
         if one.key == LIGHT_KEY and explained > MIN_LIGHT_EXPLAINED:
-            yield (
-                f"uneven light explains {explained:.0%} of the signal, and sigma allows for it; "
-                f"the light is in the same file: cut the four pupil images out of {FLUX_FRAME}, "
-                "save their counts as flux (4, n, n) and give them (--flux-map)"
-            )
+            words = f"uneven light explains {explained:.0%} of the signal"
+            yield f"{words}, and sigma allows for it; {cut}"
 
 
 def make_reference(recorded: Recorded, instrument: Instrument) -> tuple[Reference, tuple[str, ...]]:

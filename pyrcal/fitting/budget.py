@@ -135,13 +135,17 @@ def _divide_power(settled: Settled, noise: Array | None) -> Iterator[Cause]:
 def advise_measurement(causes: Sequence[Cause]) -> str:
     """Return what to measure next to halve the power that is left over; empty without causes."""
     chosen: list[Cause] = []
-    # What is unexplained is chosen last: no single measurement reduces it.
-    for one in causes:
+    for one in causes[:-1]:  # without the unexplained, which no single measurement reduces
         if sum(known.share for known in chosen) < 0.5:
             chosen.append(one)
+    if not causes:
+        return ""
+    steps = "; ".join(one.remedy for one in chosen or causes)
     shares = " and ".join(f"{one.words} ({one.share:.0%})" for one in chosen)
-    steps = "; ".join(one.remedy for one in chosen)
-    return f"half of the power left over is {shares}: {steps}" if chosen else ""
+    total = sum(one.share for one in chosen)
+    if total < 0.5:
+        return f"{total:.0%} of the power left over has a known cause, which is not half: {steps}"
+    return f"{shares} are {total:.0%} of the power left over: {steps}"
 
 
 def _model_at_best(settled: Settled) -> Array:

@@ -114,7 +114,5 @@ def test_a_sentence_that_links_a_section_quotes_numbers_of_it():
     wrong = []
     for place, sentence, sections in quotations:
         printed = set().union(*(numbers(section_text(name)) for name in sections))
-        wrong += [
-            (place, value) for value in numbers(sentence) if not is_printed(value, printed)
-        ]
+        wrong += [(place, value) for value in numbers(sentence) if not is_printed(value, printed)]
     assert wrong == []

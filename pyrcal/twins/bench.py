@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -27,7 +26,7 @@ from service.files.toml import read_toml
 from service.instrument import instrument_path
 
 _OOPAO = {
-    re.sub(r"[\W_]", "", f"{owner}.{name}").lower(): f"{owner}.{name}"
+    "".join(filter(str.isalnum, f"{owner}{name}")).lower(): f"{owner}.{name}"
     for owner, names in (*SAVED.items(), ("calib", ("D",)))
     for name in names
 }
@@ -152,7 +151,7 @@ def _state(options: argparse.Namespace) -> frozenset[str]:
 
 def _squeeze(name: str) -> str:
     """Return a name in small letters without anything but letters and digits."""
-    return re.sub(r"[\W_]", "", name).lower()
+    return "".join(filter(str.isalnum, name)).lower()
 
 
 def _read_files(given: list[tuple[str | None, Path]]) -> Iterator[_Named]:
@@ -167,7 +166,9 @@ def _read_files(given: list[tuple[str | None, Path]]) -> Iterator[_Named]:
             for name, values in arrays.items():
                 # The array of a NumPy or FITS file has no name of its own.
                 is_unnamed = name == DATASET or name.isdigit()
-                own = re.sub(r"(\.\w{2,3}){1,2}$", "", one.name) if is_unnamed else name
+                ends = [end for end in ARRAY_FILES if one.name.lower().endswith(end)]
+                own = one.name[: -len(max(ends, default="", key=len)) or None]
+                own = own if is_unnamed else name
                 yield _Named(role or own, values, one)
 
 

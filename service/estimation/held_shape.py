@@ -1,7 +1,7 @@
 """Compare the mean of the commands before and after a change of reference slopes.
 
 A wrong offset looks perfect in the slopes, from which the RTC has subtracted it: only the commands
-tell. Their mean over the turbulence changes by what the mirror holds in addition to the shape
+show it. Their mean over the turbulence changes by what the mirror holds in addition to the shape
 before. What it holds, over the shape that was sent, is 1 where sign, scale and numbers are as sent.
 Turbulence moves the mean as well: σ is taken from the scatter of blocks on both sides.
 """
@@ -39,7 +39,7 @@ SETTLING_S = 0.3
 
 
 class HeldRatio(NamedTuple):
-    """What the mirror holds of a shape."""
+    """Share of a shape that the mirror holds."""
 
     ratio: float
     """1 if it was applied as it was sent."""
@@ -52,7 +52,7 @@ class HeldRatio(NamedTuple):
 class MeanCommands(Streaming):
     """Means of the commands with the references in use and with those before."""
 
-    resets = Change.GONE | Change.SESSION | Change.RATE
+    resets = Change.GONE | Change.SESSION | Change.RATE | Change.OPEN
     unless = Mark.STANDS | Mark.ABSURD
     only_closed = True
 
@@ -90,6 +90,11 @@ class MeanCommands(Streaming):
             return replace(now, total=total, n_frames=n_frames)
         kept = now.blocks[-max(BLOCKS_BEFORE, BLOCKS_AFTER) + 1 :]
         return replace(now, blocks=(*kept, total / n_frames), total=None, n_frames=0)
+
+    @property
+    def duration_s(self) -> float:
+        """Duration of the telemetry that is compared, without the ramp."""
+        return BLOCK_S * (len(self.before[1][-BLOCKS_BEFORE:]) + len(self.blocks))
 
     def is_due(self, earlier: MeanCommands) -> bool:
         """Return True if there is a new finding since an earlier state."""

@@ -52,7 +52,13 @@ from pyrcal.fitting.methods import (
 )
 from pyrcal.fitting.models import FAR_PREFERRED_SHARE, PREFERRED_SHARE, FitModels
 from pyrcal.fitting.noise import bound_noise_share, measure_structure
-from pyrcal.fitting.origins import Origin, find_ellipse, list_origins, list_undetermined_keys
+from pyrcal.fitting.origins import (
+    Origin,
+    find_ellipse,
+    find_stroke,
+    list_origins,
+    list_undetermined_keys,
+)
 from pyrcal.fitting.pupil_checks import MIN_PUPIL_EXPLAINED
 from pyrcal.fitting.pupil_width import SeenPupil, compute_responses, measure_pupil
 from pyrcal.fitting.reference import check_reference
@@ -820,6 +826,8 @@ def _add_notes(
     )
     origins: tuple[Origin, ...] = ()
     if findings.explained:
+        stroke = find_stroke(about, slopes, fit.gains, findings.optics, findings.structure)
+        fit = replace(fit, stroke=stroke)
         origins = list_origins(
             about,
             reported,

@@ -773,7 +773,10 @@ def _make_fit(
             gain=options.gain,
             noise=usable.noise_per_pass,
         ),
-        causes=explain_left_over(settled, usable.noise_per_pass) if options.explain else (),
+        # Parts of a residual mean nothing where the model explains hardly anything.
+        causes=explain_left_over(settled, usable.noise_per_pass)
+        if options.explain and findings.explained
+        else (),
         paper_table=found.table,
     )
 

@@ -158,10 +158,11 @@ def _describe_stroke(made: Twin) -> Value:
         )
     return Value(
         "stroke",
-        gain,
-        scatter,
-        "model's slopes per metre",
-        "not determined: unit and sensor gain are both unknown, and scale all columns alike",
+        "not determined",
+        None,
+        "",
+        "unit of the commands and gain of the sensor are unknown, and scale all columns alike: "
+        f"these are {gain:.3g} times the model's per metre",
     )
 
 

@@ -10,12 +10,13 @@ import pytest
 import scipy
 
 import pyrcal
+from pyrcal.twins.bench import measure_spot
 from service.errors import ConfigurationError, MatrixError
 from service.instrument import instrument_path, load_instrument
 
 DATA = Path(os.environ.get("PYRCAL_BENCH_DATA", "../shared/data"))
 DUMP = DATA / "failing" / "whole_detector.npz"
-pytestmark = pytest.mark.skipif(not DUMP.is_file(), reason="needs the data of a simulated bench")
+needs_data = pytest.mark.skipif(not DUMP.is_file(), reason="needs the data of a simulated bench")
 
 TRUE = (0.0, -1.333, 0.0, 1.12)
 """Registration of the bench: subapertures, degrees, ratio."""
@@ -37,6 +38,7 @@ def bench(tmp_path):
     return folder
 
 
+@needs_data
 def test_the_files_of_a_bench_become_its_twin(bench, tmp_path):
     made = pyrcal.twin(bench, tmp_path / "twin", diameter_m=0.6, unit="m")
     fit, values = made.report.fit, json.loads((made.folder / "twin.json").read_text("utf-8"))
@@ -54,6 +56,7 @@ def test_the_files_of_a_bench_become_its_twin(bench, tmp_path):
     assert (made.folder / "twin.html").stat().st_size > 1e4
 
 
+@needs_data
 def test_service_and_fit_take_the_folder_of_a_twin(bench, tmp_path):
     made = pyrcal.twin(bench, tmp_path / "twin", **QUICK)
     assert instrument_path(made.folder) == made.folder / "instrument.toml"
@@ -67,6 +70,7 @@ def test_service_and_fit_take_the_folder_of_a_twin(bench, tmp_path):
         pyrcal.twin(bench, bench, diameter_m=0.6, unit="m")
 
 
+@needs_data
 @pytest.mark.parametrize(
     ("name", "shape", "named"),
     [
@@ -87,3 +91,16 @@ def test_files_that_do_not_belong_together_are_named(bench, tmp_path, name, shap
     assert named in str(refusal.value)
     assert name in str(refusal.value) or named == "--modes"
     assert [one.name for one in tmp_path.iterdir()] == ["bench"]
+
+
+def test_the_axes_of_the_path_of_a_spot_are_seen_in_its_picture():
+    """Semi-axes of 50 and 40 pixels, the longer one at 30 deg; a spot of 3 pixels on its path."""
+    angles = np.linspace(0.0, 2.0 * np.pi, 360, endpoint=False)
+    path = np.exp(1j * np.pi / 6.0) * (50.0 * np.cos(angles) + 40.0j * np.sin(angles))
+    x, y = np.meshgrid(np.arange(160.0) - 80.0, np.arange(160.0) - 80.0)
+    # The spot is at each phase for the same time.
+    picture = np.exp(-(np.abs(x + 1j * y - path[:, None, None]) ** 2) / 18.0).mean(axis=0)
+    noise = np.random.default_rng(1).normal(0.0, 0.03 * picture.max(), x.shape)
+    ratio, angle_deg = measure_spot(picture + 0.3 * picture.max() + noise)
+    assert ratio == pytest.approx(1.25, abs=0.02)
+    assert angle_deg == pytest.approx(30.0, abs=1.0)

@@ -128,7 +128,7 @@ def read_bench(options: argparse.Namespace) -> Bench:
     sampled = _find_fft_grid(imported, options.pupil_subap, has_light="light" in found)
     return Bench(
         imported=(imported,) if sampled is None else (sampled, imported),
-        stated=_state(options),
+        stated=_state(options, imported),
         sky_pupil=found.get("sky_pupil"),
         inventory=inventory,
     )
@@ -137,10 +137,12 @@ def read_bench(options: argparse.Namespace) -> Bench:
 def _import_other(options: argparse.Namespace) -> Bench:
     """Return what the files of another code describe."""
     imported = import_files(options)
-    return Bench(imported=(imported,), stated=_state(options), inventory=imported.inventory)
+    return Bench(
+        imported=(imported,), stated=_state(options, imported), inventory=imported.inventory
+    )
 
 
-def _state(options: argparse.Namespace) -> frozenset[str]:
+def _state(options: argparse.Namespace, imported: Imported) -> frozenset[str]:
     """Return the keys of the instrument file that the options give."""
     keys = {
         "diameter_m": options.diameter_m,
@@ -154,8 +156,14 @@ def _state(options: argparse.Namespace) -> frozenset[str]:
     }
     stated = {key for key, value in keys.items() if value is not None}
     if options.instrument is not None:
-        for table in read_toml(instrument_path(options.instrument)).values():
-            stated |= table.keys()
+        tables = read_toml(instrument_path(options.instrument))
+        # What the arrays show takes the place of what the file says.
+        stated |= {
+            key
+            for name, table in imported.tables.items()
+            for key, value in table.items()
+            if key in tables.get(name, {}) and tables[name][key] == value
+        }
     return frozenset(stated)
 
 
@@ -166,9 +174,12 @@ def _squeeze(name: str) -> str:
 
 def _read_files(given: list[tuple[str | None, Path]]) -> Iterator[_Named]:
     """Yield the arrays of files and of the files in folders; a given role is their name."""
-    for role, path in given:
+    with_role = {path.resolve() for role, path in given if role is not None}
+    # A file with a stated role comes first, also if its folder is given as well.
+    for role, path in sorted(given, key=lambda one: one[0] is None):
         for one in sorted(path.iterdir()) if path.is_dir() else [path]:
-            if path.is_dir() and not one.name.lower().endswith(ARRAY_FILES):
+            is_array = one.name.lower().endswith(ARRAY_FILES) and one.resolve() not in with_role
+            if path.is_dir() and not is_array:
                 continue
             arrays = read_arrays(one, [])
             if role is not None and len(arrays) != 1:
@@ -195,6 +206,8 @@ def _sort_by_role(
             unknown.append(one)
             continue
         if role in found:
+            if role in dict(options.files):
+                continue  # the other one was stated
             raise MatrixError(f"{one.path}: found a second {role}, expected one; say ROLE=FILE")
         found[role] = one.values
         inventory.append(f"{role}: {one.path} {one.values.shape}")
@@ -203,7 +216,9 @@ def _sort_by_role(
     for one in unknown:
         role = _guess_mask(one.values, np.shape(found.get("matrix", ())))
         if role is None or role in found:
-            inventory.append(f"not used: {one.path} {one.values.shape} ({one.name}); ROLE=FILE")
+            inventory.append(
+                f"not used: {one.path} {one.values.shape} ({one.name}): give ROLE=FILE"
+            )
         else:
             found[role] = one.values
             inventory.append(f"{role}, by its shape: {one.path} {one.values.shape}")
@@ -211,12 +226,14 @@ def _sort_by_role(
 
 
 def _find_role(name: str) -> str | None:
-    """Return the role for a name, or for a part of it; None if it is unknown."""
+    """Return the role for a name, for a part of it, or for one of its words; None if unknown."""
     squeezed = _squeeze(name)
+    words = "".join(one if one.isalnum() else " " for one in name).split()
     return (
         role_of_name(name)
         or (name if name in dict(_PARTS) else None)
         or next((role for role, parts in _PARTS if any(part in squeezed for part in parts)), None)
+        or next(filter(None, (role_of_name(word) for word in words if len(word) > 1)), None)
     )
 
 

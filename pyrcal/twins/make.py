@@ -12,6 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pyrcal.fitting.alternatives import PLAUSIBLE_DISPLACEMENT_PX
 from pyrcal.fitting.fit_file import Progress, fit_file
 from pyrcal.fitting.fit_table import NOTABLE_DISPLACEMENT_PX
@@ -109,7 +111,12 @@ def twin(
     else:
         given = ((None, one) for one in ([files] if isinstance(files, str | Path) else files))
     options = argparse.Namespace(**{**TOLD, **told}, files=[(role, Path(p)) for role, p in given])
-    return _make(options, Path(output), check=check, threads=threads)
+    return _make(
+        options,
+        Path(output),
+        check=check,
+        threads=threads,
+    )
 
 
 def _make(
@@ -161,7 +168,7 @@ def _fit_bench(bench: Bench, folder: Path, threads: int, progress: Progress | No
         best = replace(again, before=first.report) if _is_better(again, than=first) else first
     saved = best.imported.save(folder)
     write_whole(folder / "fit.h5", partial(fill_fit, report=best.report))
-    _write_live(saved, best.report.fit)
+    _write_live(best, saved)
     return best
 
 
@@ -214,21 +221,34 @@ def _correct_tables(tables: Tables, fit: Fit) -> Tables:
     return corrected
 
 
-def _write_live(saved: Saved, fit: Fit) -> None:
+def _write_live(made: Twin, saved: Saved) -> None:
     """Write the instrument file of ``pyrcal run``: an RTC sends slopes, not frames."""
-    folder, places = saved.instrument.parent, fit.image_offsets_px
-    text = saved.instrument.read_text(encoding="utf-8")
-    if places is not None and (
-        NOTABLE_DISPLACEMENT_PX < abs(places).max() < PLAUSIBLE_DISPLACEMENT_PX
-    ):
-        text = text.replace("[wfs]\n", f"[wfs]\nimage_offsets_px = {places.round(3).tolist()}\n")
+    folder = saved.instrument.parent
     draft, live = folder / f"draft-{TWIN_FILE}", folder / TWIN_LIVE_FILE
-    draft.write_text(text, encoding="utf-8")
+    tables = _describe_live(made.imported.tables, made.report.fit)
+    draft.write_text(replace(made.imported, tables=tables).instrument_text(), encoding="utf-8")
     write_live_instrument(draft, live)
     draft.unlink()
     # It refers to arrays by absolute paths, in a folder that is moved to its place later.
     text = live.read_text(encoding="utf-8").replace(f"{folder}/", "").replace("draft-", "")
     live.write_text(text, encoding="utf-8")
+
+
+def _describe_live(tables: Tables, fit: Fit) -> Tables:
+    """Return the tables with what frames show or the fit starts with, but slopes do not show."""
+    wfs, mirror = dict(tables["wfs"]), dict(tables["mirror"])
+    places, centres = fit.image_offsets_px, wfs.get("pupil_centres_px", "auto")
+    if not isinstance(centres, str):
+        ordered = np.sort(np.array(centres), axis=0)
+        apart_px = float(np.mean(ordered[2:] - ordered[:2]))
+        wfs["pupil_separation_subap"] = apart_px / wfs.get("pixels_per_subaperture", 1)
+    if places is not None and (
+        NOTABLE_DISPLACEMENT_PX < abs(places).max() < PLAUSIBLE_DISPLACEMENT_PX
+    ):
+        wfs["image_offsets_px"] = places.round(3).tolist()
+    if fit.accepted:
+        mirror["nominal_rotation_deg"] = round(fit.alpha.to_boundary()["rotation_deg"], 3)
+    return {**tables, "wfs": wfs, "mirror": mirror}
 
 
 def _export(made: Twin, *, check: bool) -> Twin:

@@ -28,7 +28,7 @@ _UNITS = ("subaperture", "subaperture", "deg", "ratio")
 
 _FROM_FILES = {
     *("n_subapertures", "pupil_diameter_subap", "pupil_centres_px", "obscuration_ratio"),
-    *("pixels_per_subaperture", "valid_subapertures", "pupil_separation_subap", "pupil"),
+    *("pixels_per_subaperture", "valid_subapertures", "pupil_separation_subap", "pupil", "input"),
     *("influence_functions", "modes", "mode_to_actuator", "modes_pitch_m", "positions", "fft_grid"),
 }
 """Keys of the instrument file that the importers measure on the arrays."""
@@ -158,10 +158,11 @@ def _describe_stroke(made: Twin) -> Value:
         )
     return Value(
         "stroke",
-        gain,
-        scatter,
-        "model's slopes per metre",
-        "not determined: unit and sensor gain are both unknown, and scale all columns alike",
+        "not determined",
+        None,
+        "",
+        "unit of the commands and gain of the sensor are unknown, and scale all columns alike: "
+        f"these are {gain:.3g} times the model's per metre",
     )
 
 
@@ -201,7 +202,8 @@ def list_lines(made: Twin) -> Iterator[str]:
     yield f"{'left over':32s}{100.0 * made.residual:.2f} % of the signal"
     for cause in list_causes(fit)[:5]:
         yield f"  {cause.share:.0%} of it: {cause.words}"
-    yield from (f"note: {remark}" for one in made.exported for remark in one.remarks)
+    remarks = dict.fromkeys(remark for one in made.exported for remark in one.remarks)
+    yield from (f"note: {remark}" for remark in remarks)
     yield from made.checks
     yield f"written to {made.folder}: open twin.html"
 

@@ -1,0 +1,149 @@
+"""Run exported models in their own programs, and compare the matrices that they measure."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.fitting.fit_file import make_reference
+from pyrcal.fitting.fitted import Fit
+from pyrcal.fitting.recorded import Recorded
+from pyrcal.twin import oopao_model
+from pyrcal.twin.sampled import apply_fit, correlations, residual_fraction
+from service.estimation.reference import target_of
+from service.model.instrument import Instrument
+
+Array = NDArray[Any]
+
+MAX_SECONDS = 3600.0
+"""Time after which a program that measures a model is stopped."""
+
+MAX_CHECKED_MODES = 60
+"""Number of modes that are measured."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Checked:
+    """Comparison of the matrix that an exported model measures with others."""
+
+    program: str
+    """Name of the program that measured."""
+
+    modes: NDArray[np.intp]
+    """``(n,)`` basis indices of the modes that were measured."""
+
+    matrix: Array
+    """``(n_slopes, n)`` measured matrix in the axes of conventions.md."""
+
+    left_over: float
+    """RMS of the bench's matrix that the exported model leaves, with a free gain for each mode."""
+
+    left_over_by_fit: float
+    """RMS of the bench's matrix that pyrcal's own model leaves, in the same modes."""
+
+    correlation: Array
+    """``(n,)`` correlation of each mode with the bench's."""
+
+    seconds: float
+    """Time that the measurement took."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Unchecked:
+    """A model that could not be run."""
+
+    program: str
+    reason: str
+    """Reason, in one sentence."""
+
+
+def check_oopao_model(
+    folder: Path, instrument: Instrument, fit: Fit, *, python: Path | None = None
+) -> Checked | Unchecked:
+    """Return how the OOPAO model in ``folder`` compares with the bench and with the fit.
+
+    ``python`` is an interpreter that has OOPAO; None for the present one.
+    """
+    model, some = folder / oopao_model.NAME, _choose_columns(fit)
+    with tempfile.TemporaryDirectory() as name:
+        product, begun = Path(name) / "matrix.npz", time.perf_counter()
+        command = [str(model.absolute()), str(product), *map(str, fit.modes[some])]
+        reason = _run("OOPAO", command, python, folder)
+        if reason is not None:
+            return Unchecked(program="OOPAO", reason=reason)
+        with np.load(product) as found:
+            matrix, reference = found["matrix"], found["reference"]
+    seconds = time.perf_counter() - begun
+    return _compare("OOPAO", matrix, reference, apply_fit(instrument, fit), fit, some, seconds)
+
+
+def _choose_columns(fit: Fit) -> NDArray[np.intp]:
+    """Return columns of the fit, spread over all of them."""
+    spread = np.linspace(0, len(fit.modes) - 1, MAX_CHECKED_MODES)
+    return np.unique(spread.round().astype(np.intp))
+
+
+def _run(program: str, arguments: list[str], python: Path | None, folder: Path) -> str | None:
+    """Run a Python file; return why it did not work, None if it did."""
+    variables = {**os.environ, "MPLBACKEND": "Agg", "PYTHONDONTWRITEBYTECODE": "1"}
+    try:
+        done = subprocess.run(
+            [str(python or sys.executable), *arguments],
+            cwd=folder,
+            env=variables,
+            capture_output=True,
+            text=True,
+            timeout=MAX_SECONDS,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return f"{program} could not be run: {error}."
+    if done.returncode == 0:
+        return None
+    last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+    if last.startswith("ModuleNotFoundError"):
+        return f"{program} is not installed: {last.removeprefix('ModuleNotFoundError: ')}."
+    return f"{program} did not run the model: {last}."
+
+
+def _compare(
+    program: str,
+    measured: Array,
+    reference: Array,
+    instrument: Instrument,
+    fit: Fit,
+    some: NDArray[np.intp],
+    seconds: float,
+) -> Checked:
+    """Compare signals ``(n, ...)`` of the bench's own order, one mode after the other."""
+    frames = instrument.frames is not None
+    normalised = getattr(instrument.frames, "normalised", False)
+    recorded = Recorded(
+        values=measured if frames else measured.T,
+        modes=fit.modes[some],
+        noise=None,
+        double_pass=False,
+        flux_frame=reference if frames and not normalised else None,
+        where=program,
+        sha256="",
+    )
+    matrix = target_of(make_reference(recorded, instrument)[0], instrument).matrix
+    bench = fit.measured[:, some]
+    return Checked(
+        program=program,
+        modes=fit.modes[some],
+        matrix=matrix,
+        left_over=residual_fraction(bench, matrix),
+        left_over_by_fit=residual_fraction(bench, fit.synthetic[:, some]),
+        correlation=correlations(bench, matrix),
+        seconds=seconds,
+    )

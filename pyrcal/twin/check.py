@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from pyrcal.fitting.fit_file import make_reference
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.recorded import Recorded
-from pyrcal.twin import oopao_model
+from pyrcal.twin import oopao_model, specula_model
 from pyrcal.twin.sampled import apply_fit, correlations, residual_fraction
 from service.estimation.reference import target_of
 from service.model.instrument import Instrument
+from service.model.slopes import slopes_of
 
 Array = NDArray[Any]
 
@@ -83,7 +84,25 @@ def check_oopao_model(
         with np.load(product) as found:
             matrix, reference = found["matrix"], found["reference"]
     seconds = time.perf_counter() - begun
-    return _compare("OOPAO", matrix, reference, apply_fit(instrument, fit), fit, some, seconds)
+    found = apply_fit(instrument, fit)
+    matrix = _from_bench("OOPAO", matrix, reference, found, fit.modes[some])
+    return _judge("OOPAO", matrix, fit, some, seconds)
+
+
+def check_specula_model(
+    folder: Path, instrument: Instrument, fit: Fit, *, python: Path | None = None
+) -> Checked | Unchecked:
+    """Return how the SPECULA model in ``folder`` compares with the bench and with the fit.
+
+    ``python`` is an interpreter that has SPECULA; None for the present one.
+    """
+    begun = time.perf_counter()
+    program = ["-m", "specula.scripts.specula_main", "--cpu", "--precision", "0"]
+    reason = _run("SPECULA", [*program, specula_model.NAME], python, folder)
+    if reason is not None:
+        return Unchecked(program="SPECULA", reason=reason)
+    matrix, seconds = specula_model.read_matrix(folder), time.perf_counter() - begun
+    return _judge("SPECULA", matrix, fit, np.arange(len(fit.modes)), seconds, instrument)
 
 
 def _choose_columns(fit: Fit) -> NDArray[np.intp]:
@@ -115,35 +134,46 @@ def _run(program: str, arguments: list[str], python: Path | None, folder: Path) 
     return f"{program} did not run the model: {last}."
 
 
-def _compare(
-    program: str,
-    measured: Array,
-    reference: Array,
-    instrument: Instrument,
-    fit: Fit,
-    some: NDArray[np.intp],
-    seconds: float,
-) -> Checked:
-    """Compare signals ``(n, ...)`` of the bench's own order, one mode after the other."""
+def _from_bench(
+    program: str, measured: Array, reference: Array, instrument: Instrument, modes: Array
+) -> Array:
+    """Return signals in the bench's own order ``(n, ...)`` as a fit has them."""
     frames = instrument.frames is not None
     normalised = getattr(instrument.frames, "normalised", False)
     recorded = Recorded(
         values=measured if frames else measured.T,
-        modes=fit.modes[some],
+        modes=modes,
         noise=None,
         double_pass=False,
         flux_frame=reference if frames and not normalised else None,
         where=program,
         sha256="",
     )
-    matrix = target_of(make_reference(recorded, instrument)[0], instrument).matrix
-    bench = fit.measured[:, some]
+    return target_of(make_reference(recorded, instrument)[0], instrument).matrix
+
+
+def _judge(
+    program: str,
+    matrix: Array,
+    fit: Fit,
+    some: NDArray[np.intp],
+    seconds: float,
+    instrument: Instrument | None = None,
+) -> Checked:
+    """Compare a matrix of some columns of the fit, in its axes.
+
+    It has slopes if the ``instrument`` is given, whose signals may be pixels.
+    """
+    bench, own = fit.measured[:, some], fit.synthetic[:, some]
+    if instrument is not None:
+        kind = instrument.slopes.kind
+        bench, own = (slopes_of(one, kind).reshape(-1, len(some)) for one in (bench, own))
     return Checked(
         program=program,
         modes=fit.modes[some],
         matrix=matrix,
         left_over=residual_fraction(bench, matrix),
-        left_over_by_fit=residual_fraction(bench, fit.synthetic[:, some]),
+        left_over_by_fit=residual_fraction(bench, own),
         correlation=correlations(bench, matrix),
         seconds=seconds,
     )

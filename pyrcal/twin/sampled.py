@@ -129,16 +129,17 @@ class SampledBench:
         moved = self.alpha.vector - [x, y, 0.0, 0.0]
         return self.alpha.with_vector(moved)
 
-    def render_modes(self) -> Array:
-        """Return the modes ``(n_points ** 2, n_modes)`` on the pupil, where α puts them."""
-        along = (np.arange(self.n_points) - (self.n_points - 1) / 2) * (
-            self.n_pixels / self.pixels / self.n_points
-        )
+    def points_on_mirror(self) -> Array:
+        """Return where on the mirror the points of the pupil are ``(n_points ** 2, 2)``."""
+        step = self.n_pixels / self.pixels / self.n_points
+        along = (np.arange(self.n_points) - (self.n_points - 1) / 2) * step
         x, y = np.meshgrid(along, along)
         alpha = self.mirror_alpha
-        return self.basis.render(
-            alpha.on_mirror(np.column_stack([x.ravel(), y.ravel()]) - alpha.vector[:2])
-        )
+        return alpha.on_mirror(np.column_stack([x.ravel(), y.ravel()]) - alpha.vector[:2])
+
+    def render_modes(self) -> Array:
+        """Return the modes ``(n_points ** 2, n_modes)`` on the pupil, where α puts them."""
+        return self.basis.render(self.points_on_mirror())
 
     def list_signals(self, frame_shape: tuple[int, int] | None) -> tuple[Array, Array]:
         """Return for each of the bench's signals its index in the model's, and its sign.

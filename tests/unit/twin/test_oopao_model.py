@@ -1,7 +1,4 @@
-"""A bench that OOPAO simulated becomes an OOPAO model with the same objects.
-
-``pyrcal/samples/data/oopao-pyramid.npz`` is the pyramid of 8 subapertures of test_import_oopao.
-"""
+"""A bench that OOPAO simulated becomes an OOPAO model with the same objects."""
 
 import runpy
 import sys
@@ -10,28 +7,9 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-import pyrcal
-from pyrcal.importers.oopao import from_saved
-from pyrcal.importers.saved import read_npz
 from pyrcal.twin.check import Checked, Unchecked, check_oopao_model
 from pyrcal.twin.oopao_model import write_oopao_model
-from tests.support.repository import ROOT
 from tests.support.twin import find_interpreter
-
-SAVED = ROOT / "pyrcal" / "samples" / "data" / "oopao-pyramid.npz"
-
-
-@pytest.fixture(scope="module")
-def dump():
-    return read_npz(SAVED)
-
-
-@pytest.fixture(scope="module")
-def bench(dump, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("bench")
-    saved = from_saved(dump, "it").save(folder)
-    instrument = pyrcal.load_instrument(saved.instrument)
-    return instrument, pyrcal.fit_file(instrument, saved.matrix, pyrcal.FitOptions()).fit
 
 
 class Anything(ModuleType):

@@ -276,8 +276,8 @@ def _describe_reconstruct(commands: Any) -> None:  # noqa: ANN401 - argparse's o
         "svd: least squares without weak singular values (default); map: with noise and "
         "turbulence as priors"
     )
-    condition = "of svd: largest condition number, default %(default)g"
-    noise = "of map: 1 sigma of one slope in one frame, default %(default)g"
+    condition = "with svd: largest condition number, default %(default)g"
+    noise = "with map: 1 sigma of one slope in one frame, default %(default)g"
     array = "library for the matrix; torch and cupy use a GPU; default %(default)s"
     specula = "also write Intmat and Recmat of SPECULA, in the order of this file"
     commands.add_parser(

@@ -1,7 +1,7 @@
 """Compare the mean of the commands before and after a change of reference slopes.
 
 A wrong offset looks perfect in the slopes, from which the RTC has subtracted it: only the commands
-tell. Their mean over the turbulence changes by what the mirror holds in addition to the shape
+show it. Their mean over the turbulence changes by what the mirror holds in addition to the shape
 before. What it holds, over the shape that was sent, is 1 where sign, scale and numbers are as sent.
 Turbulence moves the mean as well: σ is taken from the scatter of blocks on both sides.
 """
@@ -39,7 +39,7 @@ SETTLING_S = 0.3
 
 
 class HeldRatio(NamedTuple):
-    """What the mirror holds of a shape."""
+    """Share of a shape that the mirror holds."""
 
     ratio: float
     """1 if it was applied as it was sent."""

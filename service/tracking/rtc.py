@@ -298,5 +298,5 @@ def fail_order(context: StepContext, effect: Effect | Request, text: str) -> Non
 
 
 def log_failure(context: StepContext, _: Effect | Request, text: str) -> None:
-    """Log the failure; what is still needed is asked for again."""
+    """Log the failure; a request that is still needed is sent again."""
     context.warn("job.failed", text)

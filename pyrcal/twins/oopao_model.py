@@ -13,8 +13,8 @@ import numpy as np
 
 from pyrcal.fitting.fitted import Fit
 from pyrcal.importers.oopao import to_oopao
-from pyrcal.twin.exported import Exported
-from pyrcal.twin.sampled import SampledBench, sample_bench
+from pyrcal.twins.exported import Exported
+from pyrcal.twins.sampled import SampledBench, sample_bench
 from service.model.instrument import Instrument
 from service.model.kinds import SignalKind
 from service.model.modes import ModalBasis

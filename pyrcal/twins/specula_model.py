@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.fitting.fitted import Fit
-from pyrcal.twin.exported import Exported
-from pyrcal.twin.sampled import SampledBench, sample_bench
+from pyrcal.twins.exported import Exported
+from pyrcal.twins.sampled import SampledBench, sample_bench
 from service.errors import MatrixError
 from service.files.container import opened
 from service.model.instrument import Instrument

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from pyrcal.fitting.fit_file import make_reference
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.recorded import Recorded
-from pyrcal.twin import oopao_model, specula_model
-from pyrcal.twin.sampled import apply_fit, correlations, residual_fraction
+from pyrcal.twins import oopao_model, specula_model
+from pyrcal.twins.sampled import apply_fit, correlations, residual_fraction
 from service.estimation.reference import target_of
 from service.model.instrument import Instrument
 from service.model.slopes import slopes_of

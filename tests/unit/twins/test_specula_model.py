@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from pyrcal.fitting.specula import read_subapertures
-from pyrcal.twin.check import Checked, check_oopao_model, check_specula_model
-from pyrcal.twin.oopao_model import write_oopao_model
-from pyrcal.twin.sampled import correlations, residual_fraction
-from pyrcal.twin.specula_model import write_specula_model
+from pyrcal.twins.check import Checked, check_oopao_model, check_specula_model
+from pyrcal.twins.oopao_model import write_oopao_model
+from pyrcal.twins.sampled import correlations, residual_fraction
+from pyrcal.twins.specula_model import write_specula_model
 from service.files.container import opened
 from service.model.sensors.pyramid.description import stretch_of
 from tests.support.twin import find_interpreter

@@ -7,8 +7,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from pyrcal.twin.check import Checked, Unchecked, check_oopao_model
-from pyrcal.twin.oopao_model import write_oopao_model
+from pyrcal.twins.check import Checked, Unchecked, check_oopao_model
+from pyrcal.twins.oopao_model import write_oopao_model
 from tests.support.twin import find_interpreter
 
 

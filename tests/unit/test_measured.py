@@ -92,12 +92,13 @@ RESULT_LINK = re.compile(r"\]\((?:\.\./)*(?:docs/)?results/([\w.]+\.md(?:#[\w-]+
 
 
 def quoting_sentences():
-    """Each sentence, or cell of a table, outside the results that links a section of them."""
+    """Each sentence, or row of an explanation's table, that links a section of the results."""
     for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
         if page.parent == RESULTS:
             continue
         for number, line in enumerate(page.read_text("utf-8").splitlines(), 1):
-            for sentence in re.split(r"(?<=[.;|]) ", line) if RESULT_LINK.search(line) else ():
+            row = line.startswith("| ") and page.parent.name == "explanation"
+            for sentence in [line] if row else re.split(r"(?<=[.;|]) ", line):
                 if sections := RESULT_LINK.findall(sentence):
                     yield f"{page.relative_to(ROOT)}:{number}", sentence, sections
 

@@ -28,7 +28,7 @@ from pyrcal.importers.oopao import from_saved
 from pyrcal.importers.saved import read_npz
 from pyrcal.twins.check import Checked, Unchecked, check_oopao_model, check_specula_model
 from pyrcal.twins.oopao_model import write_oopao_model
-from pyrcal.twins.sampled import apply_fit, correlations, residual_fraction
+from pyrcal.twins.sampled import apply_fit, correlations, residual_fraction, sample_bench
 from pyrcal.twins.specula_model import write_specula_model
 from pyrcal_studies.benches import BENCHES, some_columns
 from pyrcal_studies.campaign.rows import Row, RowFile
@@ -101,8 +101,9 @@ def run_models(name: str, folder: Path, instrument: Instrument, fit: Fit) -> dic
     """Return what the exported models of a bench leave."""
     with h5py.File(folder / "matrix.h5") as file:
         shape = file["interaction_matrix"].shape[1:] if instrument.frames is not None else None
-    write_oopao_model(instrument, fit, folder, frame_shape=shape)
-    remarks = write_specula_model(instrument, fit, folder, frame_shape=shape).remarks
+    bench = sample_bench(instrument, fit, shape)
+    write_oopao_model(bench, folder)
+    remarks = write_specula_model(bench, fit, folder).remarks
     oopao = _ran(check_oopao_model(folder, instrument, fit, python=environment("oopao")))
     specula = _ran(check_specula_model(folder, instrument, fit, python=environment("specula")))
     both = np.isin(fit.modes, oopao.modes)

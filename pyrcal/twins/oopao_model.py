@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import math
-import re
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pyrcal.fitting.fitted import Fit
 from pyrcal.importers.oopao import to_oopao
 from pyrcal.twins.exported import Exported
-from pyrcal.twins.sampled import SampledBench, sample_bench
-from service.model.instrument import Instrument
+from pyrcal.twins.sampled import SampledBench
+from service.model.instrument import PupilMap
 from service.model.kinds import SignalKind
 from service.model.modes import ModalBasis
 from service.model.pupil import instrument_pupil
 from service.model.surface import Gaussian
+
+Array = NDArray[Any]
 
 NAME = "oopao_model.py"
 """Name of the Python file; its arrays have the same name and end in ``.npz``."""
@@ -29,67 +30,52 @@ _FACES = ([1, 1, 0, 0], [1, 0, 0, 1])
 
 
 def write_oopao_model(
-    instrument: Instrument,
-    fit: Fit,
-    folder: Path,
-    *,
-    frame_shape: tuple[int, int] | None = None,
-    sky: Instrument | None = None,
+    bench: SampledBench, folder: Path, sky_pupil: Array | None = None
 ) -> Exported:
-    """Write the model into ``folder``.
+    """Write the model of a bench into ``folder``; files of an earlier one are replaced.
 
-    Parameters
-    ----------
-    instrument, fit
-        The bench and the fit of its matrix.
-    folder
-        Existing folder; files of an earlier model in it are replaced.
-    frame_shape
-        Rows and columns of the bench's frames; None if it has slopes.
-    sky
-        The same instrument with the pupil on the sky; None if it is that of the calibration.
-
-    Raises
-    ------
-    ModelError
-        If the sensor is no pyramid.
+    ``sky_pupil`` is the pupil on the sky ``(n, n)``, as wide as its diameter; None if it is that
+    of the calibration.
     """
-    bench = sample_bench(instrument, fit, frame_shape)
-    mirror, arrays = _describe_mirror(bench)
-    index, sign = bench.list_signals(frame_shape)
-    whole = instrument.frames is not None or instrument.slopes.kind is SignalKind.INTENSITY
+    about = bench.instrument
+    constants, arrays = _describe_mirror(bench)
+    index, sign = bench.list_signals()
+    whole = about.frames is not None or about.slopes.kind is SignalKind.INTENSITY
     valid = np.ones((bench.width_px, bench.width_px), bool) if whole else bench.valid
     arrays |= {"amplitude": bench.amplitude, "valid": valid}
     arrays |= {"signal_index": index, "signal_sign": sign}
-    if sky is not None:
-        lit = instrument_pupil(sky, bench.points_per_pixel * bench.pixels).amplitude
-        arrays["sky_amplitude"] = np.pad(lit, (bench.n_points - len(lit)) // 2)
-    shape = (frame_shape or valid.shape) if instrument.frames is not None else index.shape
-    values = {
-        "BENCH": instrument.name,
+    if sky_pupil is not None:
+        arrays["sky_amplitude"] = _draw_sky(bench, sky_pupil)
+    shape = (bench.frame_shape or valid.shape) if about.frames is not None else index.shape
+    constants |= {
+        "BENCH": about.name,
         **_describe_sensor(bench),
         "POST_PROCESSING": "fullFrame_sum_flux" if whole else "slopesMaps",
-        **mirror,
         "SHAPE": tuple(map(int, shape)),
     }
     path = folder / NAME
-    path.write_text(_fill_in(values), encoding="utf-8")
+    path.write_text(_fill_in(constants), encoding="utf-8")
     np.savez_compressed(path.with_suffix(".npz"), **arrays)
     return Exported(path=path, remarks=bench.remarks)
 
 
+def _draw_sky(bench: SampledBench, sky_pupil: Array) -> Array:
+    """Return the amplitude of the pupil on the sky, on the array of the calibration's."""
+    about = bench.instrument
+    lit = PupilMap(lit=sky_pupil.astype(float), pitch_m=about.diameter_m / len(sky_pupil))
+    sampling = bench.points_per_pixel * bench.pixels
+    drawn = instrument_pupil(replace(about, pupil=lit), sampling).amplitude
+    return np.pad(drawn, (bench.n_points - len(drawn)) // 2)
+
+
 def _fill_in(values: dict[str, Any]) -> str:
     """Return the text of the model with its constants."""
-    text = Path(__file__).with_name("oopao_twin.py").read_text(encoding="utf-8")
-    for name, value in values.items():
-        # a function, because backslashes of a text would be read as references to groups
-        insert = partial(_assign, value=value)
-        text = re.sub(rf"^({name}(?:: [^=]+)?) = .*$", insert, text, flags=re.MULTILINE)
-    return text
-
-
-def _assign(line: re.Match[str], value: object) -> str:
-    return f"{line[1]} = {value!r}"
+    lines = []
+    for line in Path(__file__).with_name("oopao_twin.py").read_text("utf-8").splitlines():
+        name, equals, _ = line.partition(" = ")
+        key = name.partition(":")[0]
+        lines.append(f"{name} = {values[key]!r}" if equals and key in values else line)
+    return "\n".join(lines) + "\n"
 
 
 def _describe_sensor(bench: SampledBench) -> dict[str, Any]:

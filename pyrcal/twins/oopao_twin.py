@@ -127,6 +127,7 @@ def list_signals(signal: np.ndarray) -> np.ndarray:
 def measure_matrix(modes: list[int], stroke_m: float = 1e-9) -> tuple[np.ndarray, np.ndarray]:
     """Return signals per unit command, one mode after the other, and the signal without one."""
     _, star, mirror, sensor = make_model()
+    sensor.compute_focal_plane = False
     lit = ARRAYS["amplitude"].ravel() > 0.0
     found = []
     for shape in (mirror.modes @ MODES[:, modes]).T:

@@ -94,6 +94,9 @@ class SampledBench:
     unit_m: float
     """OPD of a unit command, metres, light passes included."""
 
+    frame_shape: tuple[int, int] | None
+    """Rows and columns of the bench's frames; None if it has slopes."""
+
     reverse: bool
     """True if the bench's signals have the other sign than those of conventions.md."""
 
@@ -111,54 +114,59 @@ class SampledBench:
         return _pixels(self.instrument)
 
     @property
+    def n_subapertures(self) -> int:
+        """Subapertures along the pupil's array."""
+        return self.n_pixels // self.pixels
+
+    @property
     def width_m(self) -> float:
         """Width of the pupil's array, metres in the pupil plane."""
-        return self.n_pixels / self.pixels * self.instrument.subaperture_m
+        return self.n_subapertures * self.instrument.subaperture_m
 
     @property
     def modulation(self) -> tuple[float, float, float]:
         """Semi-axes, λ over the array's width, and the angle of the first one, radians."""
-        wider = self.n_pixels / self.pixels / self.instrument.wfs.pupil_diameter
+        wider = self.n_subapertures / self.instrument.wfs.pupil_diameter
         first, second, angle = oriented_pyramid(self.instrument).modulation_axes
         return first * wider, second * wider, angle
 
     @property
     def mirror_alpha(self) -> Misregistration:
         """Registration of the mirror on the pupil."""
-        x, y = self.pupil_shift_subap
-        moved = self.alpha.vector - [x, y, 0.0, 0.0]
-        return self.alpha.with_vector(moved)
+        return self.alpha.add_step(np.array([*-self.pupil_shift_subap, 0.0, 0.0]))
 
     def points_on_mirror(self) -> Array:
         """Return where on the mirror the points of the pupil are ``(n_points ** 2, 2)``."""
-        step = self.n_pixels / self.pixels / self.n_points
-        along = (np.arange(self.n_points) - (self.n_points - 1) / 2) * step
+        sampling, alpha = self.points_per_pixel * self.pixels, self.mirror_alpha
+        along = (np.arange(self.n_points) - (self.n_points - 1) / 2) / sampling
         x, y = np.meshgrid(along, along)
-        alpha = self.mirror_alpha
         return alpha.on_mirror(np.column_stack([x.ravel(), y.ravel()]) - alpha.vector[:2])
 
     def render_modes(self) -> Array:
         """Return the modes ``(n_points ** 2, n_modes)`` on the pupil, where α puts them."""
         return self.basis.render(self.points_on_mirror())
 
-    def list_signals(self, frame_shape: tuple[int, int] | None) -> tuple[Array, Array]:
+    @property
+    def orientation(self) -> Orientation:
+        """Orientation of the bench's signals, without the sign that the mirror has instead."""
+        found = self.instrument.slopes.assumed_orientation
+        return replace(found, sign_x=1, sign_y=1) if self.reverse else found
+
+    def list_signals(self) -> tuple[Array, Array]:
         """Return for each of the bench's signals its index in the model's, and its sign.
 
         The model's signals are all Sx and all Sy of ``valid``, or its detector of
-        ``width_px ** 2`` pixels where the bench has frames; those are of ``frame_shape``.
+        ``width_px ** 2`` pixels.
         """
-        recipe = self.instrument.slopes
-        orientation = recipe.assumed_orientation
-        if self.reverse:
-            orientation = replace(orientation, sign_x=1, sign_y=1)
         if self.instrument.frames is not None:
-            return self._list_pixels(orientation, frame_shape)
-        recipe = replace(recipe, orientation=orientation)
+            return self._list_pixels()
+        recipe = replace(self.instrument.slopes, orientation=self.orientation)
         if recipe.kind is SignalKind.INTENSITY:
             numbers = 1 + self._list_image_pixels()
         else:
             numbers = 1 + np.arange(2 * int(self.valid.sum()))
-        listed = to_rtc(numbers, recipe, rtc_mask(valid_subapertures(self.instrument), orientation))
+        mask = rtc_mask(valid_subapertures(self.instrument), self.orientation)
+        listed = to_rtc(numbers, recipe, mask)
         return np.abs(listed) - 1, np.sign(listed)
 
     def _list_image_pixels(self) -> Array:
@@ -171,18 +179,16 @@ class SampledBench:
             found.append(row * self.width_px + column)
         return np.concatenate(found)
 
-    def _list_pixels(
-        self, orientation: Orientation, frame_shape: tuple[int, int] | None
-    ) -> tuple[Array, Array]:
+    def _list_pixels(self) -> tuple[Array, Array]:
         """Return the model's pixel of each of the bench's, row by row, and signs of 1."""
-        n, apart = self.width_px, round(self.separation_px)
+        n, apart, orientation = self.width_px, round(self.separation_px), self.orientation
         places = np.arange(n)
         other = np.where(places < n / 2, places + apart, places - apart) % n
         # a sign of -1 exchanges the images at -x and +x, which stay as they are
         along_y = other if orientation.sign_y < 0 else places
         along_x = other if orientation.sign_x < 0 else places
         flipped = rtc_mask(np.arange(n * n).reshape(n, n), orientation)[np.ix_(along_y, along_x)]
-        rows, columns = frame_shape or (n, n)
+        rows, columns = self.frame_shape or (n, n)
         return flipped[:rows, :columns].ravel(), np.ones(rows * columns, dtype=int)
 
 
@@ -199,9 +205,14 @@ def sample_bench(
     ModelError
         If the sensor is no pyramid.
     """
-    found = apply_fit(instrument, fit)
-    grids = _list_grids(found, frame_shape)
-    tried = [_place_images(_draw_bench(found, fit, *grid), fit) for grid in grids]
+    found, basis = apply_fit(instrument, fit), cached_basis(instrument)
+    if isinstance(basis, ModalBasis) and isinstance(basis.surface, Gaussian):
+        coupling = found.analytic_mirror.shape.coupling
+        basis = basis.of_surface(replace(basis.surface, coupling=coupling))
+    tried = [
+        _place_images(replace(_draw_bench(found, basis, fit, *grid), frame_shape=frame_shape), fit)
+        for grid in _list_grids(found, frame_shape)
+    ]
     bench, left = min(tried, key=lambda one: one[1])
     if pyramid_in(found).fft_grid is not None:
         return bench
@@ -237,7 +248,7 @@ def _list_grids(instrument: Instrument, frame_shape: tuple[int, int] | None) -> 
     return [(one + (one % 2 if one > 1 else 0), width) for one in per_pixel for width in even]
 
 
-def _draw_bench(found: Instrument, fit: Fit, points: int, width: int) -> SampledBench:
+def _draw_bench(found: Instrument, basis: Basis, fit: Fit, points: int, width: int) -> SampledBench:
     """Return a bench with its images on a centred square, for so many points and pixels."""
     pixels = _pixels(found)
     amplitude, n_pixels = _draw_pupil(found, pixels, points)
@@ -248,7 +259,7 @@ def _draw_bench(found: Instrument, fit: Fit, points: int, width: int) -> Sampled
     orientation = found.slopes.assumed_orientation
     return SampledBench(
         instrument=found,
-        basis=_fitted_basis(found, fit),
+        basis=basis,
         alpha=fit.alpha,
         n_pixels=n_pixels,
         points_per_pixel=points,
@@ -259,6 +270,7 @@ def _draw_bench(found: Instrument, fit: Fit, points: int, width: int) -> Sampled
         image_places_px=np.zeros((2, 2, 2)),
         valid=_pad(valid_subapertures(found), n_pixels // pixels),
         unit_m=1.0 if found.mirror.stroke_known else float(np.median(fit.gains)),
+        frame_shape=None,
         reverse=orientation.sign_x == orientation.sign_y == -1,
         remarks=(),
     )
@@ -293,23 +305,13 @@ def _with_ellipse(wfs: Pyramid, entry: str) -> Pyramid:
     return replace(wfs, modulation_lambda_over_d=radius, modulation_stretch=stretch)
 
 
-def _fitted_basis(instrument: Instrument, fit: Fit) -> Basis:
-    """Return the modes of the instrument; wider functions than a file's are not applied."""
-    basis = cached_basis(instrument)
-    if isinstance(basis, ModalBasis) and isinstance(basis.surface, Gaussian):
-        coupling = instrument.analytic_mirror.shape.coupling
-        return basis.of_surface(replace(basis.surface, coupling=coupling))
-    return basis
-
-
 def _pixels(instrument: Instrument) -> int:
     frames = instrument.frames
     return frames.pixels_per_subaperture if isinstance(frames, FrameWindows) else 1
 
 
 def _pad(square: Array, n: int) -> Array:
-    margin = (n - len(square)) // 2
-    return np.pad(square, margin)
+    return np.pad(square, (n - len(square)) // 2)
 
 
 def _draw_pupil(instrument: Instrument, pixels: int, points: int) -> tuple[Array, int]:
@@ -360,10 +362,7 @@ def _window_places(bench: SampledBench) -> Array:
     if not isinstance(frames, FrameWindows) or frames.centres_px is None:
         return np.zeros((2, 2, 2))
     off = by_quadrant(frames.centres_px)[..., ::-1] - (bench.width_px - 1) / 2
-    orientation = bench.instrument.slopes.assumed_orientation
-    if bench.reverse:
-        orientation = replace(orientation, sign_x=1, sign_y=1)
-    return orient_offsets(off - _SIDES * bench.separation_px, orientation)
+    return orient_offsets(off - _SIDES * bench.separation_px, bench.orientation)
 
 
 def _residual(bench: SampledBench, instrument: Instrument, fit: Fit) -> float:

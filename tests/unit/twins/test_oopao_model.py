@@ -9,6 +9,7 @@ import pytest
 
 from pyrcal.twins.check import Checked, Unchecked, check_oopao_model
 from pyrcal.twins.oopao_model import write_oopao_model
+from pyrcal.twins.sampled import sample_bench
 from tests.support.twin import find_interpreter
 
 
@@ -27,7 +28,7 @@ def read_model(path, monkeypatch):
 
 
 def test_the_model_has_the_numbers_of_the_bench(bench, dump, tmp_path, monkeypatch):
-    exported = write_oopao_model(*bench, tmp_path)
+    exported = write_oopao_model(sample_bench(*bench), tmp_path)
     model = read_model(exported.path, monkeypatch)
     number = {name: float(dump[name]) for name in ("tel.D", "wfs.modulation", "dm.mechCoupling")}
     assert model["RESOLUTION"] == int(dump["tel.resolution"])
@@ -43,7 +44,7 @@ def test_the_model_has_the_numbers_of_the_bench(bench, dump, tmp_path, monkeypat
 
 
 def test_the_model_lists_signals_as_the_bench_does(bench, dump, tmp_path, monkeypatch):
-    model = read_model(write_oopao_model(*bench, tmp_path).path, monkeypatch)
+    model = read_model(write_oopao_model(sample_bench(*bench), tmp_path).path, monkeypatch)
     n_slopes = dump["calib.D"].shape[0]
     assert model["SHAPE"] == (n_slopes,)
     # OOPAO's own order: its slopes are those of the bench, and the mirror has its sign
@@ -53,7 +54,7 @@ def test_the_model_lists_signals_as_the_bench_does(bench, dump, tmp_path, monkey
 
 
 def test_a_program_that_is_not_installed_is_named(bench, tmp_path):
-    write_oopao_model(*bench, tmp_path)
+    write_oopao_model(sample_bench(*bench), tmp_path)
     found = check_oopao_model(tmp_path, *bench, python=tmp_path / "no-python")
     assert isinstance(found, Unchecked)
     assert found.reason.startswith("OOPAO could not be run")
@@ -63,7 +64,7 @@ def test_a_program_that_is_not_installed_is_named(bench, tmp_path):
 @pytest.mark.timeout(300)
 def test_oopao_measures_the_bench_with_its_model(bench, tmp_path):
     python = find_interpreter("OOPAO")
-    write_oopao_model(*bench, tmp_path)
+    write_oopao_model(sample_bench(*bench), tmp_path)
     found = check_oopao_model(tmp_path, *bench, python=python)
     assert isinstance(found, Checked), found
     # the target of a noise-free bench of the same sampling

@@ -8,8 +8,8 @@ import pytest
 from pyrcal.fitting.specula import read_subapertures
 from pyrcal.twins.check import Checked, check_oopao_model, check_specula_model
 from pyrcal.twins.oopao_model import write_oopao_model
-from pyrcal.twins.sampled import correlations, residual_fraction
-from pyrcal.twins.specula_model import write_specula_model
+from pyrcal.twins.sampled import correlations, residual_fraction, sample_bench
+from pyrcal.twins.specula_model import swap_slopes, write_specula_model
 from service.files.container import opened
 from service.model.sensors.pyramid.description import stretch_of
 from tests.support.twin import find_interpreter
@@ -22,7 +22,7 @@ def read(folder, kind, name):
 
 def test_the_files_hold_the_bench(bench, tmp_path):
     instrument, fit = bench
-    write_specula_model(instrument, fit, tmp_path)
+    write_specula_model(sample_bench(instrument, fit), fit, tmp_path)
     with opened(tmp_path / "calibration" / "pupils" / "bench.fits") as container:
         mask = read_subapertures(container).mask
     margin = (len(fit.valid) - len(mask)) // 2
@@ -37,7 +37,7 @@ def test_the_files_hold_the_bench(bench, tmp_path):
 
 def test_the_reconstructor_inverts_the_matrix_in_nanometres(bench, tmp_path):
     instrument, fit = bench
-    write_specula_model(instrument, fit, tmp_path)
+    write_specula_model(sample_bench(instrument, fit), fit, tmp_path)
     reconstructor = read(tmp_path, "rec", "RECMAT")
     # SPECULA's first slopes are Sy of conventions.md
     sx, sy = np.split(fit.synthetic * 1e-9, 2)
@@ -46,10 +46,12 @@ def test_the_reconstructor_inverts_the_matrix_in_nanometres(bench, tmp_path):
 
 def test_what_the_parameter_file_cannot_say_is_said(bench, tmp_path):
     instrument, fit = bench
-    plain = write_specula_model(instrument, fit, tmp_path).remarks
+    plain = write_specula_model(sample_bench(instrument, fit), fit, tmp_path).remarks
     assert not [one for one in plain if "elliptic" in one]
     wfs = replace(instrument.wfs, modulation_stretch=stretch_of((3.5, 2.5), 0.3))
-    remarks = write_specula_model(replace(instrument, wfs=wfs), fit, tmp_path).remarks
+    remarks = write_specula_model(
+        sample_bench(replace(instrument, wfs=wfs), fit), fit, tmp_path
+    ).remarks
     assert [one for one in remarks if "no elliptic modulation" in one]
 
 
@@ -57,8 +59,9 @@ def test_what_the_parameter_file_cannot_say_is_said(bench, tmp_path):
 @pytest.mark.timeout(300)
 def test_specula_measures_what_oopao_measures(bench, tmp_path):
     specula, oopao = find_interpreter("specula"), find_interpreter("OOPAO")
-    write_specula_model(*bench, tmp_path)
-    write_oopao_model(*bench, tmp_path)
+    sampled = sample_bench(*bench)
+    write_specula_model(sampled, bench[1], tmp_path)
+    write_oopao_model(sampled, tmp_path)
     found = check_specula_model(tmp_path, *bench, python=specula)
     assert isinstance(found, Checked), found
     other = check_oopao_model(tmp_path, *bench, python=oopao)
@@ -66,3 +69,6 @@ def test_specula_measures_what_oopao_measures(bench, tmp_path):
     # the targets of the models' comparison, for a pupil of 32 points
     assert correlations(other.matrix, found.matrix).min() >= 0.9995
     assert residual_fraction(other.matrix, found.matrix) <= 0.015
+    # the exported reconstructor is in SPECULA's order and unit: it inverts what SPECULA measured
+    sensed = read(tmp_path, "rec", "RECMAT") @ swap_slopes(found.matrix)
+    assert np.allclose(sensed, np.eye(len(sensed)), atol=0.1)

@@ -71,10 +71,10 @@ def _draw_sky(bench: SampledBench, sky_pupil: Array) -> Array:
 def _fill_in(values: dict[str, Any]) -> str:
     """Return the text of the model with its constants."""
     lines = []
-    for line in Path(__file__).with_name("oopao_twin.py").read_text("utf-8").splitlines():
-        name, equals, _ = line.partition(" = ")
-        key = name.partition(":")[0]
-        lines.append(f"{name} = {values[key]!r}" if equals and key in values else line)
+    for source in Path(__file__).with_name("oopao_twin.py").read_text("utf-8").splitlines():
+        left, equals, _ = source.partition(" = ")
+        key = left.partition(":")[0]
+        lines.append(f"{left} = {values[key]!r}" if equals and key in values else source)
     return "\n".join(lines) + "\n"
 
 

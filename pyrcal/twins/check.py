@@ -57,6 +57,15 @@ class Checked:
     seconds: float
     """Time that the measurement took."""
 
+    @property
+    def words(self) -> str:
+        """Outcome, in one sentence."""
+        return (
+            f"{self.program} runs its model: its matrix leaves {self.left_over:.2%} of the bench's "
+            f"in {len(self.modes)} modes, the fit {self.left_over_by_fit:.2%}; the lowest "
+            f"correlation of a mode is {self.correlation.min():.4f}."
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Unchecked:
@@ -65,6 +74,11 @@ class Unchecked:
     program: str
     reason: str
     """Reason, in one sentence."""
+
+    @property
+    def words(self) -> str:
+        """Outcome, in one sentence."""
+        return self.reason
 
 
 def check_oopao_model(
@@ -129,8 +143,8 @@ def _run(program: str, arguments: list[str], python: Path | None, folder: Path) 
     if done.returncode == 0:
         return None
     last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-    if last.startswith("ModuleNotFoundError"):
-        return f"{program} is not installed: {last.removeprefix('ModuleNotFoundError: ')}."
+    if "ModuleNotFoundError" in last:
+        return f"{program} is not installed for {python or sys.executable}."
     return f"{program} did not run the model: {last}."
 
 

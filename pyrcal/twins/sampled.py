@@ -47,6 +47,9 @@ USUAL_WIDTH = 3.0
 MAX_JUDGED_MODES = 40
 """Number of modes with which the places of the pupil images are judged."""
 
+NOTABLE_SHARE = 0.001
+"""Difference of what two models leave that is worth a remark."""
+
 _Grid = tuple[int, int]
 """Points per detector pixel, and detector pixels across."""
 
@@ -343,7 +346,7 @@ def _place_images(bench: SampledBench, fit: Fit) -> tuple[SampledBench, float]:
         with_places = _residual(bench, there, fit)
         if with_places < left:
             about, left = there, with_places
-        else:
+        elif with_places > left + NOTABLE_SHARE:
             remarks = (
                 *remarks,
                 f"The fitted places of the pupil images are left out: with them {with_places:.2%} "

@@ -64,6 +64,8 @@ def test_the_files_of_a_bench_become_its_twin(bench, tmp_path):
     assert float(values["modulation_lambda_over_d"]["value"]) == pytest.approx(3.1, abs=0.1)
     assert values["wavelength_m"]["origin"].startswith("measured")
     assert (made.folder / "twin.html").stat().st_size > 1e4
+    assert [one.path.name for one in made.exported] == ["oopao_model.py", "specula_model.yml"]
+    assert all(one.path.is_file() for one in made.exported)
 
 
 @pytest.mark.skipif(not WHOLE_DETECTOR.is_file(), reason="the matrices are not here")

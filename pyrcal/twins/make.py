@@ -66,6 +66,7 @@ def main(options: argparse.Namespace) -> int:
         argparse.Namespace(**told, files=options.files),
         options.output,
         check=options.check,
+        python=options.python,
         threads=options.threads,
         progress=show_progress,
     )
@@ -78,6 +79,7 @@ def twin(
     output: str | Path,
     *,
     check: bool = False,
+    python: str | Path | None = None,
     threads: int = 2,
     **told: Any,  # noqa: ANN401 - as different as the options
 ) -> Twin:
@@ -92,6 +94,8 @@ def twin(
         Folder to write: a new one, or that of an earlier twin, which is replaced.
     check
         Whether OOPAO and SPECULA, where installed, measure the matrices of their models.
+    python
+        Interpreter that has them; None for the present one.
     threads
         Threads that share the work.
     told
@@ -116,12 +120,8 @@ def twin(
     else:
         given = ((None, one) for one in ([files] if isinstance(files, str | Path) else files))
     options = argparse.Namespace(**{**TOLD, **told}, files=[(role, Path(p)) for role, p in given])
-    return _make(
-        options,
-        Path(output),
-        check=check,
-        threads=threads,
-    )
+    interpreter = None if python is None else Path(python)
+    return _make(options, Path(output), check=check, python=interpreter, threads=threads)
 
 
 def _make(
@@ -129,6 +129,7 @@ def _make(
     output: Path,
     *,
     check: bool,
+    python: Path | None,
     threads: int,
     progress: Progress | None = None,
 ) -> Twin:
@@ -139,7 +140,7 @@ def _make(
         with tempfile.TemporaryDirectory(dir=output.absolute().parent, prefix=".twin-") as name:
             draft = Path(name) / "twin"
             made = _fit_bench(bench, draft, threads, progress)
-            made = _export(made, check=check)
+            made = _export(made, check=check, python=python)
             write_report(made)
             if output.is_dir():
                 shutil.rmtree(output)
@@ -257,7 +258,7 @@ def _describe_live(tables: Tables, fit: Fit) -> Tables:
     return {**tables, "wfs": wfs, "mirror": mirror}
 
 
-def _export(made: Twin, *, check: bool) -> Twin:
+def _export(made: Twin, *, check: bool, python: Path | None) -> Twin:
     """Write the models of other programs, and let these run them if requested."""
     about, fit, folder = made.instrument, made.report.fit, made.folder
     if about.wfs.kind != "pyramid":
@@ -270,5 +271,5 @@ def _export(made: Twin, *, check: bool) -> Twin:
         write_specula_model(sampled, fit, folder),
     )
     runs = (check_oopao_model, check_specula_model) if check else ()
-    checks = tuple(run(folder, about, fit).words for run in runs)
+    checks = tuple(run(folder, about, fit, python=python).words for run in runs)
     return replace(made, exported=exported, checks=checks)

@@ -54,8 +54,9 @@ def test_oopao_measures_what_pyrcal_computes(recipe, stop, bench, tmp_path):
     write_oopao_model(sample_bench(about, fit), tmp_path)
     found = check_oopao_model(tmp_path, about, fit, python=python)
     assert isinstance(found, Checked), found
-    assert found.correlation.min() > 0.99
-    assert found.left_over <= 0.03
+    # OOPAO's circle has twenty points; a wrong order or sign leaves most of the signal
+    assert found.left_over <= 0.02
+    assert found.correlation.min() > 0.998
 
 
 def test_the_pupil_of_the_sky_is_on_the_array_of_the_calibration(bench, tmp_path):

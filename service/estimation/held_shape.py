@@ -52,7 +52,7 @@ class HeldRatio(NamedTuple):
 class MeanCommands(Streaming):
     """Means of the commands with the references in use and with those before."""
 
-    resets = Change.GONE | Change.SESSION | Change.RATE
+    resets = Change.GONE | Change.SESSION | Change.RATE | Change.OPEN
     unless = Mark.STANDS | Mark.ABSURD
     only_closed = True
 
@@ -90,6 +90,11 @@ class MeanCommands(Streaming):
             return replace(now, total=total, n_frames=n_frames)
         kept = now.blocks[-max(BLOCKS_BEFORE, BLOCKS_AFTER) + 1 :]
         return replace(now, blocks=(*kept, total / n_frames), total=None, n_frames=0)
+
+    @property
+    def duration_s(self) -> float:
+        """Duration of the telemetry that is compared, without the ramp."""
+        return BLOCK_S * (len(self.before[1][-BLOCKS_BEFORE:]) + len(self.blocks))
 
     def is_due(self, earlier: MeanCommands) -> bool:
         """Return True if there is a new finding since an earlier state."""

@@ -434,6 +434,9 @@ class ShapeHeld:
     change: tuple[float, float] | None = None
     """The same of the change from the shape before, with 1 σ; None if that is small."""
 
+    began_ns_utc: int = 0
+    """Beginning of the telemetry that it compares, the RTC's clock; 0 if that is unknown."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopHeld:

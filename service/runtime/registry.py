@@ -32,6 +32,7 @@ from service.records import events as ev
 from service.records.events import Event
 from service.records.state import TrackerState
 from service.tracking.dither import MISSING_DITHER_ALARM_S
+from service.tracking.policy import SECOND_NS
 
 Changes = Callable[[Any, Any, LoopContext, TrackerState], list[Event]]
 """Returns the tracker's events of a detector, from its state before these blocks and after."""
@@ -136,7 +137,12 @@ def _report_held(
     found, change_m = now.measure(*shapes), shapes[0] - shapes[1]
     if found is None:
         return []
-    held = ev.ShapeHeld(id=record.id, ratio=found.ratio, sigma=found.sigma)
+    held = ev.ShapeHeld(
+        id=record.id,
+        ratio=found.ratio,
+        sigma=found.sigma,
+        began_ns_utc=loop.received_ns_utc - round(now.duration_s * SECOND_NS),
+    )
     # The smaller the change, the more another gain or seeing on both sides counts in it.
     large = np.linalg.norm(change_m) >= MIN_CHANGE_RATIO * np.linalg.norm(shapes[0])
     change = now.measure(change_m, np.zeros_like(change_m)) if large else None

@@ -28,6 +28,9 @@ Array = NDArray[Any]
 NAME = "specula_model.yml"
 """Name of the parameter file; the FITS files are in the folder beside it."""
 
+LOOP = "specula_loop.yml"
+"""Name of the changes that make a closed loop of it."""
+
 CALIBRATION = "calibration"
 """Folder of the FITS files, ``root_dir`` of the parameter file."""
 
@@ -49,7 +52,8 @@ _IMAGES = ((0, 1), (0, 0), (1, 0), (1, 1))
 def write_specula_model(bench: SampledBench, fit: Fit, folder: Path) -> Exported:
     """Write the model into ``folder``: the fitted modes, and slopes in the axes of conventions.md.
 
-    ``specula --cpu specula_model.yml``, run in the folder, measures the interaction matrix.
+    ``specula --cpu specula_model.yml``, run in the folder, measures the interaction matrix; with
+    ``specula_loop.yml`` as a second file it closes the loop on a static aberration.
     """
     apart, width = _place_images(bench)
     functions, m2c = _describe_mirror(bench, fit)
@@ -76,6 +80,7 @@ def write_specula_model(bench: SampledBench, fit: Fit, folder: Path) -> Exported
     values = {
         "name": bench.instrument.name,
         "file": NAME,
+        "loop": LOOP,
         "root": CALIBRATION,
         "tag": TAG,
         "unit": "nanometres of OPD" if known else "units of the bench",
@@ -93,10 +98,10 @@ def write_specula_model(bench: SampledBench, fit: Fit, folder: Path) -> Exported
         "modulation": radius,
         "n_modulation": max(1, 4 * math.ceil(2 * math.pi * radius / 4)),
     }
-    text = Path(__file__).with_name("specula_twin.yml").read_text(encoding="utf-8")
-    path = folder / NAME
-    path.write_text(Template(text).substitute(values), encoding="utf-8")
-    return Exported(path=path, remarks=(*bench.remarks, *_list_limits(bench)))
+    for name, template in ((NAME, "specula_twin.yml"), (LOOP, LOOP)):
+        text = Path(__file__).with_name(template).read_text(encoding="utf-8")
+        (folder / name).write_text(Template(text).substitute(values), encoding="utf-8")
+    return Exported(path=folder / NAME, remarks=(*bench.remarks, *_list_limits(bench)))
 
 
 def read_matrix(folder: Path) -> Array:

@@ -1,5 +1,7 @@
 """A bench becomes a SPECULA model, in files that SPECULA and pyrcal's own import read."""
 
+import os
+import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -72,3 +74,22 @@ def test_specula_measures_what_oopao_measures(bench, tmp_path):
     # the exported reconstructor is in SPECULA's order and unit: it inverts what SPECULA measured
     sensed = read(tmp_path, "rec", "RECMAT") @ swap_slopes(found.matrix)
     assert np.allclose(sensed, np.eye(len(sensed)), atol=0.1)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(300)
+def test_specula_closes_the_loop_with_the_exported_reconstructor(bench, tmp_path):
+    python = find_interpreter("specula")
+    write_specula_model(sample_bench(*bench), bench[1], tmp_path)
+    program = [str(python), "-m", "specula.scripts.specula_main", "--cpu", "--precision", "0"]
+    subprocess.run(
+        [*program, "specula_model.yml", "specula_loop.yml"],
+        cwd=tmp_path,
+        env={**os.environ, "MPLBACKEND": "Agg"},
+        capture_output=True,
+        check=True,
+    )
+    with opened(tmp_path / "loop" / "modes.fits") as container:
+        (stored,) = (one for one in container.arrays.values() if len(one.shape) == 2)
+        modes = np.abs(stored.numbers()).max(axis=1)
+    assert modes[-1] < 1e-3 * modes[0]

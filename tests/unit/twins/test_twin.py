@@ -15,6 +15,7 @@ from pyrcal.twins.bench import measure_spot, read_bench
 from pyrcal.twins.make import TOLD
 from service.errors import ConfigurationError, MatrixError
 from service.instrument import instrument_path, load_instrument
+from sim_rtc.options import parse_options
 from tests.support.repository import ROOT
 
 SAMPLE = ROOT / "pyrcal" / "samples" / "data" / "oopao-pyramid.npz"
@@ -91,6 +92,8 @@ def test_service_and_fit_take_the_folder_of_a_twin(bench, tmp_path):
     moved = Path(shutil.move(made.folder, tmp_path / "moved"))
     for name in (moved, moved / "live.toml"):
         assert load_instrument(name).wfs.n_subapertures == 8
+    simulated = parse_options(["--instrument", str(moved), "--plant", "measured"])
+    assert simulated.matrix == moved / "matrix.h5"
     # An earlier twin is replaced, other files are not.
     pyrcal.twin(bench, moved, **QUICK)
     with pytest.raises(ConfigurationError, match="other files"):

@@ -260,7 +260,9 @@ def _correct(imported: Imported, fit: Fit, values: Mapping[str, Any]) -> Importe
         corrected["slopes"]["orientation"] = words
         if "order" in corrected["slopes"]:
             corrected["slopes"]["order"] = order
-    return replace(imported, tables=corrected)
+    known = {f"{place.partition('.')[2]} is unknown" for place in values}
+    notes = tuple(note for note in imported.notes if note not in known)
+    return replace(imported, tables=corrected, notes=notes)
 
 
 def _write_live(made: Twin, saved: Saved) -> None:

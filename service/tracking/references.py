@@ -307,7 +307,7 @@ def on_answer(context: StepContext, request: ReferencesRequest, reply: Reply) ->
     if record is None or reply.accepted:
         return
     text = f"the RTC refused {record.id}: {reply.reason}"
-    if reply.reason.startswith("unsupported"):
+    if reply.is_unsupported:
         text += ". Another program can apply them: pyrcal export references, or topic references"
         context.references = replace(context.references, unsupported=text)
     _store(context, replace(record, state=MatrixState.REJECTED, reason=text))

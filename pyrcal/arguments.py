@@ -112,7 +112,7 @@ class _Grouped(HelpFormatter):
 
 
 class _Version(argparse.Action):
-    """Action that prints version and commit and exits; only then is git asked for the commit."""
+    """Action that prints version and commit and exits; it runs git only when it is used."""
 
     @override
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:

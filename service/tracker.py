@@ -261,7 +261,7 @@ FAILURES: Final[Reactions] = {
 
 
 def not_measuring(context: StepContext) -> bool:
-    """Return True unless the RTC measures a matrix, with an open loop that nobody may disturb."""
+    """Return True unless the RTC measures a matrix, whose open loop nothing may disturb."""
     return context.state.measuring is None
 
 

@@ -143,12 +143,12 @@ _CANDIDATE = words("id ID", "default: the one proposed last", nargs="?", default
 _OFFERED = words(
     "id ID", "id of references; default: those proposed", nargs="?", default="candidate"
 )
-_MODES = words("--modes N,...|controlled|all", "modes of the basis", type=_numbers(int))
+_MODES = words("--modes N,...|controlled|all", "modes by number, from 0", type=_numbers(int))
 _RECORDING = words("id ID", "id of a recording")
-_LASTS = words("--duration-s S", "duration", type=float)
-_EACH = words("--amplitude-m M", "RMS of each mode, OPD", type=float)
+_LASTS = words("--duration-s S", "duration in seconds", type=float)
+_EACH = words("--amplitude-m M", "RMS of each mode in metres of OPD", type=float)
 _LINES = words("--frequency-hz HZ,...", "frequency of each mode", type=_numbers(float))
-_TOTAL = words("--total-amplitude-m M", "RMS of all modes together, OPD", type=float)
+_TOTAL = words("--total-amplitude-m M", "RMS of all modes together in metres", type=float)
 _OVER = words("--over-budget", "allow more than the dither budget", default=None)
 _NO_WAIT = words("--no-wait", "return once the order is accepted")
 _SINCE = words("--since TIME", "from this time on, RFC 3339, like 2026-03-01T20:00:00Z")

@@ -409,4 +409,4 @@ TRIALS: tuple[Callable[[FitSubset], Iterator[Alternative]], ...] = (
     _try_other_weights,
     _try_without_border,
 )
-"""What is tried on every fit; each yields none, one or several alternatives."""
+"""Trials made on every fit; each yields none, one or several alternatives."""

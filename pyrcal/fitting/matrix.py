@@ -523,7 +523,7 @@ def _find_axes(
 
 
 _Axes = tuple[SlopeRecipe, Misregistration | None, AxesDoubt, LowOrder | None]
-"""What ``_find_axes`` returns."""
+"""Result of ``_find_axes``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -634,7 +634,7 @@ def _gather_findings(
 
 
 def _list_errors(findings: FitFindings, found: _Found) -> Iterator[Array]:
-    """Yield 1 σ of the registration ``(4,)`` from each error that no alternative stands for."""
+    """Yield 1 σ of the registration ``(4,)`` from each error that no alternative covers."""
     settled, solution = found.settled, found.settled.solution
     about, nuisances = settled.models.instrument, settled.nuisances
     if found.smear is not None and found.before is not None:

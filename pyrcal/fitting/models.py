@@ -88,7 +88,7 @@ class Optic(StrEnum):
 
 
 ELLIPSE = (Optic.STRETCH, Optic.SLANT)
-"""What makes a modulation elliptic; fitted together, where ``wfs.modulation_ellipse`` is unknown.
+"""Parameters of an elliptic modulation, fitted together if ``wfs.modulation_ellipse`` is unknown.
 """
 
 

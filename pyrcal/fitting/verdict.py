@@ -188,7 +188,7 @@ class Reason(NamedTuple):
     """Alternatives that it names, by their ``words``."""
 
     undecided: str = ""
-    """What to check where it names two alternatives that the matrix does not distinguish."""
+    """Advice on what to check where the matrix does not distinguish two alternatives."""
 
 
 def judge_fit(findings: FitFindings) -> tuple[Refusal | None, Reason]:

@@ -131,7 +131,7 @@ _LIT_SHARE = 0.5
 """Share of a subaperture that the pupil must fill, where the signal is the whole detector."""
 
 _MAX_SEEMING_PX = 0.6
-"""How much closer to the middle unmodulated pupil images seem by the strength of their response."""
+"""Largest error towards the middle of an unmodulated pupil image found by its response."""
 
 _MAX_PATH_DEVIATION = 0.02
 """Largest distance of a point of a modulation path from an ellipse, relative to its semi-axis."""
@@ -418,15 +418,15 @@ def _frames(
         arrays["flux_frame"] = _numpy(mean)
         sensor["pupil_centres_px"] = "auto"
         return arrays
-    sensor["pupil_centres_px"] = _image_centres(cube, sensor, notes)
+    sensor["pupil_centres_px"] = find_image_centres(cube, sensor, notes)
     return arrays
 
 
-def _image_centres(cube: Array, sensor: dict[str, Any], notes: list[str]) -> list[list[float]]:
+def find_image_centres(cube: Array, sensor: dict[str, Any], notes: list[str]) -> list[list[float]]:
     """Return windows of whole pixels around the pupil images, by the strength of the response.
 
     Light between the images responds as well, so that unmodulated images seem up to half a pixel
-    too close to one another: so much of what all four have in common is not believed.
+    too close to one another. A common movement of all four by as much is therefore ignored.
     """
     sides = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) / 2.0
     nominal = (len(cube[0]) - 1) / 2.0 + sides * sensor["pupil_separation_subap"]

@@ -170,7 +170,7 @@ class BasicComputer:
 
         It comes on top of the program's own reference slopes, and is zero until the service
         requests references. Such requests are refused until this method has been called, because
-        the service must not be told of references that are not subtracted.
+        an acknowledgement would claim references that are not subtracted.
         """
         if self._offsets is None:
             raise RuntimeError("reference_offset: expected a call of begin_batch before it")

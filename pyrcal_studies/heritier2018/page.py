@@ -349,7 +349,7 @@ def _figure_values(budget: Budget, store: Store) -> dict[int, tuple[str, str, st
             "quadratic",
             "agrees",
         ),
-        8: (f"α_x off by {off[0]:+.2f} %", "error not known", "drawing agrees"),
+        8: (f"α_x off by {off[0]:+.2f} %", "error not known", "same picture"),
         9: (
             f"{np.median(record['residual_by_mode']):.0%} of the RMS left",
             "“negligible differences”",

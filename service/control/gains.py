@@ -154,6 +154,9 @@ GAIN_FACTOR_RANGE = (0.5, 2.0)
 GATE_GAIN_SIGMAS = 2.0
 """Number of σ above the estimated optical gain at which the gate requires stability."""
 
+GAIN_RATE = 0.05 / np.sqrt(60.0)
+"""Random walk of a gain, relative, 1 σ after one second: seeing changes it by 5 % in a minute."""
+
 GAIN_SWING = 0.05
 """Relative 1 σ of the change of the optical gain with the seeing between two windows."""
 
@@ -222,8 +225,13 @@ def gain_table(measured: Sequence[ModeGain], n_modes: int) -> GainTable:
     # Conditioning of the Gaussian process on the measured modes, in the logarithm of the gain,
     # where a stronger residual is a multiple of the same shape.
     if len(modes):
-        noise = (spread / found) ** 2 + MIN_RELATIVE_SIGMA**2
-        weights = np.linalg.solve(_prior_covariance(modes, modes) + np.diag(noise), covariance.T).T
+        times_ns = np.array([gain.t_ns_utc for gain in measured])
+        age_s = (times_ns.max() - times_ns) / 1e9
+        noise = np.diag((spread / found) ** 2 + MIN_RELATIVE_SIGMA**2)
+        # Gains measured before the seeing changed are wrong together, however many they are.
+        shape = _reference_log_gain(modes) / _reference_log_gain(modes).mean()
+        noise += GAIN_RATE**2 * np.minimum.outer(age_s, age_s) * np.outer(shape, shape)
+        weights = np.linalg.solve(_prior_covariance(modes, modes) + noise, covariance.T).T
         expected = expected + weights @ (
             np.log(found) - np.log(passes) - _reference_log_gain(modes)
         )

@@ -1,7 +1,7 @@
 """Compare the mean of the commands before and after a change of reference slopes.
 
 A wrong offset looks perfect in the slopes, from which the RTC has subtracted it: only the commands
-tell. Their mean over the turbulence changes by what the mirror holds in addition to the shape
+show it. Their mean over the turbulence changes by what the mirror holds in addition to the shape
 before. What it holds, over the shape that was sent, is 1 where sign, scale and numbers are as sent.
 Turbulence moves the mean as well: σ is taken from the scatter of blocks on both sides.
 
@@ -59,7 +59,7 @@ frequencies out of some modes, which a few blocks cannot show exactly."""
 
 
 class HeldShape(NamedTuple):
-    """What the mirror holds of a shape."""
+    """Share of a shape that the mirror holds, and whether it holds another one."""
 
     ratio: float
     """1 if it was applied as it was sent."""
@@ -78,7 +78,7 @@ class HeldShape(NamedTuple):
 class MeanCommands(Streaming):
     """Means of the commands with the references in use and with those before them."""
 
-    resets = Change.GONE | Change.SESSION | Change.RATE
+    resets = Change.GONE | Change.SESSION | Change.RATE | Change.OPEN
     unless = Mark.STANDS | Mark.ABSURD
     only_closed = True
 
@@ -118,6 +118,11 @@ class MeanCommands(Streaming):
             return replace(now, total=total, n_frames=n_frames)
         kept = now.blocks[-BLOCKS_BEFORE + 1 :]
         return replace(now, blocks=(*kept, total / n_frames), total=None, n_frames=0)
+
+    @property
+    def duration_s(self) -> float:
+        """Duration of the telemetry that is compared, without the ramp."""
+        return BLOCK_S * (len(self.before) + len(self.blocks))
 
     def is_due(self, earlier: MeanCommands) -> bool:
         """Return True if there is a new finding since an earlier state."""

@@ -437,6 +437,9 @@ class ShapeHeld:
     log_odds: float = 0.0
     """Natural logarithm of the likelihood of that way over that of references as sent."""
 
+    began_ns_utc: int = 0
+    """Beginning of the telemetry that it compares, the RTC's clock; 0 if that is unknown."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopHeld:

@@ -35,7 +35,7 @@ Value = float | int | str
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """What happened: a code, and the values that differ from one time to the next."""
+    """Message about an event: a code, and the values that differ from one time to the next."""
 
     code: str
     """Key of the sentence in messages.toml; a code without one has its text in ``about``."""

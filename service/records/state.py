@@ -393,7 +393,7 @@ class LoopState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelState:
-    """What the optical model depends on besides instrument file and settings.
+    """State on which the optical model depends, besides instrument file and settings.
 
     Every job of the worker is done with it, so that any worker gives the same results. Large arrays
     are represented by keys of their contents: ``service.runtime.workers`` keeps them.

@@ -33,6 +33,7 @@ from service.records import events as ev
 from service.records.events import Event
 from service.records.state import TrackerState
 from service.tracking.dither import MISSING_DITHER_ALARM_S
+from service.tracking.policy import SECOND_NS
 from service.tracking.references import mean_gain
 
 Array = NDArray[np.float64]
@@ -145,7 +146,10 @@ def _report_held(
     if registration is not None and registration.optical_gains and record.gain:
         expected = record.gain / mean_gain(record.coefficients_m, registration.optical_gains)
     found = now.measure(shapes_m, expected)
-    return [] if found is None else [ev.ShapeHeld(id=record.id, **found._asdict())]
+    if found is None:
+        return []
+    began_ns = loop.received_ns_utc - round(now.duration_s * SECOND_NS)
+    return [ev.ShapeHeld(id=record.id, began_ns_utc=began_ns, **found._asdict())]
 
 
 @dataclass(frozen=True, slots=True)

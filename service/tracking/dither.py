@@ -149,7 +149,7 @@ def on_answer(context: StepContext, request: DitherRequest, reply: Reply) -> Non
 
 
 def on_failure(context: StepContext, _: DitherRequest, __: str) -> None:
-    """Follow no dither that the RTC could not be asked for, and ask for none for a while."""
+    """Forget a dither whose request did not reach the RTC, and request none for 5 s."""
     context.put_off(dither_s=5.0)
     context.dither = None
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from service.control.gains import GAIN_RATE
 from service.estimation import kalman
 from service.estimation.estimate import model_error
 from service.estimation.kalman import Drift, Joint, begin_joint, predict_state
@@ -39,12 +41,12 @@ from service.tracking.validity import without_previous
 MODES_KEPT = 64
 """More than any dither plays at once: of those measured longest ago the rest is forgotten."""
 
-GAIN_RATE = 0.05 / np.sqrt(60.0)
-"""Random walk of a gain, relative, 1 σ after one second: seeing changes it by 5 % in a minute."""
-
 PRIOR_SCATTER, PRIOR_FLUCTUATION = 0.1, 0.03
 """Relative 1 σ of one window before any two were compared: all of it where the window does not know
 its own noise, and besides that noise."""
+
+GAIN_CHANGE_SIGMA = 3.0
+"""The gains of a window that differ by more than this, all alike, are of another seeing."""
 
 SCATTER_WEIGHT = 0.1
 """Weight of the newest window in the scatter: ten windows are remembered."""
@@ -95,37 +97,68 @@ def update_gains(
     """
     table = {gain.mode: gain for gain in before}
     own = np.zeros(len(gains)) if sigma is None else sigma
+    change = _common_change([table.get(mode) for mode in modes], gains, own, t_ns)
+    if change:
+        # The others are of the seeing before, and would hold the curve through all gains there.
+        table = {mode: table[mode] for mode in modes if mode in table}
     for mode, gain, noise in zip(modes, gains, own, strict=True):
-        table[mode] = _update_gain(table.get(mode), mode, float(gain), float(noise), t_ns)
+        table[mode] = _update_gain(table.get(mode), mode, float(gain), float(noise), t_ns, change)
     # Sorted by time, so that the oldest measurements are forgotten.
     newest = sorted(table.values(), key=lambda gain: gain.t_ns_utc)[-MODES_KEPT:]
     return tuple(sorted(newest, key=lambda gain: gain.mode))
 
 
+def _predict_variance(gain: ModeGain, t_ns: int) -> float:
+    """Return the variance of a gain at a later time."""
+    elapsed_s = max((t_ns - gain.t_ns_utc) / SECOND_NS, 0.0)
+    return float(gain.sigma**2 + (GAIN_RATE * gain.gain) ** 2 * elapsed_s)
+
+
+def _common_change(
+    known: Sequence[ModeGain | None], measured: Array, noise: Array, t_ns: int
+) -> float:
+    """Return the relative change that all gains of a window have in common; 0 if insignificant.
+
+    Seeing changes all gains at once. A single gain of a faint star is too uncertain to show that.
+    """
+    pairs = [(gain, *one) for gain, *one in zip(known, measured, noise, strict=True) if gain]
+    if not pairs:
+        return 0.0
+    before, now, own = np.array([(g.gain, m, n) for g, m, n in pairs]).T
+    variance = np.array([_predict_variance(g, t_ns) + g.scatter**2 for g, _, __ in pairs])
+    # Only the noise of the lines is independent; gains fluctuate together.
+    relative, own = variance / before**2, np.minimum(own**2, variance) / before**2
+    weights = 1.0 / relative / np.sum(1.0 / relative)
+    change = float(weights @ (now / before - 1.0))
+    expected = float(weights @ (relative - own) + weights**2 @ own)
+    return change if change**2 > GAIN_CHANGE_SIGMA**2 * expected else 0.0
+
+
 def _update_gain(
-    gain: ModeGain | None, mode: int, measured: float, noise: float, t_ns: int
+    gain: ModeGain | None, mode: int, measured: float, noise: float, t_ns: int, change: float
 ) -> ModeGain:
     """Return one gain as a scalar random walk; the scatter of its windows is learnt.
 
     A window's own σ describes the noise next to the lines, not the fluctuation of the gain itself.
+    After a ``change`` of the seeing σ is at least as large: one window alone does not move the gain
+    far, because a loop that slips measures other gains, too. The next one then decides.
     """
     if gain is None:
         unknown = PRIOR_FLUCTUATION if noise else PRIOR_SCATTER
         scatter = float(np.hypot(noise, unknown * measured))
         return ModeGain(mode=mode, gain=measured, sigma=scatter, scatter=scatter, t_ns_utc=t_ns)
-    elapsed_s = max((t_ns - gain.t_ns_utc) / SECOND_NS, 0.0)
-    prior = gain.sigma**2 + (GAIN_RATE * gain.gain) ** 2 * elapsed_s
+    prior = _predict_variance(gain, t_ns)
     farthest = _MAX_SCATTER_SIGMA * float(np.sqrt(prior + gain.scatter**2))
     # A single outlier must not inflate the scatter for the next ten windows.
     innovation = float(np.clip(measured - gain.gain, -farthest, farthest))
     # The innovation scatters by the uncertainty of the gain, too: what is left is the window's own.
-    learnt = max(innovation**2 - prior, noise**2)
+    learnt = noise**2 if change else max(innovation**2 - prior, noise**2)
     scatter = float(np.sqrt((1 - SCATTER_WEIGHT) * gain.scatter**2 + SCATTER_WEIGHT * learnt))
     weight = prior / (prior + scatter**2)
     return ModeGain(
         mode=mode,
         gain=gain.gain + weight * innovation,
-        sigma=float(np.sqrt((1 - weight) * prior)),
+        sigma=float(np.hypot(np.sqrt((1 - weight) * prior), change * gain.gain)),
         scatter=scatter,
         t_ns_utc=t_ns,
     )

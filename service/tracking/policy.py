@@ -126,8 +126,8 @@ class Policy:
     """``(4,)`` 1 σ of α by places of pupil images that the instrument file does not state."""
 
     image_sigma: NDArray[np.float64]
-    """``(4,)`` 1 σ of α by places of pupil images that nobody has measured; ``image_floor``, or a
-    part of ``floor`` if the instrument file calls them unknown."""
+    """``(4,)`` 1 σ of α by unmeasured places of pupil images; ``image_floor``, or a part of
+    ``floor`` if the instrument file calls them unknown."""
 
     bias_memory_s: float
     """Time after which the information learnt on the passive estimate's bias has decayed to 1/e."""

@@ -23,6 +23,7 @@ from service.records.alarms import Interlock, blocking_alarm
 from service.records.products import MatrixState, ReferencesRecord, Shape, ShapeKind
 from service.records.registration import ModeGain, Registration, Validity
 from service.records.state import Level, Mode, Orders, TrackerState
+from service.tracking.filtering import check_measurable
 from service.tracking.policy import SECOND_NS
 from service.tracking.step_context import StepContext, present
 from service.tracking.transitions import move
@@ -341,6 +342,9 @@ def on_held(context: StepContext, held: ev.ShapeHeld) -> None:
     # After wrong ones the way back to the RTC's own changes the mirror by another shape.
     if record is None or record.id != context.references.used_id or record.shape is None:
         return
+    # A loop that slips holds much besides the shape.
+    if check_measurable(context.state, held.began_ns_utc) is not None:
+        return
     record = replace(record, held_ratio=held.ratio, held_sigma=held.sigma)
     _store(context, record)
     if held.log_odds > MIN_LOG_ODDS and not context.references.difference:
@@ -426,8 +430,11 @@ def _has_moved(state: TrackerState, record: ReferencesRecord) -> bool:
         return False
     if np.any(registration.alpha.distance(record.alpha) > MAX_ALPHA_CHANGE):
         return True
-    now = mean_gain(record.coefficients_m, registration.optical_gains)
-    return abs(now / record.gain - 1.0) > MAX_GAIN_CHANGE
+    gains = registration.optical_gains
+    now = mean_gain(record.coefficients_m, gains)
+    # In the first window after a change of seeing no gain is known well: the next one decides.
+    sigma = min((gain.sigma / gain.gain for gain in gains), default=np.inf)
+    return abs(now / record.gain - 1.0) > max(MAX_GAIN_CHANGE, sigma)
 
 
 def _is_offset(state: TrackerState) -> bool:

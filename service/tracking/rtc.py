@@ -149,8 +149,11 @@ def _note_references(context: StepContext, rtc: Status) -> None:
     context.loop = replace(context.loop, reference_id=name)
     if before is not None:
         context.loop = replace(context.loop, reference_since_ns_utc=context.now_ns)
-        text = f"the RTC subtracts the reference slopes {name}, they were {before}"
-        context.log("references.changed", text)
+        before, name = before.removesuffix("~"), name.removesuffix("~")
+        # The name of a ramp and that of its end are one change.
+        if name != before:
+            text = f"the RTC subtracts the reference slopes {name}, they were {before}"
+            context.log("references.changed", text)
 
 
 def _note_renaming(context: StepContext, before: Status | None, rtc: Status) -> None:
@@ -298,5 +301,5 @@ def fail_order(context: StepContext, effect: Effect | Request, text: str) -> Non
 
 
 def log_failure(context: StepContext, _: Effect | Request, text: str) -> None:
-    """Log the failure; what is still needed is asked for again."""
+    """Log the failure; a request that is still needed is sent again."""
     context.warn("job.failed", text)

@@ -170,9 +170,9 @@ async def to_its_end(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -
 class Crowd(ServerState):
     """uvicorn's list of connections, in which there is always room for one more.
 
-    An operator who wants to stop the service is the last to come. So the oldest connections end for
-    a new one, of the address that has the most, and those without a whole request first. An
-    operator may share the address, if that is a proxy's or this machine's.
+    In a crowd, the operator who sends a stop connects last. A new connection therefore ends the
+    oldest one of the address that has the most, and those without a whole request first. The
+    operator may have the same address if it is that of a proxy or of this machine.
     """
 
     def __init__(self) -> None:
@@ -240,7 +240,7 @@ class Connection(H11Protocol):
     def rank(self) -> tuple[bool, float]:
         """Return the sort key of a connection; the lowest one ends first.
 
-        Whoever has sent a whole request and waits for its answer comes last.
+        A client that has sent a whole request and waits for its answer comes last.
         """
         return self._answers and not self.cycle.more_body, self._since_s
 

@@ -29,9 +29,9 @@ class ShapedStory(Story):
         self.see(n_windows=3)
         self.measure_gain(0.6)
 
-    def measure_gain(self, gain):
+    def measure_gain(self, gain, sigma=0.01):
         """Let windows have measured this optical gain."""
-        found = ModeGain(mode=2, gain=gain, sigma=0.01, scatter=0.02, t_ns_utc=self.now_ns)
+        found = ModeGain(mode=2, gain=gain, sigma=sigma, scatter=0.02, t_ns_utc=self.now_ns)
         known = replace(self.state.alpha.registration, optical_gains=(found,))
         self.state = changed(self.state, registration=known)
         return self

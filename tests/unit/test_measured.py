@@ -86,3 +86,34 @@ def test_each_table_of_measured_values_is_quoted():
     linked = {param.values[1] for param in quotes()}
     for entry in ENTRIES.values():
         assert {entry["section"], entry["section"].partition("#")[0]} & linked
+
+
+RESULT_LINK = re.compile(r"\]\((?:\.\./)*(?:docs/)?results/([\w.]+\.md(?:#[\w-]+)?)\)")
+
+
+def quoting_sentences():
+    """Each sentence, or row of an explanation's table, that links a section of the results."""
+    for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
+        if page.parent == RESULTS:
+            continue
+        for number, line in enumerate(page.read_text("utf-8").splitlines(), 1):
+            row = line.startswith("| ") and page.parent.name == "explanation"
+            for sentence in [line] if row else re.split(r"(?<=[.;|]) ", line):
+                if sections := RESULT_LINK.findall(sentence):
+                    yield f"{page.relative_to(ROOT)}:{number}", sentence, sections
+
+
+def is_printed(value, printed):
+    """True if this number, or one that is rounded to it, is in the section."""
+    digits = len(value.partition(".")[2])
+    return any(f"{float(source):.{digits}f}" == value for source in printed)
+
+
+def test_a_sentence_that_links_a_section_quotes_numbers_of_it():
+    quotations = list(quoting_sentences())
+    assert len(quotations) > 30
+    wrong = []
+    for place, sentence, sections in quotations:
+        printed = set().union(*(numbers(section_text(name)) for name in sections))
+        wrong += [(place, value) for value in numbers(sentence) if not is_printed(value, printed)]
+    assert wrong == []

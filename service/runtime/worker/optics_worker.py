@@ -127,7 +127,7 @@ class OpticsWorker:
 
     @property
     def state(self) -> ModelState:
-        """What the results of the next job depend on."""
+        """State of the model on which the results of the next job depend."""
         strength, linearised_at = self._sensor.place
         return replace(self._state, strength=strength, linearised_at=linearised_at)
 
@@ -665,7 +665,7 @@ class OpticsWorker:
 
 
 def _parts_of_models(state: ModelState) -> tuple[object, ...]:
-    """Return what all models are made for; a change of the rest makes none of them anew."""
+    """Return the parts of the state for which all models are made."""
     return state.sensor_mode, state.slopes, state.response
 
 

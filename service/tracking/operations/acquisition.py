@@ -146,7 +146,7 @@ def abort_on_command(context: StepContext, _: cmd.AbortAcquisition) -> None:
 
 
 def on_mode_set(context: StepContext, command: cmd.SetMode) -> None:
-    """End an acquisition that nobody ordered, unless the mode is auto; hold back none any more."""
+    """End an acquisition without an order, unless the mode is auto; end a hold-off."""
     acquisition = context.acquisition
     if acquisition.held_off:
         text = f"an operator has set the mode, {command.mode}, since the last was ended"
@@ -323,7 +323,7 @@ def _own_loop_lost(context: StepContext) -> str | None:
 
 
 def _advance_stage(context: StepContext) -> None:
-    """Take one that is under way further, unless what it has asked for is awaited."""
+    """Take an acquisition under way one step further, unless it awaits an answer."""
     acquisition, rtc = context.acquisition, context.rtc
     # The RTC or the worker first answers what the acquisition has asked for in this step.
     if any(effect.cause == acquisition.cause for effect in context.effects):

@@ -198,7 +198,7 @@ def on_dither_failed(context: StepContext, request: DitherRequest, text: str) ->
 
 
 def on_failure(context: StepContext, request: MeasureRequest, text: str) -> None:
-    """Give up a matrix that the RTC could not be asked for."""
+    """Give up a matrix whose request did not reach the RTC."""
     fail_measurement(context, context.state.measurement(request.id), text)
 
 

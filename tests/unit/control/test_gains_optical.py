@@ -73,6 +73,20 @@ def test_with_one_low_mode_the_curve_is_within_three_per_cent_of_the_true_gains(
     assert 0.2 < np.sqrt(np.mean((error / table.relative_sigma[TRUE_MODES]) ** 2)) < 1.5
 
 
+def test_many_gains_of_a_former_seeing_do_not_outweigh_those_of_today():
+    """Sixty modes were dithered once, two minutes before the residual grew by a fifth."""
+    older, now = np.arange(0, 300, 5), np.append(HIGH, 11)
+    measured = [
+        ModeGain(mode=mode, gain=gain, sigma=0.03 * gain, scatter=0.02, t_ns_utc=t_ns)
+        for modes, power, t_ns in ((older, 1.0, 0), (now, 1.2, round(120e9)))
+        for mode, gain in zip(modes.tolist(), reference(modes) ** power, strict=True)
+    ]
+    found = gain_table(measured, 594).optical_gain
+    truth, before = (reference(np.arange(594)) ** power for power in (1.2, 1.0))
+    share = np.log(found / before) / np.log(truth / before)
+    assert share.min() > 0.7
+
+
 def test_a_flat_wavefront_needs_no_compensation():
     table = table_of(HIGH, np.ones(4), np.full(4, 0.005), 594)
     assert np.all(table.optical_gain > 0.85)

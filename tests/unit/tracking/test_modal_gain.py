@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from service.control.gains import GAIN_RATE
 from service.records import events as ev
 from service.records.state import Mode
 from service.tracking.filtering import (
-    GAIN_RATE,
     MODES_KEPT,
     PRIOR_FLUCTUATION,
     PRIOR_SCATTER,
@@ -52,6 +52,44 @@ def test_a_gain_that_changes_is_followed():
 def test_one_mad_window_does_not_move_it_far():
     found = windows([*[0.6] * 50, 3.0, *[0.6] * 5])
     assert found.gain == pytest.approx(0.6, abs=0.2)
+
+
+FAINT = (409, 427, 445, 463, 11)
+NOISE = np.array([0.02, 0.02, 0.02, 0.02, 0.08])
+"""Of a window at magnitude 11; none of these modes alone shows a change by a fifth."""
+
+
+def watch(truths, rng, table=()):
+    """Return the table after each window of the faint star."""
+    tables = []
+    for k, true in enumerate(truths):
+        seen = true + NOISE * rng.normal(size=5)
+        t_ns = START_NS + round((k + 1) * 5.0 * SECOND)
+        table = update_gains(table, FAINT, seen, NOISE, t_ns)
+        tables.append(table)
+    return tables
+
+
+def test_after_a_change_of_the_seeing_sigma_says_so_and_the_second_window_decides():
+    """Fifty nights whose gains fall by a third between two windows."""
+    ratios = []
+    for seed in range(50):
+        older = update_gains((), (3, 5), np.array([0.7, 0.7]), None, START_NS)
+        tables = watch([0.7] * 10 + [0.47] * 4, np.random.default_rng(seed), older)
+        assert len(tables[9]) == 7
+        # Those that are dithered no more are of the seeing before.
+        assert {gain.mode for gain in tables[10]} == set(FAINT)
+        errors = np.array([[(g.gain - 0.47) / g.sigma for g in table] for table in tables[10:]])
+        ratios.append(np.sqrt(np.mean(errors**2, axis=1)))
+        assert np.abs([gain.gain / 0.7 - 1.0 for gain in tables[10]]).max() < 0.2
+        assert np.abs([g.gain - 0.47 for g in tables[11] if g.mode != 11]).max() < 0.08
+    typical = np.sqrt(np.mean(np.square(ratios), axis=0))
+    assert np.all((typical > 0.5) & (typical < 2.0))
+
+
+def test_seeing_that_stays_is_no_change():
+    known = watch([0.7] * 500, np.random.default_rng(1))
+    assert max(gain.sigma for table in known[10:] for gain in table if gain.mode != 11) < 0.03
 
 
 def test_after_a_pause_the_next_window_counts_more():

@@ -239,6 +239,32 @@ def test_references_are_named_where_another_shape_is_much_more_likely(auto, log_
     assert (auto.last.shape is None) is wrong
 
 
+def test_a_loop_that_slips_does_not_show_what_is_held(auto):
+    """It once held 3.5 ± 0.5 times the shape, and its references were taken back."""
+    auto.use_references().show_references()
+    used, began_ns = auto.last.id, auto.now_ns
+    held = ev.ShapeHeld(id=used, ratio=3.5, sigma=0.5, log_odds=20.0, began_ns_utc=began_ns)
+    for over in (False, True):
+        auto.wait(5.0)
+        slip = ev.ConditionChanged(
+            name=alarms.EDGE_SLIP, text="slipped", over=over, t_ns_utc=auto.now_ns
+        )
+        auto.tell(slip)
+        auto.tell(held)
+    assert alarms.REFERENCES_MISAPPLIED not in auto.alarms
+    assert auto.state.references_of(used).held_ratio is None
+    auto.tell(replace(held, began_ns_utc=auto.now_ns))
+    assert alarms.REFERENCES_MISAPPLIED in auto.alarms
+
+
+def test_in_the_first_window_after_a_change_of_seeing_no_references_are_made(auto):
+    auto.use_references()
+    auto.measure_gain(0.5, sigma=0.1).wait(2 * FOLLOW_INTERVAL_S)
+    assert len(auto.asked(ev.MakeReferences)) == 1
+    auto.measure_gain(0.4, sigma=0.02).wait(1.0)
+    assert len(auto.asked(ev.MakeReferences)) == 2
+
+
 def test_the_return_to_the_rtcs_own_references_is_not_judged(auto):
     auto.use_references()
     auto.tell(ev.ShapeHeld(id=auto.last.id, ratio=-1.0, sigma=0.1, log_odds=20.0))

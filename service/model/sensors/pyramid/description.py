@@ -26,7 +26,7 @@ class Pyramid(PyramidNumbers):
     listed; None: by ``flux_threshold`` at α = 0."""
 
     modulation_stretch: tuple[float, float] | None = None
-    """What makes an ellipse of the circle, ``(e, f)`` in the RTC's own axes: the path is that of
+    """Stretch ``(e, f)`` of the circle to an ellipse, in the RTC's own axes. The path is that of
     the circle times the exponential of ``[[e, f], [f, -e]]``. None for a circle."""
 
     fft_grid: FftGrid | None = None

@@ -46,7 +46,7 @@ _EVEN_SIGMA_PX = 0.03
 pixels, 0.01 with 40."""
 
 _SAMPLING_WITHOUT_LIGHT = 3
-"""Pupil points along a subaperture of the light that stands in for a mean frame."""
+"""Pupil points along a subaperture of the light that replaces a missing mean frame."""
 
 _REMARK_DISTANCE_SUBAP = 0.25
 """Distance of the centres of the file from the light that is mentioned."""

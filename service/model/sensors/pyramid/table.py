@@ -126,7 +126,8 @@ class PyramidTable(PyramidNumbers):
     modulation_ellipse: Ellipse | None = None
     """Elliptic modulation ``{ axes_lambda_over_d = [4.0, 5.0], angle_deg = 30.0 }``, instead of
     ``modulation_lambda_over_d``: its semi-axes, and the direction of the first one from +x towards
-    +y in the RTC's axes. None: a circle; "unknown" beside a radius: fitted to a measured matrix."""
+    +y in the RTC's axes. None: a circle. "unknown" together with a radius: fitted to a measured
+    matrix."""
 
     valid_subapertures: str = "auto"
     """"auto": by ``flux_threshold``; or a mask ``path:/dataset``."""
@@ -136,9 +137,9 @@ class PyramidTable(PyramidNumbers):
     counts; "normalised-frames" are divided by their sum over the detector, and need none."""
 
     fft_grid: FftGrid | None = None
-    """Of a matrix that a simulation has made with an FFT: its grid ``{ points_per_subaperture = 2,
-    width_subap = 52.0 }``, on which it differs by per cents from a real sensor. None: a real
-    sensor, or a grid that is not known."""
+    """Grid ``{ points_per_subaperture = 2, width_subap = 52.0 }`` of a simulation that has made the
+    matrix with an FFT. Such a matrix differs by per cents from that of a real sensor. None: a
+    real sensor, or a grid that is not known."""
 
     pupil_centres_px: Centres | None = None
     """Frames only: centres of the four pupil images, row and column; "auto": found in a flux

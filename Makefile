@@ -45,10 +45,10 @@ fuzz: $(STAMP) ## a million malformed inputs of every kind; ARGS="--inputs 50000
 faults: $(STAMP) ## every fault that a night may bring, on real processes; a quarter of an hour, ARGS=--quick two minutes
 	@$(PY) -m pyrcal_studies.faults $(ARGS)
 
-nights: $(STAMP) ## random sequences of faults in simulated time; hours, ARGS="--seeds 0:6 --seconds 100" minutes
+nights: $(STAMP) ## random sequences of faults in simulated time; takes hours, ARGS="--seeds 0:6 --seconds 100" minutes
 	@$(PY) -m pyrcal_studies.campaign.fault_nights $(ARGS)
 
-restarts: $(STAMP) ## the service killed two hundred times, and what it had acknowledged; half an hour
+restarts: $(STAMP) ## the service killed two hundred times, and what it had acknowledged; takes half an hour
 	@$(PY) -m pyrcal_studies.restarts $(ARGS)
 
 lint: $(STAMP) ## lint and formatting, in a second: what .pre-commit-config.yaml calls
@@ -69,7 +69,7 @@ bench: $(STAMP) ## pyrcal beside OOPAO, HCIPy and SPECULA, each from its package
 registration-benchmark: $(STAMP) ## twenty matrices of three codes with a known registration, fitted; a minute, ARGS=--make measures them anew
 	@$(PY) -m benchmarks.registration $(ARGS)
 
-soak: $(STAMP) ## an hour at 1 kHz with company, for what grows or is lost; ARGS="--minutes 5" rehearses
+soak: $(STAMP) ## the service at 1 kHz with company, for what grows or is lost; takes an hour, ARGS="--minutes 5" rehearses
 	@$(PY) -m benchmarks.soak $(ARGS)
 
 load: $(STAMP) ## 50 clients of REST at 1 kHz, then beside 1400 who only wait; ARGS="--seconds 20" and the like

@@ -3,7 +3,8 @@
 A section of ``docs/results`` names its command after ``**Command**``; a section without one is made
 by that of the section before it, or by the first one of its page. Behind a command are a module
 and all modules of this repository that it imports. A section is old if one of them has been
-committed since its newest line was.
+committed since its newest line was. A section whose command takes half an hour or more says so, as
+the docstring of the module or the help of the target does.
 
 Run: ``python -m pyrcal_studies.results --check``. It prints the old sections, those first whose
 code has changed most, and ends with status 1 if a section with measured values has no command, or
@@ -31,6 +32,7 @@ FOLDER = ROOT / "docs" / "results"
 _COMMAND = re.compile(r"`((?:[A-Z_]+=\S+ )*(?:python -m|make|pyrcal) [^`]+)`")
 _HEADING = re.compile(r"^#{2,3} (.+)$", re.M)
 _MEASURED = re.compile(r"\*\*Measured\*\*|^\| -{3}", re.M)
+_LONG = re.compile(r"\btakes? [^.;]*?(?<!quarter of an )\bhours?\b")
 _PACKAGES = {path.parent.name for path in ROOT.glob("*/*.py")}
 
 
@@ -56,6 +58,11 @@ class Section:
     def has_values(self) -> bool:
         """True if it says what was measured, or has a table."""
         return _MEASURED.search(self.text) is not None
+
+    @property
+    def says_that_it_takes_long(self) -> bool:
+        """True if the text has a duration in hours."""
+        return _LONG.search(self.text) is not None
 
 
 def sections(page: Path) -> Iterator[Section]:
@@ -92,8 +99,8 @@ def files_behind(command: str) -> frozenset[Path]:
     """
     match [word for word in command.split() if not re.match(r"[A-Z_]+=", word)]:
         case ["make", target, *_]:
-            recipe = re.search(rf"^{target}:.*\n\t(.+)", (ROOT / "Makefile").read_text(), re.M)
-            module = recipe and re.search(r"-m (\S+)", recipe[1])
+            recipe = _recipe(target)
+            module = recipe and re.search(r"-m (\S+)", recipe[2])
             if module is None:
                 raise LookupError(f"make {target}: no such target that runs a module")
             return files_behind(f"python -m {module[1]}")
@@ -110,6 +117,23 @@ def files_behind(command: str) -> frozenset[Path]:
         case _:
             pass
     raise LookupError(f"{command}: neither a module, a target nor a command of pyrcal")
+
+
+def takes_long(command: str) -> bool:
+    """Return True if the description of a command says that it takes half an hour or more."""
+    match command.split():
+        case ["make", target, *_] if recipe := _recipe(target):
+            text = recipe[1]
+        case ["python", "-m", module, *_] if module != "pytest":
+            text = ast.get_docstring(ast.parse(_file(module).read_text("utf-8"))) or ""
+        case _:
+            return False
+    return _LONG.search(" ".join(text.split())) is not None
+
+
+def _recipe(target: str) -> re.Match[str] | None:
+    """Return the help and the first line of a target of the Makefile as groups 1 and 2."""
+    return re.search(rf"^{target}:(.*)\n\t(.+)", (ROOT / "Makefile").read_text(), re.M)
 
 
 def _file(module: str) -> Path:

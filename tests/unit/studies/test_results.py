@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from pyrcal_studies.results import files_behind, pages, sections
+from pyrcal_studies.results import files_behind, pages, sections, takes_long
 from tests.support.repository import ROOT
 
 SECTIONS = [section for page in pages() for section in sections(page) if section.has_values]
@@ -14,6 +14,16 @@ SECTIONS = [section for page in pages() for section in sections(page) if section
 def test_a_section_with_values_has_a_command_that_exists(section):
     assert section.commands
     assert all(files_behind(command) for command in section.commands)
+
+
+def test_a_section_whose_command_takes_half_an_hour_or_more_says_so():
+    long = [
+        section
+        for section in SECTIONS
+        if any(takes_long(command) for command in section.commands if command in section.text)
+    ]
+    assert len(long) >= 5
+    assert [section.name for section in long if not section.says_that_it_takes_long] == []
 
 
 @pytest.mark.parametrize("page", pages(), ids=lambda page: page.stem)

@@ -7,7 +7,7 @@ and its own mean is subtracted, so that the error of the shape is that of the re
 are shapes in constant seeing, with references of several kinds; ``moved`` are mirrors that are off
 their place, with references that follow and others that do not; ``jump`` are shapes as large as the
 limit permits while the seeing goes from 0.6 to the worst within a second; ``sweep`` are shapes that
-grow in that change by steps of 25 % until the loop is lost.
+grow from there by steps of 25 % until the loop is lost.
 
 Run: ``python -m pyrcal_studies.references_held --output var/references.jsonl --table table.md``.
 Rows that are in the file already are not computed again; ``--only jump`` runs a part. ``--limits``
@@ -78,8 +78,8 @@ LOST_M = 500e-9
 """RMS wavefront of a lost loop; the largest seeing leaves 0.2 µm."""
 LOST_BATCHES = 10
 
-SLOPES = 0.12 * 1.25 ** np.arange(11)
-"""Largest reference slopes of a sweep, one after the other until the loop is lost."""
+GROWING = 1.25 ** np.arange(9)
+"""Sizes of a sweep over the largest shape, one after the other until the loop is lost."""
 
 SWEPT = {0.9: (range(1, 6), (1, 2)), 1.2: ((1, 2), range(1, 7))}
 """Seeds of shapes and of turbulences at each worst seeing, arcsec."""
@@ -296,10 +296,9 @@ def play(plan: Plan) -> Row | list[Row]:
     if plan.case != "sweep":
         size_m = 1e-9 * plan.rms_nm or plan.limits * largest_m
         return _play_shape(plan, base, gain, size_m * shape, largest_m)
-    peak = np.abs(compute_references(matrix_of(plan.instrument, plan.alpha), gain, shape)).max()
     rows: list[Row] = []
-    for slope in SLOPES:
-        rows.append(_play_shape(plan, base, gain, slope / peak * shape, largest_m))
+    for times in GROWING:
+        rows.append(_play_shape(plan, base, gain, times * largest_m * shape, largest_m))
         if rows[-1]["lost_s"] is not None:
             break
     return rows
@@ -369,15 +368,18 @@ def sweep_plans() -> Iterable[Plan]:
 
 def tell_sweeps(rows: list[Row]) -> str:
     """Return the table of the sizes with which loops were lost."""
-    text = heading("worst seeing, arcsec", "loops", "largest slope, none lost", "lost from")
+    text = heading(
+        "worst seeing, arcsec", "loops", "slope at the limit", "none lost to", "lost from"
+    )
     for seeing in sorted({row["seeing_arcsec"] for row in rows}):
         swept = [row for row in rows if row["seeing_arcsec"] == seeing]
         ends = [group[-1] for group in grouped(swept, Plan)]
         lost = sorted(one["peak"] for one in ends if one["lost_s"] is not None)
-        survived = max((s for s in SLOPES if not lost or s < 0.99 * lost[0]), default=0.0)
+        kept = [row["peak"] for row in swept if row["lost_s"] is None]
+        safe = max((slope for slope in kept if not lost or slope < 0.99 * lost[0]), default=0.0)
         found = f"{lost[0]:.2f} to {lost[-1]:.2f}" if lost else "-"
-        n_lost = f"{len(lost)} of {len(ends)} lost"
-        text += line(f"{seeing:.1f}", n_lost, f"{survived:.2f}", found)
+        n_lost, limit = f"{len(lost)} of {len(ends)} lost", min(row["peak"] for row in swept)
+        text += line(f"{seeing:.1f}", n_lost, f"{limit:.2f}", f"{safe:.2f}", found)
     return text
 
 

@@ -22,15 +22,22 @@ if TYPE_CHECKING:
     from pyrcal.fitting.design import interaction_matrix as interaction_matrix
     from pyrcal.fitting.fit_file import fit as fit
     from pyrcal.fitting.fit_file import fit_file as fit_file
+    from pyrcal.fitting.fit_system import fit_system_files as fit_system
     from pyrcal.fitting.fitted import Fit as Fit
     from pyrcal.fitting.matrix import FitOptions as FitOptions
     from pyrcal.fitting.report import FitReport as FitReport
     from pyrcal.fitting.report import KnownFit as KnownFit
     from pyrcal.fitting.report import read_fit as read_fit
+    from pyrcal.importers.cacao import from_cacao as from_cacao
+    from pyrcal.importers.files import Reported as Reported
     from pyrcal.importers.oopao import from_oopao as from_oopao
     from pyrcal.importers.oopao import to_oopao as to_oopao
+    from pyrcal.importers.specula import from_specula as from_specula
+    from pyrcal.importers.specula import from_synim as from_synim
     from pyrcal.playback.report import Track as Track
     from pyrcal.playback.track import track as track
+    from pyrcal.twins.make import twin as twin
+    from pyrcal.twins.report import Twin as Twin
     from service.config.settings import Settings as Settings
     from service.control.reconstructor import Inversion as Inversion
     from service.control.reconstructor import InversionMethod as InversionMethod
@@ -60,14 +67,19 @@ _HOMES = {
     "Misregistration": "service.model.misregistration",
     "Orientation": "service.model.slopes",
     "Prior": "service.control.reconstructor",
+    "Reported": "pyrcal.importers.files",
     "RtcInteractionModel": "service.model.interaction",
     "Service": "pyrcal.client.rest",
     "Settings": "service.config.settings",
     "Track": "pyrcal.playback.report",
+    "Twin": "pyrcal.twins.report",
     "dither_sigma": "pyrcal.fitting.design",
     "fit": "pyrcal.fitting.fit_file",
     "fit_file": "pyrcal.fitting.fit_file",
+    "from_cacao": "pyrcal.importers.cacao",
     "from_oopao": "pyrcal.importers.oopao",
+    "from_specula": "pyrcal.importers.specula",
+    "from_synim": "pyrcal.importers.specula",
     "interaction_matrix": "pyrcal.fitting.design",
     "load_instrument": "service.instrument.reader",
     "modal_basis": "service.model.modes",
@@ -76,10 +88,12 @@ _HOMES = {
     "reconstruct": "service.control.reconstructor",
     "to_oopao": "pyrcal.importers.oopao",
     "track": "pyrcal.playback.track",
+    "twin": "pyrcal.twins.make",
     "write_bundle": "service.files.bundle",
 }
 
 _RENAMED = {
+    "fit_system": ("pyrcal.fitting.fit_system", "fit_system_files"),
     "InversionOptions": ("service.control.reconstructor", "Recipe"),
     "array_backend": ("service.model.arrays", "arrays_of"),
 }
@@ -94,6 +108,7 @@ __all__ = [
     "StorageError",
     "__version__",
     "array_backend",
+    "fit_system",
     *_HOMES,
 ]
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from service.config.link_tables import DEFAULT_ENDPOINT, Router, router_of
 from service.errors import ConfigurationError
+from service.instrument.paths import TWIN_MATRIX
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from sim_rtc import arguments as read
 from sim_rtc import manual
@@ -674,6 +675,10 @@ def parse_options(given: Sequence[str] | None = None) -> Options:
             found[one.name] = tuple(found[one.name] or ())
         elif found[one.name] is None:
             found[one.name] = one.metadata["absent"]
+    # The folder of a twin has its matrix.
+    matrix = Path(found["instrument"]) / TWIN_MATRIX
+    if found["plant"] == "measured" and found["matrix"] is None and matrix.is_file():
+        found["matrix"] = matrix
     try:
         options = Options(**found)
         options.check()

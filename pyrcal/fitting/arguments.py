@@ -46,6 +46,10 @@ _MEMORY = words(
     "--memory-gb GB", "limit of memory, default %(default)g", type=_memory_gb, default=6.0
 )
 
+_THREADS = words(
+    "--threads N", "default: one for each core", type=_count, default=os.cpu_count() or 1
+)
+
 _OF_A_FOLDER = in_group(
     ARCHIVE,
     words("--config FILE", "settings of the service, TOML", type=Path),
@@ -57,7 +61,7 @@ _OF_AN_ANSWER = (
     _JSON,
     words("--plot FILE.png", "write the figures", type=Path),
     words("--output FILE.h5", "write all results", type=Path),
-    words("--threads N", "default: one for each core", type=_count, default=os.cpu_count() or 1),
+    _THREADS,
 )
 """Options of commands that fit a registration."""
 
@@ -75,6 +79,7 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
         _describe_conventions,
         _describe_instrument,
         _describe_import,
+        _describe_twin,
     ):
         describe(commands)
 
@@ -368,21 +373,12 @@ def _describe_import(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     )
     own = words("files FILE", "files, recognised by their content", type=_role_and_path, nargs="+")
     named = words("files [ROLE=]FILE", roles, type=_role_and_path, nargs="+")
-    described = words("--instrument NAME|FILE", "description of telescope, sensor and mirror")
-    basis = words(
-        "--basis BASIS",
-        "if only positions are given: one column for each actuator, or KL modes",
-        choices=("zonal", "KL"),
-    )
-    unit = words(
-        "--unit UNIT", "unit of the commands, OPD; default: unknown", choices=("m", "um", "nm")
-    )
     response = words("--response NAME", "such as loRM; default: of single actuators if present")
     loop = words("--loop N|UID", "if there are several loops: number, from 1, or uid")
     positions = words("--positions FILE", "of the actuators, x and y in metres", type=Path)
     conf = words("folder CONF", "conf folder", type=Path)
     file = words("file FILE.fits", "AOT file", type=Path)
-    arrays = (named, unit, described, basis)
+    arrays = (named, *_OF_ARRAYS)
     of_pixels, of_spots = (
         f"im.fits {data}.fits ifunc.fits{more} --diameter-m 8.2"
         for data, more in (("pupdata", " m2c.fits"), ("subapdata", ""))
@@ -411,11 +407,37 @@ def _describe_import(commands: Any) -> None:  # noqa: ANN401 - argparse's own
                     "aot",
                     "from an AOT file",
                     "telemetry.fits --diameter-m 8.2",
-                    (file, loop, positions, unit),
+                    (file, loop, positions, _UNIT),
                     _DESCRIBED,
                 ),
                 ("files", "from NumPy, FITS or HDF5 files", by_name, arrays, _DESCRIBED),
             )
+        ),
+    )
+
+
+def _describe_twin(commands: Any) -> None:  # noqa: ANN401 - argparse's own
+    roles = "folder or files of the bench, or ROLE=FILE with a role of matrix, valid, light, "
+    roles += "modes, mode_to_actuator, positions, pupil, sky_pupil, spot"
+    output = "folder to write: a new one, or that of an earlier twin"
+    check = "let OOPAO and SPECULA, where installed, measure the matrices of their models"
+    commands.add_parser(
+        "twin",
+        help="make models of a bench from its files",
+        module="pyrcal.twins.make",
+        description="Fit everything that a model of a bench needs to its measured matrix, and "
+        "write a report, an instrument file with corrected values, and models that OOPAO and "
+        "SPECULA run.",
+        epilog="Exit status: 0 accepted; 1 written but refused (the report says why); 2 input that "
+        "cannot be used. docs/howto/twin.md explains files and results.",
+        examples=("bench --diameter-m 0.6 --unit m --output twin",),
+        options=(
+            words("files [ROLE=]FILE", roles, type=_role_and_path, nargs="+"),
+            words("--output DIR", output, type=Path, required=True),
+            words("--check", check),
+            *_OF_ARRAYS,
+            *_DESCRIBED,
+            _THREADS,
         ),
     )
 
@@ -431,6 +453,21 @@ def _read_by(parse: Callable[[str], object]) -> Callable[[str], object]:
 
     return read
 
+
+_UNIT = words(
+    "--unit UNIT", "unit of the commands, OPD; default: unknown", choices=("m", "um", "nm")
+)
+
+_OF_ARRAYS = (
+    _UNIT,
+    words("--instrument NAME|FILE", "description of telescope, sensor and mirror"),
+    words(
+        "--basis BASIS",
+        "if only positions are given: one column for each actuator, or KL modes",
+        choices=("zonal", "KL"),
+    ),
+)
+"""Options of commands that take arrays by role."""
 
 _DESCRIBED = in_group(
     DESCRIPTION,

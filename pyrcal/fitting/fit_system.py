@@ -49,12 +49,8 @@ def main(options: argparse.Namespace) -> int:
     """
     if options.plot is not None:
         check_plots()
-    system = load_system(options.system)
-    stored = dict(
-        zip(system.pairs, locate_matrices(system, options.reference, options.dataset), strict=True)
-    )
-    report = fit_pairs(
-        system, lambda pair, about: _fit_pair(system, pair, about, stored[pair], options.threads)
+    report = fit_system_files(
+        options.system, options.reference, dataset=options.dataset, threads=options.threads
     )
     print(json_text(document(report)) if options.json else table(report))
     if options.output is not None:
@@ -62,6 +58,33 @@ def main(options: argparse.Namespace) -> int:
     if options.plot is not None:
         write_system_sheet(report, options.plot)
     return ACCEPTED if report.accepted else REFUSED
+
+
+def fit_system_files(
+    system: str | Path, reference: str | Path, *, dataset: str | None = None, threads: int = 2
+) -> SystemReport:
+    """Return the positions of sensors, mirrors and stars of a system from its measured matrices.
+
+    Parameters
+    ----------
+    system
+        TOML file of sensors and mirrors.
+    reference
+        One HDF5 file, or one for each pair, with ``{sensor}`` and ``{mirror}`` in its name.
+    dataset
+        Dataset of each matrix; None for ``{sensor}/{mirror}/interaction_matrix``.
+    threads
+        Threads that share the work.
+
+    Raises
+    ------
+    PyrcalError
+        If something that was given cannot be used.
+    """
+    about = load_system(Path(system))
+    places = locate_matrices(about, Path(reference), dataset)
+    stored = dict(zip(about.pairs, places, strict=True))
+    return fit_pairs(about, lambda pair, one: _fit_pair(about, pair, one, stored[pair], threads))
 
 
 def fit_pairs(system: System, fit: Callable[[Pair, Instrument], FitReport]) -> SystemReport:

@@ -161,7 +161,7 @@ class _Folder:
         return notes
 
 
-def from_cacao(folder: Path, reported: Reported, response: str | None = None) -> Imported:
+def from_cacao(folder: str | Path, reported: Reported, response: str | None = None) -> Imported:
     """Return the mirror and the response of a folder of cacao's.
 
     Parameters
@@ -178,7 +178,7 @@ def from_cacao(folder: Path, reported: Reported, response: str | None = None) ->
     MatrixError
         If a file is missing or there are several, or shapes do not belong together.
     """
-    found = _survey(folder)
+    found = _survey(Path(folder))
     matrix, kind = _response(found, response)
     arrays: dict[str, Array] = {"matrix": matrix}
     for role in ("valid", "light"):

@@ -82,7 +82,7 @@ class Reported:
     sensor: str | None = None
     """``pyramid`` or ``shack-hartmann``; None for that of the files, or a pyramid."""
 
-    stop: str
+    stop: str = "telescope"
     """Aperture stop: ``telescope`` or ``mirror``."""
 
     obscuration_ratio: float | None = None
@@ -156,19 +156,21 @@ def from_arrays(
     modes = usable_modes(signals, mirror, reported.columns, notes, column_numbers)
     apply_unit(reported.unit, signals, mirror, notes)
     sensor = _sensor(reported, signals, notes)
+    pupil = _read_pupil(arrays, notes)
     obscuration = reported.obscuration_ratio
-    if obscuration is None:
+    if obscuration is None and not pupil:
         seen = signals.obscuration_ratio
         obscuration = round(seen, 3) if seen > MIN_OBSCURATION else 0.0
         if obscuration:
             notes.append(f"obscuration_ratio = {obscuration}: read from the hole in the mask")
+    hole = {"obscuration_ratio": obscuration or 0.0}
     return Imported(
         source=source,
         tables={
             "instrument": {
                 "name": "bench",
                 "diameter_m": reported.diameter_m,
-                "obscuration_ratio": obscuration,
+                **({"pupil": in_arrays_file("pupil")} if pupil else hole),
                 "stop": reported.stop,
             },
             "wfs": sensor,
@@ -180,7 +182,7 @@ def from_arrays(
                 "orientation": "auto",
             },
         },
-        arrays={**signals.arrays, **modes, **mirror.arrays},
+        arrays={**signals.arrays, **modes, **mirror.arrays, **pupil},
         centres_found=frames is not None,
         notes=(*notes, *(f"{key} is unknown" for key, v in sensor.items() if v == UNKNOWN)),
     )
@@ -202,6 +204,17 @@ def apply_unit(unit: str | None, signals: Signals, mirror: Mirror, notes: list[s
             )
         # Not in place: the matrix may be that of the caller.
         signals.arrays["interaction_matrix"] = signals.arrays["interaction_matrix"] / UNITS_M[unit]
+
+
+def _read_pupil(arrays: Mapping[str, Array], notes: list[str]) -> dict[str, Array]:
+    """Return the map of the pupil for the file of arrays; empty if there is none."""
+    if "pupil" not in arrays:
+        return {}
+    pupil = plane_of(arrays["pupil"])
+    if pupil.ndim != 2 or pupil.shape[0] != pupil.shape[1]:
+        raise MatrixError(f"pupil: found shape {pupil.shape}, expected a map (n, n)")
+    notes.append(f"pupil: map of {len(pupil)} points, as wide as --diameter-m from edge to edge")
+    return {"pupil": np.asarray(pupil, np.float32)}
 
 
 def _make_own_modes(

@@ -57,7 +57,8 @@ def frames_of(matrix: Array, light: Array | None, valid: Array | None) -> Frames
     ----------
     matrix
         ``(n_modes, ny, nx)``, ``(ny, nx, n_modes)``, ``(ny * nx, n_modes)``, or one row for each
-        lit pixel of ``valid``; the last two also transposed.
+        lit pixel of ``valid``; the last two also transposed. Without light and mask, rows for all
+        pixels are recognised if the detector is square.
     light
         ``(ny, nx)`` mean frame of the camera; None if none was recorded.
     valid
@@ -69,6 +70,8 @@ def frames_of(matrix: Array, light: Array | None, valid: Array | None) -> Frames
         cube = _cube_of(matrix, light_map, valid)
         light_map = np.asarray(light_map, np.float64)
         return None if cube is None else Frames(cube=cube, light=light_map, light_name=name)
+    if matrix.ndim == 2 and valid is None:
+        matrix = _unfold_frames(matrix)
     if matrix.ndim != 3:
         return None
     # Only lit pixels respond, so the response itself shows where the pupil images are.
@@ -99,6 +102,16 @@ def _cube_of(matrix: Array, light_map: Array, valid: Array | None) -> Array | No
     cube = np.zeros((flat.shape[1], *lit.shape), dtype=matrix.dtype)
     cube[:, lit] = flat.T
     return cube
+
+
+def _unfold_frames(matrix: Array) -> Array:
+    """Return rows for all pixels of a square detector as frames; others unchanged."""
+    n_pixels = max(matrix.shape)
+    side = math.isqrt(n_pixels)
+    if side**2 != n_pixels or min(matrix.shape) == n_pixels:
+        return matrix
+    by_mode = matrix if matrix.shape[1] == n_pixels else matrix.T
+    return np.ascontiguousarray(by_mode).reshape(-1, side, side)
 
 
 def describe_frames(

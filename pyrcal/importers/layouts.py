@@ -6,6 +6,7 @@ subapertures are lit.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 
@@ -29,6 +30,7 @@ ROLES = {
     "modes": ("modes", "influence_functions", "cube", "ifunc", "mode_shapes"),
     "mode_to_actuator": ("mode_to_actuator", "M2C"),
     "positions": ("positions", "xy_m", "coordinates"),
+    "pupil": ("pupil",),
 }
 """Names of arrays by role, in a file with several arrays."""
 
@@ -192,7 +194,7 @@ def cube_of(values: Array, notes: list[str]) -> NDArray[np.float32]:
     MatrixError
         If it is unclear which two axes are the map's.
     """
-    cube = np.asarray(values)
+    cube = _unfold(np.asarray(values), notes)
     if cube.ndim != 3 or cube.dtype.kind not in "iuf":
         raise MatrixError(
             f"modes: found shape {cube.shape} of {cube.dtype}, expected numbers (n_modes, n, n)"
@@ -208,6 +210,20 @@ def cube_of(values: Array, notes: list[str]) -> NDArray[np.float32]:
         notes.append("modes: listed last, (n, n, n_modes): turned to (n_modes, n, n)")
         cube = np.moveaxis(cube, -1, 0)
     return np.ascontiguousarray(cube, dtype=np.float32)
+
+
+def _unfold(values: Array, notes: list[str]) -> Array:
+    """Return shapes that are listed with one axis for all points of a square map as a cube.
+
+    OOPAO lists its influence functions so. A map has more points than there are modes.
+    """
+    points = max(values.shape, default=0)
+    side = math.isqrt(points)
+    if values.ndim != 2 or side**2 != points or min(values.shape) == points:
+        return values
+    notes.append(f"modes: {points} points each: taken as maps of {side} x {side}")
+    by_mode = values if values.shape[1] == points else values.T
+    return by_mode.reshape(-1, side, side)
 
 
 def by_role(arrays: Mapping[str, Array], where: str) -> dict[str, Array]:

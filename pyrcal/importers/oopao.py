@@ -418,11 +418,11 @@ def _frames(
         arrays["flux_frame"] = _numpy(mean)
         sensor["pupil_centres_px"] = "auto"
         return arrays
-    sensor["pupil_centres_px"] = _image_centres(cube, sensor, notes)
+    sensor["pupil_centres_px"] = find_image_centres(cube, sensor, notes)
     return arrays
 
 
-def _image_centres(cube: Array, sensor: dict[str, Any], notes: list[str]) -> list[list[float]]:
+def find_image_centres(cube: Array, sensor: dict[str, Any], notes: list[str]) -> list[list[float]]:
     """Return windows of whole pixels around the pupil images, by the strength of the response.
 
     Light between the images responds as well, so that unmodulated images seem up to half a pixel

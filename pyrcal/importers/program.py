@@ -18,7 +18,7 @@ from pyrcal.importers.imported import Array, Imported
 from pyrcal.importers.layouts import by_role, numbers_of_name, role_of_name
 from pyrcal.importers.oopao import from_saved
 from pyrcal.importers.saved import read_npz
-from pyrcal.importers.specula import UNIT, from_specula
+from pyrcal.importers.specula import from_specula, from_synim
 from service.errors import ConfigurationError, MatrixError
 from service.files.container import opened
 from service.instrument import load_instrument
@@ -38,18 +38,31 @@ def import_files(options: argparse.Namespace) -> Imported:
             return from_saved(read_npz(options.file), str(options.file))
         case "specula" | "synim":
             paths = [path for _, path in options.files]
-            return from_specula(paths, _make_reported(options), options.source)
+            read = from_synim if options.source == "synim" else from_specula
+            return read(paths, make_reported(options))
         case "cacao":
-            return from_cacao(options.folder, _make_reported(options), options.response)
+            return from_cacao(options.folder, make_reported(options), options.response)
         case "aot":
             places = None if options.positions is None else _positions(options.positions)
-            return from_aot(options.file, _make_reported(options), options.loop, places)
+            return from_aot(options.file, make_reported(options), options.loop, places)
         case _:
-            return _arrays(options)
+            return import_arrays(options, *_gather_arrays(options))
 
 
-def _arrays(options: argparse.Namespace) -> Imported:
-    """Import arrays by their names, or by the given roles."""
+def import_arrays(
+    options: argparse.Namespace, found: Mapping[str, Array], inventory: tuple[str, ...]
+) -> Imported:
+    """Return what arrays by role describe, with the options; ``inventory`` is kept."""
+    source = " ".join(str(path) for _, path in options.files)
+    if options.instrument is not None:
+        imported = from_described(source, found, options.instrument, options.unit, options.modes)
+    else:
+        imported = from_arrays(source, found, make_reported(options))
+    return replace(imported, inventory=inventory)
+
+
+def _gather_arrays(options: argparse.Namespace) -> tuple[dict[str, Array], tuple[str, ...]]:
+    """Return the arrays of the files by role, and the use that was made of each file."""
     found: dict[str, Array] = {}
     inventory: list[str] = []
     for role, path in _files(options.files):
@@ -58,18 +71,13 @@ def _arrays(options: argparse.Namespace) -> Imported:
             inventory.append(f"ignored {path}: no name of a role, see docs/howto/importing.md")
         # Modes of the command line are preferred to those in a file's name.
         if "matrix" in arrays and options.modes is None:
-            options.modes = _modes_of_name(path, arrays["matrix"], inventory)
+            options.modes = modes_of_name(path, arrays["matrix"], inventory)
         twice = found.keys() & arrays.keys()
         if twice:
             raise MatrixError(f"{path}: found a second {min(twice)}, expected one")
         inventory += [f"took {path} {np.shape(a)}: {name}" for name, a in arrays.items()]
         found |= arrays
-    source = " ".join(str(path) for _, path in options.files)
-    if options.instrument is not None:
-        imported = from_described(source, found, options.instrument, options.unit, options.modes)
-    else:
-        imported = from_arrays(source, found, _make_reported(options))
-    return replace(imported, inventory=tuple(inventory))
+    return found, tuple(inventory)
 
 
 def _files(given: Sequence[tuple[str | None, Path]]) -> Iterator[tuple[str | None, Path]]:
@@ -80,7 +88,7 @@ def _files(given: Sequence[tuple[str | None, Path]]) -> Iterator[tuple[str | Non
                 name = one.name.lower()
                 # Arrays of a MATLAB file have names, whatever that of the file is.
                 known = _role_of(one) is not None or name.endswith(".mat")
-                if one.is_file() and name.endswith(_ARRAY_FILES) and known:
+                if one.is_file() and name.endswith(ARRAY_FILES) and known:
                     yield None, one
         else:
             yield role, path
@@ -88,7 +96,7 @@ def _files(given: Sequence[tuple[str | None, Path]]) -> Iterator[tuple[str | Non
 
 def _by_role(role: str | None, path: Path, source: str, inventory: list[str]) -> dict[str, Array]:
     """Return the arrays of a file by role, from their names or the file's name."""
-    arrays = _read(path, inventory)
+    arrays = read_arrays(path, inventory)
     if role is not None:
         return {role: _only(arrays, str(path))}
     if source == "pyrtc":
@@ -101,7 +109,7 @@ def _by_role(role: str | None, path: Path, source: str, inventory: list[str]) ->
     return by_role(arrays, str(path))
 
 
-def _modes_of_name(path: Path, matrix: Array, inventory: list[str]) -> Array | None:
+def modes_of_name(path: Path, matrix: Array, inventory: list[str]) -> Array | None:
     """Return the modes that the name of a file lists, one for each column of its matrix."""
     numbers = numbers_of_name(path.name.partition(".")[0])
     if len(numbers) not in np.shape(matrix) or len(set(numbers)) < len(numbers):
@@ -116,7 +124,7 @@ def _role_of(path: Path) -> str | None:
     return role_of_name(path.name.partition(".")[0])
 
 
-def _read(path: Path, inventory: list[str]) -> dict[str, Array]:
+def read_arrays(path: Path, inventory: list[str]) -> dict[str, Array]:
     """Return the arrays of a file by name; remarks on them are appended to ``inventory``."""
     if zipfile.is_zipfile(path):
         return read_npz(path)
@@ -136,7 +144,7 @@ def _only(arrays: Mapping[str, Array], where: str) -> Array:
 def _positions(path: Path) -> Array:
     """Return positions ``(n_actuators, 2)`` of an array file, or of a text file of two columns."""
     if path.suffix.lower() not in {".txt", ".csv", ".dat"}:
-        return _only(_read(path, []), str(path))
+        return _only(read_arrays(path, []), str(path))
     delimiter = "," if path.suffix.lower() == ".csv" else None
     try:
         return np.loadtxt(path, delimiter=delimiter, ndmin=2)
@@ -144,7 +152,14 @@ def _positions(path: Path) -> Array:
         raise MatrixError(f"{path}: found {error}, expected x and y in a row") from error
 
 
-def _make_reported(options: argparse.Namespace) -> Reported:
+def make_reported(options: argparse.Namespace) -> Reported:
+    """Return the values that the options give.
+
+    Raises
+    ------
+    ConfigurationError
+        If they give no diameter.
+    """
     if options.diameter_m is None:
         other = (
             ", or --instrument with a packaged name or a file" if "instrument" in options else ""
@@ -163,12 +178,11 @@ def _make_reported(options: argparse.Namespace) -> Reported:
         pixels_per_subaperture=options.pixels_per_subap,
         columns=options.modes,
         basis=getattr(options, "basis", None),
-        centroid="gradient" if options.source == "synim" else None,
-        unit=getattr(options, "unit", UNIT if options.source in {"specula", "synim"} else None),
+        unit=getattr(options, "unit", None),
     )
 
 
-_ARRAY_FILES = (".npy", ".fits", ".fits.gz", ".fits.fz", ".npz", ".h5", ".mat")
+ARRAY_FILES = (".npy", ".fits", ".fits.gz", ".fits.fz", ".npz", ".h5", ".mat")
 """Suffixes of files that are read from a folder."""
 
 

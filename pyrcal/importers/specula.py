@@ -33,21 +33,25 @@ LENSLETS = (
 )
 
 
-def from_specula(paths: Sequence[Path], reported: Reported, source: str = "SPECULA") -> Imported:
+def from_specula(
+    paths: Sequence[str | Path], reported: Reported, source: str = "SPECULA"
+) -> Imported:
     """Import an ``Intmat``, its ``PupData`` or ``SubapData``, and an ``IFunc``.
 
-    With an ``M2C`` among the files, modes are combined from the influence functions.
+    Without a unit in ``reported`` commands are nanometres, as SPECULA's are. With an ``M2C`` among
+    the files, modes are combined from the influence functions.
 
     Raises
     ------
     MatrixError
         If one of them is missing or present twice, or a file is something else.
     """
+    reported = replace(reported, unit=reported.unit or UNIT)
     found: dict[str, Array] = {}
     places: Subapertures | None = None
     kind = reported.kind
     interleaved, notes = False, list[str]()
-    for path in paths:
+    for path in map(Path, paths):
         with opened(path) as container:
             if "fsizex" in container.facts or "np_sub" in container.facts:
                 # Only PupData has FSIZEX, only SubapData NP_SUB.
@@ -88,6 +92,17 @@ def from_specula(paths: Sequence[Path], reported: Reported, source: str = "SPECU
     if not np.array_equal(places.by_rows, np.arange(len(places.rows))):
         notes.append("subapertures were not listed row by row: sorted")
     return imported.with_notes(*notes)
+
+
+def from_synim(paths: Sequence[str | Path], reported: Reported) -> Imported:
+    """Import the same files as SynIM writes them: its slopes of lenslets are mean gradients.
+
+    Raises
+    ------
+    MatrixError
+        As ``from_specula``.
+    """
+    return from_specula(paths, replace(reported, centroid="gradient"), "synim")
 
 
 def _role_of(container: Container, notes: list[str]) -> tuple[str, Array]:

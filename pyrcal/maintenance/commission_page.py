@@ -73,7 +73,6 @@ def format_page(data: Commissioning, criteria: Sequence[Criterion]) -> str:
     accepted = n_passed == len(criteria)
     verdict = "ACCEPTED" if accepted else "NOT ACCEPTED"
     parts = [
-        f"<h1>Commissioning of {escape(data.instrument.name)}</h1>",
         f'<p class="note">{_time(data.first_ns)} to {_time(data.last_ns)} UTC. Written '
         f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC by pyrcal {software_version()}.</p>",
         f'<p class="verdict {"pass" if accepted else "fail"}">{verdict}: '
@@ -81,7 +80,7 @@ def format_page(data: Commissioning, criteria: Sequence[Criterion]) -> str:
         "<h2>Acceptance</h2>",
         _criteria_table(criteria),
         "<h2>Instrument and sources</h2>",
-        _table(("", ""), _instrument_rows(data)),
+        format_table(("", ""), _instrument_rows(data)),
         "<h2>RTC against the contract</h2>",
         _checks(data),
         "<h2>Fit of the measured interaction matrix</h2>",
@@ -104,13 +103,16 @@ def format_page(data: Commissioning, criteria: Sequence[Criterion]) -> str:
         "<h2>Alarms</h2>",
         _alarms(data),
     ]
-    title = escape(f"Commissioning of {data.instrument.name}")
+    return format_html(f"Commissioning of {data.instrument.name}", parts)
+
+
+def format_html(title: str, parts: Iterable[str]) -> str:
+    """Return a page of parts that are HTML already, with a heading and this style."""
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{title}</title><style>{_STYLE}</style></head><body>\n"
-        + "\n".join(parts)
-        + "\n</body></html>\n"
+        f"<title>{escape(title)}</title><style>{_STYLE}</style></head><body>\n"
+        f"<h1>{escape(title)}</h1>\n" + "\n".join(parts) + "\n</body></html>\n"
     )
 
 
@@ -126,7 +128,9 @@ def _criteria_table(criteria: Sequence[Criterion]) -> str:
         )
         for one in criteria
     )
-    return _table(("Part", "Criterion", "Measured", "Limit", "Outcome", "If not passed"), rows)
+    return format_table(
+        ("Part", "Criterion", "Measured", "Limit", "Outcome", "If not passed"), rows
+    )
 
 
 def _instrument_rows(data: Commissioning) -> Iterable[tuple[str, str]]:
@@ -155,7 +159,7 @@ def _checks(data: Commissioning) -> str:
         )
         for one in data.checks
     )
-    return _table(("Check", "Requirements", "Outcome", "Finding"), rows)
+    return format_table(("Check", "Requirements", "Outcome", "Finding"), rows)
 
 
 def _fit(data: Commissioning) -> str:
@@ -175,7 +179,7 @@ def _fit(data: Commissioning) -> str:
         )
     return (
         text
-        + _table(("Parameter, unit", "Fit", "1 σ"), rows)
+        + format_table(("Parameter, unit", "Fit", "1 σ"), rows)
         + _figure(_draw_gains(fit), "Gain of each mode of the measured matrix over the model's.")
     )
 
@@ -197,7 +201,9 @@ def _matrices(data: Commissioning) -> str:
         )
         for one in sorted(data.matrices, key=lambda one: one.created_ns_utc)
     )
-    return _table(("Matrix", "Modes", "State", "Largest pole radius", "Probation", "Reason"), rows)
+    return format_table(
+        ("Matrix", "Modes", "State", "Largest pole radius", "Probation", "Reason"), rows
+    )
 
 
 def _alarms(data: Commissioning) -> str:
@@ -211,7 +217,7 @@ def _alarms(data: Commissioning) -> str:
             ("a rule of the settings", "") if known is None else (known.severity, known.means)
         )
         rows.append((name, severity, _time(begin_ns), f"{(end_ns - begin_ns) * 1e-9:.0f} s", means))
-    return _table(("Alarm", "Severity", "Began (UTC)", "Lasted", "Meaning"), rows)
+    return format_table(("Alarm", "Severity", "Began (UTC)", "Lasted", "Meaning"), rows)
 
 
 # --- figures
@@ -312,7 +318,9 @@ def _mark(text: str, kind: str) -> _Html:
     return _Html(f'<span class="{kind}">{escape(text)}</span>')
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+def format_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table with a heading; text is escaped."""
+
     def cells(kind: str, row: Sequence[str]) -> str:
         texts = (one if isinstance(one, _Html) else escape(one) for one in row)
         return "<tr>" + "".join(f"<{kind}>{text}</{kind}>" for text in texts) + "</tr>"

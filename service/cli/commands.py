@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from service.errors import ArchiveError, ConfigurationError, say
+from service.instrument.paths import TWIN_LIVE_FILE
 from service.program import data_dir_of_the_one
 from service.web.keys import KeyFile, KeyScope
 
@@ -65,6 +66,10 @@ def _run(options: argparse.Namespace) -> int:
     for key in ("zenoh.listen", "zenoh.connect"):
         if key in given:
             given[key] = [given[key]]
+    # The RTC of a bench sends slopes, although its matrix may have been measured as frames.
+    live = Path(given.get("service.instrument", "")) / TWIN_LIVE_FILE
+    if live.is_file():
+        given["service.instrument"] = str(live)
     settings = load_settings(options.config, os.environ, given)
     from service.instrument.schema import read_instrument_file
 

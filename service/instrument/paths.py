@@ -8,9 +8,13 @@ from service.errors import ConfigurationError
 
 _PACKAGED = Path(__file__).parent / "packaged"
 
+TWIN_FILE, TWIN_LIVE_FILE, TWIN_MATRIX = "instrument.toml", "live.toml", "matrix.h5"
+"""Files of a folder that ``pyrcal twin`` wrote: instrument, instrument of an RTC that sends slopes,
+and matrix."""
+
 
 def instrument_path(name_or_path: str | Path) -> Path:
-    """Return the file of a packaged instrument, or the path as it is; nothing is read yet.
+    """Return the file of a packaged instrument or of a twin's folder, or the path as it is.
 
     Raises
     ------
@@ -19,6 +23,8 @@ def instrument_path(name_or_path: str | Path) -> Path:
     """
     name, _ = and_sensor_mode(name_or_path)
     path = Path(name)
+    if (path / TWIN_FILE).is_file():
+        return path / TWIN_FILE
     is_name = path.suffix != ".toml" and path.name == name
     return packaged_file(path.name) if is_name else path
 

@@ -34,7 +34,11 @@ SIGNATURES = {
     "fit_file": "instrument, path, options, dataset, threads, memory_gb, basis, progress",
     "array_backend": "library",
     "fit": "instrument, matrix, modes, noise, flux_frame, double_pass, options, threads",
+    "fit_system": "system, reference, dataset, threads",
+    "from_cacao": "folder, reported, response",
     "from_oopao": "tel, dm, wfs, calib, M2C, ngs",
+    "from_specula": "paths, reported, source",
+    "from_synim": "paths, reported",
     "interaction_matrix": "instrument, alpha",
     "load_instrument": "name_or_path",
     "modal_basis": "instrument",
@@ -43,6 +47,7 @@ SIGNATURES = {
     "reconstruct": "interaction_matrix, recipe",
     "to_oopao": "alpha, tel, wfs",
     "track": "path, instrument, settings",
+    "twin": "files, output, check, threads, told",
     "write_bundle": "path, bundle",
 }
 """Parameters of the functions that may be relied on: docs/reference/python.md."""

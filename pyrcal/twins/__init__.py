@@ -1,0 +1,1 @@
+"""Models of a fitted bench that other programs run."""

@@ -1,0 +1,282 @@
+"""Read what a bench has: find the importer of its files, and the grid that has made its matrix."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from pyrcal.importers.imported import Array, Imported
+from pyrcal.importers.layouts import role_of_name
+from pyrcal.importers.oopao import SAVED, find_image_centres, from_saved
+from pyrcal.importers.program import (
+    ARRAY_FILES,
+    import_arrays,
+    import_files,
+    modes_of_name,
+    read_arrays,
+)
+from service.errors import ConfigurationError, MatrixError
+from service.files.container import DATASET
+from service.files.toml import read_toml
+from service.instrument import instrument_path
+
+_OOPAO = {
+    "".join(filter(str.isalnum, f"{owner}{name}")).lower(): f"{owner}.{name}"
+    for owner, names in (*SAVED.items(), ("calib", ("D",)))
+    for name in names
+}
+"""OOPAO's attributes by their names in small letters without dots: MATLAB allows none."""
+
+_OOPAO_ONLY = {"tel.D", "tel.resolution", "wfs.nSubap", "wfs.tag"}
+"""Attributes that show that the files are OOPAO's objects."""
+
+_PARTS = (
+    ("mode_to_actuator", ("m2c", "modetoactuator", "modestoactuator")),
+    ("matrix", ("interaction", "intmat", "imat", "calibd")),
+    ("modes", ("influence", "ifunc", "dmmodes", "modeshapes")),
+    ("positions", ("coordinates", "positions")),
+    ("sky_pupil", ("skypupil", "pupilsky")),
+    ("spot", ("spot", "modulationpicture", "modulatedpsf")),
+    ("pupil", ("pupil",)),
+    ("valid", ("valid",)),
+    ("light", ("meanframe", "flux", "light", "reference")),
+)
+"""Parts of names by role, the more specific ones first; for names that are no role's own."""
+
+_MAX_WIDTH_RATIO = 0.12
+"""Largest relative difference of the pupil's width from that of its images as they respond. Without
+modulation light between the images responds, so that an image of 36 pixels seems 39 wide."""
+
+_SEEMING_PX = 0.6
+"""How much closer together unmodulated images seem, and half as much for others."""
+
+
+class _Named(NamedTuple):
+    """An array, its name or that of its file, and its file."""
+
+    name: str
+    values: Array
+    path: Path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Bench:
+    """The files of a bench as instrument and matrix."""
+
+    imported: tuple[Imported, ...]
+    """Instrument and matrix; a second time with the FFT grid of a simulated bench if the files
+    allow it."""
+
+    stated: frozenset[str]
+    """Keys of the instrument file that options or attributes of another code state."""
+
+    sky_pupil: Array | None = None
+    """``(n, n)`` pupil on the sky; None if there is only one pupil."""
+
+    spot: Array | None = None
+    """``(ny, nx)`` picture of the modulated spot; None if there is none."""
+
+    inventory: tuple[str, ...] = field(default=())
+    """Use that was made of each file, one sentence each."""
+
+
+def read_bench(options: argparse.Namespace) -> Bench:
+    """Return what the files of a bench describe.
+
+    Raises
+    ------
+    ConfigurationError
+        If a value that no file contains is missing.
+    MatrixError
+        If files do not belong together: it names them with their shapes.
+    """
+    paths = [path for role, path in options.files if role is None]
+    cacao = [path for path in paths if any(path.glob("**/cacaovars*"))]
+    if cacao:
+        options.source, options.folder, options.response = "cacao", cacao[0], None
+        return Bench(imported=(import_files(options),), stated=_state(options))
+    named = tuple(_read_files(options.files))
+    saved = {_OOPAO.get(_squeeze(one.name), one.name): one.values for one in named}
+    if _OOPAO_ONLY & saved.keys():
+        imported = from_saved(saved, ", ".join(str(path) for _, path in options.files))
+        stated = frozenset(key for table in imported.tables.values() for key in table)
+        inventory = tuple(
+            f"{_OOPAO.get(_squeeze(one.name), one.name)}: {one.path}" for one in named
+        )
+        return Bench(imported=(imported,), stated=stated, inventory=inventory)
+    if "INTMAT" in saved:
+        options.source = "specula"
+        options.files = [(None, path) for path in dict.fromkeys(one.path for one in named)]
+        return Bench(imported=(import_files(options),), stated=_state(options))
+    options.source = "files"
+    found, inventory = _sort_by_role(named, options)
+    try:
+        imported = import_arrays(options, found, inventory)
+    except MatrixError as error:
+        raise MatrixError(f"{error}; {'; '.join(inventory)}") from error
+    _check_modes(imported, options)
+    sampled = _find_fft_grid(imported, options.pupil_subap, has_light="light" in found)
+    return Bench(
+        imported=(imported,) if sampled is None else (sampled, imported),
+        stated=_state(options),
+        sky_pupil=found.get("sky_pupil"),
+        spot=found.get("spot"),
+        inventory=inventory,
+    )
+
+
+def _state(options: argparse.Namespace) -> frozenset[str]:
+    """Return the keys of the instrument file that the options give."""
+    keys = {
+        "diameter_m": options.diameter_m,
+        "kind": options.sensor,
+        "obscuration_ratio": options.obscuration,
+        "wavelength_m": options.wavelength_m,
+        "modulation_lambda_over_d": options.modulation,
+        "pupil_diameter_subap": options.pupil_subap,
+        "pixels_per_subaperture": options.pixels_per_subap,
+        "unit": options.unit,
+    }
+    stated = {key for key, value in keys.items() if value is not None}
+    if options.instrument is not None:
+        for table in read_toml(instrument_path(options.instrument)).values():
+            stated |= table.keys()
+    return frozenset(stated)
+
+
+def _squeeze(name: str) -> str:
+    """Return a name in small letters without anything but letters and digits."""
+    return "".join(filter(str.isalnum, name)).lower()
+
+
+def _read_files(given: list[tuple[str | None, Path]]) -> Iterator[_Named]:
+    """Yield the arrays of files and of the files in folders; a given role is their name."""
+    for role, path in given:
+        for one in sorted(path.iterdir()) if path.is_dir() else [path]:
+            if path.is_dir() and not one.name.lower().endswith(ARRAY_FILES):
+                continue
+            arrays = read_arrays(one, [])
+            if role is not None and len(arrays) != 1:
+                raise MatrixError(f"{one}: found {', '.join(arrays)}, expected one array")
+            for name, values in arrays.items():
+                # The array of a NumPy or FITS file has no name of its own.
+                is_unnamed = name == DATASET or name.isdigit()
+                ends = [end for end in ARRAY_FILES if one.name.lower().endswith(end)]
+                own = one.name[: -len(max(ends, default="", key=len)) or None]
+                own = own if is_unnamed else name
+                yield _Named(role or own, values, one)
+
+
+def _sort_by_role(
+    named: tuple[_Named, ...], options: argparse.Namespace
+) -> tuple[dict[str, Array], tuple[str, ...]]:
+    """Return the arrays by role, and the use that was made of each."""
+    found: dict[str, Array] = {}
+    inventory: list[str] = []
+    unknown: list[_Named] = []
+    for one in named:
+        role = _find_role(one.name)
+        if role is None:
+            unknown.append(one)
+            continue
+        if role in found:
+            raise MatrixError(f"{one.path}: found a second {role}, expected one; say ROLE=FILE")
+        found[role] = one.values
+        inventory.append(f"{role}: {one.path} {one.values.shape}")
+        if role == "matrix" and options.modes is None:
+            options.modes = modes_of_name(one.path, one.values, inventory)
+    for one in unknown:
+        role = _guess_mask(one.values, np.shape(found.get("matrix", ())))
+        if role is None or role in found:
+            inventory.append(f"not used: {one.path} {one.values.shape} ({one.name}); ROLE=FILE")
+        else:
+            found[role] = one.values
+            inventory.append(f"{role}, by its shape: {one.path} {one.values.shape}")
+    return found, tuple(inventory)
+
+
+def _find_role(name: str) -> str | None:
+    """Return the role for a name, or for a part of it; None if it is unknown."""
+    squeezed = _squeeze(name)
+    return (
+        role_of_name(name)
+        or (name if name in dict(_PARTS) else None)
+        or next((role for role, parts in _PARTS if any(part in squeezed for part in parts)), None)
+    )
+
+
+def _guess_mask(values: Array, shape: tuple[int, ...]) -> str | None:
+    """Return the role of a square map of 0 and 1: ``valid`` if the matrix has its rows."""
+    is_map = values.ndim == 2 and values.shape[0] == values.shape[1]
+    if not is_map or values.dtype.kind not in "biuf" or not np.isin(values, (0, 1)).all():
+        return None
+    n_lit = int(np.count_nonzero(values))
+    return "valid" if {values.size, n_lit, 2 * n_lit} & set(shape) else "pupil"
+
+
+def _check_modes(imported: Imported, options: argparse.Namespace) -> None:
+    """Refuse a matrix of fewer modes than the basis has, if nothing says of which.
+
+    Raises
+    ------
+    ConfigurationError
+        With both shapes.
+    """
+    strokes, numbers = (imported.arrays.get(key) for key in ("mode_to_actuator", "modes"))
+    if options.modes is not None or strokes is None or numbers is None:
+        return
+    if len(numbers) < strokes.shape[1] and np.array_equal(numbers, np.arange(len(numbers))):
+        raise ConfigurationError(
+            f"{imported.source}: found a matrix of {len(numbers)} columns and mode_to_actuator "
+            f"{strokes.shape}, and nothing says which of the {strokes.shape[1]} modes they are; "
+            "expected --modes, like 0:100 or 3,5,9"
+        )
+
+
+def _find_fft_grid(imported: Imported, across: float | None, *, has_light: bool) -> Imported | None:
+    """Return the bench as one that was simulated with an FFT; None if its files exclude that.
+
+    A simulated pupil has a whole number of points in each subaperture, which is one pixel, and the
+    influence functions have the same points.
+    """
+    wfs, cube = imported.tables["wfs"], imported.arrays.get("influence_functions")
+    frames = imported.arrays[DATASET]
+    if cube is None or frames.ndim != 3 or wfs.get("pixels_per_subaperture") != 1:
+        return None
+    side, width, seen = cube.shape[-1], frames.shape[-1], float(wfs["pupil_diameter_subap"])
+    tolerance = 0.0 if across else _MAX_WIDTH_RATIO
+    counts = [
+        n
+        for n in range(2, side + 1)
+        if side % n == 0 and abs(n / (across or seen) - 1.0) <= tolerance
+    ]
+    if len(counts) != 1 or frames.shape[1] != width:
+        return None
+    n, notes = counts[0], list(imported.notes)
+    centres = wfs["pupil_centres_px"]
+    if not has_light:
+        # Windows of whole pixels: their distance is even if the width of the detector less that of
+        # the pupil is.
+        apart = float(np.ptp(np.array(centres), axis=0).mean()) + _SEEMING_PX
+        odd = (width - n) % 2
+        sensor = {"pupil_separation_subap": 2 * round((apart - odd) / 2) + odd}
+        centres = find_image_centres(frames, sensor, notes)
+    notes.append(
+        f"the bench may be simulated: influence functions of {side} points for {n} subapertures of "
+        "one pixel"
+    )
+    grid = {"points_per_subaperture": side // n, "width_subap": float(width)}
+    about = {
+        **wfs,
+        "n_subapertures": n,
+        "pupil_diameter_subap": float(n),
+        "pupil_centres_px": centres,
+        "valid_subapertures": "auto",
+        "fft_grid": grid,
+    }
+    return replace(imported, tables={**imported.tables, "wfs": about}, notes=tuple(notes))

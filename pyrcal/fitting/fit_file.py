@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from pyrcal.fitting.alternatives import LIGHT_KEY
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.matrix import FitOptions, fit_matrix
-from pyrcal.fitting.memory import check_fit
+from pyrcal.fitting.memory import bytes_of_fit, check_fit
 from pyrcal.fitting.recorded import FLUX_FRAME, Recorded, read_recorded
 from pyrcal.fitting.report import FitReport
 from service.errors import MatrixError
@@ -23,6 +23,7 @@ from service.estimation.reference import Reference
 from service.files.disk_cache import cached_basis
 from service.instrument import load_instrument
 from service.model.instrument import Instrument, instrument_sha256
+from service.model.memory import GB
 from service.model.modes import Basis
 from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import CannotTell, Mapper
@@ -156,6 +157,8 @@ def fit_file(
     if memory_gb is not None:
         n_modes = len(reference.columns if options.modes is None else options.modes)
         check_fit(instrument, n_modes, memory_gb, gain_map=options.gain_map)
+        if bytes_of_fit(instrument, n_modes, gain_map=True) > memory_gb * GB:
+            options = replace(options, find_light=False)
     begun = time.perf_counter()
     found = _fit_recorded(
         instrument, recorded, reference, options, threads=threads, basis=basis, progress=progress
@@ -229,15 +232,18 @@ def _with_found_light(instrument: Instrument, recorded: Recorded, found: Fit) ->
 
 def _note_flux_frame(found: Fit) -> Iterator[str]:
     """Yield that the light in the file of the matrix would lower σ, if it would."""
+    cut = (
+        f"the light is in the same file: cut the four pupil images out of {FLUX_FRAME}, "
+        "save their counts as flux (4, n, n) and give them (--flux-map)"
+    )
+    if found.gain_map is not None:
+        yield f"a gain over the pupil is fitted in place of the light; {cut}"
     for one in found.alternatives:
         gained = 1.0 - (1.0 if one.share is None else min(one.share, 1.0))
         explained = found.residual_fraction * float(np.sqrt(gained))
         if one.key == LIGHT_KEY and explained > MIN_LIGHT_EXPLAINED:
-            yield (
-                f"uneven light explains {explained:.0%} of the signal, and sigma allows for it; "
-                f"the light is in the same file: cut the four pupil images out of {FLUX_FRAME}, "
-                "save their counts as flux (4, n, n) and give them (--flux-map)"
-            )
+            words = f"uneven light explains {explained:.0%} of the signal"
+            yield f"{words}, and sigma allows for it; {cut}"
 
 
 def make_reference(recorded: Recorded, instrument: Instrument) -> tuple[Reference, tuple[str, ...]]:

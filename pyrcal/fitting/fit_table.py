@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.fitting.alternatives import PLAUSIBLE_DISPLACEMENT_PX, format_move, systematic_terms
+from pyrcal.fitting.budget import advise_measurement
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.methods import ScanStep
 from pyrcal.fitting.report import FitReport, orientation_words
@@ -116,6 +117,10 @@ def _residual_lines(fit: Fit) -> Iterator[str]:
         yield f"{'':20s}{left.border:.1f} times as much at the pupil's border as inside"
     if left.words:
         yield f"{'':20s}{left.words}"
+    for one in fit.causes:
+        yield f"{'':20s}{one.share:.0%} of its power +- {one.sigma:.0%}: {one.words}"
+    if fit.causes:
+        yield f"{'measure next':20s}{advise_measurement(fit.causes)}"
 
 
 def _finding_lines(fit: Fit) -> Iterator[str]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.fitting.budget import Cause
 from pyrcal.fitting.comparison import Alternative
 from pyrcal.fitting.control_check import ReconstructorVerdict
 from pyrcal.fitting.disjoint_sets import DisjointSets, Distortion
@@ -107,6 +108,9 @@ class Fit(FittedMatrix):
 
     origins: tuple[Origin, ...] = ()
     """Instrument quantities that the fit determined."""
+
+    causes: tuple[Cause, ...] = ()
+    """Causes of the power that is left over, the largest first; empty if hardly any is."""
 
     unknown_not_found: tuple[str, ...] = ()
     """Keys marked as unknown in the file that the matrix does not determine."""

@@ -17,7 +17,8 @@ from pyrcal.fitting.advice import (
     add_explanations,
     add_recommendation,
 )
-from pyrcal.fitting.alternatives import add_alternatives, find_alternatives
+from pyrcal.fitting.alternatives import LIGHT_KEY, add_alternatives, find_alternatives
+from pyrcal.fitting.budget import explain_left_over
 from pyrcal.fitting.columns import (
     MAX_SMEAR,
     Smear,
@@ -29,6 +30,7 @@ from pyrcal.fitting.columns import (
 )
 from pyrcal.fitting.comparison import FitSubset
 from pyrcal.fitting.control_check import GAIN, check_control
+from pyrcal.fitting.disjoint_sets import SIGNIFICANT
 from pyrcal.fitting.fitted import Fit, Registration
 from pyrcal.fitting.gain_causes import find_gain_causes
 from pyrcal.fitting.instrument_checks import (
@@ -48,7 +50,7 @@ from pyrcal.fitting.methods import (
     settle,
     settle_at,
 )
-from pyrcal.fitting.models import FAR_PREFERRED_SHARE, FitModels
+from pyrcal.fitting.models import FAR_PREFERRED_SHARE, PREFERRED_SHARE, FitModels
 from pyrcal.fitting.noise import bound_noise_share, measure_structure
 from pyrcal.fitting.origins import Origin, find_ellipse, list_origins, list_undetermined_keys
 from pyrcal.fitting.pupil_checks import MIN_PUPIL_EXPLAINED
@@ -60,6 +62,7 @@ from pyrcal.fitting.solver import (
     Solution,
     image_patterns,
     nuisances_of,
+    refine,
 )
 from pyrcal.fitting.uncertainty import (
     LOCAL_MAGNIFICATION_FLOOR,
@@ -108,6 +111,16 @@ _SMEAR_SETTLED = 1e-3
 _LEAST_RATE = 0.1
 """Smallest slope of the measured share over the removed share used in the uncertainty."""
 
+MIN_LIGHT_FOUND = 0.1
+"""RMS share of the signal that uneven light must explain to be fitted without a request. On
+PAPYRUS it explains 0.18, on AO188, whose arms and gains it follows, 0.08. Models of one instrument
+differ by 0.01 to 0.07."""
+
+LIGHT_FOUND_WORDS = (
+    "the matrix shows uneven light: a smooth gain over the pupil is fitted, and sigma allows for "
+    "the registration without it; give the light (--flux-map) if it was measured"
+)
+
 _SMEAR_EXPLAINS = 0.9
 """Residual left after the smear is removed over that left before; above this it is rejected."""
 
@@ -135,6 +148,9 @@ class FitOptions:
 
     gain_map: bool = False
     """True to fit a smooth gain over the pupil, common to all modes."""
+
+    find_light: bool = True
+    """True to fit that gain also where the matrix clearly prefers it."""
 
     anamorphosis: bool = True
     """True to fit the anamorphosis of the mirror's image."""
@@ -268,9 +284,9 @@ def _fit_usable(
             models, instrument, found, usable, smear, options, report_stage
         )
     report_stage("verdict")
-    findings = _gather_findings(models, found, usable, axes_doubt)
+    found, findings = _gather_with_light(models, found, usable, axes_doubt, options)
     grounds = _gather_grounds(findings, found, axes_doubt, explain=options.explain)
-    fit = _make_fit(found, usable, findings, grounds, options.gain)
+    fit = _make_fit(found, usable, findings, grounds, options)
     fit = _add_notes(fit, found, findings, grounds, models.instrument, reported)
     fit = (add_explanations if options.explain else add_recommendation)(fit, grounds)
     place = models.instrument.pupil_shift_subap
@@ -311,6 +327,43 @@ def _fit_shown_pupil(
     again = _run_method(there, settled.target, begin, options, report_stage)
     left = again.settled.solution.projection.chi / settled.solution.projection.chi
     return (there, again) if left < FAR_PREFERRED_SHARE else (models, found)
+
+
+def _gather_with_light(
+    models: FitModels, found: _Found, usable: Reference, axes: AxesDoubt, options: FitOptions
+) -> tuple[_Found, FitFindings]:
+    """Return fit and findings, with a smooth gain over the pupil if the matrix shows it."""
+    findings = _gather_findings(models, found, usable, axes)
+    if not _shows_uneven_light(findings, options):
+        return found, findings
+    settled, even = found.settled, found.settled.solution
+    kind = settled.models.instrument.slopes.kind
+    maps = nuisances_of(settled.target.valid, kind, gain_map=True).maps
+    nuisances = replace(settled.nuisances, maps=maps)
+    # Light hardly moves the other unknowns, so that their derivatives still hold.
+    lit = refine(settled.models, settled.target, even.alpha, nuisances, near=even)
+    if not lit.converged:
+        return found, findings
+    again = replace(settled, solution=lit, nuisances=nuisances)
+    found = replace(found, settled=again, even=even)
+    return found, _gather_findings(models, found, usable, axes)
+
+
+def _shows_uneven_light(findings: FitFindings, options: FitOptions) -> bool:
+    """Return True if uneven light is the only explanation that the matrix clearly prefers.
+
+    A gain over the pupil follows part of what another stop, hole or modulation does, so that it is
+    not fitted where one of these is preferred.
+    """
+    light = next((one for one in findings.alternatives if one.key == LIGHT_KEY), None)
+    known = options.gain_map or options.illumination is not None
+    usual = options.find_light and options.method is Method.JOINT and not known
+    sure = findings.explained and findings.solution.converged and not findings.axes
+    if light is None or not usual or not sure:
+        return False
+    better = light.misfit < PREFERRED_SHARE and light.significance > SIGNIFICANT
+    explains = light.explained(findings.residual_fraction) > MIN_LIGHT_FOUND
+    return better and explains and not any(one.preferred for one in findings.alternatives)
 
 
 def _note_mask(fit: Fit, instrument: Instrument) -> Fit:
@@ -539,6 +592,9 @@ class _Found:
     before: Solution | None = None
     """Solution with the original columns, if a smear was removed."""
 
+    even: Solution | None = None
+    """Solution with even light, if uneven light was found."""
+
 
 def _run_method(
     models: FitModels,
@@ -640,6 +696,9 @@ def _list_errors(findings: FitFindings, found: _Found) -> Iterator[Array]:
     if found.smear is not None and found.before is not None:
         # The registration moves in proportion to the share that is removed.
         yield (solution.vector - found.before.vector) * found.smear.sigma / found.smear.share
+    if found.even is not None:
+        # Whether the gain is that of light, a matrix does not show.
+        yield solution.vector - found.even.vector
     yield _misplacement_sigma(about, findings.structure)
     # Tilted faces of a pyramid displace its images and also turn the edges between the faces. The
     # model contains the displacement only.
@@ -650,7 +709,11 @@ def _list_errors(findings: FitFindings, found: _Found) -> Iterator[Array]:
 
 
 def _make_fit(
-    found: _Found, usable: Reference, findings: FitFindings, grounds: Grounds, gain: float
+    found: _Found,
+    usable: Reference,
+    findings: FitFindings,
+    grounds: Grounds,
+    options: FitOptions,
 ) -> Fit:
     settled, solution = found.settled, found.settled.solution
     target, about, seen = settled.target, settled.models.instrument, solution.projection
@@ -701,9 +764,10 @@ def _make_fit(
             seen.gains,
             target.modes,
             target.rows,
-            gain=gain,
+            gain=options.gain,
             noise=usable.noise_per_pass,
         ),
+        causes=explain_left_over(settled, usable.noise_per_pass) if options.explain else (),
         paper_table=found.table,
     )
 
@@ -751,6 +815,7 @@ def _add_notes(
         ),
         *grounds.columns,
         *(() if found.smear is None else (found.smear.words,)),
+        *(() if found.even is None else (LIGHT_FOUND_WORDS,)),
         *((words,) if words and floor**2 > fit.covariance[3, 3] / 2.0 else ()),
     )
     origins: tuple[Origin, ...] = ()

@@ -323,6 +323,10 @@ class FitDocument(BaseModel):
     left_over: dict[str, Any] | None = None
     """Location of the residual: border (over inside), outlying subapertures and modes."""
 
+    causes: list[dict[str, Any]] = []
+    """Causes of the power left over: words, share, sigma, and remedy (what to measure to reduce
+    it); the largest first, the unexplained last."""
+
     notes: list[str]
     """Decisions of the fit that the user should know."""
 

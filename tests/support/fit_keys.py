@@ -25,6 +25,7 @@ KEYS = {
     "unknown_not_found",
     "alternatives",
     "left_over",
+    "causes",
     "anamorphosis",
     "anamorphosis_sigma",
     "image_offsets_px",

@@ -344,7 +344,9 @@ class PyramidModel(SensorModel):
         offsets = displaced_subap + (0.0 if stated is None else stated)
         shift = _turned_edge_shift(instrument, offsets)
         turn = EDGE_TURN * shift / (instrument.wfs.pupil_diameter / 2.0)
-        if isinstance(instrument.frames, FrameWindows):
+        # A simulation puts its images exactly where its file says.
+        simulated = pyramid_in(instrument).fft_grid is not None
+        if isinstance(instrument.frames, FrameWindows) and not simulated:
             shift = float(np.hypot(shift, LOCATED_SIGMA_PX / _pixels(instrument)))
         return np.array([shift, shift, turn, 0.0])
 

@@ -12,17 +12,24 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from pyrcal.fitting.advice import read_entries
 from pyrcal.fitting.alternatives import PLAUSIBLE_DISPLACEMENT_PX
+from pyrcal.fitting.comparison import Alternative
 from pyrcal.fitting.fit_file import Progress, fit_file
 from pyrcal.fitting.fit_table import NOTABLE_DISPLACEMENT_PX
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.matrix import FitOptions
 from pyrcal.fitting.report import fill_fit, orientation_words
-from pyrcal.importers.imported import Imported, Saved, Tables
+from pyrcal.importers.imported import Imported, Saved
 from pyrcal.terminal import show_progress
 from pyrcal.twins.bench import Bench, read_bench
+from pyrcal.twins.check import check_oopao_model, check_specula_model
+from pyrcal.twins.oopao_model import write_oopao_model
 from pyrcal.twins.report import Twin, list_lines, write_report
+from pyrcal.twins.sampled import sample_bench
+from pyrcal.twins.specula_model import write_specula_model
 from service.errors import ConfigurationError, PyrcalError, StorageError
+from service.files.container import DATASET
 from service.files.whole import write_whole
 from service.instrument import load_instrument
 from service.instrument.paths import TWIN_FILE, TWIN_LIVE_FILE
@@ -41,6 +48,10 @@ TOLD: Mapping[str, Any] = {
 MUCH_LESS_LEFT = 0.7
 """Residual over that of the continuous model below which the FFT grid of a simulation is adopted.
 On an unmodulated bench of OOPAO it is 0.007, on a measured bench there is no such grid."""
+
+MAX_SHARE, MIN_SIGNIFICANCE = 0.9, 2.0
+"""Another value of a number is tried if it leaves less than this share of the power that is left
+over, by more than so many σ. A fit with it decides."""
 
 EXACT = 0.01
 """Residual below which no other model is tried."""
@@ -134,7 +145,8 @@ def _make(
             draft.replace(output)
     except OSError as error:
         raise StorageError(f"{output}: cannot be written: {error}") from error
-    return replace(made, folder=output)
+    exported = tuple(replace(one, path=output / one.path.name) for one in made.exported)
+    return replace(made, folder=output, exported=exported)
 
 
 def _check_output(output: Path) -> None:
@@ -153,12 +165,15 @@ def _check_output(output: Path) -> None:
 def _fit_bench(bench: Bench, folder: Path, threads: int, progress: Progress | None) -> Twin:
     """Return the fit of the bench, with the instrument file corrected, and write both."""
     best = _choose_import(bench, folder, threads, progress)
-    first, tables = best, _correct_tables(best.imported.tables, best.report.fit)
-    best = replace(first, imported=replace(first.imported, tables=tables))
+    first, fit = best, best.report.fit
+    number = _find_number(fit)
+    corrections = fit.corrections if number is None else read_entries([number.key])
     # The axes of the slopes are as the fit has found them; other values move it.
-    if first.report.fit.corrections:
-        again = _fit(bench, best.imported, folder, threads, progress)
+    if corrections:
+        corrected = _correct(first.imported, fit, corrections)
+        again = _fit(bench, corrected, folder, threads, progress)
         best = replace(again, before=first.report) if _is_better(again, than=first) else first
+    best = replace(best, imported=_correct(best.imported, best.report.fit, _find_unknown(best)))
     saved = best.imported.save(folder)
     write_whole(folder / "fit.h5", partial(fill_fit, report=best.report))
     _write_live(saved, best.report.fit)
@@ -189,16 +204,42 @@ def _fit(
 
 
 def _is_better(again: Twin, *, than: Twin) -> bool:
-    """Return True if a fit with a corrected file is accepted, or leaves less than a refused one."""
-    if again.report.fit.accepted or than.report.fit.accepted:
+    """Return True if the fit with a corrected file alone is accepted, or leaves less."""
+    if again.report.fit.accepted != than.report.fit.accepted:
         return again.report.fit.accepted
     return again.residual < than.residual
 
 
-def _correct_tables(tables: Tables, fit: Fit) -> Tables:
-    """Return the tables of the instrument file with what the fit has found."""
-    corrected = {name: dict(table) for name, table in tables.items()}
-    for place, value in fit.corrections.items():
+def _find_number(fit: Fit) -> Alternative | None:
+    """Return the number of the instrument file that explains most of what an accepted fit leaves.
+
+    None if there is none. A fit does not need it; the model of a bench is closer with it.
+    """
+    found = [
+        one
+        for one in fit.alternatives
+        if fit.accepted
+        and one.is_number
+        and "=" in one.key
+        and one.misfit < MAX_SHARE
+        and one.significance > MIN_SIGNIFICANCE
+    ]
+    return min(found, key=lambda one: one.misfit, default=None)
+
+
+def _find_unknown(made: Twin) -> Mapping[str, Any]:
+    """Return what the fit has found of numbers that the files do not have, by table and key."""
+    return read_entries(
+        f"{one.key} = {one.found:.4g}"
+        for one in made.report.fit.optics
+        if one.reported is None and one.found is not None and one.key
+    )
+
+
+def _correct(imported: Imported, fit: Fit, values: Mapping[str, Any]) -> Imported:
+    """Return the import with these values, and with the slopes' axes that the fit has found."""
+    corrected = {name: dict(table) for name, table in imported.tables.items()}
+    for place, value in values.items():
         table, key = place.split(".")
         if place == "instrument.pupil":
             continue  # words on how the map is to be turned
@@ -211,7 +252,7 @@ def _correct_tables(tables: Tables, fit: Fit) -> Tables:
         corrected["slopes"]["orientation"] = words
         if "order" in corrected["slopes"]:
             corrected["slopes"]["order"] = order
-    return corrected
+    return replace(imported, tables=corrected)
 
 
 def _write_live(saved: Saved, fit: Fit) -> None:
@@ -233,4 +274,16 @@ def _write_live(saved: Saved, fit: Fit) -> None:
 
 def _export(made: Twin, *, check: bool) -> Twin:
     """Write the models of other programs, and let these run them if requested."""
-    return made
+    about, fit, folder = made.instrument, made.report.fit, made.folder
+    if about.wfs.kind != "pyramid":
+        return replace(made, checks=("Only benches with a pyramid are exported.",))
+    shape = made.imported.arrays[DATASET].shape
+    frame_shape = (shape[1], shape[2]) if about.frames is not None else None
+    sampled = sample_bench(about, fit, frame_shape)
+    exported = (
+        write_oopao_model(sampled, folder, made.bench.sky_pupil),
+        write_specula_model(sampled, fit, folder),
+    )
+    runs = (check_oopao_model, check_specula_model) if check else ()
+    checks = tuple(run(folder, about, fit).words for run in runs)
+    return replace(made, exported=exported, checks=checks)

@@ -122,11 +122,14 @@ def add_displaced(fit: Fit, columns: tuple[str, ...]) -> Fit:
 def add_recommendation(fit: Fit, grounds: Grounds) -> Fit:
     """Return the fit with the recommended action, in one sentence and as values to be set."""
     words, entries = _choose_action(fit, grounds)
-    return replace(fit, recommendation=words, corrections=_read_entries(entries))
+    return replace(fit, recommendation=words, corrections=read_entries(entries))
 
 
-def _read_entries(entries: Iterable[str]) -> Mapping[str, Any]:
-    """Return the values that entries of the instrument file set, by table and key."""
+def read_entries(entries: Iterable[str]) -> Mapping[str, Any]:
+    """Return the values that entries of the instrument file set, by table and key.
+
+    None removes a key. The name of a map has words on how to turn it.
+    """
     values: dict[str, Any] = {}
     for entry in entries:
         if entry == WITHOUT_ARMS:

@@ -12,7 +12,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from pyrcal.fitting.advice import read_entries
 from pyrcal.fitting.alternatives import PLAUSIBLE_DISPLACEMENT_PX
+from pyrcal.fitting.comparison import Alternative
 from pyrcal.fitting.fit_file import Progress, fit_file
 from pyrcal.fitting.fit_table import NOTABLE_DISPLACEMENT_PX
 from pyrcal.fitting.fitted import Fit
@@ -21,8 +25,13 @@ from pyrcal.fitting.report import fill_fit, orientation_words
 from pyrcal.importers.imported import Imported, Saved, Tables
 from pyrcal.terminal import show_progress
 from pyrcal.twins.bench import Bench, read_bench
+from pyrcal.twins.check import check_oopao_model, check_specula_model
+from pyrcal.twins.oopao_model import write_oopao_model
 from pyrcal.twins.report import Twin, list_lines, write_report
+from pyrcal.twins.sampled import sample_bench
+from pyrcal.twins.specula_model import write_specula_model
 from service.errors import ConfigurationError, PyrcalError, StorageError
+from service.files.container import DATASET
 from service.files.whole import write_whole
 from service.instrument import load_instrument
 from service.instrument.paths import TWIN_FILE, TWIN_LIVE_FILE
@@ -42,6 +51,10 @@ MUCH_LESS_LEFT = 0.7
 """Residual over that of the continuous model below which the FFT grid of a simulation is adopted.
 On an unmodulated bench of OOPAO it is 0.007, on a measured bench there is no such grid."""
 
+MAX_SHARE, MIN_SIGNIFICANCE = 0.9, 2.0
+"""Another value of a number is tried if it leaves less than this share of the power that is left
+over, by more than so many σ. A fit with it decides."""
+
 EXACT = 0.01
 """Residual below which no other model is tried."""
 
@@ -59,6 +72,7 @@ def main(options: argparse.Namespace) -> int:
         argparse.Namespace(**told, files=options.files),
         options.output,
         check=options.check,
+        python=options.python,
         threads=options.threads,
         progress=show_progress,
     )
@@ -71,6 +85,7 @@ def twin(
     output: str | Path,
     *,
     check: bool = False,
+    python: str | Path | None = None,
     threads: int = 2,
     **told: Any,  # noqa: ANN401 - as different as the options
 ) -> Twin:
@@ -85,6 +100,8 @@ def twin(
         Folder to write: a new one, or that of an earlier twin, which is replaced.
     check
         Whether OOPAO and SPECULA, where installed, measure the matrices of their models.
+    python
+        Interpreter that has them; None for the present one.
     threads
         Threads that share the work.
     told
@@ -109,7 +126,8 @@ def twin(
     else:
         given = ((None, one) for one in ([files] if isinstance(files, str | Path) else files))
     options = argparse.Namespace(**{**TOLD, **told}, files=[(role, Path(p)) for role, p in given])
-    return _make(options, Path(output), check=check, threads=threads)
+    interpreter = None if python is None else Path(python)
+    return _make(options, Path(output), check=check, python=interpreter, threads=threads)
 
 
 def _make(
@@ -117,6 +135,7 @@ def _make(
     output: Path,
     *,
     check: bool,
+    python: Path | None,
     threads: int,
     progress: Progress | None = None,
 ) -> Twin:
@@ -127,14 +146,15 @@ def _make(
         with tempfile.TemporaryDirectory(dir=output.absolute().parent, prefix=".twin-") as name:
             draft = Path(name) / "twin"
             made = _fit_bench(bench, draft, threads, progress)
-            made = _export(made, check=check)
+            made = _export(made, check=check, python=python)
             write_report(made)
             if output.is_dir():
                 shutil.rmtree(output)
             draft.replace(output)
     except OSError as error:
         raise StorageError(f"{output}: cannot be written: {error}") from error
-    return replace(made, folder=output)
+    exported = tuple(replace(one, path=output / one.path.name) for one in made.exported)
+    return replace(made, folder=output, exported=exported)
 
 
 def _check_output(output: Path) -> None:
@@ -153,15 +173,18 @@ def _check_output(output: Path) -> None:
 def _fit_bench(bench: Bench, folder: Path, threads: int, progress: Progress | None) -> Twin:
     """Return the fit of the bench, with the instrument file corrected, and write both."""
     best = _choose_import(bench, folder, threads, progress)
-    first, tables = best, _correct_tables(best.imported.tables, best.report.fit)
-    best = replace(first, imported=replace(first.imported, tables=tables))
+    first, fit = best, best.report.fit
+    number = _find_number(fit)
+    corrections = fit.corrections if number is None else read_entries([number.key])
     # The axes of the slopes are as the fit has found them; other values move it.
-    if first.report.fit.corrections:
-        again = _fit(bench, best.imported, folder, threads, progress)
+    if corrections:
+        corrected = _correct(first.imported, fit, corrections)
+        again = _fit(bench, corrected, folder, threads, progress)
         best = replace(again, before=first.report) if _is_better(again, than=first) else first
+    best = replace(best, imported=_correct(best.imported, best.report.fit, _find_unknown(best)))
     saved = best.imported.save(folder)
     write_whole(folder / "fit.h5", partial(fill_fit, report=best.report))
-    _write_live(saved, best.report.fit)
+    _write_live(best, saved)
     return best
 
 
@@ -189,16 +212,42 @@ def _fit(
 
 
 def _is_better(again: Twin, *, than: Twin) -> bool:
-    """Return True if a fit with a corrected file is accepted, or leaves less than a refused one."""
-    if again.report.fit.accepted or than.report.fit.accepted:
+    """Return True if the fit with a corrected file alone is accepted, or leaves less."""
+    if again.report.fit.accepted != than.report.fit.accepted:
         return again.report.fit.accepted
     return again.residual < than.residual
 
 
-def _correct_tables(tables: Tables, fit: Fit) -> Tables:
-    """Return the tables of the instrument file with what the fit has found."""
-    corrected = {name: dict(table) for name, table in tables.items()}
-    for place, value in fit.corrections.items():
+def _find_number(fit: Fit) -> Alternative | None:
+    """Return the number of the instrument file that explains most of what an accepted fit leaves.
+
+    None if there is none. A fit does not need it; the model of a bench is closer with it.
+    """
+    found = [
+        one
+        for one in fit.alternatives
+        if fit.accepted
+        and one.is_number
+        and "=" in one.key
+        and one.misfit < MAX_SHARE
+        and one.significance > MIN_SIGNIFICANCE
+    ]
+    return min(found, key=lambda one: one.misfit, default=None)
+
+
+def _find_unknown(made: Twin) -> Mapping[str, Any]:
+    """Return what the fit has found of numbers that the files do not have, by table and key."""
+    return read_entries(
+        f"{one.key} = {one.found:.4g}"
+        for one in made.report.fit.optics
+        if one.reported is None and one.found is not None and one.key
+    )
+
+
+def _correct(imported: Imported, fit: Fit, values: Mapping[str, Any]) -> Imported:
+    """Return the import with these values, and with the slopes' axes that the fit has found."""
+    corrected = {name: dict(table) for name, table in imported.tables.items()}
+    for place, value in values.items():
         table, key = place.split(".")
         if place == "instrument.pupil":
             continue  # words on how the map is to be turned
@@ -211,19 +260,17 @@ def _correct_tables(tables: Tables, fit: Fit) -> Tables:
         corrected["slopes"]["orientation"] = words
         if "order" in corrected["slopes"]:
             corrected["slopes"]["order"] = order
-    return corrected
+    known = {f"{place.partition('.')[2]} is unknown" for place in values}
+    notes = tuple(note for note in imported.notes if note not in known)
+    return replace(imported, tables=corrected, notes=notes)
 
 
-def _write_live(saved: Saved, fit: Fit) -> None:
+def _write_live(made: Twin, saved: Saved) -> None:
     """Write the instrument file of ``pyrcal run``: an RTC sends slopes, not frames."""
-    folder, places = saved.instrument.parent, fit.image_offsets_px
-    text = saved.instrument.read_text(encoding="utf-8")
-    if places is not None and (
-        NOTABLE_DISPLACEMENT_PX < abs(places).max() < PLAUSIBLE_DISPLACEMENT_PX
-    ):
-        text = text.replace("[wfs]\n", f"[wfs]\nimage_offsets_px = {places.round(3).tolist()}\n")
+    folder = saved.instrument.parent
     draft, live = folder / f"draft-{TWIN_FILE}", folder / TWIN_LIVE_FILE
-    draft.write_text(text, encoding="utf-8")
+    tables = _describe_live(made.imported.tables, made.report.fit)
+    draft.write_text(replace(made.imported, tables=tables).instrument_text(), encoding="utf-8")
     write_live_instrument(draft, live)
     draft.unlink()
     # It refers to arrays by absolute paths, in a folder that is moved to its place later.
@@ -231,6 +278,35 @@ def _write_live(saved: Saved, fit: Fit) -> None:
     live.write_text(text, encoding="utf-8")
 
 
-def _export(made: Twin, *, check: bool) -> Twin:
+def _describe_live(tables: Tables, fit: Fit) -> Tables:
+    """Return the tables with what frames show or the fit starts with, but slopes do not show."""
+    wfs, mirror = dict(tables["wfs"]), dict(tables["mirror"])
+    places, centres = fit.image_offsets_px, wfs.get("pupil_centres_px", "auto")
+    if not isinstance(centres, str):
+        ordered = np.sort(np.array(centres), axis=0)
+        apart_px = float(np.mean(ordered[2:] - ordered[:2]))
+        wfs["pupil_separation_subap"] = apart_px / wfs.get("pixels_per_subaperture", 1)
+    if places is not None and (
+        NOTABLE_DISPLACEMENT_PX < abs(places).max() < PLAUSIBLE_DISPLACEMENT_PX
+    ):
+        wfs["image_offsets_px"] = places.round(3).tolist()
+    if fit.accepted:
+        mirror["nominal_rotation_deg"] = round(fit.alpha.to_boundary()["rotation_deg"], 3)
+    return {**tables, "wfs": wfs, "mirror": mirror}
+
+
+def _export(made: Twin, *, check: bool, python: Path | None) -> Twin:
     """Write the models of other programs, and let these run them if requested."""
-    return made
+    about, fit, folder = made.instrument, made.report.fit, made.folder
+    if about.wfs.kind != "pyramid":
+        return replace(made, checks=("Only benches with a pyramid are exported.",))
+    shape = made.imported.arrays[DATASET].shape
+    frame_shape = (shape[1], shape[2]) if about.frames is not None else None
+    sampled = sample_bench(about, fit, frame_shape)
+    exported = (
+        write_oopao_model(sampled, folder, made.bench.sky_pupil),
+        write_specula_model(sampled, fit, folder),
+    )
+    runs = (check_oopao_model, check_specula_model) if check else ()
+    checks = tuple(run(folder, about, fit, python=python).words for run in runs)
+    return replace(made, exported=exported, checks=checks)

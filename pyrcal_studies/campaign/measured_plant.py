@@ -11,7 +11,8 @@ With ``--plant diffractive`` the plant is the diffractive simulated telescope, a
 interaction matrix by push-pull of 10 nm without noise. The service's instrument file is wrong:
 misplaced actuators, another obscuration, another modulation and, in half of the draws from 20 %
 on, other influence functions. Together they leave the given share of the columns unexplained at
-the true registration.
+the true registration. With ``--twin`` the service has the instrument instead that ``pyrcal twin``
+makes of the calibration matrix with noise and of the modes' shapes.
 
 Run: ``python -m pyrcal_studies.campaign.measured_plant --output var/measured_plant.jsonl --table
 table.md``. Rows that are in the file already are not computed again.
@@ -21,6 +22,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -33,6 +35,7 @@ from scipy.optimize import brentq
 from threadpoolctl import threadpool_limits
 from typing_extensions import override
 
+import pyrcal
 from pyrcal.rtc.identity import Identity, Reconstructor
 from pyrcal_studies.campaign.observatory import START_NS, Dome, Latencies, Moment, Observatory
 from pyrcal_studies.campaign.rows import Row, RowFile, heading, line, tell
@@ -40,6 +43,7 @@ from service.config import load_settings
 from service.control.loop import pole_radius
 from service.estimation.own_matrix import recognise_modes
 from service.instrument import load_instrument
+from service.instrument.paths import TWIN_LIVE_FILE
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel, RtcInteractionModel
 from service.model.kinds import Influence, InfluenceShape
@@ -96,6 +100,12 @@ N_FIRST = 20
 OTHER_COUPLING = 0.15
 """Mechanical coupling of the mirror whose response makes the smooth half of the error."""
 
+TWIN_NOISE = 0.1
+"""Noise of the matrix of which a twin is made, over the norm of a mode's column."""
+
+TWIN_POINTS_PER_SUBAPERTURE = 6
+"""Sampling of the modes' shapes that a twin is made of."""
+
 LATE_S = 8.0
 """Length of the end of a run over which the wavefront error is taken."""
 
@@ -121,6 +131,9 @@ class Plan:
     n_first: int = N_FIRST
     seconds: float = 36.0
     slope_noise: float = SLOPE_NOISE
+    twin: bool = False
+    """Whether the service's instrument is the twin of the bench."""
+
     settings: tuple[tuple[str, float | str | bool], ...] = ()
 
 
@@ -363,8 +376,40 @@ def _wrong_model(plan: Plan) -> tuple[Instrument, RtcInteractionModel]:
     return make_wrong(0.0 if excess(0.0) > 0.0 else brentq(excess, 0.0, 0.5, xtol=1e-3))
 
 
+@lru_cache(maxsize=8)
+def _twin_model(plan: Plan) -> tuple[Instrument, RtcInteractionModel]:
+    """Return the twin that is made of the bench's files, and its model."""
+    right, response = load_instrument(plan.instrument), response_of(plan)
+    n = right.wfs.n_subapertures
+    side = TWIN_POINTS_PER_SUBAPERTURE * n
+    along = ((np.arange(side) + 0.5) / side - 0.5) * n
+    y, x = np.meshgrid(along, along, indexing="ij")
+    shapes = analytic_basis(right).render(np.column_stack([x.ravel(), y.ravel()]))
+    noise = np.random.default_rng([plan.seed, 52]).standard_normal(response.shape)
+    noise *= TWIN_NOISE * np.linalg.norm(response, axis=0) / np.sqrt(len(response))
+    with tempfile.TemporaryDirectory() as name:
+        bench = Path(name) / "bench"
+        bench.mkdir()
+        np.save(bench / "interaction_matrix.npy", response + noise)
+        np.save(bench / "valid.npy", rtc_valid_subapertures(right))
+        np.save(bench / "influence_functions.npy", shapes.T.reshape(-1, side, side))
+        twin = pyrcal.twin(
+            bench,
+            bench.with_name("twin"),
+            diameter_m=right.diameter_m,
+            wavelength_m=right.wfs.wavelength_m,
+            stop=str(right.stop),
+            unit="m",
+            threads=1,
+        )
+        instrument = load_instrument(twin.folder / TWIN_LIVE_FILE)
+    return instrument, RtcInteractionModel(instrument, modal_basis(instrument))
+
+
 def service_model(plan: Plan) -> tuple[Instrument, RtcInteractionModel]:
     """Return the instrument of the service, and its model."""
+    if plan.twin:
+        return _twin_model(replace(plan, error=0.0, mode="", seconds=0.0, settings=()))
     if plan.plant == "linear":
         return models_of(plan.instrument)[:2]
     return _wrong_model(replace(plan, mode="", seconds=0.0, n_first=N_FIRST, settings=()))
@@ -538,6 +583,7 @@ def plans(given: argparse.Namespace) -> list[Plan]:
             instrument=given.instrument or diffractive * DIFFRACTIVE or INSTRUMENT,
             n_first=given.n_first or (60 if diffractive else N_FIRST),
             seconds=given.seconds,
+            twin=given.twin,
         )
         for seed in range(given.first, given.first + given.draws)
         for error in given.errors
@@ -614,6 +660,7 @@ def main() -> int:
     parser.add_argument("--matrix", default="", help="a measured matrix instead, npz with D")
     parser.add_argument("--instrument", help="its instrument file")
     parser.add_argument("--n-first", type=int, help="modes of the RTC's own matrix")
+    parser.add_argument("--twin", action="store_true", help="make the service's instrument so")
     parser.add_argument("--output", type=Path, default=Path("measured_plant.jsonl"))
     parser.add_argument("--table", type=Path, metavar="FILE.md")
     given = parser.parse_args()

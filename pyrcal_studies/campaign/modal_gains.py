@@ -6,7 +6,8 @@ poke of the mode on the residual wavefronts of the same seconds, without noise, 
 response to a flat wavefront: the mean over many residuals.
 
 Run: ``python -m pyrcal_studies.campaign.modal_gains --seeings 0.6,0.9,1.2 --magnitudes 8,11
---seeds 0:2``; nights that are there already are not run again.
+--seeds 0:2``; nights that are there already are not run again. With ``--then ARCSEC`` the seeing
+changes within 2 s in the middle of each night, and the table has the windows after that.
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ from service.records.estimates import WindowRefused
 from service.records.registration import ModeGain
 from service.runtime.worker import Compute, OpticsWorker, Sampling
 from service.tracking.filtering import update_gains
+from sim_rtc.computer.feed import BATCH_FRAMES
 from sim_rtc.computer.telemetry import Batch
 from sim_rtc.telescope.diffractive import DiffractiveOptics
 
@@ -55,8 +57,14 @@ POKE_M = 5e-9
 POKED = (0, 1, 2, 4, 7, 11, 16, 22, 30, 42, 58, 80, 110, 150, 200, 260, 330, 399, 450, 520, 580)
 """Modes whose true gain is computed, besides the dithered ones."""
 
-POKE_BATCHES = 30
-"""Batches from one poked residual to the next: 0.3 s at 1 kHz."""
+POKE_INTERVAL_S = 0.3
+"""Time from one poked residual to the next."""
+
+CHANGE_S = 2.0
+"""Duration of a change of the seeing."""
+
+TRUTH_S = 4.0
+"""Pokes within this time of the end of a window are its truth, where the seeing changes."""
 
 SETTLED_BATCHES = 50
 
@@ -69,11 +77,18 @@ class GainNight(Night):
     low_nm: float = 1.96
     """RMS of a dithered mode that the loop controls."""
 
+    then_arcsec: float | None = None
+    """Seeing of the second half of the night; None if it stays."""
+
     @property
     @override
     def words(self) -> list[str]:
-        words = super(GainNight, self).words
-        return [*words, f"--seeing={self.seeing_arcsec:g}", "--alpha=0,0,0,1"]
+        words = [*super(GainNight, self).words, f"--seeing={self.seeing_arcsec:g}"]
+        if self.then_arcsec is not None:
+            began_s = self.n_windows // 2 * self.window_s
+            words.append(f"--seeing-at={began_s}:{self.seeing_arcsec:g}")
+            words.append(f"--seeing-at={began_s + CHANGE_S}:{self.then_arcsec:g}")
+        return [*words, "--alpha=0,0,0,1"]
 
     @property
     @override
@@ -96,6 +111,9 @@ class PokedDome(Dome):
         self.responses: list[Array] = []
         """``(n_poked,)`` gains of each residual."""
 
+        self.times_s: list[float] = []
+        """When each was poked."""
+
         self._unit = response[:, self.poked] / np.square(response[:, self.poked]).sum(axis=0)
         self._n_batches = 0
 
@@ -103,8 +121,10 @@ class PokedDome(Dome):
     def _moment(self, batches: list[Batch]) -> Moment:
         for batch in batches:
             self._n_batches += 1
-            if self._n_batches > SETTLED_BATCHES and self._n_batches % POKE_BATCHES == 0:
+            every = round(POKE_INTERVAL_S * self.rate_hz / BATCH_FRAMES)
+            if self._n_batches > SETTLED_BATCHES and self._n_batches % every == 0:
                 self.responses.append(self._poke(batch))
+                self.times_s.append(self._n_batches * BATCH_FRAMES / self.rate_hz)
         return super()._moment(batches)
 
     def _poke(self, batch: Batch) -> Array:
@@ -132,6 +152,7 @@ def play(night: GainNight) -> Row:
         sums = LockIn(plan=start_dither(night, dome))
         loop, known = loop_of(dome), Misregistration()
         gains: tuple[ModeGain, ...] = ()
+        history: list[tuple[float, tuple[ModeGain, ...]]] = []
         refused, amplitude_m = 0, 0.0
         for window, _ in itertools.islice(windows(dome, sums), night.n_windows):
             outcome = (
@@ -142,8 +163,10 @@ def play(night: GainNight) -> Row:
                 continue
             known, amplitude_m, seen = outcome.alpha, outcome.dither_m, np.abs(outcome.optical_gain)
             gains = update_gains(gains, outcome.modes, seen, outcome.gain_sigma, outcome.t_ns_utc)
+            history.append((dome.time_s, gains))
         true = np.array(dome.responses)
         return asdict(night) | {
+            "history": [_departures(dome, *one) for one in history],
             "refused": refused,
             "dither_m": amplitude_m,
             "wavefront_nm": float(np.mean([one.wavefront_nm for one in dome.moments[-20:]])),
@@ -152,6 +175,18 @@ def play(night: GainNight) -> Row:
             "true": true.mean(axis=0).tolist(),
             "true_sigma": (true.std(axis=0) / np.sqrt(len(true))).tolist(),
         }
+
+
+def _departures(dome: PokedDome, time_s: float, gains: tuple[ModeGain, ...]) -> Row:
+    """Return relative errors and σ of the dithered modes after a window that ended at a time."""
+    near = np.abs(np.array(dome.times_s) - time_s) < TRUTH_S / 2.0
+    places = [dome.poked.index(gain.mode) for gain in gains]
+    true = np.array(dome.responses)[near][:, places].mean(axis=0)
+    return {
+        "time_s": time_s,
+        "error": (np.array([gain.gain for gain in gains]) / true - 1.0).tolist(),
+        "sigma": (np.array([gain.sigma for gain in gains]) / true).tolist(),
+    }
 
 
 def compare(row: Row) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
@@ -168,6 +203,30 @@ HEADER = heading(
     *("magnitude, seeing", "windows (refused)", "true gain, low, high", "dithered, largest error"),
     *("others, largest error", "modes 0 to 30", "error / σ RMS", "wavefront, nm", "dither, nm"),
 )
+
+
+def table_of_change(rows: list[Row]) -> str:
+    """Return errors and σ of the dithered modes, RMS, by the number of windows since the change.
+
+    The first one is that which has more than half of the change behind it when it ends.
+    """
+    text = heading("magnitude, seeing", "window", "error, %", "σ, %", "error / σ RMS")
+    for group in grouped(rows, GainNight, "seed"):
+        found: dict[str, list[Row]] = {}
+        for row in group:
+            began_s = row["n_windows"] // 2 * row["window_s"]
+            before = [one for one in row["history"] if one["time_s"] < began_s - TRUTH_S / 2]
+            after = [one for one in row["history"] if one["time_s"] > began_s + CHANGE_S / 2]
+            found.setdefault("last before", []).append(before[-1])
+            for number, one in enumerate(after, 1):
+                found.setdefault(str(number) if number < 4 else "4 and later", []).append(one)
+        name = "{magnitude:g}, {seeing_arcsec:g} to {then_arcsec:g} arcsec".format(**group[0])
+        for window, some in found.items():
+            error, sigma = (np.array([one[what] for one in some]) for what in ("error", "sigma"))
+            parts = (100 * error, 100 * sigma, error / sigma)
+            rms = [np.sqrt(np.mean(part**2)) for part in parts]
+            text += line(name, window, f"{rms[0]:.1f}", f"{rms[1]:.1f}", f"{rms[2]:.2f}")
+    return text
 
 
 def table(rows: list[Row]) -> str:
@@ -209,6 +268,8 @@ def main() -> int:
     parser.add_argument("--seeds", type=range_of, default=range(1), metavar="FIRST:END")
     parser.add_argument("--magnitudes", type=floats, default=(8.0, 11.0), metavar="R,R...")
     parser.add_argument("--seeings", type=floats, default=(0.6, 0.9, 1.2), metavar="ARCSEC,...")
+    parser.add_argument("--then", type=float, metavar="ARCSEC", help="seeing of the second half")
+    parser.add_argument("--rate", type=float, metavar="HZ", help="frames per second")
     parser.add_argument("--gain", type=float, default=0.6)
     parser.add_argument("--n-controlled", type=int, default=400)
     parser.add_argument(
@@ -226,7 +287,8 @@ def main() -> int:
     add_workers(parser, 1)
     given = parser.parse_args()
     rows = complete(play, _nights(given), given)
-    tell(table(rows), given.table, parser.prog)
+    text = table(rows) if given.then is None else table_of_change(rows)
+    tell(text, given.table, parser.prog)
     return 0
 
 
@@ -245,6 +307,8 @@ def _nights(given: argparse.Namespace) -> Iterator[GainNight]:
             window_s=given.window_s,
             n_windows=given.windows,
             instrument=given.instrument,
+            then_arcsec=given.then,
+            rate_hz=given.rate,
         )
 
 

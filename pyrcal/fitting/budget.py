@@ -145,7 +145,8 @@ def advise_measurement(causes: Sequence[Cause]) -> str:
     total = sum(one.share for one in chosen)
     if total < 0.5:
         return f"{total:.0%} of the power left over has a known cause, which is not half: {steps}"
-    return f"{shares} are {total:.0%} of the power left over: {steps}"
+    shares = chosen[0].words if len(chosen) == 1 else shares
+    return f"{total:.0%} of the power left over comes from {shares}: {steps}"
 
 
 def _model_at_best(settled: Settled) -> Array:

@@ -31,15 +31,17 @@ from pyrcal.twins.report import Twin, list_lines, write_report
 from pyrcal.twins.sampled import sample_bench
 from pyrcal.twins.specula_model import write_specula_model
 from service.errors import ConfigurationError, PyrcalError, StorageError
+from service.files import parse_modes
 from service.files.container import DATASET
 from service.files.whole import write_whole
 from service.instrument import load_instrument
 from service.instrument.paths import TWIN_FILE, TWIN_LIVE_FILE
+from service.model.instrument import instrument_sha256
 from sim_rtc.rehearsal import write_live_instrument
 
 ACCEPTED, REFUSED = 0, 1
 
-TOLD: Mapping[str, Any] = {
+STATED: Mapping[str, Any] = {
     **dict.fromkeys(("instrument", "unit", "basis", "diameter_m", "modes", "sensor")),
     **dict.fromkeys(("obscuration", "wavelength_m", "modulation", "pupil_subap")),
     "pixels_per_subap": None,
@@ -67,9 +69,9 @@ def main(options: argparse.Namespace) -> int:
     PyrcalError
         If something that was given cannot be used; nothing is left behind.
     """
-    told = {name: getattr(options, name) for name in TOLD}
+    stated = {name: getattr(options, name) for name in STATED}
     made = _make(
-        argparse.Namespace(**told, files=options.files),
+        argparse.Namespace(**stated, files=options.files),
         options.output,
         check=options.check,
         python=options.python,
@@ -87,7 +89,7 @@ def twin(
     check: bool = False,
     python: str | Path | None = None,
     threads: int = 2,
-    **told: Any,  # noqa: ANN401 - as different as the options
+    **stated: Any,  # noqa: ANN401 - as different as the options
 ) -> Twin:
     """Fit the model of a bench to its files, and write it for pyrcal, OOPAO and SPECULA.
 
@@ -104,7 +106,7 @@ def twin(
         Interpreter that has them; None for the present one.
     threads
         Threads that share the work.
-    told
+    stated
         Values that the files lack, named as the options of ``pyrcal twin``: ``diameter_m``,
         ``unit``, ``wavelength_m``, ``modulation``, ``pupil_subap``, ``modes``, ``instrument``.
 
@@ -118,14 +120,17 @@ def twin(
     >>> made = pyrcal.twin("bench", "twin", diameter_m=0.6, unit="m")  # doctest: +SKIP
     >>> made.report.fit.alpha, made.folder / "twin.html"  # doctest: +SKIP
     """
-    if unknown := told.keys() - TOLD.keys():
-        raise TypeError(f"twin: found {min(unknown)}, expected one of {', '.join(TOLD)}")
+    if unknown := stated.keys() - STATED.keys():
+        raise TypeError(f"twin: found {min(unknown)}, expected one of {', '.join(STATED)}")
     given: Iterable[tuple[str | None, str | Path]]
     if isinstance(files, Mapping):
         given = files.items()
     else:
         given = ((None, one) for one in ([files] if isinstance(files, str | Path) else files))
-    options = argparse.Namespace(**{**TOLD, **told}, files=[(role, Path(p)) for role, p in given])
+    if isinstance(modes := stated.get("modes"), str):
+        stated["modes"] = parse_modes(modes)
+    paths = [(role, Path(path)) for role, path in given]
+    options = argparse.Namespace(**{**STATED, **stated}, files=paths)
     interpreter = None if python is None else Path(python)
     return _make(options, Path(output), check=check, python=interpreter, threads=threads)
 
@@ -181,9 +186,12 @@ def _fit_bench(bench: Bench, folder: Path, threads: int, progress: Progress | No
         corrected = _correct(first.imported, fit, corrections)
         again = _fit(bench, corrected, folder, threads, progress)
         best = replace(again, before=first.report) if _is_better(again, than=first) else first
-    best = replace(best, imported=_correct(best.imported, best.report.fit, _find_unknown(best)))
+    best = replace(best, imported=_correct(best.imported, best.report.fit, _list_found(best)))
     saved = best.imported.save(folder)
-    write_whole(folder / "fit.h5", partial(fill_fit, report=best.report))
+    # The fit belongs to the instrument file that is written, which has what it found.
+    digest = instrument_sha256(load_instrument(saved.instrument))
+    report = replace(best.report, instrument_sha256=digest)
+    write_whole(folder / "fit.h5", partial(fill_fit, report=report))
     _write_live(best, saved)
     return best
 
@@ -235,12 +243,16 @@ def _find_number(fit: Fit) -> Alternative | None:
     return min(found, key=lambda one: one.misfit, default=None)
 
 
-def _find_unknown(made: Twin) -> Mapping[str, Any]:
-    """Return what the fit has found of numbers that the files do not have, by table and key."""
+def _list_found(made: Twin) -> Mapping[str, Any]:
+    """Return what the fit has found of optical numbers, by table and key.
+
+    Those that the files do not have, and those whose fitted value differs notably: the twin is the
+    model that reproduces the matrix, so that it has the value that did.
+    """
     return read_entries(
         f"{one.key} = {one.found:.4g}"
         for one in made.report.fit.optics
-        if one.reported is None and one.found is not None and one.key
+        if one.found is not None and one.key and (one.reported is None or one.notable)
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from html import escape
@@ -78,7 +79,7 @@ class Value(NamedTuple):
 
     unit: str
     origin: str
-    """``measured``, ``told`` or ``assumed``, and how."""
+    """``measured``, ``stated`` or ``assumed``, and how."""
 
 
 def list_values(made: Twin) -> Iterator[Value]:
@@ -139,7 +140,7 @@ def _find_origin(made: Twin, key: str) -> str:
     if value == UNKNOWN:
         return "assumed: no file contains it, and the matrix does not determine it"
     if key in made.bench.stated:
-        return "told"
+        return "stated"
     if key in {"orientation", "order"} and fit.accepted:
         return "measured: scanned with the lowest modes"
     if key in _FROM_FILES:
@@ -189,7 +190,10 @@ def list_lines(made: Twin) -> Iterator[str]:
 
 
 def _text(one: Value) -> str:
-    """Return a value with its σ."""
+    """Return a value with its σ, both to the second digit of the σ."""
+    if isinstance(one.value, float) and one.sigma:
+        n_digits = max(0, 1 - math.floor(math.log10(one.sigma)))
+        return f"{one.value:.{n_digits}f} +- {one.sigma:.{n_digits}f}"
     if isinstance(one.value, str):
         text = one.value
     else:

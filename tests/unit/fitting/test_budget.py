@@ -94,7 +94,8 @@ def test_shares_add_up_to_one_and_what_to_measure_next_makes_half():
     listed = (cause("light", 0.3), cause("shape", 0.25), cause("noise", 0.1))
     rest = cause("unexplained", 0.35)
     assert advise_measurement((*listed, rest)) == (
-        "light (30%) and shape (25%) are 55% of the power left over: measure light; measure shape"
+        "55% of the power left over comes from light (30%) and shape (25%): measure light; "
+        "measure shape"
     )
     assert advise_measurement((listed[0], rest)) == (
         "30% of the power left over has a known cause, which is not half: measure light"

@@ -12,7 +12,7 @@ import scipy
 
 import pyrcal
 from pyrcal.twins.bench import measure_spot, read_bench
-from pyrcal.twins.make import TOLD
+from pyrcal.twins.make import STATED
 from service.errors import ConfigurationError, MatrixError
 from service.instrument import instrument_path, load_instrument
 from sim_rtc.options import parse_options
@@ -59,7 +59,7 @@ def test_the_files_of_a_bench_become_its_twin(bench, tmp_path):
     # The influence functions were saved where the mirror is.
     assert np.all(np.abs(found - (0.0, 0.0, 0.0, 1.0)) < 3.0 * sigma)
     assert made.residual < 0.03
-    assert values["instrument.diameter_m"]["origin"] == "told"
+    assert values["instrument.diameter_m"]["origin"] == "stated"
     assert values["modulation_lambda_over_d"]["origin"].startswith("measured")
     # OOPAO's modulation of 3 λ/D is 3 n / (n - 1) in a pupil of n = 32 points.
     assert float(values["modulation_lambda_over_d"]["value"]) == pytest.approx(3.1, abs=0.1)
@@ -102,7 +102,7 @@ def test_service_and_fit_take_the_folder_of_a_twin(bench, tmp_path):
 
 def test_a_stated_role_is_preferred_to_that_of_a_name(bench):
     np.save(bench / "interaction_matrix.npy", np.ones((4, 4)))
-    options = argparse.Namespace(**{**TOLD, **QUICK})
+    options = argparse.Namespace(**{**STATED, **QUICK})
     options.files = [(None, bench), ("matrix", bench / "IM_KL.npy")]
     found = read_bench(options).imported[-1]
     assert found.arrays["interaction_matrix"].shape == (104, 30)

@@ -7,7 +7,7 @@ pyrcal_studies.oopao_benches FOLDER [CASE ...]``; then ``pyrcal import oopao`` a
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +52,9 @@ class Case:
     noise: float = 0.0
     """RMS of the noise over that of the signal of each mode."""
 
+
+FREE = "-free"
+"""End of the name of a bench that is simulated without its noise."""
 
 WHOLE = "fullFrame_sum_flux"
 
@@ -168,7 +171,10 @@ def main() -> None:
     """Write the dumps of all benches, or of those that are named."""
     folder, *named = sys.argv[1:]
     for name in named or CASES:
-        np.savez(Path(folder) / f"{name}.npz", **measure(CASES[name]))
+        case = CASES[name.removesuffix(FREE)]
+        if name.endswith(FREE):
+            case = replace(case, noise=0.0)
+        np.savez(Path(folder) / f"{name}.npz", **measure(case))
 
 
 if __name__ == "__main__":

@@ -23,8 +23,13 @@ from pyrcal.fitting.report import fill_fit, orientation_words
 from pyrcal.importers.imported import Imported, Saved
 from pyrcal.terminal import show_progress
 from pyrcal.twins.bench import Bench, read_bench
+from pyrcal.twins.check import check_oopao_model, check_specula_model
+from pyrcal.twins.oopao_model import write_oopao_model
 from pyrcal.twins.report import Twin, list_lines, write_report
+from pyrcal.twins.sampled import sample_bench
+from pyrcal.twins.specula_model import write_specula_model
 from service.errors import ConfigurationError, PyrcalError, StorageError
+from service.files.container import DATASET
 from service.files.whole import write_whole
 from service.instrument import load_instrument
 from service.instrument.paths import TWIN_FILE, TWIN_LIVE_FILE
@@ -140,7 +145,8 @@ def _make(
             draft.replace(output)
     except OSError as error:
         raise StorageError(f"{output}: cannot be written: {error}") from error
-    return replace(made, folder=output)
+    exported = tuple(replace(one, path=output / one.path.name) for one in made.exported)
+    return replace(made, folder=output, exported=exported)
 
 
 def _check_output(output: Path) -> None:
@@ -268,4 +274,16 @@ def _write_live(saved: Saved, fit: Fit) -> None:
 
 def _export(made: Twin, *, check: bool) -> Twin:
     """Write the models of other programs, and let these run them if requested."""
-    return made
+    about, fit, folder = made.instrument, made.report.fit, made.folder
+    if about.wfs.kind != "pyramid":
+        return replace(made, checks=("Only benches with a pyramid are exported.",))
+    shape = made.imported.arrays[DATASET].shape
+    frame_shape = (shape[1], shape[2]) if about.frames is not None else None
+    sampled = sample_bench(about, fit, frame_shape)
+    exported = (
+        write_oopao_model(sampled, folder, made.bench.sky_pupil),
+        write_specula_model(sampled, fit, folder),
+    )
+    runs = (check_oopao_model, check_specula_model) if check else ()
+    checks = tuple(run(folder, about, fit).words for run in runs)
+    return replace(made, exported=exported, checks=checks)

@@ -52,6 +52,8 @@ def test_the_files_of_a_bench_become_its_twin(bench, tmp_path):
     assert float(by_name["wavelength_m"]["value"]) == pytest.approx(640e-9, rel=0.01)
     assert by_name["stroke"]["value"] == pytest.approx(1.0, abs=0.02)
     assert (made.folder / "twin.html").stat().st_size > 1e4
+    assert [one.path.name for one in made.exported] == ["oopao_model.py", "specula_model.yml"]
+    assert all(one.path.is_file() for one in made.exported)
 
 
 def test_service_and_fit_take_the_folder_of_a_twin(bench, tmp_path):

@@ -1,0 +1,198 @@
+"""Write a fitted bench as a SPECULA model: a parameter file, and FITS files as SPECULA saves them.
+
+The layouts are those of SPECULA 1.1.0. Its images are numbered from the one at the upper right to
+the left, around; its x runs along the rows, so that its first slopes are Sy of conventions.md.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.fitting.fitted import Fit
+from pyrcal.twins.exported import Exported
+from pyrcal.twins.sampled import SampledBench
+from service.errors import MatrixError
+from service.files.container import opened
+from service.model.modes import ModalBasis
+from service.model.slopes import slopes_of
+from service.model.surface import Gaussian
+
+Array = NDArray[Any]
+
+NAME = "specula_model.yml"
+"""Name of the parameter file; the FITS files are in the folder beside it."""
+
+LOOP = "specula_loop.yml"
+"""Name of the changes that make a closed loop of it."""
+
+CALIBRATION = "calibration"
+"""Folder of the FITS files, ``root_dir`` of the parameter file."""
+
+TAG = "bench"
+"""Name of all FITS files, each in the folder of its kind."""
+
+MAX_OFF_GRID_PX = 0.02
+"""Displacement of a pupil image that is worth a remark, pixels."""
+
+_STROKE_WAVES = 0.002
+"""RMS of the shapes that the calibration pushes, wavelengths."""
+
+_NANOMETRE_M = 1e-9
+
+_IMAGES = ((0, 1), (0, 0), (1, 0), (1, 1))
+"""Side along y and along x of each of SPECULA's images."""
+
+
+def write_specula_model(bench: SampledBench, fit: Fit, folder: Path) -> Exported:
+    """Write the model into ``folder``: the fitted modes, and slopes in the axes of conventions.md.
+
+    ``specula --cpu specula_model.yml``, run in the folder, measures the interaction matrix; with
+    ``specula_loop.yml`` as a second file it closes the loop on a static aberration.
+    """
+    apart, width = _place_images(bench)
+    functions, m2c = _describe_mirror(bench, fit)
+    lit = bench.amplitude > 0.0
+    # SPECULA counts nanometres, here of the bench's own unit where its stroke is unknown.
+    known = bench.instrument.mirror.stroke_known
+    unit_m = _NANOMETRE_M if known else bench.unit_m
+    m2c = m2c * (unit_m / _NANOMETRE_M)
+    root, pitch_m = folder / CALIBRATION, bench.width_m / bench.n_points
+    _save_fits(root, "ifunc", {}, INFLUENCE_FUNCTION=functions, MASK_INF_FUNC=lit.astype(float))
+    _save_fits(root, "m2c", {}, M2C=m2c)
+    stop = {"OBJ_TYPE": "Pupilstop", "PIXPUPIL": bench.n_points, "PIXPITCH": pitch_m}
+    stop |= {"SHIFTX": 0.0, "SHIFTY": 0.0, "ROTATION": 0.0, "MAGNIFIC": 1.0}
+    _save_fits(root, "pupilstop", stop, AMPLITUDE=bench.amplitude)
+    _save_pupils(root, bench, apart, width)
+    slopes = slopes_of(fit.synthetic, bench.instrument.slopes.kind).reshape(-1, len(fit.modes))
+    reconstructor = np.linalg.pinv(swap_slopes(slopes.astype(float)) * unit_m)
+    _save_fits(root, "rec", {"NORMFACT": 0.0}, RECMAT=reconstructor)
+    wavelength_m, n = bench.instrument.wfs.wavelength_m, bench.n_subapertures
+    strokes = _STROKE_WAVES * wavelength_m / _NANOMETRE_M / (functions @ m2c).std(axis=0)
+    first, second, _ = bench.modulation
+    # its tilts rise by the wavelength from the first sample to the last
+    radius = math.sqrt(first * second) * (bench.n_points - 1) / bench.n_points
+    values = {
+        "name": bench.instrument.name,
+        "file": NAME,
+        "loop": LOOP,
+        "root": CALIBRATION,
+        "tag": TAG,
+        "unit": "nanometres of OPD" if known else "units of the bench",
+        "n_points": bench.n_points,
+        "pitch_m": pitch_m,
+        "n_modes": len(strokes),
+        "total_time_s": 2 * len(strokes) / 1000,
+        "strokes": [float(f"{one:.6g}") for one in strokes],
+        "wavelength_nm": wavelength_m / _NANOMETRE_M,
+        "fov_arcsec": math.degrees(wavelength_m / pitch_m) * 3600.0,
+        "n_subapertures": n,
+        "separation": apart,
+        "width": width,
+        "fft_res": width / n,
+        "modulation": radius,
+        "n_modulation": max(1, 4 * math.ceil(2 * math.pi * radius / 4)),
+    }
+    for name, template in ((NAME, "specula_twin.yml"), (LOOP, LOOP)):
+        text = Path(__file__).with_name(template).read_text(encoding="utf-8")
+        (folder / name).write_text(Template(text).substitute(values), encoding="utf-8")
+    return Exported(path=folder / NAME, remarks=(*bench.remarks, *_list_limits(bench)))
+
+
+def read_matrix(folder: Path) -> Array:
+    """Return the interaction matrix ``(n_slopes, n_modes)`` that SPECULA measured, all Sx first.
+
+    Raises
+    ------
+    MatrixError
+        If SPECULA has written none.
+    """
+    with opened(folder / CALIBRATION / "im" / f"{TAG}.fits") as container:
+        found = container.find("INTMAT")
+        if found is None:
+            raise MatrixError(f"{container.path}: found no INTMAT, expected SPECULA's matrix")
+        return swap_slopes(found.numbers())
+
+
+def swap_slopes(matrix: Array) -> Array:
+    """Return SPECULA's slopes ``(n_slopes, ...)`` as all Sx, then all Sy, or the reverse."""
+    return np.concatenate([matrix[len(matrix) // 2 :], matrix[: len(matrix) // 2]])
+
+
+def _place_images(bench: SampledBench) -> tuple[int, int]:
+    """Return the separation of the images and the width of the detector, subapertures.
+
+    Both in whole subapertures on both sides of the middle, as SPECULA cuts images.
+    """
+    n = bench.n_subapertures
+    apart = n + 2 * round((bench.separation_px / bench.pixels - n) / 2)
+    return apart, max(apart + n, 2 * round(bench.width_px / bench.pixels / 2))
+
+
+def _describe_mirror(bench: SampledBench, fit: Fit) -> tuple[Array, Array]:
+    """Return functions ``(n_lit_points, n_functions)`` where α puts them, and the fitted modes."""
+    lit, basis = bench.amplitude.ravel() > 0.0, bench.basis
+    if isinstance(basis, ModalBasis) and isinstance(basis.surface, Gaussian):
+        points = bench.points_on_mirror()[lit] * [1.0, basis.y_sign]
+        return basis.surface.basis(points), basis.mode_to_actuator[:, fit.modes]
+    return bench.render_modes()[lit][:, fit.modes], np.eye(len(fit.modes))
+
+
+def _save_pupils(root: Path, bench: SampledBench, apart: int, width: int) -> None:
+    """Write the pixels of the valid subapertures in the four images as SPECULA's ``PupData``."""
+    row, column = np.nonzero(bench.valid)
+    corner = (width - bench.n_subapertures - apart) // 2
+    side_y, side_x = np.transpose(_IMAGES)
+    rows = row[:, None] + corner + side_y * apart
+    columns = column[:, None] + corner + side_x * apart
+    arrays = {
+        "PIXELS": rows * width + columns,
+        "RADIUS": (np.ptp(rows, axis=0) + 1) / 2.0,
+        "CX": (columns.min(axis=0) + columns.max(axis=0)) / 2.0,
+        "CY": (rows.min(axis=0) + rows.max(axis=0)) / 2.0,
+    }
+    _save_fits(root, "pupils", {"VERSION": 2, "FSIZEX": width, "FSIZEY": width}, **arrays)
+
+
+def _save_fits(root: Path, kind: str, header: dict[str, Any], **arrays: Array) -> None:
+    """Write arrays as extensions of a FITS file, in the folder of their kind."""
+    from astropy.io import fits
+
+    folder = root / kind
+    folder.mkdir(parents=True, exist_ok=True)
+    images = []
+    for name, values in arrays.items():
+        dtype = np.int64 if values.dtype.kind in "iu" else np.float32
+        images.append(fits.ImageHDU(np.ascontiguousarray(values, dtype), name=name))
+    first = fits.PrimaryHDU(header=fits.Header({"VERSION": 1, **header}))
+    fits.HDUList([first, *images]).writeto(folder / f"{TAG}.fits", overwrite=True)
+
+
+def _list_limits(bench: SampledBench) -> tuple[str, ...]:
+    """Return what SPECULA's parameter file cannot say."""
+    found = ["SPECULA's model has slopes of the four pupil images, in the axes of conventions.md."]
+    first, second, _ = bench.modulation
+    if not math.isclose(first, second, rel_tol=1e-3):
+        found.append(
+            f"SPECULA's parameter file has no elliptic modulation: semi-axes {first:.3g} and "
+            f"{second:.3g} lambda/D are written as a circle of the same area."
+        )
+    places = bench.image_places_px
+    off = float(np.abs(places - places.mean(axis=(0, 1))).max())
+    if off > MAX_OFF_GRID_PX:
+        found.append(
+            "SPECULA's parameter file has no pupil images off the grid: displacements up to "
+            f"{off:.2g} detector pixels are left out."
+        )
+    apart, width = _place_images(bench)
+    if width < 1.1 * (apart + bench.n_subapertures):
+        found.append(
+            f"SPECULA widens the grid of {width} subapertures to 1.1 times the images, so that "
+            "its sampling differs."
+        )
+    return tuple(found)

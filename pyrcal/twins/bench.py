@@ -53,7 +53,7 @@ _MAX_WIDTH_RATIO = 0.12
 modulation light between the images responds, so that an image of 36 pixels seems 39 wide."""
 
 _SEEMING_PX = 0.6
-"""How much closer together unmodulated images seem, and half as much for others."""
+"""Error by which unmodulated images seem too close together, and half of it for others."""
 
 
 class _Named(NamedTuple):

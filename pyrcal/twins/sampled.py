@@ -48,7 +48,7 @@ MAX_JUDGED_MODES = 40
 """Number of modes with which the places of the pupil images are judged."""
 
 NOTABLE_SHARE = 0.001
-"""Difference of what two models leave that is worth a remark."""
+"""Difference of what two models leave, from which on a remark names it."""
 
 _Grid = tuple[int, int]
 """Points per detector pixel, and detector pixels across."""
@@ -104,7 +104,7 @@ class SampledBench:
     """True if the bench's signals have the other sign than those of conventions.md."""
 
     remarks: tuple[str, ...]
-    """What was assumed, one sentence each."""
+    """Assumptions, one sentence each."""
 
     @property
     def n_points(self) -> int:

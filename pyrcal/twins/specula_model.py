@@ -26,7 +26,7 @@ from service.model.surface import Gaussian
 Array = NDArray[Any]
 
 NAME = "specula_model.yml"
-"""Name of the parameter file; the FITS files are in the folder beside it."""
+"""Name of the parameter file; the FITS files are in a folder next to it."""
 
 LOOP = "specula_loop.yml"
 """Name of the changes that make a closed loop of it."""
@@ -38,7 +38,7 @@ TAG = "bench"
 """Name of all FITS files, each in the folder of its kind."""
 
 MAX_OFF_GRID_PX = 0.02
-"""Displacement of a pupil image that is worth a remark, pixels."""
+"""Displacement of a pupil image from which on a remark names it, pixels."""
 
 _STROKE_WAVES = 0.002
 """RMS of the shapes that the calibration pushes, wavelengths."""

@@ -183,6 +183,9 @@ SAMPLE_S = 10.0
 DRIFTING = "--drift=0.002,0,0.002,0"
 """Of the registration: .12 subapertures and .12 deg in an hour."""
 
+FOLLOWED = "--drift=0.1,0,0.002,0"
+"""With a shape: its references are made again each minute."""
+
 
 class Company:
     """Those who ask while the service runs: one listener of the stream, clients, an uploader."""
@@ -243,15 +246,24 @@ def a_matrix() -> bytes:
     return buffer.getvalue()
 
 
-def soak(minutes: float, folder: Path) -> tuple[list[Sample], Counter[str]]:
+def soak(minutes: float, folder: Path, shape_nm: float = 0.0) -> tuple[list[Sample], Counter[str]]:
     """Run all of it; return what was seen."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         matrix = pool.submit(a_matrix).result()
-    with standing(folder, DRIFTING) as found, ThreadPoolExecutor(CLIENTS + 2) as pool:
+    drift = FOLLOWED if shape_nm else DRIFTING
+    with standing(folder, drift) as found, ThreadPoolExecutor(CLIENTS + 2) as pool:
         company = Company(found.url, matrix)
+        if shape_nm:
+            shape = {"kind": "modes", "frame": "mirror", "unit": "nm", "values": [0, 0, shape_nm]}
+            httpx.post(f"{found.url}/v1/references", json=shape).raise_for_status()
         try:
             company.start(pool)
-            return list(_watch(found, minutes, folder / "samples.jsonl")), company.counts
+            samples = list(_watch(found, minutes, folder / "samples.jsonl"))
+            sets = found.get("/v1/references")["references"] if shape_nm else []
+            company.counts["sets of references used"] += sum(
+                one["applied_ns_utc"] is not None for one in sets
+            )
+            return samples, company.counts
         finally:
             company.over.set()
 
@@ -270,9 +282,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = study_parser("benchmarks.soak", __doc__)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--folder", type=Path, default=Path("var/soak"), help="is emptied first")
+    parser.add_argument("--shape-nm", type=float, default=0.0, help="mode 2, held and followed")
     parser.add_argument("--page", type=Path, help="page with a section 'soak'")
     options = parser.parse_args(arguments)
-    samples, counts = soak(options.minutes, options.folder)
+    samples, counts = soak(options.minutes, options.folder, options.shape_nm)
     rows = judge(samples)
     text = section(samples, rows, counts, os.cpu_count() or 1)
     (options.folder / "soak.md").write_text(text, encoding="utf-8")

@@ -6,10 +6,13 @@ its residual wavefronts give the true modal gains, by pokes without noise along 
 and its own mean is subtracted, so that the error of the shape is that of the references. ``held``
 are shapes in constant seeing, with references of several kinds; ``moved`` are mirrors that are off
 their place, with references that follow and others that do not; ``jump`` are shapes as large as the
-limit permits while the seeing goes from 0.6 to the worst within a second.
+limit permits while the seeing goes from 0.6 to the worst within a second; ``sweep`` are shapes that
+grow from there by steps of 25 % until the loop is lost.
 
 Run: ``python -m pyrcal_studies.references_held --output var/references.jsonl --table table.md``.
-Rows that are in the file already are not computed again; ``--only jump`` runs a part.
+Rows that are in the file already are not computed again; ``--only jump`` runs a part. ``--limits``
+has jumps with parts and multiples of the largest shape, ``--loop-gain`` and ``--magnitude`` with
+other loops.
 """
 
 from __future__ import annotations
@@ -65,6 +68,7 @@ EXPONENTS = {"steep": -2.0, "middle": -1.0, "flat": 0.0}
 """Amplitude as the radial order to this power."""
 
 SETTLING_FRAMES, HELD_FRAMES = 300, 1000
+SETTLED_BATCHES = SETTLING_FRAMES // BATCH_FRAMES
 POKE_M = 10e-9
 POKE_FRAMES = 150
 """Frames from one residual that is poked to the next."""
@@ -73,6 +77,12 @@ CALM_ARCSEC, RISE_S, AFTERWARDS_S = 0.6, 1.0, 1.0
 LOST_M = 500e-9
 """RMS wavefront of a lost loop; the largest seeing leaves 0.2 µm."""
 LOST_BATCHES = 10
+
+GROWING = 1.25 ** np.arange(9)
+"""Sizes of a sweep over the largest shape, one after the other until the loop is lost."""
+
+SWEPT = {0.9: (range(1, 6), (1, 2)), 1.2: ((1, 2), range(1, 7))}
+"""Seeds of shapes and of turbulences at each worst seeing, arcsec."""
 
 DITHERED = (310, 330, 360, 390, 11)
 GAIN_SIGMA = 0.02
@@ -84,7 +94,7 @@ class Plan:
     """One loop that holds a shape."""
 
     case: str
-    """held, moved or jump."""
+    """held, moved, jump or sweep."""
 
     seeing_arcsec: float
     """Constant, or the one after the jump."""
@@ -100,6 +110,20 @@ class Plan:
 
     alpha: str = "0,0,0,1"
     instrument: str = "flao-lbt"
+
+    drawn: int = 0
+    """Seed of the shape; 0: that of the turbulence."""
+
+    limits: float = 1.0
+    """Size over that of the largest shape, if ``rms_nm`` is 0."""
+
+    loop_gain: float = 0.4
+    magnitude: float = 8.0
+
+    @property
+    def jumps(self) -> bool:
+        """True if the seeing changes within the loop."""
+        return self.case in {"jump", "sweep"}
 
 
 @lru_cache(maxsize=2)
@@ -126,8 +150,8 @@ def shape_of(plan: Plan) -> Array:
     """Return the shape ``(n_controlled,)`` with signs drawn by the seed, of 1 m RMS."""
     n_controlled = TELESCOPES[plan.instrument]
     orders = compute_radial_orders(n_controlled)[SHAPED]
-    drawn = np.random.default_rng(plan.seed).normal(size=len(SHAPED))
-    if plan.case != "jump":  # amplitudes as they are defined, signs at random
+    drawn = np.random.default_rng(plan.drawn or plan.seed).normal(size=len(SHAPED))
+    if not plan.jumps:  # amplitudes as they are defined, signs at random
         drawn = np.sign(drawn)
     given = np.zeros(n_controlled)
     given[SHAPED] = orders ** EXPONENTS[plan.shape] * drawn
@@ -156,22 +180,23 @@ class Held:
 
 
 def run(plan: Plan, references: Array | None, *, poked: bool = False) -> Held:
-    """Run a loop of gain 0.4 and leak 0.999; with ``poked`` in the seeing before any jump."""
+    """Run a loop with a leak of 0.999; with ``poked`` in the seeing before any jump."""
     n_frames, seeing = SETTLING_FRAMES + HELD_FRAMES, f"{plan.seeing_arcsec}"
-    if plan.case == "jump":
+    if plan.jumps:
         settled_s, seeing = SETTLING_FRAMES / 1000.0, f"{CALM_ARCSEC}"
         if not poked:
             n_frames += round(1000.0 * (RISE_S + AFTERWARDS_S))
             seeing += f" --seeing-at {settled_s}:{CALM_ARCSEC}"
             seeing += f" --seeing-at {settled_s + RISE_S}:{plan.seeing_arcsec}"
     options = parse_options(
-        f"--plant diffractive --alpha {plan.alpha} --seed {plan.seed} --mag 8 --seeing {seeing} "
+        f"--plant diffractive --alpha {plan.alpha} --seed {plan.seed} --seeing {seeing} "
+        f"--mag {plan.magnitude} "
         f"--n-controlled {TELESCOPES[plan.instrument]}".split()
     )
     telescope = build_telescope(options, model_of(plan.instrument).instrument)
     matrix = reconstructor_of(plan.instrument, plan.alpha)
     loop = ModalLoop(n_modes=len(telescope.settings.gains), delay_frames=2, stroke_m=1e-5)
-    gains = np.full(len(matrix), 0.4, np.float32)
+    gains = np.full(len(matrix), plan.loop_gain, np.float32)
     offset = None if references is None else references.astype(np.float32)
     optics = telescope.optics.start()
     if not isinstance(optics, DiffractiveOptics):
@@ -190,14 +215,13 @@ def run(plan: Plan, references: Array | None, *, poked: bool = False) -> Held:
     modes = optics.opd_per_command[:, : len(matrix)].astype(np.float64)
     weighted = (modes - telescope.weights @ modes).T * telescope.weights
     modes_m = np.asarray(np.linalg.solve(weighted @ modes, weighted @ np.array(lefts).T).T)
-    n_settling = SETTLING_FRAMES // BATCH_FRAMES
     gain = np.ones(len(matrix))
     if poked:
-        residuals = np.array(lefts[n_settling :: POKE_FRAMES // BATCH_FRAMES])
+        residuals = np.array(lefts[SETTLED_BATCHES :: POKE_FRAMES // BATCH_FRAMES])
         gain[_poked(len(matrix))] = poke(optics, residuals, matrix)
     return Held(
         modes_m=modes_m,
-        mean_m=modes_m[n_settling:].mean(axis=0),
+        mean_m=modes_m[SETTLED_BATCHES:].mean(axis=0),
         gain=gain,
         lost_s=len(lefts) * BATCH_FRAMES / 1000.0 if n_lost >= LOST_BATCHES else None,
     )
@@ -248,7 +272,7 @@ def gains_of(plan: Plan, base: Held) -> Array:
 
 def largest_of(plan: Plan, shape: Array, gain: Array) -> float:
     """Return the RMS of the largest multiple of a shape that is accepted, metres."""
-    if plan.case != "jump" and plan.shape == "steep":
+    if not plan.jumps and plan.shape == "steep":
         return np.inf  # not of interest, and seconds of work
     model = model_of(plan.instrument)
     beyond = np.zeros(model.basis.n_modes - len(shape))
@@ -262,14 +286,25 @@ def largest_of(plan: Plan, shape: Array, gain: Array) -> float:
     ).largest_m
 
 
-def play(plan: Plan) -> Row:
-    """Return the row of a plan."""
-    usual = replace(plan, references="", shape="steep", rms_nm=0.0)
+def play(plan: Plan) -> Row | list[Row]:
+    """Return the row of a plan; of a sweep those of its sizes, until the loop is lost."""
+    usual = replace(plan, references="", shape="steep", rms_nm=0.0, drawn=0, limits=1.0)
     # The gains in calm seeing are the same to 1 % on every turbulence.
-    base = without_shape(replace(usual, seed=1) if plan.case == "jump" else usual)
+    base = without_shape(replace(usual, seed=1) if plan.jumps else usual)
     shape, gain = shape_of(plan), gains_of(plan, base)
     largest_m = largest_of(plan, shape, gain)
-    shape = shape * (1e-9 * plan.rms_nm if plan.rms_nm else largest_m)
+    if plan.case != "sweep":
+        size_m = 1e-9 * plan.rms_nm or plan.limits * largest_m
+        return _play_shape(plan, base, gain, size_m * shape, largest_m)
+    rows: list[Row] = []
+    for times in GROWING:
+        rows.append(_play_shape(plan, base, gain, times * largest_m * shape, largest_m))
+        if rows[-1]["lost_s"] is not None:
+            break
+    return rows
+
+
+def _play_shape(plan: Plan, base: Held, gain: Array, shape: Array, largest_m: float) -> Row:
     at = "0,0,0,1" if plan.references == "nominal" else plan.alpha
     references = compute_references(matrix_of(plan.instrument, at), gain, shape)
     if plan.references == "pokes":
@@ -285,13 +320,14 @@ def play(plan: Plan) -> Row:
         "peak": float(np.abs(references).max()),
         "held": float(left @ shape[SHAPED] / (shape @ shape)),
         "error_nm": float(np.linalg.norm(left - shape[SHAPED]) * 1e9),
+        "peak_nm": float(1e9 * np.linalg.norm(found.modes_m, axis=1)[SETTLED_BATCHES:].max()),
         "with_turbulence_nm": float(np.linalg.norm(found.mean_m[SHAPED] - shape[SHAPED]) * 1e9),
         "without_shape_nm": float(np.linalg.norm(base.mean_m[SHAPED]) * 1e9),
         "lost_s": found.lost_s,
     }
 
 
-def plans() -> Iterable[Plan]:
+def plans(n_jumps: int = 20) -> Iterable[Plan]:
     """Yield all loops of the page."""
     for seed, seeing in product((1, 2, 3), (0.6, 0.9, 1.2)):
         one = Plan(case="held", seeing_arcsec=seeing, seed=seed, references="holding")
@@ -307,27 +343,72 @@ def plans() -> Iterable[Plan]:
     for seeing, alpha, references in moved:
         one = Plan(case="moved", seeing_arcsec=seeing, seed=1, references=references)
         yield replace(one, alpha=alpha)
-    for instrument, seed in product(TELESCOPES, range(1, 21)):
+    for instrument, seed in product(TELESCOPES, range(1, n_jumps + 1)):
         one = Plan(case="jump", seeing_arcsec=1.2, seed=seed, references="holding", rms_nm=0.0)
         shape = tuple(EXPONENTS)[seed % len(EXPONENTS)]
         yield replace(one, shape=shape, instrument=instrument)
+    yield from sweep_plans()
+
+
+def sweep_plans() -> Iterable[Plan]:
+    """Yield the sweeps: each shape in each turbulence, on the telescope of 3 m."""
+    for seeing, (shapes, turbulences) in SWEPT.items():
+        for drawn, seed in product(shapes, turbulences):
+            yield Plan(
+                case="sweep",
+                seeing_arcsec=seeing,
+                seed=seed,
+                references="holding",
+                shape=tuple(EXPONENTS)[drawn % len(EXPONENTS)],
+                rms_nm=0.0,
+                drawn=drawn,
+                instrument="tests/system/small.toml",
+            )
+
+
+def tell_sweeps(rows: list[Row]) -> str:
+    """Return the table of the sizes with which loops were lost."""
+    text = heading(
+        "worst seeing, arcsec", "loops", "slope at the limit", "none lost to", "lost from"
+    )
+    for seeing in sorted({row["seeing_arcsec"] for row in rows}):
+        swept = [row for row in rows if row["seeing_arcsec"] == seeing]
+        ends = [group[-1] for group in grouped(swept, Plan)]
+        lost = sorted(one["peak"] for one in ends if one["lost_s"] is not None)
+        kept = [row["peak"] for row in swept if row["lost_s"] is None]
+        safe = max((slope for slope in kept if not lost or slope < 0.99 * lost[0]), default=0.0)
+        found = f"{lost[0]:.2f} to {lost[-1]:.2f}" if lost else "-"
+        n_lost, limit = f"{len(lost)} of {len(ends)} lost", min(row["peak"] for row in swept)
+        text += line(f"{seeing:.1f}", n_lost, f"{limit:.2f}", f"{safe:.2f}", found)
+    return text
 
 
 def main() -> None:
     """Complete the rows and print their table."""
     parser = campaign_parser("", __doc__)
     parser.prog = "python -m pyrcal_studies.references_held"
-    parser.add_argument("--only", type=words, default=("held", "moved", "jump"))
+    parser.add_argument("--only", type=words, default=("held", "moved", "jump", "sweep"))
     parser.add_argument("--instrument", type=words, default=tuple(TELESCOPES))
     parser.add_argument("--jump-nm", type=float, default=0.0, help="size instead of the limit's")
+    parser.add_argument("--limits", type=float, default=1.0, help="size of jumps over the limit's")
+    parser.add_argument("--jumps", type=int, default=20, help="jumps of each telescope")
+    parser.add_argument("--loop-gain", type=float, default=0.4)
+    parser.add_argument("--magnitude", type=float, default=8.0)
     given = parser.parse_args()
     with threadpool_limits(1):
+        changed = {"loop_gain": given.loop_gain, "magnitude": given.magnitude}
+        size = {"rms_nm": given.jump_nm, "limits": given.limits}
         chosen = [
-            replace(plan, rms_nm=given.jump_nm) if plan.case == "jump" else plan
-            for plan in plans()
+            replace(plan, **changed, **(size if plan.case == "jump" else {}))
+            for plan in plans(given.jumps)
             if plan.case in given.only and plan.instrument in given.instrument
         ]
         rows = complete(play, chosen, given)
+    sweeps = [row for row in rows if row["case"] == "sweep"]
+    rows = [row for row in rows if row["case"] != "sweep"]
+    if not rows:
+        tell(tell_sweeps(sweeps), given.table, parser.prog)
+        return
     text = heading(
         "loop", "seeing, arcsec", "gain", "shape, nm", "held", "error, nm", "limit, nm", "lost"
     )
@@ -348,7 +429,7 @@ def main() -> None:
             f"{mean['largest_nm']:.0f}",
             f"{len(group) - len(kept)} of {len(group)}",
         )
-    tell(text, given.table, parser.prog)
+    tell(text + (f"\n{tell_sweeps(sweeps)}" if sweeps else ""), given.table, parser.prog)
 
 
 if __name__ == "__main__":

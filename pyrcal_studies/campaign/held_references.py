@@ -1,13 +1,14 @@
 """Changes of reference slopes against the whole service in simulated time.
 
 Run: ``python -m pyrcal_studies.campaign.held_references --seeds 0:20 --output
-var/held_references.jsonl --table table.md``. Each draw is a night of 110 s (of 65 s with a fault)
-on the simulator's small telescope of 3 m in mode auto, for a worst seeing of 0.9 arcsec. From 10 s
-on a shape is loaded every 20 s: amplitudes that fall as order to the power -2 in modes 2 to 21 with
-random signs, 30 to 60 nm RMS. The RTC applies the references as it should, or from 25 s on with the
-sign turned, twice as large, or keeps the old ones; it shows what it applies, or hides it and shows
-what was sent. A row has the changes, the alarms, the matrices taken back, when a fault was named,
-and how much of each shape the mirror was measured to hold.
+var/held_references.jsonl --table table.md``. Each draw is a night of 110 s (of at most 70 s with a
+fault, which ends 5 s after it was named) on the simulator's small telescope of 3 m in mode auto,
+for a worst seeing of 0.9 arcsec. From 10 s on a shape is loaded every 20 s: amplitudes that fall as
+order to the power -2 in modes 2 to 21 with random signs, 30 to 60 nm RMS. In place of a shape that
+is refused as too large the next one is drawn. The RTC applies the references as it should, or from
+25 s on with the sign turned, twice as large, or keeps the old ones; it shows what it applies, or
+hides it and shows what was sent. A row has the changes, the alarms, the matrices taken back, when a
+fault was named, and how much of each shape the mirror was measured to hold.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from service.config import load_settings
 from service.records import alarms
 from service.records import commands as cmd
 from service.records import events as ev
-from service.records.products import Frame, ShapeKind
+from service.records.products import Frame, MatrixState, ShapeKind
 from service.records.state import Mode
 from service.runtime.policy import policy_of
 
@@ -43,7 +44,10 @@ Array32 = NDArray[np.float32]
 KINDS = ("as it should", "sign turned", "twice as large", "old ones kept")
 FACTORS = {"sign turned": -1.0, "twice as large": 2.0}
 
-NIGHT_S, FAULTY_NIGHT_S = 110.0, 65.0
+NIGHT_S, FAULTY_NIGHT_S = 110.0, 70.0
+MAKING_S = 3.0
+"""Within that time references are made or refused."""
+AFTERWARDS_S = 5.0
 FIRST_S = 10.0
 EVERY_S = 20.0
 FAULT_S = 25.0
@@ -96,12 +100,24 @@ def play(draw: Draw) -> Row:
     with threadpool_limits(1):
         night = Observatory(words, policy, Mode.AUTO, bench_of(SMALL), with_poles=False)
         for time_s in sorted({*map(float, loads), FAULT_S, night_s}):
-            night.advance(time_s - night.time_s)
+            while night.time_s < time_s and alarms.REFERENCES_MISAPPLIED not in _named(night):
+                night.advance(min(time_s - night.time_s, 1.0))
             if time_s == FAULT_S and spoil is not None:
                 night.dome.computer.spoil_references(spoil, hidden=draw.hidden)
             elif time_s in loads and alarms.REFERENCES_MISAPPLIED not in _named(night):
-                night.command(load_of(rng))
+                _load_accepted(night, rng)
+        if spoil is not None:
+            night.advance(AFTERWARDS_S)
     return asdict(draw) | _found(night)
+
+
+def _load_accepted(night: Observatory, rng: np.random.Generator) -> None:
+    """Load shapes until one is not refused."""
+    accepted = False
+    while not accepted:
+        night.command(load_of(rng))
+        night.advance(MAKING_S)
+        accepted = night.state.references.records[-1].state is not MatrixState.REFUSED
 
 
 def _named(night: Observatory) -> dict[str, float]:

@@ -63,6 +63,9 @@ class StoredArray:
     remark: str = ""
     """Notes on the values for the user; empty if there are none."""
 
+    unit: str = ""
+    """Unit of the values as a FITS file has it; empty if there is none."""
+
     def numbers(self) -> NDArray[np.float64]:
         """Return it as native float64, whatever its byte order.
 
@@ -115,6 +118,9 @@ class Container:
 
     is_fits: bool = False
     """True if images may have no name."""
+
+    columns: Callable[[], Mapping[str, StoredArray]] = dict
+    """Returns the columns of the first FITS table by name in lower case."""
 
     def listing(self) -> str:
         """Return what is in the file, in words."""
@@ -232,6 +238,7 @@ def _fits(path: Path) -> Iterator[Container]:
             find=lambda name: known.get(name.strip("/").lower()),
             facts=facts,
             is_fits=True,
+            columns=partial(_columns, file, path),
         )
 
 
@@ -251,7 +258,30 @@ def _image(hdu: _ImageHdu, where: str, file_bytes: int) -> StoredArray:
         stored_bytes=file_bytes,
         load=partial(_data, hdu),
         remark=f"{where}: {LOSSY}" if _is_lossy(hdu) else "",
+        unit=str(hdu.header.get("BUNIT", "")),
     )
+
+
+def _columns(file: Any, path: Path) -> dict[str, StoredArray]:  # noqa: ANN401  astropy's list
+    # Only images have no columns; an image that is packed into a table is one of them.
+    tables = [hdu for hdu in file if not hdu.is_image and hasattr(hdu, "columns")]
+    if not tables:
+        return {}
+    try:
+        values = tables[0].data
+        return {
+            one.name.lower(): StoredArray(
+                where=f"{path}:{one.name}",
+                shape=values[one.name].shape,
+                dtype=values[one.name].dtype,
+                stored_bytes=path.stat().st_size,
+                load=partial(values.field, one.name),
+                unit=one.unit or "",
+            )
+            for one in tables[0].columns
+        }
+    except FITS_DAMAGE as error:
+        raise MatrixError(f"{path}: damaged FITS table: {error}") from error
 
 
 LOSSY = (

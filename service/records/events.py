@@ -431,8 +431,11 @@ class ShapeHeld:
     sigma: float
     """1 σ of it, by the turbulence."""
 
-    change: tuple[float, float] | None = None
-    """The same of the change from the shape before, with 1 σ; None if that is small."""
+    other: str = ""
+    """The wrong way to apply them that agrees best with the commands."""
+
+    log_odds: float = 0.0
+    """Natural logarithm of the likelihood of that way over that of references as sent."""
 
     began_ns_utc: int = 0
     """Beginning of the telemetry that it compares, the RTC's clock; 0 if that is unknown."""

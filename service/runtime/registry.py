@@ -6,10 +6,11 @@ The order is that in which they are fed: what one marks in a block, those after 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from service.estimation.control_law import ControlLawCheck
 from service.estimation.dither_monitor import MAX_AMPLITUDE_RATIO, DitherMeasurement, DitherWatch
@@ -33,6 +34,9 @@ from service.records.events import Event
 from service.records.state import TrackerState
 from service.tracking.dither import MISSING_DITHER_ALARM_S
 from service.tracking.policy import SECOND_NS
+from service.tracking.references import mean_gain
+
+Array = NDArray[np.float64]
 
 Changes = Callable[[Any, Any, LoopContext, TrackerState], list[Event]]
 """Returns the tracker's events of a detector, from its state before these blocks and after."""
@@ -119,34 +123,33 @@ def _report_comparison(
     return [ev.Compared(finding=judged)] if judged is not None and awaited else []
 
 
-MIN_CHANGE_RATIO = 0.7
-"""Change of a shape over its size from which the change is judged, too."""
+MAX_DEPARTURE = 0.5
+"""References before of which the mirror held more or less than that share too much do not count."""
 
 
 def _report_held(
     before: MeanCommands, now: MeanCommands, loop: LoopContext, state: TrackerState
 ) -> list[Event]:
     """Return how much of the shape of new references the mirror holds."""
-    record = state.references_of(now.name)
+    record, registration = state.references_of(now.name), state.alpha.registration
     if record is None or not now.is_due(before):
         return []
-    shapes = np.zeros((2, loop.description.n_modes))
-    for shape_m, one in zip(shapes, (record, state.references_of(now.before[0])), strict=True):
+    shapes_m: dict[str, Array] = {}
+    for name in (now.name, *dict(now.before)):
+        one = state.references_of(name)
+        shape_m = shapes_m[name] = np.zeros(loop.description.n_modes)
         if one is not None:
             shape_m[: len(one.coefficients_m)] = one.coefficients_m
-    found, change_m = now.measure(*shapes), shapes[0] - shapes[1]
+            if name != now.name and abs((one.held_ratio or 1.0) - 1.0) > MAX_DEPARTURE:
+                del shapes_m[name]
+    expected = 1.0
+    if registration is not None and registration.optical_gains and record.gain:
+        expected = record.gain / mean_gain(record.coefficients_m, registration.optical_gains)
+    found = now.measure(shapes_m, expected)
     if found is None:
         return []
-    held = ev.ShapeHeld(
-        id=record.id,
-        ratio=found.ratio,
-        sigma=found.sigma,
-        began_ns_utc=loop.received_ns_utc - round(now.duration_s * SECOND_NS),
-    )
-    # The smaller the change, the more another gain or seeing on both sides counts in it.
-    large = np.linalg.norm(change_m) >= MIN_CHANGE_RATIO * np.linalg.norm(shapes[0])
-    change = now.measure(change_m, np.zeros_like(change_m)) if large else None
-    return [held if change is None else replace(held, change=(change.ratio, change.sigma))]
+    began_ns = loop.received_ns_utc - round(now.duration_s * SECOND_NS)
+    return [ev.ShapeHeld(id=record.id, began_ns_utc=began_ns, **found._asdict())]
 
 
 @dataclass(frozen=True, slots=True)

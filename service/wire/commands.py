@@ -268,6 +268,11 @@ class Reply:
     start_seq: codec.Count | None
     """First frame whose exposure contains the effect; None if there is none."""
 
+    @property
+    def is_unsupported(self) -> bool:
+        """True if the RTC never carries out such a command, by the code of its refusal."""
+        return not self.accepted and self.reason.partition(":")[0] == "unsupported"
+
 
 _KINDS: dict[type[Command], CommandKind] = {
     DitherRequest: CommandKind.DITHER,

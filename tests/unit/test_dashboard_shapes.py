@@ -84,6 +84,34 @@ def test_a_square_is_a_map_and_its_mean_is_no_shape():
     assert (found["kind"], found["values"], found["rms"]) == ("map", [1, 3, 1, 3], 1.0)
 
 
+def test_a_fits_table_has_coefficients_by_their_numbers():
+    columns = [
+        fits.Column(name="NOLL", format="J", array=[6, 4]),
+        fits.Column(name="amplitude", format="D", array=[60.0, -5.0], unit="nm"),
+    ]
+    file = io.BytesIO()
+    fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns(columns)]).writeto(file)
+    found = read("a.fits", file.getvalue())
+    assert (found["kind"], found["unit"]) == ("zernike", "nm")
+    assert found["values"] == [0, 0, 0, -5, 0, 60]
+    columns.append(fits.Column(name="sigma", format="E", array=[1.0, 1.0]))
+    file = io.BytesIO()
+    fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns(columns)]).writeto(file)
+    assert "found the columns noll, amplitude, sigma" in read("a.fits", file.getvalue())
+
+
+def test_a_map_may_have_nan_where_no_light_falls():
+    y, x = (np.indices((20, 20)) + 0.5) / 10.0 - 1.0
+    radius = np.hypot(x, y)
+    lit = (radius < 1.0) & (radius > 0.2)
+    found = read("map.npy", numpy_of(np.where(lit, x, np.nan)))
+    values = np.reshape(found["values"], x.shape)
+    np.testing.assert_allclose(values[lit], x[lit])
+    np.testing.assert_allclose(values[radius < 1.0], x[radius < 1.0], atol=0.25)
+    hole = lit & (np.abs(x - 0.5) > 0.06)
+    assert "not finite" in read("map.npy", numpy_of(np.where(hole, x, np.nan)))
+
+
 def test_what_a_document_says_of_its_numbers_is_kept():
     document = {
         "kind": "modes",

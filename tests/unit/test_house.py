@@ -203,7 +203,7 @@ WORDS_READ = {
     "service/link/session.py": "messages of zenoh and of the operating system, which have no codes",
     "service/runtime/cluster.py": "the first line of an error of Dask is shown",
     "service/tracking/dither_request.py": "only the id is known of a dither that nobody follows",
-    "service/tracking/references.py": "codes of refusals, and the mark of a ramp (R-83)",
+    "service/wire/commands.py": "a refusal begins with its code (R-43)",
     "service/tracking/transitions.py": "a table in the source, written as text",
     "pyrcal/fitting/arguments.py": "words of the command line",
     "pyrcal/fitting/fit_file.py": "an error begins with the name of its file",

@@ -31,6 +31,61 @@ def test_zernike_coefficients_in_a_fits_file_have_their_unit(tmp_path):
     }
 
 
+def table_of(path, **columns):
+    unit = {"nanometers": "nm"}
+    fits.BinTableHDU.from_columns(
+        [
+            fits.Column(
+                name=name, format="J" if name == "noll" else "D", array=values, unit=unit.get(name)
+            )
+            for name, values in columns.items()
+        ]
+    ).writeto(path)
+    return path
+
+
+def test_a_fits_table_has_coefficients_by_their_numbers(tmp_path):
+    path = table_of(tmp_path / "table.fits", noll=[6, 4], nanometers=[60.0, -5.0])
+    found = read_shape(options(path, frame="instrument"))
+    assert (found["kind"], found["unit"]) == ("zernike", "nm")
+    assert found["values"] == [0.0, 0.0, 0.0, -5.0, 0.0, 60.0]
+    with pytest.raises(ConfigurationError, match="found --kind modes, expected zernike"):
+        read_shape(options(path, kind="modes", frame="mirror"))
+
+
+def test_a_fits_table_without_numbers_has_coefficients_in_their_order(tmp_path):
+    path = table_of(tmp_path / "table.fits", nanometers=[0.0, 60.0])
+    found = read_shape(options(path, kind="modes", frame="mirror"))
+    assert (found["unit"], found["values"]) == ("nm", [0.0, 60.0])
+
+
+@pytest.mark.parametrize(
+    ("columns", "text"),
+    [
+        ({"a": [1.0], "b": [2.0]}, "found the columns a, b, expected one of coefficients"),
+        ({"noll": [0], "a": [2.0]}, "found a noll beyond 1 to"),
+        ({"noll": [4, 4], "a": [2.0, 3.0]}, "found a noll twice"),
+    ],
+)
+def test_a_fits_table_that_is_ambiguous_is_refused(tmp_path, columns, text):
+    with pytest.raises(ConfigurationError, match=text):
+        read_shape(options(table_of(tmp_path / "table.fits", **columns), unit="nm"))
+
+
+def test_a_map_may_have_nan_where_no_light_falls(tmp_path):
+    y, x = (np.indices((40, 40)) + 0.5) / 20.0 - 1.0
+    radius, path = np.hypot(x, y), tmp_path / "map.npy"
+    np.save(path, np.where((radius < 1.0) & (radius > 0.2), x, np.nan))
+    found = np.reshape(read_shape(options(path, frame="instrument", unit="nm"))["values"], x.shape)
+    # A pixel in the dark has the value of one nearby.
+    np.testing.assert_allclose(found[radius < 1.0], x[radius < 1.0], atol=0.25)
+    lit = (radius < 1.0) & (radius > 0.2)
+    np.testing.assert_allclose(found[lit], x[lit], rtol=1e-6)
+    np.save(path, np.where((radius < 1.0) & (np.abs(x - 0.5) > 0.05), x, np.nan))
+    with pytest.raises(ConfigurationError, match="values that are not finite"):
+        read_shape(options(path, frame="instrument", unit="nm"))
+
+
 def test_attributes_of_an_hdf5_file_say_what_its_numbers_are(tmp_path):
     path = tmp_path / "modes.h5"
     with h5py.File(path, "w") as file:

@@ -1,6 +1,9 @@
 // Shapes in files: JSON, NumPy, FITS. What a file says of its numbers is kept; what it does not is asked for.
 
 const UNITS = { meter: "m", micron: "um", nanometer: "nm", m: "m", um: "um", nm: "nm" };
+const NUMBERED = { noll: ["zernike", 1], mode: ["modes", 0] }; // column of numbers: kind, first number
+const TABLE_TYPES = { B: ["u", 1], I: ["i", 2], J: ["i", 4], K: ["i", 8], E: ["f", 4], D: ["f", 8] };
+const OBSCURED = 0.35; // of the pupil's radius; no central obscuration is larger
 const SAID = ["kind", "unit", "basis_id", "config_id"];
 
 // {values, and kind, unit, basis_id, config_id where the file has them}; an error says what was found.
@@ -8,12 +11,30 @@ export function shapeOf(name, buffer) {
   const read = /\.json$/i.test(name) ? ofJson : /\.npy$/i.test(name) ? ofNumpy : /\.fits?$/i.test(name) ? ofFits : null;
   if (!read) throw new Error("found another kind of file, expected .json, .npy or .fits (pyrcal references load reads HDF5, too)");
   const { values, shape = [values.length], ...said } = read(buffer);
+  const long = shape.filter((n) => n > 1);
+  if (long.length === 2 && long[0] === long[1]) said.kind ??= "map";
+  if (said.kind === "map") fillDark(values);
   const odd = values.filter((value) => !Number.isFinite(value)).length;
   if (odd) throw new Error(`found ${odd} values that are not finite, expected none`);
   if (!values.length) throw new Error("found no numbers");
-  const long = shape.filter((n) => n > 1);
-  if (long.length === 2 && long[0] === long[1]) said.kind ??= "map";
   return { ...said, values };
+}
+
+// The nearest values of a map in place of NaN where no light falls: beyond the pupil and in its middle.
+function fillDark(values) {
+  const n = Math.sqrt(values.length);
+  const place = (k) => ((k + 0.5) * 2) / n - 1;
+  const known = values.map((value, k) => [value, k]).filter(([value]) => !Number.isNaN(value));
+  values.forEach((value, k) => {
+    const [x, y] = [k % n, Math.floor(k / n)];
+    const radius = Math.hypot(place(x), place(y));
+    if (!Number.isNaN(value) || (radius <= 1 - 2 / n && radius >= OBSCURED)) return;
+    let best = Infinity;
+    for (const [given, at] of known) {
+      const far = ((at % n) - x) ** 2 + (Math.floor(at / n) - y) ** 2;
+      if (far < best) [best, values[k]] = [far, given];
+    }
+  });
 }
 
 // In the unit of the values; piston does not count.
@@ -42,6 +63,32 @@ function ofNumpy(buffer) {
   return { values: numbers(bytes, start, type, Number(size), order !== ">", shape.reduce((a, b) => a * b, 1)), shape };
 }
 
+// The shape in a table: one column of coefficients, and one of their numbers or none.
+function ofTable(bytes, at, cards) {
+  const columns = [];
+  for (let k = 1, offset = 0; k <= Number(cards.TFIELDS); k++) {
+    const [, repeat, letter] = cards[`TFORM${k}`].match(/^(\d*)([A-Z])/) ?? [];
+    const [type, size] = TABLE_TYPES[letter] ?? [];
+    if (!type || Number(repeat || 1) !== 1) throw new Error(`found a column ${cards[`TTYPE${k}`]} of ${cards[`TFORM${k}`]}, expected one number in each row`);
+    const read = (row) => numbers(bytes, at + row * Number(cards.NAXIS1) + offset, type, size, false, 1)[0];
+    const said = [Number(cards[`TSCAL${k}`] ?? 1), Number(cards[`TZERO${k}`] ?? 0)];
+    const values = Array.from({ length: Number(cards.NAXIS2) }, (_, row) => said[0] * read(row) + said[1]);
+    columns.push({ name: (cards[`TTYPE${k}`] ?? "").toLowerCase(), unit: UNITS[(cards[`TUNIT${k}`] ?? "").toLowerCase()], values });
+    offset += size;
+  }
+  const [places, others] = [columns.filter(({ name }) => NUMBERED[name]), columns.filter(({ name }) => !NUMBERED[name])];
+  if (places.length > 1 || others.length !== 1) throw new Error(`found the columns ${columns.map(({ name }) => name).join(", ")}, expected one of coefficients and at most one of their numbers, noll (from 1 on) or mode (from 0 on)`);
+  const [{ values, unit }] = others;
+  const said = { ...(unit && { unit }) };
+  if (!places.length) return { values, ...said };
+  const [{ name, values: found }] = places;
+  const [kind, first] = NUMBERED[name];
+  if (new Set(found).size < found.length || !found.every((n) => Number.isInteger(n) && n >= first && n <= 65_535)) throw new Error(`found a ${name} twice or beyond ${first} to 65535`);
+  const shape = new Array(Math.max(first, ...found) - first + 1).fill(0);
+  found.forEach((n, k) => (shape[n - first] = values[k]));
+  return { values: shape, kind, ...said };
+}
+
 // The first HDU with numbers.
 function ofFits(buffer) {
   const [bytes, text] = [new DataView(buffer), new TextDecoder("latin1")];
@@ -59,6 +106,7 @@ function ofFits(buffer) {
     const shape = Array.from({ length: Number(cards.NAXIS ?? 0) }, (_, k) => Number(cards[`NAXIS${k + 1}`]));
     const n = shape.length ? shape.reduce((a, b) => a * b, 1) : 0;
     const bits = Number(cards.BITPIX);
+    if (n && cards.XTENSION === "BINTABLE") return ofTable(bytes, at, cards);
     if (n) {
       const raw = numbers(bytes, at, bits < 0 ? "f" : bits === 8 ? "u" : "i", Math.abs(bits) / 8, false, n);
       const [scale, zero] = [Number(cards.BSCALE ?? 1), Number(cards.BZERO ?? 0)];

@@ -69,7 +69,9 @@ def write_specula_model(bench: SampledBench, fit: Fit, folder: Path) -> Exported
     stop |= {"SHIFTX": 0.0, "SHIFTY": 0.0, "ROTATION": 0.0, "MAGNIFIC": 1.0}
     _save_fits(root, "pupilstop", stop, AMPLITUDE=bench.amplitude)
     _save_pupils(root, bench, apart, width)
-    slopes = slopes_of(fit.synthetic, bench.instrument.slopes.kind).reshape(-1, len(fit.modes))
+    light = 1.0 if fit.gain_map is None else fit.gain_map[fit.valid][:, None]
+    slopes = slopes_of(fit.synthetic, bench.instrument.slopes.kind) * light
+    slopes = slopes.reshape(-1, len(fit.modes))
     reconstructor = np.linalg.pinv(swap_slopes(slopes.astype(float)) * unit_m)
     _save_fits(root, "rec", {"NORMFACT": 0.0}, RECMAT=reconstructor)
     wavelength_m, n = bench.instrument.wfs.wavelength_m, bench.n_subapertures

@@ -203,7 +203,7 @@ class MeanCommands(Streaming):
 def _long_variance(apart: Array) -> Array:
     """Return the variance of blocks ``(n_blocks, ...)`` as it counts in a mean over many of them.
 
-    Neighbours tell how much the blocks remember.
+    The correlation of neighbours shows how much the blocks remember.
     """
     variance = (apart**2).sum(axis=0) / (len(apart) - 2)
     neighbours = (apart[1:] * apart[:-1]).sum(axis=0) / (len(apart) - 2)

@@ -435,6 +435,7 @@ def _describe_twin(commands: Any) -> None:  # noqa: ANN401 - argparse's own
             words("files [ROLE=]FILE", roles, type=_role_and_path, nargs="+"),
             words("--output DIR", output, type=Path, required=True),
             words("--check", check),
+            words("--python FILE", "interpreter that has them; default this one", type=Path),
             *_OF_ARRAYS,
             *_DESCRIBED,
             _THREADS,

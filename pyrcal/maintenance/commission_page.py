@@ -46,7 +46,7 @@ th { background: #f3f5f9; } .scroll { overflow-x: auto; }
 .verdict { padding: 10px 14px; border-radius: 6px; font-weight: 600; margin: 14px 0; }
 .verdict.pass { background: #e3f4ea; } .verdict.fail { background: #fbe6e4; }
 figure { margin: 14px 0; } figcaption { color: #4a5366; font-size: 13px; }
-svg { max-width: 100%; height: auto; } .note { color: #4a5366; }
+svg, img { max-width: 100%; height: auto; } .note { color: #4a5366; }
 @media print { body { max-width: none; } figure { break-inside: avoid; } }
 """
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pyrcal.importers.imported import Array, Imported
+from pyrcal.importers.imported import UNKNOWN, Array, Imported
 from pyrcal.importers.layouts import role_of_name
 from pyrcal.importers.oopao import SAVED, find_image_centres, from_saved
 from pyrcal.importers.program import (
@@ -52,8 +52,14 @@ _MAX_WIDTH_RATIO = 0.12
 """Largest relative difference of the pupil's width from that of its images as they respond. Without
 modulation light between the images responds, so that an image of 36 pixels seems 39 wide."""
 
+MIN_AXES_RATIO = 1.03
+"""Smallest ratio of the axes of a modulated spot's path that is taken for an ellipse."""
+
+_SPOT_THRESHOLD = 0.2
+"""Light on the path of the spot over its brightest part."""
+
 _SEEMING_PX = 0.6
-"""How much closer together unmodulated images seem, and half as much for others."""
+"""Error by which unmodulated images seem too close together, and half of it for others."""
 
 
 class _Named(NamedTuple):
@@ -78,9 +84,6 @@ class Bench:
     sky_pupil: Array | None = None
     """``(n, n)`` pupil on the sky; None if there is only one pupil."""
 
-    spot: Array | None = None
-    """``(ny, nx)`` picture of the modulated spot; None if there is none."""
-
     inventory: tuple[str, ...] = field(default=())
     """Use that was made of each file, one sentence each."""
 
@@ -99,7 +102,7 @@ def read_bench(options: argparse.Namespace) -> Bench:
     cacao = [path for path in paths if any(path.glob("**/cacaovars*"))]
     if cacao:
         options.source, options.folder, options.response = "cacao", cacao[0], None
-        return Bench(imported=(import_files(options),), stated=_state(options))
+        return _import_other(options)
     named = tuple(_read_files(options.files))
     saved = {_OOPAO.get(_squeeze(one.name), one.name): one.values for one in named}
     if _OOPAO_ONLY & saved.keys():
@@ -112,7 +115,7 @@ def read_bench(options: argparse.Namespace) -> Bench:
     if "INTMAT" in saved:
         options.source = "specula"
         options.files = [(None, path) for path in dict.fromkeys(one.path for one in named)]
-        return Bench(imported=(import_files(options),), stated=_state(options))
+        return _import_other(options)
     options.source = "files"
     found, inventory = _sort_by_role(named, options)
     try:
@@ -120,17 +123,26 @@ def read_bench(options: argparse.Namespace) -> Bench:
     except MatrixError as error:
         raise MatrixError(f"{error}; {'; '.join(inventory)}") from error
     _check_modes(imported, options)
+    if "spot" in found:
+        imported = _use_spot(imported, found["spot"])
     sampled = _find_fft_grid(imported, options.pupil_subap, has_light="light" in found)
     return Bench(
         imported=(imported,) if sampled is None else (sampled, imported),
-        stated=_state(options),
+        stated=_state(options, imported),
         sky_pupil=found.get("sky_pupil"),
-        spot=found.get("spot"),
         inventory=inventory,
     )
 
 
-def _state(options: argparse.Namespace) -> frozenset[str]:
+def _import_other(options: argparse.Namespace) -> Bench:
+    """Return what the files of another code describe."""
+    imported = import_files(options)
+    return Bench(
+        imported=(imported,), stated=_state(options, imported), inventory=imported.inventory
+    )
+
+
+def _state(options: argparse.Namespace, imported: Imported) -> frozenset[str]:
     """Return the keys of the instrument file that the options give."""
     keys = {
         "diameter_m": options.diameter_m,
@@ -144,8 +156,14 @@ def _state(options: argparse.Namespace) -> frozenset[str]:
     }
     stated = {key for key, value in keys.items() if value is not None}
     if options.instrument is not None:
-        for table in read_toml(instrument_path(options.instrument)).values():
-            stated |= table.keys()
+        tables = read_toml(instrument_path(options.instrument))
+        # What the arrays show takes the place of what the file says.
+        stated |= {
+            key
+            for name, table in imported.tables.items()
+            for key, value in table.items()
+            if key in tables.get(name, {}) and tables[name][key] == value
+        }
     return frozenset(stated)
 
 
@@ -156,9 +174,12 @@ def _squeeze(name: str) -> str:
 
 def _read_files(given: list[tuple[str | None, Path]]) -> Iterator[_Named]:
     """Yield the arrays of files and of the files in folders; a given role is their name."""
-    for role, path in given:
+    with_role = {path.resolve() for role, path in given if role is not None}
+    # A file with a stated role comes first, also if its folder is given as well.
+    for role, path in sorted(given, key=lambda one: one[0] is None):
         for one in sorted(path.iterdir()) if path.is_dir() else [path]:
-            if path.is_dir() and not one.name.lower().endswith(ARRAY_FILES):
+            is_array = one.name.lower().endswith(ARRAY_FILES) and one.resolve() not in with_role
+            if path.is_dir() and not is_array:
                 continue
             arrays = read_arrays(one, [])
             if role is not None and len(arrays) != 1:
@@ -185,6 +206,8 @@ def _sort_by_role(
             unknown.append(one)
             continue
         if role in found:
+            if role in dict(options.files):
+                continue  # the other one was stated
             raise MatrixError(f"{one.path}: found a second {role}, expected one; say ROLE=FILE")
         found[role] = one.values
         inventory.append(f"{role}: {one.path} {one.values.shape}")
@@ -193,7 +216,9 @@ def _sort_by_role(
     for one in unknown:
         role = _guess_mask(one.values, np.shape(found.get("matrix", ())))
         if role is None or role in found:
-            inventory.append(f"not used: {one.path} {one.values.shape} ({one.name}); ROLE=FILE")
+            inventory.append(
+                f"not used: {one.path} {one.values.shape} ({one.name}): give ROLE=FILE"
+            )
         else:
             found[role] = one.values
             inventory.append(f"{role}, by its shape: {one.path} {one.values.shape}")
@@ -201,12 +226,14 @@ def _sort_by_role(
 
 
 def _find_role(name: str) -> str | None:
-    """Return the role for a name, or for a part of it; None if it is unknown."""
+    """Return the role for a name, for a part of it, or for one of its words; None if unknown."""
     squeezed = _squeeze(name)
+    words = "".join(one if one.isalnum() else " " for one in name).split()
     return (
         role_of_name(name)
         or (name if name in dict(_PARTS) else None)
         or next((role for role, parts in _PARTS if any(part in squeezed for part in parts)), None)
+        or next(filter(None, (role_of_name(word) for word in words if len(word) > 1)), None)
     )
 
 
@@ -238,17 +265,49 @@ def _check_modes(imported: Imported, options: argparse.Namespace) -> None:
         )
 
 
+def _use_spot(imported: Imported, picture: Array) -> Imported:
+    """Return the bench with an elliptic modulation to be fitted, if the spot's path is no circle.
+
+    The scale and the axes of the picture's camera are not known: the fit finds axes and angle.
+    """
+    ratio, angle_deg = measure_spot(picture)
+    imported = imported.with_notes(
+        f"picture of the modulated spot: axes of ratio {ratio:.3f}, the longer one at "
+        f"{angle_deg:.0f} deg of its camera"
+    )
+    if ratio < MIN_AXES_RATIO or "modulation_lambda_over_d" not in imported.tables["wfs"]:
+        return imported
+    wfs = {**imported.tables["wfs"], "modulation_ellipse": UNKNOWN}
+    del wfs["modulation_lambda_over_d"]
+    return replace(imported, tables={**imported.tables, "wfs": wfs})
+
+
+def measure_spot(picture: Array) -> tuple[float, float]:
+    """Return the ratio of the axes of a modulated spot's path, and the longer one's angle, degrees.
+
+    The spot dwells where it is slow, so that weighted by light the mean square along an axis is
+    half that of the axis. The threshold removes the background.
+    """
+    light = picture - np.median(picture)
+    path = light > _SPOT_THRESHOLD * np.percentile(light, 99.5)
+    rows, columns = np.nonzero(path)
+    squares, axes = np.linalg.eigh(np.cov(columns, rows, aweights=light[path]))
+    angle = np.rad2deg(np.arctan2(axes[1, 1], axes[0, 1])) % 180.0
+    return float(np.sqrt(squares[1] / squares[0])), float(angle)
+
+
 def _find_fft_grid(imported: Imported, across: float | None, *, has_light: bool) -> Imported | None:
     """Return the bench as one that was simulated with an FFT; None if its files exclude that.
 
     A simulated pupil has a whole number of points in each subaperture, which is one pixel, and the
     influence functions have the same points.
     """
-    wfs, cube = imported.tables["wfs"], imported.arrays.get("influence_functions")
-    frames = imported.arrays[DATASET]
-    if cube is None or frames.ndim != 3 or wfs.get("pixels_per_subaperture") != 1:
+    wfs, arrays = imported.tables["wfs"], imported.arrays
+    names, frames = ("influence_functions", "mode_shapes", "pupil"), arrays[DATASET]
+    maps = next((arrays[name] for name in names if name in arrays), None)
+    if maps is None or frames.ndim != 3 or wfs.get("pixels_per_subaperture") != 1:
         return None
-    side, width, seen = cube.shape[-1], frames.shape[-1], float(wfs["pupil_diameter_subap"])
+    side, width, seen = maps.shape[-1], frames.shape[-1], float(wfs["pupil_diameter_subap"])
     tolerance = 0.0 if across else _MAX_WIDTH_RATIO
     counts = [
         n
@@ -267,8 +326,7 @@ def _find_fft_grid(imported: Imported, across: float | None, *, has_light: bool)
         sensor = {"pupil_separation_subap": 2 * round((apart - odd) / 2) + odd}
         centres = find_image_centres(frames, sensor, notes)
     notes.append(
-        f"the bench may be simulated: influence functions of {side} points for {n} subapertures of "
-        "one pixel"
+        f"the bench may be simulated: maps of {side} points for {n} subapertures of one pixel"
     )
     grid = {"points_per_subaperture": side // n, "width_subap": float(width)}
     about = {

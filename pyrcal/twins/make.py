@@ -12,6 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pyrcal.fitting.advice import read_entries
 from pyrcal.fitting.alternatives import PLAUSIBLE_DISPLACEMENT_PX
 from pyrcal.fitting.comparison import Alternative
@@ -20,7 +22,7 @@ from pyrcal.fitting.fit_table import NOTABLE_DISPLACEMENT_PX
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.matrix import FitOptions
 from pyrcal.fitting.report import fill_fit, orientation_words
-from pyrcal.importers.imported import Imported, Saved
+from pyrcal.importers.imported import Imported, Saved, Tables
 from pyrcal.terminal import show_progress
 from pyrcal.twins.bench import Bench, read_bench
 from pyrcal.twins.check import check_oopao_model, check_specula_model
@@ -70,6 +72,7 @@ def main(options: argparse.Namespace) -> int:
         argparse.Namespace(**told, files=options.files),
         options.output,
         check=options.check,
+        python=options.python,
         threads=options.threads,
         progress=show_progress,
     )
@@ -82,6 +85,7 @@ def twin(
     output: str | Path,
     *,
     check: bool = False,
+    python: str | Path | None = None,
     threads: int = 2,
     **told: Any,  # noqa: ANN401 - as different as the options
 ) -> Twin:
@@ -96,6 +100,8 @@ def twin(
         Folder to write: a new one, or that of an earlier twin, which is replaced.
     check
         Whether OOPAO and SPECULA, where installed, measure the matrices of their models.
+    python
+        Interpreter that has them; None for the present one.
     threads
         Threads that share the work.
     told
@@ -120,7 +126,8 @@ def twin(
     else:
         given = ((None, one) for one in ([files] if isinstance(files, str | Path) else files))
     options = argparse.Namespace(**{**TOLD, **told}, files=[(role, Path(p)) for role, p in given])
-    return _make(options, Path(output), check=check, threads=threads)
+    interpreter = None if python is None else Path(python)
+    return _make(options, Path(output), check=check, python=interpreter, threads=threads)
 
 
 def _make(
@@ -128,6 +135,7 @@ def _make(
     output: Path,
     *,
     check: bool,
+    python: Path | None,
     threads: int,
     progress: Progress | None = None,
 ) -> Twin:
@@ -138,7 +146,7 @@ def _make(
         with tempfile.TemporaryDirectory(dir=output.absolute().parent, prefix=".twin-") as name:
             draft = Path(name) / "twin"
             made = _fit_bench(bench, draft, threads, progress)
-            made = _export(made, check=check)
+            made = _export(made, check=check, python=python)
             write_report(made)
             if output.is_dir():
                 shutil.rmtree(output)
@@ -176,7 +184,7 @@ def _fit_bench(bench: Bench, folder: Path, threads: int, progress: Progress | No
     best = replace(best, imported=_correct(best.imported, best.report.fit, _find_unknown(best)))
     saved = best.imported.save(folder)
     write_whole(folder / "fit.h5", partial(fill_fit, report=best.report))
-    _write_live(saved, best.report.fit)
+    _write_live(best, saved)
     return best
 
 
@@ -252,19 +260,17 @@ def _correct(imported: Imported, fit: Fit, values: Mapping[str, Any]) -> Importe
         corrected["slopes"]["orientation"] = words
         if "order" in corrected["slopes"]:
             corrected["slopes"]["order"] = order
-    return replace(imported, tables=corrected)
+    known = {f"{place.partition('.')[2]} is unknown" for place in values}
+    notes = tuple(note for note in imported.notes if note not in known)
+    return replace(imported, tables=corrected, notes=notes)
 
 
-def _write_live(saved: Saved, fit: Fit) -> None:
+def _write_live(made: Twin, saved: Saved) -> None:
     """Write the instrument file of ``pyrcal run``: an RTC sends slopes, not frames."""
-    folder, places = saved.instrument.parent, fit.image_offsets_px
-    text = saved.instrument.read_text(encoding="utf-8")
-    if places is not None and (
-        NOTABLE_DISPLACEMENT_PX < abs(places).max() < PLAUSIBLE_DISPLACEMENT_PX
-    ):
-        text = text.replace("[wfs]\n", f"[wfs]\nimage_offsets_px = {places.round(3).tolist()}\n")
+    folder = saved.instrument.parent
     draft, live = folder / f"draft-{TWIN_FILE}", folder / TWIN_LIVE_FILE
-    draft.write_text(text, encoding="utf-8")
+    tables = _describe_live(made.imported.tables, made.report.fit)
+    draft.write_text(replace(made.imported, tables=tables).instrument_text(), encoding="utf-8")
     write_live_instrument(draft, live)
     draft.unlink()
     # It refers to arrays by absolute paths, in a folder that is moved to its place later.
@@ -272,7 +278,24 @@ def _write_live(saved: Saved, fit: Fit) -> None:
     live.write_text(text, encoding="utf-8")
 
 
-def _export(made: Twin, *, check: bool) -> Twin:
+def _describe_live(tables: Tables, fit: Fit) -> Tables:
+    """Return the tables with what frames show or the fit starts with, but slopes do not show."""
+    wfs, mirror = dict(tables["wfs"]), dict(tables["mirror"])
+    places, centres = fit.image_offsets_px, wfs.get("pupil_centres_px", "auto")
+    if not isinstance(centres, str):
+        ordered = np.sort(np.array(centres), axis=0)
+        apart_px = float(np.mean(ordered[2:] - ordered[:2]))
+        wfs["pupil_separation_subap"] = apart_px / wfs.get("pixels_per_subaperture", 1)
+    if places is not None and (
+        NOTABLE_DISPLACEMENT_PX < abs(places).max() < PLAUSIBLE_DISPLACEMENT_PX
+    ):
+        wfs["image_offsets_px"] = places.round(3).tolist()
+    if fit.accepted:
+        mirror["nominal_rotation_deg"] = round(fit.alpha.to_boundary()["rotation_deg"], 3)
+    return {**tables, "wfs": wfs, "mirror": mirror}
+
+
+def _export(made: Twin, *, check: bool, python: Path | None) -> Twin:
     """Write the models of other programs, and let these run them if requested."""
     about, fit, folder = made.instrument, made.report.fit, made.folder
     if about.wfs.kind != "pyramid":
@@ -285,5 +308,5 @@ def _export(made: Twin, *, check: bool) -> Twin:
         write_specula_model(sampled, fit, folder),
     )
     runs = (check_oopao_model, check_specula_model) if check else ()
-    checks = tuple(run(folder, about, fit).words for run in runs)
+    checks = tuple(run(folder, about, fit, python=python).words for run in runs)
     return replace(made, exported=exported, checks=checks)

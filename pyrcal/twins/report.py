@@ -12,15 +12,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pyrcal.fitting.budget import advise_measurement
 from pyrcal.fitting.figures import draw_sheet
-from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.report import FitReport, document
 from pyrcal.importers.imported import UNKNOWN, Imported
 from pyrcal.maintenance.commission_page import format_html, format_table
 from pyrcal.twins.bench import Bench
 from pyrcal.twins.exported import Exported
 from service.errors import ConfigurationError, shown
-from service.files.documents import json_text
+from service.files.documents import json_text, pick
 from service.model.instrument import Instrument
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 
@@ -28,7 +28,7 @@ _UNITS = ("subaperture", "subaperture", "deg", "ratio")
 
 _FROM_FILES = {
     *("n_subapertures", "pupil_diameter_subap", "pupil_centres_px", "obscuration_ratio"),
-    *("pixels_per_subaperture", "valid_subapertures", "pupil_separation_subap", "pupil"),
+    *("pixels_per_subaperture", "valid_subapertures", "pupil_separation_subap", "pupil", "input"),
     *("influence_functions", "modes", "mode_to_actuator", "modes_pitch_m", "positions", "fft_grid"),
 }
 """Keys of the instrument file that the importers measure on the arrays."""
@@ -158,34 +158,12 @@ def _describe_stroke(made: Twin) -> Value:
         )
     return Value(
         "stroke",
-        gain,
-        scatter,
-        "model's slopes per metre",
-        "not determined: unit and sensor gain are both unknown, and scale all columns alike",
+        "not determined",
+        None,
+        "",
+        "unit of the commands and gain of the sensor are unknown, and scale all columns alike: "
+        f"these are {gain:.3g} times the model's per metre",
     )
-
-
-class Cause(NamedTuple):
-    """A cause of what the model leaves over."""
-
-    words: str
-    share: float
-    """Share of the power that is left over."""
-
-    sigma: float
-    advice: str = ""
-
-
-def list_causes(fit: Fit) -> list[Cause]:
-    """Return what explains some of what is left over, the largest first.
-
-    Each alternative is tried alone, so that shares of similar ones overlap.
-    """
-    tried = [one for one in fit.alternatives if one.share is not None and one.misfit < 1.0]
-    return [
-        Cause(one.words, 1.0 - one.misfit, one.share_sigma)
-        for one in sorted(tried, key=lambda one: one.misfit)
-    ]
 
 
 def list_lines(made: Twin) -> Iterator[str]:
@@ -199,9 +177,13 @@ def list_lines(made: Twin) -> Iterator[str]:
         if one.sigma is not None:
             yield f"{one.name:32s}{_text(one)}  {one.unit}  ({one.origin})"
     yield f"{'left over':32s}{100.0 * made.residual:.2f} % of the signal"
-    for cause in list_causes(fit)[:5]:
-        yield f"  {cause.share:.0%} of it: {cause.words}"
-    yield from (f"note: {remark}" for one in made.exported for remark in one.remarks)
+    yield from (
+        f"  {one.share:.0%} +- {one.sigma:.0%} of its power: {one.words}" for one in fit.causes
+    )
+    if fit.causes:
+        yield f"measure next: {advise_measurement(fit.causes)}"
+    remarks = dict.fromkeys(remark for one in made.exported for remark in one.remarks)
+    yield from (f"note: {remark}" for remark in remarks)
     yield from made.checks
     yield f"written to {made.folder}: open twin.html"
 
@@ -226,7 +208,8 @@ def _document(made: Twin) -> dict[str, Any]:
     return {
         "values": [one._asdict() for one in list_values(made)],
         "left_over": made.residual,
-        "causes": [one._asdict() for one in list_causes(made.report.fit)],
+        "causes": [pick(one, "words share sigma remedy") for one in made.report.fit.causes],
+        "measure_next": advise_measurement(made.report.fit.causes),
         "files": made.bench.inventory,
         "notes": made.imported.notes,
         "models": [{"file": one.path.name, "remarks": one.remarks} for one in made.exported],
@@ -240,9 +223,7 @@ def _page(made: Twin) -> str:
     fit = made.report.fit
     mark = "pass" if fit.accepted else "fail"
     values = ((one.name, _text(one), one.unit, one.origin) for one in list_values(made))
-    causes = (
-        (one.words, f"{one.share:.0%} +- {one.sigma:.0%}", one.advice) for one in list_causes(fit)
-    )
+    causes = ((one.words, f"{one.share:.0%} +- {one.sigma:.0%}", one.remedy) for one in fit.causes)
     models = [(one.path.name, "; ".join(one.remarks) or "complete") for one in made.exported]
     notes = (*made.imported.notes, *made.report.notes)
     return format_html(
@@ -255,7 +236,8 @@ def _page(made: Twin) -> str:
             "<h2>Measured, modelled, left over</h2>",
             _figure(made),
             f"<h2>What is left over: {made.residual:.1%} of the signal</h2>",
-            format_table(("Cause", "Share of the power left over", "Measure next"), causes),
+            format_table(("Cause", "Share of the power left over", "Remedy"), causes),
+            f"<p>{escape(advise_measurement(fit.causes))}</p>",
             "<h2>Models for other programs</h2>",
             format_table(("File", "What it does not contain or assumes"), models),
             *(f"<p>{escape(one)}</p>" for one in made.checks),

@@ -1,5 +1,6 @@
-"""``pyrcal twin`` on the files of a simulated bench whose registration is known."""
+"""``pyrcal twin`` on the files of simulated benches whose registration is known."""
 
+import argparse
 import json
 import os
 import shutil
@@ -10,72 +11,113 @@ import pytest
 import scipy
 
 import pyrcal
+from pyrcal.twins.bench import measure_spot, read_bench
+from pyrcal.twins.make import TOLD
 from service.errors import ConfigurationError, MatrixError
 from service.instrument import instrument_path, load_instrument
+from sim_rtc.options import parse_options
+from tests.support.repository import ROOT
 
+SAMPLE = ROOT / "pyrcal" / "samples" / "data" / "oopao-pyramid.npz"
 DATA = Path(os.environ.get("PYRCAL_BENCH_DATA", "../shared/data"))
-DUMP = DATA / "failing" / "whole_detector.npz"
-pytestmark = pytest.mark.skipif(not DUMP.is_file(), reason="needs the data of a simulated bench")
+WHOLE_DETECTOR = DATA / "failing" / "whole_detector.npz"
 
-TRUE = (0.0, -1.333, 0.0, 1.12)
-"""Registration of the bench: subapertures, degrees, ratio."""
+QUICK = {"diameter_m": 1.8, "unit": "m", "wavelength_m": 640e-9, "modulation": 3.0}
+"""With these the fit of the sample has little to find."""
 
-QUICK = {"diameter_m": 0.6, "unit": "m", "wavelength_m": 640e-9, "modulation": 0.0}
-"""With these the fit has little to find."""
+
+def split(dump, folder, *others):
+    """Write the arrays of OOPAO's objects as NumPy and MATLAB files with names of people."""
+    folder.mkdir()
+    np.save(folder / "IM_KL.npy", dump["calib.D"])
+    np.save(folder / "tel_pupil.npy", dump["tel.pupil"])
+    for name, values in (("M2C", dump["M2C"]), ("influence_functions", dump["dm.modes"])):
+        scipy.io.savemat(folder / f"{name}.mat", {name: values})
+    for name, values in others:
+        np.save(folder / f"{name}.npy", values)
+    return folder
 
 
 @pytest.fixture
 def bench(tmp_path):
-    """Return a folder with the bench's arrays as NumPy and MATLAB files."""
-    folder = tmp_path / "bench"
-    folder.mkdir()
-    with np.load(DUMP) as dump:
-        np.save(folder / "int_mat.npy", dump["calib.D"])
-        np.save(folder / "pupil.npy", dump["tel.pupil"])
-        for name, values in (("M2C", dump["M2C"]), ("influence_functions", dump["dm.modes"])):
-            scipy.io.savemat(folder / f"{name}.mat", {name: values})
-    return folder
+    """Return a folder with the files of a bench of 8 x 8 subapertures and its slopes."""
+    with np.load(SAMPLE) as dump:
+        return split(dump, tmp_path / "bench", ("my_mask", dump["wfs.validI4Q"]))
+
+
+def values_of(made):
+    """Return α, its σ in the units of files, and the values of the report by name."""
+    report = json.loads((made.folder / "twin.json").read_text("utf-8"))
+    alpha = made.report.fit.alpha.to_boundary()
+    sigma = np.array([report["fit"]["sigma"][name] for name in alpha])
+    return np.array(list(alpha.values())), sigma, {one["name"]: one for one in report["values"]}
 
 
 def test_the_files_of_a_bench_become_its_twin(bench, tmp_path):
-    made = pyrcal.twin(bench, tmp_path / "twin", diameter_m=0.6, unit="m")
-    fit, values = made.report.fit, json.loads((made.folder / "twin.json").read_text("utf-8"))
-    found = np.array(list(fit.alpha.to_boundary().values()))
-    sigma = np.array([values["fit"]["sigma"][name] for name in fit.alpha.to_boundary()])
-    assert np.all(np.abs(found - TRUE) < 3.0 * sigma)
-    # OOPAO's own grid is found from the points of its influence functions.
-    assert fit.residual_fraction < 0.015
-    by_name = {one["name"]: one for one in values["values"]}
-    assert by_name["modulation_lambda_over_d"]["origin"].startswith("measured")
-    assert float(by_name["modulation_lambda_over_d"]["value"]) == 0.0
-    assert by_name["instrument.diameter_m"]["origin"] == "told"
-    assert float(by_name["wavelength_m"]["value"]) == pytest.approx(640e-9, rel=0.01)
-    assert by_name["stroke"]["value"] == pytest.approx(1.0, abs=0.02)
+    made = pyrcal.twin(bench, tmp_path / "twin", diameter_m=1.8, unit="m")
+    found, sigma, values = values_of(made)
+    # The influence functions were saved where the mirror is.
+    assert np.all(np.abs(found - (0.0, 0.0, 0.0, 1.0)) < 3.0 * sigma)
+    assert made.residual < 0.03
+    assert values["instrument.diameter_m"]["origin"] == "told"
+    assert values["modulation_lambda_over_d"]["origin"].startswith("measured")
+    # OOPAO's modulation of 3 λ/D is 3 n / (n - 1) in a pupil of n = 32 points.
+    assert float(values["modulation_lambda_over_d"]["value"]) == pytest.approx(3.1, abs=0.1)
+    assert values["wavelength_m"]["origin"].startswith("measured")
     assert (made.folder / "twin.html").stat().st_size > 1e4
     assert [one.path.name for one in made.exported] == ["oopao_model.py", "specula_model.yml"]
     assert all(one.path.is_file() for one in made.exported)
 
 
+@pytest.mark.skipif(not WHOLE_DETECTOR.is_file(), reason="the matrices are not here")
+def test_a_simulated_bench_without_a_mean_frame_is_fitted_on_its_own_grid(tmp_path):
+    with np.load(WHOLE_DETECTOR) as dump:
+        whole = split(dump, tmp_path / "whole")
+    made = pyrcal.twin(whole, tmp_path / "twin", diameter_m=0.6, unit="m")
+    found, sigma, values = values_of(made)
+    assert np.all(np.abs(found - (0.0, -1.333, 0.0, 1.12)) < 3.0 * sigma)
+    assert made.residual < 0.015
+    assert float(values["modulation_lambda_over_d"]["value"]) == 0.0
+    assert float(values["wavelength_m"]["value"]) == pytest.approx(640e-9, rel=0.01)
+    assert values["stroke"]["value"] == pytest.approx(1.0, abs=0.02)
+    assert load_instrument(made.folder).frames is not None
+    # The service's RTC sends slopes.
+    assert load_instrument(made.folder / "live.toml").frames is None
+
+
 def test_service_and_fit_take_the_folder_of_a_twin(bench, tmp_path):
     made = pyrcal.twin(bench, tmp_path / "twin", **QUICK)
     assert instrument_path(made.folder) == made.folder / "instrument.toml"
-    # The service's RTC sends slopes, and the arrays are found where the folder is moved to.
-    moved = shutil.move(made.folder, tmp_path / "moved")
-    assert load_instrument(f"{moved}/live.toml").frames is None
-    assert load_instrument(moved).frames is not None
+    # The arrays are found where the folder is moved to.
+    moved = Path(shutil.move(made.folder, tmp_path / "moved"))
+    for name in (moved, moved / "live.toml"):
+        assert load_instrument(name).wfs.n_subapertures == 8
+    simulated = parse_options(["--instrument", str(moved), "--plant", "measured"])
+    assert simulated.matrix == moved / "matrix.h5"
     # An earlier twin is replaced, other files are not.
     pyrcal.twin(bench, moved, **QUICK)
     with pytest.raises(ConfigurationError, match="other files"):
-        pyrcal.twin(bench, bench, diameter_m=0.6, unit="m")
+        pyrcal.twin(bench, bench, **QUICK)
+
+
+def test_a_stated_role_is_preferred_to_that_of_a_name(bench):
+    np.save(bench / "interaction_matrix.npy", np.ones((4, 4)))
+    options = argparse.Namespace(**{**TOLD, **QUICK})
+    options.files = [(None, bench), ("matrix", bench / "IM_KL.npy")]
+    found = read_bench(options).imported[-1]
+    assert found.arrays["interaction_matrix"].shape == (104, 30)
+    options.files = [(None, bench)]
+    with pytest.raises(MatrixError, match="a second matrix"):
+        read_bench(options)
 
 
 @pytest.mark.parametrize(
     ("name", "shape", "named"),
     [
         ("M2C", (241, 30), "(241, 30)"),
-        ("M2C", (97, 60), "--modes"),
-        ("valid_pixel", (240, 240), "(240, 240)"),
-        ("pupil", (72, 71), "(72, 71)"),
+        ("M2C", (68, 60), "--modes"),
+        ("my_mask", (10, 10), "(10, 10)"),
+        ("tel_pupil", (32, 31), "(32, 31)"),
     ],
 )
 def test_files_that_do_not_belong_together_are_named(bench, tmp_path, name, shape, named):
@@ -85,7 +127,20 @@ def test_files_that_do_not_belong_together_are_named(bench, tmp_path, name, shap
     values = rng.random(shape) if name == "M2C" else np.ones(shape, bool)
     np.save(bench / f"{name}.npy", values)
     with pytest.raises((ConfigurationError, MatrixError)) as refusal:
-        pyrcal.twin(bench, tmp_path / "twin", diameter_m=0.6, unit="m")
+        pyrcal.twin(bench, tmp_path / "twin", **QUICK)
     assert named in str(refusal.value)
     assert name in str(refusal.value) or named == "--modes"
     assert [one.name for one in tmp_path.iterdir()] == ["bench"]
+
+
+def test_the_axes_of_the_path_of_a_spot_are_seen_in_its_picture():
+    """Semi-axes of 50 and 40 pixels, the longer one at 30 deg; a spot of 3 pixels on its path."""
+    angles = np.linspace(0.0, 2.0 * np.pi, 360, endpoint=False)
+    path = np.exp(1j * np.pi / 6.0) * (50.0 * np.cos(angles) + 40.0j * np.sin(angles))
+    x, y = np.meshgrid(np.arange(160.0) - 80.0, np.arange(160.0) - 80.0)
+    # The spot is at each phase for the same time.
+    picture = np.exp(-(np.abs(x + 1j * y - path[:, None, None]) ** 2) / 18.0).mean(axis=0)
+    noise = np.random.default_rng(1).normal(0.0, 0.03 * picture.max(), x.shape)
+    ratio, angle_deg = measure_spot(picture + 0.3 * picture.max() + noise)
+    assert ratio == pytest.approx(1.25, abs=0.02)
+    assert angle_deg == pytest.approx(30.0, abs=1.0)

@@ -57,6 +57,9 @@ MAX_SHARE, MIN_SIGNIFICANCE = 0.9, 2.0
 """Another value of a number is tried if it leaves less than this share of the power that is left
 over, by more than so many σ. A fit with it decides."""
 
+HARDLY_MORE_LEFT = 1.01
+"""Residual over that of the file's values up to which corrected values are kept."""
+
 EXACT = 0.01
 """Residual below which no other model is tried."""
 
@@ -220,10 +223,13 @@ def _fit(
 
 
 def _is_better(again: Twin, *, than: Twin) -> bool:
-    """Return True if the fit with a corrected file alone is accepted, or leaves less."""
+    """Return True if the fit with a corrected file alone is accepted, or leaves hardly more.
+
+    The entries of the file are rounded, and numbers that were free are fixed.
+    """
     if again.report.fit.accepted != than.report.fit.accepted:
         return again.report.fit.accepted
-    return again.residual < than.residual
+    return again.residual < max(HARDLY_MORE_LEFT * than.residual, EXACT)
 
 
 def _find_number(fit: Fit) -> Alternative | None:

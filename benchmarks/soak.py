@@ -259,7 +259,7 @@ def soak(minutes: float, folder: Path, shape_nm: float = 0.0) -> tuple[list[Samp
         try:
             company.start(pool)
             samples = list(_watch(found, minutes, folder / "samples.jsonl"))
-            sets = found.get("/v1/references")["references"] if shape_nm else []
+            sets = found.get("/v1/references")["records"] if shape_nm else []
             company.counts["sets of references used"] += sum(
                 one["applied_ns_utc"] is not None for one in sets
             )

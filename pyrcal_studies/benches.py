@@ -402,6 +402,7 @@ def _of_bench(bench: Bench, fit: Fit) -> list[str]:
         f"{one.words} ({float(np.max(sigma / fit.sigma)):.1f} of σ)"
         for one, sigma in systematic_terms(fit.alternatives, fit.residual_fraction, fit.sigma)[:3]
     )
+    causes = "; ".join(f"{one.share:.0%} ± {one.sigma:.0%} {one.words}" for one in fit.causes)
     return [
         f"## {bench.name}",
         "",
@@ -415,6 +416,7 @@ def _of_bench(bench: Bench, fit: Fit) -> list[str]:
         f"- Advice: {fit.recommendation}.",
         f"- Explanations that add most to the systematic part of σ: {terms or 'none'}.",
         f"- What is left over: {left or 'nothing significant'}.",
+        f"- Its power by cause: {causes}.",
         "",
         "| α | Value | Statistical σ | Systematic σ |",
         "| --- | --- | --- | --- |",

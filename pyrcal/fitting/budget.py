@@ -65,7 +65,7 @@ class Cause:
     """1 σ of ``share``, from its scatter between modes."""
 
     remedy: str
-    """What to measure or change to reduce it, as an imperative."""
+    """Advice on what to measure or change to reduce it, as an imperative."""
 
 
 def explain_left_over(settled: Settled, noise: Array | None = None) -> tuple[Cause, ...]:

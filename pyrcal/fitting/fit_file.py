@@ -16,6 +16,7 @@ from pyrcal.fitting.alternatives import LIGHT_KEY
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.matrix import FitOptions, fit_matrix
 from pyrcal.fitting.memory import bytes_of_fit, check_fit
+from pyrcal.fitting.origins import FoundStroke
 from pyrcal.fitting.recorded import FLUX_FRAME, Recorded, read_recorded
 from pyrcal.fitting.report import FitReport
 from service.errors import MatrixError
@@ -207,6 +208,10 @@ def _fit_recorded(
         except MatrixError as error:
             text = str(error).removeprefix("reference: ")
             raise MatrixError(f"{recorded.where}: {text}") from error
+    if recorded.flux_frame is not None and len(np.unique(recorded.flux_frame)) <= 2:  # a mask
+        condition = f"{FLUX_FRAME} is a mask, so that the sensor's gain is unknown"
+        unknown = FoundStroke(metres_per_unit=None, sigma=None, condition=condition)
+        found = replace(found, stroke=unknown)
     no_map = isinstance(kind_of(instrument).light(instrument), CannotTell)
     if recorded.flux_frame is None or options.illumination is not None or no_map:
         return found

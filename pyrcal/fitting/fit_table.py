@@ -128,6 +128,8 @@ def _finding_lines(fit: Fit) -> Iterator[str]:
     words = [one.words for one in fit.origins if one.correct and one.key != "orientation"]
     if words:
         yield f"{'determined by fit':20s}{'; '.join(words)}"
+    if fit.stroke is not None and any(one.key == "stroke" for one in fit.origins):
+        yield f"{'stroke':20s}{fit.stroke.words}"
     if fit.unknown_not_found:
         keys = ", ".join(fit.unknown_not_found)
         yield f"{'unknown, not found':20s}{keys}: the matrix does not determine it"

@@ -15,7 +15,7 @@ from pyrcal.fitting.control_check import ReconstructorVerdict
 from pyrcal.fitting.disjoint_sets import DisjointSets, Distortion
 from pyrcal.fitting.fitted_matrix import FittedMatrix
 from pyrcal.fitting.instrument_checks import FoundOptic
-from pyrcal.fitting.origins import Origin
+from pyrcal.fitting.origins import FoundStroke, Origin
 from pyrcal.fitting.solver import ANAMORPHOSIS_SIGMA
 from service.model.slopes import Orientation
 
@@ -108,6 +108,9 @@ class Fit(FittedMatrix):
 
     origins: tuple[Origin, ...] = ()
     """Instrument quantities that the fit determined."""
+
+    stroke: FoundStroke | None = None
+    """Unit and sign of the commands; None for a fit that explains too little."""
 
     causes: tuple[Cause, ...] = ()
     """Causes of the power that is left over, the largest first; empty if hardly any is."""

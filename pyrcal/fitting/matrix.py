@@ -52,7 +52,13 @@ from pyrcal.fitting.methods import (
 )
 from pyrcal.fitting.models import FAR_PREFERRED_SHARE, PREFERRED_SHARE, FitModels
 from pyrcal.fitting.noise import bound_noise_share, measure_structure
-from pyrcal.fitting.origins import Origin, find_ellipse, list_origins, list_undetermined_keys
+from pyrcal.fitting.origins import (
+    Origin,
+    find_ellipse,
+    find_stroke,
+    list_origins,
+    list_undetermined_keys,
+)
 from pyrcal.fitting.pupil_checks import MIN_PUPIL_EXPLAINED
 from pyrcal.fitting.pupil_width import SeenPupil, compute_responses, measure_pupil
 from pyrcal.fitting.reference import check_reference
@@ -767,7 +773,10 @@ def _make_fit(
             gain=options.gain,
             noise=usable.noise_per_pass,
         ),
-        causes=explain_left_over(settled, usable.noise_per_pass) if options.explain else (),
+        # Parts of a residual mean nothing where the model explains hardly anything.
+        causes=explain_left_over(settled, usable.noise_per_pass)
+        if options.explain and findings.explained
+        else (),
         paper_table=found.table,
     )
 
@@ -820,6 +829,8 @@ def _add_notes(
     )
     origins: tuple[Origin, ...] = ()
     if findings.explained:
+        stroke = find_stroke(about, slopes, fit.gains, findings.optics, findings.structure)
+        fit = replace(fit, stroke=stroke)
         origins = list_origins(
             about,
             reported,

@@ -27,6 +27,10 @@ MAX_LOG_SIGMA = 0.5
 """
 
 
+MODEL_GAIN_SIGMA = 0.01
+"""1 σ of the gain of all modes by errors of the model: matrices of OOPAO with 10 % noise and a
+modulation of 5 λ/D have gains of 0.989, others of 0.9999 to 1.0005."""
+
 MAX_GAIN_SCATTER = 0.35
 """Relative scatter of the gains above which their median says nothing of the wavelength."""
 
@@ -59,6 +63,29 @@ class Origin:
     def words(self) -> str:
         """Summary of key, values and method."""
         return f"{self.entry} ({self.how}; the file says {self.reported})"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FoundStroke:
+    """Unit and sign of the commands."""
+
+    metres_per_unit: float | None
+    """OPD of one unit of a command in metres, negative if commands have the other sign; None if the
+    matrix does not determine it."""
+
+    sigma: float | None
+    """1 σ of ``metres_per_unit``."""
+
+    condition: str
+    """Condition of the value, or the reason why there is none; empty if there is no condition."""
+
+    @property
+    def words(self) -> str:
+        """Value and condition as text."""
+        if self.metres_per_unit is None or self.sigma is None:
+            return f"the unit of the commands is not determined: {self.condition}"
+        value = f"a unit of command is {self.metres_per_unit:.3g} +- {self.sigma:.1g} m of OPD"
+        return f"{value}, if {self.condition}" if self.condition else value
 
 
 def list_origins(
@@ -216,3 +243,41 @@ def _find_strokes(about: Instrument) -> Iterator[Origin]:
             how="fitted: the shapes alone determine the registration",
             correct=False,
         )
+
+
+def find_stroke(
+    about: Instrument,
+    found: SlopeRecipe,
+    gains: NDArray[np.float64],
+    optics: tuple[FoundOptic, ...],
+    structure: float,
+) -> FoundStroke:
+    """Return the unit and the sign of the commands, of the gains of the modes.
+
+    Parameters are those of ``list_origins``; ``found`` is the fitted recipe.
+    """
+    middle = float(np.median(gains))
+    scatter = float(np.std(gains)) / abs(middle) if middle else np.inf
+    reason = ""
+    if "wfs.wavelength_m" in about.unknown:
+        reason = "an unknown wavelength scales all columns as the unit does"
+    elif structure > MAX_STRUCTURE:
+        reason = f"{structure:.0%} of the signal is left over and is not noise"
+    elif scatter > MAX_GAIN_SCATTER:
+        reason = f"gains of the modes scatter by {scatter:.0%}, so that they have no common unit"
+    if reason:
+        return FoundStroke(metres_per_unit=None, sigma=None, condition=reason)
+    of_sensor = [one.sigma for one in optics if one.optic is Optic.SENSOR]
+    parts = [MODEL_GAIN_SIGMA, structure, scatter / np.sqrt(len(gains)), *of_sensor]
+    conditions = []
+    # Frames are made into slopes here; those of an RTC may have any scale.
+    if about.frames is None:
+        conditions.append("the slopes have the normalisation of the instrument file")
+    axes = found.assumed_orientation
+    if about.slopes.orientation is None and axes.sign_x == axes.sign_y == -1:
+        conditions.append("the slopes have the other sign; otherwise the commands have")
+    return FoundStroke(
+        metres_per_unit=middle,
+        sigma=abs(middle) * float(np.linalg.norm(parts)),
+        condition=" and ".join(conditions),
+    )

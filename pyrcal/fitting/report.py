@@ -94,6 +94,9 @@ def document(report: FitReport) -> dict[str, Any]:
         "unknown_not_found": fit.unknown_not_found,
         "alternatives": [_alternative(one, fit) for one in fit.alternatives],
         "left_over": None if fit.left_over is None else _left_over(fit.left_over),
+        "stroke": None
+        if fit.stroke is None
+        else pick(fit.stroke, "metres_per_unit sigma condition"),
         "causes": [pick(one, "words share sigma remedy") for one in fit.causes],
         "notes": report.notes,
         "seconds": round(report.seconds, 3),

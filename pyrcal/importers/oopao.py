@@ -314,7 +314,11 @@ def _pyramid(tel: Oopao, wfs: Oopao, notes: list[str]) -> _Sensor:
             "modes differ from 1 alike"
         )
     if getattr(wfs, "rooftop", None) or getattr(wfs, "theta_rotation", 0):
-        notes.append("a rooftop, and faces that are turned, are not in pyrcal's model")
+        notes.append(
+            "a rooftop, and faces that are turned, are not in pyrcal's model: without modulation a "
+            "rooftop of 1 λ/D leaves 37 % of the signal over and makes the magnification 1.5 % too "
+            "small, which sigma contains; with 3 λ/D it leaves 4.5 %"
+        )
     binning = int(wfs.binning)
     separation = (int(wfs.nSubap) + float(wfs.n_pix_separation)) / binning
     sensor: dict[str, Any] = {"kind": "pyramid", "pupil_separation_subap": separation}

@@ -60,7 +60,7 @@ _SPOT_THRESHOLD = 0.2
 """Light on the path of the spot over its brightest part."""
 
 _SEEMING_PX = 0.6
-"""How much closer together unmodulated images seem, and half as much for others."""
+"""Error by which unmodulated images seem too close together, and half of it for others."""
 
 
 class _Named(NamedTuple):

@@ -178,16 +178,15 @@ def _judge(
 
     It has slopes if the ``instrument`` is given, whose signals may be pixels.
     """
-    bench, own = fit.measured[:, some], fit.synthetic[:, some]
+    bench = fit.measured[:, some]
     if instrument is not None:
-        kind = instrument.slopes.kind
-        bench, own = (slopes_of(one, kind).reshape(-1, len(some)) for one in (bench, own))
+        bench = slopes_of(bench, instrument.slopes.kind).reshape(-1, len(some))
     return Checked(
         program=program,
         modes=fit.modes[some],
         matrix=matrix,
         left_over=residual_fraction(bench, matrix),
-        left_over_by_fit=residual_fraction(bench, own),
+        left_over_by_fit=float(np.sqrt(np.mean(fit.residual_by_mode[some] ** 2))),
         correlation=correlations(bench, matrix),
         seconds=seconds,
     )

@@ -14,4 +14,4 @@ class Exported:
     """File that the other program runs."""
 
     remarks: tuple[str, ...]
-    """What the model does not contain or assumes, one sentence each."""
+    """Assumptions of the model and what it does not contain, one sentence each."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from pyrcal.fitting.fitted import Fit
@@ -18,7 +19,7 @@ from service.model.interaction import InteractionModel
 from service.model.kinds import SignalKind, Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import Basis, ModalBasis
-from service.model.pupil import instrument_pupil, valid_subapertures
+from service.model.pupil import Illumination, instrument_pupil, valid_subapertures
 from service.model.sensors.pyramid.description import (
     FrameWindows,
     Pyramid,
@@ -48,7 +49,10 @@ MAX_JUDGED_MODES = 40
 """Number of modes with which the places of the pupil images are judged."""
 
 NOTABLE_SHARE = 0.001
-"""Difference of what two models leave that is worth a remark."""
+"""Difference of what two models leave, from which on a remark names it."""
+
+MIN_LIGHT = 0.02
+"""Least light over the mean: a smooth gain may fall below 0 at the pupil's edge."""
 
 _Grid = tuple[int, int]
 """Points per detector pixel, and detector pixels across."""
@@ -82,8 +86,11 @@ class SampledBench:
     separation_px: float
     """Distance between the centres of neighbouring pupil images, pixels."""
 
+    illumination: Illumination | None
+    """Light over the pupil, which the fit has found as a gain; None for even light."""
+
     amplitude: Array
-    """``(n_points, n_points)`` field amplitude of the pupil on the whole array."""
+    """``(n_points, n_points)`` field amplitude of the pupil on the whole array, in this light."""
 
     pupil_shift_subap: Array
     """``(2,)`` position (x, y) of the pupil on the sensor's grid, subapertures."""
@@ -104,7 +111,7 @@ class SampledBench:
     """True if the bench's signals have the other sign than those of conventions.md."""
 
     remarks: tuple[str, ...]
-    """What was assumed, one sentence each."""
+    """Assumptions, one sentence each."""
 
     @property
     def n_points(self) -> int:
@@ -254,7 +261,8 @@ def _list_grids(instrument: Instrument, frame_shape: tuple[int, int] | None) -> 
 def _draw_bench(found: Instrument, basis: Basis, fit: Fit, points: int, width: int) -> SampledBench:
     """Return a bench with its images on a centred square, for so many points and pixels."""
     pixels = _pixels(found)
-    amplitude, n_pixels = _draw_pupil(found, pixels, points)
+    light = _read_light(fit)
+    amplitude, n_pixels = _draw_pupil(found, pixels, points, light)
     separation = pyramid_in(found).image_separation_subap * pixels
     if found.frames is None:
         # slopes are cut at whole pixels on both sides of the middle
@@ -268,6 +276,7 @@ def _draw_bench(found: Instrument, basis: Basis, fit: Fit, points: int, width: i
         points_per_pixel=points,
         width_px=width,
         separation_px=separation,
+        illumination=light,
         amplitude=amplitude,
         pupil_shift_subap=_pupil_shift(found, fit.alpha),
         image_places_px=np.zeros((2, 2, 2)),
@@ -317,10 +326,26 @@ def _pad(square: Array, n: int) -> Array:
     return np.pad(square, (n - len(square)) // 2)
 
 
-def _draw_pupil(instrument: Instrument, pixels: int, points: int) -> tuple[Array, int]:
+def _read_light(fit: Fit) -> Illumination | None:
+    """Return the light that makes slopes as much larger as the fitted gain over the pupil."""
+    if fit.gain_map is None:
+        return None
+    unknown = np.isnan(fit.gain_map)
+    nearest = scipy.ndimage.distance_transform_edt(
+        unknown, return_distances=False, return_indices=True
+    )
+    along = np.arange(len(unknown), dtype=np.float64) - (len(unknown) - 1) / 2
+    light = np.maximum(fit.gain_map[tuple(nearest)], MIN_LIGHT)
+    return Illumination(coordinates=along, intensity=light)
+
+
+def _draw_pupil(
+    instrument: Instrument, pixels: int, points: int, light: Illumination | None
+) -> tuple[Array, int]:
     """Return the amplitude on an array that the sensor's grid is centred in, and its pixels."""
     n, sampling = instrument.wfs.n_subapertures, pixels * points
-    drawn = instrument_pupil(instrument, sampling).amplitude
+    pupil = instrument_pupil(instrument, sampling)
+    drawn = (pupil if light is None else pupil.lit_by(light)).amplitude
     margin = max(0, math.ceil((len(drawn) / sampling - n) / 2))
     across = n + 2 * margin
     return _pad(drawn, across * sampling), across * pixels
@@ -378,6 +403,7 @@ def _residual(bench: SampledBench, instrument: Instrument, fit: Fit) -> float:
         bench.basis.subset(fit.modes[some]),
         pupil_sampling=sampling,
         detector_nodes=sampling,
+        illumination=bench.illumination,
     )
     found = model.interaction_matrix(bench.alpha)
     return residual_fraction(fit.measured[:, some], found)

@@ -26,7 +26,7 @@ from service.model.surface import Gaussian
 Array = NDArray[Any]
 
 NAME = "specula_model.yml"
-"""Name of the parameter file; the FITS files are in the folder beside it."""
+"""Name of the parameter file; the FITS files are in a folder next to it."""
 
 LOOP = "specula_loop.yml"
 """Name of the changes that make a closed loop of it."""
@@ -38,7 +38,7 @@ TAG = "bench"
 """Name of all FITS files, each in the folder of its kind."""
 
 MAX_OFF_GRID_PX = 0.02
-"""Displacement of a pupil image that is worth a remark, pixels."""
+"""Displacement of a pupil image from which on a remark names it, pixels."""
 
 _STROKE_WAVES = 0.002
 """RMS of the shapes that the calibration pushes, wavelengths."""
@@ -69,7 +69,9 @@ def write_specula_model(bench: SampledBench, fit: Fit, folder: Path) -> Exported
     stop |= {"SHIFTX": 0.0, "SHIFTY": 0.0, "ROTATION": 0.0, "MAGNIFIC": 1.0}
     _save_fits(root, "pupilstop", stop, AMPLITUDE=bench.amplitude)
     _save_pupils(root, bench, apart, width)
-    slopes = slopes_of(fit.synthetic, bench.instrument.slopes.kind).reshape(-1, len(fit.modes))
+    light = 1.0 if fit.gain_map is None else fit.gain_map[fit.valid][:, None]
+    slopes = slopes_of(fit.synthetic, bench.instrument.slopes.kind) * light
+    slopes = slopes.reshape(-1, len(fit.modes))
     reconstructor = np.linalg.pinv(swap_slopes(slopes.astype(float)) * unit_m)
     _save_fits(root, "rec", {"NORMFACT": 0.0}, RECMAT=reconstructor)
     wavelength_m, n = bench.instrument.wfs.wavelength_m, bench.n_subapertures

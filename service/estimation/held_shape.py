@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from service.estimation.estimator import Change, FrameContext, Mark, Streaming
+from service.estimation.estimator import Change, FrameContext, LoopContext, Mark, Streaming
 
 Array = NDArray[np.float64]
 
@@ -44,6 +44,10 @@ MAX_MODES = 300
 
 SETTLING_S = 0.3
 """Time after the ramp within which the loop reaches the shape."""
+
+CLOSING_S = 10.0
+"""Time after the loop was closed in which its commands still change by more than a shape: a segment
+that has slipped comes back by the leak, with a time constant of 4 s at 0.999 and 250 Hz."""
 
 
 GAIN_SIGMA = 0.15
@@ -99,6 +103,11 @@ class MeanCommands(Streaming):
     """Frames in that sum; negative while the loop settles."""
 
     @override
+    def restart(self, loop: LoopContext, why: Change) -> MeanCommands:
+        rate_hz = 0.0 if loop.rtc is None else loop.rtc.frame_rate_hz
+        return MeanCommands(n_frames=-round(CLOSING_S * rate_hz))
+
+    @override
     def update(self, frames: FrameContext) -> MeanCommands:
         block, rate_hz = frames.block, frames.rtc.frame_rate_hz
         name, now = block.reference_name or "", self
@@ -108,7 +117,7 @@ class MeanCommands(Streaming):
             wait = -round(SETTLING_S * rate_hz)
             before = (*self.before, *((self.name, one) for one in self.blocks))[-BLOCKS_BEFORE:]
             now = replace(self, name=name, before=before, blocks=(), total=None)
-            now = replace(now, n_frames=wait if self.name else 0)
+            now = replace(now, n_frames=min(self.n_frames, wait if self.name else 0))
         n_frames = now.n_frames + len(block.commands_m)
         if now.n_frames < 0:
             return replace(now, n_frames=min(n_frames, 0))
@@ -194,7 +203,7 @@ class MeanCommands(Streaming):
 def _long_variance(apart: Array) -> Array:
     """Return the variance of blocks ``(n_blocks, ...)`` as it counts in a mean over many of them.
 
-    Neighbours tell how much the blocks remember.
+    The correlation of neighbours shows how much the blocks remember.
     """
     variance = (apart**2).sum(axis=0) / (len(apart) - 2)
     neighbours = (apart[1:] * apart[:-1]).sum(axis=0) / (len(apart) - 2)

@@ -31,6 +31,7 @@ from service.estimation.residual import Rejection
 from service.records import alarms
 from service.records import events as ev
 from service.records.events import Event
+from service.records.products import ReferencesRecord
 from service.records.state import TrackerState
 from service.tracking.dither import MISSING_DITHER_ALARM_S
 from service.tracking.policy import SECOND_NS
@@ -131,7 +132,7 @@ def _report_held(
     before: MeanCommands, now: MeanCommands, loop: LoopContext, state: TrackerState
 ) -> list[Event]:
     """Return how much of the shape of new references the mirror holds."""
-    record, registration = state.references_of(now.name), state.alpha.registration
+    record = state.references_of(now.name)
     if record is None or not now.is_due(before):
         return []
     shapes_m: dict[str, Array] = {}
@@ -140,16 +141,22 @@ def _report_held(
         shape_m = shapes_m[name] = np.zeros(loop.description.n_modes)
         if one is not None:
             shape_m[: len(one.coefficients_m)] = one.coefficients_m
-            if name != now.name and abs((one.held_ratio or 1.0) - 1.0) > MAX_DEPARTURE:
+            held = (one.held_ratio or 1.0, _expect_ratio(one, state))
+            if name != now.name and max(abs(ratio - 1.0) for ratio in held) > MAX_DEPARTURE:
                 del shapes_m[name]
-    expected = 1.0
-    if registration is not None and registration.optical_gains and record.gain:
-        expected = record.gain / mean_gain(record.coefficients_m, registration.optical_gains)
-    found = now.measure(shapes_m, expected)
+    found = now.measure(shapes_m, _expect_ratio(record, state))
     if found is None:
         return []
     began_ns = loop.received_ns_utc - round(now.duration_s * SECOND_NS)
     return [ev.ShapeHeld(id=record.id, began_ns_utc=began_ns, **found._asdict())]
+
+
+def _expect_ratio(record: ReferencesRecord, state: TrackerState) -> float:
+    """Return how much of its shape a loop holds by references for another gain than today's."""
+    registration = state.alpha.registration
+    if registration is None or not registration.optical_gains or not record.gain:
+        return 1.0
+    return record.gain / mean_gain(record.coefficients_m, registration.optical_gains)
 
 
 @dataclass(frozen=True, slots=True)

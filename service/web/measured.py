@@ -323,6 +323,10 @@ class FitDocument(BaseModel):
     left_over: dict[str, Any] | None = None
     """Location of the residual: border (over inside), outlying subapertures and modes."""
 
+    stroke: dict[str, Any] | None = None
+    """OPD of one unit of a command: metres_per_unit (null: not determined), sigma, and condition:
+    what the value requires, or why there is none."""
+
     causes: list[dict[str, Any]] = []
     """Causes of the power left over: words, share, sigma, and remedy (what to measure to reduce
     it); the largest first, the unexplained last."""

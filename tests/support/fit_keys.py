@@ -26,6 +26,7 @@ KEYS = {
     "alternatives",
     "left_over",
     "causes",
+    "stroke",
     "anamorphosis",
     "anamorphosis_sigma",
     "image_offsets_px",

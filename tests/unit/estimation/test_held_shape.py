@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from service.estimation.held_shape import BLOCKS_BEFORE, MeanCommands
+from service.estimation.estimator import Change, LoopContext
+from service.estimation.held_shape import BLOCK_S, BLOCKS_BEFORE, CLOSING_S, MeanCommands
 from service.tracking.references import MIN_LOG_ODDS
 from tests.support.streams import block
 
@@ -44,6 +45,21 @@ def fed(factor, *, seconds=25.0, rms_m=40e-9, seed=1, before_m=NONE):
         estimator = estimator.update(frames)
         due += estimator.is_due(before)
     return estimator, due
+
+
+@pytest.mark.parametrize("names", [("ref-1",), ("ref-1", "ref-2")])
+def test_commands_do_not_count_until_a_closed_loop_has_settled(names):
+    """A slipped segment that came back looked like references with the sign turned."""
+    rtc = SimpleNamespace(frame_rate_hz=RATE_HZ)
+    loop = LoopContext(description=None, rtc=rtc)
+    estimator, n_frames = fed(1.0, seconds=2.0)[0].restart(loop, Change.OPEN), 0
+    while not estimator.blocks:
+        name = names[n_frames > 200 and -1]
+        part = SimpleNamespace(commands_m=np.zeros((10, N_MODES)), reference_name=name)
+        estimator = estimator.update(SimpleNamespace(block=part, rtc=rtc))
+        n_frames += 10
+    assert n_frames == (CLOSING_S + BLOCK_S) * RATE_HZ
+    assert not estimator.before
 
 
 WAYS = {1.0: "", -1.0: "with the sign turned", 0.0: "not at all", 2.0: "twice as large"}

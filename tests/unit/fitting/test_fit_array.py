@@ -94,3 +94,12 @@ def test_what_cannot_be_fitted_is_refused(values, more, text):
     with pytest.raises(MatrixError) as error:
         pyrcal.fit(instrument(), values, **more)
     assert text in str(error.value)
+
+
+def test_a_mean_frame_that_is_a_mask_leaves_the_unit_of_the_commands_open():
+    light = np.random.default_rng(5).uniform(0.8, 1.2, (40, 40))
+    lit = pyrcal.fit(instrument(), matrix(), flux_frame=light, threads=1).stroke
+    assert lit.metres_per_unit == pytest.approx(1.0, abs=3.0 * lit.sigma)
+    mask = pyrcal.fit(instrument(), matrix(), flux_frame=np.ones((40, 40)), threads=1).stroke
+    assert mask.metres_per_unit is None
+    assert "mask" in mask.condition

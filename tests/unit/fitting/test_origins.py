@@ -9,7 +9,13 @@ from pyrcal.fitting.comparison import Alternative
 from pyrcal.fitting.fit_table import table
 from pyrcal.fitting.instrument_checks import FoundOptic
 from pyrcal.fitting.models import Optic
-from pyrcal.fitting.origins import is_determined, list_origins, list_undetermined_keys
+from pyrcal.fitting.origins import (
+    MODEL_GAIN_SIGMA,
+    find_stroke,
+    is_determined,
+    list_origins,
+    list_undetermined_keys,
+)
 from pyrcal.fitting.report import document
 from service.model.slopes import Orientation, SlopeRecipe
 from tests.support.made import a_fit, a_report
@@ -78,3 +84,37 @@ def test_unknown_numbers_that_were_not_found_are_in_table_and_document():
     assert "wfs.wavelength_m" in line
     assert document(a_report(fit))["unknown_not_found"] == ["wfs.wavelength_m"]
     assert "unknown, not" not in table(a_report(a_fit()))
+
+
+def stroke_of(gains, about=None, structure=0.0):
+    about = replace(about or bench(), slopes=SlopeRecipe(orientation=Orientation()))
+    return find_stroke(about, about.slopes, np.asarray(gains), (), structure)
+
+
+def test_the_unit_of_the_commands_is_the_median_gain_with_its_sign():
+    found = stroke_of(-4e-6 * np.array([0.99, 1.0, 1.01]))
+    assert found.metres_per_unit == pytest.approx(-4e-6)
+    scatter = np.std([0.99, 1.0, 1.01]) / np.sqrt(3)
+    assert found.sigma == pytest.approx(4e-6 * np.hypot(MODEL_GAIN_SIGMA, scatter))
+    assert "normalisation" in found.condition  # slopes of an RTC may have any scale
+
+
+@pytest.mark.parametrize(
+    ("gains", "structure", "reason"),
+    [(np.ones(3), 0.2, "left over"), (np.array([0.2, 1.0, 5.0]), 0.0, "scatter")],
+)
+def test_the_unit_is_not_determined_where_the_gains_have_another_cause(gains, structure, reason):
+    found = stroke_of(gains, structure=structure)
+    assert found.metres_per_unit is None
+    assert reason in found.condition
+
+
+def test_an_unknown_wavelength_leaves_the_unit_open():
+    about = replace(bench(), unknown=("wfs.wavelength_m",))
+    assert stroke_of(np.ones(3), about).metres_per_unit is None
+
+
+def test_the_sign_of_slopes_whose_axes_were_found_may_be_that_of_the_commands():
+    about = replace(bench(), slopes=SlopeRecipe(orientation=None))
+    turned = SlopeRecipe(orientation=Orientation(sign_x=-1, sign_y=-1))
+    assert "the other sign" in find_stroke(about, turned, np.ones(3), (), 0.0).condition

@@ -59,6 +59,21 @@ def test_oopao_measures_what_pyrcal_computes(recipe, stop, bench, tmp_path):
     assert found.correlation.min() > 0.998
 
 
+def test_the_light_that_a_fit_finds_is_in_the_exported_pupil(bench):
+    instrument, fit = bench
+    falling = np.linspace(1.5, 0.5, len(fit.valid)) * np.ones(fit.valid.shape)
+    even = sample_bench(instrument, fit).amplitude
+    lit = sample_bench(instrument, replace(fit, gain_map=falling)).amplitude
+    sampling, seen = len(even) // len(fit.valid), even > 0.0
+    along = (np.arange(len(even)) + 0.5) / sampling - 0.5
+    expected = np.interp(along, np.arange(len(falling)), falling[0]) * np.ones(even.shape)
+    assert (lit[seen] / even[seen]) ** 2 == pytest.approx(expected[seen], rel=1e-6)
+    # beyond the valid subapertures the light is that of the nearest one
+    cut = np.where(fit.valid, falling, np.nan)
+    lit = sample_bench(instrument, replace(fit, gain_map=cut)).amplitude
+    assert np.all((lit > 0.0) == seen)
+
+
 def test_the_pupil_of_the_sky_is_on_the_array_of_the_calibration(bench, tmp_path):
     sampled = sample_bench(*bench)
     y, x = np.indices((40, 40)) - 19.5

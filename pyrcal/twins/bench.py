@@ -24,6 +24,7 @@ from service.errors import ConfigurationError, MatrixError
 from service.files.container import DATASET
 from service.files.toml import read_toml
 from service.instrument import instrument_path
+from service.model.pupil_images import find_pupil_images
 
 _OOPAO = {
     "".join(filter(str.isalnum, f"{owner}{name}")).lower(): f"{owner}.{name}"
@@ -125,7 +126,7 @@ def read_bench(options: argparse.Namespace) -> Bench:
     _check_modes(imported, options)
     if "spot" in found:
         imported = _use_spot(imported, found["spot"])
-    sampled = _find_fft_grid(imported, options.pupil_subap, has_light="light" in found)
+    sampled = _find_fft_grid(imported, options)
     return Bench(
         imported=(imported,) if sampled is None else (sampled, imported),
         stated=_state(options, imported),
@@ -296,7 +297,7 @@ def measure_spot(picture: Array) -> tuple[float, float]:
     return float(np.sqrt(squares[1] / squares[0])), float(angle)
 
 
-def _find_fft_grid(imported: Imported, across: float | None, *, has_light: bool) -> Imported | None:
+def _find_fft_grid(imported: Imported, options: argparse.Namespace) -> Imported | None:
     """Return the bench as one that was simulated with an FFT; None if its files exclude that.
 
     A simulated pupil has a whole number of points in each subaperture, which is one pixel, and the
@@ -305,9 +306,17 @@ def _find_fft_grid(imported: Imported, across: float | None, *, has_light: bool)
     wfs, arrays = imported.tables["wfs"], imported.arrays
     names, frames = ("influence_functions", "mode_shapes", "pupil"), arrays[DATASET]
     maps = next((arrays[name] for name in names if name in arrays), None)
-    if maps is None or frames.ndim != 3 or wfs.get("pixels_per_subaperture") != 1:
+    across, pixels = options.pupil_subap, options.pixels_per_subap
+    if maps is None or frames.ndim != 3 or pixels not in {None, 1}:
         return None
-    side, width, seen = maps.shape[-1], frames.shape[-1], float(wfs["pupil_diameter_subap"])
+    # Not in the light: without modulation it is between the images as well, and on their inner
+    # edges, so that they seem 2.7 pixels closer to the middle; the response shows them to 0.6.
+    strength = np.sqrt(np.mean(np.square(frames, dtype=float), axis=0))
+    try:
+        images = find_pupil_images(strength, DATASET)
+    except MatrixError:
+        return None
+    side, width, seen = maps.shape[-1], frames.shape[-1], images.diameter_px
     tolerance = 0.0 if across else _MAX_WIDTH_RATIO
     counts = [
         n
@@ -317,14 +326,12 @@ def _find_fft_grid(imported: Imported, across: float | None, *, has_light: bool)
     if len(counts) != 1 or frames.shape[1] != width:
         return None
     n, notes = counts[0], list(imported.notes)
-    centres = wfs["pupil_centres_px"]
-    if not has_light:
-        # Windows of whole pixels: their distance is even if the width of the detector less that of
-        # the pupil is.
-        apart = float(np.ptp(np.array(centres), axis=0).mean()) + _SEEMING_PX
-        odd = (width - n) % 2
-        sensor = {"pupil_separation_subap": 2 * round((apart - odd) / 2) + odd}
-        centres = find_image_centres(frames, sensor, notes)
+    # Windows of whole pixels: their distance is even if the width of the detector less that of the
+    # pupil is.
+    apart = float(np.ptp(images.centres_px, axis=0).mean()) + _SEEMING_PX
+    odd = (width - n) % 2
+    sensor = {"pupil_separation_subap": 2 * round((apart - odd) / 2) + odd}
+    centres = find_image_centres(frames, sensor, notes)
     notes.append(
         f"the bench may be simulated: maps of {side} points for {n} subapertures of one pixel"
     )
@@ -332,6 +339,7 @@ def _find_fft_grid(imported: Imported, across: float | None, *, has_light: bool)
     about = {
         **wfs,
         "n_subapertures": n,
+        "pixels_per_subaperture": 1,
         "pupil_diameter_subap": float(n),
         "pupil_centres_px": centres,
         "valid_subapertures": "auto",

@@ -152,7 +152,8 @@ def _describe_stroke(made: Twin) -> Value:
     fit = made.report.fit
     gain = float(np.median(fit.gains))
     scatter = 1.4826 * float(np.median(np.abs(fit.gains - gain)))
-    if made.instrument.mirror.stroke_known:
+    about = made.instrument
+    if about.mirror.stroke_known and "wfs.wavelength_m" not in about.unknown:
         return Value(
             "stroke", gain, scatter, "m OPD per stated m", "measured: median gain of the modes"
         )

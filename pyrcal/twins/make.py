@@ -16,7 +16,7 @@ import numpy as np
 
 from pyrcal.fitting.advice import read_entries
 from pyrcal.fitting.alternatives import PLAUSIBLE_DISPLACEMENT_PX
-from pyrcal.fitting.comparison import Alternative
+from pyrcal.fitting.comparison import MIN_EXPLAINED, Alternative
 from pyrcal.fitting.fit_file import Progress, fit_file
 from pyrcal.fitting.fit_table import NOTABLE_DISPLACEMENT_PX
 from pyrcal.fitting.fitted import Fit
@@ -48,10 +48,6 @@ STATED: Mapping[str, Any] = {
     "stop": "telescope",
 }
 """Values that files may lack, named as the options of ``pyrcal twin``, with their defaults."""
-
-MUCH_LESS_LEFT = 0.7
-"""Residual over that of the continuous model below which the FFT grid of a simulation is adopted.
-On an unmodulated bench of OOPAO it is 0.007, on a measured bench there is no such grid."""
 
 MAX_SHARE, MIN_SIGNIFICANCE = 0.9, 2.0
 """Another value of a number is tried if it leaves less than this share of the power that is left
@@ -204,13 +200,25 @@ def _choose_import(bench: Bench, folder: Path, threads: int, progress: Progress 
     *grids, usual = bench.imported
     for imported in grids:
         # The files may allow a grid that the bench does not have.
-        with contextlib.suppress(PyrcalError):
-            simulated = _fit(bench, imported, folder, threads, progress)
-            if simulated.residual < EXACT:
-                return simulated
-            made = _fit(bench, usual, folder, threads, progress)
-            return simulated if simulated.residual < MUCH_LESS_LEFT * made.residual else made
+        simulated = _try_fit(bench, imported, folder, threads, progress)
+        if simulated is None:
+            continue
+        if simulated.residual < EXACT:
+            return simulated
+        made = _try_fit(bench, usual, folder, threads, progress)
+        if made is None or made.residual**2 - simulated.residual**2 > MIN_EXPLAINED**2:
+            return simulated
+        return made
     return _fit(bench, usual, folder, threads, progress)
+
+
+def _try_fit(
+    bench: Bench, imported: Imported, folder: Path, threads: int, progress: Progress | None
+) -> Twin | None:
+    """Return the fit of an import; None if it cannot be fitted."""
+    with contextlib.suppress(PyrcalError):
+        return _fit(bench, imported, folder, threads, progress)
+    return None
 
 
 def _fit(

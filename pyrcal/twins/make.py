@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from pyrcal.fitting.advice import read_entries
 from pyrcal.fitting.alternatives import PLAUSIBLE_DISPLACEMENT_PX
@@ -150,7 +151,9 @@ def _make(
         with tempfile.TemporaryDirectory(dir=output.absolute().parent, prefix=".twin-") as name:
             draft = Path(name) / "twin"
             made = _fit_bench(bench, draft, threads, progress)
-            made = _export(made, check=check, python=python)
+            # A second thread of BLAS waits in a loop for the first one: it only costs time.
+            with threadpool_limits(1):
+                made = _export(made, check=check, python=python)
             write_report(made)
             if output.is_dir():
                 shutil.rmtree(output)

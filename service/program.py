@@ -348,7 +348,7 @@ def _describe_key(commands: Any) -> None:  # noqa: ANN401 - argparse's own
         "action",
         (
             "add",
-            "make a key and print it, only once",
+            "make a key and print it; it cannot be shown again",
             "ada --scope operate",
             (*of_service, name, scope),
         ),

@@ -29,12 +29,11 @@ ORDERS: Final = tomllib.loads(
 URL, KEY = "PYRCAL_URL", "PYRCAL_API_KEY"
 """Environment variables."""
 
-EPILOG = """
-Exit status: 0 done; 1 refused by the service or not done (status: an alarm is active or the service
-is not ready); 2 wrong command line; 3 the service cannot be reached. PYRCAL_URL and PYRCAL_API_KEY
-replace --url and --key-file.
-"""
-"""End of the help of every command that asks a service."""
+FAILURES = {
+    "orders": "the service refused the order or did not carry it out",
+    "status": "an alarm is active, the service is not ready, or it refused the request",
+}
+"""What exit status 1 means, by module or name of the command; all others are only refused."""
 
 
 class Request(NamedTuple):
@@ -123,14 +122,14 @@ def _records(name: str, purpose: str, call: str, *every: Words, **more: Any) -> 
     return Request(name, purpose, "orders", call, every, **more)
 
 
-def _numbers(kind: type[int] | type[float]) -> Any:  # noqa: ANN401 - argparse's own
-    """Return a reader of ``3,5,9``, or of a word of the service's."""
+def _numbers(kind: type[int] | type[float], *names: str) -> Any:  # noqa: ANN401 - argparse's own
+    """Return a reader of ``3,5,9``, or of one of these names."""
 
     def read(text: str) -> object:
         try:
             return [kind(part) for part in text.split(",")]
         except ValueError:
-            if kind is int and text in {"controlled", "all"}:
+            if text in names:
                 return text
         raise argparse.ArgumentTypeError(f"found {text!r}, expected numbers with commas")
 
@@ -143,13 +142,23 @@ _CANDIDATE = words("id ID", "default: the one proposed last", nargs="?", default
 _OFFERED = words(
     "id ID", "id of references; default: those proposed", nargs="?", default="candidate"
 )
-_MODES = words("--modes N,...|controlled|all", "modes by number, from 0", type=_numbers(int))
+_NUMBERED = words(
+    "--modes N,...", "modes by number, from 0; default: those in the loop", type=_numbers(int)
+)
+_NAMED = words(
+    "--modes N,...|controlled|all",
+    "modes by number, from 0; with random signs also controlled (those in the loop) or all (the "
+    "whole basis)",
+    type=_numbers(int, "controlled", "all"),
+)
 _RECORDING = words("id ID", "id of a recording")
 _LASTS = words("--duration-s S", "duration in seconds", type=float)
 _EACH = words("--amplitude-m M", "RMS of each mode in metres of OPD", type=float)
 _LINES = words("--frequency-hz HZ,...", "frequency of each mode", type=_numbers(float))
 _TOTAL = words("--total-amplitude-m M", "RMS of all modes together in metres", type=float)
-_OVER = words("--over-budget", "allow more than the dither budget", default=None)
+_OVER = words(
+    "--over-budget", "allow a total amplitude above [dither] budget_m of the settings", default=None
+)
 _NO_WAIT = words("--no-wait", "return once the order is accepted")
 _SINCE = words("--since TIME", "from this time on, RFC 3339, like 2026-03-01T20:00:00Z")
 _UNTIL = words("--until TIME", "up to this time")
@@ -161,7 +170,8 @@ GROUPS = {
     "reconstructors": "list, compute, approve, send or roll back reconstructors",
     "references": "load a shape that the loop holds; list, approve or roll back references",
     "loop": "open or close the loop; acquire the registration from nothing",
-    "dither": "start or stop the dither",
+    "dither": "start or stop the dither, from which alpha is measured; the service usually runs it "
+    "by itself",
     "measure": "measure an interaction matrix",
     "recordings": "record telemetry; list, end or remove recordings",
 }
@@ -362,31 +372,36 @@ REQUESTS = (
     ),
     _orders(
         "dither start",
-        "start the dither",
+        "start a dither; the service chooses what is not given",
         words(
             "--kind",
             "sine: one frequency for each mode; binary: random signs",
             choices=("sine", "binary"),
         ),
-        *(_MODES, _EACH, _LINES, _TOTAL, _LASTS, _OVER),
+        *(_NAMED, _EACH, _LINES, _TOTAL, _LASTS, _OVER),
         always={"action": "start"},
         example="--modes 3,5 --frequency-hz 90,110 --amplitude-m 5e-9",
     ),
     # Named, because "stop" is an order of its own.
-    _orders("dither stop", "stop the dither", operation="dither", always={"action": "stop"}),
+    _orders(
+        "dither stop",
+        "stop the dither; the service starts no other until ordered to",
+        operation="dither",
+        always={"action": "stop"},
+    ),
     _orders(
         "measure matrix",
         "have the RTC measure an interaction matrix; all patterns but sine open the loop",
         words("--pattern NAME", "push-pull-modal, hadamard, sine, ..."),
         words("--n-average N", "pushes and pulls of each mode", type=int),
-        *(_MODES, _EACH, _LINES, _LASTS, _NO_WAIT),
+        *(_NUMBERED, _EACH, _LINES, _LASTS, _NO_WAIT),
         asks="have the RTC measure; all patterns but sine open the loop",
-        example="--pattern sine --modes controlled",
+        example="--pattern sine --modes 3,5",
     ),
     _orders(
         "measure noisy",
         "measure a noisy interaction matrix on sky, by a dither of random signs",
-        *(_MODES, _TOTAL, _LASTS, _OVER, _NO_WAIT),
+        *(_NAMED, _TOTAL, _LASTS, _OVER, _NO_WAIT),
         operation="measure_noisy",
         example="--duration-s 60",
     ),
@@ -459,7 +474,7 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
             word or name,
             help=request.purpose,
             description=_sentence(request.purpose),
-            epilog=EPILOG,
+            epilog=_epilog(request),
             examples=[request.example],
             options=(*request.words, *_order_options(request), *_CONNECTION),
             module="pyrcal.shapes" if "file" in forms else f"{__package__}.ask",
@@ -477,6 +492,18 @@ def _order_options(request: Request) -> tuple[Words, ...]:
         words("--why WHY", f"reason, kept in the audit trail{required}", default=""),
         words("--who WHO", "your name; default: the login name"),
         *([words("--yes", "do it without confirmation")] if request.asks else []),
+    )
+
+
+def _epilog(request: Request) -> str:
+    """Return the end of the help of a command."""
+    usual = FAILURES.get(request.module, "the service refused the request")
+    failure = FAILURES.get(request.name, usual)
+    if request.asks or request.needs_why:
+        failure += ", or it was not confirmed"
+    return (
+        f"Exit status: 0 done; 1 {failure}; 2 wrong command line; 3 the "
+        f"service cannot be reached. Without --url, {URL} is used; without --key-file, {KEY}."
     )
 
 

@@ -99,7 +99,7 @@ def _describe_archive(commands: Any) -> None:  # noqa: ANN401 - argparse's own
         words("--recording FILE", "a file of pyrcal sim --record", type=Path),
         words("--skip S", "seconds of the recording to skip", type=seconds, default=0.0),
         words("--seconds S", "seconds to take, default %(default)g", type=seconds, default=10.0),
-        words("--night DATE", "date of the evening, UTC; default that of the recording"),
+        words("--night DATE", "UTC date of the evening; default: that of the recording"),
     )
     dry_run = words("--dry-run", "only list what would be removed")
     every = (_JSON, *_OF_A_FOLDER)
@@ -149,17 +149,20 @@ def _describe_commission(commands: Any) -> None:  # noqa: ANN401 - argparse's ow
         "commission",
         help="judge a commissioning and write its report",
         module="pyrcal.maintenance.commission",
-        description="Judge a commissioning from the archive of a night, pyrcal check-rtc and a "
-        "fit, by the limits of docs/operate/commissioning.md, and write a report. Needs the extra "
+        description="Compare the archive of a night and the output of pyrcal check-rtc and pyrcal "
+        "fit with the limits in docs/operate/commissioning.md, and write a report. Needs the extra "
         "'plots'.",
-        epilog="Exit status: 0 all criteria pass; 1 one does not, or has no input; 2 the report "
+        epilog="Exit status: 0 all criteria pass; 1 a criterion fails or has no data; 2 the report "
         "cannot be made.",
         examples=["--check-rtc check.json --fit fit.json"],
         options=(
             _OF_SETTINGS,
             words("--check-rtc FILE.json", "output of pyrcal check-rtc --json", type=Path),
             words("--fit FILE.json", "output of pyrcal fit --json", type=Path),
-            words("--night DATE", "date of the evening, UTC; default the newest with measurements"),
+            words(
+                "--night DATE",
+                "UTC date of the evening; default: the newest night with measurements",
+            ),
             words("--since TIME", "from this time on, RFC 3339, like 2026-03-01T20:00:00Z"),
             words("--until TIME", "up to this time"),
             words(output, "default %(default)s", type=Path, default=usual),
@@ -278,19 +281,20 @@ def _describe_reconstruct(commands: Any) -> None:  # noqa: ANN401 - argparse's o
         "--json or --output"
     )
     methods = (
-        "svd: least squares without weak singular values (default); map: with noise and "
-        "turbulence as priors"
+        "svd: least squares without weak singular values (default); map: maximum a posteriori, "
+        "with the noise of the slopes and the turbulence as prior"
     )
     condition = "with svd: largest condition number, default %(default)g"
     noise = "with map: 1 sigma of one slope in one frame, default %(default)g"
     array = "library for the matrix; torch and cupy use a GPU; default %(default)s"
-    specula = "also write Intmat and Recmat of SPECULA, in the order of this file"
+    specula = "also write SPECULA's Intmat and Recmat, with the slopes in the order of this file"
     commands.add_parser(
         "reconstruct",
         help="compute a reconstructor for a registration",
         module="pyrcal.fitting.reconstruct",
         description="Compute the noise-free interaction matrix for a registration, and the "
-        "reconstructor. All modes of the basis can be controlled, however few were measured.",
+        "reconstructor. The model also gives the columns of modes that were not measured, so all "
+        "modes of the basis can be controlled.",
         epilog="Exit status: 0 written; 2 input that cannot be used.",
         examples=(
             "flao-lbt fit.h5 --modes 500 --output cm.h5",

@@ -29,11 +29,13 @@ from pyrcal.twins.bench import Bench, read_bench
 from pyrcal.twins.check import check_oopao_model, check_specula_model
 from pyrcal.twins.oopao_model import write_oopao_model
 from pyrcal.twins.report import Twin, list_lines, write_report
-from pyrcal.twins.sampled import sample_bench
+from pyrcal.twins.sampled import Actuators, sample_bench
 from pyrcal.twins.specula_model import write_specula_model
 from service.errors import ConfigurationError, PyrcalError, StorageError
 from service.files import parse_modes
 from service.files.container import DATASET
+from service.files.disk_cache import cached_basis
+from service.files.toml import read_dataset
 from service.files.whole import write_whole
 from service.instrument import load_instrument
 from service.instrument.paths import TWIN_FILE, TWIN_LIVE_FILE
@@ -324,6 +326,28 @@ def _describe_live(tables: Tables, fit: Fit) -> Tables:
     return {**tables, "wfs": wfs, "mirror": mirror}
 
 
+def _read_actuators(made: Twin) -> Actuators | None:
+    """Return the actuators whose influence functions are given; None if there are no functions.
+
+    The model of the fit only keeps the modes: the functions are read as a zonal mirror.
+    """
+    folder, tables = made.folder, made.imported.tables
+    mirror, draft = dict(tables["mirror"]), folder / "draft-actuators.toml"
+    if "influence_functions" not in mirror:
+        return None
+    reference = mirror.pop("mode_to_actuator", None)
+    zonal = {**tables, "mirror": {**mirror, "basis": "zonal"}}
+    draft.write_text(replace(made.imported, tables=zonal).instrument_text(), encoding="utf-8")
+    # The optics are those of the fit: the tables may have corrected ones.
+    functions = cached_basis(replace(made.instrument, mirror=load_instrument(draft).mirror))
+    draft.unlink()
+    if reference is None:
+        return functions, np.eye(functions.n_modes)
+    strokes = read_dataset(reference, folder, "mirror.mode_to_actuator").astype(np.float64)
+    strokes[:, made.instrument.mirror.flat_modes] = 0.0  # modes that the model does not use
+    return functions, strokes
+
+
 def _export(made: Twin, *, check: bool, python: Path | None) -> Twin:
     """Write the models of other programs, and let these run them if requested."""
     about, fit, folder = made.instrument, made.report.fit, made.folder
@@ -331,7 +355,7 @@ def _export(made: Twin, *, check: bool, python: Path | None) -> Twin:
         return replace(made, checks=("Only benches with a pyramid are exported.",))
     shape = made.imported.arrays[DATASET].shape
     frame_shape = (shape[1], shape[2]) if about.frames is not None else None
-    sampled = sample_bench(about, fit, frame_shape)
+    sampled = sample_bench(about, fit, frame_shape, _read_actuators(made))
     exported = (
         write_oopao_model(sampled, folder, made.bench.sky_pupil),
         write_specula_model(sampled, fit, folder),

@@ -117,9 +117,9 @@ def _describe_mirror(bench: SampledBench) -> tuple[dict[str, Any], dict[str, Any
         or surface.segments_deg
         or not isinstance(basis, ModalBasis)
     ):
-        functions = bench.render_modes()
-        modes = np.eye(functions.shape[1]) * bench.unit_m
-        return {"SIGN": sign}, {"functions": functions, "mode_to_actuator": modes}
+        functions, modes = bench.render_functions()
+        arrays = {"functions": functions, "mode_to_actuator": modes * bench.unit_m}
+        return {"SIGN": sign}, arrays
     steps = (bench.n_points - 1) / bench.n_points
     scale = bench.instrument.subaperture_m / steps
     array = SimpleNamespace(D=bench.width_m, resolution=bench.n_points)

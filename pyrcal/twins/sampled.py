@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.instrument_checks import COUPLING_KEY
+from service.files.container import MAX_BYTES
 from service.files.disk_cache import cached_basis
 from service.model.instrument import Instrument, Mirror
 from service.model.interaction import InteractionModel
@@ -54,6 +55,9 @@ NOTABLE_SHARE = 0.001
 MIN_LIGHT = 0.02
 """Least light over the mean: a smooth gain may fall below 0 at the pupil's edge."""
 
+Actuators = tuple[Basis, Array]
+"""Influence functions of actuators, and strokes ``(n_actuators, n_modes)`` of the bench's modes."""
+
 _Grid = tuple[int, int]
 """Points per detector pixel, and detector pixels across."""
 
@@ -70,6 +74,9 @@ class SampledBench:
 
     basis: Basis
     """Modes of the mirror, with the fitted coupling."""
+
+    actuators: Actuators | None
+    """Actuators of the mirror; None if only shapes of modes are given."""
 
     alpha: Misregistration
     """Fitted registration."""
@@ -152,9 +159,14 @@ class SampledBench:
         x, y = np.meshgrid(along, along)
         return alpha.on_mirror(np.column_stack([x.ravel(), y.ravel()]) - alpha.vector[:2])
 
-    def render_modes(self) -> Array:
-        """Return the modes ``(n_points ** 2, n_modes)`` on the pupil, where α puts them."""
-        return self.basis.render(self.points_on_mirror())
+    def render_functions(self) -> tuple[Array, Array]:
+        """Return functions ``(n_points ** 2, n)`` where α puts them, and the modes made of them.
+
+        The modes are ``(n, n_modes)``: strokes of actuators, or the identity if the functions are
+        the modes themselves.
+        """
+        functions, modes = self.actuators or (self.basis, np.eye(self.basis.n_modes))
+        return functions.render(self.points_on_mirror()), modes
 
     @property
     def orientation(self) -> Orientation:
@@ -203,12 +215,15 @@ class SampledBench:
 
 
 def sample_bench(
-    instrument: Instrument, fit: Fit, frame_shape: tuple[int, int] | None = None
+    instrument: Instrument,
+    fit: Fit,
+    frame_shape: tuple[int, int] | None = None,
+    actuators: Actuators | None = None,
 ) -> SampledBench:
     """Return a fitted bench on the grid of the simulation that made its matrix, or a usual one.
 
     ``frame_shape`` is that of the bench's frames; None if it has slopes, or a square detector that
-    the files describe.
+    the files describe. ``actuators`` are those of a mirror whose functions are given.
 
     Raises
     ------
@@ -224,6 +239,7 @@ def sample_bench(
         for grid in _list_grids(found, frame_shape)
     ]
     bench, left = min(tried, key=lambda one: one[1])
+    bench = _with_actuators(bench, actuators)
     if pyramid_in(found).fft_grid is not None:
         return bench
     remark = (
@@ -231,6 +247,30 @@ def sample_bench(
         f"pixels leaves least of those that were tried, {left:.1%}: the instrument file gives no "
         "fft_grid."
     )
+    return replace(bench, remarks=(*bench.remarks, remark))
+
+
+def _with_actuators(bench: SampledBench, actuators: Actuators | None) -> SampledBench:
+    """Return the bench with its actuators, or with a remark that its models have none."""
+    basis = bench.basis
+    if isinstance(basis, ModalBasis):
+        if isinstance(basis.surface, Gaussian) and not basis.surface.segments_deg:
+            return bench  # written as positions, not as functions
+        strokes = np.eye(len(basis.mode_to_actuator))
+        own = replace(
+            basis,
+            mode_to_actuator=strokes,
+            coefficients=basis.surface.coefficients(strokes),
+            variance_m2=np.zeros(len(strokes)),
+        )
+        actuators = own, basis.mode_to_actuator
+    reason = "no influence functions of actuators are given"
+    if actuators is not None:
+        n_bytes = 8 * bench.n_points**2 * actuators[0].n_modes
+        if n_bytes <= MAX_BYTES:
+            return replace(bench, actuators=actuators)
+        reason = f"the functions of all actuators would take {n_bytes / 1e9:.0f} GB"
+    remark = f"The mirror of the models has the bench's modes instead of its actuators: {reason}."
     return replace(bench, remarks=(*bench.remarks, remark))
 
 
@@ -271,6 +311,7 @@ def _draw_bench(found: Instrument, basis: Basis, fit: Fit, points: int, width: i
     return SampledBench(
         instrument=found,
         basis=basis,
+        actuators=None,
         alpha=fit.alpha,
         n_pixels=n_pixels,
         points_per_pixel=points,

@@ -142,7 +142,8 @@ def _describe_mirror(bench: SampledBench, fit: Fit) -> tuple[Array, Array]:
     if isinstance(basis, ModalBasis) and isinstance(basis.surface, Gaussian):
         points = bench.points_on_mirror()[lit] * [1.0, basis.y_sign]
         return basis.surface.basis(points), basis.mode_to_actuator[:, fit.modes]
-    return bench.render_modes()[lit][:, fit.modes], np.eye(len(fit.modes))
+    functions, modes = bench.render_functions()
+    return functions[lit], modes[:, fit.modes]
 
 
 def _save_pupils(root: Path, bench: SampledBench, apart: int, width: int) -> None:

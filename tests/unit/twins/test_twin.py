@@ -13,7 +13,9 @@ import scipy
 import pyrcal
 from pyrcal.twins.bench import measure_spot, read_bench
 from pyrcal.twins.make import STATED
+from pyrcal.twins.sampled import sample_bench
 from service.errors import ConfigurationError, MatrixError
+from service.files.container import opened
 from service.instrument import instrument_path, load_instrument
 from sim_rtc.options import parse_options
 from tests.support.repository import ROOT
@@ -67,6 +69,25 @@ def test_the_files_of_a_bench_become_its_twin(bench, tmp_path):
     assert (made.folder / "twin.html").stat().st_size > 1e4
     assert [one.path.name for one in made.exported] == ["oopao_model.py", "specula_model.yml"]
     assert all(one.path.is_file() for one in made.exported)
+
+
+def test_the_exported_mirror_has_the_actuators_of_given_influence_functions(bench, tmp_path):
+    made = pyrcal.twin(bench, tmp_path / "twin", **QUICK)
+    with np.load(made.folder / "oopao_model.npz") as arrays, np.load(SAMPLE) as dump:
+        functions, modes = arrays["functions"], arrays["mode_to_actuator"]
+        n_points, m2c = int(np.sqrt(len(functions))), dump["M2C"]
+    assert np.allclose(modes, m2c)
+    assert functions.shape == (n_points**2, len(m2c))
+    # The combined functions are the shapes of the modes that the model of the fit has.
+    sampled = sample_bench(made.instrument, made.report.fit)
+    assert sampled.n_points == n_points
+    shapes = sampled.basis.render(sampled.points_on_mirror())
+    assert np.abs(functions @ modes - shapes).max() < 1e-6 * np.abs(shapes).max()
+    with opened(made.folder / "calibration" / "ifunc" / "bench.fits") as container:
+        assert container.find("INFLUENCE_FUNCTION").shape[1] == len(m2c)
+    assert not any("instead of its actuators" in one for one in made.exported[0].remarks)
+    # Without the functions only the shapes of the modes are left.
+    assert [one for one in sampled.remarks if "instead of its actuators" in one]
 
 
 def draw_mean_frame(pupil):

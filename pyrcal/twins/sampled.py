@@ -240,6 +240,10 @@ def sample_bench(
     ]
     bench, left = min(tried, key=lambda one: one[1])
     bench = _with_actuators(bench, actuators)
+    if "wfs.wavelength_m" in found.unknown:
+        wavelength_nm = found.wfs.wavelength_m * 1e9
+        remark = f"The wavelength is unknown: {wavelength_nm:.0f} nm is assumed."
+        bench = replace(bench, remarks=(*bench.remarks, remark))
     if pyramid_in(found).fft_grid is not None:
         return bench
     remark = (

@@ -69,6 +69,8 @@ def test_the_files_of_a_bench_become_its_twin(bench, tmp_path):
     assert (made.folder / "twin.html").stat().st_size > 1e4
     assert [one.path.name for one in made.exported] == ["oopao_model.py", "specula_model.yml"]
     assert all(one.path.is_file() for one in made.exported)
+    remark = "The wavelength is unknown: 750 nm is assumed."
+    assert not any(remark in one.remarks for one in made.exported)
 
 
 def test_the_exported_mirror_has_the_actuators_of_given_influence_functions(bench, tmp_path):
@@ -88,6 +90,15 @@ def test_the_exported_mirror_has_the_actuators_of_given_influence_functions(benc
     assert not any("instead of its actuators" in one for one in made.exported[0].remarks)
     # Without the functions only the shapes of the modes are left.
     assert [one for one in sampled.remarks if "instead of its actuators" in one]
+
+
+def test_an_assumed_wavelength_is_in_the_remarks_of_the_exported_models(bench, tmp_path):
+    # Without the unit of the commands the matrix does not determine the wavelength.
+    made = pyrcal.twin(bench, tmp_path / "twin", diameter_m=1.8, modulation=3.0)
+    assert "wfs.wavelength_m" in made.instrument.unknown
+    for one in made.exported:
+        assert "The wavelength is unknown: 750 nm is assumed." in one.remarks
+    assert "WAVELENGTH_M = 7.5e-07\n" in (made.folder / "oopao_model.py").read_text("utf-8")
 
 
 def draw_mean_frame(pupil):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -39,7 +40,7 @@ _OOPAO_ONLY = {"tel.D", "tel.resolution", "wfs.nSubap", "wfs.tag"}
 _PARTS = (
     ("mode_to_actuator", ("m2c", "modetoactuator", "modestoactuator")),
     ("matrix", ("interaction", "intmat", "imat", "calibd")),
-    ("modes", ("influence", "ifunc", "dmmodes", "modeshapes")),
+    ("modes", ("influ", "ifunc", "dmmodes", "modeshapes")),
     ("positions", ("coordinates", "positions")),
     ("sky_pupil", ("skypupil", "pupilsky")),
     ("spot", ("spot", "modulationpicture", "modulatedpsf")),
@@ -216,6 +217,7 @@ def _sort_by_role(
             options.modes = modes_of_name(one.path, one.values, inventory)
     for one in unknown:
         role = _guess_mask(one.values, np.shape(found.get("matrix", ())))
+        role = role or _guess_functions(one.values, np.shape(found.get("mode_to_actuator", ())))
         if role is None or role in found:
             inventory.append(
                 f"not used: {one.path} {one.values.shape} ({one.name}): give ROLE=FILE"
@@ -245,6 +247,16 @@ def _guess_mask(values: Array, shape: tuple[int, ...]) -> str | None:
         return None
     n_lit = int(np.count_nonzero(values))
     return "valid" if {values.size, n_lit, 2 * n_lit} & set(shape) else "pupil"
+
+
+def _guess_functions(values: Array, strokes: tuple[int, ...]) -> str | None:
+    """Return ``modes`` for square maps of as many actuators as the modes' commands have."""
+    if values.ndim != 2 or not strokes:
+        return None
+    n_actuators = max(strokes)
+    n_points = values.size // n_actuators
+    is_square = math.isqrt(n_points) ** 2 == n_points > n_actuators
+    return "modes" if is_square and n_actuators in values.shape else None
 
 
 def _check_modes(imported: Imported, options: argparse.Namespace) -> None:

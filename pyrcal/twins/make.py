@@ -133,8 +133,7 @@ def twin(
         stated["modes"] = parse_modes(modes)
     paths = [(role, Path(path)) for role, path in given]
     options = argparse.Namespace(**{**STATED, **stated}, files=paths)
-    interpreter = None if python is None else Path(python)
-    return _make(options, Path(output), check=check, python=interpreter, threads=threads)
+    return _make(options, Path(output), check=check, python=python, threads=threads)
 
 
 def _make(
@@ -142,12 +141,17 @@ def _make(
     output: Path,
     *,
     check: bool,
-    python: Path | None,
+    python: str | Path | None,
     threads: int,
     progress: Progress | None = None,
 ) -> Twin:
     """Write the twin into a temporary folder, and move it to its place when it is complete."""
     _check_output(output)
+    interpreter = None if python is None else Path(python).absolute()
+    if interpreter is not None and not interpreter.is_file():
+        raise ConfigurationError(
+            f"--python: found no file {interpreter}, expected a Python interpreter"
+        )
     bench = read_bench(options)
     try:
         with tempfile.TemporaryDirectory(dir=output.absolute().parent, prefix=".twin-") as name:
@@ -155,7 +159,7 @@ def _make(
             made = _fit_bench(bench, draft, threads, progress)
             # A second thread of BLAS waits in a loop for the first one: it only costs time.
             with threadpool_limits(1):
-                made = _export(made, check=check, python=python)
+                made = _export(made, check=check, python=interpreter)
             write_report(made)
             if output.is_dir():
                 shutil.rmtree(output)
@@ -232,6 +236,12 @@ def _fit(
     saved = imported.save(folder)
     instrument = load_instrument(saved.instrument)
     report = fit_file(instrument, saved.matrix, FitOptions(), threads=threads, progress=progress)
+    # The folder is moved to its place later.
+    remarks, notes = (
+        tuple(one.replace(f"{folder}/", "") for one in some)
+        for some in (report.fit.remarks, report.notes)
+    )
+    report = replace(report, fit=replace(report.fit, remarks=remarks), notes=notes)
     return Twin(folder=folder, bench=bench, imported=imported, instrument=instrument, report=report)
 
 

@@ -11,10 +11,9 @@ from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from pyrcal.fitting.budget import advise_measurement
 from pyrcal.fitting.figures import draw_sheet
+from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.report import FitReport, document
 from pyrcal.importers.imported import UNKNOWN, Imported
 from pyrcal.maintenance.commission_page import format_html, format_table
@@ -108,23 +107,28 @@ def list_values(made: Twin) -> Iterator[Value]:
 
 
 def _list_fitted(made: Twin) -> Iterator[tuple[str, Value]]:
-    """Yield the optical quantities that a fit has found, by key."""
-    for report in filter(None, (made.report, made.before)):
+    """Yield the optical quantities that a fit has found, by key, those of the last fit last."""
+    stated: dict[str, str] = {}
+    for report in filter(None, (made.before, made.report)):
         fit = report.fit
-        sigmas = {one.key: one for one in fit.optics}
-        for one in fit.origins:
-            optic = sigmas.get(one.key)
-            if (one.correct or optic is not None) and one.key != "order":
-                sigma = None if optic is None else optic.found_sigma
-                origin = f"measured: {one.how}; the files say {one.reported}"
-                yield one.key, Value(one.key, one.found, sigma, _unit(one.key), origin)
-        for optic in fit.optics:
-            if optic.found is not None and optic.key not in {one.key for one in fit.origins}:
-                stated = "nothing" if optic.reported is None else f"{optic.reported:g}"
-                origin = f"measured: fitted; the files say {stated}"
-                value = float(optic.found)
-                unit = _unit(optic.key)
-                yield optic.key, Value(optic.key, value, optic.found_sigma, unit, origin)
+        optics = {one.key: one for one in fit.optics}
+        origins = {one.key: one for one in fit.origins}
+        for key in dict.fromkeys([*origins, *optics]):
+            optic, origin = optics.get(key), origins.get(key)
+            if key == "order" or (optic is None and not (origin and origin.correct)):
+                continue
+            if origin is not None:
+                found, how, reported = str(origin.found), origin.how, str(origin.reported)
+            elif optic is None or optic.found is None:
+                continue
+            else:
+                found, how, reported = f"{optic.found:.4g}", "fitted", f"{optic.reported}"
+            # A second fit has the numbers of the first one in its file.
+            said = stated.setdefault(key, reported)
+            known = said not in {f'"{UNKNOWN}"', "None"}
+            files = f"the files say {said}" if known else "no file has it"
+            sigma = None if optic is None else optic.found_sigma
+            yield key, Value(key, found, sigma, _unit(key), f"measured: {how}; {files}")
 
 
 def _unit(key: str) -> str:
@@ -149,22 +153,19 @@ def _find_origin(made: Twin, key: str) -> str:
 
 
 def _describe_stroke(made: Twin) -> Value:
-    """Return the gain of the modes: the unit of the commands, where the sensor's gain is known."""
+    """Return the unit of the commands, where the matrix determines it."""
     fit = made.report.fit
-    gain = float(np.median(fit.gains))
-    scatter = 1.4826 * float(np.median(np.abs(fit.gains - gain)))
-    about = made.instrument
-    if about.mirror.stroke_known and "wfs.wavelength_m" not in about.unknown:
-        return Value(
-            "stroke", gain, scatter, "m OPD per stated m", "measured: median gain of the modes"
-        )
+    stroke = fit.stroke
+    if stroke is None or stroke.metres_per_unit is None:
+        reason = "unknown" if stroke is None else stroke.condition
+        return Value("stroke", "not determined", None, "", reason)
+    condition = f", if {stroke.condition}" if stroke.condition else ""
     return Value(
         "stroke",
-        "not determined",
-        None,
-        "",
-        "unit of the commands and gain of the sensor are unknown, and scale all columns alike: "
-        f"these are {gain:.3g} times the model's per metre",
+        stroke.metres_per_unit,
+        stroke.sigma,
+        "m of OPD per unit of the commands",
+        f"measured: median gain of the modes{condition}",
     )
 
 
@@ -175,16 +176,19 @@ def list_lines(made: Twin) -> Iterator[str]:
     fit = made.report.fit
     yield fit.recommendation
     yield fit.verdict_line
-    for one in list_values(made):
-        if one.sigma is not None:
-            yield f"{one.name:32s}{_text(one)}  {one.unit}  ({one.origin})"
+    # What a refused fit has found may be anything.
+    if fit.accepted:
+        for one in list_values(made):
+            if one.sigma is not None or one.name == "stroke":
+                yield f"{one.name:32s}{_text(one)}  {one.unit}  ({one.origin})"
     yield f"{'left over':32s}{100.0 * made.residual:.2f} % of the signal"
-    yield from (
-        f"  {one.share:.0%} +- {one.sigma:.0%} of its power: {one.words}" for one in fit.causes
-    )
-    if fit.causes:
+    if fit.accepted and fit.causes:
+        yield from (
+            f"  {one.share:.0%} +- {one.sigma:.0%} of its power: {one.words}" for one in fit.causes
+        )
         yield f"measure next: {advise_measurement(fit.causes)}"
-    remarks = dict.fromkeys(remark for one in made.exported for remark in one.remarks)
+    exported = (remark for one in made.exported for remark in one.remarks)
+    remarks = dict.fromkeys((*fit.remarks, *exported))
     yield from (f"note: {remark}" for remark in remarks)
     yield from made.checks
     yield f"written to {made.folder}: open twin.html"
@@ -194,7 +198,8 @@ def _text(one: Value) -> str:
     """Return a value with its σ, both to the second digit of the σ."""
     if isinstance(one.value, float) and one.sigma:
         n_digits = max(0, 1 - math.floor(math.log10(one.sigma)))
-        return f"{one.value:.{n_digits}f} +- {one.sigma:.{n_digits}f}"
+        value = round(one.value, n_digits) + 0.0  # without the sign of a zero
+        return f"{value:.{n_digits}f} +- {one.sigma:.{n_digits}f}"
     if isinstance(one.value, str):
         text = one.value
     else:
@@ -228,7 +233,6 @@ def _page(made: Twin) -> str:
     fit = made.report.fit
     mark = "pass" if fit.accepted else "fail"
     values = ((one.name, _text(one), one.unit, one.origin) for one in list_values(made))
-    causes = ((one.words, f"{one.share:.0%} +- {one.sigma:.0%}", one.remedy) for one in fit.causes)
     models = [(one.path.name, "; ".join(one.remarks) or "complete") for one in made.exported]
     notes = (*made.imported.notes, *made.report.notes)
     return format_html(
@@ -241,8 +245,7 @@ def _page(made: Twin) -> str:
             "<h2>Measured, modelled, left over</h2>",
             _figure(made),
             f"<h2>What is left over: {made.residual:.1%} of the signal</h2>",
-            format_table(("Cause", "Share of the power left over", "Remedy"), causes),
-            f"<p>{escape(advise_measurement(fit.causes))}</p>",
+            _describe_left_over(fit),
             "<h2>Models for other programs</h2>",
             format_table(("File", "What it does not contain or assumes"), models),
             *(f"<p>{escape(one)}</p>" for one in made.checks),
@@ -250,6 +253,16 @@ def _page(made: Twin) -> str:
             *(f'<p class="note">{escape(one)}</p>' for one in (*made.bench.inventory, *notes)),
         ],
     )
+
+
+def _describe_left_over(fit: Fit) -> str:
+    """Return the causes of what is left over as HTML."""
+    if not fit.accepted or not fit.causes:
+        reason = "The fit was refused" if not fit.accepted else "Too little is left over"
+        return f"<p>{reason}: it is not divided among causes.</p>"
+    causes = ((one.words, f"{one.share:.0%} +- {one.sigma:.0%}", one.remedy) for one in fit.causes)
+    table = format_table(("Cause", "Share of the power left over", "Remedy"), causes)
+    return f"{table}<p>{escape(advise_measurement(fit.causes))}</p>"
 
 
 def _figure(made: Twin) -> str:

@@ -56,7 +56,8 @@ def values_of(made):
 
 
 def test_the_files_of_a_bench_become_its_twin(bench, tmp_path):
-    made = pyrcal.twin(bench, tmp_path / "twin", diameter_m=1.8, unit="m")
+    (bench / "influence_functions.mat").rename(bench / "IF_dm.mat")
+    made = pyrcal.twin(bench, tmp_path / "twin", diameter_m=1.8, unit="m", modulation=5.0)
     found, sigma, values = values_of(made)
     # The influence functions were saved where the mirror is.
     assert np.all(np.abs(found - (0.0, 0.0, 0.0, 1.0)) < 3.0 * sigma)
@@ -65,6 +66,8 @@ def test_the_files_of_a_bench_become_its_twin(bench, tmp_path):
     assert values["modulation_lambda_over_d"]["origin"].startswith("measured")
     # OOPAO's modulation of 3 λ/D is 3 n / (n - 1) in a pupil of n = 32 points.
     assert float(values["modulation_lambda_over_d"]["value"]) == pytest.approx(3.1, abs=0.1)
+    # A fit with the corrected value is the second one; the report has what was stated.
+    assert "the files say 5" in values["modulation_lambda_over_d"]["origin"]
     assert values["wavelength_m"]["origin"].startswith("measured")
     assert (made.folder / "twin.html").stat().st_size > 1e4
     assert [one.path.name for one in made.exported] == ["oopao_model.py", "specula_model.yml"]
@@ -206,3 +209,14 @@ def test_the_axes_of_the_path_of_a_spot_are_seen_in_its_picture():
     ratio, angle_deg = measure_spot(picture + 0.3 * picture.max() + noise)
     assert ratio == pytest.approx(1.25, abs=0.02)
     assert angle_deg == pytest.approx(30.0, abs=1.0)
+
+
+def test_influence_functions_are_known_by_their_shape(bench, tmp_path):
+    table = scipy.io.loadmat(bench / "influence_functions.mat")["influence_functions"]
+    (bench / "influence_functions.mat").unlink()
+    np.save(bench / "X.npy", table)
+    with pytest.raises(ConfigurationError, match=r"no file .*nowhere"):
+        pyrcal.twin(bench, tmp_path / "twin", diameter_m=1.8, unit="m", python="nowhere")
+    options = argparse.Namespace(**{**STATED, "diameter_m": 1.8, "unit": "m"})
+    options.files = [(None, bench)]
+    assert f"modes, by its shape: {bench / 'X.npy'} {table.shape}" in read_bench(options).inventory

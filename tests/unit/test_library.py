@@ -47,7 +47,7 @@ SIGNATURES = {
     "reconstruct": "interaction_matrix, recipe",
     "to_oopao": "alpha, tel, wfs",
     "track": "path, instrument, settings",
-    "twin": "files, output, check, python, threads, told",
+    "twin": "files, output, check, python, threads, stated",
     "write_bundle": "path, bundle",
 }
 """Parameters of the functions that may be relied on: docs/reference/python.md."""

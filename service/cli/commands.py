@@ -67,8 +67,8 @@ def _run(options: argparse.Namespace) -> int:
         if key in given:
             given[key] = [given[key]]
     # The RTC of a bench sends slopes, although its matrix may have been measured as frames.
-    live = Path(given.get("service.instrument", "")) / TWIN_LIVE_FILE
-    if live.is_file():
+    named = given.get("service.instrument")
+    if named is not None and (live := Path(named) / TWIN_LIVE_FILE).is_file():
         given["service.instrument"] = str(live)
     settings = load_settings(options.config, os.environ, given)
     from service.instrument.schema import read_instrument_file

@@ -33,7 +33,7 @@ FAILURES = {
     "orders": "the service refused the order or did not carry it out",
     "status": "an alarm is active, the service is not ready, or it refused the request",
 }
-"""What exit status 1 means, by module or name of the command; all others are only refused."""
+"""Meaning of exit status 1, by module or name of the command. Otherwise the request was refused."""
 
 
 class Request(NamedTuple):

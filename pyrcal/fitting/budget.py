@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -173,19 +173,13 @@ def _predict_shapes(settled: Settled, residual: Array, light: Array) -> Array:
     """Return the residual ``(n_rows, n_modes)`` that free strokes of all actuators predict.
 
     Each part of the pupil is predicted from the others. A part consists of blocks as wide as the
-    distance of two actuators: an actuator is then measured beside a block that it reaches into,
+    distance of two actuators: an actuator is then measured outside a block into which it reaches,
     and errors that are narrower than an actuator predict nothing.
     """
     models, target = settled.models, settled.target
     basis, spacing = models.basis, float(MIN_BLOCK_SUBAP)
     if isinstance(basis, ModalBasis) and len(basis.mode_to_actuator) <= MAX_FUNCTIONS:
-        strokes = np.eye(len(basis.mode_to_actuator))
-        basis = replace(
-            basis,
-            mode_to_actuator=strokes,
-            coefficients=basis.surface.coefficients(strokes),
-            variance_m2=np.ones(len(strokes)),
-        )
+        basis = basis.of_actuators
         mirror = models.instrument.analytic_mirror
         spacing = mirror.pitch_m / models.instrument.subaperture_m
     model = models.model(models.cheap_sampling, basis, once=True)

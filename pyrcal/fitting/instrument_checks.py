@@ -105,6 +105,11 @@ class FoundOptic:
         return f"the instrument file says {self.reported:.3g}"
 
     @property
+    def is_adopted(self) -> bool:
+        """True if a model of the matrix has the fitted value: the file has none, or another one."""
+        return self.reported is None or self.notable
+
+    @property
     def notable(self) -> bool:
         """True if the fitted value differs significantly from the file."""
         unknown = self.found is not None and self.reported is None

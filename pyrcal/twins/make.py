@@ -207,18 +207,16 @@ def _fit_bench(bench: Bench, folder: Path, threads: int, progress: Progress | No
 def _choose_import(bench: Bench, folder: Path, threads: int, progress: Progress | None) -> Twin:
     """Return the fit of the import whose model leaves least."""
     *grids, usual = bench.imported
-    for imported in grids:
-        # The files may allow a grid that the bench does not have.
-        simulated = _try_fit(bench, imported, folder, threads, progress)
-        if simulated is None:
-            continue
-        if simulated.residual < EXACT:
-            return simulated
-        made = _try_fit(bench, usual, folder, threads, progress)
-        if made is None or made.residual**2 - simulated.residual**2 > MIN_EXPLAINED**2:
-            return simulated
-        return made
-    return _fit(bench, usual, folder, threads, progress)
+    # The files may allow a grid that the bench does not have.
+    simulated = _try_fit(bench, grids[0], folder, threads, progress) if grids else None
+    if simulated is None:
+        return _fit(bench, usual, folder, threads, progress)
+    if simulated.residual < EXACT:
+        return simulated
+    made = _try_fit(bench, usual, folder, threads, progress)
+    if made is None or made.residual**2 - simulated.residual**2 > MIN_EXPLAINED**2:
+        return simulated
+    return made
 
 
 def _try_fit(
@@ -273,15 +271,15 @@ def _find_number(fit: Fit) -> Alternative | None:
 
 
 def _list_found(made: Twin) -> Mapping[str, Any]:
-    """Return what the fit has found of optical numbers, by table and key.
+    """Return the fitted optical numbers that the twin adopts, by table and key.
 
-    Those that the files do not have, and those whose fitted value differs notably: the twin is the
-    model that reproduces the matrix, so that it has the value that did.
+    The twin is the model that reproduces the matrix. It therefore has the fitted value where the
+    files have none or a notably different one.
     """
     return read_entries(
         f"{one.key} = {one.found:.4g}"
         for one in made.report.fit.optics
-        if one.found is not None and one.key and (one.reported is None or one.notable)
+        if one.found is not None and one.key and one.is_adopted
     )
 
 
@@ -320,7 +318,10 @@ def _write_live(made: Twin, saved: Saved) -> None:
 
 
 def _describe_live(tables: Tables, fit: Fit) -> Tables:
-    """Return the tables with what frames show or the fit starts with, but slopes do not show."""
+    """Return the tables with fitted values that frames show and slopes do not.
+
+    These are the places of the pupil images, and the rotation from which the service begins.
+    """
     wfs, mirror = dict(tables["wfs"]), dict(tables["mirror"])
     places, centres = fit.image_offsets_px, wfs.get("pupil_centres_px", "auto")
     if not isinstance(centres, str):

@@ -84,11 +84,9 @@ class Value(NamedTuple):
 def list_values(made: Twin) -> Iterator[Value]:
     """Yield every value of the model with its σ and where it comes from."""
     fit = made.report.fit
-    for name, value, sigma, unit in zip(
-        PARAMETERS, fit.alpha.vector, fit.sigma, _UNITS, strict=True
-    ):
-        scale = BOUNDARY_SCALE[PARAMETERS.index(name)]
-        yield Value(name, value * scale, sigma * scale, unit, "measured: fitted")
+    alpha, sigmas = fit.alpha.vector * BOUNDARY_SCALE, fit.sigma * BOUNDARY_SCALE
+    for name, value, sigma, unit in zip(PARAMETERS, alpha, sigmas, _UNITS, strict=True):
+        yield Value(name, value, sigma, unit, "measured: fitted")
     if fit.anamorphosis is not None and fit.anamorphosis_sigma is not None:
         for name, value, sigma in zip(
             ("along x", "along 45 deg"), fit.anamorphosis, fit.anamorphosis_sigma, strict=True
@@ -124,9 +122,9 @@ def _list_fitted(made: Twin) -> Iterator[tuple[str, Value]]:
             else:
                 found, how, reported = f"{optic.found:.4g}", "fitted", f"{optic.reported}"
             # A second fit has the numbers of the first one in its file.
-            said = stated.setdefault(key, reported)
-            known = said not in {f'"{UNKNOWN}"', "None"}
-            files = f"the files say {said}" if known else "no file has it"
+            in_files = stated.setdefault(key, reported)
+            known = in_files not in {f'"{UNKNOWN}"', "None"}
+            files = f"the files say {in_files}" if known else "no file has it"
             sigma = None if optic is None else optic.found_sigma
             yield key, Value(key, found, sigma, _unit(key), f"measured: {how}; {files}")
 

@@ -260,14 +260,7 @@ def _with_actuators(bench: SampledBench, actuators: Actuators | None) -> Sampled
     if isinstance(basis, ModalBasis):
         if isinstance(basis.surface, Gaussian) and not basis.surface.segments_deg:
             return bench  # written as positions, not as functions
-        strokes = np.eye(len(basis.mode_to_actuator))
-        own = replace(
-            basis,
-            mode_to_actuator=strokes,
-            coefficients=basis.surface.coefficients(strokes),
-            variance_m2=np.zeros(len(strokes)),
-        )
-        actuators = own, basis.mode_to_actuator
+        actuators = basis.of_actuators, basis.mode_to_actuator
     reason = "no influence functions of actuators are given"
     if actuators is not None:
         n_bytes = 8 * bench.n_points**2 * actuators[0].n_modes
@@ -337,11 +330,7 @@ def apply_fit(instrument: Instrument, fit: Fit) -> Instrument:
     """Return the instrument with the values that the fit determined."""
     slopes = replace(instrument.slopes, orientation=fit.orientation, order=fit.order)
     wfs, mirror = pyramid_in(instrument), instrument.mirror
-    values = {
-        one.key: one.found
-        for one in fit.optics
-        if one.found is not None and (one.reported is None or one.notable)
-    }
+    values = {one.key: one.found for one in fit.optics if one.found is not None and one.is_adopted}
     number = values.get("modulation_lambda_over_d")
     if number is not None:
         wfs = replace(wfs, modulation_lambda_over_d=number)

@@ -125,6 +125,17 @@ class ModalBasis:
         coefficients = surface.coefficients(self.mode_to_actuator)
         return replace(self, surface=surface, coefficients=coefficients)
 
+    @property
+    def of_actuators(self) -> ModalBasis:
+        """Basis of single actuators, a unit stroke each, without statistics of the turbulence."""
+        strokes = np.eye(len(self.mode_to_actuator))
+        return replace(
+            self,
+            mode_to_actuator=strokes,
+            coefficients=self.surface.coefficients(strokes),
+            variance_m2=np.ones(len(strokes)),
+        )
+
     def known(self, points: Array) -> NDArray[np.bool_]:
         """Return that an analytic surface is known at every point, ``(n_points,)``."""
         return np.ones(len(points), dtype=np.bool_)

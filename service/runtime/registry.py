@@ -125,7 +125,8 @@ def _report_comparison(
 
 
 MAX_DEPARTURE = 0.5
-"""References before of which the mirror held more or less than that share too much do not count."""
+"""Largest relative difference between a former shape and what the mirror held of it. With more,
+the former references are not compared."""
 
 
 def _report_held(

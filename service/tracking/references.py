@@ -53,8 +53,9 @@ COMPUTATION_TIMEOUT_S = 60.0
 """References that take longer to compute were lost with their worker."""
 
 MIN_LOG_ODDS = 8.0
-"""References are applied otherwise if that is e^8 times as likely. Of 240 changes that were applied
-as sent, with eleven looks at each, the largest was e^6.5 (docs/results/reliability.md).
+"""References are reported as wrongly applied if a wrong way is e^8 times as likely as the right
+one. Of 240 changes that were applied as sent, each judged eleven times, the largest ratio was e^6.5
+(docs/results/reliability.md).
 """
 
 RECORDS_KEPT = 50
@@ -504,7 +505,7 @@ def _send_again(
 
 
 def _distrust(context: StepContext, record: ReferencesRecord, text: str) -> None:
-    """Report references that are applied otherwise than sent; in auto return to the RTC's own.
+    """Report references that the RTC applies wrongly; in auto return to the RTC's own.
 
     The RTC's own references are an offset of zeros, which no wrong sign or scale changes.
     """

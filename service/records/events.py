@@ -142,19 +142,9 @@ class FinishNoisy(Caused):
     record: MeasurementRecord
 
 
-Effect = (
-    MakeMatrix
-    | RepublishMatrix
-    | JudgeMatrix
-    | JudgeProposal
-    | SendMatrix
-    | FetchMatrix
-    | FetchReferences
-    | Ask
-    | FinishNoisy
-    | MakeReferences
-    | SendReferences
-)
+MatrixEffect = MakeMatrix | RepublishMatrix | JudgeMatrix | JudgeProposal | SendMatrix | FetchMatrix
+ReferencesEffect = FetchReferences | MakeReferences | SendReferences
+Effect = MatrixEffect | ReferencesEffect | Ask | FinishNoisy
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -485,42 +475,16 @@ class JobFailed:
     text: str
 
 
-Event = (
-    Command
-    | Tick
-    | Status
-    | SessionStarted
-    | RtcVanished
-    | ServicesMet
-    | ConditionChanged
-    | LogEvent
-    | WindowFitted
-    | WideCaptureFitted
-    | WindowLost
-    | PassiveFitted
-    | PassiveUnavailable
-    | MatrixMade
-    | MatrixFetched
-    | ReferencesFetched
-    | ModesRecognised
-    | MarginJudged
-    | ProposalJudged
-    | Acknowledgement
-    | Answered
-    | DitherSilent
-    | DitherUnusable
-    | DitherMeasured
-    | Compared
-    | LoopHeld
-    | MatrixMisapplied
-    | ReferencesMade
-    | ShapeHeld
-    | Vibrations
-    | ModelChanged
-    | ModesCommanded
-    | MatrixMeasured
-    | JobFailed
-)
+ServiceEvent = Tick | ConditionChanged | LogEvent | JobFailed
+RtcEvent = Status | SessionStarted | RtcVanished | ServicesMet | Acknowledgement | Answered
+WindowEvent = WindowFitted | WideCaptureFitted | WindowLost | PassiveFitted | PassiveUnavailable
+DitherEvent = DitherSilent | DitherUnusable | DitherMeasured
+LoopEvent = Compared | LoopHeld | MatrixMisapplied | Vibrations | ModelChanged | ModesCommanded
+TelemetryEvent = WindowEvent | DitherEvent | LoopEvent
+JudgedEvent = ModesRecognised | MarginJudged | ProposalJudged
+MatrixEvent = MatrixMade | MatrixFetched | MatrixMeasured | JudgedEvent
+ReferencesEvent = ReferencesMade | ReferencesFetched | ShapeHeld
+Event = Command | ServiceEvent | RtcEvent | TelemetryEvent | MatrixEvent | ReferencesEvent
 
 
 def new_id(name: str, now_ns: int) -> str:

@@ -244,9 +244,10 @@ def shows(of: type[View]) -> dict[str, Any]:
     return {"description": (of.__doc__ or "").partition("\n\n")[0], "model": of}
 
 
-def binary(*media_types: str) -> dict[str, Any]:
+def binary(description: str, *media_types: str) -> dict[str, Any]:
     """Return the OpenAPI description of a body of bytes."""
-    return {kind: {"schema": {"type": "string", "format": "binary"}} for kind in media_types}
+    schema = {"schema": {"type": "string", "format": "binary"}}
+    return {"description": description, "content": dict.fromkeys(media_types, schema)}
 
 
 def answer(record: object, of: type[View] | None = None) -> Response:

@@ -35,7 +35,7 @@ def import_files(options: argparse.Namespace) -> Imported:
     """
     match options.source:
         case "oopao":
-            return from_saved(read_npz(options.file), str(options.file))
+            return from_saved(read_arrays(options.file, []), str(options.file))
         case "specula" | "synim":
             paths = [path for _, path in options.files]
             read = from_synim if options.source == "synim" else from_specula

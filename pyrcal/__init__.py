@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from pyrcal.playback.track import track as track
     from pyrcal.twins.make import twin as twin
     from pyrcal.twins.report import Twin as Twin
+    from pyrcal.twins.specula_model import to_specula as to_specula
     from service.config.settings import Settings as Settings
     from service.control.reconstructor import Inversion as Inversion
     from service.control.reconstructor import InversionMethod as InversionMethod
@@ -87,6 +88,7 @@ _HOMES = {
     "read_fit": "pyrcal.fitting.report",
     "reconstruct": "service.control.reconstructor",
     "to_oopao": "pyrcal.importers.oopao",
+    "to_specula": "pyrcal.twins.specula_model",
     "track": "pyrcal.playback.track",
     "twin": "pyrcal.twins.make",
     "write_bundle": "service.files.bundle",

@@ -372,9 +372,7 @@ def _describe_import(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     )
     roles = "file or folder with arrays of known names, or ROLE=FILE with a role of matrix, valid, "
     roles += "light, modes, positions, mode_to_actuator"
-    saved = words(
-        "file FILE.npz", "arrays listed in docs/tutorials/oopao.md, by np.savez", type=Path
-    )
+    saved = words("file FILE", ".npz or .mat with the names in docs/tutorials/oopao.md", type=Path)
     own = words("files FILE", "files, recognised by their content", type=_role_and_path, nargs="+")
     named = words("files [ROLE=]FILE", roles, type=_role_and_path, nargs="+")
     response = words("--response NAME", "such as loRM; default: of single actuators if present")

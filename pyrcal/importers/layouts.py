@@ -229,14 +229,17 @@ def _unfold(values: Array, notes: list[str]) -> Array:
 def by_role(arrays: Mapping[str, Array], where: str) -> dict[str, Array]:
     """Return the arrays of a file by role, recognised by name in any letter case.
 
+    Of a name with dots, such as a field of a MATLAB struct has, the last part counts. A single
+    number, such as the diameter ``tel.D``, has no role.
+
     Raises
     ------
     MatrixError
         If two have names of the same role.
     """
     names: dict[str, str] = {}
-    for name in arrays:
-        role = _ROLE_OF_NAME.get(name.lower())
+    for name in (one for one, values in arrays.items() if np.size(values) > 1):
+        role = _ROLE_OF_NAME.get(name.rpartition(".")[2].lower())
         if role is not None and names.setdefault(role, name) != name:
             raise MatrixError(f"{where}: found {names[role]} and {name}, expected one {role}")
     return {role: arrays[name] for role, name in names.items()}

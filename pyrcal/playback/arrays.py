@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 from pyrcal.importers.saved import read_npz
 from pyrcal.playback.alignment import MAX_FRAMES, measure_delay
 from pyrcal.rtc.identity import Identity, Reconstructor
+from service import wire
 from service.errors import ConfigurationError, say
 from service.files import FileKind, kind_of
 from service.files.container import opened
@@ -44,18 +45,6 @@ from service.files.recording import Message, RecordedKind
 from service.files.whole import open_hdf5
 from service.model.instrument import Instrument
 from service.tracking.policy import SECOND_NS
-from service.wire import (
-    BATCH_LIMIT,
-    FRAMES_PER_BATCH,
-    DitherKind,
-    DitherRequest,
-    DitherStatus,
-    FrameHeader,
-    Loop,
-    Status,
-    encode,
-    encode_frames,
-)
 
 Array = NDArray[np.float64]
 
@@ -148,7 +137,9 @@ class Arrays:
             yield _matrix_message(matrix, status)
         every = max(1, round(STATUS_S * status.frame_rate_hz))
         last_status, unusable = -1, np.zeros(0, np.intp)
-        n_at_once = max(1, min(FRAMES_PER_BATCH, BATCH_LIMIT // (4 * (n_slopes + 2 * n_modes))))
+        n_at_once = max(
+            1, min(wire.FRAMES_PER_BATCH, wire.BATCH_LIMIT // (4 * (n_slopes + 2 * n_modes)))
+        )
         for start, stop in _batches(seq, n_at_once):
             rows = self._rows(start, stop, n_modes)
             # A comparison with NaN is false, so it is left out as well.
@@ -162,7 +153,7 @@ class Arrays:
                     last_status = since[0] // every
                     yield _status_message(status, int(numbers[0]), int(since[0]))
                 header = self._header(status, int(numbers[0]), last - first, int(since[0]))
-                payload, attachment = encode_frames(header, rows[first:last])
+                payload, attachment = wire.encode_frames(header, rows[first:last])
                 at_s = float(since[1] + 1) / status.frame_rate_hz
                 yield Message(at_s, RecordedKind.FRAMES, payload, attachment)
         self._report_unusable(unusable, n_frames)
@@ -223,8 +214,8 @@ class Arrays:
                     return name, int(places[0]), float(values[places[0]])
         raise AssertionError(f"row {row} of {self.path} is finite")
 
-    def _header(self, status: Status, seq0: int, n: int, since: int) -> FrameHeader:
-        return FrameHeader(
+    def _header(self, status: wire.Status, seq0: int, n: int, since: int) -> wire.FrameHeader:
+        return wire.FrameHeader(
             session=status.session,
             seq0=seq0,
             n=n,
@@ -251,7 +242,7 @@ class Arrays:
 
     def _status(
         self, instrument: Instrument, n_slopes: int, n_given: int, n_controlled: int
-    ) -> Status:
+    ) -> wire.Status:
         n_modes = instrument.modes.n_modes
         gains = np.zeros(n_modes)
         given = self._values("gains", 1) if self._has("gains") else np.array([0.5])
@@ -271,14 +262,14 @@ class Arrays:
         if not rate_hz * MAX_SPAN_S >= n_frames:
             found = f"{rate_hz:g}, at which {n_frames} frames last longer than a day"
             raise self._refusal("frame_rate_hz", found, "frames a second")
-        return Status(
+        return wire.Status(
             delay_frames=self._number("delay_frames", 2.0, MAX_DELAY_FRAMES),
             gains=tuple(gains.tolist()),
             leak=self._number("leak", 1.0, 1.0),
             session=SESSION,
             seq=None,
             t_ns=int(self._number("t0_ns_utc", 0.0, 2.0**62)),
-            loop=Loop.CLOSED if n_controlled and gains.any() else Loop.OPEN,
+            loop=wire.Loop.CLOSED if n_controlled and gains.any() else wire.Loop.OPEN,
             frame_rate_hz=rate_hz,
             n_slopes=n_slopes,
             n_modes=n_modes,
@@ -292,7 +283,7 @@ class Arrays:
             magnitude=None,
         )
 
-    def _dither(self, rate_hz: float, n_given: int, n_frames: int) -> DitherStatus | None:
+    def _dither(self, rate_hz: float, n_given: int, n_frames: int) -> wire.DitherStatus | None:
         """Return the sines that play from the first frame; None if the file describes none."""
         names = ("dither_modes", "dither_frequencies_hz", "dither_amplitude_m")
         if not any(map(self._has, names)):
@@ -318,15 +309,15 @@ class Arrays:
         self._check_each("dither_frequencies_hz", frequencies, fits, below)
         fits = (amplitudes > 0.0) & (amplitudes <= 1.0)
         self._check_each("dither_amplitude_m", amplitudes, fits, "above 0 and at most 1 m of OPD")
-        request = DitherRequest(
+        request = wire.DitherRequest(
             id="dither-of-the-file",
             modes=tuple(int(mode) for mode in modes),
             amplitude_m=tuple(amplitudes.tolist()),
-            kind=DitherKind.SINE,
+            kind=wire.DitherKind.SINE,
             frequency_hz=tuple(frequencies.tolist()),
             duration_s=n_frames / rate_hz,
         )
-        return DitherStatus(request=request, start_seq=int(self._sequence(n_frames)[0]))
+        return wire.DitherStatus(request=request, start_seq=int(self._sequence(n_frames)[0]))
 
     def _reconstructor(self, n_slopes: int, n_modes: int) -> NDArray[np.float32] | None:
         if not self._has("reconstructor"):
@@ -429,17 +420,17 @@ class Arrays:
         return ConfigurationError(f"{self.path}: {name}: found {found}, expected {expected}")
 
 
-def _matrix_message(matrix: NDArray[np.float32], status: Status) -> Message:
+def _matrix_message(matrix: NDArray[np.float32], status: wire.Status) -> Message:
     identity = Identity(system=SESSION, basis_id=status.basis_id, config_id=status.config_id)
     manifest = Reconstructor.own(MATRIX_ID, matrix, identity, created_ns=status.t_ns).manifest
-    return Message(0.0, RecordedKind.MATRIX, matrix.tobytes(), encode(manifest))
+    return Message(0.0, RecordedKind.MATRIX, matrix.tobytes(), wire.encode(manifest))
 
 
-def _status_message(status: Status, seq: int, since: int) -> Message:
+def _status_message(status: wire.Status, seq: int, since: int) -> Message:
     """Return the status of a frame, ``since`` frames after the first."""
     seconds = since / status.frame_rate_hz
     later_status = replace(status, seq=seq, t_ns=status.t_ns + round(seconds * SECOND_NS))
-    return Message(seconds, RecordedKind.STATUS, encode(later_status))
+    return Message(seconds, RecordedKind.STATUS, wire.encode(later_status))
 
 
 def _runs(usable: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:

@@ -14,18 +14,7 @@ from pyrcal.rtc.identity import Identity, Reconstructor, new_session
 from pyrcal.rtc.references import ReferenceOffset
 from pyrcal.rtc.replies import FinishedMeasurement
 from pyrcal.rtc.staging import Terms
-from service.wire import (
-    Command,
-    DitherRequest,
-    DitherStop,
-    FrameHeader,
-    Loop,
-    LoopRequest,
-    ReferencesInUse,
-    ReferencesRequest,
-    Reply,
-    Status,
-)
+from service import wire
 
 Array32 = NDArray[np.float32]
 
@@ -177,14 +166,14 @@ class BasicComputer:
         self._subtracts_offset = True
         return self._offsets
 
-    def references_in_use(self) -> ReferencesInUse:
+    def references_in_use(self) -> wire.ReferencesInUse:
         """Return the offset that is subtracted now."""
         with self._lock:
             return self._offset.in_use(self.identity.reference_id or self.identity.config_id)
 
     def end_batch(
         self, slopes: ArrayLike, commands_m: ArrayLike, dither_m: ArrayLike
-    ) -> tuple[FrameHeader, Array32]:
+    ) -> tuple[wire.FrameHeader, Array32]:
         """Return header and rows of the frames just exposed, for ``RtcLink.publish_frames``.
 
         Parameters
@@ -199,7 +188,7 @@ class BasicComputer:
         """
         rows = np.hstack([slopes, commands_m, dither_m]).astype(np.float32)
         with self._lock:
-            header = FrameHeader(
+            header = wire.FrameHeader(
                 session=self._session,
                 seq0=self.seq,
                 n=len(rows),
@@ -223,14 +212,14 @@ class BasicComputer:
         # processed.
         return self._start_ns + round(seq * 1e9 / self._frame_rate_hz)
 
-    def status(self) -> Status:
+    def status(self) -> wire.Status:
         """Return the present status, for ``RtcLink.publish_status``."""
         with self._lock:
-            return Status(
+            return wire.Status(
                 session=self._session,
                 seq=self.seq - 1 if self.seq else None,
                 t_ns=self.time_ns(max(self.seq - 1, 0)),
-                loop=Loop.CLOSED if self.closed else Loop.OPEN,
+                loop=wire.Loop.CLOSED if self.closed else wire.Loop.OPEN,
                 frame_rate_hz=self._frame_rate_hz,
                 delay_frames=self._delay_frames,
                 gains=tuple(self.gains.tolist()),
@@ -273,28 +262,28 @@ class BasicComputer:
         """Return no measurement. A program that measures matrices overrides this."""
         return ()
 
-    def execute(self, command: Command) -> Reply:
+    def execute(self, command: wire.Command) -> wire.Reply:
         """Execute a command and return the reply; a refusal carries its reason."""
         with self._lock:
             reason, start_seq = self._change(command)
-        return Reply(id=command.id, accepted=not reason, reason=reason, start_seq=start_seq)
+        return wire.Reply(id=command.id, accepted=not reason, reason=reason, start_seq=start_seq)
 
-    def _change(self, command: Command) -> tuple[str, int | None]:
+    def _change(self, command: wire.Command) -> tuple[str, int | None]:
         """Apply a command; return the reason of a refusal and the first frame of a dither."""
         match command:
-            case DitherRequest():
+            case wire.DitherRequest():
                 return self._begin_dither(command)
-            case DitherStop():
+            case wire.DitherStop():
                 self._dither = None
-            case LoopRequest():
+            case wire.LoopRequest():
                 return self._change_loop(command), None
-            case ReferencesRequest() if self._subtracts_offset:
+            case wire.ReferencesRequest() if self._subtracts_offset:
                 return self._change_references(command)
             case _:
                 return "unsupported: this RTC has no such command", None
         return "", None
 
-    def _begin_dither(self, request: DitherRequest) -> tuple[str, int | None]:
+    def _begin_dither(self, request: wire.DitherRequest) -> tuple[str, int | None]:
         if self._dither is not None:
             return f"busy: dither {self._dither.request.id} plays", None
         refusal = check_dither(
@@ -317,7 +306,7 @@ class BasicComputer:
         )
         return "", start_seq
 
-    def _change_references(self, request: ReferencesRequest) -> tuple[str, int | None]:
+    def _change_references(self, request: wire.ReferencesRequest) -> tuple[str, int | None]:
         refusal = self._offset.check(request, self.identity.config_id)
         if refusal:
             return refusal, None
@@ -325,7 +314,7 @@ class BasicComputer:
         self._offset.begin(request, start_seq, self._frame_rate_hz)
         return "", start_seq
 
-    def _change_loop(self, request: LoopRequest) -> str:
+    def _change_loop(self, request: wire.LoopRequest) -> str:
         if request.gains is not None:
             if len(request.gains) != self.n_modes:
                 return f"range: {len(request.gains)} gains, expected {self.n_modes}"
@@ -334,11 +323,11 @@ class BasicComputer:
             self.leak = request.leak
         # The number changes with the next matrix: the one in use has its own rows.
         self._n_next = request.n_controlled or self._n_next
-        if request.loop is Loop.OPEN and self.closed:
+        if request.loop is wire.Loop.OPEN and self.closed:
             # Zeroing the integrator begins a new session by the contract (R-27). A dither and a
             # matrix that waits to be swapped in belong to the session that ends.
             self._session, self._dither, self.closed = new_session(), None, False
             self._staged = None
-        elif request.loop is Loop.CLOSED:
+        elif request.loop is wire.Loop.CLOSED:
             self.closed = True
         return ""

@@ -15,19 +15,8 @@ from pyrcal.rtc.background import Background
 from pyrcal.rtc.identity import Reconstructor
 from pyrcal.rtc.replies import Computer, FinishedMeasurement
 from pyrcal.rtc.staging import Replies, Staging
+from service import wire
 from service.errors import WireError
-from service.wire import (
-    CHUNK_LIMIT,
-    Acknowledgement,
-    AckState,
-    Encodings,
-    Keys,
-    Manifest,
-    Role,
-    decode,
-    encode,
-    split,
-)
 from service.wire.signing import UNSIGNED, Signatures
 
 _log = structlog.get_logger("rtc")
@@ -62,7 +51,7 @@ class Matrices(Background):
     def __init__(
         self,
         session: zenoh.Session,
-        keys: Keys,
+        keys: wire.Keys,
         computer: Computer,
         *,
         signatures: Signatures = UNSIGNED,
@@ -83,7 +72,7 @@ class Matrices(Background):
             self._session.declare_subscriber(self._keys.all_chunks, self._on_chunk),
             self._session.declare_subscriber(self._keys.all_commits, self._on_commit),
             self._session.liveliness().declare_subscriber(
-                self._keys.alive(Role.SERVICE), self._on_service, history=True
+                self._keys.alive(wire.Role.SERVICE), self._on_service, history=True
             ),
         )
         return super().__enter__()
@@ -94,7 +83,7 @@ class Matrices(Background):
 
     def _on_chunk(self, sample: zenoh.Sample) -> None:
         # Refused before it is copied.
-        if len(sample.payload) > CHUNK_LIMIT:
+        if len(sample.payload) > wire.CHUNK_LIMIT:
             return
         key, data = str(sample.key_expr), sample.payload.to_bytes()
         self._enqueue(lambda: self._add_chunk(key, data))
@@ -156,7 +145,7 @@ class Matrices(Background):
     def _commit(self, key: str, data: bytes) -> None:
         try:
             self._signatures.check(key, data)
-            manifest = decode(Manifest, data)
+            manifest = wire.decode(wire.Manifest, data)
             if manifest.id != self._keys.matrix_id_of(key):
                 raise WireError(f"id: {manifest.id} in the manifest at {key}")
         except WireError as error:
@@ -164,7 +153,7 @@ class Matrices(Background):
             return
         refusal = self._refusal()
         if refusal:
-            self._acknowledge(self._staging.answer(manifest, AckState.REJECTED, refusal))
+            self._acknowledge(self._staging.answer(manifest, wire.AckState.REJECTED, refusal))
             return
         self._execute(self._staging.commit(manifest, time.monotonic()))
 
@@ -186,7 +175,7 @@ class Matrices(Background):
             return
         try:
             self._signatures.check(self._keys.current, data)
-            manifest = decode(Manifest, data)
+            manifest = wire.decode(wire.Manifest, data)
         except WireError as error:
             _log.warning("reconstructor.refused", reason=str(error))
             return
@@ -227,14 +216,14 @@ class Matrices(Background):
     def _stage(self, reconstructor: Reconstructor) -> None:
         self._computer.stage(reconstructor)
 
-    def _acknowledge(self, acknowledgement: Acknowledgement) -> None:
+    def _acknowledge(self, acknowledgement: wire.Acknowledgement) -> None:
         _log.info(
             "reconstructor." + acknowledgement.state,
             id=acknowledgement.id,
             reason=acknowledgement.reason,
             frame_seq=acknowledgement.frame_seq,
         )
-        self._put_acknowledgement(encode(acknowledgement))
+        self._put_acknowledgement(wire.encode(acknowledgement))
 
     def _put_acknowledgement(self, data: bytes) -> None:
         signed = self._signatures.sign(self._keys.acknowledgement, data)
@@ -243,12 +232,12 @@ class Matrices(Background):
     def _send(self, measured: FinishedMeasurement) -> None:
         """Solve a measurement; send the matrix in chunks, then its manifest."""
         manifest, matrix = measured.product(self._computer.identity, time.time_ns())
-        parts = [] if matrix is None else split(matrix, manifest.layout.chunk_bytes)
+        parts = [] if matrix is None else wire.split(matrix, manifest.layout.chunk_bytes)
         for index, part in enumerate(parts):
             self._session.put(
                 self._keys.measured_chunk(manifest.id, index),
                 part,
-                encoding=Encodings.BYTES,
+                encoding=wire.Encodings.BYTES,
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 priority=zenoh.Priority.DATA_LOW,
             )
@@ -256,8 +245,8 @@ class Matrices(Background):
         key = self._keys.measured_commit(manifest.id)
         self._session.put(
             key,
-            self._signatures.sign(key, encode(manifest)),
-            encoding=Encodings.MEASURED_COMMIT,
+            self._signatures.sign(key, wire.encode(manifest)),
+            encoding=wire.Encodings.MEASURED_COMMIT,
             congestion_control=zenoh.CongestionControl.BLOCK,
             priority=zenoh.Priority.DATA_HIGH,
         )
@@ -270,12 +259,12 @@ class Matrices(Background):
         )
 
 
-def acknowledge(session: zenoh.Session, keys: Keys, data: bytes) -> None:
+def acknowledge(session: zenoh.Session, keys: wire.Keys, data: bytes) -> None:
     """Send an encoded acknowledgement."""
     session.put(
         keys.acknowledgement,
         data,
-        encoding=Encodings.ACKNOWLEDGEMENT,
+        encoding=wire.Encodings.ACKNOWLEDGEMENT,
         congestion_control=zenoh.CongestionControl.BLOCK,
         priority=zenoh.Priority.DATA_HIGH,
     )

@@ -18,20 +18,8 @@ from numpy.typing import NDArray
 
 from pyrcal.rtc.identity import Identity, Reconstructor
 from pyrcal.rtc.staging import Terms
+from service import wire
 from service.errors import WireError
-from service.wire import (
-    Command,
-    CommandKind,
-    Encodings,
-    Keys,
-    MeasuredManifest,
-    ReferencesInUse,
-    Reply,
-    command_id,
-    decode_command,
-    encode,
-    split,
-)
 from service.wire.signing import UNSIGNED, Signatures
 
 _log = structlog.get_logger("rtc")
@@ -42,7 +30,7 @@ class FinishedMeasurement(Protocol):
 
     def product(
         self, identity: Identity, created_ns: int
-    ) -> tuple[MeasuredManifest, NDArray[np.float32] | None]:
+    ) -> tuple[wire.MeasuredManifest, NDArray[np.float32] | None]:
         """Return the manifest and the matrix; None in place of the matrix if there is none."""
 
 
@@ -76,7 +64,7 @@ class Computer(Protocol):
     def take_measured(self) -> Sequence[FinishedMeasurement]:
         """Return the measurements that were finished since the last call."""
 
-    def execute(self, command: Command) -> Reply:
+    def execute(self, command: wire.Command) -> wire.Reply:
         """Execute a command and return the reply; a refusal carries its reason."""
 
 
@@ -84,14 +72,16 @@ class Computer(Protocol):
 class HoldsReferences(Protocol):
     """A :class:`Computer` that subtracts the reference offset that the service requests."""
 
-    def references_in_use(self) -> ReferencesInUse:
+    def references_in_use(self) -> wire.ReferencesInUse:
         """Return the offset that is subtracted now."""
 
 
 class Replies:
     """Queryables of the RTC. They answer in zenoh's threads."""
 
-    def __init__(self, keys: Keys, computer: Computer, signatures: Signatures = UNSIGNED) -> None:
+    def __init__(
+        self, keys: wire.Keys, computer: Computer, signatures: Signatures = UNSIGNED
+    ) -> None:
         self._keys = keys
         self._signatures = signatures
         self._computer = computer
@@ -105,13 +95,15 @@ class Replies:
             in_use = self._computer.references_in_use
             answer_references(session, self._keys, in_use, self._signatures)
 
-    def _reply(self, kind: CommandKind, data: bytes) -> Reply:
+    def _reply(self, kind: wire.CommandKind, data: bytes) -> wire.Reply:
         try:
             self._signatures.check(self._keys.command(kind), data)
-            reply = self._cache.handle(decode_command(kind, data), time.monotonic())
+            reply = self._cache.handle(wire.decode_command(kind, data), time.monotonic())
         except WireError as error:
             # The command could not be decoded, so its id is taken from the data if it is readable.
-            reply = Reply(id=command_id(data), accepted=False, reason=str(error), start_seq=None)
+            reply = wire.Reply(
+                id=wire.command_id(data), accepted=False, reason=str(error), start_seq=None
+            )
         _log.info(
             "command",
             kind=str(kind),
@@ -123,31 +115,31 @@ class Replies:
 
     def _applied(self) -> tuple[bytes, list[bytes]]:
         active = self._computer.reconstructor
-        chunks = split(active.matrix, active.manifest.layout.chunk_bytes)
-        return encode(active.manifest), chunks
+        chunks = wire.split(active.matrix, active.manifest.layout.chunk_bytes)
+        return wire.encode(active.manifest), chunks
 
 
 def answer_commands(
     session: zenoh.Session,
-    keys: Keys,
-    reply: Callable[[CommandKind, bytes], Reply],
+    keys: wire.Keys,
+    reply: Callable[[wire.CommandKind, bytes], wire.Reply],
     signatures: Signatures = UNSIGNED,
 ) -> None:
     """Declare one queryable for each kind of command, answered by ``reply``."""
 
-    def answer(kind: CommandKind, query: zenoh.Query) -> None:
+    def answer(kind: wire.CommandKind, query: zenoh.Query) -> None:
         with query:
             data = b"" if query.payload is None else query.payload.to_bytes()
-            reply_bytes = signatures.sign(keys.command(kind), encode(reply(kind, data)))
-            query.reply(keys.command(kind), reply_bytes, encoding=Encodings.REPLY)
+            reply_bytes = signatures.sign(keys.command(kind), wire.encode(reply(kind, data)))
+            query.reply(keys.command(kind), reply_bytes, encoding=wire.Encodings.REPLY)
 
-    for kind in CommandKind:
+    for kind in wire.CommandKind:
         session.declare_queryable(keys.command(kind), partial(answer, kind))
 
 
 def answer_applied(
     session: zenoh.Session,
-    keys: Keys,
+    keys: wire.Keys,
     applied: Callable[[], tuple[bytes, list[bytes]] | None],
     signatures: Signatures = UNSIGNED,
 ) -> None:
@@ -162,9 +154,9 @@ def answer_applied(
             manifest, chunks = found
             if wanted is None:
                 signed = signatures.sign(keys.applied, manifest)
-                query.reply(keys.applied, signed, encoding=Encodings.COMMIT)
+                query.reply(keys.applied, signed, encoding=wire.Encodings.COMMIT)
             elif wanted.isdecimal() and int(wanted) < len(chunks):
-                query.reply(keys.applied, chunks[int(wanted)], encoding=Encodings.BYTES)
+                query.reply(keys.applied, chunks[int(wanted)], encoding=wire.Encodings.BYTES)
             else:
                 query.reply_err(f"range: chunk {wanted}, expected 0 to {len(chunks) - 1}")
 
@@ -173,16 +165,16 @@ def answer_applied(
 
 def answer_references(
     session: zenoh.Session,
-    keys: Keys,
-    in_use: Callable[[], ReferencesInUse],
+    keys: wire.Keys,
+    in_use: Callable[[], wire.ReferencesInUse],
     signatures: Signatures = UNSIGNED,
 ) -> None:
     """Declare the queryable of the reference offset in use."""
 
     def answer(query: zenoh.Query) -> None:
         with query:
-            signed = signatures.sign(keys.references_in_use, encode(in_use()))
-            query.reply(keys.references_in_use, signed, encoding=Encodings.REFERENCES)
+            signed = signatures.sign(keys.references_in_use, wire.encode(in_use()))
+            query.reply(keys.references_in_use, signed, encoding=wire.Encodings.REFERENCES)
 
     session.declare_queryable(keys.references_in_use, answer)
 
@@ -193,19 +185,19 @@ _REPLY_LIFETIME_S = 600.0
 
 class _Answered(NamedTuple):
     time_s: float
-    command: Command
-    reply: Reply
+    command: wire.Command
+    reply: wire.Reply
 
 
 class ReplyCache:
     """Repeats the reply to a command that arrives again within ten minutes."""
 
-    def __init__(self, execute: Callable[[Command], Reply]) -> None:
+    def __init__(self, execute: Callable[[wire.Command], wire.Reply]) -> None:
         self._execute = execute
         self._lock = threading.Lock()
         self._answered: dict[str, _Answered] = {}
 
-    def handle(self, command: Command, now_s: float) -> Reply:
+    def handle(self, command: wire.Command, now_s: float) -> wire.Reply:
         """Return the reply to a command. ``now_s`` is a monotonic time in seconds."""
         # Held while the command is executed: a repetition that comes meanwhile waits for the same
         # reply.
@@ -223,4 +215,4 @@ class ReplyCache:
             if known.command == command:
                 return known.reply
         reason = f"id: {command.id} was used for another command, expected a new id"
-        return Reply(id=command.id, accepted=False, reason=reason, start_seq=None)
+        return wire.Reply(id=command.id, accepted=False, reason=reason, start_seq=None)

@@ -7,19 +7,27 @@ the left, around; its x runs along the rows, so that its first slopes are Sy of 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from string import Template
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from pyrcal.fitting.fitted import Fit
 from pyrcal.twins.exported import Exported
-from pyrcal.twins.sampled import SampledBench
-from service.errors import MatrixError
+from pyrcal.twins.sampled import SampledBench, sample_bench
+from service.errors import MatrixError, StorageError
 from service.files.container import opened
+from service.files.disk_cache import cached_basis
+from service.instrument import load_instrument
+from service.model.instrument import Instrument
+from service.model.interaction import InteractionModel
+from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
+from service.model.pupil import valid_subapertures
 from service.model.slopes import slopes_of
 from service.model.surface import Gaussian
 
@@ -49,12 +57,82 @@ _IMAGES = ((0, 1), (0, 0), (1, 0), (1, 1))
 """Side along y and along x of each of SPECULA's images."""
 
 
+def to_specula(
+    instrument: Instrument | str | Path,
+    folder: str | Path,
+    found: Fit | Misregistration | None = None,
+) -> Exported:
+    """Write an instrument as a SPECULA model: a parameter file and its calibration FITS files.
+
+    Parameters
+    ----------
+    instrument
+        As ``load_instrument`` returns it, or what that takes.
+    folder
+        Folder to write; files of an earlier model in it are replaced.
+    found
+        Fit of its matrix, whose optical values the model then has, or a registration; None for
+        perfect registration.
+
+    Returns
+    -------
+    Exported
+        ``path`` of the parameter file, and ``remarks`` on what it assumes or cannot say.
+
+    Raises
+    ------
+    ModelError
+        If the sensor is no pyramid.
+    StorageError
+        If writing fails.
+    """
+    if not isinstance(instrument, Instrument):
+        instrument = load_instrument(instrument)
+    if not isinstance(found, Fit):
+        found = _compute_fit(instrument, found or Misregistration())
+    bench = sample_bench(instrument, found)
+    try:
+        return write_specula_model(bench, found, Path(folder))
+    except OSError as error:
+        raise StorageError(f"{folder}: cannot be written: {error}") from error
+
+
+def _compute_fit(instrument: Instrument, alpha: Misregistration) -> Fit:
+    """Return what a fit of the instrument's own matrix at this registration would find."""
+    basis, valid = cached_basis(instrument), valid_subapertures(instrument)
+    matrix = InteractionModel(instrument, basis).interaction_matrix(alpha)
+    n_modes, n_planes = basis.n_modes, instrument.slopes.kind.n_planes
+    return Fit(
+        alpha=alpha,
+        covariance=np.zeros((4, 4)),
+        subset_scatter=np.zeros(4),
+        gains=np.ones(n_modes),
+        residual_fraction=0.0,
+        residual_map=np.where(valid, 0.0, np.nan) * np.ones((n_planes, 1, 1)),
+        residual_by_mode=np.zeros(n_modes),
+        condition_number=float(np.linalg.cond(matrix)),
+        modes=np.arange(n_modes),
+        orientation=instrument.slopes.assumed_orientation,
+        order=instrument.slopes.order,
+        accepted=True,
+        converged=True,
+        verdict="computed: no matrix was fitted",
+        remarks=(),
+        left_out=(),
+        n_evaluations=1,
+        synthetic=matrix,
+        measured=matrix,
+        valid=valid,
+    )
+
+
 def write_specula_model(bench: SampledBench, fit: Fit, folder: Path) -> Exported:
     """Write the model into ``folder``: the fitted modes, and slopes in the axes of conventions.md.
 
     ``specula --cpu specula_model.yml``, run in the folder, measures the interaction matrix; with
     ``specula_loop.yml`` as a second file it closes the loop on a static aberration.
     """
+    bench = _move_pupil(bench)
     apart, width = _place_images(bench)
     functions, m2c = _describe_mirror(bench, fit)
     lit = bench.amplitude > 0.0
@@ -124,6 +202,26 @@ def read_matrix(folder: Path) -> Array:
 def swap_slopes(matrix: Array) -> Array:
     """Return SPECULA's slopes ``(n_slopes, ...)`` as all Sx, then all Sy, or the reverse."""
     return np.concatenate([matrix[len(matrix) // 2 :], matrix[: len(matrix) // 2]])
+
+
+def _move_pupil(bench: SampledBench) -> SampledBench:
+    """Return the bench with the pupil itself off the middle, where its four images were.
+
+    SPECULA's images are as far off its grid of pixels as the pupil is off the middle of its array.
+    """
+    moved, sampling = bench.pupil_shift_subap, bench.points_per_pixel * bench.pixels
+    if not np.any(moved):
+        return bench
+    margin = math.ceil(np.abs(moved).max())
+    wider = np.pad(bench.amplitude, margin * sampling)
+    return replace(
+        bench,
+        n_pixels=bench.n_pixels + 2 * margin * bench.pixels,
+        amplitude=scipy.ndimage.shift(wider, moved[::-1] * sampling, order=1),
+        pupil_shift_subap=np.zeros(2),
+        image_places_px=bench.image_places_px - moved * bench.pixels,
+        valid=np.pad(bench.valid, margin),
+    )
 
 
 def _place_images(bench: SampledBench) -> tuple[int, int]:

@@ -7,16 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any, Self
 
+from service.archive import products
 from service.archive.index import AuditEntry, Index, Pin, Range, Sent, begun_ns_utc
 from service.archive.nights import Nights, TrendSample
-from service.archive.products import (
-    PROBE_BYTES,
-    MeasuredArchive,
-    NoisyArchive,
-    ReconstructorArchive,
-    Recordings,
-    ReferencesArchive,
-)
 from service.archive.serialisation import TrackingFile
 from service.archive.store import FOLDER_MODE, Store
 from service.errors import ArchiveError, StorageError, UnknownIdError
@@ -46,17 +39,19 @@ class Archive:
         self.directory = directory
         self.index = Index(directory / "index.sqlite")
         """Index: state of each product, and the audit trail."""
-        self.reconstructors = ReconstructorArchive(directory / "reconstructors", self.index)
+        self.reconstructors = products.ReconstructorArchive(
+            directory / "reconstructors", self.index
+        )
         """Reconstructors made here or read from the RTC, and the fate of each."""
-        self.references = ReferencesArchive(directory / "reference_slopes", self.index)
+        self.references = products.ReferencesArchive(directory / "reference_slopes", self.index)
         """Offsets of reference slopes made here, and the fate of each."""
-        self.measured = MeasuredArchive(directory / "interaction_matrices", self.index)
+        self.measured = products.MeasuredArchive(directory / "interaction_matrices", self.index)
         """Interaction matrices the RTC has measured."""
-        self.noisy = NoisyArchive(directory / "noisy_matrices", self.index)
+        self.noisy = products.NoisyArchive(directory / "noisy_matrices", self.index)
         """Noisy interaction matrices of random dithers."""
-        self.recordings = Recordings(directory / "recordings")
+        self.recordings = products.Recordings(directory / "recordings")
         """Recordings of telemetry that somebody requested."""
-        self.stores: tuple[Store[Any] | Recordings, ...] = (
+        self.stores: tuple[Store[Any] | products.Recordings, ...] = (
             self.reconstructors,
             self.references,
             self.measured,
@@ -230,10 +225,10 @@ class Archive:
         path = self.reconstructors.directory / "probe.part"
         try:
             with path.open("wb") as file:
-                for start in range(0, self.reconstructors.largest_bytes, PROBE_BYTES):
+                for start in range(0, self.reconstructors.largest_bytes, products.PROBE_BYTES):
                     left = self.reconstructors.largest_bytes - start
                     # Real zeros are written, because a sparse file would take no space.
-                    file.write(bytes(min(PROBE_BYTES, left)))
+                    file.write(bytes(min(products.PROBE_BYTES, left)))
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:

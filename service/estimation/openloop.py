@@ -116,11 +116,8 @@ def find(spectra: Spectra, search: WideCaptureSearch) -> WideCaptureEstimate | W
 
 def not_found(reason: Message, spectra: Spectra) -> WindowRefused:
     """Return the refusal of a window of an open loop that led nowhere."""
-    return WindowRefused(
-        reason=compose("window.not-found", reason.key, reason=str(reason)),
-        t_ns_utc=spectra.t_end_ns_utc,
-        kind=RefusalKind.NOT_FOUND,
-    )
+    refusal = compose("window.not-found", reason.key, reason=str(reason))
+    return spectra.refuse(refusal, RefusalKind.NOT_FOUND)
 
 
 def _columns(spectra: Spectra) -> tuple[Columns, Array]:

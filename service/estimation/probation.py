@@ -28,17 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from service.estimation.comparison import (
-    DECISION_PERIOD_S,
-    INNER,
-    OUTER,
-    REFERENCE_PERIOD_S,
-    SLOPES,
-    Before,
-    Part,
-    compare_telemetry,
-    not_compared,
-)
+from service.estimation import comparison
 from service.estimation.description import EdgeWatch
 from service.estimation.estimator import Change, FrameContext, LoopContext, Mark, Streaming
 from service.estimation.frames import FrameBlock
@@ -49,7 +39,7 @@ from service.wire import Status
 
 Array = NDArray[np.float64]
 
-MAX_PROBATION_S = DECISION_PERIOD_S
+MAX_PROBATION_S = comparison.DECISION_PERIOD_S
 """Telemetry with the new matrix that is looked at; the verdict comes at the latest then."""
 
 HISTORY_S = 10.0
@@ -123,11 +113,11 @@ class Comparison(Streaming):
     n_skipped: int = 0
     """Frames since the swap that do not count yet."""
 
-    parts: tuple[Part, ...] = ()
+    parts: tuple[comparison.Part, ...] = ()
     """Parts with the matrix in use, oldest first, up to the number that counts; the last is
     incomplete."""
 
-    before: Before | None = None
+    before: comparison.Before | None = None
     """None: nothing is being compared."""
 
     reader: Reader | None = None
@@ -136,7 +126,7 @@ class Comparison(Streaming):
     own: NDArray[np.float32] | None = None
     """The matrix in use, where it is not the reader's: it has read the telemetry before, too."""
 
-    healthy: Before | None = None
+    healthy: comparison.Before | None = None
     """Reference of the last matrix that was judged worse; the next matrix is compared with it as
     well."""
 
@@ -181,7 +171,7 @@ def restart(state: Comparison, why: str) -> Comparison:
     """Return an empty comparison; one that was under way ends without a verdict."""
     found = state.found
     if state.before is not None and state.cm_id is not None:
-        found = not_compared(state.before.id, state.cm_id, why)
+        found = comparison.not_compared(state.before.id, state.cm_id, why)
     return Comparison(cm_id=state.cm_id, found=found)
 
 
@@ -223,7 +213,9 @@ def _believe(state: Comparison, matrix: NDArray[np.float32] | None) -> Compariso
     return replace(state, reader=Reader.of(matrix), parts=parts)
 
 
-def _read_by(state: Comparison, before: Before, matrix: NDArray[np.float32] | None) -> Comparison:
+def _read_by(
+    state: Comparison, before: comparison.Before, matrix: NDArray[np.float32] | None
+) -> Comparison:
     """Have the matrix in use read the telemetry before, too."""
     level = None if before.level is None else before.level.read_by(matrix)
     return replace(state, own=matrix, before=replace(before, level=level))
@@ -305,9 +297,9 @@ def _begin_comparison(state: Comparison, block: FrameBlock) -> Comparison:
     lasted_s = sum(part.n_frames for part in state.parts) * block.dt_ns * 1e-9
     if lasted_s < MIN_HISTORY_S:
         why = f"only {lasted_s:.1f} s of telemetry with {state.cm_id} to compare with"
-        return replace(fresh, found=not_compared(state.cm_id, block.cm_id, why))
+        return replace(fresh, found=comparison.not_compared(state.cm_id, block.cm_id, why))
     part_s = max(PART_S, MIN_PART_FRAMES * block.dt_ns * 1e-9)
-    before = Before.of(state.cm_id, state.parts, state.modes, part_s)
+    before = comparison.Before.of(state.cm_id, state.parts, state.modes, part_s)
     return replace(fresh, before=before, reader=state.reader)
 
 
@@ -322,7 +314,7 @@ def _part(
     steps: NDArray[np.float32],
     lines: tuple[float, ...],
     edge: EdgeWatch | None,
-) -> Part:
+) -> comparison.Part:
     """Return the sums of one block; sines of these frequencies, cycles per frame, are left out."""
     n_frames = float(len(steps))
     power = np.zeros(block.commands_m.shape[1] + 3)
@@ -335,15 +327,15 @@ def _part(
         moved *= n_frames / (n_frames - sines.shape[1])
     power[: steps.shape[1]] = moved
     looked = block.slopes[::_POWER_STRIDE_FRAMES]
-    power[SLOPES] = n_frames * np.vdot(looked, looked) / len(looked)
+    power[comparison.SLOPES] = n_frames * np.vdot(looked, looked) / len(looked)
     peak = float(np.einsum("ks,ks->k", looked, looked).max())
     if edge is not None:
         last = block.commands_m[-1, edge.modes]
         outer = edge.outer @ last
-        power[OUTER] = n_frames * (outer @ outer) / len(outer)
+        power[comparison.OUTER] = n_frames * (outer @ outer) / len(outer)
         # Rounding in single precision may make a small quadratic form negative.
-        power[INNER] = n_frames * max(float(last @ (edge.inner @ last)), 0.0)
-    return Part(n_frames=n_frames, power=power, peak=peak)
+        power[comparison.INNER] = n_frames * max(float(last @ (edge.inner @ last)), 0.0)
+    return comparison.Part(n_frames=n_frames, power=power, peak=peak)
 
 
 @lru_cache(maxsize=N_SINE_BASES)
@@ -354,7 +346,7 @@ def _sines(n_frames: int, lines: tuple[float, ...]) -> NDArray[np.float32]:
     return np.asarray(basis, np.float32)
 
 
-def _add_sums(state: Comparison, part: Part, block: FrameBlock) -> Comparison:
+def _add_sums(state: Comparison, part: comparison.Part, block: FrameBlock) -> Comparison:
     """Add sums to the part under way, or begin another one."""
     dt_s, parts = block.dt_ns * 1e-9, state.parts
     length = max(PART_S / dt_s, MIN_PART_FRAMES)
@@ -366,7 +358,7 @@ def _add_sums(state: Comparison, part: Part, block: FrameBlock) -> Comparison:
         return replace(state, parts=parts)
     # the history of the next swap
     parts = parts[-round(HISTORY_S / dt_s / length) :]
-    n_recent = round(REFERENCE_PERIOD_S / dt_s / length)
+    n_recent = round(comparison.REFERENCE_PERIOD_S / dt_s / length)
     if len(parts) > n_recent:
         # Samples of slopes are kept for recent parts only, from which the new matrix reads the
         # residual; older ones would take memory for nothing.
@@ -396,7 +388,7 @@ def _judge_parts(state: Comparison, block: FrameBlock) -> Comparison:
     looked_at = state.parts[-N_RETURN_PARTS:] if state.returned else state.parts
     over = after_s >= MAX_PROBATION_S - PART_S
     decides = over or state.returned
-    found = compare_telemetry(
+    found = comparison.compare_telemetry(
         before, looked_at, modes.astype(np.intp), block.cm_id, decides=decides
     )
     waits = found.verdict is (Verdict.WORSE if state.returned else Verdict.AS_GOOD)

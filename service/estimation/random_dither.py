@@ -291,7 +291,7 @@ def fit_random(window: Correlated, linearisation: Linearisation) -> RandomEstima
     lag_frames, trouble = _measure_lag(window, measured, matrix, noise)
     if trouble is not None:
         kind, reason = trouble
-        return WindowRefused(reason=reason, t_ns_utc=window.t_end_ns_utc, kind=kind)
+        return window.refuse(reason, kind)
     step = np.zeros(len(derivatives))
     seen = measured.project(matrix, derivatives)
     for _ in range(N_STEPS):

@@ -146,6 +146,10 @@ class Telemetry:
     n_windows: int = 1
     """Windows, one after the other, that are joined here."""
 
+    def refuse(self, reason: str | Message, kind: RefusalKind = RefusalKind.OTHER) -> WindowRefused:
+        """Return the refusal of this window."""
+        return WindowRefused(reason=reason, t_ns_utc=self.t_end_ns_utc, kind=kind)
+
     def is_like(self, other: Telemetry) -> bool:
         """Return whether both are windows of one dither and one loop."""
         return (self.session, self.cm_id, replace(self.plan, first_seq=0)) == (

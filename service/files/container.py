@@ -339,7 +339,7 @@ def _matlab(path: Path) -> Iterator[Container]:
             yield _reverse_axes(found)
         return
     try:
-        loaded = scipy.io.loadmat(path)
+        loaded = dict(_list_fields("", scipy.io.loadmat(path)))
     except Exception as error:  # scipy's reader raises whatever damaged numbers lead to
         raise MatrixError(f"{path}: damaged MATLAB file: {error}") from error
     arrays = {
@@ -351,16 +351,33 @@ def _matlab(path: Path) -> Iterator[Container]:
             load=partial(np.transpose, values),
         )
         for name, values in loaded.items()
-        if isinstance(values, np.ndarray) and values.dtype.kind in "biuf"
     }
     yield _reverse_axes(Container(path=path, arrays=arrays, find=arrays.get, facts={}))
 
 
+def _list_fields(prefix: str, values: Mapping[str, Any]) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yield variables, and fields of structs by names like ``tel.D``; words in structs alone."""
+    for name, one in values.items():
+        if not isinstance(one, np.ndarray):
+            continue
+        if one.dtype.names and one.size == 1:
+            fields = {field: one[field].item() for field in one.dtype.names}
+            yield from _list_fields(f"{prefix}{name}.", fields)
+        elif one.dtype.kind in ("biufU" if prefix else "biuf"):
+            yield prefix + name, one
+
+
 def _reverse_axes(found: Container) -> Container:
     """Return the arrays of MATLAB, whose first axis is the last one in HDF5."""
-    # Groups like "#refs#" hold what cells and objects refer to.
-    arrays = {name: _reversed(one) for name, one in found.arrays.items() if name[0] != "#"}
-    return replace(found, arrays=arrays, find=lambda name: arrays.get(name.strip("/")))
+    # Groups like "#refs#" hold what cells and objects refer to; the others are structs.
+    arrays = {
+        name.replace("/", "."): _reversed(one)
+        for name, one in found.arrays.items()
+        if name[0] != "#"
+    }
+    return replace(
+        found, arrays=arrays, find=lambda name: arrays.get(name.strip("/").replace("/", "."))
+    )
 
 
 def _reversed(stored: StoredArray) -> StoredArray:

@@ -14,13 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.model.kinds import (
-    BasisKind,
-    InfluenceShape,
-    KarhunenLoeve,
-    LoopFacts,
-    Telescope,
-)
+from service.model import kinds
 from service.model.misregistration import Misregistration
 from service.model.pointing_law import PointingLaw
 from service.model.slopes import SlopeRecipe
@@ -94,10 +88,10 @@ class Mirror(Mount):
     pitch_m: float
     """Typical distance between neighbours, metres in the pupil plane."""
 
-    shape: InfluenceShape = field(default_factory=InfluenceShape)
+    shape: kinds.InfluenceShape = field(default_factory=kinds.InfluenceShape)
     """Shape of the influence functions."""
 
-    basis: BasisKind = BasisKind.KARHUNEN_LOEVE
+    basis: kinds.BasisKind = kinds.BasisKind.KARHUNEN_LOEVE
     """Modes where ``mode_to_actuator`` is None."""
 
     segments_deg: tuple[float, ...] = ()
@@ -206,7 +200,7 @@ class SensorMode:
     wfs: SensorDescription
     """The sensor, so read."""
 
-    loop: LoopFacts
+    loop: kinds.LoopFacts
     """Properties of the loop in this mode."""
 
     def of(self, instrument: Instrument) -> Instrument:
@@ -215,18 +209,18 @@ class SensorMode:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Instrument(Telescope):
+class Instrument(kinds.Telescope):
     """One telescope, its mirror and its wavefront sensor."""
 
     wfs: SensorDescription
     mirror: Mirror | TabulatedModes
-    modes: KarhunenLoeve = field(default_factory=KarhunenLoeve)
+    modes: kinds.KarhunenLoeve = field(default_factory=kinds.KarhunenLoeve)
     slopes: SlopeRecipe = field(default_factory=SlopeRecipe)
     frames: object | None = None
     """The RTC delivers detector frames, of which the sensor's kind makes slopes like this; None: it
     delivers slopes."""
 
-    loop: LoopFacts | None = None
+    loop: kinds.LoopFacts | None = None
     """Properties of the loop that are known without an RTC; None if none are."""
 
     unknown: tuple[str, ...] = ()
@@ -410,7 +404,7 @@ def _parts(record: DataclassInstance) -> Iterator[tuple[str, object]]:
         value = getattr(record, one.name)
         if one.name in _LATER_FIELDS and not value:
             continue
-        if isinstance(value, InfluenceShape):
+        if isinstance(value, kinds.InfluenceShape):
             yield from _parts(value)
         else:
             yield one.name, value

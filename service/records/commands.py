@@ -540,35 +540,12 @@ class UnmuteAlarm(Instruction):
     """Name of the alarm."""
 
 
-Command = (
-    StopEverything
-    | Resume
-    | AcknowledgeAlarm
-    | MuteAlarm
-    | UnmuteAlarm
-    | Acquire
-    | AbortAcquisition
-    | SetMode
-    | Refit
-    | StartDither
-    | StopDither
-    | Approve
-    | Reject
-    | Publish
-    | Rollback
-    | Measure
-    | GiveUp
-    | MeasureNoisy
-    | SetLoop
-    | SetPointing
-    | SetValue
-    | Ramp
-    | LoadShape
-    | ClearShape
-    | ApproveReferences
-    | RejectReferences
-    | RollBackReferences
-)
+GuardCommand = StopEverything | Resume | AcknowledgeAlarm | MuteAlarm | UnmuteAlarm
+OperationCommand = Acquire | AbortAcquisition | SetMode | Refit | StartDither | StopDither
+MatrixCommand = Approve | Reject | Publish | Rollback | Measure | GiveUp | MeasureNoisy
+SetCommand = SetLoop | SetPointing | SetValue | Ramp
+ShapeCommand = LoadShape | ClearShape | ApproveReferences | RejectReferences | RollBackReferences
+Command = GuardCommand | OperationCommand | MatrixCommand | SetCommand | ShapeCommand
 
 
 def _each_once(modes: tuple[int, ...] | ModeSet | None) -> int:

@@ -7,23 +7,10 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
 from service.model.misregistration import Misregistration
+from service.records import estimates, products
 from service.records.commands import Command
-from service.records.estimates import (
-    LockInEstimate,
-    PassiveEstimate,
-    RandomEstimate,
-    WideCaptureEstimate,
-    WindowRefused,
-)
 from service.records.messages import Message
 from service.records.operations import MeasurementRecord, ProbationFinding
-from service.records.products import (
-    ExpectedGain,
-    GateVerdict,
-    Judged,
-    ReconstructorRecord,
-    ReferencesRecord,
-)
 from service.records.state import Level, ModelState, TrackerState
 from service.wire import Acknowledgement, ReferencesInUse, Reply, Status
 from service.wire import Command as Request
@@ -142,19 +129,9 @@ class FinishNoisy(Caused):
     record: MeasurementRecord
 
 
-Effect = (
-    MakeMatrix
-    | RepublishMatrix
-    | JudgeMatrix
-    | JudgeProposal
-    | SendMatrix
-    | FetchMatrix
-    | FetchReferences
-    | Ask
-    | FinishNoisy
-    | MakeReferences
-    | SendReferences
-)
+MatrixEffect = MakeMatrix | RepublishMatrix | JudgeMatrix | JudgeProposal | SendMatrix | FetchMatrix
+ReferencesEffect = FetchReferences | MakeReferences | SendReferences
+Effect = MatrixEffect | ReferencesEffect | Ask | FinishNoisy
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -229,7 +206,7 @@ class DitherUnusable:
 class WindowFitted:
     """The worker estimated α from one window."""
 
-    estimate: LockInEstimate | RandomEstimate
+    estimate: estimates.LockInEstimate | estimates.RandomEstimate
     began_ns_utc: int = 0
     """Start of the window, by the RTC's clock; 0 if unknown."""
 
@@ -238,7 +215,7 @@ class WindowFitted:
 class WideCaptureFitted:
     """The worker found α from afar, in a window with the loop open."""
 
-    found: WideCaptureEstimate
+    found: estimates.WideCaptureEstimate
     began_ns_utc: int = 0
     """Start of the window, by the RTC's clock; 0 if unknown."""
 
@@ -247,14 +224,14 @@ class WideCaptureFitted:
 class WindowLost:
     """A window gave no estimate."""
 
-    refused: WindowRefused
+    refused: estimates.WindowRefused
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PassiveFitted:
     """The watchdog estimated α from ordinary telemetry."""
 
-    estimate: PassiveEstimate
+    estimate: estimates.PassiveEstimate
     t_ns_utc: int
     """End of the telemetry it is of."""
 
@@ -277,7 +254,7 @@ class PassiveUnavailable:
 class MatrixMade:
     """A reconstructor has been computed, or copied, and judged."""
 
-    record: ReconstructorRecord
+    record: products.ReconstructorRecord
     wanted: bool
     """True if an operator ordered this very matrix, so that it needs no approval."""
 
@@ -295,7 +272,7 @@ class MatrixMade:
 class MatrixFetched:
     """The matrix the RTC uses, which the service did not make, is known now."""
 
-    record: ReconstructorRecord
+    record: products.ReconstructorRecord
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -345,14 +322,14 @@ class MarginJudged:
     """The gate's verdict on the matrix in use, at the current α."""
 
     id: str
-    verdict: GateVerdict
+    verdict: products.GateVerdict
     alpha: Misregistration | None = None
     """Registration at which it was judged; None if unknown."""
 
-    expected: ExpectedGain | None = None
+    expected: products.ExpectedGain | None = None
     """Gain expected from a new matrix; None if not computed."""
 
-    judged: Judged | None = None
+    judged: products.Judged | None = None
     """Conditions of the verdict; None if unknown."""
 
 
@@ -361,8 +338,8 @@ class ProposalJudged:
     """The gate's verdict on a reconstructor that is to be sent."""
 
     id: str
-    verdict: GateVerdict
-    judged: Judged
+    verdict: products.GateVerdict
+    judged: products.Judged
     wanted: bool = True
     """Value of ``wanted`` in the request for the verdict."""
 
@@ -415,7 +392,7 @@ class MatrixMisapplied:
 class ReferencesMade:
     """Reference slopes were computed, and their size was checked."""
 
-    record: ReferencesRecord
+    record: products.ReferencesRecord
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -485,42 +462,16 @@ class JobFailed:
     text: str
 
 
-Event = (
-    Command
-    | Tick
-    | Status
-    | SessionStarted
-    | RtcVanished
-    | ServicesMet
-    | ConditionChanged
-    | LogEvent
-    | WindowFitted
-    | WideCaptureFitted
-    | WindowLost
-    | PassiveFitted
-    | PassiveUnavailable
-    | MatrixMade
-    | MatrixFetched
-    | ReferencesFetched
-    | ModesRecognised
-    | MarginJudged
-    | ProposalJudged
-    | Acknowledgement
-    | Answered
-    | DitherSilent
-    | DitherUnusable
-    | DitherMeasured
-    | Compared
-    | LoopHeld
-    | MatrixMisapplied
-    | ReferencesMade
-    | ShapeHeld
-    | Vibrations
-    | ModelChanged
-    | ModesCommanded
-    | MatrixMeasured
-    | JobFailed
-)
+ServiceEvent = Tick | ConditionChanged | LogEvent | JobFailed
+RtcEvent = Status | SessionStarted | RtcVanished | ServicesMet | Acknowledgement | Answered
+WindowEvent = WindowFitted | WideCaptureFitted | WindowLost | PassiveFitted | PassiveUnavailable
+DitherEvent = DitherSilent | DitherUnusable | DitherMeasured
+LoopEvent = Compared | LoopHeld | MatrixMisapplied | Vibrations | ModelChanged | ModesCommanded
+TelemetryEvent = WindowEvent | DitherEvent | LoopEvent
+JudgedEvent = ModesRecognised | MarginJudged | ProposalJudged
+MatrixEvent = MatrixMade | MatrixFetched | MatrixMeasured | JudgedEvent
+ReferencesEvent = ReferencesMade | ReferencesFetched | ShapeHeld
+Event = Command | ServiceEvent | RtcEvent | TelemetryEvent | MatrixEvent | ReferencesEvent
 
 
 def new_id(name: str, now_ns: int) -> str:

@@ -8,14 +8,9 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from service import wire
 from service.model.misregistration import Misregistration, at_boundary
 from service.records.registration import ModeGain
-from service.wire import (
-    ControlLaw,
-    Manifest,
-    MatrixLayout,
-    Status,
-)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -279,7 +274,7 @@ _USED = (MatrixState.APPLIED, MatrixState.SUPERSEDED)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Judged(ControlLaw):
+class Judged(wire.ControlLaw):
     """Loop and α that a verdict of the gate is about.
 
     The gains are those of the modes that the reconstructor commands.
@@ -371,7 +366,7 @@ class ReconstructorRecord:
         return self.state in _USED
 
     @classmethod
-    def brought(cls, manifest: Manifest) -> ReconstructorRecord:
+    def brought(cls, manifest: wire.Manifest) -> ReconstructorRecord:
         """Return the record of a matrix that the RTC brought with it.
 
         Its manifest may name an α, which the service cannot verify.
@@ -385,9 +380,9 @@ class ReconstructorRecord:
             reason="brought by the RTC",
         )
 
-    def manifest(self, layout: MatrixLayout, rtc: Status, system: str) -> Manifest:
+    def manifest(self, layout: wire.MatrixLayout, rtc: wire.Status, system: str) -> wire.Manifest:
         """Return the manifest it travels with."""
-        return Manifest(
+        return wire.Manifest(
             id=self.id,
             layout=layout,
             alpha=None if self.alpha is None else self.alpha.to_boundary(),

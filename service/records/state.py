@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from service.model.misregistration import Misregistration
+from service.records import products
 from service.records.alarms import Alarm, AlarmRecord
 from service.records.messages import Message, Range
 from service.records.operations import (
@@ -17,16 +18,6 @@ from service.records.operations import (
     MeasurementRecord,
     Probation,
     RefitJob,
-)
-from service.records.products import (
-    Assessment,
-    GateVerdict,
-    MatrixState,
-    ModeLimit,
-    ModeProof,
-    ReconstructorRecord,
-    ReferencesRecord,
-    Shape,
 )
 from service.records.registration import (
     HistoryEntry,
@@ -213,7 +204,7 @@ class WindowCounts:
 class MatrixStates:
     """Reconstructors, and what is known of the one the RTC multiplies with."""
 
-    reconstructors: tuple[ReconstructorRecord, ...] = ()
+    reconstructors: tuple[products.ReconstructorRecord, ...] = ()
     """Oldest first, bounded; the one in use is always among them once known."""
 
     in_use: str | None = None
@@ -245,10 +236,10 @@ class MatrixStates:
     read_back_error: str = ""
     """Reason why that matrix could not be read; empty if it could."""
 
-    margin: GateVerdict | None = None
+    margin: products.GateVerdict | None = None
     """The gate's verdict on the matrix in use at the current α ± 3σ; None: not known yet."""
 
-    assessment: Assessment | None = None
+    assessment: products.Assessment | None = None
     """Loss of the matrix in use compared with a new one; None if not computed yet."""
 
     making_since_ns_utc: int | None = None
@@ -261,10 +252,10 @@ class MatrixStates:
     no_making_before_ns_utc: int = 0
     """Time before which no further reconstructor is computed."""
 
-    mode_proof: ModeProof = field(default_factory=ModeProof)
+    mode_proof: products.ModeProof = field(default_factory=products.ModeProof)
     """Modes whose response has been verified."""
 
-    mode_limit: ModeLimit | None = None
+    mode_limit: products.ModeLimit | None = None
     """Number of modes that the gate permits; None if it permits all that are requested."""
 
 
@@ -272,14 +263,14 @@ class MatrixStates:
 class ReferenceStates:
     """The shape that the loop is to hold, and the reference slopes for it."""
 
-    shape: Shape | None = None
+    shape: products.Shape | None = None
     """Shape to hold; None for the RTC's own references."""
 
-    former: tuple[Shape | None, str] = (None, "")
+    former: tuple[products.Shape | None, str] = (None, "")
     """Shape before the present one, and why its references were paused: it returns if the present
     one is refused."""
 
-    records: tuple[ReferencesRecord, ...] = ()
+    records: tuple[products.ReferencesRecord, ...] = ()
     """References of the service, oldest first, bounded; those in use are always among them."""
 
     used_id: str | None = None
@@ -470,21 +461,21 @@ class TrackerState:
     log: tuple[LogEntry, ...] = ()
     """Oldest first, bounded."""
 
-    def reconstructor(self, matrix_id: str | None) -> ReconstructorRecord | None:
+    def reconstructor(self, matrix_id: str | None) -> products.ReconstructorRecord | None:
         """Return the record of this id, or None."""
         return next((r for r in reversed(self.matrices.reconstructors) if r.id == matrix_id), None)
 
-    def references_of(self, reference_id: str | None) -> ReferencesRecord | None:
+    def references_of(self, reference_id: str | None) -> products.ReferencesRecord | None:
         """Return the record of these reference slopes, or None."""
         return next((r for r in reversed(self.references.records) if r.id == reference_id), None)
 
     @property
-    def used(self) -> ReconstructorRecord | None:
+    def used(self) -> products.ReconstructorRecord | None:
         """Record of the matrix that the RTC multiplies with; None if unknown."""
         return self.reconstructor(self.matrices.in_use)
 
     @property
-    def sent(self) -> ReconstructorRecord | None:
+    def sent(self) -> products.ReconstructorRecord | None:
         """Record of a matrix that is on its way to the RTC; None if there is none."""
         return next((r for r in self.matrices.reconstructors if r.on_its_way), None)
 
@@ -511,7 +502,8 @@ class TrackerState:
         used = (
             r.id
             for r in reversed(self.matrices.reconstructors)
-            if r.state is MatrixState.SUPERSEDED and r.config_id in {None, self.loop.config_id}
+            if r.state is products.MatrixState.SUPERSEDED
+            and r.config_id in {None, self.loop.config_id}
         )
         return next(used, None)
 
@@ -559,7 +551,7 @@ class Orders:
     seen: tuple[AlarmRecord, ...] = ()
     """Alarms with and without an operator's acknowledgement."""
 
-    shape: Shape | None = None
+    shape: products.Shape | None = None
     """Shape that the loop is to hold; None if none was loaded."""
 
     references_paused: str = ""
@@ -601,7 +593,7 @@ class Saved:
     void_intervals: tuple[VoidInterval, ...] = ()
     """Void intervals of telemetry with purpose and reason."""
 
-    mode_proof: ModeProof | None = None
+    mode_proof: products.ModeProof | None = None
     """Modes whose response was verified in ``session``; None if there are none."""
 
     @property

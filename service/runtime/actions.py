@@ -30,7 +30,8 @@ from service.records.state import TrackerState
 from service.runtime import estimates, ports
 from service.runtime.worker import Conditions, OpticsWorker
 from service.tracking.pointing_law import registration_ahead
-from service.tracking.references import mean_gain
+from service.tracking.reconstructors import require_record
+from service.tracking.references import mean_gain, require_references
 from service.version import software_version
 
 UNKNOWN_PARENT = "unknown"
@@ -312,9 +313,7 @@ class Actions:
         return ev.MatrixFetched(record=record)
 
     async def _send(self, effect: ev.SendMatrix, state: TrackerState) -> Event | None:
-        rtc, record = _there(state), state.reconstructor(effect.id)
-        if record is None:
-            raise UnknownIdError(f"unknown reconstructor {effect.id}")
+        rtc, record = _there(state), require_record(state, effect.id)
         matrix = await asyncio.to_thread(self.matrix, effect.id)
         commanded = state.loop.commanded_modes or rtc.n_controlled
         anew = effect.gains is not None or commanded != effect.n_modes
@@ -357,9 +356,7 @@ class Actions:
         return ev.ReferencesMade(record=record)
 
     async def _send_references(self, effect: ev.SendReferences, state: TrackerState) -> Event:
-        rtc, record = _there(state), state.references_of(effect.id)
-        if record is None:
-            raise UnknownIdError(f"unknown references {effect.id}")
+        rtc, record = _there(state), require_references(state, effect.id)
         store, copied = self._archive.references, record.shape is None or record.parent is not None
         if record.shape is None:
             offset = np.zeros(rtc.n_slopes, np.float32)

@@ -20,7 +20,7 @@ from service.estimation.own_matrix import OwnMatrix
 from service.estimation.passive import Passive
 from service.estimation.random_dither import Correlated, noisy_matrix
 from service.estimation.slope_convention import SlopeConvention
-from service.estimation.windows import OTHER_SESSION, ClosedLoop, Telemetry
+from service.estimation.windows import OTHER_SESSION, ClosedLoop
 from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
 from service.records import alarms, products
@@ -79,10 +79,7 @@ class PendingWindow:
         self._first_end_ns = window.t_end_ns_utc
         if waiting is None:
             return None
-        return WindowRefused(
-            reason=compose("window.given-up", most_s=MAX_WINDOW_SPAN_S),
-            t_ns_utc=waiting.t_end_ns_utc,
-        )
+        return waiting.refuse(compose("window.given-up", most_s=MAX_WINDOW_SPAN_S))
 
     async def some(self) -> None:
         """Wait until a window is there."""
@@ -110,7 +107,7 @@ async def fitted(
     try:
         outcome = await _outcome(window, state, workers, matrix_of)
     except PyrcalError as error:
-        return window_lost(window, str(error))
+        return ev.WindowLost(refused=window.refuse(str(error)))
     if isinstance(outcome, WindowRefused):
         return ev.WindowLost(refused=outcome)
     began_ns = 0
@@ -132,11 +129,7 @@ async def _outcome(
     start = start_of_fit(state, alpha, window.t_end_ns_utc)
     if rtc is not None and window.session != rtc.session:
         # the model may be of another mode of the sensor by now
-        return WindowRefused(
-            reason=OTHER_SESSION,
-            t_ns_utc=window.t_end_ns_utc,
-            kind=RefusalKind.VOID,
-        )
+        return window.refuse(OTHER_SESSION, RefusalKind.VOID)
     if isinstance(window, Correlated):
         return await workers.call(OpticsWorker.fit_random, window, start)
     if not isinstance(window, lockin.Spectra):
@@ -146,7 +139,7 @@ async def _outcome(
         found, nominal = state.operations.acquisition.alpha, state.alpha.law.nominal
         return await workers.call(OpticsWorker.find, window, found, flux, nominal)
     if rtc is None:
-        return WindowRefused(reason=compose("window.no-rtc"), t_ns_utc=window.t_end_ns_utc)
+        return window.refuse(compose("window.no-rtc"))
     loop = ClosedLoop(
         # In a thread, because a matrix that is not in memory is read from the archive.
         reconstructor=await asyncio.to_thread(_reconstructor, window, state, matrix_of),
@@ -305,12 +298,6 @@ def _origin_of(
             break
         ancestor = before
     return record
-
-
-def window_lost(window: Telemetry, reason: str) -> Event:
-    """Return what becomes of a window that cannot be fitted."""
-    refused = WindowRefused(reason=reason, t_ns_utc=window.t_end_ns_utc)
-    return ev.WindowLost(refused=refused)
 
 
 class NoisySums:

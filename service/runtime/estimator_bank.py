@@ -254,10 +254,9 @@ def _with_windows(bank: EstimatorBank, members: list[Streaming]) -> Fed:
         for k, member in enumerate(members):
             members[k], reason = member.vet(window, bank.loop)
             reasons += [] if reason is None else [reason]
-        t_ns = window.t_end_ns_utc
         # All members were asked, although one reason is enough: each of them keeps count of the
         # windows it has vetted.
-        windows.append(WindowRefused(reason=reasons[0], t_ns_utc=t_ns) if reasons else window)
+        windows.append(window.refuse(reasons[0]) if reasons else window)
     # the next one begins with the gains of now
     return replace(bank, members=tuple(members), begun_with=bank.loop.rtc), windows
 

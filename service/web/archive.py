@@ -26,19 +26,11 @@ from service.records.commands import Instruction
 from service.records.messages import compose
 from service.runtime.archiving import needed
 from service.runtime.telemetry_recorder import RecordingChoice
+from service.web import views
 from service.web.commands import AcceptedView, BodyDep, Client, ClientDep, body
 from service.web.connections import not_modified, tag_of
 from service.web.history import TimeParameters
 from service.web.problems import COMMAND, INVALID, UNKNOWN
-from service.web.views import (
-    ServiceDep,
-    answer,
-    binary,
-    define_view,
-    found_or_refuse,
-    shows,
-    to_json,
-)
 
 router = APIRouter(prefix="/v1", tags=["archive"], responses={**INVALID})
 
@@ -61,15 +53,15 @@ class Kept:
     """On their disk."""
 
 
-define_view("ArchiveItemView", Item)
-KEPT = define_view("ArchiveView", Kept)
+views.define_view("ArchiveItemView", Item)
+KEPT = views.define_view("ArchiveView", Kept)
 
 
-@router.get("/archive", responses={200: shows(KEPT)})
-async def archive(service: ServiceDep) -> Response:
+@router.get("/archive", responses={200: views.shows(KEPT)})
+async def archive(service: views.ServiceDep) -> Response:
     """Return the archived matrices, and why some are never removed."""
     in_use = needed(service.snapshot().tracker)
-    return answer(await run_in_threadpool(_kept, service.archive, in_use))
+    return views.answer(await run_in_threadpool(_kept, service.archive, in_use))
 
 
 def _kept(kept: Archive, in_use: frozenset[str]) -> Kept:
@@ -143,8 +135,8 @@ class Trail:
     """Oldest first."""
 
 
-ENTRY = define_view("AuditEntryView", AuditEntry)
-TRAIL = define_view("AuditView", Trail)
+ENTRY = views.define_view("AuditEntryView", AuditEntry)
+TRAIL = views.define_view("AuditView", Trail)
 
 
 @router.get(
@@ -152,7 +144,7 @@ TRAIL = define_view("AuditView", Trail)
     response_class=Response,
     responses={
         200: {
-            **shows(TRAIL),
+            **views.shows(TRAIL),
             "content": {
                 "application/jsonl": {"schema": {"type": "string"}},
                 "text/csv": {"schema": {"type": "string"}},
@@ -160,14 +152,16 @@ TRAIL = define_view("AuditView", Trail)
         }
     },
 )
-async def audit(service: ServiceDep, parameters: Annotated[AuditParameters, Query()]) -> Response:
+async def audit(
+    service: views.ServiceDep, parameters: Annotated[AuditParameters, Query()]
+) -> Response:
     """Return the audit trail, or export it.
 
     ``?after=`` with the ``id`` of the last entry gives the next page; an empty one is the end.
     """
     if parameters.format is AuditFormat.JSON:
         entries = await run_in_threadpool(service.archive.audit_trail, parameters.part)
-        return answer(Trail(entries=entries))
+        return views.answer(Trail(entries=entries))
     kind, lines = {
         AuditFormat.JSONL: ("application/jsonl", _json_lines),
         AuditFormat.CSV: ("text/csv", _csv_lines),
@@ -186,7 +180,7 @@ def _all(archive: Archive, part: Range) -> Iterator[dict[str, Any]]:
     """Yield all entries of a part as they leave; each page waits for the disk."""
     page = replace(part, limit=EXPORT_PAGE_ENTRIES)
     while entries := archive.audit_trail(page):
-        yield from map(to_json, entries)
+        yield from map(views.to_json, entries)
         page = replace(page, after=entries[-1].id)
 
 
@@ -219,7 +213,7 @@ def _inert(cell: object) -> object:
 
 RecordingId = Annotated[str, Path(alias="id", max_length=128, description="Id of a recording")]
 
-RECORDING = define_view("RecordingView", RecordingRecord)
+RECORDING = views.define_view("RecordingView", RecordingRecord)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -230,7 +224,7 @@ class RecordingList:
     """Oldest first."""
 
 
-RECORDINGS = define_view("RecordingsView", RecordingList)
+RECORDINGS = views.define_view("RecordingsView", RecordingList)
 
 
 class RecordingAcceptedView(AcceptedView):
@@ -274,18 +268,18 @@ async def begin(
     return RecordingAcceptedView(id=made.id, **accepted.model_dump())
 
 
-@router.get("/recordings", responses={200: shows(RECORDINGS)})
-async def recordings(service: ServiceDep) -> Response:
+@router.get("/recordings", responses={200: views.shows(RECORDINGS)})
+async def recordings(service: views.ServiceDep) -> Response:
     """Return the recordings, oldest first."""
-    return answer(RecordingList(recordings=await run_in_threadpool(service.recordings.all)))
+    return views.answer(RecordingList(recordings=await run_in_threadpool(service.recordings.all)))
 
 
-@router.get("/recordings/{id}", responses={200: shows(RECORDING), **UNKNOWN})
-async def recording(service: ServiceDep, recording_id: RecordingId) -> Response:
+@router.get("/recordings/{id}", responses={200: views.shows(RECORDING), **UNKNOWN})
+async def recording(service: views.ServiceDep, recording_id: RecordingId) -> Response:
     """Return the progress of a recording."""
     every = await run_in_threadpool(service.recordings.all)
     found = next((one for one in every if one.id == recording_id), None)
-    return answer(found_or_refuse(found, f"unknown recording {recording_id}"))
+    return views.answer(views.found_or_refuse(found, f"unknown recording {recording_id}"))
 
 
 @router.post("/recordings/{id}/end", status_code=202, responses={**COMMAND, **UNKNOWN})
@@ -308,19 +302,15 @@ async def remove(client: ClientDep, recording_id: RecordingId, command: BodyDep)
     return client.accepted(compose("archive.removed", id=recording_id), recordings="/v1/recordings")
 
 
+_FILE = views.binary("HDF5, as docs/rtc.md and pyrcal sim have recordings", "application/x-hdf5")
+
+
 @router.get(
     "/recordings/{id}/file",
     response_class=Response,
-    responses={
-        200: {
-            "description": "HDF5, as docs/rtc.md and pyrcal sim have recordings",
-            "content": binary("application/x-hdf5"),
-        },
-        **COMMAND,
-        **UNKNOWN,
-    },
+    responses={200: _FILE, **COMMAND, **UNKNOWN},
 )
-async def file(request: Request, service: ServiceDep, recording_id: RecordingId) -> Response:
+async def file(request: Request, service: views.ServiceDep, recording_id: RecordingId) -> Response:
     """Return a recording's file."""
     path = await run_in_threadpool(service.recordings.file, recording_id)
     tag = tag_of(recording_id).removeprefix("W/")  # a download may be resumed by a strong one

@@ -23,7 +23,7 @@ from pydantic_core import from_json
 from starlette.datastructures import MutableHeaders
 
 from service.archive import Actor
-from service.errors import StaleError, UnknownIdError, UntaggedError
+from service.errors import StaleError, UntaggedError
 from service.records import commands as instructions
 from service.records.commands import Instruction
 from service.records.events import new_id
@@ -31,6 +31,8 @@ from service.records.messages import Message
 from service.records.operations import RefitJob
 from service.records.state import TrackerState
 from service.runtime.supervisor import Supervisor
+from service.tracking.reconstructors import require_record
+from service.tracking.references import require_references
 from service.web import keys, matrices, measured, views
 from service.web.authentication import actor_of, needs
 from service.web.problems import COMMAND, DECISION, INVALID, UNKNOWN
@@ -326,9 +328,7 @@ ClientDep = Annotated[Client, Depends(_client_of)]
 
 
 def _one(state: TrackerState, name: str) -> Response:
-    return views.tagged(
-        views.found_or_refuse(state.reconstructor(name), f"unknown reconstructor {name}")
-    )
+    return views.tagged(require_record(state, name))
 
 
 def _all(state: TrackerState, _: str = "") -> Response:
@@ -336,9 +336,7 @@ def _all(state: TrackerState, _: str = "") -> Response:
 
 
 def _references(state: TrackerState, name: str) -> Response:
-    return views.tagged(
-        views.found_or_refuse(state.references_of(name), f"unknown references {name}")
-    )
+    return views.tagged(require_references(state, name))
 
 
 def _before(state: TrackerState, _: str) -> Response:
@@ -426,6 +424,5 @@ async def refit_job(service: views.ServiceDep, refit_id: RefitId) -> Response:
     """Return the progress of a refit, and the reconstructor it has made."""
     refits = service.snapshot().tracker.operations.refits
     job = next((job for job in refits if job.id == refit_id), None)
-    if job is None:
-        raise UnknownIdError(f"refit {refit_id}: this service has begun no such refit")
-    return views.answer(job)
+    refusal = f"refit {refit_id}: this service has begun no such refit"
+    return views.answer(views.found_or_refuse(job, refusal))

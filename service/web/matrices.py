@@ -19,6 +19,8 @@ from service.records.products import MatrixState
 from service.records.registration import MeasuredGains
 from service.runtime.snapshot import ModeGainTable, present_gains
 from service.runtime.supervisor import Supervisor
+from service.tracking.reconstructors import require_record
+from service.tracking.references import require_references
 from service.web import views
 from service.web.connections import tag_of, unless_kept
 from service.web.problems import COMMAND, INVALID, UNKNOWN
@@ -202,8 +204,7 @@ def _as_fits(numbers: Numbers, matrix_id: str) -> bytes:
 def describes_numbers(description: str, rows_and_columns: str, example: str) -> dict[str, Any]:
     """Return the OpenAPI description of such an answer."""
     return {
-        "description": description,
-        "content": views.binary(*MEDIA_TYPES.values()),
+        **views.binary(description, *MEDIA_TYPES.values()),
         "headers": {
             "X-Shape": {
                 "description": f"{rows_and_columns}; not with hdf5",
@@ -229,8 +230,7 @@ async def reconstructors(service: views.ServiceDep) -> Response:
 @router.get("/reconstructors/{id}", responses={200: views.shows(views.RECONSTRUCTOR), **UNKNOWN})
 async def reconstructor(service: views.ServiceDep, matrix_id: MatrixId) -> Response:
     """Return the record of a reconstructor."""
-    record = service.snapshot().tracker.reconstructor(matrix_id)
-    return views.tagged(views.found_or_refuse(record, f"unknown reconstructor {matrix_id}"))
+    return views.tagged(require_record(service.snapshot().tracker, matrix_id))
 
 
 @router.get(
@@ -279,8 +279,7 @@ async def references(service: views.ServiceDep) -> Response:
 )
 async def reference_record(service: views.ServiceDep, reference_id: ReferencesId) -> Response:
     """Return the record of references."""
-    record = service.snapshot().tracker.references_of(reference_id)
-    return views.tagged(views.found_or_refuse(record, f"unknown references {reference_id}"))
+    return views.tagged(require_references(service.snapshot().tracker, reference_id))
 
 
 @router.get(
@@ -322,8 +321,7 @@ async def gains(service: views.ServiceDep) -> Response:
 @router.get("/reconstructors/{id}/gains", responses={200: views.shows(views.GAINS), **UNKNOWN})
 async def reconstructor_gains(service: views.ServiceDep, matrix_id: MatrixId) -> Response:
     """Return the optical gains when a reconstructor was made."""
-    found = service.snapshot().tracker.reconstructor(matrix_id)
-    record = views.found_or_refuse(found, f"unknown reconstructor {matrix_id}")
+    record = require_record(service.snapshot().tracker, matrix_id)
     gains = MeasuredGains(
         measured=record.optical_gains, n_modes=record.n_modes, reference_id=record.reference_id
     )

@@ -23,24 +23,8 @@ from service.model.kinds import Method
 from service.records.operations import MeasurementRecord, NoisyFinding
 from service.records.state import TrackerState
 from service.runtime.uploads import FitJob, FitQueue, FitState
-from service.web import views
-from service.web.matrices import (
-    RESPONSE_PART_BYTES,
-    MatrixFormat,
-    MatrixParameters,
-    describes_numbers,
-    numbers_of,
-)
+from service.web import matrices, views
 from service.web.problems import COMMAND, INVALID, UNKNOWN, problem_response
-from service.web.views import (
-    Parameters,
-    ServiceDep,
-    answer,
-    define_view,
-    found_or_refuse,
-    held,
-    shows,
-)
 
 router = APIRouter(prefix="/v1", tags=["measured matrices"], responses={**INVALID})
 noisy = APIRouter(prefix="/v1", tags=["noisy interaction matrices"], responses={**INVALID})
@@ -49,19 +33,19 @@ fits = APIRouter(prefix="/v1", tags=["fits of uploaded matrices"], responses={**
 MeasurementId = Annotated[str, Path(alias="id", description="Id of a measured matrix")]
 NoisyId = Annotated[str, Path(alias="id", description="Id of a noisy interaction matrix")]
 
-define_view(
+views.define_view(
     "NoisyFindingView",
     NoisyFinding,
     "n_slopes n_frames n_missing snr alpha sigma optical_gain misfit cm_id session created_ns_utc "
     "sha256",
 )
-NOISY = define_view(
+NOISY = views.define_view(
     "NoisyView",
     MeasurementRecord,
     "id state reason n_modes modes total_m amplitude_m=each_m duration_s window_s seed "
     "asked_ns_utc basis_id config_id finding",
 )
-NOISY_MATRICES = define_view(
+NOISY_MATRICES = views.define_view(
     "NoisyListView",
     TrackerState,
     "noisy_matrices=noisy",
@@ -70,24 +54,24 @@ NOISY_MATRICES = define_view(
 )
 
 
-_MEASURED_NUMBERS = describes_numbers(
+_MEASURED_NUMBERS = matrices.describes_numbers(
     "The measured interaction matrix, slope per metre OPD",
     "Rows (slopes) and columns (modes)",
     "1384,400",
 )
 
 
-@router.get("/measurements", responses={200: shows(views.MEASUREMENTS)})
-async def measurements(service: ServiceDep) -> Response:
+@router.get("/measurements", responses={200: views.shows(views.MEASUREMENTS)})
+async def measurements(service: views.ServiceDep) -> Response:
     """Return the measured interaction matrices, oldest first."""
-    return answer(service.snapshot().tracker, views.MEASUREMENTS)
+    return views.answer(service.snapshot().tracker, views.MEASUREMENTS)
 
 
-@router.get("/measurements/{id}", responses={200: shows(views.MEASUREMENT), **UNKNOWN})
-async def measurement(service: ServiceDep, measurement_id: MeasurementId) -> Response:
+@router.get("/measurements/{id}", responses={200: views.shows(views.MEASUREMENT), **UNKNOWN})
+async def measurement(service: views.ServiceDep, measurement_id: MeasurementId) -> Response:
     """Return how a matrix was measured, or its progress."""
     record = service.snapshot().tracker.measurement(measurement_id)
-    return answer(found_or_refuse(record, f"unknown measurement {measurement_id}"))
+    return views.answer(views.found_or_refuse(record, f"unknown measurement {measurement_id}"))
 
 
 @router.get(
@@ -97,9 +81,9 @@ async def measurement(service: ServiceDep, measurement_id: MeasurementId) -> Res
 )
 async def measured_matrix(
     request: Request,
-    service: ServiceDep,
+    service: views.ServiceDep,
     measurement_id: MeasurementId,
-    parameters: Annotated[MatrixParameters, Query()],
+    parameters: Annotated[matrices.MatrixParameters, Query()],
 ) -> Response:
     """Return a measured matrix ``(n_slopes, n_modes)``, slope per metre OPD.
 
@@ -108,37 +92,38 @@ async def measured_matrix(
     image.
     """
     kept = service.archive.measured
-    return await numbers_of(request, measurement_id, parameters.format, kept.matrix, kept.file)
+    return await matrices.numbers_of(
+        request, measurement_id, parameters.format, kept.matrix, kept.file
+    )
 
 
-@noisy.get("/noisy-matrix", responses={200: shows(NOISY_MATRICES)})
-async def noisy_matrices(service: ServiceDep) -> Response:
+@noisy.get("/noisy-matrix", responses={200: views.shows(NOISY_MATRICES)})
+async def noisy_matrices(service: views.ServiceDep) -> Response:
     """Return the noisy interaction matrices, oldest first."""
-    return answer(service.snapshot().tracker, NOISY_MATRICES)
+    return views.answer(service.snapshot().tracker, NOISY_MATRICES)
 
 
-@noisy.get("/noisy-matrix/{id}", responses={200: shows(NOISY), **UNKNOWN})
-async def noisy_matrix(service: ServiceDep, noisy_id: NoisyId) -> Response:
+@noisy.get("/noisy-matrix/{id}", responses={200: views.shows(NOISY), **UNKNOWN})
+async def noisy_matrix(service: views.ServiceDep, noisy_id: NoisyId) -> Response:
     """Return the record of a noisy matrix, or its progress."""
     record = service.snapshot().tracker.measurement(noisy_id)
-    return answer(found_or_refuse(record, f"unknown noisy matrix {noisy_id}"), NOISY)
+    return views.answer(views.found_or_refuse(record, f"unknown noisy matrix {noisy_id}"), NOISY)
+
+
+_NOISY_FILE = views.binary(
+    "HDF5: the matrix, the noise of each element, the synthetic matrix", "application/x-hdf5"
+)
 
 
 @noisy.get(
-    "/noisy-matrix/{id}/file",
-    response_class=Response,
-    responses={
-        200: {
-            "description": "HDF5: the matrix, the noise of each element, the synthetic matrix",
-            "content": views.binary("application/x-hdf5"),
-        },
-        **UNKNOWN,
-    },
+    "/noisy-matrix/{id}/file", response_class=Response, responses={200: _NOISY_FILE, **UNKNOWN}
 )
-async def noisy_file(request: Request, service: ServiceDep, noisy_id: NoisyId) -> Response:
+async def noisy_file(request: Request, service: views.ServiceDep, noisy_id: NoisyId) -> Response:
     """Return the HDF5 file of a noisy matrix."""
     kept = service.archive.noisy
-    return await numbers_of(request, noisy_id, MatrixFormat.HDF5, kept.matrix, kept.file)
+    return await matrices.numbers_of(
+        request, noisy_id, matrices.MatrixFormat.HDF5, kept.matrix, kept.file
+    )
 
 
 # --- fits of uploads
@@ -152,13 +137,13 @@ class FitJobs:
     """Oldest first."""
 
 
-FIT_JOB = define_view(
+FIT_JOB = views.define_view(
     "FitJobView", FitJob, "id state stage name asked_ns_utc n_bytes sha256 reason"
 )
-FIT_JOBS = define_view("FitJobsView", FitJobs)
+FIT_JOBS = views.define_view("FitJobsView", FitJobs)
 
 
-FitsDep = Annotated[FitQueue, held("fits")]
+FitsDep = Annotated[FitQueue, views.held("fits")]
 """The desk a route works for."""
 
 FitId = Annotated[str, Path(alias="id", description="Id of a fit")]
@@ -184,7 +169,7 @@ def _check_packaged(name: str) -> None:
         )
 
 
-class FitParameters(Parameters):
+class FitParameters(views.Parameters):
     """Parameters of a fit, in the words of ``pyrcal fit``."""
 
     dataset: str | None = Field(default=None, min_length=1, max_length=_MAX_NAME)
@@ -382,9 +367,10 @@ class FitFigures(BaseModel):
 _UPLOAD: dict[str, Any] = {
     "requestBody": {
         "required": True,
-        "description": "An HDF5, FITS or NumPy file, or a zip of one, an instrument file and its "
-        "data",
-        "content": views.binary("application/octet-stream"),
+        **views.binary(
+            "An HDF5, FITS or NumPy file, or a zip of one, an instrument file and its data",
+            "application/octet-stream",
+        ),
     }
 }
 
@@ -401,7 +387,7 @@ _UPLOAD: dict[str, Any] = {
 )
 async def fit(
     request: Request,
-    service: ServiceDep,
+    service: views.ServiceDep,
     desk: FitsDep,
     response: Response,
     parameters: Annotated[FitParameters, Query()],
@@ -426,10 +412,10 @@ async def fit(
     return FitAcceptedView(id=job.id, links=links)
 
 
-@fits.get("/fits", responses={200: shows(FIT_JOBS)})
+@fits.get("/fits", responses={200: views.shows(FIT_JOBS)})
 async def fits_known(desk: FitsDep) -> Response:
     """Return the last fits, oldest first."""
-    return answer(FitJobs(fits=tuple(desk.jobs())))
+    return views.answer(FitJobs(fits=tuple(desk.jobs())))
 
 
 @fits.get(
@@ -440,7 +426,7 @@ async def fits_known(desk: FitsDep) -> Response:
             "its `state` and the `reason`",
             "model": FitDocument | FIT_JOB,
         },
-        202: shows(FIT_JOB) | {"description": "Not finished yet"},
+        202: views.shows(FIT_JOB) | {"description": "Not finished yet"},
         **UNKNOWN,
     },
 )
@@ -471,20 +457,20 @@ async def fit_figures(desk: FitsDep, fit_id: FitId) -> Response:
     """Return the numbers behind a fit's figures; 404 while there are none."""
     job = desk.job(fit_id)
     return Response(
-        found_or_refuse(job.figures, f"fit {fit_id} is {job.state} and has no figures"),
+        views.found_or_refuse(job.figures, f"fit {fit_id} is {job.state} and has no figures"),
         media_type="application/json",
     )
 
 
-@fits.delete("/fits/{id}", responses={200: shows(FIT_JOB), **UNKNOWN, **COMMAND})
+@fits.delete("/fits/{id}", responses={200: views.shows(FIT_JOB), **UNKNOWN, **COMMAND})
 async def give_up_fit(desk: FitsDep, fit_id: FitId) -> Response:
     """End a fit; 409 if it is over."""
-    return answer(await desk.give_up(fit_id))
+    return views.answer(await desk.give_up(fit_id))
 
 
 async def _kept(path: pathlib.Path) -> AsyncIterator[bytes]:
     with path.open("rb") as file:
-        while part := await run_in_threadpool(file.read, RESPONSE_PART_BYTES):
+        while part := await run_in_threadpool(file.read, matrices.RESPONSE_PART_BYTES):
             yield part
 
 

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from enum import StrEnum
+from functools import partial
 from http import HTTPStatus
 from typing import Annotated
 
@@ -387,21 +388,20 @@ Numbers = float | None | Mapping[str, float]
 """Unknown values are NaN, as usual in Prometheus."""
 
 
-def _gauge(name: str, text: str, value: Numbers, label: str = "") -> Metric:
-    return _fill_metric(
-        GaugeMetricFamily(f"pyrcal_{name}", text, labels=[label] * bool(label)), value
-    )
-
-
-def _counter(name: str, text: str, value: Numbers, label: str = "") -> Metric:
-    return _fill_metric(
-        CounterMetricFamily(f"pyrcal_{name}", text, labels=[label] * bool(label)), value
-    )
-
-
-def _fill_metric(family: GaugeMetricFamily | CounterMetricFamily, value: Numbers) -> Metric:
+def _metric(
+    kind: type[GaugeMetricFamily | CounterMetricFamily],
+    name: str,
+    text: str,
+    value: Numbers,
+    label: str = "",
+) -> Metric:
     """Return a metric with its number, or one for each value of its label."""
+    family = kind(f"pyrcal_{name}", text, labels=[label] * bool(label))
     for key, number in value.items() if isinstance(value, Mapping) else [("", value)]:
         labels = [key] if isinstance(value, Mapping) else []
         family.add_metric(labels, math.nan if number is None else number)
     return family
+
+
+_gauge = partial(_metric, GaugeMetricFamily)
+_counter = partial(_metric, CounterMetricFamily)

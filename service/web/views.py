@@ -46,30 +46,12 @@ from typing_extensions import TypedDict  # pydantic needs it before Python 3.12
 from service import errors, wire
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import Misregistration, at_boundary
-from service.records import alarms, products
+from service.records import alarms, operations, products
 from service.records import commands as cmd
-from service.records.operations import (
-    Acquisition,
-    Dither,
-    DitherPlan,
-    DitherPolicyState,
-    LoopCommand,
-    MeasurementRecord,
-    Probation,
-    ProbationFinding,
-)
 from service.records.products import ExpectedGain, GateVerdict, ModeLimit, ModeProof
 from service.records.registration import HistoryEntry, ModeGain, Offload, PassiveState
 from service.records.state import LogEntry, ObservatoryValue, TrackerState
-from service.runtime.snapshot import (
-    AlarmStatus,
-    Alpha,
-    ModeGainTable,
-    References,
-    Rtc,
-    Snapshot,
-    WorkerLoad,
-)
+from service.runtime import snapshot
 from service.runtime.supervisor import Supervisor
 from service.tracking import interlocks
 from service.tracking.operations.running import Operating
@@ -244,9 +226,10 @@ def shows(of: type[View]) -> dict[str, Any]:
     return {"description": (of.__doc__ or "").partition("\n\n")[0], "model": of}
 
 
-def binary(*media_types: str) -> dict[str, Any]:
+def binary(description: str, *media_types: str) -> dict[str, Any]:
     """Return the OpenAPI description of a body of bytes."""
-    return {kind: {"schema": {"type": "string", "format": "binary"}} for kind in media_types}
+    schema = {"schema": {"type": "string", "format": "binary"}}
+    return {"description": description, "content": dict.fromkeys(media_types, schema)}
 
 
 def answer(record: object, of: type[View] | None = None) -> Response:
@@ -302,9 +285,11 @@ define_view("ModeGainView", ModeGain, "mode gain gain_sigma=sigma gain_scatter=s
 define_view("VerdictView", GateVerdict)
 define_view("ExpectedGainView", ExpectedGain)
 define_view("AssessmentView", products.Assessment)
-define_view("ProbationFindingView", ProbationFinding)
+define_view("ProbationFindingView", operations.ProbationFinding)
 define_view(
-    "ProbationView", Probation, "id before state text since_ns_utc until_ns_utc finding rollback"
+    "ProbationView",
+    operations.Probation,
+    "id before state text since_ns_utc until_ns_utc finding rollback",
 )
 define_view("ModeLimitView", ModeLimit, "n_modes since_ns_utc until_ns_utc reason")
 define_view(
@@ -314,7 +299,7 @@ define_view(
 )
 ALPHA = define_view(
     "AlphaView",
-    Alpha,
+    snapshot.Alpha,
     "registration.alpha sigma=registration.shown_sigma registration.tracking_sigma sigma_limit "
     "anamorphosis_sigma registration.floor "
     "covariance parameters "
@@ -334,28 +319,28 @@ define_view("PassiveView", PassiveState)
 define_view("GainGroupView", cmd.GainGroup)
 define_view(
     "RtcView",
-    Rtc,
+    snapshot.Rtc,
     "status.session status.loop status.frame_rate_hz status.delay_frames status.leak gains "
     "status.n_controlled status.n_modes status.n_slopes status.cm_id status.basis_id "
     "status.config_id "
     "status.magnitude status.max_dither_m status.max_dither_modes t_ns_utc=status.t_ns",
 )
-define_view("LoopCommandView", LoopCommand, "id text state reason asked_ns_utc lasts_s")
+define_view("LoopCommandView", operations.LoopCommand, "id text state reason asked_ns_utc lasts_s")
 define_view(
     "DitherView",
-    Dither,
+    operations.Dither,
     "id purpose request.modes request.amplitude_m request.kind frequency_hz request.seed "
     "request.duration_s start_seq",
 )
-define_view("DitherPlanView", DitherPlan)
+define_view("DitherPlanView", operations.DitherPlan)
 define_view(
     "DitherPolicyView",
-    DitherPolicyState,
+    operations.DitherPolicyState,
     "phase reason budget_m mean_cost_m plan next_ns_utc n_windows_learnt avoided_hz",
 )
 define_view(
     "AcquisitionView",
-    Acquisition,
+    operations.Acquisition,
     "stage text under_way started_ns_utc since_ns_utc held_off commanded n_attempts=attempt alpha "
     "n_modes",
 )
@@ -372,7 +357,7 @@ RECONSTRUCTORS = define_view(
     "matrices.in_use matrices.reconstructors",
     "The reconstructors the service remembers.",
 )
-GAINS = define_view("GainTableView", ModeGainTable)
+GAINS = define_view("GainTableView", snapshot.ModeGainTable)
 define_view("ShapeView", products.Shape, "id kind frame source by loaded_ns_utc")
 REFERENCES_RECORD = define_view(
     "ReferencesRecordView",
@@ -382,7 +367,7 @@ REFERENCES_RECORD = define_view(
 )
 define_view(
     "HeldShapeView",
-    References,
+    snapshot.References,
     "kept.shape used newest verified waiting kept.unsupported misapplied=kept.difference",
 )
 REFERENCES = define_view(
@@ -394,7 +379,7 @@ REFERENCES = define_view(
 
 MEASUREMENT = define_view(
     "MeasurementView",
-    MeasurementRecord,
+    operations.MeasurementRecord,
     "id state reason pattern modes amplitude_m n_average frequency_hz duration_s asked_ns_utc "
     "start_seq created_ns_utc n_slopes double_pass session basis_id config_id sha256",
 )
@@ -403,13 +388,13 @@ MEASUREMENTS = define_view(
 )
 MEASURING = define_view(
     "MeasuringView",
-    MeasurementRecord,
+    operations.MeasurementRecord,
     "id state pattern modes asked_ns_utc opens_loop",
     "The interaction matrix being measured: ``/v1/measurements/{id}`` says more.",
 )
 NOISY_MEASUREMENT = define_view(
     "NoisyMeasurementView",
-    MeasurementRecord,
+    operations.MeasurementRecord,
     "id state total_m duration_s asked_ns_utc",
     "The noisy interaction matrix under way: ``/v1/noisy-matrix/{id}`` says more.",
 )
@@ -417,7 +402,7 @@ NOISY_MEASUREMENT = define_view(
 define_view("OperatorNoteView", alarms.OperatorNote)
 define_view(
     "AlarmView",
-    AlarmStatus,
+    snapshot.AlarmStatus,
     "record.name severity worst_severity=record.worst record.alarm_state record.since_ns_utc "
     "record.text code values cause "
     "do record.over_ns_utc record.acknowledged record.muted",
@@ -436,7 +421,7 @@ EVENTS = define_view(
 )
 define_view("PrerequisiteView", alarms.Prerequisite)
 define_view("PermissionView", interlocks.Permission)
-define_view("WorkerLoadView", WorkerLoad)
+define_view("WorkerLoadView", snapshot.WorkerLoad)
 define_view(
     "LinkView",
     LinkStatistics,
@@ -446,7 +431,7 @@ define_view(
 )
 STATE = define_view(
     "StateView",
-    Snapshot,
+    snapshot.Snapshot,
     "tracker.system tracker.operator.mode tracker.operator.stopped_because ready ready_reason "
     "now_ns uptime_s registration=alpha tracker.matrices.in_use tracker.matrices.margin "
     "tracker.matrices.assessment tracker.matrices.mode_limit tracker.matrices.mode_proof "
@@ -468,7 +453,7 @@ STATE = define_view(
 )
 ALARMS = define_view(
     "AlarmsView",
-    Snapshot,
+    snapshot.Snapshot,
     "alarms stale_alarms muted_alarms worst_severity",
     "The alarms that last, that went unseen, and that are muted.",
 )

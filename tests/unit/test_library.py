@@ -46,6 +46,7 @@ SIGNATURES = {
     "read_fit": "path",
     "reconstruct": "interaction_matrix, recipe",
     "to_oopao": "alpha, tel, wfs",
+    "to_specula": "instrument, folder, found",
     "track": "path, instrument, settings",
     "twin": "files, output, check, python, threads, stated",
     "write_bundle": "path, bundle",

@@ -269,11 +269,8 @@ class OpticsWorker:
         answer = identify_from_response(spectra.slopes[:, 0], seen, turns, self._model.instrument)
         if not answer.wrong:
             return outcome
-        return WindowRefused(
-            reason=compose("window.other-instrument", text=answer.wrong),
-            t_ns_utc=spectra.t_end_ns_utc,
-            kind=RefusalKind.MISDESCRIBED,
-        )
+        reason = compose("window.other-instrument", text=answer.wrong)
+        return spectra.refuse(reason, RefusalKind.MISDESCRIBED)
 
     def _fit_spectra(
         self, spectra: Spectra, loop: ClosedLoop, start: Misregistration
@@ -286,9 +283,7 @@ class OpticsWorker:
             if self._sensor.follow(found.modes, found.optical_gain):
                 estimate = self._refine_fit(spectra, loop, found.alpha)
         except np.linalg.LinAlgError as error:
-            return WindowRefused(
-                reason=compose("window.no-fit", str(error)), t_ns_utc=spectra.t_end_ns_utc
-            )
+            return spectra.refuse(compose("window.no-fit", str(error)))
         return _refuse_unsettled(spectra) if estimate is None else self._against_flat(estimate)
 
     def read_slope_convention(
@@ -420,9 +415,7 @@ class OpticsWorker:
                     break
                 estimate = fit_random(window, self._sensor.linearise(estimate.alpha))
         except np.linalg.LinAlgError as error:
-            return WindowRefused(
-                reason=compose("window.no-fit", str(error)), t_ns_utc=window.t_end_ns_utc
-            )
+            return window.refuse(compose("window.no-fit", str(error)))
         return _refuse_unsettled(window)
 
     def response(self, alpha: Misregistration | None) -> NDArray[np.float32]:
@@ -669,9 +662,5 @@ def _parts_of_models(state: ModelState) -> tuple[object, ...]:
     return state.sensor_mode, state.slopes, state.response
 
 
-def _refuse_unsettled(spectra: Spectra | Correlated) -> WindowRefused:
-    return WindowRefused(
-        reason=compose("window.unsettled"),
-        t_ns_utc=spectra.t_end_ns_utc,
-        kind=RefusalKind.OUT_OF_REACH,
-    )
+def _refuse_unsettled(window: Spectra | Correlated) -> WindowRefused:
+    return window.refuse(compose("window.unsettled"), RefusalKind.OUT_OF_REACH)

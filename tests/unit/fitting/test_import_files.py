@@ -215,7 +215,8 @@ def test_slopes_of_as_many_modes_as_subapertures_are_no_frames():
 def save_matlab73(path, given):
     """Write arrays as MATLAB 7.3 does: HDF5 behind a header, all axes reversed, no vectors."""
     with h5py.File(path, "w", userblock_size=512) as file:
-        for name, values in given.items():
+        structs = {f"bench/{field}": one for field, one in given.pop("bench", {}).items()}
+        for name, values in {**given, **structs}.items():
             file[name] = np.atleast_2d(values).astype(np.uint8 if name == "valid" else float).T
         file["#refs#/modes"] = np.ones((3, 3))
     with path.open("r+b") as file:
@@ -227,7 +228,7 @@ def save_matlab5(path, given):
 
 
 @pytest.mark.parametrize("save", [save_matlab73, save_matlab5])
-@pytest.mark.parametrize("together", [True, False])
+@pytest.mark.parametrize("together", ["variables", "struct", ""])
 def test_files_of_matlab_are_the_same_as_npz(save, together, tmp_path):
     valid = VALID.copy()
     valid[0] = False  # exchanging x and y must show
@@ -239,10 +240,11 @@ def test_files_of_matlab_are_the_same_as_npz(save, together, tmp_path):
         "cube": cube,
         "M2C": np.random.default_rng(4).normal(size=(5, 4)),
     }
+    both = {"bench": dict(given)} if together == "struct" else given
     np.savez(tmp_path / "all.npz", **given)
     (tmp_path / "matlab").mkdir()
     if together:
-        save(tmp_path / "matlab" / "of the bench.mat", given)
+        save(tmp_path / "matlab" / "of the bench.mat", both)
     else:
         for name, values in given.items():
             save(tmp_path / "matlab" / f"{name}.mat", {name: values})

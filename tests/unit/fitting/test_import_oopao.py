@@ -5,11 +5,14 @@ has moved by 0.2 of its subapertures and turned by 2 degrees: saved as docs/tuto
 """
 
 import re
+from argparse import Namespace
 from dataclasses import replace
 from types import SimpleNamespace
 
+import h5py
 import numpy as np
 import pytest
+import scipy
 
 import pyrcal
 from pyrcal.__main__ import main
@@ -23,7 +26,10 @@ from pyrcal.importers.oopao import (
     to_oopao,
 )
 from pyrcal.importers.saved import read_npz
+from pyrcal.twins.bench import read_bench
+from pyrcal.twins.make import STATED
 from service.errors import ConfigurationError, MatrixError
+from service.files.toml import read_toml
 from service.model.instrument import PupilMap
 from service.model.misregistration import Misregistration
 from tests.support.repository import ROOT
@@ -57,6 +63,37 @@ def test_what_oopao_saved_is_imported_and_fitted(kind, gain, tmp_path, capsys):
     # 8 subapertures and 30 modes do not exclude another stop or diameter, which is in sigma
     assert np.all(fit.sigma < [0.005, 0.002, np.deg2rad(0.02), 0.003])
     assert np.all(fit.registration.sigma_statistical < [0.001, 0.001, np.deg2rad(0.01), 0.001])
+
+
+@pytest.mark.parametrize("source", ["oopao", "files", "twin"])
+def test_fields_of_matlab_structs_are_read_like_names_with_dots(source, saved, tmp_path):
+    structs = {}
+    for name, values in saved.items():
+        *owners, field = name.split(".")
+        place = structs
+        for owner in owners:
+            place = place.setdefault(owner, {})
+        place[field] = values
+    assert isinstance(structs["dm"]["misReg"], dict)
+    scipy.io.savemat(tmp_path / "it.mat", structs)
+    np.savez(tmp_path / "it.npz", **saved)
+    found = []
+    for name in ("it.npz", "it.mat"):
+        if source == "twin":
+            given = {**STATED, "files": [(None, tmp_path / name)], "diameter_m": 1.8}
+            found.append(read_bench(Namespace(**given)).imported[0])
+            continue
+        words = ["import", source, str(tmp_path / name), "--output", str(tmp_path / name[3:])]
+        assert main(words + ["--diameter-m", "1.8"] * (source == "files")) == 0
+        with h5py.File(tmp_path / name[3:] / "matrix.h5") as file:
+            arrays = {key: file[key][()] for key in file}
+        tables = read_toml(tmp_path / name[3:] / "instrument.toml")
+        found.append(SimpleNamespace(arrays=arrays, tables=tables))
+    first, second = found
+    assert first.tables == second.tables
+    assert first.arrays.keys() == second.arrays.keys()
+    assert all(np.array_equal(first.arrays[key], second.arrays[key]) for key in first.arrays)
+    assert first.arrays["interaction_matrix"].shape == (104, 30)
 
 
 def test_geometric_lenslets_are_mean_gradients(tmp_path):

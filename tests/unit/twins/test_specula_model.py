@@ -7,13 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import pyrcal
 from pyrcal.fitting.specula import read_subapertures
 from pyrcal.twins.check import Checked, check_oopao_model, check_specula_model
 from pyrcal.twins.oopao_model import write_oopao_model
 from pyrcal.twins.sampled import correlations, residual_fraction, sample_bench
-from pyrcal.twins.specula_model import swap_slopes, write_specula_model
+from pyrcal.twins.specula_model import read_matrix, swap_slopes, write_specula_model
 from service.files.container import opened
 from service.model.sensors.pyramid.description import stretch_of
+from tests.support.repository import ROOT
 from tests.support.twin import find_interpreter
 
 
@@ -55,6 +57,54 @@ def test_what_the_parameter_file_cannot_say_is_said(bench, tmp_path):
         sample_bench(replace(instrument, wfs=wfs), fit), fit, tmp_path
     ).remarks
     assert [one for one in remarks if "no elliptic modulation" in one]
+
+
+SMALL = ROOT / "tests" / "system" / "small.toml"
+ALPHA = pyrcal.Misregistration(shift_x_subap=0.2, shift_y_subap=-0.1, rotation_rad=0.03)
+
+
+def test_an_instrument_file_and_a_registration_become_a_model(tmp_path):
+    exported = pyrcal.to_specula(SMALL, tmp_path / "new", ALPHA)
+    assert exported.path == tmp_path / "new" / "specula_model.yml"
+    assert any("no fft_grid" in one for one in exported.remarks)
+    # without an orientation in the file its slopes are those of conventions.md
+    matrix = pyrcal.interaction_matrix(SMALL, ALPHA)
+    reconstructor = read(exported.path.parent, "rec", "RECMAT") * 1e-9
+    assert np.allclose(reconstructor @ swap_slopes(matrix), np.eye(matrix.shape[1]), atol=1e-3)
+    away = pyrcal.interaction_matrix(SMALL)
+    assert not np.allclose(reconstructor @ swap_slopes(away), np.eye(away.shape[1]), atol=0.1)
+
+
+def test_only_a_pyramid_becomes_a_model(tmp_path):
+    with pytest.raises(pyrcal.ModelError, match="expected pyramid"):
+        pyrcal.to_specula(ROOT / "tests" / "data" / "lenslets.toml", tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+    (tmp_path / "file").touch()
+    with pytest.raises(pyrcal.StorageError, match="cannot be written"):
+        pyrcal.to_specula(SMALL, tmp_path / "file")
+
+
+@pytest.mark.long
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("with_fit", [False, True])
+def test_specula_measures_the_matrix_of_an_instrument_file(bench, with_fit, tmp_path):
+    python = find_interpreter("specula")
+    instrument, fit = bench if with_fit else (pyrcal.load_instrument(SMALL), None)
+    pyrcal.to_specula(instrument, tmp_path, fit or ALPHA)
+    expected = fit.synthetic if with_fit else pyrcal.interaction_matrix(instrument, ALPHA)
+    program = [str(python), "-m", "specula.scripts.specula_main", "--cpu", "--precision", "0"]
+    subprocess.run(
+        [*program, "specula_model.yml"],
+        cwd=tmp_path,
+        env={**os.environ, "MPLBACKEND": "Agg"},
+        capture_output=True,
+        check=True,
+    )
+    measured = read_matrix(tmp_path) * 1e9
+    # a model of few points differs by per cents from the continuous one, in the gain as well
+    assert residual_fraction(expected, measured) < 0.03
+    gains = np.sum(measured * expected, axis=0) / np.sum(expected**2, axis=0)
+    assert np.median(gains) == pytest.approx(1.0, abs=0.03)
 
 
 @pytest.mark.long

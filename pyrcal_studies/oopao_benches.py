@@ -151,6 +151,8 @@ def measure(case: Case) -> dict[str, Any]:
         " postProcessing validI4Q validSignal",
     }
     kept: dict[str, Any] = {"calib.D": matrix.astype(np.float32), "M2C": modes}
+    # A picture of the modulated spot, on OOPAO's grid of the focal plane.
+    kept["spot"] = np.array(sensor.modulation_camera_intensity)
     for owner, listed in names.items():
         for name in listed.split():
             value = getattr(owners[owner], name, None)

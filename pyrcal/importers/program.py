@@ -18,6 +18,7 @@ from pyrcal.importers.imported import Array, Imported
 from pyrcal.importers.layouts import by_role, numbers_of_name, role_of_name
 from pyrcal.importers.oopao import from_saved
 from pyrcal.importers.saved import read_npz
+from pyrcal.importers.simulated import find_fft_grid
 from pyrcal.importers.specula import from_specula, from_synim
 from service.errors import ConfigurationError, MatrixError
 from service.files.container import opened
@@ -46,7 +47,8 @@ def import_files(options: argparse.Namespace) -> Imported:
             places = None if options.positions is None else _positions(options.positions)
             return from_aot(options.file, make_reported(options), options.loop, places)
         case _:
-            return import_arrays(options, *_gather_arrays(options))
+            imported = import_arrays(options, *_gather_arrays(options))
+            return find_fft_grid(imported, options, certain=True) or imported
 
 
 def import_arrays(

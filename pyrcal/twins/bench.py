@@ -13,7 +13,7 @@ import numpy as np
 
 from pyrcal.importers.imported import UNKNOWN, Array, Imported
 from pyrcal.importers.layouts import role_of_name
-from pyrcal.importers.oopao import SAVED, find_image_centres, from_saved
+from pyrcal.importers.oopao import SAVED, from_saved
 from pyrcal.importers.program import (
     ARRAY_FILES,
     import_arrays,
@@ -21,11 +21,11 @@ from pyrcal.importers.program import (
     modes_of_name,
     read_arrays,
 )
+from pyrcal.importers.simulated import find_fft_grid
 from service.errors import ConfigurationError, MatrixError
 from service.files.container import DATASET
 from service.files.toml import read_toml
 from service.instrument import instrument_path
-from service.model.pupil_images import find_pupil_images
 
 _OOPAO = {
     "".join(filter(str.isalnum, f"{owner}{name}")).lower(): f"{owner}.{name}"
@@ -50,18 +50,11 @@ _PARTS = (
 )
 """Parts of names by role, the more specific ones first; for names that are no role's own."""
 
-_MAX_WIDTH_RATIO = 0.12
-"""Largest relative difference of the pupil's width from that of its images as they respond. Without
-modulation light between the images responds, so that an image of 36 pixels seems 39 wide."""
-
 MIN_AXES_RATIO = 1.03
 """Smallest ratio of the axes of a modulated spot's path that is taken for an ellipse."""
 
 _SPOT_THRESHOLD = 0.2
 """Light on the path of the spot over its brightest part."""
-
-_SEEMING_PX = 0.6
-"""Error by which unmodulated images seem too close together, and half of it for others."""
 
 
 class _Named(NamedTuple):
@@ -127,7 +120,7 @@ def read_bench(options: argparse.Namespace) -> Bench:
     _check_modes(imported, options)
     if "spot" in found:
         imported = _use_spot(imported, found["spot"])
-    sampled = _find_fft_grid(imported, options)
+    sampled = find_fft_grid(imported, options)
     return Bench(
         imported=(imported,) if sampled is None else (sampled, imported),
         stated=_state(options, imported),
@@ -290,8 +283,8 @@ def _use_spot(imported: Imported, picture: Array) -> Imported:
     )
     if ratio < MIN_AXES_RATIO or "modulation_lambda_over_d" not in imported.tables["wfs"]:
         return imported
+    # The radius, stated or unknown, is the start of the fit.
     wfs = {**imported.tables["wfs"], "modulation_ellipse": UNKNOWN}
-    del wfs["modulation_lambda_over_d"]
     return replace(imported, tables={**imported.tables, "wfs": wfs})
 
 
@@ -307,54 +300,3 @@ def measure_spot(picture: Array) -> tuple[float, float]:
     squares, axes = np.linalg.eigh(np.cov(columns, rows, aweights=light[path]))
     angle = np.rad2deg(np.arctan2(axes[1, 1], axes[0, 1])) % 180.0
     return float(np.sqrt(squares[1] / squares[0])), float(angle)
-
-
-def _find_fft_grid(imported: Imported, options: argparse.Namespace) -> Imported | None:
-    """Return the bench as one that was simulated with an FFT; None if its files exclude that.
-
-    A simulated pupil has a whole number of points in each subaperture, which is one pixel, and the
-    influence functions have the same points.
-    """
-    wfs, arrays = imported.tables["wfs"], imported.arrays
-    names, frames = ("influence_functions", "mode_shapes", "pupil"), arrays[DATASET]
-    maps = next((arrays[name] for name in names if name in arrays), None)
-    across, pixels = options.pupil_subap, options.pixels_per_subap
-    if maps is None or frames.ndim != 3 or pixels not in {None, 1}:
-        return None
-    # Not in the light: without modulation it is between the images as well, and on their inner
-    # edges, so that they seem 2.7 pixels closer to the middle; the response shows them to 0.6.
-    strength = np.sqrt(np.mean(np.square(frames, dtype=float), axis=0))
-    try:
-        images = find_pupil_images(strength, DATASET)
-    except MatrixError:
-        return None
-    side, width, seen = maps.shape[-1], frames.shape[-1], images.diameter_px
-    tolerance = 0.0 if across else _MAX_WIDTH_RATIO
-    counts = [
-        n
-        for n in range(2, side + 1)
-        if side % n == 0 and abs(n / (across or seen) - 1.0) <= tolerance
-    ]
-    if len(counts) != 1 or frames.shape[1] != width:
-        return None
-    n, notes = counts[0], list(imported.notes)
-    # Windows of whole pixels: their distance is even if the width of the detector less that of the
-    # pupil is.
-    apart = float(np.ptp(images.centres_px, axis=0).mean()) + _SEEMING_PX
-    odd = (width - n) % 2
-    sensor = {"pupil_separation_subap": 2 * round((apart - odd) / 2) + odd}
-    centres = find_image_centres(frames, sensor, notes)
-    notes.append(
-        f"the bench may be simulated: maps of {side} points for {n} subapertures of one pixel"
-    )
-    grid = {"points_per_subaperture": side // n, "width_subap": float(width)}
-    about = {
-        **wfs,
-        "n_subapertures": n,
-        "pixels_per_subaperture": 1,
-        "pupil_diameter_subap": float(n),
-        "pupil_centres_px": centres,
-        "valid_subapertures": "auto",
-        "fft_grid": grid,
-    }
-    return replace(imported, tables={**imported.tables, "wfs": about}, notes=tuple(notes))

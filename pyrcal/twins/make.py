@@ -23,7 +23,7 @@ from pyrcal.fitting.fit_table import NOTABLE_DISPLACEMENT_PX
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.matrix import FitOptions
 from pyrcal.fitting.report import fill_fit, orientation_words
-from pyrcal.importers.imported import Imported, Saved, Tables
+from pyrcal.importers.imported import UNKNOWN, Imported, Saved, Tables
 from pyrcal.terminal import show_progress
 from pyrcal.twins.bench import Bench, read_bench
 from pyrcal.twins.check import check_oopao_model, check_specula_model
@@ -58,6 +58,9 @@ over, by more than so many σ. A fit with it decides."""
 
 HARDLY_MORE_LEFT = 1.01
 """Residual over that of the file's values up to which corrected values are kept."""
+
+MAX_CORRECTIONS = 3
+"""Number of times that a file is corrected and fitted again."""
 
 EXACT = 0.01
 """Residual below which no other model is tried."""
@@ -186,14 +189,19 @@ def _check_output(output: Path) -> None:
 def _fit_bench(bench: Bench, folder: Path, threads: int, progress: Progress | None) -> Twin:
     """Return the fit of the bench, with the instrument file corrected, and write both."""
     best = _choose_import(bench, folder, threads, progress)
-    first, fit = best, best.report.fit
-    number = _find_number(fit)
-    corrections = fit.corrections if number is None else read_entries([number.key])
-    # The axes of the slopes are as the fit has found them; other values move it.
-    if corrections:
-        corrected = _correct(first.imported, fit, corrections)
+    number = _find_number(best.report.fit)
+    corrections = best.report.fit.corrections if number is None else read_entries([number.key])
+    for _ in range(MAX_CORRECTIONS):
+        if not corrections:
+            break
+        # The axes of the slopes are as the fit has found them; other values move it.
+        corrected = _correct(best.imported, best.report.fit, corrections)
         again = _fit(bench, corrected, folder, threads, progress)
-        best = replace(again, before=first.report) if _is_better(again, than=first) else first
+        if not _is_better(again, than=best):
+            break
+        best = replace(again, before=best.report)
+        # A value that was made unknown has been fitted, and is now written.
+        corrections = again.report.fit.corrections if UNKNOWN in corrections.values() else {}
     best = replace(best, imported=_correct(best.imported, best.report.fit, _list_found(best)))
     saved = best.imported.save(folder)
     # The fit belongs to the instrument file that is written, which has what it found.
@@ -293,6 +301,8 @@ def _correct(imported: Imported, fit: Fit, values: Mapping[str, Any]) -> Importe
         corrected.setdefault(table, {})[key] = value
         if value is None:
             del corrected[table][key]
+    if isinstance(corrected["wfs"].get("modulation_ellipse"), dict):
+        corrected["wfs"].pop("modulation_lambda_over_d", None)
     if fit.accepted and "slopes" in corrected:
         words = orientation_words(fit.orientation, fit.order)
         order = words.pop("order")

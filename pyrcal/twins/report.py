@@ -107,6 +107,7 @@ def list_values(made: Twin) -> Iterator[Value]:
 def _list_fitted(made: Twin) -> Iterator[tuple[str, Value]]:
     """Yield the optical quantities that a fit has found, by key, those of the last fit last."""
     stated: dict[str, str] = {}
+    has_ellipse = "modulation_ellipse" in made.imported.tables["wfs"]
     for report in filter(None, (made.before, made.report)):
         fit = report.fit
         optics = {one.key: one for one in fit.optics}
@@ -114,6 +115,8 @@ def _list_fitted(made: Twin) -> Iterator[tuple[str, Value]]:
         for key in dict.fromkeys([*origins, *optics]):
             optic, origin = optics.get(key), origins.get(key)
             if key == "order" or (optic is None and not (origin and origin.correct)):
+                continue
+            if key == "modulation_lambda_over_d" and has_ellipse:
                 continue
             if origin is not None:
                 found, how, reported = str(origin.found), origin.how, str(origin.reported)
@@ -177,7 +180,7 @@ def list_lines(made: Twin) -> Iterator[str]:
     # What a refused fit has found may be anything.
     if fit.accepted:
         for one in list_values(made):
-            if one.sigma is not None or one.name == "stroke":
+            if "." not in one.name:
                 yield f"{one.name:32s}{_text(one)}  {one.unit}  ({one.origin})"
     yield f"{'left over':32s}{100.0 * made.residual:.2f} % of the signal"
     if fit.accepted and fit.causes:

@@ -71,6 +71,9 @@ class Pupil(NamedTuple):
     subaperture_m: float
     """Width of a subaperture in the pupil plane."""
 
+    is_simulated: bool = False
+    """True if the matrix is of a simulation, which has few points in a subaperture itself."""
+
 
 def read_mirror(
     file: MirrorSection, pupil: Pupil
@@ -533,7 +536,7 @@ def _check_table(
             "at least half of it",
         )
     remarks = []
-    if density < ENOUGH_POINTS_PER_SUBAPERTURE:
+    if density < ENOUGH_POINTS_PER_SUBAPERTURE and not pupil.is_simulated:
         remarks.append(
             f"{file.where('modes_pitch_m')}: {density:.2g} table points per subaperture; below "
             f"{ENOUGH_POINTS_PER_SUBAPERTURE:g} the high modes come out wrong by per cents"

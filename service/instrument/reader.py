@@ -148,7 +148,8 @@ def _parts(file: schema.InstrumentFile) -> Mapping[str, Callable[[], Any]]:
     """Return how each part of an instrument is made; what one needs of another is made once."""
     section, kind = file.section, file.kind
     about, wfs = section(schema.AboutTable), section(kind.table)
-    pupil = Pupil(about.table.diameter_m, about.table.diameter_m / wfs.table.pupil_diameter)
+    diameter_m, is_simulated = about.table.diameter_m, "fft_grid" in wfs.given
+    pupil = Pupil(diameter_m, diameter_m / wfs.table.pupil_diameter, is_simulated)
     sensor = cache(lambda: _sensor(wfs, kind, pupil))
     mirror = cache(lambda: read_mirror(section(schema.MirrorTable), pupil))
     modes = cache(lambda: _modes(section(KarhunenLoeve), mirror()[0]))

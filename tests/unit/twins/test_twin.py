@@ -4,6 +4,7 @@ import argparse
 import json
 import os
 import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ import pytest
 import scipy
 
 import pyrcal
+from pyrcal.importers.program import import_files
+from pyrcal.importers.saved import read_npz
 from pyrcal.twins.bench import measure_spot, read_bench
 from pyrcal.twins.make import STATED
 from pyrcal.twins.sampled import sample_bench
@@ -19,6 +22,7 @@ from service.files.container import opened
 from service.instrument import instrument_path, load_instrument
 from sim_rtc.options import parse_options
 from tests.support.repository import ROOT
+from tests.support.twin import find_interpreter
 
 SAMPLE = ROOT / "pyrcal" / "samples" / "data" / "oopao-pyramid.npz"
 DATA = Path(os.environ.get("PYRCAL_BENCH_DATA", "../shared/data"))
@@ -209,6 +213,85 @@ def test_the_axes_of_the_path_of_a_spot_are_seen_in_its_picture():
     ratio, angle_deg = measure_spot(picture + 0.3 * picture.max() + noise)
     assert ratio == pytest.approx(1.25, abs=0.02)
     assert angle_deg == pytest.approx(30.0, abs=1.0)
+
+
+def test_import_and_twin_find_the_same_grid_of_a_simulation(bench, tmp_path):
+    options = argparse.Namespace(**{**STATED, **QUICK})
+    (bench / "IM_KL.npy").rename(bench / "im.npy")
+    (bench / "my_mask.npy").rename(bench / "valid.npy")
+    (bench / "tel_pupil.npy").rename(bench / "pupil.npy")
+    options.files, options.source = [(None, bench)], "files"
+    imported = import_files(options)
+    assert imported.tables == read_bench(options).imported[0].tables
+    # 32 points for 8 subapertures; slopes do not show how wide the simulation's detector was
+    grid = {"points_per_subaperture": 4, "width_subap": 20.0}
+    assert imported.tables["wfs"]["fft_grid"] == grid
+    assert any("remove fft_grid" in note for note in imported.notes)
+    # What is no whole number of points is no simulation, and neither are very fine maps.
+    for side in (33, 8 * 9):
+        maps = np.random.default_rng(1).random((68, side, side))
+        scipy.io.savemat(bench / "influence_functions.mat", {"modes": maps})
+        np.save(bench / "pupil.npy", np.ones((side, side)))
+        assert "fft_grid" not in import_files(options).tables["wfs"]
+        assert len(read_bench(options).imported) == 1
+
+
+@pytest.mark.skipif(not WHOLE_DETECTOR.is_file(), reason="the matrices are not here")
+def test_frames_are_imported_as_simulated_if_their_images_are_around_the_middle(tmp_path):
+    with np.load(WHOLE_DETECTOR) as dump:
+        bench = split(dump, tmp_path / "bench")
+        frames = dump["calib.D"].T.reshape(-1, 120, 120)
+    options = argparse.Namespace(**{**STATED, "diameter_m": 0.6, "unit": "m"}, source="files")
+    files = {"modes": "influence_functions.mat", "mode_to_actuator": "M2C.mat"}
+    options.files = [(role, bench / name) for role, name in files.items()]
+    options.files.append(("matrix", bench / "IM_KL.npy"))
+    wfs = import_files(options).tables["wfs"]
+    # Light between unmodulated images makes them seem 39 pixels wide.
+    assert wfs["pupil_diameter_subap"] == wfs["n_subapertures"] == 36
+    assert wfs["fft_grid"] == {"points_per_subaperture": 2, "width_subap": 120.0}
+    np.save(bench / "IM_KL.npy", np.roll(frames, (3, -2), axis=(1, 2)))
+    assert "fft_grid" not in import_files(options).tables["wfs"]
+    # The twin's fits decide what the place of the images does not.
+    assert "fft_grid" in read_bench(options).imported[0].tables["wfs"]
+
+
+@pytest.fixture(scope="module")
+def elliptic(tmp_path_factory):
+    """Return OOPAO's bench of 4 by 5 λ/D, the longer axis at 120 deg, and its spot."""
+    folder = tmp_path_factory.mktemp("elliptic")
+    command = [find_interpreter("OOPAO"), "-m", "pyrcal_studies.oopao_benches", folder, NAME]
+    variables = {**os.environ, "MPLBACKEND": "Agg", "PYTHONDONTWRITEBYTECODE": "1"}
+    subprocess.run(command, cwd=ROOT, env=variables, stdout=subprocess.DEVNULL, check=True)
+    return read_npz(folder / f"{NAME}.npz")
+
+
+NAME = "ellipse-4-5"
+
+
+@pytest.mark.long
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("with_picture", [True, False])
+def test_the_ellipse_of_a_modulation_is_in_the_twin(elliptic, with_picture, tmp_path):
+    """Targets: the axes within 1 %, the angle within 1 deg, with a picture of the spot."""
+    ratio, angle_deg = measure_spot(elliptic["spot"])
+    assert (ratio, angle_deg) == (pytest.approx(1.25, rel=0.01), pytest.approx(120.0, abs=1.0))
+    more = [("my_mask", elliptic["wfs.validI4Q"])]
+    more += [("modulated_spot", elliptic["spot"])] if with_picture else []
+    bench = split(elliptic, tmp_path / "bench", *more)
+    made = pyrcal.twin(bench, tmp_path / "twin", diameter_m=0.6, unit="m", threads=1)
+    found = load_instrument(made.folder).wfs.modulation_axes
+    axes, angle = sorted(found[:2]), found[2] + (np.pi / 2.0 if found[0] < found[1] else 0.0)
+    # OOPAO's λ/D is 1 - 1 / n of that of a pupil of n = 36 points.
+    assert np.array(axes) * 35 / 36 == pytest.approx([4.0, 5.0], rel=0.01)
+    assert np.rad2deg(angle) % 180.0 == pytest.approx(120.0, abs=1.0)
+    assert made.residual < 0.01
+    _, _, values = values_of(made)
+    assert values["modulation_ellipse"]["origin"].startswith("measured: fitted")
+    assert "modulation_lambda_over_d" not in values
+    # The exported model is modulated on the ellipse, not on a circle.
+    assert "ELLIPSE: tuple[float, float, float] | None = (" in (
+        made.folder / "oopao_model.py"
+    ).read_text("utf-8")
 
 
 def test_influence_functions_are_known_by_their_shape(bench, tmp_path):

@@ -114,9 +114,12 @@ def innovation_of(difference: Array, covariance: Array) -> Innovation:
 
 
 def window_innovation(
-    registration: Registration, window: PointedEstimate, policy: Policy
+    registration: Registration,
+    window: PointedEstimate,
+    policy: Policy,
+    own_error: tuple[float, ...] | None = None,
 ) -> Innovation:
-    """Return the distance of a window from α.
+    """Return the distance of a window from α; ``own_error`` as ``ModeProof.own_model_error``.
 
     It is computed from the estimate after the last window and from the estimate before it. A jump
     in the middle of a window moves that window by half of it and the next by the other half, and
@@ -126,12 +129,15 @@ def window_innovation(
         (to_previous_estimate(registration), registration.previous_estimate),
         _with_scatter(registration, window),
         policy,
-        _model_scatter(registration, policy),
+        _model_scatter(registration, policy, own_error),
     )
 
 
 def pair_innovation(
-    registration: Registration, window: PointedEstimate, policy: Policy
+    registration: Registration,
+    window: PointedEstimate,
+    policy: Policy,
+    own_error: tuple[float, ...] | None = None,
 ) -> Innovation:
     """Return the distance of a window and the previous one from the earlier estimate, together.
 
@@ -149,7 +155,7 @@ def pair_innovation(
         seen_from = (before, before.previous_estimate)
     window = _with_scatter(registration, window)
     first = _with_scatter(registration, first)
-    varies = _model_scatter(registration, policy)
+    varies = _model_scatter(registration, policy, own_error)
     alone = replace(window, alpha=first.alpha, covariance=first.covariance, t_ns_utc=first.t_ns_utc)
     nearest = min(
         _farthest(seen_from, one, policy, varies).mahalanobis_squared for one in (alone, window)
@@ -157,13 +163,17 @@ def pair_innovation(
     # Two windows of one new registration are near one another. Otherwise one is an outlier, or
     # began before the jump.
     if _squared_distance(first.alpha, first, window, policy) >= min(nearest, JUMP_THRESHOLD):
-        return _jump_inside_first(registration, first, window, policy)
+        return _jump_inside_first(registration, first, window, policy, varies)
     found = _farthest(seen_from, _together(first, window), policy, varies)
     return replace(found, rotation_limit=MAX_ROTATION_INNOVATION_OF_TWO)
 
 
 def _jump_inside_first(
-    registration: Registration, first: TimedEstimate, window: PointedEstimate, policy: Policy
+    registration: Registration,
+    first: TimedEstimate,
+    window: PointedEstimate,
+    policy: Policy,
+    varies: Array,
 ) -> Innovation:
     """Return the distance of a window if the mirror jumped to it during the previous window.
 
@@ -173,7 +183,6 @@ def _jump_inside_first(
     """
     if registration.suspected_jump is None:
         return ZERO_INNOVATION
-    varies = _model_scatter(registration, policy)
     found = _farthest((to_previous_estimate(registration),), window, policy, varies)
     # A third window would cost two seconds of a loop that suffers, but only a jump this large
     # excludes turbulence (docs/decisions/0025-jumps.md).
@@ -304,7 +313,9 @@ def _drift_variance(elapsed_s: float, policy: Policy) -> Array:
     return np.asarray(policy.drift_rate**2 * elapsed_s * min(elapsed_s / DRIFT_TIME_S, 1.0))
 
 
-def _model_scatter(registration: Registration, policy: Policy) -> Array:
+def _model_scatter(
+    registration: Registration, policy: Policy, own_error: tuple[float, ...] | None
+) -> Array:
     """Return ``(4,)`` variance between windows by the model error that they have found.
 
     A window of other modes, or of a loop with another reconstructor, has another share of it: the
@@ -312,7 +323,11 @@ def _model_scatter(registration: Registration, policy: Policy) -> Array:
     """
     # Variances: only the part beyond the usual error differs between windows.
     usual = USUAL_MODEL_ERROR_RATIO * policy.floor
-    return np.asarray(np.maximum(registration.floor**2 - usual**2, 0.0))
+    beyond = np.maximum(registration.floor**2 - usual**2, 0.0)
+    # The RTC's own matrix has shown the scatter between modes itself: no part of it is common to
+    # all windows, however coarse the mirror and so large the floor. AO188's magnification would
+    # otherwise "jump" by 17 σ from the many modes of the first dither to the next four.
+    return np.asarray(beyond if own_error is None else np.maximum(beyond, np.square(own_error)))
 
 
 def _farthest(

@@ -159,15 +159,15 @@ def process_window(context: StepContext, measured: WindowEstimate) -> None:
             joint = kalman.expect_stretches(joint, context.nominal.stretches)
         filtering.accept(context, FilterUpdate(joint=joint, n_windows=1, innovation=0.0), measured)
         return
-    first = jumps.previous_window(registration)
-    both = jumps.pair_innovation(registration, measured, context.policy)
+    first, own = jumps.previous_window(registration), context.matrices.mode_proof.own_model_error
+    both = jumps.pair_innovation(registration, measured, context.policy, own)
     if first is not None and both.is_outlier:
         if jumps.jump_lasts(registration, first, measured, both):
             _jump(context, registration, first, measured, both)
         else:
             _suspect_jump(context, registration, measured, both, first)
         return
-    far = jumps.window_innovation(registration, measured, context.policy)
+    far = jumps.window_innovation(registration, measured, context.policy, own)
     too_early = validity.explain_void(context.state, measured.began_ns_utc, Purpose.SETTLE)
     # A window that began before the doubt and agrees with the old α cannot end the doubt. If it
     # disagrees, it counts.

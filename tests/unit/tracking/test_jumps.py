@@ -10,7 +10,7 @@ from service.records import events as ev
 from service.records.estimates import PassiveEstimate
 from service.records.state import Mode
 from service.tracking.update_policy import is_settled
-from tests.support.situations import ALPHA, POLICY, SECOND, Story, estimate, rtc
+from tests.support.situations import ALPHA, POLICY, SECOND, Story, estimate, moved, rtc
 
 PER_MINUTE = np.array([0.05, 0.05, np.deg2rad(0.05), 0.0005])
 NIGHT = replace(
@@ -213,3 +213,24 @@ def test_a_magnification_that_looks_read_wrong_by_as_much_as_they_scatter_tells_
             sky.window(k * LOOK_S - 0.5)
             sky.look(k * LOOK_S, bias, noise)
         assert sky.flagged_s() == np.inf
+
+
+@pytest.mark.parametrize(
+    ("own", "step", "flagged"),
+    [
+        ((0.012, 0.013, 0.0012, 0.0017), 0.0075, False),
+        ((0.012, 0.013, 0.0012, 0.0017), 0.015, True),
+        (None, 0.0075, True),
+    ],
+)
+def test_windows_of_other_modes_differ_by_what_the_rtcs_own_matrix_shows(own, step, flagged):
+    """Numbers of AO188's twin: its own matrix shows hardly more than 1.5 times a coarse floor."""
+    floor = np.array([0.004, 0.004, np.deg2rad(0.014), 0.0014])
+    story = Story(Mode.HOLD, replace(NIGHT, floor=floor)).meet()
+    story.tell(ev.ModesRecognised(id="initial", strange=(), text="all", model_error=own))
+    for alpha in (ALPHA, ALPHA, *[moved(magnification=step)] * 2):
+        story.now_ns += 2 * SECOND
+        noise = np.diag(np.square([0.004, 0.004, 0.0002, 0.0006]))
+        found = estimate(alpha, t_ns=story.now_ns, covariance=noise)
+        story.tell(ev.WindowFitted(estimate=found, began_ns_utc=story.now_ns - 2 * SECOND))
+    assert any(entry.name in FLAGS for entry in story.state.log) is flagged

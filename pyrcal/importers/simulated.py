@@ -19,6 +19,7 @@ from pyrcal.importers.oopao import PYRAMID, find_image_centres
 from service.errors import MatrixError
 from service.files.container import DATASET
 from service.model.pupil_images import find_pupil_images
+from service.model.sensors.pyramid.description import by_quadrant
 
 _POINTS = range(2, 9)
 """Points along a subaperture of a simulation; finer maps say nothing of the model's grid."""
@@ -67,7 +68,8 @@ def find_fft_grid(
         f"{n} subapertures; if it is not, remove fft_grid from [wfs] and check pupil_diameter_subap"
     )
     tables = {**imported.tables, "wfs": {**wfs, **keys}}
-    return replace(imported, tables=tables, notes=tuple(notes))
+    # Windows between pixels would mix the points of a simulation.
+    return replace(imported, tables=tables, notes=tuple(notes), centres_found=False)
 
 
 def _describe_slopes(wfs: Mapping[str, Any], side: int) -> dict[str, Any]:
@@ -103,7 +105,9 @@ def _describe_frames(
     n = counts[0]
     # Windows of whole pixels: their distance is even if the width of the detector less that of the
     # pupil is.
-    apart = float(np.ptp(images.centres_px, axis=0).mean()) + _SEEMING_PX
+    rows, columns = np.moveaxis(by_quadrant(images.centres_px), -1, 0)
+    # The mean of both pairs: the outermost of displaced images are further apart than their square.
+    apart = float(np.mean([np.diff(rows, axis=0), np.diff(columns, axis=1).T])) + _SEEMING_PX
     odd = (width - n) % 2
     sensor = {"pupil_separation_subap": 2 * round((apart - odd) / 2) + odd}
     return {

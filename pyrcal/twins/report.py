@@ -134,7 +134,13 @@ def _list_fitted(made: Twin) -> Iterator[tuple[str, Value]]:
 
 def _unit(key: str) -> str:
     """Return the unit of a key of the instrument file."""
-    endings = {"_m": "m", "_lambda_over_d": "λ/D", "_px": "px", "_subap": "subaperture"}
+    endings = {
+        "_m": "m",
+        "_nm": "nm",
+        "_lambda_over_d": "λ/D",
+        "_px": "px",
+        "_subap": "subaperture",
+    }
     return next((unit for end, unit in endings.items() if key.endswith(end)), "")
 
 

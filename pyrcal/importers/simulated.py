@@ -19,7 +19,6 @@ from pyrcal.importers.oopao import PYRAMID, find_image_centres
 from service.errors import MatrixError
 from service.files.container import DATASET
 from service.model.pupil_images import find_pupil_images
-from service.model.sensors.pyramid.description import by_quadrant
 
 _POINTS = range(2, 9)
 """Points along a subaperture of a simulation; finer maps say nothing of the model's grid."""
@@ -105,9 +104,9 @@ def _describe_frames(
     n = counts[0]
     # Windows of whole pixels: their distance is even if the width of the detector less that of the
     # pupil is.
-    rows, columns = np.moveaxis(by_quadrant(images.centres_px), -1, 0)
     # The mean of both pairs: the outermost of displaced images are further apart than their square.
-    apart = float(np.mean([np.diff(rows, axis=0), np.diff(columns, axis=1).T])) + _SEEMING_PX
+    ordered = np.sort(images.centres_px, axis=0)
+    apart = float(np.mean(ordered[2:] - ordered[:2])) + _SEEMING_PX
     odd = (width - n) % 2
     sensor = {"pupil_separation_subap": 2 * round((apart - odd) / 2) + odd}
     return {

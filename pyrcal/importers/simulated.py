@@ -64,7 +64,8 @@ def find_fft_grid(
     keys["fft_grid"]["points_per_subaperture"] = side // n
     notes.append(
         f"the bench may be simulated, because maps of {side} points have {side // n} in each of "
-        f"{n} subapertures; if it is not, remove fft_grid from [wfs] and check pupil_diameter_subap"
+        f"{n} subapertures, and the pupil is taken as that wide; if it is not, remove fft_grid "
+        "from [wfs] and check pupil_diameter_subap"
     )
     tables = {**imported.tables, "wfs": {**wfs, **keys}}
     # Windows between pixels would mix the points of a simulation.

@@ -28,6 +28,7 @@ from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
 from service.model.pupil import valid_subapertures
+from service.model.sensors.pyramid.description import pyramid_in
 from service.model.slopes import slopes_of
 from service.model.surface import Gaussian
 
@@ -308,6 +309,11 @@ def _list_limits(bench: SampledBench) -> tuple[str, ...]:
         found.append(
             f"SPECULA's parameter file has no elliptic modulation: semi-axes {first:.3g} and "
             f"{second:.3g} lambda/D are written as a circle of the same area."
+        )
+    rooftop = pyramid_in(bench.instrument).rooftop_lambda_over_d
+    if rooftop:
+        found.append(
+            f"SPECULA's parameter file has no rooftop: that of {rooftop:.2g} lambda/D is left out."
         )
     places = bench.image_places_px
     off = float(np.abs(places - places.mean(axis=(0, 1))).max())

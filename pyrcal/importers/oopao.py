@@ -25,7 +25,6 @@ from pyrcal.importers.registration import decompose
 from service.errors import ConfigurationError, MatrixError
 from service.model.misregistration import Misregistration, rotation
 from service.model.pupil_images import find_pupil_images
-from service.model.sensors.pyramid.table import ROOFTOP_KEY
 
 _Sensor = tuple[dict[str, Any], NDArray[np.bool_], dict[str, Any]]
 """``[wfs]``, its valid subapertures, and ``[slopes]``."""
@@ -272,7 +271,7 @@ def _lit_pupil(
     diameter_m = float(tel.D) * share
     sensor["pupil_diameter_subap"] = sensor["n_subapertures"] * share
     # Modulation and rooftop are in wavelengths over tel.D, which is the array's width.
-    for key in {"modulation_lambda_over_d", ROOFTOP_KEY} & sensor.keys():
+    for key in {"modulation_lambda_over_d", "rooftop_lambda_over_d"} & sensor.keys():
         sensor[key] *= share
     if "modulation_ellipse" in sensor:
         ellipse = sensor["modulation_ellipse"]
@@ -328,7 +327,7 @@ def _pyramid(tel: Oopao, wfs: Oopao, notes: list[str]) -> _Sensor:
     if rooftop:
         # OOPAO's number is the length times the distance of the images in rad of one point.
         apart = np.pi * (int(wfs.nSubap) + float(wfs.n_pix_separation))
-        sensor[ROOFTOP_KEY] = rooftop * int(tel.resolution) / apart
+        sensor["rooftop_lambda_over_d"] = rooftop * int(tel.resolution) / apart
     slopes = {"orientation": "auto", "normalisation": "global"}
     if whole:
         valid = _lit_subapertures(_numpy(tel.pupil), int(wfs.nSubap) // binning)

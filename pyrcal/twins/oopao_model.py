@@ -18,7 +18,6 @@ from service.model.instrument import PupilMap
 from service.model.kinds import SignalKind
 from service.model.modes import ModalBasis
 from service.model.pupil import instrument_pupil
-from service.model.sensors.pyramid.description import oriented_pyramid
 from service.model.surface import Gaussian
 
 Array = NDArray[Any]
@@ -89,8 +88,7 @@ def _describe_sensor(bench: SampledBench) -> dict[str, Any]:
     first, second, angle = bench.modulation
     apart = bench.separation_px - bench.n_pixels
     columns, rows = np.moveaxis(bench.image_places_px, -1, 0)
-    wfs = oriented_pyramid(bench.instrument)
-    across = wfs.pupil_diameter * bench.pixels * bench.points_per_pixel
+    across = bench.instrument.wfs.pupil_diameter * bench.pixels * bench.points_per_pixel
     circle = math.isclose(first, second, rel_tol=1e-6)
     return {
         "RESOLUTION": bench.n_points,
@@ -104,7 +102,7 @@ def _describe_sensor(bench: SampledBench) -> dict[str, Any]:
         if circle
         else (float(first * steps), float(second * steps), math.degrees(angle)),
         # see the importer
-        "ROOFTOP": wfs.rooftop_lambda_over_d * math.pi * bench.separation_px / across,
+        "ROOFTOP": bench.rooftop_lambda_over_d * math.pi * bench.separation_px / across,
         "SHIFT_X": [round(float(one), 5) for one in columns[_FACES]],
         "SHIFT_Y": [round(-float(one), 5) for one in rows[_FACES]],
     }

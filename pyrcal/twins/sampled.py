@@ -158,6 +158,11 @@ class SampledBench:
         return first * wider, second * wider, angle
 
     @property
+    def rooftop_lambda_over_d(self) -> float:
+        """Rooftop of the pyramid, in the axes of conventions.md."""
+        return oriented_pyramid(self.instrument).rooftop_lambda_over_d
+
+    @property
     def mirror_alpha(self) -> Misregistration:
         """Registration of the mirror on the pupil."""
         return self.alpha.add_step(np.array([*-self.pupil_shift_subap, 0.0, 0.0]))

@@ -28,7 +28,6 @@ from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
 from service.model.pupil import valid_subapertures
-from service.model.sensors.pyramid.description import pyramid_in
 from service.model.slopes import slopes_of
 from service.model.surface import Gaussian
 
@@ -310,7 +309,7 @@ def _list_limits(bench: SampledBench) -> tuple[str, ...]:
             f"SPECULA's parameter file has no elliptic modulation: semi-axes {first:.3g} and "
             f"{second:.3g} lambda/D are written as a circle of the same area."
         )
-    rooftop = pyramid_in(bench.instrument).rooftop_lambda_over_d
+    rooftop = abs(bench.rooftop_lambda_over_d)
     if rooftop:
         found.append(
             f"SPECULA's parameter file has no rooftop: that of {rooftop:.2g} lambda/D is left out."

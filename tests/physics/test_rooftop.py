@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
+from service.model.instrument import PupilMap
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.sensors.pyramid.description import oriented_pyramid
@@ -22,6 +23,10 @@ FINE, WIDE = 8, 96.0
 
 def matrix_of(length, *, grid=None, sampling=3):
     small = small_instrument()
+    # The same points are lit with a grid as without.
+    u = (np.arange(FINE * 12) - (FINE * 12 - 1) / 2) / (FINE * 12 / 2)
+    radius = np.hypot(u, u[:, None])
+    lit = ((radius < 1.0) & (radius > small.obscuration_ratio)).astype(float)
     wfs = replace(
         small.wfs,
         modulation_lambda_over_d=0.0,
@@ -29,9 +34,8 @@ def matrix_of(length, *, grid=None, sampling=3):
         fft_grid=grid,
         pupil_separation_subap=16.0,
     )
-    model = InteractionModel(
-        replace(small, wfs=wfs), small_basis(), pupil_sampling=sampling, detector_nodes=sampling
-    )
+    bench = replace(small, wfs=wfs, pupil=PupilMap(lit=lit, pitch_m=small.subaperture_m / FINE))
+    model = InteractionModel(bench, small_basis(), pupil_sampling=sampling, detector_nodes=sampling)
     return model.interaction_matrix(Misregistration())
 
 

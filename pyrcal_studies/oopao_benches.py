@@ -18,6 +18,7 @@ from OOPAO.MisRegistration import MisRegistration
 from OOPAO.Pyramid import Pyramid
 from OOPAO.Source import Source
 from OOPAO.Telescope import Telescope
+from OOPAO.Zernike import Zernike
 
 Array = NDArray[np.float64]
 
@@ -52,6 +53,10 @@ class Case:
     noise: float = 0.0
     """RMS of the noise over that of the signal of each mode."""
 
+    aberration_rad: float = 0.0
+    """RMS of a static aberration of OOPAO's Zernike polynomials 3 to 12, counted from tip: drawn
+    coefficients."""
+
 
 FREE = "-free"
 """End of the name of a bench that is simulated without its noise."""
@@ -67,6 +72,8 @@ CASES = {
     "ellipse-3-4": Case(modulation=3.0, ellipse=(3.0, 4.0, 0.0)),
     "whole-unmodulated": Case(modulation=0.0, processing=WHOLE),
     "whole-three": Case(modulation=3.0, processing=WHOLE),
+    "unmodulated-aberrated": Case(modulation=0.0, aberration_rad=0.5),
+    "three-aberrated": Case(modulation=3.0, aberration_rad=1.0),
     "whole-five-noise": Case(
         modulation=5.0,
         processing=WHOLE,
@@ -129,12 +136,13 @@ def measure(case: Case) -> dict[str, Any]:
     )
     _, _, axes = np.linalg.svd(plain.modes, full_matrices=False)
     modes = axes[:N_MODES].T / (plain.modes @ axes[:N_MODES].T).std(axis=0)
+    aberration = _draw_aberration(telescope, case.aberration_rad)
     columns = []
     for shape in (mirror.modes @ modes).T:
         phase = 2 * np.pi / star.wavelength * STROKE_M * shape.reshape(n_points, n_points)
         signals = []
         for sign in (1.0, -1.0):
-            sensor.wfs_measure(phase_in=sign * phase)
+            sensor.wfs_measure(phase_in=aberration + sign * phase)
             signals.append(np.array(sensor.signal, dtype=float))
         columns.append((signals[0] - signals[1]) / (2 * STROKE_M))
     matrix = np.stack(columns, axis=1)
@@ -159,6 +167,15 @@ def measure(case: Case) -> dict[str, Any]:
             if value is not None:
                 kept[f"{owner}.{name}"] = value
     return kept
+
+
+def _draw_aberration(telescope: Telescope, rms_rad: float) -> Array:
+    """Return the static aberration over the pupil's array, radians."""
+    polynomials = Zernike(telescope, 12)
+    polynomials.computeZernike(telescope)
+    drawn = polynomials.modesFullRes[:, :, 2:] @ np.random.default_rng(2).standard_normal(10)
+    scaled: Array = rms_rad * drawn / drawn[telescope.pupil > 0].std()
+    return scaled
 
 
 def _path(first: float, second: float, angle_deg: float) -> list[list[float]]:

@@ -45,6 +45,9 @@ KEPT = ROOT / "var" / "twins"
 FREE = "-free"
 """End of the name of a bench that is simulated without its noise."""
 
+ABERRATED = "-aberrated"
+"""End of the name of a bench with a static aberration, which its instrument file calls unknown."""
+
 UNTOLD = "-grid-unknown"
 """End of the name of a bench whose ``fft_grid`` is removed from its instrument file."""
 
@@ -53,6 +56,8 @@ SIMULATED = {
     "half": "0.5 λ/D, slopes",
     "three": "3 λ/D, slopes",
     "ellipse-4-5": "4 by 5 λ/D, slopes",
+    "unmodulated-aberrated": "0 λ/D, slopes, aberration of 0.5 rad RMS",
+    "three-aberrated": "3 λ/D, slopes, aberration of 1 rad RMS",
     "whole-unmodulated": "0 λ/D, whole detector",
     "whole-three": "3 λ/D, whole detector",
     "whole-five-noise": "5 λ/D, whole detector, 289 actuators, 90 deg, 10 % noise",
@@ -76,9 +81,12 @@ def simulate(name: str) -> Path:
 def fit_simulated(name: str) -> tuple[Path, Instrument, Fit]:
     """Return the folder of an imported bench, its instrument and its fit."""
     imported = from_saved(read_npz(simulate(name.removesuffix(UNTOLD))), name)
+    wfs = dict(imported.tables["wfs"])
     if name.endswith(UNTOLD):
-        wfs = {key: one for key, one in imported.tables["wfs"].items() if key != "fft_grid"}
-        imported = replace(imported, tables={**imported.tables, "wfs": wfs})
+        del wfs["fft_grid"]
+    if name.endswith(ABERRATED):
+        wfs["static_aberration_nm"] = "unknown"
+    imported = replace(imported, tables={**imported.tables, "wfs": wfs})
     saved = imported.save(KEPT / name)
     instrument = load_instrument(saved.instrument)
     return KEPT / name, instrument, fit_file(instrument, saved.matrix, FitOptions(), threads=1).fit

@@ -412,9 +412,9 @@ def _before_and_after(report: Report) -> list[str]:
     ]
 
 
-def strehl_ratio(error_nm: float, wavelength_nm: float = 1650.0) -> float:
-    """Return the Strehl ratio by Marechal's approximation."""
-    return math.exp(-((2.0 * math.pi * error_nm / wavelength_nm) ** 2))
+def strehl_ratio(error_nm: float) -> float:
+    """Return the Strehl ratio at 1.65 um by Marechal's approximation."""
+    return math.exp(-((2.0 * math.pi * error_nm / 1650.0) ** 2))
 
 
 def _row(report: Report, name: str) -> str:

@@ -17,6 +17,7 @@ from pyrcal.fitting.comparison import MIN_EXPLAINED, OTHER_SHARE, Alternative, F
 from pyrcal.fitting.instrument_checks import (
     FoundOptic,
     may_compensate,
+    try_aberration,
     try_ellipse,
     try_free_images,
     try_instruments,
@@ -399,6 +400,7 @@ TRIALS: tuple[Callable[[FitSubset], Iterator[Alternative]], ...] = (
     try_pupils,
     try_instruments,
     try_ellipse,
+    try_aberration,
     try_free_images,
     _try_off_centre,
     _try_separate_gains,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,7 @@ DIFFERENCES = 3
 """Order of the differences of neighbours along each axis that show white noise."""
 
 MIN_SHARE = 0.01
-"""Smallest share of the power left over that is reported."""
+"""Share of the power left over above which a cause is reported."""
 
 _LIGHT_STEPS = 4
 
@@ -71,8 +71,8 @@ class Cause:
 def explain_left_over(settled: Settled, noise: Array | None = None) -> tuple[Cause, ...]:
     """Return the causes of what a fit leaves over, the largest first and the unexplained last.
 
-    Shares add up to 1. They refer to even light, whether or not the fit has a gain map. Returns no
-    causes if less than ``MIN_LEFT_OVER`` of the signal is left over.
+    Shares are whole per cents that add up to 100. They refer to even light, whether or not the fit
+    has a gain map. Returns no causes if less than ``MIN_LEFT_OVER`` of the signal is left over.
 
     Parameters
     ----------
@@ -84,10 +84,16 @@ def explain_left_over(settled: Settled, noise: Array | None = None) -> tuple[Cau
     """
     if settled.share < MIN_LEFT_OVER:
         return ()
-    known = [one for one in _divide_power(settled, noise) if one.share > MIN_SHARE]
+    known, left = [], 1.0
+    for one in _divide_power(settled, noise):
+        # The excess of one image contains noise, which has been counted.
+        share = round(min(one.share, left), 2)
+        if share > MIN_SHARE:
+            known.append(replace(one, share=share))
+            left = round(left - share, 2)
     unexplained = Cause(
         words="unexplained",
-        share=max(1.0 - sum(one.share for one in known), 0.0),
+        share=left,
         sigma=float(np.sqrt(sum(one.sigma**2 for one in known))),
         remedy="push more modes, and some with half the stroke",
     )

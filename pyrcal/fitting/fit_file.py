@@ -208,14 +208,23 @@ def _fit_recorded(
         except MatrixError as error:
             text = str(error).removeprefix("reference: ")
             raise MatrixError(f"{recorded.where}: {text}") from error
-    if recorded.flux_frame is not None and len(np.unique(recorded.flux_frame)) <= 2:  # a mask
-        condition = f"{FLUX_FRAME} is a mask, so that the sensor's gain is unknown"
+    if recorded.flux_frame is not None and not _has_counts(recorded.flux_frame):
+        condition = "there is no mean frame in counts, so that the sensor's gain is unknown"
         unknown = FoundStroke(metres_per_unit=None, sigma=None, condition=condition)
         found = replace(found, stroke=unknown)
     no_map = isinstance(kind_of(instrument).light(instrument), CannotTell)
     if recorded.flux_frame is None or options.illumination is not None or no_map:
         return found
     return replace(found, remarks=(*found.remarks, *_note_flux_frame(found)))
+
+
+def _has_counts(light: NDArray[np.float64]) -> bool:
+    """Return False for a mask, of 0 and 1 or 255, and for light over that of its brightest pixel.
+
+    The import writes the latter for frames without a mean frame.
+    """
+    brightest = light.max()
+    return bool(brightest != 1.0 and not np.isin(light, (0.0, 255.0)).all())
 
 
 def _with_found_light(instrument: Instrument, recorded: Recorded, found: Fit) -> Instrument | None:

@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 from pyrcal.fitting.comparison import MIN_EXPLAINED, Alternative, FitSubset
 from pyrcal.fitting.methods import SEARCH_RESIDUAL, Settled, settle
 from pyrcal.fitting.models import (
+    ABERRATION,
     ELLIPSE,
     FAR_PREFERRED_SHARE,
     LOGARITHM_ABOVE,
+    PREFERRED_SHARE,
     SENSOR_STEP,
     FitModels,
     Optic,
@@ -36,8 +38,15 @@ COUPLING_KEY = "coupling"
 UNKNOWN_ELLIPSE = 'modulation_ellipse = "unknown"'
 """Entry of the instrument file by which an elliptic modulation is fitted."""
 
+UNKNOWN_ABERRATION = 'static_aberration_nm = "unknown"'
+"""Entry of the instrument file by which a static aberration is fitted."""
+
 UNKNOWN_IMAGES = 'image_offsets_px = "unknown"'
 """Entry of the instrument file by which the places of the pupil images are fitted."""
+
+TRIED_ABERRATION = ABERRATION[2:7]
+"""Polynomials with which a static aberration is tried, focus to coma: each takes a matrix, and a
+beam that has others has some of these as well."""
 
 NOTABLE_CHANGE = 0.03
 """Smallest difference of a logarithm from the file's value that is reported."""
@@ -142,21 +151,41 @@ def try_ellipse(few: FitSubset) -> Iterator[Alternative]:
         return
     if Optic.STRETCH in few.models.optics or few.models.sensor_number < LOGARITHM_ABOVE:
         return
+    found = _try_family(few, ELLIPSE, UNKNOWN_ELLIPSE, FAR_PREFERRED_SHARE)
+    if found.preferred:
+        yield replace(found, is_instrument=True)
+
+
+def try_aberration(few: FitSubset) -> Iterator[Alternative]:
+    """Yield a static aberration of the beam, unless less is left over than models differ by.
+
+    Slopes change with the square of a large aberration, so that the misfit of this first step says
+    little of what a fit with ``static_aberration_nm = "unknown"`` leaves.
+    """
+    about = few.models.instrument
+    if kind_of(about).aberrate(about.wfs, 2, 0.0) is None or few.settled.share < MIN_EXPLAINED:
+        return
+    if Optic.FOCUS in few.models.optics:
+        return
+    yield _try_family(few, TRIED_ABERRATION, UNKNOWN_ABERRATION, PREFERRED_SHARE)
+
+
+def _try_family(
+    few: FitSubset, family: Sequence[Optic], entry: str, max_share: float
+) -> Alternative:
+    """Return the fit with quantities that are fitted if the file has an ``entry``."""
     rates = [
         (few.matrix(few.models.with_optic(one, SENSOR_STEP)) - few.own) / SENSOR_STEP
-        for one in ELLIPSE
+        for one in family
     ]
-    found = few.judge(
+    return few.judge(
         few.compare(few.own, *rates),
-        UNKNOWN_ELLIPSE,
-        FAR_PREFERRED_SHARE,
-        key=UNKNOWN_ELLIPSE,
+        entry,
+        max_share,
+        key=entry,
         min_explained=MIN_EXPLAINED,
         is_number=True,
-        is_instrument=True,
     )
-    if found.preferred:
-        yield found
 
 
 def try_free_images(few: FitSubset) -> Iterator[Alternative]:
@@ -218,8 +247,8 @@ def list_optics(models: FitModels, settled: Settled, sure: Uncertainty) -> tuple
     number, sensor_key = models.sensor_number, models.sensor_key
     found = []
     for k, (optic, change) in enumerate(changes.items(), nuisances.first_optic):
-        if optic in ELLIPSE:
-            continue  # two axes and an angle, which no single number says: ``find_ellipse``
+        if optic in ELLIPSE or optic in ABERRATION:
+            continue  # which no single number says: ``find_families``
         stated, value = number, moved_sensor_number(number, change)
         if optic is Optic.WIDTH and models.coupling is not None:
             stated, value = models.coupling, float(models.coupling ** np.exp(-2.0 * change))
@@ -247,6 +276,8 @@ def fit_file_values(
     Both are compared on the coarse grid, unless so little is left over that its own error counts.
     """
     nothing = replace(settled.nuisances, optics=())
+    for optic, change in settled.nuisances.changes(settled.solution.nuisances).items():
+        models = models.with_optic(optic, change) if optic in ABERRATION else models
     # The fitted places of the images are kept, so that the two fits differ in coupling and
     # modulation only.
     if np.any(nothing.displaced):

@@ -50,11 +50,11 @@ from pyrcal.fitting.methods import (
     settle,
     settle_at,
 )
-from pyrcal.fitting.models import FAR_PREFERRED_SHARE, PREFERRED_SHARE, FitModels
+from pyrcal.fitting.models import FAR_PREFERRED_SHARE, PREFERRED_SHARE, FitModels, Optic
 from pyrcal.fitting.noise import bound_noise_share, measure_structure
 from pyrcal.fitting.origins import (
     Origin,
-    find_ellipse,
+    find_families,
     find_stroke,
     list_origins,
     list_undetermined_keys,
@@ -841,10 +841,10 @@ def _add_notes(
             fit.gains,
         )
         settled, sigma = found.settled, findings.uncertainty.nuisance_sigma
-        ellipse = tuple(find_ellipse(settled, sigma, findings.structure))
-        # The two axes take the place of the radius.
-        radius = settled.models.sensor_key if ellipse else None
-        origins = (*(one for one in origins if one.key != radius), *ellipse)
+        # The two axes of an ellipse take the place of the radius.
+        radius = settled.models.sensor_key if Optic.STRETCH in settled.models.optics else None
+        families = find_families(settled, sigma, findings.structure)
+        origins = (*(one for one in origins if one.key != radius), *families)
     unknown = list_undetermined_keys(about, origins)
     return replace(fit, remarks=remarks, origins=origins, unknown_not_found=unknown)
 

@@ -66,6 +66,9 @@ ALTERNATIVE_MISFIT_RATIO = 1.3
 """Misfit of another minimum over the smallest one, below which it is an alternative."""
 
 MAX_REPEATS = 6
+ABERRATION_REPEATS = 15
+"""The same with an unknown static aberration: one of 1 rad without modulation takes 12."""
+
 LINEAR_CHANGE = 0.01
 """Logarithmic change of an optical quantity below which the model is linear."""
 
@@ -293,7 +296,8 @@ def settle(
     models, nuisances = settled.models, settled.nuisances
     # ``approaching``: iterate on the coarse grid, which is cheaper, until that has converged
     before, approaching, taken = np.inf, True, settled
-    for _ in range(MAX_REPEATS):
+    aberrated = Optic.FOCUS in models.optics
+    for _ in range(ABERRATION_REPEATS if aberrated else MAX_REPEATS):
         left = settled.solution.projection.chi
         if models is settled.models:
             models, nuisances = _update_models(settled, move_images=left < IMAGES_GAIN * before)

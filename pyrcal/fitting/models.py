@@ -66,6 +66,7 @@ def moved_sensor_number(number: float, change: float) -> float:
 
 
 ELLIPSE_KEY = "wfs.modulation_ellipse"
+ABERRATION_KEY = "wfs.static_aberration_nm"
 
 
 class Optic(StrEnum):
@@ -86,10 +87,36 @@ class Optic(StrEnum):
     SLANT = "slant"
     """The same along 45 and 135 degrees."""
 
+    TILT_X = "tilt along x"
+    """Static aberration of the beam, as all that follow: coefficients of Zernike polynomials,
+    radians RMS, see ``SensorModel.aberrate``."""
+
+    TILT_Y = "tilt along y"
+    FOCUS = "focus"
+    ASTIGMATISM_45 = "astigmatism at 45 deg"
+    ASTIGMATISM_0 = "astigmatism at 0 deg"
+    COMA_Y = "coma along y"
+    COMA_X = "coma along x"
+    TREFOIL_Y = "trefoil along y"
+    TREFOIL_X = "trefoil along x"
+    SPHERICAL = "spherical aberration"
+    ASTIGMATISM_0_4 = "astigmatism at 0 deg of the fourth order"
+    ASTIGMATISM_45_4 = "astigmatism at 45 deg of the fourth order"
+    TETRAFOIL_0 = "tetrafoil at 0 deg"
+    TETRAFOIL_22 = "tetrafoil at 22.5 deg"
+
 
 ELLIPSE = (Optic.STRETCH, Optic.SLANT)
 """Parameters of an elliptic modulation, fitted together if ``wfs.modulation_ellipse`` is unknown.
 """
+
+
+ABERRATION = tuple(Optic)[tuple(Optic).index(Optic.TILT_X) :]
+"""Zernike polynomials from Noll's number 2 on, fitted together if ``wfs.static_aberration_nm`` is
+unknown."""
+
+FAMILIES = {ELLIPSE_KEY: ELLIPSE, ABERRATION_KEY: ABERRATION}
+"""Quantities that are fitted if the instrument file marks their key as unknown."""
 
 
 @dataclass(slots=True)
@@ -210,8 +237,8 @@ class FitModels:
             found.append(Optic.WIDTH)
         if self.sensor_key is not None:
             found.append(Optic.SENSOR)
-        if ELLIPSE_KEY in self.instrument.unknown:
-            found += ELLIPSE
+        for key, family in FAMILIES.items():
+            found += family if key in self.instrument.unknown else ()
         return tuple(found)
 
     @property
@@ -220,7 +247,7 @@ class FitModels:
         keys = {
             Optic.WIDTH: "mirror.coupling",
             Optic.SENSOR: f"wfs.{self.sensor_key}",
-            **dict.fromkeys(ELLIPSE, ELLIPSE_KEY),
+            **{optic: key for key, family in FAMILIES.items() for optic in family},
         }
         return frozenset(one for one in self.optics if keys[one] in self.instrument.unknown)
 
@@ -246,16 +273,20 @@ class FitModels:
         return optic is not Optic.WIDTH or self.coupling is not None
 
     def with_optic(self, optic: Optic, change: float) -> FitModels:
-        """Return the models of an instrument with a quantity changed by a logarithm."""
-        if optic in ELLIPSE:
-            along = (change, 0.0) if optic is Optic.STRETCH else (0.0, change)
-            sensor = kind_of(self.instrument).stretch_modulation(self.instrument.wfs, along)
+        """Return the models of an instrument with a quantity changed by a logarithm, or radians."""
+        kind, wfs = kind_of(self.instrument), self.instrument.wfs
+        if optic in ELLIPSE or optic in ABERRATION:
+            if optic in ABERRATION:
+                sensor = kind.aberrate(wfs, 2 + ABERRATION.index(optic), change)
+            else:
+                along = (change, 0.0) if optic is Optic.STRETCH else (0.0, change)
+                sensor = kind.stretch_modulation(wfs, along)
             if sensor is None:
-                raise ModelError("fit: found no modulation to be stretched, expected a pyramid's")
+                raise ModelError(f"fit: found a {kind.name}, expected a pyramid, for its {optic}")
             return replace(self, instrument=replace(self.instrument, wfs=sensor))
         if optic is Optic.SENSOR and self.sensor_key is not None:
             number = moved_sensor_number(self.sensor_number, change)
-            wfs = replace(self.instrument.wfs, **{self.sensor_key: number})
+            wfs = replace(wfs, **{self.sensor_key: number})
             return replace(self, instrument=replace(self.instrument, wfs=wfs))
         if not isinstance(self.basis, ModalBasis) or not isinstance(self.basis.surface, Gaussian):
             raise ModelError("fit: found influence functions without a coupling to be changed")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pyrcal.fitting.comparison import Alternative
 from pyrcal.fitting.instrument_checks import FoundOptic, may_compensate
 from pyrcal.fitting.methods import Settled
-from pyrcal.fitting.models import ELLIPSE, ELLIPSE_KEY, Optic
+from pyrcal.fitting.models import ABERRATION, ELLIPSE, FAMILIES, Optic
 from service.model.instrument import Instrument
 from service.model.sensors.registry import kind_of
 from service.model.slopes import FLIPS, Orientation, SlopeRecipe
@@ -189,33 +189,41 @@ def _describe_optic(one: FoundOptic, *, determined: bool) -> Origin:
     )
 
 
-def find_ellipse(
+def find_families(
     settled: Settled, sigma: NDArray[np.float64], structure: float
 ) -> Iterator[Origin]:
-    """Yield the elliptic modulation, if it was fitted.
+    """Yield an elliptic modulation and a static aberration, if they were fitted.
 
     ``sigma`` ``(n_nuisances,)`` is 1 σ of all nuisances, ``structure`` that of ``list_origins``.
     """
     models, nuisances = settled.models, settled.nuisances
-    places = [
-        (k, optic)
+    places: dict[Optic, int] = {
+        optic: k
         for k, (optic, _) in enumerate(nuisances.optics, nuisances.first_optic)
         if optic is not Optic.WIDTH
-    ]
-    if not any(optic in ELLIPSE for _, optic in places):
-        return
+    }
     # The models have all but the last, linear steps.
-    for k, optic in places:
+    for optic, k in places.items():
         models = models.with_optic(optic, float(settled.solution.nuisances[k]))
     about, determined = models.instrument, structure < MAX_STRUCTURE
+    kind, unit_nm = kind_of(about), about.wfs.wavelength_m / (2.0 * np.pi * 1e-9)
     doubt = "" if determined else ", may compensate errors of the model"
-    yield Origin(
-        key=ELLIPSE_KEY.removeprefix("wfs."),
-        found=kind_of(about).modulation_entry(about.wfs),
-        reported='"unknown"',
-        how=f"fitted, 1 sigma of an axis {max(sigma[k] for k, _ in places):.1%}{doubt}",
-        correct=determined,
-    )
+    for key, family in FAMILIES.items():
+        if not places.keys() >= set(family):
+            continue
+        if family is ELLIPSE:
+            largest = max(sigma[k] for optic, k in places.items() if optic not in ABERRATION)
+            found, words = kind.modulation_entry(about.wfs), f"of an axis {largest:.1%}"
+        else:
+            largest = max(sigma[places[optic]] for optic in family)
+            found, words = kind.aberration_entry(about.wfs), f"of each {largest * unit_nm:.2g} nm"
+        yield Origin(
+            key=key.removeprefix("wfs."),
+            found=found,
+            reported='"unknown"',
+            how=f"fitted, 1 sigma {words}{doubt}",
+            correct=determined,
+        )
 
 
 def _find_wavelength(about: Instrument, gains: NDArray[np.float64]) -> Iterator[Origin]:
@@ -273,6 +281,8 @@ def find_stroke(
     # Frames are made into slopes here; those of an RTC may have any scale.
     if about.frames is None:
         conditions.append("the slopes have the normalisation of the instrument file")
+    elif kind_of(about).knows_mean_light(about):
+        conditions.append("the frames are divided by the sum of the detector")
     axes = found.assumed_orientation
     if about.slopes.orientation is None and axes.sign_x == axes.sign_y == -1:
         conditions.append("the slopes have the other sign; otherwise the commands have")

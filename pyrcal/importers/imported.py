@@ -200,7 +200,11 @@ class Imported:
         """Return the text of the instrument file, notes first."""
         lines = [f"# Imported from {self.source}.", *(f"# {note}" for note in self.notes)]
         for name, table in self.tables.items():
-            lines += ["", f"[{name}]", *(f"{key} = {_toml(value)}" for key, value in table.items())]
+            lines += [
+                "",
+                f"[{name}]",
+                *(f"{key} = {format_toml(value)}" for key, value in table.items()),
+            ]
         return "\n".join(lines) + "\n"
 
     def _fill(self, file: h5py.File) -> None:
@@ -209,12 +213,14 @@ class Imported:
             file[name] = values
 
 
-def _toml(value: object) -> str:
+def format_toml(value: object) -> str:
     """Return a value in TOML notation."""
     if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{key} = {_toml(each)}" for key, each in value.items()) + " }"
+        return (
+            "{ " + ", ".join(f"{key} = {format_toml(each)}" for key, each in value.items()) + " }"
+        )
     if isinstance(value, list | tuple):
-        return "[" + ", ".join(_toml(each) for each in value) + "]"
+        return "[" + ", ".join(format_toml(each) for each in value) + "]"
     if isinstance(value, bool | str):
         return json.dumps(value, ensure_ascii=False)
     return repr(float(value)) if isinstance(value, float | np.floating) else str(value)

@@ -69,7 +69,7 @@ class Judgement(StrEnum):
     """There is nothing to judge; it counts as not passed."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Criterion:
     """One line of the acceptance: a number and its limit."""
 
@@ -144,16 +144,9 @@ def judge(data: Commissioning) -> tuple[Criterion, ...]:
     }
     outcomes = {True: Judgement.PASS, False: Judgement.FAIL, None: Judgement.MISSING}
     return tuple(
-        Criterion(
-            group=group,
-            name=name,
-            outcome=outcomes[passed],
-            found=found,
-            limit=limit,
-            remedy=remedy,
-        )
+        Criterion(group, name, outcomes[passed], *texts)
         for group, part in parts.items()
-        for name, passed, found, limit, remedy in part(data)
+        for name, passed, *texts in part(data)
     )
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Concatenate, Final, ParamSpec, TypeVar
+from typing import Concatenate, Final, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,9 +42,6 @@ from service.runtime.worker import OpticsWorker
 from service.tracking.policy import SECOND_NS
 from service.tracking.step_context import new_lines
 from service.wire import DitherRequest, Manifest, Reply, Status, decode
-
-if TYPE_CHECKING:
-    pass
 
 P = ParamSpec("P")
 R = TypeVar("R")

@@ -21,7 +21,9 @@ from pyrcal.fitting.comparison import MIN_EXPLAINED, Alternative
 from pyrcal.fitting.fit_file import Progress, fit_file
 from pyrcal.fitting.fit_table import NOTABLE_DISPLACEMENT_PX
 from pyrcal.fitting.fitted import Fit
+from pyrcal.fitting.instrument_checks import UNKNOWN_ABERRATION
 from pyrcal.fitting.matrix import FitOptions
+from pyrcal.fitting.models import FAMILIES
 from pyrcal.fitting.report import fill_fit, orientation_words
 from pyrcal.importers.imported import UNKNOWN, Imported, Saved, Tables
 from pyrcal.terminal import show_progress
@@ -57,7 +59,8 @@ MAX_SHARE, MIN_SIGNIFICANCE = 0.9, 2.0
 over, by more than so many σ. A fit with it decides."""
 
 HARDLY_MORE_LEFT = 1.01
-"""Residual over that of the file's values up to which corrected values are kept."""
+"""Residual over that of the file's values up to which corrected values are kept: the entries of the
+file are rounded, and numbers that were free are fixed."""
 
 MAX_CORRECTIONS = 3
 """Number of times that a file is corrected and fitted again."""
@@ -197,9 +200,10 @@ def _fit_bench(bench: Bench, folder: Path, threads: int, progress: Progress | No
         # The axes of the slopes are as the fit has found them; other values move it.
         corrected = _correct(best.imported, best.report.fit, corrections)
         again = _fit(bench, corrected, folder, threads, progress)
-        if not _is_better(again, than=best):
+        share = HARDLY_MORE_LEFT if number is None else MAX_SHARE**0.5
+        if not _is_better(again, than=best, share=share):
             break
-        best = replace(again, before=best.report)
+        best, number = replace(again, before=best.report), None
         # A value that was made unknown has been fitted, and is now written.
         corrections = again.report.fit.corrections if UNKNOWN in corrections.values() else {}
     best = replace(best, imported=_correct(best.imported, best.report.fit, _list_found(best)))
@@ -251,14 +255,14 @@ def _fit(
     return Twin(folder=folder, bench=bench, imported=imported, instrument=instrument, report=report)
 
 
-def _is_better(again: Twin, *, than: Twin) -> bool:
-    """Return True if the fit with a corrected file alone is accepted, or leaves hardly more.
+def _is_better(again: Twin, *, than: Twin, share: float) -> bool:
+    """Return True if the fit with a corrected file alone is accepted, or leaves little enough.
 
-    The entries of the file are rounded, and numbers that were free are fixed.
+    ``share`` is the largest ratio of the residuals.
     """
     if again.report.fit.accepted != than.report.fit.accepted:
         return again.report.fit.accepted
-    return again.residual < max(HARDLY_MORE_LEFT * than.residual, EXACT)
+    return again.residual < max(share * than.residual, EXACT)
 
 
 def _find_number(fit: Fit) -> Alternative | None:
@@ -272,7 +276,8 @@ def _find_number(fit: Fit) -> Alternative | None:
         if fit.accepted
         and one.is_number
         and "=" in one.key
-        and one.misfit < MAX_SHARE
+        # the first step says little of a large aberration
+        and (one.misfit < MAX_SHARE or one.key == UNKNOWN_ABERRATION)
         and one.significance > MIN_SIGNIFICANCE
     ]
     return min(found, key=lambda one: one.misfit, default=None)
@@ -284,11 +289,14 @@ def _list_found(made: Twin) -> Mapping[str, Any]:
     The twin is the model that reproduces the matrix. It therefore has the fitted value where the
     files have none or a notably different one.
     """
-    return read_entries(
+    fit = made.report.fit
+    found = [
         f"{one.key} = {one.found:.4g}"
-        for one in made.report.fit.optics
+        for one in fit.optics
         if one.found is not None and one.key and one.is_adopted
-    )
+    ]
+    found += [one.entry for one in fit.origins if f"wfs.{one.key}" in FAMILIES]
+    return read_entries(found)
 
 
 def _correct(imported: Imported, fit: Fit, values: Mapping[str, Any]) -> Imported:

@@ -44,6 +44,9 @@ def write_oopao_model(
     valid = np.ones((bench.width_px, bench.width_px), bool) if whole else bench.valid
     arrays |= {"amplitude": bench.amplitude, "valid": valid}
     arrays |= {"signal_index": index, "signal_sign": sign}
+    if bench.aberration_m is not None:
+        # as of its mirror, see ``_describe_mirror``
+        arrays["aberration_m"] = -bench.aberration_m
     if sky_pupil is not None:
         arrays["sky_amplitude"] = _draw_sky(bench, sky_pupil)
     shape = (bench.frame_shape or valid.shape) if about.frames is not None else index.shape

@@ -58,6 +58,9 @@ ARRAYS = dict(np.load(Path(__file__).with_suffix(".npz")))
 MODES = ARRAYS["mode_to_actuator"]
 """``(n_actuators, n_modes)`` coefficients of the mirror, metres, for a unit of the bench."""
 
+ABERRATION_M = ARRAYS.get("aberration_m", np.zeros((RESOLUTION, RESOLUTION)))
+"""OPD of the static aberration with which the matrix was measured, metres."""
+
 
 def make_model(*, sky: bool = False) -> tuple[Telescope, Source, DeformableMirror, Pyramid]:
     """Return the telescope, its source, the mirror and the sensor.
@@ -129,16 +132,19 @@ def measure_matrix(modes: list[int], stroke_m: float = 1e-9) -> tuple[np.ndarray
     _, star, mirror, sensor = make_model()
     sensor.compute_focal_plane = False
     lit = ARRAYS["amplitude"].ravel() > 0.0
+    radians = 2 * np.pi / star.wavelength
+    sensor.wfs_measure(phase_in=radians * ABERRATION_M)
+    reference = np.ravel(sensor.referenceSignal) + sensor.signal
     found = []
     for shape in (mirror.modes @ MODES[:, modes]).T:
         stroke = stroke_m / np.std(shape[lit])
-        phase = 2 * np.pi / star.wavelength * stroke * shape.reshape(RESOLUTION, RESOLUTION)
+        push_m = stroke * shape.reshape(RESOLUTION, RESOLUTION)
         both = []
-        for push in (phase, -phase):
-            sensor.wfs_measure(phase_in=push)
+        for sign in (1, -1):
+            sensor.wfs_measure(phase_in=radians * (ABERRATION_M + sign * push_m))
             both.append(np.array(sensor.signal, dtype=float))
         found.append(list_signals(both[0] - both[1]) / (2 * stroke))
-    return np.array(found), list_signals(np.ravel(sensor.referenceSignal))
+    return np.array(found), list_signals(reference)
 
 
 if __name__ == "__main__":

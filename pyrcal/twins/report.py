@@ -15,7 +15,7 @@ from pyrcal.fitting.budget import advise_measurement
 from pyrcal.fitting.figures import draw_sheet
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.report import FitReport, document
-from pyrcal.importers.imported import UNKNOWN, Imported
+from pyrcal.importers.imported import UNKNOWN, Imported, format_toml
 from pyrcal.maintenance.commission_page import format_html, format_table
 from pyrcal.twins.bench import Bench
 from pyrcal.twins.exported import Exported
@@ -25,6 +25,10 @@ from service.model.instrument import Instrument
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 
 _UNITS = ("subaperture", "subaperture", "deg", "ratio")
+_MILLIMETRES = "mm of the pupil plane"
+
+MAX_DECIMALS = 6
+"""Number of decimals above which a value is written with an exponent."""
 
 _FROM_FILES = {
     *("n_subapertures", "pupil_diameter_subap", "pupil_centres_px", "obscuration_ratio"),
@@ -32,6 +36,10 @@ _FROM_FILES = {
     *("influence_functions", "modes", "mode_to_actuator", "modes_pitch_m", "positions", "fft_grid"),
 }
 """Keys of the instrument file that the importers measure on the arrays."""
+
+
+_DEFAULTS = ("auto", "normalised-frames")
+"""Values of such keys that an importer takes where no array shows any."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -84,71 +92,87 @@ class Value(NamedTuple):
 def list_values(made: Twin) -> Iterator[Value]:
     """Yield every value of the model with its σ and where it comes from."""
     fit = made.report.fit
+    yield from _list_registration(made)
+    measured = dict(_list_fitted(made))
+    yield from measured.values()
+    if fit.image_offsets_px is not None:
+        places = (fit.image_offsets_px.round(3) + 0.0).tolist()  # without the sign of a zero
+        yield Value("image_offsets_px", places, None, "px", "measured: fitted")
+    yield _describe_stroke(made)
+    for table, keys in made.imported.tables.items():
+        for key, value in keys.items():
+            if key not in measured and key not in {"stroke", "name"}:
+                origin = _find_origin(made, table, key)
+                yield Value(f"{table}.{key}", value, None, _unit(key), origin)
+
+
+def _list_registration(made: Twin) -> Iterator[Value]:
+    """Yield α, with its shifts in millimetres as well: the unit in which mounts are moved."""
+    fit, subaperture_mm = made.report.fit, 1e3 * made.instrument.subaperture_m
+    yield Value("subaperture", subaperture_mm, None, _MILLIMETRES, "diameter over subapertures")
     alpha, sigmas = fit.alpha.vector * BOUNDARY_SCALE, fit.sigma * BOUNDARY_SCALE
     for name, value, sigma, unit in zip(PARAMETERS, alpha, sigmas, _UNITS, strict=True):
         yield Value(name, value, sigma, unit, "measured: fitted")
+        if name.endswith("_subap"):
+            lengths = value * subaperture_mm, sigma * subaperture_mm
+            yield Value(name.replace("subap", "mm"), *lengths, _MILLIMETRES, "measured: the same")
     if fit.anamorphosis is not None and fit.anamorphosis_sigma is not None:
         for name, value, sigma in zip(
             ("along x", "along 45 deg"), fit.anamorphosis, fit.anamorphosis_sigma, strict=True
         ):
             yield Value(f"anamorphosis {name}", value, sigma, "ratio", "measured: fitted")
-    measured = dict(_list_fitted(made))
-    yield from measured.values()
-    if fit.image_offsets_px is not None:
-        places = fit.image_offsets_px.round(3).tolist()
-        yield Value("image_offsets_px", places, None, "px", "measured: fitted")
-    yield _describe_stroke(made)
-    for table, keys in made.imported.tables.items():
-        for key, value in keys.items():
-            if key not in measured and key != "stroke":
-                yield Value(f"{table}.{key}", value, None, _unit(key), _find_origin(made, key))
 
 
 def _list_fitted(made: Twin) -> Iterator[tuple[str, Value]]:
     """Yield the optical quantities that a fit has found, by key, those of the last fit last."""
-    stated: dict[str, str] = {}
-    has_ellipse = "modulation_ellipse" in made.imported.tables["wfs"]
+    hidden = {"order"}
+    if "modulation_ellipse" in made.imported.tables["wfs"]:
+        hidden.add("modulation_lambda_over_d")  # the two axes say it
     for report in filter(None, (made.before, made.report)):
-        fit = report.fit
-        optics = {one.key: one for one in fit.optics}
-        origins = {one.key: one for one in fit.origins}
+        optics = {one.key: one for one in report.fit.optics if one.found is not None}
+        origins = {one.key: one for one in report.fit.origins if one.correct or one.key in optics}
         for key in dict.fromkeys([*origins, *optics]):
-            optic, origin = optics.get(key), origins.get(key)
-            if key == "order" or (optic is None and not (origin and origin.correct)):
-                continue
-            if key == "modulation_lambda_over_d" and has_ellipse:
-                continue
-            if origin is not None:
-                found, how, reported = str(origin.found), origin.how, str(origin.reported)
-            elif optic is None or optic.found is None:
-                continue
-            else:
-                found, how, reported = f"{optic.found:.4g}", "fitted", f"{optic.reported}"
-            # A second fit has the numbers of the first one in its file.
-            in_files = stated.setdefault(key, reported)
-            known = in_files not in {f'"{UNKNOWN}"', "None"}
-            files = f"the files say {in_files}" if known else "no file has it"
+            optic = optics.get(key)
+            value = origins[key].found if optic is None else optic.found
             sigma = None if optic is None else optic.found_sigma
-            yield key, Value(key, found, sigma, _unit(key), f"measured: {how}; {files}")
+            how = origins[key].how if key in origins else "fitted"
+            if key not in hidden:
+                origin = f"measured: {how}; {_quote_files(made, key)}"
+                yield key, Value(key, value, sigma, _unit(key), origin)
+
+
+def _quote_files(made: Twin, key: str) -> str:
+    """Return which value a key of the instrument file has in the files of the bench."""
+    tables = made.bench.imported[-1].tables.values()
+    known = next((table[key] for table in tables if key in table), UNKNOWN)
+    return "no file has it" if known == UNKNOWN else f"the files say {format_toml(known)}"
 
 
 def _unit(key: str) -> str:
     """Return the unit of a key of the instrument file."""
-    endings = {"_m": "m", "_lambda_over_d": "λ/D", "_px": "px", "_subap": "subaperture"}
+    endings = {
+        "_m": "m",
+        "_nm": "nm",
+        "_lambda_over_d": "λ/D",
+        "_px": "px",
+        "_subap": "subaperture",
+    }
     return next((unit for end, unit in endings.items() if key.endswith(end)), "")
 
 
-def _find_origin(made: Twin, key: str) -> str:
-    fit, value = made.report.fit, None
-    for table in made.imported.tables.values():
-        value = table.get(key, value)
+def _find_origin(made: Twin, table: str, key: str) -> str:
+    """Return where a value comes from that no fit has as a number of its own."""
+    value = made.imported.tables[table][key]
+    read = [one.tables.get(table, {}).get(key) for one in made.bench.imported]
     if value == UNKNOWN:
         return "assumed: no file contains it, and the matrix does not determine it"
+    if key in {"orientation", "order"} and made.report.fit.accepted:
+        return "measured: scanned with the lowest modes"
+    if value not in read:
+        return f"measured: it explains the matrix better; {_quote_files(made, key)}"
     if key in made.bench.stated:
         return "stated"
-    if key in {"orientation", "order"} and fit.accepted:
-        return "measured: scanned with the lowest modes"
-    if key in _FROM_FILES:
+    if key in _FROM_FILES and value not in _DEFAULTS:
         return "measured: on the arrays of the files"
     return "assumed: the importer's default, or the instrument file's value"
 
@@ -199,12 +223,15 @@ def _text(one: Value) -> str:
     """Return a value with its σ, both to the second digit of the σ."""
     if isinstance(one.value, float) and one.sigma:
         n_digits = max(0, 1 - math.floor(math.log10(one.sigma)))
+        if n_digits > MAX_DECIMALS and one.value:
+            n_digits += 1 + math.floor(math.log10(abs(one.value)))
+            return f"{one.value:.{max(n_digits, 1)}g} +- {one.sigma:.2g}"
         value = round(one.value, n_digits) + 0.0  # without the sign of a zero
         return f"{value:.{n_digits}f} +- {one.sigma:.{n_digits}f}"
     if isinstance(one.value, str):
         text = one.value
     else:
-        text = f"{one.value:.5g}" if isinstance(one.value, float) else str(one.value)
+        text = f"{one.value:.5g}" if isinstance(one.value, float) else format_toml(one.value)
     return text if one.sigma is None else f"{text} +- {one.sigma:.2g}"
 
 
@@ -233,7 +260,9 @@ def _page(made: Twin) -> str:
     """Return the report as HTML that needs no other file."""
     fit = made.report.fit
     mark = "pass" if fit.accepted else "fail"
-    values = ((one.name, _text(one), one.unit, one.origin) for one in list_values(made))
+    values = (
+        (one.name, _text(one).replace("+-", "±"), one.unit, one.origin) for one in list_values(made)
+    )
     models = [(one.path.name, "; ".join(one.remarks) or "complete") for one in made.exported]
     notes = (*made.imported.notes, *made.report.notes)
     return format_html(
@@ -261,7 +290,7 @@ def _describe_left_over(fit: Fit) -> str:
     if not fit.accepted or not fit.causes:
         reason = "The fit was refused" if not fit.accepted else "Too little is left over"
         return f"<p>{reason}: it is not divided among causes.</p>"
-    causes = ((one.words, f"{one.share:.0%} +- {one.sigma:.0%}", one.remedy) for one in fit.causes)
+    causes = ((one.words, f"{one.share:.0%} ± {one.sigma:.0%}", one.remedy) for one in fit.causes)
     table = format_table(("Cause", "Share of the power left over", "Remedy"), causes)
     return f"{table}<p>{escape(advise_measurement(fit.causes))}</p>"
 

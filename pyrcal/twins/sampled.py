@@ -20,17 +20,19 @@ from service.model.interaction import InteractionModel
 from service.model.kinds import SignalKind, Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import Basis, ModalBasis
-from service.model.pupil import Illumination, instrument_pupil, valid_subapertures
+from service.model.pupil import Illumination, PupilGrid, instrument_pupil, valid_subapertures
 from service.model.sensors.pyramid.description import (
     FrameWindows,
     Pyramid,
     by_quadrant,
+    draw_aberration,
     orient_offsets,
     oriented_pyramid,
     pyramid_in,
+    read_aberration,
     stretch_of,
 )
-from service.model.sensors.pyramid.table import ELLIPSE_KEY, FftGrid
+from service.model.sensors.pyramid.table import ABERRATION_KEY, ELLIPSE_KEY, FftGrid
 from service.model.sensors.registry import kind_of
 from service.model.slopes import Orientation, rtc_mask, to_rtc
 from service.model.surface import Gaussian
@@ -98,6 +100,9 @@ class SampledBench:
 
     amplitude: Array
     """``(n_points, n_points)`` field amplitude of the pupil on the whole array, in this light."""
+
+    aberration_m: Array | None
+    """``(n_points, n_points)`` OPD of the static aberration, metres; None for a flat wavefront."""
 
     pupil_shift_subap: Array
     """``(2,)`` position (x, y) of the pupil on the sensor's grid, subapertures."""
@@ -299,7 +304,10 @@ def _draw_bench(found: Instrument, basis: Basis, fit: Fit, points: int, width: i
     """Return a bench with its images on a centred square, for so many points and pixels."""
     pixels = _pixels(found)
     light = _read_light(fit)
-    amplitude, n_pixels = _draw_pupil(found, pixels, points, light)
+    pupil, n_pixels = _draw_pupil(found, pixels, points, light)
+    n_points = n_pixels * points
+    phase_rad = draw_aberration(found, pupil)
+    metres = found.wfs.wavelength_m / (2.0 * math.pi)
     separation = pyramid_in(found).image_separation_subap * pixels
     if found.frames is None:
         # slopes are cut at whole pixels on both sides of the middle
@@ -315,7 +323,8 @@ def _draw_bench(found: Instrument, basis: Basis, fit: Fit, points: int, width: i
         width_px=width,
         separation_px=separation,
         illumination=light,
-        amplitude=amplitude,
+        amplitude=_pad(pupil.amplitude, n_points),
+        aberration_m=None if phase_rad is None else _pad(phase_rad * metres, n_points),
         pupil_shift_subap=_pupil_shift(found, fit.alpha),
         image_places_px=np.zeros((2, 2, 2)),
         valid=_pad(valid_subapertures(found), n_pixels // pixels),
@@ -337,8 +346,11 @@ def apply_fit(instrument: Instrument, fit: Fit) -> Instrument:
     if isinstance(mirror, Mirror) and COUPLING_KEY in values:
         mirror = replace(mirror, shape=replace(mirror.shape, coupling=values[COUPLING_KEY]))
     for origin in fit.origins:
-        if origin.key == ELLIPSE_KEY.removeprefix("wfs."):
+        if origin.key == ELLIPSE_KEY:
             wfs = _with_ellipse(wfs, origin.found)
+        elif origin.key == ABERRATION_KEY:
+            found = tomllib.loads(f"found = {origin.found}")["found"]
+            wfs = replace(wfs, aberration_rad=read_aberration(found, wfs.wavelength_m))
     return replace(instrument, slopes=slopes, wfs=wfs, mirror=mirror)
 
 
@@ -375,14 +387,12 @@ def _read_light(fit: Fit) -> Illumination | None:
 
 def _draw_pupil(
     instrument: Instrument, pixels: int, points: int, light: Illumination | None
-) -> tuple[Array, int]:
-    """Return the amplitude on an array that the sensor's grid is centred in, and its pixels."""
+) -> tuple[PupilGrid, int]:
+    """Return the pupil, and the pixels of an array around it that has the sensor's grid inside."""
     n, sampling = instrument.wfs.n_subapertures, pixels * points
     pupil = instrument_pupil(instrument, sampling)
-    drawn = (pupil if light is None else pupil.lit_by(light)).amplitude
-    margin = max(0, math.ceil((len(drawn) / sampling - n) / 2))
-    across = n + 2 * margin
-    return _pad(drawn, across * sampling), across * pixels
+    margin = max(0, math.ceil((len(pupil.coordinates) / sampling - n) / 2))
+    return pupil if light is None else pupil.lit_by(light), (n + 2 * margin) * pixels
 
 
 def _pupil_shift(instrument: Instrument, alpha: Misregistration) -> Array:

@@ -48,6 +48,25 @@ TAG = "bench"
 MAX_OFF_GRID_PX = 0.02
 """Displacement of a pupil image from which on a remark names it, pixels."""
 
+STATIC = "static"
+"""Name of the static aberration, and of its FITS file."""
+
+_STATIC = f"""\
+{STATIC}_commands:
+  class: WaveGenerator
+  constant: [1.0]
+  outputs: [output]
+{STATIC}:
+  class: DM
+  simul_params_ref: main
+  height: 0.0
+  ifunc_object: {STATIC}
+  sign: 1
+  inputs:
+    in_command: {STATIC}_commands.output
+  outputs: [out_layer]
+"""
+
 _STROKE_WAVES = 0.002
 """RMS of the shapes that the calibration pushes, wavelengths."""
 
@@ -147,6 +166,9 @@ def write_specula_model(bench: SampledBench, fit: Fit, folder: Path) -> Exported
     stop |= {"SHIFTX": 0.0, "SHIFTY": 0.0, "ROTATION": 0.0, "MAGNIFIC": 1.0}
     _save_fits(root, "pupilstop", stop, AMPLITUDE=bench.amplitude)
     _save_pupils(root, bench, apart, width)
+    if bench.aberration_m is not None:
+        static = {"INFLUENCE_FUNCTION": bench.aberration_m[lit][:, None] / _NANOMETRE_M}
+        _save_fits(root, "ifunc", {}, STATIC, **static, MASK_INF_FUNC=lit.astype(float))
     light = 1.0 if fit.gain_map is None else fit.gain_map[fit.valid][:, None]
     slopes = slopes_of(fit.synthetic, bench.instrument.slopes.kind) * light
     slopes = slopes.reshape(-1, len(fit.modes))
@@ -176,6 +198,8 @@ def write_specula_model(bench: SampledBench, fit: Fit, folder: Path) -> Exported
         "width": width,
         "fft_res": width / n,
         "modulation": radius,
+        "static": "" if bench.aberration_m is None else _STATIC,
+        "static_layer": "" if bench.aberration_m is None else f"{STATIC}.out_layer, ",
         "n_modulation": max(1, 4 * math.ceil(2 * math.pi * radius / 4)),
     }
     for name, template in ((NAME, "specula_twin.yml"), (LOOP, LOOP)):
@@ -260,7 +284,9 @@ def _save_pupils(root: Path, bench: SampledBench, apart: int, width: int) -> Non
     _save_fits(root, "pupils", {"VERSION": 2, "FSIZEX": width, "FSIZEY": width}, **arrays)
 
 
-def _save_fits(root: Path, kind: str, header: dict[str, Any], **arrays: Array) -> None:
+def _save_fits(
+    root: Path, kind: str, header: dict[str, Any], tag: str = TAG, **arrays: Array
+) -> None:
     """Write arrays as extensions of a FITS file, in the folder of their kind."""
     from astropy.io import fits
 
@@ -271,7 +297,7 @@ def _save_fits(root: Path, kind: str, header: dict[str, Any], **arrays: Array) -
         dtype = np.int64 if values.dtype.kind in "iu" else np.float32
         images.append(fits.ImageHDU(np.ascontiguousarray(values, dtype), name=name))
     first = fits.PrimaryHDU(header=fits.Header({"VERSION": 1, **header}))
-    fits.HDUList([first, *images]).writeto(folder / f"{TAG}.fits", overwrite=True)
+    fits.HDUList([first, *images]).writeto(folder / f"{tag}.fits", overwrite=True)
 
 
 def _list_limits(bench: SampledBench) -> tuple[str, ...]:

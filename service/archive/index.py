@@ -147,6 +147,11 @@ class Actor:
         )
 
 
+def by_service(name: str, text: str) -> AuditEntry:
+    """Return an entry of what the service itself does now."""
+    return AuditEntry(t_ns_utc=time.time_ns(), who="service", name=name, text=text)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pin:
     """A product that is kept for ever."""

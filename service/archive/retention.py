@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import shutil
-import time
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from service.archive.archive import Archive
-from service.archive.index import AuditEntry
+from service.archive.index import AuditEntry, by_service
 from service.archive.nights import DAY_NS
 from service.archive.store import Folder
 from service.config.settings import Settings
@@ -149,12 +148,7 @@ def remove(archive: Archive, item: Item, why: str) -> AuditEntry | None:
     if any(pin.id == item.id for pin in archive.index.pins()):
         return None
     next(store for store in archive.stores if store.noun == item.kind).remove(item.id)
-    return AuditEntry(
-        t_ns_utc=time.time_ns(),
-        who="service",
-        name="archive.removed",
-        text=f"{item.kind} {item.id}: numbers removed, {why}",
-    )
+    return by_service("archive.removed", f"{item.kind} {item.id}: numbers removed, {why}")
 
 
 def low_on_space(directory: Path, retention: RetentionPolicy, *, low: bool) -> str | None:

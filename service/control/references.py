@@ -24,6 +24,7 @@ from service.model.misregistration import Misregistration
 from service.model.modes import Basis
 from service.model.sensors.registry import kind_of
 from service.model.turbulence import REFERENCE_WAVELENGTH_M
+from service.model.zernikes import compute_zernikes
 from service.records.products import Frame
 
 Array = NDArray[np.float64]
@@ -114,33 +115,6 @@ class ModalShape:
     """RMS over the pupil of what no mode explains, over that of the shape, 0..1."""
 
 
-def zernikes(coefficients_m: NDArray[Any], points: Array) -> Array:
-    """Return a sum of Zernike polynomials at ``points`` ``(n_points, 2)`` of the unit disc, metres.
-
-    ``coefficients_m`` ``(n,)`` are those of Noll's numbers 1 to n: piston, tip along x, tilt along
-    y, focus, astigmatism. A unit coefficient has an RMS of 1 over the full disc.
-
-    References
-    ----------
-    Noll 1976, JOSA 66, 207.
-    """
-    radius, angle = np.hypot(*points.T), np.arctan2(points[:, 1], points[:, 0])
-    total = np.zeros(len(points))
-    for number, value in enumerate(coefficients_m, 1):
-        order = int(np.ceil((np.sqrt(8.0 * number + 1.0) - 3.0) / 2.0))
-        place = number - order * (order + 1) // 2 - 1
-        azimuthal = order % 2 + 2 * ((place + 1 - order % 2) // 2)
-        # The radial polynomial is Jacobi's of the squared radius.
-        half = (order - azimuthal) // 2
-        jacobi = scipy.special.eval_jacobi(half, azimuthal, 0.0, 1.0 - 2.0 * radius**2)
-        shape = np.sqrt(order + 1.0) * (-1.0) ** half * radius**azimuthal * jacobi
-        if azimuthal:
-            turned = np.cos if number % 2 == 0 else np.sin
-            shape = shape * np.sqrt(2.0) * turned(azimuthal * angle)
-        total += value * shape
-    return total
-
-
 def shape_in_modes(
     model: InteractionModel,
     alpha: Misregistration,
@@ -152,9 +126,9 @@ def shape_in_modes(
     """Return a shape as the first ``n_modes`` modes of the mirror at registration α.
 
     In the frame of the mirror ``given`` ``(n,)`` are coefficients of its modes. In that of the
-    instrument they are Zernike coefficients by Noll's number from 1 on (``zernikes``), or a map
-    ``(n, n)`` [y, x] whose sides touch the pupil; metres OPD on the sensor's axes. They are fitted
-    by least squares over the lit pupil, without piston.
+    instrument they are Zernike coefficients by Noll's number from 1 on (``compute_zernikes``), or a
+    map ``(n, n)`` [y, x] whose sides touch the pupil; metres OPD on the sensor's axes. They are
+    fitted by least squares over the lit pupil, without piston.
 
     Raises
     ------
@@ -172,7 +146,8 @@ def shape_in_modes(
         coefficients_m[:n_modes][: len(given)] = _check_shape(given[:n_modes])
         return ModalShape(coefficients_m=coefficients_m, unexplained=0.0)
     places = model.pupil.points / (model.instrument.wfs.pupil_diameter / 2.0)
-    opd_m = _check_shape(zernikes(given, places) if given.ndim == 1 else _read_map(given, places))
+    read = compute_zernikes if given.ndim == 1 else _read_map
+    opd_m = _check_shape(read(given, places))
     weights = model.pupil.weights
     # No sensor sees piston: it is taken out of the shape and of the modes.
     modes = model.render_modes(alpha)[:, :n_modes].astype(np.float64)

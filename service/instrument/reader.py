@@ -266,6 +266,8 @@ def _list_assumptions(
         words = "allows for it in its uncertainty" if taken is None else f"takes {taken:g}"
         if key == "wfs.modulation_ellipse":
             words = "takes a circle"
+        elif key == "wfs.static_aberration_nm":
+            words = "takes a flat wavefront"
         yield (
             f"{wfs.path}: {key}: unknown; a fit of a measured matrix finds it, everything else "
             f"{words}"

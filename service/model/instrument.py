@@ -357,6 +357,7 @@ _LATER_FIELDS = frozenset(
         "normalised",
         "fft_grid",
         "modulation_stretch",
+        "aberration_rad",
     }
 )
 """Fields without which an instrument has the digest that it has always had."""

@@ -18,7 +18,7 @@ import msgspec
 import structlog
 
 from service.archive import Actor, Archive, AuditEntry
-from service.archive.index import Sent
+from service.archive.index import Sent, by_service
 from service.archive.nights import TrendSample
 from service.archive.retention import RetentionPolicy, due, items, low_on_space, remove
 from service.errors import ArchiveError, StorageError
@@ -434,7 +434,7 @@ def command_json(command: Command, actor: Actor) -> str:
 
 def _loss_text(lost: int) -> tuple[AuditEntry]:
     text = f"{lost} lines came while the disk refused and {MAX_WAITING_LINES} waited already"
-    return (AuditEntry(t_ns_utc=time.time_ns(), who="service", name="archive.lost", text=text),)
+    return (by_service("archive.lost", text),)
 
 
 def restore_tracking(

@@ -38,18 +38,21 @@ MAX_COPIED_BYTES = 1 << 16
 R = TypeVar("R")
 
 
-class JobProcess:
-    """A process that does one piece of work after another; nothing runs before the first.
+class Worker:
+    """A process that does one job after another, and keeps the optical models between jobs.
 
-    Before its first job it imports the module ``imports``, which need not be imported here.
+    Nothing runs before the first job. Before that the process imports the module ``imports``, which
+    need not be imported here.
     """
 
-    def __init__(self, imports: str, *, nice: int) -> None:
-        self._imports, self._nice = imports, nice
+    def __init__(self, imports: str) -> None:
+        self._imports = imports
         self._busy = threading.Lock()
         self._process: BaseProcess | None = None
         self._line: Connection | None = None
         self._ended = threading.Event()
+        self._enter: Callable[[], None] | None = None
+        self._enters = False
 
     @property
     def pid(self) -> int | None:
@@ -121,7 +124,7 @@ class JobProcess:
             process = context.Process(
                 # Daemon, so that the interpreter does not wait for a fit at exit.
                 target=_work,
-                args=(theirs, self._nice, self._imports),
+                args=(theirs, self._imports),
                 daemon=True,
             )
             with _deaf_to_the_keyboard():
@@ -131,15 +134,6 @@ class JobProcess:
             if self._ended.is_set():  # killed while it was being born
                 process.kill()
         return self._line
-
-
-class Worker(JobProcess):
-    """A process that keeps the optical models between jobs."""
-
-    def __init__(self, imports: str) -> None:
-        super().__init__(imports, nice=0)  # until it knows how nice it is to be
-        self._enter: Callable[[], None] | None = None
-        self._enters = False
 
     def begin(self) -> Worker:
         """Begin the process before there is work for it, and return it."""
@@ -157,7 +151,7 @@ class Worker(JobProcess):
         return self
 
     def run(self, job: Callable[[], R]) -> R:
-        """Do a job on the optical models; see :meth:`JobProcess.do`."""
+        """Do a job on the optical models; see :meth:`do`."""
         if self._enter is not None:
             self.do(self._enter, sent=self._enters)
             self._enter = None
@@ -194,9 +188,10 @@ def return_free_memory() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def _work(line: Connection, nice: int, imports: str) -> None:
+def _work(line: Connection, imports: str) -> None:
     """Be the process: do what comes and send what came of it, until the line is cut."""
-    _be_polite(nice)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_follow_parent, daemon=True).start()
     import_module(imports)
     threadpool_limits(1)  # of BLAS, which has been imported now
     with contextlib.suppress(EOFError, OSError):
@@ -244,13 +239,6 @@ def _answer(head: bytes, buffers: list[bytearray]) -> object:
         return error
     except Exception as error:  # noqa: BLE001 - sent home, where it is a failed job
         return WorkerError(f"failed unforeseen: {error!r}")
-
-
-def _be_polite(nice: int) -> None:
-    """Make this process nice, and gone when its parent is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(nice)
-    threading.Thread(target=_follow_parent, daemon=True).start()
 
 
 @contextlib.contextmanager

@@ -17,6 +17,7 @@ from annotated_types import Ge, Le, MaxLen, MinLen
 from numpy.typing import NDArray
 
 from service.archive import Archive, AuditEntry
+from service.archive.index import by_service
 from service.archive.nights import TREND_S, TrendSample
 from service.archive.products import RUNNING, STORED, RecordingRecord
 from service.archive.retention import GIGABYTE, RetentionPolicy, low_on_space
@@ -187,14 +188,7 @@ class TelemetryRecorder:
             )
             text = f"{record.id}: {record.n_bytes / 1e6:.0f} MB, {record.n_dropped} dropped"
             why = f": {record.reason}" if record.reason else ""
-            self._audit(
-                AuditEntry(
-                    t_ns_utc=time.time_ns(),
-                    who="service",
-                    name="recording.ended",
-                    text=f"{text}{why}",
-                )
-            )
+            self._audit(by_service("recording.ended", f"{text}{why}"))
             try:
                 await asyncio.to_thread(self._archive.recordings.write, record)
             except StorageError as error:

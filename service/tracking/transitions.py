@@ -32,12 +32,10 @@ def _read(kind: type[StrEnum], text: str) -> dict[StrEnum, tuple[StrEnum, ...]]:
     return {kind(state): tuple(map(kind, after.split())) for state, _, after in lines}
 
 
-TABLES: Final[dict[type[StrEnum], dict[StrEnum, tuple[StrEnum, ...]]]] = {
+_LINES: Final[dict[type[StrEnum], str]] = {
     # The RTC alone says which matrix multiplies its slopes, and with which numbers: it may name
     # any as applied, and any may be found to have failed. Its answer may come late.
-    MatrixState: _read(
-        MatrixState,
-        """
+    MatrixState: """
 proposed: published refused discarded applied failed
 published: staged rejected applied failed
 staged: rejected applied failed
@@ -48,10 +46,7 @@ rejected: applied failed
 refused: applied failed
 discarded: applied failed
 """,
-    ),
-    AcquisitionStage: _read(
-        AcquisitionStage,
-        """
+    AcquisitionStage: """
 idle: opening
 opening: coarse failed aborted interrupted
 coarse: confirming opening failed aborted interrupted
@@ -63,12 +58,9 @@ failed: idle opening
 aborted: idle opening
 interrupted: opening failed aborted
 """,
-    ),
     # An alarm soon after a good verdict still takes the matrix back; the copy of the matrix before
     # may be applied after it was given up.
-    ProbationState: _read(
-        ProbationState,
-        """
+    ProbationState: """
 running: overdue passed not-judged rolling-back kept opening
 overdue: passed not-judged rolling-back kept opening
 passed: rolling-back kept opening
@@ -82,11 +74,8 @@ rolled-back:
 not-confirmed:
 not-judged:
 """,
-    ),
     # A matrix that comes although it was refused, or not in time, is kept.
-    MeasureState: _read(
-        MeasureState,
-        """
+    MeasureState: """
 waiting: asked failed given-up
 asked: running refused stored failed given-up
 running: finishing stored failed given-up
@@ -96,8 +85,9 @@ failed: stored
 stored:
 given-up:
 """,
-    ),
 }
+
+TABLES: Final = {kind: _read(kind, text) for kind, text in _LINES.items()}
 """States that may follow each state, by the kind of state. A record may always stay in its state;
 values of different kinds may be equal, such as ``failed``."""
 

@@ -417,19 +417,27 @@ _USABLE = re.compile(r"[A-Za-z0-9._-]{1,64}")
 """An id of the client's own that is harmless in a log."""
 
 
+def change_headers(send: Send, change: Callable[[MutableHeaders], object]) -> Send:
+    """Return a ``send`` that changes the headers of an answer before they are sent."""
+
+    async def changed(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            change(MutableHeaders(scope=message))
+        await send(message)
+
+    return changed
+
+
 class SecurityHeaders(Middleware):
     """Has no answer taken for another type than it says, nor kept where it does not say so."""
 
     @override
     async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
-        async def headed(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                headers = MutableHeaders(scope=message)
-                headers.setdefault("X-Content-Type-Options", "nosniff")
-                headers.setdefault("Cache-Control", "no-store")
-            await send(message)
+        def secure(headers: MutableHeaders) -> None:
+            headers.setdefault("X-Content-Type-Options", "nosniff")
+            headers.setdefault("Cache-Control", "no-store")
 
-        await self._app(scope, receive, headed)
+        await self._app(scope, receive, change_headers(send, secure))
 
 
 class RequestId(Middleware):
@@ -443,11 +451,7 @@ class RequestId(Middleware):
         requested_id = Headers(scope=scope).get(REQUEST_ID, "")
         name = requested_id if _USABLE.fullmatch(requested_id) else uuid4().hex
 
-        async def named(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                MutableHeaders(scope=message)[REQUEST_ID] = name
-            await send(message)
-
+        named = change_headers(send, lambda headers: headers.update({REQUEST_ID: name}))
         with bound_contextvars(request_id=name):
             await self._app(scope, receive, named)
 

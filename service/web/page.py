@@ -23,11 +23,10 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse, StreamingResponse
 from numpy.typing import NDArray
 from pydantic_core import from_json
-from starlette.datastructures import MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.staticfiles import StaticFiles
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import ASGIApp, Receive, Scope, Send
 from typing_extensions import override
 
 from service.control.gate import MAX_EDGE_MOTION_M
@@ -42,7 +41,7 @@ from service.records.state import LogEntry
 from service.runtime.supervisor import Supervisor
 from service.tracking.step_context import LOG_LENGTH
 from service.web.authentication import OPEN
-from service.web.connections import Middleware
+from service.web.connections import Middleware, change_headers
 from service.web.problems import INVALID, problem_response
 from service.web.views import ServiceDep, answer, as_json, define_view, held, shows
 
@@ -149,12 +148,7 @@ _PACKED: Final = re.compile(
 
 def _with_headers(app: ASGIApp, headers: Mapping[str, str]) -> ASGIApp:
     async def guarded(scope: Scope, receive: Receive, send: Send) -> None:
-        async def sent(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update(headers)
-            await send(message)
-
-        await app(scope, receive, sent)
+        await app(scope, receive, change_headers(send, lambda sent: sent.update(headers)))
 
     return guarded
 

@@ -257,6 +257,22 @@ class SensorModel(ABC):
         """Return the value of ``wfs.modulation_ellipse`` for a sensor with such a modulation."""
         raise ModelError(f"a {self.name}: found an elliptic modulation, expected a pyramid's")
 
+    def aberrate(
+        self,
+        sensor: Any,  # noqa: ANN401 - its own
+        number: int,
+        change_rad: float,
+    ) -> SensorDescription | None:
+        """Return the sensor with more of a static Zernike polynomial; None if it has none.
+
+        ``number`` is Noll's, ``change_rad`` the change of its coefficient in radians RMS.
+        """
+        return None
+
+    def aberration_entry(self, sensor: Any) -> str:  # noqa: ANN401 - its own
+        """Return the value of ``wfs.static_aberration_nm`` for a sensor with such an aberration."""
+        raise ModelError(f"a {self.name}: found a static aberration, expected a pyramid's")
+
     def other_recipes(self, recipe: SlopeRecipe) -> dict[str, SlopeRecipe]:
         """Return recipes that this one may be taken for, by what a file would say of them."""
         return {}

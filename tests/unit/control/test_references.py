@@ -13,12 +13,12 @@ from service.control.references import (
     holding_gain,
     limit_shape,
     shape_in_modes,
-    zernikes,
 )
 from service.errors import ModelError
 from service.instrument import load_instrument
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
+from service.model.zernikes import compute_zernikes
 from service.records.products import Frame
 from tests.support.numerics import (
     N_CONTROLLED,
@@ -74,7 +74,7 @@ def disc(n: int = 400) -> np.ndarray:
 
 def test_zernikes_are_orthonormal_over_the_disc():
     points = disc()
-    shapes = np.array([zernikes(row, points) for row in np.eye(36)])
+    shapes = np.array([compute_zernikes(row, points) for row in np.eye(36)])
     # the border of a disc of 400 points across is good to a few per mille
     assert shapes @ shapes.T / len(points) == pytest.approx(np.eye(36), abs=0.01)
 
@@ -94,7 +94,7 @@ def test_zernikes_are_orthonormal_over_the_disc():
 def test_zernikes_have_the_numbers_of_noll(noll, shape):
     points = disc(30)
     expected = shape(*points.T)
-    assert zernikes(np.eye(noll)[noll - 1], points) == pytest.approx(expected, abs=1e-12)
+    assert compute_zernikes(np.eye(noll)[noll - 1], points) == pytest.approx(expected, abs=1e-12)
 
 
 def test_a_shape_of_the_mirror_stays_as_it_is():
@@ -109,7 +109,7 @@ def test_a_shape_of_the_instrument_does_not_turn_with_the_mirror(alpha):
     model, astigmatism = small_model(), np.array([0, 0, 0, 0, 0, 60e-9])
     found = shape_in_modes(model, alpha, astigmatism, Frame.INSTRUMENT, n_modes=N_CONTROLLED)
     points, weights = model.pupil.points, model.pupil.weights
-    expected = zernikes(astigmatism, points / 6.0)
+    expected = compute_zernikes(astigmatism, points / 6.0)
     made = model.render_modes(alpha) @ found.coefficients_m
     left = made - expected - weights @ (made - expected)
     size = np.sqrt(weights @ (expected - weights @ expected) ** 2)
@@ -137,7 +137,7 @@ def test_a_map_is_the_same_shape_as_its_zernikes():
     axis = (np.arange(120) + 0.5) / 60.0 - 1.0
     x, y = np.meshgrid(axis, axis)
     coma = np.array([0, 0, 0, 0, 0, 0, 0, 40e-9])
-    drawn = zernikes(coma, np.column_stack([x.ravel(), y.ravel()])).reshape(120, 120)
+    drawn = compute_zernikes(coma, np.column_stack([x.ravel(), y.ravel()])).reshape(120, 120)
     by_map, by_number = (
         shape_in_modes(
             small_model(), SOMEWHERE, given, Frame.INSTRUMENT, n_modes=N_CONTROLLED

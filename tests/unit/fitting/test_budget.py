@@ -79,6 +79,7 @@ def test_the_image_with_fringes_is_named_with_its_half():
     images[2] += fringes * images[2].std(axis=0) * np.array([1.0, -1.0] * 20)
     found = fit(exact, about, options=EXPLAIN)
     assert share(found, "the image at -x +y unlike the others, mostly in its left half") > 0.3
+    assert sum(round(100.0 * one.share) for one in found.causes) == 100
 
 
 def test_hardly_anything_left_over_has_no_causes():
@@ -103,6 +104,8 @@ def test_shares_add_up_to_one_and_what_to_measure_next_makes_half():
     assert advise_measurement(()) == ""
     found = fit(matrix(noise=0.2), options=EXPLAIN)
     assert sum(one.share for one in found.causes) == pytest.approx(1.0)
+    # as they are shown, in whole per cents
+    assert sum(int(f"{one.share:.0%}"[:-1]) for one in found.causes) == 100
 
 
 @pytest.mark.skipif(not (FOLDER / "papyrus").is_dir(), reason="data of PAPYRUS are not here")

@@ -96,10 +96,14 @@ def test_what_cannot_be_fitted_is_refused(values, more, text):
     assert text in str(error.value)
 
 
-def test_a_mean_frame_that_is_a_mask_leaves_the_unit_of_the_commands_open():
+def test_a_mean_frame_without_counts_leaves_the_unit_of_the_commands_open():
     light = np.random.default_rng(5).uniform(0.8, 1.2, (40, 40))
-    lit = pyrcal.fit(instrument(), matrix(), flux_frame=light, threads=1).stroke
-    assert lit.metres_per_unit == pytest.approx(1.0, abs=3.0 * lit.sigma)
-    mask = pyrcal.fit(instrument(), matrix(), flux_frame=np.ones((40, 40)), threads=1).stroke
-    assert mask.metres_per_unit is None
-    assert "mask" in mask.condition
+    even = np.pad(np.full((20, 20), 5e3), 10)
+    for counts in (light, even):
+        lit = pyrcal.fit(instrument(), matrix(), flux_frame=counts, threads=1).stroke
+        assert lit.metres_per_unit == pytest.approx(1.0, abs=3.0 * lit.sigma)
+    mask = (even > 0.0).astype(float)
+    for other in (mask, 255.0 * mask, light / light.max()):
+        found = pyrcal.fit(instrument(), matrix(), flux_frame=other, threads=1).stroke
+        assert found.metres_per_unit is None
+        assert "no mean frame in counts" in found.condition

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from service.runtime import processes
-from service.runtime.processes import JobProcess
+from service.runtime.processes import Worker
 
 LARGE = np.arange(3_000_000, dtype=np.float32).reshape(1000, 3000)
 
@@ -17,7 +17,7 @@ def doubled(array):
 
 
 def test_an_array_is_sent_as_it_lies_and_may_be_written_to_where_it_comes():
-    worker = JobProcess("tests.support.jobs", nice=0)
+    worker = Worker("tests.support.jobs")
     try:
         found = worker.do(partial(doubled, LARGE))
     finally:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import pyrcal
+from pyrcal.twins.report import list_values
 from service.instrument import load_instrument
 from service.instrument.paths import TWIN_LIVE_FILE
 from service.model.interaction import RtcInteractionModel
@@ -47,6 +48,13 @@ def test_a_hole_of_the_pupil_and_an_unknown_modulation_are_in_the_twin(tmp_path)
     assert made.residual < 0.7 * made.before.fit.residual_fraction
     error = made.report.fit.alpha.vector * BOUNDARY_SCALE - TRUE
     assert np.all(np.abs(error) < 3.0 * made.report.fit.sigma * BOUNDARY_SCALE)
+    values = {one.name: one for one in list_values(made)}
+    origin = "measured: it explains the matrix better; the files say 0.0"
+    assert values["instrument.obscuration_ratio"].origin == origin
+    assert values["instrument.diameter_m"].origin == "stated"
+    # 3 m over 12 subapertures
+    assert values["shift_x_mm"].value == pytest.approx(250.0 * values["shift_x_subap"].value)
+    assert values["shift_x_mm"].sigma == pytest.approx(250.0 * values["shift_x_subap"].sigma)
     live = load_instrument(made.folder / TWIN_LIVE_FILE)
     assert live.obscuration_ratio == pytest.approx(bench.obscuration_ratio, abs=0.01)
     assert live.wfs.modulation_lambda_over_d == pytest.approx(3.0, rel=0.02)

@@ -20,11 +20,13 @@ from tests.support.twin import find_interpreter
 
 ALPHA = Misregistration(shift_x_subap=0.2, shift_y_subap=-0.1, rotation_rad=0.03)
 
+ABERRATION_RAD = (0.1, 0.0, 0.3, -0.2, 0.1, 0.2, -0.1)
+
 TURNED = Orientation(swap_xy=True, flip_x=True, sign_x=1, sign_y=-1)
 
 
 def describe(instrument, recipe, stop):
-    """Return the bench with other habits, and OOPAO's usual grid of its sampling."""
+    """Return an aberrated bench with other habits, and OOPAO's usual grid of its sampling."""
     valid = valid_subapertures(instrument).copy()
     valid[1, 3] = False  # so that no turn of the mask is the same mask
     width = 2 * instrument.wfs.image_separation_subap
@@ -32,6 +34,7 @@ def describe(instrument, recipe, stop):
         instrument.wfs,
         valid_subapertures=rtc_mask(valid, recipe.assumed_orientation),
         fft_grid=FftGrid(points_per_subaperture=4, width_subap=width),
+        aberration_rad=ABERRATION_RAD,
     )
     return replace(instrument, slopes=recipe, wfs=wfs, stop=stop)
 

@@ -109,8 +109,11 @@ def test_specula_measures_the_matrix_of_an_instrument_file(bench, with_fit, tmp_
 
 @pytest.mark.long
 @pytest.mark.timeout(300)
-def test_specula_measures_what_oopao_measures(bench, tmp_path):
+@pytest.mark.parametrize("aberration_rad", [(), (0.0, 0.0, 0.3, -0.2, 0.1)])
+def test_specula_measures_what_oopao_measures(aberration_rad, bench, tmp_path):
     specula, oopao = find_interpreter("specula"), find_interpreter("OOPAO")
+    about = replace(bench[0], wfs=replace(bench[0].wfs, aberration_rad=aberration_rad))
+    bench = about, bench[1]
     sampled = sample_bench(*bench)
     write_specula_model(sampled, bench[1], tmp_path)
     write_oopao_model(sampled, tmp_path)

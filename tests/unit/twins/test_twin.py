@@ -250,6 +250,9 @@ def test_frames_are_imported_as_simulated_if_their_images_are_around_the_middle(
     options.files = [(role, bench / name) for role, name in files.items()]
     options.files.append(("matrix", bench / "IM_KL.npy"))
     wfs = import_files(options).tables["wfs"]
+    # Without a unit the strength of the response is the light, which has no counts.
+    light = import_files(argparse.Namespace(**{**vars(options), "unit": None})).arrays["flux_frame"]
+    assert light.max() == 1.0
     # Light between unmodulated images makes them seem 39 pixels wide.
     assert wfs["pupil_diameter_subap"] == wfs["n_subapertures"] == 36
     assert wfs["fft_grid"] == {"points_per_subaperture": 2, "width_subap": 120.0}
@@ -296,6 +299,34 @@ def test_the_ellipse_of_a_modulation_is_in_the_twin(elliptic, with_picture, tmp_
     assert "ELLIPSE: tuple[float, float, float] | None = (" in (
         made.folder / "oopao_model.py"
     ).read_text("utf-8")
+
+
+CENTRES_PX = np.array([[11.5, 14.5], [13.5, 44.5], [42.5, 13.5], [43.5, 42.5]])
+"""Pupil images up to three pixels off a square of 28 pixels."""
+
+
+@pytest.fixture
+def displaced(tmp_path):
+    """Return the imports of a whole detector of 56 pixels that responds in four images of 20."""
+    rng, along = np.random.default_rng(5), np.arange(56.0)
+    lit = [np.hypot(along - x, along[:, None] - y) < 10.0 for y, x in CENTRES_PX]
+    np.save(tmp_path / "IM.npy", rng.standard_normal((12, 56, 56)) * np.any(lit, axis=0))
+    np.save(tmp_path / "dm_modes.npy", rng.standard_normal((12, 40, 40)))
+    np.save(tmp_path / "M2C.npy", np.eye(12))
+    options = argparse.Namespace(**{**STATED, "diameter_m": 0.6, "files": [(None, tmp_path)]})
+    return read_bench(options).imported
+
+
+def test_windows_of_a_simulated_bench_are_around_displaced_images(displaced):
+    found = np.array(displaced[0].tables["wfs"]["pupil_centres_px"])
+    # The outermost images are 32 pixels apart, which those of their square are not.
+    assert np.abs(found - CENTRES_PX).max() < 0.51
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_the_response_is_no_light_that_frames_are_divided_by(displaced, number):
+    assert displaced[number].tables["wfs"]["input"] == "normalised-frames"
+    assert "flux_frame" not in displaced[number].arrays
 
 
 def test_influence_functions_are_known_by_their_shape(bench, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -11,8 +12,10 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.model.instrument import Instrument, sensor_of_kind
+from service.model.pupil import PupilGrid
 from service.model.sensors.pyramid.table import FftGrid, PyramidNumbers
 from service.model.slopes import Orientation
+from service.model.zernikes import compute_zernikes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -31,6 +34,10 @@ class Pyramid(PyramidNumbers):
 
     fft_grid: FftGrid | None = None
     """Grid of the simulation that made a matrix; None for a real sensor."""
+
+    aberration_rad: tuple[float, ...] = ()
+    """Coefficients of the static aberration's Zernike polynomials from Noll's number 2 on, radians
+    RMS, in the RTC's own axes; empty for a flat wavefront."""
 
     image_offsets_subap: tuple[tuple[float, float], ...] | None = None
     """Displacement (x, y) of the images at -x -y, +x -y, -x +y and +x +y from their places on the
@@ -62,6 +69,11 @@ class Pyramid(PyramidNumbers):
         e, f = self.modulation_stretch or (0.0, 0.0)
         radius, ratio = self.modulation_lambda_over_d, math.exp(math.hypot(e, f))
         return radius * ratio, radius / ratio, math.atan2(f, e) / 2.0
+
+
+def read_aberration(coefficients_nm: Sequence[float], wavelength_m: float) -> tuple[float, ...]:
+    """Return ``Pyramid.aberration_rad`` of coefficients in nm RMS."""
+    return tuple(2e-9 * math.pi / wavelength_m * one for one in coefficients_nm)
 
 
 def stretch_of(axes: tuple[float, float], angle_rad: float) -> tuple[float, float]:
@@ -165,6 +177,22 @@ def oriented_pyramid(instrument: Instrument) -> Pyramid:
     orientation, (e, f) = instrument.slopes.assumed_orientation, wfs.modulation_stretch
     turned = -e if orientation.swap_xy else e, -f if orientation.flip_x != orientation.flip_y else f
     return replace(wfs, modulation_stretch=turned)
+
+
+def draw_aberration(instrument: Instrument, pupil: PupilGrid) -> NDArray[np.float64] | None:
+    """Return the static aberration over a pupil ``(n, n)`` [y, x] in radians; None without one."""
+    wfs = pyramid_in(instrument)
+    if not any(wfs.aberration_rad):
+        return None
+    phase = np.zeros(pupil.lit.shape)
+    # Zernike polynomials grow without bound beyond the pupil.
+    points = pupil.points / max(wfs.pupil_diameter / 2.0, np.hypot(*pupil.points.T).max())
+    orientation = instrument.slopes.assumed_orientation
+    points = points[:, ::-1] if orientation.swap_xy else points
+    flips = [-1.0 if one else 1.0 for one in (orientation.flip_x, orientation.flip_y)]
+    phase[pupil.lit] = compute_zernikes(np.array([0.0, *wfs.aberration_rad]), points * flips)
+    # Signs of the slopes are those of commands, which the aberration shares.
+    return -phase if orientation.sign_x == orientation.sign_y == -1 else phase
 
 
 def by_quadrant(centres_px: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -33,9 +33,10 @@ def respond_to_few(
     Parameters
     ----------
     amplitude
-        ``(N, N)`` of the pupil, real.
+        ``(N, N)`` of the pupil; complex if it has a static aberration.
     shapes
-        ``(N, N n_shapes)`` factor of each shape in the gradient, 0 at points that are not lit.
+        ``(N, N n_shapes)`` factor of each shape in the gradient, 0 at points that are not lit;
+        complex as the amplitude.
     modulated
         Roof operators times the sources' phasors: along y ``(n_sources, n, n_nodes_y, N)``, along x
         ``(n, n_sources, n_nodes_x, N)``; the two sources of a pair count as nodes along x.
@@ -46,7 +47,7 @@ def respond_to_few(
     """
     (modulated_y, modulated_x), (weights_y, weights_x) = modulated, weights
     n_sources, n, n_y, n_u = modulated_y.shape
-    n_x, dtype, n_shapes = modulated_x.shape[2], amplitude.dtype, shapes.shape[1] // n_u
+    n_x, dtype, n_shapes = modulated_x.shape[2], amplitude.real.dtype, shapes.shape[1] // n_u
 
     def respond_from(first: int) -> tuple[Array, Array]:
         """Return light and change of the sources that are computed together with the first."""
@@ -59,7 +60,7 @@ def respond_to_few(
         counts_x = weights_x[:, None].astype(dtype)
         for source in range(first, min(first + _SOURCES_TOGETHER, n_sources)):
             y, x = modulated_y[source].reshape(-1, n_u), modulated_x[:, source]
-            field.real, field.imag = y.real @ amplitude, y.imag @ amplitude
+            field.real, field.imag = _multiply(y, amplitude)
             seen = x.reshape(-1, n_u) @ field.T
             light += seen.real**2 + seen.imag**2
             # Im{conj(seen) x y} = Im{conj(seen) x} Re y + Re{conj(seen) x} Im y
@@ -70,8 +71,8 @@ def respond_to_few(
             parts_x = np.stack([x.real * counts_x, x.imag * counts_x], axis=2)
             pairs = at_rest.reshape(n, 2 * n_x, -1).swapaxes(1, 2)
             np.matmul(pairs, parts_x.reshape(n, 2 * n_x, n_u), out=along_x)
-            for part, by_line in zip((y.real, y.imag), np.split(along_x, 2, axis=1), strict=True):
-                over_y = (part * counts_y) @ shapes
+            products = _multiply(y * counts_y, shapes)
+            for over_y, by_line in zip(products, np.split(along_x, 2, axis=1), strict=True):
                 change += np.matmul(
                     by_line.reshape(n, n, -1).swapaxes(0, 1),
                     over_y.reshape(n, -1, n_shapes),
@@ -82,3 +83,11 @@ def respond_to_few(
     parts = mapper(respond_from, range(0, n_sources, _SOURCES_TOGETHER))
     light, change = (np.sum(each, axis=0) for each in zip(*parts, strict=True))
     return light, change
+
+
+def _multiply(left: Array, right: Array) -> tuple[Array, Array]:
+    """Return real and imaginary part of a product, whose right factor may be real."""
+    if np.isrealobj(right):
+        return left.real @ right, left.imag @ right
+    product = left @ right
+    return product.real, product.imag

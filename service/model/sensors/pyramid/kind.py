@@ -12,6 +12,7 @@ from service.errors import ModelError
 from service.model.kinds import SignalKind
 from service.model.sensors.kind import SensorKind
 from service.model.sensors.pyramid.table import (
+    ABERRATION_KEY,
     ELLIPSE_KEY,
     IMAGE_KEY,
     USUAL_SEPARATION,
@@ -32,6 +33,7 @@ class PyramidKind(SensorKind):
         "modulation_lambda_over_d": 3.0,
         IMAGE_KEY: None,
         ELLIPSE_KEY: None,
+        ABERRATION_KEY: None,
     }
     signals = (SignalKind.XY, SignalKind.INTENSITY)
     normalised = True

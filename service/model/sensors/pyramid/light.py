@@ -27,6 +27,7 @@ from service.errors import ModelError
 from service.model.instrument import Instrument
 from service.model.pupil import Illumination, instrument_pupil
 from service.model.sensors.pyramid.description import (
+    draw_aberration,
     image_offsets,
     oriented_pyramid,
     pyramid_in,
@@ -281,13 +282,14 @@ def _other_light(residual: float) -> CannotTell:
 
 def build_even_optics(instrument: Instrument, sampling: int = 2) -> PyramidOptics:
     """Return the sensor with an evenly lit pupil, as finely as light needs it."""
-    wfs = oriented_pyramid(instrument)
+    wfs, pupil = oriented_pyramid(instrument), instrument_pupil(instrument, sampling)
     return PyramidOptics(
         wfs=wfs,
-        pupil=instrument_pupil(instrument, sampling),
+        pupil=pupil,
         n_nodes=sampling,
         n_modulation=enough_modulation_points(wfs),
         offsets=image_offsets(instrument),
+        aberration_rad=draw_aberration(instrument, pupil),
     )
 
 

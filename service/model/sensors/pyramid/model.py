@@ -22,6 +22,7 @@ from service.model.sensors.pyramid.description import (
     by_quadrant,
     oriented_pyramid,
     pyramid_in,
+    read_aberration,
     stretch_of,
 )
 from service.model.sensors.pyramid.light import PyramidLight
@@ -108,6 +109,7 @@ class PyramidModel(SensorModel):
             stretch = stretch_of(ellipse.axes_lambda_over_d, math.radians(ellipse.angle_deg))
         return Pyramid(
             **optics | {"pupil_separation_subap": separation},
+            aberration_rad=read_aberration(table.static_aberration_nm or (), table.wavelength_m),
             image_offsets_subap=offsets,
             modulation_stretch=stretch,
             fft_grid=table.fft_grid,
@@ -204,7 +206,8 @@ class PyramidModel(SensorModel):
     def identity(self, sensor: Pyramid) -> tuple[float, ...]:
         separation = sensor.image_separation_subap
         stretch = sensor.modulation_stretch or ()
-        return (sensor.wavelength_m, sensor.modulation_lambda_over_d, separation, *stretch)
+        radius = sensor.modulation_lambda_over_d
+        return (sensor.wavelength_m, radius, separation, *stretch, *sensor.aberration_rad)
 
     def bin_sensor(self, sensor: Pyramid, binning: int) -> Pyramid:
         """Return the sensor with so many subapertures made one along each axis."""
@@ -248,6 +251,7 @@ class PyramidModel(SensorModel):
             recipe=instrument.slopes,
             arrays=fineness.arrays,
             offsets=description.image_offsets(instrument),
+            aberration_rad=description.draw_aberration(instrument, pupil),
         )
         return signals.PyramidSensor(
             optics=optics,
@@ -305,6 +309,18 @@ class PyramidModel(SensorModel):
             f"{{ axes_lambda_over_d = [{longer:#.4g}, {shorter:#.4g}], "
             f"angle_deg = {math.degrees(angle_rad) % 180.0:.2f} }}"
         )
+
+    @override
+    def aberrate(self, sensor: Pyramid, number: int, change_rad: float) -> Pyramid:
+        coefficients = np.zeros(max(number - 1, len(sensor.aberration_rad)))
+        coefficients[: len(sensor.aberration_rad)] = sensor.aberration_rad
+        coefficients[number - 2] += change_rad
+        return replace(sensor, aberration_rad=tuple(coefficients.tolist()))
+
+    @override
+    def aberration_entry(self, sensor: Pyramid) -> str:
+        unit_nm = sensor.wavelength_m / (2.0 * math.pi * 1e-9)
+        return f"[{', '.join(f'{one * unit_nm:.1f}' for one in sensor.aberration_rad)}]"
 
     @override
     def other_recipes(self, recipe: SlopeRecipe) -> dict[str, SlopeRecipe]:

@@ -32,6 +32,9 @@ from service.model.slopes import PLAIN, SlopeRecipe
 
 Array = NDArray[Any]
 
+Finish = Callable[[Foreign, list[Foreign]], Foreign]
+"""Function of a row's factors along y and x."""
+
 _SIDES = np.array([-1.0, 1.0])
 _SIGNS = -_SIDES
 """A wavefront rising along +x brightens the images at -x, and must give a positive slope."""
@@ -128,6 +131,9 @@ class PyramidOptics:
     """Displacement of each image from its place on the pixel grid, ``(2, 2, 2)``, subapertures:
     side along y, side along x, (x, y); None for no displacement."""
 
+    aberration_rad: NDArray[np.float64] | None = None
+    """``(N, N)`` phase over the pupil at rest, radians; None for a flat wavefront."""
+
     def __post_init__(self) -> None:
         """Refuse a modulation that the formulas cannot fold.
 
@@ -206,8 +212,9 @@ class PyramidOptics:
         """
         n, n_u, n_shapes = self.wfs.n_subapertures, len(self.pupil.coordinates), shapes.shape[1]
         # On the whole grid, where points without light have no part in any product.
-        on_grid = np.zeros((n_u, n_u, n_shapes), self.dtype)
-        on_grid[self.pupil.lit] = shapes * self._scale[self.pupil.lit][:, None]
+        field = self._pupil_field
+        on_grid = np.zeros((n_u, n_u, n_shapes), field.dtype)
+        on_grid[self.pupil.lit] = shapes * (-2.0 * field[self.pupil.lit])[:, None]
         images = np.empty((2, n, 2, n))
         changes = np.empty((2, 2, n, n, n_shapes), self.dtype)
         # image by image, arrays of all subapertures stay in the cache
@@ -216,7 +223,7 @@ class PyramidOptics:
             roof_x = self._roof(shift[0] + grid.x, nodes[1], grid.sides_x)
             modulated_y, modulated_x = self._modulate_roof(roof_y, roof_x)
             light, change = respond_to_few(
-                self.pupil.amplitude.astype(self.dtype),
+                field,
                 on_grid.reshape(n_u, -1),
                 (modulated_y[:, :, 0], modulated_x.reshape(n, len(modulated_y), -1, n_u)),
                 (roof_y.weights, np.tile(roof_x.weights, 2)),
@@ -272,11 +279,15 @@ class PyramidOptics:
                     signs=self._signs(len(roof_y.weights), len(roof_x.weights), planes),
                 )
             )
-        finish = self._finish(of_row.shapes)
-        return PreparedRows(images=images, parts=tuple(parts), finish=finish)
+        finish = tuple(self._finish(of_row.shapes, scale) for scale in self._scales)
+        return PreparedRows(images=images, parts=tuple(parts), finish=finish[0], turned=finish[1:])
 
     def lines(self, row: int, columns: Array, rows: PreparedRows) -> Array:
         """Return the lines of subapertures in these columns of a row, ``(n_lines, n_shapes)``."""
+        found = self._lines(row, columns, rows)
+        return found + self._lines(row, columns, rows.turn()) if rows.turned else found
+
+    def _lines(self, row: int, columns: Array, rows: PreparedRows) -> Array:
         if self._apart:
             return self._combine_images(self._image_lines(row, columns, rows))
         factors = [self._row_factors(row, columns, part) for part in rows.parts]
@@ -420,7 +431,7 @@ class PyramidOptics:
         ``(n, n, M/2, 2, n_nodes, 2, 2 of the pair, n_nodes)``: row, column, source, image side and
         node along y, image side, one of the pair and node along x.
         """
-        amplitude = self.pupil.amplitude.astype(self._complex)
+        amplitude = self._pupil_field.astype(self._complex)
         n_source, n, *_, n_u = modulated_y.shape
         at_y, at_x = modulated_y.shape[2:-1], modulated_x.shape[2:-1]
         fields = np.empty((n, n, n_source, math.prod(at_y), math.prod(at_x)), self._complex)
@@ -516,12 +527,15 @@ class PyramidOptics:
             flux = xp.sum(lines[1, ...], axis=0) * self.arrays.there(signs)
         return xp.reshape(flux, (1, -1, flux.shape[-1]))
 
-    def _finish(self, shapes: Shapes | None) -> Callable[[Foreign, list[Foreign]], Foreign]:
-        """Return what makes of a row's factors its gradient, or its response to shapes."""
+    def _finish(self, shapes: Shapes | None, scale: Array) -> Finish:
+        """Return what makes of a row's factors its gradient, or its response to shapes.
+
+        ``scale`` ``(N, N)`` multiplies a product of factors.
+        """
         if isinstance(shapes, LocalShapes):
-            return TiledResponse(shapes, self._scale, self.arrays)
+            return TiledResponse(shapes, scale, self.arrays)
         xp, there = self.arrays.xp, self.arrays.there
-        lit, scale = there(np.flatnonzero(self.pupil.lit)), there(self._scale[self.pupil.lit])
+        lit, scale = there(np.flatnonzero(self.pupil.lit)), there(scale[self.pupil.lit])
         # Sent to the device once, before the rows.
         known = None if shapes is None else there(shapes)
 
@@ -546,9 +560,21 @@ class PyramidOptics:
         return n_shapes * (n_points + n_lines) < n_points * n_lines
 
     @property
-    def _scale(self) -> Array:
-        """``(N, N)`` what a product of factors is multiplied by."""
-        return (-2.0 * self.pupil.amplitude).astype(self.dtype)
+    def _pupil_field(self) -> Array:
+        """``(N, N)`` field over the pupil, complex only with an aberration."""
+        if self.aberration_rad is None:
+            return self.pupil.amplitude.astype(self.dtype)
+        field: Array = self.pupil.amplitude * np.exp(1j * self.aberration_rad)
+        return field.astype(self._complex)
+
+    @property
+    def _scales(self) -> list[Array]:
+        """``(N, N)`` what products of factors are multiplied by, of imaginary and real parts.
+
+        Without an aberration the imaginary part alone counts.
+        """
+        field = -2.0 * self._pupil_field
+        return [field.real] if self.aberration_rad is None else [field.real, field.imag]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -595,8 +621,16 @@ class PreparedRows:
     parts: tuple[PreparedGrid, ...]
     """One for the four images together, or one for each."""
 
-    finish: Callable[[Foreign, list[Foreign]], Foreign]
+    finish: Finish
     """Function that turns a row's factors into its gradient, or into its response to shapes."""
+
+    turned: tuple[Finish, ...] = ()
+    """The same for the real part of a product of factors; empty without an aberration."""
+
+    def turn(self) -> PreparedRows:
+        """Return the same for the real parts of products instead of their imaginary ones."""
+        parts = tuple(replace(part, signs=-1j * part.signs) for part in self.parts)
+        return replace(self, parts=parts, finish=self.turned[0], turned=())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

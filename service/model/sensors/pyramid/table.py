@@ -18,6 +18,13 @@ IMAGE_KEY = "image_offsets_px"
 ELLIPSE_KEY = "modulation_ellipse"
 """Key of an elliptic modulation."""
 
+ABERRATION_KEY = "static_aberration_nm"
+"""Key of a static aberration."""
+
+N_ABERRATIONS = 14
+"""Number of Zernike polynomials of a static aberration: Noll's numbers 2 to 15, which are all up to
+the fourth radial order."""
+
 MAX_OFFSET_PX = 4.0
 """Largest displacement of a pupil image from its place on the pixel grid, detector pixels. Whole
 pixels belong into the windows that cut the images."""
@@ -140,6 +147,12 @@ class PyramidTable(PyramidNumbers):
     """Grid ``{ points_per_subaperture = 2, width_subap = 52.0 }`` of a simulation that has made the
     matrix with an FFT. Such a matrix differs by per cents from that of a real sensor. None: a
     real sensor, or a grid that is not known."""
+
+    static_aberration_nm: Annotated[tuple[float, ...], MaxLen(N_ABERRATIONS)] | None = None
+    """Static aberration of the beam in which the matrix was measured: coefficients of the Zernike
+    polynomials of Noll's numbers 2 (tilt along x) to 15 at most, nm RMS, in the RTC's axes; a
+    positive one rises where a positive command does. None: a flat wavefront. "unknown": fitted to a
+    measured matrix."""
 
     pupil_centres_px: Centres | None = None
     """Frames only: centres of the four pupil images, row and column; "auto": found in a flux

@@ -281,6 +281,8 @@ def find_stroke(
     # Frames are made into slopes here; those of an RTC may have any scale.
     if about.frames is None:
         conditions.append("the slopes have the normalisation of the instrument file")
+    elif kind_of(about).knows_mean_light(about):
+        conditions.append("the frames are divided by the sum of the detector")
     axes = found.assumed_orientation
     if about.slopes.orientation is None and axes.sign_x == axes.sign_y == -1:
         conditions.append("the slopes have the other sign; otherwise the commands have")

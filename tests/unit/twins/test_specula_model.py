@@ -90,12 +90,16 @@ def test_only_a_pyramid_becomes_a_model(tmp_path):
 
 @pytest.mark.long
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("with_fit", [False, True])
-def test_specula_measures_the_matrix_of_an_instrument_file(bench, with_fit, tmp_path):
+@pytest.mark.parametrize("case", ["file", "fit", "aberration"])
+def test_specula_measures_the_matrix_of_an_instrument_file(bench, case, tmp_path):
+    """Its pupil moves with the mirror, and a static aberration with the pupil."""
     python = find_interpreter("specula")
-    instrument, fit = bench if with_fit else (pyrcal.load_instrument(SMALL), None)
+    instrument, fit = bench if case == "fit" else (pyrcal.load_instrument(SMALL), None)
+    if case == "aberration":
+        wfs = replace(instrument.wfs, aberration_rad=(0.0, 0.0, 0.3, 0.2))
+        instrument = replace(instrument, wfs=wfs)
     pyrcal.to_specula(instrument, tmp_path, fit or ALPHA)
-    expected = fit.synthetic if with_fit else pyrcal.interaction_matrix(instrument, ALPHA)
+    expected = fit.synthetic if fit else pyrcal.interaction_matrix(instrument, ALPHA)
     program = [str(python), "-m", "specula.scripts.specula_main", "--cpu", "--precision", "0"]
     subprocess.run(
         [*program, "specula_model.yml"],

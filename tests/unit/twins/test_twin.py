@@ -22,6 +22,7 @@ from pyrcal.twins.sampled import sample_bench
 from service.errors import ConfigurationError, MatrixError
 from service.files.container import opened
 from service.instrument import instrument_path, load_instrument
+from sim_rtc.assembly import build_telescope
 from sim_rtc.options import parse_options
 from tests.support.repository import ROOT
 from tests.support.twin import find_interpreter
@@ -165,6 +166,9 @@ def test_service_and_fit_take_the_folder_of_a_twin(bench, tmp_path):
         assert load_instrument(name).wfs.n_subapertures == 8
     simulated = parse_options(["--instrument", str(moved), "--plant", "measured"])
     assert simulated.matrix == moved / "matrix.h5"
+    # The mirror of the simulated RTC is where the fit has found it.
+    optics = build_telescope(simulated, load_instrument(moved)).optics.start()
+    np.testing.assert_allclose(optics.alpha.vector, made.report.fit.alpha.vector, atol=1e-6)
     # An earlier twin is replaced, other files are not.
     pyrcal.twin(bench, moved, **QUICK)
     with pytest.raises(ConfigurationError, match="other files"):

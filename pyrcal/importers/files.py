@@ -190,18 +190,20 @@ def from_arrays(
 
 def apply_unit(unit: str | None, signals: Signals, mirror: Mirror, notes: list[str]) -> None:
     """Make the response one per metre of OPD, or mark the strokes as unknown."""
+    light = signals.arrays.get(FLUX_FRAME)
+    # A mask suffices to compare shapes. The response is no light: slopes divided by it are wrong.
+    is_mask = unit is None and light is not None and len(np.unique(light)) <= 2
+    if not signals.has_mean_frame and not is_mask:
+        signals.table["input"] = "normalised-frames"
+        del signals.arrays[FLUX_FRAME]
+        notes.append(
+            "no mean frame (light=FILE): the frames are taken as divided by the sum of the "
+            "whole detector"
+        )
     if unit is None:
         mirror.table["stroke"] = UNKNOWN
         notes.append("the unit of the commands is unknown: only shapes are compared")
     else:
-        if not signals.has_mean_frame:
-            # A mask has no counts that the frames could be divided by.
-            signals.table["input"] = "normalised-frames"
-            del signals.arrays[FLUX_FRAME]
-            notes.append(
-                "no mean frame (light=FILE): the frames are taken as divided by the sum of the "
-                "whole detector"
-            )
         # Not in place: the matrix may be that of the caller.
         signals.arrays["interaction_matrix"] = signals.arrays["interaction_matrix"] / UNITS_M[unit]
 

@@ -68,7 +68,8 @@ def find_fft_grid(
         "from [wfs] and check pupil_diameter_subap"
     )
     tables = {**imported.tables, "wfs": {**wfs, **keys}}
-    return replace(imported, tables=tables, notes=tuple(notes))
+    # Windows between pixels would mix the points of a simulation.
+    return replace(imported, tables=tables, notes=tuple(notes), centres_found=False)
 
 
 def _describe_slopes(wfs: Mapping[str, Any], side: int) -> dict[str, Any]:
@@ -104,7 +105,9 @@ def _describe_frames(
     n = counts[0]
     # Windows of whole pixels: their distance is even if the width of the detector less that of the
     # pupil is.
-    apart = float(np.ptp(images.centres_px, axis=0).mean()) + _SEEMING_PX
+    # The mean of both pairs: the outermost of displaced images are further apart than their square.
+    ordered = np.sort(images.centres_px, axis=0)
+    apart = float(np.mean(ordered[2:] - ordered[:2])) + _SEEMING_PX
     odd = (width - n) % 2
     sensor = {"pupil_separation_subap": 2 * round((apart - odd) / 2) + odd}
     return {

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from service.errors import ModelError
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
-from service.model.pupil import Illumination, annular_pupil
+from service.model.pupil import Illumination, annular_pupil, instrument_pupil
+from service.model.sensors.pyramid.description import pyramid_in
+from service.model.sensors.pyramid.table import FftGrid
 from tests.support.numerics import small_basis, small_instrument, small_model
 
 
@@ -134,3 +138,14 @@ def test_slopes_are_larger_where_there_is_more_light():
 def test_light_that_cannot_be_is_refused(intensity, text):
     with pytest.raises(ModelError, match=text):
         Illumination(coordinates=np.arange(3.0), intensity=intensity)
+
+
+def test_points_of_a_simulated_pupil_are_lit_or_not():
+    """As OOPAO draws them, on its own grid alone."""
+    about, n = small_instrument(), 2 * small_instrument().wfs.n_subapertures
+    grid = FftGrid(points_per_subaperture=2, width_subap=2.0 * n)
+    simulated = replace(about, obscuration_ratio=0.0, wfs=replace(pyramid_in(about), fft_grid=grid))
+    along = np.linspace(-n / 2, n / 2, n)
+    drawn = np.add.outer(along**2, along**2) < ((n + 1) / 2) ** 2
+    np.testing.assert_array_equal(instrument_pupil(simulated, 2).amplitude, drawn)
+    assert np.any(instrument_pupil(simulated, 3).amplitude % 1.0)

@@ -59,7 +59,7 @@ of simulators that differ from the model in influence functions and light leave 
 measured ones 0.15 to 0.4."""
 
 MAX_TESTED_MISFIT = 0.4
-"""Median misfit up to which the service was run on measured responses (docs/results/tracking.md)."""
+"""Median misfit up to which the service was tested on measured responses (results/tracking.md)."""
 
 N_FITTED = 8
 """Modes of the RTC's own matrix from which the misfit of others may be extrapolated."""

@@ -310,6 +310,11 @@ def _list_limits(bench: SampledBench) -> tuple[str, ...]:
             f"SPECULA's parameter file has no elliptic modulation: semi-axes {first:.3g} and "
             f"{second:.3g} lambda/D are written as a circle of the same area."
         )
+    rooftop = abs(bench.rooftop_lambda_over_d)
+    if rooftop:
+        found.append(
+            f"SPECULA's parameter file has no rooftop: that of {rooftop:.2g} lambda/D is left out."
+        )
     places = bench.image_places_px
     off = float(np.abs(places - places.mean(axis=(0, 1))).max())
     if off > MAX_OFF_GRID_PX:

@@ -57,6 +57,10 @@ def test_what_the_parameter_file_cannot_say_is_said(bench, tmp_path):
         sample_bench(replace(instrument, wfs=wfs), fit), fit, tmp_path
     ).remarks
     assert [one for one in remarks if "no elliptic modulation" in one]
+    wfs = replace(instrument.wfs, rooftop_lambda_over_d=0.5)
+    sharp = sample_bench(replace(instrument, wfs=wfs), fit)
+    remarks = write_specula_model(sharp, fit, tmp_path).remarks
+    assert [one for one in remarks if "no rooftop: that of 0.5 lambda/D" in one]
 
 
 SMALL = ROOT / "tests" / "system" / "small.toml"

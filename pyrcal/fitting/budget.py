@@ -46,6 +46,9 @@ DIFFERENCES = 3
 MIN_SHARE = 0.01
 """Share of the power left over above which a cause is reported."""
 
+MIN_ADVISED = 0.1
+"""Smallest share of the power left over for which a measurement is advised."""
+
 _LIGHT_STEPS = 4
 
 _IMAGES = ("-x -y", "+x -y", "-x +y", "+x +y")
@@ -142,7 +145,7 @@ def advise_measurement(causes: Sequence[Cause]) -> str:
     """Return what to measure next to halve the power that is left over; empty without causes."""
     chosen: list[Cause] = []
     for one in causes[:-1]:  # without the unexplained, which no single measurement reduces
-        if sum(known.share for known in chosen) < 0.5:
+        if one.share > MIN_ADVISED and sum(known.share for known in chosen) < 0.5:
             chosen.append(one)
     if not causes:
         return ""

@@ -69,13 +69,15 @@ def frames_of(matrix: Array, light: Array | None, valid: Array | None) -> Frames
     if light_map is not None and light_map.ndim == 2:
         cube = _cube_of(matrix, light_map, valid)
         light_map = np.asarray(light_map, np.float64)
-        return None if cube is None else Frames(cube=cube, light=light_map, light_name=name)
-    if matrix.ndim == 2 and valid is None:
-        matrix = _unfold_frames(matrix)
-    if matrix.ndim != 3:
-        return None
+        # A mask of all pixels of a detector shows no images.
+        if cube is None or light is not None or not light_map.all():
+            return None if cube is None else Frames(cube=cube, light=light_map, light_name=name)
+    else:
+        matrix = _unfold_frames(matrix) if matrix.ndim == 2 and valid is None else matrix
+        if matrix.ndim != 3:
+            return None
+        cube = np.moveaxis(matrix, -1, 0) if matrix.shape[0] == matrix.shape[1] else matrix
     # Only lit pixels respond, so the response itself shows where the pupil images are.
-    cube = np.moveaxis(matrix, -1, 0) if matrix.shape[0] == matrix.shape[1] else matrix
     strength = np.sqrt(np.mean(np.square(np.nan_to_num(cube, copy=True)), axis=0, dtype=float))
     # Its brightest pixel is 1: it has no counts, so that a fit finds no unit of the commands.
     light = strength / (strength.max() or 1.0)

@@ -45,6 +45,7 @@ th { background: #f3f5f9; } .scroll { overflow-x: auto; }
 .missing { color: #8a5a00; font-weight: 600; }
 .verdict { padding: 10px 14px; border-radius: 6px; font-weight: 600; margin: 14px 0; }
 .verdict.pass { background: #e3f4ea; } .verdict.fail { background: #fbe6e4; }
+.verdict.missing { background: #fdf3d8; }
 figure { margin: 14px 0; } figcaption { color: #4a5366; font-size: 13px; }
 svg, img { max-width: 100%; height: auto; } .note { color: #4a5366; }
 @media print { body { max-width: none; } figure { break-inside: avoid; } }

@@ -11,9 +11,11 @@ from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pyrcal.fitting.advice import Advice
 from pyrcal.fitting.budget import advise_measurement
 from pyrcal.fitting.figures import draw_sheet
 from pyrcal.fitting.fitted import Fit
+from pyrcal.fitting.models import FAMILIES
 from pyrcal.fitting.report import FitReport, document
 from pyrcal.importers.imported import UNKNOWN, Imported, format_toml
 from pyrcal.maintenance.commission_page import format_html, format_table
@@ -130,7 +132,11 @@ def _list_fitted(made: Twin) -> Iterator[tuple[str, Value]]:
         hidden.add("modulation_lambda_over_d")  # the two axes say it
     for report in filter(None, (made.before, made.report)):
         optics = {one.key: one for one in report.fit.optics if one.found is not None}
-        origins = {one.key: one for one in report.fit.origins if one.correct or one.key in optics}
+        origins = {
+            one.key: one
+            for one in report.fit.origins
+            if one.correct or one.key in optics or f"wfs.{one.key}" in FAMILIES
+        }
         for key in dict.fromkeys([*origins, *optics]):
             optic = optics.get(key)
             value = origins[key].found if optic is None else optic.found
@@ -143,9 +149,14 @@ def _list_fitted(made: Twin) -> Iterator[tuple[str, Value]]:
 
 def _quote_files(made: Twin, key: str) -> str:
     """Return which value a key of the instrument file has in the files of the bench."""
-    tables = made.bench.imported[-1].tables.values()
-    known = next((table[key] for table in tables if key in table), UNKNOWN)
-    return "no file has it" if known == UNKNOWN else f"the files say {format_toml(known)}"
+    known, kept = (
+        next((table[key] for table in one.tables.values() if key in table), UNKNOWN)
+        for one in (made.bench.imported[-1], made.imported)
+    )
+    if known == UNKNOWN:
+        return "no file has it"
+    same = ", and the models keep that" if kept == known else ""
+    return f"the files say {format_toml(known)}{same}"
 
 
 def _unit(key: str) -> str:
@@ -260,7 +271,8 @@ def _document(made: Twin) -> dict[str, Any]:
 def _page(made: Twin) -> str:
     """Return the report as HTML that needs no other file."""
     fit = made.report.fit
-    mark = "pass" if fit.accepted else "fail"
+    mark = "pass" if fit.recommendation.startswith(Advice.USE) else "missing"
+    mark = mark if fit.accepted else "fail"
     values = (
         (one.name, _text(one).replace("+-", "±"), one.unit, one.origin) for one in list_values(made)
     )

@@ -166,7 +166,7 @@ class PyramidOptics:
         With ``shapes`` it is the response to them, and the gradient exists for one row of
         subapertures at a time.
         """
-        nodes = nodes_y or self._nodes, nodes_x or self._nodes
+        nodes = nodes_y or self.nodes, nodes_x or self.nodes
         if isinstance(shapes, np.ndarray) and self.are_few(shapes.shape[1]):
             return self._respond_to_few(shapes, valid, shift, nodes, mapper)
         of_row = RowResponse(
@@ -232,6 +232,13 @@ class PyramidOptics:
             place = grid.sides_y.start, grid.sides_x.start
             images[place[0], :, place[1]] = light / self._all_light
             changes[place] = change
+        return self.gather_light(images, changes, valid)
+
+    def gather_light(
+        self, images: NDArray[np.float64], changes: Array, valid: NDArray[np.bool_]
+    ) -> LightGradient:
+        """Return the response of images ``(2, n, 2, n)``; changes ``(2, 2, n, n, n_shapes)``."""
+        n_shapes = changes.shape[-1]
         lines = changes[:, :, valid].reshape(4, -1, n_shapes)
         planes: Array = self._plane_signs(_ALL_IMAGES).reshape(-1, 4).astype(self.dtype)
         signals = (planes @ lines.reshape(4, -1)).reshape(-1, *lines.shape[1:])
@@ -325,7 +332,7 @@ class PyramidOptics:
 
     def images(self, shift: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
         """Return the light at rest ``(2, n, 2, n)``: side, row along y, side, column along x."""
-        n, nodes = self.wfs.n_subapertures, self._nodes
+        n, nodes = self.wfs.n_subapertures, self.nodes
         images = np.empty((2, n, 2, n))
         for grid in self._grids:
             roof_y = self._roof(shift[1] + grid.y, nodes, grid.sides_y)
@@ -342,10 +349,18 @@ class PyramidOptics:
         return grid if same else None
 
     @property
-    def _nodes(self) -> Nodes:
+    def nodes(self) -> Nodes:
         """Quadrature over a subaperture."""
         grid = self._fft_grid
         return Nodes.area(self.n_nodes) if grid is None else Nodes.points(self.pupil.sampling)
+
+    @property
+    def focal_frequencies(self) -> NDArray[np.float64]:
+        """Frequencies along an axis of the focal plane, 1 / subaperture, the tip between four."""
+        wide = 2.0 * (self.wfs.image_separation_subap + self.wfs.n_subapertures)
+        width = wide if self._fft_grid is None else self._fft_grid.width_subap
+        n = round(width * self.pupil.sampling)
+        return np.asarray((np.arange(n) - (n - 1) / 2) / width)
 
     @property
     def _grids(self) -> tuple[_Grid, ...]:
@@ -401,7 +416,7 @@ class PyramidOptics:
             weights.append(np.full(n // 2, weight / n))
         return np.concatenate(tilts, axis=1), np.concatenate(weights)
 
-    def _tilts(self) -> tuple[Array, Array]:
+    def source_phasors(self) -> tuple[Array, Array]:
         """Return source phasors ``(M/2, N)`` along y and ``(M/2, 2, N)`` along x.
 
         The second index along x is the pair of points that share their y component. The phasor
@@ -419,7 +434,7 @@ class PyramidOptics:
         Along y ``(M/2, n, 2, n_nodes, N)``: source, subaperture, image side, node; along x
         ``(n, M/2, 2, 2 of the pair, n_nodes, N)``.
         """
-        along_y, along_x = self._tilts()
+        along_y, along_x = self.source_phasors()
         return (
             along_y[:, None, None, None] * roof_y.kernel,
             along_x[:, None, :, None] * roof_x.kernel[:, None, :, None],

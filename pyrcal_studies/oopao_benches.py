@@ -39,6 +39,9 @@ class Case:
     ellipse: tuple[float, float, float] | None = None
     """Semi-axes, and degrees from +x to the first one, instead of the circle."""
 
+    rooftop: float = 0.0
+    """In OOPAO's unit."""
+
     processing: str = "slopesMaps"
     subapertures: int = 18
     actuators: int = 9
@@ -70,6 +73,8 @@ CASES = {
     "three": Case(modulation=3.0),
     "ellipse-4-5": Case(modulation=4.0, ellipse=(4.0, 5.0, 30.0)),
     "ellipse-3-4": Case(modulation=3.0, ellipse=(3.0, 4.0, 0.0)),
+    "rooftop": Case(modulation=0.0, rooftop=1.0),
+    "rooftop-three": Case(modulation=3.0, rooftop=1.0),
     "whole-unmodulated": Case(modulation=0.0, processing=WHOLE),
     "whole-three": Case(modulation=3.0, processing=WHOLE),
     "unmodulated-aberrated": Case(modulation=0.0, aberration_rad=0.5),
@@ -132,6 +137,7 @@ def measure(case: Case) -> dict[str, Any]:
         lightRatio=0.0 if case.processing.startswith("full") else 0.3,
         postProcessing=case.processing,
         n_pix_separation=case.separation_px,
+        rooftop=case.rooftop,
         user_modulation_path=None if case.ellipse is None else _path(*case.ellipse),
     )
     _, _, axes = np.linalg.svd(plain.modes, full_matrices=False)
@@ -156,7 +162,7 @@ def measure(case: Case) -> dict[str, Any]:
         "dm.misReg": "rotationAngle shiftX shiftY anamorphosisAngle radialScaling"
         " tangentialScaling",
         "wfs": "tag nSubap modulation user_modulation_path n_pix_separation n_pix_edge binning"
-        " postProcessing validI4Q validSignal",
+        " postProcessing rooftop validI4Q validSignal",
     }
     kept: dict[str, Any] = {"calib.D": matrix.astype(np.float32), "M2C": modes}
     # A picture of the modulated spot, on OOPAO's grid of the focal plane.

@@ -42,7 +42,12 @@ from sim_rtc.telescope.diffractive import DiffractivePlant
 from sim_rtc.telescope.imperfections import Imperfections
 from sim_rtc.telescope.influence import read_influence
 from sim_rtc.telescope.linear import LinearPlant
-from sim_rtc.telescope.measured import MeasuredPlant, read_measured_matrix, sky_diameter
+from sim_rtc.telescope.measured import (
+    MeasuredPlant,
+    read_fitted_registration,
+    read_measured_matrix,
+    sky_diameter,
+)
 from sim_rtc.telescope.mirror import MirrorDrive
 from sim_rtc.telescope.plant import Departures, Optics, Plant
 from sim_rtc.telescope.registration import (
@@ -214,7 +219,7 @@ def build_telescope(
     nominal = instrument.start if law is None else law(0.0)
     draw = far_registration if options.far else random_registration
     if options.plant == "measured":  # what is not given is not known: no true one is invented
-        start = options.alpha or nominal
+        start = options.alpha or read_fitted_registration(options.instrument) or nominal
     else:
         start = options.alpha or draw(alpha_rng, nominal.rotation_rad)
     plant = build_plant(options, instrument, basis, plant_rng, start)

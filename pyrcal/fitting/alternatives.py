@@ -21,6 +21,7 @@ from pyrcal.fitting.instrument_checks import (
     try_ellipse,
     try_free_images,
     try_instruments,
+    try_rooftop,
 )
 from pyrcal.fitting.left_over import find_arms, find_border
 from pyrcal.fitting.methods import Settled
@@ -400,6 +401,7 @@ TRIALS: tuple[Callable[[FitSubset], Iterator[Alternative]], ...] = (
     try_pupils,
     try_instruments,
     try_ellipse,
+    try_rooftop,
     try_aberration,
     try_free_images,
     _try_off_centre,

@@ -119,7 +119,7 @@ def _divide_power(settled: Settled, noise: Array | None) -> Iterator[Cause]:
     residual = target.project(lit, model[:0, None]).residual * scale
     with_light = np.sum(residual**2, axis=0)
     words = f"uneven light, a gain from {light.min():.2f} to {light.max():.2f} over the pupil"
-    remedy = "measure the mean frame, and give the light (--flux-map)"
+    remedy = "measure the mean frame, and give it to the twin (light=FILE) or fit (--flux-map)"
     yield make_cause(before - with_light, words, remedy)
     residual = residual - _predict_shapes(settled, residual, light)
     left = np.sum(residual**2, axis=0)

@@ -221,12 +221,14 @@ def _fit_recorded(
         except MatrixError as error:
             text = str(error).removeprefix("reference: ")
             raise MatrixError(f"{recorded.where}: {text}") from error
-    if recorded.flux_frame is not None and not _has_counts(recorded.flux_frame):
+    if recorded.flux_frame is None:
+        return found
+    if not _has_counts(recorded.flux_frame):
         condition = "there is no mean frame in counts, so that the sensor's gain is unknown"
         unknown = FoundStroke(metres_per_unit=None, sigma=None, condition=condition)
-        found = replace(found, stroke=unknown)
+        return replace(found, stroke=unknown)
     no_map = isinstance(kind_of(instrument).light(instrument), CannotTell)
-    if recorded.flux_frame is None or options.illumination is not None or no_map:
+    if options.illumination is not None or no_map:
         return found
     return replace(found, remarks=(*found.remarks, *_note_flux_frame(found)))
 

@@ -72,13 +72,13 @@ class Fit(FittedMatrix):
     accepted: bool
     """True if the data determine the registration."""
 
-    converged: bool
+    converged: bool = True
     """True if the steps converged."""
 
-    remarks: tuple[str, ...]
+    remarks: tuple[str, ...] = ()
     """Further notes on the fit, one sentence each."""
 
-    n_evaluations: int
+    n_evaluations: int = 1
     """Number of interaction matrices computed, those for derivatives included."""
 
     gain_map: NDArray[np.float64] | None = None

@@ -41,7 +41,7 @@ class FittedMatrix(Determination):
     verdict: str
     """Verdict in one line: accepted with its quality, or refused with the reason and the remedy."""
 
-    left_out: tuple[str, ...]
+    left_out: tuple[str, ...] = ()
     """Unused columns and slopes, one sentence for each kind."""
 
     synthetic: NDArray[Any]

@@ -21,6 +21,8 @@ from pyrcal.fitting.models import (
     FAR_PREFERRED_SHARE,
     LOGARITHM_ABOVE,
     PREFERRED_SHARE,
+    ROOFTOP,
+    ROOFTOP_FIELD,
     SENSOR_STEP,
     FitModels,
     Optic,
@@ -38,11 +40,20 @@ COUPLING_KEY = "coupling"
 UNKNOWN_ELLIPSE = 'modulation_ellipse = "unknown"'
 """Entry of the instrument file by which an elliptic modulation is fitted."""
 
+UNKNOWN_ROOFTOP = 'rooftop_lambda_over_d = "unknown"'
+"""Entry of the instrument file by which a rooftop is fitted."""
+
+ROOFTOP_FLOOR = 0.001
+"""1 σ of a fitted rooftop by the last, linear step, λ/D: without noise it was up to 0.0012 off."""
+
 UNKNOWN_ABERRATION = 'static_aberration_nm = "unknown"'
 """Entry of the instrument file by which a static aberration is fitted."""
 
 UNKNOWN_IMAGES = 'image_offsets_px = "unknown"'
 """Entry of the instrument file by which the places of the pupil images are fitted."""
+
+_KEPT = {*ABERRATION, *ROOFTOP}
+"""Quantities of which the file has no value that could take the place of the fitted one."""
 
 TRIED_ABERRATION = ABERRATION[2:7]
 """Polynomials with which a static aberration is tried, focus to coma: each takes a matrix, and a
@@ -91,6 +102,8 @@ class FoundOptic:
         """1 σ of the fitted value in its own unit; for a width, of its logarithm."""
         if self.found is None:
             return self.sigma
+        if self.optic is Optic.ROOFTOP:
+            return float(np.hypot(self.sigma, ROOFTOP_FLOOR))
         if self.optic is Optic.SENSOR:
             # Upwards, because of no modulation there is no other side.
             return moved_sensor_number(self.found, self.sigma) - self.found
@@ -152,6 +165,16 @@ def try_ellipse(few: FitSubset) -> Iterator[Alternative]:
     if Optic.STRETCH in few.models.optics or few.models.sensor_number < LOGARITHM_ABOVE:
         return
     found = _try_family(few, ELLIPSE, UNKNOWN_ELLIPSE, FAR_PREFERRED_SHARE)
+    if found.preferred:
+        yield replace(found, is_instrument=True)
+
+
+def try_rooftop(few: FitSubset) -> Iterator[Alternative]:
+    """Yield a rooftop, if the matrix prefers one to the tip of the file's pyramid."""
+    has_faces = hasattr(few.models.instrument.wfs, ROOFTOP_FIELD)
+    if not has_faces or few.settled.share < MIN_EXPLAINED or Optic.ROOFTOP in few.models.optics:
+        return
+    found = _try_family(few, ROOFTOP, UNKNOWN_ROOFTOP, FAR_PREFERRED_SHARE)
     if found.preferred:
         yield replace(found, is_instrument=True)
 
@@ -244,7 +267,8 @@ def list_optics(models: FitModels, settled: Settled, sure: Uncertainty) -> tuple
     """Return coupling and modulation as fitted; ``models`` are of the file's instrument."""
     nuisances = settled.nuisances
     changes = nuisances.changes(settled.solution.nuisances)
-    number, sensor_key = models.sensor_number, models.sensor_key
+    keys = {Optic.ROOFTOP: ROOFTOP_FIELD, Optic.SENSOR: models.sensor_key}
+    number = models.sensor_number
     found = []
     for k, (optic, change) in enumerate(changes.items(), nuisances.first_optic):
         if optic in ELLIPSE or optic in ABERRATION:
@@ -254,11 +278,13 @@ def list_optics(models: FitModels, settled: Settled, sure: Uncertainty) -> tuple
             stated, value = models.coupling, float(models.coupling ** np.exp(-2.0 * change))
         elif optic is Optic.SENSOR and value < NO_SENSOR_NUMBER_LIMIT:
             value = 0.0
+        elif optic is Optic.ROOFTOP:
+            stated, value = 0.0, round(change, 4) + 0.0  # without the sign of a zero
         known = models.exact(optic)
         found.append(
             FoundOptic(
                 optic=optic,
-                key=sensor_key if optic is Optic.SENSOR and sensor_key else COUPLING_KEY,
+                key=keys.get(optic) or COUPLING_KEY,
                 change=change,
                 sigma=float(sure.nuisance_sigma[k]),
                 found=value if known else None,
@@ -277,7 +303,7 @@ def fit_file_values(
     """
     nothing = replace(settled.nuisances, optics=())
     for optic, change in settled.nuisances.changes(settled.solution.nuisances).items():
-        models = models.with_optic(optic, change) if optic in ABERRATION else models
+        models = models.with_optic(optic, change) if optic in _KEPT else models
     # The fitted places of the images are kept, so that the two fits differ in coupling and
     # modulation only.
     if np.any(nothing.displaced):

@@ -66,13 +66,15 @@ def moved_sensor_number(number: float, change: float) -> float:
 
 
 ELLIPSE_KEY = "wfs.modulation_ellipse"
+ROOFTOP_FIELD = "rooftop_lambda_over_d"
 ABERRATION_KEY = "wfs.static_aberration_nm"
 
 
 class Optic(StrEnum):
     """An optical quantity that a matrix can determine, fitted as its logarithm.
 
-    That of the sensor is fitted as its ``sensor_coordinate``.
+    That of the sensor is fitted as its ``sensor_coordinate``, a rooftop and an aberration as
+    themselves.
     """
 
     WIDTH = "width"
@@ -86,6 +88,9 @@ class Optic(StrEnum):
 
     SLANT = "slant"
     """The same along 45 and 135 degrees."""
+
+    ROOFTOP = "rooftop"
+    """Length of the edge in place of a pyramid's tip, λ/D."""
 
     TILT_X = "tilt along x"
     """Static aberration of the beam, as all that follow: coefficients of Zernike polynomials,
@@ -115,7 +120,10 @@ ABERRATION = tuple(Optic)[tuple(Optic).index(Optic.TILT_X) :]
 """Zernike polynomials from Noll's number 2 on, fitted together if ``wfs.static_aberration_nm`` is
 unknown."""
 
-FAMILIES = {ELLIPSE_KEY: ELLIPSE, ABERRATION_KEY: ABERRATION}
+ROOFTOP = (Optic.ROOFTOP,)
+"""The one parameter of a rooftop, fitted if ``wfs.rooftop_lambda_over_d`` is unknown."""
+
+FAMILIES = {ELLIPSE_KEY: ELLIPSE, f"wfs.{ROOFTOP_FIELD}": ROOFTOP, ABERRATION_KEY: ABERRATION}
 """Quantities that are fitted if the instrument file marks their key as unknown."""
 
 
@@ -273,7 +281,7 @@ class FitModels:
         return optic is not Optic.WIDTH or self.coupling is not None
 
     def with_optic(self, optic: Optic, change: float) -> FitModels:
-        """Return the models of an instrument with a quantity changed by a logarithm, or radians."""
+        """Return the models of an instrument with a quantity changed, see ``Optic``."""
         kind, wfs = kind_of(self.instrument), self.instrument.wfs
         if optic in ELLIPSE or optic in ABERRATION:
             if optic in ABERRATION:
@@ -284,6 +292,10 @@ class FitModels:
             if sensor is None:
                 raise ModelError(f"fit: found a {kind.name}, expected a pyramid, for its {optic}")
             return replace(self, instrument=replace(self.instrument, wfs=sensor))
+        if optic is Optic.ROOFTOP:
+            length = getattr(wfs, ROOFTOP_FIELD) + change
+            wfs = replace(wfs, **{ROOFTOP_FIELD: length})
+            return replace(self, instrument=replace(self.instrument, wfs=wfs))
         if optic is Optic.SENSOR and self.sensor_key is not None:
             number = moved_sensor_number(self.sensor_number, change)
             wfs = replace(wfs, **{self.sensor_key: number})

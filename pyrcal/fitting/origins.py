@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pyrcal.fitting.comparison import Alternative
 from pyrcal.fitting.instrument_checks import FoundOptic, may_compensate
 from pyrcal.fitting.methods import Settled
-from pyrcal.fitting.models import ABERRATION, ELLIPSE, FAMILIES, Optic
+from pyrcal.fitting.models import ELLIPSE, FAMILIES, ROOFTOP, Optic
 from service.model.instrument import Instrument
 from service.model.sensors.registry import kind_of
 from service.model.slopes import FLIPS, Orientation, SlopeRecipe
@@ -209,10 +209,11 @@ def find_families(
     kind, unit_nm = kind_of(about), about.wfs.wavelength_m / (2.0 * np.pi * 1e-9)
     doubt = "" if determined else ", may compensate errors of the model"
     for key, family in FAMILIES.items():
-        if not places.keys() >= set(family):
-            continue
+        if family is ROOFTOP or not places.keys() >= set(family):
+            continue  # a rooftop is one number, see ``list_optics``
         if family is ELLIPSE:
-            largest = max(sigma[k] for optic, k in places.items() if optic not in ABERRATION)
+            axes = {Optic.SENSOR, *ELLIPSE}
+            largest = max(sigma[k] for optic, k in places.items() if optic in axes)
             found, words = kind.modulation_entry(about.wfs), f"of an axis {largest:.1%}"
         else:
             largest = max(sigma[places[optic]] for optic in family)

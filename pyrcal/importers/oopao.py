@@ -111,6 +111,7 @@ SAVED = {
         "binning": _count(1)._replace(sensor=PYRAMID),
         "postProcessing": _WORD._replace(sensor=PYRAMID),
         "n_pix_edge": _OPTIONAL._replace(sensor=PYRAMID),
+        **dict.fromkeys(("rooftop", "theta_rotation", "old_mask"), _OPTIONAL),
         "user_modulation_path": _array(2)._replace(needed=False),
         "validI4Q": _array(2)._replace(needed=False),
         "validSignal": _array(1, 2)._replace(needed=False),
@@ -269,9 +270,9 @@ def _lit_pupil(
     share = (side - 2 * rim) / side
     diameter_m = float(tel.D) * share
     sensor["pupil_diameter_subap"] = sensor["n_subapertures"] * share
-    # Modulations are counted in wavelengths over tel.D, which is the array's width.
-    if "modulation_lambda_over_d" in sensor:
-        sensor["modulation_lambda_over_d"] *= share
+    # Modulation and rooftop are in wavelengths over tel.D, which is the array's width.
+    for key in {"modulation_lambda_over_d", "rooftop_lambda_over_d"} & sensor.keys():
+        sensor[key] *= share
     if "modulation_ellipse" in sensor:
         ellipse = sensor["modulation_ellipse"]
         ellipse["axes_lambda_over_d"] = [axis * share for axis in ellipse["axes_lambda_over_d"]]
@@ -313,15 +314,20 @@ def _pyramid(tel: Oopao, wfs: Oopao, notes: list[str]) -> _Sensor:
             f"wfs.postProcessing = {wfs.postProcessing!r} normalises by a constant: gains of all "
             "modes differ from 1 alike"
         )
-    if getattr(wfs, "rooftop", None) or getattr(wfs, "theta_rotation", 0):
-        notes.append(
-            "a rooftop, and faces that are turned, are not in pyrcal's model: without modulation a "
-            "rooftop of 1 λ/D leaves 37 % of the signal over and makes the magnification 1.5 % too "
-            "small, which sigma contains; with 3 λ/D it leaves 4.5 %"
-        )
+    # OOPAO's old mask has neither.
+    rooftop, turn_rad = (
+        0.0 if getattr(wfs, "old_mask", False) else float(getattr(wfs, name, None) or 0.0)
+        for name in ("rooftop", "theta_rotation")
+    )
+    if turn_rad:
+        notes.append("wfs.theta_rotation: faces that are turned are not in pyrcal's model")
     binning = int(wfs.binning)
     separation = (int(wfs.nSubap) + float(wfs.n_pix_separation)) / binning
     sensor: dict[str, Any] = {"kind": "pyramid", "pupil_separation_subap": separation}
+    if rooftop:
+        # OOPAO's number is the length times the distance of the images in rad of one point.
+        apart = np.pi * (int(wfs.nSubap) + float(wfs.n_pix_separation))
+        sensor["rooftop_lambda_over_d"] = rooftop * int(tel.resolution) / apart
     slopes = {"orientation": "auto", "normalisation": "global"}
     if whole:
         valid = _lit_subapertures(_numpy(tel.pupil), int(wfs.nSubap) // binning)

@@ -40,7 +40,7 @@ from service.files.disk_cache import cached_basis
 from service.files.toml import read_dataset
 from service.files.whole import write_whole
 from service.instrument import load_instrument
-from service.instrument.paths import TWIN_FILE, TWIN_LIVE_FILE
+from service.instrument.paths import TWIN_FILE, TWIN_FIT, TWIN_LIVE_FILE
 from service.model.instrument import instrument_sha256
 from sim_rtc.rehearsal import write_live_instrument
 
@@ -211,7 +211,7 @@ def _fit_bench(bench: Bench, folder: Path, threads: int, progress: Progress | No
     # The fit belongs to the instrument file that is written, which has what it found.
     digest = instrument_sha256(load_instrument(saved.instrument))
     report = replace(best.report, instrument_sha256=digest)
-    write_whole(folder / "fit.h5", partial(fill_fit, report=report))
+    write_whole(folder / TWIN_FIT, partial(fill_fit, report=report))
     _write_live(best, saved)
     return best
 

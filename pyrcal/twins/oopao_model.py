@@ -88,6 +88,7 @@ def _describe_sensor(bench: SampledBench) -> dict[str, Any]:
     first, second, angle = bench.modulation
     apart = bench.separation_px - bench.n_pixels
     columns, rows = np.moveaxis(bench.image_places_px, -1, 0)
+    across = bench.instrument.wfs.pupil_diameter * bench.pixels * bench.points_per_pixel
     circle = math.isclose(first, second, rel_tol=1e-6)
     return {
         "RESOLUTION": bench.n_points,
@@ -100,6 +101,8 @@ def _describe_sensor(bench: SampledBench) -> dict[str, Any]:
         "ELLIPSE": None
         if circle
         else (float(first * steps), float(second * steps), math.degrees(angle)),
+        # see the importer
+        "ROOFTOP": bench.rooftop_lambda_over_d * math.pi * bench.separation_px / across,
         "SHIFT_X": [round(float(one), 5) for one in columns[_FACES]],
         "SHIFT_Y": [round(-float(one), 5) for one in rows[_FACES]],
     }

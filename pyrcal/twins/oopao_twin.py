@@ -37,6 +37,9 @@ MODULATION = 0.0
 ELLIPSE: tuple[float, float, float] | None = None
 """Semi-axes in the same unit, and degrees from +x to the first one; None for a circle."""
 
+ROOFTOP = 0.0
+"""Rooftop in OOPAO's unit."""
+
 SHIFT_X = [0.0, 0.0, 0.0, 0.0]
 SHIFT_Y = [0.0, 0.0, 0.0, 0.0]
 """Arguments of ``apply_shift_wfs``, pixels: the faces of the pyramid, +y against the rows."""
@@ -86,6 +89,7 @@ def make_model(*, sky: bool = False) -> tuple[Telescope, Source, DeformableMirro
         n_pix_separation=N_PIX_SEPARATION,
         n_pix_edge=N_PIX_EDGE,
         userValidSignal=ARRAYS["valid"],
+        rooftop=ROOFTOP,
         user_modulation_path=None if ELLIPSE is None else make_path(*ELLIPSE),
     )
     if any(SHIFT_X) or any(SHIFT_Y):

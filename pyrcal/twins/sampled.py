@@ -32,7 +32,12 @@ from service.model.sensors.pyramid.description import (
     read_aberration,
     stretch_of,
 )
-from service.model.sensors.pyramid.table import ABERRATION_KEY, ELLIPSE_KEY, FftGrid
+from service.model.sensors.pyramid.table import (
+    ABERRATION_KEY,
+    ELLIPSE_KEY,
+    ROOFTOP_KEY,
+    FftGrid,
+)
 from service.model.sensors.registry import kind_of
 from service.model.slopes import Orientation, rtc_mask, to_rtc
 from service.model.surface import Gaussian
@@ -151,6 +156,11 @@ class SampledBench:
         wider = self.n_subapertures / self.instrument.wfs.pupil_diameter
         first, second, angle = oriented_pyramid(self.instrument).modulation_axes
         return first * wider, second * wider, angle
+
+    @property
+    def rooftop_lambda_over_d(self) -> float:
+        """Rooftop of the pyramid, in the axes of conventions.md."""
+        return oriented_pyramid(self.instrument).rooftop_lambda_over_d
 
     @property
     def mirror_alpha(self) -> Misregistration:
@@ -343,6 +353,8 @@ def apply_fit(instrument: Instrument, fit: Fit) -> Instrument:
     number = values.get("modulation_lambda_over_d")
     if number is not None:
         wfs = replace(wfs, modulation_lambda_over_d=number)
+    if ROOFTOP_KEY in values:
+        wfs = replace(wfs, rooftop_lambda_over_d=values[ROOFTOP_KEY])
     if isinstance(mirror, Mirror) and COUPLING_KEY in values:
         mirror = replace(mirror, shape=replace(mirror.shape, coupling=values[COUPLING_KEY]))
     for origin in fit.origins:

@@ -134,11 +134,7 @@ def _compute_fit(instrument: Instrument, alpha: Misregistration) -> Fit:
         orientation=instrument.slopes.assumed_orientation,
         order=instrument.slopes.order,
         accepted=True,
-        converged=True,
         verdict="computed: no matrix was fitted",
-        remarks=(),
-        left_out=(),
-        n_evaluations=1,
         synthetic=matrix,
         measured=matrix,
         valid=valid,
@@ -237,11 +233,16 @@ def _move_pupil(bench: SampledBench) -> SampledBench:
     if not np.any(moved):
         return bench
     margin = math.ceil(np.abs(moved).max())
-    wider = np.pad(bench.amplitude, margin * sampling)
+
+    def move(drawn: Array) -> Array:
+        wider = np.pad(drawn, margin * sampling)
+        return np.asarray(scipy.ndimage.shift(wider, moved[::-1] * sampling, order=1))
+
     return replace(
         bench,
         n_pixels=bench.n_pixels + 2 * margin * bench.pixels,
-        amplitude=scipy.ndimage.shift(wider, moved[::-1] * sampling, order=1),
+        amplitude=move(bench.amplitude),
+        aberration_m=None if bench.aberration_m is None else move(bench.aberration_m),
         pupil_shift_subap=np.zeros(2),
         image_places_px=bench.image_places_px - moved * bench.pixels,
         valid=np.pad(bench.valid, margin),
@@ -308,6 +309,11 @@ def _list_limits(bench: SampledBench) -> tuple[str, ...]:
         found.append(
             f"SPECULA's parameter file has no elliptic modulation: semi-axes {first:.3g} and "
             f"{second:.3g} lambda/D are written as a circle of the same area."
+        )
+    rooftop = abs(bench.rooftop_lambda_over_d)
+    if rooftop:
+        found.append(
+            f"SPECULA's parameter file has no rooftop: that of {rooftop:.2g} lambda/D is left out."
         )
     places = bench.image_places_px
     off = float(np.abs(places - places.mean(axis=(0, 1))).max())

@@ -14,6 +14,9 @@ on, other influence functions. Together they leave the given share of the column
 the true registration. With ``--twin`` the service has the instrument instead that ``pyrcal twin``
 makes of the calibration matrix with noise and of the modes' shapes.
 
+With ``--plant measured`` the plant is that of ``pyrcal sim --plant measured`` for the folder of a
+twin (``--instrument``), and the service has the twin's instrument.
+
 Run: ``python -m pyrcal_studies.campaign.measured_plant --output var/measured_plant.jsonl --table
 table.md``. Rows that are in the file already are not computed again.
 """
@@ -37,7 +40,14 @@ from typing_extensions import override
 
 import pyrcal
 from pyrcal.rtc.identity import Identity, Reconstructor
-from pyrcal_studies.campaign.observatory import START_NS, Dome, Latencies, Moment, Observatory
+from pyrcal_studies.campaign.observatory import (
+    START_NS,
+    Dome,
+    Latencies,
+    Moment,
+    Observatory,
+    true_response,
+)
 from pyrcal_studies.campaign.rows import Row, RowFile, heading, line, tell
 from service.config import load_settings
 from service.control.loop import pole_radius
@@ -121,7 +131,8 @@ class Plan:
 
     mode: str = "auto"
     plant: str = "linear"
-    """"linear", or "diffractive"."""
+    """"linear", "diffractive", or "measured": the matrix of a twin, whose folder is
+    ``instrument``."""
 
     matrix: str = ""
     """File of a measured matrix, npz with ``D`` (n_slopes, n_modes); empty: made from the model."""
@@ -135,6 +146,11 @@ class Plan:
     """Whether the service's instrument is the twin of the bench."""
 
     settings: tuple[tuple[str, float | str | bool], ...] = ()
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether the plant's matrix is a measured one, whose registration nobody knows."""
+        return bool(self.matrix) or self.plant == "measured"
 
 
 class ModalDome(Dome):
@@ -412,6 +428,9 @@ def service_model(plan: Plan) -> tuple[Instrument, RtcInteractionModel]:
         return _twin_model(replace(plan, error=0.0, mode="", seconds=0.0, settings=()))
     if plan.plant == "linear":
         return models_of(plan.instrument)[:2]
+    if plan.plant == "measured":
+        instrument = load_instrument(Path(plan.instrument) / TWIN_LIVE_FILE)
+        return instrument, RtcInteractionModel(instrument, modal_basis(instrument))
     return _wrong_model(replace(plan, mode="", seconds=0.0, n_first=N_FIRST, settings=()))
 
 
@@ -419,6 +438,11 @@ def dome_of(plan: Plan, response: Array, own: Array | None = None) -> Dome:
     """Return the telescope; ``own`` as for ``ModalDome``."""
     if plan.plant == "diffractive":
         return DiffractiveDome(plan)
+    if plan.plant == "measured":
+        return Dome(
+            f"--plant measured --instrument {plan.instrument} --n-controlled {plan.n_first} "
+            f"--seed {plan.seed}".split()
+        )
     return ModalDome(
         models_of(plan.instrument)[0],
         response,
@@ -434,6 +458,9 @@ def response_of(plan: Plan) -> Array:
     """Return the plant's matrix ``(n_slopes, n_modes)``."""
     if plan.plant == "diffractive":
         return DiffractiveDome(plan).response
+    if plan.plant == "measured":
+        n_modes = service_model(plan)[0].modes.n_modes
+        return true_response(dome_of(plan, np.empty(0)).optics, n_modes).astype(float)
     if plan.matrix:
         with np.load(plan.matrix) as file:
             return np.asarray(file["D"], float)
@@ -443,7 +470,7 @@ def response_of(plan: Plan) -> Array:
 def fitted_alpha(plan: Plan, response: Array) -> Misregistration:
     """Return the registration that best explains all columns of the plant's matrix."""
     _, model = service_model(plan)
-    start = true_alpha(plan) if not plan.matrix else model.instrument.start
+    start = model.instrument.start if plan.is_measured else true_alpha(plan)
     found = recognise_modes(
         np.linalg.pinv(response, rcond=1e-6).astype(np.float32), model.linearise, start
     )
@@ -548,7 +575,7 @@ def came_of(plan: Plan, night: Night, response: Array, fit: Misregistration) -> 
             "off": (off * BOUNDARY_SCALE).tolist(),
             "validity": str(registration.validity.level),
         }
-        if not plan.matrix:  # nobody knows the true registration of a measured one
+        if not plan.is_measured:  # nobody knows the true registration of a measured one
             error = registration.alpha.vector - true_alpha(plan).vector
             row |= {"error_sigma": (error / registration.sigma).tolist()}
     proposed = [r for r in night.state.matrices.reconstructors if r.parent is not None]
@@ -656,7 +683,7 @@ def main() -> int:
     parser.add_argument("--draws", type=int, default=20)
     parser.add_argument("--first", type=int, default=1, help="first draw")
     parser.add_argument("--seconds", type=float, default=36.0, help="of each run")
-    parser.add_argument("--plant", choices=["linear", "diffractive"], default="linear")
+    parser.add_argument("--plant", choices=["linear", "diffractive", "measured"], default="linear")
     parser.add_argument("--matrix", default="", help="a measured matrix instead, npz with D")
     parser.add_argument("--instrument", help="its instrument file")
     parser.add_argument("--n-first", type=int, help="modes of the RTC's own matrix")

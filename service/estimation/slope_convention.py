@@ -198,8 +198,9 @@ def _judge_candidates(
             min(alike, key=lambda pose: _n_changes(pose.slopes, reported)).rotation_rad
         )
         return SlopeConvention(
-            wrong=f"by the RTC's own matrix the mirror is turned by {turned_deg:.0f} deg, "
-            f"{np.rad2deg(start_rad):.0f} deg are in the file: write [mirror] nominal_rotation_deg"
+            wrong=f"by the RTC's own matrix the mirror is turned by {turned_deg:.0f} deg, and by "
+            f"{np.rad2deg(start_rad):.0f} deg by the instrument file: write nominal_rotation_deg = "
+            f"{turned_deg:.0f} under [mirror], and restart the service"
         )
     found = min(settings, key=lambda setting: _n_changes(setting, reported))
     if not stated:

@@ -8,9 +8,10 @@ from service.errors import ConfigurationError
 
 _PACKAGED = Path(__file__).parent / "packaged"
 
-TWIN_FILE, TWIN_LIVE_FILE, TWIN_MATRIX = "instrument.toml", "live.toml", "matrix.h5"
+TWIN_FILE, TWIN_LIVE_FILE = "instrument.toml", "live.toml"
+TWIN_MATRIX, TWIN_FIT = "matrix.h5", "fit.h5"
 """Files of a folder that ``pyrcal twin`` wrote: instrument, instrument of an RTC that sends slopes,
-and matrix."""
+matrix, and its fit."""
 
 
 def instrument_path(name_or_path: str | Path) -> Path:

@@ -357,6 +357,7 @@ _LATER_FIELDS = frozenset(
         "normalised",
         "fft_grid",
         "modulation_stretch",
+        "rooftop_lambda_over_d",
         "aberration_rad",
     }
 )

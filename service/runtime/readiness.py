@@ -381,11 +381,11 @@ def _for_the_operator(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
     orders = {
         "mode": (
             state.operator.mode is Mode.HOLD,
-            "mode is hold, nothing is made: set another when it may",
+            "mode is hold: no reconstructor is made. Set mode propose or auto to have new ones",
         ),
         "dither-stopped": (
             state.dithers.stopped,
-            "the dither was stopped by an operator: start it when it may",
+            "the dither was stopped by an operator: start it when α is to be measured again",
         ),
         "interrupted": (
             state.operations.acquisition.stage is AcquisitionStage.INTERRUPTED,

@@ -314,6 +314,11 @@ class DiffractivePyramid:
 
         Indices: side along y, side along x, (x, y); subapertures. None if there are none.
         """
+        if wfs.rooftop_lambda_over_d:
+            raise ModelError(
+                f"pyramid: found a rooftop of {wfs.rooftop_lambda_over_d:g} λ/D, expected a tip: "
+                "the diffractive telescope has no rooftop; use --plant linear"
+            )
         self._wfs, self._pupil = wfs, pupil
         self.shift_subap = shift_subap
         """(x, y) by which the images are moved."""

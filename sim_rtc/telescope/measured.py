@@ -29,7 +29,9 @@ from typing_extensions import override
 
 from pyrcal.fitting.fit_file import make_reference
 from pyrcal.fitting.recorded import read_recorded
+from pyrcal.fitting.report import read_fit
 from service.errors import ConfigurationError, MatrixError, ModelError
+from service.instrument.paths import TWIN_FIT
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
@@ -100,6 +102,17 @@ def read_measured_matrix(
     return MeasuredMatrix(
         matrix=matrix, sha256=recorded.sha256, notes=tuple(filter(None, (*notes, note, size_note)))
     )
+
+
+def read_fitted_registration(instrument: str) -> Misregistration | None:
+    """Return the registration that a twin's fit has found; None if it was refused, or is no twin.
+
+    The rest of the turbulence would otherwise be that of a mirror elsewhere: with AO188's twin, 40
+    deg from nominal, it aliased into 1000 nm of tip and tilt, and alarms accused the mirror.
+    """
+    path = Path(instrument) / TWIN_FIT
+    fit = read_fit(path) if path.is_file() else None
+    return fit.alpha if fit is not None and fit.accepted else None
 
 
 def _check(matrix: Array, instrument: Instrument, where: str) -> None:

@@ -22,20 +22,31 @@ MODES = [0, 1, 2, 5, 12, 39]
 STROKE_M = 1e-9
 
 
-def bench(modulation=0.0):
+def bench(modulation=0.0, rooftop=0.0):
     small = small_instrument()
     grid = FftGrid(points_per_subaperture=POINTS, width_subap=float(WIDTH))
     wfs = replace(
-        small.wfs, fft_grid=grid, modulation_lambda_over_d=modulation, pupil_separation_subap=16.0
+        small.wfs,
+        fft_grid=grid,
+        modulation_lambda_over_d=modulation,
+        rooftop_lambda_over_d=rooftop,
+        pupil_separation_subap=16.0,
     )
     return replace(small, wfs=wfs)
 
 
 def simulated_frames(amplitude, opds_m, wfs, n_modulation):
-    """Frames ``(n_opds, WIDTH, WIDTH)`` of a textbook's pyramid, its tip between four points."""
+    """Frames ``(n_opds, WIDTH, WIDTH)`` of a textbook's pyramid, its tip between four points.
+
+    Its surface is that of the highest of the four faces.
+    """
     n, padded = len(amplitude), WIDTH * POINTS
     frequency = (np.arange(padded) - (padded - 1) / 2) / padded
-    faces = np.abs(frequency[:, None]) + np.abs(frequency)
+    # The edge is 2 sqrt(2) times as long as the two raised faces reach beyond the middle.
+    raised = wfs.rooftop_lambda_over_d / np.sqrt(2) / N / POINTS
+    faces = np.maximum(
+        np.abs(frequency[:, None] + frequency) + raised, np.abs(frequency[:, None] - frequency)
+    )
     mask = np.exp(2j * np.pi * POINTS * wfs.image_separation_subap / 2 * faces)
     u = np.arange(padded)
     # Fourier sums at half integers: a phasor before the transform, its inverse after it.
@@ -57,10 +68,20 @@ def simulated_frames(amplitude, opds_m, wfs, n_modulation):
     return np.array(frames)
 
 
-@pytest.mark.parametrize(("modulation", "n_points", "on_it"), [(0.0, 2, 1e-3), (3.0, 28, 1e-3)])
-def test_a_matrix_of_an_fft_is_that_of_the_model_on_its_grid(modulation, n_points, on_it):
+@pytest.mark.parametrize(
+    ("modulation", "n_points", "rooftop", "on_it"),
+    [
+        (0.0, 2, 0.0, 1e-3),
+        (3.0, 28, 0.0, 1e-3),
+        (0.0, 2, 0.3, 1e-3),  # no sample of the grid is in the strips of the rooftop
+        (0.0, 2, -1.2, 1e-3),  # one sample
+        (0.0, 2, 2.0, 2e-3),  # two samples
+        (3.0, 28, 1.2, 1e-3),
+    ],
+)
+def test_a_matrix_of_an_fft_is_that_of_the_model_on_its_grid(modulation, n_points, rooftop, on_it):
     """Without the grid the model, which has no ends, is 7 and 4 % off a coarse simulation."""
-    about = bench(modulation)
+    about = bench(modulation, rooftop)
     model = InteractionModel(about, small_basis(), pupil_sampling=POINTS, detector_nodes=POINTS)
     maps = np.zeros((len(MODES), *model.pupil.amplitude.shape))
     maps[:, model.pupil.lit] = STROKE_M * small_basis().render(model.pupil.points)[:, MODES].T
@@ -122,3 +143,46 @@ def test_frames_of_an_unmodulated_pyramid_have_a_unit_although_its_modulation_is
     error[2] = np.angle(np.exp(1j * error[2]))
     assert np.all(np.abs(error) < [0.002, 0.002, np.deg2rad(0.02), 0.002])
     assert np.median(found.gains) == pytest.approx(1.0, abs=0.02)
+
+
+def frames_of_rooftop(rooftop):
+    """Return an instrument with an unknown rooftop, and the frames of one, at a known α."""
+    about = bench(0.0, rooftop)
+    pupil = InteractionModel(about, small_basis(), pupil_sampling=POINTS, detector_nodes=POINTS)
+    points = (pupil.pupil.points - [0.3, -0.4]) / 1.02
+    maps = np.zeros((40, *pupil.pupil.amplitude.shape))
+    maps[:, pupil.pupil.lit] = STROKE_M * small_basis().render(points).T
+    push, pull = (
+        simulated_frames(pupil.pupil.amplitude, sign * maps, about.wfs, 2) for sign in (1.0, -1.0)
+    )
+    middle, half = (WIDTH - 1) / 2, about.wfs.image_separation_subap / 2
+    centres = middle + half * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+    told = replace(
+        about,
+        stop=Stop.TELESCOPE,
+        wfs=replace(about.wfs, rooftop_lambda_over_d=0.0),
+        frames=FrameWindows(centres_px=centres, normalised=True),
+    )
+    return told, (push - pull) / (2 * STROKE_M) / push.sum(axis=(1, 2))[:, None, None]
+
+
+@pytest.mark.parametrize("rooftop", [0.0, 0.6])
+def test_a_rooftop_is_found_where_the_file_calls_it_unknown(rooftop):
+    about, frames = frames_of_rooftop(rooftop)
+    found = fit(replace(about, unknown=("wfs.rooftop_lambda_over_d",)), frames)
+    assert found.accepted
+    assert np.all(np.abs(found.alpha.vector - [0.3, -0.4, 0.0, 1.02]) < 3.0 * found.sigma)
+    assert found.residual_fraction < 0.005
+    (one,) = (one for one in found.optics if one.key == "rooftop_lambda_over_d")
+    # a flip of one axis is no rotation: it mirrors the edge
+    mirrored = found.orientation.flip_x != found.orientation.flip_y
+    assert one.found == pytest.approx(-rooftop if mirrored else rooftop, abs=3.0 * one.found_sigma)
+    assert found.corrections["wfs.rooftop_lambda_over_d"] == pytest.approx(one.found, abs=1e-3)
+
+
+def test_a_tip_that_is_none_is_named():
+    about, frames = frames_of_rooftop(0.6)
+    found = fit(about, frames)
+    (named,) = (one for one in found.alternatives if "rooftop" in one.key)
+    assert named.preferred
+    assert found.corrections == {"wfs.rooftop_lambda_over_d": "unknown"}

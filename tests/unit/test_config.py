@@ -30,6 +30,7 @@ from service.model.pupil import (
     rtc_valid_subapertures,
     valid_subapertures,
 )
+from service.model.sensors.registry import kind_of
 from service.model.slopes import Orientation
 from service.records.state import Mode
 from sim_rtc.telescope.diffractive import build_centred_pupil
@@ -1124,6 +1125,17 @@ def test_an_elliptic_modulation_is_two_axes_and_an_angle(write):
     assert circle.wfs.modulation_stretch is None
     wfs = replace(circle.wfs, modulation_stretch=(0.1, 0.0))
     assert instrument_sha256(replace(circle, wfs=wfs)) != instrument_sha256(circle)
+
+
+def test_a_rooftop_is_a_signed_length(write):
+    bench = load_instrument(
+        write(ABOUT + APART + "rooftop_lambda_over_d = -0.5\n" + MIRROR + MODES)
+    )
+    assert bench.wfs.rooftop_lambda_over_d == -0.5
+    tip = load_instrument(write(ABOUT + APART + MIRROR + MODES))
+    assert tip.wfs.rooftop_lambda_over_d == 0.0
+    assert instrument_sha256(bench) != instrument_sha256(tip)
+    assert kind_of(bench).identity(bench.wfs) != kind_of(tip).identity(tip.wfs)
 
 
 def test_what_is_unknown_is_where_a_fit_begins_and_is_said(write):

@@ -39,9 +39,12 @@ def test_a_mean_frame_in_the_file_is_mentioned_where_its_light_would_lower_sigma
         coordinates=across, intensity=1.0 + uneven * np.sin(0.4 * across) + 0.0 * across[:, None]
     )
     columns = matrix(illumination=lamp if said else None, noise=0.05)
-    frame = np.ones((40, 40))
+    frame = np.full((40, 40), 900.0)
     found = pyrcal.fit(instrument(), columns, flux_frame=frame, threads=1)
     assert any("out of flux_frame" in one for one in found.remarks) is said
+    mask = np.ones((40, 40))
+    found = pyrcal.fit(instrument(), columns, flux_frame=mask, threads=1)
+    assert not any("out of flux_frame" in one for one in found.remarks)
     assert not any("flux_frame" in one for one in pyrcal.fit(instrument(), columns).remarks)
 
 

@@ -260,6 +260,20 @@ def test_an_elliptic_path_is_an_elliptic_modulation(saved, tmp_path):
     assert (longer, shorter) == pytest.approx((5.0 * 32 / 31, 4.0 * 32 / 31))
 
 
+def test_a_rooftop_is_the_length_of_its_edge(saved, tmp_path):
+    """OOPAO's number times 32 points over pi times the 11 pixels between two images."""
+    about = {"wfs__n_pix_separation": np.array(3), "wfs__rooftop": np.array(-1.0)}
+    found = imported_of(saved, **about)
+    expected = pytest.approx(-32.0 / (11.0 * np.pi))
+    assert found.tables["wfs"]["rooftop_lambda_over_d"] == expected
+    bench = pyrcal.load_instrument(found.save(tmp_path / "bench").instrument)
+    assert bench.wfs.rooftop_lambda_over_d == expected
+    old = imported_of(saved, **about, wfs__old_mask=np.array(True))
+    assert "rooftop_lambda_over_d" not in old.tables["wfs"]
+    turned = imported_of(saved, wfs__theta_rotation=np.array(0.1))
+    assert any("theta_rotation" in note for note in turned.notes)
+
+
 def test_a_round_path_is_a_circle_and_another_one_is_said_to_be_none(saved):
     assert modulated_on(saved, 3.0, 3.0).tables["wfs"]["modulation_lambda_over_d"] == pytest.approx(
         3.0 * 32 / 31

@@ -124,6 +124,7 @@ def test_a_circle_that_is_none_is_named():
 def test_a_circle_is_not_taken_for_an_ellipse():
     found, _, _ = fitted(3.0, 3.0)
     assert not any("ellipse" in one.key for one in found.alternatives)
+    assert not any("rooftop" in one.key for one in found.alternatives)
 
 
 def test_axes_are_searched_with_other_modulations_where_an_unknown_one_shows_none(monkeypatch):

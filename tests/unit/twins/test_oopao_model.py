@@ -2,6 +2,7 @@
 
 import runpy
 import sys
+from dataclasses import replace
 from types import ModuleType
 
 import numpy as np
@@ -41,6 +42,16 @@ def test_the_model_has_the_numbers_of_the_bench(bench, dump, tmp_path, monkeypat
     assert moved["shiftX"] == pytest.approx(0.2 * subaperture_m, abs=0.005 * subaperture_m)
     assert moved["shiftY"] == pytest.approx(0.0, abs=0.005 * subaperture_m)
     assert moved["rotationAngle"] == pytest.approx(2.0, abs=0.1)
+
+
+def test_the_model_has_the_rooftop_of_the_bench(bench, tmp_path, monkeypatch):
+    """In OOPAO's unit: the import of what it writes has the length of the bench."""
+    instrument, fit = bench
+    wfs = replace(instrument.wfs, rooftop_lambda_over_d=-0.4)
+    drawn = sample_bench(replace(instrument, wfs=wfs), fit)
+    model = read_model(write_oopao_model(drawn, tmp_path).path, monkeypatch)
+    apart = model["N_PIXELS"] + model["N_PIX_SEPARATION"]
+    assert model["ROOFTOP"] * model["RESOLUTION"] / (np.pi * apart) == pytest.approx(-0.4)
 
 
 def test_the_model_lists_signals_as_the_bench_does(bench, dump, tmp_path, monkeypatch):

@@ -57,6 +57,10 @@ def test_what_the_parameter_file_cannot_say_is_said(bench, tmp_path):
         sample_bench(replace(instrument, wfs=wfs), fit), fit, tmp_path
     ).remarks
     assert [one for one in remarks if "no elliptic modulation" in one]
+    wfs = replace(instrument.wfs, rooftop_lambda_over_d=0.5)
+    sharp = sample_bench(replace(instrument, wfs=wfs), fit)
+    remarks = write_specula_model(sharp, fit, tmp_path).remarks
+    assert [one for one in remarks if "no rooftop: that of 0.5 lambda/D" in one]
 
 
 SMALL = ROOT / "tests" / "system" / "small.toml"
@@ -86,12 +90,16 @@ def test_only_a_pyramid_becomes_a_model(tmp_path):
 
 @pytest.mark.long
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("with_fit", [False, True])
-def test_specula_measures_the_matrix_of_an_instrument_file(bench, with_fit, tmp_path):
+@pytest.mark.parametrize("case", ["file", "fit", "aberration"])
+def test_specula_measures_the_matrix_of_an_instrument_file(bench, case, tmp_path):
+    """Its pupil moves with the mirror, and a static aberration with the pupil."""
     python = find_interpreter("specula")
-    instrument, fit = bench if with_fit else (pyrcal.load_instrument(SMALL), None)
+    instrument, fit = bench if case == "fit" else (pyrcal.load_instrument(SMALL), None)
+    if case == "aberration":
+        wfs = replace(instrument.wfs, aberration_rad=(0.0, 0.0, 0.3, 0.2))
+        instrument = replace(instrument, wfs=wfs)
     pyrcal.to_specula(instrument, tmp_path, fit or ALPHA)
-    expected = fit.synthetic if with_fit else pyrcal.interaction_matrix(instrument, ALPHA)
+    expected = fit.synthetic if fit else pyrcal.interaction_matrix(instrument, ALPHA)
     program = [str(python), "-m", "specula.scripts.specula_main", "--cpu", "--precision", "0"]
     subprocess.run(
         [*program, "specula_model.yml"],

@@ -3,6 +3,7 @@
 import argparse
 import json
 import os
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 import scipy
 
 import pyrcal
+from pyrcal.importers.oopao import from_saved
 from pyrcal.importers.program import import_files
 from pyrcal.importers.saved import read_npz
 from pyrcal.twins.bench import measure_spot, read_bench
@@ -20,6 +22,7 @@ from pyrcal.twins.sampled import sample_bench
 from service.errors import ConfigurationError, MatrixError
 from service.files.container import opened
 from service.instrument import instrument_path, load_instrument
+from sim_rtc.assembly import build_telescope
 from sim_rtc.options import parse_options
 from tests.support.repository import ROOT
 from tests.support.twin import find_interpreter
@@ -163,6 +166,9 @@ def test_service_and_fit_take_the_folder_of_a_twin(bench, tmp_path):
         assert load_instrument(name).wfs.n_subapertures == 8
     simulated = parse_options(["--instrument", str(moved), "--plant", "measured"])
     assert simulated.matrix == moved / "matrix.h5"
+    # The mirror of the simulated RTC is where the fit has found it.
+    optics = build_telescope(simulated, load_instrument(moved)).optics.start()
+    np.testing.assert_allclose(optics.alpha.vector, made.report.fit.alpha.vector, atol=1e-6)
     # An earlier twin is replaced, other files are not.
     pyrcal.twin(bench, moved, **QUICK)
     with pytest.raises(ConfigurationError, match="other files"):
@@ -258,17 +264,48 @@ def test_frames_are_imported_as_simulated_if_their_images_are_around_the_middle(
     assert "fft_grid" in read_bench(options).imported[0].tables["wfs"]
 
 
+def simulate(name, folder):
+    """Return what is saved of one of OOPAO's benches."""
+    command = [find_interpreter("OOPAO"), "-m", "pyrcal_studies.oopao_benches", folder, name]
+    variables = {**os.environ, "MPLBACKEND": "Agg", "PYTHONDONTWRITEBYTECODE": "1"}
+    subprocess.run(command, cwd=ROOT, env=variables, stdout=subprocess.DEVNULL, check=True)
+    return read_npz(folder / f"{name}.npz")
+
+
 @pytest.fixture(scope="module")
 def elliptic(tmp_path_factory):
     """Return OOPAO's bench of 4 by 5 λ/D, the longer axis at 120 deg, and its spot."""
-    folder = tmp_path_factory.mktemp("elliptic")
-    command = [find_interpreter("OOPAO"), "-m", "pyrcal_studies.oopao_benches", folder, NAME]
-    variables = {**os.environ, "MPLBACKEND": "Agg", "PYTHONDONTWRITEBYTECODE": "1"}
-    subprocess.run(command, cwd=ROOT, env=variables, stdout=subprocess.DEVNULL, check=True)
-    return read_npz(folder / f"{NAME}.npz")
+    return simulate("ellipse-4-5", tmp_path_factory.mktemp("elliptic"))
 
 
-NAME = "ellipse-4-5"
+@pytest.mark.long
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize(
+    ("name", "left", "within"), [("rooftop", 0.005, 0.005), ("rooftop-three", 0.02, 0.03)]
+)
+def test_a_rooftop_that_no_file_has_is_in_the_twin(name, left, within, tmp_path):
+    """Target: 0.5 % left over without modulation; with it the tip leaves as much."""
+    saved = simulate(name, tmp_path)
+    stated = from_saved(saved, name).tables["wfs"]["rooftop_lambda_over_d"]
+    np.savez(
+        tmp_path / "it.npz", **{key: one for key, one in saved.items() if "rooftop" not in key}
+    )
+    made = pyrcal.twin(
+        tmp_path / "it.npz",
+        tmp_path / "twin",
+        check=True,
+        python=find_interpreter("OOPAO"),
+        threads=1,
+    )
+    _, _, values = values_of(made)
+    found = values["rooftop_lambda_over_d"]
+    assert float(found["value"]) == pytest.approx(stated, abs=3.0 * found["sigma"])
+    assert found["sigma"] < within
+    assert found["origin"].startswith("measured: fitted")
+    assert made.residual < left
+    # the exported model has it, too
+    (share,) = re.findall(r"its matrix leaves ([0-9.]+)% of the bench", made.checks[0])
+    assert float(share) < 100.0 * left
 
 
 @pytest.mark.long

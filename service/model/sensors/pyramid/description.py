@@ -164,19 +164,20 @@ def pyramid_in(instrument: Instrument) -> Pyramid:
 
 
 def oriented_pyramid(instrument: Instrument) -> Pyramid:
-    """Return the pyramid with its modulation in the axes of conventions.md.
+    """Return the pyramid with its modulation and its rooftop in the axes of conventions.md.
 
     Raises
     ------
     ModelError
         If the sensor is another.
     """
-    wfs = pyramid_in(instrument)
+    wfs, orientation = pyramid_in(instrument), instrument.slopes.assumed_orientation
+    mirrored = -1.0 if orientation.flip_x != orientation.flip_y else 1.0
+    wfs = replace(wfs, rooftop_lambda_over_d=mirrored * wfs.rooftop_lambda_over_d)
     if wfs.modulation_stretch is None:
         return wfs
-    orientation, (e, f) = instrument.slopes.assumed_orientation, wfs.modulation_stretch
-    turned = -e if orientation.swap_xy else e, -f if orientation.flip_x != orientation.flip_y else f
-    return replace(wfs, modulation_stretch=turned)
+    e, f = wfs.modulation_stretch
+    return replace(wfs, modulation_stretch=(-e if orientation.swap_xy else e, mirrored * f))
 
 
 def draw_aberration(instrument: Instrument, pupil: PupilGrid) -> NDArray[np.float64] | None:

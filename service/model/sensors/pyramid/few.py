@@ -27,6 +27,7 @@ def respond_to_few(
     modulated: tuple[Array, Array],
     weights: tuple[Array, Array],
     mapper: Mapper,
+    n_products: int = 1,
 ) -> tuple[Array, Array]:
     """Return the light of all sources ``(n, n)`` and its change ``(n, n, n_shapes)``, of one image.
 
@@ -39,14 +40,18 @@ def respond_to_few(
         complex as the amplitude.
     modulated
         Roof operators times the sources' phasors: along y ``(n_sources, n, n_nodes_y, N)``, along x
-        ``(n, n_sources, n_nodes_x, N)``; the two sources of a pair count as nodes along x.
+        ``(n, n_sources, n_nodes_x, N)``; the two sources of a pair count as nodes along x. Each
+        source is repeated for every product that the operator is the sum of.
     weights
         ``(n_nodes_y,)`` and ``(n_nodes_x,)`` of the quadrature.
     mapper
         Spreads the sources over threads.
+    n_products
+        Number of products.
     """
     (modulated_y, modulated_x), (weights_y, weights_x) = modulated, weights
-    n_sources, n, n_y, n_u = modulated_y.shape
+    n_terms, n, n_y, n_u = modulated_y.shape
+    n_sources = n_terms // n_products
     n_x, dtype, n_shapes = modulated_x.shape[2], amplitude.real.dtype, shapes.shape[1] // n_u
 
     def respond_from(first: int) -> tuple[Array, Array]:
@@ -59,24 +64,29 @@ def respond_to_few(
         counts_y = np.tile(weights_y, n)[:, None].astype(dtype)
         counts_x = weights_x[:, None].astype(dtype)
         for source in range(first, min(first + _SOURCES_TOGETHER, n_sources)):
-            y, x = modulated_y[source].reshape(-1, n_u), modulated_x[:, source]
-            field.real, field.imag = _multiply(y, amplitude)
-            seen = x.reshape(-1, n_u) @ field.T
+            places = range(source * n_products, (source + 1) * n_products)
+            seen = np.zeros((n * n_x, n * n_y), modulated_y.dtype)
+            for place in places:
+                y = modulated_y[place].reshape(-1, n_u)
+                field.real, field.imag = _multiply(y, amplitude)
+                seen += modulated_x[:, place].reshape(-1, n_u) @ field.T
             light += seen.real**2 + seen.imag**2
             # Im{conj(seen) x y} = Im{conj(seen) x} Re y + Re{conj(seen) x} Im y
             seen = seen.reshape(n, n_x, -1)
             np.negative(seen.imag, out=at_rest[:, :, 0, 0])
             at_rest[:, :, 0, 1] = at_rest[:, :, 1, 0] = seen.real
             at_rest[:, :, 1, 1] = seen.imag
-            parts_x = np.stack([x.real * counts_x, x.imag * counts_x], axis=2)
             pairs = at_rest.reshape(n, 2 * n_x, -1).swapaxes(1, 2)
-            np.matmul(pairs, parts_x.reshape(n, 2 * n_x, n_u), out=along_x)
-            products = _multiply(y * counts_y, shapes)
-            for over_y, by_line in zip(products, np.split(along_x, 2, axis=1), strict=True):
-                change += np.matmul(
-                    by_line.reshape(n, n, -1).swapaxes(0, 1),
-                    over_y.reshape(n, -1, n_shapes),
-                )
+            for place in places:
+                y, x = modulated_y[place].reshape(-1, n_u), modulated_x[:, place]
+                parts_x = np.stack([x.real * counts_x, x.imag * counts_x], axis=2)
+                np.matmul(pairs, parts_x.reshape(n, 2 * n_x, n_u), out=along_x)
+                products = _multiply(y * counts_y, shapes)
+                for over_y, by_line in zip(products, np.split(along_x, 2, axis=1), strict=True):
+                    change += np.matmul(
+                        by_line.reshape(n, n, -1).swapaxes(0, 1),
+                        over_y.reshape(n, -1, n_shapes),
+                    )
         light = light.reshape(n, n_x, n, n_y)
         return np.einsum("jbia,a,b->ij", light, weights_y, weights_x), change
 

@@ -15,6 +15,7 @@ from service.model.sensors.pyramid.table import (
     ABERRATION_KEY,
     ELLIPSE_KEY,
     IMAGE_KEY,
+    ROOFTOP_KEY,
     USUAL_SEPARATION,
     PyramidTable,
 )
@@ -31,6 +32,7 @@ class PyramidKind(SensorKind):
     unknown: ClassVar[Mapping[str, float | None]] = {
         "wavelength_m": 750e-9,
         "modulation_lambda_over_d": 3.0,
+        ROOFTOP_KEY: 0.0,
         IMAGE_KEY: None,
         ELLIPSE_KEY: None,
         ABERRATION_KEY: None,

@@ -210,9 +210,9 @@ class PyramidModel(SensorModel):
     @override
     def identity(self, sensor: Pyramid) -> tuple[float, ...]:
         separation = sensor.image_separation_subap
-        stretch = sensor.modulation_stretch or ()
-        radius = sensor.modulation_lambda_over_d
-        return (sensor.wavelength_m, radius, separation, *stretch, *sensor.aberration_rad)
+        stretch, rooftop = sensor.modulation_stretch or (), sensor.rooftop_lambda_over_d
+        more = (*stretch, *sensor.aberration_rad, *((rooftop,) if rooftop else ()))
+        return (sensor.wavelength_m, sensor.modulation_lambda_over_d, separation, *more)
 
     def bin_sensor(self, sensor: Pyramid, binning: int) -> Pyramid:
         """Return the sensor with so many subapertures made one along each axis."""

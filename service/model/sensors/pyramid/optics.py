@@ -1,7 +1,8 @@
 """The modulated pyramid without an FFT.
 
 The four-face pyramid's transmission is separable, so the detector field is ``Wy X Wx^T`` with X
-the modulated pupil field and W the one-dimensional "roof" operator. Unit of length: a subaperture.
+the modulated pupil field and W the one-dimensional "roof" operator. With a rooftop it is a sum of
+such products. Unit of length: a subaperture.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from service.model.local import LocalShapes, MadeElsewhere, Shapes
 from service.model.pupil import PupilGrid, gauss_legendre
 from service.model.sensors.pyramid.description import Pyramid
 from service.model.sensors.pyramid.few import respond_to_few
+from service.model.sensors.pyramid.rooftop import Rooftop, make_rooftop
 from service.model.sensors.pyramid.table import FftGrid
 from service.model.sensors.pyramid.tiles import TiledResponse
 from service.model.sensors.pyramid.working_point import Halo
@@ -212,15 +214,14 @@ class PyramidOptics:
         """
         n, n_u, n_shapes = self.wfs.n_subapertures, len(self.pupil.coordinates), shapes.shape[1]
         # On the whole grid, where points without light have no part in any product.
-        field = self._pupil_field
+        field = self.pupil_field
         on_grid = np.zeros((n_u, n_u, n_shapes), field.dtype)
         on_grid[self.pupil.lit] = shapes * (-2.0 * field[self.pupil.lit])[:, None]
         images = np.empty((2, n, 2, n))
         changes = np.empty((2, 2, n, n, n_shapes), self.dtype)
         # image by image, arrays of all subapertures stay in the cache
         for grid in _SINGLE_IMAGES if self.offsets is None else self._grids:
-            roof_y = self._roof(shift[1] + grid.y, nodes[0], grid.sides_y)
-            roof_x = self._roof(shift[0] + grid.x, nodes[1], grid.sides_x)
+            roof_y, roof_x = self._roofs(grid, shift, nodes)
             modulated_y, modulated_x = self._modulate_roof(roof_y, roof_x)
             light, change = respond_to_few(
                 field,
@@ -228,6 +229,7 @@ class PyramidOptics:
                 (modulated_y[:, :, 0], modulated_x.reshape(n, len(modulated_y), -1, n_u)),
                 (roof_y.weights, np.tile(roof_x.weights, 2)),
                 mapper,
+                self._n_products,
             )
             place = grid.sides_y.start, grid.sides_x.start
             images[place[0], :, place[1]] = light / self._all_light
@@ -266,8 +268,7 @@ class PyramidOptics:
         images = np.empty((2, self.wfs.n_subapertures, 2, self.wfs.n_subapertures))
         parts: list[PreparedGrid] = []
         for grid in _SINGLE_IMAGES if self._apart and self.offsets is None else self._grids:
-            roof_y = self._roof(of_row.shift[1] + grid.y, of_row.nodes_y, grid.sides_y)
-            roof_x = self._roof(of_row.shift[0] + grid.x, of_row.nodes_x, grid.sides_x)
+            roof_y, roof_x = self._roofs(grid, of_row.shift, (of_row.nodes_y, of_row.nodes_x))
             modulated_y, modulated_x = self._modulate_roof(roof_y, roof_x)
             fields_at_rest = self._fields(modulated_y, modulated_x)
             images[grid.sides_y, :, grid.sides_x] = self._images(fields_at_rest, roof_y, roof_x)
@@ -327,16 +328,15 @@ class PyramidOptics:
 
     @property
     def n_pairs(self) -> int:
-        """Pairs of source points."""
-        return len(self._source()[1])
+        """Pairs of source points, each as often as the roof operator has products."""
+        return len(self._source()[1]) * self._n_products
 
     def images(self, shift: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
         """Return the light at rest ``(2, n, 2, n)``: side, row along y, side, column along x."""
         n, nodes = self.wfs.n_subapertures, self.nodes
         images = np.empty((2, n, 2, n))
         for grid in self._grids:
-            roof_y = self._roof(shift[1] + grid.y, nodes, grid.sides_y)
-            roof_x = self._roof(shift[0] + grid.x, nodes, grid.sides_x)
+            roof_y, roof_x = self._roofs(grid, shift, (nodes, nodes))
             fields_at_rest = self._fields(*self._modulate_roof(roof_y, roof_x))
             images[grid.sides_y, :, grid.sides_x] = self._images(fields_at_rest, roof_y, roof_x)
         return images
@@ -377,19 +377,44 @@ class PyramidOptics:
     def _complex(self) -> type[np.complex64] | type[np.complex128]:
         return np.complex64 if self.dtype is np.float32 else np.complex128
 
-    def _roof(self, shift: float, nodes: Nodes, sides: slice) -> _Roof:
-        """Return the roof operator along one axis, at the nodes of every subaperture."""
+    def _roofs(
+        self, grid: _Grid, shift: tuple[float, float], nodes: tuple[Nodes, Nodes]
+    ) -> tuple[_Roof, _Roof]:
+        """Return the roof operators along y and x; ``nodes`` are those along y and x."""
+        rooftop = self._rooftop
+        return (
+            self._roof(shift[1] + grid.y, nodes[0], grid.sides_y, rooftop.along_y),
+            self._roof(shift[0] + grid.x, nodes[1], grid.sides_x, rooftop.along_x),
+        )
+
+    def _roof(self, shift: float, nodes: Nodes, sides: slice, factors: Array) -> _Roof:
+        """Return the roof operator along one axis, at the nodes of every subaperture.
+
+        ``factors`` are coefficients ``(n_products, n_functions)`` of the rooftop.
+        """
         n, half = self.wfs.n_subapertures, self.wfs.image_separation_subap / 2
         # Points of the detector along an axis, those of the images on either side of the middle.
         centres = np.arange(n) - (n - 1) / 2
         x = _SIDES[sides, None, None] * half + centres[:, None] + nodes.offsets - shift
         distance = x[..., None] - self.pupil.coordinates
-        width = math.inf if self._fft_grid is None else self._fft_grid.width_subap
-        kernel = _roof_kernel(distance, half, self.pupil.sampling, width)
-        return _Roof(
-            kernel=np.ascontiguousarray(kernel.swapaxes(0, 1), self._complex),
-            weights=nodes.weights,
-        )
+        faces = _face_kernels(distance, half, self.pupil.sampling, self._width_subap)
+        functions = [*faces, *self._rooftop.list_waves(distance)]
+        kernels = np.tensordot(factors, functions, axes=1).swapaxes(1, 2)
+        return _Roof(kernels=np.ascontiguousarray(kernels, self._complex), weights=nodes.weights)
+
+    @property
+    def _width_subap(self) -> float:
+        """Width of the grid of a simulation's FFT, subapertures; infinite for a real sensor."""
+        return math.inf if self._fft_grid is None else self._fft_grid.width_subap
+
+    @property
+    def _rooftop(self) -> Rooftop:
+        return make_rooftop(self.wfs, self.pupil.sampling, self._width_subap)
+
+    @property
+    def _n_products(self) -> int:
+        """Number of separable products that the roof operator is the sum of."""
+        return len(self._rooftop.along_y)
 
     def _source(self) -> tuple[Array, Array]:
         """Return tilt ``(3, M/2)`` and weight ``(M/2,)`` of every pair of source points.
@@ -432,12 +457,16 @@ class PyramidOptics:
         """Return the roof operators times the source's phasors.
 
         Along y ``(M/2, n, 2, n_nodes, N)``: source, subaperture, image side, node; along x
-        ``(n, M/2, 2, 2 of the pair, n_nodes, N)``.
+        ``(n, M/2, 2, 2 of the pair, n_nodes, N)``. If the operator is a sum of products, each
+        source is repeated for every one.
         """
         along_y, along_x = self.source_phasors()
+        kernels_x = roof_x.kernels.swapaxes(0, 1)[:, None, :, :, None]
+        modulated_y = along_y[:, None, None, None, None] * roof_y.kernels
+        modulated_x = along_x[:, None, None, :, None] * kernels_x
         return (
-            along_y[:, None, None, None] * roof_y.kernel,
-            along_x[:, None, :, None] * roof_x.kernel[:, None, :, None],
+            modulated_y.reshape(-1, *modulated_y.shape[2:]),
+            modulated_x.reshape(len(modulated_x), -1, *modulated_x.shape[3:]),
         )
 
     def _fields(self, modulated_y: Array, modulated_x: Array) -> Array:
@@ -446,15 +475,17 @@ class PyramidOptics:
         ``(n, n, M/2, 2, n_nodes, 2, 2 of the pair, n_nodes)``: row, column, source, image side and
         node along y, image side, one of the pair and node along x.
         """
-        amplitude = self._pupil_field.astype(self._complex)
-        n_source, n, *_, n_u = modulated_y.shape
+        amplitude = self.pupil_field.astype(self._complex)
+        n, n_products = modulated_y.shape[1], self._n_products
+        n_source, n_u = len(modulated_y) // n_products, modulated_y.shape[-1]
         at_y, at_x = modulated_y.shape[2:-1], modulated_x.shape[2:-1]
-        fields = np.empty((n, n, n_source, math.prod(at_y), math.prod(at_x)), self._complex)
-        for source, left in enumerate(modulated_y):
-            right = modulated_x[:, source].reshape(-1, n_u)
-            # Along y, then along x: the roof operator is separable.
+        fields = np.zeros((n, n, n_source, math.prod(at_y), math.prod(at_x)), self._complex)
+        for place, left in enumerate(modulated_y):
+            right = modulated_x[:, place].reshape(-1, n_u)
+            # Along y, then along x: each product of the roof operator is separable.
             seen = (left.reshape(-1, n_u) @ amplitude) @ right.T
-            fields[:, :, source] = seen.reshape(n, fields.shape[-2], n, -1).swapaxes(1, 2)
+            seen = seen.reshape(n, math.prod(at_y), n, -1).swapaxes(1, 2)
+            fields[:, :, place // n_products] += seen
         return fields.reshape(n, n, n_source, *at_y, *at_x)
 
     def _images(self, fields: Array, roof_y: _Roof, roof_x: _Roof) -> NDArray[np.float64]:
@@ -518,6 +549,8 @@ class PyramidOptics:
         else:
             here = rows.fields[row, columns]
             right = xp.take(rows.factors_x, there(columns), axis=0)
+        # Each product of the roof operator is a term of its own, with the field of all together.
+        here = np.repeat(here, self._n_products, axis=1)
         # Complex numbers as pairs: the imaginary part of a product is a real product of twice the
         # length.
         left = (here[None, :, :, None] * rows.signs).view(self.dtype)
@@ -575,7 +608,7 @@ class PyramidOptics:
         return n_shapes * (n_points + n_lines) < n_points * n_lines
 
     @property
-    def _pupil_field(self) -> Array:
+    def pupil_field(self) -> Array:
         """``(N, N)`` field over the pupil, complex only with an aberration."""
         if self.aberration_rad is None:
             return self.pupil.amplitude.astype(self.dtype)
@@ -588,7 +621,7 @@ class PyramidOptics:
 
         Without an aberration the imaginary part alone counts.
         """
-        field = -2.0 * self._pupil_field
+        field = -2.0 * self.pupil_field
         return [field.real] if self.aberration_rad is None else [field.real, field.imag]
 
 
@@ -704,8 +737,9 @@ def enough_modulation_points(wfs: Pyramid) -> int:
 class _Roof:
     """The roof operator along one axis at every quadrature node."""
 
-    kernel: Array
-    """``(n, 2, n_nodes, N)``: subaperture, image side, node, pupil coordinate."""
+    kernels: Array
+    """``(n_products, n, 2, n_nodes, N)``: factor of each product of a rooftop, subaperture, image
+    side, node, pupil coordinate."""
 
     weights: NDArray[np.float64]
     """``(n_nodes,)``."""
@@ -717,20 +751,22 @@ def _weight_parts(modulated: Array, roof: _Roof, axis: int) -> Array:
     return np.stack([weighted.real, weighted.imag], axis=axis)
 
 
-def _roof_kernel(
+def _face_kernels(
     distance: NDArray[np.float64], half_separation: float, sampling: int, width: float = math.inf
-) -> NDArray[np.complex128]:
-    """Return the band-limited kernel of one pyramid edge between two points of an axis.
+) -> tuple[Array, Array]:
+    """Return the band-limited kernels of the faces at positive and negative frequencies.
 
-    ``width`` is that of the grid of an FFT, subapertures, which sums over frequencies: at half
-    integers, with the tip of the pyramid between four of them. Its sum differs from the integral by
-    the ratio of a distance to its sine, and repeats itself.
+    Their sum is the kernel of one pyramid edge between two points of an axis. ``width`` is that of
+    the grid of an FFT, subapertures, which sums over frequencies: at half integers, with the tip of
+    the pyramid between four of them. Its sum differs from the integral by the ratio of a distance
+    to its sine, and repeats itself.
     """
     plus, minus = distance + half_separation, distance - half_separation
     sum_plus, sum_minus = (1.0 / np.sinc(part / width) for part in (plus, minus))
-    real = np.sinc(minus * sampling) * sum_minus + np.sinc(plus * sampling) * sum_plus
-    imaginary = _edge(plus * sampling) * sum_plus - _edge(minus * sampling) * sum_minus
-    return np.asarray(0.5 * real + 0.5j * imaginary)
+    return (
+        0.5 * (np.sinc(plus * sampling) + 1j * _edge(plus * sampling)) * sum_plus,
+        0.5 * (np.sinc(minus * sampling) - 1j * _edge(minus * sampling)) * sum_minus,
+    )
 
 
 def _edge(n: NDArray[np.float64]) -> NDArray[np.float64]:

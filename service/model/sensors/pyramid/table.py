@@ -18,6 +18,9 @@ IMAGE_KEY = "image_offsets_px"
 ELLIPSE_KEY = "modulation_ellipse"
 """Key of an elliptic modulation."""
 
+ROOFTOP_KEY = "rooftop_lambda_over_d"
+"""Key of the edge in place of the pyramid's tip."""
+
 ABERRATION_KEY = "static_aberration_nm"
 """Key of a static aberration."""
 
@@ -54,6 +57,11 @@ class PyramidNumbers(Read):
 
     modulation_lambda_over_d: Modulation
     """Radius of the modulation, λ/D; "unknown" until a matrix is fitted."""
+
+    rooftop_lambda_over_d: Annotated[float, Ge(-5.0), Le(5.0)] = 0.0
+    """Length of the edge that takes the place of the pyramid's tip, λ/D; 0 for a tip. It runs from
+    -x +y to +x -y of the RTC's axes, or from -x -y to +x +y if the length is negative. "unknown"
+    until a matrix is fitted."""
 
     pupil_separation_subap: Positive | None = None
     """Distance of the centres of neighbouring pupil images; None: 1.2 diameters of the pupil."""

@@ -79,8 +79,8 @@ def _respond(
         2j * np.pi * (centres[..., None, None] + points[:, None]) * optics.focal_frequencies
     ).astype(np.complex64)  # (2, 2, (x, y), n n_nodes, n_frequencies)
     maps = np.zeros((1 + shapes.shape[1], len(u), len(u)), np.complex64)
-    maps[0] = optics.pupil.amplitude
-    maps[1:, optics.pupil.lit] = optics.pupil.amplitude[optics.pupil.lit] * shapes.T
+    lit, maps[0] = optics.pupil.lit, optics.pupil_field
+    maps[1:, lit] = optics.pupil_field[lit] * shapes.T
     images, changes = np.zeros((2, n, 2, n)), np.zeros((2, 2, n, n, shapes.shape[1]), np.float32)
     for y, pair in zip(along_y, along_x, strict=True):
         for x in pair:

@@ -303,10 +303,14 @@ def test_the_memory_of_a_response_is_known_beforehand(normalisation, keeps, disp
 @pytest.mark.parametrize("offsets", [None, np.arange(8.0).reshape(2, 2, 2) / 50.0])
 @pytest.mark.parametrize("normalisation", Normalisation)
 @pytest.mark.parametrize("order", [SlopeOrder.XY, SlopeOrder.IMAGES])
-def test_a_few_shapes_have_the_same_response_as_by_the_gradient(order, normalisation, offsets):
+@pytest.mark.parametrize("rooftop", [0.0, 0.7])
+def test_a_few_shapes_have_the_same_response_as_by_the_gradient(
+    order, normalisation, offsets, rooftop
+):
     """In double precision; with displaced images, and images that move."""
     sensor, pupil = sensor_of(instrument_with(order, normalisation), 3, np.float64)
-    optics = replace(sensor.optics, offsets=offsets)
+    wfs = replace(sensor.optics.wfs, rooftop_lambda_over_d=rooftop)
+    optics = replace(sensor.optics, offsets=offsets, wfs=wfs)
     shapes = np.random.default_rng(1).standard_normal((len(pupil.points), 3))
     assert optics.are_few(3)
     for edges in ({}, {"nodes_x": Nodes.edges()}, {"nodes_y": Nodes.edges()}):

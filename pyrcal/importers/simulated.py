@@ -72,6 +72,29 @@ def find_fft_grid(
     return replace(imported, tables=tables, notes=tuple(notes), centres_found=False)
 
 
+def centre_images(simulated: Imported) -> Imported | None:
+    """Return a simulation of frames with its pupil images in OOPAO's own quadrants.
+
+    A rooftop or an aberration darkens images so that they seem elsewhere. None if there are no
+    frames, or if the images are in these places already.
+    """
+    wfs = simulated.tables["wfs"]
+    if "pupil_centres_px" not in wfs:
+        return None
+    found, width = np.reshape(wfs["pupil_centres_px"], (2, 2, 2)), wfs["fft_grid"]["width_subap"]
+    # One image that seems elsewhere does not move the median of four distances, and light between
+    # the images makes them seem closer.
+    apart = np.median([*(found[1] - found[0])[:, 0], *(found[:, 1] - found[:, 0])[:, 1]])
+    odd = (int(width) - wfs["n_subapertures"]) % 2
+    separation = 2 * math.ceil((apart - odd) / 2.0) + odd
+    ends = [(width - 1.0 + side * separation) / 2.0 for side in (-1, 1)]
+    centres = [[row, column] for row in ends for column in ends]
+    if centres == wfs["pupil_centres_px"]:
+        return None
+    places = {"pupil_centres_px": centres, "pupil_separation_subap": separation}
+    return replace(simulated, tables={**simulated.tables, "wfs": {**wfs, **places}})
+
+
 def _describe_slopes(wfs: Mapping[str, Any], side: int) -> dict[str, Any]:
     """Return the keys of ``[wfs]`` of a simulation that gave slopes; empty if it cannot be one."""
     n = wfs["n_subapertures"]
@@ -114,6 +137,7 @@ def _describe_frames(
         "n_subapertures": n,
         "pixels_per_subaperture": 1,
         "pupil_diameter_subap": float(n),
+        **sensor,
         "pupil_centres_px": find_image_centres(frames, sensor, notes),
         "valid_subapertures": "auto",
         "fft_grid": {"width_subap": float(width)},

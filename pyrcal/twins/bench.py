@@ -21,7 +21,7 @@ from pyrcal.importers.program import (
     modes_of_name,
     read_arrays,
 )
-from pyrcal.importers.simulated import find_fft_grid
+from pyrcal.importers.simulated import centre_images, find_fft_grid
 from service.errors import ConfigurationError, MatrixError
 from service.files.container import DATASET
 from service.files.toml import read_toml
@@ -121,8 +121,9 @@ def read_bench(options: argparse.Namespace) -> Bench:
     if "spot" in found:
         imported = _use_spot(imported, found["spot"])
     sampled = find_fft_grid(imported, options)
+    centred = None if sampled is None else centre_images(sampled)
     return Bench(
-        imported=(imported,) if sampled is None else (sampled, imported),
+        imported=tuple(filter(None, (sampled, centred, imported))),
         stated=_state(options, imported),
         sky_pupil=found.get("sky_pupil"),
         inventory=inventory,

@@ -31,7 +31,7 @@ from pyrcal.twins.bench import Bench, read_bench
 from pyrcal.twins.check import check_oopao_model, check_specula_model
 from pyrcal.twins.oopao_model import write_oopao_model
 from pyrcal.twins.report import Twin, list_lines, write_report
-from pyrcal.twins.sampled import Actuators, sample_bench
+from pyrcal.twins.sampled import Actuators, list_adopted, sample_bench
 from pyrcal.twins.specula_model import write_specula_model
 from service.errors import ConfigurationError, PyrcalError, StorageError
 from service.files import parse_modes
@@ -290,11 +290,7 @@ def _list_found(made: Twin) -> Mapping[str, Any]:
     files have none or a notably different one.
     """
     fit = made.report.fit
-    found = [
-        f"{one.key} = {one.found:.4g}"
-        for one in fit.optics
-        if one.found is not None and one.key and one.is_adopted
-    ]
+    found = [f"{key} = {value:.4g}" for key, value in list_adopted(fit).items() if key]
     found += [one.entry for one in fit.origins if f"wfs.{one.key}" in FAMILIES]
     return read_entries(found)
 

@@ -17,8 +17,7 @@ import scipy
 from numpy.typing import NDArray
 
 from pyrcal.fitting.fitted import Fit
-from pyrcal.twins.exported import Exported
-from pyrcal.twins.sampled import SampledBench, sample_bench
+from pyrcal.twins.sampled import Exported, SampledBench, sample_bench
 from service.errors import MatrixError, StorageError
 from service.files.container import opened
 from service.files.disk_cache import cached_basis
@@ -26,10 +25,8 @@ from service.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
-from service.model.modes import ModalBasis
 from service.model.pupil import valid_subapertures
 from service.model.slopes import slopes_of
-from service.model.surface import Gaussian
 
 Array = NDArray[Any]
 
@@ -149,12 +146,12 @@ def write_specula_model(bench: SampledBench, fit: Fit, folder: Path) -> Exported
     """
     bench = _move_pupil(bench)
     apart, width = _place_images(bench)
-    functions, m2c = _describe_mirror(bench, fit)
     lit = bench.amplitude > 0.0
+    functions, modes = bench.render_functions(lit)
     # SPECULA counts nanometres, here of the bench's own unit where its stroke is unknown.
     known = bench.instrument.mirror.stroke_known
     unit_m = _NANOMETRE_M if known else bench.unit_m
-    m2c = m2c * (unit_m / _NANOMETRE_M)
+    m2c = modes[:, fit.modes] * (unit_m / _NANOMETRE_M)
     root, pitch_m = folder / CALIBRATION, bench.width_m / bench.n_points
     _save_fits(root, "ifunc", {}, INFLUENCE_FUNCTION=functions, MASK_INF_FUNC=lit.astype(float))
     _save_fits(root, "m2c", {}, M2C=m2c)
@@ -257,16 +254,6 @@ def _place_images(bench: SampledBench) -> tuple[int, int]:
     n = bench.n_subapertures
     apart = n + 2 * round((bench.separation_px / bench.pixels - n) / 2)
     return apart, max(apart + n, 2 * round(bench.width_px / bench.pixels / 2))
-
-
-def _describe_mirror(bench: SampledBench, fit: Fit) -> tuple[Array, Array]:
-    """Return functions ``(n_lit_points, n_functions)`` where α puts them, and the fitted modes."""
-    lit, basis = bench.amplitude.ravel() > 0.0, bench.basis
-    if isinstance(basis, ModalBasis) and isinstance(basis.surface, Gaussian):
-        points = bench.points_on_mirror()[lit] * [1.0, basis.y_sign]
-        return basis.surface.basis(points), basis.mode_to_actuator[:, fit.modes]
-    functions, modes = bench.render_functions()
-    return functions[lit], modes[:, fit.modes]
 
 
 def _save_pupils(root: Path, bench: SampledBench, apart: int, width: int) -> None:

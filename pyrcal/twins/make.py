@@ -386,5 +386,5 @@ def _export(made: Twin, *, check: bool, python: Path | None) -> Twin:
         write_specula_model(sampled, fit, folder),
     )
     runs = (check_oopao_model, check_specula_model) if check else ()
-    checks = tuple(run(folder, about, fit, python=python).words for run in runs)
+    checks = tuple(str(run(folder, about, fit, python=python)) for run in runs)
     return replace(made, exported=exported, checks=checks)

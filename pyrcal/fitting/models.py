@@ -74,9 +74,9 @@ def moved_sensor_number(number: float, change: float) -> float:
     return LOGARITHM_ABOVE * float(ratio)
 
 
-ELLIPSE_KEY = "wfs.modulation_ellipse"
-ROOFTOP_FIELD = "rooftop_lambda_over_d"
-ABERRATION_KEY = "wfs.static_aberration_nm"
+ELLIPSE_KEY = "modulation_ellipse"
+ROOFTOP_KEY = "rooftop_lambda_over_d"
+ABERRATION_KEY = "static_aberration_nm"
 
 
 class Optic(StrEnum):
@@ -132,8 +132,8 @@ unknown."""
 ROOFTOP = (Optic.ROOFTOP,)
 """The one parameter of a rooftop, fitted if ``wfs.rooftop_lambda_over_d`` is unknown."""
 
-FAMILIES = {ELLIPSE_KEY: ELLIPSE, f"wfs.{ROOFTOP_FIELD}": ROOFTOP, ABERRATION_KEY: ABERRATION}
-"""Quantities that are fitted if the instrument file marks their key as unknown."""
+FAMILIES = {ELLIPSE_KEY: ELLIPSE, ROOFTOP_KEY: ROOFTOP, ABERRATION_KEY: ABERRATION}
+"""Quantities that are fitted if the instrument file marks their key of ``[wfs]`` as unknown."""
 
 
 @dataclass(slots=True)
@@ -255,7 +255,7 @@ class FitModels:
         if self.sensor_key is not None:
             found.append(Optic.SENSOR)
         for key, family in FAMILIES.items():
-            found += family if key in self.instrument.unknown else ()
+            found += family if f"wfs.{key}" in self.instrument.unknown else ()
         return tuple(found)
 
     @property
@@ -264,7 +264,7 @@ class FitModels:
         keys = {
             Optic.WIDTH: "mirror.coupling",
             Optic.SENSOR: f"wfs.{self.sensor_key}",
-            **{optic: key for key, family in FAMILIES.items() for optic in family},
+            **{optic: f"wfs.{key}" for key, family in FAMILIES.items() for optic in family},
         }
         return frozenset(one for one in self.optics if keys[one] in self.instrument.unknown)
 
@@ -298,7 +298,7 @@ class FitModels:
             along = (change, 0.0) if optic is Optic.STRETCH else (0.0, change)
             sensor = kind.stretch_modulation(wfs, along)
         elif optic is Optic.ROOFTOP:
-            sensor = replace(wfs, **{ROOFTOP_FIELD: getattr(wfs, ROOFTOP_FIELD) + change})
+            sensor = replace(wfs, **{ROOFTOP_KEY: getattr(wfs, ROOFTOP_KEY) + change})
         elif optic is Optic.SENSOR and self.sensor_key is not None:
             number = moved_sensor_number(self.sensor_number, change)
             sensor = replace(wfs, **{self.sensor_key: number})

@@ -219,7 +219,7 @@ def find_families(
             largest = max(sigma[places[optic]] for optic in family)
             found, words = kind.aberration_entry(about.wfs), f"of each {largest * unit_nm:.2g} nm"
         yield Origin(
-            key=key.removeprefix("wfs."),
+            key=key,
             found=found,
             reported='"unknown"',
             how=f"fitted, 1 sigma {words}{doubt}",

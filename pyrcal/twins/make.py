@@ -267,7 +267,7 @@ def _list_found(made: Twin) -> Mapping[str, Any]:
     """
     fit = made.report.fit
     found = [f"{key} = {value:.4g}" for key, value in list_adopted(fit).items() if key]
-    found += [one.entry for one in fit.origins if f"wfs.{one.key}" in FAMILIES]
+    found += [one.entry for one in fit.origins if one.key in FAMILIES]
     return read_entries(found)
 
 

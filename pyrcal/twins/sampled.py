@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.instrument_checks import COUPLING_KEY
-from pyrcal.fitting.models import set_coupling
+from pyrcal.fitting.models import ABERRATION_KEY, ELLIPSE_KEY, ROOFTOP_KEY, set_coupling
 from service.files.container import MAX_BYTES
 from service.files.disk_cache import cached_basis
 from service.model.instrument import Instrument, Mirror
@@ -33,12 +33,7 @@ from service.model.sensors.pyramid.description import (
     read_aberration,
     stretch_of,
 )
-from service.model.sensors.pyramid.table import (
-    ABERRATION_KEY,
-    ELLIPSE_KEY,
-    ROOFTOP_KEY,
-    FftGrid,
-)
+from service.model.sensors.pyramid.table import FftGrid
 from service.model.sensors.registry import kind_of
 from service.model.slopes import Orientation, rtc_mask, to_rtc
 from service.model.surface import Gaussian

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -79,7 +79,7 @@ class Bench:
     sky_pupil: Array | None = None
     """``(n, n)`` pupil on the sky; None if there is only one pupil."""
 
-    inventory: tuple[str, ...] = field(default=())
+    inventory: tuple[str, ...] = ()
     """Use that was made of each file, one sentence each."""
 
 

@@ -89,7 +89,7 @@ class SampledBench:
     basis: Basis
     """Modes of the mirror, with the fitted coupling."""
 
-    actuators: Actuators | None
+    actuators: Actuators | None = None
     """Actuators of the mirror; None if only shapes of modes are given."""
 
     alpha: Misregistration
@@ -128,13 +128,13 @@ class SampledBench:
     unit_m: float
     """OPD of a unit command, metres, light passes included."""
 
-    frame_shape: tuple[int, int] | None
+    frame_shape: tuple[int, int] | None = None
     """Rows and columns of the bench's frames; None if it has slopes."""
 
     reverse: bool
     """True if the bench's signals have the other sign than those of conventions.md."""
 
-    remarks: tuple[str, ...]
+    remarks: tuple[str, ...] = ()
     """Assumptions, one sentence each."""
 
     @property
@@ -341,7 +341,6 @@ def _draw_bench(found: Instrument, basis: Basis, fit: Fit, points: int, width: i
     return SampledBench(
         instrument=found,
         basis=basis,
-        actuators=None,
         alpha=fit.alpha,
         n_pixels=n_pixels,
         points_per_pixel=points,
@@ -354,9 +353,7 @@ def _draw_bench(found: Instrument, basis: Basis, fit: Fit, points: int, width: i
         image_places_px=np.zeros((2, 2, 2)),
         valid=_pad(valid_subapertures(found), n_pixels // pixels),
         unit_m=1.0 if found.mirror.stroke_known else float(np.median(fit.gains)),
-        frame_shape=None,
         reverse=orientation.sign_x == orientation.sign_y == -1,
-        remarks=(),
     )
 
 

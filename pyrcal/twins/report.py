@@ -154,6 +154,7 @@ def _unit(key: str) -> str:
         "_m": "m",
         "_nm": "nm",
         "_lambda_over_d": "λ/D",
+        "_ellipse": "λ/D, deg",
         "_px": "px",
         "_subap": "subaperture",
     }
@@ -263,7 +264,7 @@ def _page(made: Twin) -> str:
     values = (
         (one.name, _text(one).replace("+-", "±"), one.unit, one.origin) for one in list_values(made)
     )
-    models = [(one.path.name, "; ".join(one.remarks) or "complete") for one in made.exported]
+    models = [(one.path.name, " ".join(one.remarks) or "complete") for one in made.exported]
     notes = (*made.imported.notes, *made.report.notes)
     return format_html(
         f"Twin of {made.instrument.name}",

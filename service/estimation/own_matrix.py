@@ -58,6 +58,9 @@ MAX_UNWEIGHTED_MISFIT = 0.08
 of simulators that differ from the model in influence functions and light leave 0.01 to 0.05,
 measured ones 0.15 to 0.4."""
 
+MAX_TESTED_MISFIT = 0.4
+"""Median misfit up to which the service was tested on measured responses (results/tracking.md)."""
+
 N_FITTED = 8
 """Modes of the RTC's own matrix from which the misfit of others may be extrapolated."""
 
@@ -198,10 +201,12 @@ class OwnMatrix:
         size = self.typical_response
         found = f"{int(self.known.sum())} of {len(self.columns)} modes are the instrument file's"
         if size is not None and abs(size - 1.0) > 0.1:
-            found += f" and answer {size:.2f} times as drawn"
+            found += f" and respond {size:.2f} times as strongly as the model"
         misfit = self.typical_misfit
         if misfit is not None and misfit >= MAX_UNWEIGHTED_MISFIT:
             found += f"; the model leaves {misfit:.0%} of their response unexplained"
+            check = ": check the instrument file" if misfit > MAX_TESTED_MISFIT else ""
+            found += f" (tested up to {MAX_TESTED_MISFIT:.0%}{check})"
         return f"{found}; {self.uneven}" if self.uneven else found
 
     def _signs(self) -> str:

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from pyrcal.fitting.alternatives import LIGHT_KEY
 from pyrcal.fitting.fitted import Fit
-from pyrcal.fitting.matrix import FitOptions, fit_matrix
+from pyrcal.fitting.matrix import FitOptions, find_image_places, fit_matrix
 from pyrcal.fitting.memory import bytes_of_fit, check_fit
 from pyrcal.fitting.origins import FoundStroke
 from pyrcal.fitting.recorded import FLUX_FRAME, Recorded, read_recorded
@@ -24,6 +24,7 @@ from service.estimation.reference import Reference
 from service.files.disk_cache import cached_basis
 from service.instrument import load_instrument
 from service.model.instrument import Instrument, instrument_sha256
+from service.model.kinds import Method, SlopeOrder
 from service.model.memory import GB
 from service.model.modes import Basis
 from service.model.sensors.registry import kind_of
@@ -33,6 +34,12 @@ Progress = Callable[[str], None]
 
 _SAME_LIGHT = 0.1
 """Modulation, λ/D, that changes the light in the pupil images by less than a per cent or two."""
+
+_EXACT = 0.01
+"""RMS share of the signal below which the places of the images are right."""
+
+_PLACED_RESIDUAL = 1.02
+"""Residual with the images where their pixels show them over that with fitted places, at most."""
 
 MIN_LIGHT_EXPLAINED = 0.03
 """RMS share of the signal that uneven light must explain for a note that the file has the light."""
@@ -200,11 +207,17 @@ def _fit_recorded(
             found = fit_matrix(
                 instrument, reference, options, basis=basis, mapper=mapper, progress=report_stage
             )
+            instrument, found = _place_images(
+                instrument, recorded, reference, found, options, basis, mapper
+            )
             lit = _with_found_light(instrument, recorded, found)
             if lit is not None:
                 report_stage("fit")
                 again, _ = make_reference(recorded, lit)
+                places = found.image_offsets_px
                 found = fit_matrix(lit, again, options, basis=basis, mapper=mapper)
+                if found.image_offsets_px is None:
+                    found = replace(found, image_offsets_px=places)
         except MatrixError as error:
             text = str(error).removeprefix("reference: ")
             raise MatrixError(f"{recorded.where}: {text}") from error
@@ -218,6 +231,45 @@ def _fit_recorded(
     if options.illumination is not None or no_map:
         return found
     return replace(found, remarks=(*found.remarks, *_note_flux_frame(found)))
+
+
+def _place_images(
+    instrument: Instrument,
+    recorded: Recorded,
+    reference: Reference,
+    found: Fit,
+    options: FitOptions,
+    basis: Basis,
+    mapper: Mapper,
+) -> tuple[Instrument, Fit]:
+    """Return instrument and fit with the images where whole frames of a simulation show them.
+
+    Slopes hardly change when images are stretched apart, but their pixels do. Frames of a real
+    bench are left to the fit of slopes: uneven light would displace the images.
+    """
+    kind, key = kind_of(instrument), kind_of(instrument).find_fitted_key(instrument.wfs)
+    simulated = instrument.frames is not None and kind.fine_sampling_of(instrument.wfs) is not None
+    fitted = found.image_offsets_px is not None and options.method is Method.JOINT
+    if not simulated or not fitted or found.residual_fraction < _EXACT:
+        return instrument, found
+    number = next((one.found for one in found.optics if one.key == key), None)
+    known = {} if number is None else {str(key): number}
+    images = replace(
+        instrument,
+        wfs=replace(instrument.wfs, **known),
+        slopes=replace(instrument.slopes, order=SlopeOrder.IMAGES),
+    )
+    signals, _ = make_reference(recorded, images)
+    begin = replace(options, start=found.alpha)
+    places = find_image_places(images, signals, begin, basis, mapper)
+    if places is None:
+        return instrument, found
+    placed = replace(instrument, wfs=kind.with_images_at(instrument, places))
+    again = fit_matrix(placed, reference, options, basis=basis, mapper=mapper)
+    # With places of its own, a fit leaves a little less noise.
+    if again.residual_fraction > _PLACED_RESIDUAL * found.residual_fraction:
+        return instrument, found
+    return placed, replace(again, image_offsets_px=places)
 
 
 def _has_counts(light: NDArray[np.float64]) -> bool:

@@ -330,6 +330,13 @@ class SensorModel(ABC):
         """
         return np.zeros(4)
 
+    def turn_edges(self, instrument: Instrument, sensor: Any, shapes: Array) -> Array:  # noqa: ANN401 - its own
+        """Return what turned edges of displaced images add to the signals of wavefronts.
+
+        ``(n_signals, n_shapes)``; ``shapes`` ``(n_points, n_shapes)`` as for ``Response.apply``.
+        """
+        return np.zeros((sensor.n_signals, shapes.shape[1]))
+
     def offsets_px(self, instrument: Instrument, offsets: Array) -> Array:
         """Return displacements ``(n_images, 2)`` in pixels, as an instrument file has them.
 

@@ -209,8 +209,8 @@ def locate_images(
         If the images cannot be found, or a window leaves the frame.
     """
     windows = instrument.frames
-    if not isinstance(windows, FrameWindows):
-        return instrument, (), 0.0
+    if not isinstance(windows, FrameWindows) or pyramid_in(instrument).fft_grid is not None:
+        return instrument, (), 0.0  # a simulation has windows of whole pixels
     light, pixels = flux_frame.astype(np.float64), windows.pixels_per_subaperture
     sigma = _place_sigma(instrument, light, pixels)
     if windows.centres_px is not None:

@@ -20,6 +20,7 @@ from service.model.sensors.pyramid.description import (
     FrameWindows,
     Pyramid,
     by_quadrant,
+    orient_offsets,
     oriented_pyramid,
     pyramid_in,
     read_aberration,
@@ -28,6 +29,7 @@ from service.model.sensors.pyramid.description import (
 from service.model.sensors.pyramid.light import PyramidLight
 from service.model.sensors.pyramid.optics import PyramidOptics, enough_modulation_points
 from service.model.sensors.pyramid.table import IMAGE_KEY, PyramidMode, PyramidNumbers, PyramidTable
+from service.model.sensors.pyramid.turned_edges import turn_edges
 from service.model.sensors.pyramid.working_point import Halo
 from service.model.sensors.sensor import CannotTell, Fineness, WorkingPoint
 from service.model.slopes import SlopeRecipe
@@ -43,6 +45,9 @@ MEASURED_SIGMA_PX = 0.1
 """The same of centres that were measured on the detector's frames. Under even light they are found
 to 0.01 pixel; on real benches, where light is uneven and spiders cross the edge, two ways to find
 them differ by 0.1 to 0.4."""
+
+WHOLE_PIXEL_SIGMA_PX = 0.3
+"""The same of images that a simulation has anywhere between windows of whole pixels."""
 
 EDGE_SHIFT = 1.3
 """1 σ of a shift over the mean square displacement of the pupil images and over the distance
@@ -345,6 +350,8 @@ class PyramidModel(SensorModel):
         if pyramid_in(instrument).image_offsets_subap is not None:
             return None
         measured = isinstance(instrument.frames, FrameWindows)
+        if measured and pyramid_in(instrument).fft_grid is not None:
+            return WHOLE_PIXEL_SIGMA_PX / _pixels(instrument)
         return (MEASURED_SIGMA_PX if measured else IMAGE_SIGMA_PX) / _pixels(instrument)
 
     @override
@@ -365,6 +372,19 @@ class PyramidModel(SensorModel):
         if isinstance(instrument.frames, FrameWindows) and not simulated:
             shift = float(np.hypot(shift, LOCATED_SIGMA_PX / _pixels(instrument)))
         return np.array([shift, shift, turn, 0.0])
+
+    @override
+    def turn_edges(self, instrument: Instrument, sensor: Any, shapes: Array) -> Array:
+        frames, own = instrument.frames, instrument.slopes.assumed_orientation
+        windows = frames.off_grid_subap if isinstance(frames, FrameWindows) else np.zeros((4, 2))
+        stated = pyramid_in(instrument).image_offsets_subap
+        # A sign exchanges images in the model, but not their edges.
+        seen, off = (
+            orient_offsets(np.reshape(one, (2, 2, 2)), replace(own, sign_x=1, sign_y=1))
+            for one in (windows, np.zeros(8) if stated is None else stated)
+        )
+        exchanged = own.sign_x < 0 and own.sign_y < 0
+        return turn_edges(sensor, shapes, seen, off, exchanged=exchanged)
 
     @override
     def image_offsets(self, instrument: Instrument) -> Array | None:

@@ -168,7 +168,7 @@ class PyramidOptics:
         With ``shapes`` it is the response to them, and the gradient exists for one row of
         subapertures at a time.
         """
-        nodes = nodes_y or self._nodes, nodes_x or self._nodes
+        nodes = nodes_y or self.nodes, nodes_x or self.nodes
         if isinstance(shapes, np.ndarray) and self.are_few(shapes.shape[1]):
             return self._respond_to_few(shapes, valid, shift, nodes, mapper)
         of_row = RowResponse(
@@ -214,7 +214,7 @@ class PyramidOptics:
         """
         n, n_u, n_shapes = self.wfs.n_subapertures, len(self.pupil.coordinates), shapes.shape[1]
         # On the whole grid, where points without light have no part in any product.
-        field = self._pupil_field
+        field = self.pupil_field
         on_grid = np.zeros((n_u, n_u, n_shapes), field.dtype)
         on_grid[self.pupil.lit] = shapes * (-2.0 * field[self.pupil.lit])[:, None]
         images = np.empty((2, n, 2, n))
@@ -234,6 +234,13 @@ class PyramidOptics:
             place = grid.sides_y.start, grid.sides_x.start
             images[place[0], :, place[1]] = light / self._all_light
             changes[place] = change
+        return self.gather_light(images, changes, valid)
+
+    def gather_light(
+        self, images: NDArray[np.float64], changes: Array, valid: NDArray[np.bool_]
+    ) -> LightGradient:
+        """Return the response of images ``(2, n, 2, n)``; changes ``(2, 2, n, n, n_shapes)``."""
+        n_shapes = changes.shape[-1]
         lines = changes[:, :, valid].reshape(4, -1, n_shapes)
         planes: Array = self._plane_signs(_ALL_IMAGES).reshape(-1, 4).astype(self.dtype)
         signals = (planes @ lines.reshape(4, -1)).reshape(-1, *lines.shape[1:])
@@ -326,7 +333,7 @@ class PyramidOptics:
 
     def images(self, shift: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
         """Return the light at rest ``(2, n, 2, n)``: side, row along y, side, column along x."""
-        n, nodes = self.wfs.n_subapertures, self._nodes
+        n, nodes = self.wfs.n_subapertures, self.nodes
         images = np.empty((2, n, 2, n))
         for grid in self._grids:
             roof_y, roof_x = self._roofs(grid, shift, (nodes, nodes))
@@ -342,10 +349,18 @@ class PyramidOptics:
         return grid if same else None
 
     @property
-    def _nodes(self) -> Nodes:
+    def nodes(self) -> Nodes:
         """Quadrature over a subaperture."""
         grid = self._fft_grid
         return Nodes.area(self.n_nodes) if grid is None else Nodes.points(self.pupil.sampling)
+
+    @property
+    def focal_frequencies(self) -> NDArray[np.float64]:
+        """Frequencies along an axis of the focal plane, 1 / subaperture, the tip between four."""
+        wide = 2.0 * (self.wfs.image_separation_subap + self.wfs.n_subapertures)
+        width = wide if self._fft_grid is None else self._fft_grid.width_subap
+        n = round(width * self.pupil.sampling)
+        return np.asarray((np.arange(n) - (n - 1) / 2) / width)
 
     @property
     def _grids(self) -> tuple[_Grid, ...]:
@@ -433,7 +448,7 @@ class PyramidOptics:
             weights.append(weight * share)
         return np.concatenate(tilts, axis=1), np.concatenate(weights)
 
-    def _tilts(self) -> tuple[Array, Array]:
+    def source_phasors(self) -> tuple[Array, Array]:
         """Return source phasors ``(M/2, N)`` along y and ``(M/2, 2, N)`` along x.
 
         The second index along x is the pair of points that share their y component. The phasor
@@ -452,7 +467,7 @@ class PyramidOptics:
         ``(n, M/2, 2, 2 of the pair, n_nodes, N)``. If the operator is a sum of products, each
         source is repeated for every one.
         """
-        along_y, along_x = self._tilts()
+        along_y, along_x = self.source_phasors()
         kernels_x = roof_x.kernels.swapaxes(0, 1)[:, None, :, :, None]
         modulated_y = along_y[:, None, None, None, None] * roof_y.kernels
         modulated_x = along_x[:, None, None, :, None] * kernels_x
@@ -467,7 +482,7 @@ class PyramidOptics:
         ``(n, n, M/2, 2, n_nodes, 2, 2 of the pair, n_nodes)``: row, column, source, image side and
         node along y, image side, one of the pair and node along x.
         """
-        amplitude = self._pupil_field.astype(self._complex)
+        amplitude = self.pupil_field.astype(self._complex)
         n, n_products = modulated_y.shape[1], self._n_products
         n_source, n_u = len(modulated_y) // n_products, modulated_y.shape[-1]
         at_y, at_x = modulated_y.shape[2:-1], modulated_x.shape[2:-1]
@@ -600,7 +615,7 @@ class PyramidOptics:
         return n_shapes * (n_points + n_lines) < n_points * n_lines
 
     @property
-    def _pupil_field(self) -> Array:
+    def pupil_field(self) -> Array:
         """``(N, N)`` field over the pupil, complex only with an aberration."""
         if self.aberration_rad is None:
             return self.pupil.amplitude.astype(self.dtype)
@@ -613,7 +628,7 @@ class PyramidOptics:
 
         Without an aberration the imaginary part alone counts.
         """
-        field = -2.0 * self._pupil_field
+        field = -2.0 * self.pupil_field
         return [field.real] if self.aberration_rad is None else [field.real, field.imag]
 
 

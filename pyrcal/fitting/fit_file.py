@@ -273,10 +273,7 @@ def _place_images(
 
 
 def _has_counts(light: NDArray[np.float64]) -> bool:
-    """Return False for a mask, of 0 and 1 or 255, and for light over that of its brightest pixel.
-
-    The import writes the latter for frames without a mean frame.
-    """
+    """Return False for a mask of 0 and 1 or 255, and for light divided by its brightest pixel."""
     brightest = light.max()
     return bool(brightest != 1.0 and not np.isin(light, (0.0, 255.0)).all())
 

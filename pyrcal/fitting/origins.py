@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -30,6 +31,9 @@ MAX_LOG_SIGMA = 0.5
 MODEL_GAIN_SIGMA = 0.01
 """1 σ of the gain of all modes by errors of the model: matrices of OOPAO with 10 % noise and a
 modulation of 5 λ/D have gains of 0.989, others of 0.9999 to 1.0005."""
+
+N_NAMED = 3
+"""Number of polynomials of a static aberration that are named."""
 
 MAX_GAIN_SCATTER = 0.35
 """Relative scatter of the gains above which their median says nothing of the wavelength."""
@@ -216,8 +220,13 @@ def find_families(
             largest = max(sigma[k] for optic, k in places.items() if optic in axes)
             found, words = kind.modulation_entry(about.wfs), f"of an axis {largest:.1%}"
         else:
-            largest = max(sigma[places[optic]] for optic in family)
-            found, words = kind.aberration_entry(about.wfs), f"of each {largest * unit_nm:.2g} nm"
+            sigma_nm = unit_nm * max(sigma[places[optic]] for optic in family)
+            found, words = kind.aberration_entry(about.wfs), f"of each {sigma_nm:.2g} nm"
+            sizes = sorted(
+                zip(json.loads(found), family, strict=True), key=lambda one: -abs(one[0])
+            )
+            largest = ", ".join(f"{optic} {size:+.0f} nm" for size, optic in sizes[:N_NAMED])
+            words += f"; the largest are {largest}"
         yield Origin(
             key=key.removeprefix("wfs."),
             found=found,

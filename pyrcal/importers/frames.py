@@ -77,9 +77,7 @@ def frames_of(matrix: Array, light: Array | None, valid: Array | None) -> Frames
     # Only lit pixels respond, so the response itself shows where the pupil images are.
     cube = np.moveaxis(matrix, -1, 0) if matrix.shape[0] == matrix.shape[1] else matrix
     strength = np.sqrt(np.mean(np.square(np.nan_to_num(cube, copy=True)), axis=0, dtype=float))
-    # Its brightest pixel is 1: it has no counts, so that a fit finds no unit of the commands.
-    light = strength / (strength.max() or 1.0)
-    return Frames(cube=cube, light=light, light_name="the strength of the response")
+    return Frames(cube=cube, light=strength, light_name="the strength of the response")
 
 
 def _cube_of(matrix: Array, light_map: Array, valid: Array | None) -> Array | None:

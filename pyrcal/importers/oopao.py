@@ -349,7 +349,12 @@ def _fft_grid(tel: Oopao, wfs: Oopao, width_px: float) -> dict[str, Any]:
     # A padded telescope is cut to its light, and a binned detector has other points.
     if left or int(wfs.binning) > 1 or not _is_filled(tel):
         return {}
-    return {"fft_grid": {"points_per_subaperture": points, "width_subap": width_px}}
+    grid = {"points_per_subaperture": points, "width_subap": width_px}
+    if wfs.modulation > 0 and getattr(wfs, "user_modulation_path", None) is None:
+        usual = 4 * math.ceil(2.0 * math.pi * float(wfs.modulation) / 4.0)
+        n_points = int(getattr(wfs, "nTheta", usual))
+        grid |= {"modulation_points": n_points} if n_points % 4 == 0 else {}
+    return {"fft_grid": grid}
 
 
 def _is_filled(tel: Oopao) -> bool:

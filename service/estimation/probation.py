@@ -210,7 +210,8 @@ def _believe(state: Comparison, matrix: NDArray[np.float32] | None) -> Compariso
     if state.reader is not None and state.reader.matrix is matrix:
         return state
     parts = tuple(replace(part, residual=None) for part in state.parts)
-    return replace(state, reader=Reader.of(matrix), parts=parts)
+    # With ``own`` of the swap before, no samples are kept for the next matrix to read.
+    return replace(state, reader=Reader.of(matrix), parts=parts, own=None)
 
 
 def _read_by(

@@ -22,9 +22,13 @@ MODES = [0, 1, 2, 5, 12, 39]
 STROKE_M = 1e-9
 
 
-def bench(modulation=0.0, rooftop=0.0):
+def bench(modulation=0.0, rooftop=0.0, modulation_points=None):
     small = small_instrument()
-    grid = FftGrid(points_per_subaperture=POINTS, width_subap=float(WIDTH))
+    grid = FftGrid(
+        points_per_subaperture=POINTS,
+        width_subap=float(WIDTH),
+        modulation_points=modulation_points,
+    )
     wfs = replace(
         small.wfs,
         fft_grid=grid,
@@ -35,7 +39,7 @@ def bench(modulation=0.0, rooftop=0.0):
     return replace(small, wfs=wfs)
 
 
-def simulated_frames(amplitude, opds_m, wfs, n_modulation):
+def simulated_frames(amplitude, opds_m, wfs, n_modulation, first=0.5):
     """Frames ``(n_opds, WIDTH, WIDTH)`` of a textbook's pyramid, its tip between four points.
 
     Its surface is that of the highest of the four faces.
@@ -56,7 +60,7 @@ def simulated_frames(amplitude, opds_m, wfs, n_modulation):
     frames = []
     for opd in opds_m:
         light = np.zeros((padded, padded))
-        for t in 2 * np.pi * (np.arange(n_modulation) + 0.5) / n_modulation:
+        for t in 2 * np.pi * (np.arange(n_modulation) + first) / n_modulation:
             tilt = k * (np.cos(t) * u[:, None] + np.sin(t) * u)
             field = np.zeros((padded, padded), complex)
             phase = 2 * np.pi * opd / wfs.wavelength_m
@@ -82,11 +86,25 @@ def simulated_frames(amplitude, opds_m, wfs, n_modulation):
 def test_a_matrix_of_an_fft_is_that_of_the_model_on_its_grid(modulation, n_points, rooftop, on_it):
     """Without the grid the model, which has no ends, is 7 and 4 % off a coarse simulation."""
     about = bench(modulation, rooftop)
+    assert compare(about, n_points) < on_it
+    plain = replace(about, wfs=replace(about.wfs, fft_grid=None))
+    assert compare(plain, n_points, sampling=4) > 0.02
+
+
+@pytest.mark.parametrize(("modulation", "n_points"), [(0.5, 4), (3.0, 20)])
+def test_a_modulation_of_few_points_is_that_of_the_simulation(modulation, n_points):
+    known, unknown = (bench(modulation, 0.0, points) for points in (n_points, None))
+    assert compare(known, n_points, first=0.0) < 1e-3
+    assert compare(unknown, n_points, first=0.0) > 5e-3
+
+
+def compare(about, n_points, first=0.5, sampling=POINTS):
+    """Return by how much the model's matrix differs from that of the frames."""
     model = InteractionModel(about, small_basis(), pupil_sampling=POINTS, detector_nodes=POINTS)
     maps = np.zeros((len(MODES), *model.pupil.amplitude.shape))
     maps[:, model.pupil.lit] = STROKE_M * small_basis().render(model.pupil.points)[:, MODES].T
     push, pull = (
-        simulated_frames(model.pupil.amplitude, sign * maps, about.wfs, n_points)
+        simulated_frames(model.pupil.amplitude, sign * maps, about.wfs, n_points, first)
         for sign in (1.0, -1.0)
     )
     middle, half = WIDTH / 2, about.wfs.image_separation_subap / 2
@@ -106,12 +124,11 @@ def test_a_matrix_of_an_fft_is_that_of_the_model_on_its_grid(modulation, n_point
             for one, other in zip(push, pull, strict=True)
         ]
     ).T
-    found = model.interaction_matrix(Misregistration())[:, MODES]
-    assert np.linalg.norm(found - expected) / np.linalg.norm(expected) < on_it
-    plain = replace(about, wfs=replace(about.wfs, fft_grid=None))
-    real = InteractionModel(plain, small_basis(), pupil_sampling=4, detector_nodes=4)
-    off = real.interaction_matrix(Misregistration())[:, MODES] - expected
-    assert np.linalg.norm(off) / np.linalg.norm(expected) > 0.02
+    judged = InteractionModel(
+        about, small_basis(), pupil_sampling=sampling, detector_nodes=sampling
+    )
+    found = judged.interaction_matrix(Misregistration())[:, MODES]
+    return np.linalg.norm(found - expected) / np.linalg.norm(expected)
 
 
 @pytest.mark.parametrize("rotation_deg", [0.0, 180.0])

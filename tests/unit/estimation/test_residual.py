@@ -161,6 +161,15 @@ def test_a_loop_is_no_worse_for_what_the_matrix_before_takes_for_its_own(seed):
     assert found.verdict is Verdict.AS_GOOD, found.text
 
 
+@pytest.mark.parametrize("seed", SEEDS)
+def test_nor_is_the_matrix_after_one_that_was_compared(seed):
+    """The samples of the loop before are kept again once a comparison has ended."""
+    turns = [("a", 4.0, 1), ("b", 9.0, 2), ("c", 4.5, 3)]
+    loops = [(name, seconds, reading_beyond(number), 1.0) for name, seconds, number in turns]
+    found = judged(loops, seed, beyond_m=60e-9)
+    assert [one.verdict for one in found] == [Verdict.AS_GOOD] * 2, found[-1].text
+
+
 def test_a_third_of_the_gain_is_found_behind_modes_beyond_as_well():
     loops = [("a", 4.0, reading_beyond(1), 1.0), ("b", 4.5, 0.3 * reading_beyond(2), 1.0)]
     (found,) = judged(loops, beyond_m=30e-9)

@@ -194,7 +194,8 @@ def test_a_signal_of_the_whole_detector_becomes_frames_over_their_sum(saved, tmp
     found = whole_detector(saved)
     sensor = found.tables["wfs"]
     assert (sensor["input"], sensor["n_subapertures"]) == ("normalised-frames", 8)
-    assert sensor["fft_grid"] == {"points_per_subaperture": 4, "width_subap": 24.0}
+    grid = {"points_per_subaperture": 4, "width_subap": 24.0, "modulation_points": 20}
+    assert sensor["fft_grid"] == grid
     assert sensor["pupil_centres_px"] == [[5.5, 5.5], [5.5, 17.5], [17.5, 5.5], [17.5, 17.5]]
     assert found.arrays["interaction_matrix"].shape == (30, 24, 24)
     assert "flux_frame" not in found.arrays
@@ -234,7 +235,8 @@ def test_valid_pixels_of_a_whole_detector_are_put_in_their_places(saved):
 def test_the_grid_of_oopaos_fft_is_known_by_the_pixels_at_its_edge(saved, tmp_path):
     assert "fft_grid" not in imported_of(saved).tables["wfs"]
     found = imported_of(saved, wfs__n_pix_edge=np.array(1), wfs__n_pix_separation=np.array(3))
-    assert found.tables["wfs"]["fft_grid"] == {"points_per_subaperture": 4, "width_subap": 21.0}
+    grid = {"points_per_subaperture": 4, "width_subap": 21.0, "modulation_points": 20}
+    assert found.tables["wfs"]["fft_grid"] == grid
     instrument = pyrcal.load_instrument(found.save(tmp_path / "bench").instrument)
     assert choose_sampling(instrument) == 4
     binned = imported_of(saved, wfs__n_pix_edge=np.array(1), wfs__binning=np.array(2))

@@ -432,13 +432,20 @@ class PyramidOptics:
                 for radius, weight, n in zip(halo.radii, halo.weights, halo.n_points, strict=True)
             ]
         tilts, weights = [], []
-        for (along_y, middle_x, half_x), weight, n in rings:
+        grid = self._fft_grid
+        n_simulated = None if grid is None else grid.modulation_points
+        for place, ((along_y, middle_x, half_x), weight, n) in enumerate(rings):
             # Half of a ring and half a step off its ends: every point then has a partner that
             # differs along x only.
-            angles = 2 * np.pi * (np.arange(n // 2) + 0.5) / n
-            cosine, sine = np.cos(angles), np.sin(angles)
+            steps, share = (np.arange(n // 2) + 0.5) / n, np.full(n // 2, 1.0 / n)
+            if place == 0 and n_simulated is not None:
+                # Points at the ends as well, each of which is its own partner.
+                steps = np.arange(n_simulated // 2 + 1) / n_simulated
+                share = np.full(len(steps), 1.0 / n_simulated)
+                share[[0, -1]] /= 2.0
+            cosine, sine = np.cos(2 * np.pi * steps), np.sin(2 * np.pi * steps)
             tilts.append(np.array([along_y * cosine, middle_x * cosine, half_x * sine]))
-            weights.append(np.full(n // 2, weight / n))
+            weights.append(weight * share)
         return np.concatenate(tilts, axis=1), np.concatenate(weights)
 
     def source_phasors(self) -> tuple[Array, Array]:

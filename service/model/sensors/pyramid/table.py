@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
+from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen, MultipleOf
 
 from service.model.kinds import Count, Positive, Read
 
@@ -104,6 +104,10 @@ class FftGrid(Read):
     width_subap: Positive
     """Width of the whole grid, zeros around the pupil included; light that leaves it on one side
     comes back on the other."""
+
+    modulation_points: Annotated[int, Ge(4), Le(1000), MultipleOf(4)] | None = None
+    """Points on the circle of the modulation, the first one along x; None: as many as a smooth
+    circle needs."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

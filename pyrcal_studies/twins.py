@@ -26,7 +26,7 @@ from pyrcal.fitting.matrix import FitOptions
 from pyrcal.fitting.recorded import read_recorded
 from pyrcal.importers.oopao import from_saved
 from pyrcal.importers.saved import read_npz
-from pyrcal.twins.check import Checked, Unchecked, check_oopao_model, check_specula_model
+from pyrcal.twins.check import Checked, check_oopao_model, check_specula_model
 from pyrcal.twins.oopao_model import write_oopao_model
 from pyrcal.twins.sampled import apply_fit, correlations, residual_fraction, sample_bench
 from pyrcal.twins.specula_model import write_specula_model
@@ -127,9 +127,9 @@ def run_models(name: str, folder: Path, instrument: Instrument, fit: Fit) -> dic
     }
 
 
-def _ran(found: Checked | Unchecked) -> Checked:
-    if isinstance(found, Unchecked):
-        sys.exit(found.reason)
+def _ran(found: Checked | str) -> Checked:
+    if isinstance(found, str):
+        sys.exit(found)
     return found
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.fitting.methods import Settled
+from pyrcal.fitting.methods import Settled, draw_planes
 from pyrcal.fitting.noise import noise_sigma
 from pyrcal.fitting.solver import nuisances_of
 from service.model.modes import ModalBasis
@@ -126,7 +126,7 @@ def _divide_power(settled: Settled, noise: Array | None) -> Iterator[Cause]:
     words = "a mirror shape that differs from the command"
     remedy = "measure the influence functions, or push every actuator"
     yield make_cause(with_light - left, words, remedy)
-    planes = _as_planes(residual, target.rows, target.valid)
+    planes = draw_planes(residual, target)
     if noise is None:
         white = _measure_noise(residual, planes)
     else:
@@ -204,16 +204,6 @@ def _predict_shapes(settled: Settled, residual: Array, light: Array) -> Array:
             held = size + ridge * size.mean()
             found[fold == k] = out @ (axes @ (onto / held[:, None]))
     return min(predicted, key=lambda found: float(np.sum((residual - found) ** 2)))
-
-
-def _as_planes(residual: Array, rows: NDArray[np.bool_], valid: NDArray[np.bool_]) -> Array:
-    """Return a residual as maps ``(n_planes, n, n, n_modes)``, NaN where there is none."""
-    every = np.full((len(rows), residual.shape[1]), np.nan)
-    every[rows] = residual
-    by_plane = every.reshape(-1, int(valid.sum()), residual.shape[1])
-    planes = np.full((len(by_plane), *valid.shape, residual.shape[1]), np.nan)
-    planes[:, valid] = by_plane
-    return planes
 
 
 def _measure_noise(residual: Array, planes: Array) -> Array:

@@ -17,12 +17,14 @@ from pyrcal.fitting.comparison import MIN_EXPLAINED, Alternative, FitSubset
 from pyrcal.fitting.methods import SEARCH_RESIDUAL, Settled, settle
 from pyrcal.fitting.models import (
     ABERRATION,
+    ABERRATION_KEY,
     ELLIPSE,
+    ELLIPSE_KEY,
     FAR_PREFERRED_SHARE,
     LOGARITHM_ABOVE,
     PREFERRED_SHARE,
     ROOFTOP,
-    ROOFTOP_FIELD,
+    ROOFTOP_KEY,
     SENSOR_STEP,
     FitModels,
     Optic,
@@ -37,16 +39,10 @@ Array = NDArray[np.float64]
 COUPLING_KEY = "coupling"
 """Key of the instrument file for the width of influence functions."""
 
-UNKNOWN_ELLIPSE = 'modulation_ellipse = "unknown"'
-"""Entry of the instrument file by which an elliptic modulation is fitted."""
-
-UNKNOWN_ROOFTOP = 'rooftop_lambda_over_d = "unknown"'
-"""Entry of the instrument file by which a rooftop is fitted."""
-
 ROOFTOP_FLOOR = 0.001
 """1 σ of a fitted rooftop by the last, linear step, λ/D: without noise it was up to 0.0012 off."""
 
-UNKNOWN_ABERRATION = 'static_aberration_nm = "unknown"'
+UNKNOWN_ABERRATION = f'{ABERRATION_KEY} = "unknown"'
 """Entry of the instrument file by which a static aberration is fitted."""
 
 UNKNOWN_IMAGES = 'image_offsets_px = "unknown"'
@@ -170,17 +166,17 @@ def try_ellipse(few: FitSubset) -> Iterator[Alternative]:
         return
     if Optic.STRETCH in few.models.optics or few.models.sensor_number < LOGARITHM_ABOVE:
         return
-    found = _try_family(few, ELLIPSE, UNKNOWN_ELLIPSE, FAR_PREFERRED_SHARE)
+    found = _try_family(few, ELLIPSE, ELLIPSE_KEY, FAR_PREFERRED_SHARE)
     if found.preferred:
         yield replace(found, is_instrument=True)
 
 
 def try_rooftop(few: FitSubset) -> Iterator[Alternative]:
     """Yield a rooftop, if the matrix prefers one to the tip of the file's pyramid."""
-    has_faces = hasattr(few.models.instrument.wfs, ROOFTOP_FIELD)
+    has_faces = hasattr(few.models.instrument.wfs, ROOFTOP_KEY)
     if not has_faces or few.settled.share < MIN_EXPLAINED or Optic.ROOFTOP in few.models.optics:
         return
-    found = _try_family(few, ROOFTOP, UNKNOWN_ROOFTOP, FAR_PREFERRED_SHARE)
+    found = _try_family(few, ROOFTOP, ROOFTOP_KEY, FAR_PREFERRED_SHARE)
     if found.preferred:
         yield replace(found, is_instrument=True)
 
@@ -196,13 +192,12 @@ def try_aberration(few: FitSubset) -> Iterator[Alternative]:
         return
     if Optic.FOCUS in few.models.optics:
         return
-    yield _try_family(few, TRIED_ABERRATION, UNKNOWN_ABERRATION, PREFERRED_SHARE)
+    yield _try_family(few, TRIED_ABERRATION, ABERRATION_KEY, PREFERRED_SHARE)
 
 
-def _try_family(
-    few: FitSubset, family: Sequence[Optic], entry: str, max_share: float
-) -> Alternative:
-    """Return the fit with quantities that are fitted if the file has an ``entry``."""
+def _try_family(few: FitSubset, family: Sequence[Optic], key: str, max_share: float) -> Alternative:
+    """Return the fit with quantities that are fitted if the file's ``key`` is unknown."""
+    entry = f'{key} = "unknown"'
     rates = [
         (few.matrix(few.models.with_optic(one, SENSOR_STEP)) - few.own) / SENSOR_STEP
         for one in family
@@ -278,7 +273,7 @@ def list_optics(
     """
     nuisances = settled.nuisances
     changes = nuisances.changes(settled.solution.nuisances)
-    keys = {Optic.ROOFTOP: ROOFTOP_FIELD, Optic.SENSOR: models.sensor_key}
+    keys = {Optic.ROOFTOP: ROOFTOP_KEY, Optic.SENSOR: models.sensor_key}
     number = models.sensor_number
     found = []
     for k, (optic, change) in enumerate(changes.items(), nuisances.first_optic):

@@ -263,13 +263,22 @@ class Settled:
         scale = np.sqrt(target.weights)
         # Weighted as the fit weighs them, or the modes with the largest strokes would decide.
         typical = np.sqrt(np.mean((target.matrix[target.rows] * scale) ** 2))
-        by_slope = np.full(len(target.rows), np.nan)
         left = self.solution.projection.residual * scale
-        by_slope[target.rows] = np.sqrt(np.mean(left**2, axis=1)) / typical
-        planes = by_slope.reshape(-1, int(target.valid.sum()))
-        maps = np.full((len(planes), *target.valid.shape), np.nan)
-        maps[:, target.valid] = planes
-        return maps
+        return draw_planes(np.sqrt(np.mean(left**2, axis=1)) / typical, target)
+
+
+def draw_planes(values: Array, target: Target) -> Array:
+    """Return values of the used slopes ``(n_rows, ...)`` as maps ``(n_planes, n, n, ...)``.
+
+    NaN where no slope is used.
+    """
+    rest = values.shape[1:]
+    by_slope = np.full((len(target.rows), *rest), np.nan)
+    by_slope[target.rows] = values
+    by_plane = by_slope.reshape(-1, int(target.valid.sum()), *rest)
+    planes = np.full((len(by_plane), *target.valid.shape, *rest), np.nan)
+    planes[:, target.valid] = by_plane
+    return planes
 
 
 def settle(

@@ -58,6 +58,15 @@ def sensor_coordinate(number: float) -> float:
     return float(np.log(ratio)) if ratio > 1.0 else (ratio**2 - 1.0) / 2.0
 
 
+def set_coupling(basis: Basis, coupling: float | None) -> Basis:
+    """Return the same strokes of Gaussian functions with a coupling; others, or None: unchanged."""
+    if coupling is None or not isinstance(basis, ModalBasis):
+        return basis
+    if not isinstance(basis.surface, Gaussian):
+        return basis
+    return basis.of_surface(replace(basis.surface, coupling=coupling))
+
+
 def moved_sensor_number(number: float, change: float) -> float:
     """Return a sensor number whose coordinate is changed; 0 if the change leads beyond it."""
     coordinate = sensor_coordinate(number) + change
@@ -65,9 +74,9 @@ def moved_sensor_number(number: float, change: float) -> float:
     return LOGARITHM_ABOVE * float(ratio)
 
 
-ELLIPSE_KEY = "wfs.modulation_ellipse"
-ROOFTOP_FIELD = "rooftop_lambda_over_d"
-ABERRATION_KEY = "wfs.static_aberration_nm"
+ELLIPSE_KEY = "modulation_ellipse"
+ROOFTOP_KEY = "rooftop_lambda_over_d"
+ABERRATION_KEY = "static_aberration_nm"
 
 
 class Optic(StrEnum):
@@ -123,8 +132,8 @@ unknown."""
 ROOFTOP = (Optic.ROOFTOP,)
 """The one parameter of a rooftop, fitted if ``wfs.rooftop_lambda_over_d`` is unknown."""
 
-FAMILIES = {ELLIPSE_KEY: ELLIPSE, f"wfs.{ROOFTOP_FIELD}": ROOFTOP, ABERRATION_KEY: ABERRATION}
-"""Quantities that are fitted if the instrument file marks their key as unknown."""
+FAMILIES = {ELLIPSE_KEY: ELLIPSE, ROOFTOP_KEY: ROOFTOP, ABERRATION_KEY: ABERRATION}
+"""Quantities that are fitted if the instrument file marks their key of ``[wfs]`` as unknown."""
 
 
 @dataclass(slots=True)
@@ -246,7 +255,7 @@ class FitModels:
         if self.sensor_key is not None:
             found.append(Optic.SENSOR)
         for key, family in FAMILIES.items():
-            found += family if key in self.instrument.unknown else ()
+            found += family if f"wfs.{key}" in self.instrument.unknown else ()
         return tuple(found)
 
     @property
@@ -255,7 +264,7 @@ class FitModels:
         keys = {
             Optic.WIDTH: "mirror.coupling",
             Optic.SENSOR: f"wfs.{self.sensor_key}",
-            **{optic: key for key, family in FAMILIES.items() for optic in family},
+            **{optic: f"wfs.{key}" for key, family in FAMILIES.items() for optic in family},
         }
         return frozenset(one for one in self.optics if keys[one] in self.instrument.unknown)
 
@@ -283,30 +292,26 @@ class FitModels:
     def with_optic(self, optic: Optic, change: float) -> FitModels:
         """Return the models of an instrument with a quantity changed, see ``Optic``."""
         kind, wfs = kind_of(self.instrument), self.instrument.wfs
-        if optic in ELLIPSE or optic in ABERRATION:
-            if optic in ABERRATION:
-                sensor = kind.aberrate(wfs, 2 + ABERRATION.index(optic), change)
-            else:
-                along = (change, 0.0) if optic is Optic.STRETCH else (0.0, change)
-                sensor = kind.stretch_modulation(wfs, along)
-            if sensor is None:
-                raise ModelError(f"fit: found a {kind.name}, expected a pyramid, for its {optic}")
-            return replace(self, instrument=replace(self.instrument, wfs=sensor))
-        if optic is Optic.ROOFTOP:
-            length = getattr(wfs, ROOFTOP_FIELD) + change
-            wfs = replace(wfs, **{ROOFTOP_FIELD: length})
-            return replace(self, instrument=replace(self.instrument, wfs=wfs))
-        if optic is Optic.SENSOR and self.sensor_key is not None:
+        if optic in ABERRATION:
+            sensor = kind.aberrate(wfs, 2 + ABERRATION.index(optic), change)
+        elif optic in ELLIPSE:
+            along = (change, 0.0) if optic is Optic.STRETCH else (0.0, change)
+            sensor = kind.stretch_modulation(wfs, along)
+        elif optic is Optic.ROOFTOP:
+            sensor = replace(wfs, **{ROOFTOP_KEY: getattr(wfs, ROOFTOP_KEY) + change})
+        elif optic is Optic.SENSOR and self.sensor_key is not None:
             number = moved_sensor_number(self.sensor_number, change)
-            wfs = replace(wfs, **{self.sensor_key: number})
-            return replace(self, instrument=replace(self.instrument, wfs=wfs))
-        if not isinstance(self.basis, ModalBasis) or not isinstance(self.basis.surface, Gaussian):
+            sensor = replace(wfs, **{self.sensor_key: number})
+        elif self.coupling is None:
             raise ModelError("fit: found influence functions without a coupling to be changed")
-        surface = self.basis.surface
-        # A Gaussian is coupling ** (r / pitch)²: with a width e times larger its exponent is e²
-        # times smaller.
-        coupling = float(surface.coupling ** np.exp(-2.0 * change))
-        return replace(self, basis=self.basis.of_surface(replace(surface, coupling=coupling)))
+        else:
+            # A Gaussian is coupling ** (r / pitch)²: with a width e times larger its exponent is e²
+            # times smaller.
+            coupling = float(self.coupling ** np.exp(-2.0 * change))
+            return replace(self, basis=set_coupling(self.basis, coupling))
+        if sensor is None:
+            raise ModelError(f"fit: found a {kind.name}, expected a pyramid, for its {optic}")
+        return replace(self, instrument=replace(self.instrument, wfs=sensor))
 
     def with_displaced_images(self, offsets: Array) -> FitModels:
         """Return the models of a sensor with displaced pupil images ``(8,)``.

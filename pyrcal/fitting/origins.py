@@ -228,7 +228,7 @@ def find_families(
             largest = ", ".join(f"{optic} {size:+.0f} nm" for size, optic in sizes[:N_NAMED])
             words += f"; the largest are {largest}"
         yield Origin(
-            key=key.removeprefix("wfs."),
+            key=key,
             found=found,
             reported='"unknown"',
             how=f"fitted, 1 sigma {words}{doubt}",

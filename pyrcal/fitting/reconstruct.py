@@ -19,6 +19,7 @@ from pyrcal.fitting.fit_table import NOTABLE_DISPLACEMENT_PX, displacement_words
 from pyrcal.fitting.instrument_checks import COUPLING_KEY
 from pyrcal.fitting.light import read_light
 from pyrcal.fitting.memory import check_reconstruction
+from pyrcal.fitting.models import set_coupling
 from pyrcal.fitting.recorded import file_sha256
 from pyrcal.fitting.report import (
     KnownFit,
@@ -39,9 +40,7 @@ from service.instrument import load_instrument
 from service.model.arrays import arrays_of
 from service.model.instrument import Instrument, instrument_sha256
 from service.model.interaction import RtcInteractionModel
-from service.model.modes import Basis, ModalBasis
 from service.model.sensors.registry import kind_of
-from service.model.surface import Gaussian
 
 SAMPLING = 4
 """Pupil points per subaperture, and detector nodes: the finest of the design's table that takes
@@ -72,7 +71,7 @@ def main(options: argparse.Namespace) -> int:
     with threadpool_limits(1), ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         model = RtcInteractionModel(
             instrument,
-            _basis(instrument, fit),
+            set_coupling(cached_basis(instrument), fit.instrument_found.get(COUPLING_KEY)),
             pupil_sampling=SAMPLING,
             detector_nodes=SAMPLING,
             illumination=None if light is None else light.illumination,
@@ -220,16 +219,6 @@ def _apply_sensor(instrument: Instrument, fit: KnownFit) -> Instrument:
         return instrument
     number = fit.instrument_found[sensor_key]
     return replace(instrument, wfs=replace(instrument.wfs, **{sensor_key: number}))
-
-
-def _basis(instrument: Instrument, fit: KnownFit) -> Basis:
-    """Return the modes of the instrument, with the coupling from the fit."""
-    basis, coupling = cached_basis(instrument), fit.instrument_found.get(COUPLING_KEY)
-    if coupling is None or not isinstance(basis, ModalBasis):
-        return basis
-    if not isinstance(basis.surface, Gaussian):
-        return basis
-    return basis.of_surface(replace(basis.surface, coupling=coupling))
 
 
 def _invert_matrix(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -123,8 +124,6 @@ def write_specula(
     StorageError
         If writing fails.
     """
-    from astropy.io import fits
-
     with opened(places) as container:
         if "fsizex" not in container.facts and "np_sub" not in container.facts:
             raise MatrixError(
@@ -146,9 +145,20 @@ def write_specula(
         (intmat, "INTMAT", matrix[order] * unit_m),
         (recmat, "RECMAT", reconstructor[:, order] / unit_m),
     ):
-        header = fits.Header({"VERSION": 1, "PUP_TAG": "", "SA_TAG": "", "NORMFACT": 0.0})
-        arrays = fits.ImageHDU(np.ascontiguousarray(values, dtype=np.float32), name=name)
+        header = {"PUP_TAG": "", "SA_TAG": "", "NORMFACT": 0.0}
         try:
-            fits.HDUList([fits.PrimaryHDU(header=header), arrays]).writeto(path, overwrite=True)
+            write_fits(path, header, **{name: values})
         except OSError as error:
             raise StorageError(f"{path}: cannot be written: {error}") from error
+
+
+def write_fits(path: Path, header: Mapping[str, Any], **arrays: NDArray[Any]) -> None:
+    """Write arrays as extensions of a FITS file, as SPECULA saves its objects."""
+    from astropy.io import fits
+
+    images = []
+    for name, values in arrays.items():
+        dtype = np.int64 if values.dtype.kind in "iu" else np.float32
+        images.append(fits.ImageHDU(np.ascontiguousarray(values, dtype), name=name))
+    first = fits.PrimaryHDU(header=fits.Header({"VERSION": 1, **header}))
+    fits.HDUList([first, *images]).writeto(path, overwrite=True)

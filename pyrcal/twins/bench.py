@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -79,7 +79,7 @@ class Bench:
     sky_pupil: Array | None = None
     """``(n, n)`` pupil on the sky; None if there is only one pupil."""
 
-    inventory: tuple[str, ...] = field(default=())
+    inventory: tuple[str, ...] = ()
     """Use that was made of each file, one sentence each."""
 
 
@@ -99,13 +99,12 @@ def read_bench(options: argparse.Namespace) -> Bench:
         options.source, options.folder, options.response = "cacao", cacao[0], None
         return _import_other(options)
     named = tuple(_read_files(options.files))
-    saved = {_OOPAO.get(_squeeze(one.name), one.name): one.values for one in named}
+    saved = {_OOPAO.get(_squeeze(one.name), one.name): one for one in named}
     if _OOPAO_ONLY & saved.keys():
-        imported = from_saved(saved, ", ".join(str(path) for _, path in options.files))
+        where = ", ".join(str(path) for _, path in options.files)
+        imported = from_saved({name: one.values for name, one in saved.items()}, where)
         stated = frozenset(key for table in imported.tables.values() for key in table)
-        inventory = tuple(
-            f"{_OOPAO.get(_squeeze(one.name), one.name)}: {one.path}" for one in named
-        )
+        inventory = tuple(f"{name}: {one.path}" for name, one in saved.items())
         return Bench(imported=(imported,), stated=stated, inventory=inventory)
     if "INTMAT" in saved:
         options.source = "specula"
@@ -227,7 +226,6 @@ def _find_role(name: str) -> str | None:
     words = "".join(one if one.isalnum() else " " for one in name).split()
     return (
         role_of_name(name)
-        or (name if name in dict(_PARTS) else None)
         or next((role for role, parts in _PARTS if any(part in squeezed for part in parts)), None)
         or next(filter(None, (role_of_name(word) for word in words if len(word) > 1)), None)
     )

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from pyrcal.fitting.fit_file import make_reference
 from pyrcal.fitting.fitted import Fit
@@ -57,9 +58,9 @@ class Checked:
     seconds: float
     """Time that the measurement took."""
 
-    @property
-    def words(self) -> str:
-        """Outcome, in one sentence."""
+    @override
+    def __str__(self) -> str:
+        """Return the outcome in one sentence."""
         return (
             f"{self.program} runs its model: its matrix leaves {self.left_over:.2%} of the bench's "
             f"in {len(self.modes)} modes, the fit {self.left_over_by_fit:.2%}; the lowest "
@@ -67,56 +68,39 @@ class Checked:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Unchecked:
-    """A model that could not be run."""
-
-    program: str
-    reason: str
-    """Reason, in one sentence."""
-
-    @property
-    def words(self) -> str:
-        """Outcome, in one sentence."""
-        return self.reason
-
-
 def check_oopao_model(
     folder: Path, instrument: Instrument, fit: Fit, *, python: Path | None = None
-) -> Checked | Unchecked:
+) -> Checked | str:
     """Return how the OOPAO model in ``folder`` compares with the bench and with the fit.
 
-    ``python`` is an interpreter that has OOPAO; None for the present one.
+    If it cannot be run, the reason is returned, in one sentence. ``python`` is an interpreter that
+    has OOPAO; None for the present one.
     """
     model, some = folder / oopao_model.NAME, _choose_columns(fit)
     with tempfile.TemporaryDirectory() as name:
         product, begun = Path(name) / "matrix.npz", time.perf_counter()
         command = [str(model.absolute()), str(product), *map(str, fit.modes[some])]
-        reason = _run("OOPAO", command, python, folder)
-        if reason is not None:
-            return Unchecked(program="OOPAO", reason=reason)
+        if reason := _run("OOPAO", command, python, folder):
+            return reason
+        seconds = time.perf_counter() - begun
         with np.load(product) as found:
             matrix, reference = found["matrix"], found["reference"]
-    seconds = time.perf_counter() - begun
-    found = apply_fit(instrument, fit)
-    matrix = _from_bench("OOPAO", matrix, reference, found, fit.modes[some])
-    return _judge("OOPAO", matrix, fit, some, seconds)
+    matrix = _from_bench(matrix, reference, apply_fit(instrument, fit), fit.modes[some])
+    return _judge("OOPAO", fit.measured[:, some], matrix, fit, some, seconds)
 
 
 def check_specula_model(
     folder: Path, instrument: Instrument, fit: Fit, *, python: Path | None = None
-) -> Checked | Unchecked:
-    """Return how the SPECULA model in ``folder`` compares with the bench and with the fit.
-
-    ``python`` is an interpreter that has SPECULA; None for the present one.
-    """
+) -> Checked | str:
+    """Return how the SPECULA model in ``folder`` compares, as ``check_oopao_model`` does."""
     begun = time.perf_counter()
     program = ["-m", "specula.scripts.specula_main", "--cpu", "--precision", "0"]
-    reason = _run("SPECULA", [*program, specula_model.NAME], python, folder)
-    if reason is not None:
-        return Unchecked(program="SPECULA", reason=reason)
-    matrix, seconds = specula_model.read_matrix(folder), time.perf_counter() - begun
-    return _judge("SPECULA", matrix, fit, np.arange(len(fit.modes)), seconds, instrument)
+    if reason := _run("SPECULA", [*program, specula_model.NAME], python, folder):
+        return reason
+    seconds, some = time.perf_counter() - begun, np.arange(len(fit.modes))
+    # Its matrix has slopes, the bench's signals may be pixels.
+    bench = slopes_of(fit.measured, instrument.slopes.kind).reshape(-1, len(some))
+    return _judge("SPECULA", bench, specula_model.read_matrix(folder), fit, some, seconds)
 
 
 def _choose_columns(fit: Fit) -> NDArray[np.intp]:
@@ -148,10 +132,8 @@ def _run(program: str, arguments: list[str], python: Path | None, folder: Path) 
     return f"{program} did not run the model: {last}."
 
 
-def _from_bench(
-    program: str, measured: Array, reference: Array, instrument: Instrument, modes: Array
-) -> Array:
-    """Return signals in the bench's own order ``(n, ...)`` as a fit has them."""
+def _from_bench(measured: Array, reference: Array, instrument: Instrument, modes: Array) -> Array:
+    """Return signals of OOPAO in the bench's own order ``(n, ...)`` as a fit has them."""
     frames = instrument.frames is not None
     normalised = getattr(instrument.frames, "normalised", False)
     recorded = Recorded(
@@ -160,27 +142,16 @@ def _from_bench(
         noise=None,
         double_pass=False,
         flux_frame=reference if frames and not normalised else None,
-        where=program,
+        where="OOPAO",
         sha256="",
     )
     return target_of(make_reference(recorded, instrument)[0], instrument).matrix
 
 
 def _judge(
-    program: str,
-    matrix: Array,
-    fit: Fit,
-    some: NDArray[np.intp],
-    seconds: float,
-    instrument: Instrument | None = None,
+    program: str, bench: Array, matrix: Array, fit: Fit, some: NDArray[np.intp], seconds: float
 ) -> Checked:
-    """Compare a matrix of some columns of the fit, in its axes.
-
-    It has slopes if the ``instrument`` is given, whose signals may be pixels.
-    """
-    bench = fit.measured[:, some]
-    if instrument is not None:
-        bench = slopes_of(bench, instrument.slopes.kind).reshape(-1, len(some))
+    """Compare the matrix of a program with that of the bench, both of some columns of the fit."""
     return Checked(
         program=program,
         modes=fit.modes[some],

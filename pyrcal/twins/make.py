@@ -6,7 +6,7 @@ import argparse
 import contextlib
 import shutil
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,13 +25,13 @@ from pyrcal.fitting.instrument_checks import UNKNOWN_ABERRATION
 from pyrcal.fitting.matrix import FitOptions
 from pyrcal.fitting.models import FAMILIES
 from pyrcal.fitting.report import fill_fit, orientation_words
-from pyrcal.importers.imported import UNKNOWN, Imported, Saved, Tables
+from pyrcal.importers.imported import UNKNOWN, Imported, Tables
 from pyrcal.terminal import show_progress
 from pyrcal.twins.bench import Bench, read_bench
 from pyrcal.twins.check import check_oopao_model, check_specula_model
 from pyrcal.twins.oopao_model import write_oopao_model
 from pyrcal.twins.report import Twin, list_lines, write_report
-from pyrcal.twins.sampled import Actuators, sample_bench
+from pyrcal.twins.sampled import Actuators, list_adopted, sample_bench
 from pyrcal.twins.specula_model import write_specula_model
 from service.errors import ConfigurationError, PyrcalError, StorageError
 from service.files import parse_modes
@@ -77,15 +77,7 @@ def main(options: argparse.Namespace) -> int:
     PyrcalError
         If something that was given cannot be used; nothing is left behind.
     """
-    stated = {name: getattr(options, name) for name in STATED}
-    made = _make(
-        argparse.Namespace(**stated, files=options.files),
-        options.output,
-        check=options.check,
-        python=options.python,
-        threads=options.threads,
-        progress=show_progress,
-    )
+    made = _make(options, show_progress)
     print("\n".join(list_lines(made)))
     return ACCEPTED if made.report.fit.accepted else REFUSED
 
@@ -138,34 +130,25 @@ def twin(
     if isinstance(modes := stated.get("modes"), str):
         stated["modes"] = parse_modes(modes)
     paths = [(role, Path(path)) for role, path in given]
-    options = argparse.Namespace(**{**STATED, **stated}, files=paths)
-    return _make(options, Path(output), check=check, python=python, threads=threads)
+    task = {"output": Path(output), "check": check, "threads": threads}
+    python = None if python is None else Path(python)
+    return _make(argparse.Namespace(**{**STATED, **stated}, **task, files=paths, python=python))
 
 
-def _make(
-    options: argparse.Namespace,
-    output: Path,
-    *,
-    check: bool,
-    python: str | Path | None,
-    threads: int,
-    progress: Progress | None = None,
-) -> Twin:
+def _make(options: argparse.Namespace, progress: Progress | None = None) -> Twin:
     """Write the twin into a temporary folder, and move it to its place when it is complete."""
+    output, python = options.output, options.python and options.python.absolute()
     _check_output(output)
-    interpreter = None if python is None else Path(python).absolute()
-    if interpreter is not None and not interpreter.is_file():
-        raise ConfigurationError(
-            f"--python: found no file {interpreter}, expected a Python interpreter"
-        )
+    if python is not None and not python.is_file():
+        raise ConfigurationError(f"--python: found no file {python}, expected a Python interpreter")
     bench = read_bench(options)
     try:
         with tempfile.TemporaryDirectory(dir=output.absolute().parent, prefix=".twin-") as name:
             draft = Path(name) / "twin"
-            made = _fit_bench(bench, draft, threads, progress)
+            made = _fit_bench(bench, partial(_fit, bench, draft, options.threads, progress))
             # A second thread of BLAS waits in a loop for the first one: it only costs time.
             with threadpool_limits(1):
-                made = _export(made, check=check, python=interpreter)
+                made = _export(made, check=options.check, python=python)
             write_report(made)
             if output.is_dir():
                 shutil.rmtree(output)
@@ -189,17 +172,16 @@ def _check_output(output: Path) -> None:
         )
 
 
-def _fit_bench(bench: Bench, folder: Path, threads: int, progress: Progress | None) -> Twin:
+def _fit_bench(bench: Bench, fit_import: Callable[[Imported], Twin]) -> Twin:
     """Return the fit of the bench, with the instrument file corrected, and write both."""
-    best = _choose_import(bench, folder, threads, progress)
+    best = _choose_import(bench, fit_import)
     number = _find_number(best.report.fit)
     corrections = best.report.fit.corrections if number is None else read_entries([number.key])
     for _ in range(MAX_CORRECTIONS):
         if not corrections:
             break
         # The axes of the slopes are as the fit has found them; other values move it.
-        corrected = _correct(best.imported, best.report.fit, corrections)
-        again = _fit(bench, corrected, folder, threads, progress)
+        again = fit_import(_correct(best.imported, best.report.fit, corrections))
         share = HARDLY_MORE_LEFT if number is None else MAX_SHARE**0.5
         if not _is_better(again, than=best, share=share):
             break
@@ -207,41 +189,35 @@ def _fit_bench(bench: Bench, folder: Path, threads: int, progress: Progress | No
         # A value that was made unknown has been fitted, and is now written.
         corrections = again.report.fit.corrections if UNKNOWN in corrections.values() else {}
     best = replace(best, imported=_correct(best.imported, best.report.fit, _list_found(best)))
-    saved = best.imported.save(folder)
+    saved = best.imported.save(best.folder)
     # The fit belongs to the instrument file that is written, which has what it found.
     digest = instrument_sha256(load_instrument(saved.instrument))
     report = replace(best.report, instrument_sha256=digest)
-    write_whole(folder / TWIN_FIT, partial(fill_fit, report=report))
-    _write_live(best, saved)
+    write_whole(best.folder / TWIN_FIT, partial(fill_fit, report=report))
+    _write_live(best)
     return best
 
 
-def _choose_import(bench: Bench, folder: Path, threads: int, progress: Progress | None) -> Twin:
+def _choose_import(bench: Bench, fit_import: Callable[[Imported], Twin]) -> Twin:
     """Return the fit of the import whose model leaves least."""
     *grids, usual = bench.imported
+    simulated = None
     # The files may allow a grid that the bench does not have.
-    simulated = _try_fit(bench, grids[0], folder, threads, progress) if grids else None
+    with contextlib.suppress(PyrcalError):
+        simulated = fit_import(grids[0]) if grids else None
     if simulated is None:
-        return _fit(bench, usual, folder, threads, progress)
+        return fit_import(usual)
     if simulated.residual < EXACT:
         return simulated
-    made = _try_fit(bench, usual, folder, threads, progress)
-    if made is None or made.residual**2 - simulated.residual**2 > MIN_EXPLAINED**2:
-        return simulated
-    return made
-
-
-def _try_fit(
-    bench: Bench, imported: Imported, folder: Path, threads: int, progress: Progress | None
-) -> Twin | None:
-    """Return the fit of an import; None if it cannot be fitted."""
     with contextlib.suppress(PyrcalError):
-        return _fit(bench, imported, folder, threads, progress)
-    return None
+        made = fit_import(usual)
+        if made.residual**2 - simulated.residual**2 <= MIN_EXPLAINED**2:
+            return made
+    return simulated
 
 
 def _fit(
-    bench: Bench, imported: Imported, folder: Path, threads: int, progress: Progress | None
+    bench: Bench, folder: Path, threads: int, progress: Progress | None, imported: Imported
 ) -> Twin:
     saved = imported.save(folder)
     instrument = load_instrument(saved.instrument)
@@ -290,12 +266,8 @@ def _list_found(made: Twin) -> Mapping[str, Any]:
     files have none or a notably different one.
     """
     fit = made.report.fit
-    found = [
-        f"{one.key} = {one.found:.4g}"
-        for one in fit.optics
-        if one.found is not None and one.key and one.is_adopted
-    ]
-    found += [one.entry for one in fit.origins if f"wfs.{one.key}" in FAMILIES]
+    found = [f"{key} = {value:.4g}" for key, value in list_adopted(fit).items() if key]
+    found += [one.entry for one in fit.origins if one.key in FAMILIES]
     return read_entries(found)
 
 
@@ -322,14 +294,20 @@ def _correct(imported: Imported, fit: Fit, values: Mapping[str, Any]) -> Importe
     return replace(imported, tables=corrected, notes=notes)
 
 
-def _write_live(made: Twin, saved: Saved) -> None:
+@contextlib.contextmanager
+def _draft(made: Twin, tables: Tables) -> Iterator[Path]:
+    """Write an instrument file of other tables beside the twin's, which is removed after use."""
+    path = made.folder / f"draft-{TWIN_FILE}"
+    path.write_text(replace(made.imported, tables=tables).instrument_text(), encoding="utf-8")
+    yield path
+    path.unlink()
+
+
+def _write_live(made: Twin) -> None:
     """Write the instrument file of ``pyrcal run``: an RTC sends slopes, not frames."""
-    folder = saved.instrument.parent
-    draft, live = folder / f"draft-{TWIN_FILE}", folder / TWIN_LIVE_FILE
-    tables = _describe_live(made.imported.tables, made.report.fit)
-    draft.write_text(replace(made.imported, tables=tables).instrument_text(), encoding="utf-8")
-    write_live_instrument(draft, live)
-    draft.unlink()
+    folder, live = made.folder, made.folder / TWIN_LIVE_FILE
+    with _draft(made, _describe_live(made.imported.tables, made.report.fit)) as draft:
+        write_live_instrument(draft, live)
     # It refers to arrays by absolute paths, in a folder that is moved to its place later.
     text = live.read_text(encoding="utf-8").replace(f"{folder}/", "").replace("draft-", "")
     live.write_text(text, encoding="utf-8")
@@ -360,19 +338,18 @@ def _read_actuators(made: Twin) -> Actuators | None:
 
     The model of the fit only keeps the modes: the functions are read as a zonal mirror.
     """
-    folder, tables = made.folder, made.imported.tables
-    mirror, draft = dict(tables["mirror"]), folder / "draft-actuators.toml"
+    tables = made.imported.tables
+    mirror = dict(tables["mirror"])
     if "influence_functions" not in mirror:
         return None
     reference = mirror.pop("mode_to_actuator", None)
-    zonal = {**tables, "mirror": {**mirror, "basis": "zonal"}}
-    draft.write_text(replace(made.imported, tables=zonal).instrument_text(), encoding="utf-8")
+    with _draft(made, {**tables, "mirror": {**mirror, "basis": "zonal"}}) as draft:
+        zonal = load_instrument(draft).mirror
     # The optics are those of the fit: the tables may have corrected ones.
-    functions = cached_basis(replace(made.instrument, mirror=load_instrument(draft).mirror))
-    draft.unlink()
+    functions = cached_basis(replace(made.instrument, mirror=zonal))
     if reference is None:
         return functions, np.eye(functions.n_modes)
-    strokes = read_dataset(reference, folder, "mirror.mode_to_actuator").astype(np.float64)
+    strokes = read_dataset(reference, made.folder, "mirror.mode_to_actuator").astype(np.float64)
     strokes[:, made.instrument.mirror.flat_modes] = 0.0  # modes that the model does not use
     return functions, strokes
 
@@ -390,5 +367,5 @@ def _export(made: Twin, *, check: bool, python: Path | None) -> Twin:
         write_specula_model(sampled, fit, folder),
     )
     runs = (check_oopao_model, check_specula_model) if check else ()
-    checks = tuple(run(folder, about, fit, python=python).words for run in runs)
+    checks = tuple(str(run(folder, about, fit, python=python)) for run in runs)
     return replace(made, exported=exported, checks=checks)

@@ -12,13 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.importers.oopao import to_oopao
-from pyrcal.twins.exported import Exported
-from pyrcal.twins.sampled import SampledBench
+from pyrcal.twins.sampled import Exported, SampledBench
 from service.model.instrument import PupilMap
 from service.model.kinds import SignalKind
-from service.model.modes import ModalBasis
 from service.model.pupil import instrument_pupil
-from service.model.surface import Gaussian
 
 Array = NDArray[Any]
 
@@ -116,16 +113,12 @@ def _short(number: float) -> float | int:
 def _describe_mirror(bench: SampledBench) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the constants of the mirror, and its arrays."""
     # A wavefront that rises moves OOPAO's light to the other side than that of conventions.md.
-    sign, basis = 1 if bench.reverse else -1, bench.basis
-    surface = basis.surface if isinstance(basis, ModalBasis) else None
-    if (
-        not isinstance(surface, Gaussian)
-        or surface.segments_deg
-        or not isinstance(basis, ModalBasis)
-    ):
-        functions, modes = bench.render_functions()
+    sign = 1 if bench.reverse else -1
+    if bench.gaussian is None:
+        functions, modes = bench.render_functions(np.ones_like(bench.amplitude, bool))
         arrays = {"functions": functions, "mode_to_actuator": modes * bench.unit_m}
         return {"SIGN": sign}, arrays
+    basis, surface = bench.gaussian
     steps = (bench.n_points - 1) / bench.n_points
     scale = bench.instrument.subaperture_m / steps
     array = SimpleNamespace(D=bench.width_m, resolution=bench.n_points)

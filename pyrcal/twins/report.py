@@ -18,7 +18,7 @@ from pyrcal.fitting.report import FitReport, document
 from pyrcal.importers.imported import UNKNOWN, Imported, format_toml
 from pyrcal.maintenance.commission_page import format_html, format_table
 from pyrcal.twins.bench import Bench
-from pyrcal.twins.exported import Exported
+from pyrcal.twins.sampled import Exported
 from service.errors import ConfigurationError, shown
 from service.files.documents import json_text, pick
 from service.model.instrument import Instrument

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import tomllib
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from pyrcal.fitting.fitted import Fit
 from pyrcal.fitting.instrument_checks import COUPLING_KEY
+from pyrcal.fitting.models import ABERRATION_KEY, ELLIPSE_KEY, ROOFTOP_KEY, set_coupling
 from service.files.container import MAX_BYTES
 from service.files.disk_cache import cached_basis
 from service.model.instrument import Instrument, Mirror
@@ -23,7 +25,6 @@ from service.model.modes import Basis, ModalBasis
 from service.model.pupil import Illumination, PupilGrid, instrument_pupil, valid_subapertures
 from service.model.sensors.pyramid.description import (
     FrameWindows,
-    Pyramid,
     by_quadrant,
     draw_aberration,
     orient_offsets,
@@ -32,12 +33,7 @@ from service.model.sensors.pyramid.description import (
     read_aberration,
     stretch_of,
 )
-from service.model.sensors.pyramid.table import (
-    ABERRATION_KEY,
-    ELLIPSE_KEY,
-    ROOFTOP_KEY,
-    FftGrid,
-)
+from service.model.sensors.pyramid.table import FftGrid
 from service.model.sensors.registry import kind_of
 from service.model.slopes import Orientation, rtc_mask, to_rtc
 from service.model.surface import Gaussian
@@ -72,6 +68,17 @@ _SIDES = np.array([[[-1, -1], [1, -1]], [[-1, 1], [1, 1]]]) / 2.0
 """Position (x, y) of each image over the separation, ``(2, 2, 2)`` [side y, side x]."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Exported:
+    """A sampled bench as a model of another program."""
+
+    path: Path
+    """File that the other program runs."""
+
+    remarks: tuple[str, ...]
+    """Assumptions of the model and what it does not contain, one sentence each."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SampledBench:
     """A fitted bench in the axes of conventions.md, on a grid of points and of detector pixels."""
@@ -82,7 +89,7 @@ class SampledBench:
     basis: Basis
     """Modes of the mirror, with the fitted coupling."""
 
-    actuators: Actuators | None
+    actuators: Actuators | None = None
     """Actuators of the mirror; None if only shapes of modes are given."""
 
     alpha: Misregistration
@@ -121,13 +128,13 @@ class SampledBench:
     unit_m: float
     """OPD of a unit command, metres, light passes included."""
 
-    frame_shape: tuple[int, int] | None
+    frame_shape: tuple[int, int] | None = None
     """Rows and columns of the bench's frames; None if it has slopes."""
 
     reverse: bool
     """True if the bench's signals have the other sign than those of conventions.md."""
 
-    remarks: tuple[str, ...]
+    remarks: tuple[str, ...] = ()
     """Assumptions, one sentence each."""
 
     @property
@@ -174,14 +181,25 @@ class SampledBench:
         x, y = np.meshgrid(along, along)
         return alpha.on_mirror(np.column_stack([x.ravel(), y.ravel()]) - alpha.vector[:2])
 
-    def render_functions(self) -> tuple[Array, Array]:
-        """Return functions ``(n_points ** 2, n)`` where α puts them, and the modes made of them.
+    @property
+    def gaussian(self) -> tuple[ModalBasis, Gaussian] | None:
+        """Modes and functions of a mirror whose functions are Gaussians; None of any other.
 
-        The modes are ``(n, n_modes)``: strokes of actuators, or the identity if the functions are
-        the modes themselves.
+        Functions that end at the edges of segments are no Gaussians.
+        """
+        basis = self.basis
+        if not isinstance(basis, ModalBasis) or not isinstance(basis.surface, Gaussian):
+            return None
+        return None if basis.surface.segments_deg else (basis, basis.surface)
+
+    def render_functions(self, drawn: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """Return functions ``(n_drawn, n)`` where α puts them, and the modes made of them.
+
+        ``drawn`` ``(n_points, n_points)`` marks the points. The modes are ``(n, n_modes)``: strokes
+        of actuators, or the identity if the functions are the modes themselves.
         """
         functions, modes = self.actuators or (self.basis, np.eye(self.basis.n_modes))
-        return functions.render(self.points_on_mirror()), modes
+        return functions.render(self.points_on_mirror()[drawn.ravel()]), modes
 
     @property
     def orientation(self) -> Orientation:
@@ -245,10 +263,8 @@ def sample_bench(
     ModelError
         If the sensor is no pyramid.
     """
-    found, basis = apply_fit(instrument, fit), cached_basis(instrument)
-    if isinstance(basis, ModalBasis) and isinstance(basis.surface, Gaussian):
-        coupling = found.analytic_mirror.shape.coupling
-        basis = basis.of_surface(replace(basis.surface, coupling=coupling))
+    found = apply_fit(instrument, fit)
+    basis = set_coupling(cached_basis(instrument), list_adopted(fit).get(COUPLING_KEY))
     tried = [
         _place_images(replace(_draw_bench(found, basis, fit, *grid), frame_shape=frame_shape), fit)
         for grid in _list_grids(found, frame_shape)
@@ -273,13 +289,12 @@ def _with_actuators(bench: SampledBench, actuators: Actuators | None) -> Sampled
     """Return the bench with its actuators, or with a remark that its models have none."""
     basis = bench.basis
     if isinstance(basis, ModalBasis):
-        if isinstance(basis.surface, Gaussian) and not basis.surface.segments_deg:
-            return bench  # written as positions, not as functions
         actuators = basis.of_actuators, basis.mode_to_actuator
     reason = "no influence functions of actuators are given"
     if actuators is not None:
         n_bytes = 8 * bench.n_points**2 * actuators[0].n_modes
-        if n_bytes <= MAX_BYTES:
+        # OOPAO's model of a Gaussian mirror has positions, and SPECULA needs its functions
+        if n_bytes <= MAX_BYTES or bench.gaussian is not None:
             return replace(bench, actuators=actuators)
         reason = f"the functions of all actuators would take {n_bytes / 1e9:.0f} GB"
     remark = f"The mirror of the models has the bench's modes instead of its actuators: {reason}."
@@ -326,7 +341,6 @@ def _draw_bench(found: Instrument, basis: Basis, fit: Fit, points: int, width: i
     return SampledBench(
         instrument=found,
         basis=basis,
-        actuators=None,
         alpha=fit.alpha,
         n_pixels=n_pixels,
         points_per_pixel=points,
@@ -339,9 +353,7 @@ def _draw_bench(found: Instrument, basis: Basis, fit: Fit, points: int, width: i
         image_places_px=np.zeros((2, 2, 2)),
         valid=_pad(valid_subapertures(found), n_pixels // pixels),
         unit_m=1.0 if found.mirror.stroke_known else float(np.median(fit.gains)),
-        frame_shape=None,
         reverse=orientation.sign_x == orientation.sign_y == -1,
-        remarks=(),
     )
 
 
@@ -349,30 +361,32 @@ def apply_fit(instrument: Instrument, fit: Fit) -> Instrument:
     """Return the instrument with the values that the fit determined."""
     slopes = replace(instrument.slopes, orientation=fit.orientation, order=fit.order)
     wfs, mirror = pyramid_in(instrument), instrument.mirror
-    values = {one.key: one.found for one in fit.optics if one.found is not None and one.is_adopted}
-    number = values.get("modulation_lambda_over_d")
-    if number is not None:
-        wfs = replace(wfs, modulation_lambda_over_d=number)
-    if ROOFTOP_KEY in values:
-        wfs = replace(wfs, rooftop_lambda_over_d=values[ROOFTOP_KEY])
+    values = list_adopted(fit)
     if isinstance(mirror, Mirror) and COUPLING_KEY in values:
         mirror = replace(mirror, shape=replace(mirror.shape, coupling=values[COUPLING_KEY]))
+    wfs = replace(
+        wfs,
+        modulation_lambda_over_d=values.get(
+            "modulation_lambda_over_d", wfs.modulation_lambda_over_d
+        ),
+        rooftop_lambda_over_d=values.get(ROOFTOP_KEY, wfs.rooftop_lambda_over_d),
+    )
     for origin in fit.origins:
         if origin.key == ELLIPSE_KEY:
-            wfs = _with_ellipse(wfs, origin.found)
+            ellipse = tomllib.loads(origin.entry)[ELLIPSE_KEY]
+            first, second = ellipse["axes_lambda_over_d"]
+            stretch = stretch_of((first, second), math.radians(ellipse["angle_deg"]))
+            radius = math.sqrt(first * second)
+            wfs = replace(wfs, modulation_lambda_over_d=radius, modulation_stretch=stretch)
         elif origin.key == ABERRATION_KEY:
-            found = tomllib.loads(f"found = {origin.found}")["found"]
+            found = tomllib.loads(origin.entry)[ABERRATION_KEY]
             wfs = replace(wfs, aberration_rad=read_aberration(found, wfs.wavelength_m))
     return replace(instrument, slopes=slopes, wfs=wfs, mirror=mirror)
 
 
-def _with_ellipse(wfs: Pyramid, entry: str) -> Pyramid:
-    """Return the pyramid with an elliptic modulation, in the notation of the instrument file."""
-    ellipse = tomllib.loads(f"found = {entry}")["found"]
-    first, second = ellipse["axes_lambda_over_d"]
-    stretch = stretch_of((first, second), math.radians(ellipse["angle_deg"]))
-    radius = math.sqrt(first * second)
-    return replace(wfs, modulation_lambda_over_d=radius, modulation_stretch=stretch)
+def list_adopted(fit: Fit) -> dict[str, float]:
+    """Return the fitted optical numbers that take the place of the instrument file's, by key."""
+    return {one.key: one.found for one in fit.optics if one.found is not None and one.is_adopted}
 
 
 def _pixels(instrument: Instrument) -> int:

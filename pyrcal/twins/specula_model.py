@@ -17,8 +17,8 @@ import scipy
 from numpy.typing import NDArray
 
 from pyrcal.fitting.fitted import Fit
-from pyrcal.twins.exported import Exported
-from pyrcal.twins.sampled import SampledBench, sample_bench
+from pyrcal.fitting.specula import NANOMETRE_M, write_fits
+from pyrcal.twins.sampled import Exported, SampledBench, sample_bench
 from service.errors import MatrixError, StorageError
 from service.files.container import opened
 from service.files.disk_cache import cached_basis
@@ -26,10 +26,8 @@ from service.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
-from service.model.modes import ModalBasis
 from service.model.pupil import valid_subapertures
 from service.model.slopes import slopes_of
-from service.model.surface import Gaussian
 
 Array = NDArray[Any]
 
@@ -69,8 +67,6 @@ _STATIC = f"""\
 
 _STROKE_WAVES = 0.002
 """RMS of the shapes that the calibration pushes, wavelengths."""
-
-_NANOMETRE_M = 1e-9
 
 _IMAGES = ((0, 1), (0, 0), (1, 0), (1, 1))
 """Side along y and along x of each of SPECULA's images."""
@@ -149,29 +145,29 @@ def write_specula_model(bench: SampledBench, fit: Fit, folder: Path) -> Exported
     """
     bench = _move_pupil(bench)
     apart, width = _place_images(bench)
-    functions, m2c = _describe_mirror(bench, fit)
     lit = bench.amplitude > 0.0
+    functions, modes = bench.render_functions(lit)
     # SPECULA counts nanometres, here of the bench's own unit where its stroke is unknown.
     known = bench.instrument.mirror.stroke_known
-    unit_m = _NANOMETRE_M if known else bench.unit_m
-    m2c = m2c * (unit_m / _NANOMETRE_M)
+    unit_m = NANOMETRE_M if known else bench.unit_m
+    m2c = modes[:, fit.modes] * (unit_m / NANOMETRE_M)
     root, pitch_m = folder / CALIBRATION, bench.width_m / bench.n_points
-    _save_fits(root, "ifunc", {}, INFLUENCE_FUNCTION=functions, MASK_INF_FUNC=lit.astype(float))
-    _save_fits(root, "m2c", {}, M2C=m2c)
+    _save(root, "ifunc", {}, INFLUENCE_FUNCTION=functions, MASK_INF_FUNC=lit.astype(float))
+    _save(root, "m2c", {}, M2C=m2c)
     stop = {"OBJ_TYPE": "Pupilstop", "PIXPUPIL": bench.n_points, "PIXPITCH": pitch_m}
     stop |= {"SHIFTX": 0.0, "SHIFTY": 0.0, "ROTATION": 0.0, "MAGNIFIC": 1.0}
-    _save_fits(root, "pupilstop", stop, AMPLITUDE=bench.amplitude)
+    _save(root, "pupilstop", stop, AMPLITUDE=bench.amplitude)
     _save_pupils(root, bench, apart, width)
     if bench.aberration_m is not None:
-        static = {"INFLUENCE_FUNCTION": bench.aberration_m[lit][:, None] / _NANOMETRE_M}
-        _save_fits(root, "ifunc", {}, STATIC, **static, MASK_INF_FUNC=lit.astype(float))
+        static = {"INFLUENCE_FUNCTION": bench.aberration_m[lit][:, None] / NANOMETRE_M}
+        _save(root, "ifunc", {}, STATIC, **static, MASK_INF_FUNC=lit.astype(float))
     light = 1.0 if fit.gain_map is None else fit.gain_map[fit.valid][:, None]
     slopes = slopes_of(fit.synthetic, bench.instrument.slopes.kind) * light
     slopes = slopes.reshape(-1, len(fit.modes))
     reconstructor = np.linalg.pinv(swap_slopes(slopes.astype(float)) * unit_m)
-    _save_fits(root, "rec", {"NORMFACT": 0.0}, RECMAT=reconstructor)
+    _save(root, "rec", {"NORMFACT": 0.0}, RECMAT=reconstructor)
     wavelength_m, n = bench.instrument.wfs.wavelength_m, bench.n_subapertures
-    strokes = _STROKE_WAVES * wavelength_m / _NANOMETRE_M / (functions @ m2c).std(axis=0)
+    strokes = _STROKE_WAVES * wavelength_m / NANOMETRE_M / (functions @ m2c).std(axis=0)
     first, second, _ = bench.modulation
     # its tilts rise by the wavelength from the first sample to the last
     radius = math.sqrt(first * second) * (bench.n_points - 1) / bench.n_points
@@ -187,7 +183,7 @@ def write_specula_model(bench: SampledBench, fit: Fit, folder: Path) -> Exported
         "n_modes": len(strokes),
         "total_time_s": 2 * len(strokes) / 1000,
         "strokes": [float(f"{one:.6g}") for one in strokes],
-        "wavelength_nm": wavelength_m / _NANOMETRE_M,
+        "wavelength_nm": wavelength_m / NANOMETRE_M,
         "fov_arcsec": math.degrees(wavelength_m / pitch_m) * 3600.0,
         "n_subapertures": n,
         "separation": apart,
@@ -259,16 +255,6 @@ def _place_images(bench: SampledBench) -> tuple[int, int]:
     return apart, max(apart + n, 2 * round(bench.width_px / bench.pixels / 2))
 
 
-def _describe_mirror(bench: SampledBench, fit: Fit) -> tuple[Array, Array]:
-    """Return functions ``(n_lit_points, n_functions)`` where α puts them, and the fitted modes."""
-    lit, basis = bench.amplitude.ravel() > 0.0, bench.basis
-    if isinstance(basis, ModalBasis) and isinstance(basis.surface, Gaussian):
-        points = bench.points_on_mirror()[lit] * [1.0, basis.y_sign]
-        return basis.surface.basis(points), basis.mode_to_actuator[:, fit.modes]
-    functions, modes = bench.render_functions()
-    return functions[lit], modes[:, fit.modes]
-
-
 def _save_pupils(root: Path, bench: SampledBench, apart: int, width: int) -> None:
     """Write the pixels of the valid subapertures in the four images as SPECULA's ``PupData``."""
     row, column = np.nonzero(bench.valid)
@@ -282,23 +268,14 @@ def _save_pupils(root: Path, bench: SampledBench, apart: int, width: int) -> Non
         "CX": (columns.min(axis=0) + columns.max(axis=0)) / 2.0,
         "CY": (rows.min(axis=0) + rows.max(axis=0)) / 2.0,
     }
-    _save_fits(root, "pupils", {"VERSION": 2, "FSIZEX": width, "FSIZEY": width}, **arrays)
+    _save(root, "pupils", {"VERSION": 2, "FSIZEX": width, "FSIZEY": width}, **arrays)
 
 
-def _save_fits(
-    root: Path, kind: str, header: dict[str, Any], tag: str = TAG, **arrays: Array
-) -> None:
-    """Write arrays as extensions of a FITS file, in the folder of their kind."""
-    from astropy.io import fits
-
+def _save(root: Path, kind: str, header: dict[str, Any], tag: str = TAG, **arrays: Array) -> None:
+    """Write arrays to a file in the folder of their kind."""
     folder = root / kind
     folder.mkdir(parents=True, exist_ok=True)
-    images = []
-    for name, values in arrays.items():
-        dtype = np.int64 if values.dtype.kind in "iu" else np.float32
-        images.append(fits.ImageHDU(np.ascontiguousarray(values, dtype), name=name))
-    first = fits.PrimaryHDU(header=fits.Header({"VERSION": 1, **header}))
-    fits.HDUList([first, *images]).writeto(folder / f"{tag}.fits", overwrite=True)
+    write_fits(folder / f"{tag}.fits", header, **arrays)
 
 
 def _list_limits(bench: SampledBench) -> tuple[str, ...]:

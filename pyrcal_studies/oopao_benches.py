@@ -6,8 +6,9 @@ pyrcal_studies.oopao_benches FOLDER [CASE ...]``; then ``pyrcal import oopao`` a
 
 from __future__ import annotations
 
+import json
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -56,13 +57,28 @@ class Case:
     noise: float = 0.0
     """RMS of the noise over that of the signal of each mode."""
 
+    faces_px: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    """Arguments of ``apply_shift_wfs``, x and y of each face; None for a regular grid of images."""
+
+    unit_m: float = 1.0
+    """OPD of a unit command, metres; negative if commands have the other sign."""
+
+    seed: int = 7
+    """Seed of the noise."""
+
     aberration_rad: float = 0.0
     """RMS of a static aberration of OOPAO's Zernike polynomials 3 to 12, counted from tip: drawn
     coefficients."""
 
 
+OFF_GRID = 0.5
+"""Share of the drawn benches of whole frames whose pupil images are off a regular grid."""
+
 FREE = "-free"
 """End of the name of a bench that is simulated without its noise."""
+
+DRAWN = "drawn-"
+"""Start of the name of a bench that is drawn, before its seed."""
 
 WHOLE = "fullFrame_sum_flux"
 
@@ -108,6 +124,31 @@ CASES = {
 }
 
 
+def draw_case(seed: int) -> Case:
+    """Return a bench whose kind follows from its seed, and whose values are drawn."""
+    rng, kind = np.random.default_rng(seed), seed % 8
+    modulation = (0.0, 3.0, 5.0, 4.0)[kind % 4]
+    whole, noise = kind >= 3, 0.1 * (seed // 8 % 2)
+    subapertures, actuators = (36, 11) if kind in {0, 5, 6} else (20, (11, 17)[seed // 4 % 2])
+    pitch_subap = subapertures / (actuators - 1)
+    shift = rng.uniform(-pitch_subap / 3, pitch_subap / 3, 2)
+    turned = float(rng.choice([0.0, 90.0, 180.0]) + rng.normal(0.0, 1.5))
+    off_px = rng.uniform(-3.0, 3.0, (2, 4)) * (whole and rng.random() < OFF_GRID)
+    return Case(
+        modulation=modulation,
+        ellipse=(4.0, 5.0, float(rng.uniform(0.0, 180.0))) if kind % 4 == 3 else None,
+        processing=str(rng.choice(["fullFrame", WHOLE])) if whole else "slopesMaps",
+        subapertures=subapertures,
+        actuators=actuators,
+        separation_px=2 * round(subapertures / 4.5),
+        alpha=(float(shift[0]), float(shift[1]), turned, float(rng.uniform(0.9, 1.12))),
+        noise=noise,
+        faces_px=(tuple(off_px[0]), tuple(off_px[1])) if np.any(off_px) else None,
+        unit_m=float(rng.choice([-1.0, 1.0]) * 10 ** rng.uniform(-7.0, -5.0)),
+        seed=seed,
+    )
+
+
 def measure(case: Case) -> dict[str, Any]:
     """Return what the tutorial saves of a bench: its objects, its modes and its matrix."""
     n_points = case.subapertures * POINTS
@@ -140,6 +181,8 @@ def measure(case: Case) -> dict[str, Any]:
         rooftop=case.rooftop,
         user_modulation_path=None if case.ellipse is None else _path(*case.ellipse),
     )
+    if case.faces_px is not None:
+        sensor.apply_shift_wfs(sx=list(case.faces_px[0]), sy=list(case.faces_px[1]))
     _, _, axes = np.linalg.svd(plain.modes, full_matrices=False)
     modes = axes[:N_MODES].T / (plain.modes @ axes[:N_MODES].T).std(axis=0)
     aberration = _draw_aberration(telescope, case.aberration_rad)
@@ -152,8 +195,9 @@ def measure(case: Case) -> dict[str, Any]:
             signals.append(np.array(sensor.signal, dtype=float))
         columns.append((signals[0] - signals[1]) / (2 * STROKE_M))
     matrix = np.stack(columns, axis=1)
-    noise = np.random.default_rng(7).standard_normal(matrix.shape)
+    noise = np.random.default_rng(case.seed).standard_normal(matrix.shape)
     matrix += case.noise * matrix.std(axis=0) * noise
+    matrix *= case.unit_m
     owners = {"tel": telescope, "ngs": star, "dm": plain, "dm.misReg": plain.misReg, "wfs": sensor}
     names = {
         "tel": "D resolution pupil pupilReflectivity",
@@ -167,6 +211,7 @@ def measure(case: Case) -> dict[str, Any]:
     kept: dict[str, Any] = {"calib.D": matrix.astype(np.float32), "M2C": modes}
     # A picture of the modulated spot, on OOPAO's grid of the focal plane.
     kept["spot"] = np.array(sensor.modulation_camera_intensity)
+    kept |= {"case": json.dumps(asdict(case)), "frame": np.array(sensor.cam.frame)}
     for owner, listed in names.items():
         for name in listed.split():
             value = getattr(owners[owner], name, None)
@@ -196,7 +241,8 @@ def main() -> None:
     """Write the dumps of all benches, or of those that are named."""
     folder, *named = sys.argv[1:]
     for name in named or CASES:
-        case = CASES[name.removesuffix(FREE)]
+        drawn = name.removeprefix(DRAWN)
+        case = draw_case(int(drawn)) if drawn != name else CASES[name.removesuffix(FREE)]
         if name.endswith(FREE):
             case = replace(case, noise=0.0)
         np.savez(Path(folder) / f"{name}.npz", **measure(case))

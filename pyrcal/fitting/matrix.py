@@ -742,7 +742,7 @@ def _gather_findings(
     power = np.sum(target.matrix[target.rows] ** 2, axis=0)
     structure = measure_structure(seen.residual, power, usable.noise_per_pass)
     before = estimate_uncertainty(settled, structure, _magnification_floor(about)[0])
-    optics = list_optics(as_in_file, settled, before)
+    optics = list_optics(as_in_file, settled, before, structure)
     # This takes further fits, so only if a fitted value differs notably from the file.
     notable = any(one.notable for one in optics)
     without = fit_file_values(as_in_file, settled, optics) if notable else None

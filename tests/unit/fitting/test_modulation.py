@@ -5,13 +5,15 @@ from __future__ import annotations
 import tomllib
 from dataclasses import replace
 from functools import cache, partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from pyrcal.fitting import matrix as fit_matrix_module
+from pyrcal.fitting.instrument_checks import list_optics
 from pyrcal.fitting.matrix import AxesDoubt, FitOptions, fit_matrix
-from pyrcal.fitting.models import LOGARITHM_ABOVE, moved_sensor_number, sensor_coordinate
+from pyrcal.fitting.models import LOGARITHM_ABOVE, Optic, moved_sensor_number, sensor_coordinate
 from pyrcal_studies.drawn_fits import Condition, Draw, instrument_of, model_of
 from pyrcal_studies.drawn_fits import measured as drawn_matrices
 from pyrcal_studies.fft_pyramid import EllipticPyramid
@@ -53,6 +55,23 @@ def test_a_stated_modulation_of_none_is_questioned():
     assert modulation.found == pytest.approx(3.0, rel=0.03)
     assert np.all(np.abs(error) < [0.003, 0.003, np.deg2rad(0.02), 0.003])
     assert f"{KEY} = 3" in found.recommendation
+
+
+def test_a_signal_that_the_model_cannot_explain_makes_the_modulation_uncertain():
+    """Halves of PAPYRUS's modes are 10.45 and 11.62 λ/D: within 2 σ of their difference."""
+    models = SimpleNamespace(
+        sensor_key=KEY, sensor_number=10.5, coupling=None, exact=lambda _: True
+    )
+    nuisances = SimpleNamespace(
+        changes=lambda _: {Optic.SENSOR: 0.0}, first_optic=0, unknown=frozenset()
+    )
+    settled = SimpleNamespace(nuisances=nuisances, solution=SimpleNamespace(nuisances=None))
+    sure = SimpleNamespace(nuisance_sigma=[0.01])
+    clean, unexplained = (
+        list_optics(models, settled, sure, structure)[0].found_sigma for structure in (0.005, 0.12)
+    )
+    assert clean == pytest.approx(0.105, rel=0.05)
+    assert 11.62 - 10.45 < 2.0 * np.sqrt(2.0) * unexplained < 2.0
 
 
 def test_the_coordinate_is_the_logarithm_or_the_square_and_ends_at_none():

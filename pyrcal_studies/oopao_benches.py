@@ -91,6 +91,18 @@ CASES = {
     "ellipse-3-4": Case(modulation=3.0, ellipse=(3.0, 4.0, 0.0)),
     "rooftop": Case(modulation=0.0, rooftop=1.0),
     "rooftop-three": Case(modulation=3.0, rooftop=1.0),
+    # A rooftop and an aberration together darken one of the four images.
+    "whole-dark-image": Case(
+        modulation=0.0,
+        rooftop=0.5,
+        aberration_rad=0.3,
+        processing=WHOLE,
+        subapertures=36,
+        actuators=11,
+        separation_px=16,
+        alpha=(0.42, -1.1, 0.7, 1.12),
+        noise=0.03,
+    ),
     "whole-unmodulated": Case(modulation=0.0, processing=WHOLE),
     "whole-three": Case(modulation=3.0, processing=WHOLE),
     "unmodulated-aberrated": Case(modulation=0.0, aberration_rad=0.5),

@@ -98,7 +98,7 @@ def test_shares_add_up_to_one_and_what_to_measure_next_makes_half():
         "55% of the power left over comes from light (30%) and shape (25%): measure light; "
         "measure shape"
     )
-    assert advise_measurement((listed[0], rest)) == (
+    assert advise_measurement((listed[0], cause("noise", 0.05), rest)) == (
         "30% of the power left over has a known cause, which is not half: measure light"
     )
     assert advise_measurement(()) == ""

@@ -22,6 +22,7 @@ from pyrcal.twins.sampled import sample_bench
 from service.errors import ConfigurationError, MatrixError
 from service.files.container import opened
 from service.instrument import instrument_path, load_instrument
+from service.model.misregistration import BOUNDARY_SCALE
 from sim_rtc.assembly import build_telescope
 from sim_rtc.options import parse_options
 from tests.support.repository import ROOT
@@ -331,6 +332,23 @@ def test_the_ellipse_of_a_modulation_is_in_the_twin(elliptic, with_picture, tmp_
     ).read_text("utf-8")
 
 
+@pytest.mark.long
+@pytest.mark.timeout(500)
+def test_a_dark_image_of_a_simulation_is_not_taken_for_a_displaced_one(tmp_path):
+    """It seemed 4 pixels off, and the shift was 6 sigma wrong."""
+    saved = simulate("whole-dark-image", tmp_path)
+    # a mask of all pixels shows no image
+    bench = split(saved, tmp_path / "bench", ("valid_pixels", saved["wfs.validSignal"]))
+    stated = {"wavelength_m": float(saved["ngs.wavelength"]), "modulation": 0.0}
+    made = pyrcal.twin(
+        bench, tmp_path / "twin", diameter_m=0.6, pupil_subap=36, unit="m", threads=1, **stated
+    )
+    error = made.report.fit.alpha.vector * BOUNDARY_SCALE - [0.42, -1.1, 0.7, 1.12]
+    assert np.all(np.abs(error) < 3.0 * made.report.fit.sigma * BOUNDARY_SCALE)
+    assert np.all(np.abs(error) < [0.02, 0.02, 0.05, 0.002])
+    assert made.residual < 0.03
+
+
 CENTRES_PX = np.array([[11.5, 14.5], [13.5, 44.5], [42.5, 13.5], [43.5, 42.5]])
 """Pupil images up to three pixels off a square of 28 pixels."""
 
@@ -343,6 +361,7 @@ def displaced(tmp_path):
     np.save(tmp_path / "IM.npy", rng.standard_normal((12, 56, 56)) * np.any(lit, axis=0))
     np.save(tmp_path / "dm_modes.npy", rng.standard_normal((12, 40, 40)))
     np.save(tmp_path / "M2C.npy", np.eye(12))
+    np.save(tmp_path / "valid_pixels.npy", np.ones((56, 56)))  # OOPAO's, which shows no image
     options = argparse.Namespace(**{**STATED, "diameter_m": 0.6, "files": [(None, tmp_path)]})
     return read_bench(options).imported
 
@@ -353,7 +372,13 @@ def test_windows_of_a_simulated_bench_are_around_displaced_images(displaced):
     assert np.abs(found - CENTRES_PX).max() < 0.51
 
 
-@pytest.mark.parametrize("number", [0, 1])
+def test_images_that_seem_displaced_are_also_tried_on_a_square(displaced):
+    square = displaced[1].tables["wfs"]
+    assert square["pupil_separation_subap"] == 30
+    assert square["pupil_centres_px"] == [[y, x] for y in (12.5, 42.5) for x in (12.5, 42.5)]
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
 def test_the_response_is_no_light_that_frames_are_divided_by(displaced, number):
     assert displaced[number].tables["wfs"]["input"] == "normalised-frames"
     assert "flux_frame" not in displaced[number].arrays

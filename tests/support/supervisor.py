@@ -4,8 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from types import SimpleNamespace
 
+from service.estimation.windows import Telemetry
 from tests.support.pace import Deadline
+
+
+class Window(SimpleNamespace):
+    """A window of telemetry with no more than a test is about."""
+
+    refuse = Telemetry.refuse
 
 
 async def until(condition, timeout_s=5.0):

@@ -24,6 +24,7 @@ from service.tracking.reconstructors import check_sendable
 from service.tracking.resume import resumed, saved_of
 from sim_rtc.options import parse_options
 from tests.support.small import COMPUTE
+from tests.support.supervisor import Window
 
 FILE = """
 [instrument]
@@ -227,7 +228,7 @@ async def test_a_window_of_an_unknown_dither_is_not_taken_for_sines(night):
 
 async def test_a_window_of_a_session_before_is_not_fitted(night):
     """The worker has another model by then: of another mode, it could only fail."""
-    window = SimpleNamespace(session="before", t_end_ns_utc=7)
+    window = Window(session="before", t_end_ns_utc=7)
     lost = await fitted(window, night.state, workers=None, matrix_of=None)
     assert (lost.refused.reason.code, lost.refused.t_ns_utc) == ("window.other-session", 7)
     assert lost.refused.kind is RefusalKind.VOID

@@ -32,7 +32,7 @@ from tests.support.link import applied, send
 from tests.support.pace import in_time, patience
 from tests.support.situations import POLICY, Story, record
 from tests.support.states import changed, tracker_state
-from tests.support.supervisor import running, until
+from tests.support.supervisor import Window, running, until
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -694,7 +694,7 @@ async def test_a_window_waits_until_the_rtcs_own_matrix_has_been_read(supervisor
     supervisor._actions._remember("own", np.zeros((45, 224), np.float32))
     async with running(supervisor):
         supervisor.swapped("own")
-        windows = [SimpleNamespace(t_end_ns_utc=n * 60_000_000_000) for n in range(2)]
+        windows = [Window(t_end_ns_utc=n * 60_000_000_000) for n in range(2)]
         for window in windows:
             supervisor.fit(window)
         names = [wait.name for wait in supervisor.snapshot().waiting_for]

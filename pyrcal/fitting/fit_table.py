@@ -88,7 +88,8 @@ def _anamorphosis(found: NDArray[np.float64], sigma: NDArray[np.float64]) -> str
 
 
 def _number(value: float, decimals: int) -> str:
-    return f"{value:12.{decimals}f}" if np.isfinite(value) else f"{'-':>12s}"
+    # without the sign of a zero
+    return f"{value:z12.{decimals}f}" if np.isfinite(value) else f"{'-':>12s}"
 
 
 def _basis_lines(report: FitReport) -> Iterator[str]:

@@ -312,7 +312,7 @@ def _correct(imported: Imported, fit: Fit, values: Mapping[str, Any]) -> Importe
 
 @contextlib.contextmanager
 def _draft(made: Twin, tables: Tables) -> Iterator[Path]:
-    """Write an instrument file of other tables beside the twin's, which is removed after use."""
+    """Write an instrument file of other tables beside the twin's; it is removed after use."""
     path = made.folder / f"draft-{TWIN_FILE}"
     path.write_text(replace(made.imported, tables=tables).instrument_text(), encoding="utf-8")
     yield path

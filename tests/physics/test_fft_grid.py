@@ -131,30 +131,35 @@ def compare(about, n_points, first=0.5, sampling=POINTS):
     return np.linalg.norm(found - expected) / np.linalg.norm(expected)
 
 
+def measure_frames(about, magnification):
+    """Return the instrument with windows, and frames of its modes at a shift of 0.3 and -0.4.
+
+    A negative magnification turns the mirror by 180 deg as well.
+    """
+    pupil = InteractionModel(
+        about, small_basis(), pupil_sampling=POINTS, detector_nodes=POINTS
+    ).pupil
+    maps = np.zeros((40, *pupil.amplitude.shape))
+    points = (pupil.points - [0.3, -0.4]) / magnification
+    maps[:, pupil.lit] = STROKE_M * small_basis().render(points).T
+    push, pull = (
+        simulated_frames(pupil.amplitude, sign * maps, about.wfs, 2) for sign in (1.0, -1.0)
+    )
+    middle, half = (WIDTH - 1) / 2, about.wfs.image_separation_subap / 2
+    centres = middle + half * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+    windows = FrameWindows(centres_px=centres, normalised=True)
+    seen = replace(about, stop=Stop.TELESCOPE, frames=windows)
+    return seen, (push - pull) / (2 * STROKE_M) / push.sum(axis=(1, 2))[:, None, None]
+
+
 @pytest.mark.parametrize("rotation_deg", [0.0, 180.0])
 def test_frames_of_an_unmodulated_pyramid_have_a_unit_although_its_modulation_is_unknown(
     rotation_deg,
 ):
     """With the light of the usual 3 λ/D gains were 0.6, and no orientation was found at 180 deg."""
-    about = bench(0.0)
-    pupil = InteractionModel(about, small_basis(), pupil_sampling=POINTS, detector_nodes=POINTS)
-    turned = np.array([[1.0, 0.0], [0.0, 1.0]]) * (-1.0 if rotation_deg else 1.0)
-    points = (pupil.pupil.points - [0.3, -0.4]) @ turned / 1.1
-    maps = np.zeros((40, *pupil.pupil.amplitude.shape))
-    maps[:, pupil.pupil.lit] = STROKE_M * small_basis().render(points).T
-    push, pull = (
-        simulated_frames(pupil.pupil.amplitude, sign * maps, about.wfs, 2) for sign in (1.0, -1.0)
-    )
-    middle, half = (WIDTH - 1) / 2, about.wfs.image_separation_subap / 2
-    centres = middle + half * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
-    unknown = replace(
-        about,
-        stop=Stop.TELESCOPE,
-        wfs=replace(about.wfs, modulation_lambda_over_d=3.0),
-        frames=FrameWindows(centres_px=centres, normalised=True),
-        unknown=("wfs.modulation_lambda_over_d",),
-    )
-    found = fit(unknown, (push - pull) / (2 * STROKE_M) / push.sum(axis=(1, 2))[:, None, None])
+    about, frames = measure_frames(bench(0.0), -1.1 if rotation_deg else 1.1)
+    wfs = replace(about.wfs, modulation_lambda_over_d=3.0)
+    found = fit(replace(about, wfs=wfs, unknown=("wfs.modulation_lambda_over_d",)), frames)
     assert found.accepted
     error = found.alpha.vector - [0.3, -0.4, np.deg2rad(rotation_deg), 1.1]
     error[2] = np.angle(np.exp(1j * error[2]))
@@ -164,23 +169,8 @@ def test_frames_of_an_unmodulated_pyramid_have_a_unit_although_its_modulation_is
 
 def frames_of_rooftop(rooftop):
     """Return an instrument with an unknown rooftop, and the frames of one, at a known α."""
-    about = bench(0.0, rooftop)
-    pupil = InteractionModel(about, small_basis(), pupil_sampling=POINTS, detector_nodes=POINTS)
-    points = (pupil.pupil.points - [0.3, -0.4]) / 1.02
-    maps = np.zeros((40, *pupil.pupil.amplitude.shape))
-    maps[:, pupil.pupil.lit] = STROKE_M * small_basis().render(points).T
-    push, pull = (
-        simulated_frames(pupil.pupil.amplitude, sign * maps, about.wfs, 2) for sign in (1.0, -1.0)
-    )
-    middle, half = (WIDTH - 1) / 2, about.wfs.image_separation_subap / 2
-    centres = middle + half * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
-    told = replace(
-        about,
-        stop=Stop.TELESCOPE,
-        wfs=replace(about.wfs, rooftop_lambda_over_d=0.0),
-        frames=FrameWindows(centres_px=centres, normalised=True),
-    )
-    return told, (push - pull) / (2 * STROKE_M) / push.sum(axis=(1, 2))[:, None, None]
+    about, frames = measure_frames(bench(0.0, rooftop), 1.02)
+    return replace(about, wfs=replace(about.wfs, rooftop_lambda_over_d=0.0)), frames
 
 
 @pytest.mark.parametrize("rooftop", [0.0, 0.6])
